@@ -1,0 +1,41 @@
+"""Every error the package raises on purpose.
+
+Library code raises one of these; only the command line exits (with code 2).
+Each message quotes the offending value and says what to do about it.
+"""
+
+
+class NSFError(Exception):
+    """Base class: a fault the user can mend; its text names the remedy."""
+
+
+class ConfigError(NSFError):
+    """A key is unknown, missing, or has a value outside its valid range."""
+
+
+class ShapeError(NSFError):
+    """Arrays disagree in shape, particle number or particle identity."""
+
+
+class SchemaError(NSFError):
+    """A file is truncated, foreign, of a newer schema, or for other particles."""
+
+
+class StorageError(NSFError):
+    """A file could not be written: no space, no permission."""
+
+
+class DeviceError(NSFError):
+    """A device was asked for that this machine does not have."""
+
+
+class InstabilityError(NSFError):
+    """A time step is unstable, or particles left the domain or became non-finite."""
+
+
+class ProjectionError(NSFError):
+    """The latent projection is ill-posed or diverged."""
+
+
+class MissingRunError(NSFError):
+    """A stage needs the result of an earlier stage that does not exist."""
