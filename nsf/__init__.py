@@ -1,0 +1,1 @@
+"""Neural stress fields: reduced-order elastoplasticity and fracture."""

@@ -1,0 +1,164 @@
+"""Configuration: Hydra groups in `conf/`, composed and checked.
+
+A problem parameter is the value of one configuration key (`scene.parameters.key`), so a
+simulation at a parameter value is the same configuration with that key replaced.
+"""
+
+import difflib
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
+from hydra.utils import instantiate
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from nsf.errors import ConfigError, NSFError
+
+
+def _bundled(name: str) -> Path:
+    """Folder that a wheel carries inside the package and a checkout beside it."""
+    inside = Path(__file__).parent / name
+    return inside if inside.is_dir() else Path(__file__).parent.parent / name
+
+
+CONF = _bundled("conf")
+EXPERIMENTS = _bundled("experiments")
+
+
+def _scaled(table: DictConfig, *, _root_: DictConfig):
+    """`${scaled:{small: a, paper: b}}`: the entry of the scale in force."""
+    scale = _root_.scale
+    if scale not in table:
+        raise ConfigError(f"scale={scale} is unknown here; choose one of {', '.join(map(str, table))}")
+    return table[scale]
+
+
+def _per(count) -> float:
+    """`${per:150}` = 1/150."""
+    return 1.0 / float(count)
+
+
+OmegaConf.register_new_resolver("scaled", _scaled, replace=True)
+OmegaConf.register_new_resolver("per", _per, replace=True)
+
+
+def groups() -> dict[str, list[str]]:
+    """Names of the options of every configuration group."""
+    found = {}
+    for folder in sorted(p for p in CONF.iterdir() if p.is_dir()):
+        found[folder.name] = sorted(f.stem for f in folder.glob("*.yaml"))
+    return found
+
+
+def load(overrides: Sequence[str] = (), config_name: str = "config") -> DictConfig:
+    """Compose the configuration from Hydra overrides and resolve it.
+
+    Args:
+        overrides: `key=value` in Hydra's grammar, for example `scene=sand`, `scene.dt=0.001`.
+        config_name: the primary file in `conf/`.
+
+    Raises:
+        ConfigError: unknown key or option (with the nearest known one), a missing value,
+            a syntax error, or an `_target_` outside `nsf`.
+    """
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            config = compose(config_name, overrides=list(overrides))
+    except HydraException as error:
+        raise ConfigError(_explain(error, config_name, overrides)) from error
+    return resolve(config)
+
+
+def resolve(config: DictConfig) -> DictConfig:
+    """Replace every interpolation by its value and check targets and missing values.
+
+    Raises:
+        ConfigError: see `load`.
+    """
+    try:
+        config = OmegaConf.create(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
+    except OmegaConfBaseException as error:
+        cause = error.__cause__
+        if isinstance(cause, NSFError):
+            raise cause from error
+        raise ConfigError(str(error).splitlines()[0]) from error
+    check_targets(config)
+    return config
+
+
+def check_targets(config: DictConfig) -> None:
+    """Refuse an `_target_` that is not part of this package: configuration is not code.
+
+    Raises:
+        ConfigError: names the target.
+    """
+    stack = [OmegaConf.to_container(config, resolve=False)]
+    while stack:
+        node = stack.pop()
+        if isinstance(node, dict):
+            target = node.get("_target_")
+            if target is not None and not re.fullmatch(r"nsf(\.\w+)+", str(target)):
+                raise ConfigError(f"_target_: {target} is refused; only nsf.* classes are built from a configuration")
+            stack.extend(node.values())
+        elif isinstance(node, list):
+            stack.extend(node)
+
+
+def build(config: DictConfig, where: str):
+    """Instantiate the `_target_` of a configuration node.
+
+    Raises:
+        ConfigError: a misspelt key, or a value that the class refuses; names the node.
+    """
+    check_targets(config)
+    try:
+        return instantiate(config, _convert_="all")
+    except HydraException as error:
+        cause = error.__cause__
+        if isinstance(cause, NSFError):
+            raise cause from error
+        detail = str(cause or error).splitlines()[0]
+        if isinstance(cause, TypeError) and "unexpected keyword" in detail:
+            raise ConfigError(f"{where}: {detail.split('got an ')[-1]}; known keys are in conf/{where}/") from error
+        raise ConfigError(f"{where}: {detail}") from error
+
+
+def _keys(node, prefix: str = "") -> list[str]:
+    if not isinstance(node, dict):
+        return [prefix]
+    return [prefix] * bool(prefix) + [k for n, v in node.items() for k in _keys(v, f"{prefix}.{n}" if prefix else n)]
+
+
+def _explain(error: Exception, config_name: str, overrides: Sequence[str]) -> str:
+    """Hydra's message in one line, with the nearest known key."""
+    text = str(error)
+    first = text.splitlines()[0]
+    missing = re.search(r"Could not override '([^']+)'", text)
+    if missing:
+        key = missing.group(1)
+        known = _known_keys(config_name, [o for o in overrides if not o.lstrip("+~").startswith(key)])
+        near = difflib.get_close_matches(key, known, n=3, cutoff=0.5)
+        hint = f"; did you mean {' or '.join(near)}?" if near else "; see `nsf --help` for the groups"
+        return f"unknown key {key!r}{hint}"
+    option = re.search(r"Could not find '([^']+)/([^']+)'", text) or re.search(r"In '[^']+': Could not find '([^']+)/([^']+)'", text)
+    if option:
+        group, name = option.groups()
+        known = groups().get(group, [])
+        near = difflib.get_close_matches(name, known, n=1)
+        return f"unknown {group}={name}; choose one of {', '.join(known)}" + (f" (did you mean {near[0]}?)" if near else "")
+    return first
+
+
+def _known_keys(config_name: str, overrides: Sequence[str]) -> list[str]:
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            config = compose(config_name, overrides=list(overrides))
+    except HydraException:
+        return list(groups())
+    return _keys(OmegaConf.to_container(config, resolve=False))

@@ -1,0 +1,29 @@
+"""Full-order material point method (paper section 3). Never imports torch."""
+
+import warp as wp
+
+wp.config.log_level = wp.LOG_ERROR  # kernels are compiled without a word; errors still show
+
+from nsf.mpm.boundary import BoundaryArrays, DomainWalls, HalfSpace  # noqa: E402
+from nsf.mpm.grid import Grid, GridGeometry  # noqa: E402
+from nsf.mpm.precision import FP32, FP64, Precision, precision_of  # noqa: E402
+from nsf.mpm.solver import FullOrderMPM, GridStep  # noqa: E402
+from nsf.mpm.state import ParticleConstants, ParticleState  # noqa: E402
+from nsf.mpm.transfer import Transfer  # noqa: E402
+
+__all__ = [
+    "FP32",
+    "FP64",
+    "BoundaryArrays",
+    "DomainWalls",
+    "FullOrderMPM",
+    "Grid",
+    "GridGeometry",
+    "GridStep",
+    "HalfSpace",
+    "ParticleConstants",
+    "ParticleState",
+    "Precision",
+    "Transfer",
+    "precision_of",
+]

@@ -1,0 +1,20 @@
+"""Constitutive laws (paper, appendix "Elasticity and plasticity details")."""
+
+from nsf.mpm.materials.base import LawFunctions, Material, make_elastic_stress, make_stress_update
+from nsf.mpm.materials.driver import PATHS, deformation_path, drive
+from nsf.mpm.materials.drucker_prager import DruckerPrager
+from nsf.mpm.materials.fixed_corotated import FixedCorotated
+from nsf.mpm.materials.hencky import Hencky
+
+__all__ = [
+    "PATHS",
+    "DruckerPrager",
+    "FixedCorotated",
+    "Hencky",
+    "LawFunctions",
+    "Material",
+    "deformation_path",
+    "drive",
+    "make_elastic_stress",
+    "make_stress_update",
+]

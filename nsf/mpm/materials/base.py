@@ -1,0 +1,145 @@
+"""What a constitutive law is: parameters, a stress function and a return map."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, ClassVar
+
+import numpy as np
+import warp as wp
+
+from nsf.errors import ConfigError
+from nsf.mpm.precision import Precision
+
+
+@dataclass(frozen=True)
+class LawFunctions:
+    """The Warp side of a law.
+
+    Attributes:
+        tau_of: (F_e, mu, lam) → Kirchhoff stress [Pa].
+        return_map: (F_trial, history, mu, lam, params, dt) → (F_e, history).
+        Params: Warp struct of the law's constants.
+    """
+
+    tau_of: Any
+    return_map: Any
+    Params: Any
+
+
+@dataclass(frozen=True)
+class Material(ABC):
+    """A constitutive law with its parameters.
+
+    Attributes:
+        E: Young's modulus [Pa].
+        nu: Poisson's ratio, dimensionless, in (−1, 1/2).
+
+    Raises:
+        ConfigError: a value lies outside its physical range.
+    """
+
+    E: float
+    nu: float
+
+    history_size: ClassVar[int] = 1  # Warp has no vector of length 0, so laws without history carry one zero
+
+    def __post_init__(self):
+        if not self.E > 0:
+            raise ConfigError(f"material.E={self.E} Pa must be positive")
+        if not -1.0 < self.nu < 0.5:
+            raise ConfigError(f"material.nu={self.nu} must lie in (-1, 0.5)")
+
+    @property
+    def mu(self) -> float:
+        """Shear modulus μ̂ = E/(2(1 + ν)) [Pa]."""
+        return self.E / (2.0 * (1.0 + self.nu))
+
+    @property
+    def lam(self) -> float:
+        """First Lamé parameter λ = Eν/((1 + ν)(1 − 2ν)) [Pa]."""
+        return self.E * self.nu / ((1.0 + self.nu) * (1.0 - 2.0 * self.nu))
+
+    def initial_history(self, particles: int) -> np.ndarray:
+        """[P, H] history variables at rest."""
+        return np.zeros((particles, self.history_size))
+
+    @abstractmethod
+    def functions(self, precision: Precision) -> LawFunctions:
+        """The law's Warp functions in one precision."""
+
+    def params(self, precision: Precision):
+        """The law's constants as its Warp struct."""
+        return self.functions(precision).Params()
+
+
+@cache
+def make_stress_update(law: LawFunctions, precision: Precision, history_size: int):
+    """Kernel of the constitutive update, one thread a particle: one kernel a law and precision.
+
+    F_trial = f F_e, F_e ← returnMap(F_trial), τ = τ(F_e).
+
+    Source: paper section 3.3, step 3.
+    """
+    tau_of, return_map, Params = law.tau_of, law.return_map, law.Params
+    real, mat33 = precision.real, precision.mat33
+    vecH = wp.types.vector(length=history_size, dtype=real)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def update(
+        increment: wp.array(dtype=mat33),
+        mu: wp.array(dtype=real),
+        lam: wp.array(dtype=real),
+        params: Params,
+        dt: real,
+        F_e: wp.array(dtype=mat33),
+        history: wp.array(dtype=vecH),
+        tau: wp.array(dtype=mat33),
+    ):
+        p = wp.tid()
+        F, h = return_map(increment[p] * F_e[p], history[p], mu[p], lam[p], params, dt)
+        F_e[p] = F
+        history[p] = h
+        tau[p] = tau_of(F, mu[p], lam[p])
+
+    return update
+
+
+@cache
+def make_elastic_stress(law: LawFunctions, precision: Precision):
+    """Kernel of the elastic law alone: τ = τ(F), no return map, no history."""
+    tau_of = law.tau_of
+    real, mat33 = precision.real, precision.mat33
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def elastic_stress(
+        F: wp.array(dtype=mat33), mu: wp.array(dtype=real), lam: wp.array(dtype=real), tau: wp.array(dtype=mat33)
+    ):
+        p = wp.tid()
+        tau[p] = tau_of(F[p], mu[p], lam[p])
+
+    return elastic_stress
+
+
+@cache
+def no_params():
+    """Struct of a law without constants of its own."""
+
+    @wp.struct
+    class NoParams:
+        unused: wp.int32
+
+    return NoParams
+
+
+@cache
+def no_return_map(precision: Precision):
+    """Return map of a purely elastic law: F_e = F_trial."""
+    real, mat33, NoParams = precision.real, precision.mat33, no_params()
+    vecH = wp.types.vector(length=1, dtype=real)
+
+    @wp.func
+    def elastic(F_trial: mat33, history: vecH, mu: real, lam: real, params: NoParams, dt: real):
+        return F_trial, history
+
+    return elastic

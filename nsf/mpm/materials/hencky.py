@@ -1,0 +1,47 @@
+"""Hencky elasticity (StVK in principal logarithmic strain)."""
+
+from dataclasses import dataclass
+from functools import cache
+
+import warp as wp
+
+from nsf.mpm.materials.base import LawFunctions, Material, no_params, no_return_map
+from nsf.mpm.precision import Precision
+
+
+@cache
+def hencky_tau(precision: Precision):
+    """Warp function τ = U (2μ̂ ε + λ tr(ε) 1) Uᵀ with ε = log Σ, F = U Σ Vᵀ.
+
+    Source: paper, appendix "StVK elasticity". Printed with Vᵀ on the right, which is
+    neither symmetric nor objective; with Uᵀ it is the Kirchhoff stress of the energy
+    ψ = μ̂ tr(ε²) + λ/2 tr(ε)².
+    """
+    real, vec3, mat33 = precision.real, precision.vec3, precision.mat33
+
+    @wp.func
+    def tau_of(F: mat33, mu: real, lam: real):
+        U = mat33()
+        V = mat33()
+        sigma = vec3()
+        wp.svd3(F, U, sigma, V)
+        eps = vec3(wp.log(sigma[0]), wp.log(sigma[1]), wp.log(sigma[2]))
+        trace = eps[0] + eps[1] + eps[2]
+        principal = real(2.0) * mu * eps + lam * trace * vec3(real(1.0), real(1.0), real(1.0))
+        return U * wp.diag(principal) * wp.transpose(U)
+
+    return tau_of
+
+
+@cache
+def _functions(precision: Precision) -> LawFunctions:
+    return LawFunctions(hencky_tau(precision), no_return_map(precision), no_params())
+
+
+@dataclass(frozen=True)
+class Hencky(Material):
+    """Elastic solid, ψ = μ̂ tr(ε²) + λ/2 tr(ε)², ε the logarithmic strain."""
+
+    def functions(self, precision: Precision) -> LawFunctions:
+        """The law's Warp functions."""
+        return _functions(precision)

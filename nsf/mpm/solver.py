@@ -1,0 +1,223 @@
+"""The full-order material point method (paper section 3.3)."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import warp as wp
+
+from nsf.errors import ConfigError, InstabilityError, ShapeError
+from nsf.mpm.boundary import BoundaryArrays, DomainWalls, HalfSpace
+from nsf.mpm.device import warp_device
+from nsf.mpm.grid import Grid, GridGeometry, make_grid_update
+from nsf.mpm.materials import Material, make_stress_update
+from nsf.mpm.precision import Precision, precision_of
+from nsf.mpm.stability import check_time_step, make_particle_check
+from nsf.mpm.state import ParticleConstants, ParticleState
+from nsf.mpm.transfer import Transfer, make_g2p, make_p2g
+
+_NEVER = 2**31 - 1
+
+
+class GridStep:
+    """P2G, grid update and G2P over given particle arrays.
+
+    What the full-order and the reduced solver share: there is one sequence of these
+    kernels, so a reduced step is the full-order step on fewer particles.
+
+    Args:
+        grid: the nodes.
+        boundaries: colliders and walls.
+        transfer: transfer scheme and B-spline.
+        gravity: [3] [m/s²].
+        dt: step [s].
+        precision: floating-point types.
+        device: Warp device.
+    """
+
+    def __init__(self, grid: Grid, boundaries: BoundaryArrays, transfer: Transfer, gravity, dt, precision, device):
+        real = precision.real
+        self.grid, self.device = grid, device
+        self.dx, self.dt = real(grid.geometry.dx), real(dt)
+        self.gravity = precision.vec3(*gravity)
+        self.boundaries = boundaries
+        self.affine_shares = tuple(real(s) for s in transfer.affine_shares)
+        self._p2g = make_p2g(precision, transfer.shape)
+        self._g2p = make_g2p(precision, transfer.shape)
+        self._update = make_grid_update(precision)
+
+    def p2g(self, x, v, C, tau, mass, volume0) -> None:
+        """Particles → grid: mass, momentum and the impulse of the stress."""
+        grid = self.grid
+        grid.clear()
+        inputs = [x, v, C, tau, mass, volume0, grid.shape, grid.slots, self.dx, self.dt, grid.mass, grid.momentum]
+        wp.launch(self._p2g, dim=x.shape[0], inputs=inputs, device=self.device)
+
+    def update(self) -> None:
+        """Momentum → velocity at the next time level, boundaries included."""
+        grid = self.grid
+        inputs = [grid.mass, grid.momentum, grid.nodes, grid.shape, self.dx, self.dt, self.gravity]
+        wp.launch(self._update, dim=grid.count, inputs=inputs + self.boundaries.arguments, device=self.device)
+
+    def g2p(self, x, v, C, increment) -> None:
+        """Grid → particles: velocity, position, affine momentum, deformation increment."""
+        grid = self.grid
+        inputs = [grid.momentum, grid.shape, grid.slots, self.dx, self.dt, *self.affine_shares, x, v, C, increment]
+        wp.launch(self._g2p, dim=x.shape[0], inputs=inputs, device=self.device)
+
+
+class FullOrderMPM:
+    """Explicit symplectic MPM over every particle.
+
+    Args:
+        constants: particles.
+        material: constitutive law.
+        grid: grid geometry.
+        dt: step [s].
+        gravity: [3] [m/s²].
+        colliders: half-spaces, applied in order.
+        walls: condition on the faces of the domain.
+        transfer: PIC, APIC or RPIC, and the B-spline.
+        x, v: [P, 3] initial position [m] (default X) and velocity [m/s] (default 0).
+        precision: `fp64` or `fp32`.
+        device: `cpu`, `cuda`, `cuda:N` or `auto`.
+        check_every: steps between checks of finiteness and bounds.
+
+    Raises:
+        InstabilityError: Δt is unstable; the message names the largest stable one.
+        ShapeError: x or v is not [P, 3].
+        DeviceError: the device does not exist.
+
+    Source: paper section 3.3.
+    """
+
+    def __init__(
+        self,
+        constants: ParticleConstants,
+        material: Material,
+        grid: GridGeometry,
+        dt: float,
+        gravity: Sequence[float] = (0.0, 0.0, 0.0),
+        colliders: Sequence[HalfSpace] = (),
+        walls: DomainWalls = DomainWalls(),
+        transfer: Transfer = Transfer(),
+        x: np.ndarray | None = None,
+        v: np.ndarray | None = None,
+        precision: str | Precision = "fp64",
+        device: str = "cpu",
+        check_every: int = 50,
+    ):
+        if check_every < 1:
+            raise ConfigError(f"check_every={check_every} must be at least 1 step")
+        self.constants, self.material, self.dt = constants, material, float(dt)
+        self.precision = precision_of(precision)
+        self.device = warp_device(device)
+        self.check_every = check_every
+        self.steps_taken = 0
+        x = constants.X if x is None else np.asarray(x, np.float64)
+        v = np.zeros_like(constants.X) if v is None else np.asarray(v, np.float64)
+        if x.shape != constants.X.shape or v.shape != constants.X.shape:
+            raise ShapeError(f"x {x.shape} and v {v.shape} must have the shape of X {constants.X.shape}")
+        check_time_step(constants, v, grid.dx, dt)
+
+        real = self.precision.real
+
+        def on_device(values):
+            return wp.array(values, dtype=real, device=self.device)
+
+        self.mass, self.volume0 = on_device(constants.mass), on_device(constants.volume0)
+        self.mu, self.lam = on_device(constants.mu), on_device(constants.lam)
+        history = material.initial_history(len(constants))
+        self.state = ParticleState(x, v, history, self.precision, self.device)
+        self.grid = Grid(grid, self.precision, self.device)
+        boundaries = BoundaryArrays(colliders, walls, self.precision, self.device)
+        self.grid_step = GridStep(self.grid, boundaries, transfer, gravity, dt, self.precision, self.device)
+        law = material.functions(self.precision)
+        self._stress_update = make_stress_update(law, self.precision, material.history_size)
+        self._params = material.params(self.precision)
+        self._check = make_particle_check(self.precision, transfer.shape)
+        self._first_bad = wp.full(2, _NEVER, dtype=wp.int32, device=self.device)
+        self._graph = None
+        self.check()
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s]."""
+        return self.steps_taken * self.dt
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the solver's arrays take on the device."""
+        own = (self.mass, self.volume0, self.mu, self.lam, self._first_bad)
+        return self.state.nbytes + self.grid.nbytes + sum(a.capacity for a in own)
+
+    def step(self, n: int = 1) -> None:
+        """Advance by n steps of Δt.
+
+        Raises:
+            InstabilityError: a particle became non-finite or left the grid (checked every
+                `check_every` steps); the message names particle, step and time.
+        """
+        for _ in range(n):
+            self._advance()
+            self.steps_taken += 1
+            if self.steps_taken % self.check_every == 0:
+                self.check()
+
+    def _advance(self) -> None:
+        if not self.device.is_cuda:
+            self.stages()
+            return
+        if self._graph is None:
+            # The first step runs uncaptured, so that every kernel is compiled and loaded.
+            self.stages()
+            with wp.ScopedCapture(device=self.device) as capture:
+                self.stages()
+            self._graph = capture.graph
+            return
+        wp.capture_launch(self._graph)
+
+    def stages(self) -> None:
+        """One step, kernel by kernel: P2G, grid update, G2P, constitutive update."""
+        self.p2g()
+        self.grid_step.update()
+        self.g2p()
+        self.update_stress()
+
+    def p2g(self) -> None:
+        """Particles → grid."""
+        s = self.state
+        self.grid_step.p2g(s.x, s.v, s.C, s.tau, self.mass, self.volume0)
+
+    def g2p(self) -> None:
+        """Grid → particles."""
+        s = self.state
+        self.grid_step.g2p(s.x, s.v, s.C, s.increment)
+
+    def update_stress(self) -> None:
+        """F_e ← returnMap(f F_e), τ ← τ(F_e)."""
+        s = self.state
+        inputs = [s.increment, self.mu, self.lam, self._params, self.grid_step.dt, s.F_e, s.history, s.tau]
+        wp.launch(self._stress_update, dim=len(s), inputs=inputs, device=self.device)
+
+    def check(self) -> None:
+        """Stop if a particle is non-finite or off the grid.
+
+        Raises:
+            InstabilityError: names the particle, the step and the time.
+        """
+        s = self.state
+        self._first_bad.fill_(_NEVER)
+        inputs = [s.x, s.v, s.tau, self.grid.shape, self.grid_step.dx, self._first_bad[0:1], self._first_bad[1:2]]
+        wp.launch(self._check, dim=len(s), inputs=inputs, device=self.device)
+        non_finite, outside = (int(p) for p in self._first_bad.numpy())
+        when = f"at step {self.steps_taken}, t = {self.time:.6g} s"
+        if non_finite != _NEVER:
+            raise InstabilityError(
+                f"particle {non_finite} became non-finite {when} or in the {self.check_every} steps before; reduce dt={self.dt:g} s"
+            )
+        if outside != _NEVER:
+            where = np.array2string(s.x.numpy()[outside], precision=4)
+            raise InstabilityError(
+                f"particle {outside} left the grid {when}: x = {where} m, domain [0, {self.grid.geometry.upper}] m; "
+                f"enlarge the domain, add a boundary or reduce dt={self.dt:g} s"
+            )

@@ -1,0 +1,85 @@
+"""Is the time step stable, and has the simulation gone wrong?"""
+
+from functools import cache
+
+import numpy as np
+import warp as wp
+
+from nsf.errors import InstabilityError
+from nsf.mpm.grid import inside
+from nsf.mpm.precision import Precision
+from nsf.mpm.shape import shape_functions
+from nsf.mpm.state import ParticleConstants
+
+# c Δt/Δx = 1 is the limit of one quadrature point in the middle of each cell, the worst regular
+# arrangement of particles under B-splines (quadratic with exact quadrature: 1.63).
+MAX_ELASTIC_CFL = 1.0
+# A particle must not cross more than a cell in a step.
+MAX_ADVECTIVE_CFL = 1.0
+_ROUND_OFF = 1e-9
+
+
+def wave_speed(constants: ParticleConstants) -> float:
+    """Largest elastic wave speed c = √((λ + 2μ̂)/ρ) [m/s]."""
+    density = constants.mass / constants.volume0
+    return float(np.sqrt((constants.lam + 2.0 * constants.mu) / density).max())
+
+
+def largest_stable_dt(constants: ParticleConstants, v: np.ndarray, dx: float) -> float:
+    """Largest Δt [s] that both CFL conditions allow.
+
+    Args:
+        constants: the particles.
+        v: [P, 3] velocity [m/s].
+        dx: grid spacing [m].
+    """
+    elastic = MAX_ELASTIC_CFL * dx / wave_speed(constants)
+    speed = float(np.linalg.norm(v, axis=1).max())
+    return elastic if speed == 0.0 else min(elastic, MAX_ADVECTIVE_CFL * dx / speed)
+
+
+def check_time_step(constants: ParticleConstants, v: np.ndarray, dx: float, dt: float) -> None:
+    """Refuse an unstable step before it is taken.
+
+    Raises:
+        InstabilityError: Δt exceeds the elastic or the advective limit; names the largest stable one.
+    """
+    if not (np.isfinite(dt) and dt > 0):
+        raise InstabilityError(f"dt={dt} s must be positive and finite")
+    largest = largest_stable_dt(constants, v, dx)
+    if dt > largest * (1.0 + _ROUND_OFF):
+        c = wave_speed(constants)
+        speed = float(np.linalg.norm(v, axis=1).max())
+        raise InstabilityError(
+            f"dt={dt:g} s is unstable: elastic CFL c dt/dx = {c * dt / dx:.3g} (limit {MAX_ELASTIC_CFL:g}, c = {c:.4g} m/s), "
+            f"advective CFL |v| dt/dx = {speed * dt / dx:.3g} (limit {MAX_ADVECTIVE_CFL:g}); "
+            f"the largest stable dt is {np.nextafter(largest, 0.0):.6g} s"
+        )
+
+
+@cache
+def make_particle_check(precision: Precision, shape_name: str):
+    """Kernel that records the lowest index of a particle that is non-finite or off the grid."""
+    real, vec3, mat33 = precision.real, precision.vec3, precision.mat33
+    shape = shape_functions(precision, shape_name)
+    base_node, width = shape.base_node, shape.degree + 1
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def check(
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        tau: wp.array(dtype=mat33),
+        grid_shape: wp.vec3i,
+        dx: real,
+        first_non_finite: wp.array(dtype=wp.int32),
+        first_outside: wp.array(dtype=wp.int32),
+    ):
+        p = wp.tid()
+        # The sum of squares is finite only if every entry is.
+        size = wp.length_sq(x[p]) + wp.length_sq(v[p]) + wp.ddot(tau[p], tau[p])
+        if not wp.isfinite(size):
+            wp.atomic_min(first_non_finite, 0, p)
+        elif not inside(base_node(x[p], real(1.0) / dx), width, grid_shape):
+            wp.atomic_min(first_outside, 0, p)
+
+    return check

@@ -1,0 +1,209 @@
+"""Scenes: what is simulated (paper section 6)."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+
+from nsf import config as configuration
+from nsf.errors import ConfigError
+from nsf.mpm import DomainWalls, FullOrderMPM, GridGeometry, HalfSpace, ParticleConstants, Transfer
+from nsf.mpm.materials import Material
+from nsf.scenes.geometry import Shape
+
+
+@dataclass(frozen=True)
+class Body:
+    """Particles of one shape.
+
+    Attributes:
+        shape: where the particles are at rest.
+        particles: how many.
+        density: reference density [kg/m³].
+        velocity: initial velocity [m/s].
+
+    Raises:
+        ConfigError: no particles, a density that is not positive.
+    """
+
+    shape: Shape
+    particles: int
+    density: float
+    velocity: Sequence[float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self):
+        if self.particles < 1:
+            raise ConfigError(f"particles={self.particles} must be at least 1")
+        if not self.density > 0:
+            raise ConfigError(f"density={self.density} kg/m³ must be positive")
+
+
+@dataclass(frozen=True)
+class ParameterRange:
+    """The problem parameter μ of a scene and the values it takes (paper section 4.1).
+
+    Attributes:
+        key: configuration key that the parameter replaces, for example `material.friction_angle`.
+        unit: unit for tables and charts.
+        train, validation, test: values; no value is in two of them.
+
+    Raises:
+        ConfigError: a list is empty where it must not be, or lists overlap.
+    """
+
+    key: str
+    unit: str
+    train: Sequence[float]
+    test: Sequence[float]
+    validation: Sequence[float] = ()
+
+    @property
+    def name(self) -> str:
+        """Last part of the key."""
+        return self.key.rsplit(".", 1)[-1]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A full-order problem: bodies, law, boundaries, time span, problem parameter.
+
+    Attributes:
+        name, scale: what it is called.
+        dx: grid spacing [m]; dt: step [s]; steps: number of steps, each a frame.
+        size: domain edge lengths [m]; gravity: [3] [m/s²].
+        bodies: what moves; colliders, walls: boundaries.
+        material: constitutive law; transfer: PIC, APIC or RPIC.
+        parameters: the problem parameter and its values.
+        config: the resolved configuration that it was built from.
+    """
+
+    name: str
+    scale: str
+    dx: float
+    dt: float
+    steps: int
+    size: tuple[float, float, float]
+    gravity: tuple[float, float, float]
+    bodies: tuple[Body, ...]
+    colliders: tuple[HalfSpace, ...]
+    walls: DomainWalls
+    material: Material
+    transfer: Transfer
+    parameters: ParameterRange
+    config: DictConfig = field(repr=False, compare=False)
+
+    @classmethod
+    def from_config(cls, config: DictConfig) -> "Scene":
+        """Build from a resolved configuration with `scale`, `scene`, `material`, `transfer`.
+
+        Raises:
+            ConfigError: a key is unknown or a value outside its range.
+        """
+        s = config.scene
+        if s.steps < 1:
+            raise ConfigError(f"scene.steps={s.steps} must be at least 1")
+        colliders = tuple(configuration.build(c, "scene.colliders") for c in s.colliders.values())
+        return cls(
+            name=s.name,
+            scale=config.scale,
+            dx=float(s.dx),
+            dt=float(s.dt),
+            steps=int(s.steps),
+            size=tuple(s.size),
+            gravity=tuple(s.gravity),
+            bodies=tuple(configuration.build(b, f"scene.bodies.{n}") for n, b in s.bodies.items()),
+            colliders=colliders,
+            walls=configuration.build(s.walls, "scene.walls"),
+            material=configuration.build(config.material, "material"),
+            transfer=configuration.build(config.transfer, "transfer"),
+            parameters=ParameterRange(**OmegaConf.to_container(s.parameters)),
+            config=config,
+        )
+
+    def with_parameters(self, parameters: Mapping[str, float]) -> "Scene":
+        """The same scene at given problem parameters, `{name: value}`.
+
+        Raises:
+            ConfigError: a name is not the scene's parameter, or the value is refused.
+        """
+        config = self.config.copy()
+        for name, value in parameters.items():
+            if name != self.parameters.name:
+                raise ConfigError(f"{self.name} has no parameter {name!r}; its parameter is {self.parameters.name!r}")
+            if not (isinstance(value, int | float | np.number) and math.isfinite(value)):
+                raise ConfigError(f"{name}={value!r} must be a finite number")
+            if OmegaConf.select(config, self.parameters.key) is None:
+                raise ConfigError(f"scene.parameters.key={self.parameters.key} names no key of the configuration")
+            OmegaConf.update(config, self.parameters.key, float(value))
+        return Scene.from_config(config)
+
+    @property
+    def grid(self) -> GridGeometry:
+        """The background grid."""
+        return GridGeometry.of_domain(self.size, self.dx)
+
+    def particles(self) -> ParticleConstants:
+        """Particles of every body, in order.
+
+        Raises:
+            ConfigError: a body reaches outside the domain.
+        """
+        X, mass, volume0 = [], [], []
+        for body in self.bodies:
+            lower, upper = body.shape.bounds
+            if (lower < 0).any() or (upper > np.asarray(self.size)).any():
+                raise ConfigError(f"body from {lower} to {upper} m reaches outside the domain [0, {self.size}] m")
+            volume = body.shape.volume / body.particles
+            X.append(body.shape.sample(body.particles))
+            volume0.append(np.full(body.particles, volume))
+            mass.append(np.full(body.particles, body.density * volume))
+        X = np.concatenate(X)
+        mu, lam = np.full(len(X), self.material.mu), np.full(len(X), self.material.lam)
+        return ParticleConstants(X, np.concatenate(mass), np.concatenate(volume0), mu, lam)
+
+    def initial_velocity(self) -> np.ndarray:
+        """[P, 3] velocity at t = 0 [m/s]."""
+        return np.concatenate([np.tile(np.asarray(b.velocity, float), (b.particles, 1)) for b in self.bodies])
+
+    def full_order(
+        self, parameters: Mapping[str, float] | None = None, precision: str = "fp64", device: str = "auto"
+    ) -> FullOrderMPM:
+        """The full-order solver at t = 0 (paper section 3).
+
+        Args:
+            parameters: problem parameters `{name: value}`; the configured value by default.
+            precision: `fp64` or `fp32`.
+            device: `cpu`, `cuda`, `cuda:N` or `auto`.
+
+        Raises:
+            ConfigError, InstabilityError, DeviceError: see `FullOrderMPM`.
+        """
+        scene = self.with_parameters(parameters or {})
+        return FullOrderMPM(
+            scene.particles(),
+            scene.material,
+            scene.grid,
+            scene.dt,
+            gravity=scene.gravity,
+            colliders=scene.colliders,
+            walls=scene.walls,
+            transfer=scene.transfer,
+            v=scene.initial_velocity(),
+            precision=precision,
+            device=device,
+        )
+
+    def reduced(self, manifold, parameters: Mapping[str, float] | None = None, sample=None, **options):
+        """The reduced solver at t = 0 (paper section 5): same `step` and `state` as the full-order one.
+
+        Args:
+            manifold: a trained `nsf.Manifold` of these particles.
+            parameters: problem parameters `{name: value}`.
+            sample: indices of the sample particles S, or their number.
+            **options: see `nsf.dynamics.ReducedMPM.of_scene`.
+        """
+        from nsf.dynamics import ReducedMPM
+
+        return ReducedMPM.of_scene(self, manifold, parameters, sample, **options)
