@@ -7,7 +7,6 @@ simulation at a parameter value is the same configuration with that key replaced
 import difflib
 import re
 from collections.abc import Sequence
-from pathlib import Path
 
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
@@ -15,18 +14,10 @@ from hydra.errors import HydraException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import MarkedYAMLError
 
 from nsf.errors import ConfigError, NSFError
-
-
-def _bundled(name: str) -> Path:
-    """Folder that a wheel carries inside the package and a checkout beside it."""
-    inside = Path(__file__).parent / name
-    return inside if inside.is_dir() else Path(__file__).parent.parent / name
-
-
-CONF = _bundled("conf")
-EXPERIMENTS = _bundled("experiments")
+from nsf.paths import CONF, groups
 
 
 def _scaled(table: DictConfig, *, _root_: DictConfig):
@@ -46,14 +37,6 @@ OmegaConf.register_new_resolver("scaled", _scaled, replace=True)
 OmegaConf.register_new_resolver("per", _per, replace=True)
 
 
-def groups() -> dict[str, list[str]]:
-    """Names of the options of every configuration group."""
-    found = {}
-    for folder in sorted(p for p in CONF.iterdir() if p.is_dir()):
-        found[folder.name] = sorted(f.stem for f in folder.glob("*.yaml"))
-    return found
-
-
 def load(overrides: Sequence[str] = (), config_name: str = "config") -> DictConfig:
     """Compose the configuration from Hydra overrides and resolve it.
 
@@ -65,13 +48,19 @@ def load(overrides: Sequence[str] = (), config_name: str = "config") -> DictConf
         ConfigError: unknown key or option (with the nearest known one), a missing value,
             a syntax error, or an `_target_` outside `nsf`.
     """
-    GlobalHydra.instance().clear()
     try:
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            config = compose(config_name, overrides=list(overrides))
+        return resolve(_compose(config_name, overrides))
     except HydraException as error:
         raise ConfigError(_explain(error, config_name, overrides)) from error
-    return resolve(config)
+    except MarkedYAMLError as error:
+        mark = error.problem_mark
+        raise ConfigError(f"{mark.name}, line {mark.line + 1}: {error.problem}; correct the yaml") from error
+
+
+def _compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose(config_name, overrides=list(overrides))
 
 
 def resolve(config: DictConfig) -> DictConfig:
@@ -155,10 +144,8 @@ def _explain(error: Exception, config_name: str, overrides: Sequence[str]) -> st
 
 
 def _known_keys(config_name: str, overrides: Sequence[str]) -> list[str]:
-    GlobalHydra.instance().clear()
     try:
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            config = compose(config_name, overrides=list(overrides))
+        config = _compose(config_name, overrides)
     except HydraException:
         return list(groups())
     return _keys(OmegaConf.to_container(config, resolve=False))

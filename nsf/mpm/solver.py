@@ -1,6 +1,6 @@
 """The full-order material point method (paper section 3.3)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import warp as wp
@@ -14,6 +14,7 @@ from nsf.mpm.precision import Precision, precision_of
 from nsf.mpm.stability import check_time_step, make_particle_check
 from nsf.mpm.state import ParticleConstants, ParticleState
 from nsf.mpm.transfer import Transfer, make_g2p, make_p2g
+from nsf.timing import StageTimer, untimed
 
 _NEVER = 2**31 - 1
 
@@ -165,23 +166,30 @@ class FullOrderMPM:
 
     def _advance(self) -> None:
         if not self.device.is_cuda:
-            self.stages()
-            return
-        if self._graph is None:
+            self._run_stages()
+        elif self._graph is None:
             # The first step runs uncaptured, so that every kernel is compiled and loaded.
-            self.stages()
+            self._run_stages()
             with wp.ScopedCapture(device=self.device) as capture:
-                self.stages()
+                self._run_stages()
             self._graph = capture.graph
-            return
-        wp.capture_launch(self._graph)
+        else:
+            wp.capture_launch(self._graph)
 
-    def stages(self) -> None:
-        """One step, kernel by kernel: P2G, grid update, G2P, constitutive update."""
-        self.p2g()
-        self.grid_step.update()
-        self.g2p()
-        self.update_stress()
+    def timed_step(self, timer: StageTimer) -> None:
+        """One step, stage by stage under a timer; never from a captured graph."""
+        self._run_stages(timer)
+        self.steps_taken += 1
+
+    def _run_stages(self, timer: Callable = untimed) -> None:
+        for name, stage in self.stages.items():
+            with timer(name):
+                stage()
+
+    @property
+    def stages(self) -> dict[str, Callable[[], None]]:
+        """One step, stage by stage, in order."""
+        return {"p2g": self.p2g, "grid": self.grid_step.update, "g2p": self.g2p, "stress": self.update_stress}
 
     def p2g(self) -> None:
         """Particles → grid."""

@@ -1,0 +1,147 @@
+"""`nsf <stage> key=value …`: the command line."""
+
+import signal
+import sys
+from collections.abc import Sequence
+
+from nsf.errors import NSFError
+
+STAGES = {
+    "run": "the whole chain: simulate, train, deploy, evaluate, report; unchanged stages are reused",
+    "simulate": "full-order trajectories of every parameter value",
+    "train": "the manifold: encoder and deformation, stress and affine fields",
+    "deploy": "reduced runs at the held-out parameter values",
+    "evaluate": "errors and costs of the reduced runs beside the full-order ones",
+    "report": "tables, charts and pictures of every evaluated variant of the scene",
+    "point": "one material point along a deformation path",
+}
+_EXAMPLES = """\
+examples:
+  nsf run scene=sand scale=small                       the paper's method in a minute or two, on a CPU
+  nsf run scene=sand method=deformation_only           the baseline beside it, in the same report
+  nsf run scene=sand scene.parameters.test=[23,30.5]   other held-out values
+  nsf run -m scene=sand latent_dim=4,6 sampler.size=50,150   every combination
+  nsf point material=drucker_prager path=oedometer     plot a law before trusting it
+
+Results lie in ./runs (NSF_RUNS) and ./reports (NSF_REPORTS)."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of `nsf`; exits with 0, 2 (a fault the user can mend), 130 (interrupted) or 1."""
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    # A terminated process leaves as after Ctrl-C: nothing half-written, the manifest says so.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        sys.exit(_dispatch(arguments))
+    except NSFError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("interrupted; the same command goes on from the last whole file", file=sys.stderr)
+        sys.exit(130)
+
+
+def _dispatch(arguments: list[str]) -> int:
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(_help())
+        return 0
+    if arguments[0] == "--version":
+        from importlib.metadata import version
+
+        print(version("nsf"))
+        return 0
+    stage, overrides = arguments[0], arguments[1:]
+    if stage not in STAGES:
+        import difflib
+
+        near = difflib.get_close_matches(stage, STAGES, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"choose one of {', '.join(STAGES)}"
+        print(f"error: unknown stage {stage!r}; {hint}", file=sys.stderr)
+        return 2
+    if {"-h", "--help"} & set(overrides):
+        print(_stage_help(stage))
+        return 0
+    if {"-m", "--multirun"} & set(overrides):
+        return _multirun(stage, [o for o in overrides if o not in ("-m", "--multirun")])
+    unknown = [o for o in overrides if o.startswith("-") or ("=" not in o and not o.startswith("~"))]
+    if unknown:
+        print(f"error: {unknown[0]!r} is not key=value; see `nsf {stage} --help`", file=sys.stderr)
+        return 2
+    from nsf import config
+
+    _work(stage, config.load(overrides, config_name="point" if stage == "point" else "config"))
+    return 0
+
+
+def _work(stage: str, config) -> None:
+    if stage == "point":
+        from nsf.reporting.point import plot_point
+
+        plot_point(config)
+        return
+    from nsf.pipeline import STAGES as CHAIN
+    from nsf.pipeline import Pipeline
+
+    pipeline = Pipeline(config)
+    for name in CHAIN if stage == "run" else [stage]:
+        result = pipeline.run(name)
+    if stage in ("run", "report"):
+        _show(result)
+
+
+def _show(page) -> None:
+    """The result table of a report, on the terminal."""
+    import pandas as pd
+    from rich.console import Console
+
+    from nsf.reporting import console_table
+
+    console = Console(width=None if sys.stdout.isatty() else 160)
+    console.print(console_table(pd.read_csv(page.parent / "results.csv")))
+    print(f"open {page.resolve()}")
+
+
+def _multirun(stage: str, overrides: list[str]) -> int:
+    """Every combination of comma-separated values, through Hydra's launchers; 2 if a job failed."""
+    import hydra
+
+    from nsf import config as configuration
+
+    failed = []
+
+    def job(config) -> None:
+        print(f"--- {' '.join(hydra.core.hydra_config.HydraConfig.get().overrides.task)}")
+        try:
+            _work(stage, configuration.resolve(config))
+        except NSFError as error:
+            # Recorded in the failed run's manifest; the other jobs go on.
+            failed.append(error)
+            print(f"error: {error}", file=sys.stderr)
+
+    sys.argv = ["nsf", "--multirun", *overrides]
+    hydra.main(config_path=str(configuration.CONF), config_name="config", version_base="1.3")(job)()
+    return 2 if failed else 0
+
+
+def _help() -> str:
+    width = max(map(len, STAGES))
+    stages = "\n".join(f"  {name:<{width}}  {text}" for name, text in STAGES.items())
+    return f"usage: nsf STAGE [key=value …] [-m]\n\nstages:\n{stages}\n\n{_EXAMPLES}\n\n{_groups()}"
+
+
+def _groups() -> str:
+    from nsf.paths import groups
+
+    lines = [f"  {group:<12} {' '.join(options)}" for group, options in groups().items()]
+    return "\n".join(["configuration groups (group=option):", *lines])
+
+
+def _stage_help(stage: str) -> str:
+    from nsf.paths import CONF
+
+    primary = "point" if stage == "point" else "config"
+    keys = (CONF / f"{primary}.yaml").read_text(encoding="utf-8")
+    return (
+        f"usage: nsf {stage} [key=value …] [-m]\n\n{STAGES[stage]}\n\n{_groups()}\n\n"
+        f"keys and defaults (conf/{primary}.yaml):\n{keys}"
+    )

@@ -1,0 +1,147 @@
+"""Deployment: reduced runs over parameter values, driven by Lightning's `Trainer.predict`."""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytorch_lightning as pl
+import torch
+from torch.utils.data import DataLoader
+
+from nsf.dynamics.solver import ReducedMPM
+from nsf.errors import SchemaError
+from nsf.storage import writing
+
+_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """One reduced run.
+
+    Attributes:
+        parameter: value of the problem parameter.
+        t: [N + 1] time [s]; xhat: [N + 1, r] latent vectors.
+        residuals: [N, k + 1] projection residuals [m]; stops: [N] stop reasons.
+        sample: |S| of the first phase; integration_mean: mean |N|.
+        needed_outside: most particles or nodes a step needed outside the superset.
+        seconds: wall time of the steps, without set-up.
+        diverged: step at which x̂ ceased to be finite, −1 when it did not.
+    """
+
+    parameter: float
+    t: np.ndarray
+    xhat: np.ndarray
+    residuals: np.ndarray
+    stops: list[str]
+    sample: int
+    integration_mean: float
+    needed_outside: int
+    seconds: float
+    diverged: int
+
+    def save(self, path: Path) -> None:
+        """Write as HDF5, whole or not at all."""
+        with writing(path) as temporary, h5py.File(temporary, "w") as file:
+            file.attrs.update({"nsf_rollout": _VERSION, "parameter": self.parameter, "sample": self.sample})
+            file.attrs.update({"integration_mean": self.integration_mean, "needed_outside": self.needed_outside})
+            file.attrs.update({"seconds": self.seconds, "diverged": self.diverged})
+            for name in ("t", "xhat", "residuals"):
+                file[name] = getattr(self, name)
+            file["stops"] = np.array(self.stops, dtype=h5py.string_dtype())
+
+    @classmethod
+    def open(cls, path: Path) -> "Rollout":
+        """Read a rollout.
+
+        Raises:
+            SchemaError: the file is missing, truncated, foreign or newer.
+        """
+        try:
+            with h5py.File(path, "r") as file:
+                version = file.attrs.get("nsf_rollout")
+                if version != _VERSION:
+                    raise SchemaError(f"{path} is not a rollout of version {_VERSION} (found {version}); deploy again")
+                scalars = {k: file.attrs[k].item() for k in ("parameter", "sample", "integration_mean")}
+                scalars |= {k: file.attrs[k].item() for k in ("needed_outside", "seconds", "diverged")}
+                arrays = {k: file[k][()] for k in ("t", "xhat", "residuals")}
+                stops = [s.decode() for s in file["stops"][()]]
+        except (OSError, KeyError, RuntimeError) as error:
+            raise SchemaError(f"{path} is truncated or not a rollout ({error}); delete it and deploy again") from error
+        return cls(**scalars, **arrays, stops=stops)
+
+
+class Deployment(pl.LightningModule):
+    """Lightning module whose prediction step is a reduced run a parameter value.
+
+    Args:
+        solver_at: parameter value and device name → a `ReducedMPM` at t = 0.
+    """
+
+    def __init__(self, solver_at: Callable[[float, str], ReducedMPM]):
+        super().__init__()
+        self._solver_at = solver_at
+
+    def predict_step(self, batch: torch.Tensor, batch_idx: int) -> list[Rollout]:
+        """Run each parameter value of a batch [B] from t = 0 to T."""
+        return [rollout(self._solver_at(value, str(self.device)), value) for value in batch.tolist()]
+
+
+def rollout(solver: ReducedMPM, parameter: float) -> Rollout:
+    """Run a reduced solver to the end of its scene."""
+    solver.step(1)  # compiles, loads and captures
+    synchronise(solver)
+    started = time.perf_counter()
+    solver.step(solver.total_steps - 1)
+    synchronise(solver)
+    seconds = (time.perf_counter() - started) * solver.total_steps / max(1, solver.total_steps - 1)
+    latent = solver.trajectory()
+    finite = np.isfinite(latent.xhat).all(1)
+    diverged = -1 if finite.all() else int((~finite).argmax())
+    outside = solver.needed_outside() if diverged < 0 else 0
+    return Rollout(
+        parameter=float(parameter),
+        t=latent.t,
+        xhat=latent.xhat,
+        residuals=latent.residuals,
+        stops=latent.stops,
+        sample=solver.sample_size,
+        integration_mean=solver.integration_mean,
+        needed_outside=outside,
+        seconds=seconds,
+        diverged=diverged,
+    )
+
+
+def synchronise(solver) -> None:
+    """Wait until the solver's device has finished."""
+    if solver.device.is_cuda:
+        torch.cuda.synchronize()
+
+
+def deploy(
+    solver_at: Callable[[float, str], ReducedMPM], values: Sequence[float], device: str, progress: bool = False
+) -> list[Rollout]:
+    """Reduced runs at every parameter value.
+
+    Args:
+        solver_at: parameter value and device name → solver at t = 0.
+        values: parameter values.
+        device: `cpu` or `cuda`.
+        progress: show Lightning's progress bar.
+    """
+    values = torch.tensor(list(values), dtype=torch.float64)
+    trainer = pl.Trainer(
+        accelerator="gpu" if device.startswith("cuda") else "cpu",
+        devices=1,
+        logger=False,
+        enable_checkpointing=False,
+        enable_model_summary=False,
+        enable_progress_bar=progress,
+        inference_mode=False,  # forward-mode derivatives of the fields need version counters
+    )
+    batches = trainer.predict(Deployment(solver_at), DataLoader(values, batch_size=1, num_workers=0))
+    return [run for batch in batches for run in batch]

@@ -1,0 +1,54 @@
+"""The only door between torch and Warp: shared memory, shared stream."""
+
+from contextlib import contextmanager, nullcontext
+
+import torch
+import warp as wp
+
+from nsf.mpm.precision import Precision
+
+TORCH_DTYPES = {"fp32": torch.float32, "fp64": torch.float64}
+
+
+def torch_dtype(precision: Precision) -> torch.dtype:
+    """The torch type of a precision."""
+    return TORCH_DTYPES[precision.name]
+
+
+def as_vectors(tensor: torch.Tensor, precision: Precision) -> wp.array:
+    """View a [n, 3] tensor as a Warp array of n vectors, without a copy."""
+    return wp.from_torch(tensor, dtype=precision.vec3)
+
+
+def as_matrices(tensor: torch.Tensor, precision: Precision) -> wp.array:
+    """View a [n, 3, 3] tensor as a Warp array of n matrices, without a copy."""
+    return wp.from_torch(tensor, dtype=precision.mat33)
+
+
+def as_scalars(tensor: torch.Tensor) -> wp.array:
+    """View a [n] tensor as a Warp array, without a copy."""
+    return wp.from_torch(tensor)
+
+
+def torch_device(device) -> torch.device:
+    """The torch device of a Warp device."""
+    return torch.device(str(device)) if device.is_cuda else torch.device("cpu")
+
+
+def on_torch_stream(device):
+    """Context in which Warp launches on torch's current stream, so both order their work.
+
+    No events are recorded at entry: the stream may be under capture.
+    """
+    if not device.is_cuda:
+        return nullcontext()
+    stream = wp.stream_from_torch(torch.cuda.current_stream(torch_device(device)))
+    return wp.ScopedStream(stream, sync_enter=False, sync_exit=False)
+
+
+@contextmanager
+def captured(device):
+    """Capture what torch and Warp launch inside into one CUDA graph, which is yielded."""
+    graph = torch.cuda.CUDAGraph()
+    with torch.cuda.graph(graph), on_torch_stream(device):
+        yield graph

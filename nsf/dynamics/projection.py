@@ -1,0 +1,130 @@
+"""Network inversion: the latent vector of given sample positions (paper section 5.3)."""
+
+from dataclasses import dataclass
+
+import torch
+
+from nsf.errors import ConfigError
+
+#: Named reasons to stop, in the order of the codes that `stop_reasons` gives.
+STOP_REASONS = ("converged", "max_iterations", "stagnated", "diverged")
+
+
+@dataclass
+class ProjectionResult:
+    """Outcome of one inversion; tensors on the device, nothing read back.
+
+    Attributes:
+        xhat: [r] latent vector.
+        residuals: [k + 1] RMS distance [m] of g(X_S, x̂) to the target before each iteration and after the last.
+        updates: [k] Euclidean length of each latent update.
+    """
+
+    xhat: torch.Tensor
+    residuals: torch.Tensor
+    updates: torch.Tensor
+
+
+@dataclass(frozen=True)
+class GaussNewton:
+    """Gauss-Newton on ‖g(X_S, x̂) − x_S‖², started at x̂_n.
+
+    Attributes:
+        iterations: fixed number of iterations (the paper needs 2-3); a step whose update
+            falls below the tolerance changes nothing afterwards.
+        tolerance: length of an update (x̂ has unit variance) that counts as converged.
+
+    Raises:
+        ConfigError: a value outside its range.
+
+    Source: paper section 5.3, eq. "network_inversion"; Nocedal and Wright 1999, section 10.3.
+    """
+
+    iterations: int = 3
+    tolerance: float = 1e-6
+
+    def __post_init__(self):
+        if self.iterations < 1:
+            raise ConfigError(f"projector.iterations={self.iterations} must be at least 1")
+        if not self.tolerance > 0:
+            raise ConfigError(f"projector.tolerance={self.tolerance} must be positive")
+
+    def solve(self, at, target: torch.Tensor, xhat: torch.Tensor) -> ProjectionResult:
+        """Invert the deformation field.
+
+        Args:
+            at: the fields restricted to S.
+            target: [s, 3] positions x_S [m].
+            xhat: [r] start.
+        """
+        residuals, updates = [], []
+        active = torch.ones((), dtype=torch.bool, device=xhat.device)
+        for _ in range(self.iterations):
+            position, jacobian = at.position_and_jacobian(xhat)
+            error = (target - position).reshape(-1)
+            J = jacobian.reshape(len(error), -1)
+            update = _normal_equations(J, error)
+            residuals.append(_rms(error))
+            updates.append(torch.linalg.vector_norm(update))
+            xhat = torch.where(active, xhat + update, xhat)
+            active = active & (updates[-1] > self.tolerance)
+        residuals.append(_rms((target - at.position(xhat)).reshape(-1)))
+        return ProjectionResult(xhat, torch.stack(residuals), torch.stack(updates))
+
+
+@dataclass(frozen=True)
+class Taylor:
+    """First-order variant: one linearisation at x̂_n and no residual afterwards.
+
+    x̂_{n+1} = x̂_n + J⁺ (x_S − g(X_S, x̂_n)).
+
+    Source: Chen et al. 2023a; paper section 5.3.
+    """
+
+    iterations: int = 1
+    tolerance: float = float("inf")
+
+    def __post_init__(self):
+        if self.iterations != 1:
+            raise ConfigError(f"projector.iterations={self.iterations}: projector=taylor takes exactly 1")
+
+    def solve(self, at, target: torch.Tensor, xhat: torch.Tensor) -> ProjectionResult:
+        """Invert the linearised deformation field; arguments as for `GaussNewton.solve`."""
+        position, jacobian = at.position_and_jacobian(xhat)
+        error = (target - position).reshape(-1)
+        J = jacobian.reshape(len(error), -1)
+        update = _normal_equations(J, error)
+        left = _rms(error - J @ update)
+        return ProjectionResult(
+            xhat + update, torch.stack([_rms(error), left]), torch.linalg.vector_norm(update)[None]
+        )
+
+
+def _normal_equations(J: torch.Tensor, error: torch.Tensor) -> torch.Tensor:
+    """Solve (JᵀJ) u = Jᵀe [r] without a read-back; singular systems give non-finite values."""
+    gram = (J.T @ J).double()
+    update, _ = torch.linalg.solve_ex(gram, (J.T @ error).double())
+    return update.to(J.dtype)
+
+
+def _rms(error: torch.Tensor) -> torch.Tensor:
+    """Root mean square distance per point of a flat [3 s] error."""
+    return torch.linalg.vector_norm(error) * (3.0 / error.numel()) ** 0.5
+
+
+def stop_reasons(residuals: torch.Tensor, updates: torch.Tensor, tolerance: float) -> list[str]:
+    """Why each step's inversion stopped.
+
+    Args:
+        residuals: [n, k + 1]; updates: [n, k]; as in `ProjectionResult`, one row a step.
+        tolerance: of the projector.
+
+    Returns:
+        One of `STOP_REASONS` a step: `diverged` (non-finite), `converged` (an update below the
+        tolerance), `stagnated` (the residual grew), else `max_iterations`.
+    """
+    finite = torch.isfinite(residuals).all(1) & torch.isfinite(updates).all(1)
+    converged = (updates <= tolerance).any(1)
+    grew = residuals[:, -1] > residuals[:, 0]
+    code = torch.where(~finite, 3, torch.where(converged, 0, torch.where(grew, 2, 1)))
+    return [STOP_REASONS[c] for c in code.tolist()]

@@ -1,0 +1,404 @@
+"""The reduced-order solver: time-stepping in the latent space (paper section 5)."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from nsf.data import hash_of_positions
+from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
+from nsf.dynamics.interop import captured, on_torch_stream, torch_device, torch_dtype
+from nsf.dynamics.phase import Phase, SearchingPhase
+from nsf.dynamics.projection import GaussNewton, Taylor, stop_reasons
+from nsf.dynamics.sampling import SamplePhase, Sampler, check_well_posed
+from nsf.dynamics.stress import Method, StressFromDeformation, StressNeural
+from nsf.errors import ConfigError, ProjectionError, ShapeError
+from nsf.mpm import BoundaryArrays, Grid, GridStep, precision_of
+from nsf.mpm.device import warp_device
+from nsf.timing import StageTimer, untimed
+
+NSF = Method("nsf", neural_stress=True, neural_affine=True)
+#: Positions decoded at once when every particle is asked for [values].
+_CHUNK = 2**25
+
+
+@dataclass(frozen=True)
+class LatentTrajectory:
+    """A reduced run: what a user needs to share to share the simulation.
+
+    Attributes:
+        t: [N + 1] time [s].
+        xhat: [N + 1, r] latent vectors.
+        residuals: [N, k + 1] projection residuals [m]; updates: [N, k] lengths of latent updates.
+        stops: [N] named stop reasons.
+    """
+
+    t: np.ndarray
+    xhat: np.ndarray
+    residuals: np.ndarray
+    updates: np.ndarray
+    stops: list[str]
+
+
+class LatentState:
+    """The state of a reduced run; particle fields are decoded when they are asked for."""
+
+    def __init__(self, solver: "ReducedMPM"):
+        self._solver = solver
+
+    @property
+    def xhat(self) -> np.ndarray:
+        """[r] latent vector."""
+        return self._solver.xhat.cpu().numpy()
+
+    def __len__(self) -> int:
+        return len(self._solver.scene_particles)
+
+    def numpy(self) -> dict[str, np.ndarray]:
+        """Every particle's x, v [P, 3], C, tau [P, 3, 3], as the full-order state gives them, and xhat [r]."""
+        s = self._solver
+        everything = s._everywhere()
+        x = everything.position(s.xhat)
+        v = s.initial_velocity if s.steps_taken == 0 else (x - everything.position(s.xhat_previous)) / s.dt
+        expand = StressNeural(everything, s.parameters)
+        fields = {"x": x, "v": v, "C": everything.affine(s.xhat, s.parameters), "tau": expand(s.xhat)}
+        return {name: value.cpu().numpy() for name, value in fields.items()} | {"xhat": self.xhat}
+
+
+class ReducedMPM:
+    """Steps a latent vector: infer fields on N, one MPM step, invert on S.
+
+    Args:
+        manifold: trained fields.
+        scene: the scene at its problem parameters.
+        phases: sample particles by phase of time.
+        parameters: problem parameters in the manifold's order.
+        method: which of τ and C come from fields.
+        projector: `GaussNewton` or `Taylor`.
+        integration: how N is found.
+        precision: `fp64` or `fp32`.
+        device: `cpu`, `cuda`, `cuda:N` or `auto`.
+        dt_multiplier: deployment step in units of the scene's Δt (paper section 6.1: 1.5).
+
+    Raises:
+        ProjectionError: |S| < r/3.
+        SchemaError: the manifold was trained for other particles.
+        ConfigError, DeviceError: a value or device is refused.
+
+    Source: paper section 5.
+    """
+
+    def __init__(
+        self,
+        manifold,
+        scene,
+        phases: Sequence[SamplePhase],
+        parameters: Mapping[str, float],
+        method: Method = NSF,
+        projector: GaussNewton | Taylor = GaussNewton(),
+        integration: Integration = Integration(),
+        precision: str = "fp64",
+        device: str = "auto",
+        dt_multiplier: float = 1.0,
+    ):
+        if not dt_multiplier > 0:
+            raise ConfigError(f"dt_multiplier={dt_multiplier} must be positive")
+        for phase in phases:
+            check_well_posed(len(phase.particles), manifold.latent_dim)
+        self.manifold, self.scene, self.method, self.projector = manifold, scene, method, projector
+        self.integration = integration
+        self.precision, self.device = precision_of(precision), warp_device(device)
+        self.dtype, self.torch_device = torch_dtype(self.precision), torch_device(self.device)
+        self.dt = scene.dt * dt_multiplier
+        self.total_steps = int(np.ceil(scene.steps / dt_multiplier - 1e-9))
+        self.geometry, self.transfer, self.gravity = scene.grid, scene.transfer, scene.gravity
+        self.boundaries = BoundaryArrays(scene.colliders, scene.walls, self.precision, self.device)
+        self.scene_particles = scene.particles()
+        manifold.check_particles(hash_of_positions(self.scene_particles.X))
+        self.search = NeighbourSearch(self.geometry, self.transfer.shape, self.precision, self.device)
+
+        def tensor(values):
+            return torch.as_tensor(np.asarray(values), dtype=self.dtype, device=self.torch_device)
+
+        missing = [name for name in manifold.parameter_names if name not in parameters]
+        if missing:
+            raise ConfigError(f"parameters {dict(parameters)} lack {missing}, which the stress field was trained on")
+        self.parameters = tensor([parameters[name] for name in manifold.parameter_names])
+        self.initial_velocity = tensor(scene.initial_velocity())
+        self.xhat = tensor(manifold.encode(torch.as_tensor(self.scene_particles.X)[None])[0].cpu())
+        self.xhat_previous = self.xhat.clone()
+        self.steps_taken = 0
+        k = projector.iterations
+        self._latents = torch.zeros(self.total_steps + 1, manifold.latent_dim, dtype=self.dtype, device=self.torch_device)
+        self._latents[0] = self.xhat
+        self._residuals = torch.zeros(self.total_steps, k + 1, dtype=self.dtype, device=self.torch_device)
+        self._updates = torch.zeros(self.total_steps, k, dtype=self.dtype, device=self.torch_device)
+        self._row = torch.zeros(1, dtype=torch.int64, device=self.torch_device)
+        self._starts = [int(round(p.start * self.total_steps)) for p in phases]
+        self._sizes = []
+        self._phases = [self._build_phase(sets) for sets in self._sets_of(phases)]
+        self._enter(self._phases[0])
+
+    @classmethod
+    def of_scene(
+        cls,
+        scene,
+        manifold,
+        parameters: Mapping[str, float] | None = None,
+        sample: int | Sequence[int] | Sampler | None = None,
+        **options,
+    ) -> "ReducedMPM":
+        """The reduced solver of a scene.
+
+        Args:
+            scene: an `nsf.scenes.Scene`.
+            manifold: trained fields.
+            parameters: `{name: value}`; the configured value by default.
+            sample: particle indices, a number (random, seed 0), a `Sampler`, or None for the scene's own number.
+            **options: further arguments of the constructor.
+        """
+        name = scene.parameters.name
+        if not parameters:
+            parameters = {name: _configured(scene)}
+        scene = scene.with_parameters(parameters)
+        if sample is None:
+            sample = int(scene.config.scene.reduced.sample)
+        if isinstance(sample, int | np.integer):
+            check_well_posed(int(sample), manifold.latent_dim)
+            sample = Sampler(size=int(sample))
+        X = scene.particles().X
+        phases = sample.phases_of(X) if isinstance(sample, Sampler) else [SamplePhase(0.0, _indices(sample, len(X)))]
+        return cls(manifold, scene, phases, parameters, **options)
+
+    def _sets_of(self, phases: Sequence[SamplePhase]) -> list[ParticleSets]:
+        """Particle sets of each phase; a superset goes over the training trajectories, decoded from their latents."""
+        P = len(self.scene_particles)
+        if self.integration.strategy == "search":
+            return [
+                ParticleSets(p.particles, np.append(p.particles, np.delete(np.arange(P), p.particles)), None) for p in phases
+            ]
+        everything = self._everywhere()
+        latents = self.manifold.training_latents.to(self.torch_device, self.dtype)
+        fraction = self.manifold.training_times.to(self.torch_device) / (self.scene.dt * self.scene.steps)
+        rows = max(1, _CHUNK // (3 * P))
+        ends = [p.start for p in phases[1:]] + [1.0]
+        slack = 2.0 / self.scene.steps  # a phase also meets the frames just before and after it
+        found = []
+        for phase, end in zip(phases, ends, strict=True):
+            of_phase = latents[(fraction >= phase.start - slack) & (fraction <= end + slack)]
+            frames = (everything.position(chunk) for chunk in of_phase.split(rows))
+            found.append(self.search.superset(frames, phase.particles, self.integration.margin))
+        return found
+
+    def _build_phase(self, sets: ParticleSets) -> Phase:
+        at = self.manifold.restrict(particles=sets.integration, dtype=self.dtype, device=self.torch_device)
+        grid = Grid(self.geometry, self.precision, self.device, nodes=sets.nodes)
+        step = GridStep(grid, self.boundaries, self.transfer, self.gravity, self.dt, self.precision, self.device)
+        arguments = [sets, at, self.scene_particles, grid, step, self._stress_of, self._affine_of]
+        arguments += [self.precision, self.dtype, self.torch_device]
+        if self.integration.strategy == "search":
+            return SearchingPhase(*arguments, search=self.search)
+        return Phase(*arguments)
+
+    def _stress_of(self, at, mu: torch.Tensor, lam: torch.Tensor) -> Callable[[torch.Tensor], torch.Tensor]:
+        if self.method.neural_stress:
+            return StressNeural(at, self.parameters)
+        return StressFromDeformation(at, self.scene.material, mu, lam, self.precision, self.device)
+
+    def _affine_of(self, at) -> Callable[[torch.Tensor], torch.Tensor | None]:
+        if self.method.neural_affine:
+            return lambda xhat: at.affine(xhat, self.parameters)
+        return lambda xhat: None
+
+    def _everywhere(self):
+        """The fields at every particle."""
+        particles = np.arange(len(self.scene_particles))
+        return self.manifold.restrict(particles=particles, dtype=self.dtype, device=self.torch_device)
+
+    @property
+    def state(self) -> LatentState:
+        """The latent state; `state.numpy()` decodes every particle."""
+        return LatentState(self)
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s]."""
+        return self.steps_taken * self.dt
+
+    @property
+    def integration_mean(self) -> float:
+        """Mean |N| over the steps taken."""
+        return float(np.mean(self._sizes)) if self._sizes else float(self._phase.size)
+
+    @property
+    def sample_size(self) -> int:
+        """|S| of the first phase."""
+        return len(self._phases[0].sets.sample)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the solver's arrays and fields take on the device."""
+        own = (self._latents, self._residuals, self._updates, self.initial_velocity)
+        return max(p.nbytes for p in self._phases) + sum(a.nbytes for a in own)
+
+    def step(self, n: int = 1) -> None:
+        """Advance by n steps of Δt.
+
+        Raises:
+            ConfigError: the steps would pass the scene's end.
+        """
+        if self.steps_taken + n > self.total_steps:
+            raise ConfigError(f"{self.steps_taken} + {n} steps pass the end of the scene, {self.total_steps} steps")
+        with torch.no_grad():
+            for _ in range(n):
+                phase = self._phase_at(self.steps_taken)
+                if phase is not self._phase:
+                    self._enter(phase)
+                self._advance()
+                self._sizes.append(phase.size)
+                self.steps_taken += 1
+
+    def _phase_at(self, step: int):
+        return self._phases[max(i for i, start in enumerate(self._starts) if start <= step)]
+
+    def _enter(self, phase) -> None:
+        """Give the phase the positions one step back, which the backward difference needs."""
+        self._phase = phase
+        with torch.no_grad():
+            phase.previous.copy_(self._positions_before(phase))
+
+    def _positions_before(self, phase) -> torch.Tensor:
+        if self.steps_taken == 0:
+            # The first velocity is the initial one, not a difference of latents.
+            rows = torch.as_tensor(phase.sets.integration, device=self.torch_device)
+            return phase.at.position(self.xhat) - self.dt * self.initial_velocity[rows]
+        return phase.at.position(self.xhat_previous)
+
+    def _advance(self) -> None:
+        phase = self._phase
+        if not self.device.is_cuda or not phase.capturable:
+            self._run_stages()
+        elif phase.graph is None:
+            # The first step runs uncaptured, so that kernels and libraries are loaded.
+            self._run_stages()
+            with captured(self.device) as graph:
+                self._run_stages()
+            phase.graph = graph
+        else:
+            phase.graph.replay()
+
+    def timed_step(self, timer: StageTimer) -> None:
+        """One step, stage by stage under a timer; never from a captured graph."""
+        with torch.no_grad():
+            self._run_stages(timer)
+        self._sizes.append(self._phase.size)
+        self.steps_taken += 1
+
+    def _run_stages(self, timer: Callable = untimed) -> None:
+        with on_torch_stream(self.device):
+            for name, stage in self.stages.items():
+                with timer(name):
+                    stage()
+
+    @property
+    def stages(self) -> dict[str, Callable[[], None]]:
+        """One step, stage by stage, in order."""
+        return {
+            "inference": self.infer,
+            "transfer": self.hand_over,
+            "p2g": self.p2g,
+            "grid": self.update_grid,
+            "g2p": self.g2p,
+            "inversion": self.invert,
+        }
+
+    def infer(self) -> None:
+        """Fields on N (paper section 5.1)."""
+        self._fields = self._phase.fields(self.xhat)
+
+    def hand_over(self) -> None:
+        """Field values → the arrays that torch and Warp share."""
+        self._phase.load(*self._fields, self.dt)
+
+    def p2g(self) -> None:
+        """N → grid (paper section 5.2)."""
+        self._phase.p2g()
+
+    def update_grid(self) -> None:
+        """Grid velocities at the next time level."""
+        self._phase.grid_step.update()
+
+    def g2p(self) -> None:
+        """Grid → S."""
+        self._phase.g2p()
+
+    def invert(self) -> None:
+        """x̂_{n+1} from the new positions of S (paper section 5.3)."""
+        phase = self._phase
+        result = self.projector.solve(phase.at_sample, phase.x[: phase.s], self.xhat)
+        self.xhat_previous.copy_(self.xhat)
+        self.xhat.copy_(result.xhat)
+        self._residuals.index_copy_(0, self._row, result.residuals[None])
+        self._updates.index_copy_(0, self._row, result.updates[None])
+        self._row += 1
+        self._latents.index_copy_(0, self._row, result.xhat[None])
+
+    def trajectory(self) -> LatentTrajectory:
+        """Everything recorded up to now, on the host."""
+        n = self.steps_taken
+        residuals, updates = self._residuals[:n].cpu(), self._updates[:n].cpu()
+        stops = stop_reasons(residuals, updates, self.projector.tolerance)
+        t = np.arange(n + 1) * self.dt
+        return LatentTrajectory(t, self._latents[: n + 1].cpu().numpy(), residuals.numpy(), updates.numpy(), stops)
+
+    def needed_outside(self) -> int:
+        """Largest number of particles, over the steps taken, that a step needed but the superset lacks.
+
+        Decodes every particle at every step; for after a run. A sample particle on a node that
+        is not stored counts too.
+
+        Source: paper section 5.4, b.
+        """
+        if self.integration.strategy == "search":
+            return 0
+        everything = self._everywhere()
+        worst = 0
+        for n in range(self.steps_taken):
+            phase = self._phase_at(n)
+            x = everything.position(self._latents[n])
+            sample = torch.as_tensor(phase.sets.sample, device=self.torch_device)
+            needed = self.search.needed(x, sample)
+            needed[torch.as_tensor(phase.sets.integration, device=self.torch_device)] = False
+            marked = self.search.no_nodes(self.torch_device)
+            self.search.mark_nodes(x[sample].contiguous(), marked)
+            marked[torch.as_tensor(phase.sets.nodes, device=self.torch_device).long()] = 0
+            worst = max(worst, int(needed.sum()) + int(marked.sum()))
+        return worst
+
+    def check_finite(self) -> None:
+        """Refuse to pass on a diverged run.
+
+        Raises:
+            ProjectionError: names the first step whose latent vector is not finite.
+        """
+        finite = torch.isfinite(self._latents[: self.steps_taken + 1]).all(1).cpu()
+        if not finite.all():
+            step = int((~finite).nonzero()[0, 0])
+            raise ProjectionError(
+                f"the reduced run ({self.method.name}) diverged at step {step}, t = {step * self.dt:.4g} s; "
+                "choose more sample particles, or a parameter nearer to the training values"
+            )
+
+
+def _configured(scene) -> float:
+    from omegaconf import OmegaConf
+
+    return float(OmegaConf.select(scene.config, scene.parameters.key))
+
+
+def _indices(sample, particles: int) -> np.ndarray:
+    sample = np.unique(np.asarray(sample, dtype=np.int64))
+    if sample.ndim != 1 or not len(sample) or sample[0] < 0 or sample[-1] >= particles:
+        raise ShapeError(f"sample indices must be a non-empty list in [0, {particles})")
+    return sample

@@ -1,0 +1,67 @@
+"""Where the reduced step takes τ and C from: the methods of the 2×2 ablation."""
+
+from dataclasses import dataclass
+
+import torch
+import warp as wp
+
+from nsf.dynamics.interop import as_matrices, as_scalars, on_torch_stream
+from nsf.mpm import Precision
+from nsf.mpm.materials import Material, make_elastic_stress
+
+#: Index of each entry of a symmetric 3×3 matrix in the order xx, xy, xz, yy, yz, zz.
+SYMMETRIC = (0, 1, 2, 1, 3, 4, 2, 4, 5)
+
+
+@dataclass(frozen=True)
+class Method:
+    """What the reduced model takes from fields.
+
+    Attributes:
+        name: of the method.
+        neural_stress: τ from the stress field h; otherwise from ∂g/∂X through the elastic law.
+        neural_affine: C from the affine field l; otherwise C = 0.
+
+    Source: paper sections 4.3 and 4.4; without both fields it is Chen et al. 2023a.
+    """
+
+    name: str
+    neural_stress: bool
+    neural_affine: bool
+
+
+class StressNeural:
+    """τ = h(X, x̂, μ) (paper section 4.3)."""
+
+    def __init__(self, at, parameters: torch.Tensor):
+        self.at, self.parameters = at, parameters
+        self._expand = torch.tensor(SYMMETRIC, device=parameters.device)
+
+    def __call__(self, xhat: torch.Tensor) -> torch.Tensor:
+        """[n, 3, 3] Kirchhoff stress [Pa]."""
+        tau = self.at.stress(xhat, self.parameters)
+        return tau.index_select(-1, self._expand).view(-1, 3, 3)
+
+
+class StressFromDeformation:
+    """τ = τ(∂g/∂X) through the elastic law; plastic flow is not seen (Chen et al. 2023a).
+
+    Args:
+        at: restricted fields; material: the law; mu, lam: [n] Lamé parameters [Pa].
+    """
+
+    def __init__(self, at, material: Material, mu: torch.Tensor, lam: torch.Tensor, precision: Precision, device):
+        self.at, self.precision, self.device = at, precision, device
+        self.mu, self.lam = mu, lam
+        self.tau = torch.zeros(len(mu), 3, 3, dtype=mu.dtype, device=mu.device)
+        self._kernel = make_elastic_stress(material.functions(precision), precision)
+
+    def __call__(self, xhat: torch.Tensor) -> torch.Tensor:
+        """[n, 3, 3] Kirchhoff stress [Pa]."""
+        F = self.at.deformation_gradient(xhat).contiguous()
+        inputs = [as_matrices(F, self.precision), as_scalars(self.mu), as_scalars(self.lam)]
+        with on_torch_stream(self.device):
+            wp.launch(
+                self._kernel, dim=len(F), inputs=[*inputs, as_matrices(self.tau, self.precision)], device=self.device
+            )
+        return self.tau

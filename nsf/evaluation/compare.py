@@ -1,0 +1,162 @@
+"""A reduced run beside its full-order truth, frame by frame."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+import torch
+
+from nsf.data import Trajectory
+from nsf.dynamics import Rollout
+from nsf.evaluation import metrics
+from nsf.mpm.shape import DEGREES
+from nsf.scenes import Scene
+
+_CHUNK = 2**24  # values of one field decoded at once
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What one parameter value gave.
+
+    Attributes:
+        delta, displacement_error, stress_error: totals over frames 1..N, fractions; ∞ when the run diverged.
+        reconstruction_delta, reconstruction_stress_error: of the full-order frames encoded and decoded.
+        series: one row a frame (design.md).
+        pictures: arrays for `frames.npz`.
+    """
+
+    delta: float
+    displacement_error: float
+    stress_error: float
+    reconstruction_delta: float
+    reconstruction_stress_error: float
+    series: pd.DataFrame
+    pictures: dict[str, np.ndarray]
+
+
+def at_frames(rollout: Rollout, t: np.ndarray) -> np.ndarray:
+    """Latent vectors [F, r] at the full-order frame times, linear between deployment steps."""
+    return np.stack([np.interp(t, rollout.t, column) for column in rollout.xhat.T], axis=1)
+
+
+def compare(
+    scene: Scene,
+    manifold,
+    trajectory: Trajectory,
+    rollout: Rollout,
+    split: str,
+    device: torch.device,
+    pictures: tuple[int, int],
+) -> Comparison:
+    """Errors of a rollout against the trajectory at the same parameter value.
+
+    Args:
+        scene: the scene at that value.
+        manifold: the trained fields.
+        trajectory: the full-order run.
+        rollout: the reduced run.
+        split: `test`, `validation` or `train`.
+        device: where fields are decoded.
+        pictures: numbers of particles and of frames kept for pictures.
+    """
+    manifold.check_particles(trajectory.x_sha256)
+    everything = manifold.restrict(dtype=torch.float64, device=device)
+    frames = trajectory.frames
+    xhat = at_frames(rollout, trajectory.t)
+    finite = np.isfinite(xhat).all(1)
+    xhat[~finite] = xhat[finite][-1]  # pictures of a diverged run hold its last state; its errors are ∞
+
+    def tensor(values) -> torch.Tensor:
+        return torch.as_tensor(np.asarray(values), dtype=torch.float64, device=device)
+
+    xhat, X, mass = tensor(xhat), tensor(trajectory.X), tensor(trajectory.mass)
+    parameters = tensor([trajectory.parameters[name] for name in manifold.parameter_names])
+    inertia = scene.dx**2 * (DEGREES[scene.transfer.shape] + 1) / 12.0
+    shown_particles, shown_frames = _shown(trajectory.particles, frames, *pictures)
+    kept = {name: [] for name in ("x_full", "x_reduced", "tau_full", "tau_reduced")}
+    rows: dict[str, list] = {}
+
+    def note(**values: torch.Tensor) -> None:
+        for name, value in values.items():
+            rows.setdefault(name, []).append(value.cpu())
+
+    previous = everything.position(xhat[0])
+    per_chunk = max(1, _CHUNK // (9 * trajectory.particles))
+    for start in range(0, frames, per_chunk):
+        block = slice(start, min(start + per_chunk, frames))
+        x, tau, C, v = (tensor(trajectory.read(name, frames=block)) for name in ("x", "tau", "C", "v"))
+        C = C.view(*C.shape[:2], 3, 3)
+        latent = xhat[block]
+        x_rom, tau_rom = everything.position(latent), everything.stress(latent, parameters)
+        C_rom = everything.affine(latent, parameters)
+        v_rom = torch.diff(torch.cat([previous[None], x_rom]), dim=0) / trajectory.dt
+        if start == 0:
+            v_rom[0] = v[0]
+        previous = x_rom[-1]
+        encoded = manifold.encode(x.to(manifold.X.device)).to(device, torch.float64)
+        x_rec, tau_rec = everything.position(encoded), everything.stress(encoded, parameters)
+        note(
+            x_error=metrics.frame_squares(x_rom - x),
+            x_norm=metrics.frame_squares(x),
+            u_norm=metrics.frame_squares(x - X),
+            tau_error=metrics.tensor_squares(tau_rom - tau),
+            tau_norm=metrics.tensor_squares(tau),
+            rec_error=metrics.frame_squares(x_rec - x),
+            rec_tau_error=metrics.tensor_squares(tau_rec - tau),
+            p_rom=metrics.linear_momentum(v_rom, mass),
+            p_fom=metrics.linear_momentum(v, mass),
+            p_scale=(v.norm(dim=2) * mass).sum(1),
+            L_rom=metrics.angular_momentum(x_rom, v_rom, C_rom, mass, inertia),
+            L_fom=metrics.angular_momentum(x, v, C, mass, inertia),
+            L_scale=(x.norm(dim=2) * v.norm(dim=2) * mass).sum(1),
+            encoded=encoded,
+        )
+        inside = [n - start for n in shown_frames if block.start <= n < block.stop]
+        for name, values in (("x_full", x), ("x_reduced", x_rom), ("tau_full", tau), ("tau_reduced", tau_rom)):
+            kept[name].append(values[inside][:, shown_particles].float().cpu().numpy())
+
+    column = {name: torch.cat(values) for name, values in rows.items()}
+    diverged = rollout.diverged >= 0
+
+    def total(error: str, norm: str) -> float:
+        return metrics.relative(column[error][1:], column[norm][1:])
+
+    bad = torch.as_tensor(~finite)
+
+    def by_frame(error: str, norm: str) -> np.ndarray:
+        values = (column[error] / column[norm].clamp_min(1e-300)).sqrt()
+        values[column[norm] == 0] = torch.nan  # nothing to compare with, as the displacement at t = 0
+        return values.masked_fill(bad, torch.inf).numpy()
+
+    series = pd.DataFrame(
+        {
+            "parameter": rollout.parameter,
+            "split": split,
+            "frame": np.arange(frames),
+            "t": trajectory.t,
+            "delta": by_frame("x_error", "x_norm"),
+            "displacement_error": by_frame("x_error", "u_norm"),
+            "stress_error": by_frame("tau_error", "tau_norm"),
+            "linear_momentum_error": metrics.momentum_error(column["p_rom"], column["p_fom"], column["p_scale"]),
+            "angular_momentum_error": metrics.momentum_error(column["L_rom"], column["L_fom"], column["L_scale"]),
+            "reconstruction_delta": (column["rec_error"] / column["x_norm"]).sqrt(),
+            **{f"xhat_{k + 1}": xhat[:, k].cpu() for k in range(xhat.shape[1])},
+            **{f"encoded_{k + 1}": column["encoded"][:, k] for k in range(xhat.shape[1])},
+        }
+    )
+    return Comparison(
+        delta=np.inf if diverged else total("x_error", "x_norm"),
+        displacement_error=np.inf if diverged else total("x_error", "u_norm"),
+        stress_error=np.inf if diverged else total("tau_error", "tau_norm"),
+        reconstruction_delta=total("rec_error", "x_norm"),
+        reconstruction_stress_error=total("rec_tau_error", "tau_norm"),
+        series=series,
+        pictures={name: np.concatenate(blocks) for name, blocks in kept.items()} | {"t": trajectory.t[shown_frames]},
+    )
+
+
+def _shown(particles: int, frames: int, most_particles: int, most_frames: int) -> tuple[np.ndarray, np.ndarray]:
+    """Particles (a fixed random subset) and frames (even, with the first and the last) for pictures."""
+    chosen = np.sort(np.random.default_rng(0).permutation(particles)[:most_particles])
+    return chosen, np.unique(np.linspace(0, frames - 1, min(frames, most_frames)).round().astype(int))

@@ -1,0 +1,126 @@
+"""Errors of a reduced run against its full-order truth: pure functions."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nsf.errors import ShapeError
+
+
+def _same_shape(a: Tensor, b: Tensor) -> None:
+    if a.shape != b.shape:
+        raise ShapeError(f"trajectories differ in shape: {tuple(a.shape)} and {tuple(b.shape)}")
+
+
+def frame_squares(values: Float[Tensor, "frame particle component"]) -> Float[Tensor, "frame"]:
+    """Σ over particles and components of the squares, in float64, a frame at a time."""
+    return values.double().square().sum((1, 2))
+
+
+def relative(error: Float[Tensor, "frame"], reference: Float[Tensor, "frame"]) -> float:
+    """√(Σ error / Σ reference) of sums of squares by frame."""
+    return float((error.sum() / reference.sum()).sqrt())
+
+
+def deformation_error(
+    x_rom: Float[Tensor, "frame particle 3"], x_fom: Float[Tensor, "frame particle 3"]
+) -> float:
+    """Relative deformation error δ = ‖x_rom − x_fom‖ / ‖x_fom‖.
+
+    Dimensionless, over frames 1..N (the caller drops frame 0). Depends on where the
+    origin lies; show `displacement_error` beside it.
+
+    Args:
+        x_rom: g(X_p, x̂_n) [m].
+        x_fom: φ(X_p, t_n) [m], same frames and particle order.
+
+    Raises:
+        ShapeError: the trajectories differ in shape.
+
+    Source: Zong et al. 2023, section 6, "error def".
+    """
+    _same_shape(x_rom, x_fom)
+    return relative(frame_squares(x_rom - x_fom), frame_squares(x_fom))
+
+
+def displacement_error(
+    x_rom: Float[Tensor, "frame particle 3"],
+    x_fom: Float[Tensor, "frame particle 3"],
+    X: Float[Tensor, "particle 3"],
+) -> float:
+    """Relative displacement error ‖x_rom − x_fom‖ / ‖x_fom − X‖, which no shift of the origin changes.
+
+    Args:
+        x_rom, x_fom: as for `deformation_error` [m].
+        X: reference positions [m].
+
+    Raises:
+        ShapeError: the trajectories differ in shape.
+    """
+    _same_shape(x_rom, x_fom)
+    return relative(frame_squares(x_rom - x_fom), frame_squares(x_fom - X))
+
+
+def tensor_squares(tau: Float[Tensor, "frame particle 6"]) -> Float[Tensor, "frame"]:
+    """Σ over particles of ‖τ‖_F² of symmetric tensors xx, xy, xz, yy, yz, zz (off-diagonals count twice)."""
+    twice = torch.tensor([1.0, 2.0, 2.0, 1.0, 2.0, 1.0], dtype=torch.float64, device=tau.device)
+    return (tau.double().square() * twice).sum((1, 2))
+
+
+def stress_error(
+    tau_rom: Float[Tensor, "frame particle 6"], tau_fom: Float[Tensor, "frame particle 6"]
+) -> float:
+    """Relative error ‖τ_rom − τ_fom‖ / ‖τ_fom‖ of the Kirchhoff stress, Frobenius norms.
+
+    Raises:
+        ShapeError: the trajectories differ in shape.
+    """
+    _same_shape(tau_rom, tau_fom)
+    return relative(tensor_squares(tau_rom - tau_fom), tensor_squares(tau_fom))
+
+
+def linear_momentum(
+    v: Float[Tensor, "frame particle 3"], mass: Float[Tensor, "particle"]
+) -> Float[Tensor, "frame 3"]:
+    """Σ m v [kg m/s]."""
+    return torch.einsum("fpc,p->fc", v.double(), mass.double())
+
+
+def angular_momentum(
+    x: Float[Tensor, "frame particle 3"],
+    v: Float[Tensor, "frame particle 3"],
+    C: Float[Tensor, "frame particle 3 3"],
+    mass: Float[Tensor, "particle"],
+    inertia: float,
+) -> Float[Tensor, "frame 3"]:
+    """Σ x × m v + m D axial(C − Cᵀ) [kg m²/s], about the origin.
+
+    Args:
+        x, v, C: position [m], velocity [m/s], affine momentum [1/s].
+        mass: [kg].
+        inertia: D = Δx²(b + 1)/12 [m²] of the B-spline of degree b.
+
+    Source: Jiang et al. 2015, section 5.3.
+    """
+    m = mass.double()[None, :, None]
+    orbital = torch.linalg.cross(x.double(), m * v.double())
+    C = C.double()
+    axial = torch.stack([C[..., 2, 1] - C[..., 1, 2], C[..., 0, 2] - C[..., 2, 0], C[..., 1, 0] - C[..., 0, 1]], -1)
+    return (orbital + inertia * m * axial).sum(1)
+
+
+def momentum_error(
+    rom: Float[Tensor, "frame 3"], fom: Float[Tensor, "frame 3"], scale: Float[Tensor, "frame"]
+) -> Float[Tensor, "frame"]:
+    """‖p_rom − p_fom‖ of each frame over the largest `scale`, dimensionless.
+
+    Args:
+        rom, fom: momenta of both runs.
+        scale: Σ m |v| (or Σ m |x| |v|) of the full-order frames: the momenta themselves may cancel.
+    """
+    return (rom - fom).norm(dim=1) / scale.max()
+
+
+def reduction_ratio(particles: int, latent_dim: int) -> float:
+    """γ = 3|P|/r, full-order over latent dimension (paper section 6)."""
+    return 3.0 * particles / latent_dim

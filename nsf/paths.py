@@ -1,0 +1,18 @@
+"""Where the configuration files lie: beside the package in a checkout, inside it in a wheel."""
+
+from pathlib import Path
+
+
+def _bundled(name: str) -> Path:
+    inside = Path(__file__).parent / name
+    return inside if inside.is_dir() else Path(__file__).parent.parent / name
+
+
+CONF = _bundled("conf")
+EXPERIMENTS = _bundled("experiments")
+
+
+def groups() -> dict[str, list[str]]:
+    """Names of the options of every configuration group."""
+    folders = sorted(p for p in CONF.iterdir() if p.is_dir())
+    return {folder.name: sorted(f.stem for f in folder.glob("*.yaml")) for folder in folders}

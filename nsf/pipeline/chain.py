@@ -1,0 +1,388 @@
+"""The stages in order; each reads the files of the one before it and nothing else.
+
+scene → simulate → dataset → train → deploy → evaluate → report
+"""
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from nsf import config as configuration
+from nsf.data import Snapshots, Split, Trajectory
+from nsf.dynamics import ReducedMPM, Rollout, deploy
+from nsf.dynamics.interop import torch_device
+from nsf.errors import ConfigError, MissingRunError
+from nsf.evaluation import compare, measure, reduction_ratio
+from nsf.kinematics import Manifold, train
+from nsf.mpm import FP32, FP64, Precision
+from nsf.mpm.device import warp_device
+from nsf.pipeline.simulation import Job, simulate
+from nsf.runs import Record, Run
+from nsf.scenes import Scene
+
+#: Keys of the configuration that each stage's content depends on, beyond its parents.
+_SCENE_KEYS = ("scale", "material", "transfer")
+_NOT_PHYSICS = ("parameters", "reduced", "paper", "title")
+STAGES = ("simulate", "train", "deploy", "evaluate", "report")
+
+
+@dataclass
+class Pipeline:
+    """The chain for one configuration.
+
+    Args:
+        config: resolved configuration.
+        say: called with a line for the user.
+        root: folder of runs; `NSF_RUNS` or `runs` by default.
+    """
+
+    config: DictConfig
+    say: Callable[[str], None] = print
+    root: Path | None = None
+
+    def __post_init__(self):
+        c = self.config
+        self.scene = Scene.from_config(c)
+        p = self.scene.parameters
+        train_values = [v for v in p.train if v not in set(p.validation)]
+        self.split = Split(train=tuple(train_values), validation=tuple(p.validation), test=tuple(p.test))
+        for name, node in (("field", c.field), ("trainer", c.trainer), ("method", c.method)):
+            setattr(self, name, configuration.build(node, name))
+        self.sampler = configuration.build(c.sampler, "sampler")
+        self.projector = configuration.build(c.projector, "projector")
+        self.integration = configuration.build(c.integration, "integration")
+        if not (isinstance(c.latent_dim, int) and c.latent_dim >= 1):
+            raise ConfigError(f"latent_dim={c.latent_dim} must be an integer of at least 1")
+        if c.deploy.split not in ("test", "validation", "train"):
+            raise ConfigError(f"deploy.split={c.deploy.split} is unknown; choose test, validation or train")
+        # The device is found once, so that a missing GPU is reported before any work.
+        self.device = str(torch_device(warp_device(c.device)))
+        self.check_values()
+
+    def check_values(self) -> None:
+        """Build the scene at every parameter value: a value out of range fails before any work.
+
+        Raises:
+            ConfigError: names the value.
+        """
+        for value in (*self.split.train, *self.split.validation, *self.split.test):
+            self.scene.with_parameters({self.scene.parameters.name: value})
+
+    @property
+    def held_out(self) -> tuple[float, ...]:
+        """Values that are deployed and evaluated."""
+        values = tuple(getattr(self.split, self.config.deploy.split))
+        if not values:
+            raise ConfigError(
+                f"deploy.split={self.config.deploy.split} has no values; set scene.parameters.{self.config.deploy.split}"
+            )
+        return values
+
+    # -- runs: where each stage's result lies ---------------------------------------------------------------
+
+    def simulation(self, value: float) -> Run:
+        """The run of one full-order trajectory."""
+        c = self.config
+        scene = {k: v for k, v in OmegaConf.to_container(c.scene).items() if k not in _NOT_PHYSICS}
+        content = {k: OmegaConf.to_container(OmegaConf.create({k: c[k]}))[k] for k in _SCENE_KEYS}
+        content |= {"scene": scene, "precision": c.precision, "dtype": c.data.dtype}
+        content["parameter"] = {"key": self.scene.parameters.key, "value": float(value)}
+        return Run.open("simulate", self.scene.name, content, root=self.root)
+
+    @property
+    def training(self) -> Run:
+        """The run of the manifold."""
+        keys = ("field", "trainer", "latent_dim", "seed")
+        parents = [self.simulation(v) for v in self.split.train]
+        return Run.open("train", self.scene.name, self._content(keys), parents, root=self.root)
+
+    @property
+    def deployment(self) -> Run:
+        """The run of the reduced trajectories."""
+        keys = ("method", "sampler", "projector", "integration", "precision", "scale", "scene", "material", "transfer")
+        content = self._content(keys) | {
+            "values": list(self.held_out),
+            "split": self.config.deploy.split,
+            "dt_multiplier": self.config.deploy.dt_multiplier,
+            "device": self.device,
+        }
+        content["scene"] = {k: v for k, v in content["scene"].items() if k not in _NOT_PHYSICS}
+        return Run.open("deploy", self.scene.name, content, [self.training], root=self.root)
+
+    @property
+    def evaluation(self) -> Run:
+        """The run of errors and costs."""
+        content = self._content(("evaluation",)) | {"paper": OmegaConf.to_container(self.config.scene.get("paper", {}))}
+        parents = [self.deployment, *(self.simulation(v) for v in self.held_out)]
+        return Run.open("evaluate", self.scene.name, content, parents, root=self.root)
+
+    def _content(self, keys: Sequence[str]) -> dict:
+        plain = OmegaConf.to_container(self.config)
+        return {key: plain[key] for key in keys}
+
+    # -- stages ---------------------------------------------------------------------------------------------
+
+    def run(self, stage: str) -> Run | Path:
+        """One stage by name; what it reads must be there, except that `simulate` needs nothing.
+
+        Raises:
+            MissingRunError: an earlier stage has not run; names the command.
+        """
+        return getattr(self, stage)()
+
+    def simulate(self) -> list[Run]:
+        """Full-order trajectories of every training, validation and held-out value."""
+        values = sorted({*self.split.train, *self.split.validation, *self.held_out, *self.split.test})
+        runs = {value: self.simulation(value) for value in values}
+        missing = [value for value, run in runs.items() if not run.complete]
+        if len(missing) < len(values):
+            self.say(f"simulate: {len(values) - len(missing)} of {len(values)} trajectories are there, reused")
+        if missing:
+            started = time.perf_counter()
+            self._simulate({value: runs[value] for value in missing})
+            self.say(f"simulate: {len(missing)} trajectories in {time.perf_counter() - started:.1f} s")
+        return list(runs.values())
+
+    def _simulate(self, runs: dict[float, Run]) -> None:
+        c, name, unit = self.config, self.scene.parameters.name, self.scene.parameters.unit
+
+        def job(value: float, run: Run) -> Job:
+            parameters = {name: value}
+            build = partial(self.scene.full_order, parameters, c.precision, self.device)
+            return Job(run, f"{name} {value:g}{unit}", parameters, build)
+
+        jobs = [job(value, run) for value, run in runs.items()]
+        simulate(jobs, self.scene.steps, self.scene.dx, _stored(c.data.dtype), self.device, c.precision)
+
+    def train(self) -> Run:
+        """The manifold of the training trajectories."""
+        run = self.training
+        if self._reused(run):
+            return run
+        c = self.config
+        paths = [self.simulation(v).require().path / "trajectory.h5" for v in self.split.train]
+        snapshots = Snapshots([Trajectory.open(p) for p in paths], device=self.device, resident=c.data.resident)
+        with run.record(device=self.device, seed=c.seed) as record:
+            started = time.perf_counter()
+            manifold, metrics = train(
+                snapshots,
+                self.field,
+                self.trainer,
+                c.latent_dim,
+                c.seed,
+                run.path,
+                self.device,
+                tracking=c.tracking,
+            )
+            manifold.datasets = [self.simulation(v).id for v in self.split.train]
+            manifold.split = {"train": list(self.split.train), "test": list(self.split.test)}
+            manifold.save(run.path / "manifold.pt")
+            record.output("manifold.pt")
+            record.metrics.update(metrics, seconds=time.perf_counter() - started)
+        snapshots.close()
+        self.say(f"train: field={c.field.name}, r={c.latent_dim} in {record.metrics['seconds']:.1f} s → {run.id}")
+        return run
+
+    def solver_at(self, manifold: Manifold, value: float, device: str | None = None) -> ReducedMPM:
+        """The configured reduced solver at a parameter value, at t = 0."""
+        return self.scene.reduced(
+            manifold,
+            {self.scene.parameters.name: value},
+            self.sampler,
+            method=self.method,
+            projector=self.projector,
+            integration=self.integration,
+            precision=self.config.precision,
+            device=device or self.device,
+            dt_multiplier=self.config.deploy.dt_multiplier,
+        )
+
+    def deploy(self) -> Run:
+        """Reduced trajectories of the held-out values, through Lightning's `Trainer.predict`."""
+        run = self.deployment
+        if self._reused(run):
+            return run
+        manifold = Manifold.load(self.training.require().path / "manifold.pt")
+        with run.record(device=self.device, precision=self.config.precision) as record:
+            rollouts = deploy(lambda v, device: self.solver_at(manifold, v, device), self.held_out, self.device)
+            for index, rollout in enumerate(rollouts):
+                rollout.save(run.path / f"rollout_{index}.h5")
+                record.output(f"rollout_{index}.h5")
+                self._warn(rollout)
+            record.metrics["seconds"] = [r.seconds for r in rollouts]
+            record.metrics["needed_outside"] = max(r.needed_outside for r in rollouts)
+            record.metrics["diverged"] = [r.parameter for r in rollouts if r.diverged >= 0]
+        self.say(f"deploy: method={self.config.method.name}, |S|={rollouts[0].sample}, {len(rollouts)} values → {run.id}")
+        return run
+
+    def _warn(self, rollout: Rollout) -> None:
+        value = f"{self.scene.parameters.name}={rollout.parameter:g}"
+        if rollout.diverged >= 0:
+            self.say(f"deploy: warning: {value} diverged at step {rollout.diverged}; its errors are reported as ∞")
+        if rollout.needed_outside:
+            self.say(
+                f"deploy: warning: {value}: a step needed {rollout.needed_outside} particles or nodes outside the "
+                "integration superset; raise integration.margin or use integration=search"
+            )
+
+    def evaluate(self) -> Run:
+        """Errors and costs of the reduced trajectories."""
+        run = self.evaluation
+        if self._reused(run):
+            return run
+        deployment = self.deployment.require()
+        manifold = Manifold.load(self.training.require().path / "manifold.pt")
+        e = self.config.evaluation
+        comparisons, rollouts = [], []
+        with run.record(device=self.device, precision=self.config.precision) as record:
+            for index, value in enumerate(self.held_out):
+                rollouts.append(Rollout.open(deployment.path / f"rollout_{index}.h5"))
+                with Trajectory.open(self.simulation(value).require().path / "trajectory.h5") as trajectory:
+                    comparisons.append(
+                        compare(
+                            self.scene.with_parameters({self.scene.parameters.name: value}),
+                            manifold,
+                            trajectory,
+                            rollouts[-1],
+                            self.config.deploy.split,
+                            torch.device(self.device),
+                            (e.picture_particles, e.picture_frames),
+                        )
+                    )
+            cost = self._cost(manifold)
+            results = self._results(manifold, rollouts, comparisons, cost, run)
+            self._write(record, results, comparisons, cost, manifold)
+        self.say(f"evaluate: mean δ {100 * results['delta'].mean():.3g} % over {len(results)} values → {run.id}")
+        return run
+
+    def _cost(self, manifold: Manifold) -> dict:
+        trials, value = self.config.evaluation.trials, self.held_out[0]
+        name = self.scene.parameters.name
+        full = measure(
+            lambda: self.scene.full_order({name: value}, self.config.precision, self.device),
+            self.scene.steps,
+            trials,
+            self.device,
+        )
+        steps = self.solver_at(manifold, value).total_steps
+        reduced = measure(lambda: self.solver_at(manifold, value), steps, trials, self.device)
+        return {
+            "full_order": full.as_dict(),
+            "reduced": reduced.as_dict(),
+            "breakdown": {"reduced": reduced.stages, "full_order": full.stages},
+            "trials": min(full.trials, reduced.trials),
+            "memory_full_mib": full.memory_mib,
+            "memory_reduced_mib": reduced.memory_mib,
+            "step_ms_full": full.step_ms,
+            "step_ms_reduced": reduced.step_ms,
+        }
+
+    def _results(self, manifold, rollouts, comparisons, cost: dict, run: Run) -> pd.DataFrame:
+        manifest = run.manifest
+        commit = str(manifest.get("commit") or "unknown")[:12] + ("-dirty" if manifest.get("dirty") else "")
+        shared = {
+            "scene": self.scene.name,
+            "method": self.config.method.name,
+            "field": manifold.field,
+            "r": manifold.latent_dim,
+        }
+        timed = {
+            "gamma": reduction_ratio(len(manifold.X), manifold.latent_dim),
+            "step_ms_full": cost["step_ms_full"],
+            "step_ms_reduced": cost["step_ms_reduced"],
+            "speedup_step": cost["step_ms_full"] / cost["step_ms_reduced"],
+            "speedup_total": cost["full_order"]["total_ms"] / cost["reduced"]["total_ms"],
+            "memory_full_mib": cost["memory_full_mib"],
+            "memory_reduced_mib": cost["memory_reduced_mib"],
+            "precision": self.config.precision,
+            "device": _device_name(self.device),
+            "commit": commit,
+        }
+        rows = []
+        for rollout, c in zip(rollouts, comparisons, strict=True):
+            sizes = {"sample": rollout.sample, "integration_mean": rollout.integration_mean}
+            errors = {"delta": c.delta, "displacement_error": c.displacement_error, "stress_error": c.stress_error}
+            where = {"parameter": rollout.parameter, "split": self.config.deploy.split}
+            rows.append(shared | sizes | where | errors | timed)
+        return pd.DataFrame(rows)
+
+    def _write(self, record: Record, results: pd.DataFrame, comparisons, cost: dict, manifold) -> None:
+        path = record.path
+        results.to_csv(path / "results.csv", index=False)
+        pd.concat([c.series for c in comparisons]).to_csv(path / "series.csv", index=False)
+        stacked = {k: np.stack([c.pictures[k] for c in comparisons]) for k in comparisons[0].pictures if k != "t"}
+        splits = np.array([self.config.deploy.split] * len(comparisons))
+        np.savez_compressed(
+            path / "frames.npz",
+            parameters=results["parameter"].to_numpy(),
+            splits=splits,
+            t=comparisons[0].pictures["t"],
+            **stacked,
+        )
+        training = self.training.manifest
+        summary = {
+            "title": self.config.scene.title,
+            "scale": self.scene.scale,
+            "parameter_name": self.scene.parameters.name,
+            "parameter_unit": self.scene.parameters.unit,
+            "particles": len(manifold.X),
+            "floor": _floor(self.scene),
+            "training_seconds": training["seconds"],
+            "delta": float(results["delta"].mean()),
+            "reconstruction_delta": float(np.mean([c.reconstruction_delta for c in comparisons])),
+            "reconstruction_stress_error": float(np.mean([c.reconstruction_stress_error for c in comparisons])),
+            "variant": {k: results[k].iloc[0] for k in ("method", "field")}
+            | {k: int(results[k].iloc[0]) for k in ("r", "sample")},
+        }
+        if self.config.scene.get("paper"):
+            summary["paper"] = OmegaConf.to_container(self.config.scene.paper)
+        for name, content in (("cost.json", cost), ("summary.json", summary)):
+            (path / name).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        for name in ("results.csv", "series.csv", "frames.npz", "cost.json", "summary.json"):
+            record.output(name)
+        record.metrics.update({k: summary[k] for k in ("delta", "reconstruction_delta")})
+
+    def report(self) -> Path:
+        """The report of every evaluated variant of this scene at these held-out trajectories."""
+        from nsf.reporting import build_report
+
+        truths = {self.simulation(v).id for v in self.held_out}
+        found = Run.find("evaluate", self.scene.name, root=self.root)
+        runs = [r for r in found if r.complete and truths == {p for p in r.parents if p.startswith("simulate/")}]
+        if not runs:
+            raise MissingRunError("no evaluate run of these held-out values is there; run `nsf run` with the same keys")
+        folder = Path(self.config.report.folder) / self.config.report.name
+        page = build_report(runs, folder, self.config.scene.title)
+        self.say(f"report: {len(runs)} evaluated variants → {page}")
+        return page
+
+    def _reused(self, run: Run) -> bool:
+        if run.complete:
+            self.say(f"{run.stage}: inputs unchanged, reused → {run.id}")
+            return True
+        return False
+
+
+def _stored(dtype: str) -> Precision:
+    by_name = {"float32": FP32, "float64": FP64}
+    if dtype not in by_name:
+        raise ConfigError(f"data.dtype={dtype} is unknown; choose float32 or float64")
+    return by_name[dtype]
+
+
+def _device_name(device: str) -> str:
+    return torch.cuda.get_device_name(device) if device.startswith("cuda") else "cpu"
+
+
+def _floor(scene: Scene) -> float | None:
+    """Height of a horizontal floor [m], for pictures."""
+    heights = [c.point[2] for c in scene.colliders if np.allclose(np.asarray(c.normal) / np.linalg.norm(c.normal), (0, 0, 1))]
+    return float(heights[0]) if heights else None

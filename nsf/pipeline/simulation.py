@@ -1,0 +1,129 @@
+"""Full-order trajectories onto disk: the solver goes on while threads write what it made."""
+
+import os
+import queue
+import time
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from nsf.data import TrajectoryWriter
+from nsf.mpm import FullOrderMPM, Precision
+from nsf.mpm.recording import COLUMNS, FrameRecorder
+from nsf.progress import Progress
+from nsf.runs import Run
+
+# Trajectories that are written at once; each holds at most a few blocks of frames in memory.
+_WRITERS = min(4, os.cpu_count() or 1)
+_BLOCKS = 2
+
+
+@dataclass
+class Job:
+    """One trajectory to be made.
+
+    Attributes:
+        run: where it is kept.
+        label: what the progress bar says.
+        parameters: problem parameters.
+        build: gives the solver at t = 0.
+    """
+
+    run: Run
+    label: str
+    parameters: dict[str, float]
+    build: Callable[[], FullOrderMPM]
+    blocks: queue.Queue = field(default_factory=lambda: queue.Queue(_BLOCKS))
+
+
+def simulate(jobs: Iterable[Job], steps: int, dx: float, stored: Precision, device: str, precision: str) -> None:
+    """Run and store every job; each file appears when it is whole.
+
+    Args:
+        jobs: trajectories to be made.
+        steps: of each, one frame a step and one at t = 0.
+        dx: grid spacing [m], for the file.
+        stored: precision of the stored frames.
+        device, precision: of the physics, for the manifest.
+
+    Raises:
+        InstabilityError: a particle became non-finite or left the grid.
+        StorageError: the disk refused a file.
+        KeyboardInterrupt: passed on; what is whole stays, what is not is removed.
+    """
+    jobs = list(jobs)
+    with (
+        ThreadPoolExecutor(_WRITERS) as pool,
+        Progress("simulate", len(jobs) * (steps + 1), "frames") as progress,
+    ):
+        writing: list[Future] = []
+        for job in jobs:
+            progress.describe(job.label)
+            writing.append(_start(job, pool, steps, dx, stored, device, precision, progress))
+        for future in writing:
+            future.result()
+
+
+def _start(job: Job, pool, steps: int, dx: float, stored: Precision, device, precision, progress) -> Future:
+    """Compute one trajectory while its writer, and those of earlier ones, work."""
+    solver = job.build()
+    stored_by = pool.submit(_store, job, solver, steps + 1, dx, np.dtype(stored.numpy).name, device, precision)
+    try:
+        recorder = FrameRecorder(solver.state, solver.precision, stored)
+        started = time.perf_counter()
+        for n in range(steps + 1):
+            if n:
+                solver.step()
+            recorder.record()
+            progress.advance()
+            if recorder.full or n == steps:
+                _hand_over(job, recorder.take(), stored_by)
+        solver.check()
+        _hand_over(job, time.perf_counter() - started, stored_by)
+    except BaseException as error:
+        # The writer leaves no half-written file, and its manifest says what happened.
+        _hand_over(job, error, stored_by)
+        raise
+    return stored_by
+
+
+def _hand_over(job: Job, item, stored_by: Future) -> None:
+    """Wait for room in the queue, unless the writer has stopped."""
+    while not stored_by.done():
+        try:
+            job.blocks.put(item, timeout=0.1)
+            return
+        except queue.Full:
+            continue
+    if not isinstance(item, BaseException):
+        stored_by.result()
+
+
+def _store(job: Job, solver: FullOrderMPM, frames: int, dx: float, dtype: str, device: str, precision: str) -> None:
+    constants = solver.constants
+    with job.run.record(device=device, precision=precision) as record:
+        writer = TrajectoryWriter(
+            job.run.path / "trajectory.h5",
+            X=constants.X,
+            mass=constants.mass,
+            volume0=constants.volume0,
+            parameters=job.parameters,
+            dt=solver.dt,
+            dx=dx,
+            frames=frames,
+            dtype=dtype,
+        )
+        n = 0
+        with writer:
+            while not isinstance(item := job.blocks.get(), float):
+                if isinstance(item, BaseException):
+                    raise item
+                for frame in item:
+                    x, v, C, tau = (frame[:, COLUMNS[name]] for name in ("x", "v", "C", "tau"))
+                    writer.append(n * solver.dt, x, v, C, tau)
+                    n += 1
+            writer.cost.update(seconds=item, bytes=solver.nbytes)
+        record.metrics["seconds"] = item
+        record.output("trajectory.h5")

@@ -1,0 +1,57 @@
+"""Progress of long work: a bar with a rate and an end time, quiet when not a terminal."""
+
+import sys
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as RichProgress
+from rich.text import Text
+
+
+class _Rate(ProgressColumn):
+    def __init__(self, unit: str):
+        super().__init__()
+        self._unit = unit
+
+    def render(self, task: Task) -> Text:
+        return Text(f"{self._unit}, {task.speed or 0:,.0f}/s,")
+
+
+class Progress:
+    """A progress bar on standard error.
+
+    Args:
+        stage: what is being done.
+        total: units of work.
+        unit: what is counted.
+    """
+
+    def __init__(self, stage: str, total: int, unit: str):
+        self._bar = RichProgress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            _Rate(unit),
+            TimeRemainingColumn(),
+            TextColumn("left"),
+            console=Console(stderr=True),
+            disable=not sys.stderr.isatty(),
+            transient=True,
+        )
+        self._stage = stage
+        self._task = self._bar.add_task(stage, total=total)
+
+    def __enter__(self) -> "Progress":
+        self._bar.start()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self._bar.stop()
+
+    def describe(self, what: str) -> None:
+        """Say what is being worked on."""
+        self._bar.update(self._task, description=f"{self._stage}: {what}")
+
+    def advance(self, amount: int = 1) -> None:
+        """Count work done."""
+        self._bar.advance(self._task, amount)
