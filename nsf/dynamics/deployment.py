@@ -18,7 +18,7 @@ from nsf.storage import writing
 _VERSION = 1
 
 
-@dataclass(frozen=True)
+@dataclass  # not frozen: Lightning moves the fields of what a prediction step returns
 class Rollout:
     """One reduced run.
 

@@ -21,7 +21,8 @@ from nsf.dynamics import ReducedMPM, Rollout, deploy
 from nsf.dynamics.interop import torch_device
 from nsf.errors import ConfigError, MissingRunError
 from nsf.evaluation import compare, measure, reduction_ratio
-from nsf.kinematics import Manifold, train
+from nsf.kinematics.manifold import Manifold
+from nsf.kinematics.training import train
 from nsf.mpm import FP32, FP64, Precision
 from nsf.mpm.device import warp_device
 from nsf.pipeline.simulation import Job, simulate
@@ -188,7 +189,7 @@ class Pipeline:
             record.output("manifold.pt")
             record.metrics.update(metrics, seconds=time.perf_counter() - started)
         snapshots.close()
-        self.say(f"train: field={c.field.name}, r={c.latent_dim} in {record.metrics['seconds']:.1f} s → {run.id}")
+        self.say(f"train: field={manifold.field}, r={c.latent_dim} in {record.metrics['seconds']:.1f} s → {run.id}")
         return run
 
     def solver_at(self, manifold: Manifold, value: float, device: str | None = None) -> ReducedMPM:
@@ -352,7 +353,7 @@ class Pipeline:
 
     def report(self) -> Path:
         """The report of every evaluated variant of this scene at these held-out trajectories."""
-        from nsf.reporting import build_report
+        from nsf.reporting.build import build_report
 
         truths = {self.simulation(v).id for v in self.held_out}
         found = Run.find("evaluate", self.scene.name, root=self.root)

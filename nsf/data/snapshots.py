@@ -1,0 +1,208 @@
+"""Every frame of several trajectories as one set of training snapshots."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from nsf.data.schema import COMPONENTS
+from nsf.data.trajectory import Trajectory
+from nsf.errors import ConfigError, DeviceError, SchemaError, ShapeError
+
+# Fields that training reads again and again; v is rarely read, and streams.
+RESIDENT_FIELDS = ("x", "tau", "C")
+# Of the free memory: the rest is for networks, their gradients and what else runs.
+_RESIDENT_SHARE = 0.6
+_STAGING_BYTES = 256 * 2**20
+
+Indices = slice | Sequence[int] | np.ndarray | Tensor
+
+
+class Snapshots:
+    """Rows of (frame, parameter value), by trajectory and then by frame.
+
+    The same calls give the same values whether the data lie on the device
+    (`resident`) or stream from the files.
+
+    Args:
+        trajectories: of the same particles and parameter names.
+        device: where tensors are returned.
+        resident: keep x, tau and C on the device; "auto" if they take at most
+            60 % of what is free there.
+
+    Attributes:
+        M: number of rows.
+        P: number of particles.
+        X: [P,3] undeformed positions [m], float64 (their hash is `x_sha256`).
+        x_sha256: identity of the particles.
+        parameter_names: sorted.
+        parameters: [M,n_parameters] float32.
+        trajectory: [M] int64, index into `trajectories`.
+        frame: [M] int64, index into the trajectory's frames.
+        t: [M] float32 [s].
+        resident: whether the data lie on the device.
+
+    Raises:
+        ConfigError: there is no trajectory, or `resident` is of another value.
+        DeviceError: this machine has no such device.
+        SchemaError: trajectories are of different particles or parameters.
+    """
+
+    def __init__(
+        self,
+        trajectories: Sequence[Trajectory | str | Path],
+        device: str | torch.device = "cpu",
+        resident: bool | str = "auto",
+    ) -> None:
+        self.trajectories = [t if isinstance(t, Trajectory) else Trajectory.open(t) for t in trajectories]
+        if not self.trajectories:
+            raise ConfigError("trajectories=[]; give at least one")
+        if resident not in (True, False, "auto"):
+            raise ConfigError(f"resident={resident!r}; choose auto, true or false")
+        first = self.trajectories[0]
+        for other in self.trajectories[1:]:
+            _require_same(first, other)
+        self.device = _device(device)
+        self.P = first.particles
+        self.x_sha256 = first.x_sha256
+        self.parameter_names = tuple(first.parameters)
+        frames = [trajectory.frames for trajectory in self.trajectories]
+        self.M = sum(frames)
+        values = [list(trajectory.parameters.values()) for trajectory in self.trajectories]
+        self._starts = np.cumsum([0, *frames])
+        index = np.repeat(np.arange(len(frames)), frames)
+        self.X = torch.tensor(first.X, device=self.device)
+        self.trajectory = torch.tensor(index, device=self.device)
+        self.frame = torch.tensor(np.arange(self.M) - self._starts[index], device=self.device)
+        self.parameters = torch.tensor(
+            np.array(values, dtype="f4").reshape(len(frames), -1)[index], device=self.device
+        )
+        times = np.concatenate([trajectory.t for trajectory in self.trajectories])
+        self.t = torch.tensor(times.astype("f4"), device=self.device)
+        self.resident = (
+            self.nbytes <= _RESIDENT_SHARE * _free(self.device) if resident == "auto" else bool(resident)
+        )
+        self._data = {field: self._load(field) for field in RESIDENT_FIELDS} if self.resident else {}
+
+    @property
+    def nbytes(self) -> int:
+        """[byte] of x, tau and C of all rows in float32."""
+        return 4 * self.M * self.P * sum(COMPONENTS[field] for field in RESIDENT_FIELDS)
+
+    def slab(self, field: str, particles: Indices) -> Float[Tensor, "row particle component"]:
+        """All frames of some particles.
+
+        Args:
+            field: "x" [m], "v" [m/s], "C" [1/s] or "tau" [Pa] (Kirchhoff).
+            particles: slice or indices.
+
+        Returns:
+            [M,n,c] float32; on resident data a slice is a view, not to be written to.
+        """
+        if field in self._data:
+            return self._data[field][:, self._on_device(particles)]
+        columns = _on_host(particles)
+        count = len(range(self.P)[columns]) if isinstance(columns, slice) else len(columns)
+        out = np.empty((self.M, count, _components(field)), "f4")
+        for start, trajectory in zip(self._starts, self.trajectories, strict=False):
+            trajectory.read(field, particles=columns, out=out[start : start + trajectory.frames])
+        return torch.from_numpy(out).to(self.device)
+
+    def gather(
+        self, field: str, rows: Indices, particles: Indices
+    ) -> Float[Tensor, "row particle component"]:
+        """Some frames of some particles, in the order asked for.
+
+        Args:
+            field: "x" [m], "v" [m/s], "C" [1/s] or "tau" [Pa] (Kirchhoff).
+            rows: slice or indices into 0..M-1.
+            particles: slice or indices into 0..P-1, the same for every row.
+
+        Returns:
+            [len(rows),len(particles),c] float32.
+        """
+        if field in self._data:
+            data = self._data[field]
+            rows, particles = self._on_device(rows), self._on_device(particles)
+            if isinstance(rows, slice) or isinstance(particles, slice):
+                return data[rows, particles]
+            return data[rows[:, None], particles]
+        columns = _on_host(particles)
+        count = len(range(self.P)[columns]) if isinstance(columns, slice) else len(columns)
+        wanted = np.arange(self.M)[_on_host(rows)]
+        out = np.empty((len(wanted), count, _components(field)), "f4")
+        for i, row in enumerate(wanted):
+            index = int(np.searchsorted(self._starts, row, side="right")) - 1
+            self.trajectories[index].read(field, row - self._starts[index], columns, out=out[i : i + 1])
+        return torch.from_numpy(out).to(self.device)
+
+    def close(self) -> None:
+        """Close the files; resident data stay readable."""
+        for trajectory in self.trajectories:
+            trajectory.close()
+
+    def _load(self, field: str) -> Tensor:
+        data = torch.empty((self.M, self.P, COMPONENTS[field]), device=self.device)
+        # The host reads files straight into the tensor; a device gets them a few frames at a time.
+        frames = max(1, _STAGING_BYTES // (4 * self.P * COMPONENTS[field]))
+        for start, trajectory in zip(self._starts, self.trajectories, strict=False):
+            rows = data[start : start + trajectory.frames]
+            if self.device.type == "cpu":
+                trajectory.read(field, out=rows.numpy())
+                continue
+            for first in range(0, trajectory.frames, frames):
+                block = slice(first, first + frames)
+                rows[block].copy_(torch.from_numpy(trajectory.read(field, block)))
+        return data
+
+    def _on_device(self, indices: Indices) -> slice | Tensor:
+        if isinstance(indices, slice):
+            return indices
+        return torch.as_tensor(indices, dtype=torch.int64, device=self.device)
+
+
+def _components(field: str) -> int:
+    if field not in COMPONENTS:
+        raise ShapeError(f"field={field!r}; choose one of {', '.join(COMPONENTS)}")
+    return COMPONENTS[field]
+
+
+def _on_host(indices: Indices) -> slice | np.ndarray:
+    if isinstance(indices, slice):
+        return indices
+    return indices.cpu().numpy() if isinstance(indices, Tensor) else np.asarray(indices, dtype=np.int64)
+
+
+def _require_same(first: Trajectory, other: Trajectory) -> None:
+    if first.x_sha256 != other.x_sha256:
+        raise SchemaError(
+            f"{first.path} and {other.path} are of different particles "
+            f"({first.x_sha256[:12]}, {other.x_sha256[:12]}); simulate both from the same X"
+        )
+    if first.parameters.keys() != other.parameters.keys():
+        raise SchemaError(
+            f"{first.path} has parameters {list(first.parameters)} and {other.path} has "
+            f"{list(other.parameters)}; use trajectories of one scene"
+        )
+
+
+def _device(device: str | torch.device) -> torch.device:
+    device = torch.device(device)
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise DeviceError(f"device={device}: no GPU here, or a torch without CUDA; use device=cpu")
+    return device
+
+
+def _free(device: torch.device) -> int:
+    """[byte] that could still be allocated on the device."""
+    if device.type == "cuda":
+        return torch.cuda.mem_get_info(device)[0]
+    try:  # free pages and the file cache that the kernel would give up
+        with open("/proc/meminfo", encoding="ascii") as file:
+            return next(1024 * int(line.split()[1]) for line in file if line.startswith("MemAvailable"))
+    except (OSError, StopIteration):
+        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")

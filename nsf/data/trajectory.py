@@ -1,0 +1,333 @@
+"""One full-order simulation on disk: written once and whole, read in pieces."""
+
+import json
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import h5py
+import numpy as np
+
+from nsf.data.schema import COMPONENTS, SCHEMA_VERSION, TAU_ORDER, UNITS, hash_of_positions, packed
+from nsf.data.sink import Sink
+from nsf.errors import InstabilityError, MissingRunError, SchemaError, ShapeError
+from nsf.storage import require_space, writing
+
+# Chunks are written whole and read in parts, and never compressed: HDF5's chunk cache would only make it
+# read every whole frame for a few particles.
+_NO_CHUNK_CACHE = {"rdcc_nbytes": 0}
+
+
+class TrajectoryWriter:
+    """Writes a trajectory frame by frame; the file appears at `path` when it is whole.
+
+    Leaving the `with` block by an exception leaves no file, and an earlier
+    one of that name as it was.
+
+    Args:
+        path: the file to come.
+        X: [P,3] undeformed positions [m]; kept in float64 whatever `dtype`.
+        mass: [P] [kg].
+        volume0: [P] undeformed volumes [m^3].
+        parameters: value of every problem parameter.
+        dt: time step of the solver [s].
+        dx: grid spacing [m].
+        frames: number of frames to be appended, the initial one included.
+        dtype: "float32" or "float64", of x, v, C and tau.
+
+    Raises:
+        ShapeError: arrays disagree in the number of particles.
+        StorageError: the disk cannot hold the file (checked before the first
+            frame), or it cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        X: np.ndarray,
+        mass: np.ndarray,
+        volume0: np.ndarray,
+        parameters: Mapping[str, float],
+        dt: float,
+        dx: float,
+        frames: int,
+        dtype: str = "float32",
+    ) -> None:
+        self.path = Path(path)
+        self.frames = frames
+        self.cost: dict[str, float] = {}
+        self._written = 0
+        self._dtype = np.dtype(dtype)
+        self._particles = {
+            name: np.asarray(values, dtype="<f8")
+            for name, values in {"X": X, "mass": mass, "volume0": volume0}.items()
+        }
+        x_sha256 = hash_of_positions(self._particles["X"])
+        for name in ("mass", "volume0"):
+            if (shape := self._particles[name].shape) != (len(X),):
+                raise ShapeError(f"{name} has shape {list(shape)} for {len(X)} particles; give [{len(X)}]")
+        self._parameters = {name: float(value) for name, value in parameters.items()}
+        self._attributes = {
+            "schema_version": SCHEMA_VERSION,
+            "units": json.dumps(UNITS),
+            "tau_order": ",".join(TAU_ORDER),
+            "x_sha256": x_sha256,
+            "dt": float(dt),
+            "dx": float(dx),
+            "complete": False,
+        }
+
+    def __enter__(self) -> "TrajectoryWriter":
+        with ExitStack() as stack:
+            partial = stack.enter_context(writing(self.path))
+            particles = len(self._particles["X"])
+            require_space(partial, particles * self.frames * sum(COMPONENTS.values()) * self._dtype.itemsize)
+            self._sink = stack.enter_context(Sink(partial, "w+"))
+            stack.push(self._sink.settle)
+            self._file = stack.enter_context(h5py.File(self._sink, "w", **_NO_CHUNK_CACHE))
+            self._file.attrs.update(self._attributes)
+            for name, values in self._particles.items():
+                self._file[f"particles/{name}"] = values
+            frames = self._file.create_group("frames")
+            frames.create_dataset("t", (self.frames,), "<f8")
+            for name, c in COMPONENTS.items():
+                shape = (self.frames, particles, c)
+                frames.create_dataset(name, shape, self._dtype.newbyteorder("<"), chunks=(1, particles, c))
+            _write_scalars(self._file.create_group("parameters"), self._parameters)
+            self._stack = stack.pop_all()
+        return self
+
+    def append(self, t: float, x: np.ndarray, v: np.ndarray, C: np.ndarray, tau: np.ndarray) -> None:
+        """Write the next frame.
+
+        Args:
+            t: time [s].
+            x: [P,3] positions [m].
+            v: [P,3] velocities [m/s].
+            C: [P,3,3] or [P,9] affine velocity matrices, by rows [1/s].
+            tau: [P,3,3] or [P,6] Kirchhoff stress [Pa].
+
+        Raises:
+            InstabilityError: a value is not finite.
+            ShapeError: an array is not of all particles, or every frame is written.
+        """
+        frame = self._written
+        if frame == self.frames:
+            raise ShapeError(f"{self.path} holds frames={frame} already; open the writer with more")
+        for name, values in {"x": x, "v": v, "C": C, "tau": tau}.items():
+            dataset = self._file["frames"][name]
+            row = packed(name, values)
+            if row.shape != dataset.shape[1:]:
+                raise ShapeError(f"{name} has shape {list(row.shape)}; give {list(dataset.shape[1:])}")
+            if bad := int(np.count_nonzero(~np.isfinite(row))):
+                raise InstabilityError(
+                    f"frame {frame} has {bad} non-finite values of {name}; take a smaller dt"
+                )
+            dataset[frame] = row
+        self._file["frames/t"][frame] = t
+        self._sink.settle()
+        self._written += 1
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with self._stack:
+            if error is not None:
+                raise error
+            if self._written < self.frames:
+                raise ShapeError(
+                    f"{self.path} got {self._written} of frames={self.frames}; append the rest, "
+                    "or open it for fewer"
+                )
+            _write_scalars(self._file.create_group("cost"), self.cost)
+            self._file.attrs["complete"] = True
+
+
+class Trajectory:
+    """A whole trajectory, opened for reading; arrays are read when asked for.
+
+    Attributes:
+        path: the file.
+        X: [P,3] undeformed positions [m], float64.
+        mass: [P] [kg], float64.
+        volume0: [P] undeformed volumes [m^3], float64.
+        t: [F] time of every frame [s].
+        dt: time step of the solver [s].
+        dx: grid spacing [m].
+        parameters: value of every problem parameter, by name in sorted order.
+        cost: measured costs of the simulation.
+        x_sha256: identity of the particles (`hash_of_positions`).
+        particles: P.
+        frames: F, the initial frame included.
+    """
+
+    def __init__(self, path: Path, file: h5py.File) -> None:
+        self.path = path
+        self._file = file
+        attributes = file.attrs
+        _check_version(attributes)
+        if not attributes.get("complete"):
+            raise SchemaError("was not finished by its simulation; simulate again")
+        if attributes["tau_order"] != ",".join(TAU_ORDER):
+            raise SchemaError(
+                f"has tau_order={attributes['tau_order']}, not {','.join(TAU_ORDER)}; simulate again"
+            )
+        self.x_sha256 = str(attributes["x_sha256"])
+        self.dt, self.dx = float(attributes["dt"]), float(attributes["dx"])
+        self.X, self.mass, self.volume0 = (file["particles"][name][()] for name in ("X", "mass", "volume0"))
+        self.t = file["frames/t"][()]
+        self.particles, self.frames = len(self.X), len(self.t)
+        self.parameters = _read_scalars(file["parameters"])
+        self.cost = _read_scalars(file["cost"])
+        self._check_shapes()
+        if (x_sha256 := hash_of_positions(self.X)) != self.x_sha256:
+            raise SchemaError(
+                f"says x_sha256={self.x_sha256[:12]}, but its X has {x_sha256[:12]}; simulate again"
+            )
+
+    @classmethod
+    def open(cls, path: str | Path) -> "Trajectory":
+        """Open a trajectory and check it.
+
+        Raises:
+            MissingRunError: there is no such file.
+            SchemaError: the file is truncated, foreign, unfinished, of a newer
+                schema, incomplete or damaged; names the file.
+        """
+        path = Path(path)
+        if not path.exists():
+            raise MissingRunError(f"no trajectory at {path}; run `nsf simulate` first")
+        try:
+            file = h5py.File(path, "r", **_NO_CHUNK_CACHE)
+        except PermissionError:
+            raise
+        except OSError as error:
+            raise SchemaError(f"{path} is truncated or not HDF5; simulate again ({error})") from error
+        try:
+            return cls(path, file)
+        except BaseException as error:
+            file.close()
+            if isinstance(error, KeyError):
+                raise SchemaError(f"{path} lacks a part of a trajectory; simulate again ({error})") from error
+            if isinstance(error, SchemaError | ShapeError):
+                raise SchemaError(f"{path} {error}") from error
+            if isinstance(error, OSError | RuntimeError | TypeError | ValueError | AttributeError):
+                raise SchemaError(f"{path} is damaged; simulate again ({error})") from error
+            raise
+
+    def read(
+        self,
+        field: str,
+        frames: Any = slice(None),
+        particles: Any = None,
+        out: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Read some frames of some particles; no more than one frame beyond them is held.
+
+        Args:
+            field: "x" [m], "v" [m/s], "C" [1/s] or "tau" [Pa] (Kirchhoff).
+            frames: slice, index or indices.
+            particles: slice or indices in any order; None for all.
+            out: contiguous array [F,n,c] to read into; else a new one in the file's dtype.
+
+        Returns:
+            [F,n,c] with c = 3, 3, 9, 6.
+
+        Raises:
+            SchemaError: the data are damaged.
+            ShapeError: no such field, frame or particle, or `out` is of another shape.
+        """
+        if field not in COMPONENTS:
+            raise ShapeError(f"field={field!r}; choose one of {', '.join(COMPONENTS)}")
+        dataset = self._file["frames"][field]
+        rows = _selection(frames, self.frames, "frame")
+        columns = _selection(slice(None) if particles is None else particles, self.particles, "particle")
+        shape = (len(rows), len(columns), COMPONENTS[field])
+        if out is None:
+            out = np.empty(shape, dataset.dtype.newbyteorder("="))
+        if out.shape != shape:
+            raise ShapeError(f"out has shape {list(out.shape)}; give {list(shape)}")
+        if 0 in shape:
+            return out
+        try:
+            if isinstance(rows, range) and isinstance(columns, range):
+                dataset.read_direct(out, np.s_[_hyperslab(rows), _hyperslab(columns)])
+            else:
+                for i, row in enumerate(rows):
+                    out[i] = _read_frame(dataset, int(row), columns)
+        except (OSError, RuntimeError) as error:
+            raise SchemaError(f"{self.path} is damaged in {field}; simulate again ({error})") from error
+        return out
+
+    def close(self) -> None:
+        """Close the file; arrays already read stay valid."""
+        self._file.close()
+
+    def __enter__(self) -> "Trajectory":
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+    def __reduce__(self) -> tuple[Any, tuple[Path]]:
+        return Trajectory.open, (self.path,)  # another process opens the file for itself
+
+    def _check_shapes(self) -> None:
+        expected: dict[str, tuple[int, ...]] = {
+            "particles/mass": (self.particles,),
+            "particles/volume0": (self.particles,),
+        }
+        for name, c in COMPONENTS.items():
+            expected[f"frames/{name}"] = (self.frames, self.particles, c)
+        for name, shape in expected.items():
+            if (found := self._file[name].shape) != shape:
+                raise SchemaError(f"has {name} of shape {list(found)}, not {list(shape)}; simulate again")
+
+
+def _check_version(attributes: h5py.AttributeManager) -> None:
+    version = attributes.get("schema_version")
+    if not isinstance(version, int | np.integer):
+        raise SchemaError("is HDF5, but not written by nsf; give a file of `nsf simulate`")
+    if version > SCHEMA_VERSION:
+        raise SchemaError(
+            f"has schema_version={version}, newer than {SCHEMA_VERSION}; upgrade nsf to read it"
+        )
+    if version < SCHEMA_VERSION:
+        raise SchemaError(f"has schema_version={version}, older than {SCHEMA_VERSION}; simulate again")
+
+
+def _selection(wanted: Any, size: int, kind: str) -> range | np.ndarray:
+    """Indices as a range where they are evenly spaced upwards, else as an array."""
+    if isinstance(wanted, slice):
+        indices = range(size)[wanted]
+        return indices if indices.step > 0 else np.array(indices)
+    array = np.atleast_1d(np.asarray(wanted))
+    if array.ndim != 1 or not (array.size == 0 or np.issubdtype(array.dtype, np.integer)):
+        raise ShapeError(f"{kind}s have shape {list(array.shape)} of {array.dtype}; give integer indices [n]")
+    if array.size and not (-size <= array.min() and array.max() < size):
+        raise ShapeError(f"{kind}s reach {array.min()}..{array.max()}; there are {size}")
+    return np.where(array < 0, array + size, array).astype(np.int64)
+
+
+def _hyperslab(indices: range) -> slice:
+    return slice(indices.start, indices[-1] + 1, indices.step)
+
+
+def _read_frame(dataset: h5py.Dataset, frame: int, particles: range | np.ndarray) -> np.ndarray:
+    if isinstance(particles, range):
+        return dataset[frame, _hyperslab(particles)]
+    # HDF5 selects scattered points slowly: read the span they lie in, and pick in memory.
+    low = int(particles.min())
+    return dataset[frame, low : int(particles.max()) + 1][particles - low]
+
+
+def _write_scalars(group: h5py.Group, values: Mapping[str, float]) -> None:
+    for name, value in values.items():
+        group[name] = np.float64(value)
+
+
+def _read_scalars(group: h5py.Group) -> dict[str, float]:
+    return {name: float(group[name][()]) for name in sorted(group)}

@@ -1,0 +1,51 @@
+"""Which code and which versions produced a result."""
+
+import importlib.metadata
+import platform
+import subprocess
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+_DISTRIBUTIONS = {
+    "nsf": "nsf",
+    "warp": "warp-lang",
+    "torch": "torch",
+    "lightning": "pytorch-lightning",
+    "hydra": "hydra-core",
+    "numpy": "numpy",
+}
+
+
+@cache
+def provenance() -> dict[str, Any]:
+    """The code's commit, whether the package differs from it, and the versions in use.
+
+    `commit` and `dirty` are None where the package is not in a git checkout.
+    """
+    here = Path(__file__).parent
+    # A package installed below some other project's checkout is not tracked by it.
+    tracked = _git(here, "ls-files", "--error-unmatch", Path(__file__).name)
+    commit = _git(here, "rev-parse", "HEAD") if tracked else None
+    changes = _git(here, "status", "--porcelain", "--", ".") if commit else None
+    return {
+        "commit": commit,
+        "dirty": None if changes is None else bool(changes),
+        "versions": {"python": platform.python_version()}
+        | {name: _version(distribution) for name, distribution in _DISTRIBUTIONS.items()},
+    }
+
+
+def _git(folder: Path, *arguments: str) -> str | None:
+    try:
+        done = subprocess.run(["git", "-C", folder, *arguments], capture_output=True, text=True, timeout=10)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return None

@@ -1,0 +1,264 @@
+"""Run folders: one folder a configuration, named by a hash of everything that determines its content."""
+
+import hashlib
+import json
+import os
+import re
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from nsf.canonical import content_hash, plain
+from nsf.errors import ConfigError, MissingRunError, StorageError
+from nsf.provenance import provenance
+from nsf.storage import write_json, writing
+
+FORMAT = 1  # of the folder's layout; a new value gives every run a new hash
+_NAME = re.compile(r"[A-Za-z0-9][\w.+-]*", re.ASCII)
+
+
+@dataclass(frozen=True)
+class Run:
+    """One stage of one scene under one configuration: `root/stage/scene/hash`.
+
+    Two runs are equal when they are the same folder. Make one with `open`
+    (from a configuration), `load` (from an id) or `find` (every one there is).
+    """
+
+    stage: str
+    scene: str
+    hash: str
+    root: Path
+    _config: dict[str, Any] | None = field(default=None, repr=False, compare=False)
+    _parents: tuple[str, ...] | None = field(default=None, repr=False, compare=False)
+
+    @classmethod
+    def open(
+        cls,
+        stage: str,
+        scene: str,
+        config: Mapping[str, Any],
+        parents: Sequence["Run"] = (),
+        root: str | Path | None = None,
+    ) -> "Run":
+        """Name the run of a configuration; nothing is read or written.
+
+        Args:
+            stage: such as "simulate"; a folder name.
+            scene: such as "sand"; a folder name.
+            config: resolved configuration of the stage (plain or OmegaConf).
+            parents: runs whose files the stage reads, in the order it reads them.
+            root: folder of all runs; NSF_RUNS, else ./runs.
+
+        Raises:
+            ConfigError: a name is no folder name, or `config` holds a missing,
+                non-finite or non-JSON value.
+        """
+        for key, name in (("stage", stage), ("scene", scene)):
+            if not _NAME.fullmatch(name):
+                raise ConfigError(f"{key}={name!r} is no folder name; use letters, digits and _ . + -")
+        settings = plain(config)
+        content = {
+            "format": FORMAT,
+            "stage": stage,
+            "scene": scene,
+            "config": settings,
+            "parents": [parent.hash for parent in parents],
+        }
+        return cls(
+            stage, scene, content_hash(content), _root(root), settings, tuple(parent.id for parent in parents)
+        )
+
+    @classmethod
+    def load(cls, run_id: str, root: str | Path | None = None) -> "Run":
+        """The recorded run called `stage/scene/hash`.
+
+        Raises:
+            MissingRunError: no such run was ever started.
+        """
+        path = _root(root) / run_id
+        if run_id.count("/") != 2 or not (path / "manifest.json").is_file():
+            raise MissingRunError(
+                f"no run {run_id!r} under {_root(root)}; run its stage first, or set NSF_RUNS"
+            )
+        stage, scene, digest = run_id.split("/")
+        return cls(stage, scene, digest, _root(root))
+
+    @classmethod
+    def find(cls, stage: str, scene: str | None = None, root: str | Path | None = None) -> list["Run"]:
+        """Every run of a stage that was ever started, newest first."""
+        manifests = _root(root).glob(f"{stage}/{scene or '*'}/*/manifest.json")
+        runs = [cls(stage, path.parts[-3], path.parts[-2], _root(root)) for path in manifests]
+        return sorted(runs, key=lambda run: (run.manifest.get("created", ""), run.hash), reverse=True)
+
+    @property
+    def id(self) -> str:
+        """`stage/scene/hash`."""
+        return f"{self.stage}/{self.scene}/{self.hash}"
+
+    @property
+    def path(self) -> Path:
+        """The run's folder; it exists once the run was recorded."""
+        return self.root / self.stage / self.scene / self.hash
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The resolved configuration, from memory or from config.yaml."""
+        if self._config is not None:
+            return self._config
+        from omegaconf import OmegaConf  # 0.2 s that `nsf --help` need not pay
+
+        return OmegaConf.to_container(OmegaConf.load(self.path / "config.yaml"))  # type: ignore[return-value]
+
+    @property
+    def parents(self) -> tuple[str, ...]:
+        """Ids of the runs whose files this one reads."""
+        return tuple(self.manifest.get("parents", ())) if self._parents is None else self._parents
+
+    @property
+    def manifest(self) -> dict[str, Any]:
+        """The manifest on disk; empty when there is none or it cannot be read."""
+        try:
+            manifest = json.loads((self.path / "manifest.json").read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return {}
+        return manifest if isinstance(manifest, dict) else {}
+
+    @property
+    def complete(self) -> bool:
+        """Whether the run succeeded and its outputs are there in their recorded size."""
+        manifest = self.manifest
+        if manifest.get("status") != "complete" or manifest.get("hash") != self.hash:
+            return False
+        try:
+            return all(
+                (self.path / output["path"]).stat().st_size == output["bytes"]
+                for output in manifest["outputs"]
+            )
+        except (OSError, KeyError, TypeError):
+            return False
+
+    def require(self) -> "Run":
+        """This run, if it is complete.
+
+        Raises:
+            MissingRunError: it is not; says how far it came.
+        """
+        if self.complete:
+            return self
+        manifest = self.manifest
+        status = manifest.get("status", "never run")
+        state = "complete, but outputs are missing or cut short" if status == "complete" else status
+        why = f" ({manifest['error']})" if manifest.get("error") else ""
+        raise MissingRunError(f"{self.path} is {state}{why}; run `nsf {self.stage}` for {self.scene!r} again")
+
+    @contextmanager
+    def record(
+        self, device: str = "cpu", seed: int | None = None, precision: str | None = None
+    ) -> Iterator["Record"]:
+        """Keep the manifest while the block works.
+
+        The status is "running" from the start; "complete" after the block,
+        "failed" after an exception, "interrupted" after an interrupt. Every
+        exception goes on to the caller. A killed process leaves "running".
+
+        Args:
+            device: such as "cpu" or "cuda:0".
+            seed: of every generator in the block.
+            precision: such as "fp64".
+
+        Raises:
+            StorageError: the folder cannot be written.
+        """
+        record = Record(self.path)
+        manifest: dict[str, Any] = {
+            "format": FORMAT,
+            "stage": self.stage,
+            "scene": self.scene,
+            "hash": self.hash,
+            "parents": list(self.parents),
+            **provenance(),
+            "device": str(device),
+            "seed": seed,
+            "precision": precision,
+            "created": datetime.now(UTC).isoformat(timespec="microseconds"),
+        }
+        self._write_config()
+        write_json(self.path / "manifest.json", {**manifest, "status": "running"})
+        start = time.perf_counter()
+
+        def close(status: str, metrics: dict[str, Any], **more: Any) -> None:
+            ending = {
+                "status": status,
+                **more,
+                "seconds": time.perf_counter() - start,
+                "metrics": metrics,
+                "outputs": list(record.outputs.values()),
+            }
+            write_json(self.path / "manifest.json", manifest | ending)
+
+        try:
+            yield record
+            close("complete", record.plain_metrics())
+        except BaseException as error:
+            status = "failed" if isinstance(error, Exception) else "interrupted"
+            metrics: dict[str, Any] = {}
+            # A full disk, or a metric that no manifest can hold, must not hide the first error.
+            with suppress(ConfigError):
+                metrics = record.plain_metrics()
+            with suppress(StorageError):
+                close(status, metrics, error=f"{type(error).__name__}: {error}")
+            raise
+
+    def _write_config(self) -> None:
+        from omegaconf import OmegaConf
+
+        # OmegaConf quotes strings that look like numbers; yaml.safe_dump leaves "1e-5" bare.
+        text = OmegaConf.to_yaml(OmegaConf.create(self.config))
+        with writing(self.path / "config.yaml") as partial:
+            partial.write_text(text, encoding="utf-8")
+
+
+class Record:
+    """What a running stage says about itself: `metrics`, and the files it made."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.metrics: dict[str, Any] = {}
+        self.outputs: dict[str, dict[str, Any]] = {}
+
+    def output(self, path: str | Path) -> Path:
+        """Enter a finished file, or every file of a folder, into the manifest.
+
+        Args:
+            path: within the run's folder, absolute or relative to it.
+
+        Raises:
+            ConfigError: the path leaves the run's folder or does not exist.
+        """
+        path = self.path / path
+        files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
+        if not files or not path.resolve().is_relative_to(self.path.resolve()):
+            raise ConfigError(f"output {path} is no file inside {self.path}; write it there first")
+        for file in files:
+            name = file.resolve().relative_to(self.path.resolve()).as_posix()
+            with file.open("rb") as stream:
+                digest = hashlib.file_digest(stream, "sha256").hexdigest()
+            self.outputs[name] = {"path": name, "bytes": file.stat().st_size, "sha256": digest}
+        return path
+
+    def plain_metrics(self) -> dict[str, Any]:
+        """The metrics as JSON holds them; a value that is not finite becomes null.
+
+        Raises:
+            ConfigError: a metric is of a kind that JSON cannot hold.
+        """
+        return plain(self.metrics, finite=False, key="metrics")
+
+
+def _root(root: str | Path | None) -> Path:
+    return Path(root or os.environ.get("NSF_RUNS") or "runs").expanduser()

@@ -1,0 +1,114 @@
+"""Files that appear whole or not at all, and a full disk that says so."""
+
+import errno
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from nsf.errors import StorageError
+
+_SPACE = "free some space, or point NSF_RUNS at another disk"
+_ACCESS = "make the folder writable, or point NSF_RUNS at one that is"
+_REMEDIES = {
+    errno.ENOSPC: _SPACE,
+    errno.EDQUOT: _SPACE,
+    errno.EFBIG: "raise the limit on file size (ulimit -f)",
+    errno.EACCES: _ACCESS,
+    errno.EPERM: _ACCESS,
+    errno.EROFS: _ACCESS,
+}
+# torch.save reports a full disk as a RuntimeError without a cause; a file system this empty gives it away.
+_FULL_BYTES = 64 * 1024
+
+
+@contextmanager
+def writing(path: str | Path) -> Iterator[Path]:
+    """Yield a temporary path that becomes `path` only if the block succeeds.
+
+    The temporary file keeps the name (savers choose a format by the suffix)
+    and lies in a hidden folder beside the target, on the same file system, so
+    the final rename is atomic. On any exception, an interrupt included, it is
+    removed and an earlier file of that name stays as it was.
+
+    Args:
+        path: where the file shall be; missing folders are made.
+
+    Raises:
+        StorageError: no space, no permission or no writable file system.
+    """
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        folder = Path(tempfile.mkdtemp(prefix=".partial-", dir=path.parent))
+    except OSError as error:
+        raise _storage_error(
+            path, error.strerror or str(error), _REMEDIES.get(error.errno or 0, _ACCESS)
+        ) from error
+    try:
+        partial = folder / path.name
+        yield partial
+        _flush(partial)
+        os.replace(partial, path)
+    except (OSError, RuntimeError) as error:
+        fault = _fault(error, folder)
+        if fault is None:
+            raise
+        raise _storage_error(path, os.strerror(fault), _REMEDIES[fault]) from error
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def write_json(path: str | Path, value: Any) -> None:
+    """Write `value` as JSON, whole or not at all.
+
+    Raises:
+        StorageError: the file could not be written.
+        ValueError: a number is not finite, which JSON cannot hold.
+    """
+    text = json.dumps(value, indent=2, allow_nan=False)
+    with writing(path) as partial:
+        partial.write_text(text + "\n", encoding="utf-8")
+
+
+def require_space(path: str | Path, size: int) -> None:
+    """Refuse to begin a file that its disk cannot hold.
+
+    Args:
+        path: the file to come; its folder exists.
+        size: [byte] expected.
+
+    Raises:
+        StorageError: less than `size` is free.
+    """
+    free = shutil.disk_usage(Path(path).parent).free
+    if size > free:
+        fault = f"it needs {size / 2**20:.1f} MiB and the disk has {free / 2**20:.1f} MiB free"
+        raise _storage_error(Path(path), fault, _SPACE)
+
+
+def _flush(path: Path) -> None:
+    # Quotas and network file systems may report a full disk no earlier than here.
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+
+
+def _fault(error: OSError | RuntimeError, folder: Path) -> int | None:
+    """The errno of a storage fault behind `error`; None for any other fault."""
+    number = getattr(error, "errno", None)
+    if number in _REMEDIES:
+        filename = getattr(error, "filename", None)
+        elsewhere = isinstance(filename, str) and folder not in Path(filename).parents
+        return None if elsewhere else number
+    # h5py wraps the cause into its own text, as OSError or RuntimeError.
+    named = (number for number in _REMEDIES if os.strerror(number) in str(error))
+    full = shutil.disk_usage(folder).free < _FULL_BYTES
+    return next(named, errno.ENOSPC if full else None)
+
+
+def _storage_error(path: Path, fault: str, remedy: str) -> StorageError:
+    return StorageError(f"cannot write {path}: {fault}; {remedy}")

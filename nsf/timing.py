@@ -1,0 +1,213 @@
+"""Time and memory of a region, on any device.
+
+No array library is imported here, so that layers which must not import one
+can be timed: a device is reached through the library that is already loaded.
+"""
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from types import ModuleType
+from typing import Any
+
+from nsf.errors import DeviceError
+
+Synchronize = Callable[[], object]
+_MIB = 2**20
+
+
+def synchronizer(device: Any = "cpu") -> Synchronize:
+    """The call that waits until everything asked of `device` is done.
+
+    On CUDA it waits for the whole device, whichever library's stream the work
+    is on. On the CPU there is nothing to wait for.
+
+    Raises:
+        DeviceError: `device` is a GPU and neither torch nor Warp is loaded.
+    """
+    if not _is_cuda(device):
+        return lambda: None
+    if torch := _loaded("torch", lambda torch: torch.cuda.is_available()):
+        return lambda: torch.cuda.synchronize(str(device))
+    if warp := _loaded("warp", lambda warp: warp.is_cuda_available()):
+        return lambda: warp.synchronize_device(str(device))
+    raise DeviceError(
+        f"device={device} cannot be timed: no loaded library reaches a GPU; use device=cpu, "
+        "or import torch or warp first"
+    )
+
+
+def untimed(stage: str) -> AbstractContextManager[None]:
+    """Stand in for a `StageTimer` where nothing is to be timed."""
+    return nullcontext()
+
+
+class StageTimer:
+    """Wall time a named stage, by the host's clock around a synchronised device.
+
+        timer = StageTimer(device)
+        with timer("p2g"):
+            ...
+        timer.per_step(200)   # {"p2g": milliseconds}
+
+    Synchronising keeps stages from overlapping, so their sum exceeds an
+    untimed step: publish `trials` of the whole step beside a breakdown. It is
+    not allowed while a CUDA graph is being captured.
+
+    Args:
+        device: "cpu", "cuda:0" or a library's device object.
+        synchronize: what to wait with, in place of `synchronizer(device)`.
+    """
+
+    def __init__(self, device: Any = "cpu", synchronize: Synchronize | None = None) -> None:
+        self.milliseconds: dict[str, float] = {}
+        self.calls: dict[str, int] = {}
+        self._synchronize = synchronize or synchronizer(device)
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Add the block's time [ms] to `stage`; a block that raises is not counted."""
+        self._synchronize()
+        start = time.perf_counter()
+        yield
+        self._synchronize()
+        elapsed = 1e3 * (time.perf_counter() - start)
+        self.milliseconds[stage] = self.milliseconds.get(stage, 0.0) + elapsed
+        self.calls[stage] = self.calls.get(stage, 0) + 1
+
+    def per_step(self, steps: int) -> dict[str, float]:
+        """Mean time [ms] a step of every stage, in the order they first ran."""
+        return {stage: total / steps for stage, total in self.milliseconds.items()}
+
+    def reset(self) -> None:
+        """Forget what was measured, such as a warm-up."""
+        self.milliseconds.clear()
+        self.calls.clear()
+
+
+def trials(
+    function: Callable[[], object],
+    n: int = 10,
+    warmup: int = 1,
+    device: Any = "cpu",
+    synchronize: Synchronize | None = None,
+) -> dict[str, float]:
+    """Time `n` calls of `function`, each between two synchronisations, after `warmup` uncounted ones.
+
+    Returns:
+        "median", "p10", "p90" [ms] (linear between ranks) and "trials".
+    """
+    wait = synchronize or synchronizer(device)
+    times = []
+    for trial in range(warmup + n):
+        wait()
+        start = time.perf_counter()
+        function()
+        wait()
+        if trial >= warmup:
+            times.append(1e3 * (time.perf_counter() - start))
+    times.sort()
+    return {
+        "median": _quantile(times, 0.5),
+        "p10": _quantile(times, 0.1),
+        "p90": _quantile(times, 0.9),
+        "trials": n,
+    }
+
+
+class MemoryProbe:
+    """Peak device memory over a region, every allocator counted.
+
+        with MemoryProbe(device, nbytes=lambda: solver.nbytes) as probe:
+            ...
+        probe.peak_mib, probe.grown_mib, probe.allocators
+
+    On CUDA the peaks of torch's allocator and Warp's memory pool are added (an
+    upper bound: they may not coincide). Warp cannot reset its mark, so a region
+    that stays below an earlier one counts what Warp holds at its ends. On the
+    CPU no allocator can be asked; the caller's `nbytes` is read at the end.
+
+    Args:
+        device: "cpu", "cuda:0" or a library's device object.
+        nbytes: [byte] held by the solvers, or a function of it; only used on the CPU.
+
+    Attributes:
+        peak_mib: [MiB] the most that was held.
+        grown_mib: [MiB] the same, less what was held on entry.
+        allocators: [MiB] by allocator; "driver" is all that is in use on the
+            device at the end, other processes and loaded kernels included.
+    """
+
+    def __init__(self, device: Any = "cpu", nbytes: int | Callable[[], int] = 0) -> None:
+        self.device = device
+        self.peak_mib = self.grown_mib = 0.0
+        self.allocators: dict[str, float] = {}
+        self._nbytes = nbytes
+        self._torch = self._warp = None
+        if _is_cuda(device):
+            synchronizer(device)  # raises where the device cannot be reached
+            self._torch = _loaded("torch", lambda torch: torch.cuda.is_available())
+            self._warp = _loaded(
+                "warp", lambda warp: warp.is_cuda_available() and warp.is_mempool_enabled(str(device))
+            )
+
+    def __enter__(self) -> "MemoryProbe":
+        if self._torch:
+            self._torch.cuda.reset_peak_memory_stats(str(self.device))
+        if self._warp:
+            self._mark = self._warp.get_mempool_used_mem_high(str(self.device))
+        self._held = self._current()
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        if not _is_cuda(self.device):
+            nbytes = self._nbytes() if callable(self._nbytes) else self._nbytes
+            self.allocators = {"solver": nbytes / _MIB}
+            self.peak_mib = self.grown_mib = nbytes / _MIB
+            return
+        now = self._current()
+        peak = dict(now)
+        if self._torch:
+            peak["torch"] = self._torch.cuda.max_memory_allocated(str(self.device))
+        if self._warp:
+            mark = self._warp.get_mempool_used_mem_high(str(self.device))
+            peak["warp"] = mark if mark > self._mark else max(now["warp"], self._held["warp"])
+        self.peak_mib = sum(peak.values()) / _MIB
+        self.grown_mib = self.peak_mib - sum(self._held.values()) / _MIB
+        self.allocators = {name: size / _MIB for name, size in peak.items()} | {
+            "driver": self._driver() / _MIB
+        }
+
+    def _current(self) -> dict[str, int]:
+        held = {}
+        if self._torch:
+            held["torch"] = self._torch.cuda.memory_allocated(str(self.device))
+        if self._warp:
+            held["warp"] = self._warp.get_mempool_used_mem_current(str(self.device))
+        return held
+
+    def _driver(self) -> int:
+        if self._torch:
+            free, total = self._torch.cuda.mem_get_info(str(self.device))
+            return total - free
+        if self._warp:
+            device = self._warp.get_device(str(self.device))
+            return device.total_memory - device.free_memory
+        return 0
+
+
+def _is_cuda(device: Any) -> bool:
+    return str(device).startswith("cuda")
+
+
+def _loaded(name: str, usable: Callable[[ModuleType], bool]) -> Any:
+    module = sys.modules.get(name)
+    return module if module is not None and usable(module) else None
+
+
+def _quantile(ordered: list[float], fraction: float) -> float:
+    position = fraction * (len(ordered) - 1)
+    low = int(position)
+    high = min(low + 1, len(ordered) - 1)
+    return ordered[low] + (position - low) * (ordered[high] - ordered[low])

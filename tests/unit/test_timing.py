@@ -1,0 +1,166 @@
+"""Timers and probes; no assertion is about how long something takes."""
+
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from nsf import timing
+from nsf.errors import DeviceError
+from nsf.timing import MemoryProbe, StageTimer, synchronizer, trials, untimed
+
+MIB = 2**20
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """A clock that stands still until told."""
+    clock = SimpleNamespace(now=0.0, waits=0)
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: clock.now)
+    return clock
+
+
+def advance(clock, seconds):
+    clock.now += seconds
+
+
+def test_stages_add_up(clock):
+    timer = StageTimer()
+    for _ in range(2):
+        with timer("p2g"):
+            advance(clock, 0.002)
+        with timer("grid"):
+            advance(clock, 0.001)
+        advance(clock, 5.0)  # between stages
+    with timer("grid"):
+        advance(clock, 0.004)
+    assert timer.milliseconds == pytest.approx({"p2g": 4, "grid": 6})
+    assert timer.calls == {"p2g": 2, "grid": 3}
+    assert timer.per_step(2) == pytest.approx({"p2g": 2, "grid": 3})
+    timer.reset()
+    assert timer.milliseconds == timer.calls == {}
+
+
+def test_a_stage_waits_for_its_own_work_and_not_for_earlier_work(clock):
+    pending = [0.0]
+
+    def wait():
+        advance(clock, pending[0])
+        pending[0] = 0.0
+
+    timer = StageTimer(synchronize=wait)
+    pending[0] = 7.0
+    with timer("g2p"):
+        pending[0] = 0.003
+    assert timer.milliseconds == pytest.approx({"g2p": 3})
+    result = trials(lambda: pending.__setitem__(0, 0.002), n=3, synchronize=wait)
+    assert result["median"] == pytest.approx(2)
+
+
+def test_a_stage_that_raises_is_not_counted(clock):
+    timer = StageTimer()
+    with pytest.raises(ValueError, match="x"), timer("p2g"):
+        raise ValueError("x")
+    assert timer.milliseconds == {}
+
+
+def test_untimed_stands_in_for_a_timer():
+    with untimed("p2g"):
+        pass
+
+
+def test_trials_drop_the_warmup_and_interpolate(clock):
+    durations = iter([9.0, 0.004, 0.001, 0.003, 0.002, 0.005])
+    result = trials(lambda: advance(clock, next(durations)), n=5)
+    assert result == pytest.approx({"median": 3, "p10": 1.4, "p90": 4.6, "trials": 5})
+
+
+def test_the_cpu_counts_what_the_caller_says():
+    held = [0]
+    with MemoryProbe("cpu", nbytes=lambda: held[0]) as probe:
+        held[0] = 3 * MIB
+    assert (probe.peak_mib, probe.grown_mib, probe.allocators) == (3, 3, {"solver": 3})
+    with MemoryProbe(nbytes=MIB) as probe:
+        pass
+    assert probe.peak_mib == 1
+
+
+class FakeGpu:
+    """The calls of torch and Warp that the probe makes, in MiB."""
+
+    def __init__(self, monkeypatch, torch=True, warp=True):
+        self.torch, self.torch_peak, self.warp, self.warp_mark, self.waits = 10, 50, 20, 40, []
+        cuda = SimpleNamespace(
+            is_available=lambda: True,
+            synchronize=lambda device: self.waits.append(device),
+            reset_peak_memory_stats=lambda device: setattr(self, "torch_peak", self.torch),
+            memory_allocated=lambda device: self.torch * MIB,
+            max_memory_allocated=lambda device: self.torch_peak * MIB,
+            mem_get_info=lambda device: (900 * MIB, 1000 * MIB),
+        )
+        fake_warp = SimpleNamespace(
+            is_cuda_available=lambda: True,
+            is_mempool_enabled=lambda device: True,
+            synchronize_device=lambda device: self.waits.append(device),
+            get_mempool_used_mem_high=lambda device: self.warp_mark * MIB,
+            get_mempool_used_mem_current=lambda device: self.warp * MIB,
+            get_device=lambda device: SimpleNamespace(total_memory=1000 * MIB, free_memory=800 * MIB),
+        )
+        modules = {
+            "torch": SimpleNamespace(cuda=cuda) if torch else None,
+            "warp": fake_warp if warp else None,
+        }
+        monkeypatch.setattr(timing, "sys", SimpleNamespace(modules=modules))
+
+
+def test_a_gpu_adds_both_allocators_over_the_region_alone(monkeypatch):
+    gpu = FakeGpu(monkeypatch)
+    with MemoryProbe("cuda:0") as probe:
+        gpu.torch_peak, gpu.warp_mark = max(gpu.torch_peak, 15), 60
+    assert probe.allocators == {"torch": 15, "warp": 60, "driver": 100}
+    assert (probe.peak_mib, probe.grown_mib) == (75, 45)
+
+
+def test_an_earlier_mark_of_warp_is_not_counted(monkeypatch):
+    gpu = FakeGpu(monkeypatch, torch=False)
+    with MemoryProbe("cuda:0") as probe:
+        gpu.warp = 25
+    assert probe.allocators == {"warp": 25, "driver": 200}
+    assert (probe.peak_mib, probe.grown_mib) == (25, 5)
+
+
+@pytest.mark.parametrize("torch", [True, False])
+def test_a_gpu_is_waited_for_through_the_loaded_library(monkeypatch, torch):
+    gpu = FakeGpu(monkeypatch, torch=torch)
+    with StageTimer("cuda:1")("p2g"):
+        assert gpu.waits == ["cuda:1"]
+    assert gpu.waits == ["cuda:1"] * 2
+
+
+def test_a_gpu_that_is_not_there(monkeypatch):
+    FakeGpu(monkeypatch, torch=False, warp=False)
+    for make in (synchronizer, StageTimer, MemoryProbe):
+        with pytest.raises(DeviceError, match=r"device=cuda:0.*device=cpu"):
+            make("cuda:0")
+
+
+def test_timing_imports_no_array_library():
+    code = "import sys, nsf.timing; assert not {'torch', 'warp', 'numpy'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("device", ["cuda", "cuda:0"])
+def test_a_real_gpu(device):
+    torch, wp = pytest.importorskip("torch"), pytest.importorskip("warp")
+    if not (torch.cuda.is_available() and wp.is_cuda_available()):
+        pytest.skip("needs a GPU")
+    timer = StageTimer(device)
+    with MemoryProbe(device) as probe, timer("work"):
+        held = torch.zeros(64 * MIB, dtype=torch.uint8, device=device)
+        array = wp.zeros(32 * MIB, dtype=wp.uint8, device=device)
+    assert timer.milliseconds["work"] > 0
+    assert probe.grown_mib == pytest.approx(len(held) / MIB + len(array) / MIB, abs=4)
+    assert probe.peak_mib >= probe.grown_mib
+    assert probe.allocators["driver"] > 96
