@@ -1,0 +1,137 @@
+"""Builds a report: a folder with a page, tables, charts, pictures, and where each number comes from."""
+
+import json
+from pathlib import Path
+
+from nsf.reporting.columns import axis, parameter_text
+from nsf.reporting.page import Page, Table, html_page, markdown_page
+from nsf.reporting.pictures import draw
+from nsf.reporting.provenance import provenance_rows, sources_json
+from nsf.reporting.sources import Source, open_sources
+from nsf.reporting.swap import MARK, replaced
+from nsf.reporting.tables import Merged, console_table, means, merge, variants, without_constants
+
+__all__ = ["build_report", "console_table"]
+
+_LEAD = (
+    "A reduced-order model of elastoplastic material (Neural Stress Fields) runs beside the full-order "
+    "material point method it was trained on, at the same parameter values; this page says how far apart "
+    "the two are and what the reduced model saves."
+)
+
+_PROVENANCE = (
+    "Every number above is read from these runs. sources.json names the run of each row and picture, and the "
+    "hash of each file read; results.csv holds the rows in full precision."
+)
+
+
+def build_report(evaluate_runs, folder, title: str) -> Path:
+    """Write a report of evaluate runs to folder, replacing a report that is there.
+
+    Writes `index.html`, `index.md`, `results.csv`, `sources.json`, charts (svg, png) and pictures
+    (png, gif). Equal runs give equal files, byte for byte.
+
+    Args:
+        evaluate_runs: runs of stage `evaluate`; those not complete are passed over.
+        folder: where the report goes. It changes only once everything is written.
+        title: of the page.
+
+    Returns:
+        The path of `index.html`.
+
+    Raises:
+        MissingRunError: no run is complete.
+        SchemaError: a run's file is missing, altered since the run, or lacks a column.
+        ConfigError: folder holds something that is not a report.
+        StorageError: the disk refused a file.
+    """
+    merged = merge(open_sources(evaluate_runs))
+    with replaced(Path(folder)) as fresh:
+        merged.frame.to_csv(fresh / "results.csv", index=False)
+        sections = draw(merged, fresh)
+        page = _page(title, merged, sections)
+        (fresh / "index.html").write_text(html_page(page), encoding="utf-8")
+        (fresh / "index.md").write_text(markdown_page(page), encoding="utf-8")
+        told = sources_json(title, merged, sections, (fresh / "results.csv").read_bytes())
+        (fresh / MARK).write_text(json.dumps(told, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    return Path(folder) / "index.html"
+
+
+def _page(title: str, merged: Merged, sections) -> Page:
+    headline, same = without_constants(means(merged))
+    per_value, same_there = without_constants(merged.frame)
+    methods = merged.frame[["scene", "method"]].drop_duplicates()
+    chosen = (
+        "Of each method, the pictures show the variant with the smallest mean held-out δ. "
+        if len(variants(merged)) > len(methods)
+        else ""
+    )
+    note = f"Means over the parameter values of a split. {chosen}{_said(same)}"
+    return Page(
+        title=title,
+        lead=_LEAD,
+        facts=_facts(merged),
+        tables=[
+            Table("Results beside the paper's", headline, note),
+            Table("Each parameter value", per_value, _said(same_there), _parameter_heading(merged)),
+        ],
+        sections=sections,
+        provenance=Table("Where the numbers come from", provenance_rows(merged), _PROVENANCE),
+    )
+
+
+def _parameter_heading(merged: Merged) -> dict[str, str]:
+    """The parameter column under its own name and unit, where every row has the same parameter."""
+    names = {axis(*source.parameter) for source in merged.source}
+    return {"parameter": names.pop()} if len(names) == 1 else {}
+
+
+def _facts(merged: Merged) -> list[tuple[str, str]]:
+    """Scene, parameter and particles, scene by scene."""
+    facts = []
+    for scene, rows in merged.frame.groupby("scene", sort=False):
+        source = merged.source[rows.index[0]]
+        name, unit = source.parameter
+        values = {
+            split: sorted(part["parameter"].unique()) for split, part in rows.groupby("split", sort=False)
+        }
+        told = "; ".join(
+            f"{split} " + ", ".join(parameter_text(value, "", unit) for value in listed)
+            for split, listed in values.items()
+        )
+        latent = sorted(rows["r"].unique())
+        facts += [
+            ("Scene", source.summary.get("title", scene) + _scale(source)),
+            ("Parameter", f"{name}: {told}"),
+            (
+                "Particles",
+                f"{_particles(source, rows):,} full-order; {', '.join(map(str, latent))} latent coordinates",
+            ),
+            (
+                "Simulated",
+                f"{source.series['t'].max():.3g} s in {int(source.series['frame'].max()):,} frames",
+            ),
+        ]
+        if source.summary.get("training_seconds"):
+            facts.append(("Training", _duration(source.summary["training_seconds"])))
+    return facts
+
+
+def _particles(source: Source, rows) -> int:
+    """Particles of the full-order model; from γ = 3P/r where the summary does not say."""
+    return int(source.summary.get("particles") or round(rows["gamma"].iloc[0] * rows["r"].iloc[0] / 3))
+
+
+def _scale(source: Source) -> str:
+    scale = source.summary.get("scale")
+    return f" ({scale} scale)" if scale else ""
+
+
+def _duration(seconds: float) -> str:
+    if seconds >= 5400:
+        return f"{seconds / 3600:.1f} h"
+    return f"{seconds / 60:.1f} min" if seconds >= 90 else f"{seconds:.0f} s"
+
+
+def _said(same: str) -> str:
+    return f"The same in every row: {same}." if same else ""

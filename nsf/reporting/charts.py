@@ -1,0 +1,213 @@
+"""Charts of errors and latent coordinates: data in, figure out, units on every axis."""
+
+import math
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from nsf.reporting.columns import axis, parameter_text
+from nsf.reporting.style import INK, REDUCED, figure, line_style, styled
+
+OVER_TIME = {
+    "delta": "relative deformation error δ",
+    "displacement_error": "displacement error",
+    "stress_error": "stress error",
+    "linear_momentum_error": "linear momentum error",
+    "angular_momentum_error": "angular momentum error",
+}
+
+
+def error_over_time(
+    series: pd.DataFrame, columns=("delta", "displacement_error"), name: str = "parameter", unit: str = ""
+) -> Figure:
+    """Errors [%] of every frame over simulated time [s], one line a parameter value.
+
+    Args:
+        series: rows of `series.csv`; errors are fractions.
+        columns: the errors shown, one panel each.
+        name, unit: of the problem parameter.
+    """
+    with styled():
+        fig = figure(4.1)
+        panels = fig.subplots(1, len(columns), squeeze=False)[0]
+        for panel, column in zip(panels, columns, strict=True):
+            for i, (value, part) in enumerate(_by_parameter(series)):
+                panel.plot(
+                    part["t"],
+                    _finite(100 * part[column]),
+                    label=parameter_text(value, "", unit),
+                    **line_style(i),
+                )
+            panel.set(xlabel="time t [s]", ylabel=f"{OVER_TIME.get(column, column)} [%]")
+            _error_scale(panel, 100 * series[column])
+            panel.margins(x=0.01)
+        _legend_above(fig, panels[0], axis(name, unit))
+    return fig
+
+
+def latent_trajectories(series: pd.DataFrame, name: str = "parameter", unit: str = "") -> Figure:
+    """The latent path of each parameter value: the first two coordinates in a plane, and every one over time.
+
+    Solid: the reduced model's xhat. Dashed: the full-order frames through the encoder. Coordinates are
+    dimensionless.
+    """
+    r = sum(column.startswith("xhat_") for column in series)
+    columns = max(1, math.ceil(r / 2))
+    with styled():
+        fig = figure(5.0)
+        grid = fig.add_gridspec(2, columns + 2, width_ratios=[1.25, 1.25] + [1] * columns)
+        plane = fig.add_subplot(grid[:, :2])
+        over_time = [fig.add_subplot(grid[i // columns, 2 + i % columns]) for i in range(r)]
+        second = "xhat_2" if r > 1 else "t"
+        for i, (value, part) in enumerate(_by_parameter(series)):
+            color = line_style(i)["color"]
+            solid, dashed = (
+                {"color": color, "alpha": 0.9},
+                {"color": color, "ls": (0, (2, 1.6)), "lw": 2.4, "alpha": 0.45},
+            )
+            plane.plot(part[_encoded("xhat_1")], part[_encoded(second)], **dashed)
+            plane.plot(part["xhat_1"], part[second], label=parameter_text(value, "", unit), **solid)
+            plane.plot(part["xhat_1"].iloc[:1], part[second].iloc[:1], "o", ms=5, color=color)
+            for k, panel in enumerate(over_time, start=1):
+                panel.plot(part["t"], part[f"encoded_{k}"], **dashed)
+                panel.plot(part["t"], part[f"xhat_{k}"], **solid)
+        plane.set(xlabel="x̂₁ [–]", ylabel="x̂₂ [–]" if r > 1 else "time t [s]")
+        plane.grid()
+        for k, panel in enumerate(over_time, start=1):
+            panel.set_title(f"x̂{_subscript(k)} [–]", fontweight="normal", pad=3)
+            panel.tick_params(labelsize=8)
+            panel.locator_params(nbins=4)
+            panel.grid()
+            if k > r - columns:
+                panel.set_xlabel("t [s]")
+            else:
+                panel.tick_params(labelbottom=False)
+        plane.plot([], [], color=INK, label="reduced")
+        plane.plot([], [], color=INK, ls=(0, (2, 1.6)), lw=2.4, alpha=0.45, label="encoded full-order")
+        _legend_above(fig, plane, axis(name, unit))
+    return fig
+
+
+def reconstruction_and_rollout(series: pd.DataFrame, name: str = "parameter", unit: str = "") -> Figure:
+    """How much of each parameter value's error the manifold alone explains.
+
+    Root mean square over frames of δ [%]: the full-order frames encoded and decoded (open), and the
+    reduced model's rollout (filled). The distance between the two is what the dynamics add.
+    """
+    groups = _by_parameter(series)
+    with styled():
+        fig = figure(3.9, 7.2)
+        panel = fig.subplots()
+        low, high = (
+            _finite([100 * _rms(part[column]) for _, part in groups])
+            for column in ("reconstruction_delta", "delta")
+        )
+        at = np.arange(len(groups))
+        panel.vlines(at, low, high, color=REDUCED, lw=3, alpha=0.3)
+        panel.plot(
+            at, low, "o", ms=8, mfc="white", mec=REDUCED, mew=1.6, label="reconstruction: decode(encode(x))"
+        )
+        panel.plot(at, high, "o", ms=8, color=REDUCED, label="rollout: reduced dynamics")
+        panel.set_xticks(at, [f"{parameter_text(value)}\n{part['split'].iloc[0]}" for value, part in groups])
+        panel.set(xlabel=axis(name, unit), ylabel="RMS over frames of δ [%]", xlim=(-0.5, len(groups) - 0.5))
+        _error_scale(panel, np.concatenate([low, high]))
+        _legend_above(fig, panel, None)
+    return fig
+
+
+def delta_per_variant(variants: list[dict]) -> Figure:
+    """Mean δ [%] of each variant, its single parameter values as dots, and the paper's figure.
+
+    Args:
+        variants: per variant `label`, `mean` and `values` (fractions), and `paper` (fraction or None).
+    """
+    with styled():
+        fig = figure(1.5 + 0.46 * len(variants), 8.4)
+        panel = fig.subplots()
+        at = np.arange(len(variants))
+        for i, v in enumerate(variants):
+            label = "one parameter value" if i == 0 else None
+            dots = 100 * _finite(v["values"])
+            panel.plot(dots, np.full(len(dots), i), "o", ms=4.5, mfc="white", mec=INK, mew=0.9, label=label)
+        papers = [(i, 100 * v["paper"]) for i, v in enumerate(variants) if v["paper"] is not None]
+        if papers:
+            y, x = np.array(papers).T
+            panel.plot(x, y, "|", ms=15, mew=2.6, color="#D55E00", label="paper")
+        every = _finite([x for v in variants for x in (*v["values"], v["mean"], v["paper"] or v["mean"])])
+        shown = every[~np.isnan(every)]
+        logarithmic = len(shown) > 0 and shown.min() > 0 and shown.max() > 30 * shown.min()
+        if logarithmic:
+            panel.set_xscale("log")
+            _plain_ticks(panel.xaxis)
+        average = 100 * _finite([v["mean"] for v in variants])
+        for y in np.flatnonzero(np.isnan(average)):
+            panel.text(0.01, float(y), "diverged", transform=panel.get_yaxis_transform(), va="center")
+        if logarithmic:  # a bar's length means nothing on a logarithmic axis
+            panel.plot(average, at, "D", ms=8, color=REDUCED, label="mean", zorder=1.9)
+        else:
+            panel.barh(at, average, height=0.58, color=REDUCED, alpha=0.75, label="mean")
+        panel.set_yticks(at, [v["label"] for v in variants])
+        panel.set_ylim(len(variants) - 0.45, -0.55)
+        panel.set_xlabel("relative deformation error δ [%]")
+        panel.grid(axis="x")
+        panel.tick_params(axis="y", length=0)
+        _legend_above(fig, panel, None)
+    return fig
+
+
+def _by_parameter(series: pd.DataFrame) -> list[tuple]:
+    return list(series.groupby("parameter", sort=True))
+
+
+def _encoded(column: str) -> str:
+    return column.replace("xhat_", "encoded_")
+
+
+def _finite(values) -> np.ndarray:
+    """Values with gaps where they are not finite: a run that diverged has no line from there on."""
+    values = np.array(values, float)
+    values[~np.isfinite(values)] = np.nan
+    return values
+
+
+def _rms(values) -> float:
+    """Over the frames that have a value; ∞ once one of them is."""
+    values = np.asarray(values, float)
+    return float(np.sqrt(np.nanmean(values**2)))
+
+
+def _error_scale(panel, values) -> None:
+    """Logarithmic once the errors span more than a factor of 30, else linear from zero."""
+    values = np.asarray(values, float)
+    values = values[np.isfinite(values) & (values > 0)]
+    panel.grid(axis="y")
+    if len(values) and np.max(values) > 30 * np.quantile(values, 0.05):
+        panel.set_yscale("log")
+        panel.set_ylim(np.quantile(values, 0.02) / 1.6, np.max(values) * 1.6)
+        _plain_ticks(panel.yaxis)
+    else:
+        panel.set_ylim(0, 1.08 * np.max(values, initial=1e-12))
+
+
+def _plain_ticks(axis_line) -> None:
+    """Ticks at 1, 2 and 5 of each decade, written as plain numbers."""
+    axis_line.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axis_line.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
+    axis_line.set_minor_formatter(NullFormatter())
+
+
+def _legend_above(fig: Figure, panel, title: str | None) -> None:
+    handles, labels = panel.get_legend_handles_labels()
+    order = sorted(range(len(labels)), key=lambda i: labels[i] != "mean")
+    handles, labels = [handles[i] for i in order], [labels[i] for i in order]
+    legend = fig.legend(
+        handles, labels, title=title, loc="outside upper left", ncols=min(len(labels), 6), columnspacing=1.4,
+        handlelength=2.2, alignment="left",
+    )  # fmt: skip
+    legend.get_title().set_fontsize(9)
+
+
+def _subscript(k: int) -> str:
+    return "".join(chr(0x2080 + int(digit)) for digit in str(k))

@@ -1,0 +1,108 @@
+"""What each column of `results.csv` is called, its unit, and how its numbers are written."""
+
+import math
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column as a reader sees it.
+
+    Attributes:
+        name: the key in `results.csv`.
+        title: the heading, without the unit.
+        unit: shown after the heading; empty for text and pure numbers.
+        scale: the csv's number times this is what is shown (fractions become per cent).
+    """
+
+    name: str
+    title: str
+    unit: str = ""
+    scale: float = 1.0
+
+    @property
+    def heading(self) -> str:
+        """Title with its unit in brackets."""
+        return f"{self.title} [{self.unit}]" if self.unit else self.title
+
+    def text(self, value) -> str:
+        """The csv's value as shown in a cell."""
+        return number(value, self.scale)
+
+
+_SPEC = (
+    Column("scene", "scene"),
+    Column("method", "method"),
+    Column("field", "field"),
+    Column("r", "r"),
+    Column("sample", "|S|"),
+    Column("integration_mean", "mean |N|"),
+    Column("parameter", "parameter"),
+    Column("split", "split"),
+    Column("delta", "δ", "%", 100.0),
+    Column("displacement_error", "displacement error", "%", 100.0),
+    Column("stress_error", "stress error", "%", 100.0),
+    Column("gamma", "γ"),
+    Column("step_ms_full", "full-order step", "ms"),
+    Column("step_ms_reduced", "reduced step", "ms"),
+    Column("speedup_step", "speedup, step", "×"),
+    Column("speedup_total", "speedup, total", "×"),
+    Column("memory_full_mib", "full-order memory", "MiB"),
+    Column("memory_reduced_mib", "reduced memory", "MiB"),
+    Column("precision", "precision"),
+    Column("device", "device"),
+    Column("commit", "commit"),
+)
+
+COLUMN = {column.name: column for column in _SPEC}
+COLUMNS = tuple(COLUMN)
+"""Columns of `results.csv`, in order. Errors and δ are fractions there."""
+
+TEXT = ("scene", "method", "field", "sample", "split", "precision", "device", "commit")
+MEASURED = (
+    "delta", "displacement_error", "stress_error", "step_ms_full", "step_ms_reduced", "speedup_step",
+    "speedup_total", "memory_full_mib", "memory_reduced_mib",
+)  # fmt: skip
+"""Columns that are averaged over parameter values."""
+
+ABSENT = "–"
+
+
+def number(value, scale: float = 1.0) -> str:
+    """A value with three significant digits (integers and text in full); `–` where nothing was measured."""
+    if isinstance(value, str):
+        return value
+    if value is None or (isinstance(value, float) and math.isnan(value)):
+        return ABSENT
+    if math.isinf(value):
+        return "∞"
+    shown = float(value) * scale
+    if shown == int(shown) or abs(shown) >= 1000:
+        return f"{shown:,.0f}"
+    if abs(shown) < 1e-3:
+        return f"{shown:.2e}"
+    digits = max(0, 2 - math.floor(math.log10(abs(shown))))
+    return f"{shown:.{digits}f}"
+
+
+def parameter_text(value, name: str = "", unit: str = "") -> str:
+    """A parameter value as printed beside a picture: `friction angle 27.5°`."""
+    shown = value if isinstance(value, str) else f"{value:g}"
+    gap = "" if unit in ("", "°") else " "
+    return f"{name} {shown}{gap}{unit}".strip()
+
+
+def axis(title: str, unit: str = "") -> str:
+    """An axis label: the quantity and its unit in brackets."""
+    return f"{title} [{unit}]" if unit else title
+
+
+def device_type(device: str) -> str:
+    """`cuda:0` and `cuda:1` are one type of device: what stands before the colon."""
+    return str(device).split(":")[0].strip().lower()
+
+
+def split_rank(split: str) -> tuple[int, str]:
+    """Sorts held-out values before those trained on."""
+    order = ("test", "validation", "extrapolation")
+    return (order.index(split) if split in order else 9 if split == "train" else 5, str(split))

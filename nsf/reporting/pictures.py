@@ -1,0 +1,216 @@
+"""Which charts and particle pictures a report holds, and the sentence under each."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from nsf.reporting import charts, cost_charts, render
+from nsf.reporting.columns import MEASURED, parameter_text
+from nsf.reporting.sources import Motion, same_parameter
+from nsf.reporting.style import save
+from nsf.reporting.tables import PAPER, Merged, mean_rows, variant_labels, variants
+
+ROWS = 6  # parameter values in one picture of final shapes
+ANIMATED = 2
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One picture: its files (html shows the first, markdown the last), caption, and the runs it shows."""
+
+    files: list[str]
+    caption: str
+    runs: list[str]
+
+
+@dataclass(frozen=True)
+class Section:
+    """Pictures under one heading."""
+
+    heading: str
+    pictures: list[Picture] = field(default_factory=list)
+
+
+@dataclass
+class _Variant:
+    """One variant's rows, with everything of its runs that pictures need."""
+
+    merged: Merged
+    members: list[int]
+    label: str
+
+    def __post_init__(self):
+        self.rows = self.merged.frame.iloc[self.members]
+        self.sources = [self.merged.source[i] for i in self.members]
+        newest = max(self.sources, key=lambda source: (source.created, source.id))
+        self.summary, self.breakdown = newest.summary, newest.cost.get("breakdown", {})
+        self.parameter = newest.parameter
+        self.scene, self.method = self.rows["scene"].iloc[0], self.rows["method"].iloc[0]
+        splits = set(self.rows["split"])
+        self.held_out = next((s for s in ("test", "validation") if s in splits), self.rows["split"].iloc[0])
+        shown = self.rows["split"] == self.held_out
+        self.values = sorted(self.rows.loc[shown, "parameter"], key=_natural)
+        self.delta = self.rows.loc[shown, "delta"].mean(skipna=False)
+        self.runs = sorted({source.id for source in self.sources})
+
+    def series(self, held_out_only: bool) -> pd.DataFrame:
+        """Frames of the parameter values that this variant's rows come from, each from its own run."""
+        parts = []
+        for value, source in zip(self.rows["parameter"], self.sources, strict=True):
+            if held_out_only and not any(same_parameter(value, v) for v in self.values):
+                continue
+            parts.append(source.series[[same_parameter(p, value) for p in source.series["parameter"]]])
+        return pd.concat(parts, ignore_index=True)
+
+    def motions(self, limit: int) -> list[Motion]:
+        """At most `limit` held-out parameter values, evenly over their range, ends included."""
+        chosen = np.unique(
+            np.linspace(0, len(self.values) - 1, min(limit, len(self.values))).round().astype(int)
+        )
+        wanted = [self.values[i] for i in chosen]
+        owned: dict[str, list] = {source.id: [] for source in self.sources}
+        for value, split, source in zip(
+            self.rows["parameter"], self.rows["split"], self.sources, strict=True
+        ):
+            if split == self.held_out and value in wanted:
+                owned[source.id].append(value)
+        opened = {source.id: source for source in self.sources}
+        motions = [motion for run, values in owned.items() for motion in opened[run].motions(values)]
+        return sorted(motions, key=lambda motion: wanted.index(motion.parameter))
+
+    @property
+    def floor(self) -> float | None:
+        """Height of the floor [m] where the scene states one."""
+        return self.summary.get("floor")
+
+
+def draw(merged: Merged, folder: Path) -> list[Section]:
+    """Draw every picture of a report into folder."""
+    groups = variants(merged)
+    labels = variant_labels([merged.frame.iloc[members[0]].to_dict() for members in groups])
+    known = [_Variant(merged, members, label) for members, label in zip(groups, labels, strict=True)]
+    shown = _best_of_each_method(known)
+    sections = [
+        Section(
+            _heading(v) if len(known) > 1 else "What was simulated",
+            _of_variant(v, folder, prefix),
+        )
+        for v, prefix in zip(shown, _prefixes(shown), strict=True)
+    ]
+    return [
+        *sections,
+        Section("All variants" if len(known) > 1 else "Error and cost", _comparison(known, folder)),
+    ]
+
+
+def _best_of_each_method(known: list[_Variant]) -> list[_Variant]:
+    """The variant of each scene and method with the smallest mean held-out δ; all would drown the page."""
+    best: dict[tuple, _Variant] = {}
+    for v in known:
+        other = best.get((v.scene, v.method))
+        if other is None or not other.delta <= v.delta:
+            best[v.scene, v.method] = v
+    return list(best.values())
+
+
+def _of_variant(v: _Variant, folder: Path, prefix: str) -> list[Picture]:
+    name, unit = v.parameter
+    held_out, everything = v.series(held_out_only=True), v.series(held_out_only=False)
+    pictures = []
+
+    def add(stem: str, figure, caption: str, kinds=("svg", "png")) -> None:
+        pictures.append(Picture(save(figure, folder, prefix + stem, kinds), caption, v.runs))
+
+    motions = v.motions(ANIMATED)
+    if motions:
+        render.animation(motions, folder / f"{prefix}animation.gif", name, unit, v.floor)
+        told = f"{name} " + " and ".join(parameter_text(m.parameter, "", unit) for m in motions)
+        caption = (
+            f"The full-order model (left) and the reduced one (right) at {told}, held out from training."
+        )
+        pictures.append(Picture([f"{prefix}animation.gif"], _held_out(caption, v), v.runs))
+        add(
+            "final-shapes", render.final_shapes(v.motions(ROWS), name, unit, v.floor),
+            "The last frame of each parameter value; the right column shows how far every particle of "
+            "the reduced model lies from where the full-order model puts it.", kinds=("png",),
+        )  # fmt: skip
+    add(
+        "error-over-time", charts.error_over_time(held_out, name=name, unit=unit),
+        "The paper's error δ and the displacement error, frame by frame; the displacement error divides by "
+        "the distance moved, so it starts high where little has moved yet.",
+    )  # fmt: skip
+    physics = [
+        c for c in ("stress_error", "linear_momentum_error", "angular_momentum_error") if _has(held_out, c)
+    ]
+    if physics:
+        add(
+            "physics-over-time", charts.error_over_time(held_out, physics, name, unit),
+            "What positions do not show: errors of the Kirchhoff stress and the momenta, frame by frame.",
+        )  # fmt: skip
+    if "xhat_1" in held_out:
+        add(
+            "latent", charts.latent_trajectories(held_out, name, unit),
+            "The latent path the reduced model takes (solid) and the path of the full-order frames through "
+            "the encoder (dashed); dots mark the start.",
+        )  # fmt: skip
+    if _has(everything, "reconstruction_delta"):
+        add(
+            "reconstruction", charts.reconstruction_and_rollout(everything, name, unit),
+            "How much error the manifold alone brings (open) and how much a rollout has in the end (filled): "
+            "the distance is what the reduced dynamics add.",
+        )  # fmt: skip
+    if any(v.breakdown.values()):
+        add(
+            "runtime", cost_charts.runtime_breakdown(v.breakdown),
+            "Where a step's time goes; timing single stages synchronises the device, so their sum may exceed "
+            "the untimed step in the table.",
+        )  # fmt: skip
+    return pictures
+
+
+def _comparison(known: list[_Variant], folder: Path) -> list[Picture]:
+    entries = []
+    for v in known:
+        row = next(row for row in mean_rows(v.merged, v.members) if row["split"] == v.held_out)
+        values = v.rows.loc[v.rows["split"] == v.held_out, "delta"]
+        paper = None if pd.isna(row[PAPER]) else row[PAPER]
+        measured = {name: row[name] for name in MEASURED}
+        entries.append(
+            measured | {"label": v.label, "mean": row["delta"], "values": list(values), "paper": paper}
+        )
+    runs = sorted({run for v in known for run in v.runs})
+    splits = " and ".join(sorted({v.held_out for v in known}))
+    drawings: tuple[tuple[str, Callable, str], ...] = (
+        ("delta", charts.delta_per_variant,
+         f"Mean δ over the {splits} values, each of them (dots), and the paper's figure where it gives one."),
+        ("speedup-memory", cost_charts.speedup_and_memory,
+         "What the reduced model saves: speedup over the full-order model (line: 1×), and peak memory."),
+    )  # fmt: skip
+    return [Picture(save(drawn(entries), folder, stem), caption, runs) for stem, drawn, caption in drawings]
+
+
+def _heading(v: _Variant) -> str:
+    return v.label if v.label.startswith(v.scene) else f"{v.scene} · {v.label}"
+
+
+def _prefixes(shown: list[_Variant]) -> list[str]:
+    """File name heads that tell the variants of a report apart; none where there is one variant."""
+    if len(shown) == 1:
+        return [""]
+    scenes = len({v.scene for v in shown}) > 1
+    return [f"{v.scene}-{v.method}-" if scenes else f"{v.method}-" for v in shown]
+
+
+def _held_out(caption: str, v: _Variant) -> str:
+    return caption.replace(", held out from training", "") if v.held_out == "train" else caption
+
+
+def _has(series: pd.DataFrame, column: str) -> bool:
+    return column in series and bool(series[column].notna().any())
+
+
+def _natural(value) -> tuple:
+    return (1, 0.0, value) if isinstance(value, str) else (0, float(value), "")

@@ -1,0 +1,82 @@
+"""Where each number of a report comes from: for the page, and in full for `sources.json`."""
+
+import hashlib
+
+from nsf.reporting.columns import ABSENT
+from nsf.reporting.page import Rows
+from nsf.reporting.pictures import Section
+from nsf.reporting.sources import Source
+from nsf.reporting.tables import VARIANT, Merged
+
+_HEADINGS = ["run", "commit", "device", "precision", "seed", "made", "versions"]
+
+
+def used_sources(merged: Merged) -> list[Source]:
+    """The runs that rows come from, newest first."""
+    unique = {source.id: source for source in merged.source}
+    return sorted(unique.values(), key=lambda source: (source.created, source.id), reverse=True)
+
+
+def provenance_rows(merged: Merged) -> Rows:
+    """Run, commit, device and versions of everything shown."""
+    body = []
+    for source in used_sources(merged):
+        manifest = source.manifest
+        versions = ", ".join(
+            f"{name} {version}" for name, version in manifest.get("versions", {}).items() if version
+        )
+        told = [manifest.get(key, ABSENT) for key in ("device", "precision", "seed", "created")]
+        body.append([source.id, commit_text(manifest), *map(str, told), versions or ABSENT])
+    return Rows(_HEADINGS, body)
+
+
+def commit_text(manifest: dict) -> str:
+    """The commit a run was made at; says so where the tree had uncommitted changes."""
+    commit = str(manifest.get("commit") or "no commit")[:12]
+    if manifest.get("dirty") is None:
+        return f"{commit} (state of the tree unknown)"
+    return f"{commit} + uncommitted changes" if manifest["dirty"] else commit
+
+
+def sources_json(title: str, merged: Merged, sections: list[Section], results_csv: bytes) -> dict:
+    """Run, commit and file hashes behind every row and picture, as written to `sources.json`."""
+    frame = merged.frame
+    runs = {
+        source.id: {
+            **{
+                key: source.manifest.get(key)
+                for key in (
+                    "commit",
+                    "dirty",
+                    "device",
+                    "precision",
+                    "seed",
+                    "created",
+                    "versions",
+                    "parents",
+                )
+            },
+            "files": source.hashes,
+            "paper": source.summary.get("paper"),
+        }
+        for source in used_sources(merged)
+    }
+    rows = [
+        {"row": i, "run": source.id}
+        | {name: _plain(frame[name].iloc[i]) for name in (*VARIANT, "parameter", "split")}
+        for i, source in enumerate(merged.source)
+    ]
+    return {
+        "title": title,
+        "results.csv": {"sha256": hashlib.sha256(results_csv).hexdigest(), "rows": len(rows)},
+        "runs": runs,
+        "rows": rows,
+        "pictures": {
+            file: picture.runs for s in sections for picture in s.pictures for file in picture.files
+        },
+        "superseded": [{"run": source.id, "parameter": _plain(value)} for source, value in merged.superseded],
+    }
+
+
+def _plain(value):
+    return value.item() if hasattr(value, "item") else value

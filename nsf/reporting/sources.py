@@ -1,0 +1,157 @@
+"""What a report reads: evaluate runs, each file checked against its manifest before a number is used.
+
+Besides the keys every evaluate run has, `summary.json` may hold these, all optional:
+`title` and `scale` (of the scene), `parameter_name`, `parameter_unit`, `particles`, `training_seconds`,
+`floor` (height [m], null where the scene has none) and `paper` = {"delta": 0.004, "place": "Table 1, Sand"};
+`paper` may name the `method` it is for, else it is the paper's own, `nsf`.
+"""
+
+import hashlib
+import json
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from nsf.errors import MissingRunError, SchemaError
+from nsf.reporting.columns import COLUMNS, TEXT
+
+FILES = ("results.csv", "series.csv", "frames.npz", "cost.json", "summary.json")
+_FRAMES = ("parameters", "splits", "t", "x_full", "x_reduced", "tau_full", "tau_reduced")
+_SERIES = (
+    "parameter",
+    "split",
+    "frame",
+    "t",
+    "delta",
+    "displacement_error",
+    "stress_error",
+    "reconstruction_delta",
+)
+
+
+@dataclass(frozen=True)
+class Motion:
+    """One parameter value's particles for pictures: x [F,n,3] m, tau [F,n,6] Pa, t [F] s."""
+
+    parameter: float | str
+    split: str
+    t: np.ndarray
+    x_full: np.ndarray
+    x_reduced: np.ndarray
+    tau_full: np.ndarray
+    tau_reduced: np.ndarray
+
+
+class Source:
+    """One complete evaluate run whose files are whole.
+
+    Raises:
+        SchemaError: a file is missing, differs from its manifest, or lacks a column.
+    """
+
+    def __init__(self, run):
+        self.run, self.id, self.manifest = run, run.id, run.manifest
+        self.hashes = {name: self._checked_hash(name) for name in FILES}
+        self.results = self._csv("results.csv", COLUMNS, text=TEXT)
+        self.summary = json.loads(self._path("summary.json").read_text())
+        self.cost = json.loads(self._path("cost.json").read_text())
+
+    @property
+    def parameter(self) -> tuple[str, str]:
+        """Name and unit of the problem parameter, as a reader sees them."""
+        name = self.summary.get("parameter_name", "parameter").replace("_", " ")
+        return name, self.summary.get("parameter_unit", "")
+
+    @property
+    def created(self) -> str:
+        """When the run was made (ISO), by its manifest."""
+        return str(self.manifest.get("created", ""))
+
+    @cached_property
+    def series(self) -> pd.DataFrame:
+        """Errors and latent coordinates, one row a frame and parameter value."""
+        return self._csv("series.csv", _SERIES, text=("split",))
+
+    def motions(self, parameters) -> list[Motion]:
+        """The particles of some parameter values, in the order asked for; values not stored are left out."""
+        with np.load(self._path("frames.npz"), allow_pickle=False) as stored:
+            absent = [key for key in _FRAMES if key not in stored]
+            if absent:
+                raise SchemaError(f"{self._path('frames.npz')} lacks {absent}; run `nsf evaluate` again")
+            arrays = {key: stored[key] for key in _FRAMES}
+        rows = [(value, _where(arrays["parameters"], value)) for value in parameters]
+        return [
+            Motion(value, str(arrays["splits"][row]), arrays["t"], *(arrays[key][row] for key in _FRAMES[3:]))
+            for value, row in rows
+            if row is not None
+        ]
+
+    def _path(self, name: str) -> Path:
+        return Path(self.run.path) / name
+
+    def _checked_hash(self, name: str) -> str:
+        path = self._path(name)
+        if not path.is_file():
+            raise SchemaError(
+                f"{path} is missing from evaluate run {self.id}; run `nsf evaluate` for it again"
+            )
+        found, expected = file_hash(path), _recorded_hash(self.manifest, name)
+        if found != expected:
+            raise SchemaError(
+                f"{path} has sha256 {found[:12]} but the manifest of {self.id} records {str(expected)[:12]}: "
+                "it was changed after the run; delete the run folder and run `nsf evaluate` again"
+            )
+        return found
+
+    def _csv(self, name: str, columns, text) -> pd.DataFrame:
+        frame = pd.read_csv(self._path(name), dtype=dict.fromkeys(text, str))
+        absent = [column for column in columns if column not in frame]
+        if absent:
+            raise SchemaError(f"{self._path(name)} lacks the columns {absent}; run `nsf evaluate` again")
+        return frame
+
+
+def open_sources(evaluate_runs) -> list[Source]:
+    """The complete runs among those given, newest first.
+
+    Raises:
+        MissingRunError: none is complete.
+        SchemaError: one of them has a missing or altered file.
+    """
+    runs = list(evaluate_runs)
+    # Not `run.complete`: a finished run whose file is gone must be named, not passed over.
+    sources = [Source(run) for run in runs if run.manifest.get("status") == "complete"]
+    if not sources:
+        scene = runs[0].id.split("/")[1] if runs else "sand"
+        raise MissingRunError(
+            f"none of the {len(runs)} evaluate runs given is complete; run `nsf evaluate scene={scene}` first"
+        )
+    return sorted(sources, key=lambda source: (source.created, source.id), reverse=True)
+
+
+def same_parameter(a, b) -> bool:
+    """Whether two stored values are one parameter value (files differ in precision)."""
+    try:
+        return bool(np.isclose(float(a), float(b), rtol=1e-5, atol=1e-9))
+    except ValueError:
+        return str(a) == str(b)
+
+
+def file_hash(path: Path) -> str:
+    """sha256 of a file, in hex."""
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def _where(parameters, value) -> int | None:
+    return next(
+        (row for row, stored in enumerate(np.ravel(parameters)) if same_parameter(stored, value)), None
+    )
+
+
+def _recorded_hash(manifest, name: str) -> str | None:
+    recorded = {output["path"]: output["sha256"] for output in manifest.get("outputs", ())}
+    return recorded.get(name)

@@ -1,0 +1,58 @@
+"""A folder that is replaced whole or not at all."""
+
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from nsf.errors import ConfigError, StorageError
+
+MARK = "sources.json"
+"""The file by which a folder is known as a report and may be replaced."""
+
+
+@contextmanager
+def replaced(folder: Path) -> Iterator[Path]:
+    """An empty sibling folder to write into; it takes `folder`'s place once the block ends without an error.
+
+    Until then, and after any error or interrupt, whatever stood at `folder` stands there unchanged.
+
+    Raises:
+        ConfigError: `folder` holds something that is not a report.
+        StorageError: the disk refused a file.
+    """
+    folder = Path(folder).absolute()
+    if folder.exists() and not (folder / MARK).is_file() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ConfigError(
+            f"{folder} exists and is not a report (it has no {MARK}); name another folder or remove it"
+        )
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.new-", dir=folder.parent))
+    except OSError as error:
+        raise StorageError(f"no report can be written to {folder}: {error}") from error
+    try:
+        yield fresh
+        fresh.chmod(0o755)
+        _take_place(fresh, folder)
+    except OSError as error:
+        raise StorageError(
+            f"the report for {folder} was not written: {error}; the old one, if any, stands"
+        ) from error
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
+
+
+def _take_place(fresh: Path, folder: Path) -> None:
+    if not folder.exists():
+        fresh.rename(folder)
+        return
+    old = fresh.with_name(fresh.name.replace(".new-", ".old-"))
+    folder.rename(old)
+    try:
+        fresh.rename(folder)
+    except BaseException:
+        old.rename(folder)
+        raise
+    shutil.rmtree(old)

@@ -1,0 +1,208 @@
+"""Tables: the results of many evaluate runs merged, averaged, and written as text."""
+
+import html
+from dataclasses import dataclass
+
+import pandas as pd
+from rich.box import SIMPLE_HEAD
+from rich.markup import escape
+from rich.table import Table
+
+from nsf.reporting.columns import (
+    ABSENT,
+    COLUMN,
+    COLUMNS,
+    MEASURED,
+    TEXT,
+    device_type,
+    number,
+    split_rank,
+)
+from nsf.reporting.sources import Source, open_sources
+
+VARIANT = ("scene", "method", "field", "r", "sample", "precision", "device")
+"""The visible key of a variant; `device` counts by its type."""
+
+PAPER, PLACE, VALUES = "paper_delta", "paper_place", "values"
+_MEAN_HEADINGS = {VALUES: "values", PAPER: "paper's δ [%]", PLACE: "in the paper"}
+
+
+@dataclass(frozen=True)
+class Merged:
+    """Results of many runs: `frame` with the columns of results.csv, `source` its runs row by row."""
+
+    frame: pd.DataFrame
+    source: list[Source]
+    superseded: list[tuple[Source, float]]
+
+
+def variant_key(row) -> tuple:
+    """What tells variants apart; rows that agree in it and in the parameter are the same measurement."""
+    return (*(str(row[name]) for name in VARIANT[:-1]), device_type(row["device"]))
+
+
+def merge(sources: list[Source]) -> Merged:
+    """Join the rows of runs sorted newest first; for a variant's parameter value the newest run wins."""
+    rows, owners, superseded, seen = [], [], [], set()
+    for source in sources:
+        for row in source.results[list(COLUMNS)].to_dict("records"):
+            key = (*variant_key(row), _rounded(row["parameter"]))
+            if key in seen:
+                superseded.append((source, row["parameter"]))
+                continue
+            seen.add(key)
+            rows.append(row)
+            owners.append(source)
+    order = sorted(range(len(rows)), key=lambda i: _sort_key(rows[i]))
+    frame = pd.DataFrame([rows[i] for i in order], columns=list(COLUMNS))
+    return Merged(frame.astype(dict.fromkeys(TEXT, "str")), [owners[i] for i in order], superseded)
+
+
+def merge_results(evaluate_runs) -> pd.DataFrame:
+    """One table of many evaluate runs: a row a variant and parameter value, columns exactly `COLUMNS`.
+
+    Raises:
+        MissingRunError: no run is complete.
+        SchemaError: a run's file is missing or altered.
+    """
+    return merge(open_sources(evaluate_runs)).frame
+
+
+def variants(merged: Merged) -> list[list[int]]:
+    """Row numbers grouped by variant, in the frame's order."""
+    groups: dict[tuple, list[int]] = {}
+    for i, row in enumerate(merged.frame.to_dict("records")):
+        groups.setdefault(variant_key(row), []).append(i)
+    return list(groups.values())
+
+
+def means(merged: Merged) -> pd.DataFrame:
+    """Mean over parameter values, one row a variant and split, with the paper's figure beside the test rows.
+
+    A value that was not measured or not finite leaves the mean empty: it is never averaged around.
+    """
+    rows = [row for members in variants(merged) for row in mean_rows(merged, members)]
+    measured = [
+        name for name in MEASURED[1:] if not name.startswith("step_ms")
+    ]  # those stand in each value's row
+    columns = [*VARIANT[:-2], "split", VALUES, "delta", PAPER, PLACE, *measured, *VARIANT[-2:]]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def mean_rows(merged: Merged, members: list[int]) -> list[dict]:
+    """The means of one variant, a dict a split, held-out ones first."""
+    part = merged.frame.iloc[members]
+    stated = (merged.source[i].summary.get("paper") for i in members)
+    method = part["method"].iloc[0]
+    paper: dict = next((p for p in stated if p and p.get("method", "nsf") == method), {})
+    rows = []
+    for split in sorted(part["split"].unique(), key=split_rank):
+        chosen = part[part["split"] == split]
+        row = {name: chosen[name].iloc[0] for name in VARIANT} | {"split": split, VALUES: len(chosen)}
+        row |= {name: pd.to_numeric(chosen[name]).mean(skipna=False) for name in MEASURED}
+        shown = paper if split == "test" else {}
+        rows.append(row | {PAPER: shown.get("delta", float("nan")), PLACE: shown.get("place", ABSENT)})
+    return rows
+
+
+def variant_labels(rows: list[dict]) -> list[str]:
+    """Short names of variants: the method, and whatever else differs among them."""
+    varying = {name for name in VARIANT if len({str(row[name]) for row in rows}) > 1} | {"method"}
+    form = {"field": "{} field", "r": "r {}", "sample": "|S| {}"}
+    return [
+        " · ".join(form.get(name, "{}").format(row[name]) for name in VARIANT if name in varying)
+        for row in rows
+    ]
+
+
+def cells(frame: pd.DataFrame, renamed: dict[str, str] | None = None) -> tuple[list[str], list[list[str]]]:
+    """Headings with units (`renamed` ones as given), and every cell as text."""
+    known = {name: column.heading for name, column in COLUMN.items()} | _MEAN_HEADINGS | (renamed or {})
+    headings = [known[name] for name in frame]
+    body = [[_cell(name, row[name]) for name in frame] for row in frame.to_dict("records")]
+    return headings, body
+
+
+def without_constants(frame: pd.DataFrame, keep=("method", "parameter", "split")) -> tuple[pd.DataFrame, str]:
+    """Drop descriptive columns that say the same in every row; returns the rest, and what they say."""
+    describing = [name for name in (*VARIANT, "gamma", "integration_mean", "commit") if name in frame]
+    constant = [name for name in describing if name not in keep and frame[name].astype(str).nunique() == 1]
+    said = ", ".join(f"{COLUMN[name].title} {_cell(name, frame[name].iloc[0])}" for name in constant)
+    return frame.drop(columns=constant), said
+
+
+def markdown_table(frame: pd.DataFrame, renamed: dict[str, str] | None = None) -> str:
+    """A GitHub table with units in its headings."""
+    return markdown_rows(*cells(frame, renamed), numeric=_numeric(frame))
+
+
+def html_table(frame: pd.DataFrame, renamed: dict[str, str] | None = None) -> str:
+    """A table with units in its headings; numbers align to the right."""
+    return html_rows(*cells(frame, renamed), numeric=_numeric(frame))
+
+
+def markdown_rows(headings: list[str], body: list[list[str]], numeric: list[bool]) -> str:
+    """Texts as a GitHub table."""
+    rule = ["---:" if right else "---" for right in numeric]
+    lines = [headings, rule, *body]
+    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
+
+
+def html_rows(headings: list[str], body: list[list[str]], numeric: list[bool]) -> str:
+    """Texts as an HTML table that scrolls sideways where a page is narrow."""
+    kinds = ["number" if right else "text" for right in numeric]
+
+    def line(tag: str, texts: list[str]) -> str:
+        inner = (
+            f'<{tag} class="{kind}">{html.escape(text)}</{tag}>'
+            for kind, text in zip(kinds, texts, strict=True)
+        )
+        return f"<tr>{''.join(inner)}</tr>"
+
+    rows = "\n".join(line("td", texts) for texts in body)
+    head = line("th", headings)
+    return f'<div class="table"><table>\n<thead>{head}</thead>\n<tbody>{rows}</tbody>\n</table></div>'
+
+
+def console_table(frame: pd.DataFrame) -> Table:
+    """The results for a terminal; columns that never change are told in the caption."""
+    shown, said = without_constants(frame)
+    headings, body = cells(shown)
+    table = Table(caption=escape(said), caption_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for heading, right in zip(headings, _numeric(shown), strict=True):
+        table.add_column(escape(heading), justify="right" if right else "left", overflow="fold")
+    for row in body:
+        table.add_row(*map(escape, row))
+    return table
+
+
+def _numeric(frame: pd.DataFrame) -> list[bool]:
+    return [name not in TEXT and name != PLACE for name in frame]
+
+
+def _cell(name: str, value) -> str:
+    if name in TEXT:
+        return ABSENT if pd.isna(value) else str(value)
+    if name == "parameter" and not isinstance(value, str):
+        return f"{value:g}"
+    if name == PAPER:
+        return number(value, COLUMN["delta"].scale)
+    return COLUMN[name].text(value) if name in COLUMN else number(value)
+
+
+def _rounded(parameter):
+    """Equal values written by different runs may differ in the last digits."""
+    return parameter if isinstance(parameter, str) else float(f"{parameter:.6g}")
+
+
+def _sort_key(row) -> tuple:
+    key = map(_natural, variant_key(row))
+    return (row["scene"], row["method"] != "nsf", *key, split_rank(row["split"]), _natural(row["parameter"]))
+
+
+def _natural(value) -> tuple[int, float, str]:
+    """Numbers by size, then text."""
+    try:
+        return (0, float(value), "")
+    except ValueError:
+        return (1, 0.0, str(value))

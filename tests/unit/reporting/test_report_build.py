@@ -1,0 +1,171 @@
+"""The report folder: complete, traceable, made of the runs' numbers, and replaced whole or not at all."""
+
+import json
+import re
+
+import pandas as pd
+import pytest
+from PIL import Image
+from synthetic import TEST, Made, seal, write_run
+
+from nsf.errors import ConfigError, StorageError
+from nsf.reporting import build, build_report
+from nsf.reporting.columns import number
+from nsf.reporting.sources import file_hash
+
+TINY = Made(particles=30, frames=4, parameters=TEST[:2], splits=("test",) * 2)
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Drawing takes seconds, and some tests are about the rest."""
+    monkeypatch.setattr(build, "draw", lambda merged, folder: [])
+
+
+def files(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def test_report_has_every_file_and_links_only_what_is_there(report):
+    present = {path.name for path in report.iterdir()}
+    assert {"index.html", "index.md", "results.csv", "sources.json", "delta.svg", "delta.png"} <= present
+    page, markdown = (report / "index.html").read_text(), (report / "index.md").read_text()
+    linked = set(re.findall(r'src="([^"]+)"', page)) | set(re.findall(r"\]\(([^)]+)\)", markdown))
+    assert linked <= present
+    pictures = present - {"index.html", "index.md", "results.csv", "sources.json"}
+    assert {name.rsplit(".")[0] for name in pictures} == {name.rsplit(".")[0] for name in linked}
+    assert "http" not in page.replace("http-equiv", "")
+
+
+def test_page_opens_with_what_it_is_then_tables_then_pictures_then_provenance(report):
+    page = (report / "index.html").read_text()
+    marks = [
+        "<h1>Sand &amp; friends</h1>",
+        "friction angle: test 22.5°",
+        "71,363",
+        "Results beside the paper",
+    ]
+    marks += [
+        "Each parameter value",
+        "<figure>",
+        "Where the numbers come from",
+        "1f2e3d4c5b6a + uncommitted changes",
+    ]
+    places = [page.index(mark) for mark in marks]
+    assert places == sorted(places)
+
+
+def test_pictures_are_of_the_best_sample_of_each_method(report):
+    drawn = {path.name for path in report.glob("*final-shapes.png")}
+    assert drawn == {"nsf-final-shapes.png", "deformation_only-final-shapes.png"}
+    assert "smallest mean held-out δ" in (report / "index.md").read_text()
+    assert "nsf · |S| 150" in (report / "index.html").read_text()
+
+
+def test_sources_lead_from_each_row_to_its_run(report, sweep):
+    told = json.loads((report / "sources.json").read_text())
+    frame = pd.read_csv(report / "results.csv")
+    assert told["results.csv"]["sha256"] == file_hash(report / "results.csv")
+    assert len(told["rows"]) == len(frame)
+    for entry, row in zip(told["rows"], frame.to_dict("records"), strict=True):
+        run = next(run for run in sweep if run.id == entry["run"])
+        rows = pd.read_csv(run.path / "results.csv")
+        assert rows.loc[rows["parameter"] == row["parameter"], "delta"].item() == row["delta"]
+        assert told["runs"][run.id]["commit"] == run.manifest["commit"]
+        assert told["runs"][run.id]["files"]["results.csv"] == file_hash(run.path / "results.csv")
+    assert set(told["pictures"]) == {
+        path.name for path in report.iterdir() if path.suffix in (".svg", ".png", ".gif")
+    }
+
+
+def test_numbers_on_the_page_come_from_the_csv(tmp_path, no_pictures):
+    run = write_run(tmp_path, TINY)
+    before = build_report([run], tmp_path / "report", "t").read_text()
+    rows = pd.read_csv(run.path / "results.csv")
+    rows.loc[0, "delta"] = 0.01234567
+    rows.to_csv(run.path / "results.csv", index=False)
+    seal(run)
+    after = build_report([run], tmp_path / "report", "t").read_text()
+    mean = number(rows["delta"].mean(), 100)
+    assert "1.23" not in before
+    assert ">1.23<" in after
+    assert f">{mean}<" in after
+
+
+@pytest.fixture(scope="module")
+def diverged(tmp_path_factory):
+    """A run of two values, one of which diverged, and its report."""
+    run = write_run(tmp_path_factory.mktemp("runs"), TINY)
+    for name in ("results.csv", "series.csv"):
+        rows = pd.read_csv(run.path / name)
+        rows.loc[rows["parameter"] == TEST[0], "delta"] = float("inf")
+        rows.to_csv(run.path / name, index=False)
+    seal(run)
+    return run, build_report([run], tmp_path_factory.mktemp("reports") / "diverged", "t").parent
+
+
+def test_a_diverged_run_still_gives_a_report_that_says_so(diverged):
+    page = (diverged[1] / "index.html").read_text()
+    assert page.count('<td class="number">∞</td>') == 2  # its own row, and the mean
+
+
+def test_equal_runs_give_equal_files(diverged, tmp_path):
+    run, folder = diverged
+    assert files(build_report([run], tmp_path / "again", "t").parent) == files(folder)
+
+
+@pytest.mark.parametrize("fault", [KeyboardInterrupt(), RuntimeError("broke"), OSError(28, "No space left")])
+def test_interrupted_build_leaves_the_old_report(tmp_path, no_pictures, monkeypatch, fault):
+    run = write_run(tmp_path / "runs", TINY)
+    folder = build_report([run], tmp_path / "reports" / "sand", "old").parent
+    old = files(folder)
+
+    def fails(page):
+        raise fault
+
+    monkeypatch.setattr(build, "markdown_page", fails)
+    with pytest.raises(StorageError if isinstance(fault, OSError) else type(fault)):
+        build_report([run], folder, "new")
+    assert files(folder) == old
+    assert [path.name for path in folder.parent.iterdir()] == ["sand"]
+
+
+def test_replacing_leaves_nothing_of_the_old_report(tmp_path, no_pictures):
+    run = write_run(tmp_path / "runs", TINY)
+    folder = build_report([run], tmp_path / "reports" / "sand", "old").parent
+    (folder / "stale.png").touch()
+    build_report([run], folder, "new")
+    assert not (folder / "stale.png").exists()
+    assert "<h1>new</h1>" in (folder / "index.html").read_text()
+    assert [path.name for path in folder.parent.iterdir()] == ["sand"]
+
+
+def test_a_folder_that_is_no_report_is_not_replaced(tmp_path, no_pictures):
+    run = write_run(tmp_path / "runs", TINY)
+    (tmp_path / "precious").mkdir()
+    (tmp_path / "precious" / "thesis.tex").touch()
+    with pytest.raises(ConfigError, match="not a report"):
+        build_report([run], tmp_path / "precious", "t")
+    assert (tmp_path / "precious" / "thesis.tex").exists()
+
+
+def test_animation_is_small_and_has_the_frames(report):
+    path = report / "nsf-animation.gif"
+    assert path.stat().st_size < 3 * 2**20
+    with Image.open(path) as image:
+        assert image.n_frames == Made().frames
+        assert image.convert("RGB").getpixel((2, 2)) == (255, 255, 255)
+
+
+def test_one_value_without_paper_or_costs(tmp_path):
+    run = write_run(
+        tmp_path, Made(particles=30, frames=2, parameters=TEST[:1], splits=("train",), paper=False, r=1)
+    )
+    rows = pd.read_csv(run.path / "results.csv")
+    rows[["memory_full_mib", "memory_reduced_mib", "speedup_step"]] = float("nan")
+    rows.to_csv(run.path / "results.csv", index=False)
+    (run.path / "cost.json").write_text("{}")
+    seal(run)
+    page = build_report([run], tmp_path / "report", "t").read_text()
+    assert "runtime" not in {path.stem for path in (tmp_path / "report").iterdir()}
+    assert "held out from training" not in page

@@ -1,0 +1,146 @@
+"""Charts and pictures: they show the data they are given, name their units, and see what lies in front."""
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+from synthetic import TEST, Made, collapse
+
+from nsf.reporting import charts, cost_charts
+from nsf.reporting.camera import Camera, View
+from nsf.reporting.render import animation, final_shapes, von_mises
+from nsf.reporting.sources import Motion
+from nsf.reporting.style import save
+
+RED, BLUE = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def series(sweep):
+    return pd.read_csv(sweep[0].path / "series.csv")
+
+
+def motions(count=2, **changes):
+    made, rng = replace(Made(), **changes), np.random.default_rng(1)
+    t = np.linspace(0, 0.6, made.frames)
+    return [Motion(value, "test", t, **collapse(made, rng, value, t)) for value in TEST[:count]]
+
+
+def labels(figure):
+    return [
+        text
+        for panel in figure.axes
+        for text in (panel.get_xlabel(), panel.get_ylabel(), panel.get_title("left"))
+    ]
+
+
+def test_error_over_time_has_a_line_a_value_in_per_cent(series):
+    figure = charts.error_over_time(series, name="friction angle", unit="°")
+    for panel, column in zip(figure.axes, ("delta", "displacement_error"), strict=True):
+        assert len(panel.lines) == len(TEST)
+        for line, (_, part) in zip(panel.lines, series.groupby("parameter"), strict=True):
+            np.testing.assert_allclose(line.get_ydata(), 100 * part[column])
+    assert figure.legends[0].get_title().get_text() == "friction angle [°]"
+
+
+def test_every_axis_names_its_unit(series):
+    figures = [charts.error_over_time(series), charts.reconstruction_and_rollout(series, "angle", "°")]
+    for figure in figures:
+        for panel in figure.axes:
+            assert panel.get_xlabel().endswith("]")
+            assert panel.get_ylabel().endswith("]")
+    latent = charts.latent_trajectories(series)
+    assert sum("[–]" in text for text in labels(latent)) == 2 + 6
+
+
+def test_errors_over_decades_are_drawn_on_a_log_axis():
+    t = np.linspace(0, 1, 50)
+    frame = pd.DataFrame(
+        {"parameter": 1.0, "t": t, "delta": 10.0 ** (-4 * t), "displacement_error": 0.1 + 0.1 * t}
+    )
+    wide, narrow = charts.error_over_time(frame).axes
+    assert (wide.get_yscale(), narrow.get_yscale()) == ("log", "linear")
+
+
+def test_reconstruction_and_rollout_are_rms_over_frames(series):
+    panel = charts.reconstruction_and_rollout(series).axes[0]
+    expected = [100 * np.sqrt((part["delta"] ** 2).mean()) for _, part in series.groupby("parameter")]
+    np.testing.assert_allclose(panel.lines[1].get_ydata(), expected)
+
+
+def test_runtime_rings_say_the_sum():
+    figure = cost_charts.runtime_breakdown({"reduced": {"p2g": 1.5, "transfer": 0.5}, "full_order": {}})
+    told = [text.get_text() for panel in figure.axes for text in panel.texts]
+    assert "2\nms a step" in told
+    assert "not measured" in told
+
+
+def test_bars_say_what_was_not_measured():
+    entry = {"label": "nsf", "speedup_step": 4.0, "speedup_total": float("nan")}
+    entry |= {"memory_full_mib": 900.0, "memory_reduced_mib": 400.0}
+    told = [text.get_text() for panel in cost_charts.speedup_and_memory([entry]).axes for text in panel.texts]
+    assert "not measured" in told
+    assert "900" in told
+
+
+def test_saved_charts_are_equal_byte_for_byte(series, tmp_path):
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        save(charts.error_over_time(series), tmp_path / folder, "x")
+    for name in ("x.svg", "x.png"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("tau", "expected"),
+    [((3.0, 0, 0, 0, 0, 0), 3.0), ((0, 2.0, 0, 0, 0, 0), 2 * np.sqrt(3)), ((-5.0, 0, 0, -5.0, 0, -5.0), 0.0)],
+)
+def test_von_mises_of_tension_shear_and_pressure(tau, expected):
+    assert von_mises(np.array(tau)) == pytest.approx(expected, abs=1e-12)
+
+
+def test_camera_axes_are_orthonormal_and_z_points_up():
+    axes = Camera(azimuth=-40, elevation=25).axes
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert axes[0, 2] == 0
+    assert axes[1, 2] > 0
+
+
+def test_the_nearer_particle_hides_the_farther():
+    camera = Camera(azimuth=-90, elevation=0)  # looks along +y
+    view = View(camera, np.array([-1.0, -1.0]), np.array([1.0, 1.0]), width=40)
+    for x in ([[0, -0.5, 0], [0, 0.5, 0]], [[0, 0.5, 0], [0, -0.5, 0]]):
+        colors = np.array([RED, BLUE]) if x[0][1] < 0 else np.array([BLUE, RED])
+        middle = view.picture(np.array(x, float), colors, radius=0.3)[20, 20].astype(int)
+        assert middle[0] > middle[2] + 80
+
+
+def test_particles_right_of_the_middle_are_drawn_right():
+    view = View(Camera(-90, 0), np.array([-1.0, -1.0]), np.array([1.0, 1.0]), width=40)
+    picture = view.picture(np.array([[0.5, 0, 0.5]]), RED[None], radius=0.2).astype(int)
+    rows, columns = np.nonzero(picture[..., 0] > picture[..., 2] + 50)
+    assert rows.mean() == pytest.approx(10, abs=1.5)  # row 0 is the top
+    assert columns.mean() == pytest.approx(30, abs=1.5)
+
+
+def test_particles_that_are_not_finite_are_left_out():
+    view = View(Camera(), np.array([-1.0, -1.0]), np.array([1.0, 1.0]), width=20)
+    assert view.picture(np.full((3, 3), np.nan), np.zeros((3, 3)), 0.2).min() == 255
+
+
+def test_final_shapes_have_a_row_a_value_and_units():
+    figure = final_shapes(motions(3, particles=50), "friction angle", "°", floor=0.13)
+    assert sum(bool(panel.images) for panel in figure.axes) == 3 * 3
+    told = [text.get_text() for text in figure.texts] + labels(figure)
+    assert "friction angle 32.5°, t = 0.6 s" in told
+    assert any(text.endswith("[mm]") for text in told)
+    assert any(text.endswith("Pa]") for text in told)
+
+
+def test_animation_gives_way_to_the_limit(tmp_path):
+    shown = motions(1, particles=400, frames=12)
+    animation(shown, tmp_path / "large.gif", frames=12, width=160)
+    animation(shown, tmp_path / "small.gif", frames=12, width=160, max_bytes=40_000)
+    large, small = ((tmp_path / name).stat().st_size for name in ("large.gif", "small.gif"))
+    assert small < large

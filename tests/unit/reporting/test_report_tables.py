@@ -1,0 +1,166 @@
+"""Tables: which rows survive a merge, what is averaged, and how a number is written."""
+
+import io
+from dataclasses import replace
+
+import pandas as pd
+import pytest
+from rich.console import Console
+from synthetic import TEST, Made, seal, write_run
+
+from nsf.errors import MissingRunError, SchemaError
+from nsf.reporting import COLUMNS, console_table, merge_results
+from nsf.reporting.columns import number, parameter_text
+from nsf.reporting.sources import open_sources
+from nsf.reporting.tables import html_table, markdown_table, means, merge, variant_labels, without_constants
+
+EARLIER, LATER = "2024-05-01T10:00:00+00:00", "2024-06-01T10:00:00+00:00"
+
+
+def test_columns_are_exactly_those_of_the_design(sweep):
+    expected = [
+        "scene", "method", "field", "r", "sample", "integration_mean", "parameter", "split", "delta",
+        "displacement_error", "stress_error", "gamma", "step_ms_full", "step_ms_reduced", "speedup_step",
+        "speedup_total", "memory_full_mib", "memory_reduced_mib", "precision", "device", "commit",
+    ]  # fmt: skip
+    frame = merge_results(sweep)
+    assert list(frame.columns) == expected == list(COLUMNS)
+    assert len(frame) == len(sweep) * len(TEST)
+
+
+@pytest.mark.parametrize("newest_first", [True, False])
+def test_newest_run_wins_for_equal_variant_and_parameter(tmp_path, newest_first):
+    old = write_run(tmp_path, Made(noise=0.02, created=EARLIER))
+    new = write_run(tmp_path, Made(parameters=TEST[:2], splits=("test",) * 2, noise=0.001, created=LATER))
+    merged = merge(open_sources([new, old] if newest_first else [old, new]))
+    owner = dict(zip(merged.frame["parameter"], (source.id for source in merged.source), strict=True))
+    assert owner == {TEST[0]: new.id, TEST[1]: new.id, TEST[2]: old.id, TEST[3]: old.id}
+    assert {value for _, value in merged.superseded} == set(TEST[:2])
+
+
+@pytest.mark.parametrize(
+    "difference", [{"method": "deformation_only"}, {"sample": 50}, {"r": 5}, {"device": "cpu"}], ids=str
+)
+def test_runs_that_differ_in_the_variant_key_both_stay(tmp_path, difference):
+    made = Made(created=EARLIER)
+    runs = [write_run(tmp_path, m) for m in (made, replace(made, created=LATER, **difference))]
+    assert len(merge_results(runs)) == 2 * len(TEST)
+
+
+def test_number_of_the_device_is_no_variant(tmp_path):
+    made = Made(device="cuda:0", created=EARLIER)
+    runs = [write_run(tmp_path, m) for m in (made, replace(made, device="cuda:3", created=LATER))]
+    assert set(merge_results(runs)["device"]) == {"cuda:3"}
+
+
+def test_means_are_per_variant_and_split_and_beside_the_paper(tmp_path):
+    made = Made(splits=("test", "test", "validation", "test"))
+    run = write_run(tmp_path, made)
+    table = means(merge(open_sources([run]))).set_index("split")
+    rows = pd.read_csv(run.path / "results.csv")
+    assert table.loc["test", "delta"] == pytest.approx(rows[rows["split"] == "test"]["delta"].mean())
+    assert list(table["values"]) == [3, 1]
+    assert table.loc["test", "paper_delta"] == 0.004
+    assert table.loc["test", "paper_place"] == "Table 1, Sand"
+    assert pd.isna(table.loc["validation", "paper_delta"])
+
+
+def test_the_papers_figure_stands_beside_the_papers_method_only(sweep):
+    table = means(merge(open_sources(sweep)))
+    told = table.groupby("method")["paper_delta"].apply(lambda column: column.notna().all())
+    assert told.to_dict() == {"nsf": True, "deformation_only": False}
+
+
+def test_a_diverged_value_is_not_averaged_around(tmp_path):
+    run = write_run(tmp_path, Made())
+    rows = pd.read_csv(run.path / "results.csv")
+    rows.loc[0, ["delta", "stress_error"]] = [float("inf"), float("nan")]
+    rows.to_csv(run.path / "results.csv", index=False)
+    seal(run)
+    table = means(merge(open_sources([run])))
+    assert table["delta"].iloc[0] == float("inf")
+    assert pd.isna(table["stress_error"].iloc[0])
+    assert "∞" in markdown_table(table)
+
+
+def test_tables_show_units_and_escape(sweep):
+    frame = merge_results(sweep)
+    frame.loc[0, "field"] = "<mlp|x>"
+    markdown, page = markdown_table(frame), html_table(frame)
+    for heading in ("δ [%]", "full-order step [ms]", "speedup, total [×]", "reduced memory [MiB]"):
+        assert heading in markdown
+        assert heading in page
+    assert "<mlp\\|x>" in markdown
+    assert "&lt;mlp|x&gt;" in page
+    assert number(frame["delta"].iloc[0], 100) in page
+
+
+def test_console_table_states_constants_once(sweep):
+    stream = io.StringIO()
+    Console(file=stream, width=200).print(console_table(merge_results(sweep)))
+    text = stream.getvalue()
+    assert "scene sand" in text
+    assert "[ms]" in text  # rich would swallow it as markup
+    assert text.count("sand") == 1
+
+
+def test_without_constants_keeps_what_varies(sweep):
+    shown, said = without_constants(merge_results(sweep))
+    assert {"method", "sample", "parameter", "delta"} <= set(shown)
+    assert "precision" not in shown
+    assert "precision fp64" in said
+
+
+def test_labels_name_what_differs():
+    rows = [dict.fromkeys(("scene", "field", "precision", "device"), "x") for _ in range(2)]
+    rows[0] |= {"method": "nsf", "r": 6, "sample": "150"}
+    rows[1] |= {"method": "nsf", "r": 6, "sample": "50"}
+    assert variant_labels(rows) == ["nsf · |S| 150", "nsf · |S| 50"]
+
+
+@pytest.mark.parametrize(
+    ("value", "scale", "text"),
+    [(0.0041234, 100, "0.412"), (0.0, 100, "0"), (float("nan"), 1, "–"), (35681.5, 1, "35,682"),
+     (float("inf"), 100, "∞"), (1.6e-6, 1, "1.60e-06"), ("fp64", 1, "fp64"), (12.34, 1, "12.3")],
+)  # fmt: skip
+def test_number(value, scale, text):
+    assert number(value, scale) == text
+
+
+def test_parameter_text():
+    assert parameter_text(27.5, "friction angle", "°") == "friction angle 27.5°"
+    assert parameter_text(3.0, "E", "Pa") == "E 3 Pa"
+
+
+def test_no_complete_run_names_the_command(tmp_path):
+    run = write_run(tmp_path, Made(status="failed"))
+    with pytest.raises(MissingRunError, match="nsf evaluate scene=sand"):
+        merge_results([run])
+    with pytest.raises(MissingRunError, match="nsf evaluate"):
+        merge_results([])
+
+
+def test_incomplete_runs_are_passed_over(tmp_path):
+    whole = write_run(tmp_path, Made())
+    running = write_run(tmp_path, Made(sample=50, status="running"))
+    assert set(merge_results([running, whole])["sample"]) == {"150"}
+
+
+@pytest.mark.parametrize("name", ["results.csv", "series.csv", "frames.npz", "cost.json", "summary.json"])
+def test_missing_or_altered_file_is_named(tmp_path, name):
+    run = write_run(tmp_path, Made(particles=20, frames=3))
+    path = run.path / name
+    path.write_bytes(path.read_bytes() + b" ")
+    with pytest.raises(SchemaError, match=name):
+        merge_results([run])
+    path.unlink()
+    with pytest.raises(SchemaError, match=f"{name} is missing"):
+        merge_results([run])
+
+
+def test_results_without_a_column_name_it(tmp_path):
+    run = write_run(tmp_path, Made(particles=20, frames=3))
+    pd.read_csv(run.path / "results.csv").drop(columns="gamma").to_csv(run.path / "results.csv", index=False)
+    seal(run)
+    with pytest.raises(SchemaError, match="gamma"):
+        merge_results([run])
