@@ -145,3 +145,7 @@ def _stage_help(stage: str) -> str:
         f"usage: nsf {stage} [key=value …] [-m]\n\n{STAGES[stage]}\n\n{_groups()}\n\n"
         f"keys and defaults (conf/{primary}.yaml):\n{keys}"
     )
+
+
+if __name__ == "__main__":
+    main()

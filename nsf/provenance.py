@@ -1,6 +1,7 @@
 """Which code and which versions produced a result."""
 
 import importlib.metadata
+import os
 import platform
 import subprocess
 from functools import cache
@@ -21,13 +22,14 @@ _DISTRIBUTIONS = {
 def provenance() -> dict[str, Any]:
     """The code's commit, whether the package differs from it, and the versions in use.
 
-    `commit` and `dirty` are None where the package is not in a git checkout.
+    Where the package is not in a git checkout, as in a container, the
+    environment variable NSF_COMMIT may name the commit; `dirty` is then None.
     """
     here = Path(__file__).parent
     # A package installed below some other project's checkout is not tracked by it.
     tracked = _git(here, "ls-files", "--error-unmatch", Path(__file__).name)
-    commit = _git(here, "rev-parse", "HEAD") if tracked else None
-    changes = _git(here, "status", "--porcelain", "--", ".") if commit else None
+    commit = _git(here, "rev-parse", "HEAD") if tracked else os.environ.get("NSF_COMMIT")
+    changes = _git(here, "status", "--porcelain", "--", ".") if tracked else None
     return {
         "commit": commit,
         "dirty": None if changes is None else bool(changes),

@@ -27,7 +27,8 @@ class HalfSpace:
         friction: Coulomb coefficient of `slip` and `separate`, dimensionless.
 
     Raises:
-        ConfigError: unknown kind, zero normal, negative friction, friction on `sticky`.
+        ConfigError: unknown kind, zero normal, a value that is not finite, negative friction,
+            friction on `sticky`.
     """
 
     point: Sequence[float]
@@ -37,7 +38,8 @@ class HalfSpace:
 
     def __post_init__(self):
         _check_kind(self.kind, "half-space")
-        if not (len(self.point) == 3 and len(self.normal) == 3 and np.linalg.norm(self.normal) > 0):
+        finite = np.isfinite((*self.point, *self.normal)).all()
+        if not (len(self.point) == len(self.normal) == 3 and finite and np.any(self.normal)):
             raise ConfigError(f"half-space point={self.point} normal={self.normal}: give 3 numbers each, normal non-zero")
         if not self.friction >= 0:
             raise ConfigError(f"half-space friction={self.friction} must be at least 0")

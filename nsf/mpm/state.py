@@ -74,4 +74,5 @@ class ParticleState:
 
     def numpy(self) -> dict[str, np.ndarray]:
         """Host copies: x, v [P, 3], C, F_e, tau [P, 3, 3], history [P, H]."""
-        return {name: getattr(self, name).numpy() for name in ("x", "v", "C", "F_e", "tau", "history")}
+        # Warp's own numpy() is a view of the array where the device is the CPU.
+        return {name: getattr(self, name).numpy().copy() for name in ("x", "v", "C", "F_e", "tau", "history")}

@@ -53,8 +53,7 @@ class Pipeline:
         c = self.config
         self.scene = Scene.from_config(c)
         p = self.scene.parameters
-        train_values = [v for v in p.train if v not in set(p.validation)]
-        self.split = Split(train=tuple(train_values), validation=tuple(p.validation), test=tuple(p.test))
+        self.split = Split(train=tuple(p.train), validation=tuple(p.validation), test=tuple(p.test))
         for name, node in (("field", c.field), ("trainer", c.trainer), ("method", c.method)):
             setattr(self, name, configuration.build(node, name))
         self.sampler = configuration.build(c.sampler, "sampler")

@@ -14,6 +14,21 @@ from nsf.mpm.materials import Material
 from nsf.scenes.geometry import Shape
 
 
+def _number(key: str, value) -> float:
+    """A finite number, or a message that quotes the key."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not math.isfinite(value):
+        raise ConfigError(f"{key}={value} must be a finite number")
+    return float(value)
+
+
+def _vector(key: str, values, unit: str) -> tuple[float, float, float]:
+    """Three finite numbers, or a message that quotes the key."""
+    values = list(values)
+    if len(values) != 3 or not all(isinstance(x, int | float) and math.isfinite(x) for x in values):
+        raise ConfigError(f"{key}={values} {unit} must be 3 finite numbers")
+    return tuple(float(x) for x in values)
+
+
 @dataclass(frozen=True)
 class Body:
     """Particles of one shape.
@@ -25,7 +40,7 @@ class Body:
         velocity: initial velocity [m/s].
 
     Raises:
-        ConfigError: no particles, a density that is not positive.
+        ConfigError: no particles, a density that is not positive, a velocity that is not 3 numbers.
     """
 
     shape: Shape
@@ -34,10 +49,11 @@ class Body:
     velocity: Sequence[float] = (0.0, 0.0, 0.0)
 
     def __post_init__(self):
-        if self.particles < 1:
-            raise ConfigError(f"particles={self.particles} must be at least 1")
+        if self.particles < 1 or self.particles != int(self.particles):
+            raise ConfigError(f"particles={self.particles} must be a whole number, at least 1")
         if not self.density > 0:
             raise ConfigError(f"density={self.density} kg/m³ must be positive")
+        _vector("velocity", self.velocity, "m/s")
 
 
 @dataclass(frozen=True)
@@ -58,6 +74,18 @@ class ParameterRange:
     train: Sequence[float]
     test: Sequence[float]
     validation: Sequence[float] = ()
+
+    def __post_init__(self):
+        for split in ("train", "validation", "test"):
+            values = getattr(self, split)
+            for value in values:
+                _number(f"scene.parameters.{split}", value)
+            if not values and split == "train":
+                raise ConfigError("scene.parameters.train=[] must name at least one value")
+        for one, other in (("train", "test"), ("train", "validation"), ("test", "validation")):
+            shared = sorted(set(getattr(self, one)) & set(getattr(self, other)))
+            if shared:
+                raise ConfigError(f"scene.parameters: {shared} is in {one} and {other}; a value belongs to one split")
 
     @property
     def name(self) -> str:
@@ -102,17 +130,17 @@ class Scene:
             ConfigError: a key is unknown or a value outside its range.
         """
         s = config.scene
-        if s.steps < 1:
-            raise ConfigError(f"scene.steps={s.steps} must be at least 1")
+        if not isinstance(s.steps, int) or s.steps < 1:
+            raise ConfigError(f"scene.steps={s.steps} must be a whole number, at least 1")
         colliders = tuple(configuration.build(c, "scene.colliders") for c in s.colliders.values())
         return cls(
             name=s.name,
             scale=config.scale,
-            dx=float(s.dx),
-            dt=float(s.dt),
-            steps=int(s.steps),
-            size=tuple(s.size),
-            gravity=tuple(s.gravity),
+            dx=_number("scene.dx", s.dx),
+            dt=_number("scene.dt", s.dt),
+            steps=s.steps,
+            size=_vector("scene.size", s.size, "m"),
+            gravity=_vector("scene.gravity", s.gravity, "m/s²"),
             bodies=tuple(configuration.build(b, f"scene.bodies.{n}") for n, b in s.bodies.items()),
             colliders=colliders,
             walls=configuration.build(s.walls, "scene.walls"),
