@@ -18,7 +18,7 @@ def _check_kind(kind: str, where: str) -> None:
 
 @dataclass(frozen=True)
 class HalfSpace:
-    """The solid half-space {x : (x − point)·normal < 0}; material is on the other side.
+    """The solid half-space {x : (x − point)·normal ≤ 0}; material is on the other side.
 
     Attributes:
         point: a point of the surface [m].

@@ -11,6 +11,8 @@ from nsf.mpm.precision import Precision
 
 # Kinds of contact. Sticky: no motion. Slip: no normal motion. Separate: no motion into the boundary.
 STICKY, SLIP, SEPARATE = 0, 1, 2
+# A node this near to a surface (in Δx) lies on it and belongs to the solid, in spite of round-off.
+_ON_SURFACE = 1e-4
 KINDS = {"sticky": STICKY, "slip": SLIP, "separate": SEPARATE}
 
 
@@ -188,7 +190,7 @@ def make_grid_update(precision: Precision):
         v = momentum[slot] / m + dt * gravity
         x = dx * vec3(real(node[0]), real(node[1]), real(node[2]))
         for c in range(collider_kind.shape[0]):
-            if wp.dot(x - collider_point[c], collider_normal[c]) < real(0.0):
+            if wp.dot(x - collider_point[c], collider_normal[c]) <= real(wp.static(_ON_SURFACE)) * dx:
                 v = against_half_space(v, collider_normal[c], collider_kind[c], collider_friction[c])
         for axis in range(3):
             low = node[axis] < wall_padding

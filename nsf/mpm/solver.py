@@ -42,7 +42,7 @@ class GridStep:
         self.gravity = precision.vec3(*gravity)
         self.boundaries = boundaries
         self.affine_shares = tuple(real(s) for s in transfer.affine_shares)
-        self._p2g = make_p2g(precision, transfer.shape)
+        self._p2g = make_p2g(precision, transfer.shape, transfer.deterministic)
         self._g2p = make_g2p(precision, transfer.shape)
         self._update = make_grid_update(precision)
 

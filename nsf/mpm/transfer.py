@@ -26,6 +26,8 @@ class Transfer:
             rotation, and of its symmetric part the share `1 − damping`.
         shape: B-spline, `quadratic` or `cubic`.
         damping: RPIC damping in [0, 1], dimensionless; 1 keeps rotation only.
+        deterministic: on a GPU, sum P2G's contributions in a fixed order, so that the same run gives
+            the same bits (slower); on a CPU that is so in any case.
 
     Raises:
         ConfigError: unknown scheme or shape; damping outside [0, 1] or not with RPIC.
@@ -36,6 +38,7 @@ class Transfer:
     scheme: str = "apic"
     shape: str = "quadratic"
     damping: float = 0.0
+    deterministic: bool = False
 
     def __post_init__(self):
         if self.scheme not in SCHEMES:
@@ -54,7 +57,7 @@ class Transfer:
 
 
 @cache
-def make_p2g(precision: Precision, shape_name: str):
+def make_p2g(precision: Precision, shape_name: str, deterministic: bool = False):
     """Kernel of P2G, one thread a particle.
 
     m_i = Σ_p w_ip m_p and, with the explicit force's impulse added in the same sweep,
@@ -67,8 +70,11 @@ def make_p2g(precision: Precision, shape_name: str):
     shape = shape_functions(precision, shape_name)
     width = shape.degree + 1
     base_node, local, weights, gradients = shape.base_node, shape.local, shape.weights, shape.gradients
+    options = {"max_unroll": 4}
+    if deterministic:
+        options |= {"deterministic": wp.DeterministicMode.RUN_TO_RUN, "deterministic_max_records": width**3}
 
-    @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 4})
+    @wp.kernel(enable_backward=False, module="unique", module_options=options)
     def p2g(
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),

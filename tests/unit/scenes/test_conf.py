@@ -1,0 +1,63 @@
+"""Every yaml of the scene, material and transfer groups builds what it names."""
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+from nsf import config as configuration
+from nsf.mpm import Transfer
+from nsf.mpm.materials import Material, deformation_path, drive
+from nsf.mpm.stability import check_time_step
+from nsf.scenes import load
+
+#: What scenes set in a material; any other open value gets 0.05.
+OPEN = {"E": 1000.0, "nu": 0.3, "friction_angle": 30.0}
+
+
+def names(group):
+    found = sorted(f.stem for f in (configuration.CONF / group).glob("*.yaml"))
+    assert found
+    return found
+
+
+@pytest.mark.parametrize("name", names("material"))
+def test_material(name):
+    node = OmegaConf.load(configuration.CONF / "material" / f"{name}.yaml")
+    for key in [k for k in node if OmegaConf.is_missing(node, k)]:
+        node[key] = OPEN.get(key, 0.05)
+    material = configuration.build(node, "material")
+    assert isinstance(material, Material)
+    tau = drive(material, deformation_path("isotropic_compression", 0.01, 5)[1], 0.01)
+    assert np.isfinite(tau).all()
+    assert np.trace(tau[-1]) < 0.0
+
+
+@pytest.mark.parametrize("name", names("transfer"))
+def test_transfer(name):
+    transfer = configuration.build(
+        OmegaConf.load(configuration.CONF / "transfer" / f"{name}.yaml"), "transfer"
+    )
+    assert isinstance(transfer, Transfer)
+    assert transfer.scheme == name
+
+
+@pytest.mark.parametrize("scale", ["small", "paper"])
+@pytest.mark.parametrize("name", names("scene"))
+def test_scene(name, scale):
+    """It loads, its particles lie in the domain, and its step is stable at every value of its parameter."""
+    scene = load(name, [f"scale={scale}"])
+    assert (scene.name, scene.scale) == (name, scale)
+    assert scene.steps >= 1
+    ranges = scene.parameters
+    for value in [*ranges.train, *ranges.validation, *ranges.test]:
+        at = scene.with_parameters({ranges.name: value})
+        constants, v = at.particles(), at.initial_velocity()
+        assert len(constants) == sum(b.particles for b in at.bodies)
+        check_time_step(constants, v, at.dx, at.dt)
+
+
+@pytest.mark.parametrize("name", names("scene"))
+def test_small_scene_takes_a_step(name):
+    solver = load(name, ["scale=small"]).full_order(device="cpu")
+    solver.step()
+    solver.check()

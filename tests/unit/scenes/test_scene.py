@@ -1,0 +1,180 @@
+"""Scenes: loading, overrides, the problem parameter, what is refused."""
+
+import re
+
+import numpy as np
+import pytest
+
+from nsf import config as configuration
+from nsf.errors import ConfigError, NSFError
+from nsf.mpm.materials import DruckerPrager
+from nsf.scenes import Body, Box, ParameterRange, load
+
+FEW = "scene.bodies.column.particles=300"
+
+
+@pytest.fixture(scope="module")
+def sand():
+    return load("sand", [FEW])
+
+
+def test_sand_is_what_its_file_says(sand):
+    assert (sand.name, sand.scale) == ("sand", "small")
+    assert sand.dx == pytest.approx(1.0 / 64.0)
+    assert sand.material == DruckerPrager(2000.0, 0.2, 30.0)
+    assert sand.gravity == (0.0, 0.0, -4.0)
+    assert sand.parameters.name == "friction_angle"
+    assert sand.parameters.key == "material.friction_angle"
+
+
+def test_paper_scale():
+    """Table 1: 71 363 particles of 2.5e-8 m³, Δx = 1/150, Δt = 0.002, a 16/4 split of [21°, 38.5°]."""
+    paper = load("sand", ["scale=paper"])
+    particles = paper.particles()
+    assert len(particles) == 71363
+    np.testing.assert_allclose(particles.volume0, 2.5e-8, rtol=1e-3)
+    assert (paper.dx, paper.dt) == pytest.approx((1.0 / 150.0, 0.002))
+    assert (len(paper.parameters.train), len(paper.parameters.test)) == (16, 4)
+    assert (min(paper.parameters.train), max(paper.parameters.train)) == (21.0, 38.5)
+
+
+def test_overrides():
+    scene = load("sand", [FEW, "scene.dt=0.003", "transfer=rpic", "transfer.damping=0.5"])
+    assert (scene.dt, scene.transfer.scheme, scene.transfer.damping) == (0.003, "rpic", 0.5)
+    assert sum(b.particles for b in scene.bodies) == 300
+
+
+def test_particles(sand):
+    particles, body = sand.particles(), sand.bodies[0]
+    assert len(particles) == 300
+    assert body.shape.contains(particles.X).all()
+    assert particles.volume0.sum() == pytest.approx(body.shape.volume)
+    assert particles.mass.sum() == pytest.approx(body.density * body.shape.volume)
+    assert (particles.mu == sand.material.mu).all()
+    assert (particles.lam == sand.material.lam).all()
+
+
+def test_initial_velocity():
+    scene = load("sand", [FEW, "scene.bodies.column.velocity=[1.0, 2.0, 3.0]"])
+    np.testing.assert_array_equal(scene.initial_velocity(), np.tile([1.0, 2.0, 3.0], (300, 1)))
+
+
+def test_parameters_replace_the_key(sand):
+    changed = sand.with_parameters({"friction_angle": 35})
+    assert changed.material.friction_angle == 35.0
+    assert sand.material.friction_angle == 30.0
+    assert changed.config.material.friction_angle == 35.0
+
+
+@pytest.mark.parametrize(
+    ("parameters", "quoted"),
+    [
+        ({"cohesion": 1.0}, "sand has no parameter 'cohesion'; its parameter is 'friction_angle'"),
+        ({"friction_angle": float("nan")}, "friction_angle=nan must be a finite number"),
+        ({"friction_angle": "30"}, "friction_angle='30' must be a finite number"),
+        ({"friction_angle": 95.0}, "material.friction_angle=95.0"),
+    ],
+)
+def test_parameters_are_refused(sand, parameters, quoted):
+    with pytest.raises(ConfigError, match=re.escape(quoted)):
+        sand.with_parameters(parameters)
+
+
+def test_parameter_key_must_exist():
+    scene = load("sand", [FEW, "scene.parameters.key=material.cohesion"])
+    with pytest.raises(ConfigError, match=r"scene\.parameters\.key=material\.cohesion"):
+        scene.with_parameters({"cohesion": 1.0})
+
+
+def test_full_order_runs_at_a_parameter(sand):
+    solver = sand.full_order({"friction_angle": 21.0}, device="cpu")
+    assert solver.material.friction_angle == 21.0
+    before = solver.state.numpy()["x"]
+    solver.step(5)
+    fall = solver.state.numpy()["x"] - before
+    assert -0.5 * 4.0 * (6 * sand.dt) ** 2 < fall[:, 2].min() < 0.0
+
+
+@pytest.mark.parametrize(
+    ("overrides", "quoted"),
+    [
+        (["scene.dtt=0.1"], "unknown key 'scene.dtt'; did you mean scene.dt"),
+        (
+            ["material.friction_angel=30"],
+            "unknown key 'material.friction_angel'; did you mean material.friction_angle",
+        ),
+        (["transfer=apicc"], "unknown transfer=apicc; choose one of apic, pic, rpic (did you mean apic?)"),
+        (["scale=huge"], "scale=huge"),
+        (["scene.steps=0"], "scene.steps=0"),
+        (["scene.steps=2.5"], "scene.steps=2.5"),
+        (["scene.steps=many"], "scene.steps=many"),
+        (["scene.dt=soon"], "scene.dt=soon"),
+        (["scene.gravity=[0.0, 0.0]"], "scene.gravity=[0.0, 0.0]"),
+        (["scene.gravity=[0.0, 0.0, nan]"], "scene.gravity=[0.0, 0.0, nan]"),
+        (["scene.size=[1.0, 1.0]"], "scene.size=[1.0, 1.0]"),
+        (["scene.bodies.column.velocity=[1.0, 2.0]"], "velocity=[1.0, 2.0]"),
+        (["scene.bodies.column.particles=0"], "particles=0"),
+        (["scene.bodies.column.particles=2.5"], "particles=2.5"),
+        (["scene.bodies.column.density=-1"], "density=-1"),
+        (["scene.walls.kind=open"], "walls.kind='open'"),
+        (["scene.walls.padding=0"], "walls.padding=0"),
+        (["scene.colliders.floor.kind=glue"], "half-space.kind='glue'"),
+        (["+scene.colliders.floor.frictin=1"], "frictin"),
+        (["material.E=-1"], "material.E=-1"),
+        (["scene.parameters.train=[]"], "scene.parameters.train=[]"),
+        (["scene.parameters.test=[21.0]"], "21.0"),
+        (["scene.parameters.test=[26.0, nan]"], "nan"),
+        (["scene.dt=[1"], "[1"),
+    ],
+)
+def test_refused(overrides, quoted):
+    with pytest.raises(ConfigError, match=re.escape(quoted)):
+        load("sand", [FEW, *overrides])
+
+
+def test_unknown_scene():
+    with pytest.raises(ConfigError, match=r"unknown scene=sandd; choose one of .*did you mean sand\?"):
+        load("sandd")
+
+
+@pytest.mark.parametrize("target", ["os.system", "nsf", "builtins.eval", "nsfx.evil", "nsf.mpm;os"])
+def test_foreign_targets_are_refused(target):
+    with pytest.raises(NSFError, match=re.escape(f"_target_: {target} is refused")):
+        configuration.load(["scene=sand", f"scene.colliders.floor._target_='{target}'"])
+
+
+def test_foreign_targets_are_refused_at_any_depth():
+    from omegaconf import OmegaConf
+
+    node = OmegaConf.create({"a": [{"b": {"_target_": "os.system", "command": "true"}}]})
+    with pytest.raises(ConfigError, match=r"os\.system is refused"):
+        configuration.build(node, "here")
+
+
+def test_missing_value():
+    with pytest.raises(ConfigError, match="E"):
+        configuration.load(["scene=sand", "material.E=???"])
+
+
+def test_body_outside_the_domain(sand):
+    scene = load("sand", [FEW, "scene.bodies.column.shape.base=[0.98, 0.5, 0.13]"])
+    with pytest.raises(ConfigError, match=r"reaches outside the domain"):
+        scene.particles()
+
+
+@pytest.mark.parametrize(("particles", "density"), [(0, 1.0), (10, 0.0), (10, float("nan"))])
+def test_bad_body(particles, density):
+    with pytest.raises(ConfigError, match=f"particles={particles}|density={density}"):
+        Body(Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), particles, density)
+
+
+def test_parameter_name_is_the_end_of_its_key():
+    assert ParameterRange("scene.bodies.blade.angle", "°", [1.0], [2.0]).name == "angle"
+
+
+@pytest.mark.parametrize("pair", [("train", "test"), ("train", "validation"), ("test", "validation")])
+def test_splits_share_no_value(pair):
+    values = {"train": [1.0, 2.0], "test": [3.0], "validation": [4.0]}
+    values[pair[1]] = [*values[pair[1]], values[pair[0]][0]]
+    with pytest.raises(ConfigError, match=f"{pair[0]} and {pair[1]}"):
+        ParameterRange("material.E", "Pa", **values)
