@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
-from hydra.errors import HydraException
+from hydra.errors import HydraException, OverrideParseException
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -50,7 +50,7 @@ def load(overrides: Sequence[str] = (), config_name: str = "config") -> DictConf
     """
     try:
         return resolve(_compose(config_name, overrides))
-    except HydraException as error:
+    except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(_explain(error, config_name, overrides)) from error
     except MarkedYAMLError as error:
         mark = error.problem_mark
@@ -72,10 +72,9 @@ def resolve(config: DictConfig) -> DictConfig:
     try:
         config = OmegaConf.create(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     except OmegaConfBaseException as error:
-        cause = error.__cause__
-        if isinstance(cause, NSFError):
-            raise cause from error
-        raise ConfigError(str(error).splitlines()[0]) from error
+        # OmegaConf wraps what a resolver raises; its own words come first in the text.
+        detail = re.sub(r"^\w*Error raised while resolving interpolation: ", "", str(error).splitlines()[0])
+        raise ConfigError(detail) from error
     check_targets(config)
     return config
 
@@ -134,7 +133,9 @@ def _explain(error: Exception, config_name: str, overrides: Sequence[str]) -> st
         near = difflib.get_close_matches(key, known, n=3, cutoff=0.5)
         hint = f"; did you mean {' or '.join(near)}?" if near else "; see `nsf --help` for the groups"
         return f"unknown key {key!r}{hint}"
-    option = re.search(r"Could not find '([^']+)/([^']+)'", text) or re.search(r"In '[^']+': Could not find '([^']+)/([^']+)'", text)
+    if isinstance(error, OverrideParseException):
+        return f"{error.override!r} is not key=value in Hydra's grammar ({first}); quote brackets, commas and spaces"
+    option = re.search(r"Could not find '([^']+)/([^']+)'", text)
     if option:
         group, name = option.groups()
         known = groups().get(group, [])

@@ -151,10 +151,10 @@ class Run:
         if self.complete:
             return self
         manifest = self.manifest
-        status = manifest.get("status", "never run")
+        status = manifest.get("status", "not there")
         state = "complete, but outputs are missing or cut short" if status == "complete" else status
         why = f" ({manifest['error']})" if manifest.get("error") else ""
-        raise MissingRunError(f"{self.path} is {state}{why}; run `nsf {self.stage}` for {self.scene!r} again")
+        raise MissingRunError(f"{self.path} is {state}{why}; run `nsf {self.stage} scene={self.scene}` with the same keys")
 
     @contextmanager
     def record(

@@ -19,11 +19,12 @@ from nsf import config as configuration
 from nsf.data import Snapshots, Split, Trajectory
 from nsf.dynamics import ReducedMPM, Rollout, deploy
 from nsf.dynamics.interop import torch_device
+from nsf.dynamics.sampling import check_well_posed
 from nsf.errors import ConfigError, MissingRunError
 from nsf.evaluation import compare, measure, reduction_ratio
 from nsf.kinematics.manifold import Manifold
-from nsf.kinematics.training import train
-from nsf.mpm import FP32, FP64, Precision
+from nsf.kinematics.training import TRACKING, train
+from nsf.mpm import FP32, FP64, Precision, precision_of
 from nsf.mpm.device import warp_device
 from nsf.pipeline.simulation import Job, simulate
 from nsf.runs import Record, Run
@@ -63,6 +64,15 @@ class Pipeline:
             raise ConfigError(f"latent_dim={c.latent_dim} must be an integer of at least 1")
         if c.deploy.split not in ("test", "validation", "train"):
             raise ConfigError(f"deploy.split={c.deploy.split} is unknown; choose test, validation or train")
+        if c.tracking not in TRACKING:
+            raise ConfigError(f"tracking={c.tracking} is unknown; choose null or tensorboard")
+        if c.data.resident not in (True, False, "auto"):
+            raise ConfigError(f"data.resident={c.data.resident} must be true, false or auto")
+        if not c.deploy.dt_multiplier > 0:
+            raise ConfigError(f"deploy.dt_multiplier={c.deploy.dt_multiplier} must be positive")
+        precision_of(c.precision)
+        for region in self.sampler.regions:
+            check_well_posed(region.size, c.latent_dim)
         # The device is found once, so that a missing GPU is reported before any work.
         self.device = str(torch_device(warp_device(c.device)))
         self.check_values()

@@ -73,10 +73,12 @@ def test_half_space_turns_with_its_normal(kind, friction, v, left, rng, rotation
         np.testing.assert_allclose(update(Q @ v, [collider])[INNER], Q @ left, atol=1e-13)
 
 
-def test_a_node_on_the_surface_is_free():
-    after = update((0.0, 0.0, -1.0), [solid("sticky", point=(0.5, 0.5, 0.5))])
-    assert (after[INNER] == [0.0, 0.0, -1.0]).all()
+@pytest.mark.parametrize("round_off", [-1e-9, 0.0, 1e-9])
+def test_a_node_on_the_surface_belongs_to_the_solid(round_off):
+    after = update((0.0, 0.0, -1.0), [solid("sticky", point=(0.5, 0.5, 0.5 + round_off))])
+    assert (after[INNER] == 0.0).all()
     assert (after[4, 4, 3] == 0.0).all()
+    assert (after[4, 4, 5] == [0.0, 0.0, -1.0]).all()
 
 
 def test_half_spaces_apply_in_order():
