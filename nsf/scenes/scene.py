@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ConfigAttributeError
 
 from nsf import config as configuration
 from nsf.errors import ConfigError
@@ -129,6 +130,13 @@ class Scene:
         Raises:
             ConfigError: a key is unknown or a value outside its range.
         """
+        try:
+            return cls._build(config)
+        except ConfigAttributeError as error:
+            raise ConfigError(f"{error.full_key} is missing from the configuration; give it a value") from error
+
+    @classmethod
+    def _build(cls, config: DictConfig) -> "Scene":
         s = config.scene
         if not isinstance(s.steps, int) or s.steps < 1:
             raise ConfigError(f"scene.steps={s.steps} must be a whole number, at least 1")

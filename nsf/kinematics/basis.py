@@ -1,0 +1,354 @@
+"""`field=basis`: linear modes of the snapshots with a nonlinear closure of the latent vector.
+
+    g(X, xhat)    = X + ū(X) + Σ_k b_k(X) a_k,   a = [σ · xhat ; closure(xhat)]
+    h(X, xhat, μ) = τ̄(X) + Σ_k t_k(X) d_k(xhat, μ),   l likewise
+
+b, t, c are POD modes of x, tau and C; xhat is the first r coefficients of x over their deviation σ, so
+encoding is a dot product. The small networks see xhat alone and run once a step, not once a particle. This is
+not in the paper, whose fields are `mlp`; it takes their place in every equation of sections 4 and 5.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from typing_extensions import override
+
+from nsf.data import Snapshots
+from nsf.errors import ConfigError
+from nsf.kinematics import pod
+from nsf.kinematics.interpolation import interpolation
+from nsf.kinematics.manifold import Manifold, Restriction
+from nsf.kinematics.networks import FullyConnected
+from nsf.kinematics.phases import PHASES, TARGETS, Fit, at_least, per_phase
+
+ENCODED_ENTRIES = 1 << 26  # positions encoded at once
+
+
+@dataclass(frozen=True)
+class BasisField:
+    """Modes and the networks of their coefficients.
+
+    Attributes:
+        modes: K of x, tau and C: one for all, [x, tau=C] or [x, tau, C]; cut to the snapshots' rank.
+        beta: hidden widths over d (3, 6, 9) of the closure and the two heads, given like `modes`.
+        depth: hidden layers of each network.
+        noise: deviation of the noise added to xhat in training, in units of xhat's deviation. It keeps the
+            Jacobian and the heads regular beside the training trajectories.
+        head_parameters: the heads see the (standardised) problem parameters beside xhat.
+    """
+
+    modes: int | Sequence[int] = (96, 160, 160)
+    beta: int | Sequence[int] = (48, 48, 32)
+    depth: int = 3
+    noise: float = 0.02
+    head_parameters: bool = True
+
+    def __post_init__(self) -> None:
+        per_phase("modes", self.modes)
+        per_phase("beta", self.beta)
+        at_least("depth", self.depth, 1)
+        at_least("noise", self.noise, 0)
+
+    def prepare(self, snapshots: Snapshots, latent_dim: int) -> dict[str, Any]:
+        """POD coefficients [M, K] of x, tau and C and the energy the modes leave out.
+
+        Raises:
+            ConfigError: latent_dim exceeds the modes asked for, or the rank of the displacements.
+        """
+        wanted = per_phase("modes", self.modes)
+        if latent_dim > wanted[0]:
+            raise ConfigError(
+                f"latent_dim={latent_dim} exceeds the {wanted[0]} displacement modes; choose"
+                f" field.modes > {latent_dim} or latent_dim <= {wanted[0]}"
+            )
+        prepared = {}
+        for count, (name, components) in zip(wanted, TARGETS.values(), strict=True):
+            coefficients, unresolved = pod.decompose(snapshots, name, components, count)
+            prepared[name] = {"coefficients": coefficients.cpu(), "unresolved": unresolved}
+        rank = prepared["x"]["coefficients"].shape[1]
+        if latent_dim > rank:
+            raise ConfigError(
+                f"latent_dim={latent_dim} exceeds the rank {rank} of {snapshots.M} displacement snapshots;"
+                f" choose latent_dim <= {rank} or simulate more parameter values"
+            )
+        return prepared
+
+    def build(
+        self, snapshots: Snapshots, prepared: dict[str, Any], latent_dim: int, generator: torch.Generator
+    ) -> BasisManifold:
+        """The manifold with its modes, and untrained networks drawn from `generator`."""
+        hyperparameters = {
+            "particles": snapshots.P,
+            "frames": snapshots.M,
+            "modes": [prepared[name]["coefficients"].shape[1] for name, _ in TARGETS.values()],
+            "beta": list(per_phase("beta", self.beta)),
+            "depth": self.depth,
+            "noise": self.noise,
+            "head_parameters": self.head_parameters,
+            "unresolved": [prepared[name]["unresolved"] for name, _ in TARGETS.values()],
+        }
+        manifold = BasisManifold(
+            latent_dim, snapshots.x_sha256, list(snapshots.parameter_names), hyperparameters
+        )
+        manifold.describe(snapshots)
+        for phase, (name, components) in TARGETS.items():
+            field, coefficients = (
+                manifold.fields[phase],
+                prepared[name]["coefficients"].to(snapshots.X.device),
+            )
+            for particles, mean, modes in pod.modes(snapshots, name, components, coefficients):
+                origin = manifold.X[particles].to(mean) if phase == "deformation" else 0
+                field.mean[particles], field.modes[particles] = mean - origin, modes.float()
+            field.calibrate(coefficients)
+            if field.network is not None:
+                field.network.initialise(generator)
+        coefficients = prepared["x"]["coefficients"][:, :latent_dim]
+        manifold.training_latents.copy_(coefficients / manifold.fields["deformation"].leading)
+        return manifold
+
+    def fits(self, manifold: BasisManifold, snapshots: Snapshots, prepared: dict[str, Any]) -> Iterator[Fit]:
+        """Closure and heads, each to its coefficients over one common scale.
+
+        As the modes are orthonormal, such a loss is the mean squared error of the field over its variance.
+        """
+        for phase, (name, _) in TARGETS.items():
+            field = manifold.fields[phase]
+            if field.network is not None:
+                targets = (
+                    prepared[name]["coefficients"].to(field.scale)[:, field.leading.numel() :] / field.scale
+                )
+                yield Fit(phase, field.network, self._loss(manifold, phase, targets.float()), pointwise=False)
+
+    def _loss(self, manifold: BasisManifold, phase: str, targets: Tensor) -> Callable[..., Tensor]:
+        network = manifold.fields[phase].network
+        latents = manifold.training_latents.float()
+        parameters = manifold.standard_parameters(manifold.training_parameters.float())
+
+        def loss(rows: Tensor | slice, particles: Tensor | slice, generator: torch.Generator) -> Tensor:
+            xhat = latents[rows]
+            inputs = xhat + self.noise * torch.randn(xhat.shape, generator=generator, device=xhat.device)
+            if manifold.takes_parameters(phase):
+                inputs = torch.cat([inputs, parameters[rows]], -1)
+            return (network(inputs) - targets[rows]).square().mean()
+
+        return loss
+
+
+class ModalField(nn.Module):
+    """mean(X) + Σ_k modes_k(X) a_k with a = [leading · xhat ; scale · network(inputs)].
+
+    For the deformation this is the displacement x − X.
+
+    Args:
+        particles, components: P and c.
+        modes: K.
+        leading: how many coefficients are latents themselves (r for g, 0 for h and l).
+        inputs, width, depth: of the network; there is none if no coefficient is left to it.
+    """
+
+    def __init__(
+        self, particles: int, components: int, modes: int, leading: int, inputs: int, width: int, depth: int
+    ):
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(particles, components, dtype=torch.float64))
+        self.register_buffer("modes", torch.zeros(particles, components, modes))
+        self.register_buffer("leading", torch.ones(leading, dtype=torch.float64))
+        self.register_buffer("scale", torch.ones((), dtype=torch.float64))
+        closed = modes - leading
+        self.network = FullyConnected((inputs, *[width] * depth, closed), "silu") if closed else None
+
+    def calibrate(self, coefficients: Tensor) -> None:
+        """Take the scales from the coefficients [M, K] of the training snapshots."""
+        leading, closed = coefficients.tensor_split([self.leading.numel()], 1)
+        self.leading.copy_(leading.square().mean(0).sqrt())
+        if closed.numel():
+            self.scale.copy_(closed.square().mean().sqrt())
+
+    def at(
+        self,
+        place: Callable[[Tensor], Tensor],
+        base: Tensor | float,
+        network: FullyConnected | None,
+        like: Tensor,
+    ) -> RestrictedField:
+        """base + the field where `place` takes its mean and modes, in dtype and device as `like`."""
+        unscaled = self.modes.shape[2] - len(self.leading)
+        factors = torch.cat([self.leading, self.leading.new_ones(unscaled)]).to(like)
+        return RestrictedField(
+            (base + place(self.mean)).to(like),
+            place(self.modes).to(like) * factors,
+            len(self.leading),
+            network,
+        )
+
+
+@dataclass(frozen=True)
+class RestrictedField:
+    """mean + modes · a at n points; a = [xhat (the leading coefficients) ; network(inputs)].
+
+    Attributes:
+        mean: [n, c]; modes: [n, c, K], both in the unit of the field.
+    """
+
+    mean: Tensor
+    modes: Tensor
+    leading: int
+    network: FullyConnected | None
+
+    def subset(self, rows: slice) -> RestrictedField:
+        """The same field at some of the points, sharing memory."""
+        return RestrictedField(self.mean[rows], self.modes[rows], self.leading, self.network)
+
+    def values(self, inputs: Tensor) -> Tensor:
+        """[..., inputs] → [..., n, c]."""
+        a = [inputs[..., : self.leading]] if self.leading or self.network is None else []
+        if self.network is not None:
+            a.append(self.network(inputs))
+        coefficients = torch.cat(a, -1) if len(a) > 1 else a[0]
+        return F.linear(coefficients, self.modes.flatten(0, 1), self.mean.flatten()).unflatten(
+            -1, self.mean.shape
+        )
+
+    def values_and_jacobian(self, xhat: Tensor, identity: Tensor) -> tuple[Tensor, Tensor]:
+        """[..., r] and the identity [r, r] → [..., n, c] and [..., n, c, r], in one product."""
+        a, along = xhat, identity.expand(*xhat.shape[:-1], *identity.shape)
+        if self.network is not None:
+            closed, closed_along = self.network.forward_and_tangents(xhat, identity)
+            a, along = torch.cat([a, closed], -1), torch.cat([along, closed_along], -1)
+        rows = F.linear(torch.cat([a.unsqueeze(-2), along], -2), self.modes.flatten(0, 1))
+        rows = rows.unflatten(-1, self.mean.shape)
+        return rows[..., 0, :, :] + self.mean, rows[..., 1:, :, :].movedim(-3, -1)
+
+
+class BasisManifold(Manifold):
+    """Modal fields of x, tau and C."""
+
+    field = "basis"
+
+    def __init__(self, latent_dim, x_sha256, parameter_names, hyperparameters):
+        super().__init__(latent_dim, x_sha256, parameter_names, hyperparameters)
+        self.fields = nn.ModuleDict()
+        layout = zip(TARGETS.items(), hyperparameters["modes"], hyperparameters["beta"], strict=True)
+        for (phase, (_, d)), modes, beta in layout:
+            inputs = latent_dim + (len(self.parameter_names) if self.takes_parameters(phase) else 0)
+            leading = latent_dim if phase == "deformation" else 0
+            self.fields[phase] = ModalField(
+                hyperparameters["particles"], d, modes, leading, inputs, beta * d, hyperparameters["depth"]
+            )
+
+    def takes_parameters(self, phase: str) -> bool:
+        """Whether the phase's network sees the problem parameters."""
+        return phase != "deformation" and self.hyperparameters["head_parameters"]
+
+    @override
+    @torch.no_grad()
+    def encode(self, x: Tensor) -> Tensor:
+        self.check_frames(x)
+        field = self.fields["deformation"]
+        modes = field.modes[..., : self.latent_dim].flatten(0, 1).double() / field.leading
+        origin = self.X + field.mean
+        blocks = x.split(max(1, ENCODED_ENTRIES // self.X.numel()))
+        return torch.cat([(block.to(origin) - origin).flatten(1) @ modes for block in blocks])
+
+    @override
+    @torch.no_grad()
+    def restrict(self, particles=None, X=None, dtype=torch.float64, device="cpu") -> BasisRestriction:
+        rows, points = self.points(particles, X)
+        points = points.to(self.X.device)
+        like = torch.empty(0, dtype=dtype, device=device)
+        networks = {phase: self._deployed(phase, like) for phase in PHASES}
+        local = functools.cache(lambda: interpolation(points.to(device), self.X.to(device)))
+        place = local().value if rows is None else (lambda values: values[rows])
+        fields = {
+            phase: self.fields[phase].at(
+                place, points if phase == "deformation" else 0, networks[phase], like
+            )
+            for phase in PHASES
+        }
+
+        def gradient() -> RestrictedField:
+            def place(values: Tensor) -> Tensor:
+                return local().gradient(values).movedim(-1, 2).flatten(1, 2)
+
+            base = torch.eye(3, dtype=points.dtype, device=points.device).flatten()
+            return self.fields["deformation"].at(place, base, networks["deformation"], like)
+
+        return BasisRestriction(fields, gradient, self.latent_dim, self.takes_parameters("stress"))
+
+    def _deployed(self, phase: str, like: Tensor) -> FullyConnected | None:
+        """The phase's network from (xhat, μ) to coefficients in the field's unit."""
+        field, parameters = self.fields[phase], self.standard_parameters
+        if field.network is None:
+            return None
+        latent = torch.zeros(self.latent_dim, device=parameters.mean.device)
+        mean, std = [latent], [latent + 1]
+        if self.takes_parameters(phase):
+            mean, std = [latent, parameters.mean], [latent + 1, parameters.std]
+        scale = field.scale.expand(field.network.layers[-1].out_features)
+        return field.network.in_raw_units(
+            torch.cat(mean), torch.cat(std), torch.zeros_like(scale), scale, like.dtype, like.device
+        )
+
+
+class BasisRestriction(Restriction):
+    """Modes at n points.
+
+    Args:
+        fields: by phase.
+        gradient: makes ∂g/∂X, a field of 9 components; called when first needed.
+        takes_parameters: whether h and l see the problem parameters.
+    """
+
+    def __init__(
+        self,
+        fields: dict[str, RestrictedField],
+        gradient: Callable[[], RestrictedField],
+        latent_dim: int,
+        takes_parameters: bool,
+    ):
+        self.fields, self.latent_dim = fields, latent_dim
+        mean = fields["deformation"].mean
+        self.points, self.dtype, self.device = len(mean), mean.dtype, mean.device
+        self._gradient = functools.cache(gradient)
+        self._takes_parameters = takes_parameters
+        self._identity = torch.eye(latent_dim, dtype=self.dtype, device=self.device)
+
+    @override
+    def position(self, xhat):
+        return self.fields["deformation"].values(xhat.to(self.dtype))
+
+    @override
+    def position_and_jacobian(self, xhat):
+        return self.fields["deformation"].values_and_jacobian(xhat.to(self.dtype), self._identity)
+
+    @override
+    def deformation_gradient(self, xhat):
+        return self._gradient().values(xhat.to(self.dtype)).unflatten(-1, (3, 3))
+
+    @override
+    def stress(self, xhat, parameters):
+        return self.fields["stress"].values(self._inputs(xhat, parameters))
+
+    @override
+    def affine(self, xhat, parameters):
+        return self.fields["affine"].values(self._inputs(xhat, parameters)).unflatten(-1, (3, 3))
+
+    @override
+    def subset(self, rows):
+        fields = {phase: field.subset(rows) for phase, field in self.fields.items()}
+        return BasisRestriction(
+            fields, lambda: self._gradient().subset(rows), self.latent_dim, self._takes_parameters
+        )
+
+    def _inputs(self, xhat: Tensor, parameters: Tensor) -> Tensor:
+        xhat = xhat.to(self.dtype)
+        if not self._takes_parameters:
+            return xhat
+        return torch.cat([xhat, parameters.to(xhat).expand(*xhat.shape[:-1], -1)], -1)

@@ -1,0 +1,250 @@
+"""One phase of training as a Lightning module: blocks of optimiser steps that can be resumed to the bit."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import time
+import warnings
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytorch_lightning as pl
+import torch
+from pytorch_lightning.loggers import CSVLogger, Logger, TensorBoardLogger
+from torch import Tensor
+from typing_extensions import override
+
+from nsf.errors import InstabilityError
+from nsf.kinematics.phases import PHASES, Fit, seed_of
+from nsf.kinematics.schedules import Trainer
+from nsf.progress import Progress
+from nsf.storage import writing
+
+# Steps of one training_step: enough to hide Lightning's millisecond, and about 40 checkpoints a phase.
+SHORTEST_BLOCK, LONGEST_BLOCK, BLOCKS = 50, 500, 40
+EAGER_STEPS = 3  # before a capture, as torch asks
+CHECKPOINT = "last.ckpt"
+# What Lightning says about choices made on purpose here.
+EXPECTED_WARNINGS = (
+    r".*GPU available but not used",
+    r".*`isinstance\(treespec, LeafSpec\)` is deprecated",
+)
+
+
+@dataclass(frozen=True)
+class Descent:
+    """What one phase minimises, and how; each step is a function of the weights, its number and the seed.
+
+    Attributes:
+        fit, schedule: the network with its loss, and the batches and rates.
+        frames, particles: M and P of the snapshots.
+        resident: the snapshots lie on the device.
+    """
+
+    fit: Fit
+    schedule: Trainer
+    frames: int
+    particles: int
+    resident: bool
+    seed: int
+    device: torch.device
+
+    @property
+    def replayable(self) -> bool:
+        """Whether every step is the same sequence of kernels, with no word from the host."""
+        local = self.resident or not self.fit.pointwise
+        return self.device.type == "cuda" and self.schedule.stationary and local
+
+    def optimizer(self) -> torch.optim.Optimizer:
+        """Adam, as in the paper; `Steps` sets its rate."""
+        return torch.optim.Adam(
+            self.fit.network.parameters(), fused=True, capturable=self.device.type == "cuda"
+        )
+
+
+class Steps:
+    """Takes the optimiser steps of a phase.
+
+    On a GPU a step can cost more to launch than to compute (field=basis, H200: 2.5 ms against 0.4 ms), so
+    after some eager steps one is captured as a CUDA graph and replayed: the same kernels and the same bits.
+
+    Args:
+        descent: the phase.
+        optimizer: of its network, already in the state it starts from.
+        steps: how many there are in all.
+    """
+
+    def __init__(self, descent: Descent, optimizer: torch.optim.Optimizer, steps: int):
+        self.descent, self.optimizer, self.steps = descent, optimizer, steps
+        self._rate = torch.zeros((), device=descent.device)
+        for group in optimizer.param_groups:
+            group["lr"] = self._rate
+        self._generator = torch.Generator(descent.device)
+        self._graph: torch.cuda.CUDAGraph | None = None
+        self._eager_left = EAGER_STEPS if descent.replayable else steps
+        # Capture wants the steps before it on its own stream.
+        self._stream = torch.cuda.Stream(descent.device) if descent.replayable else None
+
+    def take(self, first: int, last: int) -> float:
+        """Take the steps first, ..., last − 1; returns their mean loss."""
+        total = torch.zeros((), device=self.descent.device)
+        if self._stream is not None:
+            self._stream.wait_stream(torch.cuda.current_stream(self.descent.device))
+        with torch.cuda.stream(self._stream):
+            for step in range(first, last):
+                total += self._take(step)
+            return float(total) / (last - first)
+
+    def _take(self, step: int) -> Tensor:
+        descent = self.descent
+        self._rate.fill_(descent.schedule.rate_at(step, self.steps))
+        self._generator.manual_seed(seed_of(descent.seed, PHASES.index(descent.fit.name), step))
+        if self._eager_left > 0:
+            self._eager_left -= 1
+            return self._descend(step)
+        if self._graph is None:
+            self._graph = torch.cuda.CUDAGraph()
+            self._graph.register_generator_state(self._generator)
+            with torch.cuda.graph(self._graph, stream=self._stream):
+                self._loss = self._descend(step)
+        self._graph.replay()
+        return self._loss
+
+    def _descend(self, step: int) -> Tensor:
+        descent = self.descent
+        rows, particles = descent.schedule.batch(
+            step, descent.fit, descent.frames, descent.particles, descent.seed, self._generator
+        )
+        low = descent.schedule.bf16 and descent.fit.pointwise and descent.device.type == "cuda"
+        # A cached cast of a weight would be a tensor of one step in the graph of all.
+        with torch.autocast(descent.device.type, torch.bfloat16, enabled=low, cache_enabled=False):
+            loss = descent.fit.loss(rows, particles, self._generator)
+        self.optimizer.zero_grad()
+        loss.backward()
+        self.optimizer.step()
+        return loss.detach()
+
+
+class FieldTraining(pl.LightningModule):
+    """Trains the network of one phase; every `training_step`, an epoch to Lightning, is a block of steps.
+
+    Args:
+        descent: the phase.
+        steps: how many.
+        checkpoint: rewritten after every block.
+        progress: told of the steps done.
+    """
+
+    def __init__(self, descent: Descent, steps: int, checkpoint: Path, progress: Progress):
+        super().__init__()
+        self.automatic_optimization = False
+        self.network = descent.fit.network
+        self.descent, self.steps = descent, steps
+        self.checkpoint, self.progress = checkpoint, progress
+        self.block = min(max(SHORTEST_BLOCK, steps // BLOCKS), LONGEST_BLOCK)
+        self.step, self.loss = 0, float("nan")
+
+    @override
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return self.descent.optimizer()
+
+    @override
+    def on_train_start(self) -> None:
+        # Lightning's wrapper of the optimizer adds a millisecond to every step.
+        self.taker = Steps(self.descent, self.optimizers(use_pl_optimizer=False), self.steps)
+        self.progress.advance(self.step)
+
+    @override
+    def training_step(self, batch: Any, index: int) -> None:
+        first, last, started = self.step, min(self.step + self.block, self.steps), time.perf_counter()
+        self.loss = self.taker.take(first, last)
+        self.step = last
+        if not self.loss < float("inf"):
+            raise InstabilityError(
+                f"training of the {self.descent.fit.name} field diverged: mean loss {self.loss} in steps"
+                f" {first} to {last}; choose a lower trainer.learning_rate, and look for non-finite data"
+            )
+        self.progress.advance(last - first)
+        metrics = {
+            "loss": self.loss,
+            "learning_rate": self.descent.schedule.rate_at(last - 1, self.steps),
+            "steps_per_second": (last - first) / (time.perf_counter() - started),
+        }
+        for logger in self.loggers:
+            logger.log_metrics(metrics, step=last)
+            logger.save()
+        self.trainer.should_stop = last == self.steps
+
+    @override
+    def on_train_epoch_end(self) -> None:
+        with writing(self.checkpoint) as partial:
+            self.trainer.save_checkpoint(partial)
+
+    @override
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        checkpoint["nsf"] = {"step": self.step, "loss": self.loss}
+
+    @override
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        self.step, self.loss = checkpoint["nsf"]["step"], checkpoint["nsf"]["loss"]
+
+
+def descend(descent: Descent, steps: int, folder: Path, tracking: str | None) -> float:
+    """Train one phase, from the checkpoint in `folder` if there is one; returns the last block's mean loss.
+
+    Raises:
+        KeyboardInterrupt: on an interrupt; the next call goes on from the last whole block.
+        InstabilityError: the loss is not finite.
+    """
+    checkpoint = folder / CHECKPOINT
+    resumed = checkpoint.is_file()
+    device = descent.device
+    with _quiet(), Progress(f"train {descent.fit.name}", steps, "steps") as progress:
+        module = FieldTraining(descent, steps, checkpoint, progress)
+        trainer = pl.Trainer(
+            accelerator="gpu" if device.type == "cuda" else "cpu",
+            devices=[device.index or 0] if device.type == "cuda" else 1,
+            max_epochs=-1,
+            enable_checkpointing=False,  # ModelCheckpoint counts the steps of Lightning's wrapped optimizer
+            logger=_loggers(folder, tracking),
+            log_every_n_steps=1,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+        )
+        try:
+            trainer.fit(
+                module, train_dataloaders=[0], ckpt_path=checkpoint if resumed else None, weights_only=True
+            )
+        except SystemExit as stop:
+            # Lightning answers an interrupt with exit code 1; the caller is to see the interrupt.
+            raise KeyboardInterrupt from stop
+    return module.loss
+
+
+def _loggers(folder: Path, tracking: str | None) -> list[Logger]:
+    # A resumed phase logs into a new version, for CSVLogger deletes what it finds.
+    version = str(len(list((folder / "csv").glob("*"))))
+    loggers: list[Logger] = [CSVLogger(folder, name="csv", version=version)]
+    if tracking == "tensorboard":
+        loggers.append(TensorBoardLogger(folder, name="tensorboard", version=version))
+    return loggers
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Without Lightning's banner and its advice against what is done on purpose."""
+    chatter = [logging.getLogger(name) for name in ("pytorch_lightning", "lightning_fabric")]
+    levels = [logger.level for logger in chatter]
+    for logger in chatter:
+        logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            for message in EXPECTED_WARNINGS:
+                warnings.filterwarnings("ignore", message=message)
+            yield
+    finally:
+        for logger, level in zip(chatter, levels, strict=True):
+            logger.setLevel(level)

@@ -1,0 +1,294 @@
+"""The manifold of deformation, stress and affine fields, and its file (paper section 4)."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import itertools
+import pickle
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from nsf.data import Standardizer
+from nsf.errors import MissingRunError, SchemaError, ShapeError
+from nsf.storage import writing
+
+FORMAT = "nsf-manifold"
+FORMAT_VERSION = 1
+FIELDS = ("basis", "mlp")  # each is a module of this package that defines a Manifold with that `field`
+_KEYS = {
+    "latent_dim",
+    "x_sha256",
+    "parameter_names",
+    "hyperparameters",
+    "datasets",
+    "split",
+    "state",
+}
+
+
+class Restriction(ABC):
+    """The three fields at n fixed material points: what a deployed model evaluates.
+
+    `xhat` is [r] or a batch [F, r]; every result then gains the leading F. `parameters` is [n_parameters] or
+    [F, n_parameters] in the order of `Manifold.parameter_names`. No call synchronises with the host, so all
+    can be captured in a CUDA graph (after one warm-up call each).
+    """
+
+    points: int
+    latent_dim: int
+    dtype: torch.dtype
+    device: torch.device
+
+    @abstractmethod
+    def position(self, xhat: Tensor) -> Tensor:
+        """x = g(X, xhat), [n, 3] in metres."""
+
+    @abstractmethod
+    def position_and_jacobian(self, xhat: Tensor) -> tuple[Tensor, Tensor]:
+        """x [n, 3] in metres and ∂g/∂xhat [n, 3, r]."""
+
+    @abstractmethod
+    def stress(self, xhat: Tensor, parameters: Tensor) -> Tensor:
+        """Kirchhoff stress tau = h(X, xhat, μ), [n, 6] in pascals, order xx xy xz yy yz zz."""
+
+    @abstractmethod
+    def affine(self, xhat: Tensor, parameters: Tensor) -> Tensor:
+        """Affine velocity matrix C = l(X, xhat), [n, 3, 3] in 1/s."""
+
+    @abstractmethod
+    def deformation_gradient(self, xhat: Tensor) -> Tensor:
+        """F = ∂g/∂X, [n, 3, 3], dimensionless."""
+
+    @abstractmethod
+    def subset(self, rows: slice) -> Restriction:
+        """The same fields at some of the points, sharing memory with this restriction."""
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of every tensor it holds; memory that tensors share counts once."""
+        storages = {t.untyped_storage().data_ptr(): t.untyped_storage().nbytes() for t in _tensors(self)}
+        return sum(storages.values())
+
+
+def _tensors(node: Any) -> Iterator[Tensor]:
+    """Tensors in the attributes of a restriction, in its containers and networks."""
+    if isinstance(node, Tensor):
+        yield node
+    elif isinstance(node, nn.Module):
+        yield from itertools.chain(node.parameters(), node.buffers())
+    elif isinstance(node, dict | list | tuple):
+        for child in node.values() if isinstance(node, dict) else node:
+            yield from _tensors(child)
+    elif dataclasses.is_dataclass(node) or isinstance(node, Restriction):
+        yield from _tensors(vars(node))
+
+
+class Manifold(nn.Module, ABC):
+    """Fields g, h, l over Ω₀ and the encoder e, for the particles and the latent space they were trained on.
+
+    A manifold lives where `.to(device)` puts it (on the host once loaded); `restrict` moves only what the
+    points asked for need.
+
+    Args:
+        latent_dim: r.
+        x_sha256: identity of the training particles.
+        parameter_names: problem parameters μ, in the order of every parameter tensor.
+        hyperparameters: plain containers; enough, with the above, to rebuild the modules. `particles` (P) and
+            `frames` (M) size the buffers here.
+
+    Attributes:
+        X: rest positions of the training particles [P, 3] m.
+        training_latents: xhat of every training snapshot [M, r].
+        training_parameters, training_times: their μ [M, n] and t [M] s.
+        datasets, split: provenance of the snapshots, plain containers.
+    """
+
+    field: ClassVar[str]
+
+    def __init__(
+        self, latent_dim: int, x_sha256: str, parameter_names: list[str], hyperparameters: dict[str, Any]
+    ):
+        super().__init__()
+        self.latent_dim = latent_dim
+        self.x_sha256 = x_sha256
+        self.parameter_names = tuple(parameter_names)
+        self.hyperparameters = dict(hyperparameters)
+        self.datasets: list = []
+        self.split: dict = {}
+        P, M, n = hyperparameters["particles"], hyperparameters["frames"], len(self.parameter_names)
+        for name, shape in {
+            "X": (P, 3),
+            "training_latents": (M, latent_dim),
+            "training_parameters": (M, n),
+            "training_times": (M,),
+        }.items():
+            self.register_buffer(name, torch.zeros(shape, dtype=torch.float64))
+        self.standard_parameters = identity(n)
+
+    def describe(self, snapshots) -> None:
+        """Copy the particles, parameters and times of the training snapshots into the manifold."""
+        self.X.copy_(torch.as_tensor(snapshots.X))
+        self.training_parameters.copy_(snapshots.parameters)
+        self.training_times.copy_(snapshots.t)
+        if self.parameter_names:
+            self.standard_parameters = Standardizer.fit([snapshots.parameters])
+
+    @abstractmethod
+    def encode(self, x: Tensor) -> Tensor:
+        """Latents xhat [F, r] (float64) of whole frames x [F, P, 3] m of the training particles."""
+
+    @abstractmethod
+    def restrict(
+        self,
+        particles: Tensor | None = None,
+        X: Tensor | None = None,
+        dtype: torch.dtype = torch.float64,
+        device: torch.device | str = "cpu",
+    ) -> Restriction:
+        """The fields at training particles (indices [n]; all if neither is given) or at points X [n, 3] m."""
+
+    def position(self, X: Tensor, xhat: Tensor) -> Tensor:
+        """g(X, xhat), [n, 3] m, anywhere in Ω₀."""
+        return self.restrict(X=X, device=self.X.device).position(xhat)
+
+    def stress(self, X: Tensor, xhat: Tensor, parameters: Tensor) -> Tensor:
+        """h(X, xhat, μ), [n, 6] Pa, anywhere in Ω₀."""
+        return self.restrict(X=X, device=self.X.device).stress(xhat, parameters)
+
+    def affine(self, X: Tensor, xhat: Tensor, parameters: Tensor) -> Tensor:
+        """l(X, xhat, μ), [n, 3, 3] 1/s, anywhere in Ω₀."""
+        return self.restrict(X=X, device=self.X.device).affine(xhat, parameters)
+
+    def check_particles(self, x_sha256: str) -> None:
+        """Refuse particles other than those of training.
+
+        Raises:
+            SchemaError: the identities differ.
+        """
+        if x_sha256 != self.x_sha256:
+            raise SchemaError(
+                f"checkpoint made for other particles: its X has sha256 {self.x_sha256[:12]}, the particles"
+                f" given {x_sha256[:12]}; deploy on the scene and resolution of its training, or train again"
+            )
+
+    def check_frames(self, x: Tensor) -> None:
+        """Refuse frames that are not [F, P, 3]."""
+        if x.ndim != 3 or x.shape[1:] != self.X.shape:
+            raise ShapeError(
+                f"frames have shape {tuple(x.shape)}; this manifold encodes [F, {self.X.shape[0]}, 3]:"
+                " pass whole frames of the training particles"
+            )
+
+    def points(self, particles: Tensor | None, X: Tensor | None) -> tuple[Tensor | slice | None, Tensor]:
+        """The training rows asked for (None: points given by X) and their rest positions [n, 3]."""
+        if particles is not None and X is not None:
+            raise ShapeError("restrict takes particles or X, not both; leave one out")
+        if X is not None:
+            return None, torch.as_tensor(X, dtype=torch.float64)
+        rows = (
+            slice(None)
+            if particles is None
+            else torch.as_tensor(particles, dtype=torch.long).to(self.X.device)
+        )
+        return rows, self.X[rows]
+
+    def save(self, path: Path | str) -> None:
+        """Write the checkpoint to `path`: whole or not at all."""
+        content = {
+            "format": FORMAT,
+            "format_version": FORMAT_VERSION,
+            "field": self.field,
+            "latent_dim": self.latent_dim,
+            "x_sha256": self.x_sha256,
+            "parameter_names": list(self.parameter_names),
+            "hyperparameters": self.hyperparameters,
+            "datasets": self.datasets,
+            "split": self.split,
+            "state": dict(self.state_dict()),
+        }
+        with writing(Path(path)) as temporary:
+            torch.save(content, temporary)
+
+    @staticmethod
+    def load(path: Path | str) -> Manifold:
+        """Read a checkpoint of any field onto the host.
+
+        The file is mapped, not read: a restriction to few particles touches few of its pages.
+
+        Raises:
+            MissingRunError: there is no such file.
+            SchemaError: the file is truncated, foreign, of a newer format, or holds more than plain data.
+        """
+        content = _read(Path(path))
+        try:
+            with torch.device("meta"):
+                manifold = _manifold_class(content["field"])(
+                    content["latent_dim"],
+                    content["x_sha256"],
+                    content["parameter_names"],
+                    content["hyperparameters"],
+                )
+            manifold.load_state_dict(content["state"], assign=True)
+        except (RuntimeError, KeyError, TypeError, AttributeError, ValueError) as error:
+            raise SchemaError(
+                f"{path} names field={content['field']!r} but its contents do not fit it"
+                f" ({_first_line(error)}); train again with `nsf train`"
+            ) from error
+        manifold.datasets, manifold.split = content["datasets"], content["split"]
+        return manifold.requires_grad_(False).eval()
+
+
+def identity(components: int) -> Standardizer:
+    """A standardisation that does nothing yet; its buffers come from a checkpoint or from data."""
+    # On the host even while a checkpoint is rebuilt on the meta device: Standardizer looks at the values.
+    return Standardizer(torch.zeros(components, device="cpu"), torch.ones(components, device="cpu"))
+
+
+def _manifold_class(field: str) -> type[Manifold]:
+    module = importlib.import_module(f"nsf.kinematics.{field}")
+    return next(
+        kind
+        for kind in vars(module).values()
+        if isinstance(kind, type) and getattr(kind, "field", None) == field
+    )
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def _read(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise MissingRunError(f"{path} does not exist; run `nsf train` first")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except (RuntimeError, EOFError, OSError, ValueError, KeyError, pickle.UnpicklingError) as error:
+        raise SchemaError(
+            f"{path} is truncated or not a checkpoint ({_first_line(error)}); delete it and run `nsf train`"
+            " again"
+        ) from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise SchemaError(
+            f"{path} is a torch file but no manifold of nsf; pass the checkpoint of a train run"
+        )
+    version = content.get("format_version")
+    if version != FORMAT_VERSION:
+        raise SchemaError(
+            f"{path} has format_version {version!r}, this nsf reads {FORMAT_VERSION}; install the nsf that"
+            " wrote it or train again with `nsf train`"
+        )
+    if content.get("field") not in FIELDS:
+        raise SchemaError(
+            f"{path} has field {content.get('field')!r}, this nsf knows {', '.join(FIELDS)};"
+            " install the nsf that wrote it"
+        )
+    missing = _KEYS - content.keys()
+    if missing:
+        raise SchemaError(f"{path} lacks {', '.join(sorted(missing))}; delete it and run `nsf train` again")
+    return content

@@ -1,0 +1,72 @@
+"""The three networks are trained one after the other: g with e, then h, then l (paper section 4.5)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from nsf.errors import ConfigError
+
+# Phase → the snapshots' field it learns and that field's components, the paper's d of a width β·d.
+TARGETS = {"deformation": ("x", 3), "stress": ("tau", 6), "affine": ("C", 9)}
+PHASES = tuple(TARGETS)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """One phase: what is optimised and the loss it minimises.
+
+    Attributes:
+        name: one of `PHASES`.
+        network: holds every parameter optimised in this phase.
+        loss: (rows, particles, generator) ↦ scalar; rows index snapshots, particles the particles of each,
+            and every random number comes from the generator.
+        pointwise: a sample is one particle of one frame; else a whole snapshot, and `particles` is unused.
+    """
+
+    name: str
+    network: nn.Module
+    loss: Callable[[Tensor | slice, Tensor | slice, torch.Generator], Tensor]
+    pointwise: bool
+
+
+def per_phase(key: str, value: int | Sequence[int]) -> tuple[int, int, int]:
+    """A count for g, h and l, given as one for all, a pair (g, h and l) or a triple.
+
+    Raises:
+        ConfigError: another number of entries, or an entry that is not a whole number of at least 1.
+    """
+    entries = (value,) if isinstance(value, int) else tuple(value)
+    if len(entries) not in (1, 2, 3) or any(not isinstance(n, int) or n < 1 for n in entries):
+        raise ConfigError(
+            f"{key}={value} is not one, two or three whole numbers >= 1; give n, [g, h=l] or [g, h, l]"
+        )
+    return (*entries, *entries[-1:] * (3 - len(entries)))
+
+
+def at_least(key: str, value: float, least: float) -> None:
+    """Refuse a value below its least, naming both.
+
+    Raises:
+        ConfigError: value < least, or not a number.
+    """
+    if not value >= least:
+        raise ConfigError(f"{key}={value} is below its least value; choose {key} >= {least}")
+
+
+def seed_of(*stream: int) -> int:
+    """One seed out of several numbers, e.g. (seed, phase, step)."""
+    state = 0
+    for number in stream:
+        # SplitMix64's constants: neighbouring seeds and steps land far apart.
+        state = ((state ^ number) * 0xBF58476D1CE4E5B9 + 0x9E3779B97F4A7C15) % 2**63
+        state ^= state >> 31
+    return state
+
+
+def seeded(device: torch.device | str, *stream: int) -> torch.Generator:
+    """A generator that depends on the numbers given and nothing else."""
+    return torch.Generator(device).manual_seed(seed_of(*stream))

@@ -1,0 +1,60 @@
+"""Proper orthogonal decomposition of snapshots whose frames are far fewer than their values."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from nsf.data import Snapshots
+
+SLAB_ENTRIES = 1 << 26  # float64 values of a slab: 0.5 GiB
+# Eigenvalues below this share of the largest are round-off: snapshots are float32, six digits of amplitude.
+RANK_TOLERANCE = 1e-12
+
+
+def slabs(snapshots: Snapshots, name: str, components: int) -> Iterator[tuple[slice, Tensor, Tensor]]:
+    """Particle slabs of a field: (particles, mean [n, c], deviations from it [M, n, c]) in float64."""
+    width = max(1, SLAB_ENTRIES // (snapshots.M * components))
+    for start in range(0, snapshots.P, width):
+        particles = slice(start, min(start + width, snapshots.P))
+        values = snapshots.slab(name, particles).double()
+        mean = values.mean(0)
+        yield particles, mean, values - mean
+
+
+def decompose(snapshots: Snapshots, name: str, components: int, count: int) -> tuple[Tensor, float]:
+    """Coefficients of the snapshots in their leading modes.
+
+    With deviations A [M, P c]: A Aᵀ = V diag(w) Vᵀ, coefficients a = V √w, and the modes are B = Aᵀ a / w, so
+    that A ≈ a Bᵀ with B orthonormal. The M×M Gram matrix is summed over particle slabs.
+
+    Args:
+        name, components: field of the snapshots.
+        count: modes wanted; fewer come back if the snapshots have a lower numerical rank.
+
+    Returns:
+        a [M, K] float64, largest mode first, in the field's unit times √(P c); and the unresolved share of
+        the energy, 1 − Σ a² / ‖A‖².
+    """
+    gram = torch.zeros(snapshots.M, snapshots.M, dtype=torch.float64, device=snapshots.X.device)
+    for _, _, deviations in slabs(snapshots, name, components):
+        rows = deviations.flatten(1)
+        gram.addmm_(rows, rows.T)
+    energies, vectors = torch.linalg.eigh(gram)
+    energies, vectors = energies.flip(0), vectors.flip(1)
+    rank = int((energies > RANK_TOLERANCE * energies[0].clamp_min(torch.finfo(torch.float64).tiny)).sum())
+    kept = min(count, rank)
+    total = float(gram.diagonal().sum())
+    unresolved = max(0.0, 1 - float(energies[:kept].sum()) / total) if total > 0 else 0.0
+    return vectors[:, :kept] * energies[:kept].sqrt(), unresolved
+
+
+def modes(
+    snapshots: Snapshots, name: str, components: int, coefficients: Tensor
+) -> Iterator[tuple[slice, Tensor, Tensor]]:
+    """Slab by slab: (particles, mean [n, c], modes [n, c, K]) in float64, for coefficients [M, K]."""
+    projection = coefficients / coefficients.square().sum(0)
+    for particles, mean, deviations in slabs(snapshots, name, components):
+        yield particles, mean, torch.einsum("mnc,mk->nck", deviations, projection)

@@ -1,0 +1,164 @@
+"""How long, with which learning rates and on which batches a field is trained."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+from typing_extensions import override
+
+from nsf.errors import ConfigError
+from nsf.kinematics.phases import PHASES, Fit, at_least, per_phase, seeded
+
+# Budget of g with e, h and l: as the paper's epochs.
+SHARES = {"deformation": 0.2, "stress": 0.4, "affine": 0.4}
+BATCH_STREAM = 1 << 20  # keeps the epochs' permutations apart from the steps' generators
+
+
+class Trainer(ABC):
+    """A schedule; every choice is a pure function of the step (and seed), so that training can be resumed.
+
+    Attributes:
+        bf16: on a GPU, evaluate a field fitted to points in bfloat16 while it trains.
+        stationary: batches have one shape and know the step through the generator alone, so a step can be
+            captured once and replayed.
+    """
+
+    bf16: bool = False
+    stationary: ClassVar[bool] = False
+
+    @abstractmethod
+    def steps_of(self, phase: str, frames: int) -> int | None:
+        """Optimiser steps of a phase on so many snapshots; None: as many as `seconds_of` allows."""
+
+    def seconds_of(self, phase: str) -> float | None:
+        """Wall-clock limit of a phase [s]; None: no limit."""
+        return None
+
+    @abstractmethod
+    def rate_at(self, step: int, steps: int) -> float:
+        """Adam's learning rate at a step."""
+
+    @abstractmethod
+    def batch(
+        self, step: int, fit: Fit, frames: int, particles: int, seed: int, generator: torch.Generator
+    ) -> tuple[Tensor | slice, Tensor | slice]:
+        """Snapshots (rows) and particles of a step."""
+
+
+@dataclass(frozen=True)
+class PaperTrainer(Trainer):
+    """The paper's schedule to the letter.
+
+    Attributes:
+        learning_rates: used one after the other.
+        epochs_deformation, epochs_stress, epochs_affine: epochs at each learning rate.
+        frames_per_batch: k; a batch holds k whole frames, k·|P| points. The paper takes the largest k that
+            fits in memory, at most 32.
+
+    Source: Zong et al. 2023, appendix "Training Details".
+    """
+
+    learning_rates: Sequence[float] = (1e-3, 5e-4, 2e-4, 1e-4, 5e-5)
+    epochs_deformation: int = 300
+    epochs_stress: int = 600
+    epochs_affine: int = 600
+    frames_per_batch: int = 32
+
+    def __post_init__(self) -> None:
+        if not self.learning_rates or min(self.learning_rates) <= 0:
+            raise ConfigError(
+                f"learning_rates={list(self.learning_rates)} must be positive; the paper has 1e-3 … 5e-5"
+            )
+        for key in ("epochs_deformation", "epochs_stress", "epochs_affine", "frames_per_batch"):
+            at_least(key, getattr(self, key), 1)
+
+    def _batches(self, frames: int) -> int:
+        return math.ceil(frames / self.frames_per_batch)
+
+    @override
+    def steps_of(self, phase: str, frames: int) -> int:
+        return len(self.learning_rates) * getattr(self, f"epochs_{phase}") * self._batches(frames)
+
+    @override
+    def rate_at(self, step: int, steps: int) -> float:
+        return self.learning_rates[step * len(self.learning_rates) // steps]
+
+    @override
+    def batch(
+        self, step: int, fit: Fit, frames: int, particles: int, seed: int, generator: torch.Generator
+    ) -> tuple[Tensor, slice]:
+        epoch, batch = divmod(step, self._batches(frames))
+        order = seeded(generator.device, seed, BATCH_STREAM + PHASES.index(fit.name), epoch)
+        rows = torch.randperm(frames, generator=order, device=generator.device)
+        return rows[batch * self.frames_per_batch : (batch + 1) * self.frames_per_batch], slice(None)
+
+
+@dataclass(frozen=True)
+class FastTrainer(Trainer):
+    """Adam with cosine decay to zero, for a number of steps or a time.
+
+    A field fitted to points (mlp) sees random particles of random frames in a step; one fitted to whole
+    snapshots (basis) sees all of them in every step.
+
+    Attributes:
+        steps: optimiser steps of g, h and l, one number for all, [g, h=l] or [g, h, l]; None: as many as the
+            budget allows.
+        learning_rate: at the first step.
+        frames_per_batch, particles_per_batch: points of a step, for a field fitted to points.
+        bf16: on a GPU, evaluate a field fitted to points in bfloat16 while it trains.
+        budget_minutes: limit on the training of all three networks [min], or None. The rate is measured once
+            at the start of each phase; the steps it allows are recorded, and as `steps` make the same bits.
+    """
+
+    stationary: ClassVar[bool] = True
+
+    steps: int | Sequence[int] | None = None
+    learning_rate: float = 2e-3
+    frames_per_batch: int = 32
+    particles_per_batch: int = 8192
+    bf16: bool = True
+    budget_minutes: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.steps is None and self.budget_minutes is None:
+            raise ConfigError(
+                "steps=null and budget_minutes=null leave training without an end; set one of them"
+            )
+        if self.steps is not None:
+            per_phase("steps", self.steps)
+        for key in ("learning_rate", "budget_minutes"):
+            value = getattr(self, key)
+            if value is not None and not value > 0:
+                raise ConfigError(f"{key}={value} must be positive; choose for example {key}=0.002")
+        for key in ("frames_per_batch", "particles_per_batch"):
+            at_least(key, getattr(self, key), 1)
+
+    @override
+    def steps_of(self, phase: str, frames: int) -> int | None:
+        return None if self.steps is None else per_phase("steps", self.steps)[PHASES.index(phase)]
+
+    @override
+    def seconds_of(self, phase: str) -> float | None:
+        return None if self.budget_minutes is None else 60 * self.budget_minutes * SHARES[phase]
+
+    @override
+    def rate_at(self, step: int, steps: int) -> float:
+        return self.learning_rate * 0.5 * (1 + math.cos(math.pi * step / steps))
+
+    @override
+    def batch(
+        self, step: int, fit: Fit, frames: int, particles: int, seed: int, generator: torch.Generator
+    ) -> tuple[Tensor | slice, Tensor | slice]:
+        if not fit.pointwise:
+            return slice(None), slice(None)
+
+        def draw(population: int, count: int) -> Tensor:
+            return torch.randint(population, (count,), generator=generator, device=generator.device)
+
+        return draw(frames, self.frames_per_batch), draw(particles, self.particles_per_batch)

@@ -1,0 +1,160 @@
+"""Training of a manifold, phase by phase (paper section 4.5): g with e, then h, then l."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Protocol
+
+import torch
+
+from nsf.data import Snapshots
+from nsf.errors import ConfigError
+from nsf.kinematics.descent import CHECKPOINT, Descent, Steps, descend
+from nsf.kinematics.manifold import Manifold
+from nsf.kinematics.phases import Fit, at_least, seeded
+from nsf.kinematics.schedules import Trainer
+from nsf.storage import writing
+
+TRACKING = (None, "tensorboard")
+WEIGHTS_STREAM = 1 << 30  # apart from the phases' streams
+PROBE_STEPS, PROBE_SECONDS = 5, 1.0  # taken at a time, and the least time over which a rate is measured
+
+
+class Field(Protocol):
+    """What a field of `conf/field/` offers to training."""
+
+    def prepare(self, snapshots: Snapshots, latent_dim: int) -> dict[str, Any]:
+        """What the snapshots determine before any network is trained: plain containers and host tensors."""
+
+    def build(
+        self, snapshots: Snapshots, prepared: dict[str, Any], latent_dim: int, generator: torch.Generator
+    ) -> Manifold:
+        """A manifold with untrained networks."""
+
+    def fits(self, manifold: Manifold, snapshots: Snapshots, prepared: dict[str, Any]) -> Iterator[Fit]:
+        """The phases; the next is asked for once the one before is trained."""
+
+
+def train(
+    snapshots: Snapshots,
+    field: Field,
+    trainer: Trainer,
+    latent_dim: int,
+    seed: int,
+    folder: Path,
+    device: str | torch.device,
+    tracking: str | None = None,
+    deterministic: bool = True,
+) -> tuple[Manifold, dict[str, float]]:
+    """Train encoder and fields on the snapshots.
+
+    An interrupted training called again with the same arguments goes on where it stood (finished phases are
+    not repeated) and ends with the same bits as one that was never interrupted.
+
+    Args:
+        snapshots: of the training parameter values, on `device`.
+        field, trainer: a field and a schedule of `conf/field/`, `conf/trainer/`.
+        latent_dim: r.
+        seed: of the initial weights, batches and noise.
+        folder: keeps logs, checkpoints and finished phases; one training a folder.
+        device: "cpu", "cuda", "cuda:1".
+        tracking: "tensorboard" for a live page beside the CSV logs.
+        deterministic: use torch's deterministic algorithms.
+
+    Returns:
+        The manifold on the host, and for each phase its steps, last loss (mean squared error over the
+        variance of the field) and seconds.
+
+    Raises:
+        ConfigError: a value is out of range.
+        InstabilityError: a loss is not finite.
+        KeyboardInterrupt: on an interrupt, after which a second call goes on.
+
+    Source: Zong et al. 2023, section 4.5.
+    """
+    at_least("latent_dim", latent_dim, 1)
+    if tracking not in TRACKING:
+        raise ConfigError(f"tracking={tracking!r} is unknown; choose null or tensorboard")
+    device, folder, started = torch.device(device), Path(folder), time.perf_counter()
+    with _determinism(deterministic):
+        prepared = _once(folder / "prepared.pt", lambda: field.prepare(snapshots, latent_dim))
+        manifold = field.build(snapshots, prepared, latent_dim, seeded("cpu", seed, WEIGHTS_STREAM)).to(
+            device
+        )
+        metrics: dict[str, float] = {}
+        for fit in field.fits(manifold, snapshots, prepared):
+            descent = Descent(fit, trainer, snapshots.M, snapshots.P, snapshots.resident, seed, device)
+            outcome = _once(folder / f"{fit.name}.pt", lambda: _phase(descent, folder, tracking))  # noqa: B023
+            fit.network.load_state_dict(outcome["state"])
+            fit.network.to(device)  # Lightning leaves it on the host
+            (folder / fit.name / CHECKPOINT).unlink(missing_ok=True)
+            metrics |= {f"{fit.name}_{key}": outcome[key] for key in ("steps", "loss", "seconds")}
+    metrics["training_seconds"] = time.perf_counter() - started
+    return manifold.cpu().requires_grad_(False).eval(), metrics
+
+
+def _phase(descent: Descent, folder: Path, tracking: str | None) -> dict[str, Any]:
+    started = time.perf_counter()
+    name, own = descent.fit.name, folder / descent.fit.name
+    steps = _once(folder / f"{name}_steps.pt", lambda: _steps(descent))
+    loss = descend(descent, steps, own, tracking)
+    return {
+        "state": {key: value.cpu() for key, value in descent.fit.network.state_dict().items()},
+        "steps": steps,
+        "loss": loss,
+        "seconds": time.perf_counter() - started,
+    }
+
+
+def _steps(descent: Descent) -> int:
+    """Steps of a phase: those asked for, at most those the budget allows at the rate measured now."""
+    name = descent.fit.name
+    steps, budget = descent.schedule.steps_of(name, descent.frames), descent.schedule.seconds_of(name)
+    if budget is None:
+        return steps
+    affordable = max(1, int(budget / _seconds_per_step(descent)))
+    return affordable if steps is None else min(steps, affordable)
+
+
+def _seconds_per_step(descent: Descent) -> float:
+    """Measured on real steps, which are then undone."""
+    network = descent.fit.network
+    state = {key: value.clone() for key, value in network.state_dict().items()}
+    steps = Steps(descent, descent.optimizer(), 1 << 30)
+    steps.take(0, PROBE_STEPS)  # warm-up
+    taken, started = 0, time.perf_counter()
+    while time.perf_counter() - started < PROBE_SECONDS:
+        taken += PROBE_STEPS
+        steps.take(taken, taken + PROBE_STEPS)
+    network.load_state_dict(state)
+    return (time.perf_counter() - started) / taken
+
+
+def _once(path: Path, compute: Callable[[], Any]) -> Any:
+    """The value kept in `path`; computed and kept there if this is the first time."""
+    if not path.is_file():
+        value = compute()
+        with writing(path) as temporary:
+            torch.save(value, temporary)
+    return torch.load(path, map_location="cpu", weights_only=True)
+
+
+@contextlib.contextmanager
+def _determinism(deterministic: bool) -> Iterator[None]:
+    """torch's deterministic algorithms, for the time of the training only."""
+    before = torch.are_deterministic_algorithms_enabled()
+    fill = torch.utils.deterministic.fill_uninitialized_memory
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    torch.use_deterministic_algorithms(deterministic)
+    torch.utils.deterministic.fill_uninitialized_memory = (
+        False  # a debugging aid that costs a write of everything
+    )
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(before)
+        torch.utils.deterministic.fill_uninitialized_memory = fill

@@ -1,0 +1,67 @@
+"""Moving least squares between particles."""
+
+import pytest
+import torch
+
+from nsf.kinematics.interpolation import NEIGHBOURS, interpolation, nearest
+
+
+def cloud(n, seed=0):
+    return torch.rand(n, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+LATTICE = torch.cartesian_prod(*[torch.arange(5.0, dtype=torch.float64)] * 3)
+FLAT = cloud(60) * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64) + 0.3
+
+
+@pytest.mark.parametrize(
+    ("particles", "shift"),
+    [(cloud(300), 0.02), (LATTICE, 0.5), (LATTICE, 0.0), (FLAT, 0.0), (cloud(NEIGHBOURS - 7), 0.01)],
+    ids=["cloud", "cells", "nodes", "flat", "few"],
+)
+def test_linear_fields(particles, shift):
+    X = particles[:40] + shift
+    coefficients = torch.tensor([[1.0, -2.0], [0.5, 3.0], [2.0, 1.0]], dtype=torch.float64)
+    local = interpolation(X, particles)
+    torch.testing.assert_close(
+        local.value(particles @ coefficients + 1), X @ coefficients + 1, rtol=1e-7, atol=1e-7
+    )
+    slope = local.gradient(particles @ coefficients + 1)
+    if particles is FLAT:  # across the plane the slope is unknown: zero
+        assert slope[..., 2].abs().max() < 1e-6
+        slope, coefficients = slope[..., :2], coefficients[:2]
+    torch.testing.assert_close(slope, coefficients.T.expand(len(X), 2, -1), rtol=1e-5, atol=1e-5)
+
+
+def test_interpolates():
+    particles = cloud(200)
+    values = torch.sin(7 * particles)
+    torch.testing.assert_close(interpolation(particles, particles).value(values), values, rtol=0, atol=1e-6)
+
+
+def test_continuous_where_neighbours_change():
+    particles = cloud(200)
+    values = torch.sin(7 * particles)
+    line = torch.linspace(0.2, 0.8, 20001, dtype=torch.float64)[:, None] * torch.ones(3, dtype=torch.float64)
+    near = nearest(line, particles, NEIGHBOURS).sort(-1).values
+    assert (near[1:] != near[:-1]).any(-1).sum() > 20
+    # A jump would not shrink with the step (5e-5 in length); slopes are at most some tens.
+    path = interpolation(line, particles).value(values)
+    assert (path[1:] - path[:-1]).abs().max() < 5e-3
+
+
+def test_coincident_particles():
+    particles = torch.cat([cloud(1).expand(30, 3), cloud(5, seed=1)])
+    local = interpolation(particles[[0, 30, 33]], particles)
+    assert local.weights.isfinite().all()
+    assert local.gradients.isfinite().all()
+    torch.testing.assert_close(local.value(particles), particles[[0, 30, 33]], rtol=0, atol=1e-6)
+
+
+def test_nearest_in_chunks(monkeypatch):
+    X, particles = cloud(50, seed=2), cloud(80)
+    whole = nearest(X, particles, 5)
+    monkeypatch.setattr("nsf.kinematics.interpolation.CHUNK_ENTRIES", 800)
+    assert torch.equal(nearest(X, particles, 5), whole)
+    reference = (X[:, None] - particles).norm(dim=-1).argsort(-1)[:, :5]
+    assert torch.equal(whole, reference)

@@ -1,0 +1,91 @@
+"""Modes of snapshots whose rank is known."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from nsf.errors import ConfigError
+from nsf.kinematics import pod
+from nsf.kinematics.basis import BasisField
+from nsf.kinematics.schedules import FastTrainer
+from nsf.kinematics.training import train
+
+M, P, RANK = 30, 120, 4
+
+
+class LowRank(SimpleNamespace):
+    """Snapshots of rank 4 in x and 3 in tau, and none in C; the methods of `nsf.data.Snapshots`."""
+
+    def slab(self, name, particles):
+        return self.data[name][:, particles]
+
+    def gather(self, name, rows, particles):
+        return self.data[name][rows][:, particles]
+
+
+@pytest.fixture
+def low_rank():
+    generator = torch.Generator().manual_seed(1)
+    X = torch.rand(P, 3, generator=generator, dtype=torch.float64)
+    weights = torch.randn(M, RANK, generator=generator) * torch.tensor([1.0, 0.5, 0.2, 0.1])
+    shapes = torch.randn(RANK, P * 6, generator=generator)
+    data = {
+        "x": X.float() + (weights @ shapes[:, : 3 * P]).view(M, P, 3),
+        "tau": (5e3 + 1e3 * weights[:, :3] @ shapes[:3]).view(M, P, 6),
+        "C": torch.zeros(M, P, 9),
+    }
+    rows = torch.arange(M)
+    return LowRank(
+        M=M,
+        P=P,
+        resident=True,
+        X=X,
+        x_sha256="0" * 64,
+        parameter_names=(),
+        parameters=torch.zeros(M, 0),
+        t=rows.float(),
+        data=data,
+    )
+
+
+def test_exact_and_orthonormal(low_rank, monkeypatch):
+    monkeypatch.setattr(pod, "SLAB_ENTRIES", 7 * 3 * M)  # several slabs, the last one shorter
+    coefficients, unresolved = pod.decompose(low_rank, "x", 3, 20)
+    assert coefficients.shape == (M, RANK)
+    assert unresolved < 1e-10
+    _, mean, modes = zip(*pod.modes(low_rank, "x", 3, coefficients), strict=True)
+    mean, modes = torch.cat(mean), torch.cat(modes)
+    x = mean + torch.einsum("mk,nck->mnc", coefficients, modes)
+    torch.testing.assert_close(x, low_rank.data["x"].double(), rtol=0, atol=1e-5)
+    flat = modes.flatten(0, 1)
+    torch.testing.assert_close(flat.T @ flat, torch.eye(RANK, dtype=torch.float64), rtol=0, atol=1e-6)
+
+
+def test_unresolved_energy(low_rank):
+    coefficients, unresolved = pod.decompose(low_rank, "x", 3, 2)
+    deviations = (low_rank.data["x"] - low_rank.data["x"].mean(0)).double()
+    assert unresolved == pytest.approx(
+        1 - float(coefficients.square().sum() / deviations.square().sum()), abs=1e-6
+    )
+    assert 0.001 < unresolved < 0.5
+
+
+def test_latents_of_full_rank_need_no_network(low_rank, tmp_path):
+    manifold, metrics = train(low_rank, BasisField(), FastTrainer(steps=20), RANK, 0, tmp_path, "cpu")
+    assert "deformation_steps" not in metrics
+    assert "affine_steps" not in metrics
+    at, xhat = manifold.restrict(), manifold.training_latents
+    torch.testing.assert_close(at.position(xhat), low_rank.data["x"].double(), rtol=0, atol=1e-5)
+    torch.testing.assert_close(xhat.std(0, correction=0), torch.ones(RANK, dtype=torch.float64))
+    assert at.affine(xhat[0], torch.zeros(0)).abs().max() == 0
+    x, jacobian = at.position_and_jacobian(xhat[3])
+    torch.testing.assert_close(at.position(xhat[3] + jacobian.new_tensor([1, 0, 0, 0])), x + jacobian[..., 0])
+
+
+@pytest.mark.parametrize(
+    ("latent_dim", "message"), [(5, "rank 4"), (97, "96 displacement modes"), (0, "latent_dim=0")]
+)
+def test_impossible_latent_dimension(low_rank, tmp_path, latent_dim, message):
+    with pytest.raises(ConfigError, match=message):
+        train(low_rank, BasisField(), FastTrainer(steps=20), latent_dim, 0, tmp_path, "cpu")

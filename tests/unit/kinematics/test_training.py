@@ -1,0 +1,208 @@
+"""Schedules, resumption to the bit, and what training refuses."""
+
+import signal
+
+import pytest
+import torch
+
+from nsf.errors import ConfigError, InstabilityError
+from nsf.kinematics import descent, training
+from nsf.kinematics.basis import BasisField
+from nsf.kinematics.mlp import MlpField
+from nsf.kinematics.phases import PHASES, Fit, per_phase, seeded
+from nsf.kinematics.schedules import FastTrainer, PaperTrainer
+
+LATENT = 2
+FIELDS = ["basis", "mlp"]
+SHORT = FastTrainer(steps=[20, 12, 12], frames_per_batch=4, particles_per_batch=16)
+
+
+@pytest.fixture(autouse=True)
+def short_blocks(monkeypatch):
+    """Five steps a block, so that a short training has several."""
+    monkeypatch.setattr(descent, "SHORTEST_BLOCK", 5)
+
+
+@pytest.fixture
+def train(snapshots, fields):
+    def run(field, folder, schedule=SHORT, seed=0, tracking=None):
+        return training.train(snapshots, fields[field], schedule, LATENT, seed, folder, "cpu", tracking)
+
+    return run
+
+
+def same(one, other):
+    return all(
+        torch.equal(a, b) for a, b in zip(one.state_dict().values(), other.state_dict().values(), strict=True)
+    )
+
+
+def interrupt_at(monkeypatch, phase, step):
+    """Raise once, before that step; returns what restores the code."""
+    true_step = descent.Steps._take
+
+    def interrupted(self, at):
+        if (self.descent.fit.name, at) == (phase, step):
+            raise KeyboardInterrupt
+        return true_step(self, at)
+
+    monkeypatch.setattr(descent.Steps, "_take", interrupted)
+    return lambda: monkeypatch.setattr(descent.Steps, "_take", true_step)
+
+
+@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize(("phase", "step"), [("deformation", 12), ("stress", 7), ("affine", 0)])
+def test_resumed_training_has_the_same_bits(monkeypatch, train, tmp_path, field, phase, step):
+    expected, metrics = train(field, tmp_path / "whole")
+    restore = interrupt_at(monkeypatch, phase, step)
+    before = signal.getsignal(signal.SIGINT)
+    with pytest.raises(KeyboardInterrupt):
+        train(field, tmp_path / "parts")
+    assert signal.getsignal(signal.SIGINT) is before
+    restore()
+    taken = []
+    true_step = descent.Steps._take
+    monkeypatch.setattr(
+        descent.Steps,
+        "_take",
+        lambda self, at: taken.append((self.descent.fit.name, at)) or true_step(self, at),
+    )
+    resumed, resumed_metrics = train(field, tmp_path / "parts")
+    assert same(resumed, expected)
+    assert taken[0] == (phase, step // 5 * 5)
+    assert all(resumed_metrics[f"{p}_loss"] == metrics[f"{p}_loss"] for p in PHASES)
+    taken.clear()
+    again, _ = train(field, tmp_path / "parts")
+    assert same(again, expected)
+    assert not taken
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_seed_decides(train, tmp_path, field):
+    torch.manual_seed(5)  # must not matter
+    one, _ = train(field, tmp_path / "1")
+    torch.manual_seed(6)
+    two, _ = train(field, tmp_path / "2")
+    other, _ = train(field, tmp_path / "3", seed=1)
+    assert same(one, two)
+    assert not same(one, other)
+
+
+def test_trained_fields_fit(trained, snapshots):
+    manifold, metrics = trained
+    at, xhat, parameters = manifold.restrict(), manifold.training_latents, manifold.training_parameters
+    stress, affine = at.stress(xhat, parameters), at.affine(xhat, parameters).flatten(-2)
+    for phase, values, name in zip(
+        PHASES, (at.position(xhat), stress, affine), ("x", "tau", "C"), strict=True
+    ):
+        assert metrics[f"{phase}_steps"] == 250
+        reference = snapshots.slab(name, slice(None)).double()
+        variance = (reference - reference.mean((0, 1))).square().mean()
+        error = (values - reference).square().mean() / variance
+        assert error < (0.5 if manifold.field == "basis" else 0.9), phase
+
+
+@pytest.mark.parametrize("field", FIELDS)
+def test_global_state_is_left_alone(train, tmp_path, field):
+    torch.use_deterministic_algorithms(False)
+    train(field, tmp_path)
+    assert not torch.are_deterministic_algorithms_enabled()
+
+
+def test_budget_is_measured_once_and_reproducible(monkeypatch, train, tmp_path):
+    monkeypatch.setattr(training, "_seconds_per_step", lambda descent: 0.5)
+    budget = FastTrainer(frames_per_batch=4, particles_per_batch=16, budget_minutes=0.5)
+    first, metrics = train("mlp", tmp_path / "budget", budget)
+    steps = [metrics[f"{phase}_steps"] for phase in PHASES]
+    assert steps == [12, 24, 24]  # 30 s in shares 0.2, 0.4, 0.4, at 0.5 s a step
+    monkeypatch.undo()
+    fixed = FastTrainer(steps=steps, frames_per_batch=4, particles_per_batch=16)
+    assert same(train("mlp", tmp_path / "fixed", fixed)[0], first)
+
+
+def test_probe_leaves_no_trace(monkeypatch, train, tmp_path):
+    monkeypatch.setattr(training, "PROBE_SECONDS", 0.01)
+    ceiling = FastTrainer(steps=[20, 12, 12], frames_per_batch=4, particles_per_batch=16, budget_minutes=1000)
+    probed, _ = train("mlp", tmp_path / "probed", ceiling)
+    assert same(probed, train("mlp", tmp_path / "plain")[0])
+
+
+def test_divergence_is_named(train, tmp_path):
+    with pytest.raises(InstabilityError, match=r"deformation field diverged.*learning_rate"):
+        train("mlp", tmp_path, FastTrainer(steps=40, learning_rate=1e30, particles_per_batch=16))
+
+
+def test_paper_schedule():
+    paper = PaperTrainer()
+    # 100 snapshots are 4 batches of at most 32.
+    assert [paper.steps_of(phase, 100) for phase in PHASES] == [5 * 300 * 4, 5 * 600 * 4, 5 * 600 * 4]
+    rates = [paper.rate_at(step, 6000) for step in (0, 1199, 1200, 5999)]
+    assert rates == [1e-3, 1e-3, 5e-4, 5e-5]
+    fit = Fit("stress", torch.nn.Identity(), lambda *_: None, pointwise=True)
+    epoch = [paper.batch(step, fit, 100, 9, 0, seeded("cpu", step)) for step in range(4, 8)]
+    assert sorted(torch.cat([rows for rows, _ in epoch]).tolist()) == list(range(100))
+    assert [len(rows) for rows, _ in epoch] == [32, 32, 32, 4]
+    assert all(particles == slice(None) for _, particles in epoch)
+    assert not torch.equal(epoch[0][0], paper.batch(0, fit, 100, 9, 0, seeded("cpu", 0))[0])
+
+
+def test_paper_schedule_trains(train, tmp_path):
+    schedule = PaperTrainer([1e-3, 1e-4], 2, 1, 1, frames_per_batch=10)
+    _, metrics = train("mlp", tmp_path, schedule)
+    assert [metrics[f"{phase}_steps"] for phase in PHASES] == [12, 6, 6]
+
+
+def test_cosine_decay():
+    assert SHORT.rate_at(0, 60) == SHORT.learning_rate
+    assert SHORT.rate_at(30, 60) == pytest.approx(SHORT.learning_rate / 2)
+    assert SHORT.rate_at(59, 60) < 1e-2 * SHORT.learning_rate
+
+
+def test_per_phase():
+    assert per_phase("beta", 4) == (4, 4, 4)
+    assert per_phase("beta", [4, 5]) == (4, 5, 5)
+    assert per_phase("beta", (4, 5, 6)) == (4, 5, 6)
+
+
+def test_widths(snapshots):
+    for field in (MlpField(beta=[2, 3]), BasisField(beta=[2, 3], modes=9)):
+        prepared = field.prepare(snapshots, LATENT)
+        manifold = field.build(snapshots, prepared, LATENT, seeded("cpu", 0))
+        networks = (
+            manifold.decoders
+            if manifold.field == "mlp"
+            else {k: f.network for k, f in manifold.fields.items()}
+        )
+        assert [networks[phase].width for phase in PHASES] == [2 * 3, 3 * 6, 3 * 9]
+        hidden = len(networks["stress"].layers) - 1
+        assert hidden == (5 if manifold.field == "mlp" else field.depth)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: MlpField(beta=0), "beta=0"),
+        (lambda: MlpField(beta=[1, 2, 3, 4]), "beta="),
+        (lambda: BasisField(modes=[9, 0]), "modes="),
+        (lambda: BasisField(depth=0), "depth=0"),
+        (lambda: BasisField(noise=-0.1), "noise=-0.1"),
+        (lambda: FastTrainer(), "budget_minutes=null"),
+        (lambda: FastTrainer(steps=0), "steps=0"),
+        (lambda: FastTrainer(steps=5, learning_rate=0.0), "learning_rate=0.0"),
+        (lambda: FastTrainer(steps=5, budget_minutes=-1), "budget_minutes=-1"),
+        (lambda: FastTrainer(steps=5, particles_per_batch=0), "particles_per_batch=0"),
+        (lambda: PaperTrainer(learning_rates=[]), "learning_rates="),
+        (lambda: PaperTrainer(epochs_stress=0), "epochs_stress=0"),
+    ],
+)
+def test_values_are_checked(make, message):
+    with pytest.raises(ConfigError, match=message.replace("[", r"\[")):
+        make()
+
+
+def test_tensorboard(train, tmp_path):
+    train("basis", tmp_path, tracking="tensorboard")
+    assert list(tmp_path.glob("stress/tensorboard/*/events*"))
+    assert (tmp_path / "stress/csv/0/metrics.csv").read_text().count("\n") == 4
+    with pytest.raises(ConfigError, match="tracking='wandb'"):
+        train("basis", tmp_path, tracking="wandb")
