@@ -60,7 +60,8 @@ class View:
         flat = camera.project(points)[:, :2]
         low, high = flat.min(axis=0), flat.max(axis=0)
         margin = 0.07 * max(high - low)
-        return cls(camera, low - margin, high + margin, width, floor)
+        # Twice the margin below, where the length scale stands.
+        return cls(camera, low - margin * np.array([1.0, 2.0]), high + margin, width, floor)
 
     @property
     def height(self) -> int:

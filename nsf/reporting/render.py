@@ -1,6 +1,7 @@
 """Particle pictures: final shapes and animations of the full-order and the reduced model side by side."""
 
 import io
+from dataclasses import replace
 
 import matplotlib
 import numpy as np
@@ -11,13 +12,13 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from PIL import Image
 
-from nsf.reporting.camera import View
+from nsf.reporting.camera import Camera, View
 from nsf.reporting.columns import parameter_text
 from nsf.reporting.sources import Motion
 from nsf.reporting.style import INK, MUTED, WIDTH, styled
 
 STRESS_COLORS, DIFFERENCE_COLORS = "viridis", "magma"
-CLIP = 99.0  # [%] percentile of the full-order stress at which the colour scale ends
+CLIP = 97.0  # [%] percentile of the full-order stress at which the colour scale ends
 GIF_BYTES = int(2.5 * 2**20)
 
 
@@ -34,11 +35,14 @@ def final_shapes(
 ) -> Figure:
     """Last frame of each parameter value: full-order, reduced, and the distance between the two.
 
+    The front half is cut away: a free surface carries little stress, the inside does.
+
     Args:
         motions: one a row; positions in metres.
         name, unit: of the problem parameter.
         floor: height of the floor line [m]; None draws none.
     """
+    motions = [_cut_open(m) for m in motions]
     last = [
         (m, m.x_full[-1], m.x_reduced[-1], von_mises(m.tau_full[-1]), von_mises(m.tau_reduced[-1]))
         for m in motions
@@ -63,9 +67,9 @@ def final_shapes(
 
 def animation(
     motions: list[Motion], path, name: str = "parameter", unit: str = "", floor: float | None = None,
-    frames: int = 40, width: int = 380, max_bytes: int = GIF_BYTES,
+    frames: int = 31, width: int = 380, max_bytes: int = GIF_BYTES,
 ) -> None:  # fmt: skip
-    """Write a gif: the full-order model beside the reduced one, coloured by stress, with the time.
+    """Write a gif: the full-order model beside the reduced one, cut open, coloured by stress, with the time.
 
     Args:
         motions: one or two parameter values, a row each.
@@ -74,6 +78,7 @@ def animation(
         width: of one picture [pixel].
         max_bytes: colours, size and frames are given up in that order until the file is no larger.
     """
+    motions = [_cut_open(m) for m in motions]
     x_full = np.concatenate([m.x_full.reshape(-1, 3) for m in motions])
     stress = _Scale.up_to(np.percentile([von_mises(m.tau_full) for m in motions], CLIP), STRESS_COLORS, _PA)
     view = View.around(x_full, width=width, floor=floor)
@@ -194,6 +199,15 @@ class _Sheet:
 
     def _text(self, left: float, low: float, text: str, **style):
         return self.fig.text(left / self._size[0], low / self._size[1], text, va="baseline", **style)
+
+
+def _cut_open(motion: Motion) -> Motion:
+    """The particles that start behind the middle, as the camera sees it."""
+    X = motion.x_full[0].astype(float)
+    toward = Camera.facing(motion.x_full).axes[2] * (1.0, 1.0, 0.0)
+    behind = (X - X.mean(axis=0)) @ toward <= 0.0
+    cut = {k: getattr(motion, k)[:, behind] for k in ("x_full", "x_reduced", "tau_full", "tau_reduced")}
+    return replace(motion, **cut)
 
 
 def _radius(motions: list[Motion]) -> float:
