@@ -1,6 +1,10 @@
-"""Progress of long work: a bar with a rate and an end time, quiet when not a terminal."""
+"""What a user sees of long work: a bar with a rate and an end time; no chatter of libraries."""
 
+import contextlib
+import logging
 import sys
+import warnings
+from collections.abc import Iterator
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, Task, TextColumn, TimeRemainingColumn
@@ -55,3 +59,28 @@ class Progress:
     def advance(self, amount: int = 1) -> None:
         """Count work done."""
         self._bar.advance(self._task, amount)
+
+
+# What Lightning says about choices made on purpose here.
+_EXPECTED_WARNINGS = (
+    r".*GPU available but not used",
+    r".*`isinstance\(treespec, LeafSpec\)` is deprecated",
+    r".*does not have many workers",
+)
+
+
+@contextlib.contextmanager
+def quiet_lightning() -> Iterator[None]:
+    """Without Lightning's banner and its advice against what is done on purpose."""
+    chatter = [logging.getLogger(name) for name in ("pytorch_lightning", "lightning_fabric")]
+    levels = [logger.level for logger in chatter]
+    for logger in chatter:
+        logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            for message in _EXPECTED_WARNINGS:
+                warnings.filterwarnings("ignore", message=message)
+            yield
+    finally:
+        for logger, level in zip(chatter, levels, strict=True):
+            logger.setLevel(level)

@@ -13,7 +13,9 @@ from torch.utils.data import DataLoader
 
 from nsf.dynamics.solver import ReducedMPM
 from nsf.errors import SchemaError
+from nsf.progress import Progress, quiet_lightning
 from nsf.storage import writing
+from nsf.timing import synchronizer
 
 _VERSION = 1
 
@@ -79,24 +81,30 @@ class Deployment(pl.LightningModule):
 
     Args:
         solver_at: parameter value and device name → a `ReducedMPM` at t = 0.
+        progress: told of each run done.
     """
 
-    def __init__(self, solver_at: Callable[[float, str], ReducedMPM]):
+    def __init__(self, solver_at: Callable[[float, str], ReducedMPM], progress: Progress):
         super().__init__()
-        self._solver_at = solver_at
+        self._solver_at, self._progress = solver_at, progress
 
     def predict_step(self, batch: torch.Tensor, batch_idx: int) -> list[Rollout]:
         """Run each parameter value of a batch [B] from t = 0 to T."""
-        return [rollout(self._solver_at(value, str(self.device)), value) for value in batch.tolist()]
+        runs = []
+        for value in batch.tolist():
+            runs.append(rollout(self._solver_at(value, str(self.device)), value))
+            self._progress.advance()
+        return runs
 
 
 def rollout(solver: ReducedMPM, parameter: float) -> Rollout:
     """Run a reduced solver to the end of its scene."""
     solver.step(1)  # compiles, loads and captures
-    synchronise(solver)
+    wait = synchronizer(solver.device)
+    wait()
     started = time.perf_counter()
     solver.step(solver.total_steps - 1)
-    synchronise(solver)
+    wait()
     seconds = (time.perf_counter() - started) * solver.total_steps / max(1, solver.total_steps - 1)
     latent = solver.trajectory()
     finite = np.isfinite(latent.xhat).all(1)
@@ -116,32 +124,31 @@ def rollout(solver: ReducedMPM, parameter: float) -> Rollout:
     )
 
 
-def synchronise(solver) -> None:
-    """Wait until the solver's device has finished."""
-    if solver.device.is_cuda:
-        torch.cuda.synchronize()
-
-
-def deploy(
-    solver_at: Callable[[float, str], ReducedMPM], values: Sequence[float], device: str, progress: bool = False
-) -> list[Rollout]:
-    """Reduced runs at every parameter value.
+def deploy(solver_at: Callable[[float, str], ReducedMPM], values: Sequence[float], device: str) -> list[Rollout]:
+    """Reduced runs at every parameter value, with a progress bar.
 
     Args:
         solver_at: parameter value and device name → solver at t = 0.
         values: parameter values.
-        device: `cpu` or `cuda`.
-        progress: show Lightning's progress bar.
+        device: `cpu`, `cuda` or `cuda:N`.
+
+    Raises:
+        KeyboardInterrupt: passed on; Lightning would exit with code 1.
     """
-    values = torch.tensor(list(values), dtype=torch.float64)
-    trainer = pl.Trainer(
-        accelerator="gpu" if device.startswith("cuda") else "cpu",
-        devices=1,
-        logger=False,
-        enable_checkpointing=False,
-        enable_model_summary=False,
-        enable_progress_bar=progress,
-        inference_mode=False,  # forward-mode derivatives of the fields need version counters
-    )
-    batches = trainer.predict(Deployment(solver_at), DataLoader(values, batch_size=1, num_workers=0))
+    loader = DataLoader(torch.tensor(list(values), dtype=torch.float64), batch_size=1, num_workers=0)
+    cuda = torch.device(device).type == "cuda"
+    with quiet_lightning(), Progress("deploy", len(values), "runs") as progress:
+        trainer = pl.Trainer(
+            accelerator="gpu" if cuda else "cpu",
+            devices=[torch.device(device).index or 0] if cuda else 1,
+            logger=False,
+            enable_checkpointing=False,
+            enable_model_summary=False,
+            enable_progress_bar=False,
+            inference_mode=False,  # torch's inference tensors could not be updated in place between steps
+        )
+        try:
+            batches = trainer.predict(Deployment(solver_at, progress), loader)
+        except SystemExit as stop:
+            raise KeyboardInterrupt from stop
     return [run for batch in batches for run in batch]

@@ -44,10 +44,10 @@ class BasisField:
         head_parameters: the heads see the (standardised) problem parameters beside xhat.
     """
 
-    modes: int | Sequence[int] = (96, 160, 160)
+    modes: int | Sequence[int] = (48, 64, 64)
     beta: int | Sequence[int] = (48, 48, 32)
     depth: int = 3
-    noise: float = 0.02
+    noise: float = 0.01
     head_parameters: bool = True
 
     def __post_init__(self) -> None:

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import logging
 import time
-import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,18 +16,13 @@ from typing_extensions import override
 from nsf.errors import InstabilityError
 from nsf.kinematics.phases import PHASES, Fit, seed_of
 from nsf.kinematics.schedules import Trainer
-from nsf.progress import Progress
+from nsf.progress import Progress, quiet_lightning
 from nsf.storage import writing
 
 # Steps of one training_step: enough to hide Lightning's millisecond, and about 40 checkpoints a phase.
 SHORTEST_BLOCK, LONGEST_BLOCK, BLOCKS = 50, 500, 40
 EAGER_STEPS = 3  # before a capture, as torch asks
 CHECKPOINT = "last.ckpt"
-# What Lightning says about choices made on purpose here.
-EXPECTED_WARNINGS = (
-    r".*GPU available but not used",
-    r".*`isinstance\(treespec, LeafSpec\)` is deprecated",
-)
 
 
 @dataclass(frozen=True)
@@ -202,7 +193,7 @@ def descend(descent: Descent, steps: int, folder: Path, tracking: str | None) ->
     checkpoint = folder / CHECKPOINT
     resumed = checkpoint.is_file()
     device = descent.device
-    with _quiet(), Progress(f"train {descent.fit.name}", steps, "steps") as progress:
+    with quiet_lightning(), Progress(f"train {descent.fit.name}", steps, "steps") as progress:
         module = FieldTraining(descent, steps, checkpoint, progress)
         trainer = pl.Trainer(
             accelerator="gpu" if device.type == "cuda" else "cpu",
@@ -231,20 +222,3 @@ def _loggers(folder: Path, tracking: str | None) -> list[Logger]:
     if tracking == "tensorboard":
         loggers.append(TensorBoardLogger(folder, name="tensorboard", version=version))
     return loggers
-
-
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
-    """Without Lightning's banner and its advice against what is done on purpose."""
-    chatter = [logging.getLogger(name) for name in ("pytorch_lightning", "lightning_fabric")]
-    levels = [logger.level for logger in chatter]
-    for logger in chatter:
-        logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            for message in EXPECTED_WARNINGS:
-                warnings.filterwarnings("ignore", message=message)
-            yield
-    finally:
-        for logger, level in zip(chatter, levels, strict=True):
-            logger.setLevel(level)

@@ -10,7 +10,7 @@ import pandas as pd
 
 from nsf import config
 from nsf.errors import ConfigError
-from nsf.reporting.columns import MEASURED, number
+from nsf.reporting.columns import MEASURED
 from nsf.reporting.tables import VARIANT, markdown_table, without_constants
 
 BEGIN, END = "<!-- figures:begin -->", "<!-- figures:end -->"
@@ -39,7 +39,7 @@ def figures(report: Path) -> str:
     return (
         f"![Final shapes, reduced beside full-order]({report.as_posix()}/final-shapes.png)\n\n"
         f"Means over {frame['parameter'].nunique()} held-out parameter values ({same}). "
-        f"The paper prints δ = {number(paper.delta, 100)} % ({paper.place}).\n\n"
+        f"The paper prints δ = {100 * paper.delta:g} % ({paper.place}).\n\n"
         f"{markdown_table(table)}\n\n"
         f"From [`{report.as_posix()}/results.csv`]({report.as_posix()}/results.csv); "
         f"the whole report is [`index.md`]({report.as_posix()}/index.md)."
