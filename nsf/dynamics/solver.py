@@ -80,6 +80,8 @@ class ReducedMPM:
         precision: `fp64` or `fp32`.
         device: `cpu`, `cuda`, `cuda:N` or `auto`.
         dt_multiplier: deployment step in units of the scene's Δt (paper section 6.1: 1.5).
+        sets: particle sets of each phase, as `sets` of an earlier solver of the same manifold and
+            samples gives them; searched for when None.
 
     Raises:
         ProjectionError: |S| < r/3.
@@ -101,6 +103,7 @@ class ReducedMPM:
         precision: str = "fp64",
         device: str = "auto",
         dt_multiplier: float = 1.0,
+        sets: Sequence[ParticleSets] | None = None,
     ):
         if not dt_multiplier > 0:
             raise ConfigError(f"dt_multiplier={dt_multiplier} must be positive")
@@ -137,7 +140,8 @@ class ReducedMPM:
         self._row = torch.zeros(1, dtype=torch.int64, device=self.torch_device)
         self._starts = [int(round(p.start * self.total_steps)) for p in phases]
         self._sizes = []
-        self._phases = [self._build_phase(sets) for sets in self._sets_of(phases)]
+        self.sets = self._sets_of(phases) if sets is None else list(sets)
+        self._phases = [self._build_phase(s) for s in self.sets]
         self._enter(self._phases[0])
 
     @classmethod

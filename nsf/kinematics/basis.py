@@ -316,7 +316,7 @@ class BasisRestriction(Restriction):
         self.fields, self.latent_dim = fields, latent_dim
         mean = fields["deformation"].mean
         self.points, self.dtype, self.device = len(mean), mean.dtype, mean.device
-        self._gradient = functools.cache(gradient)
+        self._make_gradient = gradient
         self._takes_parameters = takes_parameters
         self._identity = torch.eye(latent_dim, dtype=self.dtype, device=self.device)
 
@@ -330,7 +330,11 @@ class BasisRestriction(Restriction):
 
     @override
     def deformation_gradient(self, xhat):
-        return self._gradient().values(xhat.to(self.dtype)).unflatten(-1, (3, 3))
+        return self._gradient.values(xhat.to(self.dtype)).unflatten(-1, (3, 3))
+
+    @functools.cached_property
+    def _gradient(self) -> RestrictedField:
+        return self._make_gradient()
 
     @override
     def stress(self, xhat, parameters):
@@ -344,7 +348,7 @@ class BasisRestriction(Restriction):
     def subset(self, rows):
         fields = {phase: field.subset(rows) for phase, field in self.fields.items()}
         return BasisRestriction(
-            fields, lambda: self._gradient().subset(rows), self.latent_dim, self._takes_parameters
+            fields, lambda: self._gradient.subset(rows), self.latent_dim, self._takes_parameters
         )
 
     def _inputs(self, xhat: Tensor, parameters: Tensor) -> Tensor:

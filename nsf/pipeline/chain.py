@@ -17,7 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nsf import config as configuration
 from nsf.data import Snapshots, Split, Trajectory
-from nsf.dynamics import ReducedMPM, Rollout, deploy
+from nsf.dynamics import ParticleSets, ReducedMPM, Rollout, deploy
 from nsf.dynamics.interop import torch_device
 from nsf.dynamics.sampling import check_well_posed
 from nsf.errors import ConfigError, MissingRunError
@@ -71,6 +71,7 @@ class Pipeline:
         if not c.deploy.dt_multiplier > 0:
             raise ConfigError(f"deploy.dt_multiplier={c.deploy.dt_multiplier} must be positive")
         precision_of(c.precision)
+        self._sets: list[ParticleSets] | None = None
         for region in self.sampler.regions:
             check_well_posed(region.size, c.latent_dim)
         # The device is found once, so that a missing GPU is reported before any work.
@@ -203,7 +204,7 @@ class Pipeline:
 
     def solver_at(self, manifold: Manifold, value: float, device: str | None = None) -> ReducedMPM:
         """The configured reduced solver at a parameter value, at t = 0."""
-        return self.scene.reduced(
+        solver = self.scene.reduced(
             manifold,
             {self.scene.parameters.name: value},
             self.sampler,
@@ -213,7 +214,11 @@ class Pipeline:
             precision=self.config.precision,
             device=device or self.device,
             dt_multiplier=self.config.deploy.dt_multiplier,
+            sets=self._sets,
         )
+        # The sets depend on the manifold and the sampler alone: found once for all values.
+        self._sets = solver.sets
+        return solver
 
     def deploy(self) -> Run:
         """Reduced trajectories of the held-out values, through Lightning's `Trainer.predict`."""

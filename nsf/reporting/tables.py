@@ -165,8 +165,8 @@ def html_rows(headings: list[str], body: list[list[str]], numeric: list[bool]) -
 
 
 def console_table(frame: pd.DataFrame) -> Table:
-    """The results for a terminal; columns that never change are told in the caption."""
-    shown, said = without_constants(frame)
+    """The results for a terminal; columns that never change are told in the caption, commits in the csv."""
+    shown, said = without_constants(frame.drop(columns="commit", errors="ignore"))
     headings, body = cells(shown)
     table = Table(caption=escape(said), caption_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for heading, right in zip(headings, _numeric(shown), strict=True):
