@@ -91,7 +91,9 @@ def check_targets(config: DictConfig) -> None:
         if isinstance(node, dict):
             target = node.get("_target_")
             if target is not None and not re.fullmatch(r"nsf(\.\w+)+", str(target)):
-                raise ConfigError(f"_target_: {target} is refused; only nsf.* classes are built from a configuration")
+                raise ConfigError(
+                    f"_target_: {target} is refused; only nsf.* classes are built from a configuration"
+                )
             stack.extend(node.values())
         elif isinstance(node, list):
             stack.extend(node)
@@ -112,14 +114,18 @@ def build(config: DictConfig, where: str):
             raise cause from error
         detail = str(cause or error).splitlines()[0]
         if isinstance(cause, TypeError) and "unexpected keyword" in detail:
-            raise ConfigError(f"{where}: {detail.split('got an ')[-1]}; known keys are in conf/{where}/") from error
+            raise ConfigError(
+                f"{where}: {detail.split('got an ')[-1]}; known keys are in conf/{where}/"
+            ) from error
         raise ConfigError(f"{where}: {detail}") from error
 
 
 def _keys(node, prefix: str = "") -> list[str]:
     if not isinstance(node, dict):
         return [prefix]
-    return [prefix] * bool(prefix) + [k for n, v in node.items() for k in _keys(v, f"{prefix}.{n}" if prefix else n)]
+    return [prefix] * bool(prefix) + [
+        k for n, v in node.items() for k in _keys(v, f"{prefix}.{n}" if prefix else n)
+    ]
 
 
 def _explain(error: Exception, config_name: str, overrides: Sequence[str]) -> str:
@@ -134,13 +140,15 @@ def _explain(error: Exception, config_name: str, overrides: Sequence[str]) -> st
         hint = f"; did you mean {' or '.join(near)}?" if near else "; see `nsf --help` for the groups"
         return f"unknown key {key!r}{hint}"
     if isinstance(error, OverrideParseException):
-        return f"{error.override!r} is not key=value in Hydra's grammar ({first}); quote brackets, commas and spaces"
+        return f"{error.override!r} is not Hydra's key=value ({first}); quote brackets, commas and spaces"
     option = re.search(r"Could not find '([^']+)/([^']+)'", text)
     if option:
         group, name = option.groups()
         known = groups().get(group, [])
         near = difflib.get_close_matches(name, known, n=1)
-        return f"unknown {group}={name}; choose one of {', '.join(known)}" + (f" (did you mean {near[0]}?)" if near else "")
+        return f"unknown {group}={name}; choose one of {', '.join(known)}" + (
+            f" (did you mean {near[0]}?)" if near else ""
+        )
     return first
 
 

@@ -154,7 +154,9 @@ class Run:
         status = manifest.get("status", "not there")
         state = "complete, but outputs are missing or cut short" if status == "complete" else status
         why = f" ({manifest['error']})" if manifest.get("error") else ""
-        raise MissingRunError(f"{self.path} is {state}{why}; run `nsf {self.stage} scene={self.scene}` with the same keys")
+        raise MissingRunError(
+            f"{self.path} is {state}{why}; run `nsf {self.stage} scene={self.scene}` with the same keys"
+        )
 
     @contextmanager
     def record(

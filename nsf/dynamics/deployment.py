@@ -49,7 +49,9 @@ class Rollout:
         """Write as HDF5, whole or not at all."""
         with writing(path) as temporary, h5py.File(temporary, "w") as file:
             file.attrs.update({"nsf_rollout": _VERSION, "parameter": self.parameter, "sample": self.sample})
-            file.attrs.update({"integration_mean": self.integration_mean, "needed_outside": self.needed_outside})
+            file.attrs.update(
+                {"integration_mean": self.integration_mean, "needed_outside": self.needed_outside}
+            )
             file.attrs.update({"seconds": self.seconds, "diverged": self.diverged})
             for name in ("t", "xhat", "residuals"):
                 file[name] = getattr(self, name)
@@ -66,13 +68,17 @@ class Rollout:
             with h5py.File(path, "r") as file:
                 version = file.attrs.get("nsf_rollout")
                 if version != _VERSION:
-                    raise SchemaError(f"{path} is not a rollout of version {_VERSION} (found {version}); deploy again")
+                    raise SchemaError(
+                        f"{path} is not a rollout of version {_VERSION} (found {version}); deploy again"
+                    )
                 scalars = {k: file.attrs[k].item() for k in ("parameter", "sample", "integration_mean")}
                 scalars |= {k: file.attrs[k].item() for k in ("needed_outside", "seconds", "diverged")}
                 arrays = {k: file[k][()] for k in ("t", "xhat", "residuals")}
                 stops = [s.decode() for s in file["stops"][()]]
         except (OSError, KeyError, RuntimeError) as error:
-            raise SchemaError(f"{path} is truncated or not a rollout ({error}); delete it and deploy again") from error
+            raise SchemaError(
+                f"{path} is truncated or not a rollout ({error}); delete it and deploy again"
+            ) from error
         return cls(**scalars, **arrays, stops=stops)
 
 
@@ -124,7 +130,9 @@ def rollout(solver: ReducedMPM, parameter: float) -> Rollout:
     )
 
 
-def deploy(solver_at: Callable[[float, str], ReducedMPM], values: Sequence[float], device: str) -> list[Rollout]:
+def deploy(
+    solver_at: Callable[[float, str], ReducedMPM], values: Sequence[float], device: str
+) -> list[Rollout]:
     """Reduced runs at every parameter value, with a progress bar.
 
     Args:

@@ -36,7 +36,9 @@ class Integration:
 
     def __post_init__(self):
         if self.strategy not in STRATEGIES:
-            raise ConfigError(f"integration.strategy={self.strategy!r} is unknown; choose one of {', '.join(STRATEGIES)}")
+            raise ConfigError(
+                f"integration.strategy={self.strategy!r} is unknown; choose one of {', '.join(STRATEGIES)}"
+            )
         if self.margin < 0:
             raise ConfigError(f"integration.margin={self.margin} must be at least 0 nodes")
 
@@ -63,7 +65,9 @@ def _kernels(precision: Precision, shape_name: str):
     base_node, width = shape.base_node, shape.degree + 1
 
     @wp.kernel(enable_backward=False, module="unique")
-    def mark_nodes(x: wp.array(dtype=vec3), dx: real, margin: int, grid_shape: wp.vec3i, marked: wp.array(dtype=wp.uint8)):
+    def mark_nodes(
+        x: wp.array(dtype=vec3), dx: real, margin: int, grid_shape: wp.vec3i, marked: wp.array(dtype=wp.uint8)
+    ):
         p = wp.tid()
         base = base_node(x[p], real(1.0) / dx)
         if not inside(base, width, grid_shape):
@@ -113,9 +117,15 @@ class NeighbourSearch:
         self._mark, self._flag = _kernels(precision, shape)
 
     def mark_nodes(self, x: torch.Tensor, marked: torch.Tensor, margin: int = 0) -> None:
-        """Set `marked` [all nodes] where a particle at x [n, 3] has a non-zero weight, widened by `margin` nodes."""
+        """Set `marked` [all nodes] where a particle at x [n, 3] has weight, and `margin` nodes around."""
         g = self.geometry
-        inputs = [as_vectors(x, self.precision), self.precision.real(g.dx), margin, wp.vec3i(*g.nodes), wp.from_torch(marked)]
+        inputs = [
+            as_vectors(x, self.precision),
+            self.precision.real(g.dx),
+            margin,
+            wp.vec3i(*g.nodes),
+            wp.from_torch(marked),
+        ]
         with on_torch_stream(self.device):
             wp.launch(self._mark, dim=len(x), inputs=inputs, device=self.device)
 

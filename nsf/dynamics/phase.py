@@ -63,7 +63,11 @@ class Phase:
         scalars = [as_scalars(a[:n]) for a in (self.mass, self.volume0)]
         self._integration = (*vectors, *matrices, *scalars)
         vectors = [as_vectors(a[: self.s], self.precision) for a in (self.x, self.v)]
-        self._sample = (*vectors, as_matrices(self.C[: self.s], self.precision), as_matrices(self.increment, self.precision))
+        self._sample = (
+            *vectors,
+            as_matrices(self.C[: self.s], self.precision),
+            as_matrices(self.increment, self.precision),
+        )
         self.size = n
 
     @property

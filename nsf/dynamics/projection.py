@@ -16,7 +16,7 @@ class ProjectionResult:
 
     Attributes:
         xhat: [r] latent vector.
-        residuals: [k + 1] RMS distance [m] of g(X_S, x̂) to the target before each iteration and after the last.
+        residuals: [k + 1] RMS distance [m] of g(X_S, x̂) to the target, before each iteration and at the end.
         updates: [k] Euclidean length of each latent update.
     """
 

@@ -106,5 +106,6 @@ def check_well_posed(sample: int, latent_dim: int) -> None:
     """
     if 3 * sample < latent_dim:
         raise ProjectionError(
-            f"|S|={sample} gives {3 * sample} equations for r={latent_dim} unknowns; choose |S| >= {-(-latent_dim // 3)}"
+            f"|S|={sample} gives {3 * sample} equations for r={latent_dim} unknowns; "
+            f"choose |S| >= {-(-latent_dim // 3)}"
         )

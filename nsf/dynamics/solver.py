@@ -56,7 +56,7 @@ class LatentState:
         return len(self._solver.scene_particles)
 
     def numpy(self) -> dict[str, np.ndarray]:
-        """Every particle's x, v [P, 3], C, tau [P, 3, 3], as the full-order state gives them, and xhat [r]."""
+        """Every particle's x, v [P, 3], C, tau [P, 3, 3], as of the full-order state, and xhat [r]."""
         s = self._solver
         everything = s._everywhere()
         x = everything.position(s.xhat)
@@ -126,19 +126,23 @@ class ReducedMPM:
 
         missing = [name for name in manifold.parameter_names if name not in parameters]
         if missing:
-            raise ConfigError(f"parameters {dict(parameters)} lack {missing}, which the stress field was trained on")
+            raise ConfigError(
+                f"parameters {dict(parameters)} lack {missing}, which the stress field was trained on"
+            )
         self.parameters = tensor([parameters[name] for name in manifold.parameter_names])
         self.initial_velocity = tensor(scene.initial_velocity())
         self.xhat = tensor(manifold.encode(torch.as_tensor(self.scene_particles.X)[None])[0].cpu())
         self.xhat_previous = self.xhat.clone()
         self.steps_taken = 0
         k = projector.iterations
-        self._latents = torch.zeros(self.total_steps + 1, manifold.latent_dim, dtype=self.dtype, device=self.torch_device)
+        self._latents = torch.zeros(
+            self.total_steps + 1, manifold.latent_dim, dtype=self.dtype, device=self.torch_device
+        )
         self._latents[0] = self.xhat
         self._residuals = torch.zeros(self.total_steps, k + 1, dtype=self.dtype, device=self.torch_device)
         self._updates = torch.zeros(self.total_steps, k, dtype=self.dtype, device=self.torch_device)
         self._row = torch.zeros(1, dtype=torch.int64, device=self.torch_device)
-        self._starts = [int(round(p.start * self.total_steps)) for p in phases]
+        self._starts = [round(p.start * self.total_steps) for p in phases]
         self._sizes = []
         self.sets = self._sets_of(phases) if sets is None else list(sets)
         self._phases = [self._build_phase(s) for s in self.sets]
@@ -159,7 +163,7 @@ class ReducedMPM:
             scene: an `nsf.scenes.Scene`.
             manifold: trained fields.
             parameters: `{name: value}`; the configured value by default.
-            sample: particle indices, a number (random, seed 0), a `Sampler`, or None for the scene's own number.
+            sample: particle indices, a number (drawn at random), a `Sampler`, or None for the scene's number.
             **options: further arguments of the constructor.
         """
         name = scene.parameters.name
@@ -172,15 +176,20 @@ class ReducedMPM:
             check_well_posed(int(sample), manifold.latent_dim)
             sample = Sampler(size=int(sample))
         X = scene.particles().X
-        phases = sample.phases_of(X) if isinstance(sample, Sampler) else [SamplePhase(0.0, _indices(sample, len(X)))]
+        phases = (
+            sample.phases_of(X)
+            if isinstance(sample, Sampler)
+            else [SamplePhase(0.0, _indices(sample, len(X)))]
+        )
         return cls(manifold, scene, phases, parameters, **options)
 
     def _sets_of(self, phases: Sequence[SamplePhase]) -> list[ParticleSets]:
-        """Particle sets of each phase; a superset goes over the training trajectories, decoded from their latents."""
+        """Particle sets of each phase; supersets go over the training trajectories, decoded from latents."""
         P = len(self.scene_particles)
         if self.integration.strategy == "search":
             return [
-                ParticleSets(p.particles, np.append(p.particles, np.delete(np.arange(P), p.particles)), None) for p in phases
+                ParticleSets(p.particles, np.append(p.particles, np.delete(np.arange(P), p.particles)), None)
+                for p in phases
             ]
         everything = self._everywhere()
         latents = self.manifold.training_latents.to(self.torch_device, self.dtype)
@@ -198,7 +207,9 @@ class ReducedMPM:
     def _build_phase(self, sets: ParticleSets) -> Phase:
         at = self.manifold.restrict(particles=sets.integration, dtype=self.dtype, device=self.torch_device)
         grid = Grid(self.geometry, self.precision, self.device, nodes=sets.nodes)
-        step = GridStep(grid, self.boundaries, self.transfer, self.gravity, self.dt, self.precision, self.device)
+        step = GridStep(
+            grid, self.boundaries, self.transfer, self.gravity, self.dt, self.precision, self.device
+        )
         arguments = [sets, at, self.scene_particles, grid, step, self._stress_of, self._affine_of]
         arguments += [self.precision, self.dtype, self.torch_device]
         if self.integration.strategy == "search":
@@ -253,7 +264,9 @@ class ReducedMPM:
             ConfigError: the steps would pass the scene's end.
         """
         if self.steps_taken + n > self.total_steps:
-            raise ConfigError(f"{self.steps_taken} + {n} steps pass the end of the scene, {self.total_steps} steps")
+            raise ConfigError(
+                f"{self.steps_taken} + {n} steps pass the end of the scene, {self.total_steps} steps"
+            )
         with torch.no_grad():
             for _ in range(n):
                 phase = self._phase_at(self.steps_taken)
@@ -354,7 +367,9 @@ class ReducedMPM:
         residuals, updates = self._residuals[:n].cpu(), self._updates[:n].cpu()
         stops = stop_reasons(residuals, updates, self.projector.tolerance)
         t = np.arange(n + 1) * self.dt
-        return LatentTrajectory(t, self._latents[: n + 1].cpu().numpy(), residuals.numpy(), updates.numpy(), stops)
+        return LatentTrajectory(
+            t, self._latents[: n + 1].cpu().numpy(), residuals.numpy(), updates.numpy(), stops
+        )
 
     def needed_outside(self) -> int:
         """Largest number of particles, over the steps taken, that a step needed but the superset lacks.

@@ -50,7 +50,9 @@ class StressFromDeformation:
         at: restricted fields; material: the law; mu, lam: [n] Lamé parameters [Pa].
     """
 
-    def __init__(self, at, material: Material, mu: torch.Tensor, lam: torch.Tensor, precision: Precision, device):
+    def __init__(
+        self, at, material: Material, mu: torch.Tensor, lam: torch.Tensor, precision: Precision, device
+    ):
         self.at, self.precision, self.device = at, precision, device
         self.mu, self.lam = mu, lam
         self.tau = torch.zeros(len(mu), 3, 3, dtype=mu.dtype, device=mu.device)
@@ -62,6 +64,9 @@ class StressFromDeformation:
         inputs = [as_matrices(F, self.precision), as_scalars(self.mu), as_scalars(self.lam)]
         with on_torch_stream(self.device):
             wp.launch(
-                self._kernel, dim=len(F), inputs=[*inputs, as_matrices(self.tau, self.precision)], device=self.device
+                self._kernel,
+                dim=len(F),
+                inputs=[*inputs, as_matrices(self.tau, self.precision)],
+                device=self.device,
             )
         return self.tau

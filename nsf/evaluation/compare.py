@@ -113,7 +113,12 @@ def compare(
             encoded=encoded,
         )
         inside = [n - start for n in shown_frames if block.start <= n < block.stop]
-        for name, values in (("x_full", x), ("x_reduced", x_rom), ("tau_full", tau), ("tau_reduced", tau_rom)):
+        for name, values in (
+            ("x_full", x),
+            ("x_reduced", x_rom),
+            ("tau_full", tau),
+            ("tau_reduced", tau_rom),
+        ):
             kept[name].append(values[inside][:, shown_particles].float().cpu().numpy())
 
     column = {name: torch.cat(values) for name, values in rows.items()}
@@ -138,8 +143,12 @@ def compare(
             "delta": by_frame("x_error", "x_norm"),
             "displacement_error": by_frame("x_error", "u_norm"),
             "stress_error": by_frame("tau_error", "tau_norm"),
-            "linear_momentum_error": metrics.momentum_error(column["p_rom"], column["p_fom"], column["p_scale"]),
-            "angular_momentum_error": metrics.momentum_error(column["L_rom"], column["L_fom"], column["L_scale"]),
+            "linear_momentum_error": metrics.momentum_error(
+                column["p_rom"], column["p_fom"], column["p_scale"]
+            ),
+            "angular_momentum_error": metrics.momentum_error(
+                column["L_rom"], column["L_fom"], column["L_scale"]
+            ),
             "reconstruction_delta": (column["rec_error"] / column["x_norm"]).sqrt(),
             **{f"xhat_{k + 1}": xhat[:, k].cpu() for k in range(xhat.shape[1])},
             **{f"encoded_{k + 1}": column["encoded"][:, k] for k in range(xhat.shape[1])},
@@ -152,11 +161,14 @@ def compare(
         reconstruction_delta=total("rec_error", "x_norm"),
         reconstruction_stress_error=total("rec_tau_error", "tau_norm"),
         series=series,
-        pictures={name: np.concatenate(blocks) for name, blocks in kept.items()} | {"t": trajectory.t[shown_frames]},
+        pictures={name: np.concatenate(blocks) for name, blocks in kept.items()}
+        | {"t": trajectory.t[shown_frames]},
     )
 
 
-def _shown(particles: int, frames: int, most_particles: int, most_frames: int) -> tuple[np.ndarray, np.ndarray]:
+def _shown(
+    particles: int, frames: int, most_particles: int, most_frames: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Particles (a fixed random subset) and frames (even, with the first and the last) for pictures."""
     chosen = np.sort(np.random.default_rng(0).permutation(particles)[:most_particles])
     return chosen, np.unique(np.linspace(0, frames - 1, min(frames, most_frames)).round().astype(int))

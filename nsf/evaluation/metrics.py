@@ -105,7 +105,9 @@ def angular_momentum(
     m = mass.double()[None, :, None]
     orbital = torch.linalg.cross(x.double(), m * v.double())
     C = C.double()
-    axial = torch.stack([C[..., 2, 1] - C[..., 1, 2], C[..., 0, 2] - C[..., 2, 0], C[..., 1, 0] - C[..., 0, 1]], -1)
+    axial = torch.stack(
+        [C[..., 2, 1] - C[..., 1, 2], C[..., 0, 2] - C[..., 2, 0], C[..., 1, 0] - C[..., 0, 1]], -1
+    )
     return (orbital + inertia * m * axial).sum(1)
 
 

@@ -40,11 +40,15 @@ class HalfSpace:
         _check_kind(self.kind, "half-space")
         finite = np.isfinite((*self.point, *self.normal)).all()
         if not (len(self.point) == len(self.normal) == 3 and finite and np.any(self.normal)):
-            raise ConfigError(f"half-space point={self.point} normal={self.normal}: give 3 numbers each, normal non-zero")
+            raise ConfigError(
+                f"half-space point={self.point} normal={self.normal}: give 3 numbers each, normal non-zero"
+            )
         if not self.friction >= 0:
             raise ConfigError(f"half-space friction={self.friction} must be at least 0")
         if self.kind == "sticky" and self.friction:
-            raise ConfigError(f"half-space friction={self.friction} has no effect on kind=sticky; use kind=separate")
+            raise ConfigError(
+                f"half-space friction={self.friction} has no effect on kind=sticky; use kind=separate"
+            )
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The background grid: where its nodes are stored, and the update of their velocities (paper section 3.3, step 2)."""
+"""The background grid: where nodes are stored, and the update of their velocities (paper section 3.3)."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -43,7 +43,9 @@ class GridGeometry:
             raise ConfigError(f"dx={dx} m must be positive")
         cells = tuple(int(np.ceil(edge / dx - 1e-9)) for edge in size)
         if min(cells) < 8:
-            raise ConfigError(f"dx={dx} m leaves {min(cells)} cells across the domain {tuple(size)} m; choose a smaller dx")
+            raise ConfigError(
+                f"dx={dx} m leaves {min(cells)} cells across the domain {tuple(size)} m; choose a smaller dx"
+            )
         return cls(float(dx), tuple(c + 1 for c in cells))
 
     @property
@@ -198,7 +200,11 @@ def make_grid_update(precision: Precision):
             if low or high:
                 if wall_kind == wp.static(STICKY):
                     v = vec3()
-                elif wall_kind == wp.static(SLIP) or (low and v[axis] < real(0.0)) or (high and v[axis] > real(0.0)):
+                elif (
+                    wall_kind == wp.static(SLIP)
+                    or (low and v[axis] < real(0.0))
+                    or (high and v[axis] > real(0.0))
+                ):
                     v[axis] = real(0.0)
         momentum[slot] = v
 

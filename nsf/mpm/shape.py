@@ -67,7 +67,9 @@ def shape_functions(precision: Precision, name: str) -> ShapeFunctions:
 
     @wp.func
     def local(x: vec3, inv_dx: real, base: wp.vec3i):
-        return vec3(x[0] * inv_dx - real(base[0]), x[1] * inv_dx - real(base[1]), x[2] * inv_dx - real(base[2]))
+        return vec3(
+            x[0] * inv_dx - real(base[0]), x[1] * inv_dx - real(base[1]), x[2] * inv_dx - real(base[2])
+        )
 
     if degree == 2:
 

@@ -35,7 +35,9 @@ class GridStep:
         device: Warp device.
     """
 
-    def __init__(self, grid: Grid, boundaries: BoundaryArrays, transfer: Transfer, gravity, dt, precision, device):
+    def __init__(
+        self, grid: Grid, boundaries: BoundaryArrays, transfer: Transfer, gravity, dt, precision, device
+    ):
         real = precision.real
         self.grid, self.device = grid, device
         self.dx, self.dt = real(grid.geometry.dx), real(dt)
@@ -50,7 +52,20 @@ class GridStep:
         """Particles → grid: mass, momentum and the impulse of the stress."""
         grid = self.grid
         grid.clear()
-        inputs = [x, v, C, tau, mass, volume0, grid.shape, grid.slots, self.dx, self.dt, grid.mass, grid.momentum]
+        inputs = [
+            x,
+            v,
+            C,
+            tau,
+            mass,
+            volume0,
+            grid.shape,
+            grid.slots,
+            self.dx,
+            self.dt,
+            grid.mass,
+            grid.momentum,
+        ]
         wp.launch(self._p2g, dim=x.shape[0], inputs=inputs, device=self.device)
 
     def update(self) -> None:
@@ -62,7 +77,18 @@ class GridStep:
     def g2p(self, x, v, C, increment) -> None:
         """Grid → particles: velocity, position, affine momentum, deformation increment."""
         grid = self.grid
-        inputs = [grid.momentum, grid.shape, grid.slots, self.dx, self.dt, *self.affine_shares, x, v, C, increment]
+        inputs = [
+            grid.momentum,
+            grid.shape,
+            grid.slots,
+            self.dx,
+            self.dt,
+            *self.affine_shares,
+            x,
+            v,
+            C,
+            increment,
+        ]
         wp.launch(self._g2p, dim=x.shape[0], inputs=inputs, device=self.device)
 
 
@@ -215,17 +241,27 @@ class FullOrderMPM:
         """
         s = self.state
         self._first_bad.fill_(_NEVER)
-        inputs = [s.x, s.v, s.tau, self.grid.shape, self.grid_step.dx, self._first_bad[0:1], self._first_bad[1:2]]
+        inputs = [
+            s.x,
+            s.v,
+            s.tau,
+            self.grid.shape,
+            self.grid_step.dx,
+            self._first_bad[0:1],
+            self._first_bad[1:2],
+        ]
         wp.launch(self._check, dim=len(s), inputs=inputs, device=self.device)
         non_finite, outside = (int(p) for p in self._first_bad.numpy())
         when = f"at step {self.steps_taken}, t = {self.time:.6g} s"
         if non_finite != _NEVER:
             raise InstabilityError(
-                f"particle {non_finite} became non-finite {when} or in the {self.check_every} steps before; reduce dt={self.dt:g} s"
+                f"particle {non_finite} became non-finite {when} or in the {self.check_every} steps before; "
+                f"reduce dt={self.dt:g} s"
             )
         if outside != _NEVER:
             where = np.array2string(s.x.numpy()[outside], precision=4)
             raise InstabilityError(
-                f"particle {outside} left the grid {when}: x = {where} m, domain [0, {self.grid.geometry.upper}] m; "
+                f"particle {outside} left the grid {when}: x = {where} m, "
+                f"domain [0, {self.grid.geometry.upper}] m; "
                 f"enlarge the domain, add a boundary or reduce dt={self.dt:g} s"
             )

@@ -51,7 +51,8 @@ def check_time_step(constants: ParticleConstants, v: np.ndarray, dx: float, dt: 
         c = wave_speed(constants)
         speed = float(np.linalg.norm(v, axis=1).max())
         raise InstabilityError(
-            f"dt={dt:g} s is unstable: elastic CFL c dt/dx = {c * dt / dx:.3g} (limit {MAX_ELASTIC_CFL:g}, c = {c:.4g} m/s), "
+            f"dt={dt:g} s is unstable: elastic CFL c dt/dx = {c * dt / dx:.3g} "
+            f"(limit {MAX_ELASTIC_CFL:g}, c = {c:.4g} m/s), "
             f"advective CFL |v| dt/dx = {speed * dt / dx:.3g} (limit {MAX_ADVECTIVE_CFL:g}); "
             f"the largest stable dt is {(1.0 - 5e-6) * largest:.6g} s"  # six digits must not round up past it
         )

@@ -34,7 +34,9 @@ class ParticleConstants:
         P = len(self.X)
         shapes = {name: np.shape(getattr(self, name)) for name in ("X", "mass", "volume0", "mu", "lam")}
         if P == 0 or shapes["X"] != (P, 3) or any(shapes[k] != (P,) for k in shapes if k != "X"):
-            raise ShapeError(f"particle arrays must be X [P, 3] and mass, volume0, mu, lam [P] with P > 0; got {shapes}")
+            raise ShapeError(
+                f"particle arrays must be X [P, 3] and mass, volume0, mu, lam [P] with P > 0; got {shapes}"
+            )
 
     def __len__(self) -> int:
         return len(self.X)
@@ -62,7 +64,9 @@ class ParticleState:
         self.increment = wp.array(identity, dtype=precision.mat33, device=device)
         self.tau = wp.zeros(P, dtype=precision.mat33, device=device)
         width = history.shape[1]
-        self.history = wp.array(history, dtype=wp.types.vector(length=width, dtype=precision.real), device=device)
+        self.history = wp.array(
+            history, dtype=wp.types.vector(length=width, dtype=precision.real), device=device
+        )
 
     def __len__(self) -> int:
         return self.x.shape[0]
@@ -70,7 +74,9 @@ class ParticleState:
     @property
     def nbytes(self) -> int:
         """Bytes on the device."""
-        return sum(a.capacity for a in (self.x, self.v, self.C, self.F_e, self.increment, self.tau, self.history))
+        return sum(
+            a.capacity for a in (self.x, self.v, self.C, self.F_e, self.increment, self.tau, self.history)
+        )
 
     def numpy(self) -> dict[str, np.ndarray]:
         """Host copies: x, v [P, 3], C, F_e, tau [P, 3, 3], history [P, H]."""

@@ -42,13 +42,17 @@ class Transfer:
 
     def __post_init__(self):
         if self.scheme not in SCHEMES:
-            raise ConfigError(f"transfer.scheme={self.scheme!r} is unknown; choose one of {', '.join(SCHEMES)}")
+            raise ConfigError(
+                f"transfer.scheme={self.scheme!r} is unknown; choose one of {', '.join(SCHEMES)}"
+            )
         if self.shape not in DEGREES:
             raise ConfigError(f"transfer.shape={self.shape!r} is unknown; choose one of {', '.join(DEGREES)}")
         if not 0.0 <= self.damping <= 1.0:
             raise ConfigError(f"transfer.damping={self.damping} must lie in [0, 1]")
         if self.damping and self.scheme != "rpic":
-            raise ConfigError(f"transfer.damping={self.damping} needs transfer.scheme=rpic, not {self.scheme}")
+            raise ConfigError(
+                f"transfer.damping={self.damping} needs transfer.scheme=rpic, not {self.scheme}"
+            )
 
     @property
     def affine_shares(self) -> tuple[float, float]:
@@ -113,7 +117,9 @@ def make_p2g(precision: Precision, shape_name: str, deterministic: bool = False)
                         reach = vec3(real(float(a)) - f[0], real(float(b)) - f[1], real(float(c)) - f[2])
                         slope = vec3(da_b * w[2, c], a_db * w[2, c], w_ab * d[2, c])
                         wp.atomic_add(grid_mass, slot, weight * m)
-                        wp.atomic_add(grid_momentum, slot, weight * (momentum + affine * reach) + impulse * slope)
+                        wp.atomic_add(
+                            grid_momentum, slot, weight * (momentum + affine * reach) + impulse * slope
+                        )
 
     return p2g
 

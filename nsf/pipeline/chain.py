@@ -3,15 +3,12 @@
 scene → simulate → dataset → train → deploy → evaluate → report
 """
 
-import json
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-import pandas as pd
 import torch
 from omegaconf import DictConfig, OmegaConf
 
@@ -21,13 +18,14 @@ from nsf.dynamics import ParticleSets, ReducedMPM, Rollout, deploy
 from nsf.dynamics.interop import torch_device
 from nsf.dynamics.sampling import check_well_posed
 from nsf.errors import ConfigError, MissingRunError
-from nsf.evaluation import compare, measure, reduction_ratio
+from nsf.evaluation import compare, measure
 from nsf.kinematics.manifold import Manifold
 from nsf.kinematics.training import TRACKING, train
 from nsf.mpm import FP32, FP64, Precision, precision_of
 from nsf.mpm.device import warp_device
+from nsf.pipeline import results
 from nsf.pipeline.simulation import Job, simulate
-from nsf.runs import Record, Run
+from nsf.runs import Run
 from nsf.scenes import Scene
 
 #: Keys of the configuration that each stage's content depends on, beyond its parents.
@@ -90,11 +88,10 @@ class Pipeline:
     @property
     def held_out(self) -> tuple[float, ...]:
         """Values that are deployed and evaluated."""
-        values = tuple(getattr(self.split, self.config.deploy.split))
+        split = self.config.deploy.split
+        values = tuple(getattr(self.split, split))
         if not values:
-            raise ConfigError(
-                f"deploy.split={self.config.deploy.split} has no values; set scene.parameters.{self.config.deploy.split}"
-            )
+            raise ConfigError(f"deploy.split={split} has no values; set scene.parameters.{split}")
         return values
 
     # -- runs: where each stage's result lies ---------------------------------------------------------------
@@ -118,7 +115,17 @@ class Pipeline:
     @property
     def deployment(self) -> Run:
         """The run of the reduced trajectories."""
-        keys = ("method", "sampler", "projector", "integration", "precision", "scale", "scene", "material", "transfer")
+        keys = (
+            "method",
+            "sampler",
+            "projector",
+            "integration",
+            "precision",
+            "scale",
+            "scene",
+            "material",
+            "transfer",
+        )
         content = self._content(keys) | {
             "values": list(self.held_out),
             "split": self.config.deploy.split,
@@ -131,7 +138,9 @@ class Pipeline:
     @property
     def evaluation(self) -> Run:
         """The run of errors and costs."""
-        content = self._content(("evaluation",)) | {"paper": OmegaConf.to_container(self.config.scene.get("paper", {}))}
+        content = self._content(("evaluation",)) | {
+            "paper": OmegaConf.to_container(self.config.scene.get("paper", {}))
+        }
         parents = [self.deployment, *(self.simulation(v) for v in self.held_out)]
         return Run.open("evaluate", self.scene.name, content, parents, root=self.root)
 
@@ -155,7 +164,9 @@ class Pipeline:
         runs = {value: self.simulation(value) for value in values}
         missing = [value for value, run in runs.items() if not run.complete]
         if len(missing) < len(values):
-            self.say(f"simulate: {len(values) - len(missing)} of {len(values)} trajectories are there, reused")
+            self.say(
+                f"simulate: {len(values) - len(missing)} of {len(values)} trajectories are there, reused"
+            )
         if missing:
             started = time.perf_counter()
             self._simulate({value: runs[value] for value in missing})
@@ -180,7 +191,9 @@ class Pipeline:
             return run
         c = self.config
         paths = [self.simulation(v).require().path / "trajectory.h5" for v in self.split.train]
-        snapshots = Snapshots([Trajectory.open(p) for p in paths], device=self.device, resident=c.data.resident)
+        snapshots = Snapshots(
+            [Trajectory.open(p) for p in paths], device=self.device, resident=c.data.resident
+        )
         with run.record(device=self.device, seed=c.seed) as record:
             started = time.perf_counter()
             manifold, metrics = train(
@@ -199,7 +212,9 @@ class Pipeline:
             record.output("manifold.pt")
             record.metrics.update(metrics, seconds=time.perf_counter() - started)
         snapshots.close()
-        self.say(f"train: field={manifold.field}, r={c.latent_dim} in {record.metrics['seconds']:.1f} s → {run.id}")
+        self.say(
+            f"train: field={manifold.field}, r={c.latent_dim} in {record.metrics['seconds']:.1f} s → {run.id}"
+        )
         return run
 
     def solver_at(self, manifold: Manifold, value: float, device: str | None = None) -> ReducedMPM:
@@ -227,7 +242,9 @@ class Pipeline:
             return run
         manifold = Manifold.load(self.training.require().path / "manifold.pt")
         with run.record(device=self.device, precision=self.config.precision) as record:
-            rollouts = deploy(lambda v, device: self.solver_at(manifold, v, device), self.held_out, self.device)
+            rollouts = deploy(
+                lambda v, device: self.solver_at(manifold, v, device), self.held_out, self.device
+            )
             for index, rollout in enumerate(rollouts):
                 rollout.save(run.path / f"rollout_{index}.h5")
                 record.output(f"rollout_{index}.h5")
@@ -235,17 +252,22 @@ class Pipeline:
             record.metrics["seconds"] = [r.seconds for r in rollouts]
             record.metrics["needed_outside"] = max(r.needed_outside for r in rollouts)
             record.metrics["diverged"] = [r.parameter for r in rollouts if r.diverged >= 0]
-        self.say(f"deploy: method={self.config.method.name}, |S|={rollouts[0].sample}, {len(rollouts)} values → {run.id}")
+        self.say(
+            f"deploy: method={self.config.method.name}, |S|={rollouts[0].sample}, "
+            f"{len(rollouts)} values → {run.id}"
+        )
         return run
 
     def _warn(self, rollout: Rollout) -> None:
         value = f"{self.scene.parameters.name}={rollout.parameter:g}"
         if rollout.diverged >= 0:
-            self.say(f"deploy: warning: {value} diverged at step {rollout.diverged}; its errors are reported as ∞")
+            self.say(
+                f"deploy: warning: {value} diverged at step {rollout.diverged}; its errors are reported as ∞"
+            )
         if rollout.needed_outside:
             self.say(
-                f"deploy: warning: {value}: a step needed {rollout.needed_outside} particles or nodes outside the "
-                "integration superset; raise integration.margin or use integration=search"
+                f"deploy: warning: {value}: a step needed {rollout.needed_outside} particles or nodes "
+                "outside the integration superset; raise integration.margin or use integration=search"
             )
 
     def evaluate(self) -> Run:
@@ -273,9 +295,13 @@ class Pipeline:
                         )
                     )
             cost = self._cost(manifold)
-            results = self._results(manifold, rollouts, comparisons, cost, run)
-            self._write(record, results, comparisons, cost, manifold)
-        self.say(f"evaluate: mean δ {100 * results['delta'].mean():.3g} % over {len(results)} values → {run.id}")
+            table = results.rows(
+                self.config, manifold, rollouts, comparisons, cost, self.device, run.manifest
+            )
+            seconds = self.training.manifest["seconds"]
+            summary = results.summarise(self.scene, manifold, table, comparisons, seconds)
+            results.write(record, table, comparisons, cost, summary)
+        self.say(f"evaluate: mean δ {100 * table['delta'].mean():.3g} % over {len(table)} values → {run.id}")
         return run
 
     def _cost(self, manifold: Manifold) -> dict:
@@ -289,81 +315,7 @@ class Pipeline:
         )
         steps = self.solver_at(manifold, value).total_steps
         reduced = measure(lambda: self.solver_at(manifold, value), steps, trials, self.device)
-        return {
-            "full_order": full.as_dict(),
-            "reduced": reduced.as_dict(),
-            "breakdown": {"reduced": reduced.stages, "full_order": full.stages},
-            "trials": min(full.trials, reduced.trials),
-            "memory_full_mib": full.memory_mib,
-            "memory_reduced_mib": reduced.memory_mib,
-            "step_ms_full": full.step_ms,
-            "step_ms_reduced": reduced.step_ms,
-        }
-
-    def _results(self, manifold, rollouts, comparisons, cost: dict, run: Run) -> pd.DataFrame:
-        manifest = run.manifest
-        commit = str(manifest.get("commit") or "unknown")[:12] + ("-dirty" if manifest.get("dirty") else "")
-        shared = {
-            "scene": self.scene.name,
-            "method": self.config.method.name,
-            "field": manifold.field,
-            "r": manifold.latent_dim,
-        }
-        timed = {
-            "gamma": reduction_ratio(len(manifold.X), manifold.latent_dim),
-            "step_ms_full": cost["step_ms_full"],
-            "step_ms_reduced": cost["step_ms_reduced"],
-            "speedup_step": cost["step_ms_full"] / cost["step_ms_reduced"],
-            "speedup_total": cost["full_order"]["total_ms"] / cost["reduced"]["total_ms"],
-            "memory_full_mib": cost["memory_full_mib"],
-            "memory_reduced_mib": cost["memory_reduced_mib"],
-            "precision": self.config.precision,
-            "device": _device_name(self.device),
-            "commit": commit,
-        }
-        rows = []
-        for rollout, c in zip(rollouts, comparisons, strict=True):
-            sizes = {"sample": rollout.sample, "integration_mean": rollout.integration_mean}
-            errors = {"delta": c.delta, "displacement_error": c.displacement_error, "stress_error": c.stress_error}
-            where = {"parameter": rollout.parameter, "split": self.config.deploy.split}
-            rows.append(shared | sizes | where | errors | timed)
-        return pd.DataFrame(rows)
-
-    def _write(self, record: Record, results: pd.DataFrame, comparisons, cost: dict, manifold) -> None:
-        path = record.path
-        results.to_csv(path / "results.csv", index=False)
-        pd.concat([c.series for c in comparisons]).to_csv(path / "series.csv", index=False)
-        stacked = {k: np.stack([c.pictures[k] for c in comparisons]) for k in comparisons[0].pictures if k != "t"}
-        splits = np.array([self.config.deploy.split] * len(comparisons))
-        np.savez_compressed(
-            path / "frames.npz",
-            parameters=results["parameter"].to_numpy(),
-            splits=splits,
-            t=comparisons[0].pictures["t"],
-            **stacked,
-        )
-        training = self.training.manifest
-        summary = {
-            "title": self.config.scene.title,
-            "scale": self.scene.scale,
-            "parameter_name": self.scene.parameters.name,
-            "parameter_unit": self.scene.parameters.unit,
-            "particles": len(manifold.X),
-            "floor": _floor(self.scene),
-            "training_seconds": training["seconds"],
-            "delta": float(results["delta"].mean()),
-            "reconstruction_delta": float(np.mean([c.reconstruction_delta for c in comparisons])),
-            "reconstruction_stress_error": float(np.mean([c.reconstruction_stress_error for c in comparisons])),
-            "variant": {k: results[k].iloc[0] for k in ("method", "field")}
-            | {k: int(results[k].iloc[0]) for k in ("r", "sample")},
-        }
-        if self.config.scene.get("paper"):
-            summary["paper"] = OmegaConf.to_container(self.config.scene.paper)
-        for name, content in (("cost.json", cost), ("summary.json", summary)):
-            (path / name).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-        for name in ("results.csv", "series.csv", "frames.npz", "cost.json", "summary.json"):
-            record.output(name)
-        record.metrics.update({k: summary[k] for k in ("delta", "reconstruction_delta")})
+        return results.costs(full, reduced)
 
     def report(self) -> Path:
         """The report of every evaluated variant of this scene at these held-out trajectories."""
@@ -371,9 +323,13 @@ class Pipeline:
 
         truths = {self.simulation(v).id for v in self.held_out}
         found = Run.find("evaluate", self.scene.name, root=self.root)
-        runs = [r for r in found if r.complete and truths == {p for p in r.parents if p.startswith("simulate/")}]
+        runs = [
+            r for r in found if r.complete and truths == {p for p in r.parents if p.startswith("simulate/")}
+        ]
         if not runs:
-            raise MissingRunError("no evaluate run of these held-out values is there; run `nsf run` with the same keys")
+            raise MissingRunError(
+                "no evaluate run of these held-out values is there; run `nsf run` with the same keys"
+            )
         folder = Path(self.config.report.folder) / self.config.report.name
         page = build_report(runs, folder, self.config.scene.title)
         self.say(f"report: {len(runs)} evaluated variants → {page}")
@@ -391,13 +347,3 @@ def _stored(dtype: str) -> Precision:
     if dtype not in by_name:
         raise ConfigError(f"data.dtype={dtype} is unknown; choose float32 or float64")
     return by_name[dtype]
-
-
-def _device_name(device: str) -> str:
-    return torch.cuda.get_device_name(device) if device.startswith("cuda") else "cpu"
-
-
-def _floor(scene: Scene) -> float | None:
-    """Height of a horizontal floor [m], for pictures."""
-    heights = [c.point[2] for c in scene.colliders if np.allclose(np.asarray(c.normal) / np.linalg.norm(c.normal), (0, 0, 1))]
-    return float(heights[0]) if heights else None

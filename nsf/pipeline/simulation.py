@@ -38,7 +38,9 @@ class Job:
     blocks: queue.Queue = field(default_factory=lambda: queue.Queue(_BLOCKS))
 
 
-def simulate(jobs: Iterable[Job], steps: int, dx: float, stored: Precision, device: str, precision: str) -> None:
+def simulate(
+    jobs: Iterable[Job], steps: int, dx: float, stored: Precision, device: str, precision: str
+) -> None:
     """Run and store every job; each file appears when it is whole.
 
     Args:
@@ -69,7 +71,9 @@ def simulate(jobs: Iterable[Job], steps: int, dx: float, stored: Precision, devi
 def _start(job: Job, pool, steps: int, dx: float, stored: Precision, device, precision, progress) -> Future:
     """Compute one trajectory while its writer, and those of earlier ones, work."""
     solver = job.build()
-    stored_by = pool.submit(_store, job, solver, steps + 1, dx, np.dtype(stored.numpy).name, device, precision)
+    stored_by = pool.submit(
+        _store, job, solver, steps + 1, dx, np.dtype(stored.numpy).name, device, precision
+    )
     try:
         recorder = FrameRecorder(solver.state, solver.precision, stored)
         started = time.perf_counter()
@@ -101,7 +105,9 @@ def _hand_over(job: Job, item, stored_by: Future) -> None:
         stored_by.result()
 
 
-def _store(job: Job, solver: FullOrderMPM, frames: int, dx: float, dtype: str, device: str, precision: str) -> None:
+def _store(
+    job: Job, solver: FullOrderMPM, frames: int, dx: float, dtype: str, device: str, precision: str
+) -> None:
     constants = solver.constants
     with job.run.record(device=device, precision=precision) as record:
         writer = TrajectoryWriter(

@@ -62,8 +62,13 @@ def plot_point(config: DictConfig) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     stem = folder / f"{name}_{config.path}"
     response.to_csv(stem.with_suffix(".csv"), index=False)
-    point_chart(response, f"{name}, {config.path.replace('_', ' ')}").savefig(stem.with_suffix(".png"), dpi=150)
+    point_chart(response, f"{name}, {config.path.replace('_', ' ')}").savefig(
+        stem.with_suffix(".png"), dpi=150
+    )
     last = response.iloc[-1]
-    print(f"{name} at amplitude {last['amplitude']:g}: pressure {last['pressure']:.6g} Pa, ‖dev τ‖ {last['dev_norm']:.6g} Pa")
+    print(
+        f"{name} at amplitude {last['amplitude']:g}: "
+        f"pressure {last['pressure']:.6g} Pa, ‖dev τ‖ {last['dev_norm']:.6g} Pa"
+    )
     print(f"wrote {stem.with_suffix('.png')} and {stem.with_suffix('.csv')}")
     return stem.with_suffix(".png")

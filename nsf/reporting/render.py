@@ -42,7 +42,7 @@ def final_shapes(
         name, unit: of the problem parameter.
         floor: height of the floor line [m]; None draws none.
     """
-    motions = [_cut_open(m) for m in motions]
+    motions = _cut_open(motions)
     last = [
         (m, m.x_full[-1], m.x_reduced[-1], von_mises(m.tau_full[-1]), von_mises(m.tau_reduced[-1]))
         for m in motions
@@ -78,7 +78,7 @@ def animation(
         width: of one picture [pixel].
         max_bytes: colours, size and frames are given up in that order until the file is no larger.
     """
-    motions = [_cut_open(m) for m in motions]
+    motions = _cut_open(motions)
     x_full = np.concatenate([m.x_full.reshape(-1, 3) for m in motions])
     stress = _Scale.up_to(np.percentile([von_mises(m.tau_full) for m in motions], CLIP), STRESS_COLORS, _PA)
     view = View.around(x_full, width=width, floor=floor)
@@ -201,13 +201,17 @@ class _Sheet:
         return self.fig.text(left / self._size[0], low / self._size[1], text, va="baseline", **style)
 
 
-def _cut_open(motion: Motion) -> Motion:
-    """The particles that start behind the middle, as the camera sees it."""
-    X = motion.x_full[0].astype(float)
-    toward = Camera.facing(motion.x_full).axes[2] * (1.0, 1.0, 0.0)
+def _cut_open(motions: list[Motion]) -> list[Motion]:
+    """The particles that start behind the middle, as the camera sees them; the same of every motion."""
+    X = motions[0].x_full[0].astype(float)
+    toward = Camera.facing(motions[0].x_full).axes[2] * (1.0, 1.0, 0.0)
     behind = (X - X.mean(axis=0)) @ toward <= 0.0
-    cut = {k: getattr(motion, k)[:, behind] for k in ("x_full", "x_reduced", "tau_full", "tau_reduced")}
-    return replace(motion, **cut)
+
+    def cut(motion: Motion) -> Motion:
+        names = ("x_full", "x_reduced", "tau_full", "tau_reduced")
+        return replace(motion, **{name: getattr(motion, name)[:, behind] for name in names})
+
+    return [cut(motion) for motion in motions]
 
 
 def _radius(motions: list[Motion]) -> float:

@@ -118,7 +118,9 @@ class Cylinder(Shape):
 
     def __post_init__(self):
         if len(self.base) != 3 or not (self.radius > 0 and self.height > 0):
-            raise ConfigError(f"cylinder base={self.base} radius={self.radius} height={self.height}: must be positive lengths")
+            raise ConfigError(
+                f"cylinder base={self.base} radius={self.radius} height={self.height}: give positive lengths"
+            )
 
     @property
     def volume(self) -> float:

@@ -86,7 +86,9 @@ class ParameterRange:
         for one, other in (("train", "test"), ("train", "validation"), ("test", "validation")):
             shared = sorted(set(getattr(self, one)) & set(getattr(self, other)))
             if shared:
-                raise ConfigError(f"scene.parameters: {shared} is in {one} and {other}; a value belongs to one split")
+                raise ConfigError(
+                    f"scene.parameters: {shared} is in {one} and {other}; a value belongs to one split"
+                )
 
     @property
     def name(self) -> str:
@@ -133,7 +135,9 @@ class Scene:
         try:
             return cls._build(config)
         except ConfigAttributeError as error:
-            raise ConfigError(f"{error.full_key} is missing from the configuration; give it a value") from error
+            raise ConfigError(
+                f"{error.full_key} is missing from the configuration; give it a value"
+            ) from error
 
     @classmethod
     def _build(cls, config: DictConfig) -> "Scene":
@@ -167,11 +171,15 @@ class Scene:
         config = self.config.copy()
         for name, value in parameters.items():
             if name != self.parameters.name:
-                raise ConfigError(f"{self.name} has no parameter {name!r}; its parameter is {self.parameters.name!r}")
+                raise ConfigError(
+                    f"{self.name} has no parameter {name!r}; its parameter is {self.parameters.name!r}"
+                )
             if not (isinstance(value, int | float | np.number) and math.isfinite(value)):
                 raise ConfigError(f"{name}={value!r} must be a finite number")
             if OmegaConf.select(config, self.parameters.key) is None:
-                raise ConfigError(f"scene.parameters.key={self.parameters.key} names no key of the configuration")
+                raise ConfigError(
+                    f"scene.parameters.key={self.parameters.key} names no key of the configuration"
+                )
             OmegaConf.update(config, self.parameters.key, float(value))
         return Scene.from_config(config)
 
@@ -190,7 +198,9 @@ class Scene:
         for body in self.bodies:
             lower, upper = body.shape.bounds
             if (lower < 0).any() or (upper > np.asarray(self.size)).any():
-                raise ConfigError(f"body from {lower} to {upper} m reaches outside the domain [0, {self.size}] m")
+                raise ConfigError(
+                    f"body from {lower} to {upper} m reaches outside the domain [0, {self.size}] m"
+                )
             volume = body.shape.volume / body.particles
             X.append(body.shape.sample(body.particles))
             volume0.append(np.full(body.particles, volume))

@@ -83,7 +83,9 @@ def test_every_needed_particle_is_flagged_and_no_other(mid_run):
 
     def stencil(points):
         base = np.floor(points / dx - 0.5).astype(int)
-        return {tuple(b + (i, j, k)) for b in base for i in range(3) for j in range(3) for k in range(3)}
+        return {
+            tuple(b + np.array([i, j, k])) for b in base for i in range(3) for j in range(3) for k in range(3)
+        }
 
     nodes = stencil(x[sample])
     expected = np.array([bool(stencil(p[None]) & nodes) for p in x])

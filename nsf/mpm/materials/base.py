@@ -113,7 +113,10 @@ def make_elastic_stress(law: LawFunctions, precision: Precision):
 
     @wp.kernel(enable_backward=False, module="unique")
     def elastic_stress(
-        F: wp.array(dtype=mat33), mu: wp.array(dtype=real), lam: wp.array(dtype=real), tau: wp.array(dtype=mat33)
+        F: wp.array(dtype=mat33),
+        mu: wp.array(dtype=real),
+        lam: wp.array(dtype=real),
+        tau: wp.array(dtype=mat33),
     ):
         p = wp.tid()
         tau[p] = tau_of(F[p], mu[p], lam[p])

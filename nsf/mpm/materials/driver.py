@@ -68,7 +68,9 @@ def drive(
     result = tau.numpy().astype(np.float64)
     if not np.isfinite(result).all():
         row = int((~np.isfinite(result).all((1, 2))).argmax())
-        raise InstabilityError(f"{type(material).__name__} gave a non-finite stress at F_path[{row}]; take smaller strains")
+        raise InstabilityError(
+            f"{type(material).__name__} gave a non-finite stress at F_path[{row}]; take smaller strains"
+        )
     return result
 
 

@@ -25,7 +25,9 @@ def fixed_corotated_tau(precision: Precision):
         wp.svd3(F, U, sigma, V)
         R = U * wp.transpose(V)
         J = wp.determinant(F)
-        return real(2.0) * mu * (F - R) * wp.transpose(F) + (lam * (J - real(1.0)) * J) * wp.identity(n=3, dtype=real)
+        return real(2.0) * mu * (F - R) * wp.transpose(F) + (lam * (J - real(1.0)) * J) * wp.identity(
+            n=3, dtype=real
+        )
 
     return tau_of
 

@@ -1,0 +1,52 @@
+# Everything a fresh clone needs; only Python 3.11 or newer must be there.
+
+# The first interpreter that is new enough; another: make install PYTHON=/path/to/python3
+PYTHON ?= $(shell for p in python3 python3.11 python3.12 python3.13; do \
+	$$p -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null && echo $$p && break; done)
+
+# Named in the same pip command as the package: an open range ends in gigabytes of CUDA packages.
+TORCH := torch==2.13.0
+
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+# One thread a test worker: two workers share two cores.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
+WORKERS ?= 2
+
+.PHONY: help install quickstart test test-slow test-all lint readme clean
+
+help:  ## this list
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+
+install: $(INSTALLED)  ## .venv with the package and what it needs
+
+$(INSTALLED): pyproject.toml
+	@'$(PYTHON)' -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
+		{ echo 'Python 3.11 or newer is needed; name one: make install PYTHON=/path/to/python3.11' >&2; exit 1; }
+	'$(PYTHON)' -m venv $(VENV)
+	$(BIN)/python -m pip install $(TORCH) -e '.[dev]'
+	@touch $@
+
+quickstart: install  ## the sand column at small scale, from simulation to report
+	$(BIN)/nsf run scene=sand scale=small
+
+test: install  ## the tests, without those marked slow
+	$(PYTEST) -m 'not slow' -n $(WORKERS) --dist worksteal
+
+test-slow: install  ## the tests marked slow
+	$(PYTEST) -m slow
+
+test-all: test test-slow  ## every test
+
+lint: install  ## ruff and the layers of imports
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+
+readme: install  ## the figures in README.md, from reports/sand/results.csv
+	$(BIN)/python -m nsf.reporting.readme README.md
+
+clean:  ## remove the environment, caches and builds; runs and reports stay
+	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .mypy_cache .import_linter_cache .hypothesis *.egg-info
+	find nsf tests -name __pycache__ -type d -prune -exec rm -rf {} +

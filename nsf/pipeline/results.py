@@ -1,0 +1,129 @@
+"""The files of an evaluate run: one place that knows what reporting reads (docs/design.md)."""
+
+import json
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+import torch
+from omegaconf import DictConfig, OmegaConf
+
+from nsf.dynamics import Rollout
+from nsf.evaluation import Comparison, SolverCost, reduction_ratio
+from nsf.runs import Record
+from nsf.scenes import Scene
+
+
+def costs(full: SolverCost, reduced: SolverCost) -> dict:
+    """Content of `cost.json`."""
+    return {
+        "full_order": full.as_dict(),
+        "reduced": reduced.as_dict(),
+        "breakdown": {"reduced": reduced.stages, "full_order": full.stages},
+        "trials": min(full.trials, reduced.trials),
+        "memory_full_mib": full.memory_mib,
+        "memory_reduced_mib": reduced.memory_mib,
+        "step_ms_full": full.step_ms,
+        "step_ms_reduced": reduced.step_ms,
+    }
+
+
+def rows(
+    config: DictConfig,
+    manifold,
+    rollouts: Sequence[Rollout],
+    comparisons: Sequence[Comparison],
+    cost: dict,
+    device: str,
+    manifest: dict,
+) -> pd.DataFrame:
+    """Content of `results.csv`, one row a parameter value; errors are fractions, ∞ where a run diverged."""
+    commit = str(manifest.get("commit") or "unknown")[:12] + ("-dirty" if manifest.get("dirty") else "")
+    variant = {
+        "scene": config.scene.name,
+        "method": config.method.name,
+        "field": manifold.field,
+        "r": manifold.latent_dim,
+    }
+    measured = {
+        "gamma": reduction_ratio(len(manifold.X), manifold.latent_dim),
+        "step_ms_full": cost["step_ms_full"],
+        "step_ms_reduced": cost["step_ms_reduced"],
+        "speedup_step": cost["step_ms_full"] / cost["step_ms_reduced"],
+        "speedup_total": cost["full_order"]["total_ms"] / cost["reduced"]["total_ms"],
+        "memory_full_mib": cost["memory_full_mib"],
+        "memory_reduced_mib": cost["memory_reduced_mib"],
+        "precision": config.precision,
+        "device": torch.cuda.get_device_name(device) if device.startswith("cuda") else "cpu",
+        "commit": commit,
+    }
+    found = []
+    for rollout, comparison in zip(rollouts, comparisons, strict=True):
+        own = {
+            "sample": rollout.sample,
+            "integration_mean": rollout.integration_mean,
+            "parameter": rollout.parameter,
+            "split": config.deploy.split,
+            "delta": comparison.delta,
+            "displacement_error": comparison.displacement_error,
+            "stress_error": comparison.stress_error,
+        }
+        found.append(variant | own | measured)
+    return pd.DataFrame(found)
+
+
+def summarise(
+    scene: Scene, manifold, results: pd.DataFrame, comparisons: Sequence[Comparison], seconds: float
+) -> dict:
+    """Content of `summary.json`; `seconds` is the training's wall time."""
+    config = scene.config
+
+    def mean(name: str) -> float:
+        return float(np.mean([getattr(c, name) for c in comparisons]))
+
+    summary = {
+        "title": config.scene.title,
+        "scale": scene.scale,
+        "parameter_name": scene.parameters.name,
+        "parameter_unit": scene.parameters.unit,
+        "particles": len(manifold.X),
+        "floor": _floor(scene),
+        "training_seconds": seconds,
+        "delta": mean("delta") if math.isfinite(mean("delta")) else None,
+        "reconstruction_delta": mean("reconstruction_delta"),
+        "reconstruction_stress_error": mean("reconstruction_stress_error"),
+        "variant": {name: results[name].tolist()[0] for name in ("method", "field", "r", "sample")},
+    }
+    if config.scene.get("paper"):
+        summary["paper"] = OmegaConf.to_container(config.scene.paper)
+    return summary
+
+
+def write(
+    record: Record, results: pd.DataFrame, comparisons: Sequence[Comparison], cost: dict, summary: dict
+) -> None:
+    """Write the five files of an evaluate run into its folder."""
+    path = record.path
+    results.to_csv(path / "results.csv", index=False)
+    pd.concat([c.series for c in comparisons]).to_csv(path / "series.csv", index=False)
+    pictures = [c.pictures for c in comparisons]
+    np.savez_compressed(
+        path / "frames.npz",
+        parameters=results["parameter"].to_numpy(),
+        splits=results["split"].to_numpy(dtype=str),
+        t=pictures[0]["t"],
+        **{name: np.stack([p[name] for p in pictures]) for name in pictures[0] if name != "t"},
+    )
+    for name, content in (("cost.json", cost), ("summary.json", summary)):
+        (path / name).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    for name in ("results.csv", "series.csv", "frames.npz", "cost.json", "summary.json"):
+        record.output(name)
+    record.metrics.update({name: summary[name] for name in ("delta", "reconstruction_delta")})
+
+
+def _floor(scene: Scene) -> float | None:
+    """Height of a horizontal floor [m], for pictures."""
+    up = (0.0, 0.0, 1.0)
+    heights = [c.point[2] for c in scene.colliders if np.allclose(np.asarray(c.normal), up)]
+    return float(heights[0]) if heights else None

@@ -1,0 +1,39 @@
+"""Every option of every configuration group composes and builds what it names."""
+
+import numpy as np
+import pytest
+
+from nsf import config, scenes
+from nsf.mpm.materials import PATHS, deformation_path, drive
+from nsf.paths import groups
+from nsf.pipeline import Pipeline
+
+GROUPS = groups()
+#: A scene sets its material's constants, so a law alone is composed with the material point.
+CHAIN = [(g, option) for g in GROUPS if g not in ("scene", "material") for option in GROUPS[g]]
+
+
+@pytest.mark.parametrize(("group", "option"), CHAIN)
+@pytest.mark.parametrize("scale", ["small", "paper"])
+def test_option_builds(group, option, scale):
+    Pipeline(config.load([f"{group}={option}", f"scale={scale}", "device=cpu"]))
+
+
+@pytest.mark.parametrize("name", GROUPS["scene"])
+@pytest.mark.parametrize("scale", ["small", "paper"])
+def test_scene_is_runnable(name, scale):
+    Pipeline(config.load([f"scene={name}", f"scale={scale}", "device=cpu"])).check_values()
+    scene = scenes.load(name, [f"scale={scale}"])
+    assert scene.name == name
+    # The full-order solver refuses an unstable step.
+    scene.full_order(device="cpu")
+
+
+@pytest.mark.parametrize("name", GROUPS["material"])
+@pytest.mark.parametrize("path", PATHS)
+def test_material_follows_a_path(name, path):
+    c = config.load([f"material={name}", f"path={path}"], "point")
+    material = config.build(c.material, "material")
+    tau = drive(material, deformation_path(path, 0.01, 5)[1], dt=1e-3)
+    assert np.isfinite(tau).all()
+    assert np.abs(tau - tau.swapaxes(1, 2)).max() <= 1e-9 * np.abs(tau).max()

@@ -1,0 +1,100 @@
+"""README says what is so: its commands compose, its example runs, its figures are the report's."""
+
+import re
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from expand import variants
+
+from nsf import config
+from nsf.errors import ConfigError
+from nsf.pipeline import Pipeline
+from nsf.reporting import COLUMNS
+from nsf.reporting.readme import BEGIN, END, REPORT, figures, updated
+
+ROOT = Path(__file__).parents[2]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize("command", [line for block in blocks("sh") for line in block.splitlines()])
+def test_readme_command(command):
+    if command.startswith("make "):
+        target = command.split()[1]
+        assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+        return
+    stage, runs = variants(command)
+    for overrides in runs:
+        if stage == "point":
+            config.build(config.load(overrides, "point").material, "material")
+        else:
+            Pipeline(config.load([*overrides, "device=cpu"]))
+
+
+def test_readme_python_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("NSF_RUNS", str(tmp_path))
+    # The example's particles, so that its manifold fits; few steps and values.
+    scene = ["scene.steps=8", "scene.parameters.train=[21.0,30.0,38.5]", "scene.parameters.test=[26.0]"]
+    pipeline = Pipeline(config.load(["scene=sand", "scale=small", "device=cpu", "trainer.steps=20", *scene]))
+    pipeline.simulate()
+    pipeline.train()
+    capsys.readouterr()
+    (block,) = blocks("python")
+    exec(compile(block, "README.md", "exec"), {"__name__": "readme"})
+    assert len(capsys.readouterr().out.split("\n")) == 3
+
+
+def test_readme_links_lead_somewhere():
+    links = [link for link in re.findall(r"\]\(([^)]+)\)", README) if not link.startswith("http")]
+    named = re.findall(r"`((?:nsf|conf|docs|experiments)/[\w/.]+)`", README)
+    assert links
+    assert named
+    for path in (*links, *named):
+        assert (ROOT / path).exists(), path
+
+
+def test_readme_figures_are_those_of_the_report(monkeypatch):
+    monkeypatch.chdir(ROOT)
+    assert updated(README, REPORT) == README, "run `make readme`"
+
+
+def results(tmp_path: Path, deltas: dict[str, float]) -> Path:
+    rows = [
+        dict.fromkeys(COLUMNS, 1.0)
+        | {
+            "scene": "sand",
+            "method": method,
+            "field": "basis",
+            "split": split,
+            "device": "cpu",
+            "precision": "fp64",
+        }
+        | {"parameter": value, "delta": delta * scale, "commit": "abc"}
+        for method, delta in deltas.items()
+        for value, split, scale in ((26.0, "test", 0.5), (33.0, "test", 1.5), (21.0, "train", 99.0))
+    ]
+    pd.DataFrame(rows, columns=list(COLUMNS)).to_csv(tmp_path / "results.csv", index=False)
+    return tmp_path
+
+
+def test_figures_are_means_of_held_out_values(tmp_path):
+    text = figures(results(tmp_path, {"nsf": 0.00123, "deformation_only": 0.0456}))
+    assert "| nsf | 0.123 |" in text
+    assert "| deformation_only | 4.56 |" in text
+    assert "2 held-out" in text
+    assert "δ = 0.4 %" in text
+
+
+def test_figures_do_not_hide_divergence(tmp_path):
+    assert "| nsf | ∞ |" in figures(results(tmp_path, {"nsf": float("inf"), "deformation_only": 0.01}))
+
+
+def test_figures_need_their_markers(tmp_path):
+    assert updated(f"a\n{BEGIN}\nold\n{END}\nb", tmp_path).startswith(f"a\n{BEGIN}\n`")
+    for text in ("", BEGIN, END + BEGIN, BEGIN + END + END):
+        with pytest.raises(ConfigError, match="once each"):
+            updated(text, tmp_path)

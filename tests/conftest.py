@@ -1,0 +1,106 @@
+"""What tests of several layers share: one tiny chain, simulated, trained, deployed and evaluated once."""
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+# Before torch: on matrices this small, threads cost more than they give, and tests run beside each other.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+import torch
+
+#: A column of 500 particles on a grid of 50³, 24 steps: a second for the whole chain.
+TINY = (
+    "scene=sand",
+    "device=cpu",
+    "scene.dx=0.02",
+    "scene.dt=0.005",
+    "scene.steps=24",
+    "scene.bodies.column.particles=500",
+    "scene.parameters.train=[22,30,38]",
+    "scene.parameters.test=[26]",
+    "field.modes=[8,8,8]",
+    "field.beta=4",
+    "field.depth=1",
+    "trainer.steps=200",
+    "latent_dim=4",
+    "sampler.size=20",
+    "evaluation.trials=2",
+    "evaluation.picture_particles=100",
+    "evaluation.picture_frames=3",
+)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_thread_for_torch():
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+@dataclass(frozen=True)
+class Chain:
+    """A chain whose stages up to `evaluate` are on disk.
+
+    Attributes:
+        root: of the runs; shared, so a test that spoils a file takes a copy.
+        said: what the pipeline told the user.
+        pipeline: as it was configured.
+    """
+
+    root: Path
+    said: list[str]
+    pipeline: object
+
+    @property
+    def scene(self):
+        return self.pipeline.scene
+
+    @property
+    def checkpoint(self) -> Path:
+        return self.pipeline.training.path / "manifold.pt"
+
+    def trajectory(self, value: float) -> Path:
+        return self.pipeline.simulation(value).path / "trajectory.h5"
+
+
+def tiny_pipeline(root, *overrides, say=None):
+    """The tiny chain, or a variant of it, with its runs under `root`."""
+    from nsf import config
+    from nsf.pipeline import Pipeline
+
+    return Pipeline(config.load([*TINY, *overrides]), say=say or (lambda line: None), root=root)
+
+
+@pytest.fixture(scope="session")
+def tiny():
+    """The overrides of the tiny chain."""
+    return TINY
+
+
+@pytest.fixture(scope="session")
+def pipeline_at():
+    """(root, *overrides, say) → a `Pipeline` of the tiny chain."""
+    return tiny_pipeline
+
+
+@pytest.fixture(scope="session")
+def chain(tmp_path_factory) -> Chain:
+    """The tiny chain, made once."""
+    said: list[str] = []
+    root = tmp_path_factory.mktemp("chain") / "runs"
+    pipeline = tiny_pipeline(root, say=said.append)
+    for stage in ("simulate", "train", "deploy", "evaluate"):
+        pipeline.run(stage)
+    return Chain(root, said, pipeline)
+
+
+@pytest.fixture(scope="session")
+def tiny_manifold(chain):
+    """The tiny chain's manifold, as a user loads it."""
+    import nsf
+
+    return nsf.Manifold.load(chain.checkpoint)

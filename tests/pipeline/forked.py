@@ -1,0 +1,117 @@
+"""The command line in a process of its own that need not import torch again.
+
+A server process imports the package once; each call is a fork of it. `spoil` names a fault that
+the child brings upon itself at an exact moment, so that no test depends on how fast it runs.
+"""
+
+import importlib
+import multiprocessing
+import os
+import resource
+import signal
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+CONTEXT = multiprocessing.get_context("forkserver")
+CONTEXT.set_forkserver_preload(["nsf.pipeline", "nsf.reporting", "hydra"])
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Exit code (−N after signal N) and what was printed."""
+
+    code: int
+    out: str
+    err: str
+
+
+@dataclass(frozen=True)
+class SignalAt:
+    """Sends itself a signal at the n-th call of `module:Class.function`."""
+
+    where: str
+    call: int = 1
+    signal: int = signal.SIGINT
+
+    def __call__(self):
+        owner, name = _owner(self.where)
+        original, calls = getattr(owner, name), []
+
+        def counted(*arguments, **named):
+            calls.append(None)
+            if len(calls) == self.call:
+                os.kill(os.getpid(), self.signal)
+            return original(*arguments, **named)
+
+        setattr(owner, name, counted)
+
+
+@dataclass(frozen=True)
+class FileLimit:
+    """No file may grow past a number of bytes: what a disk without room does, without being root."""
+
+    size: int
+
+    def __call__(self):
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (self.size, self.size))
+
+
+@dataclass(frozen=True)
+class PlainReport:
+    """Reports that draw nothing: pictures have tests of their own, and take seconds."""
+
+    def __call__(self):
+        module = importlib.import_module("nsf.reporting.build")
+
+        def build_report(runs, folder, title, **more):
+            folder.mkdir(parents=True, exist_ok=True)
+            tables = [(run.path / "results.csv").read_text().splitlines() for run in runs]
+            lines = [tables[0][0], *(row for table in tables for row in table[1:])]
+            (folder / "results.csv").write_text("\n".join(lines) + "\n")
+            page = folder / "index.html"
+            page.write_text(f"{len(runs)} runs")
+            return page
+
+        module.build_report = build_report
+
+
+def _owner(where):
+    module, path = where.split(":")
+    owner = importlib.import_module(module)
+    *parents, name = path.split(".")
+    for parent in parents:
+        owner = getattr(owner, parent)
+    return owner, name
+
+
+def _child(arguments, environment, folder, faults):
+    for number, name in ((1, "out"), (2, "err")):
+        os.dup2(os.open(folder / name, os.O_CREAT | os.O_WRONLY | os.O_TRUNC), number)
+    sys.stdout, sys.stderr = (os.fdopen(os.dup(n), "w", buffering=1, encoding="utf-8") for n in (1, 2))
+    os.environ.update(environment)
+    os.chdir(folder)
+    for fault in faults:
+        fault()
+    import torch
+
+    from nsf.cli import main
+
+    torch.set_num_threads(1)
+    main(arguments)
+
+
+def run_nsf(arguments, root: Path, folder: Path, *faults, timeout=120) -> Outcome:
+    """`nsf *arguments` with NSF_RUNS = root, from within an empty folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    environment = {"NSF_RUNS": str(root), "NSF_REPORTS": str(folder / "reports"), "OMP_NUM_THREADS": "1"}
+    process = CONTEXT.Process(target=_child, args=(list(arguments), environment, folder, faults))
+    process.start()
+    process.join(timeout)
+    if process.exitcode is None:
+        process.kill()
+        process.join()
+        raise AssertionError(f"nsf {arguments} did not end in {timeout} s")
+    texts = [(folder / name).read_text() if (folder / name).exists() else "" for name in ("out", "err")]
+    return Outcome(process.exitcode, *texts)

@@ -1,0 +1,336 @@
+"""The whole chain on a tiny scene: files, reuse, what a change runs again."""
+
+import json
+import os
+import subprocess
+import sys
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from nsf.data import Trajectory
+from nsf.dynamics import NeighbourSearch, ParticleSets, ProjectionResult, Taylor
+from nsf.errors import ConfigError, MissingRunError
+from nsf.kinematics.manifold import Manifold
+from nsf.runs import Run
+
+#: Issue 2, "Done when".
+COLUMNS = [
+    "scene", "method", "field", "r", "sample", "integration_mean", "parameter", "split", "delta",
+    "displacement_error", "stress_error", "gamma", "step_ms_full", "step_ms_reduced", "speedup_step",
+    "speedup_total", "memory_full_mib", "memory_reduced_mib", "precision", "device", "commit",
+]  # fmt: skip
+STAGES = ("simulate", "train", "deploy", "evaluate")
+
+
+def stamps(root):
+    return {p: p.stat().st_mtime_ns for p in root.rglob("*") if p.is_file()}
+
+
+def said_by(pipeline_at, root, *overrides, stages=STAGES):
+    said = []
+    pipeline = pipeline_at(root, *overrides, say=said.append)
+    for stage in stages:
+        pipeline.run(stage)
+    return pipeline, said
+
+
+# -- files ----------------------------------------------------------------------------------------------
+
+
+def test_what_is_said(chain):
+    said = [line.split(":")[0] for line in chain.said]
+    assert said == ["simulate", "train", "deploy", "evaluate"]
+    assert "4 trajectories in" in chain.said[0]
+    assert "field=basis, r=4" in chain.said[1]
+    assert "method=nsf, |S|=20, 1 values" in chain.said[2]
+    assert "mean δ" in chain.said[3]
+
+
+def test_trajectories(chain):
+    for value in (22.0, 26.0, 30.0, 38.0):
+        with Trajectory.open(chain.trajectory(value)) as trajectory:
+            assert trajectory.parameters == {"friction_angle": value}
+            assert (trajectory.frames, trajectory.particles) == (25, 500)
+            np.testing.assert_allclose(trajectory.t, 0.005 * np.arange(25))
+            np.testing.assert_allclose(trajectory.read("x", 0)[0], chain.scene.particles().X, atol=1e-7)
+
+
+def test_the_stored_frames_are_the_solvers_own(chain):
+    """Frames go through a ring of blocks and a writer's thread on their way."""
+    solver = chain.scene.full_order({"friction_angle": 26.0}, device="cpu")
+    with Trajectory.open(chain.trajectory(26.0)) as trajectory:
+        for n in (0, 1, 12, 24):
+            solver.step(n - solver.steps_taken)
+            state = solver.state.numpy()
+            for name in ("x", "v"):
+                np.testing.assert_allclose(trajectory.read(name, n)[0], state[name], rtol=1e-6, atol=1e-7)
+            np.testing.assert_allclose(
+                trajectory.read("C", n)[0], state["C"].reshape(-1, 9), rtol=1e-5, atol=1e-5
+            )
+            tau = state["tau"][:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]]
+            np.testing.assert_allclose(trajectory.read("tau", n)[0], tau, rtol=1e-5, atol=1e-4)
+
+
+def test_results_have_the_columns_of_the_issue(chain):
+    results = pd.read_csv(chain.pipeline.evaluation.path / "results.csv")
+    assert list(results) == COLUMNS
+    assert len(results) == 1
+    assert not results.isna().any().any()
+    row = results.iloc[0]
+    assert (row["scene"], row["method"], row["field"], row["split"]) == ("sand", "nsf", "basis", "test")
+    assert (row["r"], row["sample"], row["parameter"], row["precision"]) == (4, 20, 26.0, "fp64")
+    assert row["gamma"] == 3 * 500 / 4
+    assert row["device"] == "cpu"
+    assert 0 < row["delta"] < 0.02
+    assert row["delta"] < row["displacement_error"]
+    assert row["speedup_step"] == pytest.approx(row["step_ms_full"] / row["step_ms_reduced"])
+    assert 20 < row["integration_mean"] <= 500
+
+
+def test_files_of_an_evaluation(chain):
+    """docs/design.md, "Evaluation's files"."""
+    path = chain.pipeline.evaluation.path
+    series = pd.read_csv(path / "series.csv")
+    assert len(series) == 25
+    assert {"parameter", "split", "frame", "t", "delta", "xhat_1", "xhat_4", "encoded_4"} <= set(series)
+    frames = np.load(path / "frames.npz")
+    assert frames["parameters"].tolist() == [26.0]
+    assert frames["splits"].tolist() == ["test"]
+    assert frames["x_full"].shape == frames["x_reduced"].shape == (1, 3, 100, 3)
+    assert frames["tau_full"].shape == frames["tau_reduced"].shape == (1, 3, 100, 6)
+    cost = json.loads((path / "cost.json").read_text())
+    assert set(cost["breakdown"]["reduced"]) == {"inference", "p2g", "grid", "g2p", "inversion", "transfer"}
+    assert cost["trials"] == 2
+    summary = json.loads((path / "summary.json").read_text())
+    assert summary["reconstruction_delta"] < summary["delta"]
+    assert summary["variant"] == {"method": "nsf", "field": "basis", "r": 4, "sample": 20}
+
+
+def test_manifests(chain):
+    p = chain.pipeline
+    for run in (*(p.simulation(v) for v in (22, 26, 30, 38)), p.training, p.deployment, p.evaluation):
+        assert run.manifest["status"] == "complete"
+        assert run.complete
+    assert p.training.manifest["parents"] == [p.simulation(v).id for v in (22, 30, 38)]
+    assert p.deployment.manifest["parents"] == [p.training.id]
+    assert p.evaluation.manifest["parents"] == [p.deployment.id, p.simulation(26).id]
+    assert p.deployment.manifest["metrics"]["needed_outside"] == 0
+
+
+def test_the_manifold_knows_its_data(chain, tiny_manifold):
+    assert tiny_manifold.split == {"train": [22.0, 30.0, 38.0], "test": [26.0]}
+    assert tiny_manifold.datasets == [chain.pipeline.simulation(v).id for v in (22, 30, 38)]
+    assert sorted(set(tiny_manifold.training_parameters.flatten().tolist())) == [22.0, 30.0, 38.0]
+
+
+# -- reuse ----------------------------------------------------------------------------------------------
+
+
+def test_a_second_run_reuses_every_stage(chain, pipeline_at):
+    before = stamps(chain.root)
+    pipeline, said = said_by(pipeline_at, chain.root)
+    runs = (pipeline.training, pipeline.deployment, pipeline.evaluation)
+    assert said[0] == "simulate: 4 of 4 trajectories are there, reused"
+    assert said[1:] == [f"{run.stage}: inputs unchanged, reused → {run.id}" for run in runs]
+    assert stamps(chain.root) == before
+
+
+def test_another_method_deploys_and_evaluates_again(copied, pipeline_at):
+    root = copied(*STAGES)
+    before = stamps(root)
+    pipeline, said = said_by(pipeline_at, root, "method=deformation_only")
+    assert "4 of 4 trajectories are there, reused" in said[0]
+    assert "train: inputs unchanged, reused" in said[1]
+    assert "method=deformation_only" in said[2]
+    assert said[3].startswith("evaluate: mean δ")
+    assert {p: t for p, t in stamps(root).items() if p in before} == before
+    results = pd.read_csv(pipeline.evaluation.path / "results.csv")
+    assert results["method"].tolist() == ["deformation_only"]
+    assert list(results) == COLUMNS
+
+
+def test_another_test_value_simulates_only_that_one(copied, pipeline_at):
+    root = copied(*STAGES)
+    before = stamps(root)
+    pipeline, said = said_by(pipeline_at, root, "scene.parameters.test=[26,34]")
+    assert said[0] == "simulate: 4 of 5 trajectories are there, reused"
+    assert "simulate: 1 trajectories in" in said[1]
+    assert "train: inputs unchanged, reused" in said[2]
+    assert "2 values" in said[3]
+    assert {p: t for p, t in stamps(root).items() if p in before} == before
+    results = pd.read_csv(pipeline.evaluation.path / "results.csv")
+    assert results["parameter"].tolist() == [26.0, 34.0]
+
+
+HASHES = {
+    # override → stages that it makes anew
+    "scene.parameters.test=[26,34]": {"deployment", "evaluation"},
+    "method=deformation_only": {"deployment", "evaluation"},
+    "sampler.size=30": {"deployment", "evaluation"},
+    "projector=taylor": {"deployment", "evaluation"},
+    "integration=search": {"deployment", "evaluation"},
+    "deploy.dt_multiplier=1.5": {"deployment", "evaluation"},
+    "evaluation.trials=3": {"evaluation"},
+    "latent_dim=3": {"training", "deployment", "evaluation"},
+    "seed=1": {"training", "deployment", "evaluation"},
+    "field.beta=5": {"training", "deployment", "evaluation"},
+    "trainer.steps=100": {"training", "deployment", "evaluation"},
+    "scene.parameters.train=[22,30]": {"training", "deployment", "evaluation"},
+    "scene.dt=0.004": {"simulation", "training", "deployment", "evaluation"},
+    "material.E=1900": {"simulation", "training", "deployment", "evaluation"},
+    "transfer=pic": {"simulation", "training", "deployment", "evaluation"},
+    "precision=fp32": {"simulation", "training", "deployment", "evaluation"},
+    "scene.bodies.column.velocity=[0,0,1]": {"simulation", "training", "deployment", "evaluation"},
+    "report.name=other": set(),
+    "scene.title=Other": set(),
+    "tracking=tensorboard": set(),
+    "data.resident=true": set(),
+}
+
+
+@pytest.mark.parametrize("override", HASHES)
+def test_what_a_change_makes_anew(chain, pipeline_at, override):
+    changed = pipeline_at(chain.root, override)
+
+    def names(pipeline):
+        stages = {k: getattr(pipeline, k).hash for k in ("training", "deployment", "evaluation")}
+        return stages | {"simulation": pipeline.simulation(30.0).hash}
+
+    before, after = names(chain.pipeline), names(changed)
+    assert {k for k in before if before[k] != after[k]} == HASHES[override]
+
+
+def test_a_value_is_one_run_however_it_is_written(chain, pipeline_at):
+    written = pipeline_at(chain.root, "scene.parameters.train=[22.0,3e1,38]")
+    assert written.training.hash == chain.pipeline.training.hash
+
+
+# -- order and splits -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("stage", "command"),
+    [("train", "nsf simulate"), ("deploy", "nsf train"), ("evaluate", "nsf deploy"), ("report", "nsf run")],
+)
+def test_a_stage_before_its_time(pipeline_at, tmp_path, stage, command):
+    with pytest.raises(MissingRunError, match=f"run `{command}"):
+        pipeline_at(tmp_path).run(stage)
+    assert not [p for p in tmp_path.rglob("*") if p.is_file() and p.name != "manifest.json"]
+
+
+def test_a_stage_before_its_time_leaves_no_failed_run(pipeline_at, tmp_path):
+    for stage in ("train", "deploy", "evaluate"):
+        with pytest.raises(MissingRunError):
+            pipeline_at(tmp_path).run(stage)
+        assert not Run.find(stage, root=tmp_path)
+
+
+def test_training_values_can_be_deployed(copied, pipeline_at):
+    root = copied("simulate", "train")
+    pipeline, _ = said_by(pipeline_at, root, "deploy.split=train", "evaluation.trials=1")
+    results = pd.read_csv(pipeline.evaluation.path / "results.csv")
+    assert results["split"].tolist() == ["train"] * 3
+    assert results["parameter"].tolist() == [22.0, 30.0, 38.0]
+
+
+def test_a_split_without_values(pipeline_at, tmp_path):
+    with pytest.raises(ConfigError, match=r"deploy\.split=validation has no values"):
+        pipeline_at(tmp_path, "deploy.split=validation").simulate()
+
+
+def test_a_longer_step_is_deployed_and_evaluated(copied, pipeline_at):
+    root = copied("simulate", "train")
+    pipeline, _ = said_by(pipeline_at, root, "deploy.dt_multiplier=1.5", "evaluation.trials=1")
+    with h5py.File(pipeline.deployment.path / "rollout_0.h5") as file:
+        assert file["xhat"].shape == (17, 4)
+    assert 0 < pd.read_csv(pipeline.evaluation.path / "results.csv")["delta"][0] < 0.03
+
+
+def test_needed_particles_outside_the_superset_are_told(copied, pipeline_at, monkeypatch):
+    complete = NeighbourSearch.superset
+
+    def incomplete(self, frames, sample, margin):
+        sets = complete(self, frames, sample, margin)
+        return ParticleSets(sets.sample, sets.integration[: len(sets.sample)], sets.nodes)
+
+    monkeypatch.setattr(NeighbourSearch, "superset", incomplete)
+    root, said = copied("simulate", "train"), []
+    pipeline = pipeline_at(root, say=said.append)
+    pipeline.run("deploy")
+    missing = pipeline.deployment.manifest["metrics"]["needed_outside"]
+    assert missing > 100
+    (warning,) = [line for line in said if "warning" in line]
+    assert f"friction_angle=26: a step needed {missing} particles or nodes outside" in warning
+    assert "integration=search" in warning  # the remedy
+
+
+# -- divergence -----------------------------------------------------------------------------------------
+
+
+class Breaks:
+    """A projector that is lost as soon as a latent has moved by 0.5."""
+
+    iterations, tolerance = 1, 1e-6
+
+    def solve(self, at, target, xhat):
+        result = Taylor().solve(at, target, xhat)
+        lost = (at.position(xhat)[:, 2].mean() - self.first(at, xhat)) < -1e-4
+        bad = torch.full_like(result.xhat, float("nan"))
+        return ProjectionResult(torch.where(lost, bad, result.xhat), result.residuals, result.updates)
+
+    def first(self, at, xhat):
+        if not hasattr(at, "_height"):
+            at._height = at.position(xhat)[:, 2].mean()
+        return at._height
+
+
+def test_a_diverged_rollout_is_infinite_and_never_nan(copied, pipeline_at):
+    root, said = copied("simulate", "train"), []
+    pipeline = pipeline_at(root, say=said.append)
+    pipeline.projector = Breaks()
+    pipeline.run("deploy")
+    pipeline.run("evaluate")
+    assert any("friction_angle=26 diverged at step" in line and "∞" in line for line in said)
+    assert pipeline.deployment.manifest["metrics"]["diverged"] == [26.0]
+    text = (pipeline.evaluation.path / "results.csv").read_text()
+    assert "nan" not in text.lower()
+    results = pd.read_csv(pipeline.evaluation.path / "results.csv")
+    assert (results[["delta", "displacement_error", "stress_error"]] == np.inf).all().all()
+    assert not results.isna().any().any()
+    frames = np.load(pipeline.evaluation.path / "frames.npz")
+    assert np.isfinite(frames["x_reduced"]).all()
+    for name in ("cost.json", "summary.json"):
+        json.loads((pipeline.evaluation.path / name).read_text(), parse_constant=pytest.fail)
+
+
+# -- the command ----------------------------------------------------------------------------------------
+
+
+def test_nsf_run_in_a_process_of_its_own(copied, tiny, tmp_path):
+    """The real command once, report and pictures included, on runs that are there already."""
+    root = copied(*STAGES)
+    environment = os.environ | {"NSF_RUNS": str(root), "NSF_REPORTS": str(tmp_path / "reports")}
+    done = subprocess.run(
+        [sys.executable, "-m", "nsf.cli", "run", *tiny],
+        cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "simulate: 4 of 4 trajectories are there, reused" in done.stdout
+    for stage in ("train", "deploy", "evaluate"):
+        assert f"{stage}: inputs unchanged, reused" in done.stdout
+    assert "δ [%]" in done.stdout
+    assert "Traceback" not in done.stderr
+    assert "\r" not in done.stderr  # no progress bar where there is no terminal
+    page = tmp_path / "reports/sand_small/index.html"
+    assert str(page) in done.stdout
+    assert page.stat().st_size > 1000
+    assert list(pd.read_csv(page.parent / "results.csv")) == COLUMNS
+    assert not [p for p in tmp_path.iterdir() if p.name not in ("runs", "reports")]
+
+
+def test_a_manifold_of_the_chain_loads_by_path_or_name(chain):
+    assert torch.equal(Manifold.load(str(chain.checkpoint)).X, Manifold.load(chain.checkpoint).X)

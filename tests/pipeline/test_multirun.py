@@ -1,0 +1,79 @@
+"""`nsf <stage> -m`: every combination of comma-separated values."""
+
+import pandas as pd
+import pytest
+from forked import PlainReport, SignalAt, run_nsf
+
+from nsf.runs import Run
+
+
+def test_every_combination_of_the_issues_grammar(nsf, copied, tmp_path):
+    """nsf run -m scene=sand field.beta=[24,48] latent_dim=4,6 sampler.size=50,150"""
+    root = copied("simulate")
+    overrides = ["field.beta=[3,4]", "latent_dim=3,4", "sampler.size=20,30", "evaluation.trials=1"]
+    outcome = nsf("run", root, *overrides, faults=[PlainReport()], multirun=True)
+    assert outcome.code == 0, outcome.err
+    assert len(Run.find("simulate", root=root)) == 4  # one data set for all
+    trained, evaluated = Run.find("train", root=root), Run.find("evaluate", root=root)
+    assert sorted(run.config["latent_dim"] for run in trained) == [3, 4]
+    assert all(run.config["field"]["beta"] == [3, 4] for run in trained)
+    results = pd.concat([pd.read_csv(run.path / "results.csv") for run in evaluated])
+    assert sorted(zip(results["r"], results["sample"], strict=True)) == [(3, 20), (3, 30), (4, 20), (4, 30)]
+    assert outcome.out.count("train: inputs unchanged, reused") == 2
+    report = pd.read_csv(tmp_path / "work/reports/sand_small/results.csv")
+    assert len(report) == 4
+    for overrides in ("latent_dim=3 sampler.size=20", "latent_dim=4 sampler.size=30"):
+        assert all(part in outcome.out for part in overrides.split())
+
+
+@pytest.mark.parametrize("values", ["9,3", "3,9"])
+def test_a_failing_job_does_not_stop_its_siblings(nsf, copied, values):
+    root = copied("simulate")
+    outcome = nsf("train", root, f"latent_dim={values}", multirun=True)
+    assert outcome.code != 0
+    assert "latent_dim=9 exceeds the 8 displacement modes" in outcome.err
+    assert "Traceback" not in outcome.err
+    runs = {run.config["latent_dim"]: run for run in Run.find("train", root=root)}
+    assert runs[3].complete
+    assert runs[9].manifest["status"] == "failed"
+
+
+def test_a_job_refused_before_it_starts(nsf, copied):
+    root = copied("simulate")
+    outcome = nsf("train", root, "trainer.steps=0,150", multirun=True)
+    assert outcome.code == 2
+    assert "steps=0" in outcome.err
+    (run,) = Run.find("train", root=root)
+    assert run.complete
+
+
+@pytest.mark.parametrize(
+    ("override", "quoted"),
+    [
+        ("latent_dimm=4,6", "'latent_dimm'"),
+        ("method=nsf,baseline", "method=baseline"),
+        ("latent_dim=[", "latent_dim=["),
+        ("latent_dim", "latent_dim"),
+        ("field._target_=os.system,os.remove", "os.system is refused"),
+    ],
+)
+def test_bad_grammar_is_refused_as_in_a_single_run(nsf, copied, override, quoted):
+    outcome = nsf("train", copied(), override, multirun=True)
+    assert outcome.code == 2
+    assert quoted in outcome.err
+    assert "Traceback" not in outcome.err
+
+
+def test_control_c_stops_all_jobs(nsf, copied):
+    root = copied("simulate")
+    moment = SignalAt("nsf.kinematics.descent:Steps._take", 100)
+    outcome = nsf("train", root, "latent_dim=3,4", faults=[moment], multirun=True)
+    assert outcome.code == 130
+    assert [run.manifest["status"] for run in Run.find("train", root=root)] == ["interrupted"]
+
+
+def test_points_of_several_materials(tmp_path):
+    arguments = ["point", "-m", "material=hencky,drucker_prager", "path=simple_shear,oedometer"]
+    outcome = run_nsf(arguments, tmp_path / "runs", tmp_path / "work")
+    assert outcome.code == 0, outcome.err
+    assert len(list((tmp_path / "work/reports/point").glob("*.csv"))) == 4

@@ -1,0 +1,105 @@
+"""Rollouts: through Lightning's `Trainer.predict`, and on disk."""
+
+import h5py
+import numpy as np
+import pytest
+
+from nsf.dynamics import Rollout, deploy, rollout
+from nsf.errors import SchemaError
+
+
+@pytest.fixture(scope="module")
+def solver_at(chain, tiny_manifold):
+    def build(value, device="cpu"):
+        return chain.scene.reduced(tiny_manifold, {"friction_angle": value}, 20, device=device)
+
+    return build
+
+
+@pytest.fixture(scope="module")
+def made(solver_at) -> Rollout:
+    return rollout(solver_at(26.0), 26.0)
+
+
+def same(one: Rollout, other: Rollout, timing: bool = True) -> bool:
+    a, b = vars(one) | {}, vars(other) | {}
+    if not timing:
+        a.pop("seconds"), b.pop("seconds")
+    return a.keys() == b.keys() and all(np.array_equal(a[k], b[k]) for k in a)
+
+
+def test_a_rollout_is_the_whole_run(made, solver_at):
+    solver = solver_at(26.0)
+    solver.step(24)
+    latent = solver.trajectory()
+    assert (made.parameter, made.sample, made.diverged, made.needed_outside) == (26.0, 20, -1, 0)
+    assert np.array_equal(made.xhat, latent.xhat)
+    assert np.array_equal(made.t, latent.t)
+    assert made.stops == latent.stops
+    assert made.integration_mean == solver.integration_mean
+    assert made.seconds > 0
+
+
+def test_batches_are_parameter_values(made, solver_at):
+    runs = deploy(solver_at, (26.0, 33.5), "cpu")
+    assert [run.parameter for run in runs] == [26.0, 33.5]
+    assert same(runs[0], made, timing=False)
+    assert not np.array_equal(runs[0].xhat, runs[1].xhat)
+
+
+def test_round_trip(made, tmp_path):
+    made.save(tmp_path / "rollout.h5")
+    assert same(Rollout.open(tmp_path / "rollout.h5"), made)
+    assert [p.name for p in tmp_path.iterdir()] == ["rollout.h5"]
+
+
+def test_a_single_step_is_a_run(chain, tiny_manifold):
+    solver = chain.scene.reduced(tiny_manifold, {"friction_angle": 26.0}, 20, device="cpu", dt_multiplier=24)
+    assert rollout(solver, 26.0).xhat.shape == (2, 4)
+
+
+@pytest.mark.parametrize("keep", [0, 8, 100, 0.5, -64])
+def test_truncated(made, tmp_path, keep):
+    path = tmp_path / "rollout.h5"
+    made.save(path)
+    whole = path.read_bytes()
+    path.write_bytes(whole[: int(keep * len(whole)) if isinstance(keep, float) else keep])
+    with pytest.raises(SchemaError, match=r"rollout\.h5 is .*(deploy again|delete)"):
+        Rollout.open(path)
+
+
+def test_missing(tmp_path):
+    with pytest.raises(SchemaError, match=r"rollout\.h5"):
+        Rollout.open(tmp_path / "rollout.h5")
+
+
+def test_foreign(tmp_path, chain):
+    with pytest.raises(SchemaError, match="is not a rollout of version 1"):
+        Rollout.open(chain.trajectory(26.0))
+    other = tmp_path / "other.h5"
+    with h5py.File(other, "w") as file:
+        file["x"] = np.zeros(3)
+    with pytest.raises(SchemaError, match="is not a rollout of version 1"):
+        Rollout.open(other)
+    (tmp_path / "text.h5").write_text("not HDF5")
+    with pytest.raises(SchemaError, match="not a rollout"):
+        Rollout.open(tmp_path / "text.h5")
+
+
+def test_newer(made, tmp_path):
+    path = tmp_path / "rollout.h5"
+    made.save(path)
+    with h5py.File(path, "a") as file:
+        file.attrs["nsf_rollout"] = 2
+    with pytest.raises(SchemaError, match=r"found 2"):
+        Rollout.open(path)
+
+
+@pytest.mark.parametrize("lost", ["xhat", "stops"])
+def test_a_part_is_missing(made, tmp_path, lost):
+    path = tmp_path / "rollout.h5"
+    made.save(path)
+    with h5py.File(path, "a") as file:
+        del file[lost]
+    with pytest.raises(SchemaError, match="deploy again"):
+        Rollout.open(path)

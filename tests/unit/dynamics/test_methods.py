@@ -1,0 +1,112 @@
+"""The 2×2 of methods: where τ and C come from (paper section 6.1, the baseline of Chen et al. 2023a)."""
+
+import numpy as np
+import pytest
+import torch
+
+from nsf import config
+from nsf.dynamics import Method
+
+ANGLE = {"friction_angle": 26.0}
+METHODS = ("nsf", "deformation_only", "neural_stress_only", "neural_affine_only")
+
+
+def configured(name, tiny) -> Method:
+    return config.build(config.load([*tiny, f"method={name}"]).method, "method")
+
+
+@pytest.fixture(params=METHODS)
+def method(request, tiny):
+    return configured(request.param, tiny)
+
+
+@pytest.fixture
+def solver(chain, tiny_manifold, method):
+    return chain.scene.reduced(tiny_manifold, ANGLE, 20, method=method, device="cpu")
+
+
+def hencky(F, mu, lam):
+    """τ = U (2μ̂ log Σ + λ tr log Σ) Uᵀ, by NumPy."""
+    U, sigma, _ = np.linalg.svd(F)
+    log = np.log(sigma)
+    principal = 2 * mu * log + lam * log.sum(1, keepdims=True)
+    return np.einsum("pij,pj,pkj->pik", U, principal, U)
+
+
+def test_the_four_are_all_there(tiny):
+    found = {(m.neural_stress, m.neural_affine): m.name for m in (configured(n, tiny) for n in METHODS)}
+    assert found == {
+        (True, True): "nsf",
+        (False, False): "deformation_only",
+        (True, False): "neural_stress_only",
+        (False, True): "neural_affine_only",
+    }
+
+
+def test_runs_to_the_end(solver):
+    solver.step(solver.total_steps)
+    assert np.isfinite(solver.trajectory().xhat).all()
+    assert solver.state.numpy()["x"][:, 2].mean() < solver.scene_particles.X[:, 2].mean() - 1e-3
+
+
+def test_stress_and_affine_on_the_particles(solver, method, tiny_manifold):
+    """What P2G gets in mid-run, against the fields and against Hencky's law of ∂g/∂X by hand."""
+    solver.step(12)
+    xhat = solver.xhat.clone()
+    solver.infer()
+    solver.hand_over()
+    phase = solver._phase
+    fields = tiny_manifold.restrict(particles=torch.as_tensor(phase.sets.integration))
+    if method.neural_stress:
+        tau = fields.stress(xhat, torch.tensor([26.0], dtype=torch.float64)).numpy()
+        tau = tau[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    else:
+        material = solver.scene.material
+        tau = hencky(fields.deformation_gradient(xhat).numpy(), material.mu, material.lam)
+    C = np.zeros((phase.size, 3, 3))
+    if method.neural_affine:
+        C = fields.affine(xhat, torch.tensor([26.0], dtype=torch.float64)).numpy()
+    scale = np.abs(tau).max()
+    assert scale > 1.0
+    np.testing.assert_allclose(phase.tau.numpy(), tau, atol=1e-8 * scale)
+    # G2P has not run, so C of the sample is still what the field gave.
+    np.testing.assert_allclose(phase.C.numpy(), C, atol=1e-10)
+    assert (np.abs(C).max() > 1e-3) == method.neural_affine
+
+
+def test_no_affine_field_means_zero_at_every_step(chain, tiny_manifold, tiny):
+    """G2P writes C of the sample particles; the next step must not see it."""
+    solver = chain.scene.reduced(
+        tiny_manifold, ANGLE, 20, method=configured("deformation_only", tiny), device="cpu"
+    )
+    solver.step(5)
+    assert solver._phase.C.abs().max() > 1e-3
+    solver.infer()
+    solver.hand_over()
+    assert solver._phase.C.abs().max() == 0.0
+
+
+def test_methods_differ(chain, tiny_manifold, tiny):
+    ends = []
+    for name in METHODS:
+        solver = chain.scene.reduced(tiny_manifold, ANGLE, 20, method=configured(name, tiny), device="cpu")
+        solver.step(solver.total_steps)
+        ends.append(solver.state.xhat)
+    for i, one in enumerate(ends):
+        for other in ends[:i]:
+            assert np.abs(one - other).max() > 1e-6
+
+
+def test_the_search_gives_every_method_the_same_run(chain, tiny_manifold, method):
+    from nsf.dynamics import Integration
+
+    X = chain.scene.particles().X
+    corner = np.linalg.norm(X - X[np.argmax(X @ [1.0, 1.0, 2.0])], axis=1).argsort()[:10]
+    runs = []
+    for integration in (Integration(), Integration("search", 0)):
+        solver = chain.scene.reduced(
+            tiny_manifold, ANGLE, corner, method=method, integration=integration, device="cpu"
+        )
+        solver.step(12)
+        runs.append(solver.state.numpy()["x"])
+    assert np.abs(runs[0] - runs[1]).max() < 1e-10

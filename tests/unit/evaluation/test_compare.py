@@ -1,0 +1,202 @@
+"""A rollout beside its full-order truth."""
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+import nsf.scenes
+from nsf.data import Trajectory
+from nsf.dynamics import Rollout
+from nsf.errors import SchemaError
+from nsf.evaluation import at_frames, compare, metrics
+
+CPU = torch.device("cpu")
+ERRORS = ["delta", "displacement_error", "stress_error"]
+MOMENTA = ["linear_momentum_error", "angular_momentum_error"]
+
+
+def rollout_of(t, xhat, diverged=-1, parameter=26.0):
+    n = len(t) - 1
+    return Rollout(parameter, t, xhat, np.zeros((n, 2)), ["converged"] * n, 20, 50.0, 0, 1.0, diverged)
+
+
+@pytest.fixture(scope="module")
+def truth(chain):
+    with Trajectory.open(chain.trajectory(26.0)) as trajectory:
+        yield trajectory
+
+
+@pytest.fixture(scope="module")
+def made(chain):
+    return Rollout.open(chain.pipeline.deployment.path / "rollout_0.h5")
+
+
+@pytest.fixture(scope="module")
+def comparison_of(chain, tiny_manifold, truth):
+    scene = chain.scene.with_parameters({"friction_angle": 26.0})
+
+    def build(rollout, split="test", pictures=(50, 4)):
+        return compare(scene, tiny_manifold, truth, rollout, split, CPU, pictures)
+
+    return build
+
+
+@pytest.fixture(scope="module")
+def perfect(tiny_manifold, truth, comparison_of):
+    """The latents of the truth's own frames: a reduced run without dynamics."""
+    xhat = tiny_manifold.encode(torch.tensor(truth.read("x"), dtype=torch.float64)).numpy()
+    return comparison_of(rollout_of(truth.t, xhat))
+
+
+def test_totals_are_the_metrics(comparison_of, made, tiny_manifold, truth):
+    """Over frames 1..N, from positions and stresses decoded here, with nothing chunked."""
+    everything, xhat = tiny_manifold.restrict(), torch.tensor(made.xhat)
+    found = comparison_of(made)
+    x, tau = (torch.tensor(truth.read(k), dtype=torch.float64) for k in ("x", "tau"))
+    x_rom = everything.position(xhat)
+    tau_rom = everything.stress(xhat, torch.tensor([26.0], dtype=torch.float64))
+    assert found.delta == pytest.approx(metrics.deformation_error(x_rom[1:], x[1:]), rel=1e-9)
+    expected = metrics.displacement_error(x_rom[1:], x[1:], torch.tensor(truth.X))
+    assert found.displacement_error == pytest.approx(expected, rel=1e-9)
+    assert found.stress_error == pytest.approx(metrics.stress_error(tau_rom[1:], tau[1:]), rel=1e-9)
+
+
+def test_a_perfect_rollout_leaves_the_reconstruction_error(perfect):
+    assert perfect.delta == pytest.approx(perfect.reconstruction_delta, rel=1e-9)
+    assert perfect.stress_error == pytest.approx(perfect.reconstruction_stress_error, rel=1e-9)
+    assert 0.0 < perfect.delta < 0.003
+    # The momenta come from backward differences and the field C: the scheme's error, not zero.
+    assert (perfect.series[MOMENTA] < 0.5).all().all()
+
+
+def test_the_rollout_is_worse_than_the_reconstruction(comparison_of, made, perfect):
+    found = comparison_of(made)
+    assert found.reconstruction_delta == perfect.reconstruction_delta
+    assert perfect.delta < found.delta < 0.05
+    assert found.displacement_error > 3.0 * found.delta
+
+
+def test_chunks_change_nothing(comparison_of, made, monkeypatch):
+    whole = comparison_of(made)
+    # The package exports a function of the module's name.
+    monkeypatch.setattr(sys.modules["nsf.evaluation.compare"], "_CHUNK", 9 * 500 * 4)
+    pieces = comparison_of(made)
+    np.testing.assert_allclose(
+        pieces.series.drop(columns="split").to_numpy(),
+        whole.series.drop(columns="split").to_numpy(),
+        rtol=1e-9,
+    )
+    assert pieces.delta == pytest.approx(whole.delta, rel=1e-12)
+    for name, values in whole.pictures.items():
+        np.testing.assert_allclose(pieces.pictures[name], values, rtol=1e-6)
+
+
+def test_series(comparison_of, made, truth):
+    series = comparison_of(made).series
+    latents = [f"{kind}_{k}" for kind in ("xhat", "encoded") for k in range(1, 5)]
+    first = ["parameter", "split", "frame", "t"]
+    assert list(series) == [*first, *ERRORS, *MOMENTA, "reconstruction_delta", *latents]
+    assert len(series) == truth.frames == 25
+    assert set(series["split"]) == {"test"}
+    np.testing.assert_array_equal(series["t"], truth.t)
+    np.testing.assert_allclose(series[[f"xhat_{k}" for k in range(1, 5)]], made.xhat, rtol=1e-12)
+    assert np.isnan(series["displacement_error"][0])  # nothing has moved yet
+    assert np.isfinite(series[[*ERRORS, *MOMENTA]][1:]).all().all()
+    errors = series["delta"][1:].to_numpy()
+    assert errors.min() <= comparison_of(made).delta <= errors.max()
+
+
+def test_pictures(comparison_of, made, truth):
+    kept = comparison_of(made, pictures=(50, 4)).pictures
+    assert kept["x_full"].shape == kept["x_reduced"].shape == (4, 50, 3)
+    assert kept["tau_full"].shape == kept["tau_reduced"].shape == (4, 50, 6)
+    np.testing.assert_allclose(kept["t"], truth.t[[0, 8, 16, 24]])
+    many = comparison_of(made, pictures=(10_000, 1000)).pictures
+    assert many["x_full"].shape == (25, 500, 3)
+    np.testing.assert_allclose(many["x_full"], truth.read("x"), rtol=1e-6)
+
+
+def test_frames_between_deployment_steps():
+    t = np.array([0.0, 1.5, 3.0])
+    run = rollout_of(t, np.array([[0.0, 10.0], [3.0, 10.0], [9.0, 40.0]]))
+    found = at_frames(run, np.array([0.0, 1.0, 2.0, 3.0]))
+    np.testing.assert_allclose(found, [[0, 10], [2, 10], [5, 20], [9, 40]])
+
+
+def test_frames_at_deployment_steps_are_exact(made):
+    assert np.array_equal(at_frames(made, made.t), made.xhat)
+
+
+def test_a_multiplied_step_is_compared_at_the_frames(chain, tiny_manifold, comparison_of, made):
+    from nsf.dynamics import rollout
+
+    value = {"friction_angle": 26.0}
+    run = rollout(chain.scene.reduced(tiny_manifold, value, 20, device="cpu", dt_multiplier=1.5), 26.0)
+    found = comparison_of(run)
+    assert len(found.series) == 25
+    assert found.delta < 3.0 * comparison_of(made).delta + 0.005
+
+
+@pytest.fixture(scope="module")
+def lost(made, comparison_of):
+    """A run that was lost at step 10."""
+    xhat = made.xhat.copy()
+    xhat[10:] = np.nan
+    return comparison_of(replace(made, xhat=xhat, diverged=10))
+
+
+def test_a_diverged_run_has_infinite_errors(lost):
+    assert [lost.delta, lost.displacement_error, lost.stress_error] == [np.inf] * 3
+    assert np.isfinite([lost.reconstruction_delta, lost.reconstruction_stress_error]).all()
+
+
+@pytest.mark.parametrize("column", [*ERRORS, *MOMENTA])
+def test_a_diverged_run_is_infinite_from_its_step_on(lost, column):
+    values = lost.series[column].to_numpy()
+    assert np.isfinite(values[1:10]).all()
+    assert (values[10:] == np.inf).all()
+
+
+def test_pictures_of_a_diverged_run_hold_its_last_state(lost):
+    assert all(np.isfinite(values).all() for values in lost.pictures.values())
+    assert np.isfinite(lost.series["reconstruction_delta"]).all()
+
+
+def test_a_run_lost_between_frames(comparison_of, made):
+    """With a longer step, frames just before the lost one lie between a finite and a lost latent."""
+    t, xhat = made.t[::2].copy(), made.xhat[::2].copy()
+    xhat[5:] = np.nan
+    lost = comparison_of(rollout_of(t, xhat, diverged=5))
+    assert lost.delta == np.inf
+    assert (lost.series["delta"][9:] == np.inf).all()
+    assert np.isfinite(lost.series["delta"][:9]).all()
+
+
+def test_a_run_lost_at_infinity(comparison_of, made):
+    xhat = made.xhat.copy()
+    xhat[7:, 0] = np.inf
+    lost = comparison_of(replace(made, xhat=xhat, diverged=7))
+    assert lost.delta == np.inf
+    assert not lost.series[1:].isna().any().any()
+
+
+def test_other_particles_are_refused(tiny, tiny_manifold, made, tmp_path):
+    scene = nsf.scenes.load("sand", [*tiny[1:], "scene.bodies.column.particles=499"])
+    from nsf.data import TrajectoryWriter
+
+    constants = scene.particles()
+    about = {"mass": constants.mass, "volume0": constants.volume0, "parameters": {"friction_angle": 26.0}}
+    zeros = {k: np.zeros((499, c)) for k, c in (("v", 3), ("C", 9), ("tau", 6))}
+    writer = TrajectoryWriter(
+        tmp_path / "t.h5", X=constants.X, **about, dt=0.005, dx=0.02, frames=1, dtype="float32"
+    )
+    with writer:
+        writer.append(0.0, constants.X, **zeros)
+    with (
+        Trajectory.open(tmp_path / "t.h5") as other,
+        pytest.raises(SchemaError, match="checkpoint made for other particles"),
+    ):
+        compare(scene, tiny_manifold, other, made, "test", CPU, (10, 2))

@@ -1,0 +1,151 @@
+"""Metrics against values worked out by hand."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from nsf.errors import ShapeError
+from nsf.evaluation import deformation_error, displacement_error, metrics, reduction_ratio, stress_error
+
+
+def tensor(values):
+    return torch.tensor(values, dtype=torch.float64)
+
+
+@pytest.fixture
+def X():
+    return tensor([[0.0, 0.0, 1.0], [0.0, 2.0, 0.0]])
+
+
+@pytest.fixture
+def x_fom(X):
+    """Two frames; all displacements are along x, of 1 and 2, then of 3 and 4."""
+    return torch.stack([X + tensor([[1.0, 0, 0], [2.0, 0, 0]]), X + tensor([[3.0, 0, 0], [4.0, 0, 0]])])
+
+
+@pytest.fixture
+def x_rom(x_fom):
+    """Off by 0.3 at one particle in one frame and by 0.4 at another in the other."""
+    x = x_fom.clone()
+    x[0, 1, 2] += 0.3
+    x[1, 0, 1] -= 0.4
+    return x
+
+
+def test_deformation_error_by_hand(x_rom, x_fom):
+    # ‖x_rom − x_fom‖² = 0.09 + 0.16; ‖x_fom‖² = (1+1) + (4+4) + (9+1) + (16+4) = 40
+    assert deformation_error(x_rom, x_fom) == pytest.approx(0.5 / math.sqrt(40.0), rel=1e-14)
+
+
+def test_displacement_error_by_hand(x_rom, x_fom, X):
+    # ‖x_fom − X‖² = 1 + 4 + 9 + 16
+    assert displacement_error(x_rom, x_fom, X) == pytest.approx(0.5 / math.sqrt(30.0), rel=1e-14)
+
+
+def test_a_shift_of_the_origin_changes_delta_and_not_the_displacement_error(x_rom, x_fom, X):
+    """physics.md: the paper's δ is not translation invariant."""
+    shift = 5.0
+    before, after = deformation_error(x_rom, x_fom), deformation_error(x_rom + shift, x_fom + shift)
+    assert after < 0.3 * before
+    moved = displacement_error(x_rom + shift, x_fom + shift, X + shift)
+    assert moved == pytest.approx(displacement_error(x_rom, x_fom, X), rel=1e-12)
+
+
+def test_a_shift_in_the_unit_cube():
+    """physics.md: shift the origin by 5 in each axis and a 1 % error reads 0.11 %."""
+    x_fom = torch.rand(3, 2000, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    x_rom = 1.01 * x_fom
+    assert deformation_error(x_rom, x_fom) == pytest.approx(0.01, rel=1e-12)
+    assert deformation_error(x_rom + 5.0, x_fom + 5.0) == pytest.approx(0.00105, rel=0.02)
+
+
+def test_stress_error_counts_off_diagonals_twice():
+    """The Frobenius norm of the matrix: xy, xz and yz each stand for two entries."""
+    for k, weight in enumerate((1, 2, 2, 1, 2, 1)):
+        tau = torch.zeros(1, 1, 6, dtype=torch.float64)
+        tau[0, 0, k] = 3.0
+        assert metrics.tensor_squares(tau).tolist() == [9.0 * weight]
+    full = tensor([[[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]]])
+    off = full.clone()
+    off[0, 0, 1] += 0.1
+    matrix = np.array([[1.0, 2, 3], [2, 4, 5], [3, 5, 6]])
+    expected = np.linalg.norm([[0.0, 0.1], [0.1, 0.0]]) / np.linalg.norm(matrix)
+    assert stress_error(off, full) == pytest.approx(expected, rel=1e-12)
+
+
+def test_no_error_is_zero(x_fom, X):
+    tau = torch.randn(2, 3, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert deformation_error(x_fom, x_fom) == 0.0
+    assert displacement_error(x_fom, x_fom, X) == 0.0
+    assert stress_error(tau, tau) == 0.0
+
+
+def test_single_precision_is_summed_in_double():
+    x_fom = torch.full((1, 100_000, 3), 0.5)
+    x_rom = x_fom + 2.0**-12
+    assert deformation_error(x_rom, x_fom) == pytest.approx(2.0**-11, rel=1e-12)
+
+
+@pytest.mark.parametrize("metric", [deformation_error, stress_error])
+def test_shapes_must_agree(metric):
+    with pytest.raises(ShapeError, match=r"\(2, 3, 3\) and \(2, 4, 3\)"):
+        metric(torch.zeros(2, 3, 3), torch.zeros(2, 4, 3))
+    with pytest.raises(ShapeError, match=r"trajectories differ"):
+        displacement_error(torch.zeros(2, 3, 3), torch.zeros(1, 3, 3), torch.zeros(3, 3))
+
+
+def test_linear_momentum():
+    v = tensor([[[1.0, 0, 0], [0, 2.0, 0]]])
+    assert metrics.linear_momentum(v, tensor([2.0, 3.0])).tolist() == [[2.0, 6.0, 0.0]]
+
+
+def test_angular_momentum_by_hand():
+    """A mass of 2 at (1, 0, 0) going along y at 3; C adds m D axial(C − Cᵀ)."""
+    x, v, mass = tensor([[[1.0, 0, 0]]]), tensor([[[0, 3.0, 0]]]), tensor([2.0])
+    C = torch.zeros(1, 1, 3, 3, dtype=torch.float64)
+    assert metrics.angular_momentum(x, v, C, mass, 0.25).tolist() == [[0.0, 0.0, 6.0]]
+    C[0, 0, 1, 0], C[0, 0, 0, 1] = 0.5, -0.5
+    assert metrics.angular_momentum(x, v, C, mass, 0.25).tolist() == [[0.0, 0.0, 6.0 + 0.25 * 2.0]]
+
+
+def test_angular_momentum_of_a_spinning_cube():
+    """A cube of edge a and mass m has I = m a²/6 about its centre.
+
+    As n³ points it lacks the momentum of each sub-cube about its own centre, m h²/6, which C = [ω×] with
+    D = h²/12 restores in full.
+    """
+    n, edge, density = 4, 2.0, 3.0
+    h = edge / n
+    axis = (torch.arange(n, dtype=torch.float64) + 0.5) * h - 0.5 * edge
+    x = torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(1, -1, 3)
+    omega = tensor([0.3, -0.7, 1.1])
+    v = torch.linalg.cross(omega.expand_as(x), x)
+    wx, wy, wz = omega.tolist()
+    spin = tensor([[0.0, -wz, wy], [wz, 0.0, -wx], [-wy, wx, 0.0]]).expand(1, n**3, 3, 3)
+    mass = torch.full((n**3,), density * h**3, dtype=torch.float64)
+    exact = density * edge**3 * edge**2 / 6.0 * omega
+    with_affine = metrics.angular_momentum(x, v, spin, mass, h**2 / 12.0)[0]
+    without = metrics.angular_momentum(x, v, torch.zeros_like(spin), mass, h**2 / 12.0)[0]
+    torch.testing.assert_close(with_affine, exact, rtol=1e-12, atol=1e-12)
+    assert (without / exact - (1.0 - 1.0 / n**2)).abs().max() < 1e-12
+
+
+def test_a_symmetric_affine_part_carries_no_angular_momentum():
+    A = torch.randn(1, 5, 3, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    zero, mass = torch.zeros(1, 5, 3, dtype=torch.float64), torch.ones(5, dtype=torch.float64)
+    assert metrics.angular_momentum(zero, zero, A + A.mT, mass, 1.0).abs().max() < 1e-14
+
+
+def test_momentum_error():
+    fom = tensor([[0.0, 0, 0], [3.0, 0, 0]])
+    rom = fom + tensor([[0, 0, 0], [0, 0.5, 0]])
+    assert metrics.momentum_error(rom, fom, tensor([1.0, 10.0])).tolist() == [0.0, 0.05]
+
+
+def test_reduction_ratio():
+    """physics.md: cake 3·200 000/6, metal 29 987, toothpaste 3·45 412/6."""
+    assert reduction_ratio(200_000, 6) == 1e5
+    assert round(reduction_ratio(49_978, 5)) == 29_987
+    assert reduction_ratio(45_412, 6) == 22_706

@@ -1,0 +1,232 @@
+"""The command line: exit codes, one clear line for bad input, the material point."""
+
+import os
+import re
+import signal
+
+import pandas as pd
+import pytest
+import torch
+
+from nsf.cli import STAGES, main
+from nsf.paths import groups
+
+
+@pytest.fixture
+def nsf(tmp_path, monkeypatch, capsys, tiny):
+    """(*arguments) → (exit code, standard output, standard error) with empty folders of runs and reports."""
+    monkeypatch.setenv("NSF_RUNS", str(tmp_path / "runs"))
+    monkeypatch.setenv("NSF_REPORTS", str(tmp_path / "reports"))
+    monkeypatch.chdir(tmp_path)
+
+    def call(stage, *overrides, tiny_scene=True):
+        keys = {o.split("=")[0].lstrip("~+") for o in overrides}
+        base = [t for t in tiny if t.split("=")[0] not in keys] if tiny_scene else []
+        with pytest.raises(SystemExit) as end:
+            main([stage, *base, *overrides])
+        return (end.value.code or 0, *capsys.readouterr())
+
+    handler = signal.getsignal(signal.SIGTERM)
+    yield call
+    signal.signal(signal.SIGTERM, handler)
+
+
+def files(folder):
+    return [p for p in folder.rglob("*") if p.is_file()]
+
+
+@pytest.mark.parametrize("arguments", [[], ["--help"], ["-h"], ["help"]])
+def test_help(arguments, capsys):
+    with pytest.raises(SystemExit) as end:
+        main(arguments)
+    out = capsys.readouterr().out
+    assert end.value.code == 0
+    assert all(stage in out for stage in STAGES)
+    assert "scene        sand" in out
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_help_of_a_stage(nsf, stage):
+    code, out, _ = nsf(stage, "--help", tiny_scene=False)
+    assert code == 0
+    assert f"usage: nsf {stage}" in out
+    assert "device: " in out
+
+
+def test_version(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["--version"])
+    assert end.value.code == 0
+    assert re.fullmatch(r"\d+\.\d+\S*\n", capsys.readouterr().out)
+
+
+REFUSED = [
+    ("run", "scene.dtt=1", ["scene.dtt", "did you mean scene.dt"]),
+    ("run", "lantent_dim=4", ["'lantent_dim'", "did you mean latent_dim"]),
+    ("run", "method=baseline", ["method=baseline", "choose one of deformation_only"]),
+    ("run", "field=bassis", ["field=bassis", "did you mean basis?"]),
+    ("run", "latent_dim", ["'latent_dim' is not key=value"]),
+    ("run", "--fast", ["'--fast' is not key=value"]),
+    ("run", "scene.parameters.test=[1", ["scene.parameters.test=[1"]),
+    ("run", "scene.parameters.test=[22,26]", ["22", "train and test", "one split"]),
+    ("run", "scene.parameters.train=[22,22,30]", ["22", "twice in train"]),
+    ("run", "scene.parameters.test=[]", ["scene.parameters.test"]),
+    ("run", "scene.parameters.test=26", ["scene.parameters.test=26"]),
+    ("run", "scene.parameters.train=abc", ["scene.parameters.train"]),
+    ("run", "scene.parameters.test=[95]", ["friction_angle=95", "[0, 90)"]),
+    ("run", "scale=big", ["scale=big", "choose one of small, paper"]),
+    ("run", "material.nu=0.6", ["material.nu=0.6", "(-1, 0.5)"]),
+    ("run", "material.E=-1", ["material.E=-1", "positive"]),
+    ("run", "material.E=soft", ["material.E=soft"]),
+    ("run", "material.friction_angle=95", ["material.friction_angle=95", "[0, 90)"]),
+    ("run", "scene.dt=0", ["dt=0", "positive"]),
+    ("run", "scene.dt=-0.1", ["dt=-0.1", "positive"]),
+    ("run", "scene.dx=0", ["dx=0", "positive"]),
+    ("run", "scene.gravity=3", ["scene.gravity=3"]),
+    ("run", "latent_dim=0", ["latent_dim=0", "at least 1"]),
+    ("run", "latent_dim=abc", ["latent_dim=abc", "at least 1"]),
+    ("run", "latent_dim=2.5", ["latent_dim=2.5"]),
+    ("run", "seed=abc", ["seed=abc"]),
+    ("run", "precision=fp16", ["precision='fp16'", "fp32, fp64"]),
+    ("run", "device=gpu", ["device=gpu"]),
+    ("run", "data.dtype=float16", ["data.dtype=float16", "float32 or float64"]),
+    ("run", "deploy.split=foo", ["deploy.split=foo", "test, validation or train"]),
+    ("run", "field._target_=os.system", ["os.system is refused"]),
+    ("run", "~latent_dim", ["latent_dim"]),
+    ("run", "~scene.dx", ["scene.dx"]),
+    ("point", "material=hencki", ["material=hencki", "did you mean hencky?"]),
+    ("point", "path=pull", ["path='pull'", "simple_shear"]),
+    ("point", "point.amplitude=abc", ["point.amplitude=abc"]),
+    ("point", "point.amplitude=-1", ["point.amplitude=-1"]),
+    ("point", "point.points=1", ["point.points=1"]),
+    ("point", "point.rate=0", ["point.rate=0"]),
+    ("point", "material.E=0", ["material.E=0"]),
+    ("point", "precision=fp16", ["precision='fp16'"]),
+]
+
+
+@pytest.mark.parametrize(("stage", "override", "quoted"), REFUSED, ids=[f"{s} {o}" for s, o, _ in REFUSED])
+def test_bad_input_is_one_clear_line(nsf, tmp_path, stage, override, quoted):
+    code, _, err = nsf(stage, override, tiny_scene=stage == "run")
+    assert code == 2
+    assert err.startswith("error: ")
+    assert len(err.strip().splitlines()) == 1
+    for text in quoted:
+        assert text in err
+    assert not files(tmp_path)
+
+
+# What later stages need is known from the start: minutes of simulating and training must not be spent first.
+BEFORE_ANY_WORK = [
+    ("sampler.size=0", ["sampler.size"]),
+    ("sampler.size=1", ["|S|=1 gives 3 equations for r=4 unknowns; choose |S| >= 2"]),
+    ("sampler.size=2.5", ["sampler.size=2.5"]),
+    ("sampler.size=501", ["sampler.size=501", "500 particles"]),
+    ("sampler.seed=abc", ["sampler.seed=abc"]),
+    ("deploy.dt_multiplier=0", ["dt_multiplier=0"]),
+    ("deploy.dt_multiplier=abc", ["dt_multiplier=abc"]),
+    ("evaluation.trials=0", ["evaluation.trials=0"]),
+    ("evaluation.trials=abc", ["evaluation.trials=abc"]),
+    ("evaluation.picture_particles=0", ["evaluation.picture_particles=0"]),
+    ("evaluation.picture_frames=0", ["evaluation.picture_frames=0"]),
+    ("tracking=wandb", ["tracking='wandb'", "tensorboard"]),
+    ("data.resident=maybe", ["resident='maybe'"]),
+    ("method.neural_stress=maybe", ["neural_stress=maybe"]),
+]
+
+
+@pytest.mark.parametrize(("override", "quoted"), BEFORE_ANY_WORK, ids=[o for o, _ in BEFORE_ANY_WORK])
+def test_bad_input_of_a_later_stage_is_refused_before_any_work(nsf, monkeypatch, override, quoted):
+    monkeypatch.setattr(chain_module(), "simulate", lambda *arguments: pytest.fail("simulate began"))
+    code, _, err = nsf("run", override)
+    assert code == 2
+    assert len(err.strip().splitlines()) == 1
+    for text in quoted:
+        assert text in err
+
+
+def chain_module():
+    from nsf.pipeline import chain
+
+    return chain
+
+
+def test_the_example_of_the_style_guide(nsf, monkeypatch):
+    """|S| = 1 with the paper's r = 6."""
+    monkeypatch.setattr(chain_module(), "simulate", lambda *arguments: pytest.fail("simulate began"))
+    code, _, err = nsf("run", "latent_dim=6", "sampler.size=1")
+    assert code == 2
+    assert "|S|=1 gives 3 equations for r=6 unknowns; choose |S| >= 2" in err
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")
+@pytest.mark.parametrize("stage", ["run", "point"])
+def test_a_gpu_where_there_is_none(nsf, tmp_path, stage):
+    code, _, err = nsf(stage, "device=cuda", tiny_scene=stage == "run")
+    assert code == 2
+    assert "device=cuda" in err
+    assert "device=cpu" in err
+    assert not files(tmp_path)
+
+
+def test_an_unstable_step_names_the_largest_stable_one(nsf, tmp_path):
+    code, _, err = nsf("simulate", "scene.dt=0.5", "scene.parameters.train=[30]")
+    assert code == 2
+    assert "dt=0.5 s is unstable" in err
+    assert not files(tmp_path)
+    largest = re.search(r"largest stable dt is (\S+) s", err).group(1)
+    assert nsf("simulate", f"scene.dt={largest}", "scene.parameters.train=[30]")[0] == 0
+    longer = 1.001 * float(largest)
+    assert nsf("simulate", f"scene.dt={longer}", "scene.parameters.train=[30]")[0] == 2
+
+
+@pytest.mark.parametrize(
+    ("stage", "near"), [("simulat", "simulate"), ("rum", "run"), ("xyz", "choose one of")]
+)
+def test_unknown_stage(nsf, stage, near):
+    code, _, err = nsf(stage, tiny_scene=False)
+    assert code == 2
+    assert f"unknown stage '{stage}'" in err
+    assert near in err
+
+
+@pytest.mark.parametrize(
+    ("stage", "needed"),
+    [("train", "nsf simulate"), ("deploy", "nsf train"), ("evaluate", "nsf deploy"), ("report", "nsf run")],
+)
+def test_a_stage_before_its_time_names_the_command(nsf, tmp_path, stage, needed):
+    code, _, err = nsf(stage)
+    assert code == 2
+    assert f"run `{needed}" in err
+    assert not [p for p in files(tmp_path) if p.name != "manifest.json"]
+
+
+def test_point_of_every_material(nsf, tmp_path):
+    for material in groups()["material"]:
+        code, out, _ = nsf("point", f"material={material}", "path=simple_shear", tiny_scene=False)
+        assert code == 0
+        found = re.findall(r"(\S+simple_shear\.(?:png|csv|svg))", out)
+        assert found
+        assert all(os.path.getsize(path) > 0 for path in found)
+    tables = sorted((tmp_path / "reports/point").glob("*.csv"))
+    assert len(tables) == len(groups()["material"])
+
+
+def test_point_gives_the_laws_values(nsf, tmp_path):
+    """physics.md: Hencky at γ = 0.2, E = 1e6, ν = 0.3."""
+    nsf("point", "material=hencky", "path=simple_shear", tiny_scene=False)
+    (table,) = (tmp_path / "reports/point").glob("*.csv")
+    last = pd.read_csv(table).iloc[-1]
+    assert last["amplitude"] == pytest.approx(0.2)
+    assert last["tau_xy"] == pytest.approx(76414.324119, rel=1e-9)
+    assert last["tau_xx"] == pytest.approx(7641.432412, rel=1e-9)
+
+
+def test_point_on_every_path(nsf):
+    from nsf.mpm.materials.driver import PATHS
+
+    for path in PATHS:
+        assert (
+            nsf("point", "material=drucker_prager", f"path={path}", "point.points=11", tiny_scene=False)[0]
+            == 0
+        )

@@ -1,0 +1,153 @@
+"""Configuration: composed, resolved, checked."""
+
+import re
+
+import pytest
+from omegaconf import OmegaConf
+
+from nsf import config
+from nsf.errors import ConfigError
+from nsf.paths import CONF, groups
+
+
+def test_defaults_compose():
+    found = config.load()
+    assert (found.scene.name, found.scale, found.latent_dim, found.sampler.size) == ("sand", "small", 6, 150)
+    assert found.scene.dx == pytest.approx(1.0 / 64.0)
+
+
+def test_nothing_is_left_to_resolve():
+    def leaves(node):
+        if isinstance(node, dict | list):
+            for child in node.values() if isinstance(node, dict) else node:
+                yield from leaves(child)
+        else:
+            yield node
+
+    raw = OmegaConf.to_container(config.load(["scale=paper"]), resolve=False)
+    assert not [leaf for leaf in leaves(raw) if isinstance(leaf, str) and ("${" in leaf or "???" in leaf)]
+
+
+def test_scale_chooses_every_size():
+    small, paper = config.load(["scale=small"]), config.load(["scale=paper"])
+    assert paper.scene.bodies.column.particles == 71363 > small.scene.bodies.column.particles
+    assert len(paper.scene.parameters.train) == 16
+    assert paper.report.name == "sand"
+    assert small.report.name == "sand_small"
+
+
+def test_a_group_option_replaces_the_whole_group():
+    found = config.load(["projector=taylor"])
+    assert found.projector == {"_target_": "nsf.dynamics.Taylor"}
+    assert config.load(["method=deformation_only"]).method.neural_stress is False
+
+
+def test_one_load_leaves_no_trace_in_the_next():
+    before = config.load()
+    config.load(["scale=paper", "latent_dim=3", "method=deformation_only"])
+    with pytest.raises(ConfigError):
+        config.load(["nonsense=1"])
+    assert config.load() == before
+
+
+@pytest.mark.parametrize(
+    "group", ["method", "projector", "integration", "sampler", "field", "trainer", "transfer"]
+)
+def test_every_option_builds(group):
+    """A new yaml is tested without being registered here."""
+    for option in groups()[group]:
+        assert config.build(config.load([f"{group}={option}"])[group], group) is not None
+
+
+def test_every_yaml_is_in_a_group_or_primary():
+    assert {p.parent.name for p in CONF.rglob("*.yaml")} - set(groups()) == {CONF.name}
+
+
+@pytest.mark.parametrize(
+    ("override", "quoted"),
+    [
+        ("lantent_dim=4", "unknown key 'lantent_dim'; did you mean latent_dim"),
+        ("sampler.sise=4", "unknown key 'sampler.sise'; did you mean sampler.size"),
+        ("foo=1", "unknown key 'foo'"),
+        ("methd=nsf", "did you mean method"),
+        ("method=nfs", "unknown method=nfs; choose one of deformation_only"),
+        ("scene=snad", "(did you mean sand?)"),
+        ("scale=big", "scale=big is unknown"),
+        ("scene.parameters.test=[1", "'scene.parameters.test=[1'"),
+        ("=3", "=3"),
+        ("scene=sand,sand", "scene=sand,sand"),
+        ("latent_dim=4,6", "latent_dim=4,6"),
+    ],
+)
+def test_refused(override, quoted):
+    with pytest.raises(ConfigError, match=re.escape(quoted)) as refusal:
+        config.load([override])
+    assert len(str(refusal.value).splitlines()) == 1
+
+
+def test_several_values_without_m_name_the_remedy():
+    with pytest.raises(ConfigError, match="-m"):
+        config.load(["latent_dim=4,6"])
+
+
+@pytest.mark.parametrize(
+    ("where", "target"),
+    [("field", "os.system"), ("scene.bodies.column.shape", "subprocess.Popen"), ("scene.walls", "nsfx.evil")],
+)
+def test_configuration_is_not_code(where, target):
+    with pytest.raises(ConfigError, match=re.escape(f"_target_: {target} is refused")):
+        config.load([f"{where}._target_={target}"])
+
+
+def test_foreign_targets_behind_an_added_key(tmp_path):
+    marker = tmp_path / "executed"
+    override = f"+scene.extra={{_target_:os.system,command:'touch {marker}'}}"
+    with pytest.raises(ConfigError, match=r"os\.system is refused"):
+        config.load([override])
+    assert not marker.exists()
+
+
+@pytest.mark.parametrize(
+    ("override", "quoted"),
+    [
+        ("sampler.size=abc", "sampler.size=abc"),
+        ("sampler.size=2.5", "sampler.size=2.5"),
+        ("sampler.seed=abc", "sampler.seed=abc"),
+        ("sampler.seed=-1", "sampler.seed=-1"),
+        ("projector.iterations=abc", "projector.iterations=abc"),
+        ("projector.iterations=2.5", "projector.iterations=2.5"),
+        ("projector.tolerance=abc", "projector.tolerance=abc"),
+        ("integration.margin=abc", "integration.margin=abc"),
+        ("method.neural_stress=maybe", "method.neural_stress=maybe"),
+        ("trainer.learning_rate=abc", "trainer.learning_rate=abc"),
+        ("field.depth=abc", "field.depth=abc"),
+        ("field.noise=abc", "field.noise=abc"),
+        ("material.E=soft", "material.E=soft"),
+        ("material.nu=half", "material.nu=half"),
+        ("transfer.damping=abc", "transfer.damping=abc"),
+    ],
+)
+def test_values_of_the_wrong_type_name_key_and_value(override, quoted):
+    group = override.split(".")[0]
+    with pytest.raises(ConfigError, match=re.escape(quoted)):
+        config.build(config.load([override])[group], group)
+
+
+def test_a_misspelt_key_in_a_node_is_named():
+    with pytest.raises(ConfigError, match=r"sampler: .*'sise'.*conf/sampler/"):
+        config.build(config.load(["+sampler.sise=3"]).sampler, "sampler")
+
+
+def test_a_target_that_does_not_exist():
+    with pytest.raises(ConfigError, match=r"nsf\.nothing\.Here"):
+        config.build(config.load(["field._target_=nsf.nothing.Here"]).field, "field")
+
+
+def test_broken_yaml_names_file_and_line(tmp_path, monkeypatch):
+    import shutil
+
+    shutil.copytree(CONF, tmp_path / "conf")
+    (tmp_path / "conf/method/broken.yaml").write_text("_target_: nsf.dynamics.Method\nname: [\n")
+    monkeypatch.setattr(config, "CONF", tmp_path / "conf")
+    with pytest.raises(ConfigError, match=r"broken\.yaml.*line [23].*correct the yaml"):
+        config.load(["method=broken"])
