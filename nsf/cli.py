@@ -61,16 +61,23 @@ def _dispatch(arguments: list[str]) -> int:
     if {"-h", "--help"} & set(overrides):
         print(_stage_help(stage))
         return 0
-    if {"-m", "--multirun"} & set(overrides):
-        return _multirun(stage, [o for o in overrides if o not in ("-m", "--multirun")])
+    multirun = bool({"-m", "--multirun"} & set(overrides))
+    overrides = [o for o in overrides if o not in ("-m", "--multirun")]
     unknown = [o for o in overrides if o.startswith("-") or ("=" not in o and not o.startswith("~"))]
     if unknown:
         print(f"error: {unknown[0]!r} is not key=value; see `nsf {stage} --help`", file=sys.stderr)
         return 2
+    if multirun:
+        return _multirun(stage, overrides)
     from nsf import config
 
-    _work(stage, config.load(overrides, config_name="point" if stage == "point" else "config"))
+    _work(stage, config.load(overrides, _primary(stage)))
     return 0
+
+
+def _primary(stage: str) -> str:
+    """Name of the stage's primary configuration file."""
+    return "point" if stage == "point" else "config"
 
 
 def _work(stage: str, config) -> None:
@@ -107,6 +114,7 @@ def _multirun(stage: str, overrides: list[str]) -> int:
 
     from nsf import config as configuration
 
+    configuration.check_sweep(overrides, _primary(stage))
     failed = []
 
     def job(config) -> None:
@@ -119,7 +127,7 @@ def _multirun(stage: str, overrides: list[str]) -> int:
             print(f"error: {error}", file=sys.stderr)
 
     sys.argv = ["nsf", "--multirun", *overrides]
-    hydra.main(config_path=str(configuration.CONF), config_name="config", version_base="1.3")(job)()
+    hydra.main(config_path=str(configuration.CONF), config_name=_primary(stage), version_base="1.3")(job)()
     return 2 if failed else 0
 
 
@@ -139,7 +147,7 @@ def _groups() -> str:
 def _stage_help(stage: str) -> str:
     from nsf.paths import CONF
 
-    primary = "point" if stage == "point" else "config"
+    primary = _primary(stage)
     keys = (CONF / f"{primary}.yaml").read_text(encoding="utf-8")
     return (
         f"usage: nsf {stage} [key=value …] [-m]\n\n{STAGES[stage]}\n\n{_groups()}\n\n"

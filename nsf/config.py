@@ -4,14 +4,19 @@ A problem parameter is the value of one configuration key (`scene.parameters.key
 simulation at a parameter value is the same configuration with that key replaced.
 """
 
+import dataclasses
 import difflib
+import math
 import re
+import types
+import typing
 from collections.abc import Sequence
 
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, OverrideParseException
-from hydra.utils import instantiate
+from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import MarkedYAMLError
@@ -50,7 +55,7 @@ def load(overrides: Sequence[str] = (), config_name: str = "config") -> DictConf
     """
     try:
         return resolve(_compose(config_name, overrides))
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise ConfigError(_explain(error, config_name, overrides)) from error
     except MarkedYAMLError as error:
         mark = error.problem_mark
@@ -106,6 +111,7 @@ def build(config: DictConfig, where: str):
         ConfigError: a misspelt key, or a value that the class refuses; names the node.
     """
     check_targets(config)
+    _check_types(config, where)
     try:
         return instantiate(config, _convert_="all")
     except HydraException as error:
@@ -118,6 +124,68 @@ def build(config: DictConfig, where: str):
                 f"{where}: {detail.split('got an ')[-1]}; known keys are in conf/{where}/"
             ) from error
         raise ConfigError(f"{where}: {detail}") from error
+
+
+_KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
+
+
+def _check_types(config: DictConfig, where: str) -> None:
+    """Refuse a value that is not of the type its class declares, as `material.E=soft`.
+
+    Raises:
+        ConfigError: names the key and the value.
+    """
+    try:
+        target = get_class(config._target_)
+    except Exception:  # a target that does not load is reported where it is built
+        return
+    hints = typing.get_type_hints(target) if dataclasses.is_dataclass(target) else {}
+    for name, hint in hints.items():
+        kinds = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
+        if name not in config or not set(kinds) <= {*_KINDS, types.NoneType}:
+            continue
+        kind, given = type(config[name]), set(kinds)
+        if kind not in given and not (kind is int and float in given):
+            wanted = " or ".join(_KINDS[k] for k in kinds if k in _KINDS)
+            raise ConfigError(f"{where}.{name}={config[name]} must be {wanted}")
+
+
+def number(key: str, value, least: float = -math.inf, whole: bool = False) -> float | int:
+    """A finite number of at least `least`.
+
+    Raises:
+        ConfigError: quotes the key and the value.
+    """
+    fits = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
+    if not (fits and math.isfinite(value) and value >= least):
+        wanted = "a whole number" if whole else "a finite number"
+        raise ConfigError(
+            f"{key}={value} must be {wanted}" + (f" of at least {least:g}" if least > -math.inf else "")
+        )
+    return value
+
+
+def check_sweep(overrides: Sequence[str], config_name: str = "config") -> None:
+    """Compose with each value of a multirun once, so that a mistake shows before the first job.
+
+    Raises:
+        ConfigError: see `load`.
+    """
+    try:
+        parsed = OverridesParser.create().parse_overrides(list(overrides))
+    except HydraException as error:
+        raise ConfigError(_explain(error, config_name, overrides)) from error
+    options = [
+        [f"{o.get_key_element()}={value}" for value in o.sweep_string_iterator()]
+        if o.is_sweep_override()
+        else [o.input_line]
+        for o in parsed
+        if not o.input_line.startswith("hydra")
+    ]
+    first = [values[0] for values in options]
+    for at, values in enumerate(options):
+        for value in values:
+            load([*first[:at], value, *first[at + 1 :]], config_name)
 
 
 def _keys(node, prefix: str = "") -> list[str]:
@@ -141,6 +209,11 @@ def _explain(error: Exception, config_name: str, overrides: Sequence[str]) -> st
         return f"unknown key {key!r}{hint}"
     if isinstance(error, OverrideParseException):
         return f"{error.override!r} is not Hydra's key=value ({first}); quote brackets, commas and spaces"
+    if first.startswith("Ambiguous value"):
+        return f"{first}; several values of a key need -m"
+    nameless = [o for o in overrides if o.startswith("=")]
+    if nameless:
+        return f"{nameless[0]!r} has no key; give key=value"
     option = re.search(r"Could not find '([^']+)/([^']+)'", text)
     if option:
         group, name = option.groups()

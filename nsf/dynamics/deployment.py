@@ -1,5 +1,6 @@
 """Deployment: reduced runs over parameter values, driven by Lightning's `Trainer.predict`."""
 
+import io
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -47,7 +48,9 @@ class Rollout:
 
     def save(self, path: Path) -> None:
         """Write as HDF5, whole or not at all."""
-        with writing(path) as temporary, h5py.File(temporary, "w") as file:
+        # In memory first: HDF5 cannot report a full disk when it closes a file.
+        memory = io.BytesIO()
+        with h5py.File(memory, "w") as file:
             file.attrs.update({"nsf_rollout": _VERSION, "parameter": self.parameter, "sample": self.sample})
             file.attrs.update(
                 {"integration_mean": self.integration_mean, "needed_outside": self.needed_outside}
@@ -56,6 +59,8 @@ class Rollout:
             for name in ("t", "xhat", "residuals"):
                 file[name] = getattr(self, name)
             file["stops"] = np.array(self.stops, dtype=h5py.string_dtype())
+        with writing(path) as partial:
+            partial.write_bytes(memory.getbuffer())
 
     @classmethod
     def open(cls, path: Path) -> "Rollout":

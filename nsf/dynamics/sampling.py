@@ -63,9 +63,22 @@ class Sampler:
     phases: Sequence[dict] = ()
 
     def __post_init__(self):
-        starts = [r.start for r in self.regions]
-        if any(r.size < 1 for r in self.regions):
-            raise ConfigError(f"sampler.size={[r.size for r in self.regions]} must be at least 1")
+        try:
+            regions = self.regions
+        except TypeError as error:
+            raise ConfigError(
+                f"sampler.phases={self.phases}: give size, start, lower, upper ({error})"
+            ) from error
+        if not isinstance(self.seed, int) or self.seed < 0:
+            raise ConfigError(f"sampler.seed={self.seed} must be a whole number of at least 0")
+        for region in regions:
+            if not isinstance(region.size, int) or region.size < 1:
+                raise ConfigError(f"sampler.size={region.size} must be a whole number of at least 1")
+            for name in ("lower", "upper"):
+                corner = getattr(region, name)
+                if corner is not None and (np.shape(corner) != (3,) or not np.isfinite(corner).all()):
+                    raise ConfigError(f"sampler.{name}={corner} must be 3 numbers [m] or null")
+        starts = [region.start for region in regions]
         if starts != sorted(set(starts)) or not 0.0 <= starts[-1] < 1.0:
             raise ConfigError(f"sampler.phases start at {starts} of T; give rising fractions in (0, 1)")
 

@@ -269,12 +269,20 @@ class ReducedMPM:
             )
         with torch.no_grad():
             for _ in range(n):
-                phase = self._phase_at(self.steps_taken)
-                if phase is not self._phase:
-                    self._enter(phase)
-                self._advance()
-                self._sizes.append(phase.size)
-                self.steps_taken += 1
+                self._step(self._advance)
+
+    def timed_step(self, timer: StageTimer) -> None:
+        """One step, stage by stage under a timer; never from a captured graph."""
+        with torch.no_grad():
+            self._step(lambda: self._run_stages(timer))
+
+    def _step(self, advance: Callable[[], None]) -> None:
+        phase = self._phase_at(self.steps_taken)
+        if phase is not self._phase:
+            self._enter(phase)
+        advance()
+        self._sizes.append(phase.size)
+        self.steps_taken += 1
 
     def _phase_at(self, step: int):
         return self._phases[max(i for i, start in enumerate(self._starts) if start <= step)]
@@ -304,13 +312,6 @@ class ReducedMPM:
             phase.graph = graph
         else:
             phase.graph.replay()
-
-    def timed_step(self, timer: StageTimer) -> None:
-        """One step, stage by stage under a timer; never from a captured graph."""
-        with torch.no_grad():
-            self._run_stages(timer)
-        self._sizes.append(self._phase.size)
-        self.steps_taken += 1
 
     def _run_stages(self, timer: Callable = untimed) -> None:
         with on_torch_stream(self.device):
@@ -417,7 +418,13 @@ def _configured(scene) -> float:
 
 
 def _indices(sample, particles: int) -> np.ndarray:
-    sample = np.unique(np.asarray(sample, dtype=np.int64))
-    if sample.ndim != 1 or not len(sample) or sample[0] < 0 or sample[-1] >= particles:
-        raise ShapeError(f"sample indices must be a non-empty list in [0, {particles})")
+    sample = np.asarray(sample)
+    if sample.ndim != 1 or not np.issubdtype(sample.dtype, np.integer) or not len(sample):
+        raise ShapeError(
+            "sample must be a number or a non-empty list of particle indices; "
+            f"got {sample.dtype} {sample.shape}; give np.flatnonzero(mask) for a mask"
+        )
+    sample = np.unique(sample)
+    if sample[0] < 0 or sample[-1] >= particles:
+        raise ShapeError(f"sample indices {sample[0]} … {sample[-1]} must lie in [0, {particles})")
     return sample

@@ -124,15 +124,20 @@ def compare(
     column = {name: torch.cat(values) for name, values in rows.items()}
     diverged = rollout.diverged >= 0
 
-    def total(error: str, norm: str) -> float:
+    def total(error: str, norm: str) -> float:  # over frames 1..N
         return metrics.relative(column[error][1:], column[norm][1:])
 
     bad = torch.as_tensor(~finite)
+    # At t = 0 nothing has moved and nothing is loaded: what stands there is round-off of the file.
+    for name in ("u_norm", "tau_norm"):
+        column[name][0] = torch.nan
 
     def by_frame(error: str, norm: str) -> np.ndarray:
-        values = (column[error] / column[norm].clamp_min(1e-300)).sqrt()
-        values[column[norm] == 0] = torch.nan  # nothing to compare with, as the displacement at t = 0
-        return values.masked_fill(bad, torch.inf).numpy()
+        return (column[error] / column[norm]).sqrt().masked_fill(bad, torch.inf).numpy()
+
+    def momentum(name: str) -> np.ndarray:
+        errors = metrics.momentum_error(column[f"{name}_rom"], column[f"{name}_fom"], column[f"{name}_scale"])
+        return errors.masked_fill(bad, torch.inf).numpy()
 
     series = pd.DataFrame(
         {
@@ -143,12 +148,8 @@ def compare(
             "delta": by_frame("x_error", "x_norm"),
             "displacement_error": by_frame("x_error", "u_norm"),
             "stress_error": by_frame("tau_error", "tau_norm"),
-            "linear_momentum_error": metrics.momentum_error(
-                column["p_rom"], column["p_fom"], column["p_scale"]
-            ),
-            "angular_momentum_error": metrics.momentum_error(
-                column["L_rom"], column["L_fom"], column["L_scale"]
-            ),
+            "linear_momentum_error": momentum("p"),
+            "angular_momentum_error": momentum("L"),
             "reconstruction_delta": (column["rec_error"] / column["x_norm"]).sqrt(),
             **{f"xhat_{k + 1}": xhat[:, k].cpu() for k in range(xhat.shape[1])},
             **{f"encoded_{k + 1}": column["encoded"][:, k] for k in range(xhat.shape[1])},

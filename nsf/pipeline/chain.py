@@ -11,6 +11,7 @@ from pathlib import Path
 
 import torch
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ConfigKeyError
 
 from nsf import config as configuration
 from nsf.data import Snapshots, Split, Trajectory
@@ -21,7 +22,7 @@ from nsf.errors import ConfigError, MissingRunError
 from nsf.evaluation import compare, measure
 from nsf.kinematics.manifold import Manifold
 from nsf.kinematics.training import TRACKING, train
-from nsf.mpm import FP32, FP64, Precision, precision_of
+from nsf.mpm import FP32, FP64, precision_of
 from nsf.mpm.device import warp_device
 from nsf.pipeline import results
 from nsf.pipeline.simulation import Job, simulate
@@ -49,29 +50,36 @@ class Pipeline:
     root: Path | None = None
 
     def __post_init__(self):
+        try:
+            self._build()
+        except ConfigKeyError as error:
+            raise ConfigError(
+                f"{error.full_key} is missing from the configuration; give it a value"
+            ) from error
+
+    def _build(self) -> None:
+        """Build and check everything, so that a bad value is refused before any work."""
         c = self.config
         self.scene = Scene.from_config(c)
         p = self.scene.parameters
         self.split = Split(train=tuple(p.train), validation=tuple(p.validation), test=tuple(p.test))
-        for name, node in (("field", c.field), ("trainer", c.trainer), ("method", c.method)):
-            setattr(self, name, configuration.build(node, name))
-        self.sampler = configuration.build(c.sampler, "sampler")
-        self.projector = configuration.build(c.projector, "projector")
-        self.integration = configuration.build(c.integration, "integration")
-        if not (isinstance(c.latent_dim, int) and c.latent_dim >= 1):
-            raise ConfigError(f"latent_dim={c.latent_dim} must be an integer of at least 1")
-        if c.deploy.split not in ("test", "validation", "train"):
-            raise ConfigError(f"deploy.split={c.deploy.split} is unknown; choose test, validation or train")
-        if c.tracking not in TRACKING:
-            raise ConfigError(f"tracking={c.tracking} is unknown; choose null or tensorboard")
-        if c.data.resident not in (True, False, "auto"):
-            raise ConfigError(f"data.resident={c.data.resident} must be true, false or auto")
-        if not c.deploy.dt_multiplier > 0:
-            raise ConfigError(f"deploy.dt_multiplier={c.deploy.dt_multiplier} must be positive")
+        for name in ("field", "trainer", "method", "sampler", "projector", "integration"):
+            setattr(self, name, configuration.build(c[name], name))
+        for key, least in (("latent_dim", 1), ("seed", 0)):
+            configuration.number(key, c[key], least=least, whole=True)
+        for key in ("trials", "picture_particles", "picture_frames"):
+            configuration.number(f"evaluation.{key}", c.evaluation[key], least=1, whole=True)
+        multiplier = c.deploy.dt_multiplier
+        if not configuration.number("deploy.dt_multiplier", multiplier) > 0:
+            raise ConfigError(f"deploy.dt_multiplier={multiplier} must be positive")
+        _one_of("deploy.split", c.deploy.split, ("test", "validation", "train"))
+        _one_of("tracking", c.tracking, TRACKING)
+        _one_of("data.resident", c.data.resident, (True, False, "auto"))
+        _one_of("data.dtype", c.data.dtype, tuple(_STORED))
         precision_of(c.precision)
+        for phase in self.sampler.phases_of(self.scene.particles().X):
+            check_well_posed(len(phase.particles), c.latent_dim)
         self._sets: list[ParticleSets] | None = None
-        for region in self.sampler.regions:
-            check_well_posed(region.size, c.latent_dim)
         # The device is found once, so that a missing GPU is reported before any work.
         self.device = str(torch_device(warp_device(c.device)))
         self.check_values()
@@ -182,7 +190,7 @@ class Pipeline:
             return Job(run, f"{name} {value:g}{unit}", parameters, build)
 
         jobs = [job(value, run) for value, run in runs.items()]
-        simulate(jobs, self.scene.steps, self.scene.dx, _stored(c.data.dtype), self.device, c.precision)
+        simulate(jobs, self.scene.steps, self.scene.dx, _STORED[c.data.dtype], self.device, c.precision)
 
     def train(self) -> Run:
         """The manifold of the training trajectories."""
@@ -342,8 +350,11 @@ class Pipeline:
         return False
 
 
-def _stored(dtype: str) -> Precision:
-    by_name = {"float32": FP32, "float64": FP64}
-    if dtype not in by_name:
-        raise ConfigError(f"data.dtype={dtype} is unknown; choose float32 or float64")
-    return by_name[dtype]
+#: Precision of stored frames by the name of their type.
+_STORED = {"float32": FP32, "float64": FP64}
+
+
+def _one_of(key: str, value, options: Sequence) -> None:
+    if not any(value == option and type(value) is type(option) for option in options):
+        shown = [str(o).lower() if isinstance(o, bool) else "null" if o is None else o for o in options]
+        raise ConfigError(f"{key}={value} is unknown; choose {', '.join(shown[:-1])} or {shown[-1]}")

@@ -1,6 +1,5 @@
 """The files of an evaluate run: one place that knows what reporting reads (docs/design.md)."""
 
-import json
 import math
 from collections.abc import Sequence
 
@@ -13,6 +12,7 @@ from nsf.dynamics import Rollout
 from nsf.evaluation import Comparison, SolverCost, reduction_ratio
 from nsf.runs import Record
 from nsf.scenes import Scene
+from nsf.storage import write_json, writing
 
 
 def costs(full: SolverCost, reduced: SolverCost) -> dict:
@@ -105,19 +105,22 @@ def write(
 ) -> None:
     """Write the five files of an evaluate run into its folder."""
     path = record.path
-    results.to_csv(path / "results.csv", index=False)
-    pd.concat([c.series for c in comparisons]).to_csv(path / "series.csv", index=False)
+    tables = {"results.csv": results, "series.csv": pd.concat([c.series for c in comparisons])}
+    for name, table in tables.items():
+        with writing(path / name) as partial:
+            table.to_csv(partial, index=False)
     pictures = [c.pictures for c in comparisons]
-    np.savez_compressed(
-        path / "frames.npz",
-        parameters=results["parameter"].to_numpy(),
-        splits=results["split"].to_numpy(dtype=str),
-        t=pictures[0]["t"],
-        **{name: np.stack([p[name] for p in pictures]) for name in pictures[0] if name != "t"},
-    )
-    for name, content in (("cost.json", cost), ("summary.json", summary)):
-        (path / name).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    for name in ("results.csv", "series.csv", "frames.npz", "cost.json", "summary.json"):
+    with writing(path / "frames.npz") as partial:
+        np.savez_compressed(
+            partial,
+            parameters=results["parameter"].to_numpy(),
+            splits=results["split"].to_numpy(dtype=str),
+            t=pictures[0]["t"],
+            **{name: np.stack([p[name] for p in pictures]) for name in pictures[0] if name != "t"},
+        )
+    write_json(path / "cost.json", cost)
+    write_json(path / "summary.json", summary)
+    for name in (*tables, "frames.npz", "cost.json", "summary.json"):
         record.output(name)
     record.metrics.update({name: summary[name] for name in ("delta", "reconstruction_delta")})
 

@@ -77,6 +77,8 @@ def number(value, scale: float = 1.0) -> str:
     if math.isinf(value):
         return "∞"
     shown = float(value) * scale
+    if abs(shown) >= 1e6:
+        return f"{shown:.2e}"
     if shown == int(shown) or abs(shown) >= 1000:
         return f"{shown:,.0f}"
     if abs(shown) < 1e-3:

@@ -8,6 +8,7 @@ from matplotlib.figure import Figure
 from omegaconf import DictConfig
 
 from nsf import config as configuration
+from nsf.errors import ConfigError
 from nsf.mpm.materials import deformation_path, drive
 from nsf.reporting.style import PALETTE, styled
 
@@ -28,9 +29,11 @@ def point_response(config: DictConfig) -> pd.DataFrame:
     """
     material = configuration.build(config.material, "material")
     p = config.point
+    configuration.number("point.amplitude", p.amplitude)
+    configuration.number("point.points", p.points, least=2, whole=True)
+    if not configuration.number("point.rate", p.rate) > 0:
+        raise ConfigError(f"point.rate={p.rate} 1/s must be positive")
     amplitude, F = deformation_path(config.path, p.amplitude, p.points)
-    if not p.rate > 0:
-        raise configuration.ConfigError(f"point.rate={p.rate} 1/s must be positive")
     tau = drive(material, F, p.amplitude / (p.points - 1) / p.rate, config.precision, config.device)
     mean = np.trace(tau, axis1=1, axis2=2) / 3.0
     deviator = np.linalg.norm(tau - mean[:, None, None] * np.eye(3), axis=(1, 2))

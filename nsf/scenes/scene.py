@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError
 
 from nsf import config as configuration
@@ -15,17 +15,14 @@ from nsf.mpm.materials import Material
 from nsf.scenes.geometry import Shape
 
 
-def _number(key: str, value) -> float:
-    """A finite number, or a message that quotes the key."""
-    if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not math.isfinite(value):
-        raise ConfigError(f"{key}={value} must be a finite number")
-    return float(value)
-
-
 def _vector(key: str, values, unit: str) -> tuple[float, float, float]:
     """Three finite numbers, or a message that quotes the key."""
-    values = list(values)
-    if len(values) != 3 or not all(isinstance(x, int | float) and math.isfinite(x) for x in values):
+    listed = isinstance(values, list | tuple | ListConfig | np.ndarray)
+    if (
+        not listed
+        or len(values) != 3
+        or not all(isinstance(x, int | float) and math.isfinite(x) for x in values)
+    ):
         raise ConfigError(f"{key}={values} {unit} must be 3 finite numbers")
     return tuple(float(x) for x in values)
 
@@ -79,8 +76,10 @@ class ParameterRange:
     def __post_init__(self):
         for split in ("train", "validation", "test"):
             values = getattr(self, split)
+            if not isinstance(values, list | tuple):
+                raise ConfigError(f"scene.parameters.{split}={values} must be a list, as [{values}]")
             for value in values:
-                _number(f"scene.parameters.{split}", value)
+                configuration.number(f"scene.parameters.{split}", value)
             if not values and split == "train":
                 raise ConfigError("scene.parameters.train=[] must name at least one value")
         for one, other in (("train", "test"), ("train", "validation"), ("test", "validation")):
@@ -142,15 +141,13 @@ class Scene:
     @classmethod
     def _build(cls, config: DictConfig) -> "Scene":
         s = config.scene
-        if not isinstance(s.steps, int) or s.steps < 1:
-            raise ConfigError(f"scene.steps={s.steps} must be a whole number, at least 1")
         colliders = tuple(configuration.build(c, "scene.colliders") for c in s.colliders.values())
         return cls(
             name=s.name,
             scale=config.scale,
-            dx=_number("scene.dx", s.dx),
-            dt=_number("scene.dt", s.dt),
-            steps=s.steps,
+            dx=float(configuration.number("scene.dx", s.dx)),
+            dt=float(configuration.number("scene.dt", s.dt)),
+            steps=configuration.number("scene.steps", s.steps, least=1, whole=True),
             size=_vector("scene.size", s.size, "m"),
             gravity=_vector("scene.gravity", s.gravity, "m/s²"),
             bodies=tuple(configuration.build(b, f"scene.bodies.{n}") for n, b in s.bodies.items()),

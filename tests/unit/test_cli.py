@@ -129,8 +129,8 @@ BEFORE_ANY_WORK = [
     ("evaluation.trials=abc", ["evaluation.trials=abc"]),
     ("evaluation.picture_particles=0", ["evaluation.picture_particles=0"]),
     ("evaluation.picture_frames=0", ["evaluation.picture_frames=0"]),
-    ("tracking=wandb", ["tracking='wandb'", "tensorboard"]),
-    ("data.resident=maybe", ["resident='maybe'"]),
+    ("tracking=wandb", ["tracking=wandb", "tensorboard"]),
+    ("data.resident=maybe", ["resident=maybe"]),
     ("method.neural_stress=maybe", ["neural_stress=maybe"]),
 ]
 

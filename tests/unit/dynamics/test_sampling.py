@@ -68,8 +68,11 @@ def test_a_phase_has_its_own_region(X):
 @pytest.mark.parametrize(
     ("settings", "quoted"),
     [
-        ({"size": 0}, "sampler.size=[0] must be at least 1"),
-        ({"size": 5, "phases": [{"start": 0.5, "size": -1}]}, "sampler.size=[5, -1] must be at least 1"),
+        ({"size": 0}, "sampler.size=0 must be a whole number of at least 1"),
+        (
+            {"size": 5, "phases": [{"start": 0.5, "size": -1}]},
+            "sampler.size=-1 must be a whole number of at least 1",
+        ),
         ({"size": 5, "phases": [{"start": 0.0, "size": 3}]}, "sampler.phases start at [0.0, 0.0] of T"),
         ({"size": 5, "phases": [{"start": 1.0, "size": 3}]}, "sampler.phases start at [0.0, 1.0] of T"),
         (
