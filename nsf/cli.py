@@ -90,6 +90,8 @@ def _work(stage: str, config) -> None:
     from nsf.pipeline import Pipeline
 
     pipeline = Pipeline(config)
+    if stage == "run":
+        pipeline.check_held_out()
     for name in CHAIN if stage == "run" else [stage]:
         result = pipeline.run(name)
     if stage in ("run", "report"):

@@ -153,7 +153,7 @@ class NeighbourSearch:
         """Union of I and of N over many configurations.
 
         Args:
-            frames: positions [F, P, 3] of all particles, chunk by chunk; gone through twice is not needed.
+            frames: positions [F, P, 3] of all particles, chunk by chunk.
             sample: [s] indices of S.
             margin: nodes by which I is widened.
         """

@@ -1,7 +1,6 @@
 """The reduced-order solver: time-stepping in the latent space (paper section 5)."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -9,11 +8,12 @@ import torch
 from nsf.data import hash_of_positions
 from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
 from nsf.dynamics.interop import captured, on_torch_stream, torch_device, torch_dtype
+from nsf.dynamics.latent import Decoder, LatentState, LatentTrajectory
 from nsf.dynamics.phase import Phase, SearchingPhase
 from nsf.dynamics.projection import GaussNewton, Taylor, stop_reasons
 from nsf.dynamics.sampling import SamplePhase, Sampler, check_well_posed
 from nsf.dynamics.stress import Method, StressFromDeformation, StressNeural
-from nsf.errors import ConfigError, ProjectionError, ShapeError
+from nsf.errors import ConfigError, ShapeError
 from nsf.mpm import BoundaryArrays, Grid, GridStep, precision_of
 from nsf.mpm.device import warp_device
 from nsf.timing import StageTimer, untimed
@@ -23,49 +23,6 @@ NSF = Method("nsf", neural_stress=True, neural_affine=True)
 _CHUNK = 2**25
 
 
-@dataclass(frozen=True)
-class LatentTrajectory:
-    """A reduced run: what a user needs to share to share the simulation.
-
-    Attributes:
-        t: [N + 1] time [s].
-        xhat: [N + 1, r] latent vectors.
-        residuals: [N, k + 1] projection residuals [m]; updates: [N, k] lengths of latent updates.
-        stops: [N] named stop reasons.
-    """
-
-    t: np.ndarray
-    xhat: np.ndarray
-    residuals: np.ndarray
-    updates: np.ndarray
-    stops: list[str]
-
-
-class LatentState:
-    """The state of a reduced run; particle fields are decoded when they are asked for."""
-
-    def __init__(self, solver: "ReducedMPM"):
-        self._solver = solver
-
-    @property
-    def xhat(self) -> np.ndarray:
-        """[r] latent vector."""
-        return self._solver.xhat.cpu().numpy()
-
-    def __len__(self) -> int:
-        return len(self._solver.scene_particles)
-
-    def numpy(self) -> dict[str, np.ndarray]:
-        """Every particle's x, v [P, 3], C, tau [P, 3, 3], as of the full-order state, and xhat [r]."""
-        s = self._solver
-        everything = s._everywhere()
-        x = everything.position(s.xhat)
-        v = s.initial_velocity if s.steps_taken == 0 else (x - everything.position(s.xhat_previous)) / s.dt
-        expand = StressNeural(everything, s.parameters)
-        fields = {"x": x, "v": v, "C": everything.affine(s.xhat, s.parameters), "tau": expand(s.xhat)}
-        return {name: value.cpu().numpy() for name, value in fields.items()} | {"xhat": self.xhat}
-
-
 class ReducedMPM:
     """Steps a latent vector: infer fields on N, one MPM step, invert on S.
 
@@ -73,7 +30,7 @@ class ReducedMPM:
         manifold: trained fields.
         scene: the scene at its problem parameters.
         phases: sample particles by phase of time.
-        parameters: problem parameters in the manifold's order.
+        parameters: problem parameters by name.
         method: which of τ and C come from fields.
         projector: `GaussNewton` or `Taylor`.
         integration: how N is found.
@@ -114,7 +71,7 @@ class ReducedMPM:
         self.precision, self.device = precision_of(precision), warp_device(device)
         self.dtype, self.torch_device = torch_dtype(self.precision), torch_device(self.device)
         self.dt = scene.dt * dt_multiplier
-        self.total_steps = int(np.ceil(scene.steps / dt_multiplier - 1e-9))
+        self.total_steps = reduced_steps(scene.steps, dt_multiplier)
         self.geometry, self.transfer, self.gravity = scene.grid, scene.transfer, scene.gravity
         self.boundaries = BoundaryArrays(scene.colliders, scene.walls, self.precision, self.device)
         self.scene_particles = scene.particles()
@@ -191,7 +148,7 @@ class ReducedMPM:
                 ParticleSets(p.particles, np.append(p.particles, np.delete(np.arange(P), p.particles)), None)
                 for p in phases
             ]
-        everything = self._everywhere()
+        everything = self.decoder()
         latents = self.manifold.training_latents.to(self.torch_device, self.dtype)
         fraction = self.manifold.training_times.to(self.torch_device) / (self.scene.dt * self.scene.steps)
         rows = max(1, _CHUNK // (3 * P))
@@ -210,26 +167,27 @@ class ReducedMPM:
         step = GridStep(
             grid, self.boundaries, self.transfer, self.gravity, self.dt, self.precision, self.device
         )
-        arguments = [sets, at, self.scene_particles, grid, step, self._stress_of, self._affine_of]
+        arguments = [sets, at, self.scene_particles, grid, step, self.stress_of, self.affine_of]
         arguments += [self.precision, self.dtype, self.torch_device]
         if self.integration.strategy == "search":
             return SearchingPhase(*arguments, search=self.search)
         return Phase(*arguments)
 
-    def _stress_of(self, at, mu: torch.Tensor, lam: torch.Tensor) -> Callable[[torch.Tensor], torch.Tensor]:
+    def stress_of(self, at, mu: torch.Tensor, lam: torch.Tensor) -> Callable[[torch.Tensor], torch.Tensor]:
+        """The method's source of τ [n, 3, 3] [Pa] at restricted points."""
         if self.method.neural_stress:
             return StressNeural(at, self.parameters)
         return StressFromDeformation(at, self.scene.material, mu, lam, self.precision, self.device)
 
-    def _affine_of(self, at) -> Callable[[torch.Tensor], torch.Tensor | None]:
+    def affine_of(self, at) -> Callable[[torch.Tensor], torch.Tensor | None]:
+        """The method's source of C [n, 3, 3] [1/s] at restricted points; gives None for C = 0."""
         if self.method.neural_affine:
             return lambda xhat: at.affine(xhat, self.parameters)
         return lambda xhat: None
 
-    def _everywhere(self):
-        """The fields at every particle."""
-        particles = np.arange(len(self.scene_particles))
-        return self.manifold.restrict(particles=particles, dtype=self.dtype, device=self.torch_device)
+    def decoder(self) -> Decoder:
+        """The fields at every particle, as the method takes them."""
+        return Decoder(self)
 
     @property
     def state(self) -> LatentState:
@@ -255,7 +213,7 @@ class ReducedMPM:
     def nbytes(self) -> int:
         """Bytes that the solver's arrays and fields take on the device."""
         own = (self._latents, self._residuals, self._updates, self.initial_velocity)
-        return max(p.nbytes for p in self._phases) + sum(a.nbytes for a in own)
+        return sum(p.nbytes for p in self._phases) + sum(a.nbytes for a in own)
 
     def step(self, n: int = 1) -> None:
         """Advance by n steps of Δt.
@@ -382,7 +340,7 @@ class ReducedMPM:
         """
         if self.integration.strategy == "search":
             return 0
-        everything = self._everywhere()
+        everything = self.decoder()
         worst = 0
         for n in range(self.steps_taken):
             phase = self._phase_at(n)
@@ -396,19 +354,10 @@ class ReducedMPM:
             worst = max(worst, int(needed.sum()) + int(marked.sum()))
         return worst
 
-    def check_finite(self) -> None:
-        """Refuse to pass on a diverged run.
 
-        Raises:
-            ProjectionError: names the first step whose latent vector is not finite.
-        """
-        finite = torch.isfinite(self._latents[: self.steps_taken + 1]).all(1).cpu()
-        if not finite.all():
-            step = int((~finite).nonzero()[0, 0])
-            raise ProjectionError(
-                f"the reduced run ({self.method.name}) diverged at step {step}, t = {step * self.dt:.4g} s; "
-                "choose more sample particles, or a parameter nearer to the training values"
-            )
+def reduced_steps(steps: int, dt_multiplier: float) -> int:
+    """Deployment steps that reach the end of a scene of `steps` steps."""
+    return int(np.ceil(steps / dt_multiplier - 1e-9))
 
 
 def _configured(scene) -> float:

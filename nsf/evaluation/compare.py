@@ -7,12 +7,12 @@ import pandas as pd
 import torch
 
 from nsf.data import Trajectory
-from nsf.dynamics import Rollout
+from nsf.dynamics import ReducedMPM, Rollout
 from nsf.evaluation import metrics
 from nsf.mpm.shape import DEGREES
-from nsf.scenes import Scene
 
 _CHUNK = 2**24  # values of one field decoded at once
+_UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])  # entries xx, xy, xz, yy, yz, zz of a symmetric matrix
 
 
 @dataclass(frozen=True)
@@ -41,37 +41,34 @@ def at_frames(rollout: Rollout, t: np.ndarray) -> np.ndarray:
 
 
 def compare(
-    scene: Scene,
-    manifold,
-    trajectory: Trajectory,
-    rollout: Rollout,
-    split: str,
-    device: torch.device,
-    pictures: tuple[int, int],
+    solver: ReducedMPM, trajectory: Trajectory, rollout: Rollout, split: str, pictures: tuple[int, int]
 ) -> Comparison:
     """Errors of a rollout against the trajectory at the same parameter value.
 
     Args:
-        scene: the scene at that value.
-        manifold: the trained fields.
+        solver: the reduced solver of the rollout: it says what the method takes τ and C from.
         trajectory: the full-order run.
         rollout: the reduced run.
         split: `test`, `validation` or `train`.
-        device: where fields are decoded.
         pictures: numbers of particles and of frames kept for pictures.
     """
+    scene, manifold, device, parameters = (
+        solver.scene,
+        solver.manifold,
+        solver.torch_device,
+        solver.parameters,
+    )
     manifold.check_particles(trajectory.x_sha256)
-    everything = manifold.restrict(dtype=torch.float64, device=device)
+    decoder = solver.decoder()
     frames = trajectory.frames
     xhat = at_frames(rollout, trajectory.t)
     finite = np.isfinite(xhat).all(1)
     xhat[~finite] = xhat[finite][-1]  # pictures of a diverged run hold its last state; its errors are ∞
 
     def tensor(values) -> torch.Tensor:
-        return torch.as_tensor(np.asarray(values), dtype=torch.float64, device=device)
+        return torch.as_tensor(np.asarray(values), dtype=solver.dtype, device=device)
 
     xhat, X, mass = tensor(xhat), tensor(trajectory.X), tensor(trajectory.mass)
-    parameters = tensor([trajectory.parameters[name] for name in manifold.parameter_names])
     inertia = scene.dx**2 * (DEGREES[scene.transfer.shape] + 1) / 12.0
     shown_particles, shown_frames = _shown(trajectory.particles, frames, *pictures)
     kept = {name: [] for name in ("x_full", "x_reduced", "tau_full", "tau_reduced")}
@@ -81,21 +78,21 @@ def compare(
         for name, value in values.items():
             rows.setdefault(name, []).append(value.cpu())
 
-    previous = everything.position(xhat[0])
+    previous = decoder.position(xhat[0])
     per_chunk = max(1, _CHUNK // (9 * trajectory.particles))
     for start in range(0, frames, per_chunk):
         block = slice(start, min(start + per_chunk, frames))
         x, tau, C, v = (tensor(trajectory.read(name, frames=block)) for name in ("x", "tau", "C", "v"))
         C = C.view(*C.shape[:2], 3, 3)
         latent = xhat[block]
-        x_rom, tau_rom = everything.position(latent), everything.stress(latent, parameters)
-        C_rom = everything.affine(latent, parameters)
+        x_rom, C_rom = decoder.position(latent), decoder.affine(latent)
+        tau_rom = decoder.stress(latent)[..., _UPPER[0], _UPPER[1]]
         v_rom = torch.diff(torch.cat([previous[None], x_rom]), dim=0) / trajectory.dt
         if start == 0:
             v_rom[0] = v[0]
         previous = x_rom[-1]
-        encoded = manifold.encode(x.to(manifold.X.device)).to(device, torch.float64)
-        x_rec, tau_rec = everything.position(encoded), everything.stress(encoded, parameters)
+        encoded = manifold.encode(x.to(manifold.X.device)).to(device, solver.dtype)
+        x_rec, tau_rec = decoder.position(encoded), decoder.at.stress(encoded, parameters)
         note(
             x_error=metrics.frame_squares(x_rom - x),
             x_norm=metrics.frame_squares(x),

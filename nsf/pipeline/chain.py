@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import torch
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError
 
@@ -18,12 +17,14 @@ from nsf.data import Snapshots, Split, Trajectory
 from nsf.dynamics import ParticleSets, ReducedMPM, Rollout, deploy
 from nsf.dynamics.interop import torch_device
 from nsf.dynamics.sampling import check_well_posed
+from nsf.dynamics.solver import reduced_steps
 from nsf.errors import ConfigError, MissingRunError
 from nsf.evaluation import compare, measure
 from nsf.kinematics.manifold import Manifold
 from nsf.kinematics.training import TRACKING, train
 from nsf.mpm import FP32, FP64, precision_of
 from nsf.mpm.device import warp_device
+from nsf.mpm.stability import check_time_step
 from nsf.pipeline import results
 from nsf.pipeline.simulation import Job, simulate
 from nsf.runs import Run
@@ -85,22 +86,32 @@ class Pipeline:
         self.check_values()
 
     def check_values(self) -> None:
-        """Build the scene at every parameter value: a value out of range fails before any work.
+        """Build the scene at every parameter value: one out of range fails before any work.
 
         Raises:
             ConfigError: names the value.
+            InstabilityError: Δt is unstable at a value.
         """
         for value in (*self.split.train, *self.split.validation, *self.split.test):
-            self.scene.with_parameters({self.scene.parameters.name: value})
+            scene = self.scene.with_parameters({self.scene.parameters.name: value})
+            dx = scene.grid.dx
+            check_time_step(scene.particles(), scene.initial_velocity(), dx, scene.dt)
 
     @property
     def held_out(self) -> tuple[float, ...]:
         """Values that are deployed and evaluated."""
+        self.check_held_out()
+        return tuple(getattr(self.split, self.config.deploy.split))
+
+    def check_held_out(self) -> None:
+        """Refuse to deploy on no value.
+
+        Raises:
+            ConfigError: the split that is deployed is empty.
+        """
         split = self.config.deploy.split
-        values = tuple(getattr(self.split, split))
-        if not values:
+        if not getattr(self.split, split):
             raise ConfigError(f"deploy.split={split} has no values; set scene.parameters.{split}")
-        return values
 
     # -- runs: where each stage's result lies ---------------------------------------------------------------
 
@@ -168,7 +179,7 @@ class Pipeline:
 
     def simulate(self) -> list[Run]:
         """Full-order trajectories of every training, validation and held-out value."""
-        values = sorted({*self.split.train, *self.split.validation, *self.held_out, *self.split.test})
+        values = sorted({*self.split.train, *self.split.validation, *self.split.test})
         runs = {value: self.simulation(value) for value in values}
         missing = [value for value, run in runs.items() if not run.complete]
         if len(missing) < len(values):
@@ -291,17 +302,12 @@ class Pipeline:
             for index, value in enumerate(self.held_out):
                 rollouts.append(Rollout.open(deployment.path / f"rollout_{index}.h5"))
                 with Trajectory.open(self.simulation(value).require().path / "trajectory.h5") as trajectory:
+                    solver = self.solver_at(manifold, value)
+                    shown = (e.picture_particles, e.picture_frames)
                     comparisons.append(
-                        compare(
-                            self.scene.with_parameters({self.scene.parameters.name: value}),
-                            manifold,
-                            trajectory,
-                            rollouts[-1],
-                            self.config.deploy.split,
-                            torch.device(self.device),
-                            (e.picture_particles, e.picture_frames),
-                        )
+                        compare(solver, trajectory, rollouts[-1], self.config.deploy.split, shown)
                     )
+            del solver
             cost = self._cost(manifold)
             table = results.rows(
                 self.config, manifold, rollouts, comparisons, cost, self.device, run.manifest
@@ -321,7 +327,7 @@ class Pipeline:
             trials,
             self.device,
         )
-        steps = self.solver_at(manifold, value).total_steps
+        steps = reduced_steps(self.scene.steps, self.config.deploy.dt_multiplier)
         reduced = measure(lambda: self.solver_at(manifold, value), steps, trials, self.device)
         return results.costs(full, reduced)
 

@@ -1,5 +1,6 @@
 """Full-order trajectories onto disk: the solver goes on while threads write what it made."""
 
+import contextlib
 import os
 import queue
 import time
@@ -71,10 +72,9 @@ def simulate(
 def _start(job: Job, pool, steps: int, dx: float, stored: Precision, device, precision, progress) -> Future:
     """Compute one trajectory while its writer, and those of earlier ones, work."""
     solver = job.build()
-    stored_by = pool.submit(
-        _store, job, solver, steps + 1, dx, np.dtype(stored.numpy).name, device, precision
-    )
+    dtype = np.dtype(stored.numpy).name
     try:
+        stored_by = pool.submit(_store, job, solver, steps + 1, dx, dtype, device, precision)
         recorder = FrameRecorder(solver.state, solver.precision, stored)
         started = time.perf_counter()
         for n in range(steps + 1):
@@ -88,7 +88,7 @@ def _start(job: Job, pool, steps: int, dx: float, stored: Precision, device, pre
         _hand_over(job, time.perf_counter() - started, stored_by)
     except BaseException as error:
         # The writer leaves no half-written file, and its manifest says what happened.
-        _hand_over(job, error, stored_by)
+        _stop(job, error)
         raise
     return stored_by
 
@@ -101,8 +101,15 @@ def _hand_over(job: Job, item, stored_by: Future) -> None:
             return
         except queue.Full:
             continue
-    if not isinstance(item, BaseException):
-        stored_by.result()
+    stored_by.result()
+
+
+def _stop(job: Job, error: BaseException) -> None:
+    """Tell the writer to give up, at once: nothing here may block, or a second interrupt would hang it."""
+    while not job.blocks.empty():
+        with contextlib.suppress(queue.Empty):
+            job.blocks.get_nowait()
+    job.blocks.put_nowait(error)
 
 
 def _store(

@@ -25,7 +25,8 @@ def provenance_rows(merged: Merged) -> Rows:
         versions = ", ".join(
             f"{name} {version}" for name, version in manifest.get("versions", {}).items() if version
         )
-        told = [manifest.get(key, ABSENT) for key in ("device", "precision", "seed", "created")]
+        kept = [manifest.get(key) for key in ("device", "precision", "seed", "created")]
+        told = [ABSENT if value is None else value for value in kept]
         body.append([source.id, commit_text(manifest), *map(str, told), versions or ABSENT])
     return Rows(_HEADINGS, body)
 

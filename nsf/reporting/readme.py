@@ -36,8 +36,11 @@ def figures(report: Path) -> str:
     means = variants[list(MEASURED)].agg(lambda values: values.mean(skipna=False))
     table, same = without_constants(means, keep=("method",))
     paper = config.load([f"scene={SCENE}", "scale=paper"]).scene.paper
+    # A report of several methods names its pictures by method.
+    several = (report / "nsf-final-shapes.png").is_file()
+    picture = "nsf-final-shapes.png" if several else "final-shapes.png"
     return (
-        f"![Final shapes, reduced beside full-order]({report.as_posix()}/final-shapes.png)\n\n"
+        f"![Final shapes, reduced beside full-order]({report.as_posix()}/{picture})\n\n"
         f"Means over {frame['parameter'].nunique()} held-out parameter values ({same}). "
         f"The paper prints δ = {100 * paper.delta:g} % ({paper.place}).\n\n"
         f"{markdown_table(table)}\n\n"

@@ -239,7 +239,7 @@ def test_training_values_can_be_deployed(copied, pipeline_at):
 
 def test_a_split_without_values(pipeline_at, tmp_path):
     with pytest.raises(ConfigError, match=r"deploy\.split=validation has no values"):
-        pipeline_at(tmp_path, "deploy.split=validation").simulate()
+        pipeline_at(tmp_path, "deploy.split=validation").deploy()
 
 
 def test_a_longer_step_is_deployed_and_evaluated(copied, pipeline_at):

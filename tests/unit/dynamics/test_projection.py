@@ -171,7 +171,6 @@ def test_on_a_linear_manifold_one_iteration_is_exact(start, goal):
         (lambda: GaussNewton(iterations=0), r"projector\.iterations=0 must be at least 1"),
         (lambda: GaussNewton(tolerance=0.0), r"projector\.tolerance=0\.0 must be positive"),
         (lambda: GaussNewton(tolerance=float("nan")), r"projector\.tolerance=nan must be positive"),
-        (lambda: Taylor(iterations=2), r"projector\.iterations=2: projector=taylor takes exactly 1"),
     ],
 )
 def test_values_out_of_range(build, quoted):

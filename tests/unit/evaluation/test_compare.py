@@ -9,11 +9,10 @@ import torch
 
 import nsf.scenes
 from nsf.data import Trajectory
-from nsf.dynamics import Rollout
+from nsf.dynamics import Method, Rollout
 from nsf.errors import SchemaError
 from nsf.evaluation import at_frames, compare, metrics
 
-CPU = torch.device("cpu")
 ERRORS = ["delta", "displacement_error", "stress_error"]
 MOMENTA = ["linear_momentum_error", "angular_momentum_error"]
 
@@ -36,10 +35,9 @@ def made(chain):
 
 @pytest.fixture(scope="module")
 def comparison_of(chain, tiny_manifold, truth):
-    scene = chain.scene.with_parameters({"friction_angle": 26.0})
-
-    def build(rollout, split="test", pictures=(50, 4)):
-        return compare(scene, tiny_manifold, truth, rollout, split, CPU, pictures)
+    def build(rollout, split="test", pictures=(50, 4), **options):
+        solver = chain.scene.reduced(tiny_manifold, {"friction_angle": 26.0}, 20, device="cpu", **options)
+        return compare(solver, truth, rollout, split, pictures)
 
     return build
 
@@ -183,7 +181,31 @@ def test_a_run_lost_at_infinity(comparison_of, made):
     assert not lost.series[1:].isna().any().any()
 
 
-def test_other_particles_are_refused(tiny, tiny_manifold, made, tmp_path):
+def test_a_method_is_held_to_the_stress_and_affine_momentum_it_used(
+    comparison_of, made, chain, tiny_manifold, truth
+):
+    """Without a stress field τ is that of ∂g/∂X, without an affine field C = 0 (spin is lost)."""
+    neural = comparison_of(made)
+    baseline = comparison_of(made, method=Method("deformation_only", False, False))
+    law = chain.scene.material
+    at, F = tiny_manifold.restrict(), []
+    for row in torch.tensor(made.xhat):
+        F.append(at.deformation_gradient(row))
+    tau_fom = torch.tensor(truth.read("tau"), dtype=torch.float64)
+    U, sigma, _ = torch.linalg.svd(torch.stack(F))
+    eps = sigma.log()
+    principal = 2 * law.mu * eps + law.lam * eps.sum(-1, keepdim=True)
+    tau = (U * principal[..., None, :]) @ U.mT
+    tau6 = torch.stack([tau[..., i, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))], -1)
+    assert baseline.stress_error == pytest.approx(metrics.stress_error(tau6[1:], tau_fom[1:]), rel=1e-6)
+    assert baseline.stress_error != pytest.approx(neural.stress_error, rel=1e-2)
+    assert baseline.delta == pytest.approx(neural.delta, rel=1e-12)
+    errors = [c.series["angular_momentum_error"].max() for c in (neural, baseline)]
+    assert errors[0] != pytest.approx(errors[1], rel=1e-6)
+
+
+def test_other_particles_are_refused(chain, tiny, tiny_manifold, made, tmp_path):
+    solver = chain.scene.reduced(tiny_manifold, {"friction_angle": 26.0}, 20, device="cpu")
     scene = nsf.scenes.load("sand", [*tiny[1:], "scene.bodies.column.particles=499"])
     from nsf.data import TrajectoryWriter
 
@@ -199,4 +221,4 @@ def test_other_particles_are_refused(tiny, tiny_manifold, made, tmp_path):
         Trajectory.open(tmp_path / "t.h5") as other,
         pytest.raises(SchemaError, match="checkpoint made for other particles"),
     ):
-        compare(scene, tiny_manifold, other, made, "test", CPU, (10, 2))
+        compare(solver, other, made, "test", (10, 2))

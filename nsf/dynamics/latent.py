@@ -1,0 +1,86 @@
+"""What a reduced run leaves: latent vectors, and the particle fields decoded from them."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+if TYPE_CHECKING:
+    from nsf.dynamics.solver import ReducedMPM
+
+
+@dataclass(frozen=True)
+class LatentTrajectory:
+    """A reduced run: what a user needs to share to share the simulation.
+
+    Attributes:
+        t: [N + 1] time [s].
+        xhat: [N + 1, r] latent vectors.
+        residuals: [N, k + 1] projection residuals [m]; updates: [N, k] lengths of latent updates.
+        stops: [N] named stop reasons.
+    """
+
+    t: np.ndarray
+    xhat: np.ndarray
+    residuals: np.ndarray
+    updates: np.ndarray
+    stops: list[str]
+
+
+class Decoder:
+    """x, τ and C of every particle as the solver's method takes them.
+
+    Without a stress field τ comes from ∂g/∂X, without an affine field C is 0: what the run
+    used, not what the manifold could have given.
+    """
+
+    def __init__(self, solver: "ReducedMPM"):
+        constants = solver.scene_particles
+        self.at = solver.manifold.restrict(
+            particles=np.arange(len(constants)), dtype=solver.dtype, device=solver.torch_device
+        )
+
+        def tensor(values: np.ndarray) -> torch.Tensor:
+            return torch.as_tensor(values, dtype=solver.dtype, device=solver.torch_device)
+
+        self._stress = solver.stress_of(self.at, tensor(constants.mu), tensor(constants.lam))
+        self._affine = solver.affine_of(self.at)
+
+    def position(self, xhat: torch.Tensor) -> torch.Tensor:
+        """x = g(X, x̂), [P, 3] of x̂ [r] or [F, P, 3] of x̂ [F, r], in metres."""
+        return self.at.position(xhat)
+
+    def stress(self, xhat: torch.Tensor) -> torch.Tensor:
+        """τ [F, P, 3, 3] of x̂ [F, r], in pascals."""
+        return torch.stack([self._stress(row).clone() for row in xhat])
+
+    def affine(self, xhat: torch.Tensor) -> torch.Tensor:
+        """C [F, P, 3, 3] of x̂ [F, r], in 1/s."""
+        found = [self._affine(row) for row in xhat]
+        empty = torch.zeros(self.at.points, 3, 3, dtype=self.at.dtype, device=self.at.device)
+        return torch.stack([empty if C is None else C for C in found])
+
+
+class LatentState:
+    """The state of a reduced run; particle fields are decoded when they are asked for."""
+
+    def __init__(self, solver: "ReducedMPM"):
+        self._solver = solver
+
+    @property
+    def xhat(self) -> np.ndarray:
+        """[r] latent vector."""
+        return self._solver.xhat.cpu().numpy()
+
+    def __len__(self) -> int:
+        return len(self._solver.scene_particles)
+
+    def numpy(self) -> dict[str, np.ndarray]:
+        """Every particle's x, v [P, 3], C, tau [P, 3, 3], as of the full-order state, and xhat [r]."""
+        s = self._solver
+        decoder, now = s.decoder(), s.xhat[None]
+        x = decoder.position(s.xhat)
+        v = s.initial_velocity if s.steps_taken == 0 else (x - decoder.position(s.xhat_previous)) / s.dt
+        fields = {"x": x, "v": v, "C": decoder.affine(now)[0], "tau": decoder.stress(now)[0]}
+        return {name: value.cpu().numpy() for name, value in fields.items()} | {"xhat": self.xhat}
