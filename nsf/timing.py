@@ -52,7 +52,7 @@ class StageTimer:
         timer.per_step(200)   # {"p2g": milliseconds}
 
     Synchronising keeps stages from overlapping, so their sum exceeds an
-    untimed step: publish `trials` of the whole step beside a breakdown. It is
+    untimed step: publish the time of the whole step beside a breakdown. It is
     not allowed while a CUDA graph is being captured.
 
     Args:
@@ -84,36 +84,6 @@ class StageTimer:
         """Forget what was measured, such as a warm-up."""
         self.milliseconds.clear()
         self.calls.clear()
-
-
-def trials(
-    function: Callable[[], object],
-    n: int = 10,
-    warmup: int = 1,
-    device: Any = "cpu",
-    synchronize: Synchronize | None = None,
-) -> dict[str, float]:
-    """Time `n` calls of `function`, each between two synchronisations, after `warmup` uncounted ones.
-
-    Returns:
-        "median", "p10", "p90" [ms] (linear between ranks) and "trials".
-    """
-    wait = synchronize or synchronizer(device)
-    times = []
-    for trial in range(warmup + n):
-        wait()
-        start = time.perf_counter()
-        function()
-        wait()
-        if trial >= warmup:
-            times.append(1e3 * (time.perf_counter() - start))
-    times.sort()
-    return {
-        "median": _quantile(times, 0.5),
-        "p10": _quantile(times, 0.1),
-        "p90": _quantile(times, 0.9),
-        "trials": n,
-    }
 
 
 class MemoryProbe:
@@ -204,10 +174,3 @@ def _is_cuda(device: Any) -> bool:
 def _loaded(name: str, usable: Callable[[ModuleType], bool]) -> Any:
     module = sys.modules.get(name)
     return module if module is not None and usable(module) else None
-
-
-def _quantile(ordered: list[float], fraction: float) -> float:
-    position = fraction * (len(ordered) - 1)
-    low = int(position)
-    high = min(low + 1, len(ordered) - 1)
-    return ordered[low] + (position - low) * (ordered[high] - ordered[low])

@@ -7,7 +7,6 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from nsf.data.datamodule import SnapshotDataModule
     from nsf.data.normalize import Standardizer
     from nsf.data.schema import TAU_MATRIX, TAU_ORDER, hash_of_positions
     from nsf.data.snapshots import Snapshots
@@ -17,7 +16,6 @@ if TYPE_CHECKING:
 __all__ = [
     "TAU_MATRIX",
     "TAU_ORDER",
-    "SnapshotDataModule",
     "Snapshots",
     "Split",
     "Standardizer",
@@ -27,7 +25,6 @@ __all__ = [
 ]
 
 _HOMES = {
-    "SnapshotDataModule": "datamodule",
     "Standardizer": "normalize",
     "Snapshots": "snapshots",
     "Split": "split",

@@ -5,12 +5,10 @@ from dataclasses import dataclass
 import torch
 import warp as wp
 
+from nsf.data import TAU_MATRIX
 from nsf.dynamics.interop import as_matrices, as_scalars, on_torch_stream
 from nsf.mpm import Precision
 from nsf.mpm.materials import Material, make_elastic_stress
-
-#: Index of each entry of a symmetric 3×3 matrix in the order xx, xy, xz, yy, yz, zz.
-SYMMETRIC = (0, 1, 2, 1, 3, 4, 2, 4, 5)
 
 
 @dataclass(frozen=True)
@@ -35,7 +33,7 @@ class StressNeural:
 
     def __init__(self, at, parameters: torch.Tensor):
         self.at, self.parameters = at, parameters
-        self._expand = torch.tensor(SYMMETRIC, device=parameters.device)
+        self._expand = torch.tensor(TAU_MATRIX, device=parameters.device).flatten()
 
     def __call__(self, xhat: torch.Tensor) -> torch.Tensor:
         """[n, 3, 3] Kirchhoff stress [Pa]."""

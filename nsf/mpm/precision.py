@@ -27,11 +27,6 @@ class Precision:
     mat33: Any
     numpy: Any
 
-    @property
-    def tag(self) -> str:
-        """Name used in kernel names."""
-        return self.name
-
 
 FP32 = Precision("fp32", wp.float32, wp.vec3f, wp.mat33f, np.float32)
 FP64 = Precision("fp64", wp.float64, wp.vec3d, wp.mat33d, np.float64)

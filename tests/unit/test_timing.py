@@ -8,7 +8,7 @@ import pytest
 
 from nsf import timing
 from nsf.errors import DeviceError
-from nsf.timing import MemoryProbe, StageTimer, synchronizer, trials, untimed
+from nsf.timing import MemoryProbe, StageTimer, synchronizer, untimed
 
 MIB = 2**20
 
@@ -54,8 +54,6 @@ def test_a_stage_waits_for_its_own_work_and_not_for_earlier_work(clock):
     with timer("g2p"):
         pending[0] = 0.003
     assert timer.milliseconds == pytest.approx({"g2p": 3})
-    result = trials(lambda: pending.__setitem__(0, 0.002), n=3, synchronize=wait)
-    assert result["median"] == pytest.approx(2)
 
 
 def test_a_stage_that_raises_is_not_counted(clock):
@@ -68,12 +66,6 @@ def test_a_stage_that_raises_is_not_counted(clock):
 def test_untimed_stands_in_for_a_timer():
     with untimed("p2g"):
         pass
-
-
-def test_trials_drop_the_warmup_and_interpolate(clock):
-    durations = iter([9.0, 0.004, 0.001, 0.003, 0.002, 0.005])
-    result = trials(lambda: advance(clock, next(durations)), n=5)
-    assert result == pytest.approx({"median": 3, "p10": 1.4, "p90": 4.6, "trials": 5})
 
 
 def test_the_cpu_counts_what_the_caller_says():
