@@ -1,6 +1,7 @@
 """What tests of several layers share: one tiny chain, simulated, trained, deployed and evaluated once."""
 
 import os
+import signal
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,6 +11,9 @@ import pytest
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import torch
+
+# A shell that runs the tests in the background has SIGINT ignored, and so would every program they start.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 #: A column of 500 particles on a grid of 50³, 24 steps: a second for the whole chain.
 TINY = (

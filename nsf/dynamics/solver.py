@@ -16,6 +16,7 @@ from nsf.dynamics.stress import Method, StressFromDeformation, StressNeural
 from nsf.errors import ConfigError, ShapeError
 from nsf.mpm import BoundaryArrays, Grid, GridStep, precision_of
 from nsf.mpm.device import warp_device
+from nsf.mpm.shape import DEGREES
 from nsf.timing import StageTimer, untimed
 
 NSF = Method("nsf", neural_stress=True, neural_affine=True)
@@ -331,16 +332,18 @@ class ReducedMPM:
         )
 
     def needed_outside(self) -> int:
-        """Largest number of particles, over the steps taken, that a step needed but the superset lacks.
+        """Most particles and nodes that a step needed and the superset lacks, or that were off the grid.
 
-        Decodes every particle at every step; for after a run. A sample particle on a node that
-        is not stored counts too.
+        Decodes every particle at every step; for after a run. The transfers pass over what is off
+        the grid, so it counts here; so does a node of a sample particle that is not stored.
 
         Source: paper section 5.4, b.
         """
         if self.integration.strategy == "search":
             return 0
         everything = self.decoder()
+        reach = 0.5 * (DEGREES[self.transfer.shape] - 1) * self.geometry.dx  # of a stencil below its particle
+        upper = torch.tensor(self.geometry.upper, dtype=self.dtype, device=self.torch_device) - reach
         worst = 0
         for n in range(self.steps_taken):
             phase = self._phase_at(n)
@@ -351,7 +354,8 @@ class ReducedMPM:
             marked = self.search.no_nodes(self.torch_device)
             self.search.mark_nodes(x[sample].contiguous(), marked)
             marked[torch.as_tensor(phase.sets.nodes, device=self.torch_device).long()] = 0
-            worst = max(worst, int(needed.sum()) + int(marked.sum()))
+            lost = ((x < reach) | (x >= upper)).any(1)
+            worst = max(worst, int(needed.sum()) + int(marked.sum()) + int(lost.sum()))
         return worst
 
 

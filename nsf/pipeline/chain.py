@@ -157,9 +157,8 @@ class Pipeline:
     @property
     def evaluation(self) -> Run:
         """The run of errors and costs."""
-        content = self._content(("evaluation",)) | {
-            "paper": OmegaConf.to_container(self.config.scene.get("paper", {}))
-        }
+        content = self._content(("evaluation",))
+        content["paper"] = self._content(("scene",))["scene"].get("paper")
         parents = [self.deployment, *(self.simulation(v) for v in self.held_out)]
         return Run.open("evaluate", self.scene.name, content, parents, root=self.root)
 
@@ -286,7 +285,7 @@ class Pipeline:
         if rollout.needed_outside:
             self.say(
                 f"deploy: warning: {value}: a step needed {rollout.needed_outside} particles or nodes "
-                "outside the integration superset; raise integration.margin or use integration=search"
+                "outside the superset or the grid; raise integration.margin or use integration=search"
             )
 
     def evaluate(self) -> Run:
@@ -345,7 +344,7 @@ class Pipeline:
                 "no evaluate run of these held-out values is there; run `nsf run` with the same keys"
             )
         folder = Path(self.config.report.folder) / self.config.report.name
-        page = build_report(runs, folder, self.config.scene.title)
+        page = build_report(runs, folder, self.config.scene.title, first=self.evaluation)
         self.say(f"report: {len(runs)} evaluated variants → {page}")
         return page
 

@@ -25,7 +25,7 @@ _PROVENANCE = (
 )
 
 
-def build_report(evaluate_runs, folder, title: str) -> Path:
+def build_report(evaluate_runs, folder, title: str, first=None) -> Path:
     """Write a report of evaluate runs to folder, replacing a report that is there.
 
     Writes `index.html`, `index.md`, `results.csv`, `sources.json`, charts (svg, png) and pictures
@@ -35,6 +35,7 @@ def build_report(evaluate_runs, folder, title: str) -> Path:
         evaluate_runs: runs of stage `evaluate`; those not complete are passed over.
         folder: where the report goes. It changes only once everything is written.
         title: of the page.
+        first: the run that stands for its variant where several are alike in every column; else the newest.
 
     Returns:
         The path of `index.html`.
@@ -45,7 +46,7 @@ def build_report(evaluate_runs, folder, title: str) -> Path:
         ConfigError: folder holds something that is not a report.
         StorageError: the disk refused a file.
     """
-    merged = merge(open_sources(evaluate_runs))
+    merged = merge(open_sources(evaluate_runs, first))
     with replaced(Path(folder)) as fresh:
         merged.frame.to_csv(fresh / "results.csv", index=False)
         sections = draw(merged, fresh)

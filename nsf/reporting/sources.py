@@ -114,8 +114,8 @@ class Source:
         return frame
 
 
-def open_sources(evaluate_runs) -> list[Source]:
-    """The complete runs among those given, newest first.
+def open_sources(evaluate_runs, first=None) -> list[Source]:
+    """The complete runs among those given: the run `first`, then the newest first.
 
     Raises:
         MissingRunError: none is complete.
@@ -129,7 +129,8 @@ def open_sources(evaluate_runs) -> list[Source]:
         raise MissingRunError(
             f"none of the {len(runs)} evaluate runs given is complete; run `nsf evaluate scene={scene}` first"
         )
-    return sorted(sources, key=lambda source: (source.created, source.id), reverse=True)
+    chosen = first.id if first else None
+    return sorted(sources, key=lambda s: (s.id == chosen, s.created, s.id), reverse=True)
 
 
 def same_parameter(a, b) -> bool:
