@@ -128,12 +128,15 @@ def _of_variant(v: _Variant, folder: Path, prefix: str) -> list[Picture]:
     if motions:
         render.animation(motions, folder / f"{prefix}animation.gif", name, unit, v.floor)
         told = f"{name} " + " and ".join(parameter_text(m.parameter, "", unit) for m in motions)
-        caption = f"The full-order model (left) and the reduced one (right) at {told}, held out from training; the front half is cut away."
+        caption = (
+            f"The full-order model (left) and the reduced one (right) at {told}, held out from training; "
+            "the front half is cut away."
+        )
         pictures.append(Picture([f"{prefix}animation.gif"], _held_out(caption, v), v.runs))
         add(
             "final-shapes", render.final_shapes(v.motions(ROWS), name, unit, v.floor),
-            "The last frame of each parameter value, the front half cut away; the right column shows how far every particle of "
-            "the reduced model lies from where the full-order model puts it.", kinds=("png",),
+            "The last frame of each parameter value, the front half cut away; the right column shows how far "
+            "each particle of the reduced model lies from where the full-order one puts it.", kinds=("png",),
         )  # fmt: skip
     add(
         "error-over-time", charts.error_over_time(held_out, name=name, unit=unit),
@@ -185,7 +188,7 @@ def _comparison(known: list[_Variant], folder: Path) -> list[Picture]:
         ("delta", charts.delta_per_variant,
          f"Mean δ over the {splits} values, each of them (dots), and the paper's figure where it gives one."),
         ("speedup-memory", cost_charts.speedup_and_memory,
-         "What the reduced model saves or costs: speedup over the full-order model (line: 1×), and peak memory."),
+         "Speedup of the reduced over the full-order model (line: 1×), and the peak memory of both."),
     )  # fmt: skip
     return [Picture(save(drawn(entries), folder, stem), caption, runs) for stem, drawn, caption in drawings]
 
