@@ -15,12 +15,12 @@ class SolverCost:
     """Cost of one solver.
 
     Attributes:
-        step_ms: median over the trials of the time of a step, untimed inside [ms]; p10, p90: quantiles.
-        total_ms: time of a whole run at the mean of the trials, which cover it from end to end [ms].
-        stages: median over the trials of each stage's time [ms], synchronised, so their sum exceeds a step.
+        step_ms: median over the parts of a run of a step's time, untimed inside [ms]; p10, p90: quantiles.
+        total_ms: time of a whole run at the mean of its parts [ms].
+        stages: median over some steps of each stage's time [ms], synchronised, so their sum exceeds a step.
         memory_mib: peak of every allocator during the run, beyond what was held before the solver [MiB].
         allocators: the same by allocator [MiB].
-        trials: how many.
+        trials: how many parts were timed.
     """
 
     step_ms: float
@@ -43,7 +43,7 @@ def measure(build: Callable[[], object], steps: int, repeats: int, device: str) 
     Args:
         build: gives a solver at t = 0 (`step`, `stages`, `nbytes`).
         steps: of a whole run.
-        repeats: trials.
+        repeats: parts.
         device: `cpu` or `cuda`.
     """
     held = _held(device)

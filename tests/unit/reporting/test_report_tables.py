@@ -38,6 +38,13 @@ def test_newest_run_wins_for_equal_variant_and_parameter(tmp_path, newest_first)
     assert {value for _, value in merged.superseded} == set(TEST[:2])
 
 
+def test_the_run_asked_for_stands_for_its_variant(tmp_path):
+    old = write_run(tmp_path, Made(noise=0.02, created=EARLIER))
+    new = write_run(tmp_path, Made(noise=0.001, created=LATER))
+    merged = merge(open_sources([new, old], first=old))
+    assert {source.id for source in merged.source} == {old.id}
+
+
 @pytest.mark.parametrize(
     "difference", [{"method": "deformation_only"}, {"sample": 50}, {"r": 5}, {"device": "cpu"}], ids=str
 )
