@@ -1,6 +1,6 @@
 """The figures of README.md: picture and table of one report, written between two markers.
 
-`make readme` calls it, so that no number in README.md is typed by hand.
+`make readme` calls it, so that no result in README.md is typed by hand.
 """
 
 import sys
