@@ -1,12 +1,13 @@
 """Errors and costs of reduced runs (paper section 6 and appendix "Runtime analysis")."""
 
 from nsf.evaluation.compare import Comparison, at_frames, compare
-from nsf.evaluation.cost import SolverCost, measure
+from nsf.evaluation.cost import SolverCost, Subject, measure
 from nsf.evaluation.metrics import deformation_error, displacement_error, reduction_ratio, stress_error
 
 __all__ = [
     "Comparison",
     "SolverCost",
+    "Subject",
     "at_frames",
     "compare",
     "deformation_error",

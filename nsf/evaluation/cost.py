@@ -9,18 +9,35 @@ import numpy as np
 
 from nsf.timing import MemoryProbe, StageTimer, synchronizer
 
+_WARM_UP = 2  # steps of a fresh solver that compile, load and capture everything
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What is timed.
+
+    Attributes:
+        build: gives a solver at t = 0 (`step`, `timed_step`, `nbytes`).
+        steps: of a whole run.
+    """
+
+    build: Callable[[], object]
+    steps: int
+
 
 @dataclass(frozen=True)
 class SolverCost:
     """Cost of one solver.
 
     Attributes:
-        step_ms: median over the parts of a run of a step's time, untimed inside [ms]; p10, p90: quantiles.
-        total_ms: time of a whole run at the mean of its parts [ms].
-        stages: median over some steps of each stage's time [ms], synchronised, so their sum exceeds a step.
-        memory_mib: peak of every allocator during the run, beyond what was held before the solver [MiB].
+        step_ms: median over the trials, each a whole run from t = 0, of the mean time of a step,
+            nothing timed inside [ms]; step_ms_p10, step_ms_p90: quantiles.
+        total_ms: median time of a whole run's steps [ms], set-up and warm-up left out.
+        stages: median over steps spread through a run of each stage's time [ms], synchronised, so
+            their sum exceeds a step.
+        memory_mib: peak of every allocator during a run, beyond what was held before the solver [MiB].
         allocators: the same by allocator [MiB].
-        trials: how many parts were timed.
+        trials: number of runs.
     """
 
     step_ms: float
@@ -37,59 +54,72 @@ class SolverCost:
         return asdict(self)
 
 
-def measure(build: Callable[[], object], steps: int, repeats: int, device: str) -> SolverCost:
-    """Time a run in `repeats` equal parts, then its stages, then its memory.
+def measure(subjects: dict[str, Subject], trials: int, device: str) -> dict[str, SolverCost]:
+    """Whole runs of every solver, turn by turn, so that a machine that slows down slows all of them.
 
     Args:
-        build: gives a solver at t = 0 (`step`, `stages`, `nbytes`).
-        steps: of a whole run.
-        repeats: parts.
-        device: `cpu` or `cuda`.
+        subjects: by name.
+        trials: runs of each.
+        device: `cpu`, `cuda` or `cuda:N`.
     """
-    held = _held(device)
-    solver = build()
+    runs: dict[str, list[Trial]] = {name: [] for name in subjects}
+    for _ in range(trials):
+        for name, subject in subjects.items():
+            runs[name].append(_trial(subject, device))
+    found = {}
+    for name, subject in subjects.items():
+        p10, median, p90 = np.percentile([run.step_ms for run in runs[name]], [10, 50, 90]).tolist()
+        largest = max(runs[name], key=lambda run: run.memory_mib)
+        found[name] = SolverCost(
+            step_ms=median,
+            step_ms_p10=p10,
+            step_ms_p90=p90,
+            total_ms=median * subject.steps,
+            stages=_stages(subject, trials, device),
+            memory_mib=largest.memory_mib,
+            allocators=largest.allocators,
+            trials=trials,
+        )
+    return found
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One run: mean time of a step, those that warm up left out [ms], and memory [MiB]."""
+
+    step_ms: float
+    memory_mib: float
+    allocators: dict[str, float]
+
+
+def _trial(subject: Subject, device: str) -> Trial:
     gc.collect()
-    wait = synchronizer(device)
-    warm = min(2, steps - 1)  # these compile, load and capture everything
-    part = max(1, (steps - warm) // repeats)
-    times = []
+    with MemoryProbe(device) as before:
+        pass
+    solver, wait = subject.build(), synchronizer(device)
+    gc.collect()
+    warm = min(_WARM_UP, subject.steps - 1)
     with MemoryProbe(device, nbytes=lambda: solver.nbytes) as probe:
         solver.step(warm)
-        for _ in range(min(repeats, (steps - warm) // part)):
-            wait()
-            started = time.perf_counter()
-            solver.step(part)
-            wait()
-            times.append(1e3 * (time.perf_counter() - started) / part)
-    solver = build()
-    solver.step(1)
-    stages = _breakdown(solver, min(repeats, steps - 1), device)
-    p10, median, p90 = np.percentile(times, [10, 50, 90]).tolist()
-    return SolverCost(
-        step_ms=median,
-        step_ms_p10=p10,
-        step_ms_p90=p90,
-        total_ms=float(np.mean(times)) * steps,
-        stages=stages,
-        memory_mib=probe.peak_mib - held,
-        allocators=probe.allocators,
-        trials=len(times),
-    )
+        wait()
+        started = time.perf_counter()
+        solver.step(subject.steps - warm)
+        wait()
+        seconds = time.perf_counter() - started
+    return Trial(1e3 * seconds / (subject.steps - warm), probe.peak_mib - before.peak_mib, probe.allocators)
 
 
-def _held(device: str) -> float:
-    gc.collect()
-    with MemoryProbe(device) as probe:
-        pass
-    return probe.peak_mib
-
-
-def _breakdown(solver, repeats: int, device: str) -> dict[str, float]:
-    """Median time of each stage [ms] over some uncaptured steps."""
-    samples: dict[str, list[float]] = {}
-    for _ in range(repeats):
+def _stages(subject: Subject, samples: int, device: str) -> dict[str, float]:
+    """Median time of each stage [ms] over uncaptured steps spread evenly through a run."""
+    solver = subject.build()
+    chosen = np.unique(np.linspace(min(_WARM_UP, subject.steps - 1), subject.steps - 1, samples).astype(int))
+    found: dict[str, list[float]] = {}
+    taken = 0
+    for step in chosen.tolist():
+        solver.step(step - taken)
         timer = StageTimer(device)
         solver.timed_step(timer)
+        taken = step + 1
         for name, ms in timer.per_step(1).items():
-            samples.setdefault(name, []).append(ms)
-    return {name: float(np.median(values)) for name, values in samples.items()}
+            found.setdefault(name, []).append(ms)
+    return {name: float(np.median(values)) for name, values in found.items()}

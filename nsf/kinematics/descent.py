@@ -136,7 +136,7 @@ class FieldTraining(pl.LightningModule):
         self.descent, self.steps = descent, steps
         self.checkpoint, self.progress = checkpoint, progress
         self.block = min(max(SHORTEST_BLOCK, steps // BLOCKS), LONGEST_BLOCK)
-        self.step, self.loss = 0, float("nan")
+        self.step, self.loss, self.seconds = 0, float("nan"), 0.0
 
     @override
     def configure_optimizers(self) -> torch.optim.Optimizer:
@@ -152,7 +152,7 @@ class FieldTraining(pl.LightningModule):
     def training_step(self, batch: Any, index: int) -> None:
         first, last, started = self.step, min(self.step + self.block, self.steps), time.perf_counter()
         self.loss = self.taker.take(first, last)
-        self.step = last
+        self.step, self.seconds = last, self.seconds + time.perf_counter() - started
         if not self.loss < float("inf"):
             raise InstabilityError(
                 f"training of the {self.descent.fit.name} field diverged: mean loss {self.loss} in steps"
@@ -176,15 +176,19 @@ class FieldTraining(pl.LightningModule):
 
     @override
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        checkpoint["nsf"] = {"step": self.step, "loss": self.loss}
+        checkpoint["nsf"] = {"step": self.step, "loss": self.loss, "seconds": self.seconds}
 
     @override
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        self.step, self.loss = checkpoint["nsf"]["step"], checkpoint["nsf"]["loss"]
+        kept = checkpoint["nsf"]
+        self.step, self.loss, self.seconds = kept["step"], kept["loss"], kept["seconds"]
 
 
-def descend(descent: Descent, steps: int, folder: Path, tracking: str | None) -> float:
-    """Train one phase, from the checkpoint in `folder` if there is one; returns the last block's mean loss.
+def descend(descent: Descent, steps: int, folder: Path, tracking: str | None) -> tuple[float, float]:
+    """Train one phase, from the checkpoint in `folder` if there is one.
+
+    Returns:
+        The last block's mean loss, and the seconds that the steps took, those before an interrupt included.
 
     Raises:
         KeyboardInterrupt: on an interrupt; the next call goes on from the last whole block.
@@ -212,7 +216,7 @@ def descend(descent: Descent, steps: int, folder: Path, tracking: str | None) ->
         except SystemExit as stop:
             # Lightning answers an interrupt with exit code 1; the caller is to see the interrupt.
             raise KeyboardInterrupt from stop
-    return module.loss
+    return module.loss, module.seconds
 
 
 def _loggers(folder: Path, tracking: str | None) -> list[Logger]:

@@ -67,7 +67,8 @@ def train(
 
     Returns:
         The manifold on the host, and for each phase its steps, last loss (mean squared error over the
-        variance of the field) and seconds.
+        variance of the field) and seconds; `training_seconds` adds those and the preparation's. Time
+        before an interrupt counts, work that an interrupt undid does not.
 
     Raises:
         ConfigError: a value is out of range.
@@ -79,9 +80,9 @@ def train(
     at_least("latent_dim", latent_dim, 1)
     if tracking not in TRACKING:
         raise ConfigError(f"tracking={tracking!r} is unknown; choose null or tensorboard")
-    device, folder, started = torch.device(device), Path(folder), time.perf_counter()
+    device, folder = torch.device(device), Path(folder)
     with _determinism(deterministic):
-        prepared = _once(folder / "prepared.pt", lambda: field.prepare(snapshots, latent_dim))
+        prepared, total = _timed(folder / "prepared.pt", lambda: field.prepare(snapshots, latent_dim))
         manifold = field.build(snapshots, prepared, latent_dim, seeded("cpu", seed, WEIGHTS_STREAM)).to(
             device
         )
@@ -93,20 +94,20 @@ def train(
             fit.network.to(device)  # Lightning leaves it on the host
             (folder / fit.name / CHECKPOINT).unlink(missing_ok=True)
             metrics |= {f"{fit.name}_{key}": outcome[key] for key in ("steps", "loss", "seconds")}
-    metrics["training_seconds"] = time.perf_counter() - started
+            total += outcome["seconds"]
+    metrics["training_seconds"] = total
     return manifold.cpu().requires_grad_(False).eval(), metrics
 
 
 def _phase(descent: Descent, folder: Path, tracking: str | None) -> dict[str, Any]:
-    started = time.perf_counter()
     name, own = descent.fit.name, folder / descent.fit.name
-    steps = _once(folder / f"{name}_steps.pt", lambda: _steps(descent))
-    loss = descend(descent, steps, own, tracking)
+    steps, probing = _timed(folder / f"{name}_steps.pt", lambda: _steps(descent))
+    loss, seconds = descend(descent, steps, own, tracking)
     return {
         "state": {key: value.cpu() for key, value in descent.fit.network.state_dict().items()},
         "steps": steps,
         "loss": loss,
-        "seconds": time.perf_counter() - started,
+        "seconds": probing + seconds,
     }
 
 
@@ -132,6 +133,17 @@ def _seconds_per_step(descent: Descent) -> float:
         steps.take(taken, taken + PROBE_STEPS)
     network.load_state_dict(state)
     return (time.perf_counter() - started) / taken
+
+
+def _timed(path: Path, compute: Callable[[], Any]) -> tuple[Any, float]:
+    """As `_once`, with the seconds that computing took."""
+
+    def timed() -> dict[str, Any]:
+        started = time.perf_counter()
+        return {"value": compute(), "seconds": time.perf_counter() - started}
+
+    kept = _once(path, timed)
+    return kept["value"], kept["seconds"]
 
 
 def _once(path: Path, compute: Callable[[], Any]) -> Any:

@@ -19,7 +19,7 @@ from nsf.dynamics.interop import torch_device
 from nsf.dynamics.sampling import check_well_posed
 from nsf.dynamics.solver import reduced_steps
 from nsf.errors import ConfigError, MissingRunError
-from nsf.evaluation import compare, measure
+from nsf.evaluation import Subject, compare, measure
 from nsf.kinematics.manifold import Manifold
 from nsf.kinematics.training import TRACKING, train
 from nsf.mpm import FP32, FP64, precision_of
@@ -41,7 +41,7 @@ class Pipeline:
     """The chain for one configuration.
 
     Args:
-        config: resolved configuration.
+        config: configuration, as `nsf.config.load` gives it; resolved here.
         say: called with a line for the user.
         root: folder of runs; `NSF_RUNS` or `runs` by default.
     """
@@ -60,8 +60,8 @@ class Pipeline:
 
     def _build(self) -> None:
         """Build and check everything, so that a bad value is refused before any work."""
-        c = self.config
-        self.scene = Scene.from_config(c)
+        self.scene = Scene.from_config(self.config)
+        c = self.config = self.scene.config
         p = self.scene.parameters
         self.split = Split(train=tuple(p.train), validation=tuple(p.validation), test=tuple(p.test))
         for name in ("field", "trainer", "method", "sampler", "projector", "integration"):
@@ -77,6 +77,8 @@ class Pipeline:
         _one_of("tracking", c.tracking, TRACKING)
         _one_of("data.resident", c.data.resident, (True, False, "auto"))
         _one_of("data.dtype", c.data.dtype, tuple(_STORED))
+        if str(c.report.name) in ("", "..") or Path(str(c.report.name)).name != str(c.report.name):
+            raise ConfigError(f"report.name={c.report.name} must be one folder's name; set report.folder")
         precision_of(c.precision)
         for phase in self.sampler.phases_of(self.scene.particles().X):
             check_well_posed(len(phase.particles), c.latent_dim)
@@ -213,7 +215,6 @@ class Pipeline:
             [Trajectory.open(p) for p in paths], device=self.device, resident=c.data.resident
         )
         with run.record(device=self.device, seed=c.seed) as record:
-            started = time.perf_counter()
             manifold, metrics = train(
                 snapshots,
                 self.field,
@@ -228,11 +229,10 @@ class Pipeline:
             manifold.split = {"train": list(self.split.train), "test": list(self.split.test)}
             manifold.save(run.path / "manifold.pt")
             record.output("manifold.pt")
-            record.metrics.update(metrics, seconds=time.perf_counter() - started)
+            record.metrics.update(metrics)
         snapshots.close()
-        self.say(
-            f"train: field={manifold.field}, r={c.latent_dim} in {record.metrics['seconds']:.1f} s → {run.id}"
-        )
+        seconds = metrics["training_seconds"]
+        self.say(f"train: field={manifold.field}, r={c.latent_dim} in {seconds:.1f} s → {run.id}")
         return run
 
     def solver_at(self, manifold: Manifold, value: float, device: str | None = None) -> ReducedMPM:
@@ -311,7 +311,7 @@ class Pipeline:
             table = results.rows(
                 self.config, manifold, rollouts, comparisons, cost, self.device, run.manifest
             )
-            seconds = self.training.manifest["seconds"]
+            seconds = self.training.manifest["metrics"]["training_seconds"]
             summary = results.summarise(self.scene, manifold, table, comparisons, seconds)
             results.write(record, table, comparisons, cost, summary)
         self.say(f"evaluate: mean δ {100 * table['delta'].mean():.3g} % over {len(table)} values → {run.id}")
@@ -320,15 +320,20 @@ class Pipeline:
     def _cost(self, manifold: Manifold) -> dict:
         trials, value = self.config.evaluation.trials, self.held_out[0]
         name = self.scene.parameters.name
-        full = measure(
-            lambda: self.scene.full_order({name: value}, self.config.precision, self.device),
-            self.scene.steps,
+        scene, multiplier = self.scene, self.config.deploy.dt_multiplier
+        cost = measure(
+            {
+                "full_order": Subject(
+                    lambda: scene.full_order({name: value}, self.config.precision, self.device), scene.steps
+                ),
+                "reduced": Subject(
+                    lambda: self.solver_at(manifold, value), reduced_steps(scene.steps, multiplier)
+                ),
+            },
             trials,
             self.device,
         )
-        steps = reduced_steps(self.scene.steps, self.config.deploy.dt_multiplier)
-        reduced = measure(lambda: self.solver_at(manifold, value), steps, trials, self.device)
-        return results.costs(full, reduced)
+        return results.costs(cost["full_order"], cost["reduced"])
 
     def report(self) -> Path:
         """The report of every evaluated variant of this scene at these held-out trajectories."""

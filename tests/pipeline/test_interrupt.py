@@ -21,7 +21,7 @@ MOMENTS = {
     "simulate": SignalAt("nsf.mpm:FullOrderMPM.step", 40),
     "train": SignalAt("nsf.kinematics.descent:Steps._take", 330),
     "deploy": SignalAt("nsf.dynamics.solver:ReducedMPM.invert", 10),
-    "evaluate": SignalAt("nsf.evaluation.cost:_breakdown"),
+    "evaluate": SignalAt("nsf.evaluation.cost:_stages"),
 }
 
 

@@ -2,24 +2,30 @@
 
 import json
 
-import numpy as np
 import pytest
 
-from nsf.evaluation import measure
+from nsf.evaluation import Subject, measure
 
 REDUCED = ["inference", "transfer", "p2g", "grid", "g2p", "inversion"]
 FULL = ["p2g", "grid", "g2p", "stress"]
 
 
 @pytest.fixture(scope="module")
-def full(chain):
-    return measure(lambda: chain.scene.full_order({"friction_angle": 26.0}, device="cpu"), 24, 3, "cpu")
+def cost(chain, tiny_manifold):
+    scene, angle = chain.scene, {"friction_angle": 26.0}
+    full = Subject(lambda: scene.full_order(angle, device="cpu"), 24)
+    reduced = Subject(lambda: scene.reduced(tiny_manifold, angle, 20, device="cpu"), 24)
+    return measure({"full": full, "reduced": reduced}, 3, "cpu")
 
 
 @pytest.fixture(scope="module")
-def reduced(chain, tiny_manifold):
-    build = chain.scene.reduced
-    return measure(lambda: build(tiny_manifold, {"friction_angle": 26.0}, 20, device="cpu"), 24, 3, "cpu")
+def full(cost):
+    return cost["full"]
+
+
+@pytest.fixture(scope="module")
+def reduced(cost):
+    return cost["reduced"]
 
 
 def test_stages_are_those_of_the_issue(full, reduced):
@@ -50,38 +56,61 @@ def test_what_a_cost_holds(full, reduced):
 
 
 class Counted:
-    """Counts its steps and takes them in no time."""
+    """Counts its steps; the first two take long, as those that compile do."""
 
-    built = 0
     nbytes = 2**20
 
-    def __init__(self):
-        Counted.built += 1
-        self.steps, self.calls = 0, []
+    def __init__(self, name="only", log=None, clock=None):
+        self.name, self.log, self.clock = name, [] if log is None else log, clock
+        self.steps, self.timed = 0, []
 
     def step(self, n=1):
-        self.calls.append(n)
-        self.steps += n
+        self.log.append(self.name)
+        for _ in range(n):
+            if self.clock is not None:
+                self.clock.now += 100.0 if self.steps < 2 else 0.25
+            self.steps += 1
 
     def timed_step(self, timer):
         with timer("only"):
+            self.timed.append(self.steps)
             self.steps += 1
 
 
-@pytest.mark.parametrize(
-    ("steps", "repeats", "trials"),
-    [(200, 10, 10), (24, 10, 10), (5, 10, 3), (3, 1, 1), (2, 10, 1), (1, 2, 1)],
-)
-def test_a_run_in_equal_parts_never_passes_its_end(steps, repeats, trials, monkeypatch):
+@pytest.fixture
+def clock(monkeypatch):
+    class Clock:
+        now = 0.0
+
+    monkeypatch.setattr("time.perf_counter", lambda: Clock.now)
     monkeypatch.setattr("gc.collect", lambda: 0)  # a second each, for nothing
+    return Clock
+
+
+@pytest.mark.parametrize(("steps", "trials"), [(200, 10), (24, 10), (5, 10), (3, 1), (2, 10), (1, 2)])
+def test_every_trial_is_a_whole_run(steps, trials, clock):
     solvers = []
 
     def build():
-        solvers.append(Counted())
+        solvers.append(Counted(clock=clock))
         return solvers[-1]
 
-    cost = measure(build, steps, repeats, "cpu")
+    cost = measure({"it": Subject(build, steps)}, trials, "cpu")["it"]
+    assert len(solvers) == trials + 1  # and one for the stages
     assert cost.trials == trials
-    assert all(solver.steps <= steps for solver in solvers)
-    assert len(set(solvers[0].calls[1:])) == 1
-    assert np.isfinite(cost.total_ms)
+    assert [s.steps for s in solvers[:-1]] == [steps] * trials
+    last = solvers[-1]
+    assert last.steps == steps
+    assert last.timed[-1] == steps - 1  # spread to the end of the run
+    assert last.timed == sorted(set(last.timed))
+    if steps > 2:
+        assert cost.step_ms == pytest.approx(250.0)  # without the steps that compile
+        assert cost.total_ms == pytest.approx(250.0 * steps)
+
+
+def test_solvers_take_turns(clock):
+    log = []
+    subjects = {n: Subject(lambda n=n: Counted(n, log), 5) for n in ("full", "reduced")}
+    measure(subjects, 3, "cpu")
+    runs = log[: 2 * 2 * 3]
+    assert runs == ["full", "full", "reduced", "reduced"] * 3

@@ -1,6 +1,7 @@
 """Schedules, resumption to the bit, and what training refuses."""
 
 import signal
+import time
 
 import pytest
 import torch
@@ -71,10 +72,24 @@ def test_resumed_training_has_the_same_bits(monkeypatch, train, tmp_path, field,
     assert same(resumed, expected)
     assert taken[0] == (phase, step // 5 * 5)
     assert all(resumed_metrics[f"{p}_loss"] == metrics[f"{p}_loss"] for p in PHASES)
+    total = resumed_metrics["training_seconds"]
     taken.clear()
-    again, _ = train(field, tmp_path / "parts")
+    again, again_metrics = train(field, tmp_path / "parts")
     assert same(again, expected)
     assert not taken
+    assert again_metrics["training_seconds"] == total  # what was done before counts, what is read does not
+
+
+def test_seconds_before_an_interrupt_count(monkeypatch, train, tmp_path):
+    restore = interrupt_at(monkeypatch, "deformation", 12)
+    true_take = descent.Steps.take
+    monkeypatch.setattr(descent.Steps, "take", lambda self, *span: time.sleep(0.2) or true_take(self, *span))
+    with pytest.raises(KeyboardInterrupt):
+        train("basis", tmp_path)
+    restore()
+    monkeypatch.setattr(descent.Steps, "take", true_take)
+    _, metrics = train("basis", tmp_path)
+    assert metrics["deformation_seconds"] > 0.4  # two whole blocks of five steps came before
 
 
 @pytest.mark.parametrize("field", FIELDS)
