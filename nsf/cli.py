@@ -122,7 +122,7 @@ def _multirun(stage: str, overrides: list[str]) -> int:
     def job(config) -> None:
         print(f"--- {' '.join(hydra.core.hydra_config.HydraConfig.get().overrides.task)}")
         try:
-            _work(stage, configuration.resolve(config))
+            _work(stage, configuration.checked(config))
         except NSFError as error:
             # Recorded in the failed run's manifest; the other jobs go on.
             failed.append(error)

@@ -6,6 +6,7 @@ simulation at a parameter value is the same configuration with that key replaced
 
 import dataclasses
 import difflib
+import inspect
 import math
 import re
 import types
@@ -38,12 +39,27 @@ def _per(count) -> float:
     return 1.0 / float(count)
 
 
+def _sin(degrees) -> float:
+    """`${sin:30}` = 0.5, of an angle in degrees."""
+    return math.sin(math.radians(float(degrees)))
+
+
+def _cos(degrees) -> float:
+    """`${cos:60}` = 0.5, of an angle in degrees."""
+    return math.cos(math.radians(float(degrees)))
+
+
 OmegaConf.register_new_resolver("scaled", _scaled, replace=True)
 OmegaConf.register_new_resolver("per", _per, replace=True)
+OmegaConf.register_new_resolver("sin", _sin, replace=True)
+OmegaConf.register_new_resolver("cos", _cos, replace=True)
 
 
 def load(overrides: Sequence[str] = (), config_name: str = "config") -> DictConfig:
-    """Compose the configuration from Hydra overrides and resolve it.
+    """Compose the configuration from Hydra overrides and check it.
+
+    Interpolations stay, so that a key that is replaced later (the problem parameter) is seen by
+    every key that refers to it.
 
     Args:
         overrides: `key=value` in Hydra's grammar, for example `scene=sand`, `scene.dt=0.001`.
@@ -54,7 +70,7 @@ def load(overrides: Sequence[str] = (), config_name: str = "config") -> DictConf
             a syntax error, or an `_target_` outside `nsf`.
     """
     try:
-        return resolve(_compose(config_name, overrides))
+        return checked(_compose(config_name, overrides))
     except (HydraException, OmegaConfBaseException, ValueError) as error:
         raise ConfigError(_explain(error, config_name, overrides)) from error
     except MarkedYAMLError as error:
@@ -66,6 +82,16 @@ def _compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
     GlobalHydra.instance().clear()
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return compose(config_name, overrides=list(overrides))
+
+
+def checked(config: DictConfig) -> DictConfig:
+    """The configuration with its interpolations, once it is sure that all of them resolve.
+
+    Raises:
+        ConfigError: see `load`.
+    """
+    resolve(config)
+    return OmegaConf.create(OmegaConf.to_container(config))
 
 
 def resolve(config: DictConfig) -> DictConfig:
@@ -121,9 +147,14 @@ def build(config: DictConfig, where: str):
         detail = str(cause or error).splitlines()[0]
         if isinstance(cause, TypeError) and "unexpected keyword" in detail:
             raise ConfigError(
-                f"{where}: {detail.split('got an ')[-1]}; known keys are in conf/{where}/"
+                f"{where}: {detail.split('got an ')[-1]}; known keys: {', '.join(_known(config))}"
             ) from error
         raise ConfigError(f"{where}: {detail}") from error
+
+
+def _known(config: DictConfig) -> list[str]:
+    """Keys that the class of a configuration node takes."""
+    return list(inspect.signature(get_class(config._target_)).parameters)
 
 
 _KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}

@@ -106,7 +106,8 @@ class Scene:
         bodies: what moves; colliders, walls: boundaries.
         material: constitutive law; transfer: PIC, APIC or RPIC.
         parameters: the problem parameter and its values.
-        config: the resolved configuration that it was built from.
+        config: the configuration that it was built from, resolved.
+        template: the same before its interpolations were resolved.
     """
 
     name: str
@@ -123,23 +124,24 @@ class Scene:
     transfer: Transfer
     parameters: ParameterRange
     config: DictConfig = field(repr=False, compare=False)
+    template: DictConfig = field(repr=False, compare=False)
 
     @classmethod
     def from_config(cls, config: DictConfig) -> "Scene":
-        """Build from a resolved configuration with `scale`, `scene`, `material`, `transfer`.
+        """Build from a configuration with `scale`, `scene`, `material`, `transfer`.
 
         Raises:
             ConfigError: a key is unknown or a value outside its range.
         """
         try:
-            return cls._build(config)
+            return cls._build(configuration.resolve(config), config)
         except ConfigAttributeError as error:
             raise ConfigError(
                 f"{error.full_key} is missing from the configuration; give it a value"
             ) from error
 
     @classmethod
-    def _build(cls, config: DictConfig) -> "Scene":
+    def _build(cls, config: DictConfig, template: DictConfig) -> "Scene":
         s = config.scene
         colliders = tuple(configuration.build(c, "scene.colliders") for c in s.colliders.values())
         return cls(
@@ -157,15 +159,16 @@ class Scene:
             transfer=configuration.build(config.transfer, "transfer"),
             parameters=ParameterRange(**OmegaConf.to_container(s.parameters)),
             config=config,
+            template=template,
         )
 
     def with_parameters(self, parameters: Mapping[str, float]) -> "Scene":
-        """The same scene at given problem parameters, `{name: value}`.
+        """The same scene at given problem parameters, `{name: value}`; keys that refer to them follow.
 
         Raises:
             ConfigError: a name is not the scene's parameter, or the value is refused.
         """
-        config = self.config.copy()
+        config = self.template.copy()
         for name, value in parameters.items():
             if name != self.parameters.name:
                 raise ConfigError(

@@ -129,6 +129,8 @@ BEFORE_ANY_WORK = [
     ("evaluation.trials=abc", ["evaluation.trials=abc"]),
     ("evaluation.picture_particles=0", ["evaluation.picture_particles=0"]),
     ("evaluation.picture_frames=0", ["evaluation.picture_frames=0"]),
+    ("report.name=../elsewhere", ["report.name=../elsewhere", "report.folder"]),
+    ("report.name=..", ["report.name=.."]),
     ("tracking=wandb", ["tracking=wandb", "tensorboard"]),
     ("data.resident=maybe", ["resident=maybe"]),
     ("method.neural_stress=maybe", ["neural_stress=maybe"]),

@@ -95,6 +95,30 @@ def test_full_order_runs_at_a_parameter(sand):
     assert -0.5 * 4.0 * (6 * sand.dt) ** 2 < fall[:, 2].min() < 0.0
 
 
+TILTED = [
+    "+scene.tilt=10.0",
+    "scene.gravity=['${sin:${scene.tilt}}', 0.0, -4.0]",
+    "scene.parameters.key=scene.tilt",
+    "scene.parameters.train=[10.0, 20.0]",
+    "scene.parameters.test=[30.0]",
+]
+
+
+def test_keys_that_refer_to_the_parameter_follow_it():
+    """A problem parameter may reach the physics through an interpolation, as an inclination does."""
+    scene = load("sand", [FEW, *TILTED])
+    assert scene.gravity[0] == pytest.approx(np.sin(np.radians(10.0)))
+    tilted = scene.with_parameters({"tilt": 30.0})
+    assert tilted.gravity[0] == pytest.approx(0.5)
+    assert tilted.with_parameters({"tilt": 90.0}).gravity[0] == pytest.approx(1.0)
+
+
+def test_a_parameter_that_is_no_key_is_refused():
+    scene = load("sand", [FEW, "scene.parameters.key=scene.tilt"])
+    with pytest.raises(ConfigError, match=r"scene\.tilt"):
+        scene.with_parameters({"tilt": 30.0})
+
+
 @pytest.mark.parametrize(
     ("overrides", "quoted"),
     [
