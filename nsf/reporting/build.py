@@ -67,7 +67,7 @@ def _page(title: str, merged: Merged, sections) -> Page:
         if len(variants(merged)) > len(methods)
         else ""
     )
-    note = f"Means over the parameter values of a split. {chosen}{_said(same)}"
+    note = f"Means over the parameter values of a split. {chosen}{_smaller(merged)}{_said(same)}"
     return Page(
         title=title,
         lead=_LEAD,
@@ -113,9 +113,26 @@ def _facts(merged: Merged) -> list[tuple[str, str]]:
                 f"{source.series['t'].max():.3g} s in {int(source.series['frame'].max()):,} frames",
             ),
         ]
-        if source.summary.get("training_seconds"):
-            facts.append(("Training", _duration(source.summary["training_seconds"])))
+        if training := _training(merged, rows):
+            facts.append(("Training", training))
     return facts
+
+
+def _training(merged: Merged, rows) -> str:
+    """How long the networks of each field took; a range where several were trained."""
+    told = []
+    for field, part in rows.groupby("field", sort=False):
+        found = {merged.source[i].summary.get("training_seconds") for i in part.index} - {None}
+        if found:
+            shown = dict.fromkeys(_duration(seconds) for seconds in (min(found), max(found)))
+            told.append(f"{' to '.join(shown)} ({field} field)")
+    return ", ".join(told)
+
+
+def _smaller(merged: Merged) -> str:
+    """A word of caution beside the paper's figure, where a run is not of the paper's size."""
+    scales = {s.summary.get("scale") for s in merged.source if s.summary.get("paper")} - {None, "paper"}
+    return f"The paper's δ is of its full size, these runs are of {min(scales)} scale. " if scales else ""
 
 
 def _particles(source: Source, rows) -> int:

@@ -59,10 +59,12 @@ COLUMNS = tuple(COLUMN)
 """Columns of `results.csv`, in order. Errors and δ are fractions there."""
 
 TEXT = ("scene", "method", "field", "sample", "split", "precision", "device", "commit")
-MEASURED = (
-    "delta", "displacement_error", "stress_error", "step_ms_full", "step_ms_reduced", "speedup_step",
-    "speedup_total", "memory_full_mib", "memory_reduced_mib",
+COSTS = (
+    "step_ms_full", "step_ms_reduced", "speedup_step", "speedup_total",
+    "memory_full_mib", "memory_reduced_mib",
 )  # fmt: skip
+"""Columns measured once a variant."""
+MEASURED = ("delta", "displacement_error", "stress_error", *COSTS)
 """Columns that are averaged over parameter values."""
 
 ABSENT = "–"

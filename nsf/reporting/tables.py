@@ -1,6 +1,7 @@
 """Tables: the results of many evaluate runs merged, averaged, and written as text."""
 
 import html
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import pandas as pd
@@ -12,6 +13,7 @@ from nsf.reporting.columns import (
     ABSENT,
     COLUMN,
     COLUMNS,
+    COSTS,
     MEASURED,
     TEXT,
     device_type,
@@ -123,12 +125,18 @@ def cells(frame: pd.DataFrame, renamed: dict[str, str] | None = None) -> tuple[l
     return headings, body
 
 
-def without_constants(frame: pd.DataFrame, keep=("method", "parameter", "split")) -> tuple[pd.DataFrame, str]:
-    """Drop descriptive columns that say the same in every row; returns the rest, and what they say."""
-    describing = [name for name in (*VARIANT, "gamma", "integration_mean", "commit") if name in frame]
+def without_constants(
+    frame: pd.DataFrame, also: Sequence[str] = (), keep: Sequence[str] = ("method", "parameter", "split")
+) -> tuple[pd.DataFrame, str]:
+    """Drop columns that describe, and those of `also`, where they say the same in every row.
+
+    Returns:
+        The frame that is left, and what the dropped columns say.
+    """
+    describing = [name for name in (*VARIANT, "gamma", "integration_mean", "commit", *also) if name in frame]
     constant = [name for name in describing if name not in keep and frame[name].astype(str).nunique() == 1]
-    said = ", ".join(f"{COLUMN[name].title} {_cell(name, frame[name].iloc[0])}" for name in constant)
-    return frame.drop(columns=constant), said
+    said = (f"{COLUMN[n].title} {_cell(n, frame[n].iloc[0])} {COLUMN[n].unit}".strip() for n in constant)
+    return frame.drop(columns=constant), ", ".join(said)
 
 
 def markdown_table(frame: pd.DataFrame, renamed: dict[str, str] | None = None) -> str:
@@ -166,7 +174,7 @@ def html_rows(headings: list[str], body: list[list[str]], numeric: list[bool]) -
 
 def console_table(frame: pd.DataFrame) -> Table:
     """The results for a terminal; columns that never change are told in the caption, commits in the csv."""
-    shown, said = without_constants(frame.drop(columns="commit", errors="ignore"))
+    shown, said = without_constants(frame.drop(columns="commit", errors="ignore"), also=COSTS)
     headings, body = cells(shown)
     table = Table(caption=escape(said), caption_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for heading, right in zip(headings, _numeric(shown), strict=True):

@@ -35,6 +35,9 @@ class Made:
     created: str = "2024-05-01T10:00:00+00:00"
     status: str = "complete"
     paper: bool = True
+    field: str = "mlp"
+    scale: str = "paper"
+    training_seconds: float = 5400
     seed: int = 0
 
 
@@ -90,7 +93,8 @@ def write_payload(path: Path, made: Made) -> None:
         "parameter_name": "friction angle",
         "parameter_unit": "°",
         "particles": 71363,
-        "training_seconds": 5400,
+        "training_seconds": made.training_seconds,
+        "scale": made.scale,
     }
     paper = {"paper": {"delta": 0.004, "place": "Table 1, Sand"}} if made.paper else {}
     (path / "summary.json").write_text(json.dumps(summary | paper | {"floor": 0.13}))
@@ -146,7 +150,7 @@ def _result(made: Made, value: float, split: str, m: dict, series: pd.DataFrame)
     apart = _total(m["x_reduced"][1:] - x)
     full, reduced = sum(FULL_STAGES.values()), sum(STAGES.values()) * (0.8 + made.sample / 750)
     return {
-        "scene": made.scene, "method": made.method, "field": "mlp", "r": made.r, "sample": made.sample,
+        "scene": made.scene, "method": made.method, "field": made.field, "r": made.r, "sample": made.sample,
         "integration_mean": 24.6 * made.sample, "parameter": value, "split": split,
         "delta": apart / _total(x),
         "displacement_error": apart / _total(x - X), "stress_error": float(series["stress_error"].mean()),

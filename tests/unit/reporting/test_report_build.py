@@ -55,6 +55,19 @@ def test_page_opens_with_what_it_is_then_tables_then_pictures_then_provenance(re
     assert places == sorted(places)
 
 
+def test_training_time_and_scale_are_told_by_field(tmp_path, no_pictures):
+    """A report that mixes fields or scales must not show one's figure for all."""
+    small = {**vars(TINY), "scale": "small"}
+    runs = [
+        write_run(tmp_path / "runs", Made(**small | {"field": field, "training_seconds": seconds}))
+        for field, seconds in (("basis", 9.0), ("mlp", 240.0))
+    ]
+    page = build_report(runs, tmp_path / "report", "Sand").read_text()
+    assert "9 s (basis field)" in page
+    assert "4.0 min (mlp field)" in page
+    assert "these runs are of small scale" in page
+
+
 def test_pictures_are_of_the_best_sample_of_each_method(report):
     drawn = {path.name for path in report.glob("*final-shapes.png")}
     assert drawn == {"nsf-final-shapes.png", "deformation_only-final-shapes.png"}

@@ -171,3 +171,15 @@ def test_results_without_a_column_name_it(tmp_path):
     seal(run)
     with pytest.raises(SchemaError, match="gamma"):
         merge_results([run])
+
+
+def test_console_table_of_one_variant_fits_a_terminal(sweep):
+    """Costs are measured once a variant, so they stand in the caption."""
+    frame = merge_results(sweep)
+    frame = frame[frame["method"] == "nsf"].head(1)
+    stream = io.StringIO()
+    Console(file=stream, width=200).print(console_table(frame))
+    text = stream.getvalue()
+    cost = number(frame["step_ms_full"].iloc[0])
+    assert f"full-order step {cost} ms" in text
+    assert max(map(len, text.split("\n\n")[0].splitlines())) < 100
