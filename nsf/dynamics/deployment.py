@@ -32,7 +32,7 @@ class Rollout:
         sample: |S| of the first phase; integration_mean: mean |N|.
         needed_outside: most particles or nodes a step needed outside the superset.
         seconds: wall time of the steps, without set-up.
-        diverged: step at which x̂ ceased to be finite, −1 when it did not.
+        diverged: step at which x̂ ceased to be finite or a sample particle left the grid, −1 when neither did.
     """
 
     parameter: float
@@ -118,8 +118,7 @@ def rollout(solver: ReducedMPM, parameter: float) -> Rollout:
     wait()
     seconds = (time.perf_counter() - started) * solver.total_steps / max(1, solver.total_steps - 1)
     latent = solver.trajectory()
-    finite = np.isfinite(latent.xhat).all(1)
-    diverged = -1 if finite.all() else int((~finite).argmax())
+    diverged = solver.left_grid()
     outside = solver.needed_outside() if diverged < 0 else 0
     return Rollout(
         parameter=float(parameter),

@@ -331,6 +331,24 @@ class ReducedMPM:
             t, self._latents[: n + 1].cpu().numpy(), residuals.numpy(), updates.numpy(), stops
         )
 
+    def left_grid(self) -> int:
+        """First step that ended with a sample particle off the grid, or non-finite; −1 when none did.
+
+        Such a particle no longer takes part in a step, so what follows is no reduced model of anything;
+        the full-order solver stops there. For after a run.
+        """
+        for n in range(1, self.steps_taken + 1):
+            x = self._phase_at(n - 1).at_sample.position(self._latents[n])
+            if not bool(self._on_grid(x).all()):
+                return n
+        return -1
+
+    def _on_grid(self, x: torch.Tensor) -> torch.Tensor:
+        """[n] whether the stencils of particles at x [n, 3] lie on the grid; False where x is not finite."""
+        reach = 0.5 * (DEGREES[self.transfer.shape] - 1) * self.geometry.dx  # of a stencil below its particle
+        upper = torch.tensor(self.geometry.upper, dtype=self.dtype, device=self.torch_device) - reach
+        return ((x >= reach) & (x < upper)).all(1)
+
     def needed_outside(self) -> int:
         """Most particles and nodes that a step needed and the superset lacks, or that were off the grid.
 
@@ -342,8 +360,6 @@ class ReducedMPM:
         if self.integration.strategy == "search":
             return 0
         everything = self.decoder()
-        reach = 0.5 * (DEGREES[self.transfer.shape] - 1) * self.geometry.dx  # of a stencil below its particle
-        upper = torch.tensor(self.geometry.upper, dtype=self.dtype, device=self.torch_device) - reach
         worst = 0
         for n in range(self.steps_taken):
             phase = self._phase_at(n)
@@ -354,7 +370,7 @@ class ReducedMPM:
             marked = self.search.no_nodes(self.torch_device)
             self.search.mark_nodes(x[sample].contiguous(), marked)
             marked[torch.as_tensor(phase.sets.nodes, device=self.torch_device).long()] = 0
-            lost = ((x < reach) | (x >= upper)).any(1)
+            lost = ~self._on_grid(x)
             worst = max(worst, int(needed.sum()) + int(marked.sum()) + int(lost.sum()))
         return worst
 

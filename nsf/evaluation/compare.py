@@ -62,8 +62,11 @@ def compare(
     decoder = solver.decoder()
     frames = trajectory.frames
     xhat = at_frames(rollout, trajectory.t)
-    finite = np.isfinite(xhat).all(1)
-    xhat[~finite] = xhat[finite][-1]  # pictures of a diverged run hold its last state; its errors are ∞
+    diverged = rollout.diverged >= 0
+    # Frames up to the last good step: those after it lie between a good latent and a lost one.
+    last = rollout.t[rollout.diverged - 1] if diverged else np.inf
+    fine = trajectory.t <= last + 1e-9
+    xhat[~fine] = xhat[fine][-1]  # pictures of a diverged run hold its last state; its errors are ∞
 
     def tensor(values) -> torch.Tensor:
         return torch.as_tensor(np.asarray(values), dtype=solver.dtype, device=device)
@@ -119,12 +122,11 @@ def compare(
             kept[name].append(values[inside][:, shown_particles].float().cpu().numpy())
 
     column = {name: torch.cat(values) for name, values in rows.items()}
-    diverged = rollout.diverged >= 0
 
     def total(error: str, norm: str) -> float:  # over frames 1..N
         return metrics.relative(column[error][1:], column[norm][1:])
 
-    bad = torch.as_tensor(~finite)
+    bad = torch.as_tensor(~fine)
     # At t = 0 nothing has moved and nothing is loaded: what stands there is round-off of the file.
     for name in ("u_norm", "tau_norm"):
         column[name][0] = torch.nan

@@ -35,7 +35,7 @@ class SolverCost:
         total_ms: median time of a whole run's steps [ms], set-up and warm-up left out.
         stages: median over steps spread through a run of each stage's time [ms], synchronised, so
             their sum exceeds a step.
-        memory_mib: peak of every allocator during a run, beyond what was held before the solver [MiB].
+        memory_mib: peak of every allocator during the first run, beyond what was held before the solver [MiB].
         allocators: the same by allocator [MiB].
         trials: number of runs.
     """
@@ -62,51 +62,52 @@ def measure(subjects: dict[str, Subject], trials: int, device: str) -> dict[str,
         trials: runs of each.
         device: `cpu`, `cuda` or `cuda:N`.
     """
-    runs: dict[str, list[Trial]] = {name: [] for name in subjects}
-    for _ in range(trials):
+    memory, times = {}, {name: [] for name in subjects}
+    for trial in range(trials):
         for name, subject in subjects.items():
-            runs[name].append(_trial(subject, device))
+            if trial == 0:
+                ms, *memory[name] = _first_trial(subject, device)
+            else:
+                ms = _step_ms(subject.build(), subject.steps, device)
+            times[name].append(ms)
     found = {}
     for name, subject in subjects.items():
-        p10, median, p90 = np.percentile([run.step_ms for run in runs[name]], [10, 50, 90]).tolist()
-        largest = max(runs[name], key=lambda run: run.memory_mib)
+        p10, median, p90 = np.percentile(times[name], [10, 50, 90]).tolist()
         found[name] = SolverCost(
             step_ms=median,
             step_ms_p10=p10,
             step_ms_p90=p90,
             total_ms=median * subject.steps,
             stages=_stages(subject, trials, device),
-            memory_mib=largest.memory_mib,
-            allocators=largest.allocators,
+            memory_mib=memory[name][0],
+            allocators=memory[name][1],
             trials=trials,
         )
     return found
 
 
-@dataclass(frozen=True)
-class Trial:
-    """One run: mean time of a step, those that warm up left out [ms], and memory [MiB]."""
-
-    step_ms: float
-    memory_mib: float
-    allocators: dict[str, float]
-
-
-def _trial(subject: Subject, device: str) -> Trial:
-    gc.collect()
+def _first_trial(subject: Subject, device: str) -> tuple[float, float, dict[str, float]]:
+    """Time of a step, and peak memory beyond what was held before, whole and by allocator [MiB]."""
+    gc.collect()  # what an earlier solver left behind; slow, so only where memory is measured
     with MemoryProbe(device) as before:
         pass
-    solver, wait = subject.build(), synchronizer(device)
+    solver = subject.build()
     gc.collect()
-    warm = min(_WARM_UP, subject.steps - 1)
     with MemoryProbe(device, nbytes=lambda: solver.nbytes) as probe:
-        solver.step(warm)
-        wait()
-        started = time.perf_counter()
-        solver.step(subject.steps - warm)
-        wait()
-        seconds = time.perf_counter() - started
-    return Trial(1e3 * seconds / (subject.steps - warm), probe.peak_mib - before.peak_mib, probe.allocators)
+        ms = _step_ms(solver, subject.steps, device)
+    return ms, probe.peak_mib - before.peak_mib, probe.allocators
+
+
+def _step_ms(solver, steps: int, device: str) -> float:
+    """Mean time of a step over a whole run [ms], those that warm up left out."""
+    wait = synchronizer(device)
+    warm = min(_WARM_UP, steps - 1)
+    solver.step(warm)
+    wait()
+    started = time.perf_counter()
+    solver.step(steps - warm)
+    wait()
+    return 1e3 * (time.perf_counter() - started) / (steps - warm)
 
 
 def _stages(subject: Subject, samples: int, device: str) -> dict[str, float]:

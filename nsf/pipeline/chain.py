@@ -280,7 +280,8 @@ class Pipeline:
         value = f"{self.scene.parameters.name}={rollout.parameter:g}"
         if rollout.diverged >= 0:
             self.say(
-                f"deploy: warning: {value} diverged at step {rollout.diverged}; its errors are reported as ∞"
+                f"deploy: warning: {value} diverged at step {rollout.diverged} (left the grid or not finite); "
+                "its errors are reported as ∞"
             )
         if rollout.needed_outside:
             self.say(

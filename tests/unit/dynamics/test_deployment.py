@@ -1,10 +1,12 @@
 """Rollouts: through Lightning's `Trainer.predict`, and on disk."""
 
+from dataclasses import replace
+
 import h5py
 import numpy as np
 import pytest
 
-from nsf.dynamics import Rollout, deploy, rollout
+from nsf.dynamics import Rollout, Taylor, deploy, rollout
 from nsf.errors import SchemaError
 
 
@@ -38,6 +40,25 @@ def test_a_rollout_is_the_whole_run(made, solver_at):
     assert made.stops == latent.stops
     assert made.integration_mean == solver.integration_mean
     assert made.seconds > 0
+
+
+class Thrown:
+    """A projector that throws the material off the grid at its fifth step, by latents that stay finite."""
+
+    iterations, tolerance, calls = 1, 0.0, 0
+
+    def solve(self, at, target, xhat):
+        self.calls += 1
+        result = Taylor().solve(at, target, xhat)
+        return replace(result, xhat=result.xhat + (1e4 if self.calls == 5 else 0.0))
+
+
+def test_a_run_that_leaves_the_grid_has_diverged(chain, tiny_manifold):
+    angle = {"friction_angle": 26.0}
+    solver = chain.scene.reduced(tiny_manifold, angle, 20, device="cpu", projector=Thrown())
+    made = rollout(solver, 26.0)
+    assert np.isfinite(made.xhat).all()
+    assert made.diverged == 5
 
 
 def test_batches_are_parameter_values(made, solver_at):
