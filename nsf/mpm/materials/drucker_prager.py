@@ -8,7 +8,7 @@ import warp as wp
 
 from nsf.errors import ConfigError
 from nsf.mpm.materials.base import LawFunctions, Material
-from nsf.mpm.materials.hencky import hencky_tau
+from nsf.mpm.materials.hencky import from_log_strain, hencky_tau, log_strain
 from nsf.mpm.precision import Precision
 
 
@@ -16,6 +16,7 @@ from nsf.mpm.precision import Precision
 def _functions(precision: Precision) -> LawFunctions:
     real, vec3, mat33 = precision.real, precision.vec3, precision.mat33
     vecH = wp.types.vector(length=1, dtype=real)
+    decompose, compose = log_strain(precision), from_log_strain(precision)
 
     @wp.struct
     class Params:
@@ -23,11 +24,7 @@ def _functions(precision: Precision) -> LawFunctions:
 
     @wp.func
     def return_map(F_trial: mat33, history: vecH, mu: real, lam: real, params: Params, dt: real):
-        U = mat33()
-        V = mat33()
-        sigma = vec3()
-        wp.svd3(F_trial, U, sigma, V)
-        eps = vec3(wp.log(sigma[0]), wp.log(sigma[1]), wp.log(sigma[2]))
+        U, eps, V = decompose(F_trial)
         trace = eps[0] + eps[1] + eps[2]
         # No cohesion: under expansion the material carries nothing (tested before the cone).
         if trace > real(0.0):
@@ -38,8 +35,7 @@ def _functions(precision: Precision) -> LawFunctions:
         excess = size + params.alpha * (real(3.0) * lam + real(2.0) * mu) * trace / (real(2.0) * mu)
         if excess <= real(0.0):
             return F_trial, history
-        eps = eps - (excess / size) * deviator
-        return U * wp.diag(vec3(wp.exp(eps[0]), wp.exp(eps[1]), wp.exp(eps[2]))) * wp.transpose(V), history
+        return compose(U, eps - (excess / size) * deviator, V), history
 
     return LawFunctions(hencky_tau(precision), return_map, Params)
 

@@ -10,6 +10,34 @@ from nsf.mpm.precision import Precision
 
 
 @cache
+def log_strain(precision: Precision):
+    """Warp function F → (U, ε, V) with F = U exp(ε) Vᵀ, ε [3] the principal logarithmic strains."""
+    vec3, mat33 = precision.vec3, precision.mat33
+
+    @wp.func
+    def decompose(F: mat33):
+        U = mat33()
+        V = mat33()
+        sigma = vec3()
+        wp.svd3(F, U, sigma, V)
+        return U, vec3(wp.log(sigma[0]), wp.log(sigma[1]), wp.log(sigma[2])), V
+
+    return decompose
+
+
+@cache
+def from_log_strain(precision: Precision):
+    """Warp function (U, ε, V) → F = U exp(ε) Vᵀ, the inverse of `log_strain`."""
+    vec3, mat33 = precision.vec3, precision.mat33
+
+    @wp.func
+    def compose(U: mat33, eps: vec3, V: mat33):
+        return U * wp.diag(vec3(wp.exp(eps[0]), wp.exp(eps[1]), wp.exp(eps[2]))) * wp.transpose(V)
+
+    return compose
+
+
+@cache
 def hencky_tau(precision: Precision):
     """Warp function τ = U (2μ̂ ε + λ tr(ε) 1) Uᵀ with ε = log Σ, F = U Σ Vᵀ.
 
@@ -18,14 +46,11 @@ def hencky_tau(precision: Precision):
     ψ = μ̂ tr(ε²) + λ/2 tr(ε)².
     """
     real, vec3, mat33 = precision.real, precision.vec3, precision.mat33
+    decompose = log_strain(precision)
 
     @wp.func
     def tau_of(F: mat33, mu: real, lam: real):
-        U = mat33()
-        V = mat33()
-        sigma = vec3()
-        wp.svd3(F, U, sigma, V)
-        eps = vec3(wp.log(sigma[0]), wp.log(sigma[1]), wp.log(sigma[2]))
+        U, eps, _ = decompose(F)
         trace = eps[0] + eps[1] + eps[2]
         principal = real(2.0) * mu * eps + lam * trace * vec3(real(1.0), real(1.0), real(1.0))
         return U * wp.diag(principal) * wp.transpose(U)
