@@ -44,6 +44,8 @@ class StressNeural:
 class StressFromDeformation:
     """τ = τ(∂g/∂X) through the elastic law; plastic flow is not seen (Chen et al. 2023a).
 
+    Without flow there is no history to follow: its variables keep their values at rest.
+
     Args:
         at: restricted fields; material: the law; mu, lam: [n] Lamé parameters [Pa].
     """
@@ -54,17 +56,20 @@ class StressFromDeformation:
         self.at, self.precision, self.device = at, precision, device
         self.mu, self.lam = mu, lam
         self.tau = torch.zeros(len(mu), 3, 3, dtype=mu.dtype, device=mu.device)
-        self._kernel = make_elastic_stress(material.functions(precision), precision)
+        vecH = wp.types.vector(length=material.history_size, dtype=precision.real)
+        self._history = wp.array(material.initial_history(len(mu)), dtype=vecH, device=device)
+        self._kernel = make_elastic_stress(material.functions(precision), precision, material.history_size)
 
     def __call__(self, xhat: torch.Tensor) -> torch.Tensor:
         """[n, 3, 3] Kirchhoff stress [Pa]."""
         F = self.at.deformation_gradient(xhat).contiguous()
-        inputs = [as_matrices(F, self.precision), as_scalars(self.mu), as_scalars(self.lam)]
+        moduli = [as_scalars(self.mu), as_scalars(self.lam)]
+        tau = as_matrices(self.tau, self.precision)
         with on_torch_stream(self.device):
             wp.launch(
                 self._kernel,
                 dim=len(F),
-                inputs=[*inputs, as_matrices(self.tau, self.precision)],
+                inputs=[as_matrices(F, self.precision), self._history, *moduli, tau],
                 device=self.device,
             )
         return self.tau

@@ -28,7 +28,7 @@ def rng():
 
 @pytest.fixture(scope="session")
 def elastic_tau():
-    """(material, F [n, 3, 3], precision) → Kirchhoff stress [n, 3, 3] of the elastic law alone."""
+    """(material, F [n, 3, 3], precision) → Kirchhoff stress [n, 3, 3] of the elastic law, no flow so far."""
 
     def evaluate(material, F, precision="fp64"):
         types = precision_of(precision)
@@ -38,8 +38,10 @@ def elastic_tau():
             for m in (material.mu, material.lam)
         ]
         tau = wp.zeros(len(F), dtype=types.mat33, device="cpu")
-        kernel = make_elastic_stress(material.functions(types), types)
-        inputs = [wp.array(F, dtype=types.mat33, device="cpu"), *moduli, tau]
+        kernel = make_elastic_stress(material.functions(types), types, material.history_size)
+        vecH = wp.types.vector(length=material.history_size, dtype=types.real)
+        history = wp.array(material.initial_history(len(F)), dtype=vecH, device="cpu")
+        inputs = [wp.array(F, dtype=types.mat33, device="cpu"), history, *moduli, tau]
         wp.launch(kernel, dim=len(F), inputs=inputs, device="cpu")
         return tau.numpy().astype(float)
 

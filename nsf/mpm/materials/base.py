@@ -17,7 +17,7 @@ class LawFunctions:
     """The Warp side of a law.
 
     Attributes:
-        tau_of: (F_e, mu, lam) → Kirchhoff stress [Pa].
+        tau_of: (F_e, history, mu, lam) → Kirchhoff stress [Pa].
         return_map: (F_trial, history, mu, lam, params, dt) → (F_e, history).
         Params: Warp struct of the law's constants.
     """
@@ -77,7 +77,7 @@ class Material(ABC):
 def make_stress_update(law: LawFunctions, precision: Precision, history_size: int):
     """Kernel of the constitutive update, one thread a particle: one kernel a law and precision.
 
-    F_trial = f F_e, F_e ← returnMap(F_trial), τ = τ(F_e).
+    F_trial = f F_e, F_e ← returnMap(F_trial), τ = τ(F_e); both may read the history variables.
 
     Source: paper section 3.3, step 3.
     """
@@ -100,26 +100,28 @@ def make_stress_update(law: LawFunctions, precision: Precision, history_size: in
         F, h = return_map(increment[p] * F_e[p], history[p], mu[p], lam[p], params, dt)
         F_e[p] = F
         history[p] = h
-        tau[p] = tau_of(F, mu[p], lam[p])
+        tau[p] = tau_of(F, h, mu[p], lam[p])
 
     return update
 
 
 @cache
-def make_elastic_stress(law: LawFunctions, precision: Precision):
-    """Kernel of the elastic law alone: τ = τ(F), no return map, no history."""
+def make_elastic_stress(law: LawFunctions, precision: Precision, history_size: int):
+    """Kernel of the elastic law alone: τ = τ(F) at a given history, no return map."""
     tau_of = law.tau_of
     real, mat33 = precision.real, precision.mat33
+    vecH = wp.types.vector(length=history_size, dtype=real)
 
     @wp.kernel(enable_backward=False, module="unique")
     def elastic_stress(
         F: wp.array(dtype=mat33),
+        history: wp.array(dtype=vecH),
         mu: wp.array(dtype=real),
         lam: wp.array(dtype=real),
         tau: wp.array(dtype=mat33),
     ):
         p = wp.tid()
-        tau[p] = tau_of(F[p], mu[p], lam[p])
+        tau[p] = tau_of(F[p], history[p], mu[p], lam[p])
 
     return elastic_stress
 

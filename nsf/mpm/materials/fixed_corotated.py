@@ -16,9 +16,10 @@ def fixed_corotated_tau(precision: Precision):
     Source: paper, appendix "Fixed corotated elasticity"; the identity is missing in print.
     """
     real, vec3, mat33 = precision.real, precision.vec3, precision.mat33
+    vecH = wp.types.vector(length=1, dtype=real)
 
     @wp.func
-    def tau_of(F: mat33, mu: real, lam: real):
+    def tau_of(F: mat33, history: vecH, mu: real, lam: real):
         U = mat33()
         V = mat33()
         sigma = vec3()

@@ -46,10 +46,11 @@ def hencky_tau(precision: Precision):
     ψ = μ̂ tr(ε²) + λ/2 tr(ε)².
     """
     real, vec3, mat33 = precision.real, precision.vec3, precision.mat33
+    vecH = wp.types.vector(length=1, dtype=real)
     decompose = log_strain(precision)
 
     @wp.func
-    def tau_of(F: mat33, mu: real, lam: real):
+    def tau_of(F: mat33, history: vecH, mu: real, lam: real):
         U, eps, _ = decompose(F)
         trace = eps[0] + eps[1] + eps[2]
         principal = real(2.0) * mu * eps + lam * trace * vec3(real(1.0), real(1.0), real(1.0))

@@ -33,7 +33,7 @@ def aging_functions(precision):
         rate: real
 
     @wp.func
-    def tau_of(F: mat33, mu: real, lam: real):
+    def tau_of(F: mat33, history: vec2, mu: real, lam: real):
         return mu * F
 
     @wp.func
