@@ -1,11 +1,14 @@
 """What the validation tests of the material point method share."""
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 import warp as wp
 
 from nsf.mpm import DomainWalls, FullOrderMPM, GridGeometry, ParticleConstants, precision_of
-from nsf.mpm.materials import FixedCorotated, make_elastic_stress
+from nsf.mpm.materials import FixedCorotated, make_elastic_stress, make_stress_update
 
 #: Single-point tolerance, relative (physics.md, section 3).
 TOLERANCE = {"fp64": 1e-10, "fp32": 1e-5}
@@ -46,6 +49,55 @@ def elastic_tau():
         return tau.numpy().astype(float)
 
     return evaluate
+
+
+@pytest.fixture(scope="session")
+def invariants():
+    """tau [..., 3, 3] → trace and norm of the deviator."""
+
+    def split(tau):
+        trace = np.trace(tau, axis1=-2, axis2=-1)
+        return trace, np.linalg.norm(tau - trace[..., None, None] / 3.0 * np.eye(3), axis=(-2, -1))
+
+    return split
+
+
+@dataclass
+class Points:
+    """Material points side by side: (increment [n, 3, 3], dt) → a step; then F_e, history, tau hold it."""
+
+    F_e: np.ndarray
+    history: np.ndarray
+    tau: np.ndarray
+    step: Callable
+
+
+@pytest.fixture(scope="session")
+def material_points():
+    """(material, n, precision) → n points at rest that the law's own kernel steps."""
+
+    def build(material, n, precision="fp64"):
+        types = precision_of(precision)
+        update = make_stress_update(material.functions(types), types, material.history_size)
+        vecH = wp.types.vector(length=material.history_size, dtype=types.real)
+        moduli = [
+            wp.full(n, types.real(m), dtype=types.real, device="cpu") for m in (material.mu, material.lam)
+        ]
+
+        def step(increment, dt=1.0):
+            F_e = wp.array(points.F_e, dtype=types.mat33, device="cpu")
+            history = wp.array(points.history, dtype=vecH, device="cpu")
+            tau = wp.zeros(n, dtype=types.mat33, device="cpu")
+            increment = wp.array(np.broadcast_to(increment, (n, 3, 3)), dtype=types.mat33, device="cpu")
+            inputs = [increment, *moduli, material.params(types), types.real(dt), F_e, history, tau]
+            wp.launch(update, dim=n, inputs=inputs, device="cpu")
+            points.F_e, points.history, points.tau = (a.numpy().astype(float) for a in (F_e, history, tau))
+            return points
+
+        points = Points(np.tile(np.eye(3), (n, 1, 1)), material.initial_history(n), np.zeros((n, 3, 3)), step)
+        return points
+
+    return build
 
 
 @pytest.fixture(scope="session")

@@ -10,13 +10,6 @@ from nsf.mpm.materials import DruckerPrager, Hencky, deformation_path, drive
 E = 1e6
 
 
-def invariants(tau):
-    """Trace and norm of the deviator."""
-    trace = np.trace(tau, axis1=-2, axis2=-1)
-    s = tau - trace[..., None, None] / 3.0 * np.eye(3)
-    return trace, np.linalg.norm(s, axis=(-2, -1))
-
-
 def stress(material, F, precision="fp64"):
     """τ of one step from rest to each F."""
     return np.array([drive(material, f[None], 1.0, precision)[0] for f in F])
@@ -54,7 +47,7 @@ def test_oedometer_stays_elastic_where_the_elastic_ratio_is_above(degrees):
 
 
 @pytest.mark.parametrize("degrees", [0.0, 25.0, 45.0])
-def test_cases_of_the_return(degrees, deformations, precision, tolerance):
+def test_cases_of_the_return(degrees, deformations, precision, tolerance, invariants):
     """Expansion → no stress; inside the cone → elastic; outside → on the cone at the trial trace."""
     material = DruckerPrager(E, 0.3, degrees)
     F = np.concatenate([deformations[:60], np.eye(3) * 0.9 + 0.02 * (deformations[:60] - np.eye(3))])
@@ -75,7 +68,7 @@ def test_cases_of_the_return(degrees, deformations, precision, tolerance):
     )
 
 
-def test_return_is_radial(deformations):
+def test_return_is_radial(deformations, invariants):
     """The deviator keeps its direction."""
     material = DruckerPrager(E, 0.2, 30.0)
     trace, excess = case_of(material, deformations)
@@ -110,7 +103,7 @@ def test_objective(deformations, rng, rotation, precision, tolerance):
 
 
 @pytest.mark.parametrize("degrees", [20.0, 30.0, 40.0])
-def test_triaxial_compression_fails_at_mohr_coulomb(degrees):
+def test_triaxial_compression_fails_at_mohr_coulomb(degrees, invariants):
     """The cone passes through σ3/σ1 = (1 − sin φ)/(1 + sin φ): α closes on that stress state."""
     sine = math.sin(math.radians(degrees))
     tau = np.diag([-(1.0 - sine), -(1.0 - sine), -(1.0 + sine)])

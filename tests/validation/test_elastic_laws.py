@@ -1,11 +1,22 @@
 """Elastic laws: closed forms, symmetry, objectivity, consistency with the energy (physics.md, section 3)."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
 
-from nsf.mpm.materials import FixedCorotated, Hencky, drive
+from nsf.mpm import materials
+from nsf.mpm.materials import (
+    DruckerPrager,
+    FixedCorotated,
+    Hencky,
+    Material,
+    VonMises,
+    VonMisesHardening,
+    VonMisesSoftening,
+    drive,
+)
 
 E, NU = 1e6, 0.3
 MU, LAM = 384615.385, 576923.077
@@ -25,10 +36,22 @@ def fixed_corotated_energy(F, mu, lam):
     return mu * ((sigma - 1.0) ** 2).sum(-1) + 0.5 * lam * (np.linalg.det(F) - 1.0) ** 2
 
 
+#: Every law, by its elastic part.
 LAWS = [
     pytest.param(Hencky, hencky_energy, id="hencky"),
     pytest.param(FixedCorotated, fixed_corotated_energy, id="fixed"),
+    pytest.param(DruckerPrager, hencky_energy, id="drucker-prager"),
+    pytest.param(partial(VonMises, yield_stress=1.0), hencky_energy, id="von-mises"),
+    pytest.param(partial(VonMisesHardening, yield_stress=1.0, hardening=0.1), hencky_energy, id="hardening"),
+    pytest.param(partial(VonMisesSoftening, yield_stress=1.0, softening=1.0), hencky_energy, id="softening"),
 ]
+
+
+def test_every_law_is_here():
+    named = {getattr(p.values[0], "func", p.values[0]) for p in LAWS}
+    laws = {law for law in vars(materials).values() if isinstance(law, type) and issubclass(law, Material)}
+    assert named == laws - {Material}
+
 
 # [τ11, τ22, τ33, τ12] [Pa], printed to 6 decimals.
 CLOSED_FORMS = [

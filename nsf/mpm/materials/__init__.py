@@ -5,6 +5,7 @@ from nsf.mpm.materials.driver import PATHS, deformation_path, drive
 from nsf.mpm.materials.drucker_prager import DruckerPrager
 from nsf.mpm.materials.fixed_corotated import FixedCorotated
 from nsf.mpm.materials.hencky import Hencky
+from nsf.mpm.materials.von_mises import VonMises, VonMisesHardening, VonMisesSoftening
 
 __all__ = [
     "PATHS",
@@ -13,6 +14,9 @@ __all__ = [
     "Hencky",
     "LawFunctions",
     "Material",
+    "VonMises",
+    "VonMisesHardening",
+    "VonMisesSoftening",
     "deformation_path",
     "drive",
     "make_elastic_stress",

@@ -1,11 +1,17 @@
 """The 2×2 of methods: where τ and C come from (paper section 6.1, the baseline of Chen et al. 2023a)."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
 
 from nsf import config
 from nsf.dynamics import Method
+from nsf.dynamics.stress import StressFromDeformation
+from nsf.mpm import precision_of
+from nsf.mpm.device import warp_device
+from nsf.mpm.materials import VonMisesSoftening
 
 ANGLE = {"friction_angle": 26.0}
 METHODS = ("nsf", "deformation_only", "neural_stress_only", "neural_affine_only")
@@ -72,6 +78,18 @@ def test_stress_and_affine_on_the_particles(solver, method, tiny_manifold):
     # G2P has not run, so C of the sample is still what the field gave.
     np.testing.assert_allclose(phase.C.numpy(), C, atol=1e-10)
     assert (np.abs(C).max() > 1e-3) == method.neural_affine
+
+
+def test_a_law_with_history_gives_its_stress_at_rest():
+    """Without flow von Mises neither yields nor is damaged: the baseline sees Hencky's law."""
+    material = VonMisesSoftening(100.0, 0.3, yield_stress=0.1, softening=1.0)
+    F = torch.eye(3, dtype=torch.float64) + 0.1 * torch.sin(torch.arange(36.0, dtype=torch.float64)).view(
+        4, 3, 3
+    )
+    mu, lam = (torch.full((4,), m, dtype=torch.float64) for m in (material.mu, material.lam))
+    fields = SimpleNamespace(deformation_gradient=lambda xhat: F)
+    tau = StressFromDeformation(fields, material, mu, lam, precision_of("fp64"), warp_device("cpu"))(None)
+    np.testing.assert_allclose(tau.numpy(), hencky(F.numpy(), material.mu, material.lam), atol=1e-8)
 
 
 def test_no_affine_field_means_zero_at_every_step(chain, tiny_manifold, tiny):

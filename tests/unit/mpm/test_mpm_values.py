@@ -17,10 +17,17 @@ from nsf.mpm import (
     precision_of,
 )
 from nsf.mpm.device import warp_device
-from nsf.mpm.materials import DruckerPrager, FixedCorotated, Hencky
+from nsf.mpm.materials import (
+    DruckerPrager,
+    FixedCorotated,
+    Hencky,
+    VonMises,
+    VonMisesHardening,
+    VonMisesSoftening,
+)
 from nsf.mpm.shape import shape_functions
 
-NAN = float("nan")
+NAN, INF = float("nan"), float("inf")
 ORIGIN, UP = (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
 
 REFUSED = [
@@ -33,6 +40,17 @@ REFUSED = [
     (lambda: DruckerPrager(1.0, 0.3, 90.0), "material.friction_angle=90.0"),
     (lambda: DruckerPrager(1.0, 0.3, -1.0), "material.friction_angle=-1.0"),
     (lambda: DruckerPrager(1.0, 0.3, NAN), "material.friction_angle=nan"),
+    (lambda: VonMises(1.0, 0.3, 0.0), "material.yield_stress=0.0 Pa"),
+    (lambda: VonMises(1.0, 0.3, -2.0), "material.yield_stress=-2.0 Pa"),
+    (lambda: VonMises(1.0, 0.3, NAN), "material.yield_stress=nan"),
+    (lambda: VonMises(1.0, 0.3, INF), "material.yield_stress=inf"),
+    (lambda: VonMises(1.0, 0.5, 1.0), "material.nu=0.5"),
+    (lambda: VonMisesHardening(1.0, 0.3, 0.0, 0.1), "material.yield_stress=0.0 Pa"),
+    (lambda: VonMisesHardening(1.0, 0.3, 1.0, -0.1), "material.hardening=-0.1"),
+    (lambda: VonMisesHardening(1.0, 0.3, 1.0, NAN), "material.hardening=nan"),
+    (lambda: VonMisesSoftening(1.0, 0.3, 0.0, 0.1), "material.yield_stress=0.0 Pa"),
+    (lambda: VonMisesSoftening(1.0, 0.3, 1.0, -0.1), "material.softening=-0.1 Pa"),
+    (lambda: VonMisesSoftening(1.0, 0.3, 1.0, INF), "material.softening=inf"),
     (lambda: Transfer("flip"), "transfer.scheme='flip'"),
     (lambda: Transfer(shape="linear"), "transfer.shape='linear'"),
     (lambda: Transfer("rpic", damping=1.5), "transfer.damping=1.5"),

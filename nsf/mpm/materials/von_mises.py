@@ -1,0 +1,147 @@
+"""Von Mises plasticity over Hencky elasticity: perfect, with hardening, or with softening to damage."""
+
+import math
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import warp as wp
+
+from nsf.errors import ConfigError
+from nsf.mpm.materials.base import LawFunctions, Material
+from nsf.mpm.materials.hencky import from_log_strain, hencky_tau, log_strain
+from nsf.mpm.precision import Precision
+
+
+@cache
+def _functions(precision: Precision) -> LawFunctions:
+    real, vec3, mat33 = precision.real, precision.vec3, precision.mat33
+    vecH = wp.types.vector(length=1, dtype=real)
+    elastic_tau = hencky_tau(precision)
+    decompose, compose = log_strain(precision), from_log_strain(precision)
+
+    @wp.struct
+    class Params:
+        hardening: real
+        softening: real
+
+    @wp.func
+    def tau_of(F: mat33, history: vecH, mu: real, lam: real):
+        if history[0] <= real(0.0):
+            return mat33()
+        return elastic_tau(F, history, mu, lam)
+
+    @wp.func
+    def return_map(F_trial: mat33, history: vecH, mu: real, lam: real, params: Params, dt: real):
+        tau_Y = history[0]
+        # Written so that a NaN counts neither as damaged nor as elastic, and reaches the solver's check.
+        if tau_Y <= real(0.0):
+            return wp.identity(n=3, dtype=real), history
+        U, eps, V = decompose(F_trial)
+        third = (eps[0] + eps[1] + eps[2]) / real(3.0)
+        deviator = eps - vec3(third, third, third)
+        size = wp.length(deviator)
+        if real(2.0) * mu * size <= tau_Y:
+            return F_trial, history
+        flow = size - tau_Y / (real(2.0) * mu)
+        # The return removes `flow` along a unit direction, so ‖ε − proj ε‖ is `flow` itself.
+        tau_Y = tau_Y + (real(2.0) * mu * params.hardening - params.softening) * flow
+        return compose(U, eps - (flow / size) * deviator, V), vecH(tau_Y)
+
+    return LawFunctions(tau_of, return_map, Params)
+
+
+@dataclass(frozen=True)
+class VonMises(Material):
+    """Perfectly plastic solid: ‖dev τ‖ ≤ τ_Y, plastic flow keeps the volume.
+
+    A trial state outside returns along its deviator, ε ← ε − δγ ε̂/‖ε̂‖ with ε̂ = dev ε and
+    δγ = ‖ε̂‖ − τ_Y/(2μ̂). The history of a particle is its τ_Y [Pa].
+
+    Attributes:
+        yield_stress: τ_Y at rest [Pa], positive; √1.5 τ_Y in uniaxial stress, τ_Y/√2 in shear.
+
+    Raises:
+        ConfigError: a value lies outside its physical range.
+
+    Source: paper, appendix "von Mises plasticity" (d = 3). Printed with δγ ε̂/‖ε‖, which does not
+    land on the yield surface once the volume changes; ‖ε̂‖ does.
+    """
+
+    yield_stress: float
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not 0.0 < self.yield_stress < math.inf:
+            raise ConfigError(f"material.yield_stress={self.yield_stress} Pa must be positive and finite")
+
+    def initial_history(self, particles: int) -> np.ndarray:
+        """[P, 1] yield stress τ_Y [Pa] at rest."""
+        return np.full((particles, 1), float(self.yield_stress))
+
+    def functions(self, precision: Precision) -> LawFunctions:
+        """The law's Warp functions."""
+        return _functions(precision)
+
+
+@dataclass(frozen=True)
+class VonMisesHardening(VonMises):
+    """Yield stress that grows with plastic flow, τ_Y ← τ_Y + 2μ̂ ξ δγ.
+
+    Each return goes to the yield stress before the step. ‖dev τ‖ therefore lags by one step,
+    and its slope d‖dev τ‖/d‖ε̂‖ → 2μ̂ ξ/(1 + ξ) is met to first order in the strain step.
+
+    Attributes:
+        hardening: ξ, dimensionless, not negative.
+
+    Raises:
+        ConfigError: a value lies outside its physical range.
+
+    Source: paper, appendix "von Mises plasticity"; Wang et al. 2019.
+    """
+
+    hardening: float
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not 0.0 <= self.hardening < math.inf:
+            raise ConfigError(f"material.hardening={self.hardening} must be finite and not negative")
+
+    def params(self, precision: Precision):
+        """The law's constants."""
+        params = self.functions(precision).Params()
+        params.hardening = precision.real(self.hardening)
+        return params
+
+
+@dataclass(frozen=True)
+class VonMisesSoftening(VonMises):
+    """Yield stress that falls with plastic flow, τ_Y ← τ_Y − θ ‖ε − proj ε‖, down to damage.
+
+    A particle whose τ_Y reaches zero is damaged for good: τ = 0, as the paper's zero Lamé parameters
+    give. Its τ_Y ≤ 0 is the mark, so the particle's moduli stay constants. From the next step on its
+    F_e is held at I: a product of increments that nothing resists would overflow in a long run, and
+    the elastic strain of a material without stiffness has no meaning.
+
+    Attributes:
+        softening: θ [Pa] lost by τ_Y for a unit of plastic logarithmic strain, not negative.
+
+    Raises:
+        ConfigError: a value lies outside its physical range.
+
+    Source: paper, appendix "von Mises plasticity"; Wang et al. 2019. The paper has no law that both
+    hardens and softens.
+    """
+
+    softening: float
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not 0.0 <= self.softening < math.inf:
+            raise ConfigError(f"material.softening={self.softening} Pa must be finite and not negative")
+
+    def params(self, precision: Precision):
+        """The law's constants."""
+        params = self.functions(precision).Params()
+        params.softening = precision.real(self.softening)
+        return params
