@@ -11,6 +11,7 @@ from nsf.mpm.materials import (
     DruckerPrager,
     FixedCorotated,
     Hencky,
+    HerschelBulkley,
     Material,
     VonMises,
     VonMisesHardening,
@@ -36,10 +37,20 @@ def fixed_corotated_energy(F, mu, lam):
     return mu * ((sigma - 1.0) ** 2).sum(-1) + 0.5 * lam * (np.linalg.det(F) - 1.0) ** 2
 
 
+def volumetric_deviatoric_energy(F, mu, lam):
+    J, kappa = np.linalg.det(F), lam + 2.0 * mu / 3.0
+    b_trace = J ** (-2.0 / 3.0) * (F**2).sum((-2, -1))
+    return 0.5 * kappa * (0.5 * (J**2 - 1.0) - np.log(J)) + 0.5 * mu * (b_trace - 3.0)
+
+
+#: Yields far outside of what the tests reach.
+herschel_bulkley = partial(HerschelBulkley, yield_stress=1e9, viscosity=1.0)
+
 #: Every law, by its elastic part.
 LAWS = [
     pytest.param(Hencky, hencky_energy, id="hencky"),
     pytest.param(FixedCorotated, fixed_corotated_energy, id="fixed"),
+    pytest.param(herschel_bulkley, volumetric_deviatoric_energy, id="herschel-bulkley"),
     pytest.param(DruckerPrager, hencky_energy, id="drucker-prager"),
     pytest.param(partial(VonMises, yield_stress=1.0), hencky_energy, id="von-mises"),
     pytest.param(partial(VonMisesHardening, yield_stress=1.0, hardening=0.1), hencky_energy, id="hardening"),
@@ -58,6 +69,12 @@ CLOSED_FORMS = [
     pytest.param(Hencky, shear(0.2), [7641.432412, -7641.432412, 0.0, 76414.324119], id="hencky-shear"),
     pytest.param(
         FixedCorotated, shear(0.2), [19278.512297, 3817.545992, None, 77304.831522], id="fixed-shear"
+    ),
+    pytest.param(
+        herschel_bulkley,
+        shear(0.2),
+        [10256.410256, -5128.205128, -5128.205128, 76923.076923],
+        id="herschel-bulkley-shear",
     ),
     pytest.param(Hencky, np.diag([1.1, 1.0, 1.0]), [128302.165121, None, None, 0.0], id="hencky-uniaxial"),
 ]

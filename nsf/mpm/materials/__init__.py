@@ -5,6 +5,7 @@ from nsf.mpm.materials.driver import PATHS, deformation_path, drive
 from nsf.mpm.materials.drucker_prager import DruckerPrager
 from nsf.mpm.materials.fixed_corotated import FixedCorotated
 from nsf.mpm.materials.hencky import Hencky
+from nsf.mpm.materials.herschel_bulkley import HerschelBulkley
 from nsf.mpm.materials.von_mises import VonMises, VonMisesHardening, VonMisesSoftening
 
 __all__ = [
@@ -12,6 +13,7 @@ __all__ = [
     "DruckerPrager",
     "FixedCorotated",
     "Hencky",
+    "HerschelBulkley",
     "LawFunctions",
     "Material",
     "VonMises",
