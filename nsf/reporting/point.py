@@ -43,6 +43,9 @@ def point_response(config: DictConfig) -> pd.DataFrame:
 
 def point_chart(response: pd.DataFrame, title: str) -> Figure:
     """Components of τ along the path, and the path in pressure and ‖dev τ‖."""
+    # An axis scaled to rounding errors would show them as a response.
+    stresses = response.set_index("amplitude")
+    response = stresses.where(stresses.abs() > 1e-9 * stresses.abs().to_numpy().max(), 0.0).reset_index()
     with styled():
         figure = Figure(figsize=(9.0, 3.8), layout="constrained")
         along, plane = figure.subplots(1, 2)

@@ -7,8 +7,10 @@ import pandas as pd
 import pytest
 from synthetic import TEST, Made, collapse
 
+from nsf import config
 from nsf.reporting import charts, cost_charts
 from nsf.reporting.camera import Camera, View
+from nsf.reporting.point import point_chart, point_response
 from nsf.reporting.render import animation, final_shapes, von_mises
 from nsf.reporting.sources import Motion
 from nsf.reporting.style import save
@@ -144,3 +146,15 @@ def test_animation_gives_way_to_the_limit(tmp_path):
     animation(shown, tmp_path / "small.gif", frames=12, width=160, max_bytes=40_000)
     large, small = ((tmp_path / name).stat().st_size for name in ("large.gif", "small.gif"))
     assert small < large
+
+
+def test_material_point_shows_no_rounding():
+    """Shear keeps the volume: pressure and the stresses out of plane are rounding, not a response."""
+    response = point_response(config.load(["material=von_mises", "path=simple_shear"], "point"))
+    assert 0 < response["pressure"].abs().max() < 1e-3
+    along, plane = point_chart(response, "shear").axes
+    assert {line.get_label() for line in along.lines} == {"τ xx", "τ yy", "τ xy"}
+    np.testing.assert_array_equal(plane.lines[0].get_xdata(), 0.0)
+    np.testing.assert_allclose(plane.lines[0].get_ydata(), response["dev_norm"], atol=1e-3)
+    np.testing.assert_allclose(along.lines[-1].get_ydata(), response["tau_xy"], atol=1e-3)
+    np.testing.assert_array_equal(along.lines[-1].get_xdata(), response["amplitude"])
