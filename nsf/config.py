@@ -24,6 +24,7 @@ from yaml import MarkedYAMLError
 
 from nsf.errors import ConfigError, NSFError
 from nsf.paths import CONF, groups
+from nsf.vectors import direction, rotation, vector
 
 
 def _scaled(table: DictConfig, *, _root_: DictConfig):
@@ -39,20 +40,15 @@ def _per(count) -> float:
     return 1.0 / float(count)
 
 
-def _sin(degrees) -> float:
-    """`${sin:30}` = 0.5, of an angle in degrees."""
-    return math.sin(math.radians(float(degrees)))
-
-
-def _cos(degrees) -> float:
-    """`${cos:60}` = 0.5, of an angle in degrees."""
-    return math.cos(math.radians(float(degrees)))
+def _turned(values, axis, angle) -> list[float]:
+    """`${turned:[1,0,0],[0,1,0],30}`: the vector turned by 30° about the axis, right-handed."""
+    matrix = rotation(direction("axis of ${turned:…}", axis), number("angle of ${turned:…}", angle))
+    return (matrix @ vector("vector of ${turned:…}", values)).tolist()
 
 
 OmegaConf.register_new_resolver("scaled", _scaled, replace=True)
 OmegaConf.register_new_resolver("per", _per, replace=True)
-OmegaConf.register_new_resolver("sin", _sin, replace=True)
-OmegaConf.register_new_resolver("cos", _cos, replace=True)
+OmegaConf.register_new_resolver("turned", _turned, replace=True)
 
 
 def load(overrides: Sequence[str] = (), config_name: str = "config") -> DictConfig:

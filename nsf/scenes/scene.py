@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError
 
 from nsf import config as configuration
@@ -13,18 +13,7 @@ from nsf.errors import ConfigError
 from nsf.mpm import DomainWalls, FullOrderMPM, GridGeometry, HalfSpace, ParticleConstants, Transfer
 from nsf.mpm.materials import Material
 from nsf.scenes.geometry import Shape
-
-
-def _vector(key: str, values, unit: str) -> tuple[float, float, float]:
-    """Three finite numbers, or a message that quotes the key."""
-    listed = isinstance(values, list | tuple | ListConfig | np.ndarray)
-    if (
-        not listed
-        or len(values) != 3
-        or not all(isinstance(x, int | float) and math.isfinite(x) for x in values)
-    ):
-        raise ConfigError(f"{key}={values} {unit} must be 3 finite numbers")
-    return tuple(float(x) for x in values)
+from nsf.vectors import vector
 
 
 @dataclass(frozen=True)
@@ -51,7 +40,7 @@ class Body:
             raise ConfigError(f"particles={self.particles} must be a whole number, at least 1")
         if not self.density > 0:
             raise ConfigError(f"density={self.density} kg/m³ must be positive")
-        _vector("velocity", self.velocity, "m/s")
+        vector("velocity", self.velocity, "m/s")
 
 
 @dataclass(frozen=True)
@@ -150,8 +139,8 @@ class Scene:
             dx=float(configuration.number("scene.dx", s.dx)),
             dt=float(configuration.number("scene.dt", s.dt)),
             steps=configuration.number("scene.steps", s.steps, least=1, whole=True),
-            size=_vector("scene.size", s.size, "m"),
-            gravity=_vector("scene.gravity", s.gravity, "m/s²"),
+            size=vector("scene.size", s.size, "m"),
+            gravity=vector("scene.gravity", s.gravity, "m/s²"),
             bodies=tuple(configuration.build(b, f"scene.bodies.{n}") for n, b in s.bodies.items()),
             colliders=colliders,
             walls=configuration.build(s.walls, "scene.walls"),

@@ -16,6 +16,24 @@ def test_defaults_compose():
     assert found.scene.dx == pytest.approx(1.0 / 64.0)
 
 
+def test_turned():
+    node = OmegaConf.create({"angle": 30, "n": "${turned:[0,0,2],[0,5,0],${angle}}"})
+    assert config.resolve(node).n == pytest.approx([1.0, 0.0, 3.0**0.5])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "quoted"),
+    [
+        ("[0,0],[0,1,0],30", "vector of ${turned:…}=[0, 0] must be 3 finite numbers"),
+        ("[0,0,1],[0,0,0],30", "axis of ${turned:…}=[0, 0, 0] has no direction"),
+        ("[0,0,1],[0,1,0],steep", "angle of ${turned:…}=steep must be a finite number"),
+    ],
+)
+def test_turned_out_of_range(arguments, quoted):
+    with pytest.raises(ConfigError, match=re.escape(quoted)):
+        config.resolve(OmegaConf.create({"n": f"${{turned:{arguments}}}"}))
+
+
 def test_everything_resolves():
     def leaves(node):
         if isinstance(node, dict | list):
@@ -37,10 +55,10 @@ def test_scale_chooses_every_size():
 
 
 def test_a_key_that_refers_to_another_follows_it():
-    found = config.load(["+scene.tilt=30.0", "scene.gravity=['${sin:${scene.tilt}}', 0.0, '${cos:60}']"])
-    assert config.resolve(found).scene.gravity == pytest.approx([0.5, 0.0, 0.5])
+    found = config.load(["+scene.tilt=30.0", "scene.gravity=${turned:[0,0,2],[0,1,0],${scene.tilt}}"])
+    assert config.resolve(found).scene.gravity == pytest.approx([1.0, 0.0, 3.0**0.5])
     found.scene.tilt = 90.0
-    assert config.resolve(found).scene.gravity == pytest.approx([1.0, 0.0, 0.5])
+    assert config.resolve(found).scene.gravity == pytest.approx([2.0, 0.0, 0.0])
 
 
 def test_a_reference_to_nothing_is_refused():

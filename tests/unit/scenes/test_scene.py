@@ -97,7 +97,7 @@ def test_full_order_runs_at_a_parameter(sand):
 
 TILTED = [
     "+scene.tilt=10.0",
-    "scene.gravity=['${sin:${scene.tilt}}', 0.0, -4.0]",
+    "scene.gravity=${turned:[0,0,4],[0,1,0],${scene.tilt}}",
     "scene.parameters.key=scene.tilt",
     "scene.parameters.train=[10.0, 20.0]",
     "scene.parameters.test=[30.0]",
@@ -107,10 +107,10 @@ TILTED = [
 def test_keys_that_refer_to_the_parameter_follow_it():
     """A problem parameter may reach the physics through an interpolation, as an inclination does."""
     scene = load("sand", [FEW, *TILTED])
-    assert scene.gravity[0] == pytest.approx(np.sin(np.radians(10.0)))
+    assert scene.gravity[0] == pytest.approx(4.0 * np.sin(np.radians(10.0)))
     tilted = scene.with_parameters({"tilt": 30.0})
-    assert tilted.gravity[0] == pytest.approx(0.5)
-    assert tilted.with_parameters({"tilt": 90.0}).gravity[0] == pytest.approx(1.0)
+    assert tilted.gravity[0] == pytest.approx(2.0)
+    assert tilted.with_parameters({"tilt": 90.0}).gravity[0] == pytest.approx(4.0)
 
 
 def test_a_parameter_that_is_no_key_is_refused():

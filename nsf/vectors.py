@@ -1,0 +1,62 @@
+"""Vectors of a configuration: checked, and turned about an axis."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from nsf.errors import ConfigError
+
+
+def is_list(values) -> bool:
+    """Whether values are several, of a yaml or of Python."""
+    return isinstance(values, Sequence | np.ndarray) and not isinstance(values, str)
+
+
+def numbers(key: str, values, unit: str = "", count: int | None = None) -> np.ndarray:
+    """An array of `count` finite numbers, or of any number of them.
+
+    Raises:
+        ConfigError: quotes the key and the values.
+    """
+    finite = is_list(values) and all(isinstance(x, int | float) and math.isfinite(x) for x in values)
+    if not finite or count not in (None, len(values)):
+        wanted = "a list of finite numbers" if count is None else f"{count} finite numbers"
+        raise ConfigError(f"{key}={values}{' ' * bool(unit)}{unit} must be {wanted}")
+    return np.array(values, float)
+
+
+def vector(key: str, values, unit: str = "") -> tuple[float, float, float]:
+    """Three finite numbers.
+
+    Raises:
+        ConfigError: quotes the key and the values.
+    """
+    return tuple(numbers(key, values, unit, 3).tolist())
+
+
+def direction(key: str, values) -> np.ndarray:
+    """The unit vector [3] along three numbers.
+
+    Raises:
+        ConfigError: they are not finite, or all zero; quotes the key and the values.
+    """
+    along = numbers(key, values, count=3)
+    if not along.any():
+        raise ConfigError(f"{key}={values} has no direction; give a vector that is not zero")
+    return along / np.linalg.norm(along)
+
+
+def rotation(axis: np.ndarray, angle: float) -> np.ndarray:
+    """Rotation matrix [3, 3] about a unit axis, right-handed.
+
+    Args:
+        axis: [3] unit vector.
+        angle: [°].
+
+    Source: Rodrigues' formula, R = I + sin θ K + 2 sin²(θ/2) K², K = axis ×.
+    """
+    x, y, z = axis
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    theta = math.radians(angle)
+    return np.eye(3) + math.sin(theta) * K + 2.0 * math.sin(0.5 * theta) ** 2 * (K @ K)
