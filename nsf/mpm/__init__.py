@@ -4,8 +4,10 @@ import warp as wp
 
 wp.config.log_level = wp.LOG_ERROR  # kernels are compiled without a word; errors still show
 
-from nsf.mpm.boundary import BoundaryArrays, DomainWalls, HalfSpace  # noqa: E402
+from nsf.mpm.boundary import BoundaryArrays, DomainWalls  # noqa: E402
+from nsf.mpm.colliders import Collider, Cuboid, HalfSpace, Sphere  # noqa: E402
 from nsf.mpm.grid import Grid, GridGeometry  # noqa: E402
+from nsf.mpm.motion import Motion  # noqa: E402
 from nsf.mpm.precision import FP32, FP64, Precision, precision_of  # noqa: E402
 from nsf.mpm.solver import FullOrderMPM, GridStep  # noqa: E402
 from nsf.mpm.state import ParticleConstants, ParticleState  # noqa: E402
@@ -15,15 +17,19 @@ __all__ = [
     "FP32",
     "FP64",
     "BoundaryArrays",
+    "Collider",
+    "Cuboid",
     "DomainWalls",
     "FullOrderMPM",
     "Grid",
     "GridGeometry",
     "GridStep",
     "HalfSpace",
+    "Motion",
     "ParticleConstants",
     "ParticleState",
     "Precision",
+    "Sphere",
     "Transfer",
     "precision_of",
 ]

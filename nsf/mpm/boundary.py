@@ -1,4 +1,4 @@
-"""Boundaries of the grid: half-spaces and the walls of the domain."""
+"""Boundaries of the grid: the walls of the domain, and solids and walls on the device."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,48 +7,12 @@ import numpy as np
 import warp as wp
 
 from nsf.errors import ConfigError
-from nsf.mpm.grid import KINDS
+from nsf.mpm.colliders import Collider, check_kind
+from nsf.mpm.contact import KINDS
+from nsf.mpm.motion import Motion, make_follow
 from nsf.mpm.precision import Precision
 
-
-def _check_kind(kind: str, where: str) -> None:
-    if kind not in KINDS:
-        raise ConfigError(f"{where}.kind={kind!r} is unknown; choose one of {', '.join(KINDS)}")
-
-
-@dataclass(frozen=True)
-class HalfSpace:
-    """The solid half-space {x : (x − point)·normal ≤ 0}; material is on the other side.
-
-    Attributes:
-        point: a point of the surface [m].
-        normal: outward normal; normalised here.
-        kind: `sticky`, `slip` (no normal motion) or `separate` (may lift off).
-        friction: Coulomb coefficient of `slip` and `separate`, dimensionless.
-
-    Raises:
-        ConfigError: unknown kind, zero normal, a value that is not finite, negative friction,
-            friction on `sticky`.
-    """
-
-    point: Sequence[float]
-    normal: Sequence[float]
-    kind: str = "sticky"
-    friction: float = 0.0
-
-    def __post_init__(self):
-        _check_kind(self.kind, "half-space")
-        finite = np.isfinite((*self.point, *self.normal)).all()
-        if not (len(self.point) == len(self.normal) == 3 and finite and np.any(self.normal)):
-            raise ConfigError(
-                f"half-space point={self.point} normal={self.normal}: give 3 numbers each, normal non-zero"
-            )
-        if not self.friction >= 0:
-            raise ConfigError(f"half-space friction={self.friction} must be at least 0")
-        if self.kind == "sticky" and self.friction:
-            raise ConfigError(
-                f"half-space friction={self.friction} has no effect on kind=sticky; use kind=separate"
-            )
+_AT_REST = Motion((0.0, 1.0), ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
 
 
 @dataclass(frozen=True)
@@ -56,7 +20,7 @@ class DomainWalls:
     """The six faces of the domain, `padding` nodes deep.
 
     Attributes:
-        kind: as for `HalfSpace`, without friction.
+        kind: as for `Collider`, without friction.
         padding: nodes from the edge on which the condition holds.
     """
 
@@ -64,27 +28,86 @@ class DomainWalls:
     padding: int = 3
 
     def __post_init__(self):
-        _check_kind(self.kind, "walls")
+        check_kind(self.kind, "walls")
         if self.padding < 1:
             raise ConfigError(f"walls.padding={self.padding} must be at least 1 node")
 
 
 class BoundaryArrays:
-    """Half-spaces and walls as the arguments of the grid-update kernel."""
+    """Colliders and walls as the arguments of the grid-update kernel.
 
-    def __init__(self, colliders: Sequence[HalfSpace], walls: DomainWalls, precision: Precision, device):
-        normals = [np.asarray(c.normal, float) / np.linalg.norm(c.normal) for c in colliders]
+    Time lives in `steps`, on the device, so that a step captured in a graph moves the colliders too. Solvers
+    that take turns at one simulation (the phases of a reduced run) share one object.
 
-        def vectors(rows):
-            return wp.array(np.array(rows, float).reshape(-1, 3), dtype=precision.vec3, device=device)
+    Args:
+        colliders: applied in order.
+        walls: condition on the faces of the domain.
+        precision: of the kernel.
+        device: Warp device.
 
-        self.point = vectors([c.point for c in colliders])
-        self.normal = vectors(normals)
-        self.kind = wp.array([KINDS[c.kind] for c in colliders], dtype=wp.int32, device=device)
-        self.friction = wp.array([c.friction for c in colliders], dtype=precision.real, device=device)
-        self.walls = walls
+    Attributes:
+        colliders, walls: as given.
+        shape: [c] code of the shape.
+        active: [c] whether it acts in this step.
+        position: [c, 3] [m]; orientation: [c, 3, 3]; both at the start t^n of the step.
+        extents: [c, 3] see `Collider.extents`.
+        velocity: [c, 3] of the point at `position`, mean over the step [m/s].
+        gradient: [c, 3, 3] of that velocity in space [1/s].
+        kind: [c] code of the contact; friction: [c].
+        steps: [c] steps taken.
+    """
+
+    def __init__(self, colliders: Sequence[Collider], walls: DomainWalls, precision: Precision, device):
+        self.colliders, self.walls, self._device = tuple(colliders), walls, device
+        count = len(self.colliders)
+
+        def array(values, dtype, *entry: int):
+            # The entry's shape, since NumPy cannot tell it when there is no collider.
+            return wp.array(np.array(values, float).reshape(-1, *entry), dtype=dtype, device=device)
+
+        positions, turns = ([getattr(c, k) for c in self.colliders] for k in ("position", "orientation"))
+        self.shape = wp.array([c.shape for c in self.colliders], dtype=wp.int32, device=device)
+        self.active = wp.full(count, 1, dtype=wp.int32, device=device)
+        self.position = array(positions, precision.vec3, 3)
+        self.orientation = array(turns, precision.mat33, 3, 3)
+        self.extents = array([c.extents for c in self.colliders], precision.vec3, 3)
+        self.velocity = wp.zeros(count, dtype=precision.vec3, device=device)
+        self.gradient = wp.zeros(count, dtype=precision.mat33, device=device)
+        self.kind = wp.array([KINDS[c.kind] for c in self.colliders], dtype=wp.int32, device=device)
+        self.friction = array([c.friction for c in self.colliders], precision.real)
+        self.steps = wp.zeros(count, dtype=wp.int32, device=device)
+        self._changes = any(c.changes for c in self.colliders)
+        if not self._changes:
+            return
+        self._follow = make_follow(precision)
+        motions = [c.motion or _AT_REST for c in self.colliders]
+        times, translations, angles = zip(*(m.keyframes() for m in motions), strict=True)
+        axes, pivots = zip(*(m.hinge() for m in motions), strict=True)
+        first = np.cumsum([0, *(len(t) for t in times)])
+        self._prescribed = [
+            array(np.concatenate(times), wp.float64),
+            array(np.concatenate(translations), wp.vec3d, 3),
+            array(np.concatenate(angles), wp.float64),
+            wp.array(first, dtype=wp.int32, device=device),
+            array(axes, wp.vec3d, 3),
+            array(pivots, wp.vec3d, 3),
+            array(positions, wp.vec3d, 3),
+            array(turns, wp.mat33d, 3, 3),
+            array([c.since for c in self.colliders], wp.float64),
+            array([c.until for c in self.colliders], wp.float64),
+        ]
+
+    def advance(self, dt: float) -> None:
+        """Pose and velocity of every collider for the next step of dt [s]; nothing where none changes."""
+        if not self._changes:
+            return
+        found = [self.active, self.position, self.orientation, self.velocity, self.gradient]
+        inputs = [*self._prescribed, dt, self.steps, *found]
+        wp.launch(self._follow, dim=len(self.colliders), inputs=inputs, device=self._device)
 
     @property
     def arguments(self) -> list:
         """In the kernel's order."""
-        return [self.point, self.normal, self.kind, self.friction, KINDS[self.walls.kind], self.walls.padding]
+        solids = [self.shape, self.active, self.position, self.orientation, self.extents]
+        solids += [self.velocity, self.gradient, self.kind, self.friction]
+        return [*solids, KINDS[self.walls.kind], self.walls.padding]

@@ -7,13 +7,8 @@ import numpy as np
 import warp as wp
 
 from nsf.errors import ConfigError
+from nsf.mpm.contact import SLIP, STICKY, make_contact
 from nsf.mpm.precision import Precision
-
-# Kinds of contact. Sticky: no motion. Slip: no normal motion. Separate: no motion into the boundary.
-STICKY, SLIP, SEPARATE = 0, 1, 2
-# A node this near to a surface (in Δx) lies on it and belongs to the solid, in spite of round-off.
-_ON_SURFACE = 1e-4
-KINDS = {"sticky": STICKY, "slip": SLIP, "separate": SEPARATE}
 
 
 @dataclass(frozen=True)
@@ -142,28 +137,16 @@ def make_grid_update(precision: Precision):
     """Kernel of the grid update: momentum → velocity, gravity, walls, colliders.
 
     v_i = (m_i v_i − Δt Σ_p τ_p ∇w_ip V_p⁰)/m_i + Δt g, then the boundary conditions
-    in order: each half-space, then the walls of the domain. P2G has already added the
-    force impulse to the momentum.
+    in order: each collider that acts, then the walls of the domain. P2G has already added
+    the force impulse to the momentum. A node belongs to a solid by the solid's pose at t^n, the
+    time of the particles that P2G took here, and v_i^{n+1} meets the condition relative to the
+    solid's mean velocity over the step (`make_follow`). Frames that move by whole cells a step
+    thus see the same contact.
 
-    Source: paper section 3.3, step 2; Coulomb friction: Stomakhin et al. 2013, section 8.
+    Source: paper section 3.3, step 2.
     """
-    real, vec3 = precision.real, precision.vec3
-
-    @wp.func
-    def against_half_space(v: vec3, normal: vec3, kind: int, friction: real):
-        if kind == wp.static(STICKY):
-            return vec3()
-        normal_speed = wp.dot(v, normal)
-        if kind == wp.static(SEPARATE) and normal_speed >= real(0.0):
-            return v
-        tangential = v - normal_speed * normal
-        speed = wp.length(tangential)
-        slow_down = friction * wp.max(-normal_speed, real(0.0))
-        if speed <= slow_down:
-            return vec3()
-        if speed > real(0.0):
-            tangential = tangential * (real(1.0) - slow_down / speed)
-        return tangential
+    real, vec3, mat33 = precision.real, precision.vec3, precision.mat33
+    outward_normal, against = make_contact(precision)
 
     @wp.kernel(enable_backward=False, module="unique")
     def grid_update(
@@ -174,8 +157,13 @@ def make_grid_update(precision: Precision):
         dx: real,
         dt: real,
         gravity: vec3,
-        collider_point: wp.array(dtype=vec3),
-        collider_normal: wp.array(dtype=vec3),
+        collider_shape: wp.array(dtype=wp.int32),
+        collider_active: wp.array(dtype=wp.int32),
+        collider_position: wp.array(dtype=vec3),
+        collider_orientation: wp.array(dtype=mat33),
+        collider_extents: wp.array(dtype=vec3),
+        collider_velocity: wp.array(dtype=vec3),
+        collider_gradient: wp.array(dtype=mat33),
         collider_kind: wp.array(dtype=wp.int32),
         collider_friction: wp.array(dtype=real),
         wall_kind: int,
@@ -191,9 +179,15 @@ def make_grid_update(precision: Precision):
         node = node_of(flat, shape)
         v = momentum[slot] / m + dt * gravity
         x = dx * vec3(real(node[0]), real(node[1]), real(node[2]))
-        for c in range(collider_kind.shape[0]):
-            if wp.dot(x - collider_point[c], collider_normal[c]) <= real(wp.static(_ON_SURFACE)) * dx:
-                v = against_half_space(v, collider_normal[c], collider_kind[c], collider_friction[c])
+        for c in range(collider_shape.shape[0]):
+            if collider_active[c] != 0:
+                arm = x - collider_position[c]
+                normal = outward_normal(
+                    collider_shape[c], arm, collider_orientation[c], collider_extents[c], dx
+                )
+                if wp.length_sq(normal) > real(0.0):
+                    solid = collider_velocity[c] + collider_gradient[c] * arm
+                    v = solid + against(v - solid, normal, collider_kind[c], collider_friction[c])
         for axis in range(3):
             low = node[axis] < wall_padding
             high = node[axis] >= shape[axis] - wall_padding

@@ -6,12 +6,13 @@ import numpy as np
 import warp as wp
 
 from nsf.errors import ConfigError, InstabilityError, ShapeError
-from nsf.mpm.boundary import BoundaryArrays, DomainWalls, HalfSpace
+from nsf.mpm.boundary import BoundaryArrays, DomainWalls
+from nsf.mpm.colliders import Collider
 from nsf.mpm.device import warp_device
 from nsf.mpm.grid import Grid, GridGeometry, make_grid_update
 from nsf.mpm.materials import Material, make_stress_update
 from nsf.mpm.precision import Precision, precision_of
-from nsf.mpm.stability import check_time_step, make_particle_check
+from nsf.mpm.stability import check_colliders, check_time_step, make_particle_check
 from nsf.mpm.state import ParticleConstants, ParticleState
 from nsf.mpm.transfer import Transfer, make_g2p, make_p2g
 from nsf.timing import StageTimer, untimed
@@ -33,14 +34,20 @@ class GridStep:
         dt: step [s].
         precision: floating-point types.
         device: Warp device.
+
+    Raises:
+        ConfigError: the grid does not resolve a collider.
+        InstabilityError: a collider crosses more than a cell in a step.
     """
 
     def __init__(
         self, grid: Grid, boundaries: BoundaryArrays, transfer: Transfer, gravity, dt, precision, device
     ):
         real = precision.real
+        check_colliders(boundaries.colliders, grid.geometry, dt)
         self.grid, self.device = grid, device
         self.dx, self.dt = real(grid.geometry.dx), real(dt)
+        self._seconds = float(dt)  # the colliders' time is fp64 in either precision
         self.gravity = precision.vec3(*gravity)
         self.boundaries = boundaries
         self.affine_shares = tuple(real(s) for s in transfer.affine_shares)
@@ -69,8 +76,9 @@ class GridStep:
         wp.launch(self._p2g, dim=x.shape[0], inputs=inputs, device=self.device)
 
     def update(self) -> None:
-        """Momentum → velocity at the next time level, boundaries included."""
+        """Momentum → velocity at the next time level, boundaries included, which move on by a step."""
         grid = self.grid
+        self.boundaries.advance(self._seconds)
         inputs = [grid.mass, grid.momentum, grid.nodes, grid.shape, self.dx, self.dt, self.gravity]
         wp.launch(self._update, dim=grid.count, inputs=inputs + self.boundaries.arguments, device=self.device)
 
@@ -101,7 +109,7 @@ class FullOrderMPM:
         grid: grid geometry.
         dt: step [s].
         gravity: [3] [m/s²].
-        colliders: half-spaces, applied in order.
+        colliders: solids, at rest or moving, applied in order.
         walls: condition on the faces of the domain.
         transfer: PIC, APIC or RPIC, and the B-spline.
         x, v: [P, 3] initial position [m] (default X) and velocity [m/s] (default 0).
@@ -110,7 +118,8 @@ class FullOrderMPM:
         check_every: steps between checks of finiteness and bounds.
 
     Raises:
-        InstabilityError: Δt is unstable; the message names the largest stable one.
+        InstabilityError: Δt is unstable or a collider too fast; the message names the largest stable one.
+        ConfigError: the grid does not resolve a collider.
         ShapeError: x or v is not [P, 3].
         DeviceError: the device does not exist.
 
@@ -124,7 +133,7 @@ class FullOrderMPM:
         grid: GridGeometry,
         dt: float,
         gravity: Sequence[float] = (0.0, 0.0, 0.0),
-        colliders: Sequence[HalfSpace] = (),
+        colliders: Sequence[Collider] = (),
         walls: DomainWalls = DomainWalls(),
         transfer: Transfer = Transfer(),
         x: np.ndarray | None = None,

@@ -1,12 +1,14 @@
 """Is the time step stable, and has the simulation gone wrong?"""
 
+from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
 import warp as wp
 
-from nsf.errors import InstabilityError
-from nsf.mpm.grid import inside
+from nsf.errors import ConfigError, InstabilityError
+from nsf.mpm.colliders import Collider
+from nsf.mpm.grid import GridGeometry, inside
 from nsf.mpm.precision import Precision
 from nsf.mpm.shape import shape_functions
 from nsf.mpm.state import ParticleConstants
@@ -14,7 +16,7 @@ from nsf.mpm.state import ParticleConstants
 # c Δt/Δx = 1 is the limit of one quadrature point in the middle of each cell, the worst regular
 # arrangement of particles under B-splines (quadratic with exact quadrature: 1.63).
 MAX_ELASTIC_CFL = 1.0
-# A particle must not cross more than a cell in a step.
+# A particle or a collider must not cross more than a cell in a step.
 MAX_ADVECTIVE_CFL = 1.0
 _ROUND_OFF = 1e-9
 
@@ -54,8 +56,36 @@ def check_time_step(constants: ParticleConstants, v: np.ndarray, dx: float, dt: 
             f"dt={dt:g} s is unstable: elastic CFL c dt/dx = {c * dt / dx:.3g} "
             f"(limit {MAX_ELASTIC_CFL:g}, c = {c:.4g} m/s), "
             f"advective CFL |v| dt/dx = {speed * dt / dx:.3g} (limit {MAX_ADVECTIVE_CFL:g}); "
-            f"the largest stable dt is {(1.0 - 5e-6) * largest:.6g} s"  # six digits must not round up past it
+            f"the largest stable dt is {_rounded_down(largest)} s"
         )
+
+
+def check_colliders(colliders: Sequence[Collider], grid: GridGeometry, dt: float) -> None:
+    """Refuse solids that the grid or the step is too coarse for.
+
+    Raises:
+        ConfigError: a shape is smaller than the grid resolves.
+        InstabilityError: a solid crosses more than a cell in a step; names the largest stable Δt.
+    """
+    for index, collider in enumerate(colliders):
+        which = f"collider {index} ({collider.name}, kind={collider.kind})"
+        if grid.dx > collider.coarsest_dx * (1.0 + _ROUND_OFF):
+            raise ConfigError(
+                f"{which} needs dx of at most {_rounded_down(collider.coarsest_dx)} m, not {grid.dx:g} m; "
+                "choose a finer grid, a larger solid or, for a blade, kind=slip"
+            )
+        speed = collider.top_speed(np.array(grid.upper))
+        if speed * dt > MAX_ADVECTIVE_CFL * grid.dx * (1.0 + _ROUND_OFF):
+            raise InstabilityError(
+                f"{which} moves at up to {speed:.6g} m/s, {speed * dt / grid.dx:.3g} cells "
+                f"in a step of dt={dt:g} s (limit {MAX_ADVECTIVE_CFL:g}); "
+                f"the largest stable dt is {_rounded_down(MAX_ADVECTIVE_CFL * grid.dx / speed)} s"
+            )
+
+
+def _rounded_down(value: float) -> str:
+    """Six digits, which must not round up past the value."""
+    return f"{(1.0 - 5e-6) * value:.6g}"
 
 
 @cache

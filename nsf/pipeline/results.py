@@ -10,6 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nsf.dynamics import Rollout
 from nsf.evaluation import Comparison, SolverCost, reduction_ratio
+from nsf.mpm import HalfSpace
 from nsf.runs import Record
 from nsf.scenes import Scene
 from nsf.storage import write_json, writing
@@ -126,7 +127,8 @@ def write(
 
 
 def _floor(scene: Scene) -> float | None:
-    """Height of a horizontal floor [m], for pictures."""
+    """Height of a horizontal floor at rest [m], for pictures."""
     up = (0.0, 0.0, 1.0)
-    heights = [c.point[2] for c in scene.colliders if np.allclose(np.asarray(c.normal), up)]
+    planes = [c for c in scene.colliders if isinstance(c, HalfSpace) and not c.changes]
+    heights = [c.point[2] for c in planes if np.allclose(c.extents, up)]
     return float(heights[0]) if heights else None

@@ -10,7 +10,7 @@ from omegaconf.errors import ConfigAttributeError
 
 from nsf import config as configuration
 from nsf.errors import ConfigError
-from nsf.mpm import DomainWalls, FullOrderMPM, GridGeometry, HalfSpace, ParticleConstants, Transfer
+from nsf.mpm import Collider, DomainWalls, FullOrderMPM, GridGeometry, ParticleConstants, Transfer
 from nsf.mpm.materials import Material
 from nsf.scenes.geometry import Shape
 from nsf.vectors import vector
@@ -107,7 +107,7 @@ class Scene:
     size: tuple[float, float, float]
     gravity: tuple[float, float, float]
     bodies: tuple[Body, ...]
-    colliders: tuple[HalfSpace, ...]
+    colliders: tuple[Collider, ...]
     walls: DomainWalls
     material: Material
     transfer: Transfer
@@ -132,7 +132,7 @@ class Scene:
     @classmethod
     def _build(cls, config: DictConfig, template: DictConfig) -> "Scene":
         s = config.scene
-        colliders = tuple(configuration.build(c, "scene.colliders") for c in s.colliders.values())
+        colliders = tuple(configuration.build(c, f"scene.colliders.{n}") for n, c in s.colliders.items())
         return cls(
             name=s.name,
             scale=config.scale,

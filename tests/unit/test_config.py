@@ -55,7 +55,7 @@ def test_scale_chooses_every_size():
 
 
 def test_a_key_that_refers_to_another_follows_it():
-    found = config.load(["+scene.tilt=30.0", "scene.gravity=${turned:[0,0,2],[0,1,0],${scene.tilt}}"])
+    found = config.load(["+scene.tilt=30.0", "scene.gravity='${turned:[0,0,2],[0,1,0],${scene.tilt}}'"])
     assert config.resolve(found).scene.gravity == pytest.approx([1.0, 0.0, 3.0**0.5])
     found.scene.tilt = 90.0
     assert config.resolve(found).scene.gravity == pytest.approx([2.0, 0.0, 0.0])

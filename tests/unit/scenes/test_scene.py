@@ -7,6 +7,7 @@ import pytest
 
 from nsf import config as configuration
 from nsf.errors import ConfigError, NSFError
+from nsf.mpm import HalfSpace, Motion
 from nsf.mpm.materials import DruckerPrager
 from nsf.scenes import Body, Box, ParameterRange, load
 
@@ -97,7 +98,7 @@ def test_full_order_runs_at_a_parameter(sand):
 
 TILTED = [
     "+scene.tilt=10.0",
-    "scene.gravity=${turned:[0,0,4],[0,1,0],${scene.tilt}}",
+    "scene.gravity='${turned:[0,0,4],[0,1,0],${scene.tilt}}'",
     "scene.parameters.key=scene.tilt",
     "scene.parameters.train=[10.0, 20.0]",
     "scene.parameters.test=[30.0]",
@@ -178,6 +179,42 @@ def test_foreign_targets_are_refused_at_any_depth():
 def test_missing_value():
     with pytest.raises(ConfigError, match="E"):
         configuration.load(["scene=sand", "material.E=???"])
+
+
+GRIP = (
+    "+scene.colliders.grip={_target_: nsf.mpm.Cuboid, centre: [0.5, 0.5, 0.3], size: [0.1, 0.2, 0.1],"
+    " angle: 30, until: 0.3, motion: {_target_: nsf.mpm.Motion, times: [0, 0.2],"
+    " translations: [[0, 0, 0], '${turned:[0.1,0,0],[0,0,1],${scene.colliders.grip.angle}}']}}"
+)
+
+
+def test_moving_colliders():
+    """Motions nest, a direction follows an angle, and lists arrive as lists."""
+    floor, grip = load("sand", [FEW, GRIP]).colliders
+    assert isinstance(floor, HalfSpace)
+    assert (grip.kind, grip.angle, grip.since, grip.until) == ("sticky", 30, 0.0, 0.3)
+    assert type(grip.motion) is Motion
+    assert [type(v) for v in (grip.size, grip.motion.times, grip.motion.translations)] == [list] * 3
+    along = grip.motion.translations[1]
+    assert type(along) is list
+    np.testing.assert_allclose(along, grip.orientation[:, 0] * 0.1, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("change", "quoted"),
+    [
+        ("until=soon", "scene.colliders.grip.until=soon must be a number"),
+        ("motion.times=[0.2,0.0]", "motion.times=[0.2, 0.0] s"),
+        ("motion.times=soon", "motion.times=soon s must be a list"),
+        ("motion.translations=[[0,0,0]]", "motion.translations=[[0, 0, 0]] must be a list of 2"),
+        ("+motion.axes=[0,0,1]", "axes"),
+        ("motion._target_=os.system", "os.system is refused"),
+    ],
+)
+def test_refused_motions(change, quoted):
+    plus = "+" * change.startswith("+")
+    with pytest.raises(ConfigError, match=re.escape(quoted)):
+        load("sand", [FEW, GRIP, f"{plus}scene.colliders.grip.{change.lstrip('+')}"])
 
 
 def test_body_outside_the_domain(sand):

@@ -1,0 +1,167 @@
+"""Prescribed motion of a solid: its keyframes, and the kernel that follows them on the device."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import warp as wp
+
+from nsf.errors import ConfigError
+from nsf.mpm.precision import Precision
+from nsf.vectors import direction, is_list, numbers, vector
+
+# A time this near to `since` or `until` (in steps) is that time, in spite of round-off.
+_SAME_TIME = 1e-6
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Keyframes of a rigid motion, relative to the pose at rest.
+
+    The point X of the solid is at pivot + R(θ)(X − pivot) + d. The translation d and the angle θ are
+    linear between keyframes, constant before the first and after the last.
+
+    Attributes:
+        times: [k] of the keyframes [s], ascending.
+        translations: [k, 3] d [m]; none if left out.
+        angles: [k] θ about `axis`, right-handed [°]; none if left out.
+        axis: [3] of the rotation, any length.
+        pivot: [3] a point of the axis, at rest [m]; the translation carries it along.
+
+    Raises:
+        ConfigError: fewer than 2 keyframes, times that do not ascend from 0 s on, lists that differ
+            in length, neither translations nor angles, angles without axis and pivot or the reverse,
+            a value that is not finite.
+    """
+
+    times: Sequence[float]
+    translations: Sequence[Sequence[float]] = ()
+    angles: Sequence[float] = ()
+    axis: Sequence[float] | None = None
+    pivot: Sequence[float] | None = None
+
+    def __post_init__(self):
+        times = numbers("motion.times", self.times, "s")
+        if len(times) < 2 or times[0] < 0.0 or (np.diff(times) <= 0.0).any():
+            raise ConfigError(
+                f"motion.times={self.times} s must be at least 2 and ascend from 0 s on; "
+                "leave out the motion of a solid at rest"
+            )
+        for name in ("translations", "angles"):
+            given = getattr(self, name)
+            if not is_list(given) or len(given) not in (0, len(times)):
+                raise ConfigError(
+                    f"motion.{name}={given} must be a list of {len(times)} keyframes, as motion.times is"
+                )
+        if not len(self.translations) and not len(self.angles):
+            raise ConfigError(
+                "motion has neither translations nor angles; give one of them a keyframe a time"
+            )
+        for d in self.translations:
+            vector("motion.translations", d, "m")
+        numbers("motion.angles", self.angles, "°")
+        if len(self.angles):
+            direction("motion.axis", self.axis)
+            vector("motion.pivot", self.pivot, "m")
+        elif self.axis is not None or self.pivot is not None:
+            raise ConfigError(
+                f"motion.axis={self.axis} and motion.pivot={self.pivot} have no effect without "
+                "motion.angles; leave them out"
+            )
+
+    def keyframes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Times [k] [s], translations [k, 3] [m] and angles [k] [rad]."""
+        k = len(self.times)
+        translations = np.array(self.translations, float) if len(self.translations) else np.zeros((k, 3))
+        angles = np.radians(self.angles) if len(self.angles) else np.zeros(k)
+        return np.array(self.times, float), translations, angles
+
+    def hinge(self) -> tuple[np.ndarray, np.ndarray]:
+        """Unit axis [3] and pivot [3] [m]; the origin where nothing turns."""
+        if not len(self.angles):
+            return np.array([0.0, 0.0, 1.0]), np.zeros(3)
+        return direction("motion.axis", self.axis), np.array(self.pivot, float)
+
+    def top_speed(self, reach: float) -> float:
+        """Bound on the speed [m/s] of the solid's points within `reach` [m] of the pivot."""
+        times, translations, angles = self.keyframes()
+        speed = np.linalg.norm(np.diff(translations, axis=0), axis=1)
+        if len(self.angles):
+            speed = speed + reach * np.abs(np.diff(angles))
+        return float((speed / np.diff(times)).max())
+
+
+@cache
+def make_follow(precision: Precision):
+    """Kernel that puts each solid at its pose at t^n and gives its velocity over the step from there.
+
+    The pose is that of the particles which P2G takes to the grid, t^n. The velocity of the solid's
+    point at x is the mean over [t^n, t^{n+1}], that is (x^{n+1} − x)/Δt of that point, so that what
+    sticks to the solid is displaced as the solid is: whatever the keyframes and Δt, translations add
+    up exactly and rotations stay rigid (f_p = R). ω × r at t^n would spiral outward, by
+    ½(ω Δt)² r a step. It is linear in x, so a velocity and its gradient hold it:
+    v(x) = velocity + gradient (x − position), gradient = (R − I)/Δt = ω × + O(Δt).
+
+    Each solid counts its own steps, hence time stays on the device and a captured graph replays. In
+    fp64 whatever the precision: velocities are differences of near positions.
+    """
+    vec3, mat33 = precision.vec3, precision.mat33
+    f64, vec3d, mat33d = wp.float64, wp.vec3d, wp.mat33d
+
+    @wp.func
+    def rotation_less_identity(axis: vec3d, angle: f64):
+        K = wp.skew(axis)
+        half = wp.sin(f64(0.5) * angle)
+        return wp.sin(angle) * K + (f64(2.0) * half * half) * (K * K)
+
+    @wp.func
+    def keyframe_before(times: wp.array(dtype=f64), first: int, last: int, t: f64):
+        """Index of the keyframe at or before t, and the fraction of the way to the next."""
+        if t <= times[first]:
+            return first, f64(0.0)
+        k = first
+        while k < last - 1 and times[k + 1] < t:
+            k += 1
+        return k, wp.min((t - times[k]) / (times[k + 1] - times[k]), f64(1.0))
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def follow(
+        times: wp.array(dtype=f64),
+        translations: wp.array(dtype=vec3d),
+        angles: wp.array(dtype=f64),
+        first: wp.array(dtype=wp.int32),
+        axis: wp.array(dtype=vec3d),
+        pivot: wp.array(dtype=vec3d),
+        rest_position: wp.array(dtype=vec3d),
+        rest_orientation: wp.array(dtype=mat33d),
+        since: wp.array(dtype=f64),
+        until: wp.array(dtype=f64),
+        dt: f64,
+        steps: wp.array(dtype=wp.int32),
+        active: wp.array(dtype=wp.int32),
+        position: wp.array(dtype=vec3),
+        orientation: wp.array(dtype=mat33),
+        velocity: wp.array(dtype=vec3),
+        gradient: wp.array(dtype=mat33),
+    ):
+        c = wp.tid()
+        n = steps[c]
+        steps[c] = n + 1
+        t = f64(n) * dt
+        later = t + f64(wp.static(_SAME_TIME)) * dt
+        active[c] = int(later >= since[c] and later < until[c])
+        k, share = keyframe_before(times, first[c], first[c + 1] - 1, t)
+        d = wp.lerp(translations[k], translations[k + 1], share)
+        angle = wp.lerp(angles[k], angles[k + 1], share)
+        k, share = keyframe_before(times, first[c], first[c + 1] - 1, f64(n + 1) * dt)
+        moved = wp.lerp(translations[k], translations[k + 1], share) - d
+        turn = rotation_less_identity(axis[c], wp.lerp(angles[k], angles[k + 1], share) - angle)
+        pose = wp.identity(n=3, dtype=f64) + rotation_less_identity(axis[c], angle)
+        arm = pose * (rest_position[c] - pivot[c])
+        position[c] = vec3(pivot[c] + d + arm)
+        orientation[c] = mat33(pose * rest_orientation[c])
+        velocity[c] = vec3((moved + turn * arm) / dt)
+        gradient[c] = mat33(turn / dt)
+
+    return follow
