@@ -1,23 +1,35 @@
 """The reduced MPM step (paper section 5.2): "There is no approximation in this step"."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 import warp as wp
 
 import nsf.scenes
-from nsf.dynamics import NeighbourSearch
+from nsf.dynamics import Integration, NeighbourSearch, Sampler
 from nsf.dynamics.integration import particle_sets
 from nsf.dynamics.interop import as_matrices, as_scalars, as_vectors
 from nsf.mpm import FP64, BoundaryArrays, Grid, GridStep
 
 STEPS = 40
+# A plate that turns as it pushes the column, and a ball that comes later.
+MOVING = (
+    "+scene.colliders.plate={_target_: nsf.mpm.Cuboid, centre: [0.36, 0.5, 0.25], size: [0.1, 0.3, 0.3],"
+    " kind: separate, friction: 0.3, motion: {_target_: nsf.mpm.Motion, times: [0.02, 0.3],"
+    " translations: [[0, 0, 0], [0.12, 0.02, 0]],"
+    " angles: [0, 20], axis: [0, 1, 0.5], pivot: [0.36, 0.5, 0.13]}}",
+    "+scene.colliders.ball={_target_: nsf.mpm.Sphere, centre: [0.57, 0.5, 0.3], radius: 0.07, kind: slip,"
+    " since: 0.06, motion: {_target_: nsf.mpm.Motion,"
+    " times: [0, 0.2], translations: [[0, 0, 0], [0, 0, -0.1]]}}",
+)
 
 
-@pytest.fixture(scope="module", params=["apic", "pic"])
+@pytest.fixture(scope="module", params=["apic", "pic", "moving"])
 def mid_run(request):
     """A sand column in mid-collapse and its state one full-order step later."""
-    overrides = [f"transfer={request.param}"]
+    overrides = MOVING if request.param == "moving" else [f"transfer={request.param}"]
     scene = nsf.scenes.load("sand", overrides)
     solver = scene.full_order({"friction_angle": 30.0}, device="cpu")
     solver.step(STEPS)
@@ -26,15 +38,16 @@ def mid_run(request):
     return scene, before, torch.tensor(solver.state.numpy()["x"])
 
 
-def moved_sample(scene, state, rows, sample, nodes):
-    """Positions [s, 3] of the sample particles after one step over `rows` (which start with the sample)."""
+def moved_sample(scene, state, rows, sample, nodes, steps=STEPS, dt=None):
+    """Positions [s, 3] of the sample particles after step number `steps` over `rows`, the sample first."""
     constants = scene.particles()
     chosen = {name: state[name][rows].contiguous() for name in ("x", "v", "C", "tau")}
     mass, volume0 = (torch.tensor(getattr(constants, k)[rows]) for k in ("mass", "volume0"))
     device = wp.get_device("cpu")
     boundaries = BoundaryArrays(scene.colliders, scene.walls, FP64, device)
     grid = Grid(scene.grid, FP64, device, nodes=nodes)
-    step = GridStep(grid, boundaries, scene.transfer, scene.gravity, scene.dt, FP64, device)
+    step = GridStep(grid, boundaries, scene.transfer, scene.gravity, dt or scene.dt, FP64, device)
+    boundaries.steps.fill_(steps)
     vectors = [as_vectors(chosen[k], FP64) for k in ("x", "v")]
     matrices = [as_matrices(chosen[k], FP64) for k in ("C", "tau")]
     step.p2g(*vectors, *matrices, as_scalars(mass), as_scalars(volume0))
@@ -91,3 +104,62 @@ def test_every_needed_particle_is_flagged_and_no_other(mid_run):
     expected = np.array([bool(stencil(p[None]) & nodes) for p in x])
     needed = sets_of(scene, before["x"], sample).integration
     assert set(needed) == set(np.flatnonzero(expected))
+
+
+@pytest.mark.parametrize("mid_run", ["moving"], indirect=True)
+def test_moving_colliders_are_felt_at_their_time(mid_run):
+    """Otherwise the test above shows nothing of them."""
+    scene, before, after = mid_run
+    every = np.arange(len(after))
+    assert (moved_sample(scene, before, every, every, None) - after).abs().max() <= 1e-12
+    late = moved_sample(scene, before, every, every, None, steps=STEPS + 1)
+    assert (late - after).abs().max() > 1e-6
+
+
+class Spy:
+    """A projector that keeps the positions it is given."""
+
+    def __init__(self, projector, found):
+        self._projector, self._found = projector, found
+
+    def solve(self, at, target, xhat):
+        self._found.append(target.clone())
+        return self._projector.solve(at, target, xhat)
+
+
+@pytest.mark.parametrize("multiplier", [1.0, 1.5])
+@pytest.mark.parametrize("strategy", ["superset", "search"])
+def test_a_reduced_run_meets_moving_colliders_in_every_phase(strategy, multiplier, tiny, tiny_manifold):
+    """S moves as in a step over every particle, with its Δt, at any time and after a change of phase."""
+    scene = nsf.scenes.load("sand", [*tiny[1:], *MOVING]).with_parameters({"friction_angle": 26.0})
+    sampler = Sampler(20, phases=[{"start": 0.5, "size": 8}])
+    solver = scene.reduced(
+        tiny_manifold,
+        {"friction_angle": 26.0},
+        sampler,
+        device="cpu",
+        integration=Integration(strategy),
+        dt_multiplier=multiplier,
+    )
+    half = round(0.5 * solver.total_steps)
+    sizes, felt = set(), 0.0
+    for n in range(solver.total_steps):
+        if n in (3, half - 1, half, half + 4):
+            state = {name: torch.tensor(value) for name, value in solver.state.numpy().items()}
+            phase = solver._phase_at(n)
+            sample, others = phase.sets.sample, np.arange(len(solver.state))
+            rows = np.concatenate([sample, np.setdiff1d(others, sample)])
+            expected = moved_sample(scene, state, rows, sample, None, n, solver.dt)
+            still = replace(scene, colliders=scene.colliders[:1])
+            without = moved_sample(still, state, rows, sample, None, n, solver.dt)
+            felt = max(felt, (without - expected).abs().max())
+            found = []
+            projector, solver.projector = solver.projector, Spy(solver.projector, found)
+            solver.step()
+            solver.projector = projector
+            assert (found[0] - expected).abs().max() <= 1e-12
+            sizes.add(len(sample))
+        else:
+            solver.step()
+    assert sizes == {20, 8}
+    assert felt > 1e-5  # otherwise the test shows nothing
