@@ -192,6 +192,17 @@ def number(key: str, value, least: float = -math.inf, whole: bool = False) -> fl
     return value
 
 
+def length(key: str, value) -> float:
+    """A positive length [m].
+
+    Raises:
+        ConfigError: quotes the key and the value.
+    """
+    if not number(key, value) > 0:
+        raise ConfigError(f"{key}={value} m must be positive")
+    return float(value)
+
+
 def check_sweep(overrides: Sequence[str], config_name: str = "config") -> None:
     """Compose with each value of a multirun once, so that a mistake shows before the first job.
 

@@ -3,10 +3,24 @@
 from collections.abc import Sequence
 
 from nsf import config as _config
-from nsf.scenes.geometry import Box, Cylinder, Shape
+from nsf.scenes.geometry import Ball, Box, Cylinder, Frame, Shape
+from nsf.scenes.ribbon import Ribbon
 from nsf.scenes.scene import Body, ParameterRange, Scene
+from nsf.scenes.tentacle_ball import TentacleBall
 
-__all__ = ["Body", "Box", "Cylinder", "ParameterRange", "Scene", "Shape", "load"]
+__all__ = [
+    "Ball",
+    "Body",
+    "Box",
+    "Cylinder",
+    "Frame",
+    "ParameterRange",
+    "Ribbon",
+    "Scene",
+    "Shape",
+    "TentacleBall",
+    "load",
+]
 
 
 def load(name: str, overrides: Sequence[str] = ()) -> Scene:

@@ -6,7 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from nsf.config import length
 from nsf.errors import ConfigError
+from nsf.vectors import vector
 
 
 @dataclass(frozen=True)
@@ -56,6 +58,7 @@ class Shape(ABC):
         while kept < start + count:
             indices = np.arange(drawn + 1, drawn + 1 + 65536, dtype=np.float64)
             points = lower + edge * np.modf(0.5 + indices[:, None] * _ADDENDS)[0]
+            points = points[((points >= lower) & (points <= upper)).all(1)]
             points = points[self.contains(points)]
             found.append(points)
             drawn, kept = drawn + 65536, kept + len(points)
@@ -64,6 +67,8 @@ class Shape(ABC):
 
 # With 1 a basis of a quartic field, hence badly approximable by fractions together.
 _ADDENDS = 2.0 ** (np.arange(1.0, 4.0) / 4.0)
+
+AXES = {"x": 0, "y": 1, "z": 2}
 
 
 @dataclass(frozen=True)
@@ -138,3 +143,90 @@ class Cylinder(Shape):
         """Whether each point lies inside."""
         d = x - np.asarray(self.base, float)
         return (d[:, 0] ** 2 + d[:, 1] ** 2 <= self.radius**2) & (d[:, 2] >= 0) & (d[:, 2] <= self.height)
+
+
+@dataclass(frozen=True)
+class Ball(Shape):
+    """A solid sphere.
+
+    Attributes:
+        centre: [m].
+        radius: [m].
+
+    Raises:
+        ConfigError: the centre is not 3 numbers, or the radius is not positive.
+    """
+
+    centre: Sequence[float]
+    radius: float
+
+    def __post_init__(self):
+        vector("ball centre", self.centre, "m")
+        length("ball radius", self.radius)
+
+    @property
+    def volume(self) -> float:
+        """Volume [m³]."""
+        return 4.0 / 3.0 * np.pi * self.radius**3
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Corners [m]."""
+        centre = np.asarray(self.centre, float)
+        return centre - self.radius, centre + self.radius
+
+    def contains(self, x: np.ndarray) -> np.ndarray:
+        """Whether each point lies inside."""
+        return ((x - np.asarray(self.centre, float)) ** 2).sum(1) <= self.radius**2
+
+
+@dataclass(frozen=True)
+class Frame(Shape):
+    """A rectangular frame: a box with a through-hole, the bars equally thick all round.
+
+    Attributes:
+        lower, upper: opposite outer corners [m].
+        thickness: of the bars, across the hole [m].
+        axis: `x`, `y` or `z`, along which the hole passes through.
+
+    Raises:
+        ConfigError: the corners are those of no box, the axis is unknown, or the bars close the hole.
+    """
+
+    lower: Sequence[float]
+    upper: Sequence[float]
+    thickness: float
+    axis: str = "y"
+
+    def __post_init__(self):
+        outer = Box(self.lower, self.upper)
+        length("frame thickness", self.thickness)
+        if self.axis not in AXES:
+            raise ConfigError(f"frame axis={self.axis!r} is unknown; choose x, y or z")
+        across = np.delete(outer.bounds[1] - outer.bounds[0], AXES[self.axis])
+        if not 2.0 * self.thickness < across.min():
+            raise ConfigError(
+                f"frame thickness={self.thickness} m closes the hole; "
+                f"give less than half of {across.min():g} m, its shorter side"
+            )
+
+    def _hole(self) -> tuple[np.ndarray, np.ndarray]:
+        """Corners of the hole, as long as the box [m]."""
+        inset = np.full(3, float(self.thickness))
+        inset[AXES[self.axis]] = 0.0
+        lower, upper = self.bounds
+        return lower + inset, upper - inset
+
+    @property
+    def volume(self) -> float:
+        """Volume [m³]."""
+        return Box(self.lower, self.upper).volume - Box(*self._hole()).volume
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Outer corners [m]."""
+        return Box(self.lower, self.upper).bounds
+
+    def contains(self, x: np.ndarray) -> np.ndarray:
+        """Whether each point lies inside."""
+        return Box(self.lower, self.upper).contains(x) & ~Box(*self._hole()).contains(x)

@@ -4,13 +4,21 @@ import numpy as np
 import pytest
 
 from nsf.errors import ConfigError
-from nsf.scenes import Box, Cylinder
+from nsf.scenes import Ball, Box, Cylinder, Frame, Ribbon, TentacleBall
+
+WAVE = [(0.2 + 0.6 * t, 0.5 + 0.06 * np.sin(9.0 * t), 0.4 + 0.1 * t * t) for t in np.linspace(0.0, 1.0, 40)]
+ZIGZAG = [(0.2, 0.5, 0.5), (0.5, 0.5, 0.5), (0.5, 0.8, 0.5), (0.5, 0.7, 0.9)]
 
 SHAPES = [
     pytest.param(Box((0.1, 0.2, 0.3), (0.5, 0.4, 0.9)), id="box"),
     pytest.param(Cylinder((0.5, 0.5, 0.13), 0.2, 0.3), id="cylinder"),
     pytest.param(Cylinder((0.5, 0.5, 0.13), 0.02, 0.4), id="thin cylinder"),
     pytest.param(Box((0.2, 0.2, 0.4), (0.8, 0.8, 0.5)), id="slab"),
+    pytest.param(Ball((0.5, 0.4, 0.3), 0.2), id="ball"),
+    pytest.param(Frame((0.2, 0.4, 0.3), (0.8, 0.6, 0.7), 0.1), id="frame"),
+    pytest.param(Ribbon(ZIGZAG, 0.06), id="bent ribbon"),
+    pytest.param(Ribbon(WAVE, 0.05), id="smooth ribbon"),
+    pytest.param(TentacleBall((0.5, 0.5, 0.5), 0.15, 40, 0.1, 0.02), id="tentacle ball"),
 ]
 
 
@@ -52,7 +60,8 @@ class TestSampling:
         )
         assert full.sum() > 50
         assert counts[full].mean() == pytest.approx(12.0, rel=0.03)
-        assert counts[full].std() < 0.65 * 12.0**0.5
+        # A scatter found from few cells is itself uncertain, by 1/√(2 cells).
+        assert counts[full].std() < 0.65 * 12.0**0.5 * (1.0 + (2.0 * full.sum()) ** -0.5)
 
     def test_no_two_points_close(self, shape):
         """The smallest gap is a good part of the lattice spacing; random points come 5 times closer."""
@@ -63,7 +72,7 @@ class TestSampling:
 
     def test_volume_against_counting(self, shape):
         lower, upper = shape.bounds
-        n = 60
+        n = 96
         axes = [lo + (hi - lo) * (np.arange(n) + 0.5) / n for lo, hi in zip(lower, upper, strict=True)]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
         counted = shape.contains(grid).mean() * np.prod(upper - lower)
@@ -93,8 +102,129 @@ def test_thin_shapes_are_cut_from_the_cube_not_squeezed():
         (lambda: Cylinder((0.5, 0.5, 0.1), 0.0, 1.0), "radius=0.0"),
         (lambda: Cylinder((0.5, 0.5, 0.1), 0.1, -1.0), "height=-1.0"),
         (lambda: Cylinder((0.5, 0.5), 0.1, 1.0), r"base=\(0.5, 0.5\)"),
+        (lambda: Ball((0.5, 0.5), 0.1), r"ball centre=\(0.5, 0.5\)"),
+        (lambda: Ball((0.5, 0.5, 0.5), 0.0), "ball radius=0.0"),
+        (lambda: Frame((0.0, 0.0, 0.0), (1.0, 0.0, 1.0), 0.1), r"upper=\(1.0, 0.0, 1.0\)"),
+        (lambda: Frame((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 0.0), "frame thickness=0.0"),
+        (lambda: Frame((0.0, 0.0, 0.0), (1.0, 1.0, 0.4), 0.2), "thickness=0.2 m closes the hole"),
+        (lambda: Frame((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 0.1, "w"), "frame axis='w'"),
+        (lambda: Ribbon([(0.0, 0.0, 0.0)], 0.1), "at least 2 points"),
+        (lambda: Ribbon([(0.0, 0.0, 0.0), (1.0, 0.0)], 0.1), r"ribbon path point=\(1.0, 0.0\)"),
+        (lambda: Ribbon([(0.0, 0.0, 0.0), (0.0, 0.0, 0.0)], 0.1), "twice in a row"),
+        (lambda: Ribbon(ZIGZAG, 0.0), "ribbon radius=0.0"),
+        (lambda: Ribbon(ZIGZAG, 0.2), r"radius=0.2 m is too large for the bends"),
+        (lambda: Ribbon([(0, 0, 0), (1, 0, 0), (0, 0, 0)], 0.1), "too large for the bends"),
+        (lambda: Ribbon([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0.5, 1, 0), (0.5, -1, 0)], 0.1), "of itself at"),
+        (lambda: TentacleBall((0.5, 0.5), 0.1, 9, 0.1, 0.01), r"centre=\(0.5, 0.5\)"),
+        (lambda: TentacleBall((0.5, 0.5, 0.5), 0.1, 0, 0.1, 0.01), "tentacles=0"),
+        (lambda: TentacleBall((0.5, 0.5, 0.5), 0.1, 2.5, 0.1, 0.01), "tentacles=2.5"),
+        (lambda: TentacleBall((0.5, 0.5, 0.5), 0.1, 9, 0.1, -0.01), "tentacle_radius=-0.01"),
+        (lambda: TentacleBall((0.5, 0.5, 0.5), 0.1, 9, 0.005, 0.01), "length=0.005 m must be at least"),
+        (lambda: TentacleBall((0.5, 0.5, 0.5), 0.1, 90, 0.1, 0.03), "90 tentacles of .* overlap"),
     ],
 )
 def test_refused(build, quoted):
     with pytest.raises(ConfigError, match=quoted):
         build()
+
+
+def counted(shape, points=400_000):
+    """Volume [m³] by random points, and its standard error."""
+    lower, upper = shape.bounds
+    hits = shape.contains(np.random.default_rng(0).uniform(lower, upper, (points, 3))).mean()
+    return np.array([hits, (hits * (1.0 - hits) / points) ** 0.5]) * np.prod(upper - lower)
+
+
+def test_frame_is_four_bars():
+    frame = Frame((0.0, 0.0, 0.0), (3.0, 1.0, 2.0), 0.5, axis="y")
+    assert frame.volume == pytest.approx(3.0 * 2.0 - 2.0 * 1.0)
+    x = [
+        (1.5, 0.5, 0.2),
+        (1.5, 0.01, 1.0),
+        (1.5, 0.99, 1.0),
+        (0.2, 0.5, 1.0),
+        (0.7, 0.5, 1.0),
+        (0.2, 1.1, 1.0),
+    ]
+    assert frame.contains(np.array(x)).tolist() == [True, False, False, True, False, False]
+
+
+@pytest.mark.parametrize("axis", ["x", "y", "z"])
+def test_frame_hole_goes_along_its_axis(axis):
+    through = np.full((50, 3), 0.5)
+    through[:, "xyz".index(axis)] = np.linspace(0.0, 1.0, 50)
+    for other in "xyz":
+        held = Frame((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), 0.2, other).contains(through)
+        assert held.any() == (other != axis)
+
+
+class TestRibbon:
+    def test_straight(self):
+        """A cylinder and two half balls."""
+        r, L = 0.1, 0.7
+        ribbon = Ribbon([(0.1, 0.5, 0.5), (0.3, 0.5, 0.5), (0.8, 0.5, 0.5)], r)
+        assert ribbon.volume == pytest.approx(np.pi * r**2 * L + 4.0 / 3.0 * np.pi * r**3, rel=1e-12)
+        np.testing.assert_allclose(ribbon.bounds, [(0.0, 0.4, 0.4), (0.9, 0.6, 0.6)])
+
+    def test_fine_path_tends_to_a_tube(self):
+        """A torus' quarter: the volume of a smooth tube is that of its length."""
+        angle = np.linspace(0.0, 0.5 * np.pi, 400)
+        path = [(0.5 * np.cos(a), 0.5 * np.sin(a), 0.5) for a in angle]
+        tube = np.pi * 0.1**2 * 0.5 * 0.5 * np.pi + 4.0 / 3.0 * np.pi * 0.1**3
+        assert Ribbon(path, 0.1).volume == pytest.approx(tube, rel=1e-5)
+
+    @pytest.mark.parametrize("seed", range(40))
+    def test_volume_of_any_path_that_is_accepted(self, seed):
+        """Bends of all sizes, also tight ones: the closed form, or a refusal."""
+        rng = np.random.default_rng(seed)
+        wild = (0.2, 0.6, 1.2, 3.0)[seed % 4]
+        ribbon = None
+        while ribbon is None:
+            path, along = [np.zeros(3)], rng.normal(size=3)
+            for _ in range(rng.integers(3, 8)):
+                along = along / np.linalg.norm(along) + wild * rng.normal(size=3)
+                path.append(path[-1] + rng.uniform(0.5, 4.0) * along / np.linalg.norm(along))
+            try:
+                ribbon = Ribbon([p.tolist() for p in path], 1.0)
+            except ConfigError:
+                continue
+        volume, error = counted(ribbon)
+        assert abs(ribbon.volume - volume) < 4.0 * error
+
+    def test_turning_back_at_just_twice_the_radius_is_accepted(self):
+        """A hairpin of two right angles touches itself and does not overlap."""
+        hairpin = Ribbon([(0.1, 0.2, 0.5), (0.8, 0.2, 0.5), (0.8, 0.4, 0.5), (0.1, 0.4, 0.5)], 0.1)
+        volume, error = counted(hairpin)
+        assert abs(hairpin.volume - volume) < 4.0 * error
+
+
+class TestTentacleBall:
+    @pytest.mark.parametrize(
+        ("tentacles", "length", "thickness"),
+        [(1, 0.2, 0.1), (2, 0.1, 0.1), (60, 0.1, 0.012), (150, 0.05, 0.008)],
+    )
+    def test_volume(self, tentacles, length, thickness):
+        ball = TentacleBall((0.5, 0.5, 0.5), 0.12, tentacles, length, thickness)
+        volume, error = counted(ball)
+        assert abs(ball.volume - volume) < 4.0 * error
+
+    def test_tentacles_are_evenly_spread(self):
+        """They balance, and no two are nearer than 0.8 of the best hexagonal spacing."""
+        d = TentacleBall((0.5, 0.5, 0.5), 0.1, 100, 0.1, 0.008)._directions()
+        np.testing.assert_allclose(np.linalg.norm(d, axis=1), 1.0)
+        assert np.linalg.norm(d.mean(0)) < 0.01
+        angles = np.arccos(np.clip(d @ d.T, -1.0, 1.0)) + 9.0 * np.eye(100)
+        assert angles.min() > 0.8 * (8.0 * np.pi / (100 * 3.0**0.5)) ** 0.5
+
+    def test_tips(self):
+        """Round, at the length from the core."""
+        ball = TentacleBall((0.0, 0.0, 0.0), 0.1, 30, 0.2, 0.01)
+        d = ball._directions()
+        assert ball.contains(0.2999 * d).all()
+        assert not ball.contains(0.3001 * d).any()
+        aside = np.cross(d, [0.3, 0.5, 0.7])
+        aside /= np.linalg.norm(aside, axis=1)[:, None]
+        assert ball.contains(0.25 * d + 0.0099 * aside).all()
+        assert not ball.contains(0.25 * d + 0.0101 * aside).any()
+        assert not ball.contains(0.299 * d + 0.006 * aside).any()
+        np.testing.assert_allclose(np.abs(ball.bounds).max(), 0.29 * np.abs(d).max() + 0.01)
