@@ -7,6 +7,7 @@ from nsf.scenes.geometry import Ball, Box, Cylinder, Frame, Shape
 from nsf.scenes.ribbon import Ribbon
 from nsf.scenes.scene import Body, ParameterRange, Scene
 from nsf.scenes.tentacle_ball import TentacleBall
+from nsf.scenes.weakness import Weakness
 
 __all__ = [
     "Ball",
@@ -19,6 +20,7 @@ __all__ = [
     "Scene",
     "Shape",
     "TentacleBall",
+    "Weakness",
     "load",
 ]
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import KW_ONLY, dataclass, field, replace
 
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
@@ -13,6 +13,7 @@ from nsf.errors import ConfigError
 from nsf.mpm import Collider, DomainWalls, FullOrderMPM, GridGeometry, ParticleConstants, Transfer
 from nsf.mpm.materials import Material
 from nsf.scenes.geometry import Shape
+from nsf.scenes.weakness import Weakness
 from nsf.vectors import vector
 
 
@@ -22,25 +23,56 @@ class Body:
 
     Attributes:
         shape: where the particles are at rest.
-        particles: how many.
         density: reference density [kg/m³].
+        particles: how many; or
+        particles_per_cell: how many in a grid cell's volume. Exactly one of the two; a body of a
+            `Scene` has `particles`.
         velocity: initial velocity [m/s].
+        weakness: particles that are softer than the material; none by default.
 
     Raises:
-        ConfigError: no particles, a density that is not positive, a velocity that is not 3 numbers.
+        ConfigError: not one of the two numbers, or one that is not positive; a density that is not
+            positive; a velocity that is not 3 numbers.
     """
 
     shape: Shape
-    particles: int
+    _: KW_ONLY
     density: float
+    particles: int | None = None
+    particles_per_cell: float | None = None
     velocity: Sequence[float] = (0.0, 0.0, 0.0)
+    weakness: Weakness | None = None
 
     def __post_init__(self):
-        if self.particles < 1 or self.particles != int(self.particles):
+        if (self.particles is None) == (self.particles_per_cell is None):
+            raise ConfigError(
+                f"particles={self.particles} and particles_per_cell={self.particles_per_cell}: "
+                "give exactly one, the other null"
+            )
+        if self.particles is not None and (self.particles < 1 or self.particles != int(self.particles)):
             raise ConfigError(f"particles={self.particles} must be a whole number, at least 1")
+        if self.particles_per_cell is not None and not 0 < self.particles_per_cell < math.inf:
+            raise ConfigError(f"particles_per_cell={self.particles_per_cell} must be positive and finite")
         if not self.density > 0:
             raise ConfigError(f"density={self.density} kg/m³ must be positive")
         vector("velocity", self.velocity, "m/s")
+
+    def counted(self, dx: float) -> "Body":
+        """The same body with `particles`, on a grid of spacing dx [m].
+
+        Raises:
+            ConfigError: the body is so small that it gets no particle.
+        """
+        if self.particles is not None:
+            return self
+        cells = self.shape.volume / dx**3
+        count = round(self.particles_per_cell * cells)
+        if count < 1:
+            raise ConfigError(
+                f"particles_per_cell={self.particles_per_cell} gives no particle: the body fills {cells:.2g} "
+                f"of a cell of dx={dx:g} m; enlarge the body or refine dx"
+            )
+        return replace(self, particles=count, particles_per_cell=None)
 
 
 @dataclass(frozen=True)
@@ -133,15 +165,18 @@ class Scene:
     def _build(cls, config: DictConfig, template: DictConfig) -> "Scene":
         s = config.scene
         colliders = tuple(configuration.build(c, f"scene.colliders.{n}") for n, c in s.colliders.items())
+        dx = float(configuration.length("scene.dx", s.dx))
         return cls(
             name=s.name,
             scale=config.scale,
-            dx=float(configuration.number("scene.dx", s.dx)),
+            dx=dx,
             dt=float(configuration.number("scene.dt", s.dt)),
             steps=configuration.number("scene.steps", s.steps, least=1, whole=True),
             size=vector("scene.size", s.size, "m"),
             gravity=vector("scene.gravity", s.gravity, "m/s²"),
-            bodies=tuple(configuration.build(b, f"scene.bodies.{n}") for n, b in s.bodies.items()),
+            bodies=tuple(
+                configuration.build(b, f"scene.bodies.{n}").counted(dx) for n, b in s.bodies.items()
+            ),
             colliders=colliders,
             walls=configuration.build(s.walls, "scene.walls"),
             material=configuration.build(config.material, "material"),
@@ -178,25 +213,27 @@ class Scene:
         return GridGeometry.of_domain(self.size, self.dx)
 
     def particles(self) -> ParticleConstants:
-        """Particles of every body, in order.
+        """Particles of every body, in order; μ̂ and λ are the material's, times a body's weakness.
 
         Raises:
-            ConfigError: a body reaches outside the domain.
+            ConfigError: a body reaches outside the domain, or a weak region holds no particles.
         """
-        X, mass, volume0 = [], [], []
+        X, mass, volume0, stiffness = [], [], [], []
         for body in self.bodies:
             lower, upper = body.shape.bounds
             if (lower < 0).any() or (upper > np.asarray(self.size)).any():
                 raise ConfigError(
-                    f"body from {lower} to {upper} m reaches outside the domain [0, {self.size}] m"
+                    f"body from {lower} to {upper} m reaches outside the domain [0, {self.size}] m; "
+                    "move it or make it smaller"
                 )
             volume = body.shape.volume / body.particles
             X.append(body.shape.sample(body.particles))
             volume0.append(np.full(body.particles, volume))
             mass.append(np.full(body.particles, body.density * volume))
-        X = np.concatenate(X)
-        mu, lam = np.full(len(X), self.material.mu), np.full(len(X), self.material.lam)
-        return ParticleConstants(X, np.concatenate(mass), np.concatenate(volume0), mu, lam)
+            stiffness.append(body.weakness.of(X[-1]) if body.weakness else np.ones(body.particles))
+        stiffness = np.concatenate(stiffness)
+        mu, lam = stiffness * self.material.mu, stiffness * self.material.lam
+        return ParticleConstants(np.concatenate(X), np.concatenate(mass), np.concatenate(volume0), mu, lam)
 
     def initial_velocity(self) -> np.ndarray:
         """[P, 3] velocity at t = 0 [m/s]."""

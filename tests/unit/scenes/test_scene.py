@@ -131,6 +131,8 @@ def test_a_parameter_that_is_no_key_is_refused():
         (["transfer=apicc"], "unknown transfer=apicc; choose one of apic, pic, rpic (did you mean apic?)"),
         (["scale=huge"], "scale=huge"),
         (["scene.steps=0"], "scene.steps=0"),
+        (["scene.dx=0"], "scene.dx=0"),
+        (["+scene.bodies.column.particles_per_cell=8"], "particles_per_cell=8: give exactly one"),
         (["scene.steps=2.5"], "scene.steps=2.5"),
         (["scene.steps=many"], "scene.steps=many"),
         (["scene.dt=soon"], "scene.dt=soon"),
@@ -226,7 +228,68 @@ def test_body_outside_the_domain(sand):
 @pytest.mark.parametrize(("particles", "density"), [(0, 1.0), (10, 0.0), (10, float("nan"))])
 def test_bad_body(particles, density):
     with pytest.raises(ConfigError, match=f"particles={particles}|density={density}"):
-        Body(Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), particles, density)
+        Body(Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), particles=particles, density=density)
+
+
+CUBE = Box((0.0, 0.0, 0.0), (0.5, 0.5, 0.5))
+
+
+class TestParticlesPerCell:
+    def test_counted_on_the_grid(self):
+        body = Body(CUBE, density=1.0, particles_per_cell=8)
+        assert body.counted(0.1).particles == 1000
+        assert body.counted(0.05).particles == 8000
+        assert body.counted(0.1).particles_per_cell is None
+
+    def test_a_number_stays(self):
+        body = Body(CUBE, density=1.0, particles=17)
+        assert body.counted(0.1) is body
+
+    def test_in_a_scene(self):
+        keys = ["scene.bodies.column.particles=null", "+scene.bodies.column.particles_per_cell=8.5"]
+        coarse, fine = (load("sand", [*keys, f"scene.dx={dx}"]) for dx in (0.04, 0.02))
+        volume = coarse.bodies[0].shape.volume
+        assert coarse.bodies[0].particles == len(coarse.particles()) == round(8.5 * volume / 0.04**3)
+        assert fine.bodies[0].particles == round(8.5 * volume / 0.02**3)
+
+    @pytest.mark.parametrize("numbers", [{}, {"particles": 10, "particles_per_cell": 8}])
+    def test_exactly_one(self, numbers):
+        with pytest.raises(ConfigError, match="give exactly one"):
+            Body(CUBE, density=1.0, **numbers)
+
+    @pytest.mark.parametrize("value", [0.0, -8.0, float("nan"), float("inf")])
+    def test_refused(self, value):
+        with pytest.raises(ConfigError, match=f"particles_per_cell={value}"):
+            Body(CUBE, density=1.0, particles_per_cell=value)
+
+    def test_a_body_too_small_for_the_grid(self):
+        with pytest.raises(ConfigError, match="gives no particle"):
+            Body(CUBE, density=1.0, particles_per_cell=8).counted(100.0)
+
+
+def test_several_bodies():
+    """In order, each with its own density, velocity and weakness."""
+    box = "{_target_: nsf.scenes.Box, lower: [0.1,0.1,0.2], upper: [0.2,0.3,0.4]}"
+    weak = f"{{_target_: nsf.scenes.Weakness, share: 1.0, factor: 0.5, region: {box}}}"
+    wall = f"{{_target_: nsf.scenes.Body, shape: {box}, particles: 50, density: 300, velocity: [0,1,0], weakness: {weak}}}"  # fmt: skip # noqa: E501
+    scene = load("sand", [FEW, f"+scene.bodies.wall={wall}"])
+    constants, v = scene.particles(), scene.initial_velocity()
+    column, other = slice(0, 300), slice(300, 350)
+    assert len(constants) == len(v) == 350
+    assert scene.bodies[0].shape.contains(constants.X[column]).all()
+    assert scene.bodies[1].shape.contains(constants.X[other]).all()
+    np.testing.assert_allclose(constants.mass[other] / constants.volume0[other], 300.0)
+    np.testing.assert_allclose(constants.mass[column] / constants.volume0[column], 200.0)
+    assert constants.volume0[other].sum() == pytest.approx(0.1 * 0.2 * 0.2)
+    assert (v[column] == 0.0).all()
+    assert (v[other] == [0.0, 1.0, 0.0]).all()
+    np.testing.assert_array_equal(constants.mu[other], 0.5 * scene.material.mu)
+    np.testing.assert_array_equal(constants.lam[column], scene.material.lam)
+    solver = scene.full_order(device="cpu")
+    solver.step(3)
+    moved = solver.state.numpy()["x"] - constants.X
+    assert (moved[other, 1] > 0.0).all()
+    assert np.abs(moved[column, 1]).max() < 0.01 * moved[other, 1].min()
 
 
 def test_parameter_name_is_the_end_of_its_key():
