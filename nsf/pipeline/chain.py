@@ -124,6 +124,9 @@ class Pipeline:
         content = {k: OmegaConf.to_container(OmegaConf.create({k: c[k]}))[k] for k in _SCENE_KEYS}
         content |= {"scene": scene, "precision": c.precision, "dtype": c.data.dtype}
         content["parameter"] = {"key": self.scene.parameters.key, "value": float(value)}
+        if self.scene.files:
+            # A changed mesh under the same path is another simulation.
+            content["files"] = self.scene.files
         return Run.open("simulate", self.scene.name, content, root=self.root)
 
     @property

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from nsf import config as _config
 from nsf.scenes.geometry import Ball, Box, Cylinder, Frame, Shape
+from nsf.scenes.mesh import Mesh, mesh_or_ball
 from nsf.scenes.ribbon import Ribbon
 from nsf.scenes.scene import Body, ParameterRange, Scene
 from nsf.scenes.tentacle_ball import TentacleBall
@@ -15,6 +16,7 @@ __all__ = [
     "Box",
     "Cylinder",
     "Frame",
+    "Mesh",
     "ParameterRange",
     "Ribbon",
     "Scene",
@@ -22,6 +24,7 @@ __all__ = [
     "TentacleBall",
     "Weakness",
     "load",
+    "mesh_or_ball",
 ]
 
 

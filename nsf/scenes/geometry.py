@@ -29,6 +29,11 @@ class Shape(ABC):
     def contains(self, x: np.ndarray) -> np.ndarray:
         """[n] whether each of the points x [n, 3] [m] lies inside."""
 
+    @property
+    def files(self) -> dict[str, str]:
+        """Path and sha256 of every file that the shape is read from."""
+        return {}
+
     def sample(self, count: int, start: int = 0) -> np.ndarray:
         """Evenly spread points of the shape.
 

@@ -74,6 +74,11 @@ class Body:
             )
         return replace(self, particles=count, particles_per_cell=None)
 
+    @property
+    def files(self) -> dict[str, str]:
+        """Path and sha256 of every file that the body is made from."""
+        return self.shape.files | (self.weakness.region.files if self.weakness else {})
+
 
 @dataclass(frozen=True)
 class ParameterRange:
@@ -211,6 +216,11 @@ class Scene:
     def grid(self) -> GridGeometry:
         """The background grid."""
         return GridGeometry.of_domain(self.size, self.dx)
+
+    @property
+    def files(self) -> dict[str, str]:
+        """Path and sha256 of every file that the scene is made from beyond its configuration."""
+        return {path: digest for body in self.bodies for path, digest in body.files.items()}
 
     def particles(self) -> ParticleConstants:
         """Particles of every body, in order; μ̂ and λ are the material's, times a body's weakness.
