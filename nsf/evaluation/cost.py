@@ -35,7 +35,7 @@ class SolverCost:
         total_ms: median time of a whole run's steps [ms], set-up and warm-up left out.
         stages: median over steps spread through a run of each stage's time [ms], synchronised, so
             their sum exceeds a step.
-        memory_mib: peak of every allocator during the first run, beyond what was held before the solver [MiB].
+        memory_mib: peak of every allocator during the first run, beyond what was held before it [MiB].
         allocators: the same by allocator [MiB].
         trials: number of runs.
     """

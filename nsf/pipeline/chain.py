@@ -283,7 +283,7 @@ class Pipeline:
         value = f"{self.scene.parameters.name}={rollout.parameter:g}"
         if rollout.diverged >= 0:
             self.say(
-                f"deploy: warning: {value} diverged at step {rollout.diverged} (left the grid or not finite); "
+                f"deploy: warning: {value} diverged at step {rollout.diverged} (off the grid or not finite); "
                 "its errors are reported as ∞"
             )
         if rollout.needed_outside:
