@@ -42,7 +42,8 @@ def error_over_time(
                 )
             panel.set(xlabel="time t [s]", ylabel=f"{OVER_TIME.get(column, column)} [%]")
             _error_scale(panel, 100 * series[column])
-            panel.margins(x=0.01)
+            # The whole time span, where runs diverged early too.
+            panel.set_xlim(-0.01 * series["t"].max(), 1.01 * series["t"].max())
         _legend_above(fig, panels[0], axis(name, unit))
     return fig
 

@@ -15,7 +15,7 @@ from PIL import Image
 from nsf.reporting.camera import Camera, View
 from nsf.reporting.columns import parameter_text
 from nsf.reporting.sources import Motion
-from nsf.reporting.style import INK, MUTED, WIDTH, styled
+from nsf.reporting.style import INK, MUTED, WARNING, WIDTH, styled
 
 STRESS_COLORS, DIFFERENCE_COLORS = "viridis", "magma"
 CLIP = 97.0  # [%] percentile of the full-order stress at which the colour scale ends
@@ -56,6 +56,7 @@ def final_shapes(
         sheet = _Sheet(view, rows=len(motions), columns=3, titles=("full-order", "reduced", "distance apart"))
         for row, ((m, x_fom, x_rom, tau_fom, tau_rom), d) in enumerate(zip(last, apart, strict=True)):
             sheet.name_row(row, f"{parameter_text(m.parameter, name, unit)}, t = {m.t[-1]:.3g} s")
+            sheet.note_stop(row, m)
             sheet.show(row, 0, view.picture(x_fom, stress.colors(tau_fom), radius))
             sheet.show(row, 1, view.picture(x_rom, stress.colors(tau_rom), radius))
             sheet.show(row, 2, view.picture(x_rom, distance.colors(d), radius))
@@ -95,6 +96,7 @@ def animation(
         clock = sheet.clock()
         for row, m in enumerate(motions):
             sheet.name_row(row, parameter_text(m.parameter, name, unit))
+            sheet.note_stop(row, m)
         for frame in chosen:
             for row, m in enumerate(motions):
                 sheet.show(
@@ -149,6 +151,12 @@ class _Sheet:
 
     def name_row(self, row: int, text: str) -> None:
         self._text(self._left[0], self._row[row] + self._tall + 0.09, text, fontsize=9.5, color=MUTED)
+
+    def note_stop(self, row: int, motion: Motion) -> None:
+        """Over the reduced picture of a run that diverged: what stands there is its last good state."""
+        if motion.stopped is not None:
+            told = f"diverged; shown as at t = {motion.stopped:.3g} s"
+            self._text(self._left[1], self._row[row] + self._tall + 0.09, told, fontsize=9.5, color=WARNING)
 
     def show(self, row: int, column: int, picture: np.ndarray) -> None:
         if (row, column) in self._images:

@@ -34,7 +34,11 @@ _SERIES = (
 
 @dataclass(frozen=True)
 class Motion:
-    """One parameter value's particles for pictures: x [F,n,3] m, tau [F,n,6] Pa, t [F] s."""
+    """One parameter value's particles for pictures: x [F,n,3] m, tau [F,n,6] Pa, t [F] s.
+
+    `stopped` is the time [s] up to which a reduced run that diverged was good (later frames hold that
+    state), None for one that reached the end.
+    """
 
     parameter: float | str
     split: str
@@ -43,6 +47,7 @@ class Motion:
     x_reduced: np.ndarray
     tau_full: np.ndarray
     tau_reduced: np.ndarray
+    stopped: float | None = None
 
 
 class Source:
@@ -84,10 +89,21 @@ class Source:
             arrays = {key: stored[key] for key in _FRAMES}
         rows = [(value, _where(arrays["parameters"], value)) for value in parameters]
         return [
-            Motion(value, str(arrays["splits"][row]), arrays["t"], *(arrays[key][row] for key in _FRAMES[3:]))
+            Motion(
+                value,
+                str(arrays["splits"][row]),
+                arrays["t"],
+                *(arrays[key][row] for key in _FRAMES[3:]),
+                stopped=self._stopped(value),
+            )
             for value, row in rows
             if row is not None
         ]
+
+    def _stopped(self, parameter) -> float | None:
+        own = self.series[[same_parameter(p, parameter) for p in self.series["parameter"]]]
+        lost = np.isinf(own["delta"])
+        return float(max(own.loc[~lost, "t"], default=0.0)) if lost.any() else None
 
     def _path(self, name: str) -> Path:
         return Path(self.run.path) / name

@@ -5,7 +5,7 @@ import itertools
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
-INK, MUTED, GRID = "#222222", "#666666", "#dddddd"
+INK, MUTED, GRID, WARNING = "#222222", "#666666", "#dddddd", "#B04A00"
 
 # Okabe and Ito 2008, without the yellow that vanishes on white; black last.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")

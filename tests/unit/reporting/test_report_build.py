@@ -11,7 +11,7 @@ from synthetic import TEST, Made, seal, write_run
 from nsf.errors import ConfigError, StorageError
 from nsf.reporting import build, build_report
 from nsf.reporting.columns import number
-from nsf.reporting.sources import file_hash
+from nsf.reporting.sources import Source, file_hash
 
 TINY = Made(particles=30, frames=4, parameters=TEST[:2], splits=("test",) * 2)
 
@@ -120,6 +120,12 @@ def diverged(tmp_path_factory):
 def test_a_diverged_run_still_gives_a_report_that_says_so(diverged):
     page = (diverged[1] / "index.html").read_text()
     assert page.count('<td class="number">∞</td>') == 2  # its own row, and the mean
+
+
+def test_a_motion_knows_when_its_run_stopped(diverged):
+    lost, good = Source(diverged[0]).motions(TEST[:2])
+    assert lost.stopped == 0.0
+    assert good.stopped is None
 
 
 def test_equal_runs_give_equal_files(diverged, tmp_path):

@@ -37,6 +37,20 @@ def labels(figure):
     ]
 
 
+def test_error_over_time_spans_the_run_where_one_diverged_early(series):
+    lost = series.copy()
+    lost.loc[lost["t"] > 0.1, ["delta", "displacement_error"]] = np.inf
+    for panel in charts.error_over_time(lost).axes:
+        assert panel.get_xlim()[1] >= series["t"].max()
+
+
+def test_pictures_of_a_diverged_run_say_when_it_stopped():
+    good, lost = motions(2)
+    figure = final_shapes([good, replace(lost, stopped=0.12)])
+    notes = [text.get_text() for text in figure.texts if "diverged" in text.get_text()]
+    assert notes == ["diverged; shown as at t = 0.12 s"]
+
+
 def test_error_over_time_has_a_line_a_value_in_per_cent(series):
     figure = charts.error_over_time(series, name="friction angle", unit="°")
     for panel, column in zip(figure.axes, ("delta", "displacement_error"), strict=True):
