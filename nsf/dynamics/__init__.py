@@ -4,7 +4,7 @@ from nsf.dynamics.deployment import Rollout, deploy, rollout
 from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
 from nsf.dynamics.latent import Decoder, LatentState, LatentTrajectory
 from nsf.dynamics.projection import STOP_REASONS, GaussNewton, ProjectionResult, Taylor, stop_reasons
-from nsf.dynamics.sampling import SamplePhase, Sampler
+from nsf.dynamics.sampling import GreedySampler, RandomSampler, SamplePhase, Sampler
 from nsf.dynamics.solver import NSF, ReducedMPM
 from nsf.dynamics.stress import Method
 
@@ -13,6 +13,7 @@ __all__ = [
     "STOP_REASONS",
     "Decoder",
     "GaussNewton",
+    "GreedySampler",
     "Integration",
     "LatentState",
     "LatentTrajectory",
@@ -20,6 +21,7 @@ __all__ = [
     "NeighbourSearch",
     "ParticleSets",
     "ProjectionResult",
+    "RandomSampler",
     "ReducedMPM",
     "Rollout",
     "SamplePhase",

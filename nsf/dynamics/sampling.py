@@ -1,11 +1,17 @@
 """Sample particles S: those whose new positions determine the latent vector (paper section 5.4)."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import torch
+from typing_extensions import override
 
 from nsf.errors import ConfigError, ProjectionError
+
+_CHUNK = 2**25  # values decoded at once
+_SNAPSHOTS = 256  # latents that displacement modes are taken from
 
 
 @dataclass(frozen=True)
@@ -36,17 +42,29 @@ class Region:
     upper: Sequence[float] | None = None
     start: float = 0.0
 
+    def candidates(self, X: np.ndarray) -> np.ndarray:
+        """Indices of the particles inside, ascending; X [P, 3] are reference positions [m].
+
+        Raises:
+            ConfigError: the region holds fewer particles than asked for.
+        """
+        lower = -np.inf if self.lower is None else np.asarray(self.lower, float)
+        upper = np.inf if self.upper is None else np.asarray(self.upper, float)
+        inside = np.flatnonzero(((lower <= X) & (upper >= X)).all(1))
+        if len(inside) < self.size:
+            raise ConfigError(
+                f"sampler.size={self.size}, but the region holds {len(inside)} particles; "
+                "choose a smaller size or a larger region"
+            )
+        return inside
+
 
 @dataclass(frozen=True)
-class Sampler:
-    """Random choice of sample particles, by region and by phase of time.
-
-    The same seed orders the particles once, so a later, smaller phase of the same region
-    keeps a part of the earlier one.
+class Sampler(ABC):
+    """A choice of sample particles, by region and by phase of time.
 
     Attributes:
         size: |S| of the first phase.
-        seed: of the random order.
         lower, upper: box of reference positions [m] of the first phase.
         phases: later phases, each with keys size, start and optionally lower, upper.
 
@@ -57,7 +75,6 @@ class Sampler:
     """
 
     size: int
-    seed: int = 0
     lower: Sequence[float] | None = None
     upper: Sequence[float] | None = None
     phases: Sequence[dict] = ()
@@ -69,8 +86,6 @@ class Sampler:
             raise ConfigError(
                 f"sampler.phases={self.phases}: give size, start, lower, upper ({error})"
             ) from error
-        if not isinstance(self.seed, int) or self.seed < 0:
-            raise ConfigError(f"sampler.seed={self.seed} must be a whole number of at least 0")
         for region in regions:
             if not isinstance(region.size, int) or region.size < 1:
                 raise ConfigError(f"sampler.size={region.size} must be a whole number of at least 1")
@@ -87,28 +102,121 @@ class Sampler:
         """Every phase, the first included."""
         return [Region(self.size, self.lower, self.upper), *(Region(**p) for p in self.phases)]
 
-    def phases_of(self, X: np.ndarray) -> list[SamplePhase]:
-        """Draw the sample particles of each phase.
+    def phases_of(self, manifold, device: str | torch.device = "cpu") -> list[SamplePhase]:
+        """Choose the sample particles of each phase.
 
         Args:
-            X: [P, 3] reference positions [m].
+            manifold: trained fields of the particles.
+            device: where the fields are evaluated, if the choice needs them.
 
         Raises:
             ConfigError: a region holds fewer particles than asked for.
         """
-        order = np.random.default_rng(self.seed).permutation(len(X))
-        found = []
-        for region in self.regions:
-            lower = np.full(3, -np.inf) if region.lower is None else np.asarray(region.lower, float)
-            upper = np.full(3, np.inf) if region.upper is None else np.asarray(region.upper, float)
-            inside = order[((X[order] >= lower) & (X[order] <= upper)).all(1)]
-            if len(inside) < region.size:
-                raise ConfigError(
-                    f"sampler.size={region.size}, but the region holds {len(inside)} particles; "
-                    "choose a smaller size or a larger region"
-                )
-            found.append(SamplePhase(region.start, np.sort(inside[: region.size])))
-        return found
+        X = manifold.X.cpu().numpy()
+        return [
+            SamplePhase(
+                region.start, np.sort(self.choose(manifold, region.candidates(X), region.size, device))
+            )
+            for region in self.regions
+        ]
+
+    @abstractmethod
+    def choose(self, manifold, candidates: np.ndarray, size: int, device="cpu") -> np.ndarray:
+        """`size` of the candidates [c], as particle indices; a smaller sample is a part of a larger."""
+
+
+@dataclass(frozen=True)
+class RandomSampler(Sampler):
+    """Particles drawn at random.
+
+    Attributes:
+        seed: of the order in which all particles are drawn.
+
+    Source: paper section 5.4.
+    """
+
+    seed: int = 0
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not isinstance(self.seed, int) or self.seed < 0:
+            raise ConfigError(f"sampler.seed={self.seed} must be a whole number of at least 0")
+
+    @override
+    def choose(self, manifold, candidates, size, device="cpu"):
+        order = np.random.default_rng(self.seed).permutation(len(manifold.X))
+        return order[np.isin(order, candidates)][:size]
+
+
+@dataclass(frozen=True)
+class GreedySampler(Sampler):
+    """Particles whose positions tell most about the whole body's: an answer to the paper's future work.
+
+    The amplitudes of the leading displacement modes are taken as Gaussian with their variances over the
+    training, and positions at S as known up to a noise. Each particle taken is the one that adds most
+    information on the amplitudes, log det(1 + R Σ Rᵀ/σ²), where R [3, k] are its components and Σ is what
+    those before it leave unknown. No random number is drawn.
+
+    Attributes:
+        modes: k, number of displacement modes.
+        noise: σ over the root mean square displacement from the mean.
+
+    Raises:
+        ConfigError: modes is not a positive whole number, or noise not positive.
+
+    Source: Krause, Singh and Guestrin 2008 (greedy sensor placement), on the modes of Drmač and Gugercin
+        2016, with a particle's three coordinates at once.
+    """
+
+    modes: int = 24
+    noise: float = 1e-3
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not isinstance(self.modes, int) or self.modes < 1:
+            raise ConfigError(f"sampler.modes={self.modes} must be a whole number of at least 1")
+        if not self.noise > 0:
+            raise ConfigError(f"sampler.noise={self.noise} must be positive")
+
+    @override
+    def choose(self, manifold, candidates, size, device="cpu"):
+        components = displacement_components(manifold, self.modes, device)
+        # In units of the noise.
+        components /= self.noise * components.square().sum((1, 2)).mean().sqrt()
+        R = components[torch.as_tensor(candidates, device=components.device)]
+        Sigma = torch.eye(R.shape[2], dtype=R.dtype, device=R.device)
+        one = torch.eye(3, dtype=R.dtype, device=R.device)
+        left = torch.ones(len(R), dtype=torch.bool, device=R.device)
+        chosen = []
+        for _ in range(size):
+            known = R @ Sigma
+            information = torch.logdet(one + known @ R.mT)
+            best = int(torch.where(left, information, -1.0).argmax())
+            gain = known[best]
+            Sigma = Sigma - gain.T @ torch.linalg.solve(one + gain @ R[best].T, gain)
+            left[best] = False
+            chosen.append(best)
+        return candidates[chosen]
+
+
+@torch.no_grad()
+def displacement_components(manifold, count: int, device: str | torch.device = "cpu") -> torch.Tensor:
+    """Principal components [P, 3, k] [m] of g(X, x̂) over the training latents, k ≤ count, largest first.
+
+    Each is a mode times the standard deviation of its amplitude. A part of the latents, evenly spread
+    over the training, is enough for the leading ones.
+    """
+    M = len(manifold.training_latents)
+    latents = manifold.training_latents[torch.linspace(0, M - 1, min(M, _SNAPSHOTS)).long()].to(device)
+    chunks = torch.arange(len(manifold.X)).split(max(1, _CHUNK // (3 * len(latents))))
+
+    def deviations(particles: torch.Tensor) -> torch.Tensor:
+        x = manifold.restrict(particles, device=device).position(latents)
+        return (x - x.mean(0)).permute(1, 2, 0)
+
+    gram = sum(u.T @ u for u in (deviations(particles).flatten(0, 1) for particles in chunks))
+    directions = torch.linalg.eigh(gram).eigenvectors.flip(1)[:, :count] / len(latents) ** 0.5
+    return torch.cat([deviations(particles) @ directions for particles in chunks])
 
 
 def check_well_posed(sample: int, latent_dim: int) -> None:

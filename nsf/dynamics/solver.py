@@ -11,7 +11,7 @@ from nsf.dynamics.interop import captured, on_torch_stream, torch_device, torch_
 from nsf.dynamics.latent import Decoder, LatentState, LatentTrajectory
 from nsf.dynamics.phase import Phase, SearchingPhase
 from nsf.dynamics.projection import GaussNewton, Taylor, stop_reasons
-from nsf.dynamics.sampling import SamplePhase, Sampler, check_well_posed
+from nsf.dynamics.sampling import RandomSampler, SamplePhase, Sampler, check_well_posed
 from nsf.dynamics.stress import Method, StressFromDeformation, StressNeural
 from nsf.errors import ConfigError, ShapeError
 from nsf.mpm import BoundaryArrays, Grid, GridStep, precision_of
@@ -68,7 +68,7 @@ class ReducedMPM:
         for phase in phases:
             check_well_posed(len(phase.particles), manifold.latent_dim)
         self.manifold, self.scene, self.method, self.projector = manifold, scene, method, projector
-        self.integration = integration
+        self.integration, self.phases = integration, phases
         self.precision, self.device = precision_of(precision), warp_device(device)
         self.dtype, self.torch_device = torch_dtype(self.precision), torch_device(self.device)
         self.dt = scene.dt * dt_multiplier
@@ -112,7 +112,7 @@ class ReducedMPM:
         scene,
         manifold,
         parameters: Mapping[str, float] | None = None,
-        sample: int | Sequence[int] | Sampler | None = None,
+        sample: int | Sequence[int] | Sampler | Sequence[SamplePhase] | None = None,
         **options,
     ) -> "ReducedMPM":
         """The reduced solver of a scene.
@@ -121,7 +121,8 @@ class ReducedMPM:
             scene: an `nsf.scenes.Scene`.
             manifold: trained fields.
             parameters: `{name: value}`; the configured value by default.
-            sample: particle indices, a number (drawn at random), a `Sampler`, or None for the scene's number.
+            sample: particle indices, a number (drawn at random), a `Sampler`, the `phases` of an earlier
+                solver, or None for the scene's number.
             **options: further arguments of the constructor.
         """
         name = scene.parameters.name
@@ -132,13 +133,14 @@ class ReducedMPM:
             sample = int(scene.config.scene.reduced.sample)
         if isinstance(sample, int | np.integer):
             check_well_posed(int(sample), manifold.latent_dim)
-            sample = Sampler(size=int(sample))
-        X = scene.particles().X
-        phases = (
-            sample.phases_of(X)
-            if isinstance(sample, Sampler)
-            else [SamplePhase(0.0, _indices(sample, len(X)))]
-        )
+            sample = RandomSampler(size=int(sample))
+        if isinstance(sample, Sampler):
+            device = torch_device(warp_device(options.get("device", "auto")))
+            phases = sample.phases_of(manifold, device)
+        elif len(sample) and isinstance(sample[0], SamplePhase):
+            phases = list(sample)
+        else:
+            phases = [SamplePhase(0.0, _indices(sample, len(manifold.X)))]
         return cls(manifold, scene, phases, parameters, **options)
 
     def _sets_of(self, phases: Sequence[SamplePhase]) -> list[ParticleSets]:

@@ -14,7 +14,7 @@ from omegaconf.errors import ConfigKeyError
 
 from nsf import config as configuration
 from nsf.data import Snapshots, Split, Trajectory
-from nsf.dynamics import ParticleSets, ReducedMPM, Rollout, deploy
+from nsf.dynamics import ParticleSets, ReducedMPM, Rollout, SamplePhase, deploy
 from nsf.dynamics.interop import torch_device
 from nsf.dynamics.sampling import check_well_posed
 from nsf.dynamics.solver import reduced_steps
@@ -80,9 +80,12 @@ class Pipeline:
         if str(c.report.name) in ("", "..") or Path(str(c.report.name)).name != str(c.report.name):
             raise ConfigError(f"report.name={c.report.name} must be one folder's name; set report.folder")
         precision_of(c.precision)
-        for phase in self.sampler.phases_of(self.scene.particles().X):
-            check_well_posed(len(phase.particles), c.latent_dim)
-        self._sets: list[ParticleSets] | None = None
+        X = self.scene.particles().X
+        for region in self.sampler.regions:
+            check_well_posed(region.size, c.latent_dim)
+            region.candidates(X)
+        self._phases: Sequence[SamplePhase] | None = None
+        self._sets: Sequence[ParticleSets] | None = None
         # The device is found once, so that a missing GPU is reported before any work.
         self.device = str(torch_device(warp_device(c.device)))
         self.check_values()
@@ -243,7 +246,7 @@ class Pipeline:
         solver = self.scene.reduced(
             manifold,
             {self.scene.parameters.name: value},
-            self.sampler,
+            self._phases or self.sampler,
             method=self.method,
             projector=self.projector,
             integration=self.integration,
@@ -252,8 +255,8 @@ class Pipeline:
             dt_multiplier=self.config.deploy.dt_multiplier,
             sets=self._sets,
         )
-        # The sets depend on the manifold and the sampler alone: found once for all values.
-        self._sets = solver.sets
+        # These depend on the manifold and the sampler alone: found once for all values.
+        self._phases, self._sets = solver.phases, solver.sets
         return solver
 
     def deploy(self) -> Run:

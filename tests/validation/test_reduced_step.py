@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 import nsf.scenes
-from nsf.dynamics import Integration, NeighbourSearch, Sampler
+from nsf.dynamics import Integration, NeighbourSearch, RandomSampler
 from nsf.dynamics.integration import particle_sets
 from nsf.dynamics.interop import as_matrices, as_scalars, as_vectors
 from nsf.mpm import FP64, BoundaryArrays, Grid, GridStep
@@ -132,7 +132,7 @@ class Spy:
 def test_a_reduced_run_meets_moving_colliders_in_every_phase(strategy, multiplier, tiny, tiny_manifold):
     """S moves as in a step over every particle, with its Δt, at any time and after a change of phase."""
     scene = nsf.scenes.load("sand", [*tiny[1:], *MOVING]).with_parameters({"friction_angle": 26.0})
-    sampler = Sampler(20, phases=[{"start": 0.5, "size": 8}])
+    sampler = RandomSampler(20, phases=[{"start": 0.5, "size": 8}])
     solver = scene.reduced(
         tiny_manifold,
         {"friction_angle": 26.0},

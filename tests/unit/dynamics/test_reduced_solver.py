@@ -15,9 +15,9 @@ from nsf.dynamics import (
     NeighbourSearch,
     ParticleSets,
     ProjectionResult,
+    RandomSampler,
     ReducedMPM,
     SamplePhase,
-    Sampler,
     Taylor,
     rollout,
 )
@@ -81,7 +81,7 @@ def test_names_of_the_python_interface(chain, tiny):
     assert other["x"][:, 2].mean() == pytest.approx(fall, rel=0.2)
 
 
-@pytest.mark.parametrize("sample", [np.arange(30), list(range(30)), Sampler(30), 30], ids=type)
+@pytest.mark.parametrize("sample", [np.arange(30), list(range(30)), RandomSampler(30), 30], ids=type)
 def test_samples_are_indices_a_number_or_a_sampler(solver_of, sample):
     assert solver_of(sample).sample_size == 30
 
@@ -278,14 +278,14 @@ def test_sets_start_with_the_sample(solver_of, corner):
 
 def test_a_change_of_phase_keeps_the_velocity(solver_of, chain):
     """A second phase of the same particles changes nothing: the backward difference goes across it."""
-    plain = Sampler(20, seed=3)
-    phased = Sampler(20, seed=3, phases=[{"start": 0.25, "size": 20}, {"start": 0.7, "size": 20}])
+    plain = RandomSampler(20, seed=3)
+    phased = RandomSampler(20, seed=3, phases=[{"start": 0.25, "size": 20}, {"start": 0.7, "size": 20}])
     one, other = run(solver_of(plain)), run(solver_of(phased))
     np.testing.assert_allclose(one.xhat, other.xhat, rtol=0, atol=1e-12)
 
 
 def test_phases_begin_when_they_say(solver_of):
-    solver = solver_of(Sampler(40, phases=[{"start": 0.5, "size": 8}]))
+    solver = solver_of(RandomSampler(40, phases=[{"start": 0.5, "size": 8}]))
     assert solver.sample_size == 40
     solver.step(12)
     assert solver._phase.s == 40
@@ -297,10 +297,12 @@ def test_phases_begin_when_they_say(solver_of):
 
 def test_every_phase_needs_enough_particles(solver_of):
     with pytest.raises(ProjectionError, match=r"\|S\|=1 gives 3 equations for r=4"):
-        solver_of(Sampler(40, phases=[{"start": 0.5, "size": 1}]))
+        solver_of(RandomSampler(40, phases=[{"start": 0.5, "size": 1}]))
 
 
-@pytest.mark.parametrize("sample", [20, Sampler(20, phases=[{"start": 0.25, "size": 8}])], ids=["one", "two"])
+@pytest.mark.parametrize(
+    "sample", [20, RandomSampler(20, phases=[{"start": 0.25, "size": 8}])], ids=["one", "two"]
+)
 def test_timed_steps_are_steps(solver_of, sample):
     timed, plain = solver_of(sample), solver_of(sample)
     timer = StageTimer("cpu")
@@ -364,7 +366,7 @@ def test_divergence_names_its_step(solver_of):
 
 
 def test_too_small_a_sample(chain, tiny_manifold):
-    for sample in (1, [7], Sampler(1)):
+    for sample in (1, [7], RandomSampler(1)):
         with pytest.raises(ProjectionError) as refusal:
             chain.scene.reduced(tiny_manifold, ANGLE, sample, device="cpu")
         assert str(refusal.value) == "|S|=1 gives 3 equations for r=4 unknowns; choose |S| >= 2"

@@ -1,12 +1,14 @@
 """Sample particles by number, region and phase of time (paper section 5.4)."""
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
-from nsf.dynamics import Sampler
-from nsf.dynamics.sampling import check_well_posed
+from nsf.dynamics import GreedySampler, RandomSampler
+from nsf.dynamics.sampling import check_well_posed, displacement_components
 from nsf.errors import ConfigError, ProjectionError
 
 
@@ -15,8 +17,13 @@ def X():
     return np.random.default_rng(5).random((200, 3))
 
 
+def of(X):
+    """As much of a manifold as a random choice needs."""
+    return SimpleNamespace(X=torch.as_tensor(X))
+
+
 def drawn(X, **settings):
-    return [phase.particles for phase in Sampler(**settings).phases_of(X)]
+    return [phase.particles for phase in RandomSampler(**settings).phases_of(of(X))]
 
 
 def test_size_and_range(X):
@@ -52,8 +59,8 @@ def test_region(X):
 
 
 def test_a_later_smaller_phase_is_a_part_of_the_earlier(X):
-    sampler = Sampler(size=60, phases=[{"start": 0.5, "size": 25}])
-    first, later = sampler.phases_of(X)
+    sampler = RandomSampler(size=60, phases=[{"start": 0.5, "size": 25}])
+    first, later = sampler.phases_of(of(X))
     assert (first.start, later.start) == (0.0, 0.5)
     assert (len(first.particles), len(later.particles)) == (60, 25)
     assert set(later.particles) < set(first.particles)
@@ -109,3 +116,61 @@ def test_fewer_equations_than_unknowns():
     with pytest.raises(ProjectionError, match=r"choose \|S\| >= 3$"):
         check_well_posed(2, 7)
     check_well_posed(2, 6)  # exactly as many equations as unknowns
+
+
+def test_displacement_components(tiny_manifold):
+    """They are those of a singular value decomposition of all snapshots."""
+    components = displacement_components(tiny_manifold, 5).flatten(0, 1)
+    u = tiny_manifold.restrict().position(tiny_manifold.training_latents)
+    u = (u - u.mean(0)).flatten(1).T / len(u) ** 0.5
+    left, singular, _ = torch.linalg.svd(u, full_matrices=False)
+    assert len(u.T) <= 256  # so that none is passed over
+    assert torch.allclose(components.norm(dim=0), singular[:5], rtol=1e-6)
+    assert torch.allclose((left[:, :5] * components).sum(0).abs(), singular[:5], rtol=1e-6)
+
+
+def information(manifold, particles, modes=12, noise=1e-3) -> float:
+    """What positions of the particles tell about the amplitudes, in closed form [nat]."""
+    R = displacement_components(manifold, modes)
+    R = R / (noise * R.square().sum((1, 2)).mean().sqrt())
+    R = R[torch.as_tensor(particles)].flatten(0, 1)
+    return 0.5 * float(torch.logdet(torch.eye(len(R), dtype=R.dtype) + R @ R.T))
+
+
+@pytest.mark.parametrize("size", [1, 2, 8, 30])
+def test_greedy_tells_more_than_any_of_many_random_samples(tiny_manifold, size):
+    chosen = GreedySampler(size, modes=12).phases_of(tiny_manifold)[0].particles
+    draws = [np.random.default_rng(seed).permutation(500)[:size] for seed in range(200)]
+    assert information(tiny_manifold, chosen) > max(information(tiny_manifold, draw) for draw in draws)
+
+
+def test_greedy_takes_the_best_particle_at_each_turn(tiny_manifold):
+    everything = np.arange(500)
+    order = GreedySampler(3, modes=12).choose(tiny_manifold, everything, 3)
+    for taken in (1, 2):
+        before = order[:taken].tolist()
+        rest = [p for p in range(500) if p not in before]
+        told = [information(tiny_manifold, [*before, p]) for p in rest]
+        assert rest[int(np.argmax(told))] == order[taken]
+
+
+def test_a_smaller_greedy_sample_is_a_part_of_a_larger(tiny_manifold):
+    few, many = (GreedySampler(n, modes=6).phases_of(tiny_manifold)[0].particles for n in (5, 40))
+    assert len(set(many)) == 40
+    assert set(few) < set(many)
+
+
+def test_greedy_keeps_to_its_region(tiny_manifold):
+    X = tiny_manifold.X.numpy()
+    middle = float(np.median(X[:, 0]))
+    sampler = GreedySampler(9, lower=[middle, 0.0, 0.0], phases=[{"start": 0.5, "size": 4}])
+    first, later = sampler.phases_of(tiny_manifold)
+    assert (X[first.particles][:, 0] >= middle).all()
+    assert len(later.particles) == 4
+
+
+@pytest.mark.parametrize("settings", [{"modes": 0}, {"modes": 2.5}, {"noise": 0.0}, {"noise": -1.0}], ids=str)
+def test_greedy_refuses(settings):
+    key, value = next(iter(settings.items()))
+    with pytest.raises(ConfigError, match=rf"sampler\.{key}={value}"):
+        GreedySampler(10, **settings)
