@@ -134,6 +134,11 @@ def _of_variant(v: _Variant, folder: Path, prefix: str) -> list[Picture]:
         )
         pictures.append(Picture([f"{prefix}animation.gif"], _held_out(caption, v), v.runs))
         add(
+            "strip", render.strip(motions[0], name, unit, v.floor),
+            f"Whole bodies over time at {name} {parameter_text(motions[0].parameter, '', unit)}: full-order "
+            "above, reduced below.", kinds=("png",),
+        )  # fmt: skip
+        add(
             "final-shapes", render.final_shapes(v.motions(ROWS), name, unit, v.floor),
             "The last frame of each parameter value, the front half cut away; the right column shows how far "
             "each particle of the reduced model lies from where the full-order one puts it.", kinds=("png",),

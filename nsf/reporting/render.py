@@ -66,6 +66,37 @@ def final_shapes(
     return sheet.fig
 
 
+def strip(
+    motion: Motion, name: str = "parameter", unit: str = "", floor: float | None = None, count: int = 5
+) -> Figure:
+    """The motion of one parameter value in `count` pictures: full-order above, reduced below, whole bodies.
+
+    Args:
+        motion: positions in metres.
+        name, unit: of the problem parameter.
+        floor: height of the floor line [m]; None draws none.
+    """
+    frames = np.unique(np.linspace(0, len(motion.t) - 1, count).round().astype(int))
+    stress = _Scale.up_to(np.percentile(von_mises(motion.tau_full), CLIP), STRESS_COLORS, _PA)
+    view = View.around(motion.x_full[frames].reshape(-1, 3), width=420, floor=floor)
+    radius = _radius([motion])
+    value = parameter_text(motion.parameter, name, unit)
+    with styled():
+        sheet = _Sheet(view, 2, len(frames), [f"t = {motion.t[k]:.3g} s" for k in frames])
+        rows = (
+            ("full-order", motion.x_full, motion.tau_full),
+            ("reduced", motion.x_reduced, motion.tau_reduced),
+        )
+        for row, (model, x, tau) in enumerate(rows):
+            sheet.name_row(row, f"{model}, {value}")
+            for column, k in enumerate(frames):
+                sheet.show(row, column, view.picture(x[k], stress.colors(von_mises(tau[k])), radius))
+        sheet.note_stop(1, motion)
+        sheet.color_bar(stress, 0, len(frames) - 1, "von Mises equivalent of the Kirchhoff stress")
+        sheet.scale_bar()
+    return sheet.fig
+
+
 def animation(
     motions: list[Motion], path, name: str = "parameter", unit: str = "", floor: float | None = None,
     frames: int = 31, width: int = 380, max_bytes: int = GIF_BYTES,

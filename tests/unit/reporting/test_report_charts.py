@@ -11,7 +11,7 @@ from nsf import config
 from nsf.reporting import charts, cost_charts
 from nsf.reporting.camera import Camera, View
 from nsf.reporting.point import point_chart, point_response
-from nsf.reporting.render import animation, final_shapes, von_mises
+from nsf.reporting.render import animation, final_shapes, strip, von_mises
 from nsf.reporting.sources import Motion
 from nsf.reporting.style import save
 
@@ -42,6 +42,18 @@ def test_error_over_time_spans_the_run_where_one_diverged_early(series):
     lost.loc[lost["t"] > 0.1, ["delta", "displacement_error"]] = np.inf
     for panel in charts.error_over_time(lost).axes:
         assert panel.get_xlim()[1] >= series["t"].max()
+
+
+def test_a_strip_shows_both_models_from_the_first_frame_to_the_last():
+    (motion,) = motions(1)
+    figure = strip(motion)
+    told = [text.get_text() for text in figure.texts]
+    assert "t = 0 s" in told
+    assert "t = 0.6 s" in told
+    assert [text.split(",")[0] for text in told if "," in text] == ["full-order", "reduced"]
+    pictures = [panel.images[0].get_array() for panel in figure.axes if panel.images]
+    assert len(pictures) == 10
+    assert not np.array_equal(pictures[0], pictures[4])
 
 
 def test_pictures_of_a_diverged_run_say_when_it_stopped():
