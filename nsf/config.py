@@ -11,7 +11,7 @@ import math
 import re
 import types
 import typing
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
@@ -139,7 +139,7 @@ def build(config: DictConfig, where: str):
     except HydraException as error:
         cause = error.__cause__
         if isinstance(cause, NSFError):
-            raise cause from error
+            raise type(cause)(f"{where}: {cause}") from error
         detail = str(cause or error).splitlines()[0]
         if isinstance(cause, TypeError) and "unexpected keyword" in detail:
             raise ConfigError(
@@ -203,11 +203,17 @@ def length(key: str, value) -> float:
     return float(value)
 
 
-def check_sweep(overrides: Sequence[str], config_name: str = "config") -> None:
+def check_sweep(
+    overrides: Sequence[str], config_name: str = "config", check: Callable[[DictConfig], object] | None = None
+) -> None:
     """Compose with each value of a multirun once, so that a mistake shows before the first job.
 
+    Args:
+        overrides, config_name: as for `load`; overrides may have several values.
+        check: called with each configuration; raises where it refuses one.
+
     Raises:
-        ConfigError: see `load`.
+        ConfigError: see `load`; and whatever `check` raises.
     """
     try:
         parsed = OverridesParser.create().parse_overrides(list(overrides))
@@ -223,7 +229,9 @@ def check_sweep(overrides: Sequence[str], config_name: str = "config") -> None:
     first = [values[0] for values in options]
     for at, values in enumerate(options):
         for value in values:
-            load([*first[:at], value, *first[at + 1 :]], config_name)
+            config = load([*first[:at], value, *first[at + 1 :]], config_name)
+            if check is not None:
+                check(config)
 
 
 def _keys(node, prefix: str = "") -> list[str]:
@@ -242,6 +250,8 @@ def _explain(error: Exception, config_name: str, overrides: Sequence[str]) -> st
     if missing:
         key = missing.group(1)
         known = _known_keys(config_name, [o for o in overrides if not o.lstrip("+~").startswith(key)])
+        if key in known:
+            return f"{key!r} takes no keys beyond its own; set them one by one, or write a scene's yaml"
         near = difflib.get_close_matches(key, known, n=3, cutoff=0.5)
         hint = f"; did you mean {' or '.join(near)}?" if near else "; see `nsf --help` for the groups"
         return f"unknown key {key!r}{hint}"

@@ -134,13 +134,21 @@ class Run:
         manifest = self.manifest
         if manifest.get("status") != "complete" or manifest.get("hash") != self.hash:
             return False
-        try:
-            return all(
-                (self.path / output["path"]).stat().st_size == output["bytes"]
-                for output in manifest["outputs"]
-            )
-        except (OSError, KeyError, TypeError):
-            return False
+        return not self._lost(manifest)
+
+    def _lost(self, manifest: dict[str, Any]) -> list[str]:
+        """Outputs of the manifest that are missing or of another size."""
+
+        def whole(output) -> bool:
+            try:
+                return (self.path / output["path"]).stat().st_size == output["bytes"]
+            except (OSError, KeyError, TypeError):
+                return False
+
+        outputs = manifest.get("outputs")
+        if not isinstance(outputs, list):
+            return ["manifest.json"]
+        return [str(o["path"]) if isinstance(o, dict) else "manifest.json" for o in outputs if not whole(o)]
 
     def require(self) -> "Run":
         """This run, if it is complete.
@@ -152,7 +160,8 @@ class Run:
             return self
         manifest = self.manifest
         status = manifest.get("status", "not there")
-        state = "complete, but outputs are missing or cut short" if status == "complete" else status
+        lost = ", ".join(self._lost(manifest))
+        state = f"not whole ({lost} missing or cut short)" if status == "complete" else status
         why = f" ({manifest['error']})" if manifest.get("error") else ""
         raise MissingRunError(
             f"{self.path} is {state}{why}; run `nsf {self.stage} scene={self.scene}` with the same keys"

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from numbers import Real
 
 import numpy as np
 
@@ -19,7 +20,9 @@ def numbers(key: str, values, unit: str = "", count: int | None = None) -> np.nd
     Raises:
         ConfigError: quotes the key and the values.
     """
-    finite = is_list(values) and all(isinstance(x, int | float) and math.isfinite(x) for x in values)
+    finite = is_list(values) and all(
+        isinstance(x, Real) and not isinstance(x, bool) and math.isfinite(x) for x in values
+    )
     if not finite or count not in (None, len(values)):
         wanted = "a list of finite numbers" if count is None else f"{count} finite numbers"
         raise ConfigError(f"{key}={values}{' ' * bool(unit)}{unit} must be {wanted}")

@@ -32,9 +32,10 @@ class SolverCost:
     Attributes:
         step_ms: median over the trials, each a whole run from t = 0, of the mean time of a step,
             nothing timed inside [ms]; step_ms_p10, step_ms_p90: quantiles.
-        total_ms: median time of a whole run's steps [ms], set-up and warm-up left out.
+        total_ms: median over the trials of the time of all steps of a run, the first ones, which load
+            and capture, included [ms]; building the solver is not.
         stages: median over steps spread through a run of each stage's time [ms], synchronised, so
-            their sum exceeds a step.
+            their sum may exceed a step.
         memory_mib: peak of every allocator during the first run, beyond what was held before it [MiB].
         allocators: the same by allocator [MiB].
         trials: number of runs.
@@ -62,22 +63,24 @@ def measure(subjects: dict[str, Subject], trials: int, device: str) -> dict[str,
         trials: runs of each.
         device: `cpu`, `cuda` or `cuda:N`.
     """
-    memory, times = {}, {name: [] for name in subjects}
+    memory: dict[str, tuple] = {}
+    times: dict[str, list[tuple[float, float]]] = {name: [] for name in subjects}
     for trial in range(trials):
         for name, subject in subjects.items():
             if trial == 0:
-                ms, *memory[name] = _first_trial(subject, device)
+                taken, *memory[name] = _first_trial(subject, device)
             else:
-                ms = _step_ms(subject.build(), subject.steps, device)
-            times[name].append(ms)
+                taken = _times(subject.build(), subject.steps, device)
+            times[name].append(taken)
     found = {}
     for name, subject in subjects.items():
-        p10, median, p90 = np.percentile(times[name], [10, 50, 90]).tolist()
+        steps, totals = np.array(times[name]).T
+        p10, median, p90 = np.percentile(steps, [10, 50, 90]).tolist()
         found[name] = SolverCost(
             step_ms=median,
             step_ms_p10=p10,
             step_ms_p90=p90,
-            total_ms=median * subject.steps,
+            total_ms=float(np.median(totals)),
             stages=_stages(subject, trials, device),
             memory_mib=memory[name][0],
             allocators=memory[name][1],
@@ -86,28 +89,31 @@ def measure(subjects: dict[str, Subject], trials: int, device: str) -> dict[str,
     return found
 
 
-def _first_trial(subject: Subject, device: str) -> tuple[float, float, dict[str, float]]:
-    """Time of a step, and peak memory beyond what was held before, whole and by allocator [MiB]."""
+def _first_trial(subject: Subject, device: str) -> tuple[tuple[float, float], float, dict[str, float]]:
+    """Times as `_times`, and peak memory beyond what was held before, whole and by allocator [MiB]."""
     gc.collect()  # what an earlier solver left behind; slow, so only where memory is measured
     with MemoryProbe(device) as before:
         pass
     solver = subject.build()
     gc.collect()
     with MemoryProbe(device, nbytes=lambda: solver.nbytes) as probe:
-        ms = _step_ms(solver, subject.steps, device)
-    return ms, probe.peak_mib - before.peak_mib, probe.allocators
+        taken = _times(solver, subject.steps, device)
+    return taken, probe.peak_mib - before.peak_mib, probe.allocators
 
 
-def _step_ms(solver, steps: int, device: str) -> float:
-    """Mean time of a step over a whole run [ms], those that warm up left out."""
+def _times(solver, steps: int, device: str) -> tuple[float, float]:
+    """Mean time of a step over a whole run, those that warm up left out, and time of all steps [ms]."""
     wait = synchronizer(device)
     warm = min(_WARM_UP, steps - 1)
+    wait()
+    begun = time.perf_counter()
     solver.step(warm)
     wait()
     started = time.perf_counter()
     solver.step(steps - warm)
     wait()
-    return 1e3 * (time.perf_counter() - started) / (steps - warm)
+    ended = time.perf_counter()
+    return 1e3 * (ended - started) / (steps - warm), 1e3 * (ended - begun)
 
 
 def _stages(subject: Subject, samples: int, device: str) -> dict[str, float]:

@@ -69,10 +69,11 @@ def check_colliders(colliders: Sequence[Collider], grid: GridGeometry, dt: float
     """
     for index, collider in enumerate(colliders):
         which = f"collider {index} ({collider.name}, kind={collider.kind})"
+        blade = ", or for a blade kind=slip" if collider.name == "cuboid" else ""
         if grid.dx > collider.coarsest_dx * (1.0 + _ROUND_OFF):
             raise ConfigError(
                 f"{which} needs dx of at most {_rounded_down(collider.coarsest_dx)} m, not {grid.dx:g} m; "
-                "choose a finer grid, a larger solid or, for a blade, kind=slip"
+                f"choose a finer grid or a larger solid{blade}"
             )
         speed = collider.top_speed(np.array(grid.upper))
         if speed * dt > MAX_ADVECTIVE_CFL * grid.dx * (1.0 + _ROUND_OFF):

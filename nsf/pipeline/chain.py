@@ -24,7 +24,7 @@ from nsf.kinematics.manifold import Manifold
 from nsf.kinematics.training import TRACKING, train
 from nsf.mpm import FP32, FP64, precision_of
 from nsf.mpm.device import warp_device
-from nsf.mpm.stability import check_time_step
+from nsf.mpm.stability import check_colliders, check_time_step
 from nsf.pipeline import results
 from nsf.pipeline.simulation import Job, simulate
 from nsf.runs import Run
@@ -99,8 +99,10 @@ class Pipeline:
         """
         for value in (*self.split.train, *self.split.validation, *self.split.test):
             scene = self.scene.with_parameters({self.scene.parameters.name: value})
-            dx = scene.grid.dx
-            check_time_step(scene.particles(), scene.initial_velocity(), dx, scene.dt)
+            grid = scene.grid
+            check_time_step(scene.particles(), scene.initial_velocity(), grid.dx, scene.dt)
+            for multiplier in (1.0, self.config.deploy.dt_multiplier):
+                check_colliders(scene.colliders, grid, multiplier * scene.dt)
 
     @property
     def held_out(self) -> tuple[float, ...]:

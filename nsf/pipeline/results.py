@@ -59,6 +59,9 @@ def rows(
         "device": torch.cuda.get_device_name(device) if device.startswith("cuda") else "cpu",
         "commit": commit,
     }
+    # What a step costs whose particles have left the grid is no one's speedup.
+    costly = ("step_ms_reduced", "speedup_step", "speedup_total", "memory_reduced_mib")
+    lost = measured | dict.fromkeys(costly, math.nan)
     found = []
     for rollout, comparison in zip(rollouts, comparisons, strict=True):
         own = {
@@ -70,7 +73,7 @@ def rows(
             "displacement_error": comparison.displacement_error,
             "stress_error": comparison.stress_error,
         }
-        found.append(variant | own | measured)
+        found.append(variant | own | (lost if rollout.diverged >= 0 else measured))
     return pd.DataFrame(found)
 
 

@@ -164,7 +164,7 @@ def _parse(path: str) -> tuple[np.ndarray, np.ndarray]:
         import trimesh
     except ImportError as error:
         raise ConfigError(
-            f"mesh={path} needs trimesh, which is not installed; pip install 'nsf[mesh]'"
+            f"mesh={path} needs trimesh, which is not installed; pip install trimesh"
         ) from error
     content = io.BytesIO(_read(path))
     try:

@@ -53,6 +53,11 @@ class Body:
             raise ConfigError(f"particles={self.particles} must be a whole number, at least 1")
         if self.particles_per_cell is not None and not 0 < self.particles_per_cell < math.inf:
             raise ConfigError(f"particles_per_cell={self.particles_per_cell} must be positive and finite")
+        for key, kind in (("shape", Shape), ("weakness", Weakness | None)):
+            if not isinstance(getattr(self, key), kind):
+                raise ConfigError(
+                    f"{key}={getattr(self, key)} must be built; give it a _target_: nsf.scenes.…"
+                )
         if not self.density > 0:
             raise ConfigError(f"density={self.density} kg/m³ must be positive")
         vector("velocity", self.velocity, "m/s")

@@ -43,6 +43,10 @@ class Weakness:
     perturbation: float = 0.0
 
     def __post_init__(self):
+        if not isinstance(self.region, Shape):
+            raise ConfigError(
+                f"weakness.region={self.region} must be a shape; give it a _target_: nsf.scenes.…"
+            )
         for name in ("factor", "share", "perturbation"):
             number(f"weakness.{name}", getattr(self, name), least=0.0)
         number("weakness.seed", self.seed, least=0, whole=True)

@@ -296,11 +296,11 @@ def test_a_diverged_rollout_is_infinite_and_never_nan(copied, pipeline_at):
     pipeline.run("evaluate")
     assert any("friction_angle=26 diverged at step" in line and "∞" in line for line in said)
     assert pipeline.deployment.manifest["metrics"]["diverged"] == [26.0]
-    text = (pipeline.evaluation.path / "results.csv").read_text()
-    assert "nan" not in text.lower()
     results = pd.read_csv(pipeline.evaluation.path / "results.csv")
     assert (results[["delta", "displacement_error", "stress_error"]] == np.inf).all().all()
-    assert not results.isna().any().any()
+    costs = ["step_ms_reduced", "speedup_step", "speedup_total", "memory_reduced_mib"]
+    assert results[costs].isna().all().all()  # of a run that has left the grid
+    assert not results.drop(columns=costs).isna().any().any()
     frames = np.load(pipeline.evaluation.path / "frames.npz")
     assert np.isfinite(frames["x_reduced"]).all()
     for name in ("cost.json", "summary.json"):

@@ -163,6 +163,11 @@ def test_values_of_the_wrong_type_name_key_and_value(override, quoted):
         config.build(config.load([override])[group], group)
 
 
+def test_a_node_cannot_be_replaced_by_other_keys():
+    with pytest.raises(ConfigError, match=r"scene.bodies.column.shape' takes no keys beyond its own"):
+        config.load(["scene.bodies.column.shape={_target_:nsf.scenes.Ball,centre:[0.5,0.5,0.5]}"])
+
+
 def test_a_misspelt_key_in_a_node_is_named():
     with pytest.raises(ConfigError, match=r"sampler: .*'sise'.*known keys: size, "):
         config.build(config.load(["+sampler.sise=3"]).sampler, "sampler")

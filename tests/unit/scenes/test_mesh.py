@@ -346,7 +346,7 @@ class TestRefused:
         path = write(tmp_path, cube())
         mesh._surface.cache_clear()
         monkeypatch.setitem(sys.modules, "trimesh", None)
-        refused(path, "pip install 'nsf[mesh]'")
+        refused(path, "pip install trimesh")
 
     @pytest.mark.parametrize(
         ("values", "quoted"),

@@ -159,6 +159,22 @@ def test_refused(overrides, quoted):
         load("sand", [FEW, *overrides])
 
 
+@pytest.mark.parametrize(
+    ("overrides", "quoted"),
+    [
+        (
+            ["+scene.bodies.column.weakness.factor=0.5"],
+            "scene.bodies.column: weakness={'factor': 0.5} must be",
+        ),
+        (["~scene.bodies.column.shape._target_"], "scene.bodies.column: shape="),
+        (["scene.colliders.floor.normal=[0, 0, 0]"], "scene.colliders.floor: half-space.normal=[0, 0, 0]"),
+    ],
+)
+def test_a_refusal_names_the_node(overrides, quoted):
+    with pytest.raises(ConfigError, match=re.escape(quoted)):
+        load("sand", [FEW, *overrides])
+
+
 def test_unknown_scene():
     with pytest.raises(ConfigError, match=r"unknown scene=sandd; choose one of .*did you mean sand\?"):
         load("sandd")
