@@ -127,10 +127,11 @@ def _of_variant(v: _Variant, folder: Path, prefix: str) -> list[Picture]:
     motions = v.motions(ANIMATED)
     if motions:
         render.animation(motions, folder / f"{prefix}animation.gif", name, unit, v.floor)
+        cut = render.is_cut_open(motions)
         told = f"{name} " + " and ".join(parameter_text(m.parameter, "", unit) for m in motions)
         caption = (
-            f"The full-order model (left) and the reduced one (right) at {told}, held out from training; "
-            "the front half is cut away."
+            f"The full-order model (left) and the reduced one (right) at {told}, held out from training"
+            f"{'; the front half is cut away' if cut else ''}."
         )
         pictures.append(Picture([f"{prefix}animation.gif"], _held_out(caption, v), v.runs))
         add(
@@ -140,8 +141,9 @@ def _of_variant(v: _Variant, folder: Path, prefix: str) -> list[Picture]:
         )  # fmt: skip
         add(
             "final-shapes", render.final_shapes(v.motions(ROWS), name, unit, v.floor),
-            "The last frame of each parameter value, the front half cut away; the right column shows how far "
-            "each particle of the reduced model lies from where the full-order one puts it.", kinds=("png",),
+            f"The last frame of each parameter value{', the front half cut away' if cut else ''}; "
+            "the right column shows how far each particle of the reduced model lies from where the "
+            "full-order one puts it.", kinds=("png",),
         )  # fmt: skip
     add(
         "error-over-time", charts.error_over_time(held_out, name=name, unit=unit),

@@ -20,6 +20,7 @@ from nsf.reporting.style import INK, MUTED, WARNING, WIDTH, styled
 STRESS_COLORS, DIFFERENCE_COLORS = "viridis", "magma"
 CLIP = 97.0  # [%] percentile of the full-order stress at which the colour scale ends
 GIF_BYTES = int(2.5 * 2**20)
+_THIN = 0.5  # of the larger horizontal extent: below it a body, as a slice or a frame, counts as thin
 
 
 def von_mises(tau: np.ndarray) -> np.ndarray:
@@ -35,7 +36,7 @@ def final_shapes(
 ) -> Figure:
     """Last frame of each parameter value: full-order, reduced, and the distance between the two.
 
-    The front half is cut away: a free surface carries little stress, the inside does.
+    The front half is cut away (`is_cut_open`): a free surface carries little stress, the inside does.
 
     Args:
         motions: one a row; positions in metres.
@@ -240,8 +241,16 @@ class _Sheet:
         return self.fig.text(left / self._size[0], low / self._size[1], text, va="baseline", **style)
 
 
+def is_cut_open(motions: list[Motion]) -> bool:
+    """Whether pictures cut the front half away: not of a thin body, which hides nothing inside."""
+    extent = np.ptp(motions[0].x_full[0][:, :2], axis=0)
+    return bool(extent.min() > _THIN * extent.max())
+
+
 def _cut_open(motions: list[Motion]) -> list[Motion]:
     """The particles that start behind the middle, as the camera sees them; the same of every motion."""
+    if not is_cut_open(motions):
+        return motions
     X = motions[0].x_full[0].astype(float)
     toward = Camera.facing(motions[0].x_full).axes[2] * (1.0, 1.0, 0.0)
     behind = (X - X.mean(axis=0)) @ toward <= 0.0

@@ -11,7 +11,7 @@ from nsf import config
 from nsf.reporting import charts, cost_charts
 from nsf.reporting.camera import Camera, View
 from nsf.reporting.point import point_chart, point_response
-from nsf.reporting.render import animation, final_shapes, strip, von_mises
+from nsf.reporting.render import animation, final_shapes, is_cut_open, strip, von_mises
 from nsf.reporting.sources import Motion
 from nsf.reporting.style import save
 
@@ -164,6 +164,19 @@ def test_final_shapes_have_a_row_a_value_and_units():
     assert "friction angle 32.5°, t = 0.6 s" in told
     assert any(text.endswith("[mm]") for text in told)
     assert any(text.endswith("Pa]") for text in told)
+
+
+def test_a_thin_body_is_shown_whole():
+    """Particles in front of its middle are seen; those of a deep body are cut away."""
+    flat = (1.0, 0.1, 1.0)
+    for scale, whole in (((1.0, 1.0, 1.0), False), (flat, True)):
+        shown = [replace(m, x_full=m.x_full * scale, x_reduced=m.x_reduced * scale) for m in motions(1)]
+        assert is_cut_open(shown) is not whole
+        X = shown[0].x_full[0]
+        front = (X - X.mean(0)) @ (Camera.facing(X).axes[2] * (1.0, 1.0, 0.0)) > 0.0
+        relaxed = [replace(shown[0], tau_full=np.where(front[:, None], 0.0, shown[0].tau_full))]
+        one, other = (final_shapes(some).axes[0].images[0].get_array() for some in (shown, relaxed))
+        assert (one != other).any() == whole
 
 
 def test_animation_gives_way_to_the_limit(tmp_path):
