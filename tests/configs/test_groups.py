@@ -37,3 +37,15 @@ def test_material_follows_a_path(name, path):
     tau = drive(material, deformation_path(path, 0.01, 5)[1], dt=1e-3)
     assert np.isfinite(tau).all()
     assert np.abs(tau - tau.swapaxes(1, 2)).max() <= 1e-9 * np.abs(tau).max()
+
+
+def test_a_scene_may_state_its_sample_regions():
+    """`sampler=region` is cake's default, a choice for every scene, and can be turned off."""
+    cake = Pipeline(config.load(["scene=cake", "device=cpu"])).sampler
+    assert [r.size for r in cake.regions] == [700, 400]
+    assert [r.start for r in cake.regions] == [0.0, 0.5]
+    assert cake.regions[0].lower == cake.regions[1].lower == [0.38, 0.38, 0.0]
+    (plain,) = Pipeline(config.load(["scene=cake", "sampler=random", "device=cpu"])).sampler.regions
+    assert (plain.size, plain.lower) == (700, None)
+    (whole,) = Pipeline(config.load(["scene=sand", "sampler=region", "device=cpu"])).sampler.regions
+    assert (whole.size, whole.lower, whole.upper) == (150, [0.0] * 3, [1.0] * 3)
