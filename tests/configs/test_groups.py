@@ -44,7 +44,7 @@ def test_a_scene_may_state_its_sample_regions():
     cake = Pipeline(config.load(["scene=cake", "device=cpu"])).sampler
     assert [r.size for r in cake.regions] == [700, 400]
     assert [r.start for r in cake.regions] == [0.0, 0.5]
-    assert cake.regions[0].lower == cake.regions[1].lower == [0.38, 0.38, 0.0]
+    assert cake.regions[0].lower == cake.regions[1].lower == [0.45, 0.45, 0.0]
     (plain,) = Pipeline(config.load(["scene=cake", "sampler=random", "device=cpu"])).sampler.regions
     assert (plain.size, plain.lower) == (700, None)
     (whole,) = Pipeline(config.load(["scene=sand", "sampler=region", "device=cpu"])).sampler.regions
