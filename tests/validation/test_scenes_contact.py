@@ -33,6 +33,10 @@ def angular_momentum(x, v, mass):
     return (mass * np.cross(x, v)).sum(-2)
 
 
+def kinetic_energy(v, mass):
+    return 0.5 * (mass * v**2).sum((-2, -1))
+
+
 class TestJellyCube:
     @staticmethod
     def spin(*overrides):
@@ -77,3 +81,37 @@ class TestJellyCube:
             drift[name] = np.linalg.norm(after - before) / np.linalg.norm(before)
         assert drift["free"] < 1e-12
         assert drift["held"] > 0.1
+
+
+class TestToothpaste:
+    @staticmethod
+    def lay(angle, *overrides):
+        """The run, its plane, and the speed [m/s] of its middle down the brush in the last tenth."""
+        scene, x, v, mass = run("toothpaste", angle, *overrides, every=10)
+        plane = scene.colliders[0]
+        down = np.cross([0.0, 1.0, 0.0], plane.extents)
+        creep = (mean(x[-1], mass) - mean(x[-2], mass)) @ down / (10 * scene.dt)
+        return scene, plane, x, v, mass, creep
+
+    @pytest.fixture(scope="class")
+    @classmethod
+    def laid(cls):
+        return {angle: cls.lay(angle) for angle in (0.0, 10.0, 20.0)}
+
+    def test_comes_to_lie_on_the_brush(self, laid):
+        for angle, (scene, plane, x, v, mass, _) in laid.items():
+            energy = kinetic_energy(v, mass)
+            assert energy[-1] < 0.03 * energy.max(), angle
+            height = (x[-1] - plane.position) @ plane.extents
+            assert height.min() > -scene.dx
+            # Thinner than the ribbon was, as it spreads.
+            assert height.max() < 2.0 * scene.bodies[0].shape.radius
+
+    def test_creeps_down_faster_on_a_steeper_brush(self, laid):
+        creep = {angle: case[-1] for angle, case in laid.items()}
+        assert abs(creep[0.0]) < 0.1 * creep[10.0]
+        assert creep[20.0] > 1.3 * creep[10.0]
+
+    def test_yield_stress_holds_it(self, laid):
+        """Twenty times the yield stress, and it stays where it fell."""
+        assert abs(self.lay(20.0, "material.yield_stress=1.0")[-1]) < 0.2 * laid[20.0][-1]
