@@ -83,6 +83,46 @@ class TestJellyCube:
         assert drift["held"] > 0.1
 
 
+class TestSquishyBall:
+    @pytest.fixture(scope="class")
+    @classmethod
+    def tilted(cls):
+        return {angle: run("squishy_ball", angle, until=0.75, every=8) for angle in (15.0, 0.0, -15.0)}
+
+    def test_rolls_down_the_plane(self, tilted):
+        """To +x and about +y at a positive inclination, the reverse at a negative one, nowhere at none."""
+        moved, spin = {}, {}
+        for angle, (scene, x, v, mass) in tilted.items():
+            moved[angle] = (mean(x[-1], mass) - mean(scene.particles().X, mass))[0]
+            spin[angle] = angular_momentum(x[-1], v[-1], mass)
+        for angle in (15.0, -15.0):
+            assert moved[angle] * angle > 0
+            assert spin[angle][1] * angle > 0
+            assert abs(moved[angle]) > 0.04
+            assert abs(moved[0.0]) < 0.2 * abs(moved[angle])
+            assert abs(spin[0.0][1]) < 0.2 * abs(spin[angle][1])
+
+    def test_tentacles_touch_each_other(self, tilted):
+        """Particles of different tentacles share a cell, hence every node about it."""
+        scene, x, _, _ = tilted[15.0]
+        shape, X = scene.bodies[0].shape, scene.particles().X
+        outer = np.linalg.norm(X - shape.centre, axis=1) > shape.radius + 0.5 * shape.length
+        # Farther apart than this at rest, two of them are not of one tentacle.
+        widest = np.hypot(0.5 * shape.length, 2.0 * shape.tentacle_radius)
+
+        def touching(positions):
+            """Pairs of such particles in a cell, counting neighbours in a list of the cell alone."""
+            cells = np.floor(positions[outer] / scene.dx).astype(int)
+            order = np.lexsort(cells.T)
+            same = (np.diff(cells[order], axis=0) == 0).all(1)
+            rest = X[outer][order]
+            return int((same & (np.linalg.norm(np.diff(rest, axis=0), axis=1) > widest)).sum())
+
+        contacts = [touching(frame) for frame in x]
+        assert touching(X) == 0
+        assert max(contacts) >= 10
+
+
 class TestToothpaste:
     @staticmethod
     def lay(angle, *overrides):
