@@ -164,8 +164,8 @@ class GreedySampler(Sampler):
     Raises:
         ConfigError: modes is not a positive whole number, or noise not positive.
 
-    Source: Krause, Singh and Guestrin 2008 (greedy sensor placement), on the modes of Drmač and Gugercin
-        2016, with a particle's three coordinates at once.
+    Source: Krause, Singh and Guestrin 2008, near-optimal sensor placements in Gaussian processes; here a
+        sensor is a particle, its three coordinates at once.
     """
 
     modes: int = 24
