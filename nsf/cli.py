@@ -22,6 +22,7 @@ examples:
   nsf run scene=sand method=deformation_only           the baseline beside it, in the same report
   nsf run scene=sand scene.parameters.test=[23,30.5]   other held-out values
   nsf run -m scene=sand latent_dim=4,6 sampler.size=50,150   every combination
+  nsf run +experiment=table1 scale=small               every job of experiments/table1.yaml, and its report
   nsf point material=drucker_prager path=oedometer     plot a law before trusting it
 
 Results lie in ./runs (NSF_RUNS) and ./reports (NSF_REPORTS)."""
@@ -72,11 +73,14 @@ def _dispatch(arguments: list[str]) -> int:
     if unknown:
         print(f"error: {unknown[0]!r} is not key=value; see `nsf {stage} --help`", file=sys.stderr)
         return 2
+    experiments = [o.removeprefix("+experiment=") for o in overrides if o.startswith("+experiment=")]
+    if experiments:
+        return _experiment(experiments[-1], stage, [o for o in overrides if not o.startswith("+experiment=")])
     if multirun:
-        return _multirun(stage, overrides)
+        return _multirun(stage, [overrides], _stages(stage))
     from nsf import config
 
-    _work(stage, config.load(overrides, _primary(stage)))
+    _work(config.load(overrides, _primary(stage)), _stages(stage))
     return 0
 
 
@@ -85,22 +89,49 @@ def _primary(stage: str) -> str:
     return "point" if stage == "point" else "config"
 
 
-def _work(stage: str, config) -> None:
-    if stage == "point":
+def _stages(stage: str) -> tuple[str, ...]:
+    """The stages that a command does for each configuration."""
+    from nsf.pipeline import STAGES as CHAIN
+
+    return CHAIN if stage == "run" else (stage,)
+
+
+def _work(config, stages: Sequence[str]) -> None:
+    if "point" in stages:
         from nsf.reporting.point import plot_point
 
         plot_point(config)
         return
-    from nsf.pipeline import STAGES as CHAIN
     from nsf.pipeline import Pipeline
 
     pipeline = Pipeline(config)
-    if stage == "run":
+    if len(stages) > 1:
         pipeline.check_held_out()
-    for name in CHAIN if stage == "run" else [stage]:
+    for name in stages:
         result = pipeline.run(name)
-    if stage in ("run", "report"):
+    if "report" in stages:
         _show(result)
+
+
+def _experiment(name: str, stage: str, overrides: list[str]) -> int:
+    """A stage, or the whole chain, of an experiment's jobs, and its report; 2 if something is missing."""
+    from nsf.pipeline.experiment import Experiment
+
+    if stage == "point":
+        print("error: experiments have no material points; leave +experiment out", file=sys.stderr)
+        return 2
+    experiment = Experiment.load(name, overrides)
+    code = 0
+    if stage != "report":
+        stages = tuple(s for s in _stages(stage) if s != "report")
+        code = _multirun(stage, experiment.sweeps, stages)
+    if stage in ("run", "report"):
+        page, missing = experiment.report()
+        _show(page)
+        for told in missing:
+            print(f"missing: {told}", file=sys.stderr)
+        code = 2 if missing else code
+    return code
 
 
 def _show(page) -> None:
@@ -115,8 +146,8 @@ def _show(page) -> None:
     print(f"open {page.resolve()}")
 
 
-def _multirun(stage: str, overrides: list[str]) -> int:
-    """Every combination of comma-separated values, through Hydra's launchers; 2 if a job failed."""
+def _multirun(stage: str, sweeps: Sequence[list[str]], stages: Sequence[str]) -> int:
+    """Every combination of each sweep's comma-separated values, by Hydra's launchers; 2 if a job failed."""
     import hydra
 
     from nsf import config as configuration
@@ -124,33 +155,40 @@ def _multirun(stage: str, overrides: list[str]) -> int:
     check = None
     if stage != "point":
         from nsf.pipeline import Pipeline as check  # checks all that can be checked before any work
-    configuration.check_sweep(overrides, _primary(stage), check)
+    for overrides in sweeps:
+        configuration.check_sweep(overrides, _primary(stage), check)
     failed = []
 
     def job(config) -> None:
         print(f"--- {' '.join(hydra.core.hydra_config.HydraConfig.get().overrides.task)}")
         try:
-            _work(stage, configuration.checked(config))
+            _work(configuration.checked(config), stages)
         except NSFError as error:
             # Recorded in the failed run's manifest; the other jobs go on.
             failed.append(error)
             print(f"error: {error}", file=sys.stderr)
 
-    sys.argv = ["nsf", "--multirun", *overrides]
-    hydra.main(config_path=str(configuration.CONF), config_name=_primary(stage), version_base="1.3")(job)()
+    for overrides in sweeps:
+        sys.argv = ["nsf", "--multirun", *overrides]
+        hydra.main(config_path=str(configuration.CONF), config_name=_primary(stage), version_base="1.3")(
+            job
+        )()
     return 2 if failed else 0
 
 
 def _help() -> str:
     width = max(map(len, STAGES))
     stages = "\n".join(f"  {name:<{width}}  {text}" for name, text in STAGES.items())
-    return f"usage: nsf STAGE [key=value …] [-m]\n\nstages:\n{stages}\n\n{_EXAMPLES}\n\n{_groups()}"
+    usage = "usage: nsf STAGE [+experiment=NAME] [key=value …] [-m]"
+    return f"{usage}\n\nstages:\n{stages}\n\n{_EXAMPLES}\n\n{_groups()}"
 
 
 def _groups() -> str:
-    from nsf.paths import groups
+    from nsf.paths import EXPERIMENTS, groups
 
     lines = [f"  {group:<12} {' '.join(options)}" for group, options in groups().items()]
+    experiments = " ".join(sorted(path.stem for path in EXPERIMENTS.glob("*.yaml")))
+    lines += ["", "experiments (+experiment=NAME):", f"  {experiments}"]
     return "\n".join(["configuration groups (group=option):", *lines])
 
 
@@ -158,9 +196,10 @@ def _stage_help(stage: str) -> str:
     from nsf.paths import CONF
 
     primary = _primary(stage)
+    experiment = "" if stage == "point" else " [+experiment=NAME]"
     keys = (CONF / f"{primary}.yaml").read_text(encoding="utf-8")
     return (
-        f"usage: nsf {stage} [key=value …] [-m]\n\n{STAGES[stage]}\n\n{_groups()}\n\n"
+        f"usage: nsf {stage}{experiment} [key=value …] [-m]\n\n{STAGES[stage]}\n\n{_groups()}\n\n"
         f"keys and defaults (conf/{primary}.yaml):\n{keys}"
     )
 

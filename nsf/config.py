@@ -203,6 +203,25 @@ def length(key: str, value) -> float:
     return float(value)
 
 
+def sweep_options(overrides: Sequence[str], config_name: str = "config") -> list[list[str]]:
+    """The overrides of a multirun, each as the list of single ones that it stands for; Hydra's own left out.
+
+    Raises:
+        ConfigError: a syntax error.
+    """
+    try:
+        parsed = OverridesParser.create().parse_overrides(list(overrides))
+    except HydraException as error:
+        raise ConfigError(_explain(error, config_name, overrides)) from error
+    return [
+        [f"{o.get_key_element()}={value}" for value in o.sweep_string_iterator()]
+        if o.is_sweep_override()
+        else [o.input_line]
+        for o in parsed
+        if not o.input_line.startswith("hydra")
+    ]
+
+
 def check_sweep(
     overrides: Sequence[str], config_name: str = "config", check: Callable[[DictConfig], object] | None = None
 ) -> None:
@@ -215,17 +234,7 @@ def check_sweep(
     Raises:
         ConfigError: see `load`; and whatever `check` raises.
     """
-    try:
-        parsed = OverridesParser.create().parse_overrides(list(overrides))
-    except HydraException as error:
-        raise ConfigError(_explain(error, config_name, overrides)) from error
-    options = [
-        [f"{o.get_key_element()}={value}" for value in o.sweep_string_iterator()]
-        if o.is_sweep_override()
-        else [o.input_line]
-        for o in parsed
-        if not o.input_line.startswith("hydra")
-    ]
+    options = sweep_options(overrides, config_name)
     first = [values[0] for values in options]
     for at, values in enumerate(options):
         for value in values:

@@ -74,7 +74,7 @@ def compare(
     xhat, X, mass = tensor(xhat), tensor(trajectory.X), tensor(trajectory.mass)
     inertia = scene.dx**2 * (DEGREES[scene.transfer.shape] + 1) / 12.0
     shown_particles, shown_frames = _shown(trajectory.particles, frames, *pictures)
-    kept = {name: [] for name in ("x_full", "x_reduced", "tau_full", "tau_reduced")}
+    kept = {name: [] for name in ("x_full", "x_reduced", "stress_full", "stress_reduced")}
     rows: dict[str, list] = {}
 
     def note(**values: torch.Tensor) -> None:
@@ -116,10 +116,12 @@ def compare(
         for name, values in (
             ("x_full", x),
             ("x_reduced", x_rom),
-            ("tau_full", tau),
-            ("tau_reduced", tau_rom),
+            ("stress_full", tau),
+            ("stress_reduced", tau_rom),
         ):
-            kept[name].append(values[inside][:, shown_particles].float().cpu().numpy())
+            shown = values[inside][:, shown_particles]
+            shown = metrics.von_mises(shown) if name.startswith("stress") else shown
+            kept[name].append(shown.float().cpu().numpy())
 
     column = {name: torch.cat(values) for name, values in rows.items()}
 

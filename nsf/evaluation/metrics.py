@@ -67,6 +67,17 @@ def tensor_squares(tau: Float[Tensor, "frame particle 6"]) -> Float[Tensor, "fra
     return (tau.double().square() * twice).sum((1, 2))
 
 
+def von_mises(tau: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch"]:
+    """Equivalent stress √(3/2) ‖dev τ‖ [Pa] of τ [Pa], entries xx, xy, xz, yy, yz, zz.
+
+    Source: de Souza Neto, Peric and Owen 2008, section 6.4.1.
+    """
+    xx, xy, xz, yy, yz, zz = tau.unbind(-1)
+    mean = (xx + yy + zz) / 3
+    shear = xy.square() + xz.square() + yz.square()
+    return (1.5 * ((xx - mean) ** 2 + (yy - mean) ** 2 + (zz - mean) ** 2 + 2 * shear)).sqrt()
+
+
 def stress_error(
     tau_rom: Float[Tensor, "frame particle 6"], tau_fom: Float[Tensor, "frame particle 6"]
 ) -> float:

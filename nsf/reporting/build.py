@@ -1,6 +1,8 @@
 """Builds a report: a folder with a page, tables, charts, pictures, and where each number comes from."""
 
 import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from nsf.reporting.columns import axis, parameter_text
@@ -11,7 +13,7 @@ from nsf.reporting.sources import Source, open_sources
 from nsf.reporting.swap import MARK, replaced
 from nsf.reporting.tables import Merged, console_table, means, merge, variants, without_constants
 
-__all__ = ["build_report", "console_table"]
+__all__ = ["Study", "build_report", "console_table"]
 
 _LEAD = (
     "A reduced-order model of elastoplastic material (Neural Stress Fields) runs beside the full-order "
@@ -25,7 +27,24 @@ _PROVENANCE = (
 )
 
 
-def build_report(evaluate_runs, folder, title: str, first=None) -> Path:
+@dataclass(frozen=True)
+class Study:
+    """What a report is about, where it is of more than one scene's variants.
+
+    Attributes:
+        question: what it was made to find out.
+        paper: what the paper reports on it.
+        settings: by run id, what tells a run apart that no column of results.csv tells.
+        missing: what was asked for and is not there, with the reason.
+    """
+
+    question: str
+    paper: str
+    settings: Mapping[str, str]
+    missing: Sequence[str]
+
+
+def build_report(evaluate_runs, folder, title: str, first=None, study: Study | None = None) -> Path:
     """Write a report of evaluate runs to folder, replacing a report that is there.
 
     Writes `index.html`, `index.md`, `results.csv`, `sources.json`, charts (svg, png) and pictures
@@ -36,6 +55,7 @@ def build_report(evaluate_runs, folder, title: str, first=None) -> Path:
         folder: where the report goes. It changes only once everything is written.
         title: of the page.
         first: the run that stands for its variant where several are alike in every column; else the newest.
+        study: what the report is about; the variants of one scene by default.
 
     Returns:
         The path of `index.html`.
@@ -46,11 +66,11 @@ def build_report(evaluate_runs, folder, title: str, first=None) -> Path:
         ConfigError: folder holds something that is not a report.
         StorageError: the disk refused a file.
     """
-    merged = merge(open_sources(evaluate_runs, first))
+    merged = merge(open_sources(evaluate_runs, first), study.settings if study else None)
     with replaced(Path(folder)) as fresh:
-        merged.frame.to_csv(fresh / "results.csv", index=False)
+        merged.csv.to_csv(fresh / "results.csv", index=False)
         sections = draw(merged, fresh)
-        page = _page(title, merged, sections)
+        page = _page(title, merged, sections, study)
         (fresh / "index.html").write_text(html_page(page), encoding="utf-8")
         (fresh / "index.md").write_text(markdown_page(page), encoding="utf-8")
         told = sources_json(title, merged, sections, (fresh / "results.csv").read_bytes())
@@ -58,7 +78,7 @@ def build_report(evaluate_runs, folder, title: str, first=None) -> Path:
     return Path(folder) / "index.html"
 
 
-def _page(title: str, merged: Merged, sections) -> Page:
+def _page(title: str, merged: Merged, sections, study: Study | None) -> Page:
     headline, same = without_constants(means(merged))
     per_value, same_there = without_constants(merged.frame)
     methods = merged.frame[["scene", "method"]].drop_duplicates()
@@ -70,8 +90,8 @@ def _page(title: str, merged: Merged, sections) -> Page:
     note = f"Means over the parameter values of a split. {chosen}{_smaller(merged)}{_said(same)}"
     return Page(
         title=title,
-        lead=_LEAD,
-        facts=_facts(merged),
+        lead=study.question if study else _LEAD,
+        facts=[*_asked(study), *_facts(merged)],
         tables=[
             Table("Results beside the paper's", headline, note),
             Table("Each parameter value", per_value, _said(same_there), _parameter_heading(merged)),
@@ -79,6 +99,12 @@ def _page(title: str, merged: Merged, sections) -> Page:
         sections=sections,
         provenance=Table("Where the numbers come from", provenance_rows(merged), _PROVENANCE),
     )
+
+
+def _asked(study: Study | None) -> list[tuple[str, str]]:
+    if study is None:
+        return []
+    return [("The paper", study.paper), *(("Missing", told) for told in study.missing)]
 
 
 def _parameter_heading(merged: Merged) -> dict[str, str]:

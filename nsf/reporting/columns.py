@@ -54,11 +54,20 @@ _SPEC = (
     Column("commit", "commit"),
 )
 
-COLUMN = {column.name: column for column in _SPEC}
-COLUMNS = tuple(COLUMN)
+COLUMNS = tuple(column.name for column in _SPEC)
 """Columns of `results.csv`, in order. Errors and δ are fractions there."""
 
-TEXT = ("scene", "method", "field", "sample", "split", "precision", "device", "commit")
+SETTING, VALUES, TRAINING, PLACE = "setting", "values", "training_seconds", "place"
+_MORE = (
+    Column(SETTING, "setting"),
+    Column(VALUES, "values"),
+    Column(TRAINING, "training", "s"),
+    Column(PLACE, "in the paper"),
+)
+COLUMN = {column.name: column for column in (*_SPEC, *_MORE)}
+"""Columns of tables: those of `results.csv`; a variant's setting beyond them; and what means are beside."""
+
+TEXT = ("scene", "method", "field", "sample", "split", "precision", "device", "commit", SETTING, PLACE)
 COSTS = (
     "step_ms_full", "step_ms_reduced", "speedup_step", "speedup_total",
     "memory_full_mib", "memory_reduced_mib",

@@ -11,7 +11,7 @@ from nsf.reporting import charts, cost_charts, render
 from nsf.reporting.columns import MEASURED, parameter_text
 from nsf.reporting.sources import Motion, same_parameter
 from nsf.reporting.style import save
-from nsf.reporting.tables import PAPER, Merged, mean_rows, variant_labels, variants
+from nsf.reporting.tables import Merged, mean_rows, paper_row, variant_labels, variants
 
 ROWS = 6  # parameter values in one picture of final shapes
 ANIMATED = 2
@@ -184,7 +184,8 @@ def _comparison(known: list[_Variant], folder: Path) -> list[Picture]:
     for v in known:
         row = next(row for row in mean_rows(v.merged, v.members) if row["split"] == v.held_out)
         values = v.rows.loc[v.rows["split"] == v.held_out, "delta"]
-        paper = None if pd.isna(row[PAPER]) else row[PAPER]
+        printed = paper_row(v.merged, v.members) or {}
+        paper = None if pd.isna(printed.get("delta")) else printed["delta"]
         measured = {name: row[name] for name in MEASURED}
         entries.append(
             measured | {"label": v.label, "mean": row["delta"], "values": list(values), "paper": paper}

@@ -23,14 +23,6 @@ GIF_BYTES = int(2.5 * 2**20)
 _THIN = 0.5  # of the larger horizontal extent: below it a body, as a slice or a frame, counts as thin
 
 
-def von_mises(tau: np.ndarray) -> np.ndarray:
-    """Equivalent Kirchhoff stress sqrt(3/2) ||dev tau|| [Pa] of tau [..., 6], ordered xx,xy,xz,yy,yz,zz."""
-    xx, xy, xz, yy, yz, zz = np.moveaxis(np.asarray(tau, float), -1, 0)
-    mean = (xx + yy + zz) / 3
-    squared = (xx - mean) ** 2 + (yy - mean) ** 2 + (zz - mean) ** 2 + 2 * (xy**2 + xz**2 + yz**2)
-    return np.sqrt(1.5 * squared)
-
-
 def final_shapes(
     motions: list[Motion], name: str = "parameter", unit: str = "", floor: float | None = None
 ) -> Figure:
@@ -44,10 +36,7 @@ def final_shapes(
         floor: height of the floor line [m]; None draws none.
     """
     motions = _cut_open(motions)
-    last = [
-        (m, m.x_full[-1], m.x_reduced[-1], von_mises(m.tau_full[-1]), von_mises(m.tau_reduced[-1]))
-        for m in motions
-    ]
+    last = [(m, m.x_full[-1], m.x_reduced[-1], m.stress_full[-1], m.stress_reduced[-1]) for m in motions]
     stress = _Scale.up_to(np.percentile([s[3] for s in last], CLIP), STRESS_COLORS, _PA)
     apart = [np.linalg.norm(x_rom - x_fom, axis=-1) for _, x_fom, x_rom, *_ in last]
     distance = _Scale.up_to(_percentile(np.concatenate(apart), 99.5), DIFFERENCE_COLORS, _M)
@@ -55,11 +44,11 @@ def final_shapes(
     radius = _radius(motions)
     with styled():
         sheet = _Sheet(view, rows=len(motions), columns=3, titles=("full-order", "reduced", "distance apart"))
-        for row, ((m, x_fom, x_rom, tau_fom, tau_rom), d) in enumerate(zip(last, apart, strict=True)):
+        for row, ((m, x_fom, x_rom, stress_fom, stress_rom), d) in enumerate(zip(last, apart, strict=True)):
             sheet.name_row(row, f"{parameter_text(m.parameter, name, unit)}, t = {m.t[-1]:.3g} s")
             sheet.note_stop(row, m)
-            sheet.show(row, 0, view.picture(x_fom, stress.colors(tau_fom), radius))
-            sheet.show(row, 1, view.picture(x_rom, stress.colors(tau_rom), radius))
+            sheet.show(row, 0, view.picture(x_fom, stress.colors(stress_fom), radius))
+            sheet.show(row, 1, view.picture(x_rom, stress.colors(stress_rom), radius))
             sheet.show(row, 2, view.picture(x_rom, distance.colors(d), radius))
         sheet.color_bar(stress, 0, 1, "von Mises equivalent of the Kirchhoff stress")
         sheet.color_bar(distance, 2, 2, "distance ‖x_rom − x_fom‖")
@@ -78,20 +67,20 @@ def strip(
         floor: height of the floor line [m]; None draws none.
     """
     frames = np.unique(np.linspace(0, len(motion.t) - 1, count).round().astype(int))
-    stress = _Scale.up_to(np.percentile(von_mises(motion.tau_full), CLIP), STRESS_COLORS, _PA)
+    stress = _Scale.up_to(np.percentile(motion.stress_full, CLIP), STRESS_COLORS, _PA)
     view = View.around(motion.x_full[frames].reshape(-1, 3), width=420, floor=floor)
     radius = _radius([motion])
     value = parameter_text(motion.parameter, name, unit)
     with styled():
         sheet = _Sheet(view, 2, len(frames), [f"t = {motion.t[k]:.3g} s" for k in frames])
         rows = (
-            ("full-order", motion.x_full, motion.tau_full),
-            ("reduced", motion.x_reduced, motion.tau_reduced),
+            ("full-order", motion.x_full, motion.stress_full),
+            ("reduced", motion.x_reduced, motion.stress_reduced),
         )
-        for row, (model, x, tau) in enumerate(rows):
+        for row, (model, x, values) in enumerate(rows):
             sheet.name_row(row, f"{model}, {value}")
             for column, k in enumerate(frames):
-                sheet.show(row, column, view.picture(x[k], stress.colors(von_mises(tau[k])), radius))
+                sheet.show(row, column, view.picture(x[k], stress.colors(values[k]), radius))
         sheet.note_stop(1, motion)
         sheet.color_bar(stress, 0, len(frames) - 1, "von Mises equivalent of the Kirchhoff stress")
         sheet.scale_bar()
@@ -113,7 +102,7 @@ def animation(
     """
     motions = _cut_open(motions)
     x_full = np.concatenate([m.x_full.reshape(-1, 3) for m in motions])
-    stress = _Scale.up_to(np.percentile([von_mises(m.tau_full) for m in motions], CLIP), STRESS_COLORS, _PA)
+    stress = _Scale.up_to(np.percentile([m.stress_full for m in motions], CLIP), STRESS_COLORS, _PA)
     view = View.around(x_full, width=width, floor=floor)
     radius = _radius(motions)
     count = len(motions[0].t)
@@ -131,11 +120,9 @@ def animation(
             sheet.note_stop(row, m)
         for frame in chosen:
             for row, m in enumerate(motions):
-                sheet.show(
-                    row, 0, view.picture(m.x_full[frame], stress.colors(von_mises(m.tau_full[frame])), radius)
-                )
-                tau_rom = von_mises(m.tau_reduced[frame])
-                sheet.show(row, 1, view.picture(m.x_reduced[frame], stress.colors(tau_rom), radius))
+                models = ((m.x_full, m.stress_full), (m.x_reduced, m.stress_reduced))
+                for column, (x, values) in enumerate(models):
+                    sheet.show(row, column, view.picture(x[frame], stress.colors(values[frame]), radius))
             clock.set_text(f"t = {motions[0].t[frame]:.2f} s")
             images.append(sheet.pixels())
     path.write_bytes(_gif(images, max_bytes))
@@ -256,7 +243,7 @@ def _cut_open(motions: list[Motion]) -> list[Motion]:
     behind = (X - X.mean(axis=0)) @ toward <= 0.0
 
     def cut(motion: Motion) -> Motion:
-        names = ("x_full", "x_reduced", "tau_full", "tau_reduced")
+        names = ("x_full", "x_reduced", "stress_full", "stress_reduced")
         return replace(motion, **{name: getattr(motion, name)[:, behind] for name in names})
 
     return [cut(motion) for motion in motions]

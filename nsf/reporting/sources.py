@@ -2,8 +2,8 @@
 
 Besides the keys every evaluate run has, `summary.json` may hold these, all optional:
 `title` and `scale` (of the scene), `parameter_name`, `parameter_unit`, `particles`, `training_seconds`,
-`floor` (height [m], null where the scene has none) and `paper` = {"delta": 0.004, "place": "Table 1, Sand"};
-`paper` may name the `method` it is for, else it is the paper's own, `nsf`.
+`floor` (height [m], null where the scene has none) and `paper`: the `place` where the paper speaks of the
+scene, and by method the figures it prints, called as in results.csv, and `training_seconds`.
 """
 
 import hashlib
@@ -19,7 +19,7 @@ from nsf.errors import MissingRunError, SchemaError
 from nsf.reporting.columns import COLUMNS, TEXT
 
 FILES = ("results.csv", "series.csv", "frames.npz", "cost.json", "summary.json")
-_FRAMES = ("parameters", "splits", "t", "x_full", "x_reduced", "tau_full", "tau_reduced")
+_FRAMES = ("parameters", "splits", "t", "x_full", "x_reduced", "stress_full", "stress_reduced")
 _SERIES = (
     "parameter",
     "split",
@@ -34,7 +34,7 @@ _SERIES = (
 
 @dataclass(frozen=True)
 class Motion:
-    """One parameter value's particles for pictures: x [F,n,3] m, tau [F,n,6] Pa, t [F] s.
+    """One parameter value's particles for pictures: x [F,n,3] m, equivalents of τ [F,n] Pa, t [F] s.
 
     `stopped` is the time [s] up to which a reduced run that diverged was good (later frames hold that
     state), None for one that reached the end.
@@ -45,8 +45,8 @@ class Motion:
     t: np.ndarray
     x_full: np.ndarray
     x_reduced: np.ndarray
-    tau_full: np.ndarray
-    tau_reduced: np.ndarray
+    stress_full: np.ndarray
+    stress_reduced: np.ndarray
     stopped: float | None = None
 
 

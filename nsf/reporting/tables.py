@@ -1,7 +1,8 @@
 """Tables: the results of many evaluate runs merged, averaged, and written as text."""
 
 import html
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import pandas as pd
@@ -15,27 +16,41 @@ from nsf.reporting.columns import (
     COLUMNS,
     COSTS,
     MEASURED,
+    PLACE,
+    SETTING,
     TEXT,
+    TRAINING,
+    VALUES,
     device_type,
     number,
     split_rank,
 )
 from nsf.reporting.sources import Source, open_sources
 
-VARIANT = ("scene", "method", "field", "r", "sample", "precision", "device")
+VARIANT = ("scene", "method", "field", "r", "sample", SETTING, "precision", "device")
 """The visible key of a variant; `device` counts by its type."""
 
-PAPER, PLACE, VALUES = "paper_delta", "paper_place", "values"
-_MEAN_HEADINGS = {VALUES: "values", PAPER: "paper's δ [%]", PLACE: "in the paper"}
+PAPER = "the paper"
+"""What stands as the field of a row of figures that the paper prints."""
+
+_SHOWN = (
+    "delta", "displacement_error", "stress_error", "gamma", "integration_mean",
+    "speedup_step", "speedup_total", "memory_full_mib", "memory_reduced_mib",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Merged:
-    """Results of many runs: `frame` with the columns of results.csv, `source` its runs row by row."""
+    """Results of many runs: `frame`, columns of results.csv and `setting`; `source`, the run of each row."""
 
     frame: pd.DataFrame
     source: list[Source]
     superseded: list[tuple[Source, float]]
+
+    @property
+    def csv(self) -> pd.DataFrame:
+        """Content of results.csv; `setting` only where the other columns do not tell rows apart."""
+        return self.frame if self.frame[SETTING].any() else self.frame.drop(columns=SETTING)
 
 
 def variant_key(row) -> tuple:
@@ -43,11 +58,18 @@ def variant_key(row) -> tuple:
     return (*(str(row[name]) for name in VARIANT[:-1]), device_type(row["device"]))
 
 
-def merge(sources: list[Source]) -> Merged:
-    """Join the rows of runs sorted newest first; for a variant's parameter value the newest run wins."""
+def merge(sources: list[Source], settings: Mapping[str, str] | None = None) -> Merged:
+    """Join the rows of runs sorted newest first; for a variant's parameter value the newest run wins.
+
+    Args:
+        sources: runs.
+        settings: by run id, what tells a run apart that no column of results.csv tells.
+    """
     rows, owners, superseded, seen = [], [], [], set()
     for source in sources:
+        told = {SETTING: (settings or {}).get(source.id, "")}
         for row in source.results[list(COLUMNS)].to_dict("records"):
+            row |= told
             key = (*variant_key(row), _rounded(row["parameter"]))
             if key in seen:
                 superseded.append((source, row["parameter"]))
@@ -56,8 +78,9 @@ def merge(sources: list[Source]) -> Merged:
             rows.append(row)
             owners.append(source)
     order = sorted(range(len(rows)), key=lambda i: _sort_key(rows[i]))
-    frame = pd.DataFrame([rows[i] for i in order], columns=list(COLUMNS))
-    return Merged(frame.astype(dict.fromkeys(TEXT, "str")), [owners[i] for i in order], superseded)
+    frame = pd.DataFrame([rows[i] for i in order], columns=[*COLUMNS, SETTING])
+    text = {name: "str" for name in TEXT if name in frame}
+    return Merged(frame.astype(text), [owners[i] for i in order], superseded)
 
 
 def merge_results(evaluate_runs) -> pd.DataFrame:
@@ -67,7 +90,7 @@ def merge_results(evaluate_runs) -> pd.DataFrame:
         MissingRunError: no run is complete.
         SchemaError: a run's file is missing or altered.
     """
-    return merge(open_sources(evaluate_runs)).frame
+    return merge(open_sources(evaluate_runs)).csv
 
 
 def variants(merged: Merged) -> list[list[int]]:
@@ -79,32 +102,49 @@ def variants(merged: Merged) -> list[list[int]]:
 
 
 def means(merged: Merged) -> pd.DataFrame:
-    """Mean over parameter values, one row a variant and split, with the paper's figure beside the test rows.
+    """Mean over parameter values, a row a variant and split; the paper's figures follow those of its method.
 
     A value that was not measured or not finite leaves the mean empty: it is never averaged around.
     """
-    rows = [row for members in variants(merged) for row in mean_rows(merged, members)]
-    measured = [
-        name for name in MEASURED[1:] if not name.startswith("step_ms")
-    ]  # those stand in each value's row
-    columns = [*VARIANT[:-2], "split", VALUES, "delta", PAPER, PLACE, *measured, *VARIANT[-2:]]
+    groups: dict[tuple, list[list[int]]] = {}
+    for members in variants(merged):
+        row = merged.frame.iloc[members[0]]
+        groups.setdefault((row["scene"], row["method"]), []).append(members)
+    rows = []
+    for same in groups.values():
+        rows += [row for members in same for row in mean_rows(merged, members)]
+        if printed := paper_row(merged, same[0]):
+            rows.append(printed)
+    columns = [*VARIANT[:-2], "split", VALUES, *_SHOWN, TRAINING, *VARIANT[-2:], PLACE]
     return pd.DataFrame(rows, columns=columns)
 
 
 def mean_rows(merged: Merged, members: list[int]) -> list[dict]:
     """The means of one variant, a dict a split, held-out ones first."""
     part = merged.frame.iloc[members]
-    stated = (merged.source[i].summary.get("paper") for i in members)
-    method = part["method"].iloc[0]
-    paper: dict = next((p for p in stated if p and p.get("method", "nsf") == method), {})
+    seconds = [merged.source[i].summary.get(TRAINING) for i in members]
     rows = []
     for split in sorted(part["split"].unique(), key=split_rank):
         chosen = part[part["split"] == split]
         row = {name: chosen[name].iloc[0] for name in VARIANT} | {"split": split, VALUES: len(chosen)}
-        row |= {name: pd.to_numeric(chosen[name]).mean(skipna=False) for name in MEASURED}
-        shown = paper if split == "test" else {}
-        rows.append(row | {PAPER: shown.get("delta", float("nan")), PLACE: shown.get("place", ABSENT)})
+        averaged = dict.fromkeys((*_SHOWN, *MEASURED))
+        row |= {name: pd.to_numeric(chosen[name]).mean(skipna=False) for name in averaged}
+        rows.append(row | {TRAINING: seconds[0], PLACE: ABSENT})
     return rows
+
+
+def paper_row(merged: Merged, members: list[int]) -> dict | None:
+    """What the paper prints of a variant's scene and method, as a row of `means`; None if nothing."""
+    row = merged.frame.iloc[members[0]]
+    stated = (merged.source[i].summary.get("paper") or {} for i in members)
+    paper: dict = next((p for p in stated if row["method"] in p), {})
+    if not paper:
+        return None
+    known = {"scene": row["scene"], "method": row["method"], "field": PAPER, "split": "test"}
+    absent = dict.fromkeys((*VARIANT, PLACE), ABSENT) | dict.fromkeys(
+        (*_SHOWN, *MEASURED, VALUES, TRAINING), math.nan
+    )
+    return absent | paper[row["method"]] | known | {PLACE: paper.get("place", ABSENT)}
 
 
 def variant_labels(rows: list[dict]) -> list[str]:
@@ -112,14 +152,16 @@ def variant_labels(rows: list[dict]) -> list[str]:
     varying = {name for name in VARIANT if len({str(row[name]) for row in rows}) > 1} | {"method"}
     form = {"field": "{} field", "r": "r {}", "sample": "|S| {}"}
     return [
-        " · ".join(form.get(name, "{}").format(row[name]) for name in VARIANT if name in varying)
+        " · ".join(
+            form.get(name, "{}").format(row[name]) for name in VARIANT if name in varying and row[name]
+        )
         for row in rows
     ]
 
 
 def cells(frame: pd.DataFrame, renamed: dict[str, str] | None = None) -> tuple[list[str], list[list[str]]]:
     """Headings with units (`renamed` ones as given), and every cell as text."""
-    known = {name: column.heading for name, column in COLUMN.items()} | _MEAN_HEADINGS | (renamed or {})
+    known = {name: column.heading for name, column in COLUMN.items()} | (renamed or {})
     headings = [known[name] for name in frame]
     body = [[_cell(name, row[name]) for name in frame] for row in frame.to_dict("records")]
     return headings, body
@@ -128,15 +170,20 @@ def cells(frame: pd.DataFrame, renamed: dict[str, str] | None = None) -> tuple[l
 def without_constants(
     frame: pd.DataFrame, also: Sequence[str] = (), keep: Sequence[str] = ("method", "parameter", "split")
 ) -> tuple[pd.DataFrame, str]:
-    """Drop columns that describe, and those of `also`, where they say the same in every row.
+    """Drop columns that describe, and those of `also`, where they say the same in every row; and empty ones.
+
+    Rows of the paper's figures say nothing of what the paper does not print.
 
     Returns:
         The frame that is left, and what the dropped columns say.
     """
     describing = [name for name in (*VARIANT, "gamma", "integration_mean", "commit", *also) if name in frame]
-    constant = [name for name in describing if name not in keep and frame[name].astype(str).nunique() == 1]
-    said = (f"{COLUMN[n].title} {_cell(n, frame[n].iloc[0])} {COLUMN[n].unit}".strip() for n in constant)
-    return frame.drop(columns=constant), ", ".join(said)
+    said = {name: {v for v in frame[name].astype(str) if v not in ("", ABSENT, "nan")} for name in describing}
+    constant = [name for name in describing if name not in keep and len(said[name]) == 1]
+    empty = [name for name in (SETTING, PLACE) if name in frame and set(frame[name]) <= {"", ABSENT}]
+    first = {name: next(v for v in frame[name] if str(v) in said[name]) for name in constant}
+    told = (f"{COLUMN[n].title} {_cell(n, first[n])} {COLUMN[n].unit}".strip() for n in constant)
+    return frame.drop(columns=[*constant, *empty]), ", ".join(told)
 
 
 def markdown_table(frame: pd.DataFrame, renamed: dict[str, str] | None = None) -> str:
@@ -185,7 +232,7 @@ def console_table(frame: pd.DataFrame) -> Table:
 
 
 def _numeric(frame: pd.DataFrame) -> list[bool]:
-    return [name not in TEXT and name != PLACE for name in frame]
+    return [name not in TEXT for name in frame]
 
 
 def _cell(name: str, value) -> str:
@@ -193,8 +240,6 @@ def _cell(name: str, value) -> str:
         return ABSENT if pd.isna(value) else str(value)
     if name == "parameter" and not isinstance(value, str):
         return f"{value:g}"
-    if name == PAPER:
-        return number(value, COLUMN["delta"].scale)
     return COLUMN[name].text(value) if name in COLUMN else number(value)
 
 

@@ -1,5 +1,6 @@
 """Scenes: what is simulated (paper section 6)."""
 
+import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
@@ -83,6 +84,24 @@ class Body:
     def files(self) -> dict[str, str]:
         """Path and sha256 of every file that the body is made from."""
         return self.shape.files | (self.weakness.region.files if self.weakness else {})
+
+
+@dataclass(frozen=True)
+class _Placing:
+    """What the points of a body hang on; hashed by its text, as shapes hold lists."""
+
+    shape: Shape
+    particles: int
+    files: tuple[str, ...]
+
+    def __hash__(self):
+        return hash((repr(self.shape), self.particles, self.files))
+
+
+@functools.lru_cache(maxsize=8)
+def _points(placing: _Placing) -> np.ndarray:
+    """[P, 3] [m]; the parameter values of a scene have their bodies in common, and placing takes a second."""
+    return placing.shape.sample(placing.particles)
 
 
 @dataclass(frozen=True)
@@ -242,7 +261,7 @@ class Scene:
                     "move it or make it smaller"
                 )
             volume = body.shape.volume / body.particles
-            X.append(body.shape.sample(body.particles))
+            X.append(_points(_Placing(body.shape, body.particles, tuple(body.shape.files.values()))))
             volume0.append(np.full(body.particles, volume))
             mass.append(np.full(body.particles, body.density * volume))
             stiffness.append(body.weakness.of(X[-1]) if body.weakness else np.ones(body.particles))

@@ -1,39 +1,41 @@
-"""Every experiment can be run: each variant of its command composes and builds."""
+"""Every experiment can be run: each of its jobs composes and builds."""
 
 import pytest
-import yaml
-from expand import variants
 
 from nsf import config
 from nsf.paths import EXPERIMENTS
 from nsf.pipeline import Pipeline
+from nsf.pipeline.experiment import Experiment
 
-FILES = sorted(EXPERIMENTS.glob("*.yaml"))
-
-
-@pytest.fixture(params=FILES, ids=lambda f: f.stem)
-def experiment(request):
-    return yaml.safe_load(request.param.read_text(encoding="utf-8"))
+NAMES = sorted(path.stem for path in EXPERIMENTS.glob("*.yaml"))
+JOBS = sorted({job.overrides for name in NAMES for job in Experiment.load(name).jobs})
 
 
 def test_there_are_experiments():
-    assert FILES
+    assert {"sand", "table1"} <= set(NAMES)
 
 
-def test_experiment_has_its_keys(experiment):
-    assert set(experiment) == {"question", "paper", "command"}
-    assert all(isinstance(text, str) and text for text in experiment.values())
+@pytest.mark.parametrize("overrides", JOBS, ids=" ".join)
+def test_every_job_builds(overrides):
+    Pipeline(config.load([*overrides, "device=cpu"]))
 
 
-def test_every_variant_builds(experiment):
-    stage, runs = variants(experiment["command"])
-    assert stage == "run"
-    assert len({tuple(run) for run in runs}) == len(runs)
-    for overrides in runs:
-        Pipeline(config.load([*overrides, "device=cpu"]))
+@pytest.mark.parametrize("name", NAMES)
+def test_jobs_are_told_apart(name):
+    """By a column of results.csv or by their setting."""
+    experiment = Experiment.load(name)
+    assert all((experiment.title, experiment.question, experiment.paper))
+    told = set()
+    for job in experiment.jobs:
+        c = config.load(job.overrides)
+        told.add((c.scene.name, c.method.name, c.field._target_, c.latent_dim, str(c.sampler), job.setting))
+    assert len(told) == len(experiment.jobs)
 
 
-def test_the_sand_experiment_is_two_by_two():
-    _, runs = variants(yaml.safe_load((EXPERIMENTS / "sand.yaml").read_text(encoding="utf-8"))["command"])
-    chosen = {tuple(word for word in run if word.startswith(("field=", "method="))) for run in runs}
-    assert len(chosen) == len(runs) == 4
+def test_table1_has_the_papers_seven_scenes():
+    jobs = [set(job.overrides) for job in Experiment.load("table1").jobs]
+    scenes = {"bread", "cake", "sand", "metal", "toothpaste", "jelly_cube", "squishy_ball"}
+    for kind in ({"method=nsf"}, {"method=deformation_only"}, {"field=mlp"}):
+        assert {f"scene={scene}" for scene in scenes} == {
+            next(o for o in job if o.startswith("scene=")) for job in jobs if kind <= job
+        }

@@ -64,17 +64,7 @@ class PlainReport:
 
     def __call__(self):
         module = importlib.import_module("nsf.reporting.build")
-
-        def build_report(runs, folder, title, **more):
-            folder.mkdir(parents=True, exist_ok=True)
-            tables = [(run.path / "results.csv").read_text().splitlines() for run in runs]
-            lines = [tables[0][0], *(row for table in tables for row in table[1:])]
-            (folder / "results.csv").write_text("\n".join(lines) + "\n")
-            page = folder / "index.html"
-            page.write_text(f"{len(runs)} runs")
-            return page
-
-        module.build_report = build_report
+        module.draw = lambda merged, folder: []
 
 
 def _owner(where):

@@ -101,7 +101,7 @@ def test_files_of_an_evaluation(chain):
     assert frames["parameters"].tolist() == [26.0]
     assert frames["splits"].tolist() == ["test"]
     assert frames["x_full"].shape == frames["x_reduced"].shape == (1, 3, 100, 3)
-    assert frames["tau_full"].shape == frames["tau_reduced"].shape == (1, 3, 100, 6)
+    assert frames["stress_full"].shape == frames["stress_reduced"].shape == (1, 3, 100)
     cost = json.loads((path / "cost.json").read_text())
     assert set(cost["breakdown"]["reduced"]) == {"inference", "p2g", "grid", "g2p", "inversion", "transfer"}
     assert cost["trials"] == 2

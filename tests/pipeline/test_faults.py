@@ -178,7 +178,7 @@ def half_written(root, stage, smallest=0):
     return [*root.rglob(".partial-*"), *results]
 
 
-@pytest.mark.parametrize(("stage", "limit"), [("simulate", 500_000), ("deploy", 4_500), ("evaluate", 10_000)])
+@pytest.mark.parametrize(("stage", "limit"), [("simulate", 500_000), ("deploy", 4_500), ("evaluate", 5_000)])
 def test_no_room_for_a_file(refused, copied, pipeline_at, stage, limit):
     """A file may not grow past a limit: a clear line, nothing half-written, and on it goes afterwards."""
     root = copied(*STAGES[: STAGES.index(stage)])
@@ -214,7 +214,7 @@ def disk_with(tmp_path, chain):
 
 
 @pytest.mark.parametrize(
-    ("stage", "free"), [("simulate", 2_500_000), ("train", 150_000), ("deploy", 12_000), ("evaluate", 36_000)]
+    ("stage", "free"), [("simulate", 2_500_000), ("train", 150_000), ("deploy", 12_000), ("evaluate", 20_000)]
 )
 def test_a_full_disk(refused, disk_with, pipeline_at, stage, free):
     """Trajectories that are whole stay; with some room, the next run goes on."""

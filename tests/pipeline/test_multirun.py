@@ -76,3 +76,34 @@ def test_points_of_several_materials(tmp_path):
     outcome = run_nsf(arguments, tmp_path / "runs", tmp_path / "work")
     assert outcome.code == 0, outcome.err
     assert len(list((tmp_path / "work/reports/point").glob("*.csv"))) == 4
+
+
+def test_an_experiment_runs_its_jobs_and_reports_them(nsf, copied, tmp_path):
+    """experiments/sand.yaml, made tiny and of one field: two of its three jobs are then the same."""
+    root = copied("simulate")
+    tiny = ["field=basis", "evaluation.trials=1", "trainer.budget_minutes=null"]
+    outcome = nsf("run", root, "+experiment=sand", "scale=small", *tiny, faults=[PlainReport()])
+    assert outcome.code == 0, outcome.err
+    report = tmp_path / "work/reports/sand_small"
+    rows = pd.read_csv(report / "results.csv")
+    found = set(zip(rows["method"], rows["field"], strict=True))
+    assert found == {("nsf", "basis"), ("deformation_only", "basis")}
+    assert "Does a neural stress field" in (report / "index.md").read_text()
+    again = nsf("report", root, "+experiment=sand", "scale=small", *tiny, faults=[PlainReport()])
+    assert again.code == 0
+    assert "2 jobs, 0 missing" in again.out
+
+
+def test_a_report_names_what_is_missing(nsf, copied, tmp_path):
+    root = copied("simulate", "train", "deploy", "evaluate")
+    outcome = nsf("report", root, "+experiment=sand", "scale=small", "field=basis", faults=[PlainReport()])
+    assert outcome.code == 2
+    assert "missing: scene=sand" in outcome.err
+    assert "method=deformation_only" in outcome.err
+    assert "Missing" in (tmp_path / "work/reports/sand_small/index.md").read_text()
+
+
+def test_an_experiment_without_results_says_how_to_get_them(nsf, copied):
+    outcome = nsf("report", copied("simulate"), "+experiment=sand", "scale=small", "field=basis")
+    assert outcome.code == 2
+    assert "run `nsf run +experiment=sand`" in outcome.err

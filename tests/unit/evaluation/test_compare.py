@@ -110,11 +110,13 @@ def test_series(comparison_of, made, truth):
 def test_pictures(comparison_of, made, truth):
     kept = comparison_of(made, pictures=(50, 4)).pictures
     assert kept["x_full"].shape == kept["x_reduced"].shape == (4, 50, 3)
-    assert kept["tau_full"].shape == kept["tau_reduced"].shape == (4, 50, 6)
+    assert kept["stress_full"].shape == kept["stress_reduced"].shape == (4, 50)
     np.testing.assert_allclose(kept["t"], truth.t[[0, 8, 16, 24]])
     many = comparison_of(made, pictures=(10_000, 1000)).pictures
     assert many["x_full"].shape == (25, 500, 3)
     np.testing.assert_allclose(many["x_full"], truth.read("x"), rtol=1e-6)
+    tau = torch.as_tensor(np.asarray(truth.read("tau"))).double()
+    np.testing.assert_allclose(many["stress_full"], metrics.von_mises(tau), rtol=1e-6)
 
 
 def test_frames_between_deployment_steps():

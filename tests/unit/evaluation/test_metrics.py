@@ -96,6 +96,14 @@ def test_shapes_must_agree(metric):
         displacement_error(torch.zeros(2, 3, 3), torch.zeros(1, 3, 3), torch.zeros(3, 3))
 
 
+@pytest.mark.parametrize(
+    ("tau", "expected"),
+    [((3.0, 0, 0, 0, 0, 0), 3.0), ((0, 2.0, 0, 0, 0, 0), 2 * 3**0.5), ((-5.0, 0, 0, -5.0, 0, -5.0), 0.0)],
+)
+def test_von_mises_of_tension_shear_and_pressure(tau, expected):
+    assert float(metrics.von_mises(tensor(tau))) == pytest.approx(expected, abs=1e-12)
+
+
 def test_linear_momentum():
     v = tensor([[[1.0, 0, 0], [0, 2.0, 0]]])
     assert metrics.linear_momentum(v, tensor([2.0, 3.0])).tolist() == [[2.0, 6.0, 0.0]]

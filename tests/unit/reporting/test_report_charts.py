@@ -11,7 +11,7 @@ from nsf import config
 from nsf.reporting import charts, cost_charts
 from nsf.reporting.camera import Camera, View
 from nsf.reporting.point import point_chart, point_response
-from nsf.reporting.render import animation, final_shapes, is_cut_open, strip, von_mises
+from nsf.reporting.render import animation, final_shapes, is_cut_open, strip
 from nsf.reporting.sources import Motion
 from nsf.reporting.style import save
 
@@ -120,14 +120,6 @@ def test_saved_charts_are_equal_byte_for_byte(series, tmp_path):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
 
 
-@pytest.mark.parametrize(
-    ("tau", "expected"),
-    [((3.0, 0, 0, 0, 0, 0), 3.0), ((0, 2.0, 0, 0, 0, 0), 2 * np.sqrt(3)), ((-5.0, 0, 0, -5.0, 0, -5.0), 0.0)],
-)
-def test_von_mises_of_tension_shear_and_pressure(tau, expected):
-    assert von_mises(np.array(tau)) == pytest.approx(expected, abs=1e-12)
-
-
 def test_camera_axes_are_orthonormal_and_z_points_up():
     axes = Camera(azimuth=-40, elevation=25).axes
     np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
@@ -174,7 +166,7 @@ def test_a_thin_body_is_shown_whole():
         assert is_cut_open(shown) is not whole
         X = shown[0].x_full[0]
         front = (X - X.mean(0)) @ (Camera.facing(X).axes[2] * (1.0, 1.0, 0.0)) > 0.0
-        relaxed = [replace(shown[0], tau_full=np.where(front[:, None], 0.0, shown[0].tau_full))]
+        relaxed = [replace(shown[0], stress_full=np.where(front, 0.0, shown[0].stress_full))]
         one, other = (final_shapes(some).axes[0].images[0].get_array() for some in (shown, relaxed))
         assert (one != other).any() == whole
 

@@ -1,0 +1,153 @@
+"""Experiments: a question, and the jobs that answer it (one file each in `experiments/`)."""
+
+import difflib
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import yaml
+
+from nsf import config as configuration
+from nsf.errors import ConfigError, MissingRunError, NSFError
+from nsf.paths import EXPERIMENTS
+from nsf.pipeline.chain import Pipeline
+from nsf.runs import Run
+
+_KEYS = {"title", "question", "paper", "jobs"}
+#: Keys that a column of results.csv tells of.
+_COLUMNS = ("scene", "method", "field", "latent_dim", "sampler.size", "precision", "device")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One configuration of an experiment.
+
+    Attributes:
+        overrides: `key=value` in Hydra's grammar.
+        setting: those of them that tell the job from others alike in all columns of results.csv.
+    """
+
+    overrides: tuple[str, ...]
+    setting: str
+
+
+@dataclass(frozen=True)
+class Experiment:
+    """A question and its jobs.
+
+    Attributes:
+        name: of the file, and of the report's folder.
+        title: of the report.
+        question: what it is to find out.
+        paper: what the paper reports on it, with the place.
+        grids: each a mapping from a key to its override with all values; every combination is a job.
+    """
+
+    name: str
+    title: str
+    question: str
+    paper: str
+    grids: tuple[dict[str, str], ...]
+
+    @classmethod
+    def load(cls, name: str, overrides: Sequence[str] = (), folder: Path = EXPERIMENTS) -> "Experiment":
+        """The experiment of `folder/name.yaml`; `overrides` take the place of its own.
+
+        Args:
+            name: of the file, without its ending.
+            overrides: `key=value`; a key that no grid has is added to each.
+            folder: of the files.
+
+        Raises:
+            ConfigError: there is no such file (the nearest is named), or a key of it is missing or unknown.
+        """
+        path = folder / f"{name}.yaml"
+        if not path.is_file():
+            known = sorted(p.stem for p in folder.glob("*.yaml"))
+            near = difflib.get_close_matches(name, known, n=1)
+            hint = f" (did you mean {near[0]}?)" if near else ""
+            raise ConfigError(f"unknown experiment={name}; choose one of {', '.join(known)}{hint}")
+        try:
+            content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        except yaml.YAMLError as error:
+            raise ConfigError(f"{path}: {error}; correct the yaml") from error
+        found = set(content) if isinstance(content, dict) else set()
+        if found != _KEYS or not isinstance(content["jobs"], list):
+            raise ConfigError(f"{path} must have the keys {', '.join(sorted(_KEYS))}; jobs is a list")
+        own = {override.split("=", 1)[0]: override for override in overrides}
+        grids = tuple(
+            {str(key): f"{key}={_values(value)}" for key, value in grid.items()} | own
+            for grid in content["jobs"]
+        )
+        texts = {key: " ".join(str(content[key]).split()) for key in ("title", "question", "paper")}
+        return cls(name=name, grids=grids, **texts)
+
+    @property
+    def sweeps(self) -> list[list[str]]:
+        """The overrides of each grid, as one multirun takes them."""
+        return [list(grid.values()) for grid in self.grids]
+
+    @property
+    def jobs(self) -> list[Job]:
+        """Every job, each once."""
+        sweeps = [configuration.sweep_options(sweep) for sweep in self.sweeps]
+        found = dict.fromkeys(job for sweep in sweeps for job in itertools.product(*sweep))
+
+        def told(job: tuple[str, ...]) -> set[str]:
+            return {override for override in job if override.split("=")[0] in _COLUMNS}
+
+        def setting(job: tuple[str, ...]) -> str:
+            alike = [set(other) for other in found if told(other) == told(job)]
+            return ", ".join(override for override in job if override not in set.intersection(*alike))
+
+        return [Job(job, setting(job)) for job in found]
+
+    def report(self, say: Callable[[str], None] = print, root: Path | None = None) -> tuple[Path, list[str]]:
+        """Write `reports/<name>` from what the jobs left, whichever device they ran on.
+
+        Returns:
+            The page, and what is missing on it.
+
+        Raises:
+            MissingRunError: no job was evaluated.
+        """
+        from nsf.reporting.build import Study, build_report
+
+        runs: dict[str, Run] = {}
+        settings, missing, scales = {}, [], set()
+        for job in self.jobs:
+            config = configuration.load(job.overrides)
+            try:
+                run = Pipeline(config, say, root).evaluated()
+            except NSFError as error:
+                missing.append(f"{' '.join(job.overrides)}: {error}")
+                continue
+            runs[run.id], settings[run.id] = run, job.setting
+            scales.add(config.scale)
+        if not runs:
+            raise MissingRunError(
+                f"no job of {self.name} was evaluated; run `nsf run +experiment={self.name}`"
+            )
+        folder = Path(config.report.folder) / (f"{self.name}_small" if scales == {"small"} else self.name)
+        study = Study(self.question, self.paper, settings, missing)
+        page = build_report(list(runs.values()), folder, self.title, study=study)
+        say(f"report: {len(runs)} jobs, {len(missing)} missing → {page}")
+        return page, missing
+
+
+def _values(value) -> str:
+    """A value, or a list of values to be taken in turn, in Hydra's grammar."""
+    return ",".join(map(_text, value)) if isinstance(value, list) else _text(value)
+
+
+def _text(value) -> str:
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list):
+        return f"[{','.join(map(_text, value))}]"
+    if isinstance(value, dict):
+        return "{" + ",".join(f"{key}:{_text(v)}" for key, v in value.items()) + "}"
+    return str(value)
