@@ -72,6 +72,19 @@ class TestPerturbation:
     def test_all_that_are_left(self, X):
         assert not np.isin(weak(X, share=0.5, perturbation=1.0), weak(X, share=0.5)).any()
 
+    def test_a_region_nearly_all_weak_takes_others_of_the_body(self, X):
+        """Bread: nine in ten are weak, and 30 % are exchanged."""
+        before, after = weak(X, share=0.9), weak(X, share=0.9, perturbation=0.3)
+        region = MIDDLE.contains(X).sum()
+        assert len(before) == len(after)
+        assert len(np.setdiff1d(after, before)) == round(0.3 * len(before))
+        assert (~MIDDLE.contains(X[after])).sum() == round(0.3 * len(before)) - (region - len(before)) > 0
+
+    def test_a_body_too_small_to_exchange(self, X):
+        few = X[MIDDLE.contains(X)]
+        with pytest.raises(ConfigError, match=r"weakness\.perturbation=0\.5 exchanges .* lower it"):
+            Weakness(MIDDLE, share=0.9, perturbation=0.5).of(few)
+
 
 @pytest.mark.parametrize(
     ("options", "quoted"),
@@ -86,7 +99,6 @@ class TestPerturbation:
         ({"seed": 0.5}, "weakness.seed=0.5"),
         ({"perturbation": -0.1}, "weakness.perturbation=-0.1"),
         ({"perturbation": 1.2}, "weakness.perturbation=1.2"),
-        ({"share": 0.8, "perturbation": 0.5}, "weakness.perturbation=0.5 needs a share of 1.2"),
     ],
 )
 def test_refused(options, quoted):
