@@ -11,7 +11,7 @@ import math
 import re
 import types
 import typing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
@@ -241,6 +241,41 @@ def check_sweep(
             config = load([*first[:at], value, *first[at + 1 :]], config_name)
             if check is not None:
                 check(config)
+
+
+def replaced(config: DictConfig, values: Mapping[str, typing.Any], known: Sequence[str]) -> DictConfig:
+    """A copy with other values of some keys; a key that refers to a replaced one follows.
+
+    Args:
+        config: composed, its interpolations kept.
+        values: by dotted key.
+        known: keys that may be replaced, as of `leaves`.
+
+    Raises:
+        ConfigError: an unknown key, with the nearest known one, or one that holds others.
+    """
+    config = config.copy()
+    for key, value in values.items():
+        if key not in known:
+            inner = [k for k in known if k.startswith(f"{key}.")]
+            near = inner or difflib.get_close_matches(key, known, n=3, cutoff=0.5)
+            hint = f"did you mean {' or '.join(near[:3])}?" if near else "give a dotted key, as scene.gravity"
+            raise ConfigError(f"{'several keys in' if inner else 'unknown key'} {key!r}; {hint}")
+        OmegaConf.update(config, key, value)
+    return config
+
+
+def leaves(node, prefix: str = "") -> list[str]:
+    """Dotted keys of a plain tree that hold values, and those that a `_target_` has a default for."""
+    if not isinstance(node, dict):
+        return [prefix]
+    unset = _known(OmegaConf.create(node)) if "_target_" in node else []
+    return [
+        key
+        for name, child in (dict.fromkeys(unset) | node).items()
+        if not name.startswith("_")
+        for key in leaves(child, f"{prefix}.{name}" if prefix else name)
+    ]
 
 
 def _keys(node, prefix: str = "") -> list[str]:

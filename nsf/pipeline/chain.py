@@ -30,10 +30,10 @@ from nsf.pipeline import results
 from nsf.pipeline.simulation import Job, simulate
 from nsf.runs import Run
 from nsf.scenes import Scene
+from nsf.scenes.scene import NOT_PHYSICS
 
 #: Keys of the configuration that each stage's content depends on, beyond its parents.
 _SCENE_KEYS = ("scale", "material", "transfer")
-_NOT_PHYSICS = ("parameters", "reduced", "paper", "title")
 STAGES = ("simulate", "train", "deploy", "evaluate", "report")
 
 
@@ -81,6 +81,7 @@ class Pipeline:
         if str(c.report.name) in ("", "..") or Path(str(c.report.name)).name != str(c.report.name):
             raise ConfigError(f"report.name={c.report.name} must be one folder's name; set report.folder")
         precision_of(c.precision)
+        self.deployed = self._changed(c.deploy.changes)
         X = self.scene.particles().X
         for region in self.sampler.regions:
             check_well_posed(region.size, c.latent_dim)
@@ -91,6 +92,17 @@ class Pipeline:
         self.device = str(torch_device(warp_device(c.device)))
         self.check_values()
 
+    def _changed(self, changes: DictConfig | None) -> Scene:
+        """The scene of the held-out simulations and of deployment."""
+        if not changes:
+            return self.scene
+        if not isinstance(changes, DictConfig):
+            raise ConfigError(f"deploy.changes={changes} must map keys to values, as {{material.nu:0.25}}")
+        try:
+            return self.scene.with_changes(OmegaConf.to_container(changes))
+        except ConfigError as error:
+            raise ConfigError(f"deploy.changes: {error}") from error
+
     def check_values(self) -> None:
         """Build the scene at every parameter value: one out of range fails before any work.
 
@@ -98,8 +110,8 @@ class Pipeline:
             ConfigError: names the value.
             InstabilityError: Δt is unstable at a value.
         """
-        for value in (*self.split.train, *self.split.validation, *self.split.test):
-            scene = self.scene.with_parameters({self.scene.parameters.name: value})
+        for value, scene in self._needed():
+            scene = scene.with_parameters({self.scene.parameters.name: value})
             grid = scene.grid
             check_time_step(scene.particles(), scene.initial_velocity(), grid.dx, scene.dt)
             for multiplier in (1.0, self.config.deploy.dt_multiplier):
@@ -123,17 +135,21 @@ class Pipeline:
 
     # -- runs: where each stage's result lies ---------------------------------------------------------------
 
-    def simulation(self, value: float) -> Run:
-        """The run of one full-order trajectory."""
+    def simulation(self, value: float, scene: Scene | None = None) -> Run:
+        """The run of one full-order trajectory, of the scene of training by default."""
         c = self.config
-        scene = {k: v for k, v in OmegaConf.to_container(c.scene).items() if k not in _NOT_PHYSICS}
-        content = {k: OmegaConf.to_container(OmegaConf.create({k: c[k]}))[k] for k in _SCENE_KEYS}
-        content |= {"scene": scene, "precision": c.precision, "dtype": c.data.dtype}
+        scene = scene or self.scene
+        content = self._physics(scene)
+        content |= {"precision": c.precision, "dtype": c.data.dtype}
         content["parameter"] = {"key": self.scene.parameters.key, "value": float(value)}
-        if self.scene.files:
+        if scene.files:
             # A changed mesh under the same path is another simulation.
-            content["files"] = self.scene.files
+            content["files"] = scene.files
         return Run.open("simulate", self.scene.name, content, root=self.root)
+
+    def truth(self, value: float) -> Run:
+        """The run of the full-order trajectory that a deployed one is held to."""
+        return self.simulation(value, self.deployed)
 
     @property
     def training(self) -> Run:
@@ -145,24 +161,17 @@ class Pipeline:
     @property
     def deployment(self) -> Run:
         """The run of the reduced trajectories."""
-        keys = (
-            "method",
-            "sampler",
-            "projector",
-            "integration",
-            "precision",
-            "scale",
-            "scene",
-            "material",
-            "transfer",
+        keys = ("method", "sampler", "projector", "integration", "precision")
+        content = (
+            self._content(keys)
+            | self._physics(self.deployed)
+            | {
+                "values": list(self.held_out),
+                "split": self.config.deploy.split,
+                "dt_multiplier": self.config.deploy.dt_multiplier,
+                "device": self.device,
+            }
         )
-        content = self._content(keys) | {
-            "values": list(self.held_out),
-            "split": self.config.deploy.split,
-            "dt_multiplier": self.config.deploy.dt_multiplier,
-            "device": self.device,
-        }
-        content["scene"] = {k: v for k, v in content["scene"].items() if k not in _NOT_PHYSICS}
         return Run.open("deploy", self.scene.name, content, [self.training], root=self.root)
 
     @property
@@ -170,7 +179,7 @@ class Pipeline:
         """The run of errors and costs."""
         content = self._content(("evaluation",))
         content["paper"] = self._content(("scene",))["scene"].get("paper")
-        parents = [self.deployment, *(self.simulation(v) for v in self.held_out)]
+        parents = [self.deployment, *(self.truth(v) for v in self.held_out)]
         return Run.open("evaluate", self.scene.name, content, parents, root=self.root)
 
     def evaluated(self) -> Run:
@@ -185,6 +194,13 @@ class Pipeline:
             if there.evaluation.complete:
                 return there.evaluation
         return self.evaluation.require()
+
+    @staticmethod
+    def _physics(scene: Scene) -> dict:
+        """What the configuration says of a scene's physics."""
+        plain = OmegaConf.to_container(scene.config)
+        content = {key: plain[key] for key in _SCENE_KEYS}
+        return content | {"scene": {k: v for k, v in plain["scene"].items() if k not in NOT_PHYSICS}}
 
     def _content(self, keys: Sequence[str]) -> dict:
         plain = OmegaConf.to_container(self.config)
@@ -202,28 +218,35 @@ class Pipeline:
 
     def simulate(self) -> list[Run]:
         """Full-order trajectories of every training, validation and held-out value."""
-        values = sorted({*self.split.train, *self.split.validation, *self.split.test})
-        runs = {value: self.simulation(value) for value in values}
-        missing = [value for value, run in runs.items() if not run.complete]
-        if len(missing) < len(values):
-            self.say(
-                f"simulate: {len(values) - len(missing)} of {len(values)} trajectories are there, reused"
-            )
+        # A changed scene that changes nothing, or trains on what it deploys, names one run twice.
+        runs = {self.simulation(value, scene): (value, scene) for value, scene in self._needed()}
+        missing = {run: needed for run, needed in runs.items() if not run.complete}
+        if len(missing) < len(runs):
+            self.say(f"simulate: {len(runs) - len(missing)} of {len(runs)} trajectories are there, reused")
         if missing:
             started = time.perf_counter()
-            self._simulate({value: runs[value] for value in missing})
+            self._simulate(missing)
             self.say(f"simulate: {len(missing)} trajectories in {time.perf_counter() - started:.1f} s")
-        return list(runs.values())
+        return list(runs)
 
-    def _simulate(self, runs: dict[float, Run]) -> None:
+    def _needed(self) -> list[tuple[float, Scene]]:
+        """Every value with the scene that is simulated there: the deployed one where values are held out."""
+        held_out = getattr(self.split, self.config.deploy.split)
+        plain = {*self.split.train, *self.split.validation, *self.split.test}.difference(
+            () if self.config.deploy.split == "train" else held_out
+        )
+        needed = [(value, self.scene) for value in plain] + [(value, self.deployed) for value in held_out]
+        return sorted(needed, key=lambda pair: pair[0])
+
+    def _simulate(self, runs: dict[Run, tuple[float, Scene]]) -> None:
         c, name, unit = self.config, self.scene.parameters.name, self.scene.parameters.unit
 
-        def job(value: float, run: Run) -> Job:
+        def job(run: Run, value: float, scene: Scene) -> Job:
             parameters = {name: value}
-            build = partial(self.scene.full_order, parameters, c.precision, self.device)
+            build = partial(scene.full_order, parameters, c.precision, self.device)
             return Job(run, f"{name} {value:g}{unit}", parameters, build)
 
-        jobs = [job(value, run) for value, run in runs.items()]
+        jobs = [job(run, *needed) for run, needed in runs.items()]
         simulate(jobs, self.scene.steps, self.scene.dx, _STORED[c.data.dtype], self.device, c.precision)
 
     def train(self) -> Run:
@@ -259,7 +282,7 @@ class Pipeline:
 
     def solver_at(self, manifold: Manifold, value: float, device: str | None = None) -> ReducedMPM:
         """The configured reduced solver at a parameter value, at t = 0."""
-        solver = self.scene.reduced(
+        solver = self.deployed.reduced(
             manifold,
             {self.scene.parameters.name: value},
             self._phases or self.sampler,
@@ -323,7 +346,7 @@ class Pipeline:
         with run.record(device=self.device, precision=self.config.precision) as record:
             for index, value in enumerate(self.held_out):
                 rollouts.append(Rollout.open(deployment.path / f"rollout_{index}.h5"))
-                with Trajectory.open(self.simulation(value).require().path / "trajectory.h5") as trajectory:
+                with Trajectory.open(self.truth(value).require().path / "trajectory.h5") as trajectory:
                     solver = self.solver_at(manifold, value)
                     shown = (e.picture_particles, e.picture_frames)
                     comparisons.append(
@@ -335,7 +358,7 @@ class Pipeline:
                 self.config, manifold, rollouts, comparisons, cost, self.device, run.manifest
             )
             seconds = self.training.manifest["metrics"]["training_seconds"]
-            summary = results.summarise(self.scene, manifold, table, comparisons, seconds)
+            summary = results.summarise(self.deployed, manifold, table, comparisons, seconds)
             results.write(record, table, comparisons, cost, summary)
         self.say(f"evaluate: mean δ {100 * table['delta'].mean():.3g} % over {len(table)} values → {run.id}")
         return run
@@ -343,7 +366,7 @@ class Pipeline:
     def _cost(self, manifold: Manifold) -> dict:
         trials, value = self.config.evaluation.trials, self.held_out[0]
         name = self.scene.parameters.name
-        scene, multiplier = self.scene, self.config.deploy.dt_multiplier
+        scene, multiplier = self.deployed, self.config.deploy.dt_multiplier
         cost = measure(
             {
                 "full_order": Subject(
@@ -362,7 +385,7 @@ class Pipeline:
         """The report of every evaluated variant of this scene at these held-out trajectories."""
         from nsf.reporting.build import build_report
 
-        truths = {self.simulation(v).id for v in self.held_out}
+        truths = {self.truth(v).id for v in self.held_out}
         found = Run.find("evaluate", self.scene.name, root=self.root)
         runs = [
             r for r in found if r.complete and truths == {p for p in r.parents if p.startswith("simulate/")}

@@ -94,6 +94,7 @@ def summarise(
         "particles": len(manifold.X),
         "floor": _floor(scene),
         "training_seconds": seconds,
+        "changes": OmegaConf.to_container(config.deploy).get("changes") or {},
         "delta": mean("delta") if math.isfinite(mean("delta")) else None,
         "reconstruction_delta": mean("reconstruction_delta"),
         "reconstruction_stress_error": mean("reconstruction_stress_error"),

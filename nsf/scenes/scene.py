@@ -4,6 +4,7 @@ import functools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
@@ -16,6 +17,9 @@ from nsf.mpm.materials import Material
 from nsf.scenes.geometry import Shape
 from nsf.scenes.weakness import Weakness
 from nsf.vectors import vector
+
+#: Keys of a scene that its simulation does not depend on.
+NOT_PHYSICS = ("parameters", "reduced", "paper", "title")
 
 
 @dataclass(frozen=True)
@@ -235,6 +239,38 @@ class Scene:
                 )
             OmegaConf.update(config, self.parameters.key, float(value))
         return Scene.from_config(config)
+
+    def with_changes(self, changes: Mapping[str, Any]) -> "Scene":
+        """The scene with other values of some configuration keys, and the same particles at rest and steps.
+
+        A manifold of this scene can be deployed on that one: the fields are functions of the particles'
+        X, and a latent vector steps by Δt on the grid.
+
+        Args:
+            changes: values by dotted key of the scene, its material or its transfer.
+
+        Raises:
+            ConfigError: a key is unknown, the problem parameter's, or one that changes X, the grid or the
+                steps; a value is refused.
+        """
+        if self.parameters.key in changes:
+            raise ConfigError(f"{self.parameters.key} is the problem parameter; set scene.parameters.test")
+        plain = OmegaConf.to_container(self.config)
+        plain["scene"] = {k: v for k, v in plain["scene"].items() if k not in ("name", *NOT_PHYSICS)}
+        known = configuration.leaves({part: plain[part] for part in ("scene", "material", "transfer")})
+        changed = Scene.from_config(configuration.replaced(self.template, changes, known))
+        kept = {
+            "particles": np.array_equal(changed.particles().X, self.particles().X),
+            "grid nodes": (changed.grid, changed.size) == (self.grid, self.size),
+            "time steps": (changed.dt, changed.steps) == (self.dt, self.steps),
+        }
+        other = [what for what, same in kept.items() if not same]
+        if other:
+            raise ConfigError(
+                f"{', '.join(changes)} gives other {', '.join(other)} than the manifold is trained on; "
+                f"set it for the whole chain, {next(iter(changes))}=…"
+            )
+        return changed
 
     @property
     def grid(self) -> GridGeometry:

@@ -166,6 +166,44 @@ def test_another_test_value_simulates_only_that_one(copied, pipeline_at):
     assert results["parameter"].tolist() == [26.0, 34.0]
 
 
+def test_deploying_on_another_scene_than_the_one_trained_on(copied, pipeline_at):
+    """Appendix "Generalization": the deployed scene and its truths differ, the training does not."""
+    root = copied(*STAGES)
+    before = stamps(root)
+    change = "scene.gravity"
+    plain = pipeline_at(root)
+    pipeline, said = said_by(
+        pipeline_at, root, f"deploy.changes={{{change}:[0,0,-6]}}", "evaluation.trials=1"
+    )
+    assert said[0] == "simulate: 3 of 4 trajectories are there, reused"
+    assert "train: inputs unchanged, reused" in said[2]
+    assert {p: t for p, t in stamps(root).items() if p in before} == before
+    assert pipeline.truth(26.0).hash != pipeline.simulation(26.0).hash == plain.truth(26.0).hash
+    assert pipeline.evaluation.manifest["parents"] == [pipeline.deployment.id, pipeline.truth(26.0).id]
+    assert json.loads((pipeline.evaluation.path / "summary.json").read_text())["changes"] == {
+        change: [0, 0, -6]
+    }
+    fallen = []
+    for run in (plain.truth(26.0), pipeline.truth(26.0)):
+        with Trajectory.open(run.path / "trajectory.h5") as trajectory:
+            fallen.append((trajectory.X - trajectory.read("x", 12)[0])[:, 2].mean())
+    assert fallen[1] > 1.2 * fallen[0] > 0
+    # The reduced run falls further too: its grid step has the other gravity.
+    latents = [h5py.File(p.deployment.path / "rollout_0.h5")["xhat"][()] for p in (plain, pipeline)]
+    manifold = Manifold.load(plain.training.path / "manifold.pt")
+    z = [manifold.restrict().position(torch.tensor(xhat[12]))[:, 2].mean().item() for xhat in latents]
+    assert z[1] < z[0]
+    # The changed truth is what a plain run of that scene makes.
+    assert pipeline_at(root, f"{change}=[0,0,-6]").simulation(26.0).complete
+
+
+def test_a_changed_training_value_is_another_simulation(chain, pipeline_at):
+    pipeline = pipeline_at(chain.root, "deploy.split=train", "deploy.changes={material.E:1900}")
+    assert pipeline.training.hash == chain.pipeline.training.hash
+    assert pipeline.truth(30.0).hash != pipeline.simulation(30.0).hash
+    assert len(pipeline._needed()) == 7  # three values twice, and the test value
+
+
 HASHES = {
     # override → stages that it makes anew
     "scene.parameters.test=[26,34]": {"deployment", "evaluation"},
@@ -174,6 +212,8 @@ HASHES = {
     "projector=taylor": {"deployment", "evaluation"},
     "integration=search": {"deployment", "evaluation"},
     "deploy.dt_multiplier=1.5": {"deployment", "evaluation"},
+    "deploy.changes={material.E:1900}": {"deployment", "evaluation"},
+    "deploy.changes={}": set(),
     "evaluation.trials=3": {"evaluation"},
     "latent_dim=3": {"training", "deployment", "evaluation"},
     "seed=1": {"training", "deployment", "evaluation"},

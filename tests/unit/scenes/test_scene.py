@@ -318,3 +318,46 @@ def test_splits_share_no_value(pair):
     values[pair[1]] = [*values[pair[1]], values[pair[0]][0]]
     with pytest.raises(ConfigError, match=f"{pair[0]} and {pair[1]}"):
         ParameterRange("material.E", "Pa", **values)
+
+
+# -- changes: another scene for the same manifold ---------------------------------------------------------
+
+
+def test_changes_keep_the_particles():
+    bread = load("bread")
+    changed = bread.with_changes(
+        {"scene.bodies.slice.weakness.perturbation": 0.3, "scene.gravity": [0, 0, -1]}
+    )
+    before, after = bread.particles(), changed.particles()
+    np.testing.assert_array_equal(after.X, before.X)
+    assert (after.mu < before.mu).any()
+    assert (after.mu < before.mu.max()).sum() == (before.mu < before.mu.max()).sum()
+    assert changed.gravity == (0.0, 0.0, -1.0)
+    assert bread.gravity == (0.0, 0.0, 0.0)
+
+
+def test_a_key_that_refers_to_a_changed_one_follows():
+    scene = load("sand", [FEW, "scene.bodies.column.density='${material.E}'"])
+    assert scene.with_changes({"material.E": 300.0}).bodies[0].density == 300.0
+
+
+@pytest.mark.parametrize(
+    ("change", "quoted"),
+    [
+        ({"scene.gravty": [0, 0, -1]}, "unknown key 'scene.gravty'; did you mean scene.gravity"),
+        ({"scene.bodies.column.velocty": 1}, "did you mean scene.bodies.column.velocity"),
+        ({"scene.walls": 1}, "several keys in 'scene.walls'; did you mean scene.walls.kind"),
+        ({"latent_dim": 3}, "unknown key 'latent_dim'"),
+        ({"scene.parameters.test": [3]}, "unknown key 'scene.parameters.test'"),
+        ({"material.friction_angle": 3}, "is the problem parameter; set scene.parameters.test"),
+        ({"scene.bodies.column.particles": 200}, "scene.bodies.column.particles gives other particles"),
+        ({"scene.bodies.column.shape.radius": 0.05}, "gives other particles than the manifold is trained on"),
+        ({"scene.dx": 0.02}, "scene.dx gives other grid nodes"),
+        ({"scene.dt": 0.001}, "set it for the whole chain, scene.dt=…"),
+        ({"scene.steps": 5}, "scene.steps gives other time steps"),
+        ({"material.nu": 0.7}, "material.nu=0.7 must lie in"),
+    ],
+)
+def test_changes_refused(sand, change, quoted):
+    with pytest.raises(ConfigError, match=re.escape(quoted)):
+        sand.with_changes(change)
