@@ -11,7 +11,7 @@ not in the paper, whose fields are `mlp`; it takes their place in every equation
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -266,12 +266,14 @@ class BasisManifold(Manifold):
         networks = {phase: self._deployed(phase, like) for phase in PHASES}
         local = functools.cache(lambda: interpolation(points.to(device), self.X.to(device)))
         place = local().value if rows is None else (lambda values: values[rows])
-        fields = {
-            phase: self.fields[phase].at(
+        fields = PlacedFields(
+            lambda phase: self.fields[phase].at(
                 place, points if phase == "deformation" else 0, networks[phase], like
             )
-            for phase in PHASES
-        }
+        )
+        if rows is not None:
+            for phase in PHASES:
+                fields[phase]  # what a deployed model holds is all there from the start
 
         def gradient() -> RestrictedField:
             def place(values: Tensor) -> Tensor:
@@ -297,6 +299,17 @@ class BasisManifold(Manifold):
         )
 
 
+class PlacedFields(dict):
+    """Restricted fields by phase, each made when first asked for: points in between may need but one."""
+
+    def __init__(self, make: Callable[[str], RestrictedField]):
+        self._make = make
+
+    def __missing__(self, phase: str) -> RestrictedField:
+        self[phase] = self._make(phase)
+        return self[phase]
+
+
 class BasisRestriction(Restriction):
     """Modes at n points.
 
@@ -308,7 +321,7 @@ class BasisRestriction(Restriction):
 
     def __init__(
         self,
-        fields: dict[str, RestrictedField],
+        fields: Mapping[str, RestrictedField],
         gradient: Callable[[], RestrictedField],
         latent_dim: int,
         takes_parameters: bool,
@@ -346,7 +359,7 @@ class BasisRestriction(Restriction):
 
     @override
     def subset(self, rows):
-        fields = {phase: field.subset(rows) for phase, field in self.fields.items()}
+        fields = {phase: self.fields[phase].subset(rows) for phase in PHASES}
         return BasisRestriction(
             fields, lambda: self._gradient.subset(rows), self.latent_dim, self._takes_parameters
         )

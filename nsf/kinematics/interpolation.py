@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -10,6 +12,8 @@ from torch import Tensor
 NEIGHBOURS = 20  # 19 with weight and the one that ends the support: first two shells of a cubic lattice
 SOFTENING = 1e-8  # of the squared support radius: bounds the weight at a particle, error there about 1e-8
 RIDGE = 1e-10  # of the moment matrix's trace: the slope across a flat neighbourhood is zero, not 0/0
+GROUP = 1024  # points that look for neighbours together
+MARGIN = 2.2  # particle spacings: the radius of a half ball that holds the neighbours, as at a face
 CHUNK_ENTRIES = 1 << 26  # distances held at once
 
 
@@ -18,14 +22,21 @@ class Interpolation:
     """f(X_i) = Σ_j weights_ij f(X_j) over the neighbours j of each of n points, and its derivative in X_i.
 
     Attributes:
-        neighbours: training particles [n, k].
+        X: points [n, 3] m; particles: [P, 3] m, both float64 on one device.
+        neighbours: of the points among the particles [n, k].
         weights: [n, k], dimensionless; they sum to 1.
-        gradients: ∂weights/∂X [n, k, 3] 1/m, the exact derivative, the moving support included.
     """
 
+    X: Tensor
+    particles: Tensor
     neighbours: Tensor
     weights: Tensor
-    gradients: Tensor
+
+    @cached_property
+    def gradients(self) -> Tensor:
+        """∂weights/∂X [n, k, 3] 1/m, the exact derivative, the moving support included; made if asked for."""
+        chunks = _chunks(self.X, self.neighbours)
+        return torch.cat([_gradients(x, self.particles[near]) for x, near in chunks])
 
     def value(self, field: Tensor) -> Tensor:
         """Field [P, ...] at the points [n, ...], in float64 on the field's device."""
@@ -49,8 +60,51 @@ class Interpolation:
 
 def nearest(X: Tensor, particles: Tensor, k: int) -> Tensor:
     """Indices [n, k] of the k particles [P, 3] nearest to each point X [n, 3], nearest first."""
-    rows = max(1, CHUNK_ENTRIES // particles.shape[0])
-    return torch.cat([_squared(x, particles).topk(k, largest=False).indices for x in X.split(rows)])
+    extent = particles.amax(0) - particles.amin(0)
+    spacing = (extent.prod() / len(particles)) ** (1 / 3)
+    found = torch.empty(len(X), k, dtype=torch.long, device=X.device)
+    for rows in lying_together(X, GROUP):
+        found[rows] = _nearest(X[rows], particles, k, MARGIN * spacing, extent.max())
+    return found
+
+
+def lying_together(X: Tensor, count: int) -> tuple[Tensor, ...]:
+    """Rows of the points X [n, 3] in groups of `count`, each from one part of space."""
+    if len(X) <= count:
+        return (torch.arange(len(X), device=X.device),)
+    extent = X.amax(0) - X.amin(0)
+    tiny = torch.finfo(X.dtype).tiny ** 0.25
+    edge = (extent.clamp_min(1e-6 * extent.max()).prod() * count / len(X)) ** (1 / 3) + tiny
+    x, y, z = ((X - X.amin(0)) / edge).unbind(1)
+    # Columns of cells one after the other, there and back, so that a group that ends one begins the next.
+    i, j = x.floor(), y.floor()
+    columns = j.amax() + 1
+    column = i * columns + torch.where(i % 2 == 0, j, columns - 1 - j)
+    height = z / (z.amax() + 1)
+    return (column + torch.where(column % 2 == 0, height, 1 - height)).argsort().split(count)
+
+
+def _nearest(X: Tensor, particles: Tensor, k: int, margin: Tensor, extent: Tensor) -> Tensor:
+    """`nearest` among the particles in the points' bounding box and a margin [m] about it.
+
+    The margin is doubled until no particle beyond it can be nearer, or it is the body's extent.
+    """
+    lower, upper = X.amin(0), X.amax(0)
+    while 0 < margin < extent:
+        around = ((particles >= lower - margin) & (particles <= upper + margin)).all(1).nonzero()[:, 0]
+        if len(around) >= k:
+            near, squared = _among(X, particles[around], k)
+            if squared.max() <= margin**2:
+                return around[near]
+        margin = 2 * margin
+    return _among(X, particles, k)[0]
+
+
+def _among(X: Tensor, particles: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """The k nearest [n, k] of all particles, and their squared distances [m²]."""
+    rows = max(1, CHUNK_ENTRIES // len(particles))
+    found = [_squared(x, particles).topk(k, largest=False) for x in X.split(rows)]
+    return torch.cat([f.indices for f in found]), torch.cat([f.values for f in found])
 
 
 def _squared(X: Tensor, particles: Tensor) -> Tensor:
@@ -94,15 +148,21 @@ def local_weights(X: Tensor, neighbours: Tensor) -> Tensor:
 def interpolation(X: Tensor, particles: Tensor) -> Interpolation:
     """The interpolation from training particles [P, 3] m to points X [n, 3] m (both float64, one device)."""
     neighbours = nearest(X, particles, min(NEIGHBOURS, particles.shape[0]))
-    weights, gradients = [], []
+    weights = [local_weights(x, particles[near]) for x, near in _chunks(X, neighbours)]
+    return Interpolation(X, particles, neighbours, torch.cat(weights))
+
+
+def _chunks(X: Tensor, neighbours: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+    """Points and their neighbours, as many at once as the fit's matrices leave room for."""
     rows = max(1, CHUNK_ENTRIES // (64 * neighbours.shape[1]))
-    for points, near in zip(X.split(rows), neighbours.split(rows), strict=True):
-        around = particles[near]
-        # One direction at a time: torch 2.13's vmap of linalg.solve has wrong forward derivatives.
-        derivatives = [
-            torch.func.jvp(lambda point: local_weights(point, around), (points,), (axis.expand_as(points),))  # noqa: B023
-            for axis in torch.eye(3, dtype=X.dtype, device=X.device)
-        ]
-        weights.append(derivatives[0][0])
-        gradients.append(torch.stack([derivative for _, derivative in derivatives], -1))
-    return Interpolation(neighbours, torch.cat(weights), torch.cat(gradients))
+    return zip(X.split(rows), neighbours.split(rows), strict=True)
+
+
+def _gradients(X: Tensor, neighbours: Tensor) -> Tensor:
+    """Derivative [n, k, 3] of `local_weights` in X."""
+    # One direction at a time: torch 2.13's vmap of linalg.solve has wrong forward derivatives.
+    derivatives = [
+        torch.func.jvp(lambda point: local_weights(point, neighbours), (X,), (axis.expand_as(X),))[1]
+        for axis in torch.eye(3, dtype=X.dtype, device=X.device)
+    ]
+    return torch.stack(derivatives, -1)

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nsf.kinematics.interpolation import NEIGHBOURS, interpolation, nearest
+from nsf.kinematics.interpolation import NEIGHBOURS, interpolation, lying_together, nearest
 
 
 def cloud(n, seed=0):
@@ -65,3 +65,33 @@ def test_nearest_in_chunks(monkeypatch):
     assert torch.equal(nearest(X, particles, 5), whole)
     reference = (X[:, None] - particles).norm(dim=-1).argsort(-1)[:, :5]
     assert torch.equal(whole, reference)
+
+
+@pytest.mark.parametrize(
+    "particles",
+    [
+        cloud(3000),
+        cloud(3000) * torch.tensor([1.0, 0.02, 0.5]),
+        torch.cat([cloud(1500), cloud(1500) * 0.1 + 4]),
+    ],
+    ids=["cube", "slice", "clusters"],
+)
+@pytest.mark.parametrize("inside", [True, False])
+def test_nearest_in_groups(particles, inside):
+    """Groups look only about themselves; no particle that is nearer may be missed."""
+    particles = particles.double()
+    X = particles[:1700] + (0.01 if inside else 0.7) * cloud(1700, seed=3)
+    reference = (X[:, None] - particles).square().sum(-1).topk(20, largest=False)
+    found = nearest(X, particles, 20)
+    distances = (X[:, None] - particles[found]).square().sum(-1)
+    torch.testing.assert_close(distances, reference.values, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("X", [cloud(5000), cloud(5000) * torch.tensor([1.0, 0.0, 0.3]), cloud(7), cloud(0)])
+def test_points_lying_together(X):
+    groups = lying_together(X.double(), 100)
+    assert torch.equal(torch.cat(groups).sort().values, torch.arange(len(X)))
+    assert max(map(len, groups)) <= 100
+    if X.any() and len(X) > 100 and X[:, 1].any():  # 50 groups of a cube: most span a fraction of each edge
+        spans = torch.stack([X[g].amax(0) - X[g].amin(0) for g in groups])
+        assert spans.median(0).values.max() < 0.5
