@@ -14,6 +14,7 @@ STAGES = {
     "deploy": "reduced runs at the held-out parameter values",
     "evaluate": "errors and costs of the reduced runs beside the full-order ones",
     "report": "tables, charts and pictures of every evaluated variant of the scene",
+    "superresolve": "deployed fields at many more points, beside a full-order run of as many particles",
     "point": "one material point along a deformation path",
 }
 _EXAMPLES = """\

@@ -3,16 +3,20 @@
 from nsf.evaluation.compare import Comparison, at_frames, compare
 from nsf.evaluation.cost import SolverCost, Subject, measure
 from nsf.evaluation.metrics import deformation_error, displacement_error, reduction_ratio, stress_error
+from nsf.evaluation.superresolution import SuperResolution, query, superresolve
 
 __all__ = [
     "Comparison",
     "SolverCost",
     "Subject",
+    "SuperResolution",
     "at_frames",
     "compare",
     "deformation_error",
     "displacement_error",
     "measure",
+    "query",
     "reduction_ratio",
     "stress_error",
+    "superresolve",
 ]

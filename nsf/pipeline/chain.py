@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError
 
@@ -20,7 +21,7 @@ from nsf.dynamics.interop import torch_device
 from nsf.dynamics.sampling import check_well_posed
 from nsf.dynamics.solver import reduced_steps
 from nsf.errors import ConfigError, MissingRunError
-from nsf.evaluation import Subject, compare, measure
+from nsf.evaluation import Subject, compare, measure, superresolve
 from nsf.kinematics.manifold import Manifold
 from nsf.kinematics.training import TRACKING, train
 from nsf.mpm import FP32, FP64, precision_of
@@ -71,6 +72,8 @@ class Pipeline:
             configuration.number(key, c[key], least=least, whole=True)
         for key in ("trials", "picture_particles", "picture_frames"):
             configuration.number(f"evaluation.{key}", c.evaluation[key], least=1, whole=True)
+        configuration.number("super_resolution.factor", c.super_resolution.factor, least=2, whole=True)
+        configuration.number("super_resolution.frames", c.super_resolution.frames, least=1, whole=True)
         multiplier = c.deploy.dt_multiplier
         if not configuration.number("deploy.dt_multiplier", multiplier) > 0:
             raise ConfigError(f"deploy.dt_multiplier={multiplier} must be positive")
@@ -194,6 +197,13 @@ class Pipeline:
             if there.evaluation.complete:
                 return there.evaluation
         return self.evaluation.require()
+
+    @property
+    def superresolution(self) -> Run:
+        """The run of the deployed fields at more points."""
+        content = self._content(("super_resolution",))
+        parents = [self.deployment, *(self.truth(v) for v in self.held_out)]
+        return Run.open("superresolve", self.scene.name, content, parents, root=self.root)
 
     @staticmethod
     def _physics(scene: Scene) -> dict:
@@ -398,6 +408,41 @@ class Pipeline:
         page = build_report(runs, folder, self.config.scene.title, first=self.evaluation)
         self.say(f"report: {len(runs)} evaluated variants → {page}")
         return page
+
+    def superresolve(self) -> Run:
+        """The reduced trajectories at many more points, beside full-order ones of as many particles."""
+        run = self.superresolution
+        if self._reused(run):
+            return run
+        c, deployment = self.config, self.deployment.require()
+        manifold = Manifold.load(self.training.require().path / "manifold.pt")
+        steps, count = self.scene.steps, c.super_resolution.frames
+        frames = np.unique(np.linspace(0, steps, min(count, steps) + 1).round().astype(int))[1:].tolist()
+        paths = [self.truth(value).require().path / "trajectory.h5" for value in self.held_out]
+        with run.record(device=self.device, precision=c.precision) as record:
+            fine = []
+            for index, path in enumerate(paths):
+                rollout = Rollout.open(deployment.path / f"rollout_{index}.h5")
+                with Trajectory.open(path) as trajectory:
+                    fine.append(
+                        superresolve(
+                            manifold,
+                            self.deployed,
+                            trajectory,
+                            rollout,
+                            c.super_resolution.factor,
+                            frames,
+                            c.precision,
+                            self.device,
+                        )
+                    )
+            table = results.write_superresolution(record, self.deployed, fine)
+        self.say(
+            f"superresolve: {table['points'][0]:,} points, mean δ {100 * table['delta'].mean():.3g} % "
+            f"({100 * table['particles_delta'].mean():.3g} % at the {len(manifold.X):,} particles), "
+            f"queried in {table['seconds'].sum():.1f} s → {run.id}"
+        )
+        return run
 
     def _reused(self, run: Run) -> bool:
         if run.complete:

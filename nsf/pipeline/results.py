@@ -9,7 +9,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from nsf.dynamics import Rollout
-from nsf.evaluation import Comparison, SolverCost, reduction_ratio
+from nsf.evaluation import Comparison, SolverCost, SuperResolution, reduction_ratio
 from nsf.mpm import HalfSpace
 from nsf.runs import Record
 from nsf.scenes import Scene
@@ -128,6 +128,22 @@ def write(
     for name in (*tables, "frames.npz", "cost.json", "summary.json"):
         record.output(name)
     record.metrics.update({name: summary[name] for name in ("delta", "reconstruction_delta")})
+
+
+def write_superresolution(record: Record, scene: Scene, fine: Sequence[SuperResolution]) -> pd.DataFrame:
+    """Write `superresolution.csv` and `superresolution.png` into a run's folder; gives the table."""
+    from nsf.reporting.render import fine_shapes
+
+    table = pd.DataFrame([f.row for f in fine])
+    with writing(record.path / "superresolution.csv") as partial:
+        table.to_csv(partial, index=False)
+    picture = fine_shapes(fine, scene.parameters.name.replace("_", " "), scene.parameters.unit, _floor(scene))
+    with writing(record.path / "superresolution.png") as partial:
+        picture.savefig(partial)
+    for name in ("superresolution.csv", "superresolution.png"):
+        record.output(name)
+    record.metrics.update(table.drop(columns="parameter").mean().to_dict())
+    return table
 
 
 def _floor(scene: Scene) -> float | None:

@@ -101,6 +101,19 @@ class View:
         fine = canvas.reshape(self.height, _OVERSAMPLE, self.width, _OVERSAMPLE, 3)
         return (255 * np.clip(fine.mean(axis=(1, 3)), 0, 1)).astype(np.uint8)
 
+    def front(self, x: np.ndarray, radius: float) -> np.ndarray:
+        """Rows of the particles x [n, 3] m within two radii [m] of the foremost about them.
+
+        The others are hidden behind these; of millions it leaves those that a picture shows.
+        """
+        alive = np.flatnonzero(np.isfinite(x).all(axis=1))
+        right, up, toward = self.camera.project(x[alive]).T
+        columns = int((right.max() - right.min()) / radius) + 1
+        cell = ((up - up.min()) / radius).astype(int) * columns + ((right - right.min()) / radius).astype(int)
+        foremost = np.full(cell.max() + 1, -np.inf)
+        np.maximum.at(foremost, cell, toward)
+        return alive[toward >= foremost[cell] - 2.0 * radius]
+
     def _pixels(self, projected: np.ndarray, scale: float) -> np.ndarray:
         """Camera axes [m] to column, row [pixel] and nearness [m]."""
         column = (projected[:, 0] - self.low[0]) * scale

@@ -2,6 +2,7 @@
 
 import io
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import matplotlib
 import numpy as np
@@ -16,6 +17,9 @@ from nsf.reporting.camera import Camera, View
 from nsf.reporting.columns import parameter_text
 from nsf.reporting.sources import Motion
 from nsf.reporting.style import INK, MUTED, WARNING, WIDTH, styled
+
+if TYPE_CHECKING:
+    from nsf.evaluation import SuperResolution
 
 STRESS_COLORS, DIFFERENCE_COLORS = "viridis", "magma"
 CLIP = 97.0  # [%] percentile of the full-order stress at which the colour scale ends
@@ -41,7 +45,7 @@ def final_shapes(
     apart = [np.linalg.norm(x_rom - x_fom, axis=-1) for _, x_fom, x_rom, *_ in last]
     distance = _Scale.up_to(_percentile(np.concatenate(apart), 99.5), DIFFERENCE_COLORS, _M)
     view = View.around(np.concatenate([x_fom for _, x_fom, *_ in last]), width=520, floor=floor)
-    radius = _radius(motions)
+    radius = _radius(motions[0].x_full[0])
     with styled():
         sheet = _Sheet(view, rows=len(motions), columns=3, titles=("full-order", "reduced", "distance apart"))
         for row, ((m, x_fom, x_rom, stress_fom, stress_rom), d) in enumerate(zip(last, apart, strict=True)):
@@ -52,6 +56,38 @@ def final_shapes(
             sheet.show(row, 2, view.picture(x_rom, distance.colors(d), radius))
         sheet.color_bar(stress, 0, 1, "von Mises equivalent of the Kirchhoff stress")
         sheet.color_bar(distance, 2, 2, "distance ‖x_rom − x_fom‖")
+        sheet.scale_bar()
+    return sheet.fig
+
+
+def fine_shapes(
+    fine: list["SuperResolution"], name: str = "parameter", unit: str = "", floor: float | None = None
+) -> Figure:
+    """Last frame of the reduced run at its particles and at many more points, and the fine full-order run.
+
+    Whole bodies, coloured by ‖x − X‖: a picture of many points shows the surface, which carries no stress.
+
+    Args:
+        fine: one a row.
+        name, unit: of the problem parameter.
+        floor: height of the floor line [m]; None draws none.
+    """
+    distances = np.linalg.norm(fine[0].x_full - fine[0].X, axis=1)
+    moved = _Scale.up_to(_percentile(distances, 99.5), STRESS_COLORS, _M)
+    view = View.around(np.concatenate([f.x_full for f in fine]), width=520, floor=floor)
+    count, more = len(fine[0].particles), len(fine[0].X)
+    titles = (f"reduced, {count:,} particles", f"reduced, {more:,} points", f"full-order, {more:,} particles")
+    with styled():
+        sheet = _Sheet(view, rows=len(fine), columns=3, titles=titles)
+        for row, f in enumerate(fine):
+            sheet.name_row(row, parameter_text(f.row["parameter"], name, unit))
+            shown = ((f.x_reduced, f.particles), (f.x_reduced, ...), (f.x_full, ...))
+            for column, (x, rows) in enumerate(shown):
+                X, x, radius = f.X[rows], x[rows], _radius(f.X[rows])
+                front = view.front(x, radius)
+                colors = moved.colors(np.linalg.norm(x[front] - X[front], axis=1))
+                sheet.show(row, column, view.picture(x[front], colors, radius))
+        sheet.color_bar(moved, 0, 2, "displacement ‖x − X‖")
         sheet.scale_bar()
     return sheet.fig
 
@@ -69,7 +105,7 @@ def strip(
     frames = np.unique(np.linspace(0, len(motion.t) - 1, count).round().astype(int))
     stress = _Scale.up_to(np.percentile(motion.stress_full, CLIP), STRESS_COLORS, _PA)
     view = View.around(motion.x_full[frames].reshape(-1, 3), width=420, floor=floor)
-    radius = _radius([motion])
+    radius = _radius(motion.x_full[0])
     value = parameter_text(motion.parameter, name, unit)
     with styled():
         sheet = _Sheet(view, 2, len(frames), [f"t = {motion.t[k]:.3g} s" for k in frames])
@@ -104,7 +140,7 @@ def animation(
     x_full = np.concatenate([m.x_full.reshape(-1, 3) for m in motions])
     stress = _Scale.up_to(np.percentile([m.stress_full for m in motions], CLIP), STRESS_COLORS, _PA)
     view = View.around(x_full, width=width, floor=floor)
-    radius = _radius(motions)
+    radius = _radius(motions[0].x_full[0])
     count = len(motions[0].t)
     chosen = np.unique(np.linspace(0, count - 1, min(frames, count)).round().astype(int))
     images = []
@@ -249,10 +285,9 @@ def _cut_open(motions: list[Motion]) -> list[Motion]:
     return [cut(motion) for motion in motions]
 
 
-def _radius(motions: list[Motion]) -> float:
-    """A sphere's radius [m] at which the first frame looks closed: from the volume its particles fill."""
-    X = motions[0].x_full[0].astype(float)
-    volume = np.prod(np.maximum(np.ptp(X, axis=0), 1e-6))
+def _radius(X: np.ndarray) -> float:
+    """A sphere's radius [m] at which particles X [n, 3] look closed: from the volume they fill."""
+    volume = np.prod(np.maximum(np.ptp(X.astype(float), axis=0), 1e-6))
     return 0.62 * (volume / len(X)) ** (1 / 3)
 
 

@@ -225,6 +225,7 @@ HASHES = {
     "transfer=pic": {"simulation", "training", "deployment", "evaluation"},
     "precision=fp32": {"simulation", "training", "deployment", "evaluation"},
     "scene.bodies.column.velocity=[0,0,1]": {"simulation", "training", "deployment", "evaluation"},
+    "super_resolution.factor=3": set(),
     "report.name=other": set(),
     "scene.title=Other": set(),
     "tracking=tensorboard": set(),
@@ -254,7 +255,13 @@ def test_a_value_is_one_run_however_it_is_written(chain, pipeline_at):
 
 @pytest.mark.parametrize(
     ("stage", "command"),
-    [("train", "nsf simulate"), ("deploy", "nsf train"), ("evaluate", "nsf deploy"), ("report", "nsf run")],
+    [
+        ("train", "nsf simulate"),
+        ("deploy", "nsf train"),
+        ("evaluate", "nsf deploy"),
+        ("superresolve", "nsf deploy"),
+        ("report", "nsf run"),
+    ],
 )
 def test_a_stage_before_its_time(pipeline_at, tmp_path, stage, command):
     with pytest.raises(MissingRunError, match=f"run `{command}"):
@@ -345,6 +352,27 @@ def test_a_diverged_rollout_is_infinite_and_never_nan(copied, pipeline_at):
     assert np.isfinite(frames["x_reduced"]).all()
     for name in ("cost.json", "summary.json"):
         json.loads((pipeline.evaluation.path / name).read_text(), parse_constant=pytest.fail)
+
+
+# -- super-resolution -----------------------------------------------------------------------------------
+
+
+def test_super_resolution_of_a_deployment(copied, pipeline_at):
+    root, options = copied(*STAGES), ("super_resolution.factor=2", "super_resolution.frames=3")
+    pipeline, said = said_by(pipeline_at, root, *options, stages=["superresolve"])
+    run = pipeline.superresolution
+    assert run.manifest["parents"] == [pipeline.deployment.id, pipeline.truth(26.0).id]
+    assert "1,000 points" in said[0]
+    assert "at the 500 particles" in said[0]
+    table = pd.read_csv(run.path / "superresolution.csv")
+    assert list(table)[:5] == ["parameter", "factor", "points", "delta", "displacement_error"]
+    assert table[["parameter", "factor", "points"]].to_numpy().tolist() == [[26.0, 2, 1000]]
+    assert table.notna().all(axis=None)
+    assert table["seconds"][0] > 0
+    assert 0 < table["delta"][0] < 0.05
+    assert (run.path / "superresolution.png").stat().st_size > 10_000
+    _, again = said_by(pipeline_at, root, *options, stages=["superresolve"])
+    assert again == [f"superresolve: inputs unchanged, reused → {run.id}"]
 
 
 # -- the command ----------------------------------------------------------------------------------------

@@ -131,6 +131,8 @@ BEFORE_ANY_WORK = [
     ("deploy.changes=3", ["deploy.changes=3", "{material.nu:0.25}"]),
     ("evaluation.trials=0", ["evaluation.trials=0"]),
     ("evaluation.trials=abc", ["evaluation.trials=abc"]),
+    ("super_resolution.factor=1", ["super_resolution.factor=1", "at least 2"]),
+    ("super_resolution.frames=0", ["super_resolution.frames=0"]),
     ("evaluation.picture_particles=0", ["evaluation.picture_particles=0"]),
     ("evaluation.picture_frames=0", ["evaluation.picture_frames=0"]),
     ("report.name=../elsewhere", ["report.name=../elsewhere", "report.folder"]),

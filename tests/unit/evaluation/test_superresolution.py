@@ -1,0 +1,107 @@
+"""Fields of a reduced run at more points than it was trained on."""
+
+import numpy as np
+import pytest
+import torch
+from test_compare import rollout_of
+
+from nsf.data import Trajectory
+from nsf.dynamics import Rollout
+from nsf.evaluation import metrics, query, superresolution, superresolve
+from nsf.kinematics.manifold import Manifold
+from nsf.scenes import load
+
+FRAMES = [12, 24]
+
+
+@pytest.fixture(scope="module")
+def manifold(chain):
+    return Manifold.load(chain.checkpoint)
+
+
+@pytest.fixture(scope="module")
+def truth(chain):
+    with Trajectory.open(chain.trajectory(26.0)) as trajectory:
+        yield trajectory
+
+
+@pytest.fixture(scope="module")
+def made(chain):
+    return Rollout.open(chain.pipeline.deployment.path / "rollout_0.h5")
+
+
+@pytest.fixture(scope="module")
+def fine(chain, manifold, truth, made):
+    return superresolve(manifold, chain.scene, truth, made, 3, FRAMES, device="cpu")
+
+
+def test_a_refined_scene_begins_with_the_same_particles():
+    ball = "{_target_: nsf.scenes.Body, shape: {_target_: nsf.scenes.Ball, centre: [0.5,0.5,0.6], radius: 0.1}, particles_per_cell: 2, density: 1}"  # fmt: skip # noqa: E501
+    scene = load("sand", ["scene.bodies.column.particles=300", f"+scene.bodies.ball={ball}"])
+    fine = scene.refined(4)
+    assert [b.particles for b in fine.bodies] == [4 * b.particles for b in scene.bodies]
+    assert (fine.grid, fine.dt) == (scene.grid, scene.dt)
+    before, after = scene.particles(), fine.particles()
+    rows = superresolution._rows_in(fine, scene)
+    np.testing.assert_array_equal(after.X[rows], before.X)
+    assert after.mass.sum() == pytest.approx(before.mass.sum())
+
+
+def test_query_is_the_restriction_in_groups(manifold, chain, monkeypatch):
+    X = torch.tensor(chain.scene.refined(2).particles().X)
+    xhat = manifold.training_latents[[3, 30]]
+    whole = manifold.restrict(X=X).position(xhat)
+    monkeypatch.setattr(superresolution, "POINTS", 64)
+    found = query(manifold, X, xhat)
+    assert found.shape == (2, 1000, 3)
+    torch.testing.assert_close(found, whole, rtol=0, atol=1e-13)
+    assert query(manifold, X, xhat.float()).dtype == torch.float32
+
+
+def test_points_in_place_of_particles_give_their_positions(fine):
+    assert 0 <= fine.row["query_difference"] < 1e-7
+
+
+def test_row_against_a_fine_run_of_its_own(fine, chain, manifold, made, truth):
+    scene = chain.scene.refined(3)
+    solver, x_full = scene.full_order({"friction_angle": 26.0}, device="cpu"), []
+    for _ in FRAMES:
+        solver.step(12)
+        x_full.append(solver.state.x.numpy().copy())
+    x_full, X = torch.tensor(np.stack(x_full)), torch.tensor(scene.particles().X)
+    x = manifold.restrict(X=X).position(torch.tensor(made.xhat[FRAMES]))
+    row = fine.row
+    assert (row["parameter"], row["factor"], row["points"]) == (26.0, 3, 1500)
+    assert row["delta"] == pytest.approx(metrics.deformation_error(x, x_full), rel=1e-9)
+    assert row["displacement_error"] == pytest.approx(metrics.displacement_error(x, x_full, X), rel=1e-9)
+    few = slice(0, 500)
+    assert row["particles_delta"] == pytest.approx(
+        metrics.deformation_error(x[:, few], x_full[:, few]), rel=1e-6
+    )
+    coarse = torch.tensor(truth.read("x")[FRAMES])
+    assert row["full_order_difference"] == pytest.approx(
+        metrics.displacement_error(coarse, x_full[:, few], X[few]), rel=1e-9
+    )
+    assert 0 < row["interpolation_error"] < 0.2
+    assert row["seconds"] > 0
+    np.testing.assert_allclose(fine.x_full, x_full[-1])
+    np.testing.assert_allclose(fine.x_reduced, x[-1], atol=1e-12)
+
+
+def test_a_tear_is_smeared(chain):
+    """Two halves apart by 1 m: points left out at the tear land in between, others where they belong."""
+    X = torch.tensor(chain.scene.refined(4).particles().X)
+    moved = X + (X[:, :1] > 0.5) * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+    found = superresolution.interpolated(X[500:], X[:500], moved[None, :500], "cpu")[0]
+    apart = (found - moved[500:]).norm(dim=1)
+    near = (X[500:, 0] - 0.5).abs() < 0.01
+    assert apart[near].max() > 0.3
+    assert apart[(X[500:, 0] - 0.5).abs() > 0.05].max() < 1e-6
+
+
+def test_a_diverged_run_has_no_finite_error(chain, manifold, truth, made):
+    lost = rollout_of(made.t, np.where(np.arange(25)[:, None] < 20, made.xhat, np.nan), diverged=20)
+    found = superresolve(manifold, chain.scene, truth, lost, 2, FRAMES, device="cpu")
+    assert found.row["delta"] == found.row["particles_displacement_error"] == np.inf
+    assert np.isfinite(found.x_reduced).all()  # its last good state, for pictures
+    assert np.isfinite(found.row["interpolation_error"])
