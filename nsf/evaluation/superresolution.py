@@ -1,8 +1,9 @@
 """The fields of a reduced run at many more points than they were trained on (paper section 6.2)."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -10,10 +11,11 @@ import torch
 from nsf.data import Trajectory
 from nsf.dynamics import Rollout
 from nsf.dynamics.interop import torch_device, torch_dtype
+from nsf.errors import InstabilityError
 from nsf.evaluation import metrics
 from nsf.evaluation.compare import at_frames
 from nsf.kinematics.interpolation import interpolation, lying_together
-from nsf.mpm import precision_of
+from nsf.mpm import FullOrderMPM, diagnosed, precision_of
 from nsf.mpm.device import warp_device
 from nsf.timing import synchronizer
 
@@ -87,6 +89,7 @@ def superresolve(
     rollout: Rollout,
     factor: int,
     frames: Sequence[int],
+    substeps: int = 1,
     precision: str = "fp64",
     device: str = "auto",
 ) -> SuperResolution:
@@ -101,23 +104,24 @@ def superresolve(
         rollout: the reduced run.
         factor: points for each particle.
         frames: of the trajectory, in ascending order, without frame 0.
+        substeps: steps of the fine run for each step; its Δt is as much smaller.
         precision, device: of both.
+
+    Raises:
+        InstabilityError: the fine run is unstable where the coarse one is not, as more particles meet
+            more extreme strains; names the remedy.
     """
     name = scene.parameters.name
-    fine = scene.refined(factor)
+    fine = scene.refined(factor, substeps)
     where = torch_device(warp_device(device))
     wait = synchronizer(where)
     X = fine.particles().X
     shared = _rows_in(fine, scene)
 
     started = time.perf_counter()
-    solver = fine.full_order({name: rollout.parameter}, precision, device)
-    x_full = np.empty((len(frames), *X.shape))
-    for k, frame in enumerate(frames):
-        solver.step(frame - solver.steps_taken)
-        x_full[k] = solver.state.x.numpy()
-    solver.check()
-    del solver
+    x_full = _full_order_frames(
+        partial(fine.full_order, {name: rollout.parameter}, precision, device), substeps * np.array(frames)
+    )
     full_order_seconds = time.perf_counter() - started
 
     dtype = torch_dtype(precision_of(precision))
@@ -163,6 +167,21 @@ def superresolve(
         "full_order_seconds": full_order_seconds,
     }
     return SuperResolution(row, X, x[-1].numpy(), x_full[-1].numpy(), shared)
+
+
+def _full_order_frames(build: Callable[[], FullOrderMPM], steps: Sequence[int]) -> np.ndarray:
+    """Positions [F, n, 3] [m] after some numbers of steps."""
+    solver = build()
+    x = np.empty((len(steps), len(solver.constants), 3))
+    try:
+        for k, step in enumerate(steps):
+            solver.step(step - solver.steps_taken)
+            x[k] = solver.state.x.numpy()
+        solver.check()
+    except InstabilityError as error:
+        found = diagnosed(error, build, solver.steps_taken)
+        raise InstabilityError(f"fine full-order run: {found}; raise super_resolution.substeps") from error
+    return x
 
 
 def _rows_in(fine, scene) -> np.ndarray:

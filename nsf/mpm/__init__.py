@@ -9,7 +9,7 @@ from nsf.mpm.colliders import Collider, Cuboid, HalfSpace, Sphere  # noqa: E402
 from nsf.mpm.grid import Grid, GridGeometry  # noqa: E402
 from nsf.mpm.motion import Motion  # noqa: E402
 from nsf.mpm.precision import FP32, FP64, Precision, precision_of  # noqa: E402
-from nsf.mpm.solver import FullOrderMPM, GridStep  # noqa: E402
+from nsf.mpm.solver import FullOrderMPM, GridStep, diagnosed  # noqa: E402
 from nsf.mpm.state import ParticleConstants, ParticleState  # noqa: E402
 from nsf.mpm.transfer import Transfer  # noqa: E402
 
@@ -31,5 +31,6 @@ __all__ = [
     "Precision",
     "Sphere",
     "Transfer",
+    "diagnosed",
     "precision_of",
 ]

@@ -10,9 +10,15 @@ from nsf.mpm.boundary import BoundaryArrays, DomainWalls
 from nsf.mpm.colliders import Collider
 from nsf.mpm.device import warp_device
 from nsf.mpm.grid import Grid, GridGeometry, make_grid_update
-from nsf.mpm.materials import Material, make_stress_update
+from nsf.mpm.materials import Material, make_elastic_stress, make_stress_update
 from nsf.mpm.precision import Precision, precision_of
-from nsf.mpm.stability import check_colliders, check_time_step, make_particle_check
+from nsf.mpm.stability import (
+    MAX_ELASTIC_CFL,
+    check_colliders,
+    check_time_step,
+    make_particle_check,
+    wave_speed_at,
+)
 from nsf.mpm.state import ParticleConstants, ParticleState
 from nsf.mpm.transfer import Transfer, make_g2p, make_p2g
 from nsf.timing import StageTimer, untimed
@@ -242,6 +248,26 @@ class FullOrderMPM:
         inputs = [s.increment, self.mu, self.lam, self._params, self.grid_step.dt, s.F_e, s.history, s.tau]
         wp.launch(self._stress_update, dim=len(s), inputs=inputs, device=self.device)
 
+    def elastic_cfl(self) -> float:
+        """Largest elastic CFL number c Δt/Δx of the state, c from the law's tangent stiffness at F_e.
+
+        For a diagnosis: it copies the state to the host and back.
+        """
+        kernel = make_elastic_stress(
+            self.material.functions(self.precision), self.precision, self.material.history_size
+        )
+        tau = wp.empty_like(self.state.tau)
+
+        def tau_of(F: np.ndarray) -> np.ndarray:
+            stretched = wp.array(F, dtype=self.precision.mat33, device=self.device)
+            inputs = [stretched, self.state.history, self.mu, self.lam, tau]
+            wp.launch(kernel, dim=len(F), inputs=inputs, device=self.device)
+            return tau.numpy().astype(float)
+
+        density = self.constants.mass / self.constants.volume0
+        speed = wave_speed_at(tau_of, self.state.F_e.numpy().astype(float), density)
+        return speed * self.dt / self.grid.geometry.dx
+
     def check(self) -> None:
         """Stop if a particle is non-finite or off the grid.
 
@@ -274,3 +300,29 @@ class FullOrderMPM:
                 f"domain [0, {self.grid.geometry.upper}] m; "
                 f"enlarge the domain, add a boundary or reduce dt={self.dt:g} s"
             )
+
+
+def diagnosed(
+    error: InstabilityError, build: Callable[[], FullOrderMPM], steps_taken: int
+) -> InstabilityError:
+    """The error of a run that failed a check, with the elastic CFL number at the check before it.
+
+    The check of Δt before a run knows the material at rest only; a law that stiffens in tension outgrows it.
+    The run is made again up to there, which costs nothing where nothing fails.
+
+    Args:
+        error: of the check that failed.
+        build: gives the solver at t = 0.
+        steps_taken: up to the check that failed.
+    """
+    solver = build()
+    rest = solver.elastic_cfl()
+    solver.step((steps_taken - 1) // solver.check_every * solver.check_every)
+    cfl = solver.elastic_cfl()
+    advice = ""
+    if cfl > MAX_ELASTIC_CFL:
+        advice = f", as the material is stretched: try dt={solver.dt * MAX_ELASTIC_CFL / cfl:.2g} s"
+    return InstabilityError(
+        f"{error}; elastic CFL c dt/dx = {rest:.3g} at rest, {cfl:.3g} at step {solver.steps_taken} "
+        f"(limit {MAX_ELASTIC_CFL:g}){advice}"
+    )

@@ -1,6 +1,6 @@
 """Is the time step stable, and has the simulation gone wrong?"""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cache
 
 import numpy as np
@@ -19,12 +19,34 @@ MAX_ELASTIC_CFL = 1.0
 # A particle or a collider must not cross more than a cell in a step.
 MAX_ADVECTIVE_CFL = 1.0
 _ROUND_OFF = 1e-9
+_STRETCHED = 1e-3  # by which a principal stretch grows for the tangent stiffness: a round-off of fp32 is 1e-7
 
 
 def wave_speed(constants: ParticleConstants) -> float:
     """Largest elastic wave speed c = √((λ + 2μ̂)/ρ) [m/s]."""
     density = constants.mass / constants.volume0
     return float(np.sqrt((constants.lam + 2.0 * constants.mu) / density).max())
+
+
+def wave_speed_at(tau_of: Callable[[np.ndarray], np.ndarray], F: np.ndarray, density: np.ndarray) -> float:
+    """Largest speed in space of an elastic wave along a principal direction n of stretched particles [m/s].
+
+    c² = (∂τ_nn/∂ log λ_n − τ_nn)/ρ₀: the tangent stiffness ∂P/∂F of that direction, and the wave travels λ_n
+    times as far in space as in the reference. Fixed corotated: ρ₀ c² = 2μ̂ λ_n² + λ J², so a stretch λ_n
+    multiplies the speed at rest.
+
+    Args:
+        tau_of: elastic deformation gradients [P, 3, 3] → Kirchhoff stress [P, 3, 3] [Pa].
+        F: [P, 3, 3] elastic deformation gradients.
+        density: [P] reference density [kg/m³].
+    """
+    tau, directions, largest = tau_of(F), np.linalg.svd(F)[0], 0.0
+    for axis in range(3):
+        n = directions[:, :, axis]
+        longer = F + _STRETCHED * np.einsum("pi,pj,pjk->pik", n, n, F)
+        along, before = (np.einsum("pi,pij,pj->p", n, t, n) for t in (tau_of(longer), tau))
+        largest = max(largest, float((((along - before) / _STRETCHED - before) / density).max()))
+    return largest**0.5
 
 
 def largest_stable_dt(constants: ParticleConstants, v: np.ndarray, dx: float) -> float:

@@ -73,7 +73,8 @@ class Pipeline:
         for key in ("trials", "picture_particles", "picture_frames"):
             configuration.number(f"evaluation.{key}", c.evaluation[key], least=1, whole=True)
         configuration.number("super_resolution.factor", c.super_resolution.factor, least=2, whole=True)
-        configuration.number("super_resolution.frames", c.super_resolution.frames, least=1, whole=True)
+        for key in ("substeps", "frames"):
+            configuration.number(f"super_resolution.{key}", c.super_resolution[key], least=1, whole=True)
         multiplier = c.deploy.dt_multiplier
         if not configuration.number("deploy.dt_multiplier", multiplier) > 0:
             raise ConfigError(f"deploy.dt_multiplier={multiplier} must be positive")
@@ -432,6 +433,7 @@ class Pipeline:
                             rollout,
                             c.super_resolution.factor,
                             frames,
+                            c.super_resolution.substeps,
                             c.precision,
                             self.device,
                         )

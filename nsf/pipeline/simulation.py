@@ -11,7 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from nsf.data import TrajectoryWriter
-from nsf.mpm import FullOrderMPM, Precision
+from nsf.errors import InstabilityError
+from nsf.mpm import FullOrderMPM, Precision, diagnosed
 from nsf.mpm.recording import COLUMNS, FrameRecorder
 from nsf.progress import Progress
 from nsf.runs import Run
@@ -77,14 +78,17 @@ def _start(job: Job, pool, steps: int, dx: float, stored: Precision, device, pre
         stored_by = pool.submit(_store, job, solver, steps + 1, dx, dtype, device, precision)
         recorder = FrameRecorder(solver.state, solver.precision, stored)
         started = time.perf_counter()
-        for n in range(steps + 1):
-            if n:
-                solver.step()
-            recorder.record()
-            progress.advance()
-            if recorder.full or n == steps:
-                _hand_over(job, recorder.take(), stored_by)
-        solver.check()
+        try:
+            for n in range(steps + 1):
+                if n:
+                    solver.step()
+                recorder.record()
+                progress.advance()
+                if recorder.full or n == steps:
+                    _hand_over(job, recorder.take(), stored_by)
+            solver.check()
+        except InstabilityError as error:
+            raise diagnosed(error, job.build, solver.steps_taken) from error
         _hand_over(job, time.perf_counter() - started, stored_by)
     except BaseException as error:
         # The writer leaves no half-written file, and its manifest says what happened.

@@ -272,12 +272,17 @@ class Scene:
             )
         return changed
 
-    def refined(self, factor: int) -> "Scene":
+    def refined(self, factor: int, substeps: int = 1) -> "Scene":
         """The same scene with factor times the particles on the same grid; a body's own come first in it.
 
         Weak elements are drawn anew, as there are others to draw from: their share stays.
+
+        Args:
+            factor: particles for each particle.
+            substeps: steps for each step.
         """
         config = self.template.copy()
+        config.scene.dt, config.scene.steps = self.dt / substeps, substeps * self.steps
         for name, body in zip(self.config.scene.bodies, self.bodies, strict=True):
             node = config.scene.bodies[name]
             node.particles, node.particles_per_cell = factor * body.particles, None

@@ -13,8 +13,10 @@ import torch
 
 from nsf.data import Trajectory
 from nsf.dynamics import NeighbourSearch, ParticleSets, ProjectionResult, Taylor
-from nsf.errors import ConfigError, MissingRunError
+from nsf.errors import ConfigError, InstabilityError, MissingRunError
+from nsf.evaluation import superresolution
 from nsf.kinematics.manifold import Manifold
+from nsf.mpm import FullOrderMPM
 from nsf.runs import Run
 
 #: Issue 2, "Done when".
@@ -352,6 +354,21 @@ def test_a_diverged_rollout_is_infinite_and_never_nan(copied, pipeline_at):
     assert np.isfinite(frames["x_reduced"]).all()
     for name in ("cost.json", "summary.json"):
         json.loads((pipeline.evaluation.path / name).read_text(), parse_constant=pytest.fail)
+
+
+def test_an_unstable_simulation_tells_its_cfl_number(pipeline_at, tmp_path, monkeypatch):
+    def check(solver):
+        if solver.steps_taken == 24:
+            raise InstabilityError("particle 3 became non-finite")
+
+    monkeypatch.setattr(FullOrderMPM, "check", check)
+    pipeline = pipeline_at(tmp_path, "scene.parameters.train=[30]")
+    with pytest.raises(InstabilityError, match=r"particle 3 became non-finite; elastic CFL .* at step 0"):
+        pipeline.run("simulate")
+    error = pipeline.simulation(26.0).manifest["error"]
+    assert "elastic CFL c dt/dx" in error
+    with pytest.raises(InstabilityError, match=r"fine full-order run: .*; raise super_resolution\.substeps"):
+        superresolution._full_order_frames(pipeline.scene.full_order, [24])
 
 
 # -- super-resolution -----------------------------------------------------------------------------------

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nsf.errors import ConfigError, DeviceError, InstabilityError, ShapeError
-from nsf.mpm import DomainWalls, HalfSpace, Transfer
+from nsf.mpm import DomainWalls, HalfSpace, Transfer, diagnosed
 from nsf.mpm.materials import DruckerPrager
 
 DX = 1.0 / 16.0
@@ -190,3 +190,41 @@ def test_time_and_bytes(falling_sand):
     # 17³ nodes of mass and momentum, and 200 particles, in 8-byte reals.
     assert solver.grid.nbytes == 17**3 * 4 * 8
     assert solver.nbytes > solver.grid.nbytes + 200 * (3 + 3 + 4 * 9) * 8
+
+
+# -- the elastic CFL number in motion -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("precision", ["fp64", "fp32"])
+def test_cfl_at_rest_is_the_checked_one(precision, block, solver_of):
+    solver = solver_of(block, precision=precision)
+    wave = np.sqrt(10.0 * 0.7 / (1.3 * 0.4))
+    assert solver.elastic_cfl() == pytest.approx(wave * 0.002 / DX, rel=2e-3)
+
+
+def test_cfl_grows_with_the_stretch(block, solver_of):
+    """Fixed corotated: ρ₀ c² = 2μ̂ λ² + λ J² along a stretch λ."""
+    solver = solver_of(block)
+    turn = np.linalg.qr(np.random.default_rng(0).normal(size=(3, 3)))[0]
+    F = turn @ np.diag([3.0, 0.9, 0.6])
+    solver.state.F_e.assign(np.tile(F, (len(block), 1, 1)))
+    mu, lam = 10.0 / 2.6, 10.0 * 0.3 / (1.3 * 0.4)
+    speed = np.sqrt(2.0 * mu * 9.0 + lam * (3.0 * 0.9 * 0.6) ** 2)
+    assert solver.elastic_cfl() == pytest.approx(speed * 0.002 / DX, rel=2e-3)
+
+
+def test_a_diagnosis_looks_at_the_check_before(block, solver_of):
+    def build():
+        v = 40.0 * (block - 0.5) * [1.0, 0.0, 0.0]
+        return solver_of(block, dt=0.014, v=v, check_every=2)
+
+    solver = build()
+    solver.step(2)
+    found = str(diagnosed(InstabilityError("lost; reduce dt"), build, 4))
+    rest, motion = build().elastic_cfl(), solver.elastic_cfl()
+    assert motion > 1.0 > rest
+    assert f"lost; reduce dt; elastic CFL c dt/dx = {rest:.3g} at rest, {motion:.3g} at step 2" in found
+    assert f"try dt={0.014 / motion:.2g} s" in found
+    calm = str(diagnosed(InstabilityError("lost"), lambda: solver_of(block), 1))
+    assert "at step 0 (limit 1)" in calm
+    assert "try" not in calm
