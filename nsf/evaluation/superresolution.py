@@ -68,7 +68,7 @@ def query(manifold, X: torch.Tensor, xhat: torch.Tensor) -> torch.Tensor:
     x = torch.empty(len(xhat), *X.shape, dtype=xhat.dtype)
     for rows in lying_together(X, POINTS):
         at = manifold.restrict(X=X[rows], dtype=xhat.dtype, device=xhat.device)
-        x[:, rows] = at.position(xhat).cpu()
+        x[:, rows.cpu()] = at.position(xhat).cpu()
     return x
 
 

@@ -199,6 +199,16 @@ def test_deploying_on_another_scene_than_the_one_trained_on(copied, pipeline_at)
     assert pipeline_at(root, f"{change}=[0,0,-6]").simulation(26.0).complete
 
 
+def test_extrapolation(copied, pipeline_at):
+    """Appendix "Generalization": friction angles beyond those of training, which reach 38° here."""
+    root = copied("simulate", "train")
+    pipeline, said = said_by(pipeline_at, root, "scene.parameters.test=[44,55]", "evaluation.trials=1")
+    assert "train: inputs unchanged, reused" in said[2]
+    results = pd.read_csv(pipeline.evaluation.path / "results.csv")
+    assert results["parameter"].tolist() == [44.0, 55.0]
+    assert 0 < results["delta"][0] < results["delta"][1]
+
+
 def test_a_changed_training_value_is_another_simulation(chain, pipeline_at):
     pipeline = pipeline_at(chain.root, "deploy.split=train", "deploy.changes={material.E:1900}")
     assert pipeline.training.hash == chain.pipeline.training.hash
