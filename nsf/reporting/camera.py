@@ -102,7 +102,7 @@ class View:
         return (255 * np.clip(fine.mean(axis=(1, 3)), 0, 1)).astype(np.uint8)
 
     def front(self, x: np.ndarray, radius: float) -> np.ndarray:
-        """Rows of the particles x [n, 3] m within two radii [m] of the foremost about them.
+        """Rows of the particles x [n, 3] m within three radii [m] of the foremost about them.
 
         The others are hidden behind these; of millions it leaves those that a picture shows.
         """
@@ -112,7 +112,7 @@ class View:
         cell = ((up - up.min()) / radius).astype(int) * columns + ((right - right.min()) / radius).astype(int)
         foremost = np.full(cell.max() + 1, -np.inf)
         np.maximum.at(foremost, cell, toward)
-        return alive[toward >= foremost[cell] - 2.0 * radius]
+        return alive[toward >= foremost[cell] - 3.0 * radius]
 
     def _pixels(self, projected: np.ndarray, scale: float) -> np.ndarray:
         """Camera axes [m] to column, row [pixel] and nearness [m]."""

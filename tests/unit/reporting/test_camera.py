@@ -1,0 +1,22 @@
+"""What the camera sees of many particles."""
+
+import numpy as np
+
+from nsf.reporting.camera import View
+from nsf.scenes import Box
+
+
+def test_the_foremost_particles_make_the_same_picture():
+    x = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)).sample(40_000)
+    x[7] = np.nan
+    colors, radius = x.copy(), 0.62 * len(x) ** (-1 / 3)
+    colors[7] = 0.0
+    view = View.around(x, width=200)
+    front = view.front(x, radius)
+    assert 7 not in front
+    assert len(front) < 0.5 * len(x)
+    whole, seen = view.picture(x, colors, radius), view.picture(x[front], colors[front], radius)
+    differs = (np.abs(whole.astype(int) - seen) > 8).any(axis=2)
+    assert differs.mean() < 0.02
+    fewer = view.picture(x[front[::3]], colors[front[::3]], radius)
+    assert (np.abs(whole.astype(int) - fewer) > 8).any(axis=2).mean() > 0.1
