@@ -186,6 +186,32 @@ class FullOrderMPM:
         own = (self.mass, self.volume0, self.mu, self.lam, self._first_bad)
         return self.state.nbytes + self.grid.nbytes + sum(a.capacity for a in own)
 
+    def resume(self, steps: int, x: np.ndarray, v: np.ndarray, C: np.ndarray, tau: np.ndarray) -> None:
+        """Go on from a state that is known by its positions, velocities and stresses alone.
+
+        F_e is the stretch that carries τ (`Material.stretch_of`), the history variables are those that the
+        law assumes for τ (`Material.history_of`), and the colliders are where they are at that time.
+
+        Args:
+            steps: time of the state in steps of Δt.
+            x, v: [P, 3] position [m] and velocity [m/s].
+            C: [P, 3, 3] affine momentum [1/s].
+            tau: [P, 3, 3] symmetric Kirchhoff stress [Pa].
+
+        Raises:
+            InstabilityError: no deformation carries the stress of a particle, Δt is too long for v, or a
+                particle is non-finite or off the grid.
+        """
+        check_time_step(self.constants, v, self.grid.geometry.dx, self.dt)
+        tau = np.asarray(tau, np.float64)
+        F_e = self.material.stretch_of(tau, self.constants.mu, self.constants.lam)
+        state = {"x": x, "v": v, "C": C, "F_e": F_e, "tau": tau, "history": self.material.history_of(tau)}
+        for name, values in state.items():
+            getattr(self.state, name).assign(values)
+        self.grid_step.boundaries.start_from(steps)
+        self.steps_taken = steps
+        self.check()
+
     def step(self, n: int = 1) -> None:
         """Advance by n steps of Δt.
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nsf.errors import ConfigError, DeviceError, InstabilityError, ShapeError
-from nsf.mpm import DomainWalls, HalfSpace, Transfer
+from nsf.mpm import DomainWalls, HalfSpace, Motion, Transfer
 from nsf.mpm.materials import DruckerPrager
 
 DX = 1.0 / 16.0
@@ -190,3 +190,47 @@ def test_time_and_bytes(falling_sand):
     # 17³ nodes of mass and momentum, and 200 particles, in 8-byte reals.
     assert solver.grid.nbytes == 17**3 * 4 * 8
     assert solver.nbytes > solver.grid.nbytes + 200 * (3 + 3 + 4 * 9) * 8
+
+
+@pytest.mark.parametrize("precision", ["fp64", "fp32"])
+def test_a_resumed_run_is_the_run_itself(precision, falling_sand):
+    """Positions, velocities and stresses are enough, as an isotropic law needs no rotation of F_e."""
+    whole, resumed = falling_sand(precision), falling_sand(precision)
+    whole.step(30)
+    state = whole.state.numpy()
+    assert np.abs(state["tau"]).max() > 0.0
+    tau = 0.5 * (state["tau"] + state["tau"].transpose(0, 2, 1))
+    resumed.resume(30, state["x"], state["v"], state["C"], tau)
+    assert resumed.time == whole.time
+    whole.step(20)
+    resumed.step(20)
+    a, b = whole.state.numpy(), resumed.state.numpy()
+    tolerance = {"fp64": 1e-11, "fp32": 1e-2}[precision]
+    for name in ("x", "v", "tau"):
+        assert np.abs(a[name] - b[name]).max() < tolerance * np.abs(a[name]).max(), name
+
+
+def test_a_resumed_run_meets_its_colliders_where_they_are(block, solver_of):
+    lifted = Motion((0.0, 0.1), ((0.0, 0.0, 0.0), (0.0, 0.0, 0.1)))
+    plate = HalfSpace((0.0, 0.0, 0.37), (0.0, 0.0, 1.0), "sticky", motion=lifted)
+    whole, resumed = (solver_of(block, E=100.0, colliders=[plate]) for _ in range(2))
+    whole.step(10)
+    state = whole.state.numpy()
+    resumed.resume(10, *(state[name] for name in ("x", "v", "C", "tau")))
+    whole.step(25)
+    resumed.step(25)
+    a, b = whole.state.numpy(), resumed.state.numpy()
+    assert np.abs(a["v"]).max() > 0.1
+    np.testing.assert_allclose(b["x"], a["x"], atol=1e-12)
+
+
+def test_a_state_that_cannot_be_resumed(falling_sand):
+    solver = falling_sand()
+    state = solver.state.numpy()
+    x, v, C, tau = (state[name] for name in ("x", "v", "C", "tau"))
+    with pytest.raises(InstabilityError, match="advective CFL"):
+        solver.resume(5, x, 1e3 * (1.0 + v), C, tau)
+    lost = x.copy()
+    lost[3] = 9.0
+    with pytest.raises(InstabilityError, match="particle 3 left the grid at step 5"):
+        solver.resume(5, lost, v, C, tau)
