@@ -3,6 +3,7 @@
 scene → simulate → dataset → train → deploy → evaluate → report
 """
 
+import contextlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from omegaconf.errors import ConfigKeyError
 
 from nsf import config as configuration
 from nsf.data import Snapshots, Split, Trajectory
-from nsf.dynamics import ParticleSets, ReducedMPM, Rollout, SamplePhase, deploy
+from nsf.dynamics import ParticleSets, ReducedMPM, Rollout, SamplePhase, calibrate, deploy, go_on
 from nsf.dynamics.interop import torch_device
 from nsf.dynamics.sampling import check_well_posed
 from nsf.dynamics.solver import reduced_steps
@@ -74,6 +75,7 @@ class Pipeline:
         if not configuration.number("deploy.dt_multiplier", multiplier) > 0:
             raise ConfigError(f"deploy.dt_multiplier={multiplier} must be positive")
         _one_of("deploy.split", c.deploy.split, ("test", "validation", "train"))
+        _one_of("deploy.on_distrust", c.deploy.on_distrust, ("report", "full_order"))
         _one_of("tracking", c.tracking, TRACKING)
         _one_of("data.resident", c.data.resident, (True, False, "auto"))
         _one_of("data.dtype", c.data.dtype, tuple(_STORED))
@@ -159,6 +161,7 @@ class Pipeline:
             "values": list(self.held_out),
             "split": self.config.deploy.split,
             "dt_multiplier": self.config.deploy.dt_multiplier,
+            "on_distrust": self.config.deploy.on_distrust,
             "device": self.device,
         }
         content["scene"] = {k: v for k, v in content["scene"].items() if k not in _NOT_PHYSICS}
@@ -268,16 +271,28 @@ class Pipeline:
             return run
         manifold = Manifold.load(self.training.require().path / "manifold.pt")
         with run.record(device=self.device, precision=self.config.precision) as record:
-            rollouts = deploy(
-                lambda v, device: self.solver_at(manifold, v, device), self.held_out, self.device
-            )
+            build = partial(self.solver_at, manifold)
+            started = time.perf_counter()
+            trust = calibrate(build, manifold, self.device)
+            record.metrics["trust"] = {
+                "residual_m": trust.residual,
+                "distance_m": trust.distance,
+                "seconds": time.perf_counter() - started,
+            }
+            hand_over = self.config.deploy.on_distrust == "full_order"
+            rollouts = deploy(build, self.held_out, self.device, trust, until_distrusted=hand_over)
             for index, rollout in enumerate(rollouts):
                 rollout.save(run.path / f"rollout_{index}.h5")
                 record.output(f"rollout_{index}.h5")
                 self._warn(rollout)
+                if rollout.handed_over >= 0:
+                    solver = self.solver_at(manifold, rollout.parameter)
+                    go_on(solver, rollout, run.path / continuation(index), _STORED[self.config.data.dtype])
+                    record.output(continuation(index))
             record.metrics["seconds"] = [r.seconds for r in rollouts]
             record.metrics["needed_outside"] = max(r.needed_outside for r in rollouts)
             record.metrics["diverged"] = [r.parameter for r in rollouts if r.diverged >= 0]
+            record.metrics["distrusted"] = [r.parameter for r in rollouts if r.distrusted >= 0]
         self.say(
             f"deploy: method={self.config.method.name}, |S|={rollouts[0].sample}, "
             f"{len(rollouts)} values → {run.id}"
@@ -290,6 +305,13 @@ class Pipeline:
             self.say(
                 f"deploy: warning: {value} diverged at step {rollout.diverged} (off the grid or not finite); "
                 "its errors are reported as ∞"
+            )
+        if (step := rollout.distrusted) >= 0:
+            n, t = rollout.handed_over, rollout.t
+            then = f"; the full-order solver goes on from t = {t[n]:.4g} s" if n >= 0 else ""
+            self.say(
+                f"deploy: warning: {value} left what the model was trained on at t = {t[step]:.4g} s: "
+                f"{rollout.trust.max():.3g} times as far as training data are from themselves{then}"
             )
         if rollout.needed_outside:
             self.say(
@@ -309,19 +331,23 @@ class Pipeline:
         with run.record(device=self.device, precision=self.config.precision) as record:
             for index, value in enumerate(self.held_out):
                 rollouts.append(Rollout.open(deployment.path / f"rollout_{index}.h5"))
-                with Trajectory.open(self.simulation(value).require().path / "trajectory.h5") as trajectory:
+                with contextlib.ExitStack() as files:
+                    truth = self.simulation(value).require().path / "trajectory.h5"
+                    trajectory, rest = files.enter_context(Trajectory.open(truth)), None
+                    if rollouts[-1].handed_over >= 0:
+                        path = deployment.path / continuation(index)
+                        rest = files.enter_context(Trajectory.open(path))
                     solver = self.solver_at(manifold, value)
                     shown = (e.picture_particles, e.picture_frames)
-                    comparisons.append(
-                        compare(solver, trajectory, rollouts[-1], self.config.deploy.split, shown)
-                    )
+                    split = self.config.deploy.split
+                    comparisons.append(compare(solver, trajectory, rollouts[-1], split, shown, rest))
             del solver
             cost = self._cost(manifold)
             table = results.rows(
                 self.config, manifold, rollouts, comparisons, cost, self.device, run.manifest
             )
             seconds = self.training.manifest["metrics"]["training_seconds"]
-            summary = results.summarise(self.scene, manifold, table, comparisons, seconds)
+            summary = results.summarise(self.scene, manifold, table, comparisons, rollouts, seconds)
             results.write(record, table, comparisons, cost, summary)
         self.say(f"evaluate: mean δ {100 * table['delta'].mean():.3g} % over {len(table)} values → {run.id}")
         return run
@@ -367,6 +393,11 @@ class Pipeline:
             self.say(f"{run.stage}: inputs unchanged, reused → {run.id}")
             return True
         return False
+
+
+def continuation(index: int) -> str:
+    """File of a deploy run in which the full-order solver goes on with rollout `index`."""
+    return f"continuation_{index}.h5"
 
 
 #: Precision of stored frames by the name of their type.

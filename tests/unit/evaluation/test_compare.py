@@ -19,7 +19,9 @@ MOMENTA = ["linear_momentum_error", "angular_momentum_error"]
 
 def rollout_of(t, xhat, diverged=-1, parameter=26.0):
     n = len(t) - 1
-    return Rollout(parameter, t, xhat, np.zeros((n, 2)), ["converged"] * n, 20, 50.0, 0, 1.0, diverged)
+    return Rollout(
+        parameter, t, xhat, np.zeros((n, 2)), ["converged"] * n, np.zeros(n + 1), 20, 50.0, 0, 1.0, diverged
+    )
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +98,7 @@ def test_series(comparison_of, made, truth):
     series = comparison_of(made).series
     latents = [f"{kind}_{k}" for kind in ("xhat", "encoded") for k in range(1, 5)]
     first = ["parameter", "split", "frame", "t"]
-    assert list(series) == [*first, *ERRORS, *MOMENTA, "reconstruction_delta", *latents]
+    assert list(series) == [*first, *ERRORS, *MOMENTA, "reconstruction_delta", "trust", *latents]
     assert len(series) == truth.frames == 25
     assert set(series["split"]) == {"test"}
     np.testing.assert_array_equal(series["t"], truth.t)
@@ -128,11 +130,12 @@ def test_frames_at_deployment_steps_are_exact(made):
     assert np.array_equal(at_frames(made, made.t), made.xhat)
 
 
-def test_a_multiplied_step_is_compared_at_the_frames(chain, tiny_manifold, comparison_of, made):
+def test_a_multiplied_step_is_compared_at_the_frames(chain, tiny_manifold, tiny_trust, comparison_of, made):
     from nsf.dynamics import rollout
 
     value = {"friction_angle": 26.0}
-    run = rollout(chain.scene.reduced(tiny_manifold, value, 20, device="cpu", dt_multiplier=1.5), 26.0)
+    solver = chain.scene.reduced(tiny_manifold, value, 20, device="cpu", dt_multiplier=1.5)
+    run = rollout(solver, 26.0, tiny_trust)
     found = comparison_of(run)
     assert len(found.series) == 25
     assert found.delta < 3.0 * comparison_of(made).delta + 0.005
