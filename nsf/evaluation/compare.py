@@ -7,7 +7,7 @@ import pandas as pd
 import torch
 
 from nsf.data import Trajectory
-from nsf.dynamics import ReducedMPM, Rollout
+from nsf.dynamics import Decoder, ReducedMPM, Rollout
 from nsf.errors import SchemaError
 from nsf.evaluation import metrics
 from nsf.mpm.shape import DEGREES
@@ -120,18 +120,7 @@ def compare(
         block = slice(start, min(start + per_chunk, frames))
         x, tau, C, v = (tensor(trajectory.read(name, frames=block)) for name in ("x", "tau", "C", "v"))
         C = C.view(*C.shape[:2], 3, 3)
-        latent = xhat[block.start : min(block.stop, own)]
-        x_rom, C_rom, tau_rom = [], [], []
-        if len(latent):
-            x_rom.append(decoder.position(latent))
-            C_rom.append(decoder.affine(latent))
-            tau_rom.append(decoder.stress(latent)[..., _UPPER[0], _UPPER[1]])
-        if block.stop > own:
-            since = slice(max(block.start, own) - own + 1, block.stop - own + 1)
-            x_rom.append(tensor(continuation.read("x", frames=since)))
-            C_rom.append(tensor(continuation.read("C", frames=since)).unflatten(2, (3, 3)))
-            tau_rom.append(tensor(continuation.read("tau", frames=since)))
-        x_rom, C_rom, tau_rom = (torch.cat(parts) for parts in (x_rom, C_rom, tau_rom))
+        x_rom, C_rom, tau_rom = _reduced_fields(decoder, xhat[:own], continuation, block)
         v_rom = torch.diff(torch.cat([previous[None], x_rom]), dim=0) / trajectory.dt
         if start == 0:
             v_rom[0] = v[0]
@@ -208,6 +197,29 @@ def compare(
         pictures={name: np.concatenate(blocks) for name, blocks in kept.items()}
         | {"t": trajectory.t[shown_frames]},
     )
+
+
+def _reduced_fields(
+    decoder: Decoder, xhat: torch.Tensor, continuation: Trajectory | None, frames: slice
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """x [F, P, 3] [m], C [F, P, 3, 3] [1/s] and τ [F, P, 6] [Pa] of some frames of a reduced run.
+
+    Args:
+        decoder: the fields at every particle.
+        xhat: [own, r] latent vectors of the frames up to the hand-over; the later ones are read.
+        continuation: full-order frames, of which the first is the last of `xhat`.
+        frames: which, of the whole run.
+    """
+    own, parts = len(xhat), []
+    latent = xhat[frames.start : frames.stop]
+    if len(latent):
+        tau = decoder.stress(latent)[..., _UPPER[0], _UPPER[1]]
+        parts.append((decoder.position(latent), decoder.affine(latent), tau))
+    if frames.stop > own:
+        since = slice(max(frames.start, own) - own + 1, frames.stop - own + 1)
+        x, C, tau = (torch.as_tensor(continuation.read(k, frames=since)).to(xhat) for k in ("x", "C", "tau"))
+        parts.append((x, C.unflatten(2, (3, 3)), tau))
+    return tuple(torch.cat(fields) for fields in zip(*parts, strict=True))
 
 
 def _shown(

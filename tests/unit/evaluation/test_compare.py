@@ -9,9 +9,10 @@ import torch
 
 import nsf.scenes
 from nsf.data import Trajectory
-from nsf.dynamics import Method, Rollout
+from nsf.dynamics import Method, Rollout, go_on
 from nsf.errors import SchemaError
 from nsf.evaluation import at_frames, compare, metrics
+from nsf.evaluation.compare import trust_at_frames
 
 ERRORS = ["delta", "displacement_error", "stress_error"]
 MOMENTA = ["linear_momentum_error", "angular_momentum_error"]
@@ -225,3 +226,47 @@ def test_other_particles_are_refused(chain, tiny, tiny_manifold, made, tmp_path)
         pytest.raises(SchemaError, match="checkpoint made for other particles"),
     ):
         compare(solver, other, made, "test", (10, 2))
+
+
+@pytest.fixture(scope="module")
+def continuation(chain, tiny_manifold, made, tmp_path_factory):
+    """A rollout that was handed over at step 10, and its full-order rest."""
+    handed = replace(made, handed_over=10, xhat=made.xhat[:13], t=made.t[:13], trust=0.1 * np.arange(13))
+    solver = chain.pipeline.solver_at(tiny_manifold, 26.0, "cpu")
+    path = tmp_path_factory.mktemp("rest") / "continuation.h5"
+    go_on(solver, handed, path)
+    with Trajectory.open(path) as rest:
+        yield handed, rest
+
+
+@pytest.mark.parametrize("chunk", [None, 9 * 500 * 4])
+def test_a_continued_run_is_compared_with_its_own_frames(
+    continuation, chunk, chain, tiny_manifold, truth, comparison_of, made, monkeypatch
+):
+    if chunk:
+        monkeypatch.setattr(sys.modules["nsf.evaluation.compare"], "_CHUNK", chunk)
+    solver, (handed, rest) = chain.pipeline.solver_at(tiny_manifold, 26.0, "cpu"), continuation
+    found = compare(solver, truth, handed, "test", (500, 25), rest)
+    reduced = comparison_of(made).series
+    np.testing.assert_allclose(found.series["delta"][:11], reduced["delta"][:11], rtol=1e-9)
+    x, x_rom = (source.read("x").astype(float) for source in (truth, rest))
+    expected = np.linalg.norm(x_rom - x[10:], axis=(1, 2)) / np.linalg.norm(x[10:], axis=(1, 2))
+    np.testing.assert_allclose(found.series["delta"][11:], expected[1:], rtol=1e-6)
+    np.testing.assert_allclose(found.pictures["x_reduced"][11:], x_rom[1:], rtol=1e-6)
+    np.testing.assert_allclose(found.pictures["tau_reduced"][11:], rest.read("tau")[1:], rtol=1e-6)
+    assert np.isfinite(found.series[MOMENTA]).all().all()
+    np.testing.assert_allclose(found.series["trust"][:11], 0.1 * np.arange(11))
+    assert found.series.loc[11:, ["trust", "xhat_1"]].isna().all().all()
+
+
+def test_a_continuation_must_reach_the_end(continuation, chain, tiny_manifold, truth):
+    solver, (handed, rest) = chain.pipeline.solver_at(tiny_manifold, 26.0, "cpu"), continuation
+    for wrong, run in ((None, handed), (rest, replace(handed, handed_over=9))):
+        with pytest.raises(SchemaError, match=r"handed over at frame \d+ of 24"):
+            compare(solver, truth, run, "test", (10, 2), wrong)
+
+
+def test_trust_at_frames_between_deployment_steps(made):
+    run = replace(made, t=np.array([0.0, 1.5, 3.0]), trust=np.array([0.0, 0.5, np.inf]), handed_over=-1)
+    found = trust_at_frames(run, np.array([0.0, 1.0, 1.5, 2.0, 3.0]))
+    np.testing.assert_array_equal(found, [0.0, 0.5, 0.5, np.inf, np.inf])

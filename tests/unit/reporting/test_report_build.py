@@ -11,7 +11,9 @@ from synthetic import TEST, Made, seal, write_run
 from nsf.errors import ConfigError, StorageError
 from nsf.reporting import build, build_report
 from nsf.reporting.columns import number
-from nsf.reporting.sources import Source, file_hash
+from nsf.reporting.pictures import _Variant
+from nsf.reporting.sources import Source, file_hash, open_sources
+from nsf.reporting.tables import merge
 from nsf.reporting.trust import spearman, trust_note
 
 TINY = Made(particles=30, frames=4, parameters=TEST[:2], splits=("test",) * 2)
@@ -227,3 +229,18 @@ def test_a_run_that_was_handed_over_does_not_count(tmp_path):
     assert "Over the 3 reduced runs" in trust_note(frame)
     assert "is 1.00." in trust_note(frame)
     assert "Spearman" not in trust_note(frame[1:])
+
+
+def test_captions_say_where_the_full_order_solver_goes_on(tmp_path):
+    run = write_run(tmp_path / "runs", Made(**(vars(TINY) | {"trust": (0.4, 3.0)})))
+    summary = json.loads((run.path / "summary.json").read_text())
+
+    def said():
+        merged = merge(open_sources([run]))
+        return _Variant(merged, [0, 1], "nsf").continued()
+
+    assert said() == ""
+    summary["trust"][1]["handed_over_at"] = 0.15
+    (run.path / "summary.json").write_text(json.dumps(summary))
+    seal(run)
+    assert said() == " The full-order solver goes on at 27.5° from 0.15 s on."
