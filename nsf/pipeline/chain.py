@@ -308,10 +308,13 @@ class Pipeline:
             )
         if (step := rollout.distrusted) >= 0:
             n, t = rollout.handed_over, rollout.t
-            then = f"; the full-order solver goes on from t = {t[n]:.4g} s" if n >= 0 else ""
+            then = (
+                f"; the full-order solver goes on from t = {t[n]:.4g} s"
+                if n >= 0
+                else f": {rollout.trust.max():.3g} times as far as training data are from themselves"
+            )
             self.say(
-                f"deploy: warning: {value} left what the model was trained on at t = {t[step]:.4g} s: "
-                f"{rollout.trust.max():.3g} times as far as training data are from themselves{then}"
+                f"deploy: warning: {value} left what the model was trained on at t = {t[step]:.4g} s{then}"
             )
         if rollout.needed_outside:
             self.say(
