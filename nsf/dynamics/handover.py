@@ -42,7 +42,7 @@ def hand_over(solver: ReducedMPM, rollout: Rollout) -> FullOrderMPM:
     return full
 
 
-def go_on(solver: ReducedMPM, rollout: Rollout, path: Path, stored: Precision = FP32) -> None:
+def go_on(solver: ReducedMPM, rollout: Rollout, path: Path, stored: Precision = FP32) -> int:
     """Run the full-order solver from the hand-over to the end of the scene.
 
     Args:
@@ -50,6 +50,9 @@ def go_on(solver: ReducedMPM, rollout: Rollout, path: Path, stored: Precision = 
         rollout: a run with `handed_over` ≥ 0.
         path: of the trajectory, whose first frame is the state handed over.
         stored: precision of its frames.
+
+    Returns:
+        Number of particles whose decoded stress was beyond the law and was scaled down to what it carries.
 
     Raises:
         InstabilityError: the full-order solver loses stability; names the hand-over.
@@ -82,6 +85,7 @@ def go_on(solver: ReducedMPM, rollout: Rollout, path: Path, stored: Precision = 
                         writer.append(written * full.dt, x, v, C, tau)
                         written += 1
             full.check()
+        return full.beyond_law
     except InstabilityError as error:
         raise InstabilityError(
             f"the reduced run at {parameters} was handed over to the full-order solver at "

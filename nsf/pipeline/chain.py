@@ -286,8 +286,7 @@ class Pipeline:
                 record.output(f"rollout_{index}.h5")
                 self._warn(rollout)
                 if rollout.handed_over >= 0:
-                    solver = self.solver_at(manifold, rollout.parameter)
-                    go_on(solver, rollout, run.path / continuation(index), _STORED[self.config.data.dtype])
+                    self._go_on(manifold, rollout, run.path / continuation(index))
                     record.output(continuation(index))
             record.metrics["seconds"] = [r.seconds for r in rollouts]
             record.metrics["needed_outside"] = max(r.needed_outside for r in rollouts)
@@ -299,8 +298,20 @@ class Pipeline:
         )
         return run
 
+    def _go_on(self, manifold: Manifold, rollout: Rollout, path: Path) -> None:
+        solver = self.solver_at(manifold, rollout.parameter)
+        beyond = go_on(solver, rollout, path, _STORED[self.config.data.dtype])
+        if beyond:
+            self.say(
+                f"deploy: warning: {self._named(rollout)}: at the hand-over the stress of {beyond} particles "
+                "was beyond what the law carries, and was scaled down to that"
+            )
+
+    def _named(self, rollout: Rollout) -> str:
+        return f"{self.scene.parameters.name}={rollout.parameter:g}"
+
     def _warn(self, rollout: Rollout) -> None:
-        value = f"{self.scene.parameters.name}={rollout.parameter:g}"
+        value = self._named(rollout)
         if rollout.diverged >= 0:
             self.say(
                 f"deploy: warning: {value} diverged at step {rollout.diverged} (off the grid or not finite); "

@@ -11,6 +11,8 @@ import warp as wp
 from nsf.errors import ConfigError, InstabilityError
 from nsf.mpm.precision import Precision
 
+_HALVINGS = 30  # of the share of a stress that a law carries
+
 
 @dataclass(frozen=True)
 class LawFunctions:
@@ -97,8 +99,7 @@ class Material(ABC):
             InstabilityError: no deformation carries the stress of a particle; names the first.
         """
         principal, axes = np.linalg.eigh(tau)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            stretches = self.stretches_of(principal, mu, lam)
+        stretches = self._stretches(principal, mu, lam)
         bad = ~np.isfinite(stretches).all(1)
         if bad.any():
             p = int(bad.argmax())
@@ -108,6 +109,32 @@ class Material(ABC):
                 f"particle {p} has the principal stresses {shown} Pa at mu={mu[p]:g} Pa"
             )
         return (axes * stretches[:, None, :]) @ axes.transpose(0, 2, 1)
+
+    def carried_share(self, tau: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
+        """Largest share [P] of each stress, at most 1, that a deformation carries, by bisection.
+
+        A stress that comes from elsewhere than the law, as a field's, may lie beyond what the law can give.
+
+        Args:
+            tau: [P, 3, 3] symmetric Kirchhoff stress [Pa].
+            mu, lam: [P] Lamé parameters [Pa].
+        """
+        principal = np.linalg.eigvalsh(tau)
+        share = np.ones(len(tau))
+        beyond = ~np.isfinite(self._stretches(principal, mu, lam)).all(1)
+        principal, mu, lam = principal[beyond], mu[beyond], lam[beyond]
+        lower, upper = np.zeros(len(mu)), np.ones(len(mu))
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (lower + upper)
+            carried = np.isfinite(self._stretches(middle[:, None] * principal, mu, lam)).all(1)
+            lower, upper = np.where(carried, middle, lower), np.where(carried, upper, middle)
+        share[beyond] = lower
+        return share
+
+    def _stretches(self, principal: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
+        """`stretches_of`, whose NaN are an answer."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return self.stretches_of(principal, mu, lam)
 
     def history_of(self, tau: np.ndarray) -> np.ndarray:
         """[P, H] history variables assumed where only τ [P, 3, 3] [Pa] is known: those at rest.

@@ -234,3 +234,18 @@ def test_a_state_that_cannot_be_resumed(falling_sand):
     lost[3] = 9.0
     with pytest.raises(InstabilityError, match="particle 3 left the grid at step 5"):
         solver.resume(5, lost, v, C, tau)
+    with pytest.raises(InstabilityError, match="stress to resume from at step 5 is not finite"):
+        solver.resume(5, x, v, C, np.full_like(tau, np.nan))
+
+
+def test_a_stress_beyond_the_law_is_scaled_down_and_counted(block, solver_of):
+    solver = solver_of(block, E=100.0)
+    state = solver.state.numpy()
+    tau = state["tau"].copy()
+    tau[4] = -1e3 * np.eye(3)
+    tau[5] = -1.0 * np.eye(3)
+    solver.resume(0, state["x"], state["v"], state["C"], tau)
+    assert solver.beyond_law == 1
+    found = solver.state.numpy()["tau"]
+    np.testing.assert_array_equal(found[5], tau[5])
+    assert -1e3 < found[4, 0, 0] < -10.0
