@@ -103,6 +103,16 @@ def chain(tmp_path_factory) -> Chain:
 
 
 @pytest.fixture(scope="session")
+def tiny_trust(chain, tiny_manifold):
+    """The estimate of trust of the tiny chain's reduced runs."""
+    from functools import partial
+
+    from nsf.dynamics import calibrate
+
+    return calibrate(partial(chain.pipeline.solver_at, tiny_manifold), tiny_manifold, "cpu")
+
+
+@pytest.fixture(scope="session")
 def tiny_manifold(chain):
     """The tiny chain's manifold, as a user loads it."""
     import nsf

@@ -1,12 +1,14 @@
 """Reduced-order dynamics: latent time-stepping (paper section 5)."""
 
-from nsf.dynamics.deployment import Rollout, deploy, rollout
+from nsf.dynamics.deployment import Rollout, calibrate, deploy, rollout
+from nsf.dynamics.handover import go_on, hand_over
 from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
 from nsf.dynamics.latent import Decoder, LatentState, LatentTrajectory
 from nsf.dynamics.projection import STOP_REASONS, GaussNewton, ProjectionResult, Taylor, stop_reasons
 from nsf.dynamics.sampling import GreedySampler, RandomSampler, SamplePhase, Sampler
 from nsf.dynamics.solver import NSF, ReducedMPM
 from nsf.dynamics.stress import Method
+from nsf.dynamics.trust import Trust
 
 __all__ = [
     "NSF",
@@ -27,7 +29,11 @@ __all__ = [
     "SamplePhase",
     "Sampler",
     "Taylor",
+    "Trust",
+    "calibrate",
     "deploy",
+    "go_on",
+    "hand_over",
     "rollout",
     "stop_reasons",
 ]

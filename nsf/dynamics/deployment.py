@@ -13,12 +13,18 @@ import torch
 from torch.utils.data import DataLoader
 
 from nsf.dynamics.solver import ReducedMPM
+from nsf.dynamics.trust import LatentDistance, Trust, training_values
 from nsf.errors import SchemaError
 from nsf.progress import Progress, quiet_lightning
 from nsf.storage import writing
 from nsf.timing import synchronizer
 
-_VERSION = 1
+_VERSION = 2
+#: Steps between looks at the trust of a run that is to be handed over: a look reads back, and what was
+#: done since the last one is lost.
+_LOOK = 20
+#: Times less than this share of Δt apart are the same.
+_SAME_TIME = 1e-6
 
 
 @dataclass  # not frozen: Lightning moves the fields of what a prediction step returns
@@ -29,10 +35,14 @@ class Rollout:
         parameter: value of the problem parameter.
         t: [N + 1] time [s]; xhat: [N + 1, r] latent vectors.
         residuals: [N, k + 1] projection residuals [m]; stops: [N] stop reasons.
+        trust: [N + 1] how far each step is from the training data, in units of how far these are from
+            themselves (`Trust.ratios`).
         sample: |S| of the first phase; integration_mean: mean |N|.
         needed_outside: most particles or nodes a step needed outside the superset.
         seconds: wall time of the steps, without set-up.
         diverged: step at which x̂ ceased to be finite or a sample particle left the grid, −1 when neither did.
+        handed_over: step from whose state the full-order solver goes on, −1 when it does not. The steps then
+            end with the first distrusted one.
     """
 
     parameter: float
@@ -40,11 +50,18 @@ class Rollout:
     xhat: np.ndarray
     residuals: np.ndarray
     stops: list[str]
+    trust: np.ndarray
     sample: int
     integration_mean: float
     needed_outside: int
     seconds: float
     diverged: int
+    handed_over: int = -1
+
+    @property
+    def distrusted(self) -> int:
+        """First step that is not to be believed (ratio above 1), −1 when there is none."""
+        return first_above(self.trust)
 
     def save(self, path: Path) -> None:
         """Write as HDF5, whole or not at all."""
@@ -56,7 +73,8 @@ class Rollout:
                 {"integration_mean": self.integration_mean, "needed_outside": self.needed_outside}
             )
             file.attrs.update({"seconds": self.seconds, "diverged": self.diverged})
-            for name in ("t", "xhat", "residuals"):
+            file.attrs["handed_over"] = self.handed_over
+            for name in ("t", "xhat", "residuals", "trust"):
                 file[name] = getattr(self, name)
             file["stops"] = np.array(self.stops, dtype=h5py.string_dtype())
         with writing(path) as partial:
@@ -78,7 +96,8 @@ class Rollout:
                     )
                 scalars = {k: file.attrs[k].item() for k in ("parameter", "sample", "integration_mean")}
                 scalars |= {k: file.attrs[k].item() for k in ("needed_outside", "seconds", "diverged")}
-                arrays = {k: file[k][()] for k in ("t", "xhat", "residuals")}
+                scalars["handed_over"] = file.attrs["handed_over"].item()
+                arrays = {k: file[k][()] for k in ("t", "xhat", "residuals", "trust")}
                 stops = [s.decode() for s in file["stops"][()]]
         except (OSError, KeyError, RuntimeError) as error:
             raise SchemaError(
@@ -92,50 +111,135 @@ class Deployment(pl.LightningModule):
 
     Args:
         solver_at: parameter value and device name → a `ReducedMPM` at t = 0.
+        trust: the estimate of whether to believe a run.
+        until_distrusted: as for `rollout`.
         progress: told of each run done.
     """
 
-    def __init__(self, solver_at: Callable[[float, str], ReducedMPM], progress: Progress):
+    def __init__(
+        self,
+        solver_at: Callable[[float, str], ReducedMPM],
+        trust: Trust,
+        until_distrusted: bool,
+        progress: Progress,
+    ):
         super().__init__()
-        self._solver_at, self._progress = solver_at, progress
+        self._solver_at, self._trust, self._progress = solver_at, trust, progress
+        self._until_distrusted = until_distrusted
 
     def predict_step(self, batch: torch.Tensor, batch_idx: int) -> list[Rollout]:
         """Run each parameter value of a batch [B] from t = 0 to T."""
         runs = []
         for value in batch.tolist():
-            runs.append(rollout(self._solver_at(value, str(self.device)), value))
+            solver = self._solver_at(value, str(self.device))
+            runs.append(rollout(solver, value, self._trust, self._until_distrusted))
             self._progress.advance()
         return runs
 
 
-def rollout(solver: ReducedMPM, parameter: float) -> Rollout:
-    """Run a reduced solver to the end of its scene."""
+def rollout(solver: ReducedMPM, parameter: float, trust: Trust, until_distrusted: bool = False) -> Rollout:
+    """Run a reduced solver to the end of its scene.
+
+    Args:
+        solver: at t = 0.
+        parameter: value of the problem parameter, for the record.
+        trust: the estimate of whether to believe the run.
+        until_distrusted: stop at the first step that is not to be believed, and name the one before it from
+            whose state a full-order run can go on: the last whose time is a whole number of the scene's Δt.
+    """
     solver.step(1)  # compiles, loads and captures
     wait = synchronizer(solver.device)
     wait()
-    started = time.perf_counter()
-    solver.step(solver.total_steps - 1)
+    looked, started = 0, time.perf_counter()
+    look = _LOOK if until_distrusted else solver.total_steps
+    while solver.steps_taken < solver.total_steps:
+        solver.step(min(look, solver.total_steps - solver.steps_taken))
+        if until_distrusted:
+            if first_above(_ratios(solver, trust, solver.left_grid(since=looked + 1))) >= 0:
+                break
+            looked = solver.steps_taken
     wait()
-    seconds = (time.perf_counter() - started) * solver.total_steps / max(1, solver.total_steps - 1)
+    taken = solver.steps_taken
+    seconds = (time.perf_counter() - started) * taken / max(1, taken - 1)
     latent = solver.trajectory()
-    diverged = solver.left_grid()
-    outside = solver.needed_outside() if diverged < 0 else 0
+    diverged, handed_over, steps = solver.left_grid(), -1, taken
+    ratios = _ratios(solver, trust, diverged)
+    distrusted = first_above(ratios)
+    if until_distrusted and distrusted >= 0:
+        diverged, steps = -1, distrusted
+        handed_over = _whole_step_before(latent.t, distrusted, solver.scene.dt)
+    believed = steps if handed_over < 0 else handed_over
+    outside = solver.needed_outside(believed) if diverged < 0 else 0
     return Rollout(
         parameter=float(parameter),
-        t=latent.t,
-        xhat=latent.xhat,
-        residuals=latent.residuals,
-        stops=latent.stops,
+        t=latent.t[: steps + 1],
+        xhat=latent.xhat[: steps + 1],
+        residuals=latent.residuals[:steps],
+        stops=latent.stops[:steps],
+        trust=ratios[: steps + 1],
         sample=solver.sample_size,
         integration_mean=solver.integration_mean,
         needed_outside=outside,
         seconds=seconds,
         diverged=diverged,
+        handed_over=handed_over,
     )
 
 
+def first_above(ratios: np.ndarray) -> int:
+    """First step whose ratio [N + 1] exceeds 1; −1 when none does."""
+    above = np.flatnonzero(ratios > 1.0)
+    return int(above[0]) if len(above) else -1
+
+
+def _ratios(solver: ReducedMPM, trust: Trust, diverged: int) -> np.ndarray:
+    """Trust of the steps taken [n + 1]; ∞ from the step at which the run diverged."""
+    latent = solver.trajectory()
+    ratios = trust.ratios(latent.xhat, latent.residuals[:, -1])
+    if diverged >= 0:
+        ratios[diverged:] = np.inf
+    return ratios
+
+
+def _whole_step_before(t: np.ndarray, step: int, dt: float) -> int:
+    """Last step before `step` whose time is a whole number of Δt [s]; 0, the start, if there is none.
+
+    Frames and colliders of the full-order solver then stand where they would in a run of its own.
+    """
+    fractions = t[:step] / dt
+    whole = np.flatnonzero(np.abs(fractions - np.round(fractions)) < _SAME_TIME)
+    return int(whole[-1]) if len(whole) else 0
+
+
+def calibrate(solver_at: Callable[[float, str], ReducedMPM], manifold, device: str) -> Trust:
+    """The estimate of trust, from reduced runs at the first, the middle and the last training value.
+
+    Runs and not the snapshots' own residuals: what a step leaves at S depends on S, the method and Δt.
+
+    Args:
+        solver_at: parameter value and device name → solver at t = 0.
+        manifold: trained fields.
+        device: `cpu`, `cuda` or `cuda:N`.
+    """
+    values, runs = training_values(manifold), []
+    with Progress("calibrate", len(values), "runs") as progress:
+        for value in values:
+            solver = solver_at(value, device)
+            solver.step(solver.total_steps)
+            latent, diverged = solver.trajectory(), solver.left_grid()
+            good = diverged if diverged >= 0 else len(latent.xhat)
+            runs.append((latent.xhat[:good], latent.residuals[: good - 1, -1]))
+            progress.advance()
+    particles = np.unique(np.concatenate([phase.particles for phase in solver.phases]))
+    return Trust.calibrated(LatentDistance(manifold, particles, device), runs)
+
+
 def deploy(
-    solver_at: Callable[[float, str], ReducedMPM], values: Sequence[float], device: str
+    solver_at: Callable[[float, str], ReducedMPM],
+    values: Sequence[float],
+    device: str,
+    trust: Trust,
+    until_distrusted: bool = False,
 ) -> list[Rollout]:
     """Reduced runs at every parameter value, with a progress bar.
 
@@ -143,6 +247,7 @@ def deploy(
         solver_at: parameter value and device name → solver at t = 0.
         values: parameter values.
         device: `cpu`, `cuda` or `cuda:N`.
+        trust, until_distrusted: as for `rollout`.
 
     Raises:
         KeyboardInterrupt: passed on; Lightning would exit with code 1.
@@ -160,7 +265,7 @@ def deploy(
             inference_mode=False,  # torch's inference tensors could not be updated in place between steps
         )
         try:
-            batches = trainer.predict(Deployment(solver_at, progress), loader)
+            batches = trainer.predict(Deployment(solver_at, trust, until_distrusted, progress), loader)
         except SystemExit as stop:
             raise KeyboardInterrupt from stop
     return [run for batch in batches for run in batch]

@@ -333,13 +333,14 @@ class ReducedMPM:
             t, self._latents[: n + 1].cpu().numpy(), residuals.numpy(), updates.numpy(), stops
         )
 
-    def left_grid(self) -> int:
+    def left_grid(self, since: int = 1) -> int:
         """First step that ended with a sample particle off the grid, or non-finite; −1 when none did.
 
+        Only steps from `since` on are looked at.
         Such a particle no longer takes part in a step, so what follows is no reduced model of anything;
         the full-order solver stops there. For after a run.
         """
-        for n in range(1, self.steps_taken + 1):
+        for n in range(since, self.steps_taken + 1):
             x = self._phase_at(n - 1).at_sample.position(self._latents[n])
             if not bool(self._on_grid(x).all()):
                 return n
@@ -351,9 +352,10 @@ class ReducedMPM:
         upper = torch.tensor(self.geometry.upper, dtype=self.dtype, device=self.torch_device) - reach
         return ((x >= reach) & (x < upper)).all(1)
 
-    def needed_outside(self) -> int:
+    def needed_outside(self, steps: int | None = None) -> int:
         """Most particles and nodes that a step needed and the superset lacks, or that were off the grid.
 
+        Looks at the first `steps` steps, or at all that were taken.
         Decodes every particle at every step; for after a run. The transfers pass over what is off
         the grid, so it counts here; so does a node of a sample particle that is not stored.
 
@@ -363,7 +365,7 @@ class ReducedMPM:
             return 0
         everything = self.decoder()
         worst = 0
-        for n in range(self.steps_taken):
+        for n in range(self.steps_taken if steps is None else steps):
             phase = self._phase_at(n)
             x = everything.position(self._latents[n])
             sample = torch.as_tensor(phase.sets.sample, device=self.torch_device)

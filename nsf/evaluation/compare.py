@@ -7,11 +7,13 @@ import pandas as pd
 import torch
 
 from nsf.data import Trajectory
-from nsf.dynamics import ReducedMPM, Rollout
+from nsf.dynamics import Decoder, ReducedMPM, Rollout
+from nsf.errors import SchemaError
 from nsf.evaluation import metrics
 from nsf.mpm.shape import DEGREES
 
 _CHUNK = 2**24  # values of one field decoded at once
+_SAME_TIME = 1e-9  # [s]
 _UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])  # entries xx, xy, xz, yy, yz, zz of a symmetric matrix
 
 
@@ -21,6 +23,7 @@ class Comparison:
 
     Attributes:
         delta, displacement_error, stress_error: totals over frames 1..N, fractions; ∞ when the run diverged.
+            Of a run that was handed over, the frames of its continuation count like the reduced ones.
         reconstruction_delta, reconstruction_stress_error: of the full-order frames encoded and decoded.
         series: one row a frame (design.md).
         pictures: arrays for `frames.npz`.
@@ -40,8 +43,28 @@ def at_frames(rollout: Rollout, t: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(t, rollout.t, column) for column in rollout.xhat.T], axis=1)
 
 
+def trust_at_frames(rollout: Rollout, t: np.ndarray) -> np.ndarray:
+    """Trust [F] at the full-order frame times: that of the first deployment step which has reached them.
+
+    NaN after a hand-over, where nothing is estimated.
+    """
+    reached = np.minimum(np.searchsorted(rollout.t, t - _SAME_TIME), len(rollout.t) - 1)
+    return np.where(_of_continuation(rollout, t), np.nan, rollout.trust[reached])
+
+
+def _of_continuation(rollout: Rollout, t: np.ndarray) -> np.ndarray:
+    """[F] whether the frames at times t come after the hand-over."""
+    n = rollout.handed_over
+    return t > rollout.t[n] + _SAME_TIME if n >= 0 else np.zeros(len(t), bool)
+
+
 def compare(
-    solver: ReducedMPM, trajectory: Trajectory, rollout: Rollout, split: str, pictures: tuple[int, int]
+    solver: ReducedMPM,
+    trajectory: Trajectory,
+    rollout: Rollout,
+    split: str,
+    pictures: tuple[int, int],
+    continuation: Trajectory | None = None,
 ) -> Comparison:
     """Errors of a rollout against the trajectory at the same parameter value.
 
@@ -51,6 +74,10 @@ def compare(
         rollout: the reduced run.
         split: `test`, `validation` or `train`.
         pictures: numbers of particles and of frames kept for pictures.
+        continuation: the full-order frames of a rollout that was handed over, from the hand-over on.
+
+    Raises:
+        SchemaError: the trajectory is of other particles, or a continuation is missing or too short.
     """
     scene, manifold, device, parameters = (
         solver.scene,
@@ -65,8 +92,14 @@ def compare(
     diverged = rollout.diverged >= 0
     # Frames up to the last good step: those after it lie between a good latent and a lost one.
     last = rollout.t[rollout.diverged - 1] if diverged else np.inf
-    fine = trajectory.t <= last + 1e-9
+    fine = trajectory.t <= last + _SAME_TIME
     xhat[~fine] = xhat[fine][-1]  # pictures of a diverged run hold its last state; its errors are ∞
+    own = int((~_of_continuation(rollout, trajectory.t)).sum())  # frames up to the hand-over
+    if own < frames and (continuation is None or continuation.frames != frames - own + 1):
+        raise SchemaError(
+            f"the run at {rollout.parameter:g} was handed over at frame {own - 1} of {frames - 1}, and its "
+            "full-order continuation does not reach the end; deploy again"
+        )
 
     def tensor(values) -> torch.Tensor:
         return torch.as_tensor(np.asarray(values), dtype=solver.dtype, device=device)
@@ -87,9 +120,7 @@ def compare(
         block = slice(start, min(start + per_chunk, frames))
         x, tau, C, v = (tensor(trajectory.read(name, frames=block)) for name in ("x", "tau", "C", "v"))
         C = C.view(*C.shape[:2], 3, 3)
-        latent = xhat[block]
-        x_rom, C_rom = decoder.position(latent), decoder.affine(latent)
-        tau_rom = decoder.stress(latent)[..., _UPPER[0], _UPPER[1]]
+        x_rom, C_rom, tau_rom = _reduced_fields(decoder, xhat[:own], continuation, block)
         v_rom = torch.diff(torch.cat([previous[None], x_rom]), dim=0) / trajectory.dt
         if start == 0:
             v_rom[0] = v[0]
@@ -129,6 +160,7 @@ def compare(
         return metrics.relative(column[error][1:], column[norm][1:])
 
     bad = torch.as_tensor(~fine)
+    xhat[own:] = torch.nan  # full-order frames are no latent vectors
     # At t = 0 nothing has moved and nothing is loaded: what stands there is round-off of the file.
     for name in ("u_norm", "tau_norm"):
         column[name][0] = torch.nan
@@ -152,6 +184,7 @@ def compare(
             "linear_momentum_error": momentum("p"),
             "angular_momentum_error": momentum("L"),
             "reconstruction_delta": (column["rec_error"] / column["x_norm"]).sqrt(),
+            "trust": trust_at_frames(rollout, trajectory.t),
             **{f"xhat_{k + 1}": xhat[:, k].cpu() for k in range(xhat.shape[1])},
             **{f"encoded_{k + 1}": column["encoded"][:, k] for k in range(xhat.shape[1])},
         }
@@ -166,6 +199,29 @@ def compare(
         pictures={name: np.concatenate(blocks) for name, blocks in kept.items()}
         | {"t": trajectory.t[shown_frames]},
     )
+
+
+def _reduced_fields(
+    decoder: Decoder, xhat: torch.Tensor, continuation: Trajectory | None, frames: slice
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """x [F, P, 3] [m], C [F, P, 3, 3] [1/s] and τ [F, P, 6] [Pa] of some frames of a reduced run.
+
+    Args:
+        decoder: the fields at every particle.
+        xhat: [own, r] latent vectors of the frames up to the hand-over; the later ones are read.
+        continuation: full-order frames, of which the first is the last of `xhat`.
+        frames: which, of the whole run.
+    """
+    own, parts = len(xhat), []
+    latent = xhat[frames.start : frames.stop]
+    if len(latent):
+        tau = decoder.stress(latent)[..., _UPPER[0], _UPPER[1]]
+        parts.append((decoder.position(latent), decoder.affine(latent), tau))
+    if frames.stop > own:
+        since = slice(max(frames.start, own) - own + 1, frames.stop - own + 1)
+        x, C, tau = (torch.as_tensor(continuation.read(k, frames=since)).to(xhat) for k in ("x", "C", "tau"))
+        parts.append((x, C.unflatten(2, (3, 3)), tau))
+    return tuple(torch.cat(fields) for fields in zip(*parts, strict=True))
 
 
 def _shown(

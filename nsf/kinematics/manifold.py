@@ -139,6 +139,15 @@ class Manifold(nn.Module, ABC):
         if self.parameter_names:
             self.standard_parameters = Standardizer.fit([snapshots.parameters])
 
+    @property
+    def training_trajectories(self) -> Tensor:
+        """[M] number of the trajectory that each training snapshot is of.
+
+        Snapshots are by trajectory, then by time: where time does not grow, another trajectory begins.
+        """
+        begins = torch.diff(self.training_times, prepend=self.training_times[:1]) <= 0
+        return begins.long().cumsum(0) - 1
+
     @abstractmethod
     def encode(self, x: Tensor) -> Tensor:
         """Latents xhat [F, r] (float64) of whole frames x [F, P, 3] m of the training particles."""

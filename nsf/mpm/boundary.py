@@ -97,6 +97,10 @@ class BoundaryArrays:
             array([c.until for c in self.colliders], wp.float64),
         ]
 
+    def start_from(self, steps: int) -> None:
+        """Let the next step be the one that starts `steps` steps after t = 0."""
+        self.steps.fill_(steps)
+
     def advance(self, dt: float) -> None:
         """Pose and velocity of every collider for the next step of dt [s]; nothing where none changes."""
         if not self._changes:

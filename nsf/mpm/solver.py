@@ -123,6 +123,9 @@ class FullOrderMPM:
         device: `cpu`, `cuda`, `cuda:N` or `auto`.
         check_every: steps between checks of finiteness and bounds.
 
+    Attributes:
+        beyond_law: particles whose stress `resume` had to scale down.
+
     Raises:
         InstabilityError: Δt is unstable or a collider too fast; the message names the largest stable one.
         ConfigError: the grid does not resolve a collider.
@@ -154,7 +157,7 @@ class FullOrderMPM:
         self.precision = precision_of(precision)
         self.device = warp_device(device)
         self.check_every = check_every
-        self.steps_taken = 0
+        self.steps_taken = self.beyond_law = 0
         x = constants.X if x is None else np.asarray(x, np.float64)
         v = np.zeros_like(constants.X) if v is None else np.asarray(v, np.float64)
         if x.shape != constants.X.shape or v.shape != constants.X.shape:
@@ -191,6 +194,37 @@ class FullOrderMPM:
         """Bytes that the solver's arrays take on the device."""
         own = (self.mass, self.volume0, self.mu, self.lam, self._first_bad)
         return self.state.nbytes + self.grid.nbytes + sum(a.capacity for a in own)
+
+    def resume(self, steps: int, x: np.ndarray, v: np.ndarray, C: np.ndarray, tau: np.ndarray) -> None:
+        """Go on from a state that is known by its positions, velocities and stresses alone.
+
+        F_e is the stretch that carries τ (`Material.stretch_of`), the history variables are those that the
+        law assumes for τ (`Material.history_of`), and the colliders are where they are at that time. A
+        stress beyond the law is scaled down to what it carries; `beyond_law` counts them.
+
+        Args:
+            steps: time of the state in steps of Δt.
+            x, v: [P, 3] position [m] and velocity [m/s].
+            C: [P, 3, 3] affine momentum [1/s].
+            tau: [P, 3, 3] symmetric Kirchhoff stress [Pa].
+
+        Raises:
+            InstabilityError: Δt is too long for v, or a particle is non-finite or off the grid.
+        """
+        check_time_step(self.constants, v, self.grid.geometry.dx, self.dt)
+        tau, moduli = np.asarray(tau, np.float64), (self.constants.mu, self.constants.lam)
+        if not np.isfinite(tau).all():
+            raise InstabilityError(f"the stress to resume from at step {steps} is not finite")
+        share = self.material.carried_share(tau, *moduli)
+        self.beyond_law = int((share < 1.0).sum())
+        tau = share[:, None, None] * tau
+        F_e = self.material.stretch_of(tau, *moduli)
+        state = {"x": x, "v": v, "C": C, "F_e": F_e, "tau": tau, "history": self.material.history_of(tau)}
+        for name, values in state.items():
+            getattr(self.state, name).assign(values)
+        self.grid_step.boundaries.start_from(steps)
+        self.steps_taken = steps
+        self.check()
 
     def step(self, n: int = 1) -> None:
         """Advance by n steps of Δt.

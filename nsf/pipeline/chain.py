@@ -3,6 +3,7 @@
 scene → simulate → dataset → train → deploy → evaluate → report
 """
 
+import contextlib
 import time
 from collections.abc import Callable, Sequence
 from copy import copy
@@ -16,7 +17,7 @@ from omegaconf.errors import ConfigKeyError
 
 from nsf import config as configuration
 from nsf.data import Snapshots, Split, Trajectory
-from nsf.dynamics import ParticleSets, ReducedMPM, Rollout, SamplePhase, deploy
+from nsf.dynamics import ParticleSets, ReducedMPM, Rollout, SamplePhase, calibrate, deploy, go_on
 from nsf.dynamics.interop import torch_device
 from nsf.dynamics.sampling import check_well_posed
 from nsf.dynamics.solver import reduced_steps
@@ -79,6 +80,7 @@ class Pipeline:
         if not configuration.number("deploy.dt_multiplier", multiplier) > 0:
             raise ConfigError(f"deploy.dt_multiplier={multiplier} must be positive")
         _one_of("deploy.split", c.deploy.split, ("test", "validation", "train"))
+        _one_of("deploy.on_distrust", c.deploy.on_distrust, ("report", "full_order"))
         _one_of("tracking", c.tracking, TRACKING)
         _one_of("data.resident", c.data.resident, (True, False, "auto"))
         _one_of("data.dtype", c.data.dtype, tuple(_STORED))
@@ -173,6 +175,7 @@ class Pipeline:
                 "values": list(self.held_out),
                 "split": self.config.deploy.split,
                 "dt_multiplier": self.config.deploy.dt_multiplier,
+                "on_distrust": self.config.deploy.on_distrust,
                 "device": self.device,
             }
         )
@@ -316,28 +319,61 @@ class Pipeline:
             return run
         manifold = Manifold.load(self.training.require().path / "manifold.pt")
         with run.record(device=self.device, precision=self.config.precision) as record:
-            rollouts = deploy(
-                lambda v, device: self.solver_at(manifold, v, device), self.held_out, self.device
-            )
+            build = partial(self.solver_at, manifold)
+            started = time.perf_counter()
+            trust = calibrate(build, manifold, self.device)
+            record.metrics["trust"] = {
+                "residual_m": trust.residual,
+                "distance_m": trust.distance,
+                "seconds": time.perf_counter() - started,
+            }
+            hand_over = self.config.deploy.on_distrust == "full_order"
+            rollouts = deploy(build, self.held_out, self.device, trust, until_distrusted=hand_over)
             for index, rollout in enumerate(rollouts):
                 rollout.save(run.path / f"rollout_{index}.h5")
                 record.output(f"rollout_{index}.h5")
                 self._warn(rollout)
+                if rollout.handed_over >= 0:
+                    self._go_on(manifold, rollout, run.path / continuation(index))
+                    record.output(continuation(index))
             record.metrics["seconds"] = [r.seconds for r in rollouts]
             record.metrics["needed_outside"] = max(r.needed_outside for r in rollouts)
             record.metrics["diverged"] = [r.parameter for r in rollouts if r.diverged >= 0]
+            record.metrics["distrusted"] = [r.parameter for r in rollouts if r.distrusted >= 0]
         self.say(
             f"deploy: method={self.config.method.name}, |S|={rollouts[0].sample}, "
             f"{len(rollouts)} values → {run.id}"
         )
         return run
 
+    def _go_on(self, manifold: Manifold, rollout: Rollout, path: Path) -> None:
+        solver = self.solver_at(manifold, rollout.parameter)
+        beyond = go_on(solver, rollout, path, _STORED[self.config.data.dtype])
+        if beyond:
+            self.say(
+                f"deploy: warning: {self._named(rollout)}: at the hand-over the stress of {beyond} particles "
+                "was beyond what the law carries, and was scaled down to that"
+            )
+
+    def _named(self, rollout: Rollout) -> str:
+        return f"{self.scene.parameters.name}={rollout.parameter:g}"
+
     def _warn(self, rollout: Rollout) -> None:
-        value = f"{self.scene.parameters.name}={rollout.parameter:g}"
+        value = self._named(rollout)
         if rollout.diverged >= 0:
             self.say(
                 f"deploy: warning: {value} diverged at step {rollout.diverged} (off the grid or not finite); "
                 "its errors are reported as ∞"
+            )
+        if (step := rollout.distrusted) >= 0:
+            n, t = rollout.handed_over, rollout.t
+            then = (
+                f"; the full-order solver goes on from t = {t[n]:.4g} s"
+                if n >= 0
+                else f": {rollout.trust.max():.3g} times as far as training data are from themselves"
+            )
+            self.say(
+                f"deploy: warning: {value} left what the model was trained on at t = {t[step]:.4g} s{then}"
             )
         if rollout.needed_outside:
             self.say(
@@ -357,19 +393,23 @@ class Pipeline:
         with run.record(device=self.device, precision=self.config.precision) as record:
             for index, value in enumerate(self.held_out):
                 rollouts.append(Rollout.open(deployment.path / f"rollout_{index}.h5"))
-                with Trajectory.open(self.truth(value).require().path / "trajectory.h5") as trajectory:
+                with contextlib.ExitStack() as files:
+                    truth = self.truth(value).require().path / "trajectory.h5"
+                    trajectory, rest = files.enter_context(Trajectory.open(truth)), None
+                    if rollouts[-1].handed_over >= 0:
+                        path = deployment.path / continuation(index)
+                        rest = files.enter_context(Trajectory.open(path))
                     solver = self.solver_at(manifold, value)
                     shown = (e.picture_particles, e.picture_frames)
-                    comparisons.append(
-                        compare(solver, trajectory, rollouts[-1], self.config.deploy.split, shown)
-                    )
+                    split = self.config.deploy.split
+                    comparisons.append(compare(solver, trajectory, rollouts[-1], split, shown, rest))
             del solver
             cost = self._cost(manifold)
             table = results.rows(
                 self.config, manifold, rollouts, comparisons, cost, self.device, run.manifest
             )
             seconds = self.training.manifest["metrics"]["training_seconds"]
-            summary = results.summarise(self.deployed, manifold, table, comparisons, seconds)
+            summary = results.summarise(self.deployed, manifold, table, comparisons, rollouts, seconds)
             results.write(record, table, comparisons, cost, summary)
         self.say(f"evaluate: mean δ {100 * table['delta'].mean():.3g} % over {len(table)} values → {run.id}")
         return run
@@ -451,6 +491,11 @@ class Pipeline:
             self.say(f"{run.stage}: inputs unchanged, reused → {run.id}")
             return True
         return False
+
+
+def continuation(index: int) -> str:
+    """File of a deploy run in which the full-order solver goes on with rollout `index`."""
+    return f"continuation_{index}.h5"
 
 
 #: Precision of stored frames by the name of their type.

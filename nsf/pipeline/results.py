@@ -59,7 +59,7 @@ def rows(
         "device": torch.cuda.get_device_name(device) if device.startswith("cuda") else "cpu",
         "commit": commit,
     }
-    # What a step costs whose particles have left the grid is no one's speedup.
+    # What a step costs whose particles have left the grid is no one's speedup, nor is half a reduced run's.
     costly = ("step_ms_reduced", "speedup_step", "speedup_total", "memory_reduced_mib")
     lost = measured | dict.fromkeys(costly, math.nan)
     found = []
@@ -73,12 +73,34 @@ def rows(
             "displacement_error": comparison.displacement_error,
             "stress_error": comparison.stress_error,
         }
-        found.append(variant | own | (lost if rollout.diverged >= 0 else measured))
+        reduced = rollout.diverged < 0 and rollout.handed_over < 0
+        found.append(variant | own | (measured if reduced else lost))
     return pd.DataFrame(found)
 
 
+def trust_of(rollout: Rollout) -> dict:
+    """Entry of `summary.json`: times in s, null where nothing happened; a ratio of ∞ is null too."""
+    largest = float(rollout.trust.max())
+
+    def when(step: int) -> float | None:
+        return float(rollout.t[step]) if step >= 0 else None
+
+    return {
+        "parameter": rollout.parameter,
+        "trust": largest if math.isfinite(largest) else None,
+        "distrusted": rollout.distrusted >= 0,
+        "distrusted_at": when(rollout.distrusted),
+        "handed_over_at": when(rollout.handed_over),
+    }
+
+
 def summarise(
-    scene: Scene, manifold, results: pd.DataFrame, comparisons: Sequence[Comparison], seconds: float
+    scene: Scene,
+    manifold,
+    results: pd.DataFrame,
+    comparisons: Sequence[Comparison],
+    rollouts: Sequence[Rollout],
+    seconds: float,
 ) -> dict:
     """Content of `summary.json`; `seconds` is the training's wall time."""
     config = scene.config
@@ -98,6 +120,7 @@ def summarise(
         "delta": mean("delta") if math.isfinite(mean("delta")) else None,
         "reconstruction_delta": mean("reconstruction_delta"),
         "reconstruction_stress_error": mean("reconstruction_stress_error"),
+        "trust": [trust_of(rollout) for rollout in rollouts],
         "variant": {name: results[name].tolist()[0] for name in ("method", "field", "r", "sample")},
     }
     if config.scene.get("paper"):

@@ -12,6 +12,7 @@ from nsf.reporting.provenance import provenance_rows, sources_json
 from nsf.reporting.sources import Source, open_sources
 from nsf.reporting.swap import MARK, replaced
 from nsf.reporting.tables import Merged, console_table, means, merge, variants, without_constants
+from nsf.reporting.trust import RENAMED, trust_note, trust_rows
 
 __all__ = ["Study", "build_report", "console_table"]
 
@@ -87,6 +88,7 @@ def _page(title: str, merged: Merged, sections, study: Study | None) -> Page:
         if len(variants(merged)) > len(methods)
         else ""
     )
+    parameter, trust = _parameter_heading(merged), trust_rows(merged)
     note = f"Means over the parameter values of a split. {chosen}{_smaller(merged)}{_said(same)}"
     return Page(
         title=title,
@@ -94,7 +96,8 @@ def _page(title: str, merged: Merged, sections, study: Study | None) -> Page:
         facts=[*_asked(study), *_facts(merged)],
         tables=[
             Table("Results beside the paper's", headline, note),
-            Table("Each parameter value", per_value, _said(same_there), _parameter_heading(merged)),
+            Table("Each parameter value", per_value, _said(same_there), parameter),
+            *([Table("Trust", trust, trust_note(trust), parameter | RENAMED)] if len(trust) else []),
         ],
         sections=sections,
         provenance=Table("Where the numbers come from", provenance_rows(merged), _PROVENANCE),

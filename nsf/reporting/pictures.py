@@ -65,6 +65,15 @@ class _Variant:
             parts.append(source.series[[same_parameter(p, value) for p in source.series["parameter"]]])
         return pd.concat(parts, ignore_index=True)
 
+    def continued(self) -> str:
+        """Which held-out runs go on at full order, as a sentence for captions; empty where none does."""
+        told, unit = [], self.parameter[1]
+        for value, source in zip(self.rows["parameter"], self.sources, strict=True):
+            at = (source.trust(value) or {}).get("handed_over_at")
+            if at is not None and value in self.values:
+                told.append(f"at {parameter_text(value, '', unit)} from {at:.3g} s on")
+        return f" The full-order solver goes on {', '.join(told)}." if told else ""
+
     def motions(self, limit: int) -> list[Motion]:
         """At most `limit` held-out parameter values, evenly over their range, ends included."""
         chosen = np.unique(
@@ -119,7 +128,7 @@ def _best_of_each_method(known: list[_Variant]) -> list[_Variant]:
 def _of_variant(v: _Variant, folder: Path, prefix: str) -> list[Picture]:
     name, unit = v.parameter
     held_out, everything = v.series(held_out_only=True), v.series(held_out_only=False)
-    pictures = []
+    pictures, continued = [], v.continued()
 
     def add(stem: str, figure, caption: str, kinds=("svg", "png")) -> None:
         pictures.append(Picture(save(figure, folder, prefix + stem, kinds), caption, v.runs))
@@ -131,24 +140,24 @@ def _of_variant(v: _Variant, folder: Path, prefix: str) -> list[Picture]:
         told = f"{name} " + " and ".join(parameter_text(m.parameter, "", unit) for m in motions)
         caption = (
             f"The full-order model (left) and the reduced one (right) at {told}, held out from training"
-            f"{'; the front half is cut away' if cut else ''}."
+            f"{'; the front half is cut away' if cut else ''}.{continued}"
         )
         pictures.append(Picture([f"{prefix}animation.gif"], _held_out(caption, v), v.runs))
         add(
             "strip", render.strip(motions[0], name, unit, v.floor),
             f"Whole bodies over time at {name} {parameter_text(motions[0].parameter, '', unit)}: full-order "
-            "above, reduced below.", kinds=("png",),
+            f"above, reduced below.{continued}", kinds=("png",),
         )  # fmt: skip
         add(
             "final-shapes", render.final_shapes(v.motions(ROWS), name, unit, v.floor),
             f"The last frame of each parameter value{', the front half cut away' if cut else ''}; "
             "the right column shows how far each particle of the reduced model lies from where the "
-            "full-order one puts it.", kinds=("png",),
+            f"full-order one puts it.{continued}", kinds=("png",),
         )  # fmt: skip
     add(
         "error-over-time", charts.error_over_time(held_out, name=name, unit=unit),
         "The paper's error δ and the displacement error, frame by frame; the displacement error divides by "
-        "the distance moved, so it starts high where little has moved yet.",
+        f"the distance moved, so it starts high where little has moved yet.{continued}",
     )  # fmt: skip
     physics = [
         c for c in ("stress_error", "linear_momentum_error", "angular_momentum_error") if _has(held_out, c)

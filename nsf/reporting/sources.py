@@ -3,7 +3,9 @@
 Besides the keys every evaluate run has, `summary.json` may hold these, all optional:
 `title` and `scale` (of the scene), `parameter_name`, `parameter_unit`, `particles`, `training_seconds`,
 `floor` (height [m], null where the scene has none) and `paper`: the `place` where the paper speaks of the
-scene, and by method the figures it prints, called as in results.csv, and `training_seconds`.
+scene, and by method the figures it prints, called as in results.csv, and `training_seconds`. `trust` is
+a list, one entry a parameter value: {"parameter", "trust", "distrusted", "distrusted_at", "handed_over_at"}
+(docs/design.md).
 """
 
 import hashlib
@@ -79,6 +81,11 @@ class Source:
     def series(self) -> pd.DataFrame:
         """Errors and latent coordinates, one row a frame and parameter value."""
         return self._csv("series.csv", _SERIES, text=("split",))
+
+    def trust(self, parameter) -> dict | None:
+        """What the run says of the trust of one parameter value, None for a run that does not know."""
+        told = self.summary.get("trust", ())
+        return next((entry for entry in told if same_parameter(entry["parameter"], parameter)), None)
 
     def motions(self, parameters) -> list[Motion]:
         """The particles of some parameter values, in the order asked for; values not stored are left out."""

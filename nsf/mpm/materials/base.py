@@ -8,8 +8,10 @@ from typing import Any, ClassVar
 import numpy as np
 import warp as wp
 
-from nsf.errors import ConfigError
+from nsf.errors import ConfigError, InstabilityError
 from nsf.mpm.precision import Precision
+
+_HALVINGS = 30  # of the share of a stress that a law carries
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,79 @@ class Material(ABC):
     @abstractmethod
     def functions(self, precision: Precision) -> LawFunctions:
         """The law's Warp functions in one precision."""
+
+    @abstractmethod
+    def stretches_of(self, principal: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
+        """Principal stretches that carry principal Kirchhoff stresses, on the branch through the identity.
+
+        Args:
+            principal: [P, 3] principal Kirchhoff stresses [Pa].
+            mu, lam: [P] Lamé parameters [Pa].
+
+        Returns:
+            [P, 3] in the order of the stresses; NaN where the law carries no such stress.
+        """
+
+    def stretch_of(self, tau: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
+        """The symmetric F_e = V with τ(V) = τ: the inverse of the elastic law.
+
+        τ does not tell the rotation R of F_e = V R, and an isotropic law needs none: neither τ(F_e) nor
+        what a return map makes of f F_e depends on it.
+
+        Args:
+            tau: [P, 3, 3] symmetric Kirchhoff stress [Pa].
+            mu, lam: [P] Lamé parameters [Pa].
+
+        Returns:
+            [P, 3, 3] left elastic stretch, dimensionless.
+
+        Raises:
+            InstabilityError: no deformation carries the stress of a particle; names the first.
+        """
+        principal, axes = np.linalg.eigh(tau)
+        stretches = self._stretches(principal, mu, lam)
+        bad = ~np.isfinite(stretches).all(1)
+        if bad.any():
+            p = int(bad.argmax())
+            shown = np.array2string(principal[p], precision=4)
+            raise InstabilityError(
+                f"no deformation of {type(self).__name__} carries the stress of {int(bad.sum())} particles: "
+                f"particle {p} has the principal stresses {shown} Pa at mu={mu[p]:g} Pa"
+            )
+        return (axes * stretches[:, None, :]) @ axes.transpose(0, 2, 1)
+
+    def carried_share(self, tau: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
+        """Largest share [P] of each stress, at most 1, that a deformation carries, by bisection.
+
+        A stress that comes from elsewhere than the law, as a field's, may lie beyond what the law can give.
+
+        Args:
+            tau: [P, 3, 3] symmetric Kirchhoff stress [Pa].
+            mu, lam: [P] Lamé parameters [Pa].
+        """
+        principal = np.linalg.eigvalsh(tau)
+        share = np.ones(len(tau))
+        beyond = ~np.isfinite(self._stretches(principal, mu, lam)).all(1)
+        principal, mu, lam = principal[beyond], mu[beyond], lam[beyond]
+        lower, upper = np.zeros(len(mu)), np.ones(len(mu))
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (lower + upper)
+            carried = np.isfinite(self._stretches(middle[:, None] * principal, mu, lam)).all(1)
+            lower, upper = np.where(carried, middle, lower), np.where(carried, upper, middle)
+        share[beyond] = lower
+        return share
+
+    def _stretches(self, principal: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
+        """`stretches_of`, whose NaN are an answer."""
+        with np.errstate(invalid="ignore", divide="ignore"):
+            return self.stretches_of(principal, mu, lam)
+
+    def history_of(self, tau: np.ndarray) -> np.ndarray:
+        """[P, H] history variables assumed where only τ [P, 3, 3] [Pa] is known: those at rest.
+
+        A law says where it can know better.
+        """
+        return self.initial_history(len(tau))
 
     def params(self, precision: Precision):
         """The law's constants as its Warp struct."""

@@ -4,11 +4,12 @@ import math
 from dataclasses import dataclass
 from functools import cache
 
+import numpy as np
 import warp as wp
 
 from nsf.errors import ConfigError
 from nsf.mpm.materials.base import LawFunctions, Material
-from nsf.mpm.materials.hencky import from_log_strain, hencky_tau, log_strain
+from nsf.mpm.materials.hencky import from_log_strain, hencky_stretches, hencky_tau, log_strain
 from nsf.mpm.precision import Precision
 
 
@@ -69,6 +70,10 @@ class DruckerPrager(Material):
     def functions(self, precision: Precision) -> LawFunctions:
         """The law's Warp functions."""
         return _functions(precision)
+
+    def stretches_of(self, principal: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
+        """[P, 3] stretches of [P, 3] principal stresses, in closed form."""
+        return hencky_stretches(principal, mu, lam)
 
     def params(self, precision: Precision):
         """The law's constants."""

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from functools import cache
 
+import numpy as np
 import warp as wp
 
 from nsf.mpm.materials.base import LawFunctions, Material, no_params, no_return_map
@@ -59,6 +60,17 @@ def hencky_tau(precision: Precision):
     return tau_of
 
 
+def hencky_stretches(principal: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
+    """Principal stretches exp(ε) of `hencky_tau`, ε = (τ − λ tr(τ)/(3λ + 2μ̂) 1)/(2μ̂).
+
+    Args:
+        principal: [P, 3] principal Kirchhoff stresses [Pa]; mu, lam: [P] Lamé parameters [Pa].
+    """
+    mu, lam = mu[:, None], lam[:, None]
+    trace = principal.sum(1, keepdims=True)
+    return np.exp((principal - lam / (3.0 * lam + 2.0 * mu) * trace) / (2.0 * mu))
+
+
 @cache
 def _functions(precision: Precision) -> LawFunctions:
     return LawFunctions(hencky_tau(precision), no_return_map(precision), no_params())
@@ -71,3 +83,7 @@ class Hencky(Material):
     def functions(self, precision: Precision) -> LawFunctions:
         """The law's Warp functions."""
         return _functions(precision)
+
+    def stretches_of(self, principal: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
+        """[P, 3] stretches of [P, 3] principal stresses, in closed form."""
+        return hencky_stretches(principal, mu, lam)

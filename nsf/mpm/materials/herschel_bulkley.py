@@ -4,11 +4,14 @@ import math
 from dataclasses import dataclass
 from functools import cache
 
+import numpy as np
 import warp as wp
 
 from nsf.errors import ConfigError
 from nsf.mpm.materials.base import LawFunctions, Material
 from nsf.mpm.precision import Precision
+
+_NEWTON_STEPS = 50  # from its start the mean shrinks by a third a step, then converges quadratically
 
 
 @cache
@@ -61,6 +64,29 @@ def isochoric_mean(precision: Precision):
         return m
 
     return mean
+
+
+def volumetric_deviatoric_stretches(principal: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
+    """Principal stretches of `volumetric_deviatoric_tau`: J from tr τ, b̄ = d + m 1 from d = dev τ/μ̂.
+
+    J² = 1 + 2 tr(τ)/(3κ); m is the largest root of Π (dᵢ + m) = 1 (`isochoric_mean`), by Newton's steps down
+    from 1 + max |dᵢ|, where every factor is at least 1.
+
+    Args:
+        principal: [P, 3] principal Kirchhoff stresses [Pa]; mu, lam: [P] Lamé parameters [Pa].
+
+    Returns:
+        [P, 3]; NaN where tr τ is below what an empty volume carries.
+    """
+    pressure = principal.mean(1, keepdims=True)
+    kappa = (lam + 2.0 / 3.0 * mu)[:, None]
+    J = np.sqrt(1.0 + 2.0 * pressure / kappa)
+    d = (principal - pressure) / mu[:, None]
+    p, q = 0.5 * (d * d).sum(1, keepdims=True), 1.0 - d.prod(1, keepdims=True)
+    m = 1.0 + np.abs(d).max(1, keepdims=True)
+    for _ in range(_NEWTON_STEPS):
+        m = m - ((m * m - p) * m - q) / (3.0 * m * m - p)
+    return J ** (1.0 / 3.0) * np.sqrt(d + m)
 
 
 @cache
@@ -131,6 +157,10 @@ class HerschelBulkley(Material):
     def functions(self, precision: Precision) -> LawFunctions:
         """The law's Warp functions."""
         return _functions(precision)
+
+    def stretches_of(self, principal: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
+        """[P, 3] stretches of [P, 3] principal stresses; volume and shape apart."""
+        return volumetric_deviatoric_stretches(principal, mu, lam)
 
     def params(self, precision: Precision):
         """The law's constants."""

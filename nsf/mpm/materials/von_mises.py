@@ -9,7 +9,7 @@ import warp as wp
 
 from nsf.errors import ConfigError
 from nsf.mpm.materials.base import LawFunctions, Material
-from nsf.mpm.materials.hencky import from_log_strain, hencky_tau, log_strain
+from nsf.mpm.materials.hencky import from_log_strain, hencky_stretches, hencky_tau, log_strain
 from nsf.mpm.precision import Precision
 
 
@@ -83,6 +83,10 @@ class VonMises(Material):
         """The law's Warp functions."""
         return _functions(precision)
 
+    def stretches_of(self, principal: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
+        """[P, 3] stretches of [P, 3] principal stresses, in closed form."""
+        return hencky_stretches(principal, mu, lam)
+
 
 @dataclass(frozen=True)
 class VonMisesHardening(VonMises):
@@ -106,6 +110,15 @@ class VonMisesHardening(VonMises):
         super().__post_init__()
         if not 0.0 <= self.hardening < math.inf:
             raise ConfigError(f"material.hardening={self.hardening} must be finite and not negative")
+
+    def history_of(self, tau: np.ndarray) -> np.ndarray:
+        """[P, 1] a lower bound of τ_Y [Pa]: at least that at rest, and at least the ‖dev τ‖ which is carried.
+
+        What a particle that has unloaded had hardened beyond that is lost.
+        """
+        mean = np.trace(tau, axis1=1, axis2=2)[:, None, None] / 3.0
+        carried = np.linalg.norm(tau - mean * np.eye(3), axis=(1, 2))
+        return np.maximum(carried, self.yield_stress)[:, None]
 
     def params(self, precision: Precision):
         """The law's constants."""
@@ -139,6 +152,10 @@ class VonMisesSoftening(VonMises):
         super().__post_init__()
         if not 0.0 <= self.softening < math.inf:
             raise ConfigError(f"material.softening={self.softening} Pa must be finite and not negative")
+
+    def history_of(self, tau: np.ndarray) -> np.ndarray:
+        """[P, 1] an upper bound of τ_Y [Pa], that at rest: a damaged particle looks like an unloaded one."""
+        return self.initial_history(len(tau))
 
     def params(self, precision: Precision):
         """The law's constants."""

@@ -19,8 +19,8 @@ def solver_at(chain, tiny_manifold):
 
 
 @pytest.fixture(scope="module")
-def made(solver_at) -> Rollout:
-    return rollout(solver_at(26.0), 26.0)
+def made(solver_at, tiny_trust) -> Rollout:
+    return rollout(solver_at(26.0), 26.0, tiny_trust)
 
 
 def same(one: Rollout, other: Rollout, timing: bool = True) -> bool:
@@ -53,16 +53,16 @@ class Thrown:
         return replace(result, xhat=result.xhat + (1e4 if self.calls == 5 else 0.0))
 
 
-def test_a_run_that_leaves_the_grid_has_diverged(chain, tiny_manifold):
+def test_a_run_that_leaves_the_grid_has_diverged(chain, tiny_manifold, tiny_trust):
     angle = {"friction_angle": 26.0}
     solver = chain.scene.reduced(tiny_manifold, angle, 20, device="cpu", projector=Thrown())
-    made = rollout(solver, 26.0)
+    made = rollout(solver, 26.0, tiny_trust)
     assert np.isfinite(made.xhat).all()
     assert made.diverged == 5
 
 
-def test_batches_are_parameter_values(made, solver_at):
-    runs = deploy(solver_at, (26.0, 33.5), "cpu")
+def test_batches_are_parameter_values(made, solver_at, tiny_trust):
+    runs = deploy(solver_at, (26.0, 33.5), "cpu", tiny_trust)
     assert [run.parameter for run in runs] == [26.0, 33.5]
     assert same(runs[0], made, timing=False)
     assert not np.array_equal(runs[0].xhat, runs[1].xhat)
@@ -74,9 +74,9 @@ def test_round_trip(made, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["rollout.h5"]
 
 
-def test_a_single_step_is_a_run(chain, tiny_manifold):
+def test_a_single_step_is_a_run(chain, tiny_manifold, tiny_trust):
     solver = chain.scene.reduced(tiny_manifold, {"friction_angle": 26.0}, 20, device="cpu", dt_multiplier=24)
-    assert rollout(solver, 26.0).xhat.shape == (2, 4)
+    assert rollout(solver, 26.0, tiny_trust).xhat.shape == (2, 4)
 
 
 @pytest.mark.parametrize("keep", [0, 8, 100, 0.5, -64])
@@ -95,12 +95,12 @@ def test_missing(tmp_path):
 
 
 def test_foreign(tmp_path, chain):
-    with pytest.raises(SchemaError, match="is not a rollout of version 1"):
+    with pytest.raises(SchemaError, match="is not a rollout of version 2"):
         Rollout.open(chain.trajectory(26.0))
     other = tmp_path / "other.h5"
     with h5py.File(other, "w") as file:
         file["x"] = np.zeros(3)
-    with pytest.raises(SchemaError, match="is not a rollout of version 1"):
+    with pytest.raises(SchemaError, match="is not a rollout of version 2"):
         Rollout.open(other)
     (tmp_path / "text.h5").write_text("not HDF5")
     with pytest.raises(SchemaError, match="not a rollout"):
@@ -111,12 +111,12 @@ def test_newer(made, tmp_path):
     path = tmp_path / "rollout.h5"
     made.save(path)
     with h5py.File(path, "a") as file:
-        file.attrs["nsf_rollout"] = 2
-    with pytest.raises(SchemaError, match=r"found 2"):
+        file.attrs["nsf_rollout"] = 3
+    with pytest.raises(SchemaError, match=r"found 3"):
         Rollout.open(path)
 
 
-@pytest.mark.parametrize("lost", ["xhat", "stops"])
+@pytest.mark.parametrize("lost", ["xhat", "stops", "trust"])
 def test_a_part_is_missing(made, tmp_path, lost):
     path = tmp_path / "rollout.h5"
     made.save(path)

@@ -357,9 +357,10 @@ class Fails:
         return result if self.left else ProjectionResult(bad, result.residuals, result.updates)
 
 
-def test_divergence_names_its_step(solver_of):
-    run = rollout(solver_of(projector=Fails(at=4)), 26.0)
+def test_divergence_names_its_step(solver_of, tiny_trust):
+    run = rollout(solver_of(projector=Fails(at=4)), 26.0, tiny_trust)
     assert run.diverged == 4
+    assert np.isposinf(run.trust[4:]).all()
 
 
 # -- refusals -------------------------------------------------------------------------------------------

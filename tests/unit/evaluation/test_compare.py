@@ -9,9 +9,10 @@ import torch
 
 import nsf.scenes
 from nsf.data import Trajectory
-from nsf.dynamics import Method, Rollout
+from nsf.dynamics import Method, Rollout, go_on
 from nsf.errors import SchemaError
 from nsf.evaluation import at_frames, compare, metrics
+from nsf.evaluation.compare import trust_at_frames
 
 ERRORS = ["delta", "displacement_error", "stress_error"]
 MOMENTA = ["linear_momentum_error", "angular_momentum_error"]
@@ -19,7 +20,9 @@ MOMENTA = ["linear_momentum_error", "angular_momentum_error"]
 
 def rollout_of(t, xhat, diverged=-1, parameter=26.0):
     n = len(t) - 1
-    return Rollout(parameter, t, xhat, np.zeros((n, 2)), ["converged"] * n, 20, 50.0, 0, 1.0, diverged)
+    return Rollout(
+        parameter, t, xhat, np.zeros((n, 2)), ["converged"] * n, np.zeros(n + 1), 20, 50.0, 0, 1.0, diverged
+    )
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +99,7 @@ def test_series(comparison_of, made, truth):
     series = comparison_of(made).series
     latents = [f"{kind}_{k}" for kind in ("xhat", "encoded") for k in range(1, 5)]
     first = ["parameter", "split", "frame", "t"]
-    assert list(series) == [*first, *ERRORS, *MOMENTA, "reconstruction_delta", *latents]
+    assert list(series) == [*first, *ERRORS, *MOMENTA, "reconstruction_delta", "trust", *latents]
     assert len(series) == truth.frames == 25
     assert set(series["split"]) == {"test"}
     np.testing.assert_array_equal(series["t"], truth.t)
@@ -130,11 +133,12 @@ def test_frames_at_deployment_steps_are_exact(made):
     assert np.array_equal(at_frames(made, made.t), made.xhat)
 
 
-def test_a_multiplied_step_is_compared_at_the_frames(chain, tiny_manifold, comparison_of, made):
+def test_a_multiplied_step_is_compared_at_the_frames(chain, tiny_manifold, tiny_trust, comparison_of, made):
     from nsf.dynamics import rollout
 
     value = {"friction_angle": 26.0}
-    run = rollout(chain.scene.reduced(tiny_manifold, value, 20, device="cpu", dt_multiplier=1.5), 26.0)
+    solver = chain.scene.reduced(tiny_manifold, value, 20, device="cpu", dt_multiplier=1.5)
+    run = rollout(solver, 26.0, tiny_trust)
     found = comparison_of(run)
     assert len(found.series) == 25
     assert found.delta < 3.0 * comparison_of(made).delta + 0.005
@@ -224,3 +228,47 @@ def test_other_particles_are_refused(chain, tiny, tiny_manifold, made, tmp_path)
         pytest.raises(SchemaError, match="checkpoint made for other particles"),
     ):
         compare(solver, other, made, "test", (10, 2))
+
+
+@pytest.fixture(scope="module")
+def continuation(chain, tiny_manifold, made, tmp_path_factory):
+    """A rollout that was handed over at step 10, and its full-order rest."""
+    handed = replace(made, handed_over=10, xhat=made.xhat[:13], t=made.t[:13], trust=0.1 * np.arange(13))
+    solver = chain.pipeline.solver_at(tiny_manifold, 26.0, "cpu")
+    path = tmp_path_factory.mktemp("rest") / "continuation.h5"
+    go_on(solver, handed, path)
+    with Trajectory.open(path) as rest:
+        yield handed, rest
+
+
+@pytest.mark.parametrize("chunk", [None, 9 * 500 * 4])
+def test_a_continued_run_is_compared_with_its_own_frames(
+    continuation, chunk, chain, tiny_manifold, truth, comparison_of, made, monkeypatch
+):
+    if chunk:
+        monkeypatch.setattr(sys.modules["nsf.evaluation.compare"], "_CHUNK", chunk)
+    solver, (handed, rest) = chain.pipeline.solver_at(tiny_manifold, 26.0, "cpu"), continuation
+    found = compare(solver, truth, handed, "test", (500, 25), rest)
+    reduced = comparison_of(made).series
+    np.testing.assert_allclose(found.series["delta"][:11], reduced["delta"][:11], rtol=1e-9)
+    x, x_rom = (source.read("x").astype(float) for source in (truth, rest))
+    expected = np.linalg.norm(x_rom - x[10:], axis=(1, 2)) / np.linalg.norm(x[10:], axis=(1, 2))
+    np.testing.assert_allclose(found.series["delta"][11:], expected[1:], rtol=1e-6)
+    np.testing.assert_allclose(found.pictures["x_reduced"][11:], x_rom[1:], rtol=1e-6)
+    np.testing.assert_allclose(found.pictures["tau_reduced"][11:], rest.read("tau")[1:], rtol=1e-6)
+    assert np.isfinite(found.series[MOMENTA]).all().all()
+    np.testing.assert_allclose(found.series["trust"][:11], 0.1 * np.arange(11))
+    assert found.series.loc[11:, ["trust", "xhat_1"]].isna().all().all()
+
+
+def test_a_continuation_must_reach_the_end(continuation, chain, tiny_manifold, truth):
+    solver, (handed, rest) = chain.pipeline.solver_at(tiny_manifold, 26.0, "cpu"), continuation
+    for wrong, run in ((None, handed), (rest, replace(handed, handed_over=9))):
+        with pytest.raises(SchemaError, match=r"handed over at frame \d+ of 24"):
+            compare(solver, truth, run, "test", (10, 2), wrong)
+
+
+def test_trust_at_frames_between_deployment_steps(made):
+    run = replace(made, t=np.array([0.0, 1.5, 3.0]), trust=np.array([0.0, 0.5, np.inf]), handed_over=-1)
+    found = trust_at_frames(run, np.array([0.0, 1.0, 1.5, 2.0, 3.0]))
+    np.testing.assert_array_equal(found, [0.0, 0.5, 0.5, np.inf, np.inf])

@@ -38,6 +38,7 @@ class Made:
     field: str = "mlp"
     scale: str = "paper"
     training_seconds: float = 5400
+    trust: tuple = ()  # ratio of each parameter value; None is not finite
     seed: int = 0
 
 
@@ -96,6 +97,12 @@ def write_payload(path: Path, made: Made) -> None:
         "training_seconds": made.training_seconds,
         "scale": made.scale,
     }
+    if made.trust:
+        summary["trust"] = [
+            {"parameter": value, "trust": ratio, "distrusted": ratio is None or ratio > 1.0,
+             "distrusted_at": None if ratio is not None and ratio <= 1.0 else 0.2, "handed_over_at": None}
+            for value, ratio in zip(made.parameters, made.trust, strict=True)
+        ]  # fmt: skip
     paper = (
         {"paper": {"place": "Table 1, Sand", "nsf": {"delta": 0.004, "sample": 150, "gamma": 36000}}}
         if made.paper

@@ -11,7 +11,10 @@ from synthetic import TEST, Made, seal, write_run
 from nsf.errors import ConfigError, StorageError
 from nsf.reporting import build, build_report
 from nsf.reporting.columns import number
-from nsf.reporting.sources import Source, file_hash
+from nsf.reporting.pictures import _Variant
+from nsf.reporting.sources import Source, file_hash, open_sources
+from nsf.reporting.tables import merge
+from nsf.reporting.trust import spearman, trust_note
 
 TINY = Made(particles=30, frames=4, parameters=TEST[:2], splits=("test",) * 2)
 
@@ -188,3 +191,56 @@ def test_one_value_without_paper_or_costs(tmp_path):
     page = build_report([run], tmp_path / "report", "t").read_text()
     assert "runtime" not in {path.stem for path in (tmp_path / "report").iterdir()}
     assert "held out from training" not in page
+
+
+def test_trust_beside_the_true_error(tmp_path, no_pictures):
+    made = Made(**(vars(Made(particles=30, frames=4)) | {"trust": (0.4, 0.8, 3.0, None)}))
+    run = write_run(tmp_path / "runs", made)
+    delta = pd.read_csv(run.path / "results.csv")["delta"]
+    page = build_report([run], tmp_path / "report", "Sand").parent / "index.md"
+    section = page.read_text().split("## Trust")[1].split("##")[0]
+    assert "distrust ratio" in section
+    assert "first distrusted [s]" in section
+    rows = [line for line in section.splitlines() if line.startswith("| 36")]
+    assert "∞" in rows[0]
+    ranks = pd.Series([1.0, 2.0, 3.0, 4.0])
+    agreement = f"{ranks.corr(delta.rank()):.2f}"
+    assert (
+        f"Over the 4 reduced runs of this table its Spearman rank correlation with the true δ is {agreement}"
+        in section
+    )
+
+
+def test_runs_that_know_no_trust_show_none(tmp_path, no_pictures):
+    page = build_report([write_run(tmp_path / "runs", TINY)], tmp_path / "report", "Sand")
+    assert "<h2>Trust" not in page.read_text()
+
+
+@pytest.mark.parametrize(
+    ("b", "expected"), [([10, 20, 30], 1.0), ([3, 2, 1], -1.0), ([1.0, float("inf"), 2.0], 0.5)]
+)
+def test_spearman(b, expected):
+    assert spearman(pd.Series([1, 2, 3]), pd.Series(b)) == pytest.approx(expected)
+
+
+def test_a_run_that_was_handed_over_does_not_count(tmp_path):
+    frame = pd.DataFrame({"trust": [0.5, 1.0, 2.0, 9.0], "delta": [1.0, 2.0, 3.0, 0.0]})
+    frame["handed_over_at"] = [float("nan")] * 3 + [0.1]
+    assert "Over the 3 reduced runs" in trust_note(frame)
+    assert "is 1.00." in trust_note(frame)
+    assert "Spearman" not in trust_note(frame[1:])
+
+
+def test_captions_say_where_the_full_order_solver_goes_on(tmp_path):
+    run = write_run(tmp_path / "runs", Made(**(vars(TINY) | {"trust": (0.4, 3.0)})))
+    summary = json.loads((run.path / "summary.json").read_text())
+
+    def said():
+        merged = merge(open_sources([run]))
+        return _Variant(merged, [0, 1], "nsf").continued()
+
+    assert said() == ""
+    summary["trust"][1]["handed_over_at"] = 0.15
+    (run.path / "summary.json").write_text(json.dumps(summary))
+    seal(run)
+    assert said() == " The full-order solver goes on at 27.5° from 0.15 s on."

@@ -1,0 +1,94 @@
+"""A reduced run that is no longer believed goes on at full order."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from nsf.data import TrajectoryWriter
+from nsf.dynamics.deployment import Rollout
+from nsf.dynamics.solver import ReducedMPM
+from nsf.errors import InstabilityError
+from nsf.mpm import FP32, FullOrderMPM, Precision
+from nsf.mpm.recording import COLUMNS, FrameRecorder
+
+
+def hand_over(solver: ReducedMPM, rollout: Rollout) -> FullOrderMPM:
+    """The full-order solver at the time and in the state in which the rollout handed over.
+
+    x, C and τ are the fields' at every particle, as the method takes them, and v is the backward difference
+    of x, as in a reduced step. τ determines F_e up to a rotation, which the laws do not see, and history
+    variables as far as the law can tell (`FullOrderMPM.resume`). At t = 0 the state is the scene's own.
+
+    Args:
+        solver: the reduced solver of the rollout; only its fields are used.
+        rollout: a run with `handed_over` ≥ 0.
+
+    Raises:
+        InstabilityError: the decoded state is none of the full-order solver's; see `FullOrderMPM.resume`.
+    """
+    scene, n = solver.scene, rollout.handed_over
+    full = scene.full_order(precision=solver.precision.name, device=str(solver.device))
+    if n == 0:
+        return full
+    decoder = solver.decoder()
+    before, now = torch.as_tensor(rollout.xhat[n - 1 : n + 1], dtype=solver.dtype, device=solver.torch_device)
+    with torch.no_grad():
+        x = decoder.position(now)
+        v = (x - decoder.position(before)) / solver.dt
+        C, tau = decoder.affine(now[None])[0], decoder.stress(now[None])[0]
+    state = (a.double().cpu().numpy() for a in (x, v, C, 0.5 * (tau + tau.mT)))
+    full.resume(round(rollout.t[n] / full.dt), *state)
+    return full
+
+
+def go_on(solver: ReducedMPM, rollout: Rollout, path: Path, stored: Precision = FP32) -> int:
+    """Run the full-order solver from the hand-over to the end of the scene.
+
+    Args:
+        solver: the reduced solver of the rollout.
+        rollout: a run with `handed_over` ≥ 0.
+        path: of the trajectory, whose first frame is the state handed over.
+        stored: precision of its frames.
+
+    Returns:
+        Number of particles whose decoded stress was beyond the law and was scaled down to what it carries.
+
+    Raises:
+        InstabilityError: the full-order solver loses stability; names the hand-over.
+    """
+    scene, parameters = solver.scene, {solver.scene.parameters.name: rollout.parameter}
+    try:
+        full = hand_over(solver, rollout)
+        begin, constants = full.steps_taken, full.constants
+        writer = TrajectoryWriter(
+            path,
+            X=constants.X,
+            mass=constants.mass,
+            volume0=constants.volume0,
+            parameters=parameters,
+            dt=full.dt,
+            dx=scene.dx,
+            frames=scene.steps - begin + 1,
+            dtype=np.dtype(stored.numpy).name,
+        )
+        recorder = FrameRecorder(full.state, full.precision, stored)
+        written = begin
+        with writer:
+            for n in range(begin, scene.steps + 1):
+                if n > begin:
+                    full.step()
+                recorder.record()
+                if recorder.full or n == scene.steps:
+                    for frame in recorder.take():
+                        x, v, C, tau = (frame[:, COLUMNS[name]] for name in ("x", "v", "C", "tau"))
+                        writer.append(written * full.dt, x, v, C, tau)
+                        written += 1
+            full.check()
+        return full.beyond_law
+    except InstabilityError as error:
+        raise InstabilityError(
+            f"the reduced run at {parameters} was handed over to the full-order solver at "
+            f"t = {rollout.t[rollout.handed_over]:.4g} s, which lost stability: {error}; "
+            "deploy with on_distrust=report, or simulate this value"
+        ) from error
