@@ -21,10 +21,25 @@ class SamplePhase:
     Attributes:
         start: first moment, as a fraction of the time span T.
         particles: [s] particle indices.
+        weights: [s] of their squared distances in the projection; None for all one.
+
+    Raises:
+        ConfigError: a weight is not positive, or there are not as many as particles.
     """
 
     start: float
     particles: np.ndarray
+    weights: np.ndarray | None = None
+
+    def __post_init__(self):
+        if self.weights is None:
+            return
+        positive = np.isfinite(self.weights) & (np.asarray(self.weights) > 0)
+        if np.shape(self.weights) != np.shape(self.particles) or not positive.all():
+            raise ConfigError(
+                f"weights of {len(self.particles)} sample particles must be as many positive numbers; "
+                f"got {np.shape(self.weights)}, {int(positive.sum())} of them positive"
+            )
 
 
 @dataclass(frozen=True)

@@ -103,7 +103,7 @@ class ReducedMPM:
         self._starts = [round(p.start * self.total_steps) for p in phases]
         self._sizes = []
         self.sets = self._sets_of(phases) if sets is None else list(sets)
-        self._phases = [self._build_phase(s) for s in self.sets]
+        self._phases = [self._build_phase(s, p.weights) for s, p in zip(self.sets, phases, strict=True)]
         self._enter(self._phases[0])
 
     @classmethod
@@ -164,14 +164,14 @@ class ReducedMPM:
             found.append(self.search.superset(frames, phase.particles, self.integration.margin))
         return found
 
-    def _build_phase(self, sets: ParticleSets) -> Phase:
+    def _build_phase(self, sets: ParticleSets, weights: np.ndarray | None) -> Phase:
         at = self.manifold.restrict(particles=sets.integration, dtype=self.dtype, device=self.torch_device)
         grid = Grid(self.geometry, self.precision, self.device, nodes=sets.nodes)
         step = GridStep(
             grid, self.boundaries, self.transfer, self.gravity, self.dt, self.precision, self.device
         )
         arguments = [sets, at, self.scene_particles, grid, step, self.stress_of, self.affine_of]
-        arguments += [self.precision, self.dtype, self.torch_device]
+        arguments += [self.precision, self.dtype, self.torch_device, weights]
         if self.integration.strategy == "search":
             return SearchingPhase(*arguments, search=self.search)
         return Phase(*arguments)
@@ -315,7 +315,7 @@ class ReducedMPM:
     def invert(self) -> None:
         """x̂_{n+1} from the new positions of S (paper section 5.3)."""
         phase = self._phase
-        result = self.projector.solve(phase.at_sample, phase.x[: phase.s], self.xhat)
+        result = self.projector.solve(phase.at_sample, phase.x[: phase.s], self.xhat, phase.weights)
         self.xhat_previous.copy_(self.xhat)
         self.xhat.copy_(result.xhat)
         self._residuals.index_copy_(0, self._row, result.residuals[None])

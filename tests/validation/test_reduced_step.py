@@ -122,9 +122,9 @@ class Spy:
     def __init__(self, projector, found):
         self._projector, self._found = projector, found
 
-    def solve(self, at, target, xhat):
+    def solve(self, at, target, xhat, weights=None):
         self._found.append(target.clone())
-        return self._projector.solve(at, target, xhat)
+        return self._projector.solve(at, target, xhat, weights)
 
 
 @pytest.mark.parametrize("multiplier", [1.0, 1.5])
