@@ -1,5 +1,6 @@
 """Reduced-order dynamics: latent time-stepping (paper section 5)."""
 
+from nsf.dynamics.cubature import CubatureSampler
 from nsf.dynamics.deployment import Rollout, deploy, rollout
 from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
 from nsf.dynamics.latent import Decoder, LatentState, LatentTrajectory
@@ -11,6 +12,7 @@ from nsf.dynamics.stress import Method
 __all__ = [
     "NSF",
     "STOP_REASONS",
+    "CubatureSampler",
     "Decoder",
     "GaussNewton",
     "GreedySampler",
