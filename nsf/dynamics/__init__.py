@@ -1,5 +1,6 @@
 """Reduced-order dynamics: latent time-stepping (paper section 5)."""
 
+from nsf.dynamics.cubature import CubatureSampler
 from nsf.dynamics.deployment import Rollout, calibrate, deploy, rollout
 from nsf.dynamics.handover import go_on, hand_over
 from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
@@ -13,6 +14,7 @@ from nsf.dynamics.trust import Trust
 __all__ = [
     "NSF",
     "STOP_REASONS",
+    "CubatureSampler",
     "Decoder",
     "GaussNewton",
     "GreedySampler",

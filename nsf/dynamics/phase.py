@@ -20,8 +20,10 @@ class Phase:
         grid_step: builds the shared P2G, grid update and G2P on a grid.
         stress: source of τ at N, from the Lamé parameters mu, lam [n].
         affine: source of C at N; gives None for C = 0.
+        weights: [s] of S in the projection; None for all one.
 
     Attributes:
+        weights: [s] the same, of mean one.
         previous: [n, 3] positions of N one step back.
         x, v, C, tau: what P2G reads; the first |S| rows are what G2P moves.
     """
@@ -40,10 +42,14 @@ class Phase:
         precision: Precision,
         dtype: torch.dtype,
         device: torch.device,
+        weights: np.ndarray | None = None,
     ):
         n, self.s = len(sets.integration), len(sets.sample)
         self.sets, self.at, self.at_sample = sets, at, at.subset(slice(0, self.s))
         self.grid, self.grid_step, self.precision = grid, grid_step, precision
+        self.weights = None
+        if weights is not None:
+            self.weights = torch.as_tensor(weights / np.mean(weights), dtype=dtype, device=device)
 
         def rows(values: np.ndarray) -> torch.Tensor:
             return torch.as_tensor(values[sets.integration], dtype=dtype, device=device)
@@ -74,7 +80,8 @@ class Phase:
     def nbytes(self) -> int:
         """Bytes of arrays and fields on the device."""
         own = (self.mass, self.volume0, self.x, self.v, self.previous, self.C, self.tau, self.increment)
-        return self.at.nbytes + self.grid.nbytes + sum(a.nbytes for a in own)
+        weights = 0 if self.weights is None else self.weights.nbytes
+        return self.at.nbytes + self.grid.nbytes + sum(a.nbytes for a in own) + weights
 
     def fields(self, xhat: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
         """x [n, 3], τ and C [n, 3, 3] at N (paper section 5.1)."""

@@ -17,7 +17,8 @@ class ProjectionResult:
 
     Attributes:
         xhat: [r] latent vector.
-        residuals: [k + 1] RMS distance [m] of g(X_S, x̂) to the target, before each iteration and at the end.
+        residuals: [k + 1] RMS distance [m] of g(X_S, x̂) to the target, before each iteration and at the end;
+            weighted where the particles are.
         updates: [k] Euclidean length of each latent update.
     """
 
@@ -28,7 +29,7 @@ class ProjectionResult:
 
 @dataclass(frozen=True)
 class GaussNewton:
-    """Gauss-Newton on ‖g(X_S, x̂) − x_S‖², started at x̂_n.
+    """Gauss-Newton on Σ w_p ‖g(X_p, x̂) − x_p‖² over S, started at x̂_n.
 
     Attributes:
         iterations: fixed number of iterations (the paper needs 2-3); a step whose update
@@ -50,26 +51,27 @@ class GaussNewton:
         if not self.tolerance > 0:
             raise ConfigError(f"projector.tolerance={self.tolerance} must be positive")
 
-    def solve(self, at, target: torch.Tensor, xhat: torch.Tensor) -> ProjectionResult:
+    def solve(
+        self, at, target: torch.Tensor, xhat: torch.Tensor, weights: torch.Tensor | None = None
+    ) -> ProjectionResult:
         """Invert the deformation field.
 
         Args:
             at: the fields restricted to S.
             target: [s, 3] positions x_S [m].
             xhat: [r] start.
+            weights: [s] w_p, of mean one; None for all one, as in the paper.
         """
         residuals, updates = [], []
         active = torch.ones((), dtype=torch.bool, device=xhat.device)
         for _ in range(self.iterations):
-            position, jacobian = at.position_and_jacobian(xhat)
-            error = (target - position).reshape(-1)
-            J = jacobian.reshape(len(error), -1)
+            error, J = _equations(at, target, xhat, weights)
             update = _normal_equations(J, error)
             residuals.append(_rms(error))
             updates.append(torch.linalg.vector_norm(update))
             xhat = torch.where(active, xhat + update, xhat)
             active = active & (updates[-1] > self.tolerance)
-        residuals.append(_rms((target - at.position(xhat)).reshape(-1)))
+        residuals.append(_rms(_weighted(target - at.position(xhat), weights)))
         return ProjectionResult(xhat, torch.stack(residuals), torch.stack(updates))
 
 
@@ -85,16 +87,29 @@ class Taylor:
     iterations: ClassVar[int] = 1
     tolerance: ClassVar[float] = 0.0  # it checks nothing, so it never claims convergence
 
-    def solve(self, at, target: torch.Tensor, xhat: torch.Tensor) -> ProjectionResult:
+    def solve(
+        self, at, target: torch.Tensor, xhat: torch.Tensor, weights: torch.Tensor | None = None
+    ) -> ProjectionResult:
         """Invert the linearised deformation field; arguments as for `GaussNewton.solve`."""
-        position, jacobian = at.position_and_jacobian(xhat)
-        error = (target - position).reshape(-1)
-        J = jacobian.reshape(len(error), -1)
+        error, J = _equations(at, target, xhat, weights)
         update = _normal_equations(J, error)
         left = _rms(error - J @ update)
         return ProjectionResult(
             xhat + update, torch.stack([_rms(error), left]), torch.linalg.vector_norm(update)[None]
         )
+
+
+def _equations(at, target: torch.Tensor, xhat: torch.Tensor, weights) -> tuple[torch.Tensor, torch.Tensor]:
+    """Error [3 s] of the positions and its Jacobian [3 s, r], rows times √w."""
+    position, jacobian = at.position_and_jacobian(xhat)
+    return _weighted(target - position, weights), _weighted(jacobian, weights)
+
+
+def _weighted(rows: torch.Tensor, weights: torch.Tensor | None) -> torch.Tensor:
+    """Values [s, 3, …] of each particle times √w, as one row a coordinate [3 s, …]."""
+    if weights is not None:
+        rows = rows * weights.sqrt().view(-1, *[1] * (rows.ndim - 1))
+    return rows.flatten(0, 1)
 
 
 def _normal_equations(J: torch.Tensor, error: torch.Tensor) -> torch.Tensor:

@@ -1,14 +1,18 @@
 """Sample particles S: those whose new positions determine the latent vector (paper section 5.4)."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from typing_extensions import override
 
 from nsf.errors import ConfigError, ProjectionError
+
+if TYPE_CHECKING:
+    from nsf.dynamics.solver import ReducedMPM
 
 _CHUNK = 2**25  # values decoded at once
 _SNAPSHOTS = 256  # latents that displacement modes are taken from
@@ -21,10 +25,25 @@ class SamplePhase:
     Attributes:
         start: first moment, as a fraction of the time span T.
         particles: [s] particle indices.
+        weights: [s] of their squared distances in the projection; None for all one.
+
+    Raises:
+        ConfigError: a weight is not positive, or there are not as many as particles.
     """
 
     start: float
     particles: np.ndarray
+    weights: np.ndarray | None = None
+
+    def __post_init__(self):
+        if self.weights is None:
+            return
+        positive = np.isfinite(self.weights) & (np.asarray(self.weights) > 0)
+        if np.shape(self.weights) != np.shape(self.particles) or not positive.all():
+            raise ConfigError(
+                f"weights of {len(self.particles)} sample particles must be as many positive numbers; "
+                f"got {np.shape(self.weights)}, {int(positive.sum())} of them positive"
+            )
 
 
 @dataclass(frozen=True)
@@ -102,23 +121,41 @@ class Sampler(ABC):
         """Every phase, the first included."""
         return [Region(self.size, self.lower, self.upper), *(Region(**p) for p in self.phases)]
 
-    def phases_of(self, manifold, device: str | torch.device = "cpu") -> list[SamplePhase]:
+    def phases_of(
+        self,
+        manifold,
+        device: str | torch.device = "cpu",
+        whole: "Callable[[Mapping[str, float]], ReducedMPM] | None" = None,
+    ) -> list[SamplePhase]:
         """Choose the sample particles of each phase.
 
         Args:
             manifold: trained fields of the particles.
             device: where the fields are evaluated, if the choice needs them.
+            whole: problem parameters → the reduced solver whose sample is every particle, if the choice
+                needs steps of it.
 
         Raises:
             ConfigError: a region holds fewer particles than asked for.
         """
-        X = manifold.X.cpu().numpy()
+        ends = [region.start for region in self.regions[1:]] + [1.0]
         return [
-            SamplePhase(
-                region.start, np.sort(self.choose(manifold, region.candidates(X), region.size, device))
-            )
-            for region in self.regions
+            self.phase_of(region, end, manifold, device, whole)
+            for region, end in zip(self.regions, ends, strict=True)
         ]
+
+    @abstractmethod
+    def phase_of(self, region: Region, end: float, manifold, device="cpu", whole=None) -> SamplePhase:
+        """The sample particles of one phase, which ends at a fraction of T; the rest as for `phases_of`."""
+
+
+class UnweightedSampler(Sampler):
+    """A choice of particles that all weigh the same."""
+
+    @override
+    def phase_of(self, region, end, manifold, device="cpu", whole=None):
+        candidates = region.candidates(manifold.X.cpu().numpy())
+        return SamplePhase(region.start, np.sort(self.choose(manifold, candidates, region.size, device)))
 
     @abstractmethod
     def choose(self, manifold, candidates: np.ndarray, size: int, device="cpu") -> np.ndarray:
@@ -126,7 +163,7 @@ class Sampler(ABC):
 
 
 @dataclass(frozen=True)
-class RandomSampler(Sampler):
+class RandomSampler(UnweightedSampler):
     """Particles drawn at random.
 
     Attributes:
@@ -149,7 +186,7 @@ class RandomSampler(Sampler):
 
 
 @dataclass(frozen=True)
-class GreedySampler(Sampler):
+class GreedySampler(UnweightedSampler):
     """Particles whose positions tell most about the whole body's: an answer to the paper's future work.
 
     The amplitudes of the leading displacement modes are taken as Gaussian with their variances over the

@@ -103,7 +103,7 @@ class ReducedMPM:
         self._starts = [round(p.start * self.total_steps) for p in phases]
         self._sizes = []
         self.sets = self._sets_of(phases) if sets is None else list(sets)
-        self._phases = [self._build_phase(s) for s in self.sets]
+        self._phases = [self._build_phase(s, p.weights) for s, p in zip(self.sets, phases, strict=True)]
         self._enter(self._phases[0])
 
     @classmethod
@@ -136,7 +136,16 @@ class ReducedMPM:
             sample = RandomSampler(size=int(sample))
         if isinstance(sample, Sampler):
             device = torch_device(warp_device(options.get("device", "auto")))
-            phases = sample.phases_of(manifold, device)
+            everyone = np.arange(len(manifold.X))
+            whole = ParticleSets(everyone, everyone, None)
+            as_deployed = {k: options[k] for k in ("method", "precision", "device") if k in options}
+            phases = sample.phases_of(
+                manifold,
+                device,
+                lambda training: cls.of_scene(
+                    scene, manifold, training, everyone, sets=[whole], **as_deployed
+                ),
+            )
         elif len(sample) and isinstance(sample[0], SamplePhase):
             phases = list(sample)
         else:
@@ -164,14 +173,14 @@ class ReducedMPM:
             found.append(self.search.superset(frames, phase.particles, self.integration.margin))
         return found
 
-    def _build_phase(self, sets: ParticleSets) -> Phase:
+    def _build_phase(self, sets: ParticleSets, weights: np.ndarray | None) -> Phase:
         at = self.manifold.restrict(particles=sets.integration, dtype=self.dtype, device=self.torch_device)
         grid = Grid(self.geometry, self.precision, self.device, nodes=sets.nodes)
         step = GridStep(
             grid, self.boundaries, self.transfer, self.gravity, self.dt, self.precision, self.device
         )
         arguments = [sets, at, self.scene_particles, grid, step, self.stress_of, self.affine_of]
-        arguments += [self.precision, self.dtype, self.torch_device]
+        arguments += [self.precision, self.dtype, self.torch_device, weights]
         if self.integration.strategy == "search":
             return SearchingPhase(*arguments, search=self.search)
         return Phase(*arguments)
@@ -315,13 +324,39 @@ class ReducedMPM:
     def invert(self) -> None:
         """x̂_{n+1} from the new positions of S (paper section 5.3)."""
         phase = self._phase
-        result = self.projector.solve(phase.at_sample, phase.x[: phase.s], self.xhat)
+        result = self.projector.solve(phase.at_sample, phase.x[: phase.s], self.xhat, phase.weights)
         self.xhat_previous.copy_(self.xhat)
         self.xhat.copy_(result.xhat)
         self._residuals.index_copy_(0, self._row, result.residuals[None])
         self._updates.index_copy_(0, self._row, result.updates[None])
         self._row += 1
         self._latents.index_copy_(0, self._row, result.xhat[None])
+
+    def equations_at(
+        self, step: int, xhat: torch.Tensor, previous: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """What the projection at the end of a step is given, linearised where it starts.
+
+        Leaves the solver in the midst of that step.
+
+        Args:
+            step: steps before it, which set its moment.
+            xhat, previous: [r] x̂_n and x̂_{n−1}.
+
+        Returns:
+            Error x_S − g(X_S, x̂_n) [s, 3] [m] and Jacobian ∂g/∂x̂ [s, 3, r] [m].
+        """
+        self.steps_taken = step
+        self.xhat.copy_(xhat)
+        self.xhat_previous.copy_(previous)
+        self._enter(self._phase_at(step))
+        with torch.no_grad(), on_torch_stream(self.device):
+            self.boundaries.steps.fill_(step)
+            for name, stage in self.stages.items():
+                if name != "inversion":
+                    stage()
+            position, jacobian = self._phase.at_sample.position_and_jacobian(self.xhat)
+        return self._phase.x[: self._phase.s] - position, jacobian
 
     def trajectory(self) -> LatentTrajectory:
         """Everything recorded up to now, on the host."""

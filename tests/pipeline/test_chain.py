@@ -336,7 +336,7 @@ class Breaks:
 
     iterations, tolerance = 1, 1e-6
 
-    def solve(self, at, target, xhat):
+    def solve(self, at, target, xhat, weights=None):
         result = Taylor().solve(at, target, xhat)
         lost = (at.position(xhat)[:, 2].mean() - self.first(at, xhat)) < -1e-4
         bad = torch.full_like(result.xhat, float("nan"))

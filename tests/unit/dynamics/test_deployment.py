@@ -47,9 +47,9 @@ class Thrown:
 
     iterations, tolerance, calls = 1, 0.0, 0
 
-    def solve(self, at, target, xhat):
+    def solve(self, at, target, xhat, weights=None):
         self.calls += 1
-        result = Taylor().solve(at, target, xhat)
+        result = Taylor().solve(at, target, xhat, weights)
         return replace(result, xhat=result.xhat + (1e4 if self.calls == 5 else 0.0))
 
 

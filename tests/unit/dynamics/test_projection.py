@@ -97,6 +97,31 @@ def test_least_squares_when_the_target_is_off_the_manifold(start, goal):
     assert rms(target - position) > 1e-2
 
 
+class Repeated(Bent):
+    """Its first point twice and its second three times."""
+
+    def __init__(self):
+        super().__init__()
+        times = torch.tensor([2, 3, 1, 1, 1])
+        self.A, self.B = (values.repeat_interleave(times, 0) for values in (self.A, self.B))
+
+
+@pytest.mark.parametrize("projector", [GaussNewton(2), Taylor()], ids=["gauss_newton", "taylor"])
+def test_weights_count_points(projector, start, goal):
+    """A point of weight two is two points, in the latent vector and in the residuals."""
+    at, repeated = Bent(), Repeated()
+    away = 0.05 * torch.randn(5, 3, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    times = torch.tensor([2, 3, 1, 1, 1])
+    target = at.position(goal) + away
+    weights = times / times.double().mean()
+    one = projector.solve(at, target, start, weights)
+    other = projector.solve(repeated, target.repeat_interleave(times, 0), start)
+    plain = projector.solve(at, target, start)
+    for name in ("xhat", "residuals", "updates"):
+        torch.testing.assert_close(getattr(one, name), getattr(other, name))
+    assert (one.xhat - plain.xhat).norm() > 1e-4  # otherwise the test shows nothing
+
+
 def test_converged(start, goal):
     at = Bent()
     result = GaussNewton(6).solve(at, at.position(goal), start)

@@ -10,6 +10,7 @@ import nsf
 import nsf.scenes
 from nsf.dynamics import (
     NSF,
+    GaussNewton,
     Integration,
     Method,
     NeighbourSearch,
@@ -313,6 +314,42 @@ def test_timed_steps_are_steps(solver_of, sample):
     assert list(timer.per_step(10)) == ["inference", "transfer", "p2g", "grid", "g2p", "inversion"]
 
 
+# -- weights ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def weighted_run(solver_of):
+    """Weights of 20 sample particles, options → the first half of a run."""
+    particles = np.arange(0, 500, 25)
+    return lambda weights, **options: run(solver_of([SamplePhase(0.0, particles, weights)], **options), 12)
+
+
+@pytest.mark.parametrize("projector", [GaussNewton(), Taylor()], ids=["gauss_newton", "taylor"])
+def test_weights_of_one_are_no_weights(weighted_run, projector):
+    one, other = (weighted_run(weights, projector=projector) for weights in (np.ones(20), None))
+    for name in ("xhat", "residuals", "updates"):
+        assert np.array_equal(getattr(one, name), getattr(other, name))
+
+
+def test_a_common_factor_of_the_weights_changes_nothing(weighted_run):
+    weights = np.random.default_rng(0).uniform(0.1, 3.0, 20)
+    one, doubled, scaled = (weighted_run(c * weights) for c in (1.0, 2.0, 0.3))
+    assert np.array_equal(one.xhat, doubled.xhat)
+    np.testing.assert_allclose(scaled.xhat, one.xhat, rtol=0, atol=1e-10)
+    np.testing.assert_allclose(scaled.residuals, one.residuals, rtol=1e-8)
+    assert np.abs(one.xhat - weighted_run(None).xhat).max() > 1e-5  # otherwise the test shows nothing
+
+
+@pytest.mark.parametrize(
+    "weights",
+    [np.ones(19), np.zeros(20), np.full(20, np.nan), -np.ones(20)],
+    ids=["few", "zero", "nan", "negative"],
+)
+def test_weights_out_of_range(weights):
+    with pytest.raises(ConfigError, match=r"weights of 20 sample particles must be as many positive numbers"):
+        SamplePhase(0.0, np.arange(20), weights)
+
+
 # -- records --------------------------------------------------------------------------------------------
 
 
@@ -350,9 +387,9 @@ class Fails:
     def __init__(self, at):
         self.left = at
 
-    def solve(self, at, target, xhat):
+    def solve(self, at, target, xhat, weights=None):
         self.left -= 1
-        result = Taylor().solve(at, target, xhat)
+        result = Taylor().solve(at, target, xhat, weights)
         bad = torch.full_like(result.xhat, float("nan"))
         return result if self.left else ProjectionResult(bad, result.residuals, result.updates)
 

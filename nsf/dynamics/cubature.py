@@ -1,0 +1,188 @@
+"""Weighted sample particles: a cubature of the projection's sums (an answer to the paper's future work)."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from typing_extensions import override
+
+from nsf.dynamics.sampling import SamplePhase, Sampler
+from nsf.errors import ConfigError, ProjectionError
+
+if TYPE_CHECKING:
+    from nsf.dynamics.solver import ReducedMPM
+
+_EXACT = 1e-9  # residual over target at which a cubature counts as exact
+_STILL = 1e-6  # root mean square motion in a step over Δx, below which a body counts as at rest
+
+
+@dataclass(frozen=True)
+class CubatureSampler(Sampler):
+    """Few particles with weights under which the projection does what all particles would do.
+
+    From a state of the training the full-order step moves every particle to x_p, and the projection on all
+    of them takes a Gauss-Newton step from the sums Σ J_pᵀ J_p and Σ J_pᵀ (x_p − g(X_p, x̂)), J_p = ∂g/∂x̂.
+    S and its positive weights are found so that the weighted sums over S come near to both in many states,
+    by least squares with a growing set of particles. No random number is drawn. |S| may end below `size`,
+    when fewer particles give the sums exactly; a smaller sample is not a part of a larger. A phase of time
+    learns from the states of its own time.
+
+    Attributes:
+        size: |S| at most.
+        states: number of training states, evenly spread over those of the phase.
+
+    Raises:
+        ConfigError: states is not a positive whole number.
+
+    Source: An, Kim and James 2008, optimizing cubature for efficient integration of subspace deformations;
+        here for the normal equations of the inversion (paper section 5.3) in place of a force, and with
+        every particle a candidate at each turn.
+    """
+
+    states: int = 64
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not isinstance(self.states, int) or self.states < 1:
+            raise ConfigError(f"sampler.states={self.states} must be a whole number of at least 1")
+
+    @override
+    def phase_of(self, region, end, manifold, device="cpu", whole=None):
+        candidates = region.candidates(manifold.X.cpu().numpy())
+        rows = training_rows(manifold, region.start, end, self.states)
+        columns, target = normal_equations(manifold, rows, candidates, whole)
+        chosen, weights = nonnegative_fit(columns, target, region.size)
+        order = np.argsort(chosen)
+        return SamplePhase(region.start, candidates[chosen][order], weights[order])
+
+
+def training_rows(manifold, start: float, end: float, count: int) -> torch.Tensor:
+    """At most `count` rows of the training latents, evenly spread over those with t/T in [start, end).
+
+    Neither the first nor the last frame of a trajectory is among them: a step needs the latent before it,
+    and begins before the end.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    t = manifold.training_times
+    # Rows go by trajectory and then by frame, so time falls where a trajectory begins.
+    inner = torch.zeros(len(t), dtype=torch.bool, device=t.device)
+    inner[1:-1] = (t[1:-1] > t[:-2]) & (t[2:] > t[1:-1])
+    rows = torch.nonzero(inner & (t >= start * t.max()) & (t < end * t.max())).flatten()
+    if not len(rows):
+        raise ConfigError(f"no training state lies in [{start:g}, {end:g}) of T; sampler=cubature needs one")
+    return rows[torch.linspace(0, len(rows) - 1, min(count, len(rows))).round().long()]
+
+
+@torch.no_grad()
+def normal_equations(
+    manifold, rows: torch.Tensor, candidates: np.ndarray, whole: "Callable[[Mapping[str, float]], ReducedMPM]"
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Each particle's share in the normal equations of one projection step from training states.
+
+    A state has r equations of the right-hand side and r (r + 1)/2 of the matrix, in the latent coordinates
+    in which Σ_P JᵀJ is the identity, so that they do not depend on the coordinates; both sums have norm one,
+    but for the right-hand side's of a body at rest.
+
+    Args:
+        manifold: trained fields.
+        rows: [k] of its training latents.
+        candidates: [c] particle indices.
+        whole: problem parameters → reduced solver whose sample is every particle.
+
+    Returns:
+        Columns [k (r + r (r + 1)/2), c] and the sum of those of every particle.
+
+    Raises:
+        ProjectionError: a particle is not finite after a step.
+    """
+    columns, target, solver, parameters = [], [], None, None
+    for row in rows.tolist():
+        if parameters is None or not torch.equal(parameters, manifold.training_parameters[row]):
+            parameters = manifold.training_parameters[row]
+            values = dict(zip(manifold.parameter_names, parameters.tolist(), strict=True))
+            solver = whole(values)
+            chosen = torch.as_tensor(candidates, device=solver.torch_device)
+        previous, xhat = manifold.training_latents[row - 1 : row + 1].to(solver.torch_device, solver.dtype)
+        step = round(float(manifold.training_times[row]) / solver.dt)
+        error, J = solver.equations_at(step, xhat, previous)
+        if not error.isfinite().all():
+            raise ProjectionError(
+                f"a step from training frame {step} at {values} is not finite; "
+                "sampler=cubature has nothing to learn from it"
+            )
+        least = _STILL * solver.geometry.dx * len(error) ** 0.5
+        for shares in _shares(error.double(), J.double(), least):
+            columns.append(shares[chosen].T)
+            target.append(shares.sum(0))
+    return torch.cat(columns), torch.cat(target)
+
+
+def _shares(error: torch.Tensor, J: torch.Tensor, least: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Shares [P, r] in the right-hand side and [P, r (r + 1)/2] in the matrix; error [P, 3], J [P, 3, r].
+
+    The right-hand side is divided by the norm of its sum, the motion on the manifold, at least `least` [m].
+    """
+    r = J.shape[2]
+    L = torch.linalg.cholesky(torch.einsum("pir,pis->rs", J, J))
+    # J L⁻ᵀ: the Jacobian in the coordinates Lᵀ x̂, in which the sum of JᵀJ is the identity.
+    J = torch.linalg.solve_triangular(L.T, J, upper=True, left=False)
+    right = torch.einsum("pir,pi->pr", J, error)
+    row, column = torch.triu_indices(r, r, device=J.device)
+    # Twice what is off the diagonal, in squares, so that the norm is that of the whole matrix.
+    both = torch.where(row == column, 1.0, 2.0).to(J).sqrt()
+    matrix = both * torch.einsum("pir,pis->prs", J, J)[:, row, column]
+    return right / torch.linalg.vector_norm(right.sum(0)).clamp_min(least), matrix / r**0.5
+
+
+def nonnegative_fit(columns: torch.Tensor, target: torch.Tensor, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Few columns and positive weights whose sum comes near the target, in least squares.
+
+    Each column taken is the one whose direction is nearest to the residual's; all weights are then fitted
+    anew, and columns whose weight would be negative leave.
+
+    Args:
+        columns: [m, c]; target: [m].
+        size: most columns.
+
+    Returns:
+        Indices [s] in the order taken and weights [s], s ≤ size.
+
+    Source: An, Kim and James 2008, section 4; with every column a candidate it is Lawson and Hanson 1974,
+        chapter 23, algorithm NNLS, on columns of norm one, stopped at `size`.
+    """
+    # A particle that no latent moves is never taken.
+    norms = torch.linalg.vector_norm(columns, dim=0).clamp_min(torch.finfo(columns.dtype).tiny)
+    chosen, weights, residual = [], target.new_zeros(0), target
+    for _ in range(3 * size):  # Lawson and Hanson's bound; columns that left may come back
+        # Not the steepest: a few particles whose x̂ moves them far would be taken for their length alone.
+        cosine = columns.T @ residual / norms
+        cosine[chosen] = 0.0
+        best = int(cosine.argmax())
+        exact = torch.linalg.vector_norm(residual) <= _EXACT * torch.linalg.vector_norm(target)
+        if len(chosen) == size or exact or not cosine[best] > 0:
+            break
+        before = chosen
+        chosen, weights = _fitted(
+            columns, target, [*chosen, best], torch.cat([weights, weights.new_zeros(1)])
+        )
+        if chosen == before:
+            break  # no column lowers the residual by more than round-off
+        residual = target - columns[:, chosen] @ weights
+    return np.array(chosen), weights.cpu().numpy()
+
+
+def _fitted(columns, target, chosen: list[int], weights: torch.Tensor) -> tuple[list[int], torch.Tensor]:
+    """Least squares over the chosen columns; from feasible weights, columns leave as theirs reach zero."""
+    while True:
+        # QR on every device, as each column taken is independent of those before it.
+        fit = torch.linalg.lstsq(columns[:, chosen], target[:, None], driver="gels").solution[:, 0]
+        if (fit > 0).all():
+            return chosen, fit
+        share = torch.where(fit > 0, torch.inf, weights / (weights - fit))
+        keep = share > share.min()
+        weights = (weights + share.min() * (fit - weights))[keep]
+        chosen = [column for column, kept in zip(chosen, keep.tolist(), strict=True) if kept]
