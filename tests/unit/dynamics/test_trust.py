@@ -131,7 +131,7 @@ def test_a_diverged_calibration_run_is_cut(chain, tiny_manifold, tiny_trust):
         def __init__(self):
             object.__setattr__(self, "calls", [0])
 
-        def solve(self, at, target, xhat):
+        def solve(self, at, target, xhat, weights=None):
             self.calls[0] += 1
             result = super().solve(at, target, xhat)
             far = 1e4 if self.calls[0] == 12 else 0.0
