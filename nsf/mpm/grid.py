@@ -112,14 +112,17 @@ def node_of(flat: int, shape: wp.vec3i):
 
 @wp.func
 def inside(base: wp.vec3i, width: int, shape: wp.vec3i):
-    """Whether a stencil of `width` nodes an axis that starts at `base` lies on the grid."""
+    """Whether a stencil of `width` nodes an axis that starts at `base` lies on the grid.
+
+    `base` may be any integer: a GPU gives a position far away the largest one, to which nothing can be added.
+    """
     return (
         base[0] >= 0
         and base[1] >= 0
         and base[2] >= 0
-        and base[0] + width <= shape[0]
-        and base[1] + width <= shape[1]
-        and base[2] + width <= shape[2]
+        and base[0] <= shape[0] - width
+        and base[1] <= shape[1] - width
+        and base[2] <= shape[2] - width
     )
 
 

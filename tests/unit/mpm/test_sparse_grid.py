@@ -5,6 +5,7 @@ import pytest
 import warp as wp
 
 from nsf.mpm import FP64, BoundaryArrays, DomainWalls, Grid, GridGeometry, GridStep, HalfSpace, Transfer
+from nsf.mpm.grid import inside
 
 DX, DT = 1.0 / 16.0, 0.002
 GEOMETRY = GridGeometry.of_domain((1.0, 1.0, 1.0), DX)
@@ -99,3 +100,26 @@ def test_clear(particles):
     grid.clear()
     assert not grid.mass.numpy().any()
     assert not grid.momentum.numpy().any()
+
+
+@wp.kernel(enable_backward=False)
+def _stencils_inside(base: wp.array(dtype=wp.vec3i), shape: wp.vec3i, found: wp.array(dtype=wp.int32)):
+    p = wp.tid()
+    if inside(base[p], 3, shape):
+        found[p] = 1
+
+
+def test_no_integer_far_away_lies_on_the_grid():
+    """A GPU turns a huge position into the largest integer; adding to it wraps around."""
+    largest, least = np.iinfo(np.int32).max, np.iinfo(np.int32).min
+    base = [[0, 0, 0], [5, 6, 7], *(np.eye(3, dtype=int) * far for far in (largest, least, 8, -1))]
+    base = np.vstack([np.atleast_2d(b) for b in base]).astype(np.int32)
+    found = wp.zeros(len(base), dtype=wp.int32, device="cpu")
+    wp.launch(
+        _stencils_inside,
+        len(base),
+        inputs=[wp.array(base, dtype=wp.vec3i, device="cpu"), wp.vec3i(8, 9, 10)],
+        outputs=[found],
+        device="cpu",
+    )
+    assert found.numpy().tolist() == [1, 1] + [0] * (len(base) - 2)
