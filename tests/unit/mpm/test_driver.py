@@ -57,6 +57,9 @@ class Aging(Material):
     def functions(self, precision):
         return aging_functions(precision)
 
+    def stretches_of(self, principal, mu, lam):
+        return np.full_like(principal, np.nan)  # stress does not tell the stretch
+
     def params(self, precision):
         params = self.functions(precision).Params()
         params.rate = precision.real(self.rate)
