@@ -38,12 +38,16 @@ def torch_device(device) -> torch.device:
 def on_torch_stream(device):
     """Context in which Warp launches on torch's current stream, so both order their work.
 
-    No events are recorded at entry: the stream may be under capture.
+    No events are recorded at entry: the stream may be under capture. Inside another such context it does
+    nothing: to leave an inner one would take the stream away from the outer, and Warp would clear arrays
+    on the default stream, which a capture does not see.
     """
     if not device.is_cuda:
         return nullcontext()
-    stream = wp.stream_from_torch(torch.cuda.current_stream(torch_device(device)))
-    return wp.ScopedStream(stream, sync_enter=False, sync_exit=False)
+    stream = torch.cuda.current_stream(torch_device(device))
+    if device.stream.cuda_stream == stream.cuda_stream:
+        return nullcontext()
+    return wp.ScopedStream(wp.stream_from_torch(stream), sync_enter=False, sync_exit=False)
 
 
 @contextmanager

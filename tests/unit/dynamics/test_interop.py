@@ -1,0 +1,65 @@
+"""Torch and Warp on one stream, and steps captured as a CUDA graph."""
+
+from contextlib import nullcontext
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from nsf.dynamics import Method
+from nsf.dynamics.interop import on_torch_stream
+
+METHODS = [(a, b) for a in (True, False) for b in (True, False)]
+
+
+class FakeDevice:
+    """Stands for a GPU whose current Warp stream is `stream`."""
+
+    is_cuda = True
+
+    def __init__(self, handle):
+        self.stream = SimpleNamespace(cuda_stream=handle)
+
+    def __str__(self):
+        return "cuda:0"
+
+
+@pytest.fixture
+def entered(monkeypatch):
+    """Handles of the streams that Warp was told to launch on."""
+    told = []
+    monkeypatch.setattr(torch.cuda, "current_stream", lambda device: SimpleNamespace(cuda_stream=7))
+    monkeypatch.setattr(wp, "stream_from_torch", lambda stream: stream)
+    monkeypatch.setattr(
+        wp, "ScopedStream", lambda stream, **more: told.append(stream.cuda_stream) or nullcontext()
+    )
+    return told
+
+
+def test_torchs_stream_is_entered_once(entered):
+    """Leaving an inner context would take the stream away from the outer one."""
+    with on_torch_stream(FakeDevice(0)):
+        assert entered == [7]
+    with on_torch_stream(FakeDevice(7)):
+        assert entered == [7]
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize(("neural_stress", "neural_affine"), METHODS)
+def test_captured_steps_are_the_steps_themselves(neural_stress, neural_affine, chain, tiny_manifold):
+    """Every replay clears the grid and takes the stress anew."""
+    if not (torch.cuda.is_available() and wp.is_cuda_available()):
+        pytest.skip("needs a GPU")
+    method = Method("one", neural_stress, neural_affine)
+    found = []
+    for captured in (True, False):
+        solver = chain.pipeline.scene.reduced(
+            tiny_manifold, {"friction_angle": 26.0}, 60, method=method, device="cuda"
+        )
+        for phase in solver._phases:
+            phase.capturable = captured
+        solver.step(8)
+        found.append(solver.trajectory().xhat)
+    np.testing.assert_allclose(*found, rtol=1e-6, atol=1e-8)
