@@ -9,7 +9,7 @@ from pathlib import Path
 import yaml
 
 from nsf import config as configuration
-from nsf.errors import ConfigError, MissingRunError, NSFError
+from nsf.errors import ConfigError, MissingRunError
 from nsf.paths import EXPERIMENTS
 from nsf.pipeline.chain import Pipeline
 from nsf.runs import Run
@@ -118,10 +118,11 @@ class Experiment:
         settings, missing, scales = {}, [], set()
         for job in self.jobs:
             config = configuration.load(job.overrides)
+            pipeline = Pipeline(config, say, root)
             try:
-                run = Pipeline(config, say, root).evaluated()
-            except NSFError as error:
-                missing.append(f"{' '.join(job.overrides)}: {error}")
+                run = pipeline.evaluated()
+            except MissingRunError:
+                missing.append(f"{' '.join(job.overrides)}: {_why(pipeline)}")
                 continue
             runs[run.id], settings[run.id] = run, job.setting
             scales.add(config.scale)
@@ -134,6 +135,21 @@ class Experiment:
         page = build_report(list(runs.values()), folder, self.title, study=study)
         say(f"report: {len(runs)} jobs, {len(missing)} missing → {page}")
         return page, missing
+
+
+def _why(pipeline: Pipeline) -> str:
+    """What became of a job that has no result: the first stage that did not end well."""
+    needed = {
+        "simulate": [pipeline.simulation(v) for v in pipeline.split.train],
+        "train": [pipeline.training],
+        "deploy": [pipeline.deployment],
+        "evaluate": [pipeline.evaluation],
+    }
+    for stage, runs in needed.items():
+        for run in runs:
+            if error := run.manifest.get("error"):
+                return f"{stage} {run.manifest.get('status')}: {error}"
+    return "not run"
 
 
 def _values(value) -> str:

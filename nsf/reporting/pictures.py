@@ -15,6 +15,7 @@ from nsf.reporting.tables import Merged, mean_rows, paper_row, variant_labels, v
 
 ROWS = 6  # parameter values in one picture of final shapes
 ANIMATED = 2
+ANIMATIONS_BYTES = 8 * 2**20  # of all on a page
 
 
 @dataclass(frozen=True)
@@ -105,7 +106,7 @@ def draw(merged: Merged, folder: Path) -> list[Section]:
     sections = [
         Section(
             _heading(v) if len(known) > 1 else "What was simulated",
-            _of_variant(v, folder, prefix),
+            _of_variant(v, folder, prefix, min(render.GIF_BYTES, ANIMATIONS_BYTES // len(shown))),
         )
         for v, prefix in zip(shown, _prefixes(shown), strict=True)
     ]
@@ -125,7 +126,7 @@ def _best_of_each_method(known: list[_Variant]) -> list[_Variant]:
     return list(best.values())
 
 
-def _of_variant(v: _Variant, folder: Path, prefix: str) -> list[Picture]:
+def _of_variant(v: _Variant, folder: Path, prefix: str, gif_bytes: int) -> list[Picture]:
     name, unit = v.parameter
     held_out, everything = v.series(held_out_only=True), v.series(held_out_only=False)
     pictures, continued = [], v.continued()
@@ -135,7 +136,7 @@ def _of_variant(v: _Variant, folder: Path, prefix: str) -> list[Picture]:
 
     motions = v.motions(ANIMATED)
     if motions:
-        render.animation(motions, folder / f"{prefix}animation.gif", name, unit, v.floor)
+        render.animation(motions, folder / f"{prefix}animation.gif", name, unit, v.floor, max_bytes=gif_bytes)
         cut = render.is_cut_open(motions)
         told = f"{name} " + " and ".join(parameter_text(m.parameter, "", unit) for m in motions)
         caption = (
