@@ -1,4 +1,4 @@
-"""The figures of README.md: picture and table of one report, written between two markers.
+"""The figures of README.md: pictures and table of one report, written between two markers.
 
 `make readme` calls it, so that no result in README.md is typed by hand.
 """
@@ -10,44 +10,54 @@ import pandas as pd
 
 from nsf import config
 from nsf.errors import ConfigError
-from nsf.reporting.columns import MEASURED
 from nsf.reporting.tables import VARIANT, markdown_table, without_constants
 
 BEGIN, END = "<!-- figures:begin -->", "<!-- figures:end -->"
-REPORT, SCENE = Path("reports/sand"), "sand"
+REPORT, EXPERIMENT = Path("reports/table1"), "table1"
+_PICTURES = ("bread-nsf-strip.png", "cake-nsf-strip.png")
+_ERRORS = ("delta", "displacement_error", "stress_error")
+_COSTS = ("speedup_step", "memory_full_mib", "memory_reduced_mib")
+_PAPER = "paper_delta"
 _PENDING = (
-    f"`{REPORT}` holds no report yet: `nsf run scene={SCENE} scale=paper` writes one, "
+    f"`{REPORT}` holds no report yet: `nsf run +experiment={EXPERIMENT}` writes one, "
     "`make readme` shows it here."
 )
 
 
 def figures(report: Path) -> str:
-    """The picture and the mean held-out results of a report, as markdown.
+    """Pictures and the mean held-out results of a report beside the paper's δ, as markdown.
 
     Args:
         report: folder of the report, relative to README.md.
     """
     if not (report / "results.csv").is_file():
         return _PENDING
+    folder = report.as_posix()
     frame = pd.read_csv(report / "results.csv")
     frame = frame[frame["split"] == "test"]
-    by = [name for name in VARIANT if name in frame]
-    variants = frame.groupby(by, sort=False, as_index=False)
+    variants = frame.groupby([name for name in VARIANT if name in frame], sort=False, as_index=False)
     # A value that diverged leaves the mean infinite, one that was not measured leaves it empty.
-    means = variants[list(MEASURED)].agg(lambda values: values.mean(skipna=False))
-    table, same = without_constants(means, keep=("method",))
-    paper = config.load([f"scene={SCENE}", "scale=paper"]).scene.paper
-    # A report of several methods names its pictures by method.
-    several = (report / "nsf-final-shapes.png").is_file()
-    picture = "nsf-final-shapes.png" if several else "final-shapes.png"
-    return (
-        f"![Final shapes, reduced beside full-order]({report.as_posix()}/{picture})\n\n"
-        f"Means over {frame['parameter'].nunique()} held-out parameter values ({same}). "
-        f"The paper prints δ = {100 * paper.nsf.delta:g} % ({paper.place}).\n\n"
-        f"{markdown_table(table)}\n\n"
-        f"From [`{report.as_posix()}/results.csv`]({report.as_posix()}/results.csv); "
-        f"the whole report is [`index.md`]({report.as_posix()}/index.md)."
+    means = variants[[*_ERRORS, *_COSTS]].agg(lambda values: values.mean(skipna=False))
+    means[_PAPER] = [_printed(row["scene"], row["method"]) for row in means.to_dict("records")]
+    described = [name for name in means if name not in (*_ERRORS, *_COSTS, _PAPER)]
+    table, same = without_constants(means[[*described, _PAPER, *_ERRORS, *_COSTS]], keep=("scene", "method"))
+    pictures = "".join(
+        f"![Full-order above, reduced below]({folder}/{name})\n\n"
+        for name in _PICTURES
+        if (report / name).is_file()
     )
+    return (
+        f"{pictures}Means over held-out parameter values at the paper's size ({same}).\n\n"
+        + markdown_table(table, {_PAPER: "paper's δ [%]"})
+        + f"\n\nFrom [`{folder}/results.csv`]({folder}/results.csv); the whole report is "
+        f"[`index.md`]({folder}/index.md)."
+    )
+
+
+def _printed(scene: str, method: str) -> float:
+    """δ [%] that the paper prints of a scene and method, NaN where it prints none."""
+    paper = config.load([f"scene={scene}", "scale=paper"]).scene.paper
+    return 100 * paper.get(method, {}).get("delta", float("nan"))
 
 
 def updated(text: str, report: Path) -> str:

@@ -1,8 +1,10 @@
 """README says what is so: its commands compose, its example runs, its figures are the report's."""
 
 import re
+import shutil
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import pytest
 from expand import variants
@@ -48,8 +50,23 @@ def test_readme_python_runs(tmp_path, monkeypatch, capsys):
     assert len(capsys.readouterr().out.split("\n")) == 3
 
 
+def test_readme_scene_builds(tmp_path, monkeypatch):
+    """The scene with a mesh of one's own, as README shows it."""
+    trimesh = pytest.importorskip("trimesh")
+    shutil.copytree(config.CONF, tmp_path / "conf")
+    (block,) = blocks("yaml")
+    (tmp_path / "conf/scene/bunny.yaml").write_text(block)
+    monkeypatch.setattr(config, "CONF", tmp_path / "conf")
+    monkeypatch.chdir(tmp_path)
+    trimesh.creation.icosphere(subdivisions=2).export("bunny.obj")
+    pipeline = Pipeline(config.load(["scene=bunny", "scale=small", "device=cpu"]))
+    assert pipeline.scene.material.yield_stress == 50.0
+    assert np.ptp(pipeline.scene.particles().X[:, 2]) == pytest.approx(0.25, rel=0.1)
+    assert pipeline.held_out == (30.0, 70.0)
+
+
 def test_readme_links_lead_somewhere():
-    links = [link for link in re.findall(r"\]\(([^)]+)\)", README) if not link.startswith("http")]
+    links = [link for link in re.findall(r"\]\(([^)]+)\)", README) if not link.startswith(("http", "#"))]
     named = re.findall(r"`((?:nsf|conf|docs|experiments)/[\w/.]+)`", README)
     assert links
     assert named
@@ -83,14 +100,15 @@ def results(tmp_path: Path, deltas: dict[str, float]) -> Path:
 
 def test_figures_are_means_of_held_out_values(tmp_path):
     text = figures(results(tmp_path, {"nsf": 0.00123, "deformation_only": 0.0456}))
-    assert "| nsf | 0.123 |" in text
-    assert "| deformation_only | 4.56 |" in text
-    assert "2 held-out" in text
-    assert "δ = 0.4 %" in text
+    assert "| sand | nsf | 0.400 | 0.123 |" in text  # the paper's, then ours
+    assert "| sand | deformation_only | – | 4.56 |" in text
+    assert "paper's δ [%] | δ [%]" in text
 
 
 def test_figures_do_not_hide_divergence(tmp_path):
-    assert "| nsf | ∞ |" in figures(results(tmp_path, {"nsf": float("inf"), "deformation_only": 0.01}))
+    assert "| sand | nsf | 0.400 | ∞ |" in figures(
+        results(tmp_path, {"nsf": float("inf"), "deformation_only": 0.01})
+    )
 
 
 def test_figures_need_their_markers(tmp_path):
