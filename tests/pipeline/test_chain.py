@@ -214,7 +214,7 @@ def test_a_changed_training_value_is_another_simulation(chain, pipeline_at):
     pipeline = pipeline_at(chain.root, "deploy.split=train", "deploy.changes={material.E:1900}")
     assert pipeline.training.hash == chain.pipeline.training.hash
     assert pipeline.truth(30.0).hash != pipeline.simulation(30.0).hash
-    assert len(pipeline._needed()) == 7  # three values twice, and the test value
+    assert len(pipeline.needed()) == 7  # three values twice, and the test value
 
 
 HASHES = {
