@@ -16,7 +16,7 @@ from nsf.data import Snapshots, Trajectory
 from nsf.dynamics import ParticleSets, ReducedMPM, Rollout, SamplePhase, calibrate, deploy, go_on
 from nsf.dynamics.solver import reduced_steps
 from nsf.errors import MissingRunError
-from nsf.evaluation import Subject, compare, measure, superresolve
+from nsf.evaluation import Comparison, Subject, compare, measure, superresolve
 from nsf.kinematics.manifold import Manifold
 from nsf.kinematics.training import train
 from nsf.pipeline import results
@@ -200,24 +200,13 @@ class Pipeline(Plan):
         run = self.evaluation
         if self._reused(run):
             return run
-        deployment = self.deployment.require()
-        manifold = self._manifold()
-        e = self.config.evaluation
-        comparisons, rollouts = [], []
+        deployment, truths, manifold = self.deployment.require(), self._truths(), self._manifold()
         with run.record(device=self.device, precision=self.config.precision) as record:
-            for index, value in enumerate(self.held_out):
-                rollouts.append(Rollout.open(deployment.path / _rollout(index)))
-                with contextlib.ExitStack() as files:
-                    truth = self.truth(value).require().path / "trajectory.h5"
-                    trajectory, rest = files.enter_context(Trajectory.open(truth)), None
-                    if rollouts[-1].handed_over >= 0:
-                        path = deployment.path / _continuation(index)
-                        rest = files.enter_context(Trajectory.open(path))
-                    solver = self.solver_at(manifold, value)
-                    shown = (e.picture_particles, e.picture_frames)
-                    split = self.config.deploy.split
-                    comparisons.append(compare(solver, trajectory, rollouts[-1], split, shown, rest))
-            del solver
+            rollouts = [Rollout.open(deployment.path / _rollout(index)) for index in range(len(truths))]
+            comparisons = [
+                self._compare(manifold, rollout, truth, deployment.path / _continuation(index))
+                for index, (rollout, truth) in enumerate(zip(rollouts, truths, strict=True))
+            ]
             cost = self._cost(manifold)
             table = results.rows(
                 self.config, manifold, rollouts, comparisons, cost, self.device, run.manifest
@@ -227,6 +216,19 @@ class Pipeline(Plan):
             results.write(record, table, comparisons, cost, summary)
         self.say(f"evaluate: mean δ {100 * table['delta'].mean():.3g} % over {len(table)} values → {run.id}")
         return run
+
+    def _truths(self) -> list[Path]:
+        """Files of the full-order trajectories that the deployed ones are held to."""
+        return [self.truth(value).require().path / "trajectory.h5" for value in self.held_out]
+
+    def _compare(self, manifold: Manifold, rollout: Rollout, truth: Path, continuation: Path) -> Comparison:
+        shown = (self.config.evaluation.picture_particles, self.config.evaluation.picture_frames)
+        with contextlib.ExitStack() as files:
+            trajectory = files.enter_context(Trajectory.open(truth))
+            handed_over = rollout.handed_over >= 0
+            rest = files.enter_context(Trajectory.open(continuation)) if handed_over else None
+            solver = self.solver_at(manifold, rollout.parameter)
+            return compare(solver, trajectory, rollout, self.config.deploy.split, shown, rest)
 
     def _cost(self, manifold: Manifold) -> dict:
         trials, value = self.config.evaluation.trials, self.held_out[0]
@@ -269,25 +271,25 @@ class Pipeline(Plan):
         run = self.superresolution
         if self._reused(run):
             return run
-        c, deployment = self.config, self.deployment.require()
-        manifold = self._manifold()
-        steps, count = self.scene.steps, c.super_resolution.frames
-        frames = np.unique(np.linspace(0, steps, min(count, steps) + 1).round().astype(int))[1:].tolist()
-        paths = [self.truth(value).require().path / "trajectory.h5" for value in self.held_out]
+        c, asked = self.config, self.config.super_resolution
+        deployment, truths, manifold = self.deployment.require(), self._truths(), self._manifold()
+        # Evenly spread, without frame 0, at which nothing has moved.
+        steps = self.scene.steps
+        frames = np.unique(np.linspace(0, steps, min(asked.frames, steps) + 1).round().astype(int))[1:]
         with run.record(device=self.device, precision=c.precision) as record:
             fine = []
-            for index, path in enumerate(paths):
+            for index, truth in enumerate(truths):
                 rollout = Rollout.open(deployment.path / _rollout(index))
-                with Trajectory.open(path) as trajectory:
+                with Trajectory.open(truth) as trajectory:
                     fine.append(
                         superresolve(
                             manifold,
                             self.deployed,
                             trajectory,
                             rollout,
-                            c.super_resolution.factor,
-                            frames,
-                            c.super_resolution.substeps,
+                            asked.factor,
+                            frames.tolist(),
+                            asked.substeps,
                             c.precision,
                             self.device,
                         )
