@@ -107,7 +107,7 @@ def _work(config, stages: Sequence[str]) -> None:
 
     pipeline = Pipeline(config)
     if len(stages) > 1:
-        pipeline.check_held_out()
+        pipeline.check_held_out()  # before hours of simulation and training, not after
     for name in stages:
         result = pipeline.run(name)
     if "report" in stages:

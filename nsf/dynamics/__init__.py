@@ -6,7 +6,7 @@ from nsf.dynamics.handover import go_on, hand_over
 from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
 from nsf.dynamics.latent import Decoder, LatentState, LatentTrajectory
 from nsf.dynamics.projection import STOP_REASONS, GaussNewton, ProjectionResult, Taylor, stop_reasons
-from nsf.dynamics.sampling import GreedySampler, RandomSampler, SamplePhase, Sampler
+from nsf.dynamics.sampling import GreedySampler, RandomSampler, SamplePhase, Sampler, UnweightedSampler
 from nsf.dynamics.solver import NSF, ReducedMPM
 from nsf.dynamics.stress import Method
 from nsf.dynamics.trust import Trust
@@ -32,6 +32,7 @@ __all__ = [
     "Sampler",
     "Taylor",
     "Trust",
+    "UnweightedSampler",
     "calibrate",
     "deploy",
     "go_on",

@@ -67,10 +67,9 @@ def training_rows(manifold, start: float, end: float, count: int) -> torch.Tenso
     Raises:
         ConfigError: there is none.
     """
-    t = manifold.training_times
-    # Rows go by trajectory and then by frame, so time falls where a trajectory begins.
+    t, trajectory = manifold.training_times, manifold.training_trajectories
     inner = torch.zeros(len(t), dtype=torch.bool, device=t.device)
-    inner[1:-1] = (t[1:-1] > t[:-2]) & (t[2:] > t[1:-1])
+    inner[1:-1] = trajectory[:-2] == trajectory[2:]
     rows = torch.nonzero(inner & (t >= start * t.max()) & (t < end * t.max())).flatten()
     if not len(rows):
         raise ConfigError(f"no training state lies in [{start:g}, {end:g}) of T; sampler=cubature needs one")

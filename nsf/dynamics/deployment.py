@@ -13,13 +13,17 @@ import torch
 from torch.utils.data import DataLoader
 
 from nsf.dynamics.solver import ReducedMPM
-from nsf.dynamics.trust import LatentDistance, Trust, training_values
+from nsf.dynamics.trust import LatentDistance, Trust, first_distrusted, training_values
 from nsf.errors import SchemaError
 from nsf.progress import Progress, quiet_lightning
 from nsf.storage import writing
 from nsf.timing import synchronizer
 
 _VERSION = 2
+_SCALARS = (
+    "parameter", "sample", "integration_mean", "needed_outside", "seconds", "diverged", "handed_over",
+)  # fmt: skip
+_ARRAYS = ("t", "xhat", "residuals", "trust")
 #: Steps between looks at the trust of a run that is to be handed over: a look reads back, and what was
 #: done since the last one is lost.
 _LOOK = 20
@@ -61,20 +65,15 @@ class Rollout:
     @property
     def distrusted(self) -> int:
         """First step that is not to be believed (ratio above 1), −1 when there is none."""
-        return first_above(self.trust)
+        return first_distrusted(self.trust)
 
     def save(self, path: Path) -> None:
         """Write as HDF5, whole or not at all."""
         # In memory first: HDF5 cannot report a full disk when it closes a file.
         memory = io.BytesIO()
         with h5py.File(memory, "w") as file:
-            file.attrs.update({"nsf_rollout": _VERSION, "parameter": self.parameter, "sample": self.sample})
-            file.attrs.update(
-                {"integration_mean": self.integration_mean, "needed_outside": self.needed_outside}
-            )
-            file.attrs.update({"seconds": self.seconds, "diverged": self.diverged})
-            file.attrs["handed_over"] = self.handed_over
-            for name in ("t", "xhat", "residuals", "trust"):
+            file.attrs.update({"nsf_rollout": _VERSION} | {name: getattr(self, name) for name in _SCALARS})
+            for name in _ARRAYS:
                 file[name] = getattr(self, name)
             file["stops"] = np.array(self.stops, dtype=h5py.string_dtype())
         with writing(path) as partial:
@@ -94,10 +93,8 @@ class Rollout:
                     raise SchemaError(
                         f"{path} is not a rollout of version {_VERSION} (found {version}); deploy again"
                     )
-                scalars = {k: file.attrs[k].item() for k in ("parameter", "sample", "integration_mean")}
-                scalars |= {k: file.attrs[k].item() for k in ("needed_outside", "seconds", "diverged")}
-                scalars["handed_over"] = file.attrs["handed_over"].item()
-                arrays = {k: file[k][()] for k in ("t", "xhat", "residuals", "trust")}
+                scalars = {name: file.attrs[name].item() for name in _SCALARS}
+                arrays = {name: file[name][()] for name in _ARRAYS}
                 stops = [s.decode() for s in file["stops"][()]]
         except (OSError, KeyError, RuntimeError) as error:
             raise SchemaError(
@@ -147,24 +144,12 @@ def rollout(solver: ReducedMPM, parameter: float, trust: Trust, until_distrusted
         until_distrusted: stop at the first step that is not to be believed, and name the one before it from
             whose state a full-order run can go on: the last whose time is a whole number of the scene's Δt.
     """
-    solver.step(1)  # compiles, loads and captures
-    wait = synchronizer(solver.device)
-    wait()
-    looked, started = 0, time.perf_counter()
-    look = _LOOK if until_distrusted else solver.total_steps
-    while solver.steps_taken < solver.total_steps:
-        solver.step(min(look, solver.total_steps - solver.steps_taken))
-        if until_distrusted:
-            if first_above(_ratios(solver, trust, solver.left_grid(since=looked + 1))) >= 0:
-                break
-            looked = solver.steps_taken
-    wait()
+    seconds = _timed_run(solver, trust if until_distrusted else None)
     taken = solver.steps_taken
-    seconds = (time.perf_counter() - started) * taken / max(1, taken - 1)
     latent = solver.trajectory()
     diverged, handed_over, steps = solver.left_grid(), -1, taken
     ratios = _ratios(solver, trust, diverged)
-    distrusted = first_above(ratios)
+    distrusted = first_distrusted(ratios)
     if until_distrusted and distrusted >= 0:
         diverged, steps = -1, distrusted
         handed_over = _whole_step_before(latent.t, distrusted, solver.scene.dt)
@@ -186,10 +171,26 @@ def rollout(solver: ReducedMPM, parameter: float, trust: Trust, until_distrusted
     )
 
 
-def first_above(ratios: np.ndarray) -> int:
-    """First step whose ratio [N + 1] exceeds 1; −1 when none does."""
-    above = np.flatnonzero(ratios > 1.0)
-    return int(above[0]) if len(above) else -1
+def _timed_run(solver: ReducedMPM, trust: Trust | None) -> float:
+    """Take every step, or with an estimate of trust stop soon after the first one it does not believe.
+
+    Returns:
+        Wall time [s] of the steps; the first, which compiles, loads and captures, counts as the others' mean.
+    """
+    solver.step(1)
+    wait = synchronizer(solver.device)
+    wait()
+    looked, started = 0, time.perf_counter()
+    look = solver.total_steps if trust is None else _LOOK
+    while solver.steps_taken < solver.total_steps:
+        solver.step(min(look, solver.total_steps - solver.steps_taken))
+        if trust is not None:
+            if first_distrusted(_ratios(solver, trust, solver.left_grid(since=looked + 1))) >= 0:
+                break
+            looked = solver.steps_taken
+    wait()
+    taken = solver.steps_taken
+    return (time.perf_counter() - started) * taken / max(1, taken - 1)
 
 
 def _ratios(solver: ReducedMPM, trust: Trust, diverged: int) -> np.ndarray:

@@ -84,6 +84,7 @@ def go_on(solver: ReducedMPM, rollout: Rollout, path: Path, stored: Precision = 
                         x, v, C, tau = (frame[:, COLUMNS[name]] for name in ("x", "v", "C", "tau"))
                         writer.append(written * full.dt, x, v, C, tau)
                         written += 1
+            # Before the file gets its name: only a run that went well leaves one.
             full.check()
         return full.beyond_law
     except InstabilityError as error:

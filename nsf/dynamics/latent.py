@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from nsf.dynamics.projection import ProjectionResult, stop_reasons
+
 if TYPE_CHECKING:
     from nsf.dynamics.solver import ReducedMPM
 
@@ -26,6 +28,44 @@ class LatentTrajectory:
     residuals: np.ndarray
     updates: np.ndarray
     stops: list[str]
+
+
+class LatentRecord:
+    """What the steps leave, on the device: filled in place and without a read-back, as in a captured graph.
+
+    Args:
+        xhat: [r] latent vector at t = 0.
+        steps: most steps.
+        iterations: k, those of the projector.
+
+    Attributes:
+        xhat: [steps + 1, r] latent vectors; zero where no step has been.
+    """
+
+    def __init__(self, xhat: torch.Tensor, steps: int, iterations: int):
+        self.xhat = xhat.new_zeros(steps + 1, len(xhat))
+        self.xhat[0] = xhat
+        self._residuals, self._updates = (xhat.new_zeros(steps, k) for k in (iterations + 1, iterations))
+        self._row = torch.zeros(1, dtype=torch.int64, device=xhat.device)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes on the device."""
+        return sum(a.nbytes for a in (self.xhat, self._residuals, self._updates))
+
+    def add(self, result: ProjectionResult) -> None:
+        """Put down the end of one step."""
+        self._residuals.index_copy_(0, self._row, result.residuals[None])
+        self._updates.index_copy_(0, self._row, result.updates[None])
+        self._row += 1
+        self.xhat.index_copy_(0, self._row, result.xhat[None])
+
+    def trajectory(self, steps: int, dt: float, tolerance: float) -> LatentTrajectory:
+        """The first steps of dt [s] on the host; `tolerance` is the projector's."""
+        residuals, updates = self._residuals[:steps].cpu(), self._updates[:steps].cpu()
+        stops = stop_reasons(residuals, updates, tolerance)
+        t, xhat = np.arange(steps + 1) * dt, self.xhat[: steps + 1].cpu().numpy()
+        return LatentTrajectory(t, xhat, residuals.numpy(), updates.numpy(), stops)
 
 
 class Decoder:

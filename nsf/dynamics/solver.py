@@ -1,6 +1,7 @@
 """The reduced-order solver: time-stepping in the latent space (paper section 5)."""
 
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 import numpy as np
 import torch
@@ -8,9 +9,9 @@ import torch
 from nsf.data import hash_of_positions
 from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
 from nsf.dynamics.interop import captured, on_torch_stream, torch_device, torch_dtype
-from nsf.dynamics.latent import Decoder, LatentState, LatentTrajectory
+from nsf.dynamics.latent import Decoder, LatentRecord, LatentState, LatentTrajectory
 from nsf.dynamics.phase import Phase, SearchingPhase
-from nsf.dynamics.projection import GaussNewton, Taylor, stop_reasons
+from nsf.dynamics.projection import GaussNewton, Taylor
 from nsf.dynamics.sampling import RandomSampler, SamplePhase, Sampler, check_well_posed
 from nsf.dynamics.stress import Method, StressFromDeformation, StressNeural
 from nsf.errors import ConfigError, ShapeError
@@ -92,14 +93,7 @@ class ReducedMPM:
         self.xhat = tensor(manifold.encode(torch.as_tensor(self.scene_particles.X)[None])[0].cpu())
         self.xhat_previous = self.xhat.clone()
         self.steps_taken = 0
-        k = projector.iterations
-        self._latents = torch.zeros(
-            self.total_steps + 1, manifold.latent_dim, dtype=self.dtype, device=self.torch_device
-        )
-        self._latents[0] = self.xhat
-        self._residuals = torch.zeros(self.total_steps, k + 1, dtype=self.dtype, device=self.torch_device)
-        self._updates = torch.zeros(self.total_steps, k, dtype=self.dtype, device=self.torch_device)
-        self._row = torch.zeros(1, dtype=torch.int64, device=self.torch_device)
+        self._record = LatentRecord(self.xhat, self.total_steps, projector.iterations)
         self._starts = [round(p.start * self.total_steps) for p in phases]
         self._sizes = []
         self.sets = self._sets_of(phases) if sets is None else list(sets)
@@ -179,11 +173,21 @@ class ReducedMPM:
         step = GridStep(
             grid, self.boundaries, self.transfer, self.gravity, self.dt, self.precision, self.device
         )
-        arguments = [sets, at, self.scene_particles, grid, step, self.stress_of, self.affine_of]
-        arguments += [self.precision, self.dtype, self.torch_device, weights]
-        if self.integration.strategy == "search":
-            return SearchingPhase(*arguments, search=self.search)
-        return Phase(*arguments)
+        search = self.integration.strategy == "search"
+        build = partial(SearchingPhase, search=self.search) if search else Phase
+        return build(
+            sets,
+            at,
+            self.scene_particles,
+            grid,
+            step,
+            self.stress_of,
+            self.affine_of,
+            self.precision,
+            self.dtype,
+            self.torch_device,
+            weights,
+        )
 
     def stress_of(self, at, mu: torch.Tensor, lam: torch.Tensor) -> Callable[[torch.Tensor], torch.Tensor]:
         """The method's source of τ [n, 3, 3] [Pa] at restricted points."""
@@ -224,8 +228,7 @@ class ReducedMPM:
     @property
     def nbytes(self) -> int:
         """Bytes that the solver's arrays and fields take on the device."""
-        own = (self._latents, self._residuals, self._updates, self.initial_velocity)
-        return sum(p.nbytes for p in self._phases) + sum(a.nbytes for a in own)
+        return sum(p.nbytes for p in self._phases) + self._record.nbytes + self.initial_velocity.nbytes
 
     def step(self, n: int = 1) -> None:
         """Advance by n steps of Δt.
@@ -327,10 +330,7 @@ class ReducedMPM:
         result = self.projector.solve(phase.at_sample, phase.x[: phase.s], self.xhat, phase.weights)
         self.xhat_previous.copy_(self.xhat)
         self.xhat.copy_(result.xhat)
-        self._residuals.index_copy_(0, self._row, result.residuals[None])
-        self._updates.index_copy_(0, self._row, result.updates[None])
-        self._row += 1
-        self._latents.index_copy_(0, self._row, result.xhat[None])
+        self._record.add(result)
 
     def equations_at(
         self, step: int, xhat: torch.Tensor, previous: torch.Tensor
@@ -351,7 +351,7 @@ class ReducedMPM:
         self.xhat_previous.copy_(previous)
         self._enter(self._phase_at(step))
         with torch.no_grad(), on_torch_stream(self.device):
-            self.boundaries.steps.fill_(step)
+            self.boundaries.start_from(step)
             for name, stage in self.stages.items():
                 if name != "inversion":
                     stage()
@@ -360,13 +360,7 @@ class ReducedMPM:
 
     def trajectory(self) -> LatentTrajectory:
         """Everything recorded up to now, on the host."""
-        n = self.steps_taken
-        residuals, updates = self._residuals[:n].cpu(), self._updates[:n].cpu()
-        stops = stop_reasons(residuals, updates, self.projector.tolerance)
-        t = np.arange(n + 1) * self.dt
-        return LatentTrajectory(
-            t, self._latents[: n + 1].cpu().numpy(), residuals.numpy(), updates.numpy(), stops
-        )
+        return self._record.trajectory(self.steps_taken, self.dt, self.projector.tolerance)
 
     def left_grid(self, since: int = 1) -> int:
         """First step that ended with a sample particle off the grid, or non-finite; −1 when none did.
@@ -376,7 +370,7 @@ class ReducedMPM:
         the full-order solver stops there. For after a run.
         """
         for n in range(since, self.steps_taken + 1):
-            x = self._phase_at(n - 1).at_sample.position(self._latents[n])
+            x = self._phase_at(n - 1).at_sample.position(self._record.xhat[n])
             if not bool(self._on_grid(x).all()):
                 return n
         return -1
@@ -402,7 +396,7 @@ class ReducedMPM:
         worst = 0
         for n in range(self.steps_taken if steps is None else steps):
             phase = self._phase_at(n)
-            x = everything.position(self._latents[n])
+            x = everything.position(self._record.xhat[n])
             sample = torch.as_tensor(phase.sets.sample, device=self.torch_device)
             needed = self.search.needed(x, sample)
             needed[torch.as_tensor(phase.sets.integration, device=self.torch_device)] = False

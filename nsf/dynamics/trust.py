@@ -111,6 +111,12 @@ class Trust:
         return np.nan_to_num(ratios, nan=np.inf, posinf=np.inf)
 
 
+def first_distrusted(ratios: np.ndarray) -> int:
+    """First step whose ratio [N + 1] exceeds 1; −1 when none does."""
+    above = np.flatnonzero(ratios > 1.0)
+    return int(above[0]) if len(above) else -1
+
+
 def training_values(manifold) -> list[float]:
     """First, middle and last of the training values of the problem parameter, without repetition."""
     # Snapshots keep parameters in float32, of which seven digits are the value's own.

@@ -92,8 +92,8 @@ def compare(
     diverged = rollout.diverged >= 0
     # Frames up to the last good step: those after it lie between a good latent and a lost one.
     last = rollout.t[rollout.diverged - 1] if diverged else np.inf
-    fine = trajectory.t <= last + _SAME_TIME
-    xhat[~fine] = xhat[fine][-1]  # pictures of a diverged run hold its last state; its errors are ∞
+    good = trajectory.t <= last + _SAME_TIME
+    xhat[~good] = xhat[good][-1]  # pictures of a diverged run hold its last state; its errors are ∞
     own = int((~_of_continuation(rollout, trajectory.t)).sum())  # frames up to the hand-over
     if own < frames and (continuation is None or continuation.frames != frames - own + 1):
         raise SchemaError(
@@ -159,45 +159,68 @@ def compare(
     def total(error: str, norm: str) -> float:  # over frames 1..N
         return metrics.relative(column[error][1:], column[norm][1:])
 
-    bad = torch.as_tensor(~fine)
     xhat[own:] = torch.nan  # full-order frames are no latent vectors
-    # At t = 0 nothing has moved and nothing is loaded: what stands there is round-off of the file.
-    for name in ("u_norm", "tau_norm"):
-        column[name][0] = torch.nan
-
-    def by_frame(error: str, norm: str) -> np.ndarray:
-        return (column[error] / column[norm]).sqrt().masked_fill(bad, torch.inf).numpy()
-
-    def momentum(name: str) -> np.ndarray:
-        errors = metrics.momentum_error(column[f"{name}_rom"], column[f"{name}_fom"], column[f"{name}_scale"])
-        return errors.masked_fill(bad, torch.inf).numpy()
-
-    series = pd.DataFrame(
-        {
-            "parameter": rollout.parameter,
-            "split": split,
-            "frame": np.arange(frames),
-            "t": trajectory.t,
-            "delta": by_frame("x_error", "x_norm"),
-            "displacement_error": by_frame("x_error", "u_norm"),
-            "stress_error": by_frame("tau_error", "tau_norm"),
-            "linear_momentum_error": momentum("p"),
-            "angular_momentum_error": momentum("L"),
-            "reconstruction_delta": (column["rec_error"] / column["x_norm"]).sqrt(),
-            "trust": trust_at_frames(rollout, trajectory.t),
-            **{f"xhat_{k + 1}": xhat[:, k].cpu() for k in range(xhat.shape[1])},
-            **{f"encoded_{k + 1}": column["encoded"][:, k] for k in range(xhat.shape[1])},
-        }
-    )
     return Comparison(
         delta=np.inf if diverged else total("x_error", "x_norm"),
         displacement_error=np.inf if diverged else total("x_error", "u_norm"),
         stress_error=np.inf if diverged else total("tau_error", "tau_norm"),
         reconstruction_delta=total("rec_error", "x_norm"),
         reconstruction_stress_error=total("rec_tau_error", "tau_norm"),
-        series=series,
+        series=_series(column, rollout, trajectory.t, split, xhat.cpu(), good),
         pictures={name: np.concatenate(blocks) for name, blocks in kept.items()}
         | {"t": trajectory.t[shown_frames]},
+    )
+
+
+def _series(
+    column: dict[str, torch.Tensor],
+    rollout: Rollout,
+    t: np.ndarray,
+    split: str,
+    xhat: torch.Tensor,
+    good: np.ndarray,
+) -> pd.DataFrame:
+    """One row a frame.
+
+    Args:
+        column: what `compare` notes of each frame, by name.
+        rollout: the reduced run.
+        t: [F] time of each frame [s].
+        split: `test`, `validation` or `train`.
+        xhat: [F, r] latent vectors, on the host.
+        good: [F] whether the run had not diverged; errors of other frames are ∞.
+    """
+    bad = torch.as_tensor(~good)
+
+    def by_frame(error: str, norm: str) -> torch.Tensor:
+        return (column[error] / column[norm]).sqrt().masked_fill(bad, torch.inf)
+
+    def moving(error: str, norm: str) -> torch.Tensor:
+        # At t = 0 nothing has moved and nothing is loaded: what stands there is round-off of the file.
+        errors = by_frame(error, norm)
+        errors[0] = torch.nan
+        return errors
+
+    def momentum(name: str) -> torch.Tensor:
+        errors = metrics.momentum_error(column[f"{name}_rom"], column[f"{name}_fom"], column[f"{name}_scale"])
+        return errors.masked_fill(bad, torch.inf)
+
+    return pd.DataFrame(
+        {
+            "parameter": rollout.parameter,
+            "split": split,
+            "frame": np.arange(len(t)),
+            "t": t,
+            "delta": by_frame("x_error", "x_norm"),
+            "displacement_error": moving("x_error", "u_norm"),
+            "stress_error": moving("tau_error", "tau_norm"),
+            "linear_momentum_error": momentum("p"),
+            "angular_momentum_error": momentum("L"),
+            "reconstruction_delta": (column["rec_error"] / column["x_norm"]).sqrt(),
+            "trust": trust_at_frames(rollout, t),
+            **{f"xhat_{k + 1}": xhat[:, k] for k in range(xhat.shape[1])},
+            **{f"encoded_{k + 1}": column["encoded"][:, k] for k in range(xhat.shape[1])},
+        }
     )
 
 

@@ -11,7 +11,7 @@ import torch
 from nsf.data import Trajectory
 from nsf.dynamics import Rollout
 from nsf.dynamics.interop import torch_device, torch_dtype
-from nsf.errors import InstabilityError
+from nsf.errors import ConfigError, InstabilityError
 from nsf.evaluation import metrics
 from nsf.evaluation.compare import at_frames
 from nsf.kinematics.interpolation import interpolation, lying_together
@@ -108,10 +108,17 @@ def superresolve(
         precision, device: of both.
 
     Raises:
+        ConfigError: the rollout was handed over to the full-order solver, so its fields end before the scene.
         InstabilityError: the fine run is unstable where the coarse one is not, as more particles meet
             more extreme strains; names the remedy.
     """
     name = scene.parameters.name
+    if rollout.handed_over >= 0:
+        raise ConfigError(
+            f"the reduced run at {name}={rollout.parameter:g} was handed over to the full-order solver at "
+            f"t = {rollout.t[rollout.handed_over]:.4g} s and has no fields beyond; "
+            "deploy with deploy.on_distrust=report"
+        )
     fine = scene.refined(factor, substeps)
     where = torch_device(warp_device(device))
     wait = synchronizer(where)
@@ -136,10 +143,7 @@ def superresolve(
     seconds = time.perf_counter() - started
 
     x_full, X_all = torch.as_tensor(x_full), torch.as_tensor(X)
-    left_out = np.setdiff1d(np.arange(len(X)), shared)
-    X_left, x_left = X_all[left_out], x_full[:, left_out]
-    x_between = interpolated(X_left, X_all[shared], x_full[:, shared], where)
-    apart = (x_between[-1] - x_left[-1]).norm(dim=1)
+    interpolation_error, smeared = _interpolation_errors(X_all, x_full, shared, 0.5 * scene.dx, where)
     at_particles = manifold.restrict(dtype=dtype, device=where).position(xhat).cpu()
     coarse = torch.as_tensor(np.stack([trajectory.read("x", frame)[0] for frame in frames]))
 
@@ -160,13 +164,34 @@ def superresolve(
         "particles_delta": particles_delta,
         "particles_displacement_error": particles_displacement_error,
         "full_order_difference": metrics.displacement_error(coarse, x_full[:, shared], X_all[shared]),
-        "interpolation_error": metrics.displacement_error(x_between, x_left, X_left),
-        "smeared": float((apart > 0.5 * scene.dx).double().mean()),
+        "interpolation_error": interpolation_error,
+        "smeared": smeared,
         "query_difference": float((x[:, shared] - at_particles).norm(dim=2).max()),
         "seconds": seconds,
         "full_order_seconds": full_order_seconds,
     }
     return SuperResolution(row, X, x[-1].numpy(), x_full[-1].numpy(), shared)
+
+
+def _interpolation_errors(
+    X: torch.Tensor, x: torch.Tensor, shared: np.ndarray, far: float, device
+) -> tuple[float, float]:
+    """Displacement error of the points that are not shared, interpolated from those that are.
+
+    Args:
+        X: [n, 3] points at rest [m]; x: [F, n, 3] [m].
+        shared: [P] rows to interpolate from.
+        far: distance [m] beyond which a point counts as smeared.
+        device: where the interpolation is made.
+
+    Returns:
+        The error, and the share of points smeared in the last frame.
+    """
+    left_out = np.setdiff1d(np.arange(len(X)), shared)
+    X_left, x_left = X[left_out], x[:, left_out]
+    x_between = interpolated(X_left, X[shared], x[:, shared], device)
+    smeared = ((x_between[-1] - x_left[-1]).norm(dim=1) > far).double().mean()
+    return metrics.displacement_error(x_between, x_left, X_left), float(smeared)
 
 
 def _full_order_frames(build: Callable[[], FullOrderMPM], steps: Sequence[int]) -> np.ndarray:

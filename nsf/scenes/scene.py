@@ -92,7 +92,7 @@ class Body:
 
 @dataclass(frozen=True)
 class _Placing:
-    """What the points of a body hang on; hashed by its text, as shapes hold lists."""
+    """What the points of a body depend on; hashed by its text, as shapes hold lists."""
 
     shape: Shape
     particles: int
@@ -104,7 +104,7 @@ class _Placing:
 
 @functools.lru_cache(maxsize=8)
 def _points(placing: _Placing) -> np.ndarray:
-    """[P, 3] [m]; the parameter values of a scene have their bodies in common, and placing takes a second."""
+    """[P, 3] points at rest [m]; placing is slow, and a scene's parameter values share their bodies."""
     return placing.shape.sample(placing.particles)
 
 

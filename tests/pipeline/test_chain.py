@@ -78,7 +78,7 @@ def test_the_stored_frames_are_the_solvers_own(chain):
             np.testing.assert_allclose(trajectory.read("tau", n)[0], tau, rtol=1e-5, atol=1e-4)
 
 
-def test_results_have_the_columns_of_the_issue(chain):
+def test_results_have_the_columns_of_a_report(chain):
     results = pd.read_csv(chain.pipeline.evaluation.path / "results.csv")
     assert list(results) == COLUMNS
     assert len(results) == 1
@@ -214,7 +214,7 @@ def test_a_changed_training_value_is_another_simulation(chain, pipeline_at):
     pipeline = pipeline_at(chain.root, "deploy.split=train", "deploy.changes={material.E:1900}")
     assert pipeline.training.hash == chain.pipeline.training.hash
     assert pipeline.truth(30.0).hash != pipeline.simulation(30.0).hash
-    assert len(pipeline._needed()) == 7  # three values twice, and the test value
+    assert len(pipeline.needed()) == 7  # three values twice, and the test value
 
 
 HASHES = {
@@ -287,6 +287,16 @@ def test_a_stage_before_its_time_leaves_no_failed_run(pipeline_at, tmp_path):
         with pytest.raises(MissingRunError):
             pipeline_at(tmp_path).run(stage)
         assert not Run.find(stage, root=tmp_path)
+
+
+@pytest.mark.parametrize("stage", ["evaluate", "superresolve"])
+def test_a_lost_truth_leaves_no_failed_run(copied, pipeline_at, stage):
+    root = copied("simulate", "train", "deploy")
+    pipeline = pipeline_at(root)
+    shutil.rmtree(pipeline.truth(26.0).path)
+    with pytest.raises(MissingRunError, match="run `nsf simulate"):
+        pipeline.run(stage)
+    assert not Run.find(stage, root=root)
 
 
 def test_training_values_can_be_deployed(copied, pipeline_at):

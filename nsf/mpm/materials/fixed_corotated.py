@@ -9,7 +9,7 @@ import warp as wp
 from nsf.mpm.materials.base import LawFunctions, Material, no_params, no_return_map
 from nsf.mpm.precision import Precision
 
-_VOLUMES = (0.5, 8.0)  # [-] of J: below 1/2 the pressure falls again under compression
+_VOLUMES = (0.5, 8.0)  # [-] of J: below 1/2 the pressure falls again under compression; 8 is a bracket
 _NEWTON_STEPS = 60  # a few for Newton's method; as many for halving alone
 _CLOSED = 1e-12  # [-] a last step of J below this is an answer
 
@@ -39,7 +39,7 @@ def fixed_corotated_tau(precision: Precision):
 
 
 def fixed_corotated_stretches(principal: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
-    """Principal stretches of `fixed_corotated_tau` on the branch through the identity: σ and J at least 1/2.
+    """Principal stretches of `fixed_corotated_tau` on the branch through the identity: σ ≥ 1/2, 1/2 ≤ J ≤ 8.
 
     With q = λ (J − 1) J each stretch is the larger root of 2μ̂ σ(σ − 1) = τ − q, so that one unknown is
     left, J = Π σ(q(J)): Newton's method from J = 1, which halves its bracket where a step would leave it.

@@ -134,7 +134,8 @@ class VonMisesSoftening(VonMises):
     A particle whose τ_Y reaches zero is damaged for good: τ = 0, as the paper's zero Lamé parameters
     give. Its τ_Y ≤ 0 is the mark, so the particle's moduli stay constants. From the next step on its
     F_e is held at I: a product of increments that nothing resists would overflow in a long run, and
-    the elastic strain of a material without stiffness has no meaning.
+    the elastic strain of a material without stiffness has no meaning. τ alone does not tell damage, as a
+    damaged particle looks like an unloaded one: `history_of` gives τ_Y at rest, an upper bound.
 
     Attributes:
         softening: θ [Pa] lost by τ_Y for a unit of plastic logarithmic strain, not negative.
@@ -152,10 +153,6 @@ class VonMisesSoftening(VonMises):
         super().__post_init__()
         if not 0.0 <= self.softening < math.inf:
             raise ConfigError(f"material.softening={self.softening} Pa must be finite and not negative")
-
-    def history_of(self, tau: np.ndarray) -> np.ndarray:
-        """[P, 1] an upper bound of τ_Y [Pa], that at rest: a damaged particle looks like an unloaded one."""
-        return self.initial_history(len(tau))
 
     def params(self, precision: Precision):
         """The law's constants."""

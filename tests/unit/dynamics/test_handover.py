@@ -8,7 +8,7 @@ import pytest
 from nsf.data import Trajectory
 from nsf.dynamics import go_on, hand_over, rollout
 from nsf.errors import InstabilityError
-from nsf.mpm import FP64
+from nsf.mpm import FP64, FullOrderMPM
 
 
 @pytest.fixture(scope="module")
@@ -79,4 +79,21 @@ def test_lost_stability_is_said_clearly(solver, made, tmp_path):
     broken = replace(made, xhat=xhat, handed_over=12)
     with pytest.raises(InstabilityError, match=r"friction_angle.*26.*at t = 0\.06 s, which lost stability"):
         go_on(solver, broken, tmp_path / "rest.h5")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_run_lost_at_its_end_leaves_no_file(solver, made, tmp_path, monkeypatch):
+    def check(full):
+        if full.steps_taken == 24:
+            raise InstabilityError("off the grid")
+
+    def seldom_checked(*arguments):
+        full = hand_over(*arguments)
+        full.check_every = 100  # so that the last check is the one after the last step
+        return full
+
+    monkeypatch.setattr(FullOrderMPM, "check", check)
+    monkeypatch.setattr("nsf.dynamics.handover.hand_over", seldom_checked)
+    with pytest.raises(InstabilityError, match="lost stability: off the grid"):
+        go_on(solver, replace(made, handed_over=12), tmp_path / "rest.h5")
     assert not list(tmp_path.iterdir())

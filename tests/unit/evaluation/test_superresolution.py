@@ -1,5 +1,7 @@
 """Fields of a reduced run at more points than it was trained on."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,6 +9,7 @@ from test_compare import rollout_of
 
 from nsf.data import Trajectory
 from nsf.dynamics import Rollout
+from nsf.errors import ConfigError
 from nsf.evaluation import metrics, query, superresolution, superresolve
 from nsf.kinematics.manifold import Manifold
 from nsf.scenes import load
@@ -105,3 +108,10 @@ def test_a_diverged_run_has_no_finite_error(chain, manifold, truth, made):
     assert found.row["delta"] == found.row["particles_displacement_error"] == np.inf
     assert np.isfinite(found.x_reduced).all()  # its last good state, for pictures
     assert np.isfinite(found.row["interpolation_error"])
+
+
+def test_a_run_that_was_handed_over_is_refused(chain, manifold, truth, made):
+    """Its fields end at the hand-over; the frames after it are not theirs."""
+    handed = replace(made, handed_over=8)
+    with pytest.raises(ConfigError, match=r"handed over .* deploy with deploy\.on_distrust=report"):
+        superresolve(manifold, chain.scene, truth, handed, 2, FRAMES, device="cpu")

@@ -1,0 +1,235 @@
+"""What a configuration asks for: everything that its stages need, checked, and the run of each stage."""
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import dataclass
+from pathlib import Path
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ConfigKeyError
+
+from nsf import config as configuration
+from nsf.data import Split
+from nsf.dynamics.interop import torch_device
+from nsf.dynamics.sampling import check_well_posed
+from nsf.errors import ConfigError
+from nsf.kinematics.training import TRACKING
+from nsf.mpm import FP32, FP64, Precision, precision_of
+from nsf.mpm.device import warp_device
+from nsf.mpm.stability import check_colliders, check_time_step
+from nsf.runs import Run
+from nsf.scenes import Scene
+from nsf.scenes.scene import NOT_PHYSICS
+
+#: Keys of the configuration that a simulation's content depends on.
+_SCENE_KEYS = ("scale", "material", "transfer")
+#: Precision of stored frames by the name of their type.
+_STORED = {"float32": FP32, "float64": FP64}
+
+
+@dataclass
+class Plan:
+    """The stages of one configuration, before any work.
+
+    Args:
+        config: configuration, as `nsf.config.load` gives it; resolved here.
+        root: folder of runs; `NSF_RUNS` or `runs` by default.
+
+    Attributes:
+        scene: that is trained on; deployed: that of the held-out simulations and of deployment.
+        split: parameter values by their use.
+        device: found once, so that a missing GPU is reported before any work.
+
+    Raises:
+        ConfigError: a value is missing or refused; names it.
+        InstabilityError: Δt is unstable at a parameter value.
+    """
+
+    config: DictConfig
+    root: Path | None = None
+
+    def __post_init__(self):
+        try:
+            self._build()
+        except ConfigKeyError as error:
+            raise ConfigError(
+                f"{error.full_key} is missing from the configuration; give it a value"
+            ) from error
+
+    def _build(self) -> None:
+        """Build and check everything, so that a bad value is refused before any work."""
+        self.scene = Scene.from_config(self.config)
+        c = self.config = self.scene.config
+        p = self.scene.parameters
+        self.split = Split(train=tuple(p.train), validation=tuple(p.validation), test=tuple(p.test))
+        for name in ("field", "trainer", "method", "sampler", "projector", "integration"):
+            setattr(self, name, configuration.build(c[name], name))
+        self._check_numbers()
+        self._check_words()
+        self.deployed = self._changed(c.deploy.changes)
+        X = self.scene.particles().X
+        for region in self.sampler.regions:
+            check_well_posed(region.size, c.latent_dim)
+            region.candidates(X)
+        self.device = str(torch_device(warp_device(c.device)))
+        self._check_parameter_values()
+
+    def _check_numbers(self) -> None:
+        """Numbers that nothing is built from before the stage that needs them."""
+        c = self.config
+        for key, least in (("latent_dim", 1), ("seed", 0)):
+            configuration.number(key, c[key], least=least, whole=True)
+        for key in ("trials", "picture_particles", "picture_frames"):
+            configuration.number(f"evaluation.{key}", c.evaluation[key], least=1, whole=True)
+        for key, least in (("factor", 2), ("substeps", 1), ("frames", 1)):
+            configuration.number(f"super_resolution.{key}", c.super_resolution[key], least=least, whole=True)
+        multiplier = c.deploy.dt_multiplier
+        if not configuration.number("deploy.dt_multiplier", multiplier) > 0:
+            raise ConfigError(f"deploy.dt_multiplier={multiplier} must be positive")
+
+    def _check_words(self) -> None:
+        """Values that are one of a few, and the report's name."""
+        c = self.config
+        _one_of("deploy.split", c.deploy.split, ("test", "validation", "train"))
+        _one_of("deploy.on_distrust", c.deploy.on_distrust, ("report", "full_order"))
+        _one_of("tracking", c.tracking, TRACKING)
+        _one_of("data.resident", c.data.resident, (True, False, "auto"))
+        _one_of("data.dtype", c.data.dtype, tuple(_STORED))
+        if str(c.report.name) in ("", "..") or Path(str(c.report.name)).name != str(c.report.name):
+            raise ConfigError(f"report.name={c.report.name} must be one folder's name; set report.folder")
+        precision_of(c.precision)
+
+    def _changed(self, changes: DictConfig | None) -> Scene:
+        """The scene of the held-out simulations and of deployment."""
+        if not changes:
+            return self.scene
+        if not isinstance(changes, DictConfig):
+            raise ConfigError(f"deploy.changes={changes} must map keys to values, as {{material.nu:0.25}}")
+        try:
+            return self.scene.with_changes(OmegaConf.to_container(changes))
+        except ConfigError as error:
+            raise ConfigError(f"deploy.changes: {error}") from error
+
+    def _check_parameter_values(self) -> None:
+        """Build the scene at every parameter value: one out of range fails before any work."""
+        for value, scene in self.needed():
+            scene = scene.with_parameters({self.scene.parameters.name: value})
+            grid = scene.grid
+            check_time_step(scene.particles(), scene.initial_velocity(), grid.dx, scene.dt)
+            for multiplier in (1.0, self.config.deploy.dt_multiplier):
+                check_colliders(scene.colliders, grid, multiplier * scene.dt)
+
+    @property
+    def held_out(self) -> tuple[float, ...]:
+        """Values that are deployed and evaluated."""
+        self.check_held_out()
+        return tuple(getattr(self.split, self.config.deploy.split))
+
+    def check_held_out(self) -> None:
+        """Refuse to deploy on no value.
+
+        Raises:
+            ConfigError: the split that is deployed is empty.
+        """
+        split = self.config.deploy.split
+        if not getattr(self.split, split):
+            raise ConfigError(f"deploy.split={split} has no values; set scene.parameters.{split}")
+
+    @property
+    def stored(self) -> Precision:
+        """Precision of the frames of trajectories."""
+        return _STORED[self.config.data.dtype]
+
+    def needed(self) -> list[tuple[float, Scene]]:
+        """Every value with the scene that is simulated there: the deployed one where values are held out."""
+        held_out = getattr(self.split, self.config.deploy.split)
+        plain = {*self.split.train, *self.split.validation, *self.split.test}.difference(
+            () if self.config.deploy.split == "train" else held_out
+        )
+        needed = [(value, self.scene) for value in plain] + [(value, self.deployed) for value in held_out]
+        return sorted(needed, key=lambda pair: pair[0])
+
+    def simulation(self, value: float, scene: Scene | None = None) -> Run:
+        """The run of one full-order trajectory, of the scene of training by default."""
+        c = self.config
+        scene = scene or self.scene
+        content = self._physics(scene)
+        content |= {"precision": c.precision, "dtype": c.data.dtype}
+        content["parameter"] = {"key": self.scene.parameters.key, "value": float(value)}
+        if scene.files:
+            # A changed mesh under the same path is another simulation.
+            content["files"] = scene.files
+        return Run.open("simulate", self.scene.name, content, root=self.root)
+
+    def truth(self, value: float) -> Run:
+        """The run of the full-order trajectory that a deployed one is held to."""
+        return self.simulation(value, self.deployed)
+
+    @property
+    def training(self) -> Run:
+        """The run of the manifold."""
+        keys = ("field", "trainer", "latent_dim", "seed")
+        parents = [self.simulation(v) for v in self.split.train]
+        return Run.open("train", self.scene.name, self._content(keys), parents, root=self.root)
+
+    @property
+    def deployment(self) -> Run:
+        """The run of the reduced trajectories."""
+        keys = ("method", "sampler", "projector", "integration", "precision")
+        content = (
+            self._content(keys)
+            | self._physics(self.deployed)
+            | {
+                "values": list(self.held_out),
+                "split": self.config.deploy.split,
+                "dt_multiplier": self.config.deploy.dt_multiplier,
+                "on_distrust": self.config.deploy.on_distrust,
+                "device": self.device,
+            }
+        )
+        return Run.open("deploy", self.scene.name, content, [self.training], root=self.root)
+
+    @property
+    def evaluation(self) -> Run:
+        """The run of errors and costs."""
+        content = self._content(("evaluation",))
+        content["paper"] = self._content(("scene",))["scene"].get("paper")
+        parents = [self.deployment, *(self.truth(v) for v in self.held_out)]
+        return Run.open("evaluate", self.scene.name, content, parents, root=self.root)
+
+    def evaluated(self) -> Run:
+        """The complete run of errors and costs, of this device or another: it may have been brought here.
+
+        Raises:
+            MissingRunError: there is none; says how far it came.
+        """
+        for device in (self.device, "cuda:0", "cpu"):
+            there = copy(self)
+            there.device = device
+            if there.evaluation.complete:
+                return there.evaluation
+        return self.evaluation.require()
+
+    @property
+    def superresolution(self) -> Run:
+        """The run of the deployed fields at more points."""
+        content = self._content(("super_resolution",))
+        parents = [self.deployment, *(self.truth(v) for v in self.held_out)]
+        return Run.open("superresolve", self.scene.name, content, parents, root=self.root)
+
+    @staticmethod
+    def _physics(scene: Scene) -> dict:
+        """What the configuration says of a scene's physics."""
+        plain = OmegaConf.to_container(scene.config)
+        content = {key: plain[key] for key in _SCENE_KEYS}
+        return content | {"scene": {k: v for k, v in plain["scene"].items() if k not in NOT_PHYSICS}}
+
+    def _content(self, keys: Sequence[str]) -> dict:
+        plain = OmegaConf.to_container(self.config)
+        return {key: plain[key] for key in keys}
+
+
+def _one_of(key: str, value, options: Sequence) -> None:
+    if not any(value == option and type(value) is type(option) for option in options):
+        shown = [str(o).lower() if isinstance(o, bool) else "null" if o is None else o for o in options]
+        raise ConfigError(f"{key}={value} is unknown; choose {', '.join(shown[:-1])} or {shown[-1]}")
