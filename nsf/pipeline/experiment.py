@@ -11,7 +11,7 @@ import yaml
 from nsf import config as configuration
 from nsf.errors import ConfigError, MissingRunError
 from nsf.paths import EXPERIMENTS
-from nsf.pipeline.chain import Pipeline
+from nsf.pipeline.plan import Plan
 from nsf.runs import Run
 
 _KEYS = {"title", "question", "paper", "jobs"}
@@ -118,11 +118,11 @@ class Experiment:
         settings, missing, scales = {}, [], set()
         for job in self.jobs:
             config = configuration.load(job.overrides)
-            pipeline = Pipeline(config, say, root)
+            plan = Plan(config, root)
             try:
-                run = pipeline.evaluated()
+                run = plan.evaluated()
             except MissingRunError:
-                missing.append(f"{' '.join(job.overrides)}: {_why(pipeline)}")
+                missing.append(f"{' '.join(job.overrides)}: {_why(plan)}")
                 continue
             runs[run.id], settings[run.id] = run, job.setting
             scales.add(config.scale)
@@ -137,13 +137,13 @@ class Experiment:
         return page, missing
 
 
-def _why(pipeline: Pipeline) -> str:
+def _why(plan: Plan) -> str:
     """What became of a job that has no result: the first stage that did not end well."""
     needed = {
-        "simulate": [pipeline.simulation(v) for v in pipeline.split.train],
-        "train": [pipeline.training],
-        "deploy": [pipeline.deployment],
-        "evaluate": [pipeline.evaluation],
+        "simulate": [plan.simulation(v) for v in plan.split.train],
+        "train": [plan.training],
+        "deploy": [plan.deployment],
+        "evaluate": [plan.evaluation],
     }
     for stage, runs in needed.items():
         for run in runs:
