@@ -1,5 +1,6 @@
 """A reduced run that is no longer believed goes on at full order."""
 
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ from nsf.dynamics.deployment import Rollout
 from nsf.dynamics.solver import ReducedMPM
 from nsf.errors import InstabilityError
 from nsf.mpm import FP32, FullOrderMPM, Precision
-from nsf.mpm.recording import COLUMNS, FrameRecorder
+from nsf.mpm.recording import blocks, unpacked
 
 
 def hand_over(solver: ReducedMPM, rollout: Rollout) -> FullOrderMPM:
@@ -72,20 +73,11 @@ def go_on(solver: ReducedMPM, rollout: Rollout, path: Path, stored: Precision = 
             frames=scene.steps - begin + 1,
             dtype=np.dtype(stored.numpy).name,
         )
-        recorder = FrameRecorder(full.state, full.precision, stored)
-        written = begin
+        # The last check falls inside, before the file gets its name: only a run that went well leaves one.
         with writer:
-            for n in range(begin, scene.steps + 1):
-                if n > begin:
-                    full.step()
-                recorder.record()
-                if recorder.full or n == scene.steps:
-                    for frame in recorder.take():
-                        x, v, C, tau = (frame[:, COLUMNS[name]] for name in ("x", "v", "C", "tau"))
-                        writer.append(written * full.dt, x, v, C, tau)
-                        written += 1
-            # Before the file gets its name: only a run that went well leaves one.
-            full.check()
+            frames = itertools.chain.from_iterable(blocks(full, scene.steps - begin, stored))
+            for n, frame in enumerate(frames, begin):
+                writer.append(n * full.dt, *unpacked(frame))
         return full.beyond_law
     except InstabilityError as error:
         raise InstabilityError(

@@ -1,5 +1,6 @@
 """Frames of a run, packed on the device and copied to the host in blocks."""
 
+from collections.abc import Iterator
 from functools import cache
 
 import numpy as np
@@ -79,3 +80,31 @@ class FrameRecorder:
         block = self._block[: self.count].numpy().copy()
         self.count = 0
         return block
+
+
+def blocks(solver, steps: int, stored: Precision, after=lambda: None) -> Iterator[np.ndarray]:
+    """The state as it stands and after each of `steps` steps, in blocks of packed frames [n, P, 21].
+
+    Args:
+        solver: a `FullOrderMPM`.
+        steps: to be taken.
+        stored: precision of the frames.
+        after: called after each frame.
+
+    Raises:
+        InstabilityError: the solver loses stability; after the last block, if its last check finds it.
+    """
+    recorder = FrameRecorder(solver.state, solver.precision, stored)
+    for n in range(steps + 1):
+        if n:
+            solver.step()
+        recorder.record()
+        after()
+        if recorder.full or n == steps:
+            yield recorder.take()
+    solver.check()
+
+
+def unpacked(frame: np.ndarray) -> tuple[np.ndarray, ...]:
+    """x, v [P, 3], C [P, 9] and τ [P, 6] of a packed frame [P, 21]."""
+    return tuple(frame[:, columns] for columns in COLUMNS.values())

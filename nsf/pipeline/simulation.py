@@ -13,7 +13,7 @@ import numpy as np
 from nsf.data import TrajectoryWriter
 from nsf.errors import InstabilityError
 from nsf.mpm import FullOrderMPM, Precision, diagnosed
-from nsf.mpm.recording import COLUMNS, FrameRecorder
+from nsf.mpm.recording import blocks, unpacked
 from nsf.progress import Progress
 from nsf.runs import Run
 
@@ -76,17 +76,10 @@ def _start(job: Job, pool, steps: int, dx: float, stored: Precision, device, pre
     dtype = np.dtype(stored.numpy).name
     try:
         stored_by = pool.submit(_store, job, solver, steps + 1, dx, dtype, device, precision)
-        recorder = FrameRecorder(solver.state, solver.precision, stored)
         started = time.perf_counter()
         try:
-            for n in range(steps + 1):
-                if n:
-                    solver.step()
-                recorder.record()
-                progress.advance()
-                if recorder.full or n == steps:
-                    _hand_over(job, recorder.take(), stored_by)
-            solver.check()
+            for block in blocks(solver, steps, stored, after=progress.advance):
+                _hand_over(job, block, stored_by)
         except InstabilityError as error:
             raise diagnosed(error, job.build, solver.steps_taken) from error
         _hand_over(job, time.perf_counter() - started, stored_by)
@@ -138,8 +131,7 @@ def _store(
                 if isinstance(item, BaseException):
                     raise item
                 for frame in item:
-                    x, v, C, tau = (frame[:, COLUMNS[name]] for name in ("x", "v", "C", "tau"))
-                    writer.append(n * solver.dt, x, v, C, tau)
+                    writer.append(n * solver.dt, *unpacked(frame))
                     n += 1
             writer.cost.update(seconds=item, bytes=solver.nbytes)
         record.metrics["seconds"] = item

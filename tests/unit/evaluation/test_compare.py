@@ -26,17 +26,6 @@ def rollout_of(t, xhat, diverged=-1, parameter=26.0):
 
 
 @pytest.fixture(scope="module")
-def truth(chain):
-    with Trajectory.open(chain.trajectory(26.0)) as trajectory:
-        yield trajectory
-
-
-@pytest.fixture(scope="module")
-def made(chain):
-    return Rollout.open(chain.pipeline.deployment.path / "rollout_0.h5")
-
-
-@pytest.fixture(scope="module")
 def comparison_of(chain, tiny_manifold, truth):
     def build(rollout, split="test", pictures=(50, 4), **options):
         solver = chain.scene.reduced(tiny_manifold, {"friction_angle": 26.0}, 20, device="cpu", **options)

@@ -7,35 +7,16 @@ import pytest
 import torch
 from test_compare import rollout_of
 
-from nsf.data import Trajectory
-from nsf.dynamics import Rollout
 from nsf.errors import ConfigError
 from nsf.evaluation import metrics, query, superresolution, superresolve
-from nsf.kinematics.manifold import Manifold
 from nsf.scenes import load
 
 FRAMES = [12, 24]
 
 
 @pytest.fixture(scope="module")
-def manifold(chain):
-    return Manifold.load(chain.checkpoint)
-
-
-@pytest.fixture(scope="module")
-def truth(chain):
-    with Trajectory.open(chain.trajectory(26.0)) as trajectory:
-        yield trajectory
-
-
-@pytest.fixture(scope="module")
-def made(chain):
-    return Rollout.open(chain.pipeline.deployment.path / "rollout_0.h5")
-
-
-@pytest.fixture(scope="module")
-def fine(chain, manifold, truth, made):
-    return superresolve(manifold, chain.scene, truth, made, 3, FRAMES, device="cpu")
+def fine(chain, tiny_manifold, truth, made):
+    return superresolve(tiny_manifold, chain.scene, truth, made, 3, FRAMES, device="cpu")
 
 
 def test_a_refined_scene_begins_with_the_same_particles():
@@ -50,29 +31,29 @@ def test_a_refined_scene_begins_with_the_same_particles():
     assert after.mass.sum() == pytest.approx(before.mass.sum())
 
 
-def test_query_is_the_restriction_in_groups(manifold, chain, monkeypatch):
+def test_query_is_the_restriction_in_groups(tiny_manifold, chain, monkeypatch):
     X = torch.tensor(chain.scene.refined(2).particles().X)
-    xhat = manifold.training_latents[[3, 30]]
-    whole = manifold.restrict(X=X).position(xhat)
+    xhat = tiny_manifold.training_latents[[3, 30]]
+    whole = tiny_manifold.restrict(X=X).position(xhat)
     monkeypatch.setattr(superresolution, "POINTS", 64)
-    found = query(manifold, X, xhat)
+    found = query(tiny_manifold, X, xhat)
     assert found.shape == (2, 1000, 3)
     torch.testing.assert_close(found, whole, rtol=0, atol=1e-13)
-    assert query(manifold, X, xhat.float()).dtype == torch.float32
+    assert query(tiny_manifold, X, xhat.float()).dtype == torch.float32
 
 
 def test_points_in_place_of_particles_give_their_positions(fine):
     assert 0 <= fine.row["query_difference"] < 1e-7
 
 
-def test_row_against_a_fine_run_of_its_own(fine, chain, manifold, made, truth):
+def test_row_against_a_fine_run_of_its_own(fine, chain, tiny_manifold, made, truth):
     scene = chain.scene.refined(3)
     solver, x_full = scene.full_order({"friction_angle": 26.0}, device="cpu"), []
     for _ in FRAMES:
         solver.step(12)
         x_full.append(solver.state.x.numpy().copy())
     x_full, X = torch.tensor(np.stack(x_full)), torch.tensor(scene.particles().X)
-    x = manifold.restrict(X=X).position(torch.tensor(made.xhat[FRAMES]))
+    x = tiny_manifold.restrict(X=X).position(torch.tensor(made.xhat[FRAMES]))
     row = fine.row
     assert (row["parameter"], row["factor"], row["points"]) == (26.0, 3, 1500)
     assert row["delta"] == pytest.approx(metrics.deformation_error(x, x_full), rel=1e-9)
@@ -102,16 +83,16 @@ def test_a_tear_is_smeared(chain):
     assert apart[(X[500:, 0] - 0.5).abs() > 0.05].max() < 1e-6
 
 
-def test_a_diverged_run_has_no_finite_error(chain, manifold, truth, made):
+def test_a_diverged_run_has_no_finite_error(chain, tiny_manifold, truth, made):
     lost = rollout_of(made.t, np.where(np.arange(25)[:, None] < 20, made.xhat, np.nan), diverged=20)
-    found = superresolve(manifold, chain.scene, truth, lost, 2, FRAMES, device="cpu")
+    found = superresolve(tiny_manifold, chain.scene, truth, lost, 2, FRAMES, device="cpu")
     assert found.row["delta"] == found.row["particles_displacement_error"] == np.inf
     assert np.isfinite(found.x_reduced).all()  # its last good state, for pictures
     assert np.isfinite(found.row["interpolation_error"])
 
 
-def test_a_run_that_was_handed_over_is_refused(chain, manifold, truth, made):
+def test_a_run_that_was_handed_over_is_refused(chain, tiny_manifold, truth, made):
     """Its fields end at the hand-over; the frames after it are not theirs."""
     handed = replace(made, handed_over=8)
     with pytest.raises(ConfigError, match=r"handed over .* deploy with deploy\.on_distrust=report"):
-        superresolve(manifold, chain.scene, truth, handed, 2, FRAMES, device="cpu")
+        superresolve(tiny_manifold, chain.scene, truth, handed, 2, FRAMES, device="cpu")
