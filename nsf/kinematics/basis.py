@@ -26,7 +26,7 @@ from nsf.kinematics import pod
 from nsf.kinematics.interpolation import interpolation
 from nsf.kinematics.manifold import Manifold, Restriction
 from nsf.kinematics.networks import FullyConnected
-from nsf.kinematics.phases import PHASES, TARGETS, Fit, at_least, per_phase
+from nsf.kinematics.phases import PHASES, TARGETS, Fit, at_least, joined, per_phase, shaped
 
 ENCODED_ENTRIES = 1 << 26  # positions encoded at once
 
@@ -361,6 +361,10 @@ class BasisRestriction(Restriction):
         return self.fields["affine"].values(self._inputs(xhat, parameters)).unflatten(-1, (3, 3))
 
     @override
+    def module(self, phase):
+        return ModalModule(self.fields[phase], phase, phase != "deformation" and self._takes_parameters)
+
+    @override
     def subset(self, rows):
         fields = {phase: self.fields[phase].subset(rows) for phase in PHASES}
         return BasisRestriction(
@@ -369,6 +373,20 @@ class BasisRestriction(Restriction):
 
     def _inputs(self, xhat: Tensor, parameters: Tensor) -> Tensor:
         xhat = xhat.to(self.dtype)
-        if not self._takes_parameters:
-            return xhat
-        return torch.cat([xhat, parameters.to(xhat).expand(*xhat.shape[:-1], -1)], -1)
+        return joined(xhat, parameters) if self._takes_parameters else xhat
+
+
+class ModalModule(nn.Module):
+    """A restricted field as a module: its tensors are buffers."""
+
+    def __init__(self, field: RestrictedField, phase: str, takes_parameters: bool):
+        super().__init__()
+        self.register_buffer("mean", field.mean)
+        self.register_buffer("modes", field.modes)
+        self.leading, self.network = field.leading, field.network
+        self.phase, self.takes_parameters = phase, takes_parameters
+
+    @override
+    def forward(self, xhat: Tensor, parameters: Tensor) -> Tensor:
+        field = RestrictedField(self.mean, self.modes, self.leading, self.network)
+        return shaped(self.phase, field.values(joined(xhat, parameters) if self.takes_parameters else xhat))
