@@ -19,6 +19,7 @@ STAGES = {
 }
 COMMANDS = {
     "export": "a deployed run for other programs: HTML page, USD, VTK, ONNX, pictures and film",
+    "doctor": "versions, devices, folders and extras of this installation",
 }
 _EXAMPLES = """\
 examples:
@@ -94,9 +95,18 @@ def _dispatch(arguments: list[str]) -> int:
 
 def _command(name: str, arguments: list[str]) -> int:
     """A command that is no stage: its arguments are options, not keys of a configuration."""
-    from nsf.export.command import main as export
+    if name == "export":
+        from nsf.export.command import main as export
 
-    return export(arguments)
+        return export(arguments)
+    if arguments:
+        asked = {"-h", "--help"} & set(arguments)
+        print(f"usage: nsf {name}\n\n{COMMANDS[name]}", file=sys.stdout if asked else sys.stderr)
+        return 0 if asked else 2
+    from nsf.doctor import report
+
+    print(report())
+    return 0
 
 
 def _primary(stage: str) -> str:
