@@ -17,6 +17,10 @@ STAGES = {
     "superresolve": "deployed fields at many more points, beside a full-order run of as many particles",
     "point": "one material point along a deformation path",
 }
+COMMANDS = {
+    "export": "a deployed run for other programs: HTML page, USD, VTK, ONNX, pictures and film",
+    "doctor": "versions, devices, folders and extras of this installation",
+}
 _EXAMPLES = """\
 examples:
   nsf run scene=sand scale=small                       the paper's method in a minute or two, on a CPU
@@ -24,6 +28,7 @@ examples:
   nsf run scene=sand scene.parameters.test=[23,30.5]   other held-out values
   nsf run -m scene=sand latent_dim=4,6 sampler.size=50,150   every combination
   nsf run +experiment=table1 scale=small               every job of experiments/table1.yaml, and its report
+  nsf export --html --frames                           the newest deployed run as a page and a film
   nsf point material=drucker_prager path=oedometer     plot a law before trusting it
 
 Results lie in ./runs (NSF_RUNS) and ./reports (NSF_REPORTS)."""
@@ -58,11 +63,14 @@ def _dispatch(arguments: list[str]) -> int:
         print(version("nsf"))
         return 0
     stage, overrides = arguments[0], arguments[1:]
+    if stage in COMMANDS:
+        return _command(stage, overrides)
     if stage not in STAGES:
         import difflib
 
-        near = difflib.get_close_matches(stage, STAGES, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"choose one of {', '.join(STAGES)}"
+        known = (*STAGES, *COMMANDS)
+        near = difflib.get_close_matches(stage, known, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"choose one of {', '.join(known)}"
         print(f"error: unknown stage {stage!r}; {hint}", file=sys.stderr)
         return 2
     if {"-h", "--help"} & set(overrides):
@@ -82,6 +90,22 @@ def _dispatch(arguments: list[str]) -> int:
     from nsf import config
 
     _work(config.load(overrides, _primary(stage)), _stages(stage))
+    return 0
+
+
+def _command(name: str, arguments: list[str]) -> int:
+    """A command that is no stage: its arguments are options, not keys of a configuration."""
+    if name == "export":
+        from nsf.export.command import main as export
+
+        return export(arguments)
+    if arguments:
+        asked = {"-h", "--help"} & set(arguments)
+        print(f"usage: nsf {name}\n\n{COMMANDS[name]}", file=sys.stdout if asked else sys.stderr)
+        return 0 if asked else 2
+    from nsf.doctor import report
+
+    print(report())
     return 0
 
 
@@ -179,9 +203,13 @@ def _multirun(stage: str, sweeps: Sequence[list[str]], stages: Sequence[str]) ->
 
 def _help() -> str:
     width = max(map(len, STAGES))
-    stages = "\n".join(f"  {name:<{width}}  {text}" for name, text in STAGES.items())
+    stages, commands = (
+        "\n".join(f"  {name:<{width}}  {text}" for name, text in table.items())
+        for table in (STAGES, COMMANDS)
+    )
     usage = "usage: nsf STAGE [+experiment=NAME] [key=value …] [-m]"
-    return f"{usage}\n\nstages:\n{stages}\n\n{_EXAMPLES}\n\n{_groups()}"
+    others = f"others, with options of their own (nsf export --help):\n{commands}"
+    return f"{usage}\n\nstages:\n{stages}\n\n{others}\n\n{_EXAMPLES}\n\n{_groups()}"
 
 
 def _groups() -> str:

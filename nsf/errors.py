@@ -37,5 +37,9 @@ class ProjectionError(NSFError):
     """The latent projection is ill-posed or diverged."""
 
 
+class MissingExtraError(NSFError):
+    """A library that only some users need is not installed."""
+
+
 class MissingRunError(NSFError):
     """A stage needs the result of an earlier stage that does not exist."""

@@ -95,6 +95,50 @@ class Run:
         runs = [cls(stage, path.parts[-3], path.parts[-2], _root(root)) for path in manifests]
         return sorted(runs, key=lambda run: (run.manifest.get("created", ""), run.hash), reverse=True)
 
+    @classmethod
+    def named(cls, stage: str, name: str | None = None, root: str | Path | None = None) -> "Run":
+        """The complete run of a stage that a user means.
+
+        Args:
+            stage: such as "deploy".
+            name: the run's id, the beginning of the id, of `scene/hash` or of the hash, or the path of the
+                run's folder; None for the newest complete run.
+            root: folder of all runs, for a name that is no path; NSF_RUNS, else ./runs.
+
+        Raises:
+            MissingRunError: no run or several fit, which it lists; the run is not complete, or of another
+                stage.
+        """
+        there = cls.find(stage, root=root)
+        if name is None:
+            if newest := next((run for run in there if run.complete), None):
+                return newest
+            raise MissingRunError(
+                f"no complete {stage} run under {_root(root)}; run `nsf {stage}` first, or set NSF_RUNS"
+            )
+        if (Path(name) / "manifest.json").is_file():
+            return cls._at(Path(name).resolve(), stage)
+        fit = [
+            run
+            for run in there
+            if any(n.startswith(name.strip("/")) for n in (run.id, run.id[len(stage) + 1 :], run.hash))
+        ]
+        if len(fit) != 1:
+            among = "\n  ".join(f"{run.id}  ({run.manifest.get('status')})" for run in fit or there)
+            what = f"{len(fit)} {stage} runs begin with" if fit else f"no {stage} run is, or begins with,"
+            listed = f"; choose one of\n  {among}" if among else f"; run `nsf {stage}` first"
+            raise MissingRunError(f"{what} {name!r} under {_root(root)}{listed}")
+        return fit[0].require()
+
+    @classmethod
+    def _at(cls, path: Path, stage: str) -> "Run":
+        """The complete run in a folder."""
+        found, scene, digest = path.parts[-3:]
+        run = cls(found, scene, digest, path.parents[2])
+        if found != stage:
+            raise MissingRunError(f"{path} is a {found} run; name a {stage} run")
+        return run.require()
+
     @property
     def id(self) -> str:
         """`stage/scene/hash`."""

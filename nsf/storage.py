@@ -12,8 +12,8 @@ from typing import Any
 
 from nsf.errors import StorageError
 
-_SPACE = "free some space, or point NSF_RUNS at another disk"
-_ACCESS = "make the folder writable, or point NSF_RUNS at one that is"
+_SPACE = "free some space, or write to another disk (NSF_RUNS, NSF_REPORTS)"
+_ACCESS = "make the folder writable, or write elsewhere (NSF_RUNS, NSF_REPORTS)"
 _REMEDIES = {
     errno.ENOSPC: _SPACE,
     errno.EDQUOT: _SPACE,

@@ -1,7 +1,7 @@
 """Reduced-order dynamics: latent time-stepping (paper section 5)."""
 
 from nsf.dynamics.cubature import CubatureSampler
-from nsf.dynamics.deployment import Rollout, calibrate, deploy, rollout
+from nsf.dynamics.deployment import Rollout, calibrate, continuation_file, deploy, rollout, rollout_file
 from nsf.dynamics.handover import go_on, hand_over
 from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
 from nsf.dynamics.latent import Decoder, LatentState, LatentTrajectory
@@ -34,9 +34,11 @@ __all__ = [
     "Trust",
     "UnweightedSampler",
     "calibrate",
+    "continuation_file",
     "deploy",
     "go_on",
     "hand_over",
     "rollout",
+    "rollout_file",
     "stop_reasons",
 ]

@@ -103,6 +103,16 @@ class Rollout:
         return cls(**scalars, **arrays, stops=stops)
 
 
+def rollout_file(index: int) -> str:
+    """File of a deploy run with the reduced run at the held-out value of that index."""
+    return f"rollout_{index}.h5"
+
+
+def continuation_file(index: int) -> str:
+    """File of a deploy run in which the full-order solver goes on with that reduced run."""
+    return f"continuation_{index}.h5"
+
+
 class Deployment(pl.LightningModule):
     """Lightning module whose prediction step is a reduced run a parameter value.
 

@@ -1,5 +1,6 @@
 """What a reduced run leaves: latent vectors, and the particle fields decoded from them."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -7,6 +8,7 @@ import numpy as np
 import torch
 
 from nsf.dynamics.projection import ProjectionResult, stop_reasons
+from nsf.kinematics.manifold import Restriction
 
 if TYPE_CHECKING:
     from nsf.dynamics.solver import ReducedMPM
@@ -69,23 +71,23 @@ class LatentRecord:
 
 
 class Decoder:
-    """x, τ and C of every particle as the solver's method takes them.
+    """x, τ and C at the points of a restriction, as a method takes them.
 
     Without a stress field τ comes from ∂g/∂X, without an affine field C is 0: what the run
     used, not what the manifold could have given.
+
+    Args:
+        at: fields restricted to P points.
+        stress, affine: the sources of τ and C (`Method.stress_of`, `Method.affine_of`).
     """
 
-    def __init__(self, solver: "ReducedMPM"):
-        constants = solver.scene_particles
-        self.at = solver.manifold.restrict(
-            particles=np.arange(len(constants)), dtype=solver.dtype, device=solver.torch_device
-        )
-
-        def tensor(values: np.ndarray) -> torch.Tensor:
-            return torch.as_tensor(values, dtype=solver.dtype, device=solver.torch_device)
-
-        self._stress = solver.stress_of(self.at, tensor(constants.mu), tensor(constants.lam))
-        self._affine = solver.affine_of(self.at)
+    def __init__(
+        self,
+        at: Restriction,
+        stress: Callable[[torch.Tensor], torch.Tensor],
+        affine: Callable[[torch.Tensor], torch.Tensor | None],
+    ):
+        self.at, self._stress, self._affine = at, stress, affine
 
     def position(self, xhat: torch.Tensor) -> torch.Tensor:
         """x = g(X, x̂), [P, 3] of x̂ [r] or [F, P, 3] of x̂ [F, r], in metres."""

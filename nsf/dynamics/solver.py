@@ -13,7 +13,7 @@ from nsf.dynamics.latent import Decoder, LatentRecord, LatentState, LatentTrajec
 from nsf.dynamics.phase import Phase, SearchingPhase
 from nsf.dynamics.projection import GaussNewton, Taylor
 from nsf.dynamics.sampling import RandomSampler, SamplePhase, Sampler, check_well_posed
-from nsf.dynamics.stress import Method, StressFromDeformation, StressNeural
+from nsf.dynamics.stress import Method
 from nsf.errors import ConfigError, ShapeError
 from nsf.mpm import BoundaryArrays, Grid, GridStep, precision_of
 from nsf.mpm.device import warp_device
@@ -191,19 +191,26 @@ class ReducedMPM:
 
     def stress_of(self, at, mu: torch.Tensor, lam: torch.Tensor) -> Callable[[torch.Tensor], torch.Tensor]:
         """The method's source of τ [n, 3, 3] [Pa] at restricted points."""
-        if self.method.neural_stress:
-            return StressNeural(at, self.parameters)
-        return StressFromDeformation(at, self.scene.material, mu, lam, self.precision, self.device)
+        return self.method.stress_of(
+            at, self.parameters, self.scene.material, mu, lam, self.precision, self.device
+        )
 
     def affine_of(self, at) -> Callable[[torch.Tensor], torch.Tensor | None]:
         """The method's source of C [n, 3, 3] [1/s] at restricted points; gives None for C = 0."""
-        if self.method.neural_affine:
-            return lambda xhat: at.affine(xhat, self.parameters)
-        return lambda xhat: None
+        return self.method.affine_of(at, self.parameters)
 
     def decoder(self) -> Decoder:
         """The fields at every particle, as the method takes them."""
-        return Decoder(self)
+        constants = self.scene_particles
+        at = self.manifold.restrict(
+            particles=np.arange(len(constants)), dtype=self.dtype, device=self.torch_device
+        )
+
+        def tensor(values: np.ndarray) -> torch.Tensor:
+            return torch.as_tensor(values, dtype=self.dtype, device=self.torch_device)
+
+        stress = self.stress_of(at, tensor(constants.mu), tensor(constants.lam))
+        return Decoder(at, stress, self.affine_of(at))
 
     @property
     def state(self) -> LatentState:

@@ -1,5 +1,6 @@
 """Where the reduced step takes τ and C from: the methods of the 2×2 ablation."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -26,6 +27,34 @@ class Method:
     name: str
     neural_stress: bool
     neural_affine: bool
+
+    def stress_of(
+        self,
+        at,
+        parameters: torch.Tensor,
+        material: Material,
+        mu: torch.Tensor,
+        lam: torch.Tensor,
+        precision: Precision,
+        device,
+    ) -> Callable[[torch.Tensor], torch.Tensor]:
+        """The source of τ: x̂ [r] → [n, 3, 3] [Pa].
+
+        Args:
+            at: fields restricted to n points.
+            parameters: [n_parameters] problem parameters μ.
+            material: the law; mu, lam: [n] Lamé parameters [Pa] of the points.
+            precision, device: of the law's kernel.
+        """
+        if self.neural_stress:
+            return StressNeural(at, parameters)
+        return StressFromDeformation(at, material, mu, lam, precision, device)
+
+    def affine_of(self, at, parameters: torch.Tensor) -> Callable[[torch.Tensor], torch.Tensor | None]:
+        """The source of C at restricted fields: x̂ [r] → [n, 3, 3] [1/s], or None for C = 0."""
+        if self.neural_affine:
+            return lambda xhat: at.affine(xhat, parameters)
+        return lambda xhat: None
 
 
 class StressNeural:

@@ -26,7 +26,7 @@ from nsf.kinematics import pod
 from nsf.kinematics.interpolation import interpolation
 from nsf.kinematics.manifold import Manifold, Restriction
 from nsf.kinematics.networks import FullyConnected
-from nsf.kinematics.phases import PHASES, TARGETS, Fit, at_least, per_phase
+from nsf.kinematics.phases import PHASES, TARGETS, Fit, at_least, joined, per_phase, shaped
 
 ENCODED_ENTRIES = 1 << 26  # positions encoded at once
 
@@ -39,22 +39,23 @@ class BasisField:
         modes: K of x, tau and C: one for all, [x, tau=C] or [x, tau, C]; cut to the snapshots' rank.
         beta: hidden widths over d (3, 6, 9) of the closure and the two heads, given like `modes`.
         depth: hidden layers of each network.
-        noise: deviation of the noise added to xhat in training, in units of xhat's deviation. It keeps the
-            Jacobian and the heads regular beside the training trajectories.
+        displacement_noise: deviation of the noise added in training to each displacement coefficient that is
+            a latent, over that of the first. Weak latents are off by as much as strong ones, since a step
+            puts an error of the same length into each; the closure and the heads have to stay regular there.
         head_parameters: the heads see the (standardised) problem parameters beside xhat.
     """
 
     modes: int | Sequence[int] = (48, 64, 64)
     beta: int | Sequence[int] = (48, 48, 32)
     depth: int = 3
-    noise: float = 0.01
+    displacement_noise: float = 0.01
     head_parameters: bool = True
 
     def __post_init__(self) -> None:
         per_phase("modes", self.modes)
         per_phase("beta", self.beta)
         at_least("depth", self.depth, 1)
-        at_least("noise", self.noise, 0)
+        at_least("displacement_noise", self.displacement_noise, 0)
 
     def prepare(self, snapshots: Snapshots, latent_dim: int) -> dict[str, Any]:
         """POD coefficients [M, K] of x, tau and C and the energy the modes leave out.
@@ -90,7 +91,7 @@ class BasisField:
             "modes": [prepared[name]["coefficients"].shape[1] for name, _ in TARGETS.values()],
             "beta": list(per_phase("beta", self.beta)),
             "depth": self.depth,
-            "noise": self.noise,
+            "displacement_noise": self.displacement_noise,
             "head_parameters": self.head_parameters,
             "unresolved": [prepared[name]["unresolved"] for name, _ in TARGETS.values()],
         }
@@ -130,10 +131,12 @@ class BasisField:
         network = manifold.fields[phase].network
         latents = manifold.training_latents.float()
         parameters = manifold.standard_parameters(manifold.training_parameters.float())
+        deviations = manifold.fields["deformation"].leading.float()
+        noise = self.displacement_noise * deviations[0] / deviations
 
         def loss(rows: Tensor | slice, particles: Tensor | slice, generator: torch.Generator) -> Tensor:
             xhat = latents[rows]
-            inputs = xhat + self.noise * torch.randn(xhat.shape, generator=generator, device=xhat.device)
+            inputs = xhat + noise * torch.randn(xhat.shape, generator=generator, device=xhat.device)
             if manifold.takes_parameters(phase):
                 inputs = torch.cat([inputs, parameters[rows]], -1)
             return (network(inputs) - targets[rows]).square().mean()
@@ -358,6 +361,10 @@ class BasisRestriction(Restriction):
         return self.fields["affine"].values(self._inputs(xhat, parameters)).unflatten(-1, (3, 3))
 
     @override
+    def module(self, phase):
+        return ModalModule(self.fields[phase], phase, phase != "deformation" and self._takes_parameters)
+
+    @override
     def subset(self, rows):
         fields = {phase: self.fields[phase].subset(rows) for phase in PHASES}
         return BasisRestriction(
@@ -366,6 +373,20 @@ class BasisRestriction(Restriction):
 
     def _inputs(self, xhat: Tensor, parameters: Tensor) -> Tensor:
         xhat = xhat.to(self.dtype)
-        if not self._takes_parameters:
-            return xhat
-        return torch.cat([xhat, parameters.to(xhat).expand(*xhat.shape[:-1], -1)], -1)
+        return joined(xhat, parameters) if self._takes_parameters else xhat
+
+
+class ModalModule(nn.Module):
+    """A restricted field as a module: its tensors are buffers."""
+
+    def __init__(self, field: RestrictedField, phase: str, takes_parameters: bool):
+        super().__init__()
+        self.register_buffer("mean", field.mean)
+        self.register_buffer("modes", field.modes)
+        self.leading, self.network = field.leading, field.network
+        self.phase, self.takes_parameters = phase, takes_parameters
+
+    @override
+    def forward(self, xhat: Tensor, parameters: Tensor) -> Tensor:
+        field = RestrictedField(self.mean, self.modes, self.leading, self.network)
+        return shaped(self.phase, field.values(joined(xhat, parameters) if self.takes_parameters else xhat))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 NEIGHBOURS = 20  # 19 with weight and the one that ends the support: first two shells of a cubic lattice
@@ -40,20 +41,24 @@ class Interpolation:
 
     def value(self, field: Tensor) -> Tensor:
         """Field [P, ...] at the points [n, ...], in float64 on the field's device."""
-        return self._apply("nk,nk...->n...", self.weights, field)
+        # Sums rows as it reads them: to hold every point's neighbours first takes six times as long on a CPU.
+        near, rows = self.neighbours.to(field.device).unique(return_inverse=True)
+        values = field[near].double().reshape(len(near), -1)
+        weights = self.weights.to(field.device)
+        found = F.embedding_bag(rows, values, mode="sum", per_sample_weights=weights)
+        return found.reshape(len(rows), *field.shape[1:])
 
     def gradient(self, field: Tensor) -> Tensor:
         """Its derivative [n, ..., 3] in 1/m."""
-        return self._apply("nkd,nk...->n...d", self.gradients, field)
-
-    def _apply(self, contraction: str, factors: Tensor, field: Tensor) -> Tensor:
         row_entries = self.neighbours.shape[1] * max(1, field[0].numel())
         rows = max(1, CHUNK_ENTRIES // row_entries)
-        parts = zip(factors.split(rows), self.neighbours.split(rows), strict=True)
+        parts = zip(self.gradients.split(rows), self.neighbours.split(rows), strict=True)
         return torch.cat(
             [
-                torch.einsum(contraction, factor.to(field.device), field[neighbour.to(field.device)].double())
-                for factor, neighbour in parts
+                torch.einsum(
+                    "nkd,nk...->n...d", factor.to(field.device), field[near.to(field.device)].double()
+                )
+                for factor, near in parts
             ]
         )
 

@@ -66,6 +66,14 @@ class Restriction(ABC):
         """F = ∂g/∂X, [n, 3, 3], dimensionless."""
 
     @abstractmethod
+    def module(self, phase: str) -> nn.Module:
+        """The field of a phase (`PHASES`) in raw units, for exporters; the problem parameters are an input.
+
+        `forward` takes tensors called as they are here: xhat [F, r], parameters [n_parameters] and, where the
+        field is a function of X and not of the restriction's points, X [n, 3]; it gives [F, n, …].
+        """
+
+    @abstractmethod
     def subset(self, rows: slice) -> Restriction:
         """The same fields at some of the points, sharing memory with this restriction."""
 

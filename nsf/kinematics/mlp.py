@@ -14,7 +14,7 @@ from nsf.data import Snapshots, Standardizer
 from nsf.kinematics.encoder import Encoder
 from nsf.kinematics.manifold import Manifold, Restriction, identity
 from nsf.kinematics.networks import FullyConnected
-from nsf.kinematics.phases import PHASES, TARGETS, Fit, per_phase
+from nsf.kinematics.phases import PHASES, TARGETS, Fit, joined, per_phase, shaped
 
 HIDDEN_LAYERS = 5
 ENCODED_POINTS = 1 << 22  # particles of whole frames encoded at once
@@ -197,12 +197,16 @@ class MlpRestriction(Restriction):
     @override
     def stress(self, xhat, parameters):
         if self._takes_parameters:
-            xhat = torch.cat([xhat, parameters.to(xhat).expand(*xhat.shape[:-1], -1)], -1)
+            xhat = joined(xhat, parameters)
         return self._decode("stress", xhat)
 
     @override
     def affine(self, xhat, parameters):
         return self._decode("affine", xhat).unflatten(-1, (3, 3))
+
+    @override
+    def module(self, phase):
+        return PointModule(self.decoders[phase], phase, phase == "stress" and self._takes_parameters)
 
     @override
     def subset(self, rows):
@@ -228,3 +232,16 @@ class MlpRestriction(Restriction):
         latents = latents.to(self.dtype).reshape(-1, latents.shape[-1])
         size = self.points * width * self.dtype.itemsize
         return latents.split(max(1, ACTIVATION_BYTES // max(1, size)))
+
+
+class PointModule(nn.Module):
+    """A decoder as a module: a function of the points too."""
+
+    def __init__(self, decoder: FullyConnected, phase: str, takes_parameters: bool):
+        super().__init__()
+        self.decoder, self.phase, self.takes_parameters = decoder, phase, takes_parameters
+
+    @override
+    def forward(self, X: Tensor, xhat: Tensor, parameters: Tensor) -> Tensor:
+        latents = joined(xhat, parameters) if self.takes_parameters else xhat
+        return shaped(self.phase, self.decoder(pair(X, latents)))

@@ -15,6 +15,16 @@ TARGETS = {"deformation": ("x", 3), "stress": ("tau", 6), "affine": ("C", 9)}
 PHASES = tuple(TARGETS)
 
 
+def joined(xhat: Tensor, parameters: Tensor) -> Tensor:
+    """Latents [..., r] each with the problem parameters [n] (or [..., n]): [..., r + n]."""
+    return torch.cat([xhat, parameters.to(xhat).expand(*xhat.shape[:-1], -1)], -1)
+
+
+def shaped(phase: str, values: Tensor) -> Tensor:
+    """Values [..., d] of a phase's field as it is given: C as a matrix [..., 3, 3]."""
+    return values.unflatten(-1, (3, 3)) if phase == "affine" else values
+
+
 @dataclass(frozen=True)
 class Fit:
     """One phase: what is optimised and the loss it minimises.

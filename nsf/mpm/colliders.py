@@ -258,3 +258,10 @@ class Cuboid(Collider):
     def coarsest_dx(self) -> float:
         """For `separate`, a third of the least edge [m]."""
         return min(self.size) / (2.0 * _REACH) if self.kind == "separate" else math.inf
+
+
+def floor_height(colliders: Sequence[Collider]) -> float | None:
+    """Height [m] of a horizontal floor at rest, for pictures; None where there is none."""
+    planes = [c for c in colliders if isinstance(c, HalfSpace) and not c.changes]
+    heights = [c.point[2] for c in planes if np.allclose(c.extents, (0.0, 0.0, 1.0))]
+    return float(heights[0]) if heights else None

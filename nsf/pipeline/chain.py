@@ -13,7 +13,17 @@ import numpy as np
 from omegaconf import DictConfig
 
 from nsf.data import Snapshots, Trajectory
-from nsf.dynamics import ParticleSets, ReducedMPM, Rollout, SamplePhase, calibrate, deploy, go_on
+from nsf.dynamics import (
+    ParticleSets,
+    ReducedMPM,
+    Rollout,
+    SamplePhase,
+    calibrate,
+    continuation_file,
+    deploy,
+    go_on,
+    rollout_file,
+)
 from nsf.dynamics.solver import reduced_steps
 from nsf.errors import MissingRunError
 from nsf.evaluation import Comparison, Subject, compare, measure, superresolve
@@ -144,12 +154,12 @@ class Pipeline(Plan):
             hand_over = self.config.deploy.on_distrust == "full_order"
             rollouts = deploy(build, self.held_out, self.device, trust, until_distrusted=hand_over)
             for index, rollout in enumerate(rollouts):
-                rollout.save(run.path / _rollout(index))
-                record.output(_rollout(index))
+                rollout.save(run.path / rollout_file(index))
+                record.output(rollout_file(index))
                 self._warn(rollout)
                 if rollout.handed_over >= 0:
-                    self._go_on(manifold, rollout, run.path / _continuation(index))
-                    record.output(_continuation(index))
+                    self._go_on(manifold, rollout, run.path / continuation_file(index))
+                    record.output(continuation_file(index))
             record.metrics["seconds"] = [r.seconds for r in rollouts]
             record.metrics["needed_outside"] = max(r.needed_outside for r in rollouts)
             record.metrics["diverged"] = [r.parameter for r in rollouts if r.diverged >= 0]
@@ -202,9 +212,9 @@ class Pipeline(Plan):
             return run
         deployment, truths, manifold = self.deployment.require(), self._truths(), self._manifold()
         with run.record(device=self.device, precision=self.config.precision) as record:
-            rollouts = [Rollout.open(deployment.path / _rollout(index)) for index in range(len(truths))]
+            rollouts = [Rollout.open(deployment.path / rollout_file(index)) for index in range(len(truths))]
             comparisons = [
-                self._compare(manifold, rollout, truth, deployment.path / _continuation(index))
+                self._compare(manifold, rollout, truth, deployment.path / continuation_file(index))
                 for index, (rollout, truth) in enumerate(zip(rollouts, truths, strict=True))
             ]
             cost = self._cost(manifold)
@@ -279,7 +289,7 @@ class Pipeline(Plan):
         with run.record(device=self.device, precision=c.precision) as record:
             fine = []
             for index, truth in enumerate(truths):
-                rollout = Rollout.open(deployment.path / _rollout(index))
+                rollout = Rollout.open(deployment.path / rollout_file(index))
                 with Trajectory.open(truth) as trajectory:
                     fine.append(
                         superresolve(
@@ -307,13 +317,3 @@ class Pipeline(Plan):
             self.say(f"{run.stage}: inputs unchanged, reused → {run.id}")
             return True
         return False
-
-
-def _rollout(index: int) -> str:
-    """File of a deploy run with the reduced run at the held-out value of that index."""
-    return f"rollout_{index}.h5"
-
-
-def _continuation(index: int) -> str:
-    """File of a deploy run in which the full-order solver goes on with that reduced run."""
-    return f"continuation_{index}.h5"

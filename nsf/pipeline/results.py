@@ -10,7 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nsf.dynamics import Rollout
 from nsf.evaluation import Comparison, SolverCost, SuperResolution, reduction_ratio
-from nsf.mpm import HalfSpace
+from nsf.mpm import floor_height
 from nsf.runs import Record
 from nsf.scenes import Scene
 from nsf.storage import write_json, writing
@@ -114,7 +114,7 @@ def summarise(
         "parameter_name": scene.parameters.name,
         "parameter_unit": scene.parameters.unit,
         "particles": len(manifold.X),
-        "floor": _floor(scene),
+        "floor": floor_height(scene.colliders),
         "training_seconds": seconds,
         "changes": OmegaConf.to_container(config.deploy).get("changes") or {},
         "delta": mean("delta") if math.isfinite(mean("delta")) else None,
@@ -160,18 +160,12 @@ def write_superresolution(record: Record, scene: Scene, fine: Sequence[SuperReso
     table = pd.DataFrame([f.row for f in fine])
     with writing(record.path / "superresolution.csv") as partial:
         table.to_csv(partial, index=False)
-    picture = fine_shapes(fine, scene.parameters.name.replace("_", " "), scene.parameters.unit, _floor(scene))
+    picture = fine_shapes(
+        fine, scene.parameters.name.replace("_", " "), scene.parameters.unit, floor_height(scene.colliders)
+    )
     with writing(record.path / "superresolution.png") as partial:
         picture.savefig(partial)
     for name in ("superresolution.csv", "superresolution.png"):
         record.output(name)
     record.metrics.update(table.drop(columns="parameter").mean().to_dict())
     return table
-
-
-def _floor(scene: Scene) -> float | None:
-    """Height of a horizontal floor at rest [m], for pictures."""
-    up = (0.0, 0.0, 1.0)
-    planes = [c for c in scene.colliders if isinstance(c, HalfSpace) and not c.changes]
-    heights = [c.point[2] for c in planes if np.allclose(c.extents, up)]
-    return float(heights[0]) if heights else None

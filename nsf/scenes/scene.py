@@ -281,12 +281,28 @@ class Scene:
             factor: particles for each particle.
             substeps: steps for each step.
         """
-        config = self.template.copy()
+        config = self._recounted([factor * body.particles for body in self.bodies])
         config.scene.dt, config.scene.steps = self.dt / substeps, substeps * self.steps
-        for name, body in zip(self.config.scene.bodies, self.bodies, strict=True):
-            node = config.scene.bodies[name]
-            node.particles, node.particles_per_cell = factor * body.particles, None
         return Scene.from_config(config)
+
+    def resampled(self, particles: int) -> "Scene":
+        """The same scene with that many particles, each body with its share of them.
+
+        A body's own particles come first in it, if it gets more; weak elements are drawn anew.
+
+        Raises:
+            ConfigError: a body's share is less than one particle.
+        """
+        ends = np.cumsum([0] + [body.particles for body in self.bodies])
+        return Scene.from_config(self._recounted(np.diff(np.rint(particles * (ends / ends[-1])))))
+
+    def _recounted(self, counts: Sequence[int]) -> DictConfig:
+        """The configuration with other numbers of particles of the bodies."""
+        config = self.template.copy()
+        for name, count in zip(self.config.scene.bodies, counts, strict=True):
+            node = config.scene.bodies[name]
+            node.particles, node.particles_per_cell = int(count), None
+        return config
 
     @property
     def grid(self) -> GridGeometry:

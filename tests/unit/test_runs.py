@@ -221,6 +221,39 @@ def test_names_are_folder_names(name):
         Run.open("train", name, {})
 
 
+def test_a_run_is_named_by_any_clear_beginning(tmp_path, monkeypatch):
+    runs = [
+        recorded(Run.open("deploy", s, {"k": k}, root=tmp_path)) for s in ("sand", "cake") for k in (1, 2)
+    ]
+    for run in runs:
+        names = (run.id, run.id[:-3], run.hash, run.hash[:8], f"{run.scene}/{run.hash[:8]}", str(run.path))
+        assert {Run.named("deploy", name, tmp_path) for name in names} == {run}
+    monkeypatch.chdir(runs[0].path.parent)
+    assert Run.named("deploy", runs[0].hash, "elsewhere").id == runs[0].id  # its folder, from here
+    assert Run.named("deploy", root=tmp_path) == runs[-1]
+    newest = Run.open("deploy", "sand", {"k": 3}, root=tmp_path)
+    with pytest.raises(ValueError, match="lost"), newest.record():
+        raise ValueError("lost")
+    assert Run.named("deploy", root=tmp_path) == runs[-1]  # the newest that is complete
+    with pytest.raises(MissingRunError, match=r"failed \(ValueError: lost\)"):
+        Run.named("deploy", newest.hash, tmp_path)
+
+
+def test_a_run_named_badly_lists_what_is_there(tmp_path):
+    with pytest.raises(MissingRunError, match=r"no complete deploy run .* run `nsf deploy` first"):
+        Run.named("deploy", root=tmp_path)
+    with pytest.raises(MissingRunError, match=r"begins with, 'sand' .* run `nsf deploy` first"):
+        Run.named("deploy", "sand", tmp_path)
+    runs = [recorded(Run.open("deploy", "sand", {"k": k}, root=tmp_path)) for k in (1, 2)]
+    for name, told in (("sand", "2 deploy runs begin with 'sand'"), ("cake", "no deploy run is, or begins")):
+        with pytest.raises(MissingRunError, match=told) as caught:
+            Run.named("deploy", name, tmp_path)
+        assert all(f"{run.id}  (complete)" in str(caught.value) for run in runs)
+    train = recorded(Run.open("train", "sand", {}, root=tmp_path))
+    with pytest.raises(MissingRunError, match="is a train run; name a deploy run"):
+        Run.named("deploy", str(train.path))
+
+
 def test_plain_of_tensors_and_paths(tmp_path):
     torch = pytest.importorskip("torch")
     assert plain({"a": torch.tensor(2.0), "p": tmp_path}) == {"a": 2.0, "p": str(tmp_path)}

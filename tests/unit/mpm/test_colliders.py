@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nsf.errors import ConfigError, InstabilityError
-from nsf.mpm import FP64, BoundaryArrays, Cuboid, DomainWalls, HalfSpace, Motion, Sphere
+from nsf.mpm import FP64, BoundaryArrays, Cuboid, DomainWalls, HalfSpace, Motion, Sphere, floor_height
 
 DX = 1.0 / 16.0
 ORIGIN, UP, MIDDLE = (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.5, 0.5, 0.5)
@@ -91,3 +91,18 @@ def test_no_step_is_counted_where_nothing_moves(block, solver_of):
     solver = solver_of(block, colliders=[HalfSpace((0.0, 0.0, 0.1), UP)])
     solver.step(3)
     assert solver.grid_step.boundaries.steps.numpy().tolist() == [0]
+
+
+@pytest.mark.parametrize(
+    ("colliders", "height"),
+    [
+        ((HalfSpace(MIDDLE, (0.0, 0.0, 2.0)),), 0.5),
+        ((Sphere(MIDDLE, 0.1), Cuboid(MIDDLE, (0.4, 0.4, 0.4)), HalfSpace(MIDDLE, UP)), 0.5),
+        ((HalfSpace(MIDDLE, (0.0, 0.1, 1.0)),), None),
+        ((HalfSpace(MIDDLE, UP, motion=rushing(1.0)),), None),
+        ((Sphere(MIDDLE, 0.1),), None),
+        ((), None),
+    ],
+)
+def test_a_floor_is_a_horizontal_plane_at_rest(colliders, height):
+    assert floor_height(colliders) == height

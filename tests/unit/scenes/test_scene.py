@@ -19,6 +19,18 @@ def sand():
     return load("sand", [FEW])
 
 
+def test_a_resampled_scene_has_as_many_particles_as_asked_for():
+    ball = "{_target_: nsf.scenes.Body, shape: {_target_: nsf.scenes.Ball, centre: [0.8, 0.8, 0.8], radius: 0.05}, particles: 7, density: 1}"  # noqa: E501
+    scene = load("sand", [FEW, f"+scene.bodies.ball={ball}"])
+    more = scene.resampled(1001)
+    assert [body.particles for body in more.bodies] == [978, 23]
+    X = more.particles().X
+    np.testing.assert_array_equal(X[:300], scene.particles().X[:300])
+    np.testing.assert_array_equal(X[978:985], scene.particles().X[300:])
+    with pytest.raises(ConfigError, match="particles=0"):
+        scene.resampled(5)
+
+
 def test_sand_is_what_its_file_says(sand):
     assert (sand.name, sand.scale) == ("sand", "small")
     assert sand.dx == pytest.approx(1.0 / 64.0)

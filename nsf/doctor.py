@@ -1,0 +1,114 @@
+"""`nsf doctor`: what this installation consists of, where it keeps things, and what it lacks."""
+
+import importlib.metadata
+import os
+import platform
+import re
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from nsf.provenance import provenance
+
+_DEVELOPMENT = ("dev",)  # extras that a user does not miss
+
+
+def report() -> str:
+    """Versions, devices, caches and extras, as text; a part that cannot be told says why."""
+    parts = {"versions": _versions, "devices": _devices, "folders": _folders, "extras": _extras}
+    return "\n\n".join("\n".join((f"{title}:", *_lines(find))) for title, find in parts.items())
+
+
+def _lines(find: Callable[[], Iterator[str]]) -> list[str]:
+    lines = []
+    try:
+        lines.extend(f"  {line}" for line in find())
+    except Exception as error:  # whatever is broken here is what the reader wants to know
+        lines.append(f"  {'warning':<10} {type(error).__name__}: {error}")
+    return lines
+
+
+def _versions() -> Iterator[str]:
+    found = provenance()
+    commit = str(found["commit"] or "unknown")[:12] + (", changed" if found["dirty"] else "")
+    for name, version in found["versions"].items():
+        yield f"{name:<10} {version or 'missing'}" + (f" (commit {commit})" if name == "nsf" else "")
+    yield f"{'system':<10} {platform.platform()}"
+
+
+def _devices() -> Iterator[str]:
+    import torch
+    import warp as wp
+
+    wp.config.log_level = wp.LOG_ERROR
+    wp.init()
+    yield f"cpu        {os.cpu_count()} cores, {torch.get_num_threads()} threads of torch"
+    for device in wp.get_cuda_devices():
+        memory = device.total_memory / 2**30
+        yield f"{device.alias:<10} {device.name}, {memory:.0f} GiB, sm_{device.arch}"
+    if not wp.is_cuda_available():
+        yield "no GPU     Warp finds no driver; it needs 580 or newer. Everything runs on the CPU"
+        return
+    driver, toolkit = wp.get_cuda_driver_version(), wp.get_cuda_toolkit_version()
+    yield f"driver     {_kernel_module()}CUDA {_dotted(driver)}; Warp is built for CUDA {_dotted(toolkit)}"
+    if not torch.cuda.is_available():
+        yield f"warning    torch {torch.__version__} does not reach the GPU that Warp does"
+
+
+def _dotted(version: Sequence[int]) -> str:
+    return ".".join(map(str, version))
+
+
+def _kernel_module() -> str:
+    """Version of the NVIDIA driver, where Linux tells it."""
+    try:
+        found = re.search(r"\d+\.\d+\.\d+", Path("/proc/driver/nvidia/version").read_text())
+    except OSError:
+        return ""
+    return f"{found[0]}, " if found else ""
+
+
+def _folders() -> Iterator[str]:
+    import warp as wp
+
+    runs, reports = (Path(os.environ.get(f"NSF_{name.upper()}") or name) for name in ("runs", "reports"))
+    count = sum(1 for _ in runs.glob("*/*/*/manifest.json"))
+    yield f"runs       {_weighed(runs)}, {count} runs"
+    yield f"reports    {_weighed(reports)}"
+    yield f"kernels    {_weighed(Path(wp.config.kernel_cache_dir))}, compiled again where deleted"
+
+
+def _weighed(folder: Path) -> str:
+    """A folder with its size."""
+    folder = folder.expanduser()
+    if not folder.is_dir():
+        return f"{folder} (not there)"
+    size = 0
+    for path, _, names in os.walk(folder):
+        for name in names:
+            try:
+                size += os.lstat(os.path.join(path, name)).st_size
+            except OSError:  # removed while we look
+                continue
+    return f"{folder} ({size / 2**20:,.1f} MiB)"
+
+
+def _extras() -> Iterator[str]:
+    from packaging.requirements import Requirement
+
+    required = [Requirement(text) for text in importlib.metadata.requires("nsf") or ()]
+    extras = importlib.metadata.metadata("nsf").get_all("Provides-Extra") or ()
+    for extra in extras:
+        if extra in _DEVELOPMENT:
+            continue
+        own = [r for r in required if r.marker and r.marker.evaluate({"extra": extra})]
+        missing = [r.name for r in own if not _fits(r)]
+        state = f"missing {', '.join(missing)}: pip install 'nsf[{extra}]'" if missing else "there"
+        yield f"{extra:<10} {state}"
+
+
+def _fits(requirement) -> bool:
+    try:
+        version = importlib.metadata.version(requirement.name)
+    except importlib.metadata.PackageNotFoundError:
+        return False
+    return requirement.specifier.contains(version, prereleases=True)

@@ -1,0 +1,89 @@
+"""`--html`: one page that plays in a browser, opened from disk, without a network."""
+
+import base64
+import html
+import json
+import zlib
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+
+from nsf.errors import ConfigError
+from nsf.export import colors
+from nsf.export.playback import QUANTITIES, Playback
+from nsf.storage import writing
+
+NEEDS = ()
+POINTS = 20_000  # unless asked for: a page of some MiB that a telephone plays
+LARGEST = 1 << 29  # bytes of positions and colours that a browser unpacks
+
+
+def write(playback: Playback, folder: Path) -> Path:
+    """Write the page: positions in 16 bits of their bounding box, von Mises stress in 8 of its colour scale.
+
+    Each plane of values is stored as its difference from the plane before, and the whole deflated. The
+    address may name where to begin, paused: `page.html#frame=50`, and `&color=displacement`.
+
+    Raises:
+        ConfigError: so many points in so many frames are too much for a browser.
+    """
+    if not playback.points_given:
+        playback = playback.thinned(POINTS)
+    N, F = len(playback.X), len(playback.t)
+    if (size := 7 * N * (F + 1)) > LARGEST:
+        raise ConfigError(
+            f"{N} points in {F} frames are {size / 2**20:.0f} MiB in a browser, at most {LARGEST >> 20}; "
+            "give fewer --points or a larger --every"
+        )
+    x = np.empty((F + 1, N, 3), np.float32)  # the first plane is at rest
+    stress = np.empty((F, N), np.uint8)
+    for block in playback.blocks("html"):
+        x[0, block.rows], x[1:, block.rows] = block.X.numpy(), block.x.numpy()
+        stress[:, block.rows] = _quantised(block.von_mises.numpy(), 0.0, playback.tops["von_mises"], np.uint8)
+    lower, upper = x.min((0, 1)), x.max((0, 1))
+    told = {
+        "title": playback.title,
+        "run": playback.run.id,
+        "points": N,
+        "particles": len(playback.manifold.X),
+        "t": playback.t.tolist(),
+        "fps": playback.fps,
+        "stopped": playback.stopped,
+        "lower": lower.tolist(),
+        "upper": upper.tolist(),
+        "floor": playback.floor,
+        "radius": playback.radius,
+        "color": playback.color,
+        "quantities": {
+            name: {"title": quantity.title, "unit": quantity.unit, "top": playback.tops[name]}
+            for name, quantity in QUANTITIES.items()
+        },
+        "colors": colors.table(),
+    }
+    planes = _differences(_quantised(x, lower, upper, np.uint16)), _differences(stress)
+    data = base64.b64encode(zlib.compress(b"".join(plane.tobytes() for plane in planes), 6)).decode()
+    page = files("nsf.export").joinpath("player.html").read_text(encoding="utf-8")
+    path = folder / f"{playback.name}.html"
+    with writing(path) as partial, partial.open("w", encoding="utf-8") as file:
+        for name, text in (
+            ("__TITLE__", html.escape(playback.title)),
+            ("__TOLD__", json.dumps(told).replace("<", "\\u003c")),
+        ):
+            page = page.replace(name, text)
+        before, after = page.split("__DATA__")
+        file.writelines((before, data, after))
+    return path
+
+
+def _quantised(values: np.ndarray, lower, upper, kind: type) -> np.ndarray:
+    """Values from `lower` to `upper`, and beyond, as whole numbers from 0 to the largest of `kind`."""
+    largest = np.iinfo(kind).max
+    span = np.maximum(np.subtract(upper, lower), np.finfo(np.float32).tiny)
+    return np.rint(np.clip((values - lower) / span, 0.0, 1.0) * largest).astype(kind)
+
+
+def _differences(planes: np.ndarray) -> np.ndarray:
+    """Each plane less the one before, modulo the type, byte by byte: nearly all high bytes are alike."""
+    differences = np.diff(planes, axis=0, prepend=np.zeros_like(planes[:1]))
+    return np.moveaxis(np.ascontiguousarray(differences).view(np.uint8).reshape(-1, planes.itemsize), 1, 0)

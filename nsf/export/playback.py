@@ -1,0 +1,332 @@
+"""A reduced run from its files, decoded at as many points as asked for, block by block."""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from omegaconf import OmegaConf
+
+from nsf import config as configuration
+from nsf.data import Trajectory
+from nsf.data.schema import TAU_COLUMNS, TAU_ROWS
+from nsf.dynamics import Decoder, Rollout, continuation_file, rollout_file
+from nsf.dynamics.interop import torch_device, torch_dtype
+from nsf.errors import ConfigError, MissingRunError
+from nsf.evaluation import metrics
+from nsf.evaluation.superresolution import POINTS
+from nsf.kinematics.interpolation import lying_together
+from nsf.kinematics.manifold import Manifold, Restriction
+from nsf.mpm import floor_height, precision_of
+from nsf.mpm.device import warp_device
+from nsf.progress import Progress
+from nsf.runs import Run
+from nsf.scenes import Scene
+
+BLOCK = 1 << 21  # positions decoded at once, of all frames: with τ some hundred MiB
+SHOWN = 2000  # particles that set the colour scale and the camera
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What points can be coloured by.
+
+    Attributes:
+        title, unit: for a legend.
+        clip: [%] percentile at which the colour scale ends: peaks of stress would darken all else.
+    """
+
+    title: str
+    unit: str
+    clip: float
+
+
+QUANTITIES = {
+    "von_mises": Quantity("von Mises equivalent of the Kirchhoff stress", "Pa", 97.0),
+    "displacement": Quantity("displacement", "m", 99.5),
+}
+
+
+@dataclass(frozen=True)
+class Block:
+    """Some of the points in every frame, on the host.
+
+    Attributes:
+        rows: of these points among all.
+        X: [n, 3] at rest [m]; x: [F, n, 3] [m].
+        tau: [F, n, 6] Kirchhoff stress [Pa], order xx xy xz yy yz zz.
+    """
+
+    rows: slice
+    X: torch.Tensor
+    x: torch.Tensor
+    tau: torch.Tensor
+
+    @property
+    def displacement(self) -> torch.Tensor:
+        """x − X [F, n, 3] [m]."""
+        return self.x - self.X
+
+    def magnitude(self, quantity: str) -> torch.Tensor:
+        """One of `QUANTITIES` [F, n], in its unit."""
+        return self.von_mises if quantity == "von_mises" else self.displacement.norm(dim=-1)
+
+    @property
+    def von_mises(self) -> torch.Tensor:
+        """Equivalent of τ [F, n] [Pa]."""
+        return metrics.von_mises(self.tau)
+
+    @property
+    def pressure(self) -> torch.Tensor:
+        """−tr τ / 3 [F, n] [Pa]."""
+        return metrics.pressure(self.tau)
+
+
+class Playback:
+    """One reduced run of a deploy run: its frames, and its points at rest.
+
+    Only the files of the deploy run and of its train run are read; the scene is built, with the key of the
+    parameter from a simulate run's configuration, where points in between or the elastic law ask for it.
+
+    Args:
+        run: complete deploy run.
+        parameter: held-out value; the first by default.
+        points: how many. More than the training particles are points of the same shapes in between
+            (super-resolution), fewer are particles drawn once and for all; the particles by default.
+        color: what points are coloured by, of `QUANTITIES`.
+        every: takes each `every`-th step, and the last.
+        fps: frames shown a second.
+        device: where the fields are decoded: `cpu`, `cuda`, `cuda:N` or `auto`.
+
+    Attributes:
+        points_given: whether a number of points was asked for.
+        t: [F] time of the frames [s].
+        X: [N, 3] points at rest [m], in the order of the blocks.
+        stopped: time [s] at which the run diverged, None when it did not; frames end before it.
+
+    Raises:
+        ConfigError: no such value; a number that is not positive; points in between of a run that the
+            full-order solver went on with, as that part has no fields.
+        MissingRunError: the train run is not whole.
+        DeviceError: there is no such device.
+    """
+
+    def __init__(
+        self,
+        run: Run,
+        parameter: float | None = None,
+        points: int | None = None,
+        color: str = "von_mises",
+        every: int = 1,
+        fps: float = 30.0,
+        device: str = "auto",
+    ):
+        configuration.number("every", every, least=1, whole=True)
+        if points is not None:
+            configuration.number("points", points, least=1, whole=True)
+        if color not in QUANTITIES:
+            raise ConfigError(f"color={color} is unknown; choose one of {', '.join(QUANTITIES)}")
+        if not (fps > 0 and math.isfinite(fps)):
+            raise ConfigError(f"fps={fps} must be positive and finite")
+        self.run, self.color, self.every, self.fps, self._settings = run, color, every, fps, run.config
+        index, self.parameter = _chosen(self._settings["values"], parameter)
+        self._training = Run.load(run.parents[0], run.root).require()
+        self._warp_device = warp_device(device)
+        self.device = torch_device(self._warp_device)
+        self._precision = precision_of(self._settings["precision"])
+        self._dtype = torch_dtype(self._precision)
+        self._method = configuration.build(OmegaConf.create(self._settings["method"]), "method")
+        self.manifold = Manifold.load(self._training.path / "manifold.pt").to(self.device)
+        self._rollout = Rollout.open(run.path / rollout_file(index))
+        self._continuation = run.path / continuation_file(index)
+        self.points_given = points is not None
+        self._choose_frames()
+        self._choose_points(points)
+
+    def _choose_frames(self) -> None:
+        rollout = self._rollout
+        diverged, handed_over = rollout.diverged, rollout.handed_over
+        t = rollout.t if diverged < 0 else rollout.t[:diverged]
+        own = len(t)  # frames of the reduced run; later ones are the full-order solver's
+        if handed_over >= 0:
+            own = handed_over + 1
+            with Trajectory.open(self._continuation) as rest:
+                t = np.concatenate([t[:own], rest.t[1:]])
+        chosen = np.union1d(np.arange(0, len(t), self.every), len(t) - 1)
+        self.stopped = float(rollout.t[diverged]) if diverged >= 0 else None
+        self.t = t[chosen]
+        self._xhat = torch.as_tensor(
+            rollout.xhat[chosen[chosen < own]], dtype=self._dtype, device=self.device
+        )
+        self._later = chosen[chosen >= own] - (own - 1)  # of the continuation, whose first is a reduced one
+
+    def _choose_points(self, points: int | None) -> None:
+        X = self.manifold.X.cpu().numpy()
+        rows, constants = np.arange(len(X)), None
+        self._between = points is not None and points > len(X)
+        if self._between:
+            if len(self._later):
+                raise ConfigError(
+                    f"points={points}: the full-order solver went on with this run at "
+                    f"t = {self._rollout.t[self._rollout.handed_over]:.4g} s, and has its {len(X)} particles "
+                    "alone; leave points out, or deploy with deploy.on_distrust=report"
+                )
+            constants = self._scene.resampled(points).particles()
+            X = constants.X
+            rows = torch.cat(lying_together(torch.as_tensor(X), POINTS)).numpy()
+        elif points is not None:
+            # As drawn for reports: strides of a quasi-random sequence would show a pattern.
+            rows = np.sort(np.random.default_rng(0).permutation(len(X))[:points])
+        self.X, self._rows = X[rows], rows
+        self._moduli = None
+        if not self._method.neural_stress:
+            constants = constants or self._scene.particles()
+            self._moduli = constants.mu[rows], constants.lam[rows]
+
+    @property
+    def name(self) -> str:
+        """For files: the parameter and its value, such as `friction_angle_26`."""
+        return f"{self.parameter_name}_{self.parameter:g}"
+
+    @property
+    def title(self) -> str:
+        """For readers: the scene, the parameter and its value."""
+        scene = self.run.scene.replace("_", " ")
+        return f"{scene}, {self.parameter_name.replace('_', ' ')} {self.parameter:g}"
+
+    @property
+    def xhat(self) -> np.ndarray:
+        """[F, r] latent vectors, without the frames that the full-order solver went on with."""
+        return self._xhat.cpu().numpy()
+
+    @property
+    def parameter_name(self) -> str:
+        """Name of the problem parameter."""
+        return self.manifold.parameter_names[0]
+
+    @property
+    def floor(self) -> float | None:
+        """Height of a horizontal floor at rest [m]."""
+        colliders = OmegaConf.create(self._settings["scene"]["colliders"])
+        return floor_height([configuration.build(c, f"scene.colliders.{n}") for n, c in colliders.items()])
+
+    @property
+    def radius(self) -> float:
+        """Of a sphere [m] at which the points look closed: from the volume that they fill at rest."""
+        extent = np.maximum(np.ptp(self.X, axis=0), 1e-6)
+        return float(0.62 * (np.prod(extent) / len(self.X)) ** (1 / 3))
+
+    def thinned(self, points: int) -> "Playback":
+        """The same frames at `points` of the particles, or at all if these are fewer."""
+        points = min(points, len(self.manifold.X))
+        return Playback(self.run, self.parameter, points, self.color, self.every, self.fps, str(self.device))
+
+    @cached_property
+    def tops(self) -> dict[str, float]:
+        """Where the colour scale of each of `QUANTITIES` ends, the same for any number of points."""
+        found: dict[str, float] = {}
+        for name, quantity in QUANTITIES.items():
+            values = torch.cat([block.magnitude(name).flatten() for block in self._some])
+            found[name] = float(np.percentile(values.double().numpy(), quantity.clip)) or 1.0
+        return found
+
+    @cached_property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Corners [3] [m] of the box about some particles at rest and in every frame."""
+        x = torch.cat([torch.cat([block.X[None], block.x]).flatten(0, 1) for block in self._some]).double()
+        return x.amin(0).numpy(), x.amax(0).numpy()
+
+    @cached_property
+    def _some(self) -> list[Block]:
+        return list(self.thinned(SHOWN)._decoded())
+
+    def restricted(self, rows: slice = slice(None), dtype: torch.dtype | None = None) -> Restriction:
+        """The fields at some of the points, in the run's precision by default."""
+        where = {"dtype": dtype or self._dtype, "device": self.device}
+        if self._between:
+            return self.manifold.restrict(X=torch.as_tensor(self.X[rows], device=self.device), **where)
+        return self.manifold.restrict(particles=self._rows[rows], **where)
+
+    def blocks(self, what: str = "decode") -> Iterator[Block]:
+        """Every point in every frame, a block of points at a time, with a progress bar.
+
+        No more than a block is held: memory does not grow with points × frames.
+
+        Args:
+            what: is being made, for the bar.
+        """
+        with Progress(f"export: {what}", len(self.X), "points") as progress:
+            for block in self._decoded():
+                yield block
+                progress.advance(len(block.X))
+
+    def _decoded(self) -> Iterator[Block]:
+        size = max(1, min(POINTS, BLOCK // len(self.t)))
+        for start in range(0, len(self.X), size):
+            rows = slice(start, min(start + size, len(self.X)))
+            with torch.no_grad():
+                decoder = self._decoder(rows)
+                x = decoder.position(self._xhat).cpu()
+                tau = decoder.stress(self._xhat)[..., TAU_ROWS, TAU_COLUMNS].cpu()
+            if len(self._later):
+                x, tau = (torch.cat([a, b.to(a)]) for a, b in zip((x, tau), self._read(rows), strict=True))
+            yield Block(rows, torch.as_tensor(self.X[rows]).to(x), x, tau)
+
+    def _decoder(self, rows: slice) -> Decoder:
+        """The fields at some of the points, as the run's method takes them."""
+        at = self.restricted(rows)
+
+        def tensor(values: Sequence[float]) -> torch.Tensor:
+            return torch.as_tensor(values, dtype=self._dtype, device=self.device)
+
+        parameters = tensor([self.parameter])
+        law = None, None, None
+        if self._moduli is not None:
+            law = self._scene.material, *(tensor(values[rows]) for values in self._moduli)
+        stress = self._method.stress_of(at, parameters, *law, self._precision, self._warp_device)
+        return Decoder(at, stress, self._method.affine_of(at, parameters))
+
+    def _read(self, rows: slice) -> tuple[torch.Tensor, torch.Tensor]:
+        """x and τ of some of the points in the frames that the full-order solver went on with."""
+        with Trajectory.open(self._continuation) as rest:
+            found = (rest.read(name, frames=self._later, particles=self._rows[rows]) for name in ("x", "tau"))
+            return tuple(torch.as_tensor(values) for values in found)
+
+    @cached_property
+    def _scene(self) -> Scene:
+        """The scene deployed on, for its shapes and law; keys that follow the parameter are as configured.
+
+        Raises:
+            MissingRunError: the configuration of the simulation that was trained on is not there.
+        """
+        content = {key: self._settings[key] for key in ("scale", "material", "transfer", "scene")}
+        try:
+            key = Run.load(self._training.parents[0], self.run.root).config["parameter"]["key"]
+        except MissingRunError as error:
+            raise MissingRunError(
+                f"points beside the particles, and stress from the deformation, need the scene: {error}"
+            ) from error
+        varied = {"key": key, "unit": "", "train": [self.parameter], "test": []}
+        content["scene"] = content["scene"] | {"parameters": varied}
+        scene = Scene.from_config(OmegaConf.create(content))
+        return scene.with_parameters({scene.parameters.name: self.parameter})
+
+
+def _chosen(values: Sequence[float], parameter: float | None) -> tuple[int, float]:
+    """Index and value of a held-out parameter value.
+
+    Raises:
+        ConfigError: it is none of them; names them.
+    """
+    if parameter is None:
+        return 0, float(values[0])
+    for index, value in enumerate(values):
+        if math.isclose(value, parameter, rel_tol=1e-9):
+            return index, float(value)
+    held_out = ", ".join(f"{value:g}" for value in values)
+    raise ConfigError(
+        f"parameter={parameter:g} was not deployed; choose one of {held_out}, or deploy with "
+        f"scene.parameters.test=[{parameter:g}]"
+    )

@@ -1,0 +1,179 @@
+"""The page of `--html`, in a browser without a network."""
+
+import base64
+import io
+import json
+import re
+import shutil
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from nsf.errors import ConfigError
+from nsf.export import html
+from nsf.export.playback import Playback
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+@pytest.fixture(scope="module")
+def page(played, tmp_path_factory) -> Path:
+    return html.write(played(every=2), tmp_path_factory.mktemp("page"))
+
+
+def held(page) -> tuple[dict, str]:
+    """What a page tells of its run, and its data."""
+    text = page.read_text(encoding="utf-8")
+    told = json.loads(re.search(r'id="told">(.*?)</script>', text)[1])
+    return told, re.search(r'id="data">(.*?)</script>', text)[1]
+
+
+def planes(page) -> tuple[np.ndarray, np.ndarray]:
+    """Positions [F + 1, N, 3] in 16 bits and stress [F, N] in 8."""
+    told, data = held(page)
+    N, F = told["points"], len(told["t"])
+    count = 3 * N * (F + 1)
+    data = np.frombuffer(zlib.decompress(base64.b64decode(data)), np.uint8)
+    low, high, stress = np.split(data, [count, 2 * count])
+    x = (low + 256 * high.astype(np.uint16)).reshape(F + 1, N, 3)
+    return x.cumsum(0, dtype=np.uint16), stress.reshape(F, N).cumsum(0, dtype=np.uint8)
+
+
+def test_the_page_holds_positions_and_stress(page, played):
+    told, _ = held(page)
+    x, stress = planes(page)
+    lower, upper = np.array(told["lower"]), np.array(told["upper"])
+    (block,) = played(every=2).blocks()
+    x = lower + x / 65535 * (upper - lower)
+    np.testing.assert_allclose(x[0], block.X, atol=1e-5)
+    np.testing.assert_allclose(x[1:], block.x, atol=1e-5)
+    top = told["quantities"]["von_mises"]["top"]
+    np.testing.assert_allclose(stress / 255 * top, block.von_mises.clamp(max=top), atol=top / 250)
+
+
+def test_the_page_is_alone(page):
+    text = page.read_text(encoding="utf-8")
+    assert not re.search(
+        r"(src|href)\s*=|@import|fetch\(|https?://", text.split('id="data"')[0] + text[-20000:]
+    )
+    assert "__" not in text.split('id="data"')[0]
+
+
+def test_a_page_is_small_unless_points_are_asked_for(played, tmp_path, monkeypatch):
+    monkeypatch.setattr(html, "POINTS", 100)
+    assert '"points": 100,' in html.write(played(), tmp_path).read_text()
+    assert '"points": 300,' in html.write(played(300), tmp_path).read_text()
+    monkeypatch.setattr(html, "LARGEST", 1000)
+    with pytest.raises(
+        ConfigError, match=r"300 points in 6 frames .* give fewer --points or a larger --every"
+    ):
+        html.write(played(300), tmp_path)
+
+
+def test_text_of_a_run_cannot_end_the_script(played, tmp_path, monkeypatch):
+    monkeypatch.setattr(Playback, "title", "</script><b>")
+    text = html.write(played(10), tmp_path).read_text()
+    assert "</script><b>" not in text
+    assert "<title>&lt;/script&gt;&lt;b&gt;</title>" in text
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """Headless Chromium that cannot reach a network."""
+    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    if CHROMIUM is None:
+        pytest.skip("no Chromium here (apt install chromium)")
+    with api.sync_playwright() as driver:
+        options = ["--no-sandbox", "--enable-unsafe-swiftshader"]
+        chromium = driver.chromium.launch(executable_path=CHROMIUM, args=options)
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def opened(browser, page):
+    """(address part) → the page, drawn; a fault on it fails the test, as does any request but its own."""
+    faults, context = [], browser.new_context(viewport={"width": 600, "height": 420}, offline=True)
+
+    def open_page(part=""):
+        tab = context.new_page()
+        tab.on("pageerror", lambda error: faults.append(str(error)))
+        tab.on("request", lambda request: faults.append(request.url) if "file:" not in request.url else None)
+        tab.on(
+            "console", lambda m: faults.append(m.text) if m.type == "error" or "INVALID" in m.text else None
+        )
+        tab.goto(page.as_uri() + part)
+        tab.wait_for_selector("body[data-ready=true]", timeout=20000)
+        tab.wait_for_selector("body[data-frame]")
+        return tab
+
+    yield open_page
+    context.close()
+    assert not faults
+
+
+def drawn(tab) -> np.ndarray:
+    """Pixels of the canvas."""
+    tab.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
+    picture = Image.open(io.BytesIO(tab.locator("canvas").screenshot()))
+    return np.asarray(picture.convert("RGB")).astype(int)
+
+
+def differs(one, other) -> float:
+    """Share of pixels of another colour."""
+    return float((np.abs(one - other).max(2) > 24).mean())
+
+
+def test_the_browser_unpacks_the_same(opened, page):
+    unpack = """async (data) => {
+        document.getElementById("data").textContent = data;
+        const { x, stress } = await unpacked();
+        return [Array.from(x), Array.from(stress)];
+    }"""
+    for found, packed in zip(opened().evaluate(unpack, held(page)[1]), planes(page), strict=True):
+        np.testing.assert_array_equal(found, packed.ravel())
+
+
+def test_it_plays(opened):
+    tab = opened()
+    assert tab.title() == "sand, friction angle 26"
+    assert tab.text_content("#play") == "Pause"
+    begun = float(tab.evaluate("document.body.dataset.frame"))
+    tab.wait_for_function(f"Number(document.body.dataset.frame) != {begun}")
+    tab.click("#play")
+    assert tab.text_content("#play") == "Play"
+    still = drawn(tab)
+    assert differs(still, drawn(tab)) == 0
+
+
+def test_the_scrubber_and_the_colours_change_what_is_drawn(opened):
+    tab = opened("#frame=0")
+    before = drawn(tab)
+    colored = before[np.ptp(before, axis=2) > 25]
+    assert len(colored) > 500
+    tab.fill("#frame", "12")
+    after = drawn(tab)
+    assert tab.evaluate("document.body.dataset.frame") == "12.00"
+    assert "0.120 s" in tab.text_content("#time")
+    assert differs(before, after) > 0.01
+    tab.select_option("#color", "displacement")
+    assert "displacement" in tab.text_content("#scale")
+    assert differs(after, drawn(tab)) > 0.005
+    tab.check("#cut")
+    cut = drawn(tab)
+    assert differs(after, cut) > 0.005
+    tab.mouse.move(300, 200)
+    tab.mouse.down()
+    tab.mouse.move(380, 220, steps=3)
+    tab.mouse.up()
+    assert differs(cut, drawn(tab)) > 0.005
+
+
+def test_the_address_names_a_frame_and_a_colour(opened):
+    tab = opened("#frame=3&color=displacement")
+    drawn(tab)
+    assert tab.evaluate("document.body.dataset.frame") == "3.00"
+    assert tab.input_value("#color") == "displacement"

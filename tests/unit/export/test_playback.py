@@ -1,0 +1,148 @@
+"""What exporters are given: frames and points of a reduced run, decoded block by block."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from decoded import whole
+
+from nsf.dynamics import Rollout, go_on
+from nsf.errors import ConfigError, DeviceError, MissingRunError
+from nsf.evaluation import metrics
+from nsf.export import playback
+from nsf.export.playback import Playback
+from nsf.runs import Run
+
+
+@pytest.fixture
+def solver(chain, tiny_manifold):
+    return chain.pipeline.solver_at(tiny_manifold, 26.0)
+
+
+def test_blocks_are_what_the_solver_decodes(played, solver, deployed, monkeypatch):
+    monkeypatch.setattr(playback, "POINTS", 64)
+    shown = played()
+    np.testing.assert_allclose(shown.t, np.array([0, 5, 10, 15, 20, 24]) * 0.005)
+    xhat = torch.tensor(Rollout.open(deployed.path / "rollout_0.h5").xhat[[0, 5, 10, 15, 20, 24]])
+    x, tau = whole(shown)
+    decoder = solver.decoder()
+    torch.testing.assert_close(x, decoder.position(xhat))
+    torch.testing.assert_close(
+        tau[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].unflatten(-1, (3, 3)), decoder.stress(xhat)
+    )
+    assert (shown.title, shown.name) == ("sand, friction angle 26", "friction_angle_26")
+    assert shown.floor == 0.13
+
+
+def test_stress_from_the_deformation(pipeline_at, own_root, tiny_manifold):
+    """method=deformation_only: the law's stress, at the particles and in between."""
+    pipeline = pipeline_at(own_root, "method=deformation_only")
+    run = pipeline.deploy()
+    xhat = torch.tensor(Rollout.open(run.path / "rollout_0.h5").xhat[[0, 20, 24]])
+    decoder = pipeline.solver_at(tiny_manifold, 26.0).decoder()
+    x, tau = whole(Playback(run, every=20, device="cpu"))
+    torch.testing.assert_close(x, decoder.position(xhat))
+    torch.testing.assert_close(tau, decoder.stress(xhat).flatten(2)[..., [0, 1, 2, 4, 5, 8]])
+    more = Playback(run, every=20, points=600, device="cpu")
+    _, between = whole(more)
+    rows = [np.flatnonzero((more.X == X).all(1))[0] for X in tiny_manifold.X.numpy()[:20]]
+    torch.testing.assert_close(between[:, rows], tau[:, :20], rtol=1e-4, atol=1e-2)
+
+
+def test_fewer_points_are_particles(played, tiny_manifold):
+    few = played(40)
+    everything, _ = whole(played())
+    rows = [int(np.flatnonzero((tiny_manifold.X.numpy() == X).all(1))[0]) for X in few.X]
+    assert len(set(rows)) == 40
+    torch.testing.assert_close(whole(few)[0], everything[:, rows])
+
+
+def test_more_points_hold_the_particles(played, tiny_manifold, monkeypatch):
+    monkeypatch.setattr(playback, "POINTS", 300)
+    shown = played(1234)
+    assert shown.X.shape == (1234, 3)
+    rows = [int(np.flatnonzero((shown.X == X).all(1))[0]) for X in tiny_manifold.X.numpy()]
+    x, tau = whole(shown)
+    torch.testing.assert_close(x[:, rows], whole(played())[0], rtol=0, atol=1e-7)
+    assert torch.isfinite(tau).all()
+    assert shown.tops == played().tops  # colours do not depend on the number of points
+
+
+def test_magnitudes(played):
+    block = next(played(50).blocks())
+    torch.testing.assert_close(block.magnitude("von_mises"), metrics.von_mises(block.tau))
+    torch.testing.assert_close(block.magnitude("displacement"), (block.x - block.X).norm(dim=2))
+    xx, yy, zz = (block.tau[..., k] for k in (0, 3, 5))
+    torch.testing.assert_close(block.pressure, -(xx + yy + zz) / 3)
+
+
+def spoiled(run, tmp_path, **changes):
+    """A copy of the tiny chain's runs whose rollout is another."""
+    root = tmp_path / "runs"
+    shutil.copytree(run.root, root)
+    copy = Run.load(run.id, root)
+    path = copy.path / "rollout_0.h5"
+    rollout = replace(Rollout.open(path), **changes)
+    rollout.save(path)
+    manifest = copy.manifest
+    for output in manifest["outputs"]:
+        output["bytes"] = (copy.path / output["path"]).stat().st_size
+    (copy.path / "manifest.json").write_text(json.dumps(manifest))
+    return copy, rollout
+
+
+def test_a_diverged_run_ends_before_it_is_lost(deployed, tmp_path):
+    run, _ = spoiled(deployed, tmp_path, diverged=18)
+    shown = Playback(run, every=5, device="cpu")
+    np.testing.assert_allclose(shown.t, np.array([0, 5, 10, 15, 17]) * 0.005)
+    assert shown.stopped == pytest.approx(0.09)
+
+
+def test_a_run_handed_over_goes_on_at_full_order(deployed, tmp_path, solver):
+    run, rollout = spoiled(deployed, tmp_path, handed_over=8)
+    go_on(solver, rollout, run.path / "continuation_0.h5")
+    shown = Playback(run, every=5, device="cpu")
+    np.testing.assert_allclose(shown.t, np.array([0, 5, 10, 15, 20, 24]) * 0.005)
+    x, tau = whole(shown)
+    torch.testing.assert_close(x[:2], solver.decoder().position(torch.tensor(rollout.xhat[[0, 5]])))
+    assert (x[2:, :, 2].mean(1).diff() < 0).all()  # the column goes on falling
+    assert torch.isfinite(tau).all()
+    with pytest.raises(ConfigError, match=r"full-order solver went on with .* deploy\.on_distrust=report"):
+        Playback(run, points=501, device="cpu")
+
+
+def test_only_points_in_between_need_the_simulation(deployed, tmp_path):
+    shutil.copytree(deployed.root, tmp_path / "runs")
+    shutil.rmtree(tmp_path / "runs/simulate")
+    run = Run.load(deployed.id, tmp_path / "runs")
+    assert len(whole(Playback(run, points=100, device="cpu"))[0]) == 25
+    with pytest.raises(MissingRunError, match=r"need the scene: no run 'simulate/sand"):
+        Playback(run, points=600, device="cpu")
+    shutil.rmtree(tmp_path / "runs/train")
+    with pytest.raises(MissingRunError, match=r"no run 'train/sand"):
+        Playback(run, device="cpu")
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"points": 0}, "points=0 must be a whole number of at least 1"),
+        ({"points": -5}, "points=-5"),
+        ({"every": 0}, "every=0"),
+        ({"fps": 0.0}, "fps=0"),
+        ({"fps": float("nan")}, "fps=nan"),
+        ({"color": "red"}, "color=red is unknown; choose one of von_mises, displacement"),
+        ({"parameter": 27.0}, r"parameter=27 was not deployed; choose one of 26, or .*test=\[27\]"),
+    ],
+)
+def test_refused(deployed, options, told):
+    with pytest.raises(ConfigError, match=told):
+        Playback(deployed, device="cpu", **options)
+
+
+def test_an_unknown_device_is_refused(deployed):
+    with pytest.raises(DeviceError, match="device=tpu"):
+        Playback(deployed, device="tpu")
