@@ -5,7 +5,7 @@ import json
 import os
 import re
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -15,10 +15,11 @@ from typing import Any
 from nsf.canonical import content_hash, plain
 from nsf.errors import ConfigError, MissingRunError, StorageError
 from nsf.provenance import provenance
-from nsf.storage import write_json, writing
+from nsf.storage import in_use, locked, write_json, writing
 
 FORMAT = 1  # of the folder's layout; a new value gives every run a new hash
 _NAME = re.compile(r"[A-Za-z0-9][\w.+-]*", re.ASCII)
+_LOCK = ".lock"
 
 
 @dataclass(frozen=True)
@@ -120,6 +121,11 @@ class Run:
         return tuple(self.manifest.get("parents", ())) if self._parents is None else self._parents
 
     @property
+    def parent_runs(self) -> list["Run"]:
+        """The runs whose files this one reads, whether or not they are there."""
+        return [Run(*parent.split("/"), self.root) for parent in self.parents]
+
+    @property
     def manifest(self) -> dict[str, Any]:
         """The manifest on disk; empty when there is none or it cannot be read."""
         try:
@@ -127,6 +133,16 @@ class Run:
         except (OSError, ValueError):
             return {}
         return manifest if isinstance(manifest, dict) else {}
+
+    @property
+    def status(self) -> str:
+        """The manifest's status, or "killed" where it says "running" and no process holds the run's lock."""
+        status = self.manifest.get("status", "missing")
+        if status != "running":
+            return status
+        with suppress(StorageError):  # of someone else's folder
+            return status if in_use(self.path / _LOCK) else "killed"
+        return status
 
     @property
     def complete(self) -> bool:
@@ -159,13 +175,32 @@ class Run:
         if self.complete:
             return self
         manifest = self.manifest
-        status = manifest.get("status", "not there")
+        status = self.status if manifest else "not there"
         lost = ", ".join(self._lost(manifest))
         state = f"not whole ({lost} missing or cut short)" if status == "complete" else status
         why = f" ({manifest['error']})" if manifest.get("error") else ""
         raise MissingRunError(
             f"{self.path} is {state}{why}; run `nsf {self.stage} scene={self.scene}` with the same keys"
         )
+
+    @contextmanager
+    def claimed(self, say: Callable[[str], object] | None = None) -> Iterator[bool]:
+        """Keep other processes from making this run while the block works.
+
+        Look whether the run is complete inside the block: another process may have made it meanwhile.
+
+        Args:
+            say: told that another process makes the run, which is then waited for; None does not wait.
+
+        Yields:
+            Whether the run is claimed; False only where another process makes it and nothing is waited for.
+
+        Raises:
+            StorageError: the folder cannot be written.
+        """
+        told = f"{self.stage}: waiting for another process, which is making {self.id}"
+        with locked(self.path / _LOCK, None if say is None else lambda: say(told)) as claimed:
+            yield claimed
 
     @contextmanager
     def record(
@@ -176,6 +211,7 @@ class Run:
         The status is "running" from the start; "complete" after the block,
         "failed" after an exception, "interrupted" after an interrupt. Every
         exception goes on to the caller. A killed process leaves "running".
+        Only one process records a run at a time; see `claimed`.
 
         Args:
             device: such as "cpu" or "cuda:0".
@@ -198,8 +234,6 @@ class Run:
             "precision": precision,
             "created": datetime.now(UTC).isoformat(timespec="microseconds"),
         }
-        self._write_config()
-        write_json(self.path / "manifest.json", {**manifest, "status": "running"})
         start = time.perf_counter()
 
         def close(status: str, metrics: dict[str, Any], **more: Any) -> None:
@@ -212,18 +246,21 @@ class Run:
             }
             write_json(self.path / "manifest.json", manifest | ending)
 
-        try:
-            yield record
-            close("complete", record.plain_metrics())
-        except BaseException as error:
-            status = "failed" if isinstance(error, Exception) else "interrupted"
-            metrics: dict[str, Any] = {}
-            # A full disk, or a metric that no manifest can hold, must not hide the first error.
-            with suppress(ConfigError):
-                metrics = record.plain_metrics()
-            with suppress(StorageError):
-                close(status, metrics, error=f"{type(error).__name__}: {error}")
-            raise
+        with self.claimed(lambda told: None):
+            self._write_config()
+            write_json(self.path / "manifest.json", {**manifest, "status": "running"})
+            try:
+                yield record
+                close("complete", record.plain_metrics())
+            except BaseException as error:
+                status = "failed" if isinstance(error, Exception) else "interrupted"
+                metrics: dict[str, Any] = {}
+                # A full disk, or a metric that no manifest can hold, must not hide the first error.
+                with suppress(ConfigError):
+                    metrics = record.plain_metrics()
+                with suppress(StorageError):
+                    close(status, metrics, error=f"{type(error).__name__}: {error}")
+                raise
 
     def _write_config(self) -> None:
         from omegaconf import OmegaConf

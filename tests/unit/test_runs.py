@@ -2,7 +2,9 @@
 
 import hashlib
 import json
+import multiprocessing
 import os
+import signal
 import subprocess
 
 import numpy as np
@@ -97,7 +99,7 @@ def test_a_recorded_run(run):
     assert (manifest["device"], manifest["seed"], manifest["precision"]) == ("cuda:0", 1, "fp32")
     assert manifest["seconds"] >= 0
     assert manifest.keys() >= {"stage", "scene", "hash", "commit", "dirty", "versions", "created"}
-    assert sorted(os.listdir(child.path)) == ["config.yaml", "manifest.json", "nets"]
+    assert sorted(os.listdir(child.path)) == [".lock", "config.yaml", "manifest.json", "nets"]
 
 
 def test_the_config_on_disk_is_plain_and_the_same(run):
@@ -150,6 +152,73 @@ def test_a_full_disk_at_the_end_does_not_hide_the_error(run, monkeypatch):
 
     with pytest.raises(ValueError, match="first"):
         work()
+
+
+SPAWN = multiprocessing.get_context("spawn")
+
+
+def hold(run, started, finish):
+    """Record a run, and say when it has begun; the end waits for a word."""
+    with run.record() as record:
+        (run.path / "data.bin").write_text("theirs")
+        record.output("data.bin")
+        started.set()
+        finish.wait(60)
+
+
+@pytest.fixture
+def held(run):
+    """(run, its other process, the word that lets it finish): another process is recording the run."""
+    started, finish = SPAWN.Event(), SPAWN.Event()
+    process = SPAWN.Process(target=hold, args=(run, started, finish))
+    process.start()
+    assert started.wait(60)
+    yield run, process, finish
+    process.kill()
+    process.join()
+
+
+def test_a_second_process_waits_and_finds_the_run_complete(held):
+    run, _, finish = held
+    told = []
+
+    def say(line):
+        told.append(line)
+        finish.set()
+
+    assert run.status == "running"
+    with run.claimed() as mine:
+        assert not mine
+    assert not run.complete
+    with run.claimed(say) as mine:
+        assert mine
+        assert run.complete
+    assert told == [f"simulate: waiting for another process, which is making {run.id}"]
+    with run.claimed(say):
+        assert len(told) == 1  # a free run is not waited for
+
+
+def test_a_killed_process_leaves_its_run_free(held):
+    run, process, _ = held
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    assert run.manifest["status"] == "running"
+    assert run.status == "killed"
+    with pytest.raises(MissingRunError, match="is killed; run `nsf simulate"):
+        run.require()
+    with run.claimed() as mine:
+        assert mine
+    assert recorded(run).complete
+
+
+def test_a_run_is_claimed_by_a_process_and_not_by_a_thread(run):
+    with run.claimed() as mine, run.claimed() as again, run.record():
+        assert mine
+        assert again
+        assert run.status == "running"
+    assert run.status == "complete"
+    with run.claimed() as mine:
+        assert mine
 
 
 @pytest.mark.parametrize("damage", ["shrink", "remove", "manifest", "list", "foreign", "outputs"])
