@@ -24,6 +24,8 @@ examples:
   nsf run scene=sand scene.parameters.test=[23,30.5]   other held-out values
   nsf run -m scene=sand latent_dim=4,6 sampler.size=50,150   every combination
   nsf run +experiment=table1 scale=small               every job of experiments/table1.yaml, and its report
+  nsf run -m +experiment=sand hydra/launcher=joblib    jobs side by side on this machine
+  nsf run -m +experiment=table1 hydra/launcher=slurm   jobs in Slurm's queue; keys: conf/hydra/launcher/slurm.yaml
   nsf point material=drucker_prager path=oedometer     plot a law before trusting it
 
 Results lie in ./runs (NSF_RUNS) and ./reports (NSF_REPORTS)."""
@@ -74,14 +76,23 @@ def _dispatch(arguments: list[str]) -> int:
     if unknown:
         print(f"error: {unknown[0]!r} is not key=value; see `nsf {stage} --help`", file=sys.stderr)
         return 2
-    experiments = [o.removeprefix("+experiment=") for o in overrides if o.startswith("+experiment=")]
-    if experiments:
-        return _experiment(experiments[-1], stage, [o for o in overrides if not o.startswith("+experiment=")])
-    if multirun:
-        return _multirun(stage, [overrides], _stages(stage))
     from nsf import config
 
-    _work(config.load(overrides, _primary(stage)), _stages(stage))
+    launcher = [o for o in overrides if config.of_launcher(o)]
+    experiments = [o.removeprefix("+experiment=") for o in overrides if o.startswith("+experiment=")]
+    own = [o for o in overrides if o not in launcher and not o.startswith("+experiment=")]
+    if experiments:
+        return _experiment(experiments[-1], stage, own, launcher)
+    if multirun:
+        return _multirun(stage, own, launcher)
+    if launcher:
+        print(f"error: {launcher[0]} is about the jobs of a sweep; add -m", file=sys.stderr)
+        return 2
+    from nsf.pipeline.sweep import work
+
+    result = work(config.load(overrides, _primary(stage)), _stages(stage))
+    if stage in ("run", "report"):
+        _show(result)
     return 0
 
 
@@ -97,24 +108,7 @@ def _stages(stage: str) -> tuple[str, ...]:
     return CHAIN if stage == "run" else (stage,)
 
 
-def _work(config, stages: Sequence[str]) -> None:
-    if "point" in stages:
-        from nsf.reporting.point import plot_point
-
-        plot_point(config)
-        return
-    from nsf.pipeline import Pipeline
-
-    pipeline = Pipeline(config)
-    if len(stages) > 1:
-        pipeline.check_held_out()  # before hours of simulation and training, not after
-    for name in stages:
-        result = pipeline.run(name)
-    if "report" in stages:
-        _show(result)
-
-
-def _experiment(name: str, stage: str, overrides: list[str]) -> int:
+def _experiment(name: str, stage: str, overrides: list[str], launcher: list[str]) -> int:
     """A stage, or the whole chain, of an experiment's jobs, and its report; 2 if something is missing."""
     from nsf.pipeline.experiment import Experiment
 
@@ -124,8 +118,7 @@ def _experiment(name: str, stage: str, overrides: list[str]) -> int:
     experiment = Experiment.load(name, overrides)
     code = 0
     if stage != "report":
-        stages = tuple(s for s in _stages(stage) if s != "report")
-        code = _multirun(stage, experiment.sweeps, stages)
+        code = _sweep(stage, experiment.sweeps, launcher)
     if stage in ("run", "report"):
         page, missing = experiment.report()
         _show(page)
@@ -133,6 +126,28 @@ def _experiment(name: str, stage: str, overrides: list[str]) -> int:
             print(f"missing: {told}", file=sys.stderr)
         code = 2 if missing else code
     return code
+
+
+def _multirun(stage: str, overrides: list[str], launcher: list[str]) -> int:
+    """Every combination of comma-separated values, and the report of each scene; 2 if a job failed."""
+    from nsf.pipeline.sweep import reports
+
+    code = 0 if stage == "report" else _sweep(stage, [overrides], launcher)
+    if stage in ("run", "report"):
+        for page in reports(overrides):
+            _show(page)
+    return code
+
+
+def _sweep(stage: str, sweeps: Sequence[list[str]], launcher: list[str]) -> int:
+    """The stage of every job, or the chain up to the report, which is made once all are done."""
+    from nsf.pipeline.sweep import sweep
+
+    stages = tuple(s for s in _stages(stage) if s != "report")
+    failed = sweep(sweeps, stages, launcher, _primary(stage))
+    for failure in failed:
+        print(f"failed: {failure}", file=sys.stderr)
+    return 2 if failed else 0
 
 
 def _show(page) -> None:
@@ -147,47 +162,18 @@ def _show(page) -> None:
     print(f"open {page.resolve()}")
 
 
-def _multirun(stage: str, sweeps: Sequence[list[str]], stages: Sequence[str]) -> int:
-    """Every combination of each sweep's comma-separated values, by Hydra's launchers; 2 if a job failed."""
-    import hydra
-
-    from nsf import config as configuration
-
-    check = None
-    if stage != "point":
-        from nsf.pipeline import Pipeline as check  # checks all that can be checked before any work
-    for overrides in sweeps:
-        configuration.check_sweep(overrides, _primary(stage), check)
-    failed = []
-
-    def job(config) -> None:
-        print(f"--- {' '.join(hydra.core.hydra_config.HydraConfig.get().overrides.task)}")
-        try:
-            _work(configuration.checked(config), stages)
-        except NSFError as error:
-            # Recorded in the failed run's manifest; the other jobs go on.
-            failed.append(error)
-            print(f"error: {error}", file=sys.stderr)
-
-    for overrides in sweeps:
-        sys.argv = ["nsf", "--multirun", *overrides]
-        hydra.main(config_path=str(configuration.CONF), config_name=_primary(stage), version_base="1.3")(
-            job
-        )()
-    return 2 if failed else 0
-
-
 def _help() -> str:
     width = max(map(len, STAGES))
     stages = "\n".join(f"  {name:<{width}}  {text}" for name, text in STAGES.items())
-    usage = "usage: nsf STAGE [+experiment=NAME] [key=value …] [-m]"
+    usage = "usage: nsf STAGE [-m] [+experiment=NAME] [key=value …]"
     return f"{usage}\n\nstages:\n{stages}\n\n{_EXAMPLES}\n\n{_groups()}"
 
 
 def _groups() -> str:
     from nsf.paths import EXPERIMENTS, groups
 
-    lines = [f"  {group:<12} {' '.join(options)}" for group, options in groups().items()]
+    width = max(map(len, groups()))
+    lines = [f"  {group:<{width}} {' '.join(options)}" for group, options in groups().items()]
     experiments = " ".join(sorted(path.stem for path in EXPERIMENTS.glob("*.yaml")))
     lines += ["", "experiments (+experiment=NAME):", f"  {experiments}"]
     return "\n".join(["configuration groups (group=option):", *lines])
@@ -200,7 +186,7 @@ def _stage_help(stage: str) -> str:
     experiment = "" if stage == "point" else " [+experiment=NAME]"
     keys = (CONF / f"{primary}.yaml").read_text(encoding="utf-8")
     return (
-        f"usage: nsf {stage}{experiment} [key=value …] [-m]\n\n{STAGES[stage]}\n\n{_groups()}\n\n"
+        f"usage: nsf {stage} [-m]{experiment} [key=value …]\n\n{STAGES[stage]}\n\n{_groups()}\n\n"
         f"keys and defaults (conf/{primary}.yaml):\n{keys}"
     )
 

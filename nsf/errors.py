@@ -39,3 +39,7 @@ class ProjectionError(NSFError):
 
 class MissingRunError(NSFError):
     """A stage needs the result of an earlier stage that does not exist."""
+
+
+class LaunchError(NSFError):
+    """The jobs of a sweep could not be started: a package, a program or a queue is missing."""

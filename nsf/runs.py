@@ -15,7 +15,7 @@ from typing import Any
 from nsf.canonical import content_hash, plain
 from nsf.errors import ConfigError, MissingRunError, StorageError
 from nsf.provenance import provenance
-from nsf.storage import in_use, locked, write_json, writing
+from nsf.storage import clear_partial, in_use, locked, write_json, writing
 
 FORMAT = 1  # of the folder's layout; a new value gives every run a new hash
 _NAME = re.compile(r"[A-Za-z0-9][\w.+-]*", re.ASCII)
@@ -247,6 +247,7 @@ class Run:
             write_json(self.path / "manifest.json", manifest | ending)
 
         with self.claimed(lambda told: None):
+            clear_partial(self.path)
             self._write_config()
             write_json(self.path / "manifest.json", {**manifest, "status": "running"})
             try:

@@ -26,6 +26,7 @@ _REMEDIES = {
 }
 # torch.save reports a full disk as a RuntimeError without a cause; a file system this empty gives it away.
 _FULL_BYTES = 64 * 1024
+_PARTIAL = ".partial-"  # of hidden folders in which files are written
 _LOCK_SECONDS = 0.2  # between two looks at a lock that another process has
 
 
@@ -47,7 +48,7 @@ def writing(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        folder = Path(tempfile.mkdtemp(prefix=".partial-", dir=path.parent))
+        folder = Path(tempfile.mkdtemp(prefix=_PARTIAL, dir=path.parent))
     except OSError as error:
         raise _storage_error(
             path, error.strerror or str(error), _REMEDIES.get(error.errno or 0, _ACCESS)
@@ -64,6 +65,12 @@ def writing(path: str | Path) -> Iterator[Path]:
         raise _storage_error(path, os.strerror(fault), _REMEDIES[fault]) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def clear_partial(folder: Path) -> None:
+    """Remove what killed processes left half-written below a folder that no other process writes to."""
+    for left in folder.rglob(f"{_PARTIAL}*"):
+        shutil.rmtree(left, ignore_errors=True)
 
 
 @contextmanager

@@ -211,6 +211,14 @@ def test_a_killed_process_leaves_its_run_free(held):
     assert recorded(run).complete
 
 
+def test_what_a_killed_process_left_half_written_is_removed(run):
+    for folder in (run.path / ".partial-1", run.path / "g" / ".partial-2"):
+        folder.mkdir(parents=True)
+        (folder / "trajectory.h5").write_text("half")
+    recorded(run)
+    assert not list(run.path.rglob(".partial-*"))
+
+
 def test_a_run_is_claimed_by_a_process_and_not_by_a_thread(run):
     with run.claimed() as mine, run.claimed() as again, run.record():
         assert mine
