@@ -132,6 +132,10 @@ def _launched(launcher: Launcher, jobs: list[list[str]], say: Callable[[str], ob
         say(f"{len(jobs)} jobs go into Slurm's queue, which squeue shows; their logs are in {logs}")
     try:
         return [launched.return_value for launched in launcher.launch(jobs, 0)]
+    except KeyboardInterrupt:
+        if kind == "SlurmLauncher":
+            say("the jobs stay in Slurm's queue, and go on; scancel ends them")
+        raise
     except Exception as error:
         # A process that dies takes with it what the launcher would have returned of the others.
         if kind == "JoblibLauncher" and _died(error):
