@@ -5,7 +5,7 @@ import signal
 import sys
 from collections.abc import Sequence
 
-from nsf.errors import NSFError
+from nsf.errors import ConfigError, NSFError
 
 STAGES = {
     "run": "the whole chain: simulate, train, deploy, evaluate, report; unchanged stages are reused",
@@ -17,6 +17,13 @@ STAGES = {
     "superresolve": "deployed fields at many more points, beside a full-order run of as many particles",
     "point": "one material point along a deformation path",
 }
+#: Commands that are no stage: what they do, and what they take.
+TOOLS = {
+    "runs": (
+        "every run there is, filtered by fields, metrics and keys; or what differs between two",
+        "[key=value[,value…] …] [sort=[-]key]\n       nsf runs diff ID ID",
+    ),
+}
 _EXAMPLES = """\
 examples:
   nsf run scene=sand scale=small                       the paper's method in a minute or two, on a CPU
@@ -25,8 +32,10 @@ examples:
   nsf run -m scene=sand latent_dim=4,6 sampler.size=50,150   every combination
   nsf run +experiment=table1 scale=small               every job of experiments/table1.yaml, and its report
   nsf run -m +experiment=sand hydra/launcher=joblib    jobs side by side on this machine
-  nsf run -m +experiment=table1 hydra/launcher=slurm   jobs in Slurm's queue; keys: conf/hydra/launcher/slurm.yaml
+  nsf run -m +experiment=table1 hydra/launcher=slurm   jobs in Slurm's queue (conf/hydra/launcher/slurm.yaml)
   nsf point material=drucker_prager path=oedometer     plot a law before trusting it
+  nsf runs stage=evaluate scene=sand latent_dim=4 sort=delta   runs by what made them, the best first
+  nsf runs diff 1a2b 3c4d                              what differs between two runs, in keys and in result
 
 Results lie in ./runs (NSF_RUNS) and ./reports (NSF_REPORTS)."""
 
@@ -60,22 +69,21 @@ def _dispatch(arguments: list[str]) -> int:
         print(version("nsf"))
         return 0
     stage, overrides = arguments[0], arguments[1:]
+    if stage in TOOLS:
+        return _tool(stage, overrides)
     if stage not in STAGES:
         import difflib
 
-        near = difflib.get_close_matches(stage, STAGES, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"choose one of {', '.join(STAGES)}"
-        print(f"error: unknown stage {stage!r}; {hint}", file=sys.stderr)
-        return 2
+        known = (*STAGES, *TOOLS)
+        near = difflib.get_close_matches(stage, known, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"choose one of {', '.join(known)}"
+        raise ConfigError(f"unknown stage {stage!r}; {hint}")
     if {"-h", "--help"} & set(overrides):
         print(_stage_help(stage))
         return 0
     multirun = bool({"-m", "--multirun"} & set(overrides))
     overrides = [o for o in overrides if o not in ("-m", "--multirun")]
-    unknown = [o for o in overrides if o.startswith("-") or ("=" not in o and not o.startswith("~"))]
-    if unknown:
-        print(f"error: {unknown[0]!r} is not key=value; see `nsf {stage} --help`", file=sys.stderr)
-        return 2
+    _check_words(stage, [o for o in overrides if not o.startswith("~")])
     from nsf import config
 
     launcher = [o for o in overrides if config.of_launcher(o)]
@@ -86,13 +94,44 @@ def _dispatch(arguments: list[str]) -> int:
     if multirun:
         return _multirun(stage, own, launcher)
     if launcher:
-        print(f"error: {launcher[0]} is about the jobs of a sweep; add -m", file=sys.stderr)
-        return 2
+        raise ConfigError(f"{launcher[0]} is about the jobs of a sweep; add -m")
     from nsf.pipeline.sweep import work
 
     result = work(config.load(overrides, _primary(stage)), _stages(stage))
     if stage in ("run", "report"):
         _show(result)
+    return 0
+
+
+def _check_words(command: str, words: Sequence[str]) -> None:
+    unknown = [word for word in words if word.startswith("-") or "=" not in word]
+    if unknown:
+        raise ConfigError(f"{unknown[0]!r} is not key=value; see `nsf {command} --help`")
+
+
+def _tool(name: str, words: list[str]) -> int:
+    if {"-h", "--help"} & set(words):
+        text, usage = TOOLS[name]
+        print(f"usage: nsf {name} {usage}\n\n{text}")
+        return 0
+    return _runs(words)
+
+
+def _runs(words: list[str]) -> int:
+    """The table of runs, or of what differs between two."""
+    from nsf.reporting.listing import difference_table, entries, runs_table
+    from nsf.runs import Run
+
+    if words[:1] == ["diff"]:
+        if len(words) != 3:
+            raise ConfigError(f"nsf runs diff takes two runs, not {len(words) - 1}; `nsf runs` lists them")
+        _console().print(difference_table(*map(Run.named, words[1:])))
+        return 0
+    _check_words("runs", words)
+    filters = dict(word.split("=", 1) for word in words)
+    found = entries(filters, filters.pop("sort", "-created"))
+    _console().print(runs_table(found))
+    print(f"{len(found)} runs", file=sys.stderr)
     return 0
 
 
@@ -113,8 +152,7 @@ def _experiment(name: str, stage: str, overrides: list[str], launcher: list[str]
     from nsf.pipeline.experiment import Experiment
 
     if stage == "point":
-        print("error: experiments have no material points; leave +experiment out", file=sys.stderr)
-        return 2
+        raise ConfigError("experiments have no material points; leave +experiment out")
     experiment = Experiment.load(name, overrides)
     code = 0
     if stage != "report":
@@ -153,20 +191,25 @@ def _sweep(stage: str, sweeps: Sequence[list[str]], launcher: list[str]) -> int:
 def _show(page) -> None:
     """The result table of a report, on the terminal."""
     import pandas as pd
-    from rich.console import Console
 
     from nsf.reporting import console_table
 
-    console = Console(width=None if sys.stdout.isatty() else 160)
-    console.print(console_table(pd.read_csv(page.parent / "results.csv")))
+    _console().print(console_table(pd.read_csv(page.parent / "results.csv")))
     print(f"open {page.resolve()}")
+
+
+def _console():
+    from rich.console import Console
+
+    return Console(width=None if sys.stdout.isatty() else 160)
 
 
 def _help() -> str:
     width = max(map(len, STAGES))
     stages = "\n".join(f"  {name:<{width}}  {text}" for name, text in STAGES.items())
+    tools = "\n".join(f"  {name:<{width}}  {text}" for name, (text, _) in TOOLS.items())
     usage = "usage: nsf STAGE [-m] [+experiment=NAME] [key=value …]"
-    return f"{usage}\n\nstages:\n{stages}\n\n{_EXAMPLES}\n\n{_groups()}"
+    return f"{usage}\n\nstages:\n{stages}\n\nbeside them:\n{tools}\n\n{_EXAMPLES}\n\n{_groups()}"
 
 
 def _groups() -> str:

@@ -90,11 +90,31 @@ class Run:
         return cls(stage, scene, digest, _root(root))
 
     @classmethod
-    def find(cls, stage: str, scene: str | None = None, root: str | Path | None = None) -> list["Run"]:
-        """Every run of a stage that was ever started, newest first."""
-        manifests = _root(root).glob(f"{stage}/{scene or '*'}/*/manifest.json")
-        runs = [cls(stage, path.parts[-3], path.parts[-2], _root(root)) for path in manifests]
+    def find(
+        cls, stage: str | None = None, scene: str | None = None, root: str | Path | None = None
+    ) -> list["Run"]:
+        """Every run, of a stage or a scene where one is named, that was ever started, newest first."""
+        manifests = _root(root).glob(f"{stage or '*'}/{scene or '*'}/*/manifest.json")
+        runs = [cls(*path.parts[-4:-1], _root(root)) for path in manifests]
         return sorted(runs, key=lambda run: (run.manifest.get("created", ""), run.hash), reverse=True)
+
+    @classmethod
+    def named(cls, name: str, root: str | Path | None = None) -> "Run":
+        """The recorded run whose id is `name`, or whose hash begins with it.
+
+        Raises:
+            MissingRunError: no run is called so, or several are, which are named.
+        """
+        if "/" in name:
+            return cls.load(name, root)
+        found = [run for run in cls.find(root=root) if run.hash.startswith(name)]
+        if len(found) != 1:
+            several = ", ".join(run.id for run in found[:5])
+            why = (
+                f"is short for {several}; give more of it" if found else "is not there; `nsf runs` lists them"
+            )
+            raise MissingRunError(f"run {name!r} under {_root(root)} {why}")
+        return found[0]
 
     @property
     def id(self) -> str:
