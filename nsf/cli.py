@@ -19,6 +19,10 @@ STAGES = {
 }
 #: Commands that are no stage: what they do, and what they take.
 TOOLS = {
+    "search": (
+        "values of numeric keys that make δ, or δ and the step's time, small at the validation values",
+        "key=low..high[:log] … [key=value …] [search.objectives=[delta,step_ms]] [search.trials=20]",
+    ),
     "runs": (
         "every run there is, filtered by fields, metrics and keys; or what differs between two",
         "[key=value[,value…] …] [sort=[-]key]\n       nsf runs diff ID ID",
@@ -34,6 +38,7 @@ examples:
   nsf run -m +experiment=sand hydra/launcher=joblib    jobs side by side on this machine
   nsf run -m +experiment=table1 hydra/launcher=slurm   jobs in Slurm's queue (conf/hydra/launcher/slurm.yaml)
   nsf point material=drucker_prager path=oedometer     plot a law before trusting it
+  nsf search scene=sand scene.parameters.validation=[27,31] latent_dim=4..8   the r of the smallest δ there
   nsf runs stage=evaluate scene=sand latent_dim=4 sort=delta   runs by what made them, the best first
   nsf runs diff 1a2b 3c4d                              what differs between two runs, in keys and in result
 
@@ -114,7 +119,19 @@ def _tool(name: str, words: list[str]) -> int:
         text, usage = TOOLS[name]
         print(f"usage: nsf {name} {usage}\n\n{text}")
         return 0
-    return _runs(words)
+    return {"runs": _runs, "search": _search}[name](words)
+
+
+def _search(words: list[str]) -> int:
+    """Trials until there are enough, and the best of them."""
+    _check_words("search", words)
+    from nsf.pipeline.search import search
+    from nsf.reporting.search import best_table
+
+    chart = search(words)
+    _console().print(best_table(chart.with_name("trials.csv")))
+    print(f"open {chart.resolve()}")
+    return 0
 
 
 def _runs(words: list[str]) -> int:

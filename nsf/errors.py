@@ -42,4 +42,8 @@ class MissingRunError(NSFError):
 
 
 class LaunchError(NSFError):
-    """The jobs of a sweep could not be started: a package, a program or a queue is missing."""
+    """The jobs of a sweep could not be started: a program or a queue is missing."""
+
+
+class MissingExtraError(NSFError):
+    """A package is not installed that only some of what nsf does needs."""

@@ -1,6 +1,5 @@
 """Sweeps: the stages of many configurations, by one of Hydra's launchers."""
 
-import importlib.util
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -17,6 +16,7 @@ from omegaconf import DictConfig
 
 from nsf import config as configuration
 from nsf.errors import LaunchError, NSFError
+from nsf.extras import require
 from nsf.pipeline.chain import Pipeline
 from nsf.pipeline.plan import Plan
 
@@ -74,10 +74,12 @@ def sweep(
 
     Raises:
         NSFError: a value is refused, which shows before the first job.
-        LaunchError: the launcher is not installed, or no job could be started.
+        MissingExtraError: the launcher is not installed.
+        LaunchError: no job could be started.
     """
     config, loader = configuration.launching(launcher, config_name)
-    _check_installed(config)
+    plugin = ".".join(config.hydra.launcher._target_.split(".")[:2])
+    require(plugin, f"hydra/launcher={config.hydra.runtime.choices['hydra/launcher']}", "sweep")
     for overrides in sweeps:
         configuration.check_sweep(overrides, config_name, None if "point" in stages else Plan)
     jobs = configuration.jobs(sweeps, config_name)
@@ -115,13 +117,6 @@ def _job(config: DictConfig, stages: Sequence[str]) -> str | None:
         traceback.print_exc()
         return f"{type(error).__name__}: {error}"
     return None
-
-
-def _check_installed(config: DictConfig) -> None:
-    plugin = ".".join(config.hydra.launcher._target_.split(".")[:2])
-    if not importlib.util.find_spec(plugin):
-        name = config.hydra.runtime.choices["hydra/launcher"]
-        raise LaunchError(f"hydra/launcher={name} is not installed; pip install 'nsf[sweep]'")
 
 
 def _launched(launcher: Launcher, jobs: list[list[str]], say: Callable[[str], object]) -> list[str | None]:

@@ -8,7 +8,7 @@ from functools import partial
 import pytest
 from forked import SignalAt
 
-from nsf.errors import ConfigError, LaunchError
+from nsf.errors import ConfigError, LaunchError, MissingExtraError
 from nsf.pipeline import sweep as module
 from nsf.pipeline.sweep import sweep
 from nsf.runs import Run
@@ -73,7 +73,7 @@ def test_after_a_kill_only_the_job_in_flight_is_redone(nsf, copied):
 @pytest.mark.parametrize("launcher", ["joblib", "slurm"])
 def test_a_missing_extra_names_the_remedy(monkeypatch, launcher):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
-    with pytest.raises(LaunchError, match=rf"hydra/launcher={launcher}.*pip install 'nsf\[sweep\]'"):
+    with pytest.raises(MissingExtraError, match=rf"hydra/launcher={launcher}.*pip install 'nsf\[sweep\]'"):
         sweep([["seed=1"]], ["train"], [f"hydra/launcher={launcher}"])
 
 
