@@ -27,6 +27,10 @@ TOOLS = {
         "every run there is, filtered by fields, metrics and keys; or what differs between two",
         "[key=value[,value…] …] [sort=[-]key]\n       nsf runs diff ID ID",
     ),
+    "index": (
+        "a page of every run, with a thumbnail each, that sorts and filters in the browser",
+        "[folder=PATH]; reports/runs by default",
+    ),
 }
 _EXAMPLES = """\
 examples:
@@ -119,7 +123,22 @@ def _tool(name: str, words: list[str]) -> int:
         text, usage = TOOLS[name]
         print(f"usage: nsf {name} {usage}\n\n{text}")
         return 0
-    return {"runs": _runs, "search": _search}[name](words)
+    return {"index": _index, "runs": _runs, "search": _search}[name](words)
+
+
+def _index(words: list[str]) -> int:
+    """The page of all runs."""
+    _check_words("index", words)
+    asked = dict(word.split("=", 1) for word in words)
+    folder = asked.pop("folder", os.path.join(os.environ.get("NSF_REPORTS", "reports"), "runs"))
+    if asked:
+        raise ConfigError(f"nsf index has no key {next(iter(asked))!r}; it takes folder=PATH")
+    from pathlib import Path
+
+    from nsf.reporting.index import write_index
+
+    print(f"open {write_index(Path(folder)).resolve()}")
+    return 0
 
 
 def _search(words: list[str]) -> int:

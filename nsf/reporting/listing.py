@@ -60,13 +60,16 @@ class Entry:
 
     @cached_property
     def settings(self) -> dict[str, Any]:
-        """The configuration by dotted key: of the runs that this one goes back to, and on top its own."""
+        """The configuration by dotted key: of the runs that this one goes back to, and on top its own.
+
+        Where those runs differ, as simulations do in their parameter, the values are a tuple.
+        """
         found: dict[str, list[Any]] = {}
         for parent in self.run.parent_runs:
             for key, value in (Entry(parent).settings if parent.manifest else {}).items():
                 known = found.setdefault(key, [])
-                known += [] if value in known else [value]
-        inherited = {key: known[0] if len(known) == 1 else known for key, known in found.items()}
+                known += [v for v in (value if isinstance(value, tuple) else (value,)) if v not in known]
+        inherited = {key: known[0] if len(known) == 1 else tuple(known) for key, known in found.items()}
         return inherited | _flat(self.run.config)
 
     def texts(self) -> list[str]:
@@ -139,7 +142,7 @@ def difference_table(first: Run, second: Run) -> Table:
         keys = [key for key in (left | right) if left.get(key) != right.get(key)]
         for index, key in enumerate(keys):
             a, b = left.get(key), right.get(key)
-            table.add_row("" if index else part, key, escape(_text(a)), escape(_text(b)), _change(a, b))
+            table.add_row("" if index else part, key, escape(text(a)), escape(text(b)), _change(a, b))
         if not keys:
             table.add_row(part, "the same", "", "", "")
     return table
@@ -159,7 +162,8 @@ def _value(entry: Entry, key: str):
 
 
 def _matches(value, wanted: str) -> bool:
-    return any(fnmatchcase(_text(value), pattern) for pattern in wanted.split(","))
+    several = value if isinstance(value, tuple) else (value,)
+    return any(fnmatchcase(text(one), pattern) for one in several for pattern in wanted.split(","))
 
 
 def _order(value) -> tuple[int, float, str]:
@@ -180,7 +184,10 @@ def _flat(value, prefix: str = "") -> dict[str, Any]:
     }
 
 
-def _text(value) -> str:
+def text(value) -> str:
+    """A value of a configuration or a manifest as shown; several values in a row."""
+    if isinstance(value, tuple):
+        return ", ".join(map(text, value))
     if value is None:
         return ABSENT
     if isinstance(value, bool):

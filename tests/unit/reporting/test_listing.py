@@ -58,6 +58,7 @@ def test_all_newest_first(root):
         ({"status": "failed"}, 1),
         ({"scene": "j*"}, 1),
         ({"parameter.value": "3"}, 1),
+        ({"parameter.value": "2", "stage": "train"}, 3),  # of one of the data that it was made from
         ({"stage": "deploy"}, 0),
     ],
 )
