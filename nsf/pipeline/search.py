@@ -117,6 +117,8 @@ def _parted(words: Sequence[str]) -> tuple[list[Range], list[str]]:
         raise ConfigError(
             "nsf search needs a range, as latent_dim=4..8 or field.displacement_noise=1e-3..0.1:log"
         )
+    if any(word.startswith("+experiment=") for word in words):
+        raise ConfigError("a search has no experiment; give the keys of one of its jobs instead")
     return ranges, [word for word, r in found.items() if not r]
 
 
