@@ -14,7 +14,7 @@ INSTALLED := $(VENV)/.installed
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 WORKERS ?= 2
 
-.PHONY: help install quickstart test test-slow test-all lint readme clean
+.PHONY: help install quickstart test test-slow test-slurm test-all lint readme clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -31,13 +31,16 @@ $(INSTALLED): pyproject.toml
 quickstart: install  ## the sand column at small scale, from simulation to report
 	$(BIN)/nsf run scene=sand scale=small
 
-test: install  ## the tests, without those marked slow
-	$(PYTEST) -m 'not slow' -n $(WORKERS) --dist worksteal
+test: install  ## the tests, without those marked slow or slurm
+	$(PYTEST) -m 'not slow and not slurm' -n $(WORKERS) --dist worksteal
 
 test-slow: install  ## the tests marked slow
 	$(PYTEST) -m slow
 
-test-all: test test-slow  ## every test
+test-slurm: install  ## sweeps through a Slurm of one node; on Debian after apt install slurm-wlm munge
+	$(PYTEST) -m slurm
+
+test-all: test test-slow test-slurm  ## every test
 
 lint: install  ## ruff and the layers of imports
 	$(BIN)/ruff check .

@@ -5,7 +5,7 @@ import signal
 import sys
 from collections.abc import Sequence
 
-from nsf.errors import NSFError
+from nsf.errors import ConfigError, NSFError
 
 STAGES = {
     "run": "the whole chain: simulate, train, deploy, evaluate, report; unchanged stages are reused",
@@ -17,9 +17,22 @@ STAGES = {
     "superresolve": "deployed fields at many more points, beside a full-order run of as many particles",
     "point": "one material point along a deformation path",
 }
-COMMANDS = {
-    "export": "a deployed run for other programs: HTML page, USD, VTK, ONNX, pictures and film",
-    "doctor": "versions, devices, folders and extras of this installation",
+#: Commands that are no stage: what they do, and what they take; None for those with options of their own.
+TOOLS = {
+    "search": (
+        "values of numeric keys that make δ, or δ and the step's time, small at the validation values",
+        "key=low..high[:log] … [key=value …] [search.objectives=[delta,step_ms]] [search.trials=20]",
+    ),
+    "runs": (
+        "every run there is, filtered by fields, metrics and keys; or what differs between two",
+        "[key=value[,value…] …] [sort=[-]key]\n       nsf runs diff ID ID",
+    ),
+    "index": (
+        "a page of every run, with a thumbnail each, that sorts and filters in the browser",
+        "[folder=PATH]; reports/runs by default",
+    ),
+    "export": ("a deployed run for other programs: HTML page, USD, VTK, ONNX, pictures and film", None),
+    "doctor": ("versions, devices, folders and extras of this installation", ""),
 }
 _EXAMPLES = """\
 examples:
@@ -28,8 +41,13 @@ examples:
   nsf run scene=sand scene.parameters.test=[23,30.5]   other held-out values
   nsf run -m scene=sand latent_dim=4,6 sampler.size=50,150   every combination
   nsf run +experiment=table1 scale=small               every job of experiments/table1.yaml, and its report
+  nsf run -m +experiment=sand hydra/launcher=joblib    jobs side by side on this machine
+  nsf run -m +experiment=table1 hydra/launcher=slurm   jobs in Slurm's queue (conf/hydra/launcher/slurm.yaml)
   nsf export --html --frames                           the newest deployed run as a page and a film
   nsf point material=drucker_prager path=oedometer     plot a law before trusting it
+  nsf search scene=sand scene.parameters.validation=[27,31] latent_dim=4..8   the r of the smallest δ there
+  nsf runs stage=evaluate scene=sand latent_dim=4 sort=delta   runs by what made them, the best first
+  nsf runs diff 1a2b 3c4d                              what differs between two runs, in keys and in result
 
 Results lie in ./runs (NSF_RUNS) and ./reports (NSF_REPORTS)."""
 
@@ -63,49 +81,114 @@ def _dispatch(arguments: list[str]) -> int:
         print(version("nsf"))
         return 0
     stage, overrides = arguments[0], arguments[1:]
-    if stage in COMMANDS:
-        return _command(stage, overrides)
+    if stage in TOOLS:
+        return _tool(stage, overrides)
     if stage not in STAGES:
         import difflib
 
-        known = (*STAGES, *COMMANDS)
+        known = (*STAGES, *TOOLS)
         near = difflib.get_close_matches(stage, known, n=1)
         hint = f"did you mean {near[0]}?" if near else f"choose one of {', '.join(known)}"
-        print(f"error: unknown stage {stage!r}; {hint}", file=sys.stderr)
-        return 2
+        raise ConfigError(f"unknown stage {stage!r}; {hint}")
     if {"-h", "--help"} & set(overrides):
         print(_stage_help(stage))
         return 0
     multirun = bool({"-m", "--multirun"} & set(overrides))
     overrides = [o for o in overrides if o not in ("-m", "--multirun")]
-    unknown = [o for o in overrides if o.startswith("-") or ("=" not in o and not o.startswith("~"))]
-    if unknown:
-        print(f"error: {unknown[0]!r} is not key=value; see `nsf {stage} --help`", file=sys.stderr)
-        return 2
-    experiments = [o.removeprefix("+experiment=") for o in overrides if o.startswith("+experiment=")]
-    if experiments:
-        return _experiment(experiments[-1], stage, [o for o in overrides if not o.startswith("+experiment=")])
-    if multirun:
-        return _multirun(stage, [overrides], _stages(stage))
+    _check_words(stage, [o for o in overrides if not o.startswith("~")])
     from nsf import config
 
-    _work(config.load(overrides, _primary(stage)), _stages(stage))
+    launcher = [o for o in overrides if config.of_launcher(o)]
+    experiments = [o.removeprefix("+experiment=") for o in overrides if o.startswith("+experiment=")]
+    own = [o for o in overrides if o not in launcher and not o.startswith("+experiment=")]
+    if experiments:
+        return _experiment(experiments[-1], stage, own, launcher)
+    if multirun:
+        return _multirun(stage, own, launcher)
+    if launcher:
+        raise ConfigError(f"{launcher[0]} is about the jobs of a sweep; add -m")
+    from nsf.pipeline.sweep import work
+
+    result = work(config.load(overrides, _primary(stage)), _stages(stage))
+    if stage in ("run", "report"):
+        _show(result)
     return 0
 
 
-def _command(name: str, arguments: list[str]) -> int:
-    """A command that is no stage: its arguments are options, not keys of a configuration."""
-    if name == "export":
-        from nsf.export.command import main as export
+def _check_words(command: str, words: Sequence[str]) -> None:
+    unknown = [word for word in words if word.startswith("-") or "=" not in word]
+    if unknown:
+        raise ConfigError(f"{unknown[0]!r} is not key=value; see `nsf {command} --help`")
 
-        return export(arguments)
-    if arguments:
-        asked = {"-h", "--help"} & set(arguments)
-        print(f"usage: nsf {name}\n\n{COMMANDS[name]}", file=sys.stdout if asked else sys.stderr)
-        return 0 if asked else 2
+
+def _tool(name: str, words: list[str]) -> int:
+    text, usage = TOOLS[name]
+    if usage is not None and {"-h", "--help"} & set(words):
+        print(f"usage: nsf {name} {usage}\n\n{text}")
+        return 0
+    tools = {"doctor": _doctor, "export": _export, "index": _index, "runs": _runs, "search": _search}
+    return tools[name](words)
+
+
+def _doctor(words: list[str]) -> int:
+    """What this installation consists of."""
+    if words:
+        raise ConfigError(f"nsf doctor takes nothing, not {words[0]!r}")
     from nsf.doctor import report
 
     print(report())
+    return 0
+
+
+def _export(words: list[str]) -> int:
+    """A deployed run in other programs' formats."""
+    from nsf.export.command import main as export
+
+    return export(words)
+
+
+def _index(words: list[str]) -> int:
+    """The page of all runs."""
+    _check_words("index", words)
+    asked = dict(word.split("=", 1) for word in words)
+    folder = asked.pop("folder", os.path.join(os.environ.get("NSF_REPORTS", "reports"), "runs"))
+    if asked:
+        raise ConfigError(f"nsf index has no key {next(iter(asked))!r}; it takes folder=PATH")
+    from pathlib import Path
+
+    from nsf.reporting.index import write_index
+
+    print(f"open {write_index(Path(folder)).resolve()}")
+    return 0
+
+
+def _search(words: list[str]) -> int:
+    """Trials until there are enough, and the best of them."""
+    _check_words("search", words)
+    from nsf.pipeline.search import search
+    from nsf.reporting.search import best_table
+
+    chart = search(words)
+    _console().print(best_table(chart.with_name("trials.csv")))
+    print(f"open {chart.resolve()}")
+    return 0
+
+
+def _runs(words: list[str]) -> int:
+    """The table of runs, or of what differs between two."""
+    from nsf.reporting.listing import difference_table, entries, runs_table
+    from nsf.runs import Run
+
+    if words[:1] == ["diff"]:
+        if len(words) != 3:
+            raise ConfigError(f"nsf runs diff takes two runs, not {len(words) - 1}; `nsf runs` lists them")
+        _console().print(difference_table(*map(Run.named, words[1:])))
+        return 0
+    _check_words("runs", words)
+    filters = dict(word.split("=", 1) for word in words)
+    found = entries(filters, filters.pop("sort", "-created"))
+    _console().print(runs_table(found))
+    print(f"{len(found)} runs", file=sys.stderr)
     return 0
 
 
@@ -121,35 +204,16 @@ def _stages(stage: str) -> tuple[str, ...]:
     return CHAIN if stage == "run" else (stage,)
 
 
-def _work(config, stages: Sequence[str]) -> None:
-    if "point" in stages:
-        from nsf.reporting.point import plot_point
-
-        plot_point(config)
-        return
-    from nsf.pipeline import Pipeline
-
-    pipeline = Pipeline(config)
-    if len(stages) > 1:
-        pipeline.check_held_out()  # before hours of simulation and training, not after
-    for name in stages:
-        result = pipeline.run(name)
-    if "report" in stages:
-        _show(result)
-
-
-def _experiment(name: str, stage: str, overrides: list[str]) -> int:
+def _experiment(name: str, stage: str, overrides: list[str], launcher: list[str]) -> int:
     """A stage, or the whole chain, of an experiment's jobs, and its report; 2 if something is missing."""
     from nsf.pipeline.experiment import Experiment
 
     if stage == "point":
-        print("error: experiments have no material points; leave +experiment out", file=sys.stderr)
-        return 2
+        raise ConfigError("experiments have no material points; leave +experiment out")
     experiment = Experiment.load(name, overrides)
     code = 0
     if stage != "report":
-        stages = tuple(s for s in _stages(stage) if s != "report")
-        code = _multirun(stage, experiment.sweeps, stages)
+        code = _sweep(stage, experiment.sweeps, launcher)
     if stage in ("run", "report"):
         page, missing = experiment.report()
         _show(page)
@@ -159,63 +223,57 @@ def _experiment(name: str, stage: str, overrides: list[str]) -> int:
     return code
 
 
+def _multirun(stage: str, overrides: list[str], launcher: list[str]) -> int:
+    """Every combination of comma-separated values, and the report of each scene; 2 if a job failed."""
+    from nsf.pipeline.sweep import reports
+
+    code = 0 if stage == "report" else _sweep(stage, [overrides], launcher)
+    if stage in ("run", "report"):
+        for page in reports(overrides):
+            _show(page)
+    return code
+
+
+def _sweep(stage: str, sweeps: Sequence[list[str]], launcher: list[str]) -> int:
+    """The stage of every job, or the chain up to the report, which is made once all are done."""
+    from nsf.pipeline.sweep import sweep
+
+    stages = tuple(s for s in _stages(stage) if s != "report")
+    failed = sweep(sweeps, stages, launcher, _primary(stage))
+    for failure in failed:
+        print(f"failed: {failure}", file=sys.stderr)
+    return 2 if failed else 0
+
+
 def _show(page) -> None:
     """The result table of a report, on the terminal."""
     import pandas as pd
-    from rich.console import Console
 
     from nsf.reporting import console_table
 
-    console = Console(width=None if sys.stdout.isatty() else 160)
-    console.print(console_table(pd.read_csv(page.parent / "results.csv")))
+    _console().print(console_table(pd.read_csv(page.parent / "results.csv")))
     print(f"open {page.resolve()}")
 
 
-def _multirun(stage: str, sweeps: Sequence[list[str]], stages: Sequence[str]) -> int:
-    """Every combination of each sweep's comma-separated values, by Hydra's launchers; 2 if a job failed."""
-    import hydra
+def _console():
+    from rich.console import Console
 
-    from nsf import config as configuration
-
-    check = None
-    if stage != "point":
-        from nsf.pipeline import Pipeline as check  # checks all that can be checked before any work
-    for overrides in sweeps:
-        configuration.check_sweep(overrides, _primary(stage), check)
-    failed = []
-
-    def job(config) -> None:
-        print(f"--- {' '.join(hydra.core.hydra_config.HydraConfig.get().overrides.task)}")
-        try:
-            _work(configuration.checked(config), stages)
-        except NSFError as error:
-            # Recorded in the failed run's manifest; the other jobs go on.
-            failed.append(error)
-            print(f"error: {error}", file=sys.stderr)
-
-    for overrides in sweeps:
-        sys.argv = ["nsf", "--multirun", *overrides]
-        hydra.main(config_path=str(configuration.CONF), config_name=_primary(stage), version_base="1.3")(
-            job
-        )()
-    return 2 if failed else 0
+    return Console(width=None if sys.stdout.isatty() else 160)
 
 
 def _help() -> str:
     width = max(map(len, STAGES))
-    stages, commands = (
-        "\n".join(f"  {name:<{width}}  {text}" for name, text in table.items())
-        for table in (STAGES, COMMANDS)
-    )
-    usage = "usage: nsf STAGE [+experiment=NAME] [key=value …] [-m]"
-    others = f"others, with options of their own (nsf export --help):\n{commands}"
-    return f"{usage}\n\nstages:\n{stages}\n\n{others}\n\n{_EXAMPLES}\n\n{_groups()}"
+    stages = "\n".join(f"  {name:<{width}}  {text}" for name, text in STAGES.items())
+    tools = "\n".join(f"  {name:<{width}}  {text}" for name, (text, _) in TOOLS.items())
+    usage = "usage: nsf STAGE [-m] [+experiment=NAME] [key=value …]"
+    return f"{usage}\n\nstages:\n{stages}\n\nbeside them:\n{tools}\n\n{_EXAMPLES}\n\n{_groups()}"
 
 
 def _groups() -> str:
     from nsf.paths import EXPERIMENTS, groups
 
-    lines = [f"  {group:<12} {' '.join(options)}" for group, options in groups().items()]
+    width = max(map(len, groups()))
+    lines = [f"  {group:<{width}} {' '.join(options)}" for group, options in groups().items()]
     experiments = " ".join(sorted(path.stem for path in EXPERIMENTS.glob("*.yaml")))
     lines += ["", "experiments (+experiment=NAME):", f"  {experiments}"]
     return "\n".join(["configuration groups (group=option):", *lines])
@@ -228,7 +286,7 @@ def _stage_help(stage: str) -> str:
     experiment = "" if stage == "point" else " [+experiment=NAME]"
     keys = (CONF / f"{primary}.yaml").read_text(encoding="utf-8")
     return (
-        f"usage: nsf {stage}{experiment} [key=value …] [-m]\n\n{STAGES[stage]}\n\n{_groups()}\n\n"
+        f"usage: nsf {stage} [-m]{experiment} [key=value …]\n\n{STAGES[stage]}\n\n{_groups()}\n\n"
         f"keys and defaults (conf/{primary}.yaml):\n{keys}"
     )
 

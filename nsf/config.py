@@ -7,16 +7,20 @@ simulation at a parameter value is the same configuration with that key replaced
 import dataclasses
 import difflib
 import inspect
+import itertools
 import math
 import re
 import types
 import typing
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 
 from hydra import compose, initialize_config_dir
+from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, OverrideParseException
+from hydra.types import RunMode
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -45,6 +49,21 @@ def _turned(values, axis, angle) -> list[float]:
     matrix = rotation(direction("axis of ${turned:…}", axis), number("angle of ${turned:…}", angle))
     return (matrix @ vector("vector of ${turned:…}", values)).tolist()
 
+
+# conf/hydra/launcher/joblib.yaml takes the place of the launcher's own configuration on purpose.
+warnings.filterwarnings(
+    "ignore", message=r"\s*'hydra/launcher/joblib' is validated against ConfigStore schema"
+)
+
+#: How jobs of a sweep are launched, unless told otherwise: without files of Hydra's own.
+_SWEEP = (
+    "hydra/launcher=serial",
+    "hydra/job_logging=disabled",
+    "hydra/hydra_logging=disabled",
+    "hydra.output_subdir=null",
+    "hydra.sweep.dir=${oc.env:NSF_RUNS,runs}/multirun",
+    "hydra.sweep.subdir=.",
+)
 
 OmegaConf.register_new_resolver("scaled", _scaled, replace=True)
 OmegaConf.register_new_resolver("per", _per, replace=True)
@@ -203,23 +222,61 @@ def length(key: str, value) -> float:
     return float(value)
 
 
-def sweep_options(overrides: Sequence[str], config_name: str = "config") -> list[list[str]]:
-    """The overrides of a multirun, each as the list of single ones that it stands for; Hydra's own left out.
+def of_launcher(override: str) -> bool:
+    """Whether an override is about how jobs are launched, as `hydra/launcher=slurm`, and not about a job."""
+    return override.lstrip("+~").startswith(("hydra/", "hydra."))
+
+
+def launching(overrides: Sequence[str], config_name: str = "config") -> tuple[DictConfig, ConfigLoader]:
+    """The configuration from which Hydra launches jobs, and what composes each of them.
+
+    Args:
+        overrides: Hydra's own, as `hydra/launcher=slurm`, `hydra.launcher.partition=gpu`.
+        config_name: as for `load`.
 
     Raises:
-        ConfigError: a syntax error.
+        ConfigError: an unknown key or launcher, with the nearest known one.
     """
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(CONF), version_base="1.3", job_name="nsf"):
+        hydra = GlobalHydra.instance().hydra
+        try:
+            config = hydra.compose_config(
+                config_name, [*_SWEEP, *overrides], RunMode.MULTIRUN, with_log_configuration=False
+            )
+        except HydraException as error:
+            raise ConfigError(_explain(error, config_name, overrides)) from error
+        return config, hydra.config_loader
+
+
+def jobs(sweeps: Sequence[Sequence[str]], config_name: str = "config") -> list[tuple[str, ...]]:
+    """The overrides of every job of sweeps, each job once: every combination of a sweep's values.
+
+    Raises:
+        ConfigError: a syntax error, or an interval of values.
+    """
+    options = [_options(overrides, config_name) for overrides in sweeps]
+    return list(dict.fromkeys(job for values in options for job in itertools.product(*values)))
+
+
+def _options(overrides: Sequence[str], config_name: str) -> list[list[str]]:
+    """The overrides of a multirun, each as the list of single ones that it stands for; of a key, the last."""
+    GlobalHydra.instance().clear()
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        parser = OverridesParser.create(GlobalHydra.instance().config_loader())  # which glob(*) looks through
     try:
-        parsed = OverridesParser.create().parse_overrides(list(overrides))
+        parsed = parser.parse_overrides(list(overrides))
     except HydraException as error:
         raise ConfigError(_explain(error, config_name, overrides)) from error
-    return [
-        [f"{o.get_key_element()}={value}" for value in o.sweep_string_iterator()]
-        if o.is_sweep_override()
-        else [o.input_line]
-        for o in parsed
-        if not o.input_line.startswith("hydra")
-    ]
+    options: dict[str, list[str]] = {}
+    for override in parsed:
+        key = override.get_key_element()
+        options[key] = [override.input_line]
+        if override.is_sweep_override():
+            if not override.is_discrete_sweep():
+                raise ConfigError(f"{override.input_line} has no end of values; list them, or use nsf search")
+            options[key] = [f"{key}={value}" for value in override.sweep_string_iterator()]
+    return list(options.values())
 
 
 def check_sweep(
@@ -234,7 +291,7 @@ def check_sweep(
     Raises:
         ConfigError: see `load`; and whatever `check` raises.
     """
-    options = sweep_options(overrides, config_name)
+    options = _options(overrides, config_name)
     first = [values[0] for values in options]
     for at, values in enumerate(options):
         for value in values:
@@ -293,7 +350,8 @@ def _explain(error: Exception, config_name: str, overrides: Sequence[str]) -> st
     missing = re.search(r"Could not override '([^']+)'", text)
     if missing:
         key = missing.group(1)
-        known = _known_keys(config_name, [o for o in overrides if not o.lstrip("+~").startswith(key)])
+        others = [o for o in overrides if not o.lstrip("+~").startswith(key)]
+        known = _known_keys(config_name, others, of_launcher(key))
         if key in known:
             return f"{key!r} takes no keys beyond its own; set them one by one, or write a scene's yaml"
         near = difflib.get_close_matches(key, known, n=3, cutoff=0.5)
@@ -306,7 +364,7 @@ def _explain(error: Exception, config_name: str, overrides: Sequence[str]) -> st
     nameless = [o for o in overrides if o.startswith("=")]
     if nameless:
         return f"{nameless[0]!r} has no key; give key=value"
-    option = re.search(r"Could not find '([^']+)/([^']+)'", text)
+    option = re.search(r"Could not find '(.+)/([^']+)'", text)
     if option:
         group, name = option.groups()
         known = groups().get(group, [])
@@ -317,9 +375,9 @@ def _explain(error: Exception, config_name: str, overrides: Sequence[str]) -> st
     return first
 
 
-def _known_keys(config_name: str, overrides: Sequence[str]) -> list[str]:
+def _known_keys(config_name: str, overrides: Sequence[str], launcher: bool) -> list[str]:
     try:
-        config = _compose(config_name, overrides)
+        config = launching(overrides, config_name)[0] if launcher else _compose(config_name, overrides)
     except HydraException:
         return list(groups())
     return _keys(OmegaConf.to_container(config, resolve=False))

@@ -43,3 +43,7 @@ class MissingExtraError(NSFError):
 
 class MissingRunError(NSFError):
     """A stage needs the result of an earlier stage that does not exist."""
+
+
+class LaunchError(NSFError):
+    """The jobs of a sweep could not be started: a program or a queue is missing."""

@@ -13,6 +13,8 @@ EXPERIMENTS = _bundled("experiments")
 
 
 def groups() -> dict[str, list[str]]:
-    """Names of the options of every configuration group."""
-    folders = sorted(p for p in CONF.iterdir() if p.is_dir())
-    return {folder.name: sorted(f.stem for f in folder.glob("*.yaml")) for folder in folders}
+    """Names of the options of every configuration group, such as `scene` or `hydra/launcher`."""
+    found: dict[str, list[str]] = {}
+    for file in sorted(CONF.glob("*/**/*.yaml")):
+        found.setdefault(file.parent.relative_to(CONF).as_posix(), []).append(file.stem)
+    return found

@@ -66,6 +66,7 @@ _EXPECTED_WARNINGS = (
     r".*GPU available but not used",
     r".*`isinstance\(treespec, LeafSpec\)` is deprecated",
     r".*does not have many workers",
+    r".*The `srun` command is available on your system but is not used",
 )
 
 

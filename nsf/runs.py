@@ -5,7 +5,7 @@ import json
 import os
 import re
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -15,10 +15,12 @@ from typing import Any
 from nsf.canonical import content_hash, plain
 from nsf.errors import ConfigError, MissingRunError, StorageError
 from nsf.provenance import provenance
-from nsf.storage import write_json, writing
+from nsf.storage import clear_partial, in_use, locked, write_json, writing
 
 FORMAT = 1  # of the folder's layout; a new value gives every run a new hash
 _NAME = re.compile(r"[A-Za-z0-9][\w.+-]*", re.ASCII)
+_LOCK = ".lock"
+_LISTED = 8  # runs that an error names
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,8 @@ class Run:
     """One stage of one scene under one configuration: `root/stage/scene/hash`.
 
     Two runs are equal when they are the same folder. Make one with `open`
-    (from a configuration), `load` (from an id) or `find` (every one there is).
+    (from a configuration), `load` (from an id), `named` (from what a user types), `newest` or `find` (every
+    one there is).
     """
 
     stage: str
@@ -89,55 +92,56 @@ class Run:
         return cls(stage, scene, digest, _root(root))
 
     @classmethod
-    def find(cls, stage: str, scene: str | None = None, root: str | Path | None = None) -> list["Run"]:
-        """Every run of a stage that was ever started, newest first."""
-        manifests = _root(root).glob(f"{stage}/{scene or '*'}/*/manifest.json")
-        runs = [cls(stage, path.parts[-3], path.parts[-2], _root(root)) for path in manifests]
+    def find(
+        cls, stage: str | None = None, scene: str | None = None, root: str | Path | None = None
+    ) -> list["Run"]:
+        """Every run, of a stage or a scene where one is named, that was ever started, newest first."""
+        manifests = _root(root).glob(f"{stage or '*'}/{scene or '*'}/*/manifest.json")
+        runs = [cls(*path.parts[-4:-1], _root(root)) for path in manifests]
         return sorted(runs, key=lambda run: (run.manifest.get("created", ""), run.hash), reverse=True)
 
     @classmethod
-    def named(cls, stage: str, name: str | None = None, root: str | Path | None = None) -> "Run":
-        """The complete run of a stage that a user means.
-
-        Args:
-            stage: such as "deploy".
-            name: the run's id, the beginning of the id, of `scene/hash` or of the hash, or the path of the
-                run's folder; None for the newest complete run.
-            root: folder of all runs, for a name that is no path; NSF_RUNS, else ./runs.
+    def newest(cls, stage: str, root: str | Path | None = None) -> "Run":
+        """The newest complete run of a stage.
 
         Raises:
-            MissingRunError: no run or several fit, which it lists; the run is not complete, or of another
-                stage.
+            MissingRunError: there is none.
         """
-        there = cls.find(stage, root=root)
-        if name is None:
-            if newest := next((run for run in there if run.complete), None):
-                return newest
-            raise MissingRunError(
-                f"no complete {stage} run under {_root(root)}; run `nsf {stage}` first, or set NSF_RUNS"
-            )
+        if run := next((run for run in cls.find(stage, root=root) if run.complete), None):
+            return run
+        raise MissingRunError(
+            f"no complete {stage} run under {_root(root)}; run `nsf {stage}` first, or set NSF_RUNS"
+        )
+
+    @classmethod
+    def named(cls, name: str, stage: str | None = None, root: str | Path | None = None) -> "Run":
+        """The recorded run that a user means, complete or not.
+
+        Args:
+            name: the run's folder, or as much of the beginning of its id, of `scene/hash` or of its hash as
+                no other run shares.
+            stage: such as "deploy"; None for any.
+            root: folder of all runs, for a name that is no folder; NSF_RUNS, else ./runs.
+
+        Raises:
+            MissingRunError: no run or several fit, which it lists; or the folder is of another stage.
+        """
         if (Path(name) / "manifest.json").is_file():
-            return cls._at(Path(name).resolve(), stage)
+            path = Path(name).resolve()
+            if stage not in (None, path.parts[-3]):
+                raise MissingRunError(f"{path} is a {path.parts[-3]} run; name a {stage} run")
+            return cls(*path.parts[-3:], path.parents[2])
+        there, beginning = cls.find(stage, root=root), name.strip("/")
         fit = [
             run
             for run in there
-            if any(n.startswith(name.strip("/")) for n in (run.id, run.id[len(stage) + 1 :], run.hash))
+            if any(n.startswith(beginning) for n in (run.id, f"{run.scene}/{run.hash}", run.hash))
         ]
         if len(fit) != 1:
-            among = "\n  ".join(f"{run.id}  ({run.manifest.get('status')})" for run in fit or there)
-            what = f"{len(fit)} {stage} runs begin with" if fit else f"no {stage} run is, or begins with,"
-            listed = f"; choose one of\n  {among}" if among else f"; run `nsf {stage}` first"
-            raise MissingRunError(f"{what} {name!r} under {_root(root)}{listed}")
-        return fit[0].require()
-
-    @classmethod
-    def _at(cls, path: Path, stage: str) -> "Run":
-        """The complete run in a folder."""
-        found, scene, digest = path.parts[-3:]
-        run = cls(found, scene, digest, path.parents[2])
-        if found != stage:
-            raise MissingRunError(f"{path} is a {found} run; name a {stage} run")
-        return run.require()
+            kind = f"{stage} run" if stage else "run"
+            what = f"{len(fit)} {kind}s begin with" if fit else f"no {kind} is, or begins with,"
+            raise MissingRunError(f"{what} {name!r} under {_root(root)}; {_listed(fit or there, stage)}")
+        return fit[0]
 
     @property
     def id(self) -> str:
@@ -164,6 +168,11 @@ class Run:
         return tuple(self.manifest.get("parents", ())) if self._parents is None else self._parents
 
     @property
+    def parent_runs(self) -> list["Run"]:
+        """The runs whose files this one reads, whether or not they are there."""
+        return [Run(*parent.split("/"), self.root) for parent in self.parents]
+
+    @property
     def manifest(self) -> dict[str, Any]:
         """The manifest on disk; empty when there is none or it cannot be read."""
         try:
@@ -171,6 +180,16 @@ class Run:
         except (OSError, ValueError):
             return {}
         return manifest if isinstance(manifest, dict) else {}
+
+    @property
+    def status(self) -> str:
+        """The manifest's status, or "killed" where it says "running" and no process holds the run's lock."""
+        status = self.manifest.get("status", "missing")
+        if status != "running":
+            return status
+        with suppress(StorageError):  # of someone else's folder
+            return status if in_use(self.path / _LOCK) else "killed"
+        return status
 
     @property
     def complete(self) -> bool:
@@ -203,13 +222,32 @@ class Run:
         if self.complete:
             return self
         manifest = self.manifest
-        status = manifest.get("status", "not there")
+        status = self.status if manifest else "not there"
         lost = ", ".join(self._lost(manifest))
         state = f"not whole ({lost} missing or cut short)" if status == "complete" else status
         why = f" ({manifest['error']})" if manifest.get("error") else ""
         raise MissingRunError(
             f"{self.path} is {state}{why}; run `nsf {self.stage} scene={self.scene}` with the same keys"
         )
+
+    @contextmanager
+    def claimed(self, say: Callable[[str], object] | None = None) -> Iterator[bool]:
+        """Keep other processes from making this run while the block works.
+
+        Look whether the run is complete inside the block: another process may have made it meanwhile.
+
+        Args:
+            say: told that another process makes the run, which is then waited for; None does not wait.
+
+        Yields:
+            Whether the run is claimed; False only where another process makes it and nothing is waited for.
+
+        Raises:
+            StorageError: the folder cannot be written.
+        """
+        told = f"{self.stage}: waiting for another process, which is making {self.id}"
+        with locked(self.path / _LOCK, None if say is None else lambda: say(told)) as claimed:
+            yield claimed
 
     @contextmanager
     def record(
@@ -220,6 +258,7 @@ class Run:
         The status is "running" from the start; "complete" after the block,
         "failed" after an exception, "interrupted" after an interrupt. Every
         exception goes on to the caller. A killed process leaves "running".
+        Only one process records a run at a time; see `claimed`.
 
         Args:
             device: such as "cpu" or "cuda:0".
@@ -242,8 +281,6 @@ class Run:
             "precision": precision,
             "created": datetime.now(UTC).isoformat(timespec="microseconds"),
         }
-        self._write_config()
-        write_json(self.path / "manifest.json", {**manifest, "status": "running"})
         start = time.perf_counter()
 
         def close(status: str, metrics: dict[str, Any], **more: Any) -> None:
@@ -256,18 +293,22 @@ class Run:
             }
             write_json(self.path / "manifest.json", manifest | ending)
 
-        try:
-            yield record
-            close("complete", record.plain_metrics())
-        except BaseException as error:
-            status = "failed" if isinstance(error, Exception) else "interrupted"
-            metrics: dict[str, Any] = {}
-            # A full disk, or a metric that no manifest can hold, must not hide the first error.
-            with suppress(ConfigError):
-                metrics = record.plain_metrics()
-            with suppress(StorageError):
-                close(status, metrics, error=f"{type(error).__name__}: {error}")
-            raise
+        with self.claimed(lambda told: None):
+            clear_partial(self.path)
+            self._write_config()
+            write_json(self.path / "manifest.json", {**manifest, "status": "running"})
+            try:
+                yield record
+                close("complete", record.plain_metrics())
+            except BaseException as error:
+                status = "failed" if isinstance(error, Exception) else "interrupted"
+                metrics: dict[str, Any] = {}
+                # A full disk, or a metric that no manifest can hold, must not hide the first error.
+                with suppress(ConfigError):
+                    metrics = record.plain_metrics()
+                with suppress(StorageError):
+                    close(status, metrics, error=f"{type(error).__name__}: {error}")
+                raise
 
     def _write_config(self) -> None:
         from omegaconf import OmegaConf
@@ -313,6 +354,16 @@ class Record:
             ConfigError: a metric is of a kind that JSON cannot hold.
         """
         return plain(self.metrics, finite=False, key="metrics")
+
+
+def _listed(runs: Sequence[Run], stage: str | None) -> str:
+    """The remedy for a name that fits none or several: the runs to choose from, newest first."""
+    if not runs:
+        return f"run `nsf {stage or 'run'}` first"
+    lines = [f"{run.id}  ({run.status})" for run in runs[:_LISTED]]
+    if len(runs) > _LISTED:
+        lines.append(f"and {len(runs) - _LISTED} more, which `nsf runs` lists")
+    return "choose one of" + "".join(f"\n  {line}" for line in lines)
 
 
 def _root(root: str | Path | None) -> Path:

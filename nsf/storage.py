@@ -5,10 +5,12 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from filelock import FileLock, Timeout
 
 from nsf.errors import StorageError
 
@@ -24,6 +26,8 @@ _REMEDIES = {
 }
 # torch.save reports a full disk as a RuntimeError without a cause; a file system this empty gives it away.
 _FULL_BYTES = 64 * 1024
+_PARTIAL = ".partial-"  # of hidden folders in which files are written
+_LOCK_SECONDS = 0.2  # between two looks at a lock that another process has
 
 
 @contextmanager
@@ -44,7 +48,7 @@ def writing(path: str | Path) -> Iterator[Path]:
     path = Path(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        folder = Path(tempfile.mkdtemp(prefix=".partial-", dir=path.parent))
+        folder = Path(tempfile.mkdtemp(prefix=_PARTIAL, dir=path.parent))
     except OSError as error:
         raise _storage_error(
             path, error.strerror or str(error), _REMEDIES.get(error.errno or 0, _ACCESS)
@@ -61,6 +65,72 @@ def writing(path: str | Path) -> Iterator[Path]:
         raise _storage_error(path, os.strerror(fault), _REMEDIES[fault]) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def clear_partial(folder: Path) -> None:
+    """Remove what killed processes left half-written below a folder that no other process writes to."""
+    for left in folder.rglob(f"{_PARTIAL}*"):
+        shutil.rmtree(left, ignore_errors=True)
+
+
+@contextmanager
+def locked(path: str | Path, waiting: Callable[[], object] | None = None) -> Iterator[bool]:
+    """Hold a lock that one process has at a time; any thread of it may, and may again.
+
+    The operating system frees the lock of a process that ended, however it ended; the file stays.
+
+    Args:
+        path: of the lock's file; missing folders are made.
+        waiting: called once before waiting for another process; without it, nothing is waited for.
+
+    Yields:
+        Whether the lock is held; False only where another process has it and nothing is waited for.
+
+    Raises:
+        StorageError: the file cannot be made.
+    """
+    path = Path(path)
+    lock = _lock(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        held = _acquired(lock, waiting)
+    except OSError as error:
+        raise _storage_error(
+            path, error.strerror or str(error), _REMEDIES.get(error.errno or 0, _ACCESS)
+        ) from error
+    try:
+        yield held
+    finally:
+        if held:
+            lock.release()
+
+
+def in_use(path: str | Path) -> bool:
+    """Whether a process, this one included, holds the lock of that file.
+
+    Raises:
+        StorageError: the file cannot be opened.
+    """
+    if _lock(Path(path)).is_locked:
+        return True
+    with locked(path) as free:
+        return not free
+
+
+def _lock(path: Path) -> FileLock:
+    # One object a path, so that a second claim of the same process is no claim of another one.
+    return FileLock(path, thread_local=False, is_singleton=True, poll_interval=_LOCK_SECONDS)
+
+
+def _acquired(lock: FileLock, waiting: Callable[[], object] | None) -> bool:
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        if waiting is None:
+            return False
+        waiting()
+        lock.acquire()
+    return True
 
 
 def write_json(path: str | Path, value: Any) -> None:

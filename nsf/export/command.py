@@ -68,9 +68,11 @@ def main(arguments: Sequence[str]) -> int:
     from nsf.extras import optional
     from nsf.runs import Run
 
-    run = Run.named("deploy", asked.run)
     if asked.run is None:
+        run = Run.newest("deploy")
         print(f"export: the newest deploy run, {run.id}")
+    else:
+        run = Run.named(asked.run, "deploy").require()
     from nsf.export.playback import Playback
 
     writers = {name: importlib.import_module(f"nsf.export.{name}") for name in formats}

@@ -9,13 +9,13 @@ from typing import Any
 
 import pytorch_lightning as pl
 import torch
-from pytorch_lightning.loggers import CSVLogger, Logger, TensorBoardLogger
 from torch import Tensor
 from typing_extensions import override
 
 from nsf.errors import InstabilityError
 from nsf.kinematics.phases import PHASES, Fit, seed_of
 from nsf.kinematics.schedules import Trainer
+from nsf.kinematics.tracking import loggers
 from nsf.progress import Progress, quiet_lightning
 from nsf.storage import writing
 
@@ -204,7 +204,7 @@ def descend(descent: Descent, steps: int, folder: Path, tracking: str | None) ->
             devices=[device.index or 0] if device.type == "cuda" else 1,
             max_epochs=-1,
             enable_checkpointing=False,  # ModelCheckpoint counts the steps of Lightning's wrapped optimizer
-            logger=_loggers(folder, tracking),
+            logger=loggers(folder, tracking),
             log_every_n_steps=1,
             enable_progress_bar=False,
             enable_model_summary=False,
@@ -217,12 +217,3 @@ def descend(descent: Descent, steps: int, folder: Path, tracking: str | None) ->
             # Lightning answers an interrupt with exit code 1; the caller is to see the interrupt.
             raise KeyboardInterrupt from stop
     return module.loss, module.seconds
-
-
-def _loggers(folder: Path, tracking: str | None) -> list[Logger]:
-    # A resumed phase logs into a new version, for CSVLogger deletes what it finds.
-    version = str(len(list((folder / "csv").glob("*"))))
-    loggers: list[Logger] = [CSVLogger(folder, name="csv", version=version)]
-    if tracking == "tensorboard":
-        loggers.append(TensorBoardLogger(folder, name="tensorboard", version=version))
-    return loggers

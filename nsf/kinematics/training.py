@@ -12,14 +12,13 @@ from typing import Any, Protocol
 import torch
 
 from nsf.data import Snapshots
-from nsf.errors import ConfigError
 from nsf.kinematics.descent import CHECKPOINT, Descent, Steps, descend
 from nsf.kinematics.manifold import Manifold
 from nsf.kinematics.phases import Fit, at_least, seeded
 from nsf.kinematics.schedules import Trainer
+from nsf.kinematics.tracking import check_tracking
 from nsf.storage import writing
 
-TRACKING = (None, "tensorboard")
 WEIGHTS_STREAM = 1 << 30  # apart from the phases' streams
 PROBE_STEPS, PROBE_SECONDS = 5, 1.0  # taken at a time, and the least time over which a rate is measured
 
@@ -62,7 +61,7 @@ def train(
         seed: of the initial weights, batches and noise.
         folder: keeps logs, checkpoints and finished phases; one training a folder.
         device: "cpu", "cuda", "cuda:1".
-        tracking: "tensorboard" for a live page beside the CSV logs.
+        tracking: "tensorboard" or "mlflow" for a live page beside the CSV logs.
         deterministic: use torch's deterministic algorithms.
 
     Returns:
@@ -72,14 +71,14 @@ def train(
 
     Raises:
         ConfigError: a value is out of range.
+        MissingExtraError: what tracks is not installed.
         InstabilityError: a loss is not finite.
         KeyboardInterrupt: on an interrupt, after which a second call goes on.
 
     Source: Zong et al. 2023, section 4.5.
     """
     at_least("latent_dim", latent_dim, 1)
-    if tracking not in TRACKING:
-        raise ConfigError(f"tracking={tracking!r} is unknown; choose null or tensorboard")
+    check_tracking(tracking)
     device, folder = torch.device(device), Path(folder)
     with _determinism(deterministic):
         prepared, total = _timed(folder / "prepared.pt", lambda: field.prepare(snapshots, latent_dim))

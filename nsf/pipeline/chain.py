@@ -69,11 +69,12 @@ class Pipeline(Plan):
             self.say(f"simulate: {len(runs) - len(missing)} of {len(runs)} trajectories are there, reused")
         if missing:
             started = time.perf_counter()
-            self._simulate(missing)
-            self.say(f"simulate: {len(missing)} trajectories in {time.perf_counter() - started:.1f} s")
+            made = self._simulate(missing)
+            elsewhere = f", {len(missing) - made} by another process" if made < len(missing) else ""
+            self.say(f"simulate: {made} trajectories in {time.perf_counter() - started:.1f} s{elsewhere}")
         return list(runs)
 
-    def _simulate(self, runs: dict[Run, tuple[float, Scene]]) -> None:
+    def _simulate(self, runs: dict[Run, tuple[float, Scene]]) -> int:
         c, name, unit = self.config, self.scene.parameters.name, self.scene.parameters.unit
 
         def job(run: Run, value: float, scene: Scene) -> Job:
@@ -82,15 +83,17 @@ class Pipeline(Plan):
             return Job(run, f"{name} {value:g}{unit}", parameters, build)
 
         jobs = [job(run, *needed) for run, needed in runs.items()]
-        simulate(jobs, self.scene.steps, self.scene.dx, self.stored, self.device, c.precision)
+        return simulate(
+            jobs, self.scene.steps, self.scene.dx, self.stored, self.device, c.precision, self.say
+        )
 
     def train(self) -> Run:
         """The manifold of the training trajectories."""
-        run = self.training
-        if self._reused(run):
-            return run
+        return self._made(self.training, self._train)
+
+    def _train(self, run: Run) -> None:
         c = self.config
-        paths = [self.simulation(v).require().path / "trajectory.h5" for v in self.split.train]
+        paths = [self.simulation(v).path / "trajectory.h5" for v in self.split.train]
         snapshots = Snapshots(
             [Trajectory.open(p) for p in paths], device=self.device, resident=c.data.resident
         )
@@ -113,7 +116,6 @@ class Pipeline(Plan):
         snapshots.close()
         seconds = metrics["training_seconds"]
         self.say(f"train: field={manifold.field}, r={c.latent_dim} in {seconds:.1f} s → {run.id}")
-        return run
 
     def _manifold(self) -> Manifold:
         return Manifold.load(self.training.require().path / "manifold.pt")
@@ -138,9 +140,9 @@ class Pipeline(Plan):
 
     def deploy(self) -> Run:
         """Reduced trajectories of the held-out values, through Lightning's `Trainer.predict`."""
-        run = self.deployment
-        if self._reused(run):
-            return run
+        return self._made(self.deployment, self._deploy)
+
+    def _deploy(self, run: Run) -> None:
         manifold = self._manifold()
         with run.record(device=self.device, precision=self.config.precision) as record:
             build = partial(self.solver_at, manifold)
@@ -168,7 +170,6 @@ class Pipeline(Plan):
             f"deploy: method={self.config.method.name}, |S|={rollouts[0].sample}, "
             f"{len(rollouts)} values → {run.id}"
         )
-        return run
 
     def _go_on(self, manifold: Manifold, rollout: Rollout, path: Path) -> None:
         solver = self.solver_at(manifold, rollout.parameter)
@@ -207,10 +208,10 @@ class Pipeline(Plan):
 
     def evaluate(self) -> Run:
         """Errors and costs of the reduced trajectories."""
-        run = self.evaluation
-        if self._reused(run):
-            return run
-        deployment, truths, manifold = self.deployment.require(), self._truths(), self._manifold()
+        return self._made(self.evaluation, self._evaluate)
+
+    def _evaluate(self, run: Run) -> None:
+        deployment, truths, manifold = self.deployment, self._truths(), self._manifold()
         with run.record(device=self.device, precision=self.config.precision) as record:
             rollouts = [Rollout.open(deployment.path / rollout_file(index)) for index in range(len(truths))]
             comparisons = [
@@ -225,11 +226,10 @@ class Pipeline(Plan):
             summary = results.summarise(self.deployed, manifold, table, comparisons, rollouts, seconds)
             results.write(record, table, comparisons, cost, summary)
         self.say(f"evaluate: mean δ {100 * table['delta'].mean():.3g} % over {len(table)} values → {run.id}")
-        return run
 
     def _truths(self) -> list[Path]:
         """Files of the full-order trajectories that the deployed ones are held to."""
-        return [self.truth(value).require().path / "trajectory.h5" for value in self.held_out]
+        return [self.truth(value).path / "trajectory.h5" for value in self.held_out]
 
     def _compare(self, manifold: Manifold, rollout: Rollout, truth: Path, continuation: Path) -> Comparison:
         shown = (self.config.evaluation.picture_particles, self.config.evaluation.picture_frames)
@@ -278,11 +278,11 @@ class Pipeline(Plan):
 
     def superresolve(self) -> Run:
         """The reduced trajectories at many more points, beside full-order ones of as many particles."""
-        run = self.superresolution
-        if self._reused(run):
-            return run
+        return self._made(self.superresolution, self._superresolve)
+
+    def _superresolve(self, run: Run) -> None:
         c, asked = self.config, self.config.super_resolution
-        deployment, truths, manifold = self.deployment.require(), self._truths(), self._manifold()
+        deployment, truths, manifold = self.deployment, self._truths(), self._manifold()
         # Evenly spread, without frame 0, at which nothing has moved.
         steps = self.scene.steps
         frames = np.unique(np.linspace(0, steps, min(asked.frames, steps) + 1).round().astype(int))[1:]
@@ -310,10 +310,15 @@ class Pipeline(Plan):
             f"({100 * table['particles_delta'].mean():.3g} % at the {len(manifold.X):,} particles), "
             f"queried in {table['seconds'].sum():.1f} s → {run.id}"
         )
-        return run
 
-    def _reused(self, run: Run) -> bool:
-        if run.complete:
-            self.say(f"{run.stage}: inputs unchanged, reused → {run.id}")
-            return True
-        return False
+    def _made(self, run: Run, make: Callable[[Run], None]) -> Run:
+        """The run, made here unless it is there or another process makes it meanwhile."""
+        if not run.complete:
+            for parent in run.parent_runs:
+                parent.require()
+            with run.claimed(self.say):
+                if not run.complete:
+                    make(run)
+                    return run
+        self.say(f"{run.stage}: inputs unchanged, reused → {run.id}")
+        return run

@@ -1,7 +1,6 @@
 """Experiments: a question, and the jobs that answer it (one file each in `experiments/`)."""
 
 import difflib
-import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,8 +90,7 @@ class Experiment:
     @property
     def jobs(self) -> list[Job]:
         """Every job, each once."""
-        sweeps = [configuration.sweep_options(sweep) for sweep in self.sweeps]
-        found = dict.fromkeys(job for sweep in sweeps for job in itertools.product(*sweep))
+        found = configuration.jobs(self.sweeps)
 
         def told(job: tuple[str, ...]) -> set[str]:
             return {override for override in job if override.split("=")[0] in _COLUMNS}

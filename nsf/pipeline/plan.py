@@ -13,7 +13,7 @@ from nsf.data import Split
 from nsf.dynamics.interop import torch_device
 from nsf.dynamics.sampling import check_well_posed
 from nsf.errors import ConfigError
-from nsf.kinematics.training import TRACKING
+from nsf.kinematics.tracking import check_tracking
 from nsf.mpm import FP32, FP64, Precision, precision_of
 from nsf.mpm.device import warp_device
 from nsf.mpm.stability import check_colliders, check_time_step
@@ -92,7 +92,7 @@ class Plan:
         c = self.config
         _one_of("deploy.split", c.deploy.split, ("test", "validation", "train"))
         _one_of("deploy.on_distrust", c.deploy.on_distrust, ("report", "full_order"))
-        _one_of("tracking", c.tracking, TRACKING)
+        check_tracking(c.tracking)
         _one_of("data.resident", c.data.resident, (True, False, "auto"))
         _one_of("data.dtype", c.data.dtype, tuple(_STORED))
         if str(c.report.name) in ("", "..") or Path(str(c.report.name)).name != str(c.report.name):

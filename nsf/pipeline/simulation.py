@@ -40,10 +40,30 @@ class Job:
     blocks: queue.Queue = field(default_factory=lambda: queue.Queue(_BLOCKS))
 
 
+@dataclass(frozen=True)
+class _Shared:
+    """What the jobs have in common; see `simulate`."""
+
+    steps: int
+    dx: float
+    stored: Precision
+    device: str
+    precision: str
+
+
 def simulate(
-    jobs: Iterable[Job], steps: int, dx: float, stored: Precision, device: str, precision: str
-) -> None:
+    jobs: Iterable[Job],
+    steps: int,
+    dx: float,
+    stored: Precision,
+    device: str,
+    precision: str,
+    say: Callable[[str], object],
+) -> int:
     """Run and store every job; each file appears when it is whole.
+
+    Processes that are given the same jobs share them: what another one is making is left to it, and waited
+    for at the end.
 
     Args:
         jobs: trajectories to be made.
@@ -51,6 +71,10 @@ def simulate(
         dx: grid spacing [m], for the file.
         stored: precision of the stored frames.
         device, precision: of the physics, for the manifest.
+        say: told which trajectory is waited for.
+
+    Returns:
+        How many were made here.
 
     Raises:
         InstabilityError: a particle became non-finite or left the grid.
@@ -58,27 +82,37 @@ def simulate(
         KeyboardInterrupt: passed on; what is whole stays, what is not is removed.
     """
     jobs = list(jobs)
+    shared = _Shared(steps, dx, stored, device, precision)
     with (
         ThreadPoolExecutor(_WRITERS) as pool,
         Progress("simulate", len(jobs) * (steps + 1), "frames") as progress,
     ):
         writing: list[Future] = []
-        for job in jobs:
-            progress.describe(job.label)
-            writing.append(_start(job, pool, steps, dx, stored, device, precision, progress))
+        for wait in (None, say):
+            left = []
+            for job in jobs:
+                with contextlib.ExitStack() as claim:
+                    if not claim.enter_context(job.run.claimed(wait)):
+                        left.append(job)
+                    elif not job.run.complete:
+                        progress.describe(job.label)
+                        writing.append(_start(job, claim, pool, shared, progress))
+            jobs = left
         for future in writing:
             future.result()
+    return len(writing)
 
 
-def _start(job: Job, pool, steps: int, dx: float, stored: Precision, device, precision, progress) -> Future:
-    """Compute one trajectory while its writer, and those of earlier ones, work."""
+def _start(
+    job: Job, claim: contextlib.ExitStack, pool: ThreadPoolExecutor, shared: _Shared, progress: Progress
+) -> Future:
+    """Compute one trajectory while its writer, which takes the claim over, and those of earlier ones work."""
     solver = job.build()
-    dtype = np.dtype(stored.numpy).name
     try:
-        stored_by = pool.submit(_store, job, solver, steps + 1, dx, dtype, device, precision)
+        stored_by = pool.submit(_store, job, claim.pop_all(), solver, shared)
         started = time.perf_counter()
         try:
-            for block in blocks(solver, steps, stored, after=progress.advance):
+            for block in blocks(solver, shared.steps, shared.stored, after=progress.advance):
                 _hand_over(job, block, stored_by)
         except InstabilityError as error:
             raise diagnosed(error, job.build, solver.steps_taken) from error
@@ -109,11 +143,9 @@ def _stop(job: Job, error: BaseException) -> None:
     job.blocks.put_nowait(error)
 
 
-def _store(
-    job: Job, solver: FullOrderMPM, frames: int, dx: float, dtype: str, device: str, precision: str
-) -> None:
+def _store(job: Job, claim: contextlib.ExitStack, solver: FullOrderMPM, shared: _Shared) -> None:
     constants = solver.constants
-    with job.run.record(device=device, precision=precision) as record:
+    with claim, job.run.record(device=shared.device, precision=shared.precision) as record:
         writer = TrajectoryWriter(
             job.run.path / "trajectory.h5",
             X=constants.X,
@@ -121,9 +153,9 @@ def _store(
             volume0=constants.volume0,
             parameters=job.parameters,
             dt=solver.dt,
-            dx=dx,
-            frames=frames,
-            dtype=dtype,
+            dx=shared.dx,
+            frames=shared.steps + 1,
+            dtype=np.dtype(shared.stored.numpy).name,
         )
         n = 0
         with writer:

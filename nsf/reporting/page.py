@@ -22,7 +22,7 @@ DEFINITIONS = (
     ("speedup", "full-order over reduced wall time, of one step and of the whole simulation."),
 )
 
-_CSS = """
+CSS = """
 :root { color-scheme: light dark;
   --ink: #1d1d1f; --muted: #5f6368; --line: #d9dce0; --page: #fff; --band: #f5f6f8; }
 @media (prefers-color-scheme: dark) {
@@ -99,7 +99,7 @@ def html_page(page: Page) -> str:
     return (
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{_esc(page.title)}</title>\n<style>{_CSS}</style>\n</head>\n<body>\n<main>\n{body}\n</main>\n"
+        f"<title>{_esc(page.title)}</title>\n<style>{CSS}</style>\n</head>\n<body>\n<main>\n{body}\n</main>\n"
         "</body>\n</html>\n"
     )
 

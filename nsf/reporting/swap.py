@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from nsf.errors import ConfigError, StorageError
+from nsf.storage import locked
 
 MARK = "sources.json"
 """The file by which a folder is known as a report and may be replaced."""
@@ -35,7 +36,8 @@ def replaced(folder: Path) -> Iterator[Path]:
     try:
         yield fresh
         fresh.chmod(0o755)
-        _take_place(fresh, folder)
+        with locked(folder.with_name(f".{folder.name}.lock"), waiting=lambda: None):
+            _take_place(fresh, folder)
     except OSError as error:
         raise StorageError(
             f"the report for {folder} was not written: {error}; the old one, if any, stands"

@@ -82,14 +82,15 @@ def test_an_experiment_runs_its_jobs_and_reports_them(nsf, copied, tmp_path):
     """experiments/sand.yaml, made tiny and of one field: two of its three jobs are then the same."""
     root = copied("simulate")
     tiny = ["field=basis", "evaluation.trials=1", "trainer.budget_minutes=null"]
-    outcome = nsf("run", root, "+experiment=sand", "scale=small", *tiny, faults=[PlainReport()])
+    arguments = ["+experiment=sand", "scale=small", *tiny]
+    outcome = nsf("run", root, *arguments, faults=[PlainReport()], multirun=True)
     assert outcome.code == 0, outcome.err
     report = tmp_path / "work/reports/sand_small"
     rows = pd.read_csv(report / "results.csv")
     found = set(zip(rows["method"], rows["field"], strict=True))
     assert found == {("nsf", "basis"), ("deformation_only", "basis")}
     assert "Does a neural stress field" in (report / "index.md").read_text()
-    again = nsf("report", root, "+experiment=sand", "scale=small", *tiny, faults=[PlainReport()])
+    again = nsf("report", root, *arguments, faults=[PlainReport()])
     assert again.code == 0
     assert "2 jobs, 0 missing" in again.out
 

@@ -210,6 +210,33 @@ def test_a_stage_before_its_time_names_the_command(nsf, tmp_path, stage, needed)
     assert not [p for p in files(tmp_path) if p.name != "manifest.json"]
 
 
+def test_runs_are_listed_and_compared(nsf, chain, monkeypatch):
+    monkeypatch.setenv("NSF_RUNS", str(chain.root))
+    code, out, _ = nsf("runs", "stage=evaluate", "scene=sand", "latent_dim=4", tiny_scene=False)
+    assert code == 0
+    assert chain.pipeline.evaluation.hash in out
+    one, two = (chain.pipeline.simulation(value).hash for value in (22.0, 30.0))
+    code, out, _ = nsf("runs", "diff", one, two[:8], tiny_scene=False)
+    assert code == 0
+    assert "parameter.value" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "quoted"),
+    [
+        (["stage=evaluate", "sort=dleta"], "did you mean delta"),
+        (["--all"], "'--all' is not key=value"),
+        (["diff", "abc"], "takes two runs, not 1"),
+        (["diff", "abc", "def"], "run 'abc'"),
+    ],
+)
+def test_runs_refuses_what_it_does_not_know(nsf, chain, monkeypatch, words, quoted):
+    monkeypatch.setenv("NSF_RUNS", str(chain.root))
+    code, _, err = nsf("runs", *words, tiny_scene=False)
+    assert code == 2
+    assert quoted in err
+
+
 def test_point_of_every_material(nsf, tmp_path):
     for material in groups()["material"]:
         code, out, _ = nsf("point", f"material={material}", "path=simple_shear", tiny_scene=False)

@@ -90,7 +90,7 @@ def test_every_option_builds(group):
 
 
 def test_every_yaml_is_in_a_group_or_primary():
-    assert {p.parent.name for p in CONF.rglob("*.yaml")} - set(groups()) == {CONF.name}
+    assert {p.parent.relative_to(CONF).as_posix() for p in CONF.rglob("*.yaml")} - set(groups()) == {"."}
 
 
 @pytest.mark.parametrize(
@@ -186,3 +186,32 @@ def test_broken_yaml_names_file_and_line(tmp_path, monkeypatch):
     monkeypatch.setattr(config, "CONF", tmp_path / "conf")
     with pytest.raises(ConfigError, match=r"broken\.yaml.*line [23].*correct the yaml"):
         config.load(["method=broken"])
+
+
+def test_jobs_are_every_combination_once():
+    sweeps = [["scene=sand,bread", "latent_dim=4"], ["scene=bread", "latent_dim=4", "field=glob(m*)"]]
+    assert config.jobs(sweeps) == [
+        ("scene=sand", "latent_dim=4"),
+        ("scene=bread", "latent_dim=4"),
+        ("scene=bread", "latent_dim=4", "field=mlp"),
+    ]
+    assert config.jobs([["seed=range(0,3)", "seed=1,2"]]) == [("seed=1",), ("seed=2",)]
+    assert config.jobs([sweeps[0], sweeps[0]]) == config.jobs([sweeps[0]])
+
+
+def test_an_interval_is_for_a_search():
+    with pytest.raises(ConfigError, match=r"interval.*nsf search"):
+        config.jobs([["latent_dim=interval(2,8)"]])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "quoted"),
+    [
+        (["hydra/launcher=slurmm"], "did you mean slurm?"),
+        (["hydra/launcher=slurm", "hydra.launcher.partitionn=a"], "did you mean hydra.launcher.partition"),
+        (["hydra.launcher.n_job=2", "hydra/launcher=joblib"], "did you mean hydra.launcher.n_jobs"),
+    ],
+)
+def test_a_launcher_that_is_not_there(overrides, quoted):
+    with pytest.raises(ConfigError, match=re.escape(quoted)):
+        config.launching(overrides)

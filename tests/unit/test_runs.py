@@ -2,7 +2,9 @@
 
 import hashlib
 import json
+import multiprocessing
 import os
+import signal
 import subprocess
 
 import numpy as np
@@ -97,7 +99,7 @@ def test_a_recorded_run(run):
     assert (manifest["device"], manifest["seed"], manifest["precision"]) == ("cuda:0", 1, "fp32")
     assert manifest["seconds"] >= 0
     assert manifest.keys() >= {"stage", "scene", "hash", "commit", "dirty", "versions", "created"}
-    assert sorted(os.listdir(child.path)) == ["config.yaml", "manifest.json", "nets"]
+    assert sorted(os.listdir(child.path)) == [".lock", "config.yaml", "manifest.json", "nets"]
 
 
 def test_the_config_on_disk_is_plain_and_the_same(run):
@@ -150,6 +152,81 @@ def test_a_full_disk_at_the_end_does_not_hide_the_error(run, monkeypatch):
 
     with pytest.raises(ValueError, match="first"):
         work()
+
+
+SPAWN = multiprocessing.get_context("spawn")
+
+
+def hold(run, started, finish):
+    """Record a run, and say when it has begun; the end waits for a word."""
+    with run.record() as record:
+        (run.path / "data.bin").write_text("theirs")
+        record.output("data.bin")
+        started.set()
+        finish.wait(60)
+
+
+@pytest.fixture
+def held(run):
+    """(run, its other process, the word that lets it finish): another process is recording the run."""
+    started, finish = SPAWN.Event(), SPAWN.Event()
+    process = SPAWN.Process(target=hold, args=(run, started, finish))
+    process.start()
+    assert started.wait(60)
+    yield run, process, finish
+    process.kill()
+    process.join()
+
+
+def test_a_second_process_waits_and_finds_the_run_complete(held):
+    run, _, finish = held
+    told = []
+
+    def say(line):
+        told.append(line)
+        finish.set()
+
+    assert run.status == "running"
+    with run.claimed() as mine:
+        assert not mine
+    assert not run.complete
+    with run.claimed(say) as mine:
+        assert mine
+        assert run.complete
+    assert told == [f"simulate: waiting for another process, which is making {run.id}"]
+    with run.claimed(say):
+        assert len(told) == 1  # a free run is not waited for
+
+
+def test_a_killed_process_leaves_its_run_free(held):
+    run, process, _ = held
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    assert run.manifest["status"] == "running"
+    assert run.status == "killed"
+    with pytest.raises(MissingRunError, match="is killed; run `nsf simulate"):
+        run.require()
+    with run.claimed() as mine:
+        assert mine
+    assert recorded(run).complete
+
+
+def test_what_a_killed_process_left_half_written_is_removed(run):
+    for folder in (run.path / ".partial-1", run.path / "g" / ".partial-2"):
+        folder.mkdir(parents=True)
+        (folder / "trajectory.h5").write_text("half")
+    recorded(run)
+    assert not list(run.path.rglob(".partial-*"))
+
+
+def test_a_run_is_claimed_by_a_process_and_not_by_a_thread(run):
+    with run.claimed() as mine, run.claimed() as again, run.record():
+        assert mine
+        assert again
+        assert run.status == "running"
+    assert run.status == "complete"
+    with run.claimed() as mine:
+        assert mine
 
 
 @pytest.mark.parametrize("damage", ["shrink", "remove", "manifest", "list", "foreign", "outputs"])
@@ -227,31 +304,32 @@ def test_a_run_is_named_by_any_clear_beginning(tmp_path, monkeypatch):
     ]
     for run in runs:
         names = (run.id, run.id[:-3], run.hash, run.hash[:8], f"{run.scene}/{run.hash[:8]}", str(run.path))
-        assert {Run.named("deploy", name, tmp_path) for name in names} == {run}
+        assert {Run.named(name, "deploy", tmp_path) for name in names} == {run}
     monkeypatch.chdir(runs[0].path.parent)
-    assert Run.named("deploy", runs[0].hash, "elsewhere").id == runs[0].id  # its folder, from here
-    assert Run.named("deploy", root=tmp_path) == runs[-1]
+    assert Run.named(runs[0].hash, "deploy", "elsewhere").id == runs[0].id  # its folder, from here
+    assert Run.newest("deploy", tmp_path) == runs[-1]
     newest = Run.open("deploy", "sand", {"k": 3}, root=tmp_path)
     with pytest.raises(ValueError, match="lost"), newest.record():
         raise ValueError("lost")
-    assert Run.named("deploy", root=tmp_path) == runs[-1]  # the newest that is complete
-    with pytest.raises(MissingRunError, match=r"failed \(ValueError: lost\)"):
-        Run.named("deploy", newest.hash, tmp_path)
+    assert Run.newest("deploy", tmp_path) == runs[-1]  # the newest that is complete
+    assert Run.named(newest.hash, root=tmp_path).status == "failed"
 
 
 def test_a_run_named_badly_lists_what_is_there(tmp_path):
     with pytest.raises(MissingRunError, match=r"no complete deploy run .* run `nsf deploy` first"):
-        Run.named("deploy", root=tmp_path)
+        Run.newest("deploy", tmp_path)
     with pytest.raises(MissingRunError, match=r"begins with, 'sand' .* run `nsf deploy` first"):
-        Run.named("deploy", "sand", tmp_path)
+        Run.named("sand", "deploy", tmp_path)
     runs = [recorded(Run.open("deploy", "sand", {"k": k}, root=tmp_path)) for k in (1, 2)]
     for name, told in (("sand", "2 deploy runs begin with 'sand'"), ("cake", "no deploy run is, or begins")):
         with pytest.raises(MissingRunError, match=told) as caught:
-            Run.named("deploy", name, tmp_path)
+            Run.named(name, "deploy", tmp_path)
         assert all(f"{run.id}  (complete)" in str(caught.value) for run in runs)
     train = recorded(Run.open("train", "sand", {}, root=tmp_path))
+    with pytest.raises(MissingRunError, match="3 runs begin with ''"):
+        Run.named("", root=tmp_path)
     with pytest.raises(MissingRunError, match="is a train run; name a deploy run"):
-        Run.named("deploy", str(train.path))
+        Run.named(str(train.path), "deploy")
 
 
 def test_plain_of_tensors_and_paths(tmp_path):

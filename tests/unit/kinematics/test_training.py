@@ -1,12 +1,13 @@
 """Schedules, resumption to the bit, and what training refuses."""
 
 import signal
+import sys
 import time
 
 import pytest
 import torch
 
-from nsf.errors import ConfigError, InstabilityError
+from nsf.errors import ConfigError, InstabilityError, MissingExtraError
 from nsf.kinematics import descent, training
 from nsf.kinematics.basis import BasisField
 from nsf.kinematics.mlp import MlpField
@@ -219,5 +220,30 @@ def test_tensorboard(train, tmp_path):
     train("basis", tmp_path, tracking="tensorboard")
     assert list(tmp_path.glob("stress/tensorboard/*/events*"))
     assert (tmp_path / "stress/csv/0/metrics.csv").read_text().count("\n") == 4
-    with pytest.raises(ConfigError, match="tracking='wandb'"):
+    with pytest.raises(ConfigError, match="tracking=wandb"):
         train("basis", tmp_path, tracking="wandb")
+
+
+def test_mlflow_keeps_the_losses_in_sqlite(train, tmp_path, monkeypatch):
+    mlflow = pytest.importorskip("mlflow", reason="mlflow is not installed; pip install 'nsf[mlflow]'")
+    monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "train" / "sand" / "0123"
+    train("basis", folder, tracking="mlflow")
+    client = mlflow.MlflowClient(f"sqlite:///{tmp_path}/train/sand/mlflow.db")
+    (experiment,) = (e for e in client.search_experiments() if e.name == "train/sand")
+    runs = client.search_runs([experiment.experiment_id])
+    assert {run.info.run_name for run in runs} == {f"0123/{phase}" for phase in PHASES}
+    (stress,) = (run for run in runs if run.info.run_name == "0123/stress")
+    history = client.get_metric_history(stress.info.run_id, "loss")
+    assert [point.step for point in history] == [5, 10, 12]
+    assert stress.info.status == "FINISHED"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["train"]  # nothing beside it, as ./mlruns
+
+
+@pytest.mark.parametrize("tracking", ["tensorboard", "mlflow"])
+def test_tracking_that_is_not_installed(train, tmp_path, monkeypatch, tracking):
+    monkeypatch.setitem(sys.modules, tracking, None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'nsf\["):
+        train("basis", tmp_path, tracking=tracking)
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,63 @@
+"""Where the losses of a training are written: CSV always, TensorBoard or MLflow beside it if asked for."""
+
+import os
+from pathlib import Path
+
+from pytorch_lightning.loggers import CSVLogger, Logger, MLFlowLogger, TensorBoardLogger
+
+from nsf.errors import ConfigError
+from nsf.extras import optional
+from nsf.storage import locked, writing
+
+#: What `tracking` may be, with the extra that brings it.
+EXTRAS = {"tensorboard": "track", "mlflow": "mlflow"}
+
+
+def check_tracking(tracking: str | None) -> None:
+    """Refuse a kind of tracking that is unknown or not installed.
+
+    Raises:
+        ConfigError: it is unknown.
+        MissingExtraError: it is not installed; names the command.
+    """
+    if tracking is None:
+        return
+    if tracking not in EXTRAS:
+        raise ConfigError(f"tracking={tracking} is unknown; choose null, {' or '.join(EXTRAS)}")
+    optional(tracking, EXTRAS[tracking])
+
+
+def loggers(folder: Path, tracking: str | None) -> list[Logger]:
+    """The loggers of one phase.
+
+    Args:
+        folder: of the phase, in the folder of the training.
+        tracking: "tensorboard" writes into `folder`; "mlflow" into `mlflow.db` (SQLite) beside the trainings,
+            or to MLFLOW_TRACKING_URI. None: the CSV log alone.
+    """
+    # A resumed phase logs into a new version, for CSVLogger deletes what it finds.
+    version = str(len(list((folder / "csv").glob("*"))))
+    found: list[Logger] = [CSVLogger(folder, name="csv", version=version)]
+    if tracking == "tensorboard":
+        found.append(TensorBoardLogger(folder, name="tensorboard", version=version))
+    if tracking == "mlflow":
+        found.append(_mlflow(folder))
+    return found
+
+
+def _mlflow(folder: Path) -> MLFlowLogger:
+    """One MLflow run a phase, which a resumed phase goes on with."""
+    os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
+    trainings, kept = folder.parent.parent.resolve(), folder / "mlflow_run.txt"
+    # Two processes that make the tables of a data base at once would fail.
+    with locked(trainings / ".mlflow.lock", waiting=lambda: None):
+        logger = MLFlowLogger(
+            experiment_name=f"{trainings.parent.name}/{trainings.name}",
+            run_name=f"{folder.parent.name}/{folder.name}",
+            tracking_uri=os.environ.get("MLFLOW_TRACKING_URI", f"sqlite:///{trainings / 'mlflow.db'}"),
+            artifact_location=(trainings / "mlflow").as_uri(),
+            run_id=kept.read_text(encoding="utf-8") if kept.is_file() else None,
+        )
+        with writing(kept) as partial:
+            partial.write_text(str(logger.run_id), encoding="utf-8")
+    return logger

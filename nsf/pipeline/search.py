@@ -1,0 +1,210 @@
+"""Search for good values of numeric keys, by Optuna: at the validation values, never at the test values."""
+
+import math
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+from omegaconf import DictConfig, OmegaConf
+
+from nsf import config as configuration
+from nsf.canonical import content_hash
+from nsf.errors import ConfigError, MissingRunError, NSFError
+from nsf.extras import optional
+from nsf.pipeline.chain import STAGES, Pipeline
+from nsf.pipeline.plan import Plan
+from nsf.reporting.search import OBJECTIVES, write_search
+from nsf.storage import locked
+
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_RANGE = re.compile(rf"(?P<key>[\w./]+)=(?P<low>{_NUMBER})\.\.(?P<high>{_NUMBER})(?P<log>:log)?")
+
+
+@dataclass(frozen=True)
+class Range:
+    """Values of a key from `low` to `high`, both included, of equal weight on a logarithmic scale if `log`.
+
+    Whole numbers where both ends are written as such.
+
+    Raises:
+        ConfigError: there is nothing between the ends, or a logarithmic scale reaches zero.
+    """
+
+    key: str
+    low: float
+    high: float
+    log: bool
+
+    def __post_init__(self):
+        if not self.low < self.high:
+            raise ConfigError(f"{self} has nothing between its ends; give the smaller one first")
+        if self.log and self.low <= 0:
+            raise ConfigError(f"{self} reaches zero; a logarithmic scale begins above it")
+
+    def __str__(self):
+        return f"{self.key}={self.low}..{self.high}{':log' * self.log}"
+
+    @classmethod
+    def parse(cls, word: str) -> "Range | None":
+        """The range that `key=low..high` or `key=low..high:log` stands for; None for any other word."""
+        found = _RANGE.fullmatch(word)
+        if not found:
+            return None
+        ends = found["low"], found["high"]
+        kind = int if all(re.fullmatch(r"[+-]?\d+", end) for end in ends) else float
+        return cls(found["key"], *map(kind, ends), bool(found["log"]))
+
+    def suggest(self, trial) -> str:
+        """The override with a trial's value."""
+        suggest = trial.suggest_int if isinstance(self.low, int) else trial.suggest_float
+        return f"{self.key}={suggest(self.key, self.low, self.high, log=self.log)}"
+
+
+def search(words: Sequence[str], say: Callable[[str], object] = print, root: Path | None = None) -> Path:
+    """Try values until `search.trials` have been tried, and write what came out.
+
+    The trials lie in `search.db` in the folder of runs: the same keys go on with the same trials, also from
+    several processes at once. Simulations and whatever else a trial shares with others is reused.
+
+    Args:
+        words: `key=low..high[:log]`, and `key=value` of everything else.
+        say: told of each trial.
+        root: folder of all runs; NSF_RUNS, else ./runs.
+
+    Returns:
+        The chart, beside which `trials.csv` lies.
+
+    Raises:
+        MissingExtraError: Optuna is not installed.
+        ConfigError: no range; no validation values; a value that a key refuses at an end of its range.
+        MissingRunError: no trial has a result.
+    """
+    optional("optuna", "search")
+    ranges, fixed = _parted(words)
+    config = configuration.load(fixed)
+    objectives, trials = _asked(config)
+    _check(ranges, fixed, root)
+    study = _study(config, ranges, fixed, objectives, Path(Plan(config, root).training.root))
+
+    def objective(trial):
+        tried = [r.suggest(trial) for r in ranges]
+        try:
+            run, values = _tried([*fixed, *tried], objectives, root)
+        except NSFError as error:
+            trial.set_user_attr("error", str(error))
+            say(f"trial {trial.number}: {' '.join(tried)}: {error}")
+            raise
+        trial.set_user_attr("run", run)
+        columns = [OBJECTIVES[name] for name in objectives]
+        told = [f"{c.title} {c.text(value)} {c.unit}" for c, value in zip(columns, values, strict=True)]
+        say(f"trial {trial.number}: {' '.join(tried)}: {', '.join(told)}")
+        return values
+
+    _optimize(study, objective, trials, say)
+    table = _table(study, ranges, objectives)
+    if not table["pareto"].any():
+        raise MissingRunError("no trial of this search has a result; the lines above say why")
+    folder = Path(config.report.folder) / f"search_{study.study_name}"
+    return write_search(table, [r.key for r in ranges], objectives, folder)
+
+
+def _parted(words: Sequence[str]) -> tuple[list[Range], list[str]]:
+    found = {word: Range.parse(word) for word in words}
+    ranges = [r for r in found.values() if r]
+    if not ranges:
+        raise ConfigError(
+            "nsf search needs a range, as latent_dim=4..8 or field.displacement_noise=1e-3..0.1:log"
+        )
+    if any(word.startswith("+experiment=") for word in words):
+        raise ConfigError("a search has no experiment; give the keys of one of its jobs instead")
+    return ranges, [word for word, r in found.items() if not r]
+
+
+def _asked(config: DictConfig) -> tuple[list[str], int]:
+    asked = OmegaConf.to_container(config.search)
+    objectives = asked["objectives"]
+    known = isinstance(objectives, list) and objectives and set(objectives) <= set(OBJECTIVES)
+    if not known or len(set(objectives)) < len(objectives):
+        raise ConfigError(f"search.objectives={objectives} must list one or more of {', '.join(OBJECTIVES)}")
+    return objectives, configuration.number("search.trials", asked["trials"], least=1, whole=True)
+
+
+def _check(ranges: Sequence[Range], fixed: Sequence[str], root: Path | None) -> None:
+    """Build both ends of each range, with the test values still there, so that no value is in two splits."""
+    for end in ("low", "high"):
+        overrides = [*fixed, *(f"{r.key}={getattr(r, end)}" for r in ranges), "deploy.split=validation"]
+        plan = Plan(configuration.load(overrides), root)
+        if not plan.split.validation:
+            raise ConfigError(
+                f"scene={plan.scene.name} has no validation values, and a search never looks at test values; "
+                "give some, apart from those of training and test, as scene.parameters.validation=[27,31]"
+            )
+
+
+def _study(config: DictConfig, ranges, fixed: Sequence[str], objectives: Sequence[str], root: Path):
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    content = {
+        "ranges": sorted(map(str, ranges)),
+        "objectives": objectives,
+        "fixed": sorted(word for word in fixed if not word.startswith(("search.", "report."))),
+    }
+    root.mkdir(parents=True, exist_ok=True)
+    storage = f"sqlite:///{root.resolve() / 'search.db'}"
+    # Two processes that make the same tables at once would fail.
+    with locked(root / "search.lock", waiting=lambda: None):
+        study = optuna.create_study(
+            storage=storage,
+            study_name=f"{config.scene.name}_{content_hash(content)[:6]}",
+            directions=["minimize"] * len(objectives),
+            load_if_exists=True,
+        )
+    # A generator that began again with the same seed would suggest again what was tried.
+    study.sampler = optuna.samplers.TPESampler(seed=config.seed + len(study.trials))
+    return study
+
+
+def _optimize(study, objective, trials: int, say: Callable[[str], object]) -> None:
+    from optuna.study import MaxTrialsCallback
+    from optuna.trial import TrialState
+
+    ended = (TrialState.COMPLETE, TrialState.FAIL)
+    there = len(study.get_trials(deepcopy=False, states=ended))
+    if there:
+        say(f"search: {there} trials of {study.study_name} are there")
+    if there < trials:
+        study.optimize(objective, callbacks=[MaxTrialsCallback(trials, ended)], catch=(NSFError,))
+
+
+def _tried(overrides: list[str], objectives: Sequence[str], root: Path | None) -> tuple[str, list[float]]:
+    """The evaluate run of one trial, and its objectives: means over the validation values."""
+    config = configuration.load([*overrides, "deploy.split=validation", "scene.parameters.test=[]"])
+    pipeline = Pipeline(config, lambda line: None, root)
+    for stage in STAGES[:-1]:
+        run = pipeline.run(stage)
+    results = pd.read_csv(run.path / "results.csv")
+    if set(results["split"]) != {"validation"}:
+        raise ConfigError(f"{run.id} is not of the validation values alone; leave deploy.split out")
+    values = [float(results[OBJECTIVES[name].name].mean()) for name in objectives]
+    if not all(map(math.isfinite, values)):
+        raise MissingRunError(f"{run.id}: the reduced run diverged")
+    return run.id, values
+
+
+def _table(study, ranges: Sequence[Range], objectives: Sequence[str]) -> pd.DataFrame:
+    """One row a trial that has ended: number, values of the keys, objectives, and the run or the error."""
+    from optuna.trial import TrialState
+
+    best = {trial.number for trial in study.best_trials}
+    rows = [
+        {"trial": trial.number}
+        | {r.key: trial.params.get(r.key) for r in ranges}
+        | dict(zip(objectives, trial.values or [math.nan] * len(objectives), strict=True))
+        | {"pareto": trial.number in best}
+        | {key: trial.user_attrs.get(key, "") for key in ("run", "error")}
+        for trial in study.get_trials(states=(TrialState.COMPLETE, TrialState.FAIL))
+    ]
+    return pd.DataFrame(rows)

@@ -1,0 +1,178 @@
+"""Sweeps: the stages of many configurations, by one of Hydra's launchers."""
+
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from hydra._internal.callbacks import Callbacks
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.plugins import Plugins
+from hydra.plugins.launcher import Launcher
+from hydra.types import HydraContext
+from omegaconf import DictConfig
+
+from nsf import config as configuration
+from nsf.errors import LaunchError, NSFError
+from nsf.extras import optional
+from nsf.pipeline.chain import Pipeline
+from nsf.pipeline.plan import Plan
+
+_SUBMITTED = "*/*_submitted.pkl"  # a file of each job that Slurm took
+_DIED = "its process died (killed, or out of memory or time)"
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A job without a result: the overrides that tell it from others of the sweep, and what became of it."""
+
+    job: tuple[str, ...]
+    error: str
+
+    def __str__(self):
+        return f"{' '.join(self.job) or 'the one job'}: {self.error}"
+
+
+def work(config: DictConfig, stages: Sequence[str], say: Callable[[str], object] = print):
+    """Stages of one configuration; gives the result of the last one.
+
+    Raises:
+        NSFError: of every kind that a stage raises.
+    """
+    if "point" in stages:
+        from nsf.reporting.point import plot_point
+
+        return plot_point(config)
+    pipeline = Pipeline(config, say)
+    if len(stages) > 1:
+        pipeline.check_held_out()  # before hours of simulation and training, not after
+    for name in stages:
+        result = pipeline.run(name)
+    return result
+
+
+def sweep(
+    sweeps: Sequence[Sequence[str]],
+    stages: Sequence[str],
+    launcher: Sequence[str] = (),
+    config_name: str = "config",
+    say: Callable[[str], object] = print,
+) -> list[Failure]:
+    """Stages of every job; one that fails is recorded in its run's manifest, and does not stop the others.
+
+    Args:
+        sweeps: overrides whose keys may have several values, without Hydra's own.
+        stages: as of `work`.
+        launcher: Hydra's overrides, as `hydra/launcher=slurm`; one job after the other by default.
+        config_name: the primary file in `conf/`.
+        say: told where the logs of jobs are that run elsewhere.
+
+    Returns:
+        What failed.
+
+    Raises:
+        NSFError: a value is refused, which shows before the first job.
+        MissingExtraError: the launcher is not installed.
+        LaunchError: no job could be started.
+    """
+    config, loader = configuration.launching(launcher, config_name)
+    plugin = ".".join(config.hydra.launcher._target_.split(".")[:2])
+    optional(plugin, "sweep")
+    for overrides in sweeps:
+        configuration.check_sweep(overrides, config_name, None if "point" in stages else Plan)
+    jobs = configuration.jobs(sweeps, config_name)
+    context = HydraContext(config_loader=loader, callbacks=Callbacks())
+    started = Plugins.instance().instantiate_launcher(context, partial(_job, stages=tuple(stages)), config)
+    errors = _launched(started, [list(job) for job in jobs], say)
+    common = set.intersection(*map(set, jobs))
+    return [
+        Failure(tuple(override for override in job if override not in common), error)
+        for job, error in zip(jobs, errors, strict=True)
+        if error
+    ]
+
+
+def reports(overrides: Sequence[str], say: Callable[[str], object] = print) -> list[Path]:
+    """The pages of a sweep's scenes, each once, as its last job has them.
+
+    Raises:
+        MissingRunError: no job of a scene was evaluated.
+    """
+    configs = [configuration.load(job) for job in configuration.jobs([overrides])]
+    last = {(config.report.folder, config.report.name): config for config in configs}
+    return [Pipeline(config, say).report() for config in last.values()]
+
+
+def _job(config: DictConfig, stages: Sequence[str]) -> str | None:
+    """One job, in a process of its own or not. The error goes back as text, which every process can read."""
+    print(f"--- {' '.join(HydraConfig.get().overrides.task)}", flush=True)
+    try:
+        work(configuration.checked(config), stages, partial(print, flush=True))
+    except NSFError as error:
+        print(f"error: {error}", file=sys.stderr, flush=True)
+        return str(error)
+    except Exception as error:
+        traceback.print_exc()
+        return f"{type(error).__name__}: {error}"
+    return None
+
+
+def _launched(launcher: Launcher, jobs: list[list[str]], say: Callable[[str], object]) -> list[str | None]:
+    """The error of each job, None for one that ended well."""
+    kind, logs = type(launcher).__name__, Path()
+    if kind == "SlurmLauncher":
+        logs = Path(launcher.params["submitit_folder"]).parent
+        say(f"{len(jobs)} jobs go into Slurm's queue, which squeue shows; their logs are in {logs}")
+    try:
+        return [launched.return_value for launched in launcher.launch(jobs, 0)]
+    except KeyboardInterrupt:
+        if kind == "SlurmLauncher":
+            say("the jobs stay in Slurm's queue, and go on; scancel ends them")
+        raise
+    except Exception as error:
+        # A process that dies takes with it what the launcher would have returned of the others.
+        if kind == "JoblibLauncher" and _died(error):
+            return _one_by_one(launcher, jobs)
+        if kind == "SlurmLauncher" and any(logs.glob(_SUBMITTED)):
+            return _from_slurm(logs, len(jobs))
+        told = [line for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
+        raise LaunchError(
+            f"no job could be launched: {told[-1]}; correct the keys of hydra.launcher"
+        ) from error
+
+
+def _died(error: Exception) -> bool:
+    from joblib.externals.loky import BrokenProcessPool
+
+    return isinstance(error, BrokenProcessPool)
+
+
+def _one_by_one(launcher: Launcher, jobs: list[list[str]]) -> list[str | None]:
+    """Each job launched alone, so that one whose process dies takes no other with it."""
+    errors: list[str | None] = []
+    for index, job in enumerate(jobs):
+        try:
+            errors += [launched.return_value for launched in launcher.launch([job], index)]
+        except Exception as error:
+            if not _died(error):
+                raise
+            errors.append(_DIED)
+    return errors
+
+
+def _from_slurm(logs: Path, count: int) -> list[str | None]:
+    """What each job of an array left, once all have ended."""
+    from submitit import SlurmJob
+    from submitit.core.utils import UncompletedJobError
+
+    errors: list[str | None] = [_DIED] * count
+    for job_id in {pickle.parent.name for pickle in logs.glob(_SUBMITTED)}:
+        job = SlurmJob(logs / "%j", job_id, tasks=[0])
+        index = int(job_id.partition("_")[2] or 0)
+        try:
+            errors[index] = job.results()[0].return_value
+        except UncompletedJobError:
+            errors[index] = f"{_DIED}; see {job.paths.stderr}"
+    return errors

@@ -1,0 +1,202 @@
+"""Runs in a table, and what differs between two of them: from manifests and configurations alone."""
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from fnmatch import fnmatchcase
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from rich.markup import escape
+from rich.table import Table
+
+from nsf.errors import ConfigError
+from nsf.reporting.columns import ABSENT, number
+from nsf.runs import Run
+
+#: What a user sees of each run first.
+FIELDS = ("stage", "scene", "id", "created", "status", "seconds", "metric")
+#: The metric that stands for a stage, and how it is told.
+_MAIN = {
+    "evaluate": ("delta", "δ"),
+    "superresolve": ("delta", "δ"),
+    "train": ("deformation_loss", "loss of g"),
+}
+_ORIGIN = ("commit", "dirty", "device", "seed", "precision", "versions")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A run as it is listed."""
+
+    run: Run
+
+    @cached_property
+    def manifest(self) -> dict[str, Any]:
+        """The run's manifest."""
+        return self.run.manifest
+
+    @cached_property
+    def values(self) -> dict[str, Any]:
+        """Fields, numbers unformatted, and metrics by their names."""
+        main, _ = _MAIN.get(self.run.stage, (None, None))
+        fields = {
+            "stage": self.run.stage,
+            "scene": self.run.scene,
+            "id": self.run.hash,
+            "created": self.manifest.get("created"),
+            "status": self.run.status,
+            "seconds": self.manifest.get("seconds"),
+            "metric": self.metrics.get(main),
+        }
+        return {key: self.manifest.get(key) for key in _ORIGIN} | self.metrics | fields
+
+    @cached_property
+    def metrics(self) -> dict[str, Any]:
+        """The manifest's metrics, one number or text a key."""
+        return _flat(self.manifest.get("metrics") or {})
+
+    @cached_property
+    def settings(self) -> dict[str, Any]:
+        """The configuration by dotted key: of the runs that this one goes back to, and on top its own.
+
+        Where those runs differ, as simulations do in their parameter, the values are a tuple.
+        """
+        found: dict[str, list[Any]] = {}
+        for parent in self.run.parent_runs:
+            for key, value in (Entry(parent).settings if parent.manifest else {}).items():
+                known = found.setdefault(key, [])
+                known += [v for v in (value if isinstance(value, tuple) else (value,)) if v not in known]
+        inherited = {key: known[0] if len(known) == 1 else tuple(known) for key, known in found.items()}
+        return inherited | _flat(self.run.config)
+
+    def texts(self) -> list[str]:
+        """The fields as shown."""
+        shown = {key: ABSENT if value is None else str(value) for key, value in self.values.items()}
+        if self.values["created"]:
+            when = datetime.fromisoformat(self.values["created"]).astimezone()
+            shown["created"] = f"{when:%Y-%m-%d %H:%M:%S}"
+        shown["seconds"] = number(self.values["seconds"])
+        if self.values["metric"] is not None:
+            _, title = _MAIN[self.run.stage]
+            percent = title == "δ"
+            shown["metric"] = (
+                f"{title} {number(self.values['metric'], 100 if percent else 1)}" + " %" * percent
+            )
+        return [shown[field] for field in FIELDS]
+
+
+def entries(filters: Mapping[str, str] | None = None, sort: str = "-created", root: Path | None = None):
+    """The runs that pass every filter, sorted.
+
+    Args:
+        filters: by field, metric or key of the configuration (of the run or those it goes back to): the
+            value it must have; several are parted by commas, and `*` stands for anything.
+        sort: field, metric or key; from the largest down with a leading `-`. Runs without it come last.
+        root: folder of all runs; NSF_RUNS, else ./runs.
+
+    Returns:
+        A list of `Entry`.
+
+    Raises:
+        ConfigError: no run has such a key; names the nearest.
+    """
+    found = [Entry(run) for run in Run.find(root=root)]
+    key = sort.removeprefix("-")
+    for name in (*(filters or ()), key):
+        _check_key(name, found)
+    for name, wanted in (filters or {}).items():
+        found = [entry for entry in found if _matches(_value(entry, name), wanted)]
+    there = [entry for entry in found if _value(entry, key) is not None]
+    there.sort(key=lambda entry: _order(_value(entry, key)), reverse=sort.startswith("-"))
+    return there + [entry for entry in found if _value(entry, key) is None]
+
+
+def runs_table(found: Sequence[Entry]) -> Table:
+    """The runs for the terminal."""
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    for field in FIELDS:
+        heading = "time [s]" if field == "seconds" else field
+        table.add_column(escape(heading), justify="right" if field == "seconds" else "left", no_wrap=True)
+    for entry in found:
+        table.add_row(*map(escape, entry.texts()))
+    return table
+
+
+def difference_table(first: Run, second: Run) -> Table:
+    """What differs between two runs: configuration, origin, and result with its relative change."""
+    one, two = Entry(first), Entry(second)
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    for heading in ("", "key", first.id, second.id, "change"):
+        table.add_column(heading, overflow="fold")
+    parts = {
+        "configuration": (one.settings, two.settings),
+        "origin": tuple(_flat({k: e.manifest.get(k) for k in _ORIGIN}) for e in (one, two)),
+        "result": tuple(
+            {"status": e.run.status, "seconds": e.values["seconds"]} | e.metrics for e in (one, two)
+        ),
+    }
+    for part, (left, right) in parts.items():
+        keys = [key for key in (left | right) if left.get(key) != right.get(key)]
+        for index, key in enumerate(keys):
+            a, b = left.get(key), right.get(key)
+            table.add_row("" if index else part, key, escape(text(a)), escape(text(b)), _change(a, b))
+        if not keys:
+            table.add_row(part, "the same", "", "", "")
+    return table
+
+
+def _check_key(key: str, found: Sequence[Entry]) -> None:
+    if key in FIELDS or any(key in entry.values or key in entry.settings for entry in found):
+        return
+    known = dict.fromkeys([*FIELDS, *(k for entry in found for k in (*entry.values, *entry.settings))])
+    near = difflib.get_close_matches(key, known, n=3, cutoff=0.5)
+    hint = f"did you mean {' or '.join(near)}?" if near else f"choose {', '.join(FIELDS)}, a metric or a key"
+    raise ConfigError(f"no run has {key!r}; {hint}")
+
+
+def _value(entry: Entry, key: str):
+    return entry.values[key] if key in entry.values else entry.settings.get(key)
+
+
+def _matches(value, wanted: str) -> bool:
+    several = value if isinstance(value, tuple) else (value,)
+    return any(fnmatchcase(text(one), pattern) for one in several for pattern in wanted.split(","))
+
+
+def _order(value) -> tuple[int, float, str]:
+    """Numbers by size, before text in the order of the alphabet."""
+    if isinstance(value, int | float):
+        return (0, float(value), "")
+    return (1, 0.0, str(value))
+
+
+def _flat(value, prefix: str = "") -> dict[str, Any]:
+    """A tree as dotted keys."""
+    if not isinstance(value, dict) or not value:
+        return {prefix: value} if prefix else {}
+    return {
+        key: leaf
+        for name, child in value.items()
+        for key, leaf in _flat(child, f"{prefix}.{name}" if prefix else str(name)).items()
+    }
+
+
+def text(value) -> str:
+    """A value of a configuration or a manifest as shown; several values in a row."""
+    if isinstance(value, tuple):
+        return ", ".join(map(text, value))
+    if value is None:
+        return ABSENT
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _change(a, b) -> str:
+    kinds = (int, float)
+    if isinstance(a, bool) or not isinstance(a, kinds) or not isinstance(b, kinds) or a == 0:
+        return ""
+    return f"{100 * (b - a) / abs(a):+.3g} %"

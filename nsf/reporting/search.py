@@ -1,0 +1,74 @@
+"""What a search found: its trials as a table, and the best of them on a chart."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pandas as pd
+from rich.markup import escape
+from rich.table import Table
+
+from nsf.reporting.columns import COLUMN, Column
+from nsf.reporting.style import MUTED, PALETTE, figure, save, styled
+from nsf.storage import writing
+
+#: What a search can make small, by the name that a user gives it.
+OBJECTIVES: dict[str, Column] = {"delta": COLUMN["delta"], "step_ms": COLUMN["step_ms_reduced"]}
+
+
+def write_search(table: pd.DataFrame, keys: Sequence[str], objectives: Sequence[str], folder: Path) -> Path:
+    """Write `trials.csv` and the chart, `search.svg` and `search.png`; gives the chart.
+
+    Args:
+        table: one row a trial: `trial`, the keys, the objectives (NaN where it failed), `pareto`.
+        keys, objectives: columns of it; an objective is a key of `OBJECTIVES`.
+        folder: they go there.
+
+    Raises:
+        StorageError: the disk refused a file.
+    """
+    with writing(folder / "trials.csv") as partial:
+        table.to_csv(partial, index=False)
+    with styled():
+        fig = figure(4.2)
+        ax = fig.add_subplot()
+        (_front if len(objectives) == 2 else _progress)(ax, table.dropna(subset=list(objectives)), objectives)
+        ax.grid(True)
+        ax.legend()
+    save(fig, folder, "search")
+    return folder / "search.png"
+
+
+def best_table(path: Path) -> Table:
+    """The best trials of a `trials.csv`, for the terminal: the Pareto front."""
+    trials = pd.read_csv(path)
+    best = trials[trials["pareto"]].drop(columns=["pareto", "error"])
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    columns = {name: OBJECTIVES.get(name, Column(name, name)) for name in best}
+    for column in columns.values():
+        table.add_column(escape(column.heading), overflow="fold")
+    for _, row in best.iterrows():
+        table.add_row(*(column.text(row[name]) for name, column in columns.items()))
+    return table
+
+
+def _front(ax, done: pd.DataFrame, objectives: Sequence[str]) -> None:
+    """Both objectives of every trial, and the front of those that no other trial beats in both."""
+    x, y = objectives
+    shown = done[[x, y]] * [OBJECTIVES[x].scale, OBJECTIVES[y].scale]
+    front = shown[done["pareto"]].sort_values(x)
+    ax.scatter(shown[x], shown[y], s=22, color=MUTED, label="trials")
+    ax.step(front[x], front[y], where="post", color=PALETTE[0], marker="o", label="Pareto front")
+    for at, row in front.iterrows():
+        ax.annotate(f"{done['trial'][at]}", (row[x], row[y]), xytext=(4, 4), textcoords="offset points")
+    ax.set(
+        xlabel=OBJECTIVES[x].heading, ylabel=OBJECTIVES[y].heading, title="Trials at the validation values"
+    )
+
+
+def _progress(ax, done: pd.DataFrame, objectives: Sequence[str]) -> None:
+    """The objective of every trial, and the best until then."""
+    (name,) = objectives
+    shown = done[name] * OBJECTIVES[name].scale
+    ax.scatter(done["trial"], shown, s=22, color=MUTED, label="trials")
+    ax.step(done["trial"], shown.cummin(), where="post", color=PALETTE[0], label="best until then")
+    ax.set(xlabel="trial", ylabel=OBJECTIVES[name].heading, title="Trials at the validation values")

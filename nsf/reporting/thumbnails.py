@@ -1,0 +1,100 @@
+"""A small picture of a run, by its stage: what it moved, learnt or missed."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from PIL import Image
+
+from nsf.data import Trajectory
+from nsf.dynamics import Rollout
+from nsf.errors import NSFError
+from nsf.reporting.style import FULL, PALETTE, REDUCED, figure, styled
+from nsf.runs import Run
+from nsf.storage import writing
+
+_SIZE = (1.6, 1.0)  # [inch] at 100 dpi
+_POINTS = 1500
+
+
+def thumbnail(run: Run, path: Path) -> bool:
+    """Draw a run into a png, unless it is there already; False where there is nothing to be seen.
+
+    Raises:
+        StorageError: the disk refused the file.
+    """
+    if path.is_file():
+        return True
+    draw = _DRAWN.get(run.stage)
+    if draw is None or not run.complete:
+        return False
+    with styled():
+        fig = figure(_SIZE[1], _SIZE[0])
+        fig.set_layout_engine("none")
+        ax = fig.add_axes((0, 0, 1, 1))
+        ax.axis("off")
+        try:
+            draw(ax, run.path)
+        except (NSFError, OSError, ValueError, KeyError):
+            return False  # a page of all runs must not fail for one that cannot be read
+        with writing(path) as partial:
+            fig.savefig(partial, metadata={"Software": None})
+    return True
+
+
+def _simulated(ax: Axes, folder: Path) -> None:
+    """The particles at the end."""
+    with Trajectory.open(folder / "trajectory.h5") as trajectory:
+        step = max(1, trajectory.particles // _POINTS)
+        x = trajectory.read("x", trajectory.frames - 1, slice(None, None, step)).reshape(-1, 3)
+    _scatter(ax, x, FULL)
+
+
+def _trained(ax: Axes, folder: Path) -> None:
+    """The losses of the three phases."""
+    phases: dict[str, list[Path]] = {}
+    for log in sorted(folder.glob("*/csv/*/metrics.csv")):
+        phases.setdefault(log.parents[2].name, []).append(log)
+    if not phases:
+        raise ValueError("no log")
+    for color, logs in zip(PALETTE, phases.values(), strict=False):
+        loss = pd.concat(map(pd.read_csv, logs)).sort_values("step")
+        ax.semilogy(loss["step"], loss["loss"], color=color, linewidth=1)
+
+
+def _deployed(ax: Axes, folder: Path) -> None:
+    """The first two latent coordinates of every reduced run."""
+    for path in sorted(folder.glob("rollout_*.h5")):
+        xhat = Rollout.open(path).xhat
+        ax.plot(xhat[:, 0], xhat[:, min(1, xhat.shape[1] - 1)], color=REDUCED, linewidth=1)
+
+
+def _evaluated(ax: Axes, folder: Path) -> None:
+    """The particles at the end, full-order and reduced, of the first value."""
+    with np.load(folder / "frames.npz", allow_pickle=False) as frames:
+        for name, color in (("x_full", FULL), ("x_reduced", REDUCED)):
+            x = frames[name][0, -1]
+            _scatter(ax, x[:: max(1, len(x) // _POINTS)], color)
+
+
+def _superresolved(ax: Axes, folder: Path) -> None:
+    """The picture that the run holds."""
+    with Image.open(folder / "superresolution.png") as picture:
+        picture.thumbnail((320, 200))
+        ax.imshow(np.asarray(picture))
+
+
+def _scatter(ax: Axes, x: np.ndarray, color: str) -> None:
+    ax.scatter(x[:, 0], x[:, 2], s=2.0, color=color, linewidths=0, alpha=0.7)
+    ax.set_aspect("equal", adjustable="datalim")
+
+
+_DRAWN: dict[str, Callable[[Axes, Path], None]] = {
+    "simulate": _simulated,
+    "train": _trained,
+    "deploy": _deployed,
+    "evaluate": _evaluated,
+    "superresolve": _superresolved,
+}

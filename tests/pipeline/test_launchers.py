@@ -1,0 +1,91 @@
+"""The launchers of a sweep: what crosses from one process to another, and what is left of one that died."""
+
+import os
+import signal
+import sys
+from functools import partial
+
+import pytest
+from forked import SignalAt
+
+from nsf.errors import ConfigError, LaunchError, MissingExtraError
+from nsf.pipeline import sweep as module
+from nsf.pipeline.sweep import sweep
+from nsf.runs import Run
+
+pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="hydra-joblib-launcher is not installed")
+JOBLIB = ["hydra/launcher=joblib"]
+
+
+def test_a_failure_crosses_from_another_process(copied, tiny, monkeypatch):
+    root = copied("simulate")
+    monkeypatch.setenv("NSF_RUNS", str(root))
+    (failure,) = sweep([[*tiny, "latent_dim=9,3"]], ["train"], JOBLIB)
+    assert str(failure).startswith("latent_dim=9: latent_dim=9 exceeds the 8 displacement modes")
+    runs = {run.config["latent_dim"]: run for run in Run.find("train", root=root)}
+    assert runs[3].complete
+    assert runs[9].manifest["status"] == "failed"
+    assert "exceeds the 8 displacement modes" in runs[9].manifest["error"]
+
+
+def dies_at(config, stages, seed):
+    if config.seed == seed:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_dead_process_takes_no_sibling_with_it(tmp_path, monkeypatch):
+    monkeypatch.setenv("NSF_RUNS", str(tmp_path))
+    monkeypatch.setattr(module, "_job", partial(dies_at, seed=2))
+    failed = sweep([["seed=1,2"]], ["train"], JOBLIB)
+    assert [(failure.job, failure.error.split(" (")[0]) for failure in failed] == [
+        (("seed=2",), "its process died")
+    ]
+
+
+def raises(config, stages, say):
+    raise ValueError("not foreseen")
+
+
+def test_an_error_that_is_no_ones_fault_is_told_too(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("NSF_RUNS", str(tmp_path))
+    monkeypatch.setattr(module, "work", raises)
+    (failure,) = sweep([["seed=1"]], ["train"])
+    assert str(failure) == "the one job: ValueError: not foreseen"
+    assert "Traceback" in capsys.readouterr().err
+
+
+def test_after_a_kill_only_the_job_in_flight_is_redone(nsf, copied):
+    root = copied("simulate")
+    # Each job takes 400 steps; the kill comes in the middle of the second one.
+    moment = SignalAt("nsf.kinematics.descent:Steps._take", 700, signal.SIGKILL)
+    killed = nsf("train", root, "seed=1,2,3", faults=[moment], multirun=True)
+    assert killed.code == -signal.SIGKILL
+    assert sorted(run.status for run in Run.find("train", root=root)) == ["complete", "killed"]
+    (done,) = (run for run in Run.find("train", root=root) if run.complete)
+    before = (done.path / "manifold.pt").stat().st_mtime_ns
+    again = nsf("train", root, "seed=1,2,3", multirun=True)
+    assert again.code == 0
+    assert again.out.count("reused") == 1
+    assert (done.path / "manifold.pt").stat().st_mtime_ns == before
+    assert [run.status for run in Run.find("train", root=root)] == ["complete"] * 3
+
+
+@pytest.mark.parametrize(("launcher", "plugin"), [("joblib", "joblib"), ("slurm", "submitit")])
+def test_a_missing_extra_names_the_remedy(monkeypatch, launcher, plugin):
+    monkeypatch.setitem(sys.modules, f"hydra_plugins.hydra_{plugin}_launcher", None)
+    with pytest.raises(MissingExtraError, match=rf"{plugin}_launcher.*pip install 'nsf\[sweep\]'"):
+        sweep([["seed=1"]], ["train"], [f"hydra/launcher={launcher}"])
+
+
+def test_a_launcher_that_cannot_start(tmp_path, monkeypatch):
+    monkeypatch.setenv("NSF_RUNS", str(tmp_path))
+    with pytest.raises(LaunchError, match="no job could be launched: n_jobs == 0"):
+        sweep([["seed=1"]], ["train"], [*JOBLIB, "hydra.launcher.n_jobs=0"])
+    with pytest.raises(ConfigError, match=r"hydra\.launcher\.n_jobs=many"):
+        sweep([["seed=1"]], ["train"], [*JOBLIB, "hydra.launcher.n_jobs=many"])
+
+
+def test_a_launcher_is_for_sweeps(nsf, copied):
+    outcome = nsf("train", copied("simulate"), *JOBLIB)
+    assert outcome.code == 2
+    assert "add -m" in outcome.err
