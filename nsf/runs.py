@@ -95,6 +95,37 @@ class Run:
         runs = [cls(stage, path.parts[-3], path.parts[-2], _root(root)) for path in manifests]
         return sorted(runs, key=lambda run: (run.manifest.get("created", ""), run.hash), reverse=True)
 
+    @classmethod
+    def named(cls, stage: str, text: str = "", root: str | Path | None = None) -> "Run":
+        """The one complete run of a stage that a user means; the newest if `text` is empty.
+
+        Args:
+            stage: such as "deploy".
+            text: the run's id, its folder, or as much of the beginning of its id or hash as no other
+                run of the stage shares.
+
+        Raises:
+            MissingRunError: there is no such run, or it is not complete.
+            ConfigError: the text fits several runs; names them.
+        """
+        runs = [run for run in cls.find(stage, root=root) if run.complete]
+        if not runs:
+            raise MissingRunError(
+                f"no complete {stage} run under {_root(root)}; do `nsf run`, or set NSF_RUNS"
+            )
+        if not text:
+            return runs[0]
+        given = text.strip("/").removeprefix(f"{str(_root(root)).strip('/')}/")
+        fitting = [run for run in runs if f"{run.id}/".startswith(given) or run.hash.startswith(given)]
+        if len(fitting) > 1:
+            raise ConfigError(
+                f"{text} fits {len(fitting)} runs, {', '.join(run.id for run in fitting)}; give more of one"
+            )
+        if not fitting:
+            known = ", ".join(run.id for run in runs[:8])
+            raise MissingRunError(f"no complete {stage} run is called {text}; there are {known}")
+        return fitting[0]
+
     @property
     def id(self) -> str:
         """`stage/scene/hash`."""

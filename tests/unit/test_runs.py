@@ -248,3 +248,29 @@ def test_provenance_in_and_outside_a_checkout(tmp_path, monkeypatch):
     assert fresh()["versions"]["numpy"] == np.__version__
     monkeypatch.setenv("PATH", "")
     assert fresh()["commit"] is None
+
+
+def test_a_run_is_named_by_what_tells_it_from_the_others(tmp_path):
+    runs = [recorded(Run.open("deploy", scene, {"r": r}, root=tmp_path)) for scene, r in SOME]
+    for run in runs:
+        for text in (run.id, run.hash, run.hash[:8], run.id[:-3], f"{run.path}/", run.path.relative_to("/")):
+            assert Run.named("deploy", str(text), root=tmp_path) == run
+    assert Run.named("deploy", "deploy/cake", root=tmp_path) == runs[2]
+    assert Run.named("deploy", root=tmp_path) == runs[-1]
+    with pytest.raises(ConfigError, match=f"fits 2 runs, .*{runs[0].id}.*; give more"):
+        Run.named("deploy", "deploy/sand", root=tmp_path)
+    for text in ("train/sand", "xyz", f"{runs[0].id}0", ".."):
+        with pytest.raises(MissingRunError, match=f"no complete deploy run is called {text}; there are "):
+            Run.named("deploy", text, root=tmp_path)
+
+
+SOME = (("sand", 5), ("sand", 6), ("cake", 5))
+
+
+def test_a_run_that_is_not_whole_has_no_name(tmp_path):
+    with pytest.raises(MissingRunError, match="no complete deploy run under"):
+        Run.named("deploy", root=tmp_path)
+    run = recorded(Run.open("deploy", "sand", {"r": 5}, root=tmp_path))
+    (run.path / "data.bin").unlink()
+    with pytest.raises(MissingRunError, match="no complete deploy run under"):
+        Run.named("deploy", run.id, root=tmp_path)
