@@ -10,6 +10,7 @@ from nsf.dynamics.projection import ProjectionResult, stop_reasons
 
 if TYPE_CHECKING:
     from nsf.dynamics.solver import ReducedMPM
+    from nsf.kinematics.manifold import Restriction
 
 
 @dataclass(frozen=True)
@@ -69,34 +70,46 @@ class LatentRecord:
 
 
 class Decoder:
-    """x, τ and C of every particle as the solver's method takes them.
+    """x, τ and C of particles as the solver's method takes them.
 
     Without a stress field τ comes from ∂g/∂X, without an affine field C is 0: what the run
     used, not what the manifold could have given.
+
+    Args:
+        solver: it says what the method takes τ and C from, and at which parameters.
+        particles: [n] their indices; every particle by default.
+        at: fields of the same particles, as of another decoder's `at`; restricted anew if None.
     """
 
-    def __init__(self, solver: "ReducedMPM"):
+    def __init__(
+        self,
+        solver: "ReducedMPM",
+        particles: np.ndarray | None = None,
+        at: "Restriction | None" = None,
+    ):
         constants = solver.scene_particles
-        self.at = solver.manifold.restrict(
-            particles=np.arange(len(constants)), dtype=solver.dtype, device=solver.torch_device
-        )
+        if particles is None:
+            particles = np.arange(len(constants))
+        if at is None:
+            at = solver.manifold.restrict(particles, dtype=solver.dtype, device=solver.torch_device)
+        self.at = at
 
         def tensor(values: np.ndarray) -> torch.Tensor:
-            return torch.as_tensor(values, dtype=solver.dtype, device=solver.torch_device)
+            return torch.as_tensor(values[particles], dtype=solver.dtype, device=solver.torch_device)
 
         self._stress = solver.stress_of(self.at, tensor(constants.mu), tensor(constants.lam))
         self._affine = solver.affine_of(self.at)
 
     def position(self, xhat: torch.Tensor) -> torch.Tensor:
-        """x = g(X, x̂), [P, 3] of x̂ [r] or [F, P, 3] of x̂ [F, r], in metres."""
+        """x = g(X, x̂), [n, 3] of x̂ [r] or [F, n, 3] of x̂ [F, r], in metres."""
         return self.at.position(xhat)
 
     def stress(self, xhat: torch.Tensor) -> torch.Tensor:
-        """τ [F, P, 3, 3] of x̂ [F, r], in pascals."""
+        """τ [F, n, 3, 3] of x̂ [F, r], in pascals."""
         return torch.stack([self._stress(row).clone() for row in xhat])
 
     def affine(self, xhat: torch.Tensor) -> torch.Tensor:
-        """C [F, P, 3, 3] of x̂ [F, r], in 1/s."""
+        """C [F, n, 3, 3] of x̂ [F, r], in 1/s."""
         found = [self._affine(row) for row in xhat]
         empty = torch.zeros(self.at.points, 3, 3, dtype=self.at.dtype, device=self.at.device)
         return torch.stack([empty if C is None else C for C in found])

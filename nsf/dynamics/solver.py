@@ -205,6 +205,10 @@ class ReducedMPM:
         """The fields at every particle, as the method takes them."""
         return Decoder(self)
 
+    def sets_at(self, step: int) -> ParticleSets:
+        """S, N and I of the step that starts `step` steps after t = 0."""
+        return self._phase_at(step).sets
+
     @property
     def state(self) -> LatentState:
         """The latent state; `state.numpy()` decodes every particle."""
