@@ -17,6 +17,10 @@ STAGES = {
     "superresolve": "deployed fields at many more points, beside a full-order run of as many particles",
     "point": "one material point along a deformation path",
 }
+#: Commands that take a run and options of their own, see `nsf.live.command`.
+LIVE = {
+    "view": "a deployment in the browser: steer the reduced run, see it beside the full-order one",
+}
 _EXAMPLES = """\
 examples:
   nsf run scene=sand scale=small                       the paper's method in a minute or two, on a CPU
@@ -25,6 +29,7 @@ examples:
   nsf run -m scene=sand latent_dim=4,6 sampler.size=50,150   every combination
   nsf run +experiment=table1 scale=small               every job of experiments/table1.yaml, and its report
   nsf point material=drucker_prager path=oedometer     plot a law before trusting it
+  nsf view                                             the newest deployment in the browser
 
 Results lie in ./runs (NSF_RUNS) and ./reports (NSF_REPORTS)."""
 
@@ -58,11 +63,15 @@ def _dispatch(arguments: list[str]) -> int:
         print(version("nsf"))
         return 0
     stage, overrides = arguments[0], arguments[1:]
+    if stage in LIVE:
+        from nsf.live.command import main as live
+
+        return live(stage, LIVE[stage], overrides)
     if stage not in STAGES:
         import difflib
 
-        near = difflib.get_close_matches(stage, STAGES, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"choose one of {', '.join(STAGES)}"
+        near = difflib.get_close_matches(stage, [*STAGES, *LIVE], n=1)
+        hint = f"did you mean {near[0]}?" if near else f"choose one of {', '.join([*STAGES, *LIVE])}"
         print(f"error: unknown stage {stage!r}; {hint}", file=sys.stderr)
         return 2
     if {"-h", "--help"} & set(overrides):
@@ -178,10 +187,12 @@ def _multirun(stage: str, sweeps: Sequence[list[str]], stages: Sequence[str]) ->
 
 
 def _help() -> str:
-    width = max(map(len, STAGES))
-    stages = "\n".join(f"  {name:<{width}}  {text}" for name, text in STAGES.items())
-    usage = "usage: nsf STAGE [+experiment=NAME] [key=value …] [-m]"
-    return f"{usage}\n\nstages:\n{stages}\n\n{_EXAMPLES}\n\n{_groups()}"
+    width = max(map(len, [*STAGES, *LIVE]))
+    stages, live = (
+        "\n".join(f"  {name:<{width}}  {text}" for name, text in table.items()) for table in (STAGES, LIVE)
+    )
+    usage = "usage: nsf STAGE [+experiment=NAME] [key=value …] [-m]\n       nsf view [RUN] [--help]"
+    return f"{usage}\n\nstages:\n{stages}\n\nlive:\n{live}\n\n{_EXAMPLES}\n\n{_groups()}"
 
 
 def _groups() -> str:

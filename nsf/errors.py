@@ -39,3 +39,7 @@ class ProjectionError(NSFError):
 
 class MissingRunError(NSFError):
     """A stage needs the result of an earlier stage that does not exist."""
+
+
+class MissingExtraError(NSFError):
+    """A command needs a package that is not installed; names the extra."""

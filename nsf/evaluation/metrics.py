@@ -78,6 +78,11 @@ def von_mises(tau: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch"]:
     return (1.5 * ((xx - mean) ** 2 + (yy - mean) ** 2 + (zz - mean) ** 2 + 2 * shear)).sqrt()
 
 
+def pressure(tau: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch"]:
+    """Kirchhoff pressure −tr τ/3 [Pa] of τ [Pa], entries xx, xy, xz, yy, yz, zz; positive in compression."""
+    return -(tau[..., 0] + tau[..., 3] + tau[..., 5]) / 3
+
+
 def stress_error(
     tau_rom: Float[Tensor, "frame particle 6"], tau_fom: Float[Tensor, "frame particle 6"]
 ) -> float:

@@ -40,7 +40,5 @@ def test_a_run_without_its_configuration_says_what_to_do(chain, tmp_path):
     shutil.copytree(chain.root / "deploy", tmp_path / "deploy")
     run = replace(chain.pipeline.deployment, root=tmp_path)
     (run.path / CONFIGURATION).unlink()
-    with pytest.raises(
-        MissingRunError, match="delete the folder and run `nsf deploy scene=sand`"
-    ):
+    with pytest.raises(MissingRunError, match="delete the folder and run `nsf deploy scene=sand`"):
         Pipeline.of_run(run)
