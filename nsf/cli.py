@@ -17,9 +17,10 @@ STAGES = {
     "superresolve": "deployed fields at many more points, beside a full-order run of as many particles",
     "point": "one material point along a deformation path",
 }
-#: Commands that take a run and options of their own, see `nsf.live.command`.
+#: Commands that take a run and options of their own, each a module of `nsf.live`.
 LIVE = {
     "view": "a deployment in the browser: steer the reduced run, see it beside the full-order one",
+    "serve": "a deployment's latent vectors as a stream that many browsers decode",
 }
 _EXAMPLES = """\
 examples:
@@ -191,7 +192,7 @@ def _help() -> str:
     stages, live = (
         "\n".join(f"  {name:<{width}}  {text}" for name, text in table.items()) for table in (STAGES, LIVE)
     )
-    usage = "usage: nsf STAGE [+experiment=NAME] [key=value …] [-m]\n       nsf view [RUN] [--help]"
+    usage = "usage: nsf STAGE [+experiment=NAME] [key=value …] [-m]\n       nsf view|serve [RUN] [--help]"
     return f"{usage}\n\nstages:\n{stages}\n\nlive:\n{live}\n\n{_EXAMPLES}\n\n{_groups()}"
 
 
