@@ -1,23 +1,73 @@
-"""What `nsf serve --bench` measures: frames a second that clients on loopback get, and bytes."""
+"""What `--bench` measures: how fast a slider is followed, and what a stream costs."""
 
 import asyncio
+import itertools
 import json
 import logging
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pandas as pd
 from websockets.asyncio.client import connect
 
+from nsf.live.coloring import Coloring
 from nsf.live.player import Player
 from nsf.live.server import Stream
 from nsf.live.wire import field_message, frame_message
 
 #: A rate that no server reaches: it sends as fast as it can.
 _UNLIMITED = 1e6
+_TRIALS = 9
 _SECONDS, _WARM_UP, _STEER = 5.0, 1.0, 0.5
+
+
+def follow(player: Player) -> pd.DataFrame:
+    """How fast `nsf view` can be, without what viser and the browser take.
+
+    Returns:
+        One row a step at which what is shown stands still while the parameter is moved: median and longest
+        time [s] from there until the run at the new value is shown. `build` of it is the solver's; frames/s
+        are those of a step and its picture, beside the full-order run's, one after the other.
+    """
+    model, coloring = player.model, Coloring(player.model)
+    known = model.truth(model.initial)
+    rows, values = [], _values(*model.parameter.trained)
+    with player:
+        player.playing = False
+        for step in sorted({player.steps // 4, player.steps // 2, player.steps}):
+            player.seek(step)
+            waits, builds, steps, pictures = ([] for _ in range(4))
+            for _ in range(_TRIALS):
+                started = time.perf_counter()
+                player.steer(next(values))
+                while player.tick().run.value != player.value:
+                    time.sleep(0.001)
+                waits.append(time.perf_counter() - started)
+                moment = player.tick()
+                builds.append(waits[-1] - moment.run.seconds)
+                steps.append(moment.run.seconds / moment.run.reached)
+                started = time.perf_counter()
+                coloring.picture(moment, known, "von Mises stress")
+                pictures.append(time.perf_counter() - started)
+            rows.append(
+                {
+                    "shown step": step,
+                    "median [s]": round(float(np.median(waits)), 3),
+                    "longest [s]": round(max(waits), 3),
+                    "of it build [s]": round(float(np.median(builds)), 3),
+                    "step [ms]": round(1e3 * float(np.median(steps)), 2),
+                    "picture [ms]": round(1e3 * float(np.median(pictures)), 2),
+                    "frames/s": round(1.0 / float(np.median(steps) + np.median(pictures)), 1),
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def _values(low: float, high: float) -> Iterator[float]:
+    """Values between two, none twice: the run at one that was asked for would be there already."""
+    return (low + (high - low) * (n * 0.618034 % 1.0) for n in itertools.count(1))
 
 
 def bench(player: Player, counts: Sequence[int], rate: float) -> pd.DataFrame:
@@ -77,16 +127,14 @@ async def _measured(player: Player, count: int, rate: float) -> list[float]:
 async def _clients(url: str, count: int, low: float, high: float) -> list[float]:
     async def client(steers: bool) -> float:
         async with connect(url, compression=None) as connection:
-            frames, steered, n = 0, 0.0, 0
+            frames, steered, values = 0, 0.0, _values(low, high)
             started = time.monotonic() + _WARM_UP
             while (now := time.monotonic()) < started + _SECONDS:
                 message = await connection.recv()
                 frames += isinstance(message, bytes) and now > started
                 if steers and now > steered + _STEER:
-                    # Values that are not asked for twice, or the run would be there already.
-                    n, steered = n + 1, now
-                    value = low + (high - low) * (n * 0.618034 % 1.0)
-                    await connection.send(json.dumps({"value": value}))
+                    steered = now
+                    await connection.send(json.dumps({"value": next(values)}))
             return frames / _SECONDS
 
     return await asyncio.gather(*(client(index == 0) for index in range(count)))

@@ -93,12 +93,8 @@ class Coloring:
             law = von_mises if by == "von Mises stress" else pressure
             reduced = _of_stress(law, run.stress(step))
             full = _of_stress(law, truth.stress(t)) if truth else None
-        return Picture(x, _bytes(scale, reduced), x_full, _bytes(scale, full) if truth else None)
+        return Picture(x, scale.pixels(reduced), x_full, scale.pixels(full) if truth else None)
 
 
 def _of_stress(law: Callable[[torch.Tensor], torch.Tensor], tau: np.ndarray) -> np.ndarray:
     return law(torch.as_tensor(tau)).numpy()
-
-
-def _bytes(scale: ColorScale, values: np.ndarray) -> np.ndarray:
-    return (255 * scale.colors(values)).astype(np.uint8)

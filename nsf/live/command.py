@@ -49,6 +49,11 @@ def _view(run: Run, options: argparse.Namespace) -> None:
     from nsf.live.page import Page  # first: without viser there is no use in building a model
 
     player = _player(run, options)
+    if options.bench:
+        from nsf.live.bench import follow
+
+        print(follow(player).to_string(index=False))
+        return
     page = Page(player, options.host, options.port)
     if options.host not in LOOPBACK:
         print(f"view: warning: whoever reaches {options.host} can look and steer; nsf serve asks for a token")
@@ -122,7 +127,9 @@ def _parser(command: str, text: str) -> argparse.ArgumentParser:
     add("--port", type=_port, default={"view": 8080, "serve": 8765}[command], help="to serve at")
     add("--points", type=_count, default=6000, help="most particles that are shown")
     add("--device", default="auto", help="of the reduced run: cpu, cuda, cuda:N or auto")
-    if command == "serve":
+    if command == "view":
+        add("--bench", action="store_true", help="measure how fast the slider is followed, and end")
+    else:
         add("--token", help="that whoever joins must give; drawn at random unless only this machine can")
         add("--rate", type=_positive, default=30.0, help="frames a second")
         add(

@@ -36,5 +36,11 @@ class ColorScale:
 
     def colors(self, values: np.ndarray) -> np.ndarray:
         """Values in SI as colours [n,3]; what is not finite takes the end of the scale."""
-        clipped = np.minimum(np.nan_to_num(values, nan=np.inf), self.top)
-        return self.mappable.to_rgba(clipped / self.factor)[:, :3]
+        return self.mappable.to_rgba(self._clipped(values))[:, :3]
+
+    def pixels(self, values: np.ndarray) -> np.ndarray:
+        """The same as numbers of 8 bits."""
+        return self.mappable.to_rgba(self._clipped(values), bytes=True)[:, :3]
+
+    def _clipped(self, values: np.ndarray) -> np.ndarray:
+        return np.minimum(np.nan_to_num(values, nan=np.inf), self.top) / self.factor

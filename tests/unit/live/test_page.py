@@ -44,7 +44,7 @@ def test_colours_say_what_they_are_of(model, coloring, run):
     def colors(by, step=run.steps):
         return coloring.picture(Moment(run, step), model.truth(26.0), by)
 
-    lowest = (255 * coloring.scales["displacement"].colors(np.zeros(1))).astype(np.uint8)
+    lowest = coloring.scales["displacement"].pixels(np.zeros(1)).astype(int)
     # In double precision nothing has moved at t = 0; the page shows float32.
     assert abs(colors("displacement", 0).colors_reduced.astype(int) - lowest).max() <= 1
     assert len(np.unique(colors("displacement").colors_reduced, axis=0)) > 20
