@@ -101,8 +101,8 @@ class Run:
 
         Args:
             stage: such as "deploy".
-            text: the run's id, its folder, or as much of the beginning of its id or hash as no other
-                run of the stage shares.
+            text: the run's id, its folder, or as much of the beginning of its id, with or without the stage,
+                or of its hash as no other run of the stage shares.
 
         Raises:
             MissingRunError: there is no such run, or it is not complete.
@@ -116,7 +116,11 @@ class Run:
         if not text:
             return runs[0]
         given = text.strip("/").removeprefix(f"{str(_root(root)).strip('/')}/")
-        fitting = [run for run in runs if f"{run.id}/".startswith(given) or run.hash.startswith(given)]
+        fitting = [
+            run
+            for run in runs
+            if any(name.startswith(given) for name in (run.id, f"{run.scene}/{run.hash}", run.hash))
+        ]
         if len(fitting) > 1:
             raise ConfigError(
                 f"{text} fits {len(fitting)} runs, {', '.join(run.id for run in fitting)}; give more of one"

@@ -185,6 +185,7 @@ class LiveModel:
         shown: [n] indices of the particles that are shown.
         at: the fields there.
         X: [n, 3] their positions at rest [m].
+        spacing: edge of the cube that each has to fill [m].
 
     Raises:
         MissingRunError: the deployment, or the training that it rests on, is not whole.
@@ -207,6 +208,7 @@ class LiveModel:
         self.shown = _shown(self.particles, sample, points)
         self.at = self.manifold.restrict(self.shown, dtype=torch.float32, device=self._pipeline.device)
         self.X = self.manifold.X[self.shown].numpy().astype(np.float32)
+        self.spacing = float((solver.scene_particles.volume0.sum() / len(self.shown)) ** (1 / 3))
 
     @property
     def initial(self) -> float:

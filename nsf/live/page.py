@@ -77,7 +77,7 @@ class Page:
         extent = high - low
         self._beside = np.array([(1.0 + _GAP) * extent[0], 0.0, 0.0])
         X = self._model.X
-        size = 0.9 * float((np.prod(np.ptp(X, axis=0) + 1e-9) / len(X)) ** (1 / 3))
+        size = 1.1 * self._model.spacing
         # What the camera has in front of the middle hides the inside, where the stress is.
         self._behind = X[:, 1] >= X[:, 1].mean()
         self._thick = bool(extent[:2].min() > 0.5 * extent[:2].max())
@@ -113,8 +113,10 @@ class Page:
         )
         across = (2.0 + _GAP) * extent[0]
         camera = self._server.initial_camera
-        camera.position = 0.5 * self._beside + across * np.array([0.1, -0.7, 0.3])
-        camera.look_at = 0.5 * self._beside
+        # Right of the middle, since the controls are there.
+        middle = 0.65 * self._beside
+        camera.position = middle + across * np.array([0.1, -0.7, 0.3])
+        camera.look_at = middle
         camera.up = (0.0, 0.0, 1.0)
 
     # -- controls -------------------------------------------------------------------------------------------

@@ -47,6 +47,7 @@ def field_message(model: LiveModel) -> bytes:
         "title": model.title,
         "run": model.run.id,
         "particles": model.particles,
+        "spacing": model.spacing,
         "low": x.min((0, 1)).tolist(),
         "high": x.max((0, 1)).tolist(),
         "moved": float(np.percentile(np.linalg.norm(x - model.X, axis=2), 99.5)),

@@ -255,7 +255,8 @@ def test_a_run_is_named_by_what_tells_it_from_the_others(tmp_path):
     for run in runs:
         for text in (run.id, run.hash, run.hash[:8], run.id[:-3], f"{run.path}/", run.path.relative_to("/")):
             assert Run.named("deploy", str(text), root=tmp_path) == run
-    assert Run.named("deploy", "deploy/cake", root=tmp_path) == runs[2]
+    for text in ("deploy/cake", "cake", "cake/"):
+        assert Run.named("deploy", text, root=tmp_path) == runs[2]
     assert Run.named("deploy", root=tmp_path) == runs[-1]
     with pytest.raises(ConfigError, match=f"fits 2 runs, .*{runs[0].id}.*; give more"):
         Run.named("deploy", "deploy/sand", root=tmp_path)
