@@ -20,6 +20,8 @@ _CHUNK = 4
 _KEPT = 64
 #: Frames in which a run is played, and those for which its end stands still.
 _FRAMES, _HOLD = 150, 30
+#: Frames that a run is ahead of what is shown when it is first shown: they play while the next is made.
+_LEAD = 20
 
 
 @dataclass(frozen=True)
@@ -53,9 +55,10 @@ class Moment:
 class Player:
     """Runs a live model ahead of what is shown, and starts it anew where the parameter is moved to.
 
-    A run at another value is shown once it has come as far as the one that is shown, and only then gives way
-    to a newer value: while a slider is dragged, what is shown follows it as fast as runs can be made. Any
-    thread may call; `work` belongs to one, which `with player:` provides.
+    A run at another value is shown once it has come as far as the one that is shown, or a little further
+    where that goes on, and only then gives way to a newer value: while a slider is dragged, what is shown
+    follows it as fast as runs can be made. Any thread may call; `work` belongs to one, which `with player:`
+    provides.
 
     Args:
         model: what is run.
@@ -139,7 +142,8 @@ class Player:
         if run.finished:
             self._keep(run)
         with self._wake:
-            if self._coming is not None and (run.finished or run.reached >= self._step):
+            lead = _LEAD * self.stride if self.playing else 0
+            if self._coming is not None and (run.finished or run.reached >= self._step + lead):
                 self._shown, self._coming = run, None
         return not idle
 

@@ -75,6 +75,21 @@ def test_while_it_is_dragged_every_shown_run_is_of_a_value_that_was_asked_for(pl
     assert player.tick().run.finished
 
 
+def test_while_it_is_dragged_it_plays_on(player, monkeypatch):
+    """Each run that is shown is ahead of what is shown, so that the next can be made meanwhile."""
+    monkeypatch.setattr("nsf.live.player._LEAD", 6)
+    work(player)
+    shown = []
+    for n in range(100):
+        player.steer(25.0 + 0.1 * n)  # at every piece of work: no hand is faster
+        player.work()
+        if n % 3 == 0:
+            shown.append(player.tick())
+    steps = [moment.step for moment in shown]
+    assert len({moment.run.value for moment in shown}) > 5
+    assert steps[:24] == list(range(1, 25))
+
+
 def test_a_run_that_was_made_is_not_made_again(player, monkeypatch):
     work(player)
     first = player.tick().run
