@@ -95,10 +95,9 @@ def _bench(player: "Player", options: argparse.Namespace) -> None:
     from nsf.live.bench import bench, sizes
 
     found = sizes(player)
-    print(
-        f"serve: a frame is {found['frame']} bytes a user, of which x̂ is {found['latent']}; as particles it"
-    )
-    print(f"serve: were {found['positions']:,}, with stress {found['positions and stress']:,}")
+    print(f"serve: a frame is {found['frame']} bytes a user, of which x̂ is {found['latent']}")
+    told = f"{found['positions']:,} bytes, with their stress {found['positions and stress']:,}"
+    print(f"serve: the positions of all particles would be {told}")
     print(f"serve: the field, once a user, is {found['field']:,} bytes")
     with player:
         print(bench(player, options.bench, options.rate).to_string(index=False))
