@@ -19,6 +19,9 @@ STAGES = {
 }
 #: Commands that are no stage: what they do, and what they take; None for those with options of their own.
 TOOLS = {
+    "view": ("a deployment in the browser: steer the reduced run, see it beside the full-order one", None),
+    "serve": ("a deployment's latent vectors as a stream that many browsers decode", None),
+    "export": ("a deployed run for other programs: HTML page, USD, VTK, ONNX, pictures and film", None),
     "search": (
         "values of numeric keys that make δ, or δ and the step's time, small at the validation values",
         "key=low..high[:log] … [key=value …] [search.objectives=[delta,step_ms]] [search.trials=20]",
@@ -31,7 +34,6 @@ TOOLS = {
         "a page of every run, with a thumbnail each, that sorts and filters in the browser",
         "[folder=PATH]; reports/runs by default",
     ),
-    "export": ("a deployed run for other programs: HTML page, USD, VTK, ONNX, pictures and film", None),
     "doctor": ("versions, devices, folders and extras of this installation", ""),
 }
 _EXAMPLES = """\
@@ -45,6 +47,7 @@ examples:
   nsf run -m +experiment=table1 hydra/launcher=slurm   jobs in Slurm's queue (conf/hydra/launcher/slurm.yaml)
   nsf export --html --frames                           the newest deployed run as a page and a film
   nsf point material=drucker_prager path=oedometer     plot a law before trusting it
+  nsf view                                             the newest deployment in the browser
   nsf search scene=sand scene.parameters.validation=[27,31] latent_dim=4..8   the r of the smallest δ there
   nsf runs stage=evaluate scene=sand latent_dim=4 sort=delta   runs by what made them, the best first
   nsf runs diff 1a2b 3c4d                              what differs between two runs, in keys and in result
@@ -126,6 +129,10 @@ def _tool(name: str, words: list[str]) -> int:
     if usage is not None and {"-h", "--help"} & set(words):
         print(f"usage: nsf {name} {usage}\n\n{text}")
         return 0
+    if name in ("view", "serve"):
+        from nsf.live.command import main as live
+
+        return live(name, text, words)
     tools = {"doctor": _doctor, "export": _export, "index": _index, "runs": _runs, "search": _search}
     return tools[name](words)
 

@@ -77,7 +77,7 @@ class Decoder:
     used, not what the manifold could have given.
 
     Args:
-        at: fields restricted to P points.
+        at: fields restricted to n points.
         stress, affine: the sources of τ and C (`Method.stress_of`, `Method.affine_of`).
     """
 
@@ -90,15 +90,15 @@ class Decoder:
         self.at, self._stress, self._affine = at, stress, affine
 
     def position(self, xhat: torch.Tensor) -> torch.Tensor:
-        """x = g(X, x̂), [P, 3] of x̂ [r] or [F, P, 3] of x̂ [F, r], in metres."""
+        """x = g(X, x̂), [n, 3] of x̂ [r] or [F, n, 3] of x̂ [F, r], in metres."""
         return self.at.position(xhat)
 
     def stress(self, xhat: torch.Tensor) -> torch.Tensor:
-        """τ [F, P, 3, 3] of x̂ [F, r], in pascals."""
+        """τ [F, n, 3, 3] of x̂ [F, r], in pascals."""
         return torch.stack([self._stress(row).clone() for row in xhat])
 
     def affine(self, xhat: torch.Tensor) -> torch.Tensor:
-        """C [F, P, 3, 3] of x̂ [F, r], in 1/s."""
+        """C [F, n, 3, 3] of x̂ [F, r], in 1/s."""
         found = [self._affine(row) for row in xhat]
         empty = torch.zeros(self.at.points, 3, 3, dtype=self.at.dtype, device=self.at.device)
         return torch.stack([empty if C is None else C for C in found])

@@ -15,6 +15,7 @@ from nsf.dynamics.projection import GaussNewton, Taylor
 from nsf.dynamics.sampling import RandomSampler, SamplePhase, Sampler, check_well_posed
 from nsf.dynamics.stress import Method
 from nsf.errors import ConfigError, ShapeError
+from nsf.kinematics.manifold import Restriction
 from nsf.mpm import BoundaryArrays, Grid, GridStep, precision_of
 from nsf.mpm.device import warp_device
 from nsf.mpm.shape import DEGREES
@@ -199,18 +200,28 @@ class ReducedMPM:
         """The method's source of C [n, 3, 3] [1/s] at restricted points; gives None for C = 0."""
         return self.method.affine_of(at, self.parameters)
 
-    def decoder(self) -> Decoder:
-        """The fields at every particle, as the method takes them."""
+    def decoder(self, particles: np.ndarray | None = None, at: Restriction | None = None) -> Decoder:
+        """The fields at particles, as the method takes them.
+
+        Args:
+            particles: [n] their indices; every particle by default.
+            at: fields of the same particles, as of another decoder's `at`; restricted anew if None.
+        """
         constants = self.scene_particles
-        at = self.manifold.restrict(
-            particles=np.arange(len(constants)), dtype=self.dtype, device=self.torch_device
-        )
+        if particles is None:
+            particles = np.arange(len(constants))
+        if at is None:
+            at = self.manifold.restrict(particles, dtype=self.dtype, device=self.torch_device)
 
         def tensor(values: np.ndarray) -> torch.Tensor:
-            return torch.as_tensor(values, dtype=self.dtype, device=self.torch_device)
+            return torch.as_tensor(values[particles], dtype=self.dtype, device=self.torch_device)
 
         stress = self.stress_of(at, tensor(constants.mu), tensor(constants.lam))
         return Decoder(at, stress, self.affine_of(at))
+
+    def sets_at(self, step: int) -> ParticleSets:
+        """S, N and I of the step that starts `step` steps after t = 0."""
+        return self._phase_at(step).sets
 
     @property
     def state(self) -> LatentState:

@@ -39,23 +39,22 @@ class BasisField:
         modes: K of x, tau and C: one for all, [x, tau=C] or [x, tau, C]; cut to the snapshots' rank.
         beta: hidden widths over d (3, 6, 9) of the closure and the two heads, given like `modes`.
         depth: hidden layers of each network.
-        displacement_noise: deviation of the noise added in training to each displacement coefficient that is
-            a latent, over that of the first. Weak latents are off by as much as strong ones, since a step
-            puts an error of the same length into each; the closure and the heads have to stay regular there.
+        noise: deviation of the noise added to xhat in training, in units of xhat's deviation. It keeps the
+            Jacobian and the heads regular beside the training trajectories.
         head_parameters: the heads see the (standardised) problem parameters beside xhat.
     """
 
     modes: int | Sequence[int] = (48, 64, 64)
     beta: int | Sequence[int] = (48, 48, 32)
     depth: int = 3
-    displacement_noise: float = 0.01
+    noise: float = 0.01
     head_parameters: bool = True
 
     def __post_init__(self) -> None:
         per_phase("modes", self.modes)
         per_phase("beta", self.beta)
         at_least("depth", self.depth, 1)
-        at_least("displacement_noise", self.displacement_noise, 0)
+        at_least("noise", self.noise, 0)
 
     def prepare(self, snapshots: Snapshots, latent_dim: int) -> dict[str, Any]:
         """POD coefficients [M, K] of x, tau and C and the energy the modes leave out.
@@ -91,7 +90,7 @@ class BasisField:
             "modes": [prepared[name]["coefficients"].shape[1] for name, _ in TARGETS.values()],
             "beta": list(per_phase("beta", self.beta)),
             "depth": self.depth,
-            "displacement_noise": self.displacement_noise,
+            "noise": self.noise,
             "head_parameters": self.head_parameters,
             "unresolved": [prepared[name]["unresolved"] for name, _ in TARGETS.values()],
         }
@@ -131,12 +130,10 @@ class BasisField:
         network = manifold.fields[phase].network
         latents = manifold.training_latents.float()
         parameters = manifold.standard_parameters(manifold.training_parameters.float())
-        deviations = manifold.fields["deformation"].leading.float()
-        noise = self.displacement_noise * deviations[0] / deviations
 
         def loss(rows: Tensor | slice, particles: Tensor | slice, generator: torch.Generator) -> Tensor:
             xhat = latents[rows]
-            inputs = xhat + noise * torch.randn(xhat.shape, generator=generator, device=xhat.device)
+            inputs = xhat + self.noise * torch.randn(xhat.shape, generator=generator, device=xhat.device)
             if manifold.takes_parameters(phase):
                 inputs = torch.cat([inputs, parameters[rows]], -1)
             return (network(inputs) - targets[rows]).square().mean()

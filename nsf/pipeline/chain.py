@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from nsf.data import Snapshots, Trajectory
 from nsf.dynamics import (
@@ -32,10 +32,13 @@ from nsf.kinematics.training import train
 from nsf.pipeline import results
 from nsf.pipeline.plan import Plan
 from nsf.pipeline.simulation import Job, simulate
-from nsf.runs import Run
+from nsf.runs import Record, Run
 from nsf.scenes import Scene
+from nsf.storage import writing
 
 STAGES = ("simulate", "train", "deploy", "evaluate", "report")
+#: File of a deploy run with the configuration of its whole chain, interpolations kept.
+CONFIGURATION = "configuration.yaml"
 
 
 class Pipeline(Plan):
@@ -51,6 +54,28 @@ class Pipeline(Plan):
         self.say = say
         self._phases: Sequence[SamplePhase] | None = None
         self._sets: Sequence[ParticleSets] | None = None
+
+    @classmethod
+    def of_run(cls, run: Run, device: str = "auto", say: Callable[[str], None] = print) -> "Pipeline":
+        """The chain that a deploy run is part of, for more than the run holds.
+
+        Args:
+            run: a complete deploy run.
+            device: of what is done with it; the run may have been made on another.
+            say: as for `Pipeline`.
+
+        Raises:
+            MissingRunError: the run was made before its whole configuration was kept.
+        """
+        path = run.path / CONFIGURATION
+        if not path.is_file():
+            raise MissingRunError(
+                f"{run.path} has no {CONFIGURATION}: it was made by an earlier nsf; "
+                f"delete the folder and run `nsf deploy scene={run.scene}` with the same keys"
+            )
+        config = OmegaConf.load(path)
+        config.device = device
+        return cls(config, say, run.root)
 
     def run(self, stage: str) -> Run | Path:
         """One stage by name; what it reads must be there, except that `simulate` needs nothing.
@@ -117,11 +142,18 @@ class Pipeline(Plan):
         seconds = metrics["training_seconds"]
         self.say(f"train: field={manifold.field}, r={c.latent_dim} in {seconds:.1f} s → {run.id}")
 
-    def _manifold(self) -> Manifold:
+    def manifold(self) -> Manifold:
+        """The trained manifold.
+
+        Raises:
+            MissingRunError: it is not trained.
+        """
         return Manifold.load(self.training.require().path / "manifold.pt")
 
-    def solver_at(self, manifold: Manifold, value: float, device: str | None = None) -> ReducedMPM:
-        """The configured reduced solver at a parameter value, at t = 0."""
+    def solver_at(
+        self, manifold: Manifold, value: float, device: str | None = None, precision: str | None = None
+    ) -> ReducedMPM:
+        """The reduced solver at a parameter value, at t = 0; device and precision as configured."""
         solver = self.deployed.reduced(
             manifold,
             {self.scene.parameters.name: value},
@@ -129,7 +161,7 @@ class Pipeline(Plan):
             method=self.method,
             projector=self.projector,
             integration=self.integration,
-            precision=self.config.precision,
+            precision=precision or self.config.precision,
             device=device or self.device,
             dt_multiplier=self.config.deploy.dt_multiplier,
             sets=self._sets,
@@ -143,7 +175,7 @@ class Pipeline(Plan):
         return self._made(self.deployment, self._deploy)
 
     def _deploy(self, run: Run) -> None:
-        manifold = self._manifold()
+        manifold = self.manifold()
         with run.record(device=self.device, precision=self.config.precision) as record:
             build = partial(self.solver_at, manifold)
             started = time.perf_counter()
@@ -162,6 +194,7 @@ class Pipeline(Plan):
                 if rollout.handed_over >= 0:
                     self._go_on(manifold, rollout, run.path / continuation_file(index))
                     record.output(continuation_file(index))
+            self._write_configuration(record)
             record.metrics["seconds"] = [r.seconds for r in rollouts]
             record.metrics["needed_outside"] = max(r.needed_outside for r in rollouts)
             record.metrics["diverged"] = [r.parameter for r in rollouts if r.diverged >= 0]
@@ -170,6 +203,12 @@ class Pipeline(Plan):
             f"deploy: method={self.config.method.name}, |S|={rollouts[0].sample}, "
             f"{len(rollouts)} values → {run.id}"
         )
+
+    def _write_configuration(self, record: Record) -> None:
+        # config.yaml is resolved, so in it no key follows another value of the problem parameter.
+        with writing(record.path / CONFIGURATION) as partial:
+            OmegaConf.save(self.scene.template, partial)
+        record.output(CONFIGURATION)
 
     def _go_on(self, manifold: Manifold, rollout: Rollout, path: Path) -> None:
         solver = self.solver_at(manifold, rollout.parameter)
@@ -211,7 +250,7 @@ class Pipeline(Plan):
         return self._made(self.evaluation, self._evaluate)
 
     def _evaluate(self, run: Run) -> None:
-        deployment, truths, manifold = self.deployment, self._truths(), self._manifold()
+        deployment, truths, manifold = self.deployment, self._truths(), self.manifold()
         with run.record(device=self.device, precision=self.config.precision) as record:
             rollouts = [Rollout.open(deployment.path / rollout_file(index)) for index in range(len(truths))]
             comparisons = [
@@ -282,7 +321,7 @@ class Pipeline(Plan):
 
     def _superresolve(self, run: Run) -> None:
         c, asked = self.config, self.config.super_resolution
-        deployment, truths, manifold = self.deployment, self._truths(), self._manifold()
+        deployment, truths, manifold = self.deployment, self._truths(), self.manifold()
         # Evenly spread, without frame 0, at which nothing has moved.
         steps = self.scene.steps
         frames = np.unique(np.linspace(0, steps, min(asked.frames, steps) + 1).round().astype(int))[1:]

@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING
 import matplotlib
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from PIL import Image
 
 from nsf.reporting.camera import Camera, View
+from nsf.reporting.colors import CLIP, DIFFERENCE_COLORS, METRES, PASCALS, STRESS_COLORS, ColorScale
 from nsf.reporting.columns import parameter_text
 from nsf.reporting.sources import Motion
 from nsf.reporting.style import INK, MUTED, WARNING, WIDTH, styled
@@ -21,8 +20,6 @@ from nsf.reporting.style import INK, MUTED, WARNING, WIDTH, styled
 if TYPE_CHECKING:
     from nsf.evaluation import SuperResolution
 
-STRESS_COLORS, DIFFERENCE_COLORS = "viridis", "magma"
-CLIP = 97.0  # [%] percentile of the full-order stress at which the colour scale ends
 GIF_BYTES = int(2.5 * 2**20)
 _THIN = 0.5  # of the larger horizontal extent: below it a body, as a slice or a frame, counts as thin
 
@@ -41,9 +38,9 @@ def final_shapes(
     """
     motions = _cut_open(motions)
     last = [(m, m.x_full[-1], m.x_reduced[-1], m.stress_full[-1], m.stress_reduced[-1]) for m in motions]
-    stress = _Scale.up_to(np.percentile([s[3] for s in last], CLIP), STRESS_COLORS, _PA)
+    stress = ColorScale.up_to(np.percentile([s[3] for s in last], CLIP), STRESS_COLORS, PASCALS)
     apart = [np.linalg.norm(x_rom - x_fom, axis=-1) for _, x_fom, x_rom, *_ in last]
-    distance = _Scale.up_to(_percentile(np.concatenate(apart), 99.5), DIFFERENCE_COLORS, _M)
+    distance = ColorScale.up_to(_percentile(np.concatenate(apart), 99.5), DIFFERENCE_COLORS, METRES)
     view = View.around(np.concatenate([x_fom for _, x_fom, *_ in last]), width=520, floor=floor)
     radius = _radius(motions[0].x_full[0])
     with styled():
@@ -73,7 +70,7 @@ def fine_shapes(
         floor: height of the floor line [m]; None draws none.
     """
     distances = np.linalg.norm(fine[0].x_full - fine[0].X, axis=1)
-    moved = _Scale.up_to(_percentile(distances, 99.5), STRESS_COLORS, _M)
+    moved = ColorScale.up_to(_percentile(distances, 99.5), STRESS_COLORS, METRES)
     view = View.around(np.concatenate([f.x_full for f in fine]), width=520, floor=floor)
     count, more = len(fine[0].particles), len(fine[0].X)
     titles = (f"reduced, {count:,} particles", f"reduced, {more:,} points", f"full-order, {more:,} particles")
@@ -103,7 +100,7 @@ def strip(
         floor: height of the floor line [m]; None draws none.
     """
     frames = np.unique(np.linspace(0, len(motion.t) - 1, count).round().astype(int))
-    stress = _Scale.up_to(np.percentile(motion.stress_full, CLIP), STRESS_COLORS, _PA)
+    stress = ColorScale.up_to(np.percentile(motion.stress_full, CLIP), STRESS_COLORS, PASCALS)
     view = View.around(motion.x_full[frames].reshape(-1, 3), width=420, floor=floor)
     radius = _radius(motion.x_full[0])
     value = parameter_text(motion.parameter, name, unit)
@@ -138,7 +135,7 @@ def animation(
     """
     motions = _cut_open(motions)
     x_full = np.concatenate([m.x_full.reshape(-1, 3) for m in motions])
-    stress = _Scale.up_to(np.percentile([m.stress_full for m in motions], CLIP), STRESS_COLORS, _PA)
+    stress = ColorScale.up_to(np.percentile([m.stress_full for m in motions], CLIP), STRESS_COLORS, PASCALS)
     view = View.around(x_full, width=width, floor=floor)
     radius = _radius(motions[0].x_full[0])
     count = len(motions[0].t)
@@ -162,30 +159,6 @@ def animation(
             clock.set_text(f"t = {motions[0].t[frame]:.2f} s")
             images.append(sheet.pixels())
     path.write_bytes(_gif(images, max_bytes))
-
-
-_PA = ((1e6, "MPa"), (1e3, "kPa"), (1.0, "Pa"), (1e-3, "mPa"), (1e-6, "µPa"))
-_M = ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm"))
-
-
-class _Scale:
-    """A colour scale from zero, in the unit that suits its end."""
-
-    def __init__(self, top: float, cmap: str, factor: float, unit: str):
-        self.factor, self.unit, self.top = factor, unit, top
-        self.mappable = ScalarMappable(Normalize(0, top / factor), matplotlib.colormaps[cmap])
-
-    @classmethod
-    def up_to(cls, top: float, cmap: str, units) -> "_Scale":
-        """`top` in SI; the largest unit in which it is no less than 0.3 is taken."""
-        top = float(top) if np.isfinite(top) and top > 0 else units[-1][0]
-        factor, unit = next(((f, u) for f, u in units if top >= 0.3 * f), units[-1])
-        return cls(top, cmap, factor, unit)
-
-    def colors(self, values: np.ndarray) -> np.ndarray:
-        """Values in SI as colours [n,3]; what is not finite takes the end of the scale."""
-        clipped = np.minimum(np.nan_to_num(values, nan=np.inf), self.top)
-        return self.mappable.to_rgba(clipped / self.factor)[:, :3]
 
 
 class _Sheet:
@@ -221,7 +194,7 @@ class _Sheet:
         panel.axis("off")
         self._images[row, column] = panel.imshow(picture, aspect="auto", interpolation="antialiased")
 
-    def color_bar(self, scale: _Scale, first: int, last: int, title: str) -> None:
+    def color_bar(self, scale: ColorScale, first: int, last: int, title: str) -> None:
         left, wide = self._left[first], self._left[last] - self._left[first] + self._wide
         panel = self._axes(left + 0.08 * wide, 0.42, 0.84 * wide, 0.11)
         bar = self.fig.colorbar(

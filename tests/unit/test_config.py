@@ -151,7 +151,7 @@ def test_foreign_targets_behind_an_added_key(tmp_path):
         ("method.neural_stress=maybe", "method.neural_stress=maybe"),
         ("trainer.learning_rate=abc", "trainer.learning_rate=abc"),
         ("field.depth=abc", "field.depth=abc"),
-        ("field.displacement_noise=abc", "field.displacement_noise=abc"),
+        ("field.noise=abc", "field.noise=abc"),
         ("material.E=soft", "material.E=soft"),
         ("material.nu=half", "material.nu=half"),
         ("transfer.damping=abc", "transfer.damping=abc"),

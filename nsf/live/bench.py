@@ -1,0 +1,145 @@
+"""What `--bench` measures: how fast a slider is followed, and what a stream costs."""
+
+import asyncio
+import itertools
+import json
+import logging
+import sys
+import time
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import pandas as pd
+from websockets.asyncio.client import connect
+
+from nsf.live.coloring import Coloring
+from nsf.live.player import Player
+from nsf.live.server import Stream
+from nsf.live.wire import field_message, frame_message
+
+#: A rate that no server reaches: it sends as fast as it can.
+_UNLIMITED = 1e6
+_TRIALS = 9
+_SECONDS, _WARM_UP, _STEER = 5.0, 1.0, 0.5
+
+
+def follow(player: Player) -> pd.DataFrame:
+    """How fast `nsf view` can be, without what viser and the browser take.
+
+    Returns:
+        One row a step at which what is shown stands still while the parameter is moved: median and longest
+        time [s] from there until the run at the new value is shown. `build` of it is the solver's; frames/s
+        are those of a step and its picture, beside the full-order run's, one after the other.
+    """
+    model, coloring = player.model, Coloring(player.model)
+    known = model.truth(model.initial)
+    rows, values = [], _values(*model.parameter.trained)
+    with player:
+        player.playing = False
+        for step in sorted({player.steps // 4, player.steps // 2, player.steps}):
+            player.seek(step)
+            waits, builds, steps, pictures = ([] for _ in range(4))
+            for _ in range(_TRIALS):
+                started = time.perf_counter()
+                player.steer(next(values))
+                while player.tick().run.value != player.value:
+                    time.sleep(0.001)
+                waits.append(time.perf_counter() - started)
+                moment = player.tick()
+                builds.append(waits[-1] - moment.run.seconds)
+                steps.append(moment.run.seconds / moment.run.reached)
+                started = time.perf_counter()
+                coloring.picture(moment, known, "von Mises stress")
+                pictures.append(time.perf_counter() - started)
+            rows.append(
+                {
+                    "shown step": step,
+                    "median [s]": round(float(np.median(waits)), 3),
+                    "longest [s]": round(max(waits), 3),
+                    "of it build [s]": round(float(np.median(builds)), 3),
+                    "step [ms]": round(1e3 * float(np.median(steps)), 2),
+                    "picture [ms]": round(1e3 * float(np.median(pictures)), 2),
+                    "frames/s": round(1.0 / float(np.median(steps) + np.median(pictures)), 1),
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def _values(low: float, high: float) -> Iterator[float]:
+    """Values between two, none twice: the run at one that was asked for would be there already."""
+    return (low + (high - low) * (n * 0.618034 % 1.0) for n in itertools.count(1))
+
+
+def bench(player: Player, counts: Sequence[int], rate: float) -> pd.DataFrame:
+    """Frames a second at each number of clients, at the rate asked for and as fast as can be.
+
+    The clients are another process of this machine. One of them moves the parameter twice a second, so
+    that the server makes reduced runs all the while. Nothing is sent, and so nothing counted, while a run
+    stands still at its end.
+
+    Returns:
+        Columns clients, rate asked for, mean and least frames/s of a client.
+    """
+    logging.getLogger("nsf").setLevel(logging.WARNING)  # who comes and goes is no news here
+    rows = []
+    for count in counts:
+        for wanted in (rate, _UNLIMITED):
+            got = asyncio.run(_measured(player, count, wanted))
+            rows.append(
+                {
+                    "clients": count,
+                    "asked": f"{wanted:g}" if wanted < _UNLIMITED else "all it can",
+                    "frames/s": round(float(np.mean(got)), 1),
+                    "slowest client": round(min(got), 1),
+                }
+            )
+    return pd.DataFrame(rows)
+
+
+def sizes(player: Player) -> dict[str, int]:
+    """Bytes: a frame on the wire, the same as positions and as positions and stress, and the field, once."""
+    frame, model = len(frame_message(player.tick())), player.model
+    return {
+        # A server's WebSocket frame of up to 125 bytes has a header of two.
+        "frame": frame + (2 if frame <= 125 else 4),
+        "latent": 4 * model.manifold.latent_dim,
+        "positions": 12 * model.particles,
+        "positions and stress": 36 * model.particles,
+        "field": len(field_message(model)),
+    }
+
+
+async def _measured(player: Player, count: int, rate: float) -> list[float]:
+    stream = Stream(player, "127.0.0.1", rate=rate)
+    async with await stream.listen(0) as server:
+        playing = asyncio.create_task(stream.play())
+        port = server.sockets[0].getsockname()[1]
+        p = player.model.parameter
+        arguments = [f"ws://127.0.0.1:{port}/stream", count, *p.trained]
+        clients = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", __name__, *map(str, arguments), stdout=asyncio.subprocess.PIPE
+        )
+        said, _ = await clients.communicate()
+        playing.cancel()
+    return json.loads(said)
+
+
+async def _clients(url: str, count: int, low: float, high: float) -> list[float]:
+    async def client(steers: bool) -> float:
+        async with connect(url, compression=None) as connection:
+            frames, steered, values = 0, 0.0, _values(low, high)
+            started = time.monotonic() + _WARM_UP
+            while (now := time.monotonic()) < started + _SECONDS:
+                message = await connection.recv()
+                frames += isinstance(message, bytes) and now > started
+                if steers and now > steered + _STEER:
+                    steered = now
+                    await connection.send(json.dumps({"value": next(values)}))
+            return frames / _SECONDS
+
+    return await asyncio.gather(*(client(index == 0) for index in range(count)))
+
+
+if __name__ == "__main__":
+    url, count, low, high = sys.argv[1:]
+    print(json.dumps(asyncio.run(_clients(url, int(count), float(low), float(high)))))

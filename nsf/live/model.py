@@ -1,0 +1,288 @@
+"""A deployed reduced model that runs at any value of its problem parameter, and the truth beside it."""
+
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from nsf.data import Trajectory
+from nsf.data.schema import packed
+from nsf.dynamics import Decoder, ReducedMPM, Trust
+from nsf.dynamics.trust import LatentDistance
+from nsf.errors import ConfigError, InstabilityError
+from nsf.mpm.stability import check_time_step
+from nsf.pipeline import Pipeline
+from nsf.runs import Run
+
+#: Of live runs, whatever that of the deployment: a CPU reads half as much a step. On the sand column it
+#: moves no particle by more than a thousandth of the displacement.
+PRECISION = "fp32"
+#: How far a parameter reaches beyond its training values on each side, over their span.
+_BEYOND = 0.5
+#: Steps of a parameter's range.
+_STEPS = 200
+_SNAPSHOTS = 64  # training snapshots that bounds and colour scales are taken from
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """The problem parameter and where it may go.
+
+    Attributes:
+        name, unit: of the scene's parameter.
+        trained: smallest and largest training value.
+        lower, upper: smallest and largest value that can be asked for.
+        known: values with a full-order trajectory, ascending.
+    """
+
+    name: str
+    unit: str
+    trained: tuple[float, float]
+    lower: float
+    upper: float
+    known: tuple[float, ...]
+
+    @property
+    def step(self) -> float:
+        """Difference that is worth another run."""
+        return (self.upper - self.lower) / _STEPS or 1.0
+
+    def inside(self, value: float) -> bool:
+        """Whether a value is between the training values."""
+        return self.trained[0] <= value <= self.trained[1]
+
+    def checked(self, value: float) -> float:
+        """The value, or the known one that lies within half a step of it.
+
+        Raises:
+            ConfigError: it is not finite, or out of reach.
+        """
+        if not (math.isfinite(value) and self.lower <= value <= self.upper):
+            raise ConfigError(f"{self.name}={value:g} must lie in [{self.lower:g}, {self.upper:g}]")
+        nearest = min(self.known, key=lambda known: abs(known - value), default=value)
+        return nearest if abs(nearest - value) <= self.step / 2 else float(value)
+
+
+class Truth:
+    """The full-order run at a parameter value, at the particles that are shown.
+
+    Args:
+        trajectory: opened; frames are read when they are asked for.
+        particles: [n] indices.
+    """
+
+    def __init__(self, trajectory: Trajectory, particles: np.ndarray):
+        self._trajectory, self._particles = trajectory, particles
+
+    def positions(self, t: float) -> np.ndarray:
+        """[n, 3] m at time t [s], linear between frames."""
+        return self._at("x", t)
+
+    def stress(self, t: float) -> np.ndarray:
+        """[n, 6] Kirchhoff stress [Pa] at time t [s], linear between frames."""
+        return self._at("tau", t)
+
+    def _at(self, field: str, t: float) -> np.ndarray:
+        last = self._trajectory.frames - 1
+        at = min(max(t / self._trajectory.dt, 0.0), float(last))
+        # Times of a step are whole numbers of Δt but for round-off: then one frame is read, not two.
+        first = round(at) if abs(at - round(at)) < 1e-6 else int(at)
+        here = self._read(field, first)
+        part = at - first
+        return here if part < 1e-6 else here + part * (self._read(field, first + 1) - here)
+
+    def _read(self, field: str, frame: int) -> np.ndarray:
+        return self._trajectory.read(field, frames=[frame], particles=self._particles)[0].astype(np.float32)
+
+
+class LiveRun:
+    """A reduced run, as far as it has come; one thread advances it while others read what is there.
+
+    Args:
+        value: of the problem parameter.
+        solver: at t = 0.
+        decoder: its fields at the particles that are shown.
+        trust: the estimate of whether to believe it.
+
+    Attributes:
+        steps, dt: of the whole run; dt in s.
+        reached: last step that can be read.
+        finished: whether it has come to its end: that of the scene, or where it diverged.
+        diverged: whether it ended early, with x̂ not finite or a sample particle off the grid.
+        seconds: wall time of the steps [s].
+    """
+
+    def __init__(self, value: float, solver: ReducedMPM, decoder: Decoder, trust: Trust):
+        self.value, self.steps, self.dt = value, solver.total_steps, solver.dt
+        self._solver: ReducedMPM | None = solver
+        self._decoder, self._trust = decoder, trust
+        self._xhat = np.zeros((self.steps + 1, solver.manifold.latent_dim), np.float32)
+        self._ratios = np.zeros(self.steps + 1)
+        self._xhat[0] = solver.state.xhat
+        self._ratios[0] = trust.ratios(self._xhat[:1], np.zeros(0))[0]
+        self.reached, self.seconds, self.diverged = 0, 0.0, False
+
+    @property
+    def finished(self) -> bool:
+        """Whether nothing is left to do."""
+        return self._solver is None
+
+    def advance(self, steps: int) -> None:
+        """Take steps, or those that are left; the last one frees the solver."""
+        solver, first = self._solver, self.reached + 1
+        if solver is None:
+            return
+        started = time.perf_counter()
+        solver.step(min(steps, self.steps - self.reached))
+        latent = solver.trajectory()
+        lost = solver.left_grid(since=first)
+        last = solver.steps_taken if lost < 0 else lost - 1
+        found = slice(first, last + 1)
+        self._xhat[found] = latent.xhat[found]
+        residuals = latent.residuals[first - 1 : last, -1]
+        self._ratios[found] = self._trust.ratios(latent.xhat[first - 1 : last + 1], residuals)[1:]
+        self.seconds += time.perf_counter() - started
+        self.diverged = lost >= 0
+        self.reached = last  # only now: what is read up to here is there
+        if self.diverged or last == self.steps:
+            self._solver = None
+
+    def xhat(self, step: int) -> np.ndarray:
+        """[r] float32 latent vector."""
+        return self._xhat[step]
+
+    def trust(self, step: int) -> float:
+        """Largest distrust ratio up to the step; ∞ at the end of a run that diverged."""
+        if self.diverged and step >= self.reached:
+            return math.inf
+        return float(self._ratios[: step + 1].max())
+
+    def positions(self, step: int) -> np.ndarray:
+        """[n, 3] m, float32."""
+        return self._decoder.position(torch.as_tensor(self._xhat[step])).cpu().numpy()
+
+    def stress(self, step: int) -> np.ndarray:
+        """[n, 6] Kirchhoff stress [Pa] as the method takes it, float32."""
+        now = torch.as_tensor(self._xhat[step], device=self._decoder.at.device)
+        return packed("tau", self._decoder.stress(now[None])[0].cpu().numpy())
+
+
+class LiveModel:
+    """The reduced model of a deploy run.
+
+    Args:
+        run: complete.
+        points: most particles that are shown; sample particles are always among them.
+        device: `cpu`, `cuda`, `cuda:N` or `auto`.
+
+    Attributes:
+        run, manifold, parameter.
+        title: of the scene.
+        particles: P.
+        shown: [n] indices of the particles that are shown.
+        at: the fields there.
+        X: [n, 3] their positions at rest [m].
+        spacing: edge of the cube that each has to fill [m].
+
+    Raises:
+        MissingRunError: the deployment, or the training that it rests on, is not whole.
+        DeviceError: the device is not there.
+    """
+
+    def __init__(self, run: Run, points: int = 6000, device: str = "auto"):
+        self.run = run
+        self._pipeline = Pipeline.of_run(run, device)
+        self.title = self._pipeline.deployed.config.scene.title
+        self.manifold = self._pipeline.manifold()
+        self._truths = _truths(self._pipeline)
+        self.parameter = _parameter(self._pipeline, tuple(sorted(self._truths)))
+        # Samples and sets in the deployment's own precision; live runs share them.
+        solver = self._pipeline.solver_at(self.manifold, self.initial)
+        sample = np.unique(np.concatenate([sets.sample for sets in solver.sets]))
+        self._sets_at = solver.sets_at
+        self.trust = _trust(run, self.manifold, sample, self._pipeline.device)
+        self.particles = len(self.manifold.X)
+        self.shown = _shown(self.particles, sample, points)
+        self.at = self.manifold.restrict(self.shown, dtype=torch.float32, device=self._pipeline.device)
+        self.X = self.manifold.X[self.shown].numpy().astype(np.float32)
+        self.spacing = float((solver.scene_particles.volume0.sum() / len(self.shown)) ** (1 / 3))
+
+    @property
+    def initial(self) -> float:
+        """The value to begin with: the first that was deployed."""
+        return self._pipeline.held_out[0]
+
+    def start(self, value: float) -> LiveRun:
+        """A run at a parameter value, at t = 0."""
+        solver = self._pipeline.solver_at(self.manifold, value, precision=PRECISION)
+        return LiveRun(value, solver, solver.decoder(self.shown, self.at), self.trust)
+
+    def truth(self, value: float) -> Truth | None:
+        """The full-order run at a known value; None elsewhere."""
+        run = self._truths.get(value)
+        return Truth(Trajectory.open(run.path / "trajectory.h5"), self.shown) if run else None
+
+    def roles(self, step: int) -> np.ndarray:
+        """[n] of each shown particle in the step that begins there: 2 in S, 1 in N only, 0 in neither."""
+        sets = self._sets_at(step)
+        role = np.zeros(self.particles, np.int8)
+        role[sets.integration], role[sets.sample] = 1, 2
+        return role[self.shown]
+
+    def training_frames(self) -> tuple[np.ndarray, np.ndarray]:
+        """x [F, n, 3] m and τ [F, n, 6] Pa of some of the training snapshots, as the fields have them."""
+        known = self.manifold.training_latents
+        rows = torch.linspace(0, len(known) - 1, min(len(known), _SNAPSHOTS)).long()
+        xhat = known[rows].to(self.at.device)
+        parameters = self.manifold.training_parameters[rows].to(self.at.device)
+        return self.at.position(xhat).cpu().numpy(), self.at.stress(xhat, parameters).cpu().numpy()
+
+
+def _truths(pipeline: Pipeline) -> Mapping[float, Run]:
+    """Full-order runs of the scene that is deployed, by parameter value."""
+    pairs = ((value, scene) for value, scene in pipeline.needed() if scene is pipeline.deployed)
+    runs = {value: pipeline.simulation(value, scene) for value, scene in pairs}
+    return {value: run for value, run in runs.items() if run.complete}
+
+
+def _parameter(pipeline: Pipeline, known: tuple[float, ...]) -> Parameter:
+    """The parameter with its reach: as far beyond the training as the scene can be built and is stable."""
+    p, values = pipeline.scene.parameters, pipeline.split.train
+    low, high = min(values), max(values)
+    span = (high - low) or abs(low) or 1.0
+
+    def reach(end: float, sign: float) -> float:
+        for share in (1.0, 0.75, 0.5, 0.25, 0.1):
+            value = end + sign * share * _BEYOND * span
+            if _possible(pipeline, value):
+                return value
+        return end
+
+    wanted = [*known, *pipeline.held_out]
+    lower, upper = min(reach(low, -1.0), *wanted), max(reach(high, 1.0), *wanted)
+    return Parameter(p.name, p.unit, (low, high), lower, upper, known)
+
+
+def _possible(pipeline: Pipeline, value: float) -> bool:
+    try:
+        scene = pipeline.deployed.with_parameters({pipeline.scene.parameters.name: value})
+        check_time_step(scene.particles(), scene.initial_velocity(), scene.dx, scene.dt)
+    except (ConfigError, InstabilityError):
+        return False
+    return True
+
+
+def _trust(run: Run, manifold, sample: np.ndarray, device: str) -> Trust:
+    """The estimate as the deployment calibrated it."""
+    scales = run.manifest["metrics"]["trust"]
+    return Trust(scales["residual_m"], scales["distance_m"], LatentDistance(manifold, sample, device))
+
+
+def _shown(particles: int, sample: np.ndarray, points: int) -> np.ndarray:
+    """The sample particles, and others at random, ascending."""
+    order = np.random.default_rng(0).permutation(particles)
+    others = order[~np.isin(order, sample)][: max(0, points - len(sample))]
+    return np.sort(np.concatenate([sample, others]))

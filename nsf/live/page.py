@@ -1,0 +1,249 @@
+"""The page of `nsf view`: the reduced run beside the full-order one, and a slider that runs it anew."""
+
+import logging
+import math
+import threading
+from collections.abc import Callable
+from functools import partial
+
+import matplotlib
+import numpy as np
+import viser
+from matplotlib.colors import to_hex
+
+from nsf.live.coloring import ROLES, SAMPLE, Coloring, Picture
+from nsf.live.model import Parameter
+from nsf.live.player import Moment, Player, every
+from nsf.reporting.colors import ColorScale
+
+log = logging.getLogger(__name__)
+
+FRAMES_PER_SECOND = 30
+#: Between the two bodies, over the width of what moves.
+_GAP = 0.25
+_GREY = (187, 187, 187)
+_GREEN, _AMBER, _RED = "#2B8A3E", "#E69F00", "#C92A2A"
+
+
+class Page:
+    """A viser server that shows a player.
+
+    Every browser sees the same moment and may steer it.
+
+    Args:
+        player: what is shown.
+        host, port: where the page is served; another port is taken if this one is.
+
+    Attributes:
+        drawn: pictures drawn since the start.
+    """
+
+    def __init__(self, player: Player, host: str = "127.0.0.1", port: int = 8080):
+        self._player, self._model = player, player.model
+        self._coloring = Coloring(player.model)
+        self._truth_value, self._truth = math.nan, None
+        self._last: tuple | None = None
+        self.drawn = 0
+        # Its own banner would speak of viser's address only.
+        self._server = viser.ViserServer(host=host, port=port, verbose=False, label="nsf view")
+        self._place()
+        self._build_controls()
+
+    @property
+    def url(self) -> str:
+        """Where a browser finds it."""
+        return f"http://{self._server.get_host()}:{self._server.get_port()}"
+
+    def close(self) -> None:
+        """Stop serving."""
+        self._server.stop()
+
+    def run(self, closing: threading.Event) -> None:
+        """Draw until `closing` is set."""
+        every(1.0 / FRAMES_PER_SECOND, closing, self.draw)
+
+    # -- scene ----------------------------------------------------------------------------------------------
+
+    def _place(self) -> None:
+        """Where both bodies stand, and the camera: from what moves in the training data."""
+        x, _ = self._model.training_frames()
+        low, high = x.min((0, 1)), x.max((0, 1))
+        self._centre = 0.5 * (low + high)
+        extent = high - low
+        self._beside = np.array([(1.0 + _GAP) * extent[0], 0.0, 0.0])
+        X = self._model.X
+        size = 1.1 * self._model.spacing
+        # What the camera has in front of the middle hides the inside, where the stress is.
+        self._behind = X[:, 1] >= X[:, 1].mean()
+        self._thick = bool(extent[:2].min() > 0.5 * extent[:2].max())
+        scene = self._server.scene
+        scene.set_up_direction("+z")
+        ground = np.array([*(0.5 * self._beside[:2]), low[2] - self._centre[2]])
+        width, depth = 2.0 * (1.0 + _GAP) * extent[0] + extent[1], 2.0 * extent[1]
+        cell = 10.0 ** np.floor(np.log10(extent.max()))
+        scene.add_grid(
+            "/floor",
+            width,
+            depth,
+            position=ground,
+            cell_size=cell / 10,
+            section_size=cell / 2,
+            cell_color=(235, 235, 235),
+            section_color=(205, 205, 205),
+            shadow_opacity=0.0,
+        )
+        add = partial(
+            scene.add_point_cloud,
+            points=self._model.X - self._centre,
+            point_shape="circle",
+            precision="float16",
+        )
+        self._reduced = add("/reduced", colors=_GREY, point_size=size)
+        self._full = add("/full", colors=_GREY, point_size=size, position=self._beside)
+        self._sample = add("/sample", colors=SAMPLE, point_size=1.6 * size, visible=False)
+        above = high[2] - self._centre[2] + 0.12 * extent.max()
+        scene.add_label("/reduced name", "reduced", position=(0.0, 0.0, above))
+        self._full_name = scene.add_label(
+            "/full name", "full-order", position=self._beside + np.array([0.0, 0.0, above])
+        )
+        across = (2.0 + _GAP) * extent[0]
+        camera = self._server.initial_camera
+        # Right of the middle, since the controls are there.
+        middle = 0.65 * self._beside
+        camera.position = middle + across * np.array([0.1, -0.7, 0.3])
+        camera.look_at = middle
+        camera.up = (0.0, 0.0, 1.0)
+
+    # -- controls -------------------------------------------------------------------------------------------
+
+    def _build_controls(self) -> None:
+        gui, parameter, player = self._server.gui, self._model.parameter, self._player
+        unit = f" [{parameter.unit}]" if parameter.unit else ""
+        gui.add_markdown(f"**{self._model.title}**, `{self._model.run.id}`")
+        self._slider = gui.add_slider(
+            f"{parameter.name.replace('_', ' ')}{unit}",
+            min=parameter.lower,
+            max=parameter.upper,
+            step=parameter.step,
+            initial_value=player.value,
+            marks=tuple((value, f"{value:g}") for value in parameter.trained),
+            hint="marks: smallest and largest training value",
+        )
+        self._slider.on_update(self._by_hand(lambda: player.steer(self._slider.value)))
+        if parameter.known:
+            known = gui.add_dropdown(
+                "with full-order run", ["…", *(f"{value:g}" for value in parameter.known)], initial_value="…"
+            )
+            known.on_update(self._by_hand(lambda: self._go_to(known.value)))
+        self._light = gui.add_html("")
+        self._play = gui.add_button("pause")
+        self._play.on_click(lambda _: self._toggle())
+        self._time = gui.add_slider("step", min=0, max=player.steps, step=1, initial_value=0)
+        self._time.on_update(self._by_hand(self._scrub))
+        self._by = gui.add_dropdown("colour", list(self._coloring.scales))
+        self._legend = gui.add_html("")
+        self._cut = gui.add_checkbox("cut open", initial_value=self._thick)
+        self._show_sample = gui.add_checkbox("sample particles", initial_value=False)
+        self._told = gui.add_html("")
+
+    @staticmethod
+    def _by_hand(act: Callable[[], None]) -> Callable[[viser.GuiEvent], None]:
+        """What to do where a user moves a control, and not where the page itself does."""
+
+        def on_update(event: viser.GuiEvent) -> None:
+            if event.client is not None:
+                act()
+
+        return on_update
+
+    def _go_to(self, text: str) -> None:
+        chosen = [value for value in self._model.parameter.known if f"{value:g}" == text]
+        if chosen:
+            self._slider.value = chosen[0]
+            self._player.steer(chosen[0])
+
+    def _toggle(self) -> None:
+        self._player.playing = not self._player.playing
+        self._play.label = "pause" if self._player.playing else "play"
+
+    def _scrub(self) -> None:
+        if self._player.playing:
+            self._toggle()
+        self._player.seek(self._time.value)
+
+    # -- drawing --------------------------------------------------------------------------------------------
+
+    def draw(self) -> None:
+        """Go on by a frame and show it, if anything is new."""
+        moment = self._player.tick()
+        controls = (self._by.value, self._cut.value, self._show_sample.value)
+        told = (moment.run, moment.step, moment.run.finished, *controls)
+        if told == self._last:
+            return
+        self._last = told
+        if moment.run.value != self._truth_value:
+            self._truth_value, self._truth = moment.run.value, self._model.truth(moment.run.value)
+        picture = self._coloring.picture(moment, self._truth, self._by.value)
+        with self._server.atomic():
+            self._show(picture, moment)
+        self.drawn += 1
+
+    def _show(self, picture: Picture, moment: Moment) -> None:
+        kept = self._behind if self._cut.value else np.full(len(self._behind), True)
+        x = picture.x_reduced - self._centre
+        self._reduced.points, self._reduced.colors = x[kept], picture.colors_reduced[kept]
+        self._full.visible = self._full_name.visible = picture.x_full is not None
+        if picture.x_full is not None:
+            self._full.points = picture.x_full[kept] - self._centre
+            self._full.colors = picture.colors_full[kept]
+        self._sample.visible = self._show_sample.value
+        if self._show_sample.value:
+            self._sample.points = x[kept & (self._model.roles(moment.step) == 2)]
+        if self._time.value != moment.step:
+            self._time.value = moment.step
+        self._light.content = light(moment, self._model.parameter)
+        self._legend.content = legend(self._coloring.scales[self._by.value], self._by.value)
+        self._told.content = self._what_it_took(moment)
+
+    def _what_it_took(self, moment: Moment) -> str:
+        run, p = moment.run, self._model.parameter
+        shown = f"{p.name.replace('_', ' ')} = {run.value:.4g}{p.unit}, t = {moment.t:.3g} s"
+        rate = f"; {run.reached / run.seconds:.0f} latent steps a second" if run.seconds else ""
+        known = "" if self._truth else "<br>no full-order run at this value"
+        return _small(
+            f"{shown}<br>{len(self._model.shown):,} of {self._model.particles:,} particles{rate}{known}"
+        )
+
+
+def light(moment: Moment, parameter: Parameter) -> str:
+    """Whether to believe what is shown, as HTML: green, amber beyond the training values, red if not."""
+    low, high = parameter.trained
+    if moment.run.diverged and moment.step >= moment.run.reached:
+        color, text = _RED, f"diverged at t = {moment.t:.3g} s"
+    elif moment.trust > 1.0:
+        color, text = _RED, f"distrusted: ratio {moment.trust:.2g}, above 1"
+    elif not parameter.inside(moment.run.value):
+        color, text = _AMBER, f"beyond the training values, {low:g} to {high:g}{parameter.unit}"
+    else:
+        color, text = _GREEN, f"distrust ratio {moment.trust:.2f}, below 1"
+    dot = f"<span style='color:{color};font-size:1.6em;vertical-align:middle'>●</span>"
+    return f"<div style='padding:0 0.8em'>{dot} {text}</div>"
+
+
+def legend(scale: ColorScale | None, name: str) -> str:
+    """A colour scale, as HTML."""
+    if scale is None:
+        names = ("neither", "integration only", "sample")
+        dots = (f"<span style='color:{c}'>●</span> {n}" for c, n in zip(ROLES, names, strict=True))
+        return _small(" &nbsp; ".join(dots))
+    colors = matplotlib.colormaps[scale.mappable.get_cmap().name](np.linspace(0, 1, 9))
+    bar = f"height:0.7em;background:linear-gradient(90deg,{','.join(map(to_hex, colors))})"
+    low, high = scale.mappable.get_clim()
+    ends = f"<span>{low:.3g}</span><span>{name} [{scale.unit}]</span><span>{high:.3g}</span>"
+    return _small(
+        f"<div style='{bar}'></div><div style='display:flex;justify-content:space-between'>{ends}</div>"
+    )
+
+
+def _small(text: str) -> str:
+    return f"<div style='padding:0 0.8em;font-size:0.85em'>{text}</div>"

@@ -1,0 +1,184 @@
+"""The server of `nsf serve`: one reduced run, whose latent vectors many browsers decode."""
+
+import asyncio
+import hmac
+import http
+import logging
+from importlib.resources import files
+from urllib.parse import parse_qs, urlsplit
+
+from websockets.asyncio.server import Server, ServerConnection, broadcast, serve
+from websockets.datastructures import Headers
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+
+from nsf.errors import ConfigError
+from nsf.live import LOOPBACK
+from nsf.live.player import Moment, Player
+from nsf.live.wire import asked_value, field_message, frame_message, state_message
+
+log = logging.getLogger(__name__)
+
+#: Longest message of a client [bytes]; a parameter value takes twenty.
+_LONGEST = 256
+_LONGEST_REASON = 60  # letters of a close, which may take 123 bytes
+#: Pause after a client's message [s]: who sends more often waits, and nobody else does.
+_PACE = 0.01
+#: The page loads nothing from elsewhere, and its address, which may hold the token, is told to no one.
+_HEADERS = {
+    "Cache-Control": "no-store",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
+    "connect-src 'self' ws: wss:; img-src data:; frame-ancestors 'none'",
+}
+
+
+class Stream:
+    """Serves a page, the deformation field, and the latent vector of each frame.
+
+    `/` is the page, `/field` what it decodes with (`wire.field_message`), `/stream` a WebSocket: a binary
+    message a frame, and a text message where another parameter value is shown. A client may send a value
+    (`wire.asked_value`). One that sends anything else, or that does not keep up for `patience`, is closed.
+
+    Args:
+        player: what is shown; all clients see the same.
+        host: where it is served.
+        token: who does not give it as `?token=…` is refused; None asks for none.
+        rate: frames a second.
+        patience: seconds that a client may lag.
+    """
+
+    def __init__(
+        self, player: Player, host: str, token: str | None = None, rate: float = 30.0, patience: float = 5.0
+    ):
+        self._player, self._host, self._token = player, host, token
+        self._rate, self._patience = rate, patience
+        self._field = field_message(player.model)
+        self._page = files("nsf.live").joinpath("page.html").read_bytes()
+        self._clients: set[ServerConnection] = set()
+        moment = player.tick()
+        self._state, self._frame = state_message(moment), frame_message(moment)
+
+    @property
+    def clients(self) -> int:
+        """How many are connected."""
+        return len(self._clients)
+
+    async def listen(self, port: int) -> Server:
+        """Begin to accept clients; use the server as an async context.
+
+        Raises:
+            ConfigError: the address cannot be taken.
+        """
+        try:
+            return await serve(
+                self._attend,
+                self._host,
+                port,
+                process_request=self._answer,
+                max_size=_LONGEST,
+                compression=None,  # 32 bytes of floating-point numbers do not get smaller
+                ping_interval=self._patience / 2,
+                ping_timeout=self._patience / 2,
+                close_timeout=self._patience / 2,
+                logger=_quiet(),
+            )
+        except OSError as error:
+            raise ConfigError(
+                f"cannot serve at {self._host}:{port} ({error}); give another --port"
+            ) from error
+
+    async def play(self) -> None:
+        """Send frames until cancelled."""
+        clock = asyncio.get_running_loop()
+        due = clock.time()
+        while True:
+            self._send(self._player.tick())
+            due = max(due + 1.0 / self._rate, clock.time())
+            await asyncio.sleep(due - clock.time())
+
+    def _send(self, moment: Moment) -> None:
+        state, frame = state_message(moment), frame_message(moment)
+        # Written without waiting: a client that does not read holds nobody up, and its pongs fail to come.
+        if state != self._state:
+            broadcast(self._clients, state)
+        if (state, frame) != (self._state, self._frame):  # a run that stands still costs no bytes
+            broadcast(self._clients, frame)
+        self._state, self._frame = state, frame
+
+    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Refuse, serve a file, or let a WebSocket be opened."""
+        asked = urlsplit(request.path)
+        why = self._refusal(request, parse_qs(asked.query).get("token", [""])[-1])
+        if why:
+            log.warning("%s refused: %s", _name(connection), why)
+            return connection.respond(http.HTTPStatus.FORBIDDEN, f"{why}\n")
+        if asked.path == "/stream":
+            return None
+        if asked.path == "/":
+            return _file(self._page, "text/html; charset=utf-8")
+        if asked.path == "/field":
+            return _file(self._field, "application/octet-stream")
+        return connection.respond(http.HTTPStatus.NOT_FOUND, "there are /, /field and /stream\n")
+
+    def _refusal(self, request: Request, token: str) -> str | None:
+        """Why a request is not answered, if it is not."""
+        named, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
+        host = named[0] if len(named) == 1 else ""
+        if self._host in LOOPBACK and urlsplit(f"//{host}").hostname not in LOOPBACK:
+            # Another name for this machine is how a foreign page would get past the check of its origin.
+            return f"host {host!r} is not this machine's own name"
+        # Only browsers send an origin, and they always do so for a WebSocket.
+        if any(origin not in (f"http://{host}", f"https://{host}") for origin in origins):
+            return f"origin {origins} is another site"
+        if self._token is not None and not hmac.compare_digest(token.encode(), self._token.encode()):
+            return "token is missing or wrong"
+        return None
+
+    async def _attend(self, connection: ServerConnection) -> None:
+        """Follow one client until it goes."""
+        name = _name(connection)
+        broadcast([connection], self._state)
+        broadcast([connection], self._frame)
+        self._clients.add(connection)
+        log.info("%s joined, %d now", name, self.clients)
+        why = "closed by itself"
+        try:
+            async for message in connection:
+                self._player.steer(asked_value(message))
+                await asyncio.sleep(_PACE)
+        except ConfigError as error:
+            why = f"sent rubbish: {error}"
+            await connection.close(1008, str(error)[:_LONGEST_REASON])
+        except ConnectionClosed as error:
+            why = _reason(error)
+        finally:
+            self._clients.discard(connection)
+            log.info("%s left, %d now: %s", name, self.clients, why)
+
+
+def _file(body: bytes, kind: str) -> Response:
+    headers = Headers({"Content-Type": kind, "Content-Length": str(len(body)), **_HEADERS})
+    return Response(http.HTTPStatus.OK, "OK", headers, body)
+
+
+def _name(connection: ServerConnection) -> str:
+    address = connection.remote_address
+    return f"{address[0]}:{address[1]}" if address else "a client that is gone"
+
+
+def _reason(error: ConnectionClosed) -> str:
+    """Why a connection ended that its client did not close."""
+    if error.sent is None:
+        return "dropped"
+    if error.sent.code == 1011:
+        return "too slow"  # what the library says when a ping was not answered in time
+    return f"closed with {error.sent.code}, {error.sent.reason}"
+
+
+def _quiet() -> logging.Logger:
+    """Where websockets tells of failed handshakes, with a traceback: what matters of them is logged above."""
+    logger = logging.getLogger("nsf.live.websockets")
+    logger.setLevel(logging.CRITICAL)
+    return logger

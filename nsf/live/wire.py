@@ -1,0 +1,110 @@
+"""What goes over the wire: the deformation field once, then a latent vector a frame."""
+
+import json
+import struct
+
+import numpy as np
+import torch
+
+from nsf.errors import ConfigError
+from nsf.live.model import LiveModel
+from nsf.live.player import Moment
+
+_LEVELS = 32767  # of a signed 16-bit number
+FIELD = "basis"
+
+
+def field_message(model: LiveModel) -> bytes:
+    """The deformation field g at the particles that are shown, and what a page must know beside it.
+
+    g(X, x̂) = mean + Σ_k scale_k modes_k a_k with a = [x̂ ; closure(x̂)], as `BasisManifold` has it. The
+    closure's weights go too: it runs in the browser, so that a frame is x̂ alone.
+
+    Returns:
+        Length of the header as uint32, the header (JSON, padded with spaces to whole words), then arrays, all
+        little-endian: rest and mean [n, 3] float32 [m], scale [K] float32, modes [n, 3, K] int16, and of each
+        layer of the closure weight [out, in] and bias [out] float32. SiLU stands between the layers.
+
+    Raises:
+        ConfigError: the fields are no linear modes.
+    """
+    _check_field(model)
+    field = model.at.fields["deformation"]
+    modes = _host(field.modes)
+    scale = np.maximum(np.abs(modes).max((0, 1)), np.finfo(np.float32).tiny) / _LEVELS
+    layers = [] if field.network is None else field.network.layers
+    arrays = {
+        "rest": model.X,
+        "mean": _host(field.mean),
+        "scale": scale,
+        "modes": np.round(modes / scale).astype("<i2"),
+    }
+    for index, layer in enumerate(layers):
+        arrays |= {f"weight{index}": _host(layer.weight), f"bias{index}": _host(layer.bias)}
+    arrays = {k: a if a.dtype == np.dtype("<i2") else a.astype("<f4") for k, a in arrays.items()}
+    p, (x, _) = model.parameter, model.training_frames()
+    header = {
+        "title": model.title,
+        "run": model.run.id,
+        "particles": model.particles,
+        "spacing": model.spacing,
+        "low": x.min((0, 1)).tolist(),
+        "high": x.max((0, 1)).tolist(),
+        "moved": float(np.percentile(np.linalg.norm(x - model.X, axis=2), 99.5)),
+        "parameter": {
+            "name": p.name.replace("_", " "),
+            "unit": p.unit,
+            "lower": p.lower,
+            "upper": p.upper,
+            "step": p.step,
+            "trained": p.trained,
+        },
+        "latent_dim": model.manifold.latent_dim,
+        "layers": len(layers),
+        "arrays": {name: {"shape": a.shape, "type": a.dtype.str[1:]} for name, a in arrays.items()},
+    }
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    # Each array begins at a whole word: a browser can view it where it lies.
+    body = b"".join(a.tobytes() + b"\0" * (-a.nbytes % 4) for a in arrays.values())
+    return struct.pack("<I", len(text)) + text + body
+
+
+def frame_message(moment: Moment) -> bytes:
+    """t [s], the distrust ratio and x̂, [2 + r] float32, little-endian."""
+    return np.concatenate([[moment.t, moment.trust], moment.xhat]).astype("<f4").tobytes()
+
+
+def state_message(moment: Moment) -> str:
+    """Which parameter value is shown, as JSON."""
+    return json.dumps({"value": moment.run.value, "diverged": moment.run.diverged})
+
+
+def asked_value(message: str | bytes) -> float:
+    """The parameter value that a client asks for: `{"value": 31.5}`, and nothing else.
+
+    Raises:
+        ConfigError: it says anything else.
+    """
+    try:
+        asked = json.loads(message) if isinstance(message, str) else None
+    except ValueError:
+        asked = None
+    if not isinstance(asked, dict) or asked.keys() != {"value"} or type(asked["value"]) not in (int, float):
+        raise ConfigError('a client may only send {"value": number}')
+    try:
+        return float(asked["value"])
+    except OverflowError as error:
+        raise ConfigError("the value is too large") from error
+
+
+def _check_field(model: LiveModel) -> None:
+    if model.manifold.field != FIELD:
+        raise ConfigError(
+            f"{model.run.id} has field={model.manifold.field}, which each browser "
+            f"would have to evaluate at every particle; serve a deployment of field={FIELD}, or use nsf view"
+        )
+
+
+def _host(tensor: torch.Tensor) -> np.ndarray:
+    return tensor.cpu().numpy()

@@ -1,0 +1,141 @@
+"""`nsf view` and `nsf serve` on the command line: help, bad input, the end."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+
+import pytest
+from test_player import wait_until
+
+from nsf.cli import LIVE, main
+
+
+@pytest.fixture
+def nsf(chain, monkeypatch, capsys):
+    """(*arguments) → (exit code, standard output, standard error), with the tiny chain's runs."""
+    monkeypatch.setenv("NSF_RUNS", str(chain.root))
+    handler = signal.getsignal(signal.SIGTERM)
+
+    def call(*arguments):
+        with pytest.raises(SystemExit) as end:
+            main(list(arguments))
+        return (end.value.code or 0, *capsys.readouterr())
+
+    yield call
+    signal.signal(signal.SIGTERM, handler)
+
+
+@pytest.mark.parametrize("command", LIVE)
+def test_help(nsf, command):
+    code, out, _ = nsf(command, "--help")
+    assert code == 0
+    assert f"usage: nsf {command}" in out
+    assert "--port" in out
+
+
+def test_help_names_the_commands(nsf):
+    _, out, _ = nsf("--help")
+    for command, text in LIVE.items():
+        assert re.search(rf"^ +{command} +{text}$", out, re.MULTILINE)
+
+
+REFUSED = [
+    (("view", "--port", "65536"), "65536 must lie in [0, 65535]"),
+    (("view", "--port", "abc"), "invalid"),
+    (("view", "--points", "0"), "must be at least 1"),
+    (("view", "--rate", "30"), "unrecognized arguments"),
+    (("view", "latent_dim=4"), "no complete deploy run is called latent_dim=4; there are deploy/sand/"),
+    (("view", "train/sand"), "no complete deploy run is called train/sand"),
+    (("view", "--device", "gpu"), "device=gpu"),
+    (("serve", "--rate", "0"), "must be positive"),
+    (("serve", "--rate", "nan"), "must be positive"),
+    (("serve", "--patience", "-1"), "must be positive"),
+    (("serve", "--bench", "0"), "must be at least 1"),
+    (("serve", "--bench", "1,x"), "invalid"),
+    (("serve", "--host", "no.such.host.invalid"), "cannot serve at no.such.host.invalid:8765"),
+    (("veiw",), "did you mean view?"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "quoted"), REFUSED, ids=[" ".join(a) for a, _ in REFUSED])
+def test_bad_input_is_told(nsf, arguments, quoted):
+    code, _, err = nsf(*arguments)
+    assert code == 2
+    assert quoted in err
+    assert "Traceback" not in err
+
+
+@pytest.mark.parametrize(("command", "package"), [("view", "viser"), ("serve", "websockets")])
+def test_a_missing_extra_names_the_command(nsf, monkeypatch, command, package):
+    monkeypatch.setitem(sys.modules, package, None)
+    code, _, err = nsf(command)
+    assert code == 2
+    assert err.startswith(f"error: {package} cannot be imported")
+    assert "pip install 'nsf[view]'" in err
+
+
+@pytest.mark.parametrize("command", LIVE)
+def test_it_serves_until_it_is_interrupted(chain, command, tmp_path):
+    pytest.importorskip("viser", reason="viser is not installed")
+    own = {"NSF_RUNS": str(chain.root), "PYTHONUNBUFFERED": "1"}
+    with (tmp_path / "said").open("w+") as said:
+        started = subprocess.Popen(
+            [sys.executable, "-m", "nsf.cli", command, "--port", "0", "--device", "cpu"],
+            stdout=said,
+            stderr=subprocess.STDOUT,
+            env=os.environ | own,
+        )
+
+        def told():
+            return (tmp_path / "said").read_text()
+
+        try:
+            wait_until(lambda: f"{command}: open" in told() or started.poll() is not None)
+            assert "the newest deployment" in told()
+            assert chain.pipeline.deployment.id in told()
+            (url,) = re.findall(rf"{command}: open (http://127\.0\.0\.1:\d+/?) ", told())
+            with urllib.request.urlopen(url, timeout=20) as response:
+                assert response.status == 200
+            started.send_signal(signal.SIGINT)
+            assert started.wait(20) == 0
+            assert told().rstrip().endswith(f"{command}: ended")
+        finally:
+            started.kill()
+
+
+def test_beyond_this_machine_a_token_is_asked_for(chain, tmp_path):
+    said = tmp_path / "said"
+    with said.open("w") as stream:
+        started = subprocess.Popen(
+            [sys.executable, "-m", "nsf.cli", "serve", "--port", "0", "--host", "0.0.0.0", "--device", "cpu"],
+            stdout=stream,
+            stderr=subprocess.STDOUT,
+            env=os.environ | {"NSF_RUNS": str(chain.root)},
+        )
+        try:
+            wait_until(lambda: "serve: open" in said.read_text() or started.poll() is not None)
+            (port, token) = re.search(
+                r"http://0\.0\.0\.0:(\d+)/\?token=(\S{20,}) ", said.read_text()
+            ).groups()
+            with urllib.request.urlopen(f"http://127.0.0.1:{port}/?token={token}", timeout=20) as response:
+                assert response.status == 200
+            with pytest.raises(urllib.error.HTTPError, match="403"):
+                urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=20)
+        finally:
+            started.kill()
+
+
+def test_what_bench_measures(chain, model, player):
+    pytest.importorskip("websockets", reason="websockets is not installed")
+    from nsf.live.bench import follow, sizes
+
+    found = sizes(player)
+    assert found["frame"] == 2 + 4 * (2 + 4)
+    assert found["positions"] == 12 * 500
+    table = follow(player)
+    assert table["shown step"].tolist() == [6, 12, 24]
+    assert (table["frames/s"] > 0).all()

@@ -1,0 +1,146 @@
+"""`nsf view` in a real browser, without a network."""
+
+import re
+import threading
+
+import numpy as np
+import pytest
+from test_player import wait_until
+
+pytest.importorskip("viser", reason="viser is not installed")
+
+from nsf.live.coloring import Coloring
+from nsf.live.page import Page, legend, light
+from nsf.live.player import Moment, Player
+
+#: What a client draws is behind its canvas, above which the panel lies.
+SCENE = {"x": 0, "y": 120, "width": 700, "height": 480}
+
+
+@pytest.fixture(scope="module")
+def coloring(model):
+    return Coloring(model)
+
+
+@pytest.fixture(scope="module")
+def run(model):
+    run = model.start(26.0)
+    run.advance(run.steps)
+    return run
+
+
+def test_every_colouring_of_every_moment(model, coloring, run):
+    truth = model.truth(26.0)
+    for by in coloring.scales:
+        for step in (0, run.steps):
+            for beside in (truth, None):
+                picture = coloring.picture(Moment(run, step), beside, by)
+                assert picture.x_reduced.shape == picture.colors_reduced.shape == (200, 3)
+                assert picture.colors_reduced.dtype == np.uint8
+                assert (picture.x_full is None) == (picture.colors_full is None) == (beside is None)
+
+
+def test_colours_say_what_they_are_of(model, coloring, run):
+    def colors(by, step=run.steps):
+        return coloring.picture(Moment(run, step), model.truth(26.0), by)
+
+    lowest = coloring.scales["displacement"].pixels(np.zeros(1)).astype(int)
+    # In double precision nothing has moved at t = 0; the page shows float32.
+    assert abs(colors("displacement", 0).colors_reduced.astype(int) - lowest).max() <= 1
+    assert len(np.unique(colors("displacement").colors_reduced, axis=0)) > 20
+    assert len(np.unique(colors("distance to the truth").colors_full, axis=0)) == 1
+    assert len(np.unique(colors("distance to the truth").colors_reduced, axis=0)) > 5
+    sample = colors("particle sets").colors_reduced[model.roles(0) == 2]
+    assert len(np.unique(sample, axis=0)) == 1
+    assert not np.array_equal(colors("pressure").colors_full, colors("von Mises stress").colors_full)
+
+
+def test_the_light(model, run):
+    low, high = "22", "38°"
+    inside = Moment(run, run.steps)
+    assert inside.trust < 1.0
+    assert "below 1" in light(inside, model.parameter)
+    beyond = model.start(46.0)
+    assert f"beyond the training values, {low} to {high}" in light(Moment(beyond, 0), model.parameter)
+    beyond._ratios[0] = 2.5
+    assert "distrusted: ratio 2.5" in light(Moment(beyond, 0), model.parameter)
+    lost = model.start(26.0)
+    lost._solver.xhat[0] = 1e4
+    lost.advance(lost.steps)
+    assert "diverged at t = " in light(Moment(lost, lost.reached), model.parameter)
+
+
+def test_the_legend_names_its_ends(coloring):
+    stress = legend(coloring.scales["von Mises stress"], "von Mises stress")
+    assert re.search(r"<span>0</span><span>von Mises stress \[\w*Pa\]</span>", stress)
+    assert re.search(r"<span>-[\d.]+</span><span>pressure", legend(coloring.scales["pressure"], "pressure"))
+    assert "integration only" in legend(None, "particle sets")
+
+
+@pytest.fixture
+def served(model):
+    """A page that is drawn, and its player."""
+    player = Player(model)
+    page, closing = Page(player, port=0), threading.Event()
+    drawing = threading.Thread(target=page.run, args=(closing,))
+    with player:
+        drawing.start()
+        yield page, player
+        closing.set()
+        drawing.join()
+        page.close()
+
+
+def opened(browser, url):
+    """A window of the page, and the addresses it asked for."""
+    window, asked = browser.new_page(viewport={"width": 1100, "height": 640}), []
+    window.on("request", lambda request: asked.append(request.url))
+    window.goto(url)
+    window.get_by_role("slider").first.wait_for(timeout=60_000)
+    return window, asked
+
+
+def test_in_a_browser(browser, served):
+    page, player = served
+    window, asked = opened(browser, page.url)
+    assert not [
+        u for u in asked if not u.startswith((page.url, "data:", "blob:", page.url.replace("http", "ws")))
+    ]
+    window.get_by_role("button", name="pause").click()
+    window.get_by_role("button", name="play", exact=True).wait_for()
+    player.seek(player.steps)
+    wait_until(lambda: player.tick().run.finished)
+    window.get_by_text("t = 0.12 s").wait_for()
+    before = window.screenshot(clip=SCENE)
+    window.get_by_label("sample particles").check()
+    wait_until(lambda: window.screenshot(clip=SCENE) != before)
+    window.get_by_label("sample particles").uncheck()
+    wait_until(lambda: window.screenshot(clip=SCENE) == before)
+
+    number = window.get_by_role("textbox").first
+    number.fill("46")
+    number.press("Enter")
+    wait_until(lambda: player.tick().run.value == 46.0)
+    window.get_by_text("beyond the training values").wait_for()
+    window.get_by_text("no full-order run at this value").wait_for()
+    wait_until(lambda: window.screenshot(clip=SCENE) != before)
+
+
+def test_two_browsers_share_what_is_shown(browser, served):
+    page, player = served
+    (one, _), (other, _) = opened(browser, page.url), opened(browser, page.url)
+    one.get_by_role("button", name="pause").click()
+    other.get_by_role("button", name="play", exact=True).wait_for()
+    player.seek(player.steps)
+    before = [window.screenshot(clip=SCENE) for window in (one, other)]
+    number = other.get_by_role("textbox").first
+    number.fill("30")
+    number.press("Enter")
+    for window, shown in zip((one, other), before, strict=True):
+        window.get_by_text("friction angle = 30°, t = 0.12 s").wait_for()
+        wait_until(lambda window=window, shown=shown: window.screenshot(clip=SCENE) != shown)
+    one.close()
+    drawn = page.drawn
+    player.playing = True
+    wait_until(lambda: page.drawn > drawn + 5)
+    assert other.get_by_role("slider").count() == 2

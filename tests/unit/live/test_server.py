@@ -1,0 +1,360 @@
+"""The stream: its numbers, and clients that are slow, drop, send rubbish, or come from elsewhere."""
+
+import asyncio
+import json
+import logging
+import math
+import socket
+import struct
+import threading
+import urllib.error
+import urllib.request
+from contextlib import asynccontextmanager
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from test_player import wait_until
+
+pytest.importorskip("websockets", reason="websockets is not installed")
+
+from websockets.asyncio.client import connect
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+
+from nsf.errors import ConfigError
+from nsf.live.player import Player
+from nsf.live.server import Stream
+from nsf.live.wire import asked_value, field_message, frame_message
+
+
+@asynccontextmanager
+async def streaming(model, host="127.0.0.1", **options):
+    """A stream under way: (stream, player, port)."""
+    with Player(model) as player:
+        stream = Stream(player, host, **{"rate": 200.0, **options})
+        async with await stream.listen(0) as server:
+            playing = asyncio.create_task(stream.play())
+            yield stream, player, server.sockets[0].getsockname()[1]
+            playing.cancel()
+
+
+def connected(port):
+    return connect(f"ws://127.0.0.1:{port}/stream")
+
+
+async def frames(connection, count):
+    found = []
+    while len(found) < count:
+        message = await asyncio.wait_for(connection.recv(), 20)
+        if isinstance(message, bytes):
+            found.append(np.frombuffer(message, "<f4"))
+    return np.array(found)
+
+
+async def until(true):
+    for _ in range(2000):
+        if true():
+            return
+        await asyncio.sleep(0.01)
+    raise AssertionError("nothing happened within 20 s")
+
+
+def test_a_frame_is_time_trust_and_latent(model):
+    async def run():
+        async with streaming(model) as (_, player, port), connected(port) as client:
+            assert json.loads(await client.recv()) == {"value": 26.0, "diverged": False}
+            found = await frames(client, 60)
+            made = player.tick().run
+        assert found.shape == (60, 2 + 4)
+        for t, trust, *xhat in found:
+            step = round(t / made.dt)
+            np.testing.assert_array_equal(xhat, made.xhat(step))
+            assert trust == pytest.approx(made.trust(step), rel=1e-6)
+
+    asyncio.run(run())
+
+
+def test_all_clients_see_what_one_asks_for(model):
+    async def run():
+        async with streaming(model) as (stream, _, port):
+            async with connected(port) as one, connected(port) as other:
+                await until(lambda: stream.clients == 2)
+                await one.send('{"value": 34}')
+                for client in (one, other):
+                    async with asyncio.timeout(20):
+                        while (
+                            isinstance(message := await client.recv(), bytes)
+                            or json.loads(message)["value"] != 34
+                        ):
+                            pass
+            await until(lambda: stream.clients == 0)
+
+    asyncio.run(run())
+
+
+RUBBISH = [
+    "", "x", "{}", "[]", "34", '{"value": "34"}', '{"value": null}', '{"value": true}', '{"value": [34]}',
+    '{"value": NaN}', '{"value": Infinity}', '{"value": 1e999}', '{"value": 47}', '{"value": 34, "more": 1}',
+    '{"value": 1' + "0" * 320 + "}", "[" * 250, b"\0\1\2\3",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("message", RUBBISH, ids=[str(m)[:24] for m in RUBBISH])
+def test_rubbish_is_refused(message, player):
+    with pytest.raises(ConfigError):
+        player.steer(asked_value(message))
+    assert player.value == 26.0
+
+
+@pytest.mark.parametrize(
+    ("message", "code", "why"),
+    [
+        ("rubbish", 1008, "sent rubbish: a client may only send"),
+        ('{"value": 1e9}', 1008, "sent rubbish: friction_angle=1e+09 must lie in [14, 46]"),
+        (b"\0", 1008, "sent rubbish"),
+        ("x" * 1000, 1009, "closed with 1009"),
+    ],
+)
+def test_a_client_that_sends_rubbish_is_closed_and_no_other(model, message, code, why, caplog):
+    async def run():
+        joined = streaming(model)
+        async with joined as (stream, _, port), connected(port) as good, connected(port) as bad:
+            await until(lambda: stream.clients == 2)
+            await bad.send(message)
+            with pytest.raises(ConnectionClosed) as closed:
+                await frames(bad, 10**6)
+            assert closed.value.rcvd.code == code
+            await until(lambda: stream.clients == 1)
+            await frames(good, 20)
+
+    with caplog.at_level(logging.INFO, "nsf"):
+        asyncio.run(run())
+    assert f"left, 1 now: {why}" in caplog.text
+
+
+def test_bytes_that_are_no_websocket_disturb_nobody(model):
+    async def run():
+        async with streaming(model) as (stream, _, port), connected(port) as good:
+            for told in (
+                b"\x00\xff" * 500,
+                b"GET /stream HTTP/1.1\r\n\r\n",
+                b"POST / HTTP/1.1\r\n\r\n",
+                b"",
+            ):
+                reader, writer = await asyncio.open_connection("127.0.0.1", port)
+                writer.write(told)
+                writer.write_eof()
+                await asyncio.wait_for(reader.read(), 20)
+                writer.close()
+            await frames(good, 20)
+            assert stream.clients == 1
+
+    asyncio.run(run())
+
+
+def handshake(port) -> socket.socket:
+    """A client by hand, which then does what no library would."""
+    raw = socket.create_connection(("127.0.0.1", port))
+    raw.sendall(
+        b"GET /stream HTTP/1.1\r\nHost: 127.0.0.1:%d\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 13\r\n\r\n" % port
+    )
+    return raw
+
+
+def test_a_client_that_does_not_read_is_closed_and_no_other(model, caplog):
+    async def run():
+        async with streaming(model, patience=0.4) as (stream, _, port), connected(port) as good:
+            slow = handshake(port)
+            await until(lambda: stream.clients == 2)
+            reading = asyncio.create_task(frames(good, 10**6))
+            await until(lambda: stream.clients == 1)
+            assert not reading.done()
+            reading.cancel()
+            slow.close()
+
+    with caplog.at_level(logging.INFO, "nsf"):
+        asyncio.run(run())
+    assert "left, 1 now: too slow" in caplog.text
+
+
+def test_a_client_that_drops_is_noticed_and_disturbs_nobody(model, caplog):
+    async def run():
+        async with streaming(model) as (stream, _, port), connected(port) as good:
+            gone = handshake(port)
+            await until(lambda: stream.clients == 2)
+            gone.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            gone.close()  # reset, not closed
+            await until(lambda: stream.clients == 1)
+            await frames(good, 20)
+
+    with caplog.at_level(logging.INFO, "nsf"):
+        asyncio.run(run())
+    assert "left, 1 now: dropped" in caplog.text
+
+
+def refused(model, path="/stream", headers=None, host="127.0.0.1", **options):
+    """The status that a client gets."""
+
+    async def run():
+        async with streaming(model, host, **options) as (_, _, port):
+            own = {k: v.replace("PORT", str(port)) for k, v in (headers or {}).items()}
+            origin = own.pop("Origin", None)
+            try:
+                async with connect(f"ws://127.0.0.1:{port}{path}", origin=origin, additional_headers=own):
+                    return 101
+            except InvalidStatus as error:
+                return error.response.status_code
+
+    return asyncio.run(run())
+
+
+@pytest.mark.parametrize(
+    ("origin", "status"),
+    [
+        (None, 101),  # no browser
+        ("http://127.0.0.1:PORT", 101),
+        ("http://evil.example", 403),
+        ("http://127.0.0.1:1", 403),
+        ("http://127.0.0.1.evil.example:PORT", 403),
+        ("null", 403),
+    ],
+)
+def test_a_page_of_another_site_is_refused(model, origin, status):
+    assert refused(model, headers={"Origin": origin} if origin else {}) == status
+
+
+def answer(port, path="/", **headers):
+    request = urllib.request.Request(f"http://127.0.0.1:{port}{path}", headers=headers)
+    try:
+        with urllib.request.urlopen(request, timeout=20) as response:
+            return response.status, response.read()
+    except urllib.error.HTTPError as error:
+        return error.code, error.read()
+
+
+def test_another_name_for_this_machine_is_refused(model, caplog):
+    """A foreign page whose name was made to lead here has the right origin, but not the right host."""
+
+    async def run():
+        async with streaming(model) as (_, _, port):
+            evil = {"Host": f"evil.example:{port}", "Origin": f"http://evil.example:{port}"}
+            assert (await asyncio.to_thread(answer, port, **evil))[0] == 403
+            for host in ("localhost", "127.0.0.1", "[::1]"):
+                assert (await asyncio.to_thread(answer, port, Host=f"{host}:{port}"))[0] == 200
+
+    asyncio.run(run())
+    assert "refused: host 'evil.example" in caplog.text
+
+
+def test_a_token_is_asked_of_every_request(model):
+    token = {"token": "s e/c?ret"}
+    for path, status in (
+        ("/stream", 403),
+        ("/stream?token=", 403),
+        ("/stream?token=s%20e", 403),
+        ("/stream?token=%E2%98%83", 403),
+        ("/stream?token=s%20e%2Fc%3Fret", 101),
+    ):
+        assert refused(model, path, host="0.0.0.0", **token) == status
+
+    async def run():
+        async with streaming(model, **token) as (_, _, port):
+            for path in ("/", "/field", "/other", "/?token=wrong"):
+                assert (await asyncio.to_thread(answer, port, path))[0] == 403
+            assert (await asyncio.to_thread(answer, port, "/?token=s%20e%2Fc%3Fret"))[0] == 200
+
+    asyncio.run(run())
+
+
+def test_what_is_served(model):
+    async def run():
+        async with streaming(model) as (_, _, port):
+            assert b"<title>" in (await asyncio.to_thread(answer, port))[1]
+            assert (await asyncio.to_thread(answer, port, "/field"))[1] == field_message(model)
+            assert (await asyncio.to_thread(answer, port, "/../../etc/passwd"))[0] == 404
+
+    asyncio.run(run())
+
+
+def test_a_port_that_is_taken_says_so(model):
+    async def run():
+        async with streaming(model) as (stream, _, port):
+            with pytest.raises(ConfigError, match=f"cannot serve at 127.0.0.1:{port} .*give another --port"):
+                await stream.listen(port)
+
+    asyncio.run(run())
+
+
+def test_the_field_is_smaller_than_its_numbers_and_a_frame_than_particles(model):
+    field = model.at.fields["deformation"]
+    assert len(field_message(model)) < field.modes.numel() * 2 + 2 * field.mean.nbytes + 20_000
+    frame = frame_message(Player(model).tick())
+    assert len(frame) == 4 * (2 + model.manifold.latent_dim)
+
+
+def test_a_field_that_is_no_modes_is_refused(model):
+    other = SimpleNamespace(run=model.run, manifold=SimpleNamespace(field="mlp"))
+    with pytest.raises(ConfigError, match=r"has field=mlp.*serve a deployment of field=basis"):
+        field_message(other)
+
+
+# -- the page -----------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def address(model):
+    """A stream on a thread of its own, since a browser blocks: its port, and its player."""
+    ready, loop, found = threading.Event(), asyncio.new_event_loop(), {}
+
+    async def run():
+        async with streaming(model, rate=30.0) as (_, player, port):
+            found.update(port=port, player=player, end=asyncio.Event())
+            ready.set()
+            await found["end"].wait()
+
+    thread = threading.Thread(target=loop.run_until_complete, args=(run(),))
+    thread.start()
+    assert ready.wait(20)
+    yield f"http://127.0.0.1:{found['port']}/", found["player"]
+    loop.call_soon_threadsafe(found["end"].set)
+    thread.join()
+    loop.close()
+
+
+def test_a_browser_decodes_what_the_server_does(browser, address, model):
+    url, player = address
+    windows, asked, faults = [browser.new_page() for _ in range(2)], [], []
+    for window in windows:
+        window.on("request", lambda request: asked.append(request.url))
+        window.on("pageerror", lambda error: faults.append(str(error)))
+        window.goto(url)
+        wait_until(lambda window=window: window.evaluate("state.drawn > 5"))
+    one, other = windows
+    assert all(u.startswith(url) or u.startswith("data:") for u in asked)
+    assert not faults
+    before = other.screenshot()
+
+    one.locator("#value").fill("34")
+    wait_until(lambda: player.value == 34.0)
+    for window in windows:
+        window.get_by_text("friction angle = 34.00°").wait_for()
+    wait_until(lambda: other.evaluate("state.value === 34 && state.t > 0.1"))
+    assert other.screenshot() != before
+
+    shown = other.evaluate("({t: state.t, x: Array.from(state.x)})")
+    run = player.tick().run
+    x = np.reshape(shown["x"], (-1, 3))
+    expected = run.positions(round(shown["t"] / run.dt))
+    moved = np.abs(expected - model.X).max()
+    assert np.abs(x - expected).max() < 1e-4 * moved
+    assert math.isfinite(moved)
+
+
+def test_a_browser_says_when_the_stream_ends(browser, address):
+    url, _ = address
+    window = browser.new_page()
+    window.goto(url)
+    wait_until(lambda: window.evaluate("state.drawn > 2"))
+    window.evaluate("socket.send('rubbish')")
+    window.get_by_text("closed (1008) a client may only send").wait_for()
