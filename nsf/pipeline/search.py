@@ -115,7 +115,7 @@ def _parted(words: Sequence[str]) -> tuple[list[Range], list[str]]:
     ranges = [r for r in found.values() if r]
     if not ranges:
         raise ConfigError(
-            "nsf search needs a range, as latent_dim=4..8 or field.displacement_noise=1e-3..0.1:log"
+            "nsf search needs a range, as latent_dim=4..8 or field.noise=1e-3..0.1:log"
         )
     if any(word.startswith("+experiment=") for word in words):
         raise ConfigError("a search has no experiment; give the keys of one of its jobs instead")

@@ -31,11 +31,11 @@ def tried(copied, tiny, tmp_path):
 
 
 def test_the_front_of_two_objectives(tried):
-    words = ("scene.parameters.validation=[25]", "latent_dim=3..5", "field.displacement_noise=0.001..0.1:log")
+    words = ("scene.parameters.validation=[25]", "latent_dim=3..5", "field.noise=0.001..0.1:log")
     table, said = tried(*words, "search.objectives=[delta,step_ms]", "search.trials=3")
     assert list(table["trial"]) == [0, 1, 2]
     assert set(table["latent_dim"]) <= {3, 4, 5}
-    assert table["field.displacement_noise"].between(0.001, 0.1).all()
+    assert table["field.noise"].between(0.001, 0.1).all()
     for _, row in table.iterrows():
         better = table[(table["delta"] <= row["delta"]) & (table["step_ms"] <= row["step_ms"])]
         assert row["pareto"] == (len(better) == 1)
@@ -72,7 +72,7 @@ def test_a_failed_trial_is_kept_and_the_others_go_on(tried, monkeypatch):
         (["latent_dim=4..6", "+experiment=sand"], "has no experiment"),
         (["latent_dim=6..4"], "nothing between"),
         (["latent_dimm=4..6"], "did you mean latent_dim"),
-        (["field.displacement_noise=0.0..0.1:log"], "reaches zero"),
+        (["field.noise=0.0..0.1:log"], "reaches zero"),
         (["latent_dim=0..4", "scene.parameters.validation=[25]"], "latent_dim=0"),
         (["latent_dim=4..6", "search.objectives=[speed]"], "delta, step_ms"),
         (["latent_dim=4..6", "search.objectives=delta"], "delta, step_ms"),
