@@ -114,9 +114,7 @@ def _parted(words: Sequence[str]) -> tuple[list[Range], list[str]]:
     found = {word: Range.parse(word) for word in words}
     ranges = [r for r in found.values() if r]
     if not ranges:
-        raise ConfigError(
-            "nsf search needs a range, as latent_dim=4..8 or field.noise=1e-3..0.1:log"
-        )
+        raise ConfigError("nsf search needs a range, as latent_dim=4..8 or field.noise=1e-3..0.1:log")
     if any(word.startswith("+experiment=") for word in words):
         raise ConfigError("a search has no experiment; give the keys of one of its jobs instead")
     return ranges, [word for word, r in found.items() if not r]

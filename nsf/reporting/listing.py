@@ -101,7 +101,7 @@ def entries(filters: Mapping[str, str] | None = None, sort: str = "-created", ro
         A list of `Entry`.
 
     Raises:
-        ConfigError: no run has such a key; names the nearest.
+        ConfigError: there are runs, and none has such a key; names the nearest.
     """
     found = [Entry(run) for run in Run.find(root=root)]
     key = sort.removeprefix("-")
@@ -149,7 +149,7 @@ def difference_table(first: Run, second: Run) -> Table:
 
 
 def _check_key(key: str, found: Sequence[Entry]) -> None:
-    if key in FIELDS or any(key in entry.values or key in entry.settings for entry in found):
+    if not found or key in FIELDS or any(key in entry.values or key in entry.settings for entry in found):
         return
     known = dict.fromkeys([*FIELDS, *(k for entry in found for k in (*entry.values, *entry.settings))])
     near = difflib.get_close_matches(key, known, n=3, cutoff=0.5)

@@ -10,8 +10,10 @@ import pytest
 from expand import variants
 
 from nsf import config
+from nsf.cli import TOOLS, main
 from nsf.errors import ConfigError
 from nsf.pipeline import Pipeline
+from nsf.pipeline.search import Range
 from nsf.reporting import COLUMNS
 from nsf.reporting.readme import BEGIN, END, REPORT, figures, updated
 
@@ -24,10 +26,23 @@ def blocks(language: str) -> list[str]:
 
 
 @pytest.mark.parametrize("command", [line for block in blocks("sh") for line in block.splitlines()])
-def test_readme_command(command):
+def test_readme_command(command, tmp_path, monkeypatch, capsys):
     if command.startswith("make "):
         target = command.split()[1]
         assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+        return
+    name, *words = command.removeprefix("nsf ").split()
+    if name == "search":
+        ranges = [Range.parse(word) for word in words]
+        assert any(ranges)
+        Pipeline(config.load([word for word, found in zip(words, ranges, strict=True) if not found]))
+        return
+    if name in TOOLS:
+        monkeypatch.setenv("NSF_RUNS", str(tmp_path / "runs"))
+        monkeypatch.setenv("NSF_REPORTS", str(tmp_path / "reports"))
+        with pytest.raises(SystemExit) as ended:
+            main([name, *words])
+        assert not ended.value.code or "no complete deploy run" in capsys.readouterr().err
         return
     stage, runs = variants(command)
     for overrides in runs:
