@@ -17,7 +17,8 @@ MARK = "sources.json"
 def replaced(folder: Path) -> Iterator[Path]:
     """An empty sibling folder to write into; it takes `folder`'s place once the block ends without an error.
 
-    Until then, and after any error or interrupt, whatever stood at `folder` stands there unchanged.
+    Until then, and after any error or interrupt, whatever stood at `folder` stands there unchanged. Two
+    processes that replace it do so in turn, by the lock `.<name>.lock` beside it, which stays.
 
     Raises:
         ConfigError: `folder` holds something that is not a report.

@@ -227,7 +227,7 @@ def test_runs_are_listed_and_compared(nsf, chain, monkeypatch):
         (["stage=evaluate", "sort=dleta"], "did you mean delta"),
         (["--all"], "'--all' is not key=value"),
         (["diff", "abc"], "takes two runs, not 1"),
-        (["diff", "abc", "def"], "run 'abc'"),
+        (["diff", "abc", "def"], "no run is, or begins with, 'abc'"),
     ],
 )
 def test_runs_refuses_what_it_does_not_know(nsf, chain, monkeypatch, words, quoted):
