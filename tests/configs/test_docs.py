@@ -52,7 +52,8 @@ def add(file: str, content: str, project: Path, monkeypatch) -> None:
         if group == "nsf/kinematics":  # as the page says
             monkeypatch.setattr(manifold, "FIELDS", (*manifold.FIELDS, name))
     elif group == "experiments":
-        assert Experiment.load(name, folder=project / "experiments").jobs
+        for job in Experiment.load(name, folder=project / "experiments").jobs:
+            Pipeline(config.load([*job.overrides, "device=cpu"]))
     elif group == "conf/hydra/launcher":
         launcher = config.launching([f"hydra/launcher={name}"])[0].hydra.launcher
         assert set(yaml.safe_load(content)) - {"defaults"} <= set(launcher)
