@@ -14,7 +14,7 @@ INSTALLED := $(VENV)/.installed
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 WORKERS ?= 2
 
-.PHONY: help install quickstart test test-slow test-slurm test-all lint readme clean
+.PHONY: help install quickstart test test-slow test-slurm test-all lint readme docs clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -50,6 +50,9 @@ lint: install  ## ruff and the layers of imports
 readme: install  ## the figures in README.md, from reports/sand/results.csv
 	$(BIN)/python -m nsf.reporting.readme README.md
 
+docs: install  ## the documentation, in site/
+	OMP_NUM_THREADS=1 $(BIN)/python -m mkdocs build --strict
+
 clean:  ## remove the environment, caches and builds; runs and reports stay
-	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .mypy_cache .import_linter_cache .hypothesis *.egg-info
+	rm -rf $(VENV) build dist site .pytest_cache .ruff_cache .mypy_cache .import_linter_cache .hypothesis *.egg-info
 	find nsf tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from nsf.provenance import provenance
 
-_DEVELOPMENT = ("dev",)  # extras that a user does not miss
+_DEVELOPMENT = ("dev", "docs")  # extras that a user does not miss
 
 
 def report() -> str:

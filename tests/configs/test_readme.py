@@ -7,49 +7,22 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from expand import variants
+from pages import ROOT, blocks_of, try_command
 
 from nsf import config
-from nsf.cli import TOOLS, main
 from nsf.errors import ConfigError
 from nsf.pipeline import Pipeline
-from nsf.pipeline.search import Range
 from nsf.reporting import COLUMNS
 from nsf.reporting.readme import BEGIN, END, REPORT, figures, updated
 
-ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
-def blocks(language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
-
-
-@pytest.mark.parametrize("command", [line for block in blocks("sh") for line in block.splitlines()])
+@pytest.mark.parametrize(
+    "command", [line for block in blocks_of(README, "sh") for line in block.splitlines()]
+)
 def test_readme_command(command, tmp_path, monkeypatch, capsys):
-    if command.startswith("make "):
-        target = command.split()[1]
-        assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
-        return
-    name, *words = command.removeprefix("nsf ").split()
-    if name == "search":
-        ranges = [Range.parse(word) for word in words]
-        assert any(ranges)
-        Pipeline(config.load([word for word, found in zip(words, ranges, strict=True) if not found]))
-        return
-    if name in TOOLS:
-        monkeypatch.setenv("NSF_RUNS", str(tmp_path / "runs"))
-        monkeypatch.setenv("NSF_REPORTS", str(tmp_path / "reports"))
-        with pytest.raises(SystemExit) as ended:
-            main([name, *words])
-        assert not ended.value.code or "no complete deploy run" in capsys.readouterr().err
-        return
-    stage, runs = variants(command)
-    for overrides in runs:
-        if stage == "point":
-            config.build(config.load(overrides, "point").material, "material")
-        else:
-            Pipeline(config.load([*overrides, "device=cpu"]))
+    try_command(command, tmp_path, monkeypatch, capsys)
 
 
 def test_readme_python_runs(tmp_path, monkeypatch, capsys):
@@ -60,7 +33,7 @@ def test_readme_python_runs(tmp_path, monkeypatch, capsys):
     pipeline.simulate()
     pipeline.train()
     capsys.readouterr()
-    (block,) = blocks("python")
+    (block,) = blocks_of(README, "python")
     exec(compile(block, "README.md", "exec"), {"__name__": "readme"})
     assert len(capsys.readouterr().out.split("\n")) == 3
 
@@ -69,7 +42,7 @@ def test_readme_scene_builds(tmp_path, monkeypatch):
     """The scene with a mesh of one's own, as README shows it."""
     trimesh = pytest.importorskip("trimesh")
     shutil.copytree(config.CONF, tmp_path / "conf")
-    (block,) = blocks("yaml")
+    (block,) = blocks_of(README, "yaml")
     (tmp_path / "conf/scene/bunny.yaml").write_text(block)
     monkeypatch.setattr(config, "CONF", tmp_path / "conf")
     monkeypatch.chdir(tmp_path)

@@ -1,0 +1,70 @@
+"""Code blocks of README.md and of docs/, taken apart and tried."""
+
+import re
+from pathlib import Path
+
+import pytest
+from expand import variants
+
+from nsf import config
+from nsf.cli import TOOLS, main
+from nsf.paths import EXPERIMENTS
+from nsf.pipeline import Pipeline
+from nsf.pipeline.experiment import Experiment
+from nsf.pipeline.search import Range
+
+ROOT = Path(__file__).parents[2]
+_BLOCK = re.compile(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$', re.MULTILINE | re.DOTALL)
+
+
+def blocks(text: str) -> list[tuple[str, str, str]]:
+    """(language, title or "", content) of every fenced block of a page, in order."""
+    return _BLOCK.findall(text)
+
+
+def blocks_of(text: str, language: str) -> list[str]:
+    """Contents of the blocks in one language."""
+    return [content for found, _, content in blocks(text) if found == language]
+
+
+def try_command(command: str, folder: Path, monkeypatch, capsys, experiments: Path = EXPERIMENTS) -> None:
+    """Call what is quick, in an empty `folder` of runs; compose and build what a stage would run.
+
+    `make` and `pytest` are only asked whether the target or the file is there.
+    """
+    program, *words = command.split()
+    if program == "make":
+        assert re.search(rf"^{words[0]}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+        return
+    if program == "pytest":
+        assert (ROOT / words[0]).is_file()
+        return
+    assert program == "nsf"
+    name, *words = words
+    if name == "search":
+        ranges = [Range.parse(word) for word in words]
+        assert any(ranges)
+        Pipeline(config.load([word for word, found in zip(words, ranges, strict=True) if not found]))
+    elif name in TOOLS:
+        monkeypatch.setenv("NSF_RUNS", str(folder / "runs"))
+        monkeypatch.setenv("NSF_REPORTS", str(folder / "reports"))
+        with pytest.raises(SystemExit) as ended:
+            main([name, *words])
+        assert not ended.value.code or "no complete deploy run" in capsys.readouterr().err
+    else:
+        _build(command, experiments)
+
+
+def _build(command: str, experiments: Path) -> None:
+    stage, runs = variants(command)
+    for overrides in runs:
+        named = [o.removeprefix("+experiment=") for o in overrides if o.startswith("+experiment=")]
+        own = [o for o in overrides if not o.startswith("+experiment=")]
+        if stage == "point":
+            config.build(config.load(own, "point").material, "material")
+        elif named:
+            # The others are built in test_experiments.py; a key of the command line is in all of them.
+            first = Experiment.load(named[-1], own, experiments).jobs[0]
+            config.load([*first.overrides, "device=cpu"])
+        else:
+            Pipeline(config.load([*own, "device=cpu"]))

@@ -1,0 +1,96 @@
+"""Every code block of docs/ does what its page says: files build, commands compose, Python runs."""
+
+import importlib
+import re
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from pages import ROOT, blocks, try_command
+
+from nsf import config
+from nsf.kinematics import manifold
+from nsf.pipeline import Pipeline
+from nsf.pipeline.experiment import Experiment
+
+DOCS = ROOT / "docs"
+#: What is written for readers of the code has signatures, not programs.
+PAGES = sorted(p.relative_to(DOCS).as_posix() for p in DOCS.glob("**/*.md") if p.name != "design.md")
+
+
+@pytest.fixture
+def project(tmp_path, monkeypatch):
+    """A checkout to which a page adds its files: `conf`, `experiments` and what extends the package."""
+    for folder in ("conf", "experiments"):
+        shutil.copytree(ROOT / folder, tmp_path / folder)
+    monkeypatch.setattr(config, "CONF", tmp_path / "conf")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("NSF_RUNS", str(tmp_path / "runs"))
+    monkeypatch.setenv("NSF_REPORTS", str(tmp_path / "reports"))
+    before = set(sys.modules)
+    for package in ("nsf.mpm.materials", "nsf.kinematics"):
+        folder = tmp_path / package.replace(".", "/")
+        folder.mkdir(parents=True)
+        path = importlib.import_module(package).__path__
+        monkeypatch.setattr(sys.modules[package], "__path__", [*path, str(folder)])
+    yield tmp_path
+    for name in set(sys.modules) - before:
+        if str(tmp_path) in (getattr(sys.modules[name], "__file__", None) or ""):
+            del sys.modules[name]
+
+
+def add(file: str, content: str, project: Path, monkeypatch) -> None:
+    """Write a file of a page where it belongs, and build what it defines."""
+    path = project / file
+    path.write_text(content, encoding="utf-8")
+    group, name = Path(file).parent.as_posix(), path.stem
+    if path.suffix == ".py":
+        importlib.invalidate_caches()
+        importlib.import_module(file.removesuffix(".py").replace("/", "."))
+        if group == "nsf/kinematics":  # as the page says
+            monkeypatch.setattr(manifold, "FIELDS", (*manifold.FIELDS, name))
+    elif group == "experiments":
+        for job in Experiment.load(name, folder=project / "experiments").jobs:
+            Pipeline(config.load([*job.overrides, "device=cpu"]))
+    elif group == "conf/hydra/launcher":
+        launcher = config.launching([f"hydra/launcher={name}"])[0].hydra.launcher
+        assert set(yaml.safe_load(content)) - {"defaults"} <= set(launcher)
+    elif group == "conf/material":
+        config.build(config.load([f"material={name}"], "point").material, "material")
+    else:
+        assert group in ("conf/scene", "conf/field"), file
+        option = f"{group.removeprefix('conf/')}={name}"
+        Pipeline(config.load([option, "scale=small", "device=cpu"]))
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_page(page, project, monkeypatch, capsys):
+    text = (DOCS / page).read_text(encoding="utf-8")
+    if "trimesh" in text:
+        pytest.importorskip("trimesh")
+    found = blocks(text)
+    assert len(found) == text.count("\n```") / 2, "a block that is not read: indented, or without a language"
+    for language, title, content in found:
+        try:
+            if title:
+                add(title, content, project, monkeypatch)
+            elif language == "python":
+                exec(compile(content, page, "exec"), {"__name__": "page"})
+            else:
+                assert language == "sh", f"a {language} block without a title"
+                for command in content.splitlines():
+                    try_command(command, project, monkeypatch, capsys, project / "experiments")
+        except BaseException as error:
+            error.add_note(f"in docs/{page}:\n{content}")
+            raise
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_named_paths_are_there(page):
+    """A path of the repository that a page names, unless the page adds it or a command makes it."""
+    text = (DOCS / page).read_text(encoding="utf-8")
+    own = {title for _, title, _ in blocks(text)}
+    for path in set(re.findall(r"`((?:nsf|conf|docs|experiments|tests|reports)/[\w/.]+)`", text)) - own:
+        assert (ROOT / path).exists() or path.startswith("reports/"), path
