@@ -197,6 +197,7 @@ def delta_over(
             drawn[0].set_xscale("log")
             _plain_ticks(drawn[0].xaxis)
         told = {line.get_label(): line for panel in drawn for line in panel.lines}
+        told |= {name: told.pop(name) for name in ("the paper",) if name in told}  # last
         if len(told) > 1:
             fig.legend(told.values(), told.keys(), loc="outside upper left", ncols=6, handlelength=2.2)
     return fig

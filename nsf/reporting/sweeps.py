@@ -58,7 +58,7 @@ def _over(key: str, frame: pd.DataFrame, merged: Merged, folder: Path) -> Pictur
     for scene, part in shown.dropna(subset="x").groupby(_SCENE, sort=False):
         panels[scene] = {
             name: group.groupby("x")["delta"].apply(list).to_dict()
-            for name, group in _settings(part, without=(key, *_SEEDS))
+            for name, group in _settings(part, (key, *_SEEDS), alone="mean")
         }
         printed = paper_row(merged, [part["row"].iloc[0]]) or {}
         paper = tuple(pd.to_numeric(printed.get(name), errors="coerce") for name in (column, "delta"))
@@ -80,7 +80,7 @@ def _scatter(frame: pd.DataFrame, merged: Merged, folder: Path) -> Picture:
     entries = []
     for seed in _SEEDS:
         part = frame[frame[seed].notna()] if seed in frame else frame.iloc[:0]
-        for name, group in _settings(part, without=_SEEDS):
+        for name, group in _settings(part, _SEEDS, alone=merged.frame["scene"].iloc[0]):
             values = group.groupby(seed)["delta"].apply(lambda deltas: deltas.mean(skipna=False))
             printed = (paper_row(merged, [group["row"].iloc[0]]) or {}).get("delta")
             told = {"mean": values.mean(skipna=False), "values": list(values)}
@@ -94,8 +94,14 @@ def _scatter(frame: pd.DataFrame, merged: Merged, folder: Path) -> Picture:
     return Picture(save(figure, folder, "delta-over-seeds"), caption, sorted(set(frame[_RUN])))
 
 
-def _settings(frame: pd.DataFrame, without: Sequence[str]) -> list[tuple[str, pd.DataFrame]]:
-    """The rows of each setting of the job's keys, by a name of those keys that tell settings apart."""
+def _settings(frame: pd.DataFrame, without: Sequence[str], alone: str) -> list[tuple[str, pd.DataFrame]]:
+    """The rows of each setting of the job's keys, by a name of those keys that tell settings apart.
+
+    Args:
+        frame: rows of `_held_out`.
+        without: keys that are no setting.
+        alone: the name of all rows where they have one setting.
+    """
     told: list[str] = []
     groups = 1
     for key in frame.columns.drop([_RUN, "delta", "row", "x", *without], errors="ignore"):
@@ -103,7 +109,7 @@ def _settings(frame: pd.DataFrame, without: Sequence[str]) -> list[tuple[str, pd
         if found > groups:
             told, groups = [*told, key], found
     if not told:
-        return [(str(frame[_SCENE].iloc[0]), frame)] if len(frame) else []
+        return [(alone, frame)] if len(frame) else []
     return [
         (" · ".join(str(value) for value in values if not pd.isna(value)), group)
         for values, group in frame.groupby(told, dropna=False, sort=False)

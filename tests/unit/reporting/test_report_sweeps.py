@@ -54,8 +54,8 @@ def test_delta_over_what_varies_with_every_value_and_seed(tmp_path, drawn):
     (section,) = sweeps.swept(merged, keys, tmp_path)
     ((name, (panels, x, papers)),) = drawn
     assert (name, x) == ("delta_over", "sample particles |S| [–]")
-    assert (list(panels), list(panels["sand"]), papers["sand"][0]) == (["sand"], ["sand"], 150)
-    line = panels["sand"]["sand"]
+    assert (list(panels), list(panels["sand"]), papers["sand"][0]) == (["sand"], ["mean"], 150)
+    line = panels["sand"]["mean"]
     assert {at: len(values) for at, values in line.items()} == {20: 6, 50: 6, 150: 6}
     assert sorted(line[20]) == sorted(merged.frame.loc[merged.frame["sample"] == "20", "delta"])
     (picture,) = section.pictures
@@ -86,7 +86,7 @@ def test_lines_are_named_by_what_tells_them_apart():
     frame = pd.DataFrame(
         {"scene": "sand", "field": ["basis", "mlp"], "trainer.steps": [None, "null"], "x": 1.0, "run": "a"}
     )
-    assert [name for name, _ in sweeps._settings(frame, ())] == ["basis", "mlp"]
+    assert [name for name, _ in sweeps._settings(frame, (), "mean")] == ["basis", "mlp"]
 
 
 def test_the_band_spans_the_values_and_a_diverged_run_leaves_a_gap():
