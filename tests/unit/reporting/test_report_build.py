@@ -35,7 +35,7 @@ def test_report_has_every_file_and_links_only_what_is_there(report):
     page, markdown = (report / "index.html").read_text(), (report / "index.md").read_text()
     linked = set(re.findall(r'src="([^"]+)"', page)) | set(re.findall(r"\]\(([^)]+)\)", markdown))
     assert linked <= present
-    pictures = present - {"index.html", "index.md", "results.csv", "sources.json"}
+    pictures = present - {"index.html", "index.md", "results.csv", "results.tex", "sources.json"}
     assert {name.rsplit(".")[0] for name in pictures} == {name.rsplit(".")[0] for name in linked}
     assert "http" not in page.replace("http-equiv", "")
 
