@@ -81,7 +81,7 @@ def test_pictures_are_of_the_best_sample_of_each_method(report):
 def test_sources_lead_from_each_row_to_its_run(report, sweep):
     told = json.loads((report / "sources.json").read_text())
     frame = pd.read_csv(report / "results.csv")
-    assert told["results.csv"]["sha256"] == file_hash(report / "results.csv")
+    assert told["files"]["results.csv"] == file_hash(report / "results.csv")
     assert len(told["rows"]) == len(frame)
     for entry, row in zip(told["rows"], frame.to_dict("records"), strict=True):
         run = next(run for run in sweep if run.id == entry["run"])
