@@ -14,10 +14,10 @@ INSTALLED := $(VENV)/.installed
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 WORKERS ?= 2
 
-.PHONY: help install quickstart test test-slow test-slurm test-all lint readme docs clean
+.PHONY: help install quickstart test test-slow test-slurm test-all lint readme check-reports docs clean
 
 help:  ## this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-11s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-13s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 install: $(INSTALLED)  ## .venv with the package and what it needs
 
@@ -47,8 +47,12 @@ lint: install  ## ruff and the layers of imports
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 
-readme: install  ## the figures in README.md, from reports/sand/results.csv
+readme: install  ## the figures in README.md, from a report, and the list of reports
 	$(BIN)/python -m nsf.reporting.readme README.md
+	$(BIN)/nsf reports folder=reports
+
+check-reports: install  ## whether reports/ is as it was generated
+	$(BIN)/nsf reports folder=reports check=true
 
 docs: install  ## the documentation, in site/
 	OMP_NUM_THREADS=1 $(BIN)/python -m mkdocs build --strict

@@ -34,6 +34,10 @@ TOOLS = {
         "a page of every run, with a thumbnail each, that sorts and filters in the browser",
         "[folder=PATH]; reports/runs by default",
     ),
+    "reports": (
+        "the list of all reports, reports/index.md; check=true: whether one of them was changed since",
+        "[folder=PATH] [check=true]; reports by default",
+    ),
     "doctor": ("versions, devices, folders and extras of this installation", ""),
 }
 _EXAMPLES = """\
@@ -124,6 +128,16 @@ def _check_words(command: str, words: Sequence[str]) -> None:
         raise ConfigError(f"{unknown[0]!r} is not key=value; see `nsf {command} --help`")
 
 
+def _asked(command: str, words: Sequence[str], *known: str) -> dict[str, str]:
+    """The values of a tool's keys."""
+    _check_words(command, words)
+    asked = dict(word.split("=", 1) for word in words)
+    if unknown := [key for key in asked if key not in known]:
+        keys = " and ".join(f"{key}=" for key in known)
+        raise ConfigError(f"nsf {command} has no key {unknown[0]!r}; it takes {keys}")
+    return asked
+
+
 def _tool(name: str, words: list[str]) -> int:
     text, usage = TOOLS[name]
     if usage is not None and {"-h", "--help"} & set(words):
@@ -133,7 +147,10 @@ def _tool(name: str, words: list[str]) -> int:
         from nsf.live.command import main as live
 
         return live(name, text, words)
-    tools = {"doctor": _doctor, "export": _export, "index": _index, "runs": _runs, "search": _search}
+    tools = {
+        "doctor": _doctor, "export": _export, "index": _index,
+        "reports": _reports, "runs": _runs, "search": _search,
+    }  # fmt: skip
     return tools[name](words)
 
 
@@ -156,17 +173,33 @@ def _export(words: list[str]) -> int:
 
 def _index(words: list[str]) -> int:
     """The page of all runs."""
-    _check_words("index", words)
-    asked = dict(word.split("=", 1) for word in words)
-    folder = asked.pop("folder", os.path.join(os.environ.get("NSF_REPORTS", "reports"), "runs"))
-    if asked:
-        raise ConfigError(f"nsf index has no key {next(iter(asked))!r}; it takes folder=PATH")
+    asked = _asked("index", words, "folder")
+    folder = asked.get("folder", os.path.join(os.environ.get("NSF_REPORTS", "reports"), "runs"))
     from pathlib import Path
 
     from nsf.reporting.index import write_index
 
     print(f"open {write_index(Path(folder)).resolve()}")
     return 0
+
+
+def _reports(words: list[str]) -> int:
+    """The list of reports, or what is wrong with them; 2 if something is."""
+    asked = _asked("reports", words, "folder", "check")
+    if asked.get("check", "true") not in ("true", "false"):
+        raise ConfigError(f"check={asked['check']} must be true or false")
+    from pathlib import Path
+
+    from nsf.reporting.committed import faults, write_list
+
+    folder = Path(asked.get("folder", os.environ.get("NSF_REPORTS", "reports")))
+    if asked.get("check") != "true":
+        print(f"open {write_list(folder).resolve()}")
+        return 0
+    found = faults(folder)
+    for fault in found:
+        print(fault, file=sys.stderr)
+    return 2 if found else 0
 
 
 def _search(words: list[str]) -> int:

@@ -4,6 +4,7 @@ import importlib.metadata
 import os
 import platform
 import subprocess
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -36,6 +37,13 @@ def provenance() -> dict[str, Any]:
         "versions": {"python": platform.python_version()}
         | {name: _version(distribution) for name, distribution in _DISTRIBUTIONS.items()},
     }
+
+
+def not_ignored(paths: Sequence[Path]) -> list[Path]:
+    """Those of some paths in one folder that git does not ignore; all of them where there is no git."""
+    names = [str(path.absolute()) for path in paths]
+    ignored = _git(paths[0].parents[1], "check-ignore", *names) if paths else None
+    return [path for path, name in zip(paths, names, strict=True) if name not in (ignored or "").split("\n")]
 
 
 def _git(folder: Path, *arguments: str) -> str | None:

@@ -30,6 +30,11 @@ class Job:
     overrides: tuple[str, ...]
     setting: str
 
+    @property
+    def keys(self) -> dict[str, str]:
+        """Value by key."""
+        return dict(override.split("=", 1) for override in self.overrides)
+
 
 @dataclass(frozen=True)
 class Experiment:
@@ -113,7 +118,7 @@ class Experiment:
         from nsf.reporting.build import Study, build_report
 
         runs: dict[str, Run] = {}
-        settings, missing, scales = {}, [], set()
+        settings, keys, missing, scales = {}, {}, [], set()
         for job in self.jobs:
             config = configuration.load(job.overrides)
             plan = Plan(config, root)
@@ -122,14 +127,14 @@ class Experiment:
             except MissingRunError:
                 missing.append(f"{' '.join(job.overrides)}: {_why(plan)}")
                 continue
-            runs[run.id], settings[run.id] = run, job.setting
+            runs[run.id], settings[run.id], keys[run.id] = run, job.setting, job.keys
             scales.add(config.scale)
         if not runs:
             raise MissingRunError(
                 f"no job of {self.name} was evaluated; run `nsf run +experiment={self.name}`"
             )
         folder = Path(config.report.folder) / (f"{self.name}_small" if scales == {"small"} else self.name)
-        study = Study(self.question, self.paper, settings, missing)
+        study = Study(self.question, self.paper, settings, keys, missing)
         page = build_report(list(runs.values()), folder, self.title, study=study)
         say(f"report: {len(runs)} jobs, {len(missing)} missing → {page}")
         return page, missing

@@ -6,11 +6,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from nsf.reporting.columns import axis, parameter_text
+from nsf.reporting.latex import latex_table
 from nsf.reporting.page import Page, Table, html_page, markdown_page
 from nsf.reporting.pictures import draw
 from nsf.reporting.provenance import provenance_rows, sources_json
 from nsf.reporting.sources import Source, open_sources
 from nsf.reporting.swap import MARK, replaced
+from nsf.reporting.sweeps import swept
 from nsf.reporting.tables import Merged, console_table, means, merge, variants, without_constants
 from nsf.reporting.trust import RENAMED, trust_note, trust_rows
 
@@ -24,7 +26,8 @@ _LEAD = (
 
 _PROVENANCE = (
     "Every number above is read from these runs. sources.json names the run of each row and picture, and the "
-    "hash of each file read; results.csv holds the rows in full precision."
+    "hash of each file read or written; results.csv holds the rows in full precision, results.tex the first "
+    "table."
 )
 
 
@@ -36,20 +39,22 @@ class Study:
         question: what it was made to find out.
         paper: what the paper reports on it.
         settings: by run id, what tells a run apart that no column of results.csv tells.
+        keys: by run id, the keys of its job.
         missing: what was asked for and is not there, with the reason.
     """
 
     question: str
     paper: str
     settings: Mapping[str, str]
+    keys: Mapping[str, Mapping[str, str]]
     missing: Sequence[str]
 
 
 def build_report(evaluate_runs, folder, title: str, first=None, study: Study | None = None) -> Path:
     """Write a report of evaluate runs to folder, replacing a report that is there.
 
-    Writes `index.html`, `index.md`, `results.csv`, `sources.json`, charts (svg, png) and pictures
-    (png, gif). Equal runs give equal files, byte for byte.
+    Writes `index.html`, `index.md`, `results.csv`, `results.tex`, `sources.json`, charts (svg, png) and
+    pictures (png, gif). Equal runs give equal files, byte for byte.
 
     Args:
         evaluate_runs: runs of stage `evaluate`; those not complete are passed over.
@@ -70,11 +75,14 @@ def build_report(evaluate_runs, folder, title: str, first=None, study: Study | N
     merged = merge(open_sources(evaluate_runs, first), study.settings if study else None)
     with replaced(Path(folder)) as fresh:
         merged.csv.to_csv(fresh / "results.csv", index=False)
-        sections = draw(merged, fresh)
+        sections = [*(swept(merged, study.keys, fresh) if study else ()), *draw(merged, fresh)]
         page = _page(title, merged, sections, study)
         (fresh / "index.html").write_text(html_page(page), encoding="utf-8")
         (fresh / "index.md").write_text(markdown_page(page), encoding="utf-8")
-        told = sources_json(title, merged, sections, (fresh / "results.csv").read_bytes())
+        (fresh / "results.tex").write_text(
+            latex_table(page.tables[0].content, title, page.tables[0].note), encoding="utf-8"
+        )
+        told = sources_json(page, merged, fresh)
         (fresh / MARK).write_text(json.dumps(told, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
     return Path(folder) / "index.html"
 

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from nsf.reporting.columns import axis, parameter_text
-from nsf.reporting.style import INK, REDUCED, figure, line_style, styled
+from nsf.reporting.style import INK, PAPER, REDUCED, figure, line_style, styled
 
 OVER_TIME = {
     "delta": "relative deformation error δ",
@@ -118,20 +118,23 @@ def reconstruction_and_rollout(series: pd.DataFrame, name: str = "parameter", un
     return fig
 
 
-def delta_per_variant(variants: list[dict]) -> Figure:
-    """Mean δ [%] of each variant, its single parameter values as dots, and the paper's figure.
+def delta_per_variant(variants: list[dict], dots: str = "one parameter value") -> Figure:
+    """Mean δ [%] of each variant, what it is the mean of as dots, and the paper's figure.
 
     Args:
         variants: per variant `label`, `mean` and `values` (fractions), and `paper` (fraction or None).
+        dots: what each of the values is of.
     """
     with styled():
         fig = figure(1.5 + 0.46 * len(variants), 8.4)
         panel = fig.subplots()
         at = np.arange(len(variants))
         for i, v in enumerate(variants):
-            label = "one parameter value" if i == 0 else None
-            dots = 100 * _finite(v["values"])
-            panel.plot(dots, np.full(len(dots), i), "o", ms=4.5, mfc="white", mec=INK, mew=0.9, label=label)
+            values = 100 * _finite(v["values"])
+            label = dots if i == 0 else None
+            panel.plot(
+                values, np.full(len(values), i), "o", ms=4.5, mfc="white", mec=INK, mew=0.9, label=label
+            )
         papers = [(i, 100 * v["paper"]) for i, v in enumerate(variants) if v["paper"] is not None]
         if papers:
             y, x = np.array(papers).T
@@ -155,6 +158,48 @@ def delta_per_variant(variants: list[dict]) -> Figure:
         panel.grid(axis="x")
         panel.tick_params(axis="y", length=0)
         _legend_above(fig, panel, None)
+    return fig
+
+
+def delta_over(
+    panels: dict[str, dict[str, dict[float, list[float]]]], x: str, papers: dict[str, tuple[float, float]]
+) -> Figure:
+    """δ [%] over a number: the mean as a line, from the smallest to the largest value as a band.
+
+    Args:
+        panels: by scene, a panel each: by the name of a line, the values of δ (fractions) at each x.
+        x: label of that axis.
+        papers: by scene, the x and δ (a fraction) that the paper prints.
+    """
+    names = list(dict.fromkeys(name for lines in panels.values() for name in lines))
+    known = {x for lines in panels.values() for line in lines.values() for x in line}
+    with styled():
+        fig = figure(3.7)
+        drawn = fig.subplots(1, len(panels), squeeze=False, sharex=True)[0]
+        for panel, (scene, lines) in zip(drawn, panels.items(), strict=True):
+            every = []
+            for name, line in lines.items():
+                at = sorted(line)
+                values = [100 * np.asarray(line[x], float) for x in at]
+                style = line_style(names.index(name))
+                low, high = (_finite([end(v) for v in values]) for end in (np.min, np.max))
+                panel.fill_between(at, low, high, color=style["color"], alpha=0.18, linewidth=0)
+                panel.plot(at, _finite([v.mean() for v in values]), marker="o", ms=4, label=name, **style)
+                every += [*low, *high]
+            if scene in papers:
+                value, delta = papers[scene]
+                panel.plot(value, 100 * delta, "X", ms=8, color=PAPER, label="the paper")
+                every.append(100 * delta)
+                known.add(value)
+            panel.set(title=scene, xlabel=x, ylabel="δ [%]")
+            _error_scale(panel, every)
+        if max(known) > 10 * min(known):
+            drawn[0].set_xscale("log")
+            _plain_ticks(drawn[0].xaxis)
+        told = {line.get_label(): line for panel in drawn for line in panel.lines}
+        told |= {name: told.pop(name) for name in ("the paper",) if name in told}  # last
+        if len(told) > 1:
+            fig.legend(told.values(), told.keys(), loc="outside upper left", ncols=6, handlelength=2.2)
     return fig
 
 

@@ -1,11 +1,10 @@
 """Where each number of a report comes from: for the page, and in full for `sources.json`."""
 
-import hashlib
+from pathlib import Path
 
 from nsf.reporting.columns import ABSENT
-from nsf.reporting.page import Rows
-from nsf.reporting.pictures import Section
-from nsf.reporting.sources import Source
+from nsf.reporting.page import Page, Rows
+from nsf.reporting.sources import Source, file_hash
 from nsf.reporting.tables import VARIANT, Merged
 
 _HEADINGS = ["run", "commit", "device", "precision", "seed", "made", "versions"]
@@ -39,8 +38,14 @@ def commit_text(manifest: dict) -> str:
     return f"{commit} + uncommitted changes" if manifest["dirty"] else commit
 
 
-def sources_json(title: str, merged: Merged, sections: list[Section], results_csv: bytes) -> dict:
-    """Run, commit and file hashes behind every row and picture, as written to `sources.json`."""
+def sources_json(page: Page, merged: Merged, folder: Path) -> dict:
+    """What a report is, the run, commit and file hashes behind every row and picture, and its files' hashes.
+
+    Args:
+        page: all of it.
+        merged: its rows.
+        folder: holds every other file of the report.
+    """
     frame = merged.frame
     runs = {
         source.id: {
@@ -68,12 +73,13 @@ def sources_json(title: str, merged: Merged, sections: list[Section], results_cs
         for i, source in enumerate(merged.source)
     ]
     return {
-        "title": title,
-        "results.csv": {"sha256": hashlib.sha256(results_csv).hexdigest(), "rows": len(rows)},
+        "title": page.title,
+        "question": page.lead,
+        "files": {path.name: file_hash(path) for path in sorted(folder.iterdir())},
         "runs": runs,
         "rows": rows,
         "pictures": {
-            file: picture.runs for s in sections for picture in s.pictures for file in picture.files
+            file: picture.runs for s in page.sections for picture in s.pictures for file in picture.files
         },
         "superseded": [{"run": source.id, "parameter": _plain(value)} for source, value in merged.superseded],
     }

@@ -188,12 +188,12 @@ def without_constants(
 
 def markdown_table(frame: pd.DataFrame, renamed: dict[str, str] | None = None) -> str:
     """A GitHub table with units in its headings."""
-    return markdown_rows(*cells(frame, renamed), numeric=_numeric(frame))
+    return markdown_rows(*cells(frame, renamed), numeric=is_numeric(frame))
 
 
 def html_table(frame: pd.DataFrame, renamed: dict[str, str] | None = None) -> str:
     """A table with units in its headings; numbers align to the right."""
-    return html_rows(*cells(frame, renamed), numeric=_numeric(frame))
+    return html_rows(*cells(frame, renamed), numeric=is_numeric(frame))
 
 
 def markdown_rows(headings: list[str], body: list[list[str]], numeric: list[bool]) -> str:
@@ -224,14 +224,15 @@ def console_table(frame: pd.DataFrame) -> Table:
     shown, said = without_constants(frame.drop(columns="commit", errors="ignore"), also=COSTS)
     headings, body = cells(shown)
     table = Table(caption=escape(said), caption_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for heading, right in zip(headings, _numeric(shown), strict=True):
+    for heading, right in zip(headings, is_numeric(shown), strict=True):
         table.add_column(escape(heading), justify="right" if right else "left", overflow="fold")
     for row in body:
         table.add_row(*map(escape, row))
     return table
 
 
-def _numeric(frame: pd.DataFrame) -> list[bool]:
+def is_numeric(frame: pd.DataFrame) -> list[bool]:
+    """Which columns hold numbers, which align to the right."""
     return [name not in TEXT for name in frame]
 
 

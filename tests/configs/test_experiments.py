@@ -16,6 +16,15 @@ def test_there_are_experiments():
     assert {"sand", "table1"} <= set(NAMES)
 
 
+def test_the_ablation_is_every_method_on_every_scene():
+    jobs = {job.overrides for job in Experiment.load("ablation").jobs}
+    methods = {path.stem for path in (config.CONF / "method").glob("*.yaml")}
+    scenes = {path.stem for path in (config.CONF / "scene").glob("*.yaml")} - {"drop"}  # not of the paper
+    assert jobs == {
+        (f"scene={scene}", "scale=paper", f"method={method}") for scene in scenes for method in methods
+    }
+
+
 @pytest.mark.parametrize("overrides", JOBS, ids=" ".join)
 def test_every_job_builds(overrides):
     Pipeline(config.load([*overrides, "device=cpu"]))

@@ -90,6 +90,7 @@ def test_an_experiment_runs_its_jobs_and_reports_them(nsf, copied, tmp_path):
     found = set(zip(rows["method"], rows["field"], strict=True))
     assert found == {("nsf", "basis"), ("deformation_only", "basis")}
     assert "Does a neural stress field" in (report / "index.md").read_text()
+    assert r"deformation\_only & " in (report / "results.tex").read_text()
     again = nsf("report", root, *arguments, faults=[PlainReport()])
     assert again.code == 0
     assert "2 jobs, 0 missing" in again.out

@@ -47,6 +47,12 @@ def test_a_setting_tells_what_columns_do_not(written):
     assert settings == ["", "", "sampler=random", "sampler=greedy"]
 
 
+def test_keys_of_a_job(written):
+    *_, last = written(TEXT).jobs
+    assert last.keys["sampler"] == "greedy"
+    assert last.keys["scene.parameters.test"] == "[44,55]"
+
+
 def test_overrides_take_the_place_of_the_files(written):
     experiment = written(TEXT, "field=mlp", "seed=1,2")
     assert [job.overrides for job in experiment.jobs][:2] == [

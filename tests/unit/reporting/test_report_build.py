@@ -35,7 +35,7 @@ def test_report_has_every_file_and_links_only_what_is_there(report):
     page, markdown = (report / "index.html").read_text(), (report / "index.md").read_text()
     linked = set(re.findall(r'src="([^"]+)"', page)) | set(re.findall(r"\]\(([^)]+)\)", markdown))
     assert linked <= present
-    pictures = present - {"index.html", "index.md", "results.csv", "sources.json"}
+    pictures = present - {"index.html", "index.md", "results.csv", "results.tex", "sources.json"}
     assert {name.rsplit(".")[0] for name in pictures} == {name.rsplit(".")[0] for name in linked}
     assert "http" not in page.replace("http-equiv", "")
 
@@ -81,7 +81,7 @@ def test_pictures_are_of_the_best_sample_of_each_method(report):
 def test_sources_lead_from_each_row_to_its_run(report, sweep):
     told = json.loads((report / "sources.json").read_text())
     frame = pd.read_csv(report / "results.csv")
-    assert told["results.csv"]["sha256"] == file_hash(report / "results.csv")
+    assert told["files"]["results.csv"] == file_hash(report / "results.csv")
     assert len(told["rows"]) == len(frame)
     for entry, row in zip(told["rows"], frame.to_dict("records"), strict=True):
         run = next(run for run in sweep if run.id == entry["run"])

@@ -1,0 +1,116 @@
+"""How δ depends on what an experiment varies: a number, or nothing but seeds."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from nsf.reporting import charts
+from nsf.reporting.columns import axis
+from nsf.reporting.pictures import Picture, Section
+from nsf.reporting.style import save
+from nsf.reporting.tables import Merged, paper_row
+
+_SCENE, _RUN = "scene", "run"
+_SEEDS = ("seed", "sampler.seed")
+_AXES = {
+    "sampler.size": ("sample particles |S|", "–", "sample"),
+    "latent_dim": ("latent coordinates r", "–", "r"),
+    "field.beta": ("hidden width β over d", "–", None),
+    "deploy.dt_multiplier": ("deployment step", "full-order Δt", None),
+}
+"""Keys that are an axis: its title and unit, and the column of results.csv that tells what became of it."""
+
+
+def swept(merged: Merged, keys: Mapping[str, Mapping[str, str]], folder: Path) -> list[Section]:
+    """Draw δ over each number that the jobs vary; over the seeds where they vary nothing else.
+
+    Args:
+        merged: results.
+        keys: by run id, the keys of its job.
+        folder: of the report.
+    """
+    frame = _held_out(merged, keys)
+    varied = [key for key in frame.columns if key in (*_AXES, *_SEEDS) and frame[key].nunique() > 1]
+    pictures = [_over(key, frame, merged, folder) for key in varied if key in _AXES]
+    if not pictures and varied:
+        pictures = [_scatter(frame, merged, folder)]
+    return [Section("What is varied", pictures)] if pictures else []
+
+
+def _held_out(merged: Merged, keys: Mapping[str, Mapping[str, str]]) -> pd.DataFrame:
+    """One row a job and held-out value: the job's keys, its run, δ, and the row of `merged`."""
+    rows = [
+        {_SCENE: row["scene"]} | keys.get(source.id, {}) | {_RUN: source.id, "delta": row["delta"], "row": i}
+        for i, (row, source) in enumerate(zip(merged.frame.to_dict("records"), merged.source, strict=True))
+        if row["split"] != "train"
+    ]
+    return pd.DataFrame(rows)
+
+
+def _over(key: str, frame: pd.DataFrame, merged: Merged, folder: Path) -> Picture:
+    """δ over one key, a panel a scene, a line for each setting of the other keys."""
+    title, unit, column = _AXES[key]
+    shown = frame[frame[key].notna()]
+    source = merged.frame[column].loc[shown["row"]].array if column else shown[key]
+    shown = shown.assign(x=pd.to_numeric(pd.Series(source, index=shown.index), errors="coerce"))
+    panels, papers = {}, {}
+    for scene, part in shown.dropna(subset="x").groupby(_SCENE, sort=False):
+        panels[scene] = {
+            name: group.groupby("x")["delta"].apply(list).to_dict()
+            for name, group in _settings(part, (key, *_SEEDS), alone="mean")
+        }
+        printed = paper_row(merged, [part["row"].iloc[0]]) or {}
+        paper = tuple(pd.to_numeric(printed.get(name), errors="coerce") for name in (column, "delta"))
+        if not any(map(pd.isna, paper)):
+            papers[scene] = paper
+    seeds = any(shown[seed].nunique() > 1 for seed in _SEEDS if seed in shown)
+    figure = charts.delta_over(panels, axis(title, unit), papers)
+    caption = (
+        f"Mean δ (line) against {title}, and from the smallest to the largest over the held-out values"
+        f"{' and seeds' if seeds else ''} (band). Where a run diverged, the line has a gap."
+        + (" The cross is what the paper prints." if papers else "")
+    )
+    stem = f"delta-over-{key.replace('.', '-').replace('_', '-')}"
+    return Picture(save(figure, folder, stem), caption, sorted(set(shown[_RUN])))
+
+
+def _scatter(frame: pd.DataFrame, merged: Merged, folder: Path) -> Picture:
+    """Mean δ of each seed, a row for each setting of the other keys."""
+    entries = []
+    for seed in _SEEDS:
+        part = frame[frame[seed].notna()] if seed in frame else frame.iloc[:0]
+        for name, group in _settings(part, _SEEDS, alone=merged.frame["scene"].iloc[0]):
+            values = group.groupby(seed)["delta"].apply(lambda deltas: deltas.mean(skipna=False))
+            printed = (paper_row(merged, [group["row"].iloc[0]]) or {}).get("delta")
+            told = {"mean": values.mean(skipna=False), "values": list(values)}
+            paper = None if pd.isna(printed) else printed
+            entries.append({"label": f"{name} · {len(values)} × {seed}", "paper": paper} | told)
+    caption = (
+        "δ, averaged over the held-out values, for each seed (dots): seed is of the networks' first weights "
+        "and batches, sampler.seed of the sample particles; their mean, and what the paper prints."
+    )
+    figure = charts.delta_per_variant(entries, dots="one seed")
+    return Picture(save(figure, folder, "delta-over-seeds"), caption, sorted(set(frame[_RUN])))
+
+
+def _settings(frame: pd.DataFrame, without: Sequence[str], alone: str) -> list[tuple[str, pd.DataFrame]]:
+    """The rows of each setting of the job's keys, by a name of those keys that tell settings apart.
+
+    Args:
+        frame: rows of `_held_out`.
+        without: keys that are no setting.
+        alone: the name of all rows where they have one setting.
+    """
+    told: list[str] = []
+    groups = 1
+    for key in frame.columns.drop([_RUN, "delta", "row", "x", *without], errors="ignore"):
+        found = frame.groupby([*told, key], dropna=False).ngroups
+        if found > groups:
+            told, groups = [*told, key], found
+    if not told:
+        return [(alone, frame)] if len(frame) else []
+    return [
+        (" · ".join(str(value) for value in values if not pd.isna(value)), group)
+        for values, group in frame.groupby(told, dropna=False, sort=False)
+    ]

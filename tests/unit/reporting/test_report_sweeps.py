@@ -1,0 +1,128 @@
+"""What an experiment varies: δ over numbers with bands, over seeds; and the table for LaTeX."""
+
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+from synthetic import Made, write_run
+
+from nsf.reporting import build_report, charts, sweeps
+from nsf.reporting.build import Study
+from nsf.reporting.latex import escaped, latex_table
+from nsf.reporting.sources import open_sources
+from nsf.reporting.tables import means, merge
+
+VALUES = (22.5, 27.5)
+
+
+def runs(root, **made):
+    """A run of each combination, with the keys of its job."""
+    found, keys, settings = [], {}, {}
+    for size, noise in made.get("sizes", {150: 0.004}).items():
+        for seed in made.get("seeds", ("0",)):
+            own = Made(particles=30, frames=4, parameters=VALUES, splits=("test",) * 2, sample=size)
+            own.noise, own.seed, own.scene = (
+                noise * (1 + 0.2 * int(seed)),
+                int(seed),
+                made.get("scene", "sand"),
+            )
+            run = write_run(root, own)
+            found.append(run)
+            settings[run.id] = f"seed={seed}"
+            keys[run.id] = {"scene": own.scene, "sampler.size": f"{size}", "sampler": "random", "seed": seed}
+    return found, keys, settings
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The arguments of each chart drawn."""
+    calls = []
+
+    def catch(name):
+        draw = getattr(charts, name)
+        monkeypatch.setattr(charts, name, lambda *a, **k: calls.append((name, a)) or draw(*a, **k))
+
+    catch("delta_over")
+    catch("delta_per_variant")
+    return calls
+
+
+def test_delta_over_what_varies_with_every_value_and_seed(tmp_path, drawn):
+    found, keys, settings = runs(tmp_path, sizes={20: 0.02, 50: 0.008, 150: 0.004}, seeds=("0", "1", "2"))
+    merged = merge(open_sources(found), settings)
+    (section,) = sweeps.swept(merged, keys, tmp_path)
+    ((name, (panels, x, papers)),) = drawn
+    assert (name, x) == ("delta_over", "sample particles |S| [–]")
+    assert (list(panels), list(panels["sand"]), papers["sand"][0]) == (["sand"], ["mean"], 150)
+    line = panels["sand"]["mean"]
+    assert {at: len(values) for at, values in line.items()} == {20: 6, 50: 6, 150: 6}
+    assert sorted(line[20]) == sorted(merged.frame.loc[merged.frame["sample"] == "20", "delta"])
+    (picture,) = section.pictures
+    assert picture.files == ["delta-over-sampler-size.svg", "delta-over-sampler-size.png"]
+    assert "and seeds (band)" in picture.caption
+    assert set(picture.runs) == {run.id for run in found}
+
+
+def test_seeds_alone_are_dots(tmp_path, drawn):
+    found, keys, settings = runs(tmp_path, seeds=("0", "1", "2"))
+    merged = merge(open_sources(found), settings)
+    (section,) = sweeps.swept(merged, keys, tmp_path)
+    ((name, (entries,)),) = drawn
+    assert name == "delta_per_variant"
+    (entry,) = entries
+    assert (entry["label"], len(entry["values"])) == ("sand · 3 × seed", 3)
+    assert entry["mean"] == pytest.approx(merged.frame["delta"].mean())
+    assert section.pictures[0].files[0] == "delta-over-seeds.svg"
+
+
+def test_nothing_varied_draws_nothing(tmp_path):
+    found, keys, _ = runs(tmp_path)
+    assert sweeps.swept(merge(open_sources(found)), keys, tmp_path) == []
+
+
+def test_lines_are_named_by_what_tells_them_apart():
+    """A key that goes with another one adds nothing to the name."""
+    frame = pd.DataFrame(
+        {"scene": "sand", "field": ["basis", "mlp"], "trainer.steps": [None, "null"], "x": 1.0, "run": "a"}
+    )
+    assert [name for name, _ in sweeps._settings(frame, (), "mean")] == ["basis", "mlp"]
+
+
+def test_the_band_spans_the_values_and_a_diverged_run_leaves_a_gap():
+    line = {10.0: [0.02, 0.04], 20.0: [0.01, np.inf], 1000.0: [0.01, 0.02]}
+    figure = charts.delta_over({"sand": {"random": line}}, "|S| [–]", {})
+    (panel,) = figure.axes
+    np.testing.assert_allclose(panel.lines[0].get_ydata(), [3.0, np.nan, 1.5])
+    corners = panel.collections[0].get_paths()[0].vertices[:, 1]
+    assert (corners.min(), corners.max()) == pytest.approx((2.0, 4.0))
+    assert (panel.get_xscale(), panel.get_xlabel(), panel.get_ylabel()) == ("log", "|S| [–]", "δ [%]")
+
+
+def test_latex_is_the_first_table_of_the_page(tmp_path):
+    found, keys, settings = runs(tmp_path, sizes={20: 0.02, 150: 0.004})
+    study = Study("How many?", "Two.", settings, keys, [])
+    folder = build_report(found, tmp_path / "report", "Sand & 50 %", study=study).parent
+    lines = (folder / "results.tex").read_text().splitlines()
+    page = (folder / "index.md").read_text()
+    assert "![Mean δ" in page
+    first = page.index("Results beside")
+    rows = re.findall(r"^\| (.*) \|$", page[first : page.index("##", first)], re.MULTILINE)
+    body = [line for line in lines if line.endswith(r" \\")]
+    assert len(body) == len(rows) - 1  # without the rule under the headings
+    assert body[0].startswith("method & ")
+    assert r"\textbar{}S\textbar{}" in body[0]
+    assert r"$\delta$ [\%]" in body[0]
+    assert any("the paper" in line for line in body)
+    assert {len(line.split(" & ")) for line in body} == {len(rows[0].replace("\\|", "").split("|"))}
+    assert lines[-1] == r"\end{tabular}"
+
+
+def test_latex_escapes():
+    assert escaped("a_b & 5 % ≤ |S| – 1×") == r"a\_b \& 5 \% ≤ \textbar{}S\textbar{} -- 1$\times$"
+    assert escaped("\\{") == r"\textbackslash{}\{"
+
+
+def test_latex_knows_every_sign_of_a_table(sweep):
+    text = latex_table(means(merge(open_sources(sweep))), "Sand", "")
+    assert text.isascii()
