@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from nsf.export.colors import MAP
 from nsf.export.playback import QUANTITIES, Playback
 from nsf.extras import optional
 from nsf.progress import Progress
+from nsf.reporting.colors import STRESS_COLORS
 from nsf.storage import require_space, writing
 
 NEEDS = ("pyvista", "imageio.v2", "imageio_ffmpeg")
@@ -78,7 +78,7 @@ def _furnish(plotter, pyvista, playback: Playback, first: np.ndarray):
         points,
         scalars=playback.color,
         clim=(0.0, top),
-        cmap=MAP,
+        cmap=STRESS_COLORS,
         render_points_as_spheres=True,
         point_size=max(1.5, 2.0 * playback.radius * pixels),
         ambient=0.4,

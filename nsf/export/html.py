@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from nsf.errors import ConfigError
-from nsf.export import colors
 from nsf.export.playback import QUANTITIES, Playback
+from nsf.reporting.colors import STRESS_COLORS, ColorScale
 from nsf.storage import writing
 
 NEEDS = ()
@@ -59,7 +59,7 @@ def write(playback: Playback, folder: Path) -> Path:
             name: {"title": quantity.title, "unit": quantity.unit, "top": playback.tops[name]}
             for name, quantity in QUANTITIES.items()
         },
-        "colors": colors.table(),
+        "colors": ColorScale(1.0, STRESS_COLORS, 1.0, "").pixels(np.linspace(0, 1, 256)).ravel().tolist(),
     }
     planes = _differences(_quantised(x, lower, upper, np.uint16)), _differences(stress)
     data = base64.b64encode(zlib.compress(b"".join(plane.tobytes() for plane in planes), 6)).decode()

@@ -22,6 +22,7 @@ from nsf.kinematics.manifold import Manifold, Restriction
 from nsf.mpm import floor_height, precision_of
 from nsf.mpm.device import warp_device
 from nsf.progress import Progress
+from nsf.reporting.colors import CLIP
 from nsf.runs import Run
 from nsf.scenes import Scene
 
@@ -44,7 +45,7 @@ class Quantity:
 
 
 QUANTITIES = {
-    "von_mises": Quantity("von Mises equivalent of the Kirchhoff stress", "Pa", 97.0),
+    "von_mises": Quantity("von Mises equivalent of the Kirchhoff stress", "Pa", CLIP),
     "displacement": Quantity("displacement", "m", 99.5),
 }
 

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from nsf.export.colors import mapped
 from nsf.export.playback import Block, Playback
 from nsf.extras import optional
+from nsf.reporting.colors import STRESS_COLORS, ColorScale
 from nsf.storage import writing
 
 NEEDS = ("pxr.Usd", "pxr.UsdGeom", "pxr.Sdf", "pxr.Vt")
@@ -65,7 +65,8 @@ def _fill(points, block: Block, playback: Playback) -> None:
         return Vt.FloatArray.FromNumpy(np.ascontiguousarray(values, np.float32).ravel())
 
     moved, von_mises, pressure = block.displacement, block.von_mises, block.pressure
-    shown, top = block.magnitude(playback.color), playback.tops[playback.color]
+    shown = block.magnitude(playback.color)
+    scale = ColorScale(playback.tops[playback.color], STRESS_COLORS, 1.0, playback.color)
     for k in range(len(block.x)):
         x = block.x[k].float().numpy()
         points.GetPointsAttr().Set(vectors(x), k)
@@ -74,4 +75,4 @@ def _fill(points, block: Block, playback: Playback) -> None:
         scalars["vonMises"].Set(numbers(von_mises[k].numpy()), k)
         scalars["pressure"].Set(numbers(pressure[k].numpy()), k)
         stress.Set(numbers(block.tau[k].numpy()), k)
-        color.Set(vectors(mapped(shown[k].numpy(), top)), k)
+        color.Set(vectors(scale.colors(shown[k].numpy())), k)
