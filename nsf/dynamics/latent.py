@@ -33,7 +33,7 @@ class LatentTrajectory:
 
 
 class LatentRecord:
-    """What the steps leave, on the device: filled in place and without a read-back, as in a captured graph.
+    """Where a run is and what its steps leave, on the device: filled in place and without a read-back.
 
     Args:
         xhat: [r] latent vector at t = 0.
@@ -41,30 +41,36 @@ class LatentRecord:
         iterations: k, those of the projector.
 
     Attributes:
+        now, before: [r] x̂_n and x̂_{n−1}.
+        row: [1] n.
         xhat: [steps + 1, r] latent vectors; zero where no step has been.
+        residuals: [steps, k + 1] and updates: [steps, k], as in `ProjectionResult`.
     """
 
     def __init__(self, xhat: torch.Tensor, steps: int, iterations: int):
+        self.now, self.before = xhat.clone(), xhat.clone()
         self.xhat = xhat.new_zeros(steps + 1, len(xhat))
         self.xhat[0] = xhat
-        self._residuals, self._updates = (xhat.new_zeros(steps, k) for k in (iterations + 1, iterations))
-        self._row = torch.zeros(1, dtype=torch.int64, device=xhat.device)
+        self.residuals, self.updates = (xhat.new_zeros(steps, k) for k in (iterations + 1, iterations))
+        self.row = torch.zeros(1, dtype=torch.int64, device=xhat.device)
 
     @property
     def nbytes(self) -> int:
         """Bytes on the device."""
-        return sum(a.nbytes for a in (self.xhat, self._residuals, self._updates))
+        return sum(a.nbytes for a in (self.xhat, self.residuals, self.updates))
 
     def add(self, result: ProjectionResult) -> None:
         """Put down the end of one step."""
-        self._residuals.index_copy_(0, self._row, result.residuals[None])
-        self._updates.index_copy_(0, self._row, result.updates[None])
-        self._row += 1
-        self.xhat.index_copy_(0, self._row, result.xhat[None])
+        self.before.copy_(self.now)
+        self.now.copy_(result.xhat)
+        self.residuals.index_copy_(0, self.row, result.residuals[None])
+        self.updates.index_copy_(0, self.row, result.updates[None])
+        self.row += 1
+        self.xhat.index_copy_(0, self.row, result.xhat[None])
 
     def trajectory(self, steps: int, dt: float, tolerance: float) -> LatentTrajectory:
         """The first steps of dt [s] on the host; `tolerance` is the projector's."""
-        residuals, updates = self._residuals[:steps].cpu(), self._updates[:steps].cpu()
+        residuals, updates = self.residuals[:steps].cpu(), self.updates[:steps].cpu()
         stops = stop_reasons(residuals, updates, tolerance)
         t, xhat = np.arange(steps + 1) * dt, self.xhat[: steps + 1].cpu().numpy()
         return LatentTrajectory(t, xhat, residuals.numpy(), updates.numpy(), stops)
@@ -123,6 +129,6 @@ class LatentState:
         s = self._solver
         decoder, now = s.decoder(), s.xhat[None]
         x = decoder.position(s.xhat)
-        v = s.initial_velocity if s.steps_taken == 0 else (x - decoder.position(s.xhat_previous)) / s.dt
+        v = s.initial_velocity if s.steps_taken == 0 else (x - decoder.position(s.record.before)) / s.dt
         fields = {"x": x, "v": v, "C": decoder.affine(now)[0], "tau": decoder.stress(now)[0]}
         return {name: value.cpu().numpy() for name, value in fields.items()} | {"xhat": self.xhat}

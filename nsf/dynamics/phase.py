@@ -1,106 +1,122 @@
 """Arrays of one phase of time: the particles that a reduced step moves, and their grid."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
+from typing_extensions import override
 
 from nsf.dynamics.integration import NeighbourSearch, ParticleSets
 from nsf.dynamics.interop import as_matrices, as_scalars, as_vectors
-from nsf.mpm import Grid, GridStep, ParticleConstants, Precision
+from nsf.dynamics.latent import LatentRecord
+from nsf.dynamics.projection import GaussNewton, Taylor
+from nsf.mpm import GridStep, ParticleConstants, Precision
+
+#: The stages of one step in the order of the paper's section 5: name → what it does.
+Stages = dict[str, Callable[[], None]]
 
 
-class Phase:
-    """Fixed S, N and I: nothing is searched during a run.
-
-    Args:
-        sets: S, N (S first) and I.
-        at: the manifold restricted to N.
-        constants: every particle of the scene.
-        grid_step: builds the shared P2G, grid update and G2P on a grid.
-        stress: source of τ at N, from the Lamé parameters mu, lam [n].
-        affine: source of C at N; gives None for C = 0.
-        weights: [s] of S in the projection; None for all one.
+@dataclass(frozen=True)
+class Setting:
+    """What the phases of one solver share.
 
     Attributes:
-        weights: [s] the same, of mean one.
-        previous: [n, 3] positions of N one step back.
-        x, v, C, tau: what P2G reads; the first |S| rows are what G2P moves.
+        constants: every particle of the scene; initial_velocity: [P, 3] theirs [m/s].
+        record: the latent state.
+        projector: of the inversion.
+        dt: step [s].
+        precision, dtype, device: of the arrays.
+    """
+
+    constants: ParticleConstants
+    initial_velocity: torch.Tensor
+    record: LatentRecord
+    projector: GaussNewton | Taylor
+    dt: float
+    precision: Precision
+    dtype: torch.dtype
+    device: torch.device
+
+
+class Phase(ABC):
+    """What P2G reads and G2P moves; where the values come from is left to the kinds of field.
+
+    Args:
+        setting: of the solver.
+        sets: S, N and I.
+        order: [n] the particles of N in the order of the arrays, S first.
+        grid_step: the shared P2G, grid update and G2P.
+        at_sample: the manifold restricted to S.
+
+    Attributes:
+        order: as given.
+        x, v, C, tau: what P2G reads; G2P moves the first |S| rows of x and v.
+        s: |S|.
     """
 
     capturable = True
+    graph = None
 
     def __init__(
-        self,
-        sets: ParticleSets,
-        at,
-        constants: ParticleConstants,
-        grid: Grid,
-        grid_step: GridStep,
-        stress: Callable,
-        affine: Callable,
-        precision: Precision,
-        dtype: torch.dtype,
-        device: torch.device,
-        weights: np.ndarray | None = None,
+        self, setting: Setting, sets: ParticleSets, order: np.ndarray, grid_step: GridStep, at_sample
     ):
-        n, self.s = len(sets.integration), len(sets.sample)
-        self.sets, self.at, self.at_sample = sets, at, at.subset(slice(0, self.s))
-        self.grid, self.grid_step, self.precision = grid, grid_step, precision
-        self.weights = None
-        if weights is not None:
-            self.weights = torch.as_tensor(weights / np.mean(weights), dtype=dtype, device=device)
+        n, self.s = len(order), len(sets.sample)
+        self.setting, self.sets, self.order = setting, sets, order
+        self.grid_step, self.at_sample = grid_step, at_sample
+        dtype, device = setting.dtype, setting.device
 
-        def rows(values: np.ndarray) -> torch.Tensor:
-            return torch.as_tensor(values[sets.integration], dtype=dtype, device=device)
+        def rows(values) -> torch.Tensor:
+            return torch.as_tensor(values[order], dtype=dtype, device=device)
 
+        constants = setting.constants
         self.mass, self.volume0 = rows(constants.mass), rows(constants.volume0)
-        self._stress, self._affine = stress(at, rows(constants.mu), rows(constants.lam)), affine(at)
-        self.x, self.v, self.previous = (torch.zeros(n, 3, dtype=dtype, device=device) for _ in range(3))
+        self.mu, self.lam = rows(constants.mu), rows(constants.lam)
+        self.initial_velocity = rows(setting.initial_velocity)
+        self.x, self.v = (torch.zeros(n, 3, dtype=dtype, device=device) for _ in range(2))
         self.C, self.tau = (torch.zeros(n, 3, 3, dtype=dtype, device=device) for _ in range(2))
-        self.increment = torch.zeros(self.s, 3, 3, dtype=dtype, device=device)
-        self.graph = None
+        # G2P gives these of S too; the next step takes C from its source again.
+        self._C_of_sample, self._increment = (
+            torch.zeros(self.s, 3, 3, dtype=dtype, device=device) for _ in range(2)
+        )
         self.bind(n)
 
     def bind(self, n: int) -> None:
         """Show the first n rows to Warp."""
-        vectors = [as_vectors(a[:n], self.precision) for a in (self.x, self.v)]
-        matrices = [as_matrices(a[:n], self.precision) for a in (self.C, self.tau)]
+        precision = self.setting.precision
+        vectors = [as_vectors(a[:n], precision) for a in (self.x, self.v)]
+        matrices = [as_matrices(a[:n], precision) for a in (self.C, self.tau)]
         scalars = [as_scalars(a[:n]) for a in (self.mass, self.volume0)]
         self._integration = (*vectors, *matrices, *scalars)
-        vectors = [as_vectors(a[: self.s], self.precision) for a in (self.x, self.v)]
-        self._sample = (
-            *vectors,
-            as_matrices(self.C[: self.s], self.precision),
-            as_matrices(self.increment, self.precision),
-        )
+        vectors = [as_vectors(a[: self.s], precision) for a in (self.x, self.v)]
+        matrices = [as_matrices(a, precision) for a in (self._C_of_sample, self._increment)]
+        self._sample = (*vectors, *matrices)
         self.size = n
+
+    @property
+    @abstractmethod
+    def stages(self) -> Stages:
+        """One step, stage by stage, in order."""
+
+    @abstractmethod
+    def enter(self, first: bool) -> None:
+        """Begin with the latents of the record; `first`: v is the initial velocity, not a difference."""
+
+    @property
+    def mean_size(self) -> float:
+        """Mean |N| over the steps taken in this phase."""
+        return float(self.size)
 
     @property
     def nbytes(self) -> int:
         """Bytes of arrays and fields on the device."""
-        own = (self.mass, self.volume0, self.x, self.v, self.previous, self.C, self.tau, self.increment)
-        weights = 0 if self.weights is None else self.weights.nbytes
-        return self.at.nbytes + self.grid.nbytes + sum(a.nbytes for a in own) + weights
-
-    def fields(self, xhat: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
-        """x [n, 3], τ and C [n, 3, 3] at N (paper section 5.1)."""
-        return self.at.position(xhat), self._stress(xhat), self._affine(xhat)
-
-    def load(self, x: torch.Tensor, tau: torch.Tensor, C: torch.Tensor | None, dt: float) -> None:
-        """Field values → the arrays that torch and Warp share."""
-        self.x.copy_(x)
-        # Backward difference, not the grid velocity: the reduced model has no v field (section 5.1).
-        torch.sub(x, self.previous, out=self.v).div_(dt)
-        self.previous.copy_(x)
-        self.tau.copy_(tau)
-        if C is not None:
-            self.C.copy_(C)
-        else:
-            self.C.zero_()
+        own = (self.mass, self.volume0, self.mu, self.lam, self.initial_velocity, self.x, self.v)
+        own += (self.C, self.tau, self._C_of_sample, self._increment)
+        return self.at_sample.nbytes + self.grid_step.grid.nbytes + sum(a.nbytes for a in own)
 
     def p2g(self) -> None:
-        """N → grid."""
+        """N → grid (paper section 5.2)."""
         self.grid_step.p2g(*self._integration)
 
     def g2p(self) -> None:
@@ -108,7 +124,86 @@ class Phase:
         self.grid_step.g2p(*self._sample)
 
 
-class SearchingPhase(Phase):
+class DecodedPhase(Phase):
+    """Fields of any kind, evaluated by torch at every particle of N; nothing is searched during a run.
+
+    Args:
+        at: the manifold restricted to N in the order of the sets.
+        stress, affine: sources of τ and C at N; `affine` gives None for C = 0.
+        weights: [s] of S in the projection; None for all one.
+    """
+
+    def __init__(
+        self,
+        setting: Setting,
+        sets: ParticleSets,
+        grid_step: GridStep,
+        at,
+        stress: Callable,
+        affine: Callable,
+        weights: np.ndarray | None,
+    ):
+        super().__init__(setting, sets, sets.integration, grid_step, at.subset(slice(0, len(sets.sample))))
+        self.at, self.weights = at, None
+        if weights is not None:
+            self.weights = torch.as_tensor(
+                weights / np.mean(weights), dtype=setting.dtype, device=setting.device
+            )
+        self.previous = torch.zeros_like(self.x)
+        self._stress, self._affine = stress(at, self.mu, self.lam), affine(at)
+
+    @property
+    @override
+    def stages(self) -> Stages:
+        return {
+            "inference": self.infer,
+            "transfer": self.load,
+            "p2g": self.p2g,
+            "grid": self.grid_step.update,
+            "g2p": self.g2p,
+            "inversion": self.invert,
+        }
+
+    @override
+    def enter(self, first: bool) -> None:
+        if first:
+            self.previous.copy_(
+                self.at.position(self.setting.record.now) - self.setting.dt * self.initial_velocity
+            )
+        else:
+            self.previous.copy_(self.at.position(self.setting.record.before))
+
+    @property
+    @override
+    def nbytes(self) -> int:
+        weights = 0 if self.weights is None else self.weights.nbytes
+        shared = self.at_sample.nbytes  # S is a part of N
+        return super().nbytes - shared + self.at.nbytes + self.previous.nbytes + weights
+
+    def infer(self) -> None:
+        """x [n, 3], τ and C [n, 3, 3] at N (paper section 5.1)."""
+        xhat = self.setting.record.now
+        self._fields = self.at.position(xhat), self._stress(xhat), self._affine(xhat)
+
+    def load(self) -> None:
+        """Field values → the arrays that torch and Warp share."""
+        x, tau, C = self._fields
+        self.x.copy_(x)
+        # Backward difference, not the grid velocity: the reduced model has no v field (section 5.1).
+        torch.sub(x, self.previous, out=self.v).div_(self.setting.dt)
+        self.previous.copy_(x)
+        self.tau.copy_(tau)
+        if C is not None:
+            self.C.copy_(C)
+
+    def invert(self) -> None:
+        """x̂_{n+1} from the new positions of S (paper section 5.3)."""
+        record = self.setting.record
+        result = self.setting.projector.solve(self.at_sample, self.x[: self.s], record.now, self.weights)
+        record.add(result)
+
+
+class SearchingPhase(DecodedPhase):
     """S fixed, N searched at each step exactly as in the paper (section 5.4, a and b).
 
     Its sets hold every particle, S first; the fields are evaluated everywhere and the
@@ -117,22 +212,31 @@ class SearchingPhase(Phase):
 
     capturable = False
 
-    def __init__(self, *arguments, search: NeighbourSearch, **named):
-        super().__init__(*arguments, **named)
+    def __init__(self, *arguments, search: NeighbourSearch):
+        super().__init__(*arguments)
         self._search = search
         self._masses = self.mass.clone(), self.volume0.clone()
         self._sample_rows = torch.arange(self.s, device=self.x.device)
+        self._sizes = []
 
-    def load(self, x: torch.Tensor, tau: torch.Tensor, C: torch.Tensor | None, dt: float) -> None:
+    @property
+    @override
+    def mean_size(self) -> float:
+        return float(np.mean(self._sizes)) if self._sizes else super().mean_size
+
+    @override
+    def load(self) -> None:
         """Field values of the needed particles → the shared arrays."""
+        x, tau, C = self._fields
         needed = self._search.needed(x, self._sample_rows)
         needed[: self.s] = True
         rows = needed.nonzero().flatten()
         n = len(rows)
         self.x[:n] = x[rows]
-        self.v[:n] = (x[rows] - self.previous[rows]) / dt
+        self.v[:n] = (x[rows] - self.previous[rows]) / self.setting.dt
         self.previous.copy_(x)
         self.tau[:n] = tau[rows]
         self.C[:n] = 0.0 if C is None else C[rows]
         self.mass[:n], self.volume0[:n] = (values[rows] for values in self._masses)
         self.bind(n)
+        self._sizes.append(n)

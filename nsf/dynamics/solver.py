@@ -10,11 +10,13 @@ from nsf.data import hash_of_positions
 from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
 from nsf.dynamics.interop import captured, on_torch_stream, torch_device, torch_dtype
 from nsf.dynamics.latent import Decoder, LatentRecord, LatentState, LatentTrajectory
-from nsf.dynamics.phase import Phase, SearchingPhase
+from nsf.dynamics.modal import ModalPhase
+from nsf.dynamics.phase import DecodedPhase, Phase, SearchingPhase, Setting, Stages
 from nsf.dynamics.projection import GaussNewton, Taylor
 from nsf.dynamics.sampling import RandomSampler, SamplePhase, Sampler, check_well_posed
 from nsf.dynamics.stress import Method
 from nsf.errors import ConfigError, ShapeError
+from nsf.kinematics.basis import BasisManifold
 from nsf.kinematics.manifold import Restriction
 from nsf.mpm import BoundaryArrays, Grid, GridStep, precision_of
 from nsf.mpm.device import warp_device
@@ -91,12 +93,14 @@ class ReducedMPM:
             )
         self.parameters = tensor([parameters[name] for name in manifold.parameter_names])
         self.initial_velocity = tensor(scene.initial_velocity())
-        self.xhat = tensor(manifold.encode(torch.as_tensor(self.scene_particles.X)[None])[0].cpu())
-        self.xhat_previous = self.xhat.clone()
+        start = tensor(manifold.encode(torch.as_tensor(self.scene_particles.X)[None])[0].cpu())
+        self.record = LatentRecord(start, self.total_steps, projector.iterations)
         self.steps_taken = 0
-        self._record = LatentRecord(self.xhat, self.total_steps, projector.iterations)
+        self._setting = Setting(
+            self.scene_particles, self.initial_velocity, self.record, projector, self.dt, self.precision,
+            self.dtype, self.torch_device,
+        )  # fmt: skip
         self._starts = [round(p.start * self.total_steps) for p in phases]
-        self._sizes = []
         self.sets = self._sets_of(phases) if sets is None else list(sets)
         self._phases = [self._build_phase(s, p.weights) for s, p in zip(self.sets, phases, strict=True)]
         self._enter(self._phases[0])
@@ -169,26 +173,20 @@ class ReducedMPM:
         return found
 
     def _build_phase(self, sets: ParticleSets, weights: np.ndarray | None) -> Phase:
-        at = self.manifold.restrict(particles=sets.integration, dtype=self.dtype, device=self.torch_device)
         grid = Grid(self.geometry, self.precision, self.device, nodes=sets.nodes)
         step = GridStep(
             grid, self.boundaries, self.transfer, self.gravity, self.dt, self.precision, self.device
         )
+        on_coefficients = isinstance(self.projector, GaussNewton | Taylor)
+        if isinstance(self.manifold, BasisManifold) and on_coefficients:
+            return ModalPhase(
+                self._setting, sets, step, self.transfer.shape, self.manifold, self.method, self.parameters,
+                self.scene.material, weights,
+            )  # fmt: skip
+        at = self.manifold.restrict(particles=sets.integration, dtype=self.dtype, device=self.torch_device)
         search = self.integration.strategy == "search"
-        build = partial(SearchingPhase, search=self.search) if search else Phase
-        return build(
-            sets,
-            at,
-            self.scene_particles,
-            grid,
-            step,
-            self.stress_of,
-            self.affine_of,
-            self.precision,
-            self.dtype,
-            self.torch_device,
-            weights,
-        )
+        build = partial(SearchingPhase, search=self.search) if search else DecodedPhase
+        return build(self._setting, sets, step, at, self.stress_of, self.affine_of, weights)
 
     def stress_of(self, at, mu: torch.Tensor, lam: torch.Tensor) -> Callable[[torch.Tensor], torch.Tensor]:
         """The method's source of τ [n, 3, 3] [Pa] at restricted points."""
@@ -229,14 +227,25 @@ class ReducedMPM:
         return LatentState(self)
 
     @property
+    def xhat(self) -> torch.Tensor:
+        """[r] latent vector, on the device."""
+        return self.record.now
+
+    @property
     def time(self) -> float:
         """Simulated time [s]."""
         return self.steps_taken * self.dt
 
     @property
     def integration_mean(self) -> float:
-        """Mean |N| over the steps taken."""
-        return float(np.mean(self._sizes)) if self._sizes else float(self._phase.size)
+        """Mean |N| over the steps taken; before them, how many there may be."""
+        ends = [*self._starts[1:], self.total_steps]
+        taken = [
+            max(0, min(self.steps_taken, end) - start) for start, end in zip(self._starts, ends, strict=True)
+        ]
+        if not self.steps_taken:
+            return float(self._phase.size)
+        return sum(n * p.mean_size for n, p in zip(taken, self._phases, strict=True)) / self.steps_taken
 
     @property
     def sample_size(self) -> int:
@@ -246,7 +255,7 @@ class ReducedMPM:
     @property
     def nbytes(self) -> int:
         """Bytes that the solver's arrays and fields take on the device."""
-        return sum(p.nbytes for p in self._phases) + self._record.nbytes + self.initial_velocity.nbytes
+        return sum(p.nbytes for p in self._phases) + self.record.nbytes + self.initial_velocity.nbytes
 
     def step(self, n: int = 1) -> None:
         """Advance by n steps of Δt.
@@ -272,24 +281,16 @@ class ReducedMPM:
         if phase is not self._phase:
             self._enter(phase)
         advance()
-        self._sizes.append(phase.size)
         self.steps_taken += 1
 
     def _phase_at(self, step: int):
         return self._phases[max(i for i, start in enumerate(self._starts) if start <= step)]
 
-    def _enter(self, phase) -> None:
-        """Give the phase the positions one step back, which the backward difference needs."""
+    def _enter(self, phase: Phase) -> None:
+        """Give the phase the state one step back, which the backward difference needs."""
         self._phase = phase
         with torch.no_grad():
-            phase.previous.copy_(self._positions_before(phase))
-
-    def _positions_before(self, phase) -> torch.Tensor:
-        if self.steps_taken == 0:
-            # The first velocity is the initial one, not a difference of latents.
-            rows = torch.as_tensor(phase.sets.integration, device=self.torch_device)
-            return phase.at.position(self.xhat) - self.dt * self.initial_velocity[rows]
-        return phase.at.position(self.xhat_previous)
+            phase.enter(first=self.steps_taken == 0)  # the first velocity is the initial one
 
     def _advance(self) -> None:
         phase = self._phase
@@ -311,44 +312,9 @@ class ReducedMPM:
                     stage()
 
     @property
-    def stages(self) -> dict[str, Callable[[], None]]:
+    def stages(self) -> Stages:
         """One step, stage by stage, in order."""
-        return {
-            "inference": self.infer,
-            "transfer": self.hand_over,
-            "p2g": self.p2g,
-            "grid": self.update_grid,
-            "g2p": self.g2p,
-            "inversion": self.invert,
-        }
-
-    def infer(self) -> None:
-        """Fields on N (paper section 5.1)."""
-        self._fields = self._phase.fields(self.xhat)
-
-    def hand_over(self) -> None:
-        """Field values → the arrays that torch and Warp share."""
-        self._phase.load(*self._fields, self.dt)
-
-    def p2g(self) -> None:
-        """N → grid (paper section 5.2)."""
-        self._phase.p2g()
-
-    def update_grid(self) -> None:
-        """Grid velocities at the next time level."""
-        self._phase.grid_step.update()
-
-    def g2p(self) -> None:
-        """Grid → S."""
-        self._phase.g2p()
-
-    def invert(self) -> None:
-        """x̂_{n+1} from the new positions of S (paper section 5.3)."""
-        phase = self._phase
-        result = self.projector.solve(phase.at_sample, phase.x[: phase.s], self.xhat, phase.weights)
-        self.xhat_previous.copy_(self.xhat)
-        self.xhat.copy_(result.xhat)
-        self._record.add(result)
+        return self._phase.stages
 
     def equations_at(
         self, step: int, xhat: torch.Tensor, previous: torch.Tensor
@@ -365,20 +331,20 @@ class ReducedMPM:
             Error x_S − g(X_S, x̂_n) [s, 3] [m] and Jacobian ∂g/∂x̂ [s, 3, r] [m].
         """
         self.steps_taken = step
-        self.xhat.copy_(xhat)
-        self.xhat_previous.copy_(previous)
+        self.record.now.copy_(xhat)
+        self.record.before.copy_(previous)
         self._enter(self._phase_at(step))
         with torch.no_grad(), on_torch_stream(self.device):
             self.boundaries.start_from(step)
             for name, stage in self.stages.items():
                 if name != "inversion":
                     stage()
-            position, jacobian = self._phase.at_sample.position_and_jacobian(self.xhat)
+            position, jacobian = self._phase.at_sample.position_and_jacobian(self.record.now)
         return self._phase.x[: self._phase.s] - position, jacobian
 
     def trajectory(self) -> LatentTrajectory:
         """Everything recorded up to now, on the host."""
-        return self._record.trajectory(self.steps_taken, self.dt, self.projector.tolerance)
+        return self.record.trajectory(self.steps_taken, self.dt, self.projector.tolerance)
 
     def left_grid(self, since: int = 1) -> int:
         """First step that ended with a sample particle off the grid, or non-finite; −1 when none did.
@@ -388,7 +354,7 @@ class ReducedMPM:
         the full-order solver stops there. For after a run.
         """
         for n in range(since, self.steps_taken + 1):
-            x = self._phase_at(n - 1).at_sample.position(self._record.xhat[n])
+            x = self._phase_at(n - 1).at_sample.position(self.record.xhat[n])
             if not bool(self._on_grid(x).all()):
                 return n
         return -1
@@ -414,7 +380,7 @@ class ReducedMPM:
         worst = 0
         for n in range(self.steps_taken if steps is None else steps):
             phase = self._phase_at(n)
-            x = everything.position(self._record.xhat[n])
+            x = everything.position(self.record.xhat[n])
             sample = torch.as_tensor(phase.sets.sample, device=self.torch_device)
             needed = self.search.needed(x, sample)
             needed[torch.as_tensor(phase.sets.integration, device=self.torch_device)] = False

@@ -23,7 +23,7 @@ from typing_extensions import override
 from nsf.data import Snapshots
 from nsf.errors import ConfigError
 from nsf.kinematics import pod
-from nsf.kinematics.interpolation import interpolation
+from nsf.kinematics.interpolation import Interpolation, interpolation
 from nsf.kinematics.manifold import Manifold, Restriction
 from nsf.kinematics.networks import FullyConnected
 from nsf.kinematics.phases import PHASES, TARGETS, Fit, at_least, joined, per_phase, shaped
@@ -227,6 +227,27 @@ class RestrictedField:
         return rows[..., 0, :, :] + self.mean, rows[..., 1:, :, :].movedim(-3, -1)
 
 
+def _slope(local: Interpolation, values: Tensor) -> Tensor:
+    """∂/∂X of a field [P, 3, ...] at points [n, 9, ...]."""
+    return local.gradient(values).movedim(-1, 2).flatten(1, 2)
+
+
+@dataclass(frozen=True)
+class ModalFactors:
+    """A field at n points, mean + modes · [leading · xhat ; network(xhat, μ)].
+
+    Attributes:
+        mean: [n, c] in the unit of the field; modes: [n, c, K] as trained, in fp32.
+        leading: σ [r] of the coefficients that are latents; [0] for h and l.
+        network: of the others, in raw units; None if there is none.
+    """
+
+    mean: Tensor
+    modes: Tensor
+    leading: Tensor
+    network: FullyConnected | None
+
+
 class BasisManifold(Manifold):
     """Modal fields of x, tau and C."""
 
@@ -276,13 +297,38 @@ class BasisManifold(Manifold):
                 fields[phase]  # what a deployed model holds is all there from the start
 
         def gradient() -> RestrictedField:
-            def place(values: Tensor) -> Tensor:
-                return local().gradient(values).movedim(-1, 2).flatten(1, 2)
-
             base = torch.eye(3, dtype=points.dtype, device=points.device).flatten()
-            return self.fields["deformation"].at(place, base, networks["deformation"], like)
+            return self.fields["deformation"].at(
+                lambda values: _slope(local(), values), base, networks["deformation"], like
+            )
 
         return BasisRestriction(fields, gradient, self.latent_dim, self.takes_parameters("stress"))
+
+    @torch.no_grad()
+    def factors(self, name: str, particles, dtype: torch.dtype, device: torch.device | str) -> ModalFactors:
+        """A field at particles as its factors, which a restriction multiplies out.
+
+        Args:
+            name: `deformation`, `stress`, `affine`, or `gradient` for ∂g/∂X, whose coefficients are the
+                deformation's.
+            particles: [n] indices.
+            dtype: of the mean and the network.
+            device: of all.
+        """
+        rows, points = self.points(particles, None)
+        like = torch.empty(0, dtype=dtype, device=device)
+        phase = "deformation" if name == "gradient" else name
+        field = self.fields[phase]
+        if name == "gradient":
+            local = interpolation(points, self.X)
+            base = torch.eye(3, dtype=points.dtype, device=points.device).flatten()
+            mean, modes = _slope(local, field.mean), _slope(local, field.modes).float()
+        else:
+            base = points if name == "deformation" else 0
+            mean, modes = field.mean[rows], field.modes[rows]
+        return ModalFactors(
+            (base + mean).to(like), modes.to(device), field.leading, self._deployed(phase, like)
+        )
 
     def _deployed(self, phase: str, like: Tensor) -> FullyConnected | None:
         """The phase's network from (xhat, μ) to coefficients in the field's unit."""

@@ -1,0 +1,58 @@
+"""Arrays and packed kernel launches on one device, shared by torch and Warp."""
+
+from collections.abc import Sequence
+
+import torch
+import warp as wp
+
+from nsf.dynamics.interop import torch_device, torch_dtype
+from nsf.mpm import Precision
+
+
+class Arena:
+    """Holds what packed launches point to, and counts it.
+
+    Args:
+        precision: of the floating-point arrays that are of the model.
+        device: Warp device.
+    """
+
+    def __init__(self, precision: Precision, device):
+        self.precision, self.device = precision, device
+        self.real, self._torch = torch_dtype(precision), torch_device(device)
+        self._held: list[torch.Tensor] = []
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of the arrays."""
+        return sum(a.nbytes for a in self._held)
+
+    def hold(self, values, dtype: torch.dtype) -> torch.Tensor:
+        """The values as a contiguous array of this device."""
+        tensor = torch.as_tensor(values).to(self._torch, dtype).contiguous()
+        self._held.append(tensor)
+        return tensor
+
+    def zeros(self, *shape: int, dtype: torch.dtype = torch.float64) -> torch.Tensor:
+        """Zeros."""
+        return self.hold(torch.zeros(shape, device=self._torch), dtype)
+
+    def modes(self, modes: torch.Tensor) -> torch.Tensor:
+        """Modes [n, c, K] in the order that the device reads best.
+
+        On a GPU the values of neighbouring particles lie side by side, on a CPU those of one particle do.
+        """
+        if not self.device.is_cuda:
+            return self.hold(modes, torch.float32)
+        return self.hold(modes.permute(1, 2, 0), torch.float32).permute(2, 0, 1)
+
+    def lanes(self, count: int) -> int:
+        """Threads that work on one result: `count` of a GPU, one of a CPU."""
+        return count if self.device.is_cuda else 1
+
+    def pack(self, kernel, dim: int | tuple[int, ...], arguments: Sequence, block: int = 256) -> wp.Launch:
+        """A launch whose arguments are packed once; tensors among them are shown to Warp as they are."""
+        inputs = [wp.from_torch(a) if isinstance(a, torch.Tensor) else a for a in arguments]
+        return wp.launch(
+            kernel, dim=dim, inputs=inputs, device=self.device, block_dim=self.lanes(block), record_cmd=True
+        )

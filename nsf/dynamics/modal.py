@@ -1,0 +1,296 @@
+"""A phase whose fields are modes times coefficients: one step is a dozen kernels, and torch takes no part."""
+
+import numpy as np
+import torch
+import warp as wp
+from typing_extensions import override
+
+from nsf.dynamics.arena import Arena
+from nsf.dynamics.integration import ParticleSets
+from nsf.dynamics.interop import as_matrices, as_vectors, on_torch_stream
+from nsf.dynamics.latent import LatentRecord
+from nsf.dynamics.modal_kernels import (
+    BLOCK,
+    PROJECTION_BLOCK,
+    WARP,
+    make_contraction,
+    make_gathering,
+    make_layer,
+    make_position,
+    make_projection,
+    make_selection,
+)
+from nsf.dynamics.phase import Phase, Setting, Stages
+from nsf.dynamics.projection import Taylor
+from nsf.dynamics.stress import Method
+from nsf.kinematics.basis import ModalFactors
+from nsf.kinematics.interpolation import lying_together
+from nsf.mpm import GridStep
+from nsf.mpm.device import warp_device
+from nsf.mpm.grid import Grid
+from nsf.mpm.materials import Material, make_elastic_stress
+from nsf.mpm.shape import DEGREES
+
+_GROUP = 32  # particles that lie together in the arrays: a warp is needed, or passed over, as one
+
+
+class ModalPhase(Phase):
+    """Fields of `field=basis`.
+
+    The networks run once a step, on x̂ alone; modes and coefficients are contracted at those particles of N
+    that the step needs, which are found at each step among the sets'; and the projection works on
+    coefficients. Mathematically a step is that of `DecodedPhase`.
+
+    Args:
+        setting: of the solver; its projector is `GaussNewton` or `Taylor`.
+        sets: S, N (the candidates) and I.
+        grid_step: the shared P2G, grid update and G2P; shape: its B-spline.
+        manifold: a `BasisManifold`.
+        method: which of τ and C come from fields.
+        parameters: [n_parameters] μ.
+        material: the law, for a τ that comes from ∂g/∂X.
+        weights: [s] of S in the projection; None for all one.
+    """
+
+    def __init__(
+        self,
+        setting: Setting,
+        sets: ParticleSets,
+        grid_step: GridStep,
+        shape: str,
+        manifold,
+        method: Method,
+        parameters: torch.Tensor,
+        material: Material,
+        weights: np.ndarray | None,
+    ):
+        order = _lying_together(sets, setting.constants.X)
+        at_sample = manifold.restrict(sets.sample, dtype=setting.dtype, device=setting.device)
+        super().__init__(setting, sets, order, grid_step, at_sample)
+        self._arena = arena = Arena(setting.precision, warp_device(str(setting.device)))
+        deformation = manifold.factors("deformation", order, dtype=setting.dtype, device=setting.device)
+        displacement = arena.modes(deformation.modes)
+        self.coefficients = state = Coefficients(arena, displacement.shape[2], manifold.latent_dim)
+        self._place = _placing(arena, state, deformation.mean, displacement, self)
+        self._selection = Selection(arena, state, grid_step.grid, shape, sets, self.x)
+        self.needed = self._selection.needed
+        self._fields = _fields(arena, self, manifold, method, order, parameters, material)
+        self._projection = Projection(arena, state, deformation, displacement, self, weights)
+
+    @property
+    @override
+    def stages(self) -> Stages:
+        return {
+            "inference": self.infer,
+            "p2g": self.p2g,
+            "grid": self.grid_step.update,
+            "g2p": self.g2p,
+            "inversion": self.invert,
+        }
+
+    @override
+    def enter(self, first: bool) -> None:
+        record, state = self.setting.record, self.coefficients
+        for xhat in (record.before, record.now):
+            state.latent.copy_(xhat)
+            with on_torch_stream(self._arena.device):
+                self._projection.evaluate.launch()
+        state.first.fill_(int(first))
+        state.step += 1  # what an earlier step stamped is of no account
+
+    def infer(self) -> None:
+        """x and v, the particles that S needs, and their τ and C (paper sections 5.1 and 5.4)."""
+        for launch in (self._place, *self._selection.launches, *self._fields):
+            launch.launch()
+
+    def invert(self) -> None:
+        """x̂_{n+1} from the displacement of S (paper section 5.3)."""
+        for launch in self._projection.launches:
+            launch.launch()
+
+    @property
+    @override
+    def mean_size(self) -> float:
+        found, steps = self._selection.count.tolist()
+        return found / steps if steps else float(self.size)
+
+    @property
+    @override
+    def nbytes(self) -> int:
+        return super().nbytes + self._arena.nbytes
+
+
+class Coefficients:
+    """Where a run is, in coefficients, on the device.
+
+    Attributes:
+        latent: [r] x̂_n in fp64.
+        a, rate: [K] coefficients of the displacement and their backward difference [1/s].
+        tangents: [K r] ∂a/∂x̂.
+        first: [1] whether the next step is the first of the run.
+        step: [1] a number that no two steps share.
+    """
+
+    def __init__(self, arena: Arena, modes: int, latents: int):
+        self.latent, self.a, self.rate = arena.zeros(latents), arena.zeros(modes), arena.zeros(modes)
+        self.tangents = arena.zeros(modes * latents)
+        self.first, self.step = (arena.zeros(1, dtype=torch.int32) for _ in range(2))
+
+
+class Selection:
+    """Finds at each step which candidates the step of S needs.
+
+    Attributes:
+        needed: [n] whether a candidate is.
+        count: [2] particles needed in all steps taken, and the number of these.
+        launches: in order.
+    """
+
+    def __init__(
+        self, arena: Arena, state: Coefficients, grid: Grid, shape: str, sets: ParticleSets, x: torch.Tensor
+    ):
+        precision, reach = arena.precision, DEGREES[shape]
+        nodes = np.array(grid.geometry.nodes)
+        lower, upper = np.zeros(3, int), nodes - 1
+        if grid.sparse:
+            stored = np.stack(np.unravel_index(sets.nodes, nodes), 1)
+            lower = np.maximum(stored.min(0) - reach, 0)
+            upper = np.minimum(stored.max(0) + reach, nodes - 1)
+        extent = upper - lower + 1
+        box = wp.vec3i(*lower.tolist()), wp.vec3i(*extent.tolist())
+        self.needed = arena.zeros(len(x), dtype=torch.int32)
+        self.count = arena.zeros(2, dtype=torch.int64)
+        stamps = arena.zeros(int(extent.prod()), dtype=torch.int32)
+        stamp, select = make_selection(precision, shape)
+        positions = as_vectors(x, precision)
+        shared = [precision.real(1.0 / grid.geometry.dx), *box, state.step, stamps]
+        around = (2 * reach + 1) ** 3
+        self.launches = [
+            arena.pack(stamp, (len(sets.sample), around), [positions, *shared]),
+            arena.pack(select, len(x), [*shared, positions, self.needed, self.count]),
+        ]
+
+
+class Projection:
+    """The inversion of the deformation field (paper section 5.3).
+
+    Attributes:
+        launches: those of a step.
+        evaluate: gives a, ȧ and ∂a/∂x̂ at the latent vector of the state.
+    """
+
+    def __init__(self, arena, state, deformation, displacement, phase: Phase, weights: np.ndarray | None):
+        setting, s, K = phase.setting, phase.s, displacement.shape[2]
+        projector, record, r = setting.projector, setting.record, len(state.latent)
+        of_sample = displacement[:s]
+        w = torch.ones(s) if weights is None else torch.as_tensor(weights / np.mean(weights))
+        w = arena.hold(w, torch.float64)
+        B = of_sample.double().flatten(0, 1)
+        G = arena.hold(B.T @ (w.repeat_interleave(3)[:, None] * B), torch.float64).flatten()
+        b = arena.zeros(K + 1)
+        network, widths, packed = deformation.network, (), torch.zeros(1)
+        if network is not None:
+            widths = (r, *(layer.out_features for layer in network.layers))
+            # Transposed, so that neighbouring threads read neighbouring weights.
+            packed = torch.cat(
+                [part.flatten() for layer in network.layers for part in (layer.weight.T, layer.bias)]
+            )
+        lanes = arena.lanes(BLOCK)
+        gather = arena.pack(
+            make_gathering(arena.precision),
+            (K + 1) * lanes,
+            [of_sample, as_vectors(phase.v[:s], arena.precision), w, wp.float64(setting.dt), lanes, b],
+            BLOCK,
+        )
+        kernel = make_projection(arena.precision, widths, r, K)
+        packed, sigma = arena.hold(packed, arena.real), arena.hold(deformation.leading, torch.float64)
+        linear = int(isinstance(projector, Taylor))
+
+        def solve(iterations: int) -> wp.Launch:
+            how = [wp.float64(s), iterations, wp.float64(projector.tolerance), linear, wp.float64(setting.dt)]
+            latents = [state.latent, state.a, state.tangents, state.rate, record.now, record.before]
+            kept = [record.xhat.flatten(), record.residuals.flatten(), record.updates.flatten(), record.row]
+            arguments = [packed, sigma, G, b, *how, *latents, *kept, state.first, state.step]
+            return arena.pack(kernel, arena.lanes(PROJECTION_BLOCK), arguments, PROJECTION_BLOCK)
+
+        self.launches, self.evaluate = [gather, solve(projector.iterations)], solve(0)
+
+
+def _lying_together(sets: ParticleSets, X: np.ndarray) -> np.ndarray:
+    """N with S first, and the others in groups of neighbours."""
+    s = len(sets.sample)
+    others = sets.integration[s:]
+    if not len(others):
+        return sets.integration
+    groups = lying_together(torch.as_tensor(X[others]), _GROUP)
+    return np.concatenate([sets.sample, others[torch.cat(groups).numpy()]])
+
+
+def _placing(arena: Arena, state: Coefficients, mean: torch.Tensor, modes: torch.Tensor, phase: Phase):
+    """The launch that gives x and v at N."""
+    vectors = [as_vectors(a, arena.precision) for a in (phase.initial_velocity, phase.x, phase.v)]
+    mean = as_vectors(arena.hold(mean, arena.real), arena.precision)
+    inputs = [mean, modes, state.a, state.rate, vectors[0], state.first, *vectors[1:]]
+    return arena.pack(make_position(arena.precision), len(phase.x), inputs)
+
+
+def _fields(arena, phase: ModalPhase, manifold, method: Method, order, parameters, material) -> list:
+    """The launches that give τ and C at N, as the method takes them."""
+    options = {"dtype": arena.real, "device": phase.setting.device}
+    taken = [("stress", method.neural_stress, phase.tau), ("affine", method.neural_affine, phase.C)]
+    heads = [(manifold.factors(name, order, **options), found) for name, neural, found in taken if neural]
+    launches, coefficients = _networks(arena, [f.network for f, _ in heads], phase.setting.record, parameters)
+    for (factors, found), a in zip(heads, coefficients, strict=True):
+        launches.append(_contraction(arena, phase, factors, a, found))
+    if not method.neural_stress:
+        F = arena.zeros(len(order), 3, 3, dtype=arena.real)
+        factors = manifold.factors("gradient", order, **options)
+        launches += [
+            _contraction(arena, phase, factors, phase.coefficients.a, F),
+            _elastic(arena, phase, material, F),
+        ]
+    return launches
+
+
+def _networks(arena: Arena, networks: list, record: LatentRecord, parameters) -> tuple[list, list]:
+    """The launches of the heads, layer by layer and both at once, and where they leave their coefficients."""
+    inputs = [record.now] * len(networks)
+    launches, lanes = [], arena.lanes(WARP)
+    for layers in zip(*(network.layers for network in networks), strict=True):
+        first, last = not launches, len(launches) == len(networks[0].layers) - 1
+        weights = []
+        for layer in layers:
+            W, b = layer.weight, layer.bias
+            if first:  # x̂ is followed by the problem parameters, which do not change in a run
+                r = len(record.now)
+                W, b = W[:, :r], b + W[:, r:] @ parameters.to(W)[: W.shape[1] - r]
+            weights.append([arena.hold(W, arena.real), arena.hold(b, arena.real)])
+        outputs = [arena.zeros(len(b), dtype=arena.real) for _, b in weights]
+        sides = [[*w, x] for w, x in zip(weights, inputs, strict=True)]
+        # One network alone stands on both sides; the second gets no thread.
+        arguments = [*sides[0], *sides[-1], int(not last), lanes, outputs[0], outputs[-1]]
+        threads = sum(len(y) for y in outputs) * lanes
+        launches.append(arena.pack(make_layer(arena.precision), threads, arguments))
+        inputs = outputs
+    return launches, inputs
+
+
+def _contraction(
+    arena: Arena, phase: ModalPhase, factors: ModalFactors, a: torch.Tensor, found: torch.Tensor
+):
+    """The launch of a field with coefficients a at the needed particles."""
+    n, c, _ = factors.modes.shape
+    kernel = make_contraction(arena.precision, symmetric=c == 6, coefficients=wp.dtype_from_torch(a.dtype))
+    mean = arena.hold(factors.mean, arena.real)
+    return arena.pack(kernel, (c // 3, n), [phase.needed, mean, arena.modes(factors.modes), a, found])
+
+
+def _elastic(arena: Arena, phase: ModalPhase, material: Material, F: torch.Tensor):
+    """The launch of τ = τ(F) at N; without flow the history keeps its values at rest."""
+    precision, n = arena.precision, len(F)
+    history = arena.hold(material.initial_history(n), arena.real)
+    vecH = wp.types.vector(length=material.history_size, dtype=precision.real)
+    kernel = make_elastic_stress(material.functions(precision), precision, material.history_size)
+    matrices = [as_matrices(a, precision) for a in (F, phase.tau)]
+    inputs = [matrices[0], wp.from_torch(history, dtype=vecH), phase.mu, phase.lam, matrices[1]]
+    return arena.pack(kernel, n, inputs)

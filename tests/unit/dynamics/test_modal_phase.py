@@ -1,0 +1,112 @@
+"""Steps of `field=basis` in coefficients are the steps that decode every particle with torch."""
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from nsf.dynamics import GaussNewton, Integration, Method, RandomSampler, SamplePhase, Taylor
+from nsf.dynamics.modal import ModalPhase
+from nsf.dynamics.phase import DecodedPhase
+from nsf.kinematics.mlp import MlpManifold
+
+METHODS = [Method(f"{a}{b}", a, b) for a in (True, False) for b in (True, False)]
+
+
+@pytest.fixture
+def pair(chain, tiny_manifold, monkeypatch):
+    """options → a solver in coefficients and one that decodes, of the same fields."""
+
+    def build(sample=20, **options):
+        def one():
+            return chain.scene.reduced(tiny_manifold, {"friction_angle": 26.0}, sample, **options)
+
+        options.setdefault("device", "cpu")
+        modal = one()
+        with monkeypatch.context() as patch:
+            patch.setattr("nsf.dynamics.solver.BasisManifold", MlpManifold)
+            decoded = one()
+        assert isinstance(modal._phase, ModalPhase)
+        assert isinstance(decoded._phase, DecodedPhase)
+        return modal, decoded
+
+    return build
+
+
+def runs(solvers, steps=24):
+    for solver in solvers:
+        solver.step(steps)
+    return [solver.trajectory() for solver in solvers]
+
+
+def same(one, other, tolerance=1e-9):
+    np.testing.assert_allclose(one.xhat, other.xhat, rtol=0, atol=tolerance)
+    np.testing.assert_allclose(one.residuals, other.residuals, rtol=1e-4, atol=1e-3 * tolerance)
+    # After convergence the one counts round-off and the other nothing.
+    np.testing.assert_allclose(one.updates, other.updates, rtol=1e-4, atol=2e-6)
+    assert one.stops == other.stops
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
+def test_every_method(pair, method):
+    # The modes of ∂g/∂X are rounded to fp32, as the others are from the start.
+    same(*runs(pair(method=method)), tolerance=1e-9 if method.neural_stress else 1e-6)
+
+
+@pytest.mark.parametrize("strategy", ["superset", "search"])
+def test_every_integration(pair, strategy):
+    same(*runs(pair(integration=Integration(strategy, 1))))
+
+
+def test_taylor(pair):
+    same(*runs(pair(projector=Taylor())))
+
+
+def test_one_iteration_and_none_converged(pair):
+    same(*runs(pair(projector=GaussNewton(iterations=1))))
+    same(*runs(pair(projector=GaussNewton(iterations=4, tolerance=1e-14))))
+
+
+def test_weights_and_phases(pair):
+    weights = np.random.default_rng(0).uniform(0.1, 3.0, 20)
+    phases = [SamplePhase(0.0, np.arange(0, 500, 25), weights), SamplePhase(0.5, np.arange(7, 500, 50), None)]
+    same(*runs(pair(phases)))
+    same(*runs(pair(RandomSampler(20, phases=[{"start": 0.25, "size": 8}]))))
+
+
+def test_a_longer_step(pair):
+    same(*runs(pair(dt_multiplier=1.5), steps=16))
+
+
+def test_single_precision(pair):
+    modal, decoded = runs(pair(precision="fp32"))
+    np.testing.assert_allclose(modal.xhat, decoded.xhat, rtol=0, atol=0.02)
+    # The velocity is a difference of coefficients, not of rounded positions.
+    reference = runs(pair())[0]
+    assert np.abs(modal.xhat - reference.xhat).max() < np.abs(decoded.xhat - reference.xhat).max()
+
+
+def test_the_particles_taken_are_those_of_the_search(pair, chain):
+    X = chain.scene.particles().X
+    corner = np.sort(np.linalg.norm(X - X[np.argmax(X @ [1.0, 1.0, 2.0])], axis=1).argsort()[:10])
+    modal, decoded = pair(corner, integration=Integration("search", 0))
+    runs((modal, decoded), 12)
+    assert modal.integration_mean == decoded.integration_mean < 500
+    fixed, _ = pair(corner)
+    assert fixed.integration_mean > len(corner)  # before a step: how many there may be
+    runs((fixed,), 12)
+    assert fixed.integration_mean == modal.integration_mean
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
+def test_the_gpu_takes_the_same_steps(chain, tiny_manifold, method):
+    if not (torch.cuda.is_available() and wp.is_cuda_available()):
+        pytest.skip("needs a GPU")
+    found = []
+    for device in ("cuda", "cpu"):
+        solver = chain.scene.reduced(
+            tiny_manifold, {"friction_angle": 26.0}, 60, method=method, device=device
+        )
+        found += runs((solver,))
+    same(*found, tolerance=1e-6)
