@@ -510,7 +510,7 @@ def make_projection(precision: Precision, widths: tuple[int, ...], latents: int,
         step: wp.array(dtype=wp.int32),
     ): ...
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, module="unique", launch_bounds=PROJECTION_BLOCK)
     def projection(
         weights: wp.array(dtype=real),
         sigma: wp.array(dtype=wp.float64),
