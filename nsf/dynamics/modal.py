@@ -11,7 +11,6 @@ from nsf.dynamics.interop import as_matrices, as_vectors, on_torch_stream
 from nsf.dynamics.latent import LatentRecord
 from nsf.dynamics.modal_kernels import (
     BLOCK,
-    PROJECTION_BLOCK,
     WARP,
     make_contraction,
     make_gathering,
@@ -19,6 +18,7 @@ from nsf.dynamics.modal_kernels import (
     make_position,
     make_projection,
     make_selection,
+    projection_block,
 )
 from nsf.dynamics.phase import Phase, Setting, Stages
 from nsf.dynamics.projection import Taylor
@@ -188,13 +188,11 @@ class Projection:
         B = of_sample.double().flatten(0, 1)
         G = arena.hold(B.T @ (w.repeat_interleave(3)[:, None] * B), torch.float64).flatten()
         b = arena.zeros(K + 1)
-        network, widths, packed = deformation.network, (), torch.zeros(1)
-        if network is not None:
-            widths = (r, *(layer.out_features for layer in network.layers))
-            # Transposed, so that neighbouring threads read neighbouring weights.
-            packed = torch.cat(
-                [part.flatten() for layer in network.layers for part in (layer.weight.T, layer.bias)]
-            )
+        layers = [] if deformation.network is None else list(deformation.network.layers)
+        widths = (r, *(layer.out_features for layer in layers)) if layers else ()
+        weights = [torch.cat([layer.weight.flatten(), layer.bias]) for layer in layers] or [torch.zeros(1)]
+        weights[-1] = weights[-1] / deformation.scale  # as trained, so that fp32 holds them
+        weights = arena.hold(torch.cat(weights), torch.float32)
         lanes = arena.lanes(BLOCK)
         gather = arena.pack(
             make_gathering(arena.precision),
@@ -203,15 +201,17 @@ class Projection:
             BLOCK,
         )
         kernel = make_projection(arena.precision, widths, r, K)
-        packed, sigma = arena.hold(packed, arena.real), arena.hold(deformation.leading, torch.float64)
+        sigma = arena.hold(deformation.leading, torch.float64)
+        block = projection_block(widths)
         linear = int(isinstance(projector, Taylor))
 
         def solve(iterations: int) -> wp.Launch:
             how = [wp.float64(s), iterations, wp.float64(projector.tolerance), linear, wp.float64(setting.dt)]
             latents = [state.latent, state.a, state.tangents, state.rate, record.now, record.before]
             kept = [record.xhat.flatten(), record.residuals.flatten(), record.updates.flatten(), record.row]
-            arguments = [packed, sigma, G, b, *how, *latents, *kept, state.first, state.step]
-            return arena.pack(kernel, arena.lanes(PROJECTION_BLOCK), arguments, PROJECTION_BLOCK)
+            sums = [weights, wp.float64(deformation.scale), sigma, G, b]
+            arguments = [*sums, *how, *latents, *kept, state.first, state.step]
+            return arena.pack(kernel, arena.lanes(block), arguments, block)
 
         self.launches, self.evaluate = [gather, solve(projector.iterations)], solve(0)
 

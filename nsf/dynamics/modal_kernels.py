@@ -4,7 +4,6 @@ Nothing here is read back to the host, and no launch depends on a value, so a st
 A few sums go over the threads of a block or of a warp by native code; on a CPU a block is one thread.
 """
 
-import itertools
 from functools import cache
 
 import warp as wp
@@ -15,46 +14,46 @@ from nsf.mpm.shape import shape_functions
 
 WARP = 32  # threads that share a dot product on a GPU
 BLOCK = 128  # threads that share a sum over S
-#: Threads of the block that projects, and bytes of shared memory for its partial sums.
-PROJECTION_BLOCK, _PARTIAL_BYTES = 512, 24576
 
 
-_WARP_SUM = """
+def _combination(coefficients: str, unroll: int = 16) -> str:
+    """Native code that adds Σ_k modes[p, c..c+2, k] a_k to one, two and three, for each a of a list.
+
+    In Warp's own loop each turn waits for its loads; here many are under way at once. The types of the sums
+    are `real`; a CPU may change the order of additions, so that it works on several at once.
+    """
+    names = coefficients.split()
+    sums = "".join(f"real {a}_1 = 0, {a}_2 = 0, {a}_3 = 0;" for a in names)
+    terms = "".join(
+        f"const real {a}_k = real({a}.data[k]);"
+        f"{a}_1 += one * {a}_k; {a}_2 += two * {a}_k; {a}_3 += three * {a}_k;"
+        for a in names
+    )
+    return f"""
+    {sums}
+    {{
 #if defined(__CUDA_ARCH__)
-    for (int d = 16; d > 0; d /= 2) value += __shfl_xor_sync(0xffffffffu, value, d);
+        const size_t step = modes.strides[2];
+#else
+        #pragma clang fp reassociate(on)
+        const size_t step = sizeof(float);
 #endif
-    return value;
+        const size_t next = modes.strides[1];
+        const char* first = (const char*)modes.data + size_t(p) * modes.strides[0] + size_t(c) * next;
+        const int K = modes.shape[2];
+        #pragma unroll {unroll}
+        for (int k = 0; k < K; ++k) {{
+            const char* at = first + k * step;
+            const real one = real(*(const float*)at);
+            const real two = real(*(const float*)(at + next)), three = real(*(const float*)(at + 2 * next));
+            {terms}
+        }}
+    }}
 """
 
 
-@cache
-def _make_warp_sum(precision: Precision):
-    """Function: the sum of a value over the threads of a warp, for each of them."""
-    real = precision.real
-
-    @wp.func_native(_WARP_SUM)
-    def warp_sum(value: real) -> real: ...
-
-    return warp_sum
-
-
-_BLOCK_SUM = """
-#if defined(__CUDA_ARCH__)
-    __shared__ double partial[32];
-    for (int d = 16; d > 0; d /= 2) value += __shfl_xor_sync(0xffffffffu, value, d);
-    if (threadIdx.x % 32 == 0) partial[threadIdx.x / 32] = value;
-    __syncthreads();
-    value = 0.0;
-    for (int w = 0; w < blockDim.x / 32; ++w) value += partial[w];
-#endif
-    return value;
-"""
-
-
-@wp.func_native(_BLOCK_SUM)
-def block_sum(value: wp.float64) -> wp.float64:
-    """The sum of a value over the threads of a block, for each of them; once a kernel."""
-    ...
+def _scalar(precision: Precision) -> str:
+    return {"fp32": "float", "fp64": "double"}[precision.name]
 
 
 @cache
@@ -65,6 +64,21 @@ def make_position(precision: Precision):
     there is no v field); in the first step v is the initial velocity.
     """
     real, vec3 = precision.real, precision.vec3
+    vec6 = wp.types.vector(length=6, dtype=real)
+    snippet = f"""
+    typedef {_scalar(precision)} real;
+    const int c = 0;
+    {_combination("a rate", 8)}
+    return wp::vec_t<6, real>({{a_1, a_2, a_3, rate_1, rate_2, rate_3}});
+    """
+
+    @wp.func_native(snippet)
+    def combined(
+        modes: wp.array3d(dtype=wp.float32),
+        a: wp.array(dtype=wp.float64),
+        rate: wp.array(dtype=wp.float64),
+        p: int,
+    ) -> vec6: ...
 
     @wp.kernel(enable_backward=False, module="unique")
     def position(
@@ -78,15 +92,12 @@ def make_position(precision: Precision):
         v: wp.array(dtype=vec3),
     ):
         p = wp.tid()
-        moved, moving = vec3(), vec3()
-        for k in range(modes.shape[2]):
-            b = vec3(real(modes[p, 0, k]), real(modes[p, 1, k]), real(modes[p, 2, k]))
-            moved += real(a[k]) * b
-            moving += real(rate[k]) * b
-        x[p] = mean[p] + moved
+        moved = combined(modes, a, rate, p)
+        x[p] = mean[p] + vec3(moved[0], moved[1], moved[2])
         if first[0] != 0:
-            moving = initial_velocity[p]
-        v[p] = moving
+            v[p] = initial_velocity[p]
+        else:
+            v[p] = vec3(moved[3], moved[4], moved[5])
 
     return position
 
@@ -164,7 +175,17 @@ def make_contraction(precision: Precision, symmetric: bool, coefficients):
     The six components of a symmetric field are xx xy xz yy yz zz, the nine of another go row by row.
     Particles that are not needed are passed over. `coefficients` is the type of a.
     """
-    real = precision.real
+    real, vec3 = precision.real, precision.vec3
+    snippet = f"""
+    typedef {_scalar(precision)} real;
+    {_combination("a")}
+    return wp::vec_t<3, real>(a_1, a_2, a_3);
+    """
+
+    @wp.func_native(snippet)
+    def combined(
+        modes: wp.array3d(dtype=wp.float32), a: wp.array(dtype=coefficients), p: int, c: int
+    ) -> vec3: ...
 
     @wp.kernel(enable_backward=False, module="unique")
     def contraction(
@@ -178,13 +199,8 @@ def make_contraction(precision: Precision, symmetric: bool, coefficients):
         if needed[p] == 0:
             return
         c = 3 * group
-        one, two, three = real(0.0), real(0.0), real(0.0)
-        for k in range(modes.shape[2]):
-            a_k = real(a[k])
-            one += real(modes[p, c, k]) * a_k
-            two += real(modes[p, c + 1, k]) * a_k
-            three += real(modes[p, c + 2, k]) * a_k
-        one, two, three = one + mean[p, c], two + mean[p, c + 1], three + mean[p, c + 2]
+        value = combined(modes, a, p, c)
+        one, two, three = value[0] + mean[p, c], value[1] + mean[p, c + 1], value[2] + mean[p, c + 2]
         if wp.static(not symmetric):
             found[p, group, 0] = one
             found[p, group, 1] = two
@@ -210,16 +226,29 @@ def make_layer(precision: Precision):
 
     SiLU where `active`, else the identity; the second network's outputs follow the first's.
     """
-    real, warp_sum = precision.real, _make_warp_sum(precision)
+    real = precision.real
+    snippet = f"""
+    typedef {_scalar(precision)} real;
+    const int n = x.shape[0];
+    const real* row = W.data + size_t(o) * n;
+    real sum = 0;
+    #pragma unroll 4
+    for (int i = lane; i < n; i += lanes) sum += row[i] * x.data[i];
+#if defined(__CUDA_ARCH__)
+    for (int d = 16; d > 0; d /= 2) sum += __shfl_xor_sync(0xffffffffu, sum, d);
+#endif
+    return sum + b.data[o];
+    """
 
-    @wp.func
+    @wp.func_native(snippet)
     def row(
-        W: wp.array2d(dtype=real), b: wp.array(dtype=real), x: wp.array(dtype=real), o: int, lane: int, n: int
-    ):
-        total = real(0.0)
-        for i in range(lane, x.shape[0], n):
-            total += W[o, i] * x[i]
-        return warp_sum(total) + b[o]
+        W: wp.array2d(dtype=real),
+        b: wp.array(dtype=real),
+        x: wp.array(dtype=real),
+        o: int,
+        lane: int,
+        lanes: int,
+    ) -> real: ...
 
     @wp.func
     def silu(z: real):
@@ -265,6 +294,45 @@ def make_gathering(precision: Precision):
     block gives Σ_p w_p |Δt v_p|².
     """
     vec3 = precision.vec3
+    snippet = """
+    double sum = 0.0;
+    const size_t next = modes.strides[1];
+    const char* first = (const char*)modes.data + size_t(k) * modes.strides[2];
+    const bool of_mode = k < modes.shape[2];
+    #pragma unroll 4
+    for (int p = lane; p < weights.shape[0]; p += lanes) {
+        const double x = double(v.data[p][0]), y = double(v.data[p][1]), z = double(v.data[p][2]);
+        double one = dt * x, two = dt * y, three = dt * z;
+        if (of_mode) {
+            const char* at = first + size_t(p) * modes.strides[0];
+            one = double(*(const float*)at);
+            two = double(*(const float*)(at + next));
+            three = double(*(const float*)(at + 2 * next));
+        }
+        sum += weights.data[p] * (one * x + two * y + three * z);
+    }
+    sum *= dt;
+#if defined(__CUDA_ARCH__)
+    __shared__ double partial[32];
+    for (int d = 16; d > 0; d /= 2) sum += __shfl_xor_sync(0xffffffffu, sum, d);
+    if (threadIdx.x % 32 == 0) partial[threadIdx.x / 32] = sum;
+    __syncthreads();
+    sum = 0.0;
+    for (int w = 0; w < blockDim.x / 32; ++w) sum += partial[w];
+#endif
+    return sum;
+    """
+
+    @wp.func_native(snippet)
+    def share(
+        modes: wp.array3d(dtype=wp.float32),
+        v: wp.array(dtype=vec3),
+        weights: wp.array(dtype=wp.float64),
+        dt: wp.float64,
+        k: int,
+        lane: int,
+        lanes: int,
+    ) -> wp.float64: ...
 
     @wp.kernel(enable_backward=False, module="unique")
     def gathering(
@@ -277,21 +345,86 @@ def make_gathering(precision: Precision):
     ):
         t = wp.tid()
         k, lane = t / lanes, t % lanes
-        total = wp.float64(0.0)
-        for p in range(lane, weights.shape[0], lanes):
-            moved = dt * wp.vec3d(wp.float64(v[p][0]), wp.float64(v[p][1]), wp.float64(v[p][2]))
-            if k < modes.shape[2]:
-                mode = wp.vec3d(
-                    wp.float64(modes[p, 0, k]), wp.float64(modes[p, 1, k]), wp.float64(modes[p, 2, k])
-                )
-                total += weights[p] * wp.dot(mode, moved)
-            else:
-                total += weights[p] * wp.dot(moved, moved)
-        total = block_sum(total)
+        total = share(modes, v, weights, dt, k, lane, lanes)
         if lane == 0:
             b[k] = total
 
     return gathering
+
+
+def projection_block(widths: tuple[int, ...]) -> int:
+    """Threads of the block that projects: enough to take the widest layer in one turn, if there may be."""
+    widest = max((*widths[1:], 1))
+    return min(1024, 32 * -(-(-(-widest // 2) * _PARTS) // 32))
+
+
+#: Threads that share a sum over a layer's inputs; each has two outputs, to read its inputs once for both.
+_PARTS = 8
+#: Bytes of shared memory that Bᵀw B may take; more of it stays where it is.
+_GRAM_BYTES = 20480
+
+# Native code of the closure and its tangents, all layers in one piece: a step comes to it once, so that code
+# is not yet at hand and must be short. Values are summed in the precision of the step, tangents in fp32: they
+# steer Gauss-Newton, and miss its fixed point by no more than their round-off times the residual.
+_CLOSURE = """
+        const int width[] = {widths};
+        int offset = 0;
+        #pragma unroll 1
+        for (int l = 0; l < {layers}; ++l) {{
+            const int in = width[l], out = width[l + 1], half = (out + 1) / 2, from = l % 2, to = 1 - from;
+            const bool last = l == {layers} - 1;
+            const slope_t* W = weights.data + offset;
+            const slope_t* bias = W + in * out;
+            offset += (in + 1) * out;
+            #pragma unroll 1
+            for (int e = lane; e < (half * PARTS + 31) / 32 * 32; e += lanes) {{
+                const int part = e % PARTS, o = e / PARTS;
+                const bool live = o < half, both = live && o + half < out;
+                const slope_t* row_1 = W + (live ? o : 0) * in;
+                const slope_t* row_2 = both ? row_1 + half * in : row_1;
+                real v_1 = 0, v_2 = 0;
+                slope_t u_1[R], u_2[R];
+                for (int c = 0; c < R; ++c) u_1[c] = u_2[c] = 0.0f;
+                #pragma unroll 6
+                for (int i = part; i < in; i += PARTS) {{
+                    const slope_t w_1 = row_1[i], w_2 = row_2[i];
+                    const real h = value[from][i];
+                    v_1 += real(w_1) * h;
+                    v_2 += real(w_2) * h;
+                    for (int c = 0; c < R; ++c) {{
+                        const slope_t t = slope[from][i * R + c];
+                        u_1[c] += w_1 * t;
+                        u_2[c] += w_2 * t;
+                    }}
+                }}
+#if defined(__CUDA_ARCH__)
+                #pragma unroll 1
+                for (int d = PARTS / 2; d > 0; d /= 2) {{
+                    v_1 += __shfl_xor_sync(0xffffffffu, v_1, d);
+                    v_2 += __shfl_xor_sync(0xffffffffu, v_2, d);
+                    for (int c = 0; c < R; ++c) {{
+                        u_1[c] += __shfl_xor_sync(0xffffffffu, u_1[c], d);
+                        u_2[c] += __shfl_xor_sync(0xffffffffu, u_2[c], d);
+                    }}
+                }}
+#endif
+                #pragma unroll 1
+                for (int side = part; side < 2; side += PARTS) {{
+                    if (side == 0 ? !live : !both) continue;
+                    const int k = o + side * half;
+                    const real z = (side == 0 ? v_1 : v_2) + real(bias[k]);
+                    const real s = real(1) / (real(1) + exp(-z));
+                    const slope_t rise = slope_t(s * (real(1) + z * (real(1) - s)));
+                    if (last) at[R + k] = scale * z; else value[to][k] = z * s;
+                    for (int c = 0; c < R; ++c) {{
+                        const slope_t u = side == 0 ? u_1[c] : u_2[c];
+                        if (last) A[(R + k) * R + c] = scale * u; else slope[to][k * R + c] = rise * u;
+                    }}
+                }}
+            }}
+            NSF_SYNC;
+        }}
+"""
 
 
 @cache
@@ -307,7 +440,7 @@ def make_projection(precision: Precision, widths: tuple[int, ...], latents: int,
     its derivative goes forward with its value. Without iterations the kernel only evaluates a and A.
 
     Args:
-        precision: of the closure; sums and the solution are fp64.
+        precision: of the closure; sums over modes and the solution are fp64.
         widths: of the closure's layers (r, hidden..., K − r); empty without one.
         latents: r.
         modes: K.
@@ -315,158 +448,146 @@ def make_projection(precision: Precision, widths: tuple[int, ...], latents: int,
     Source: paper section 5.3.
     """
     real = precision.real
-    R, K, C = latents, modes, latents + 1
-    widest = max((*widths[1:], 1))
-    size = 4 if precision.name == "fp32" else 8
-    splits = max(1, min(PROJECTION_BLOCK // widest, _PARTIAL_BYTES // (widest * C * size)))
-    layers, offset = "", 0
-    for n, (inputs, outputs) in enumerate(itertools.pairwise(widths)):
-        last = "true" if n == len(widths) - 2 else "false"
-        layers += f"layer({inputs}, {outputs}, weights.data + {offset}, {last});\n"
-        offset += (inputs + 1) * outputs
-    scalar = "float" if precision.name == "fp32" else "double"
+    widest = max((*widths[:-1], latents))
+    kept = 8 * modes**2 <= _GRAM_BYTES
+    closure = ""
+    if widths:
+        closure = _CLOSURE.format(layers=len(widths) - 1, widths="{" + ", ".join(map(str, widths)) + "}")
     snippet = f"""
-    typedef {scalar} real;
+    typedef {_scalar(precision)} real;
+    typedef float slope_t;  // as Warp takes float(x) for its own
 #if defined(__CUDA_ARCH__)
     #define NSF_SHARED __shared__
     #define NSF_SYNC __syncthreads()
-    const int lane = threadIdx.x, lanes = blockDim.x;
+    const int lane = threadIdx.x, lanes = blockDim.x, PARTS = {_PARTS};
 #else
     #define NSF_SHARED
     #define NSF_SYNC
-    const int lane = 0, lanes = 1;
+    const int lane = 0, lanes = 1, PARTS = 1;
+    auto rsqrt = [](double value) {{ return 1.0 / sqrt(value); }};
 #endif
-    const int R = {R}, K = {K}, C = {C}, S = {splits};
-    NSF_SHARED real h[{max(widest, R) * C}], partial[{splits * widest * C}];
-    NSF_SHARED double x[R], a_n[K], at[K], A[K * R], q[K], M[K * R], g[R], H[R * R];
-    NSF_SHARED double error;
+    const int R = {latents}, K = {modes}, C = R + 1;
+    NSF_SHARED real value[2][{widest}];
+    NSF_SHARED float slope[2][{widest} * R];
+    NSF_SHARED double x[R], moved[K], at[K], A[K * R], q[K], M[K * R], g[R], H[R * R], error;
     NSF_SHARED int going;
+    {"NSF_SHARED double gram[K * K];" if kept else "const double* gram = G.data;"}
 
-    // A layer of the closure and its tangents: column 0 is the value, column c the derivative along x_c.
-    // W is [in, out], followed by the biases.
-    auto layer = [&](int in, int out, const real* W, bool last) {{
-        const real* bias = W + in * out;
-        for (int e = lane; e < out * S; e += lanes) {{
-            const int o = e % out, part = e / out;
-            real sum[C];
-            for (int c = 0; c < C; ++c) sum[c] = real(0);
-            for (int i = part; i < in; i += S) {{
-                const real w = W[i * out + o];
-                for (int c = 0; c < C; ++c) sum[c] += w * h[i * C + c];
-            }}
-            for (int c = 0; c < C; ++c) partial[(part * out + o) * C + c] = sum[c];
-        }}
-        NSF_SYNC;
-        for (int o = lane; o < out; o += lanes) {{
-            real z[C];
-            for (int c = 0; c < C; ++c) z[c] = real(0);
-            for (int part = 0; part < S; ++part)
-                for (int c = 0; c < C; ++c) z[c] += partial[(part * out + o) * C + c];
-            z[0] += bias[o];
-            if (last) {{
-                at[R + o] = z[0];
-                for (int c = 1; c < C; ++c) A[(R + o) * R + c - 1] = z[c];
-            }} else {{
-                const real s = real(1) / (real(1) + exp(-z[0]));
-                const real slope = s * (real(1) + z[0] * (real(1) - s));
-                h[o * C] = z[0] * s;
-                for (int c = 1; c < C; ++c) h[o * C + c] = slope * z[c];
-            }}
-        }}
-        NSF_SYNC;
-    }};
     auto evaluate = [&]() {{
-        for (int e = lane; e < R * C; e += lanes) {{
-            const int i = e / C, c = e % C;
-            h[e] = c == 0 ? real(x[i]) : real(c - 1 == i);
-            if (c == 0) at[i] = sigma.data[i] * x[i];
-            else A[i * R + c - 1] = c - 1 == i ? sigma.data[i] : 0.0;
+        for (int e = lane; e < R * R; e += lanes) {{
+            const int i = e / R, c = e % R;
+            slope[0][e] = i == c ? 1.0f : 0.0f;
+            A[e] = i == c ? sigma.data[i] : 0.0;
+            if (c == 0) {{
+                value[0][i] = real(x[i]);
+                at[i] = sigma.data[i] * x[i];
+            }}
         }}
         NSF_SYNC;
-        {layers}
+        {closure}
     }};
-    // q = b - G da and the squared error.
+    // q = b - G da.
     auto residual = [&]() {{
+        for (int k = lane; k < K; k += lanes) moved[k] = at[k] - a.data[k];
+        NSF_SYNC;
         for (int k = lane; k < K; k += lanes) {{
             double sum = b.data[k];
-            for (int j = 0; j < K; ++j) sum -= G.data[j * K + k] * (at[j] - a_n[j]);
+            #pragma unroll 8
+            for (int j = 0; j < K; ++j) sum -= gram[j * K + k] * moved[j];
             q[k] = sum;
         }}
         NSF_SYNC;
-        if (lane == 0) {{
-            double sum = b.data[K];
-            for (int k = 0; k < K; ++k) sum -= (at[k] - a_n[k]) * (b.data[k] + q[k]);
-            error = sum > 0.0 ? sum : (sum <= 0.0 ? 0.0 : sum);
-        }}
-        NSF_SYNC;
+    }};
+    // The squared error, of which q is known.
+    auto left = [&]() {{
+        double sum = b.data[K];
+        #pragma unroll 8
+        for (int k = 0; k < K; ++k) sum -= moved[k] * (b.data[k] + q[k]);
+        return sum > 0.0 ? sum : (sum <= 0.0 ? 0.0 : sum);  // a NaN stays one
     }};
 
     for (int i = lane; i < R; i += lanes) x[i] = latent.data[i];
-    for (int k = lane; k < K; k += lanes) a_n[k] = at[k] = a.data[k];
+    for (int k = lane; k < K; k += lanes) at[k] = a.data[k];
     for (int e = lane; e < K * R; e += lanes) A[e] = tangents.data[e];
+    {"for (int e = lane; e < K * K; e += lanes) gram[e] = G.data[e];" if kept else ""}
     if (lane == 0) going = 1;
     NSF_SYNC;
-    if (iterations == 0) evaluate();
     const long long n = row.data[0];
     int done = 0;
-    for (; done < iterations; ++done) {{
-        residual();
-        for (int e = lane; e < K * R; e += lanes) {{
-            const int k = e / R, c = e % R;
-            double sum = 0.0;
-            for (int j = 0; j < K; ++j) sum += G.data[j * K + k] * A[j * R + c];
-            M[e] = sum;
-        }}
-        NSF_SYNC;
-        for (int e = lane; e < R * C; e += lanes) {{
-            const int c = e / C, d = e % C;
-            double sum = 0.0;
-            for (int k = 0; k < K; ++k) sum += A[k * R + c] * (d < R ? M[k * R + d] : q[k]);
-            if (d < R) H[c * R + d] = sum; else g[c] = sum;
-        }}
-        NSF_SYNC;
-        if (lane == 0) {{
-            // Cholesky in place; a matrix that is not positive definite gives a NaN, not a wrong update.
-            double L[R * R], u[R], length = 0.0, change = 0.0;
-            for (int i = 0; i < R; ++i)
-                for (int j = 0; j <= i; ++j) {{
-                    double sum = H[i * R + j];
-                    for (int m = 0; m < j; ++m) sum -= L[i * R + m] * L[j * R + m];
-                    L[i * R + j] = i == j ? sqrt(sum) : sum / L[j * R + j];
+    do {{
+        if (iterations > 0) {{
+            residual();
+            for (int e = lane; e < K * R; e += lanes) {{
+                const int k = e / R, c = e % R;
+                double sum = 0.0;
+                #pragma unroll 8
+                for (int j = 0; j < K; ++j) sum += gram[j * K + k] * A[j * R + c];
+                M[e] = sum;
+            }}
+            if (lane == lanes - 1) error = left();
+            NSF_SYNC;
+            for (int e = lane; e < R * C; e += lanes) {{
+                const int c = e / C, d = e % C;
+                double sum = 0.0;
+                #pragma unroll 8
+                for (int k = 0; k < K; ++k) sum += A[k * R + c] * (d < R ? M[k * R + d] : q[k]);
+                if (d < R) H[c * R + d] = sum; else g[c] = sum;
+            }}
+            NSF_SYNC;
+            if (lane == 0) {{
+                // Cholesky; a matrix that is not positive definite gives a NaN, not a wrong update.
+                double L[R][R], inverse[R], u[R], length = 0.0, change = 0.0;
+                #pragma unroll
+                for (int i = 0; i < R; ++i) {{
+                    #pragma unroll
+                    for (int j = 0; j <= i; ++j) {{
+                        double sum = H[i * R + j];
+                        #pragma unroll
+                        for (int m = 0; m < j; ++m) sum -= L[i][m] * L[j][m];
+                        if (i == j) inverse[i] = rsqrt(sum);
+                        else L[i][j] = sum * inverse[j];
+                    }}
                 }}
-            for (int i = 0; i < R; ++i) {{
-                double sum = g[i];
-                for (int m = 0; m < i; ++m) sum -= L[i * R + m] * u[m];
-                u[i] = sum / L[i * R + i];
-                change += u[i] * u[i];
+                #pragma unroll
+                for (int i = 0; i < R; ++i) {{
+                    double sum = g[i];
+                    #pragma unroll
+                    for (int m = 0; m < i; ++m) sum -= L[i][m] * u[m];
+                    u[i] = sum * inverse[i];
+                    change += u[i] * u[i];
+                }}
+                #pragma unroll
+                for (int i = R - 1; i >= 0; --i) {{
+                    double sum = u[i];
+                    #pragma unroll
+                    for (int m = i + 1; m < R; ++m) sum -= L[m][i] * u[m];
+                    u[i] = sum * inverse[i];
+                    length += u[i] * u[i];
+                    x[i] += u[i];
+                }}
+                length = sqrt(length);
+                residuals.data[n * (iterations + 1) + done] = real(sqrt(error / sample));
+                updates.data[n * iterations + done] = real(length);
+                // What a linearised model leaves: |e - J u|² = |e|² - uᵀ(AᵀG A)u at the minimum.
+                if (linear) error = error > change ? error - change : 0.0;
+                going = !(length <= tolerance);
             }}
-            for (int i = R - 1; i >= 0; --i) {{
-                double sum = u[i];
-                for (int m = i + 1; m < R; ++m) sum -= L[m * R + i] * u[m];
-                u[i] = sum / L[i * R + i];
-                length += u[i] * u[i];
-            }}
-            for (int i = 0; i < R; ++i) x[i] += u[i];
-            length = sqrt(length);
-            residuals.data[n * (iterations + 1) + done] = real(sqrt(error / sample));
-            updates.data[n * iterations + done] = real(length);
-            // What a linearised model leaves: |e - J u|² = |e|² - uᵀ(AᵀG A)u at the minimum.
-            if (linear) error = error > change ? error - change : 0.0;
-            going = !(length <= tolerance);
+            NSF_SYNC;
         }}
-        NSF_SYNC;
         evaluate();
-        NSF_SYNC;
-        if (!going) {{ ++done; break; }}
-    }}
-    if (iterations > 0 && !linear) residual();
-    if (lane == 0 && iterations > 0) {{
-        for (int i = done; i <= iterations; ++i)
-            residuals.data[n * (iterations + 1) + i] = real(sqrt(error / sample));
-        for (int i = done; i < iterations; ++i) updates.data[n * iterations + i] = real(0);
-        row.data[0] = n + 1;
-        first.data[0] = 0;
-        step.data[0] += 1;
+        ++done;
+    }} while (going && done < iterations);
+    if (iterations > 0) {{
+        residual();
+        if (lane == 0) {{
+            if (!linear) error = left();
+            for (int i = done; i <= iterations; ++i)
+                residuals.data[n * (iterations + 1) + i] = real(sqrt(error / sample));
+            for (int i = done; i < iterations; ++i) updates.data[n * iterations + i] = real(0);
+            row.data[0] = n + 1;
+            first.data[0] = 0;
+            step.data[0] += 1;
+        }}
     }}
     for (int i = lane; i < R; i += lanes) {{
         if (iterations > 0) {{
@@ -477,7 +598,7 @@ def make_projection(precision: Precision, widths: tuple[int, ...], latents: int,
         latent.data[i] = x[i];
     }}
     for (int k = lane; k < K; k += lanes) {{
-        rate.data[k] = (at[k] - a_n[k]) / dt;
+        rate.data[k] = (at[k] - a.data[k]) / dt;
         a.data[k] = at[k];
     }}
     for (int e = lane; e < K * R; e += lanes) tangents.data[e] = A[e];
@@ -487,7 +608,8 @@ def make_projection(precision: Precision, widths: tuple[int, ...], latents: int,
 
     @wp.func_native(snippet)
     def solve(
-        weights: wp.array(dtype=real),
+        weights: wp.array(dtype=wp.float32),
+        scale: wp.float64,
         sigma: wp.array(dtype=wp.float64),
         G: wp.array(dtype=wp.float64),
         b: wp.array(dtype=wp.float64),
@@ -510,9 +632,10 @@ def make_projection(precision: Precision, widths: tuple[int, ...], latents: int,
         step: wp.array(dtype=wp.int32),
     ): ...
 
-    @wp.kernel(enable_backward=False, module="unique", launch_bounds=PROJECTION_BLOCK)
+    @wp.kernel(enable_backward=False, module="unique", launch_bounds=projection_block(widths))
     def projection(
-        weights: wp.array(dtype=real),
+        weights: wp.array(dtype=wp.float32),
+        scale: wp.float64,
         sigma: wp.array(dtype=wp.float64),
         G: wp.array(dtype=wp.float64),
         b: wp.array(dtype=wp.float64),
@@ -535,7 +658,7 @@ def make_projection(precision: Precision, widths: tuple[int, ...], latents: int,
         step: wp.array(dtype=wp.int32),
     ):
         solve(
-            weights, sigma, G, b, sample, iterations, tolerance, linear, dt, latent, a, tangents, rate,
+            weights, scale, sigma, G, b, sample, iterations, tolerance, linear, dt, latent, a, tangents, rate,
             xhat, xhat_previous, xhats, residuals, updates, row, first, step,
         )  # fmt: skip
 

@@ -239,12 +239,14 @@ class ModalFactors:
     Attributes:
         mean: [n, c] in the unit of the field; modes: [n, c, K] as trained, in fp32.
         leading: σ [r] of the coefficients that are latents; [0] for h and l.
+        scale: of the others, with which the network's last layer was multiplied.
         network: of the others, in raw units; None if there is none.
     """
 
     mean: Tensor
     modes: Tensor
     leading: Tensor
+    scale: float
     network: FullyConnected | None
 
 
@@ -326,9 +328,8 @@ class BasisManifold(Manifold):
         else:
             base = points if name == "deformation" else 0
             mean, modes = field.mean[rows], field.modes[rows]
-        return ModalFactors(
-            (base + mean).to(like), modes.to(device), field.leading, self._deployed(phase, like)
-        )
+        network, scale = self._deployed(phase, like), float(field.scale)
+        return ModalFactors((base + mean).to(like), modes.to(device), field.leading, scale, network)
 
     def _deployed(self, phase: str, like: Tensor) -> FullyConnected | None:
         """The phase's network from (xhat, μ) to coefficients in the field's unit."""

@@ -178,4 +178,4 @@ def test_a_step_started_from_latents_is_the_one_of_the_run(strategy, tiny, tiny_
         error, J = other.equations_at(n, latents[n], latents[n - 1])
         assert len(error) == (20 if n < 12 else 8)
         update = torch.linalg.lstsq(J.flatten(0, 1), error.flatten()[:, None]).solution[:, 0]
-        torch.testing.assert_close(latents[n] + update, latents[n + 1], rtol=0, atol=1e-9)
+        torch.testing.assert_close(latents[n] + update, latents[n + 1], rtol=0, atol=1e-7)  # fp32 tangents

@@ -39,7 +39,7 @@ def runs(solvers, steps=24):
     return [solver.trajectory() for solver in solvers]
 
 
-def same(one, other, tolerance=1e-9):
+def same(one, other, tolerance=2e-7):
     np.testing.assert_allclose(one.xhat, other.xhat, rtol=0, atol=tolerance)
     np.testing.assert_allclose(one.residuals, other.residuals, rtol=1e-4, atol=1e-3 * tolerance)
     # After convergence the one counts round-off and the other nothing.
@@ -50,7 +50,7 @@ def same(one, other, tolerance=1e-9):
 @pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
 def test_every_method(pair, method):
     # The modes of ∂g/∂X are rounded to fp32, as the others are from the start.
-    same(*runs(pair(method=method)), tolerance=1e-9 if method.neural_stress else 1e-6)
+    same(*runs(pair(method=method)), tolerance=2e-7 if method.neural_stress else 5e-6)
 
 
 @pytest.mark.parametrize("strategy", ["superset", "search"])
