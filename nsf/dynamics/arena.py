@@ -38,19 +38,21 @@ class Arena:
         return self.hold(torch.zeros(shape, device=self._torch), dtype)
 
     def modes(self, modes: torch.Tensor) -> torch.Tensor:
-        """Modes [n, c, K] in the order that the device reads best.
+        """Modes [n, c, K] in vectors of four, in the order that the device reads best, flat.
 
-        On a GPU the values of neighbouring particles lie side by side, on a CPU those of one particle do.
+        A GPU has the vectors of neighbouring particles side by side, [c, K/4, n, 4]; a CPU those of one
+        particle, [n, c, K/4, 4].
         """
-        if not self.device.is_cuda:
-            return self.hold(modes, torch.float32)
-        return self.hold(modes.permute(1, 2, 0), torch.float32).permute(2, 0, 1)
+        modes = torch.nn.functional.pad(modes, (0, -modes.shape[2] % 4)).unflatten(2, (-1, 4))
+        if self.device.is_cuda:
+            modes = modes.permute(1, 2, 0, 3)
+        return self.hold(modes, torch.float32).flatten()
 
     def lanes(self, count: int) -> int:
         """Threads that work on one result: `count` of a GPU, one of a CPU."""
         return count if self.device.is_cuda else 1
 
-    def pack(self, kernel, dim: int | tuple[int, ...], arguments: Sequence, block: int = 256) -> wp.Launch:
+    def pack(self, kernel, dim: int | tuple[int, ...], arguments: Sequence, block: int = 128) -> wp.Launch:
         """A launch whose arguments are packed once; tensors among them are shown to Warp as they are."""
         inputs = [wp.from_torch(a) if isinstance(a, torch.Tensor) else a for a in arguments]
         return wp.launch(

@@ -70,7 +70,7 @@ class ModalPhase(Phase):
         self._arena = arena = Arena(setting.precision, warp_device(str(setting.device)))
         deformation = manifold.factors("deformation", order, dtype=setting.dtype, device=setting.device)
         displacement = arena.modes(deformation.modes)
-        self.coefficients = state = Coefficients(arena, displacement.shape[2], manifold.latent_dim)
+        self.coefficients = state = Coefficients(arena, deformation.modes.shape[2], manifold.latent_dim)
         self._place = _placing(arena, state, deformation.mean, displacement, self)
         self._selection = Selection(arena, state, grid_step.grid, shape, sets, self.x)
         self.needed = self._selection.needed
@@ -166,7 +166,7 @@ class Selection:
         shared = [precision.real(1.0 / grid.geometry.dx), *box, state.step, stamps]
         around = (2 * reach + 1) ** 3
         self.launches = [
-            arena.pack(stamp, (len(sets.sample), around), [positions, *shared]),
+            arena.pack(stamp, len(sets.sample) * around, [positions, *shared]),
             arena.pack(select, len(x), [*shared, positions, self.needed, self.count]),
         ]
 
@@ -180,9 +180,9 @@ class Projection:
     """
 
     def __init__(self, arena, state, deformation, displacement, phase: Phase, weights: np.ndarray | None):
-        setting, s, K = phase.setting, phase.s, displacement.shape[2]
+        setting, s, K = phase.setting, phase.s, len(state.a)
         projector, record, r = setting.projector, setting.record, len(state.latent)
-        of_sample = displacement[:s]
+        of_sample = deformation.modes[:s]
         w = torch.ones(s) if weights is None else torch.as_tensor(weights / np.mean(weights))
         w = arena.hold(w, torch.float64)
         B = of_sample.double().flatten(0, 1)
@@ -193,11 +193,11 @@ class Projection:
         weights = [torch.cat([layer.weight.flatten(), layer.bias]) for layer in layers] or [torch.zeros(1)]
         weights[-1] = weights[-1] / deformation.scale  # as trained, so that fp32 holds them
         weights = arena.hold(torch.cat(weights), torch.float32)
-        lanes = arena.lanes(BLOCK)
+        lanes, velocity = arena.lanes(BLOCK), as_vectors(phase.v[:s], arena.precision)
         gather = arena.pack(
             make_gathering(arena.precision),
             (K + 1) * lanes,
-            [of_sample, as_vectors(phase.v[:s], arena.precision), w, wp.float64(setting.dt), lanes, b],
+            [displacement, len(phase.x), -(-K // 4), velocity, w, wp.float64(setting.dt), lanes, b],
             BLOCK,
         )
         kernel = make_projection(arena.precision, widths, r, K)
@@ -231,7 +231,7 @@ def _placing(arena: Arena, state: Coefficients, mean: torch.Tensor, modes: torch
     vectors = [as_vectors(a, arena.precision) for a in (phase.initial_velocity, phase.x, phase.v)]
     mean = as_vectors(arena.hold(mean, arena.real), arena.precision)
     inputs = [mean, modes, state.a, state.rate, vectors[0], state.first, *vectors[1:]]
-    return arena.pack(make_position(arena.precision), len(phase.x), inputs)
+    return arena.pack(make_position(arena.precision, -(-len(state.a) // 4)), len(phase.x), inputs)
 
 
 def _fields(arena, phase: ModalPhase, manifold, method: Method, order, parameters, material) -> list:
@@ -279,10 +279,10 @@ def _contraction(
     arena: Arena, phase: ModalPhase, factors: ModalFactors, a: torch.Tensor, found: torch.Tensor
 ):
     """The launch of a field with coefficients a at the needed particles."""
-    n, c, _ = factors.modes.shape
-    kernel = make_contraction(arena.precision, symmetric=c == 6, coefficients=wp.dtype_from_torch(a.dtype))
+    n, c, K = factors.modes.shape
+    kernel = make_contraction(arena.precision, -(-K // 4), c == 6, wp.dtype_from_torch(a.dtype))
     mean = arena.hold(factors.mean, arena.real)
-    return arena.pack(kernel, (c // 3, n), [phase.needed, mean, arena.modes(factors.modes), a, found])
+    return arena.pack(kernel, c // 3 * n, [phase.needed, mean, arena.modes(factors.modes), a, found])
 
 
 def _elastic(arena: Arena, phase: ModalPhase, material: Material, F: torch.Tensor):

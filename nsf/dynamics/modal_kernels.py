@@ -14,41 +14,57 @@ from nsf.mpm.shape import shape_functions
 
 WARP = 32  # threads that share a dot product on a GPU
 BLOCK = 128  # threads that share a sum over S
+_AHEAD = 4  # vectors of modes whose loads are under way together
 
 
-def _combination(coefficients: str, unroll: int = 16) -> str:
-    """Native code that adds Σ_k modes[p, c..c+2, k] a_k to one, two and three, for each a of a list.
+def _combination(names: str, coefficient: str) -> str:
+    """Native code of the sums name_1..name_3 = Σ_k modes[p, c..c+2, k] name_k, for each name.
 
-    In Warp's own loop each turn waits for its loads; here many are under way at once. The types of the sums
-    are `real`; a CPU may change the order of additions, so that it works on several at once.
+    The K modes lie in vectors of four, on a GPU those of neighbouring particles side by side (`Arena.modes`):
+    what is under way then covers the time that memory takes, even for few particles. A GPU first takes the
+    coefficients into shared memory; a particle that is not `live` only helps with that. A CPU may change the
+    order of additions, so that it works on several at once.
     """
-    names = coefficients.split()
-    sums = "".join(f"real {a}_1 = 0, {a}_2 = 0, {a}_3 = 0;" for a in names)
-    terms = "".join(
-        f"const real {a}_k = real({a}.data[k]);"
-        f"{a}_1 += one * {a}_k; {a}_2 += two * {a}_k; {a}_3 += three * {a}_k;"
-        for a in names
-    )
+    names = names.split()
+    each = "".join
+    sums = each(f"real {n}_1 = 0, {n}_2 = 0, {n}_3 = 0;" for n in names)
+
+    def terms(mode: str, coefficient: str) -> str:
+        return each(
+            f"{n}_{i + 1} += real({mode.format(i)}) * real({coefficient.format(n)});"
+            for n in names
+            for i in range(3)
+        )
+
+    of_four = each(terms(f"w{{}}.{x}", f"shared_{{}}[4 * q + {i}]") for i, x in enumerate("xyzw"))
+    shared = each(f"__shared__ {coefficient} shared_{n}[4 * Q];" for n in names)
+    filled = each(f"shared_{n}[k] = k < {n}.shape[0] ? {n}.data[k] : 0;" for n in names)
     return f"""
     {sums}
-    {{
 #if defined(__CUDA_ARCH__)
-        const size_t step = modes.strides[2];
-#else
-        #pragma clang fp reassociate(on)
-        const size_t step = sizeof(float);
-#endif
-        const size_t next = modes.strides[1];
-        const char* first = (const char*)modes.data + size_t(p) * modes.strides[0] + size_t(c) * next;
-        const int K = modes.shape[2];
-        #pragma unroll {unroll}
-        for (int k = 0; k < K; ++k) {{
-            const char* at = first + k * step;
-            const real one = real(*(const float*)at);
-            const real two = real(*(const float*)(at + next)), three = real(*(const float*)(at + 2 * next));
-            {terms}
+    {shared}
+    for (int k = threadIdx.x; k < 4 * Q; k += blockDim.x) {{ {filled} }}
+    __syncthreads();
+    if (live) {{
+        const float4* first = (const float4*)modes.data + size_t(c) * Q * particles + p;
+        #pragma unroll {_AHEAD}
+        for (int q = 0; q < Q; ++q) {{
+            const float4 w0 = __ldcs(first + size_t(q) * particles);
+            const float4 w1 = __ldcs(first + size_t(Q + q) * particles);
+            const float4 w2 = __ldcs(first + size_t(2 * Q + q) * particles);
+            {of_four}
         }}
     }}
+#else
+    if (live) {{
+        #pragma clang fp reassociate(on)
+        const wp::float32* first = modes.data + (size_t(p) * components + c) * 4 * Q;
+        for (int k = 0; k < {names[0]}.shape[0]; ++k) {{
+            const wp::float32 w0 = first[k], w1 = first[4 * Q + k], w2 = first[8 * Q + k];
+            {terms("w{}", "{}.data[k]")}
+        }}
+    }}
+#endif
 """
 
 
@@ -57,7 +73,7 @@ def _scalar(precision: Precision) -> str:
 
 
 @cache
-def make_position(precision: Precision):
+def make_position(precision: Precision, vectors: int):
     """Kernel of x and v at N, one thread a particle.
 
     x = mean + Σ_k b_k a_k and v = Σ_k b_k ȧ_k, where ȧ is the backward difference of a (paper section 5.1:
@@ -67,23 +83,25 @@ def make_position(precision: Precision):
     vec6 = wp.types.vector(length=6, dtype=real)
     snippet = f"""
     typedef {_scalar(precision)} real;
-    const int c = 0;
-    {_combination("a rate", 8)}
+    const int Q = {vectors}, c = 0, components = 3, particles = x.shape[0];
+    const bool live = true;
+    {_combination("a rate", "double")}
     return wp::vec_t<6, real>({{a_1, a_2, a_3, rate_1, rate_2, rate_3}});
     """
 
     @wp.func_native(snippet)
     def combined(
-        modes: wp.array3d(dtype=wp.float32),
+        modes: wp.array(dtype=wp.float32),
         a: wp.array(dtype=wp.float64),
         rate: wp.array(dtype=wp.float64),
+        x: wp.array(dtype=vec3),
         p: int,
     ) -> vec6: ...
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def position(
         mean: wp.array(dtype=vec3),
-        modes: wp.array3d(dtype=wp.float32),
+        modes: wp.array(dtype=wp.float32),
         a: wp.array(dtype=wp.float64),
         rate: wp.array(dtype=wp.float64),
         initial_velocity: wp.array(dtype=vec3),
@@ -92,7 +110,7 @@ def make_position(precision: Precision):
         v: wp.array(dtype=vec3),
     ):
         p = wp.tid()
-        moved = combined(modes, a, rate, p)
+        moved = combined(modes, a, rate, x, p)
         x[p] = mean[p] + vec3(moved[0], moved[1], moved[2])
         if first[0] != 0:
             v[p] = initial_velocity[p]
@@ -124,7 +142,7 @@ def make_selection(precision: Precision, shape_name: str):
             return -1
         return (at[0] * extent[1] + at[1]) * extent[2] + at[2]
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def stamp(
         x: wp.array(dtype=vec3),
         inv_dx: real,
@@ -133,14 +151,15 @@ def make_selection(precision: Precision, shape_name: str):
         step: wp.array(dtype=wp.int32),
         stamps: wp.array(dtype=wp.int32),
     ):
-        p, offset = wp.tid()
+        t = wp.tid()
+        p, offset = t / wp.static(across**3), t % wp.static(across**3)
         base = base_node(x[p], inv_dx)
         place = wp.vec3i(offset / (across * across), (offset / across) % across, offset % across)
         c = cell(base + place - wp.vec3i(reach, reach, reach), lower, extent)
         if c >= 0:
             stamps[c] = step[0]
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def select(
         inv_dx: real,
         lower: wp.vec3i,
@@ -169,37 +188,47 @@ def make_selection(precision: Precision, shape_name: str):
 
 
 @cache
-def make_contraction(precision: Precision, symmetric: bool, coefficients):
+def make_contraction(precision: Precision, vectors: int, symmetric: bool, coefficients):
     """Kernel of a matrix field at N, mean + Σ_k modes_k a_k, three components a thread.
 
     The six components of a symmetric field are xx xy xz yy yz zz, the nine of another go row by row.
     Particles that are not needed are passed over. `coefficients` is the type of a.
     """
     real, vec3 = precision.real, precision.vec3
+    scalar = {wp.float32: "float", wp.float64: "double"}[coefficients]
     snippet = f"""
     typedef {_scalar(precision)} real;
-    {_combination("a")}
+    const int Q = {vectors}, components = mean.shape[1], particles = mean.shape[0];
+    {_combination("a", scalar)}
     return wp::vec_t<3, real>(a_1, a_2, a_3);
     """
 
     @wp.func_native(snippet)
     def combined(
-        modes: wp.array3d(dtype=wp.float32), a: wp.array(dtype=coefficients), p: int, c: int
+        modes: wp.array(dtype=wp.float32),
+        mean: wp.array2d(dtype=real),
+        a: wp.array(dtype=coefficients),
+        p: int,
+        c: int,
+        live: bool,
     ) -> vec3: ...
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def contraction(
         needed: wp.array(dtype=wp.int32),
         mean: wp.array2d(dtype=real),
-        modes: wp.array3d(dtype=wp.float32),
+        modes: wp.array(dtype=wp.float32),
         a: wp.array(dtype=coefficients),
         found: wp.array3d(dtype=real),
     ):
-        group, p = wp.tid()
-        if needed[p] == 0:
-            return
+        t = wp.tid()
+        n = needed.shape[0]
+        group, p = t / n, t % n
         c = 3 * group
-        value = combined(modes, a, p, c)
+        live = needed[p] != 0
+        value = combined(modes, mean, a, p, c, live)
+        if not live:
+            return
         one, two, three = value[0] + mean[p, c], value[1] + mean[p, c + 1], value[2] + mean[p, c + 2]
         if wp.static(not symmetric):
             found[p, group, 0] = one
@@ -254,7 +283,7 @@ def make_layer(precision: Precision):
     def silu(z: real):
         return z / (real(1.0) + wp.exp(-z))
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def layer(
         W_1: wp.array2d(dtype=real),
         b_1: wp.array(dtype=real),
@@ -296,18 +325,21 @@ def make_gathering(precision: Precision):
     vec3 = precision.vec3
     snippet = """
     double sum = 0.0;
-    const size_t next = modes.strides[1];
-    const char* first = (const char*)modes.data + size_t(k) * modes.strides[2];
-    const bool of_mode = k < modes.shape[2];
     #pragma unroll 4
     for (int p = lane; p < weights.shape[0]; p += lanes) {
         const double x = double(v.data[p][0]), y = double(v.data[p][1]), z = double(v.data[p][2]);
         double one = dt * x, two = dt * y, three = dt * z;
-        if (of_mode) {
-            const char* at = first + size_t(p) * modes.strides[0];
-            one = double(*(const float*)at);
-            two = double(*(const float*)(at + next));
-            three = double(*(const float*)(at + 2 * next));
+        if (k < modes) {
+#if defined(__CUDA_ARCH__)
+            const size_t next = size_t(vectors) * particles * 4;
+            const wp::float32* at = displacement.data + (size_t(k / 4) * particles + p) * 4 + k % 4;
+#else
+            const size_t next = 4 * vectors;
+            const wp::float32* at = displacement.data + size_t(p) * 3 * next + k;
+#endif
+            one = at[0];
+            two = at[next];
+            three = at[2 * next];
         }
         sum += weights.data[p] * (one * x + two * y + three * z);
     }
@@ -325,7 +357,10 @@ def make_gathering(precision: Precision):
 
     @wp.func_native(snippet)
     def share(
-        modes: wp.array3d(dtype=wp.float32),
+        displacement: wp.array(dtype=wp.float32),
+        particles: int,
+        vectors: int,
+        modes: int,
         v: wp.array(dtype=vec3),
         weights: wp.array(dtype=wp.float64),
         dt: wp.float64,
@@ -334,9 +369,11 @@ def make_gathering(precision: Precision):
         lanes: int,
     ) -> wp.float64: ...
 
-    @wp.kernel(enable_backward=False, module="unique")
+    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def gathering(
-        modes: wp.array3d(dtype=wp.float32),
+        displacement: wp.array(dtype=wp.float32),
+        particles: int,
+        vectors: int,
         v: wp.array(dtype=vec3),
         weights: wp.array(dtype=wp.float64),
         dt: wp.float64,
@@ -345,7 +382,7 @@ def make_gathering(precision: Precision):
     ):
         t = wp.tid()
         k, lane = t / lanes, t % lanes
-        total = share(modes, v, weights, dt, k, lane, lanes)
+        total = share(displacement, particles, vectors, b.shape[0] - 1, v, weights, dt, k, lane, lanes)
         if lane == 0:
             b[k] = total
 
@@ -385,16 +422,27 @@ _CLOSURE = """
                 real v_1 = 0, v_2 = 0;
                 slope_t u_1[R], u_2[R];
                 for (int c = 0; c < R; ++c) u_1[c] = u_2[c] = 0.0f;
-                #pragma unroll 6
-                for (int i = part; i < in; i += PARTS) {{
-                    const slope_t w_1 = row_1[i], w_2 = row_2[i];
-                    const real h = value[from][i];
-                    v_1 += real(w_1) * h;
-                    v_2 += real(w_2) * h;
-                    for (int c = 0; c < R; ++c) {{
-                        const slope_t t = slope[from][i * R + c];
-                        u_1[c] += w_1 * t;
-                        u_2[c] += w_2 * t;
+                #pragma unroll 1
+                for (int start = part; start < in; start += PARTS * AHEAD) {{
+                    slope_t w_1[AHEAD], w_2[AHEAD];
+                    #pragma unroll
+                    for (int j = 0; j < AHEAD; ++j) {{
+                        const int i = start + j * PARTS;
+                        w_1[j] = i < in ? row_1[i] : 0.0f;
+                        w_2[j] = i < in ? row_2[i] : 0.0f;
+                    }}
+                    #pragma unroll
+                    for (int j = 0; j < AHEAD; ++j) {{
+                        const int i = start + j * PARTS;
+                        if (i >= in) break;
+                        const real h = value[from][i];
+                        v_1 += real(w_1[j]) * h;
+                        v_2 += real(w_2[j]) * h;
+                        const slope_t* t = slope[from] + i * ROW;
+                        for (int c = 0; c < R; ++c) {{
+                            u_1[c] += w_1[j] * t[c];
+                            u_2[c] += w_2[j] * t[c];
+                        }}
                     }}
                 }}
 #if defined(__CUDA_ARCH__)
@@ -418,7 +466,7 @@ _CLOSURE = """
                     if (last) at[R + k] = scale * z; else value[to][k] = z * s;
                     for (int c = 0; c < R; ++c) {{
                         const slope_t u = side == 0 ? u_1[c] : u_2[c];
-                        if (last) A[(R + k) * R + c] = scale * u; else slope[to][k * R + c] = rise * u;
+                        if (last) A[(R + k) * R + c] = scale * u; else slope[to][k * ROW + c] = rise * u;
                     }}
                 }}
             }}
@@ -467,8 +515,10 @@ def make_projection(precision: Precision, widths: tuple[int, ...], latents: int,
     auto rsqrt = [](double value) {{ return 1.0 / sqrt(value); }};
 #endif
     const int R = {latents}, K = {modes}, C = R + 1;
+    const int ROW = (R + 3) / 4 * 4;  // whole vectors of four
+    const int AHEAD = {min(18, -(-widest // _PARTS))};  // weights whose loads are under way together
     NSF_SHARED real value[2][{widest}];
-    NSF_SHARED float slope[2][{widest} * R];
+    NSF_SHARED alignas(16) slope_t slope[2][{widest} * ROW];
     NSF_SHARED double x[R], moved[K], at[K], A[K * R], q[K], M[K * R], g[R], H[R * R], error;
     NSF_SHARED int going;
     {"NSF_SHARED double gram[K * K];" if kept else "const double* gram = G.data;"}
@@ -476,7 +526,7 @@ def make_projection(precision: Precision, widths: tuple[int, ...], latents: int,
     auto evaluate = [&]() {{
         for (int e = lane; e < R * R; e += lanes) {{
             const int i = e / R, c = e % R;
-            slope[0][e] = i == c ? 1.0f : 0.0f;
+            slope[0][i * ROW + c] = i == c ? 1.0f : 0.0f;
             A[e] = i == c ? sigma.data[i] : 0.0;
             if (c == 0) {{
                 value[0][i] = real(x[i]);
@@ -632,7 +682,9 @@ def make_projection(precision: Precision, widths: tuple[int, ...], latents: int,
         step: wp.array(dtype=wp.int32),
     ): ...
 
-    @wp.kernel(enable_backward=False, module="unique", launch_bounds=projection_block(widths))
+    @wp.kernel(
+        enable_backward=False, module="unique", grid_stride=False, launch_bounds=projection_block(widths)
+    )
     def projection(
         weights: wp.array(dtype=wp.float32),
         scale: wp.float64,
