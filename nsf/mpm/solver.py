@@ -65,11 +65,20 @@ class GridStep:
 
     def p2g(self, x, v, C, tau, mass, volume0) -> None:
         """Particles → grid: mass, momentum and the impulse of the stress."""
+        self.clear(x)
+        self.scatter(x, v, C, tau, mass, volume0)
+
+    def clear(self, x) -> None:
+        """Zero the nodes of the last step and list the blocks that particles at x reach."""
         grid = self.grid
         grid.clear()
         if not grid.sparse:
             inputs = [x, grid.shape, grid.block_shape, self.dx, grid.marks, grid.blocks, grid.listed]
             wp.launch(self._reach, dim=x.shape[0], inputs=inputs, device=self.device)
+
+    def scatter(self, x, v, C, tau, mass, volume0) -> None:
+        """Add what particles carry to their nodes, which are clear."""
+        grid = self.grid
         inputs = [
             x,
             v,
