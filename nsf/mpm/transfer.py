@@ -12,7 +12,7 @@ import warp as wp
 from nsf.errors import ConfigError
 from nsf.mpm.access import make_add, make_load
 from nsf.mpm.grid import flat_index, inside, storage
-from nsf.mpm.materials import LawFunctions
+from nsf.mpm.materials import LawFunctions, make_law_update
 from nsf.mpm.precision import Precision
 from nsf.mpm.shape import DEGREES, shape_functions
 
@@ -233,7 +233,7 @@ def make_g2p_stress(precision: Precision, shape_name: str, law: LawFunctions, hi
     shape = shape_functions(precision, shape_name)
     base_node, width = shape.base_node, shape.degree + 1
     gather = make_gather(precision, shape_name)
-    tau_of, return_map, Params = law.tau_of, law.return_map, law.Params
+    law_update, Params = make_law_update(law, precision, history_size), law.Params
     vecH = wp.types.vector(length=history_size, dtype=real)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 4})
@@ -263,9 +263,9 @@ def make_g2p_stress(precision: Precision, shape_name: str, law: LawFunctions, hi
         v[p] = velocity
         x[p] = x[p] + dt * velocity
         C[p] = affine
-        F, h = return_map(f * F_e[p], history[p], mu[p], lam[p], params, dt)
+        F, h, stress = law_update(f * F_e[p], history[p], mu[p], lam[p], params, dt)
         F_e[p] = F
         history[p] = h
-        tau[p] = tau_of(F, h, mu[p], lam[p])
+        tau[p] = stress
 
     return g2p_stress
