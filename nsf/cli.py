@@ -38,6 +38,11 @@ TOOLS = {
         "the list of all reports, reports/index.md; check=true: whether one of them was changed since",
         "[folder=PATH] [check=true]; reports by default",
     ),
+    "bench": (
+        "time and memory of a step, kernel by kernel; writes reports/speed",
+        "[benches=full_order,scaling] [particles=10k,200k,1m] [precision=fp32,fp64] [device=auto]\n"
+        "       [trials=10] [folder=PATH]; sizes that suit the device by default",
+    ),
     "doctor": ("versions, devices, folders and extras of this installation", ""),
 }
 _EXAMPLES = """\
@@ -55,6 +60,7 @@ examples:
   nsf search scene=sand scene.parameters.validation=[27,31] latent_dim=4..8   the r of the smallest δ there
   nsf runs stage=evaluate scene=sand latent_dim=4 sort=delta   runs by what made them, the best first
   nsf runs diff 1a2b 3c4d                              what differs between two runs, in keys and in result
+  nsf bench particles=10k,40k precision=fp32           what a step costs on this machine, and its floor
 
 Results lie in ./runs (NSF_RUNS) and ./reports (NSF_REPORTS)."""
 
@@ -148,10 +154,22 @@ def _tool(name: str, words: list[str]) -> int:
 
         return live(name, text, words)
     tools = {
-        "doctor": _doctor, "export": _export, "index": _index,
+        "bench": _bench, "doctor": _doctor, "export": _export, "index": _index,
         "reports": _reports, "runs": _runs, "search": _search,
     }  # fmt: skip
     return tools[name](words)
+
+
+def _bench(words: list[str]) -> int:
+    """Benchmarks, and the report of all there are."""
+    asked = _asked("bench", words, "benches", "particles", "precision", "device", "trials", "folder")
+    from nsf.bench import bench, table
+
+    folder = asked.pop("folder", os.path.join(os.environ.get("NSF_REPORTS", "reports"), "speed"))
+    page = bench(folder, asked, lambda text: print(text, file=sys.stderr))
+    _console().print(table(page.with_name("results.csv")))
+    print(f"open {page.resolve()}")
+    return 0
 
 
 def _doctor(words: list[str]) -> int:

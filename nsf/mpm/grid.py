@@ -7,8 +7,16 @@ import numpy as np
 import warp as wp
 
 from nsf.errors import ConfigError
+from nsf.mpm.access import make_load
 from nsf.mpm.contact import SLIP, STICKY, make_contact
 from nsf.mpm.precision import Precision
+from nsf.mpm.shape import shape_functions
+
+#: Nodes along the edge of a block, the part of the grid that is cleared and updated as one.
+BLOCK = 4
+_BLOCK_NODES = BLOCK**3
+# Threads that share the nodes of the listed blocks: enough to fill a GPU, too few to be noticed.
+_THREADS = {"cuda": 2**17, "cpu": _BLOCK_NODES}
 
 
 @dataclass(frozen=True)
@@ -55,17 +63,22 @@ class GridGeometry:
 
 
 class Grid:
-    """Mass and momentum (then velocity) of the grid's nodes, on one device.
+    """Momentum (then velocity) and mass of the grid's nodes, on one device.
 
     Stored for every node of the box, or only for the nodes listed (a reduced model
     touches few). The kernels find a node's storage through `slots`.
 
+    Of a box, a step clears and updates only the blocks of 4³ nodes that particles reach. They are
+    found on the device, so a captured step finds them anew; all other nodes stay zero.
+
     Attributes:
         geometry: spacing and node counts.
-        mass: [n] m_i [kg].
-        momentum: [n, 3] m_i v_i [kg m/s] after P2G, v_i [m/s] after the update.
+        values: [n, 4] m_i v_i [kg m/s] after P2G, v_i [m/s] after the update; last m_i [kg].
         nodes: [n] flat node index of each stored node; empty when every node is stored.
         slots: [all nodes] storage index or −1; empty when every node is stored.
+        marks: [all blocks] 1 for a block that is listed; empty where nodes are listed, as the next two.
+        blocks: [all blocks] flat indices of the listed blocks, in any order.
+        listed: [1] their number.
     """
 
     def __init__(self, geometry: GridGeometry, precision: Precision, device, nodes: np.ndarray | None = None):
@@ -79,23 +92,59 @@ class Grid:
         self.nodes = wp.array(nodes if self.sparse else np.zeros(0), dtype=wp.int32, device=device)
         self.slots = wp.array(slots, dtype=wp.int32, device=device)
         self.shape = wp.vec3i(*geometry.nodes)
-        self.mass = wp.zeros(count, dtype=precision.real, device=device)
-        self.momentum = wp.zeros(count, dtype=precision.vec3, device=device)
+        self.values = wp.zeros(count, dtype=precision.vec4, device=device)
+        edges = tuple(-(-n // BLOCK) for n in geometry.nodes)
+        blocks = 0 if self.sparse else int(np.prod(edges))
+        self.block_shape = wp.vec3i(*edges)
+        self.marks, self.blocks = (wp.zeros(blocks, dtype=wp.int32, device=device) for _ in range(2))
+        self.listed = wp.zeros(min(blocks, 1), dtype=wp.int32, device=device)
+        most = _THREADS["cuda" if self.values.device.is_cuda else "cpu"]
+        #: Threads of a kernel over the nodes of a step.
+        self.threads = count if self.sparse else min(blocks * _BLOCK_NODES, most)
+        self._precision = precision
+        self._clear = make_clear(precision)
 
     @property
     def count(self) -> int:
         """Number of stored nodes."""
-        return self.mass.shape[0]
+        return self.values.shape[0]
+
+    @property
+    def mass(self) -> wp.array:
+        """[n] m_i [kg]; a view, for as long as the grid lives."""
+        return self._view(self._precision.real, 3)
+
+    @property
+    def momentum(self) -> wp.array:
+        """[n, 3] m_i v_i [kg m/s] after P2G, v_i [m/s] after the update; a view, as `mass`."""
+        return self._view(self._precision.vec3, 0)
+
+    def _view(self, dtype, column: int) -> wp.array:
+        values = self.values
+        ptr = values.ptr + column * np.dtype(self._precision.numpy).itemsize
+        return wp.array(
+            ptr=ptr, dtype=dtype, shape=values.shape, strides=values.strides, device=values.device
+        )
 
     @property
     def nbytes(self) -> int:
         """Bytes on the device."""
-        return sum(a.capacity for a in (self.mass, self.momentum, self.nodes, self.slots))
+        own = (self.values, self.nodes, self.slots, self.marks, self.blocks, self.listed)
+        return sum(a.capacity for a in own)
+
+    @property
+    def stored(self) -> list:
+        """What the kernels find the nodes of a step by, in their order."""
+        return [self.nodes, self.slots, self.blocks, self.listed, self.shape, self.block_shape, self.threads]
 
     def clear(self) -> None:
-        """Zero mass and momentum."""
-        self.mass.zero_()
-        self.momentum.zero_()
+        """Zero momentum and mass, and list no block."""
+        if self.sparse:
+            self.values.zero_()
+            return
+        inputs = [*self.stored, self.marks, self.values]
+        wp.launch(self._clear, dim=self.threads, inputs=inputs, device=self.values.device)
+        self.listed.zero_()
 
 
 @wp.func
@@ -135,6 +184,95 @@ def storage(flat: int, slots: wp.array(dtype=wp.int32)):
     return slot
 
 
+@wp.func
+def nodes_of_step(nodes: wp.array(dtype=wp.int32), listed: wp.array(dtype=wp.int32)):
+    """Number of nodes that a step works on: of a list those stored, of a box those in the listed blocks."""
+    if listed.shape[0] > 0:
+        return listed[0] * wp.static(_BLOCK_NODES)
+    return nodes.shape[0]
+
+
+@wp.func
+def node_of_step(
+    index: int,
+    nodes: wp.array(dtype=wp.int32),
+    blocks: wp.array(dtype=wp.int32),
+    shape: wp.vec3i,
+    block_shape: wp.vec3i,
+):
+    """Flat index of the `index`-th of these nodes, −1 where a block reaches over the edge of the box."""
+    if nodes.shape[0] > 0:
+        return nodes[index]
+    block = node_of(blocks[index / wp.static(_BLOCK_NODES)], block_shape)
+    within = node_of(index % wp.static(_BLOCK_NODES), wp.vec3i(BLOCK, BLOCK, BLOCK))
+    i = BLOCK * block[0] + within[0]
+    j = BLOCK * block[1] + within[1]
+    k = BLOCK * block[2] + within[2]
+    if i >= shape[0] or j >= shape[1] or k >= shape[2]:
+        return -1
+    return flat_index(i, j, k, shape)
+
+
+@cache
+def make_clear(precision: Precision):
+    """Kernel that zeroes the nodes of the listed blocks and takes the blocks' marks away."""
+    vec4 = precision.vec4
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def clear(
+        nodes: wp.array(dtype=wp.int32),
+        slots: wp.array(dtype=wp.int32),
+        blocks: wp.array(dtype=wp.int32),
+        listed: wp.array(dtype=wp.int32),
+        shape: wp.vec3i,
+        block_shape: wp.vec3i,
+        threads: int,
+        marks: wp.array(dtype=wp.int32),
+        values: wp.array(dtype=vec4),
+    ):
+        index = wp.tid()
+        count = nodes_of_step(nodes, listed)
+        while index < count:
+            marks[blocks[index / wp.static(_BLOCK_NODES)]] = 0
+            flat = node_of_step(index, nodes, blocks, shape, block_shape)
+            if flat >= 0:
+                values[storage(flat, slots)] = vec4()
+            index += threads
+
+    return clear
+
+
+@cache
+def make_reach(precision: Precision, shape_name: str):
+    """Kernel that lists the blocks which hold a node of a particle's stencil, one thread a particle."""
+    real, vec3 = precision.real, precision.vec3
+    shape = shape_functions(precision, shape_name)
+    base_node, width = shape.base_node, shape.degree + 1
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def reach(
+        x: wp.array(dtype=vec3),
+        shape: wp.vec3i,
+        block_shape: wp.vec3i,
+        dx: real,
+        marks: wp.array(dtype=wp.int32),
+        blocks: wp.array(dtype=wp.int32),
+        listed: wp.array(dtype=wp.int32),
+    ):
+        base = base_node(x[wp.tid()], real(1.0) / dx)
+        if not inside(base, width, shape):
+            return
+        for i in range(base[0] / BLOCK, (base[0] + width - 1) / BLOCK + 1):
+            for j in range(base[1] / BLOCK, (base[1] + width - 1) / BLOCK + 1):
+                for k in range(base[2] / BLOCK, (base[2] + width - 1) / BLOCK + 1):
+                    block = flat_index(i, j, k, block_shape)
+                    # Read first: nearly every particle finds its blocks marked, and an atomic costs more.
+                    if marks[block] == 0 and wp.atomic_cas(marks, block, 0, 1) == 0:
+                        blocks[wp.atomic_add(listed, 0, 1)] = block
+
+    return reach
+
+
 @cache
 def make_grid_update(precision: Precision):
     """Kernel of the grid update: momentum → velocity, gravity, walls, colliders.
@@ -148,15 +286,20 @@ def make_grid_update(precision: Precision):
 
     Source: paper section 3.3, step 2.
     """
-    real, vec3, mat33 = precision.real, precision.vec3, precision.mat33
+    real, vec3, vec4, mat33 = precision.real, precision.vec3, precision.vec4, precision.mat33
     outward_normal, against = make_contact(precision)
+    load = make_load(precision)
 
     @wp.kernel(enable_backward=False, module="unique")
     def grid_update(
-        mass: wp.array(dtype=real),
-        momentum: wp.array(dtype=vec3),
         nodes: wp.array(dtype=wp.int32),
+        slots: wp.array(dtype=wp.int32),
+        blocks: wp.array(dtype=wp.int32),
+        listed: wp.array(dtype=wp.int32),
         shape: wp.vec3i,
+        block_shape: wp.vec3i,
+        threads: int,
+        values: wp.array(dtype=vec4),
         dx: real,
         dt: real,
         gravity: vec3,
@@ -172,37 +315,39 @@ def make_grid_update(precision: Precision):
         wall_kind: int,
         wall_padding: int,
     ):
-        slot = wp.tid()
-        m = mass[slot]
-        if m <= real(0.0):
-            return
-        flat = slot
-        if nodes.shape[0] > 0:
-            flat = nodes[slot]
-        node = node_of(flat, shape)
-        v = momentum[slot] / m + dt * gravity
-        x = dx * vec3(real(node[0]), real(node[1]), real(node[2]))
-        for c in range(collider_shape.shape[0]):
-            if collider_active[c] != 0:
-                arm = x - collider_position[c]
-                normal = outward_normal(
-                    collider_shape[c], arm, collider_orientation[c], collider_extents[c], dx
-                )
-                if wp.length_sq(normal) > real(0.0):
-                    solid = collider_velocity[c] + collider_gradient[c] * arm
-                    v = solid + against(v - solid, normal, collider_kind[c], collider_friction[c])
-        for axis in range(3):
-            low = node[axis] < wall_padding
-            high = node[axis] >= shape[axis] - wall_padding
-            if low or high:
-                if wall_kind == wp.static(STICKY):
-                    v = vec3()
-                elif (
-                    wall_kind == wp.static(SLIP)
-                    or (low and v[axis] < real(0.0))
-                    or (high and v[axis] > real(0.0))
-                ):
-                    v[axis] = real(0.0)
-        momentum[slot] = v
+        index = wp.tid()
+        count = nodes_of_step(nodes, listed)
+        while index < count:
+            flat = node_of_step(index, nodes, blocks, shape, block_shape)
+            index += threads
+            value = vec4()
+            if flat >= 0:
+                value = load(values, storage(flat, slots))
+            if value[3] > real(0.0):
+                node = node_of(flat, shape)
+                v = vec3(value[0], value[1], value[2]) / value[3] + dt * gravity
+                x = dx * vec3(real(node[0]), real(node[1]), real(node[2]))
+                for c in range(collider_shape.shape[0]):
+                    if collider_active[c] != 0:
+                        arm = x - collider_position[c]
+                        normal = outward_normal(
+                            collider_shape[c], arm, collider_orientation[c], collider_extents[c], dx
+                        )
+                        if wp.length_sq(normal) > real(0.0):
+                            solid = collider_velocity[c] + collider_gradient[c] * arm
+                            v = solid + against(v - solid, normal, collider_kind[c], collider_friction[c])
+                for axis in range(3):
+                    low = node[axis] < wall_padding
+                    high = node[axis] >= shape[axis] - wall_padding
+                    if low or high:
+                        if wall_kind == wp.static(STICKY):
+                            v = vec3()
+                        elif (
+                            wall_kind == wp.static(SLIP)
+                            or (low and v[axis] < real(0.0))
+                            or (high and v[axis] > real(0.0))
+                        ):
+                            v[axis] = real(0.0)
+                values[storage(flat, slots)] = vec4(v[0], v[1], v[2], value[3])
 
     return grid_update

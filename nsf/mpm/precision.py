@@ -17,6 +17,7 @@ class Precision:
         name: `fp32` or `fp64`.
         real: Warp scalar.
         vec3: Warp 3-vector.
+        vec4: Warp 4-vector.
         mat33: Warp 3×3 matrix, row major.
         numpy: NumPy scalar type.
     """
@@ -24,12 +25,13 @@ class Precision:
     name: str
     real: Any
     vec3: Any
+    vec4: Any
     mat33: Any
     numpy: Any
 
 
-FP32 = Precision("fp32", wp.float32, wp.vec3f, wp.mat33f, np.float32)
-FP64 = Precision("fp64", wp.float64, wp.vec3d, wp.mat33d, np.float64)
+FP32 = Precision("fp32", wp.float32, wp.vec3f, wp.vec4f, wp.mat33f, np.float32)
+FP64 = Precision("fp64", wp.float64, wp.vec3d, wp.vec4d, wp.mat33d, np.float64)
 _BY_NAME = {"fp32": FP32, "fp64": FP64}
 
 

@@ -1,6 +1,7 @@
 """The full-order material point method (paper section 3.3)."""
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 
 import numpy as np
 import warp as wp
@@ -9,7 +10,7 @@ from nsf.errors import ConfigError, InstabilityError, ShapeError
 from nsf.mpm.boundary import BoundaryArrays, DomainWalls
 from nsf.mpm.colliders import Collider
 from nsf.mpm.device import warp_device
-from nsf.mpm.grid import Grid, GridGeometry, make_grid_update
+from nsf.mpm.grid import Grid, GridGeometry, make_grid_update, make_reach
 from nsf.mpm.materials import Material, make_elastic_stress, make_stress_update
 from nsf.mpm.precision import Precision, precision_of
 from nsf.mpm.stability import (
@@ -20,8 +21,8 @@ from nsf.mpm.stability import (
     wave_speed_at,
 )
 from nsf.mpm.state import ParticleConstants, ParticleState
-from nsf.mpm.transfer import Transfer, make_g2p, make_p2g
-from nsf.timing import StageTimer, untimed
+from nsf.mpm.transfer import Transfer, make_g2p, make_g2p_stress, make_p2g
+from nsf.timing import StageTimer
 
 _NEVER = 2**31 - 1
 
@@ -59,12 +60,25 @@ class GridStep:
         self.affine_shares = tuple(real(s) for s in transfer.affine_shares)
         self._p2g = make_p2g(precision, transfer.shape, transfer.deterministic)
         self._g2p = make_g2p(precision, transfer.shape)
+        self._reach = make_reach(precision, transfer.shape)
         self._update = make_grid_update(precision)
 
     def p2g(self, x, v, C, tau, mass, volume0) -> None:
         """Particles → grid: mass, momentum and the impulse of the stress."""
+        self.clear(x)
+        self.scatter(x, v, C, tau, mass, volume0)
+
+    def clear(self, x) -> None:
+        """Zero the nodes of the last step and list the blocks that particles at x reach."""
         grid = self.grid
         grid.clear()
+        if not grid.sparse:
+            inputs = [x, grid.shape, grid.block_shape, self.dx, grid.marks, grid.blocks, grid.listed]
+            wp.launch(self._reach, dim=x.shape[0], inputs=inputs, device=self.device)
+
+    def scatter(self, x, v, C, tau, mass, volume0) -> None:
+        """Add what particles carry to their nodes, which are clear."""
+        grid = self.grid
         inputs = [
             x,
             v,
@@ -76,8 +90,7 @@ class GridStep:
             grid.slots,
             self.dx,
             self.dt,
-            grid.mass,
-            grid.momentum,
+            grid.values,
         ]
         wp.launch(self._p2g, dim=x.shape[0], inputs=inputs, device=self.device)
 
@@ -85,25 +98,21 @@ class GridStep:
         """Momentum → velocity at the next time level, boundaries included, which move on by a step."""
         grid = self.grid
         self.boundaries.advance(self._seconds)
-        inputs = [grid.mass, grid.momentum, grid.nodes, grid.shape, self.dx, self.dt, self.gravity]
-        wp.launch(self._update, dim=grid.count, inputs=inputs + self.boundaries.arguments, device=self.device)
+        inputs = [*grid.stored, grid.values, self.dx, self.dt, self.gravity]
+        wp.launch(
+            self._update, dim=grid.threads, inputs=inputs + self.boundaries.arguments, device=self.device
+        )
 
     def g2p(self, x, v, C, increment) -> None:
         """Grid → particles: velocity, position, affine momentum, deformation increment."""
-        grid = self.grid
-        inputs = [
-            grid.momentum,
-            grid.shape,
-            grid.slots,
-            self.dx,
-            self.dt,
-            *self.affine_shares,
-            x,
-            v,
-            C,
-            increment,
-        ]
+        inputs = [*self.gathering, x, v, C, increment]
         wp.launch(self._g2p, dim=x.shape[0], inputs=inputs, device=self.device)
+
+    @property
+    def gathering(self) -> list:
+        """What G2P gathers from and with, in the kernels' order."""
+        grid = self.grid
+        return [grid.values, grid.shape, grid.slots, self.dx, self.dt, *self.affine_shares]
 
 
 class FullOrderMPM:
@@ -178,6 +187,7 @@ class FullOrderMPM:
         self.grid_step = GridStep(self.grid, boundaries, transfer, gravity, dt, self.precision, self.device)
         law = material.functions(self.precision)
         self._stress_update = make_stress_update(law, self.precision, material.history_size)
+        self._g2p_stress = make_g2p_stress(self.precision, transfer.shape, law, material.history_size)
         self._params = material.params(self.precision)
         self._check = make_particle_check(self.precision, transfer.shape)
         self._first_bad = wp.full(2, _NEVER, dtype=wp.int32, device=self.device)
@@ -241,29 +251,31 @@ class FullOrderMPM:
 
     def _advance(self) -> None:
         if not self.device.is_cuda:
-            self._run_stages()
+            self._run()
         elif self._graph is None:
             # The first step runs uncaptured, so that every kernel is compiled and loaded.
-            self._run_stages()
+            self._run()
             with wp.ScopedCapture(device=self.device) as capture:
-                self._run_stages()
+                self._run()
             self._graph = capture.graph
         else:
             wp.capture_launch(self._graph)
 
+    def _run(self) -> None:
+        self.p2g()
+        self.grid_step.update()
+        self.g2p_stress()
+
     def timed_step(self, timer: StageTimer) -> None:
         """One step, stage by stage under a timer; never from a captured graph."""
-        self._run_stages(timer)
-        self.steps_taken += 1
-
-    def _run_stages(self, timer: Callable = untimed) -> None:
         for name, stage in self.stages.items():
             with timer(name):
                 stage()
+        self.steps_taken += 1
 
     @property
     def stages(self) -> dict[str, Callable[[], None]]:
-        """One step, stage by stage, in order."""
+        """One step, stage by stage, in order; `step` makes one pass of the last two."""
         return {"p2g": self.p2g, "grid": self.grid_step.update, "g2p": self.g2p, "stress": self.update_stress}
 
     def p2g(self) -> None:
@@ -271,15 +283,27 @@ class FullOrderMPM:
         s = self.state
         self.grid_step.p2g(s.x, s.v, s.C, s.tau, self.mass, self.volume0)
 
+    def g2p_stress(self) -> None:
+        """Grid → particles, F_e ← returnMap(f F_e), τ ← τ(F_e)."""
+        s = self.state
+        inputs = [*self.grid_step.gathering, self.mu, self.lam, self._params]
+        inputs += [s.x, s.v, s.C, s.F_e, s.history, s.tau]
+        wp.launch(self._g2p_stress, dim=len(s), inputs=inputs, device=self.device)
+
+    @cached_property
+    def increment(self) -> wp.array:
+        """[P, 3, 3] f = I + Δt ∇v of the last step that was taken stage by stage; `step` needs none."""
+        return wp.empty_like(self.state.F_e)
+
     def g2p(self) -> None:
         """Grid → particles."""
         s = self.state
-        self.grid_step.g2p(s.x, s.v, s.C, s.increment)
+        self.grid_step.g2p(s.x, s.v, s.C, self.increment)
 
     def update_stress(self) -> None:
         """F_e ← returnMap(f F_e), τ ← τ(F_e)."""
         s = self.state
-        inputs = [s.increment, self.mu, self.lam, self._params, self.grid_step.dt, s.F_e, s.history, s.tau]
+        inputs = [self.increment, self.mu, self.lam, self._params, self.grid_step.dt, s.F_e, s.history, s.tau]
         wp.launch(self._stress_update, dim=len(s), inputs=inputs, device=self.device)
 
     def elastic_cfl(self) -> float:

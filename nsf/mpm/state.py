@@ -49,7 +49,6 @@ class ParticleState:
         x, v: [P, 3] position [m] and velocity [m/s].
         C: [P, 3, 3] affine momentum [1/s].
         F_e: [P, 3, 3] elastic deformation gradient.
-        increment: [P, 3, 3] I + Δt ∇v of the last step.
         tau: [P, 3, 3] Kirchhoff stress [Pa].
         history: [P] vectors of the law's history variables.
     """
@@ -61,7 +60,6 @@ class ParticleState:
         self.v = wp.array(v, dtype=precision.vec3, device=device)
         self.C = wp.zeros(P, dtype=precision.mat33, device=device)
         self.F_e = wp.array(identity, dtype=precision.mat33, device=device)
-        self.increment = wp.array(identity, dtype=precision.mat33, device=device)
         self.tau = wp.zeros(P, dtype=precision.mat33, device=device)
         width = history.shape[1]
         self.history = wp.array(
@@ -74,9 +72,7 @@ class ParticleState:
     @property
     def nbytes(self) -> int:
         """Bytes on the device."""
-        return sum(
-            a.capacity for a in (self.x, self.v, self.C, self.F_e, self.increment, self.tau, self.history)
-        )
+        return sum(a.capacity for a in (self.x, self.v, self.C, self.F_e, self.tau, self.history))
 
     def numpy(self) -> dict[str, np.ndarray]:
         """Host copies: x, v [P, 3], C, F_e, tau [P, 3, 3], history [P, H]."""

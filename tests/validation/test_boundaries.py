@@ -26,7 +26,9 @@ def update(
 ):
     """Velocity of every node [9, 9, 9, 3] after a grid update that starts from v at every node."""
     types = precision_of(precision)
-    grid = Grid(GridGeometry.of_domain((1.0, 1.0, 1.0), DX), types, "cpu")
+    geometry = GridGeometry.of_domain((1.0, 1.0, 1.0), DX)
+    # Every node is listed: of a box, only blocks that particles reach are updated.
+    grid = Grid(geometry, types, "cpu", nodes=np.arange(geometry.count))
     boundaries = BoundaryArrays(colliders, walls, types, "cpu")
     step = GridStep(grid, boundaries, Transfer(), gravity, 0.1, types, wp.get_device("cpu"))
     grid.mass.fill_(mass)

@@ -34,7 +34,9 @@ Z = (0.0, 0.0, 1.0)
 def updated(v, colliders, step=0, dt=0.01, precision="fp64"):
     """Velocity of the nodes [15, 15, 15, 3] after grid update number `step`, from v at every node."""
     types = precision_of(precision)
-    grid = Grid(GridGeometry.of_domain((1.0, 1.0, 1.0), DX), types, "cpu")
+    geometry = GridGeometry.of_domain((1.0, 1.0, 1.0), DX)
+    # Every node is listed: of a box, only blocks that particles reach are updated.
+    grid = Grid(geometry, types, "cpu", nodes=np.arange(geometry.count))
     boundaries = BoundaryArrays(colliders, DomainWalls("separate", 1), types, "cpu")
     work = GridStep(grid, boundaries, Transfer(), (0.0, 0.0, 0.0), dt, types, wp.get_device("cpu"))
     boundaries.steps.fill_(step)

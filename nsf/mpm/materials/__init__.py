@@ -1,6 +1,12 @@
 """Constitutive laws (paper, appendix "Elasticity and plasticity details")."""
 
-from nsf.mpm.materials.base import LawFunctions, Material, make_elastic_stress, make_stress_update
+from nsf.mpm.materials.base import (
+    LawFunctions,
+    Material,
+    make_elastic_stress,
+    make_law_update,
+    make_stress_update,
+)
 from nsf.mpm.materials.driver import PATHS, deformation_path, drive
 from nsf.mpm.materials.drucker_prager import DruckerPrager
 from nsf.mpm.materials.fixed_corotated import FixedCorotated
@@ -22,5 +28,6 @@ __all__ = [
     "deformation_path",
     "drive",
     "make_elastic_stress",
+    "make_law_update",
     "make_stress_update",
 ]

@@ -20,13 +20,16 @@ class LawFunctions:
 
     Attributes:
         tau_of: (F_e, history, mu, lam) → Kirchhoff stress [Pa].
-        return_map: (F_trial, history, mu, lam, params, dt) → (F_e, history).
+        return_map: (F_trial, history, mu, lam, params, dt) → (F_e, history); None where `update` is given.
         Params: Warp struct of the law's constants.
+        update: (F_trial, history, mu, lam, params, dt) → (F_e, history, tau), of a law whose return map and
+            stress share work; by default the one after the other.
     """
 
     tau_of: Any
     return_map: Any
     Params: Any
+    update: Any = None
 
 
 @dataclass(frozen=True)
@@ -149,6 +152,23 @@ class Material(ABC):
 
 
 @cache
+def make_law_update(law: LawFunctions, precision: Precision, history_size: int):
+    """Warp function (F_trial, history, mu, lam, params, dt) → (F_e, history, τ): the constitutive update."""
+    if law.update is not None:
+        return law.update
+    tau_of, return_map, Params = law.tau_of, law.return_map, law.Params
+    real, mat33 = precision.real, precision.mat33
+    vecH = wp.types.vector(length=history_size, dtype=real)
+
+    @wp.func
+    def update(F_trial: mat33, history: vecH, mu: real, lam: real, params: Params, dt: real):
+        F, h = return_map(F_trial, history, mu, lam, params, dt)
+        return F, h, tau_of(F, h, mu, lam)
+
+    return update
+
+
+@cache
 def make_stress_update(law: LawFunctions, precision: Precision, history_size: int):
     """Kernel of the constitutive update, one thread a particle: one kernel a law and precision.
 
@@ -156,7 +176,7 @@ def make_stress_update(law: LawFunctions, precision: Precision, history_size: in
 
     Source: paper section 3.3, step 3.
     """
-    tau_of, return_map, Params = law.tau_of, law.return_map, law.Params
+    law_update, Params = make_law_update(law, precision, history_size), law.Params
     real, mat33 = precision.real, precision.mat33
     vecH = wp.types.vector(length=history_size, dtype=real)
 
@@ -172,10 +192,10 @@ def make_stress_update(law: LawFunctions, precision: Precision, history_size: in
         tau: wp.array(dtype=mat33),
     ):
         p = wp.tid()
-        F, h = return_map(increment[p] * F_e[p], history[p], mu[p], lam[p], params, dt)
+        F, h, stress = law_update(increment[p] * F_e[p], history[p], mu[p], lam[p], params, dt)
         F_e[p] = F
         history[p] = h
-        tau[p] = tau_of(F, h, mu[p], lam[p])
+        tau[p] = stress
 
     return update
 

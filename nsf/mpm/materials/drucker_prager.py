@@ -9,36 +9,34 @@ import warp as wp
 
 from nsf.errors import ConfigError
 from nsf.mpm.materials.base import LawFunctions, Material
-from nsf.mpm.materials.hencky import from_log_strain, hencky_stretches, hencky_tau, log_strain
+from nsf.mpm.materials.hencky import hencky_stretches, hencky_tau, hencky_update
 from nsf.mpm.precision import Precision
 
 
 @cache
 def _functions(precision: Precision) -> LawFunctions:
-    real, vec3, mat33 = precision.real, precision.vec3, precision.mat33
+    real, vec3 = precision.real, precision.vec3
     vecH = wp.types.vector(length=1, dtype=real)
-    decompose, compose = log_strain(precision), from_log_strain(precision)
 
     @wp.struct
     class Params:
         alpha: real
 
     @wp.func
-    def return_map(F_trial: mat33, history: vecH, mu: real, lam: real, params: Params, dt: real):
-        U, eps, V = decompose(F_trial)
+    def flow(eps: vec3, history: vecH, mu: real, lam: real, params: Params):
         trace = eps[0] + eps[1] + eps[2]
         # No cohesion: under expansion the material carries nothing (tested before the cone).
         if trace > real(0.0):
-            return U * wp.transpose(V), history
+            return vec3(), history
         third = trace / real(3.0)
         deviator = eps - vec3(third, third, third)
         size = wp.length(deviator)
         excess = size + params.alpha * (real(3.0) * lam + real(2.0) * mu) * trace / (real(2.0) * mu)
         if excess <= real(0.0):
-            return F_trial, history
-        return compose(U, eps - (excess / size) * deviator, V), history
+            return eps, history
+        return eps - (excess / size) * deviator, history
 
-    return LawFunctions(hencky_tau(precision), return_map, Params)
+    return LawFunctions(hencky_tau(precision), None, Params, hencky_update(precision, flow, Params))
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,20 @@ def from_log_strain(precision: Precision):
 
 
 @cache
+def principal_tau(precision: Precision):
+    """Warp function (U, ε, mu, lam) → τ = U (2μ̂ ε + λ tr(ε) 1) Uᵀ, `hencky_tau` of principal log strains."""
+    real, vec3, mat33 = precision.real, precision.vec3, precision.mat33
+
+    @wp.func
+    def tau_of(U: mat33, eps: vec3, mu: real, lam: real):
+        trace = eps[0] + eps[1] + eps[2]
+        principal = real(2.0) * mu * eps + lam * trace * vec3(real(1.0), real(1.0), real(1.0))
+        return U * wp.diag(principal) * wp.transpose(U)
+
+    return tau_of
+
+
+@cache
 def hencky_tau(precision: Precision):
     """Warp function τ = U (2μ̂ ε + λ tr(ε) 1) Uᵀ with ε = log Σ, F = U Σ Vᵀ.
 
@@ -46,18 +60,43 @@ def hencky_tau(precision: Precision):
     neither symmetric nor objective; with Uᵀ it is the Kirchhoff stress of the energy
     ψ = μ̂ tr(ε²) + λ/2 tr(ε)².
     """
-    real, vec3, mat33 = precision.real, precision.vec3, precision.mat33
+    real, mat33 = precision.real, precision.mat33
     vecH = wp.types.vector(length=1, dtype=real)
-    decompose = log_strain(precision)
+    decompose, stress = log_strain(precision), principal_tau(precision)
 
     @wp.func
     def tau_of(F: mat33, history: vecH, mu: real, lam: real):
         U, eps, _ = decompose(F)
-        trace = eps[0] + eps[1] + eps[2]
-        principal = real(2.0) * mu * eps + lam * trace * vec3(real(1.0), real(1.0), real(1.0))
-        return U * wp.diag(principal) * wp.transpose(U)
+        return stress(U, eps, mu, lam)
 
     return tau_of
+
+
+def hencky_update(precision: Precision, flow, Params):
+    """Warp function of the constitutive update of a law over Hencky elasticity: F_trial is decomposed once.
+
+    The flow is along the principal directions of F_trial = U exp(ε) Vᵀ, which F_e therefore shares.
+
+    Args:
+        precision: floating-point types.
+        flow: Warp function (ε, history, mu, lam, params) → (ε, history); ε as it was where nothing flows.
+        Params: Warp struct of the law's constants.
+    """
+    real, mat33 = precision.real, precision.mat33
+    vecH = wp.types.vector(length=1, dtype=real)
+    decompose, compose = log_strain(precision), from_log_strain(precision)
+    stress = principal_tau(precision)
+
+    @wp.func
+    def update(F_trial: mat33, history: vecH, mu: real, lam: real, params: Params, dt: real):
+        U, eps, V = decompose(F_trial)
+        left, h = flow(eps, history, mu, lam, params)
+        tau = stress(U, left, mu, lam)
+        if left == eps:
+            return F_trial, h, tau
+        return compose(U, left, V), h, tau
+
+    return update
 
 
 def hencky_stretches(principal: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ import warp as wp
 
 from nsf.errors import ConfigError
 from nsf.mpm.materials.base import LawFunctions, Material
-from nsf.mpm.materials.hencky import from_log_strain, hencky_stretches, hencky_tau, log_strain
+from nsf.mpm.materials.hencky import hencky_stretches, hencky_tau, hencky_update
 from nsf.mpm.precision import Precision
 
 
@@ -18,7 +18,6 @@ def _functions(precision: Precision) -> LawFunctions:
     real, vec3, mat33 = precision.real, precision.vec3, precision.mat33
     vecH = wp.types.vector(length=1, dtype=real)
     elastic_tau = hencky_tau(precision)
-    decompose, compose = log_strain(precision), from_log_strain(precision)
 
     @wp.struct
     class Params:
@@ -31,24 +30,32 @@ def _functions(precision: Precision) -> LawFunctions:
             return mat33()
         return elastic_tau(F, history, mu, lam)
 
+    # Both are written so that a NaN counts neither as damaged nor as elastic, and reaches the solver's check.
     @wp.func
-    def return_map(F_trial: mat33, history: vecH, mu: real, lam: real, params: Params, dt: real):
+    def flow(eps: vec3, history: vecH, mu: real, lam: real, params: Params):
         tau_Y = history[0]
-        # Written so that a NaN counts neither as damaged nor as elastic, and reaches the solver's check.
-        if tau_Y <= real(0.0):
-            return wp.identity(n=3, dtype=real), history
-        U, eps, V = decompose(F_trial)
         third = (eps[0] + eps[1] + eps[2]) / real(3.0)
         deviator = eps - vec3(third, third, third)
         size = wp.length(deviator)
         if real(2.0) * mu * size <= tau_Y:
-            return F_trial, history
-        flow = size - tau_Y / (real(2.0) * mu)
-        # The return removes `flow` along a unit direction, so ‖ε − proj ε‖ is `flow` itself.
-        tau_Y = tau_Y + (real(2.0) * mu * params.hardening - params.softening) * flow
-        return compose(U, eps - (flow / size) * deviator, V), vecH(tau_Y)
+            return eps, history
+        flowed = size - tau_Y / (real(2.0) * mu)
+        # The return removes `flowed` along a unit direction, so ‖ε − proj ε‖ is `flowed` itself.
+        tau_Y = tau_Y + (real(2.0) * mu * params.hardening - params.softening) * flowed
+        return eps - (flowed / size) * deviator, vecH(tau_Y)
 
-    return LawFunctions(tau_of, return_map, Params)
+    whole = hencky_update(precision, flow, Params)
+
+    @wp.func
+    def update(F_trial: mat33, history: vecH, mu: real, lam: real, params: Params, dt: real):
+        if history[0] <= real(0.0):
+            return wp.identity(n=3, dtype=real), history, mat33()
+        F_e, h, tau = whole(F_trial, history, mu, lam, params, dt)
+        if h[0] <= real(0.0):
+            tau = mat33()
+        return F_e, h, tau
+
+    return LawFunctions(tau_of, None, Params, update)
 
 
 @dataclass(frozen=True)

@@ -187,9 +187,9 @@ def test_time_and_bytes(falling_sand):
     solver = falling_sand()
     solver.step(3)
     assert solver.time == pytest.approx(0.006)
-    # 17³ nodes of mass and momentum, and 200 particles, in 8-byte reals.
-    assert solver.grid.nbytes == 17**3 * 4 * 8
-    assert solver.nbytes > solver.grid.nbytes + 200 * (3 + 3 + 4 * 9) * 8
+    # 17³ nodes of mass and momentum in 8-byte reals, a mark and an entry of a list for each of 5³ blocks.
+    assert solver.grid.nbytes == 17**3 * 4 * 8 + (5**3 * 2 + 1) * 4
+    assert solver.nbytes > solver.grid.nbytes + 200 * (3 + 3 + 3 * 9) * 8
 
 
 # -- the elastic CFL number in motion -------------------------------------------------------------------

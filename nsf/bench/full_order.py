@@ -1,0 +1,116 @@
+"""A full-order step: a block of dry sand that collapses, at several sizes."""
+
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from nsf.bench.measure import bandwidth, build, pass_time, step_times
+from nsf.bench.rows import KernelRow, Result, Row, Settings, commit, size_name
+from nsf.mpm import (
+    DomainWalls,
+    FullOrderMPM,
+    GridGeometry,
+    HalfSpace,
+    ParticleConstants,
+)
+from nsf.mpm.grid import BLOCK
+from nsf.mpm.materials import DruckerPrager
+from nsf.scenes import Box
+
+SIZES = {"cuda": (71_000, 200_000, 1_000_000), "cpu": (10_000, 40_000)}
+_CELLS = 160  # along the edge of the domain, the paper's grid
+_PARTICLES_PER_CELL = 8
+_FLOOR = 4  # [cells]
+_SAND = DruckerPrager(E=2000.0, nu=0.2, friction_angle=30.0)
+_DENSITY, _GRAVITY, _DT = 200.0, (0.0, 0.0, -4.0), 6e-4
+
+
+def collapse(particles: int, precision: str, device: str) -> FullOrderMPM:
+    """A cube of sand on the floor of the unit cube, 8 particles a cell, just let go.
+
+    The grid is the paper's, 160³, whatever the number of particles; the sand is that of the scene `sand`.
+    """
+    dx = 1.0 / _CELLS
+    edge = dx * (particles / _PARTICLES_PER_CELL) ** (1.0 / 3.0)
+    low = (0.5 - edge / 2, 0.5 - edge / 2, _FLOOR * dx)
+    X = Box(low, tuple(a + edge for a in low)).sample(particles)
+    volume0 = np.full(particles, edge**3 / particles)
+    moduli = (np.full(particles, m) for m in (_SAND.mu, _SAND.lam))
+    return FullOrderMPM(
+        ParticleConstants(X, _DENSITY * volume0, volume0, *moduli),
+        _SAND,
+        GridGeometry.of_domain((1.0, 1.0, 1.0), dx),
+        _DT,
+        gravity=_GRAVITY,
+        colliders=[HalfSpace(low, (0.0, 0.0, 1.0), "sticky")],
+        walls=DomainWalls(),
+        precision=precision,
+        device=device,
+    )
+
+
+def run(settings: Settings, say: Callable[[str], None]) -> Result:
+    """Every size; the precisions of a size turn by turn."""
+    kind = "cuda" if settings.device.startswith("cuda") else "cpu"
+    return measured("full_order", settings.particles or SIZES[kind], settings, say)
+
+
+def measured(bench: str, sizes, settings: Settings, say: Callable[[str], None]) -> Result:
+    """Steps and their passes at each size, under the name of a benchmark."""
+    found, device = Result(), settings.device
+    speed = bandwidth(device)
+    say(f"{bench}: a copy on {device} moves {speed / 1e9:.0f} GB/s")
+    for particles in sizes:
+        built = {p: build(partial(collapse, particles, p, device), device) for p in settings.precisions}
+        solvers = {precision: solver for precision, (solver, _) in built.items()}
+        times = step_times(solvers, settings.trials, device)
+        for precision, (solver, peak_mib) in built.items():
+            same = dict(
+                bench=bench, case=f"full_order_{size_name(particles)}", particles=particles,
+                precision=precision, device=device, commit=commit(),
+            )  # fmt: skip
+            p10, median, p90 = np.percentile(times[precision], [10, 50, 90]).tolist()
+            row = Row(
+                **same, sample=None, integration=None, batch=1, delta=None,
+                ms_median=median, ms_p10=p10, ms_p90=p90, peak_mib=peak_mib,
+            )  # fmt: skip
+            found.rows.append(row)
+            say(f"{row.case} {precision}: {median:.4g} ms a step")
+            for kernel, (ms, size) in pass_times(solver).items():
+                mib, gb_per_s, floor_ms = size / 2**20, size / ms / 1e6, 1e3 * size / speed
+                found.kernels.append(
+                    KernelRow(**same, kernel=kernel, ms=ms, mib=mib, gb_per_s=gb_per_s, floor_ms=floor_ms)
+                )
+    return found
+
+
+def pass_times(solver: FullOrderMPM) -> dict[str, tuple[float, int]]:
+    """Median time [ms] of each pass of a step over memory, in order, and the bytes it has to read and write.
+
+    A value counts once however often it is read, a node of the grid once for all its particles. A pass that
+    is repeated on its own is a step of nothing: the solver's state is of no use afterwards.
+    """
+    P, H = len(solver.state), solver.material.history_size
+    s, step, device = solver.state, solver.grid_step, str(solver.device)
+    solver.p2g()
+    nodes = BLOCK**3 * int(solver.grid.listed.numpy()[0])
+    values = {
+        "clear": 3 * P + 4 * nodes,  # x; the nodes
+        "p2g": 26 * P + 8 * nodes,  # x, v, C, τ, m, V; the nodes, there and back
+        "grid": 8 * nodes,
+        "g2p_stress": (14 + H) * P + 4 * nodes + (33 + H) * P,  # x, F_e, h, μ̂, λ; v_i; x, v, C, F_e, h, τ
+    }
+    calls = {
+        "clear": lambda: step.clear(s.x),
+        "p2g": lambda: step.scatter(s.x, s.v, s.C, s.tau, solver.mass, solver.volume0),
+        "grid": step.update,
+        "g2p_stress": solver.g2p_stress,
+    }
+    found = {}
+    for name, call in calls.items():
+        solver.p2g()  # the pass before has left nothing that has a meaning
+        if name == "g2p_stress":
+            step.update()
+        found[name] = pass_time(call, device), np.dtype(solver.precision.numpy).itemsize * values[name]
+    return found

@@ -1,0 +1,84 @@
+"""Times of calls: turn by turn, after a warm-up, around a synchronised device."""
+
+import gc
+import time
+from collections.abc import Callable, Mapping
+
+import numpy as np
+import warp as wp
+
+from nsf.timing import MemoryProbe, synchronizer
+
+_TRIAL_SECONDS = 0.05  # of a trial, at least: the clock and the last synchronisation are lost in it
+_MOST_STEPS = 100
+_WARM_UP = 3  # steps that compile, load and capture
+_COPY_BYTES = {"cuda": 2**30, "cpu": 2**27}  # larger than any cache
+_REPEATS = 10  # of a pass in one graph, so that launching it costs nothing
+
+
+def build(make: Callable[[], object], device: str) -> tuple[object, float]:
+    """A solver that has taken its first steps, and its peak memory [MiB] beyond what was held before."""
+    gc.collect()
+    with MemoryProbe(device) as before:
+        pass
+    solver = None
+    with MemoryProbe(device, nbytes=lambda: solver.nbytes) as probe:
+        solver = make()
+        solver.step(_WARM_UP)
+    return solver, probe.peak_mib - before.peak_mib
+
+
+def step_times(solvers: Mapping[str, object], trials: int, device: str) -> dict[str, np.ndarray]:
+    """[trials] mean time of a step [ms] of each solver, turn by turn, so that what slows one slows all."""
+    wait = synchronizer(device)
+
+    def trial(solver, steps: int) -> float:
+        wait()
+        begun = time.perf_counter()
+        solver.step(steps)
+        wait()
+        return 1e3 * (time.perf_counter() - begun) / steps
+
+    steps = {}
+    for name, solver in solvers.items():
+        once = min(trial(solver, 1) for _ in range(2))
+        steps[name] = int(np.clip(np.ceil(1e3 * _TRIAL_SECONDS / once), 1, _MOST_STEPS))
+    found = {name: [] for name in solvers}
+    for _ in range(trials):
+        for name, solver in solvers.items():
+            found[name].append(trial(solver, steps[name]))
+    return {name: np.array(times) for name, times in found.items()}
+
+
+def pass_time(call: Callable[[], None], device: str, trials: int = 5) -> float:
+    """Median time of one call of kernels [ms]; on a GPU from a graph of many."""
+    wait = synchronizer(device)
+
+    def many() -> None:
+        for _ in range(_REPEATS):
+            call()
+
+    call()
+    if wp.get_device(device).is_cuda:
+        with wp.ScopedCapture(device=device) as capture:
+            many()
+
+        def many() -> None:
+            wp.capture_launch(capture.graph)
+
+        many()
+    times = []
+    for _ in range(trials):
+        wait()
+        begun = time.perf_counter()
+        many()
+        wait()
+        times.append(1e3 * (time.perf_counter() - begun) / _REPEATS)
+    return float(np.median(times))
+
+
+def bandwidth(device: str) -> float:
+    """Bytes a second that a copy reads and writes on the device [B/s]."""
+    size = _COPY_BYTES["cuda" if wp.get_device(device).is_cuda else "cpu"]
+    source, target = (wp.zeros(size // 4, dtype=wp.float32, device=device) for _ in range(2))
+    return 2.0 * size / (1e-3 * pass_time(lambda: wp.copy(target, source), device))

@@ -1,0 +1,146 @@
+"""The report of all benchmarks: tables, and charts beside the floor that the memory sets."""
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from rich.box import SIMPLE_HEAD
+from rich.table import Table
+
+from nsf.reporting.columns import number
+from nsf.reporting.style import INK, figure, line_style, save, stage_colors, styled
+from nsf.reporting.tables import markdown_rows
+from nsf.storage import writing
+
+_HEADINGS = {
+    "ms_median": "step, median [ms]",
+    "ms_p10": "10 % [ms]",
+    "ms_p90": "90 % [ms]",
+    "peak_mib": "peak memory [MiB]",
+    "delta": "δ",
+    "sample": "|S|",
+    "integration": "|N|",
+    "ms": "time [ms]",
+    "mib": "moved [MiB]",
+    "gb_per_s": "bandwidth [GB/s]",
+    "floor_ms": "floor [ms]",
+}
+_TEXT = ("bench", "case", "precision", "device", "kernel", "commit")
+_LEAD = (
+    "Time of a step, both sides of a ratio measured in one process turn by turn, after a warm-up, around a "
+    "synchronised device: the median over the trials, each the mean of many steps. Memory is the peak of "
+    "every allocator beyond what was held before the solver was built. `nsf bench` writes this report."
+)
+_KERNELS = (
+    "Each pass of a full-order step on its own. Moved: what it has to read and write, each value once. "
+    "Floor: the time that these bytes take a copy measured in the same run; a step cannot be faster than "
+    "the floors of its passes together as long as its state does not fit into a cache."
+)
+
+
+def write_report(folder: Path) -> Path:
+    """Charts and index.md from results.csv and kernels.csv of a folder."""
+    results, kernels = (pd.read_csv(folder / name) for name in ("results.csv", "kernels.csv"))
+    parts = ["# Speed", _LEAD]
+    for device in results["device"].unique():
+        rows, passes = (frame[frame["device"] == device] for frame in (results, kernels))
+        stem = device.replace(":", "")
+        parts.append(f"## On {device}")
+        with styled():
+            save(step_over_particles(rows, passes), folder, f"step-{stem}")
+            save(passes_beside_floor(passes), folder, f"kernels-{stem}")
+        caption = "Time of a step over the number of particles; dashed: the floor that the bandwidth sets."
+        parts += [f"![{caption}](step-{stem}.png)", caption, _markdown(rows)]
+        caption = "Time of each pass of a full-order step; the mark is its floor."
+        parts += [f"![{caption}](kernels-{stem}.png)", caption, _KERNELS, _markdown(passes)]
+    page = folder / "index.md"
+    with writing(page) as partial:
+        partial.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+    return page
+
+
+def step_over_particles(results: pd.DataFrame, kernels: pd.DataFrame) -> Figure:
+    """Time of a step [ms] over P, both axes logarithmic: a line for each kind of solver and precision.
+
+    Args:
+        results: rows of one device.
+        kernels: passes of its full-order steps, whose floors add up to that of a step.
+    """
+    series = results.assign(solver=[_solver(case) for case in results["case"]])
+    with styled():
+        fig = figure(4.4)
+        panel = fig.subplots()
+        colors = {}
+        lines = series.groupby(["solver", "precision"], sort=False)
+        for i, ((solver, precision), part) in enumerate(lines):
+            # A size that two benchmarks have counts by its best median.
+            part = part.sort_values("ms_median").drop_duplicates("particles").sort_values("particles")
+            style = line_style(i)
+            P, median = part["particles"], part["ms_median"]
+            panel.fill_between(P, part["ms_p10"], part["ms_p90"], color=style["color"], alpha=0.18, lw=0)
+            panel.plot(P, median, marker="o", ms=4.5, label=f"{solver}, {precision}", **style)
+            colors[solver, precision] = style["color"]
+        for precision, part in kernels.groupby("precision", sort=True):
+            floor = part.groupby(["bench", "particles"])["floor_ms"].sum().groupby("particles").mean()
+            panel.plot(
+                floor.index, floor, ls=(0, (5, 2)), lw=1.2, color=colors["full-order", precision],
+                label=f"full-order floor, {precision}",
+            )  # fmt: skip
+        panel.set(xscale="log", yscale="log", xlabel="particles P [–]", ylabel="time of a step [ms]")
+        panel.grid(which="major")
+        fig.legend(loc="outside upper left", ncols=3, handlelength=2.6)
+    return fig
+
+
+def passes_beside_floor(kernels: pd.DataFrame) -> Figure:
+    """Time [ms] of the passes of a full-order step, a bar each, and its floor as a mark; the largest case."""
+    largest = kernels[kernels["particles"] == kernels["particles"].max()].drop_duplicates(
+        ["precision", "kernel"], keep="last"
+    )
+    names = list(dict.fromkeys(largest["kernel"]))
+    with styled():
+        fig = figure(1.5 + 0.42 * len(names))
+        panels = fig.subplots(1, largest["precision"].nunique(), sharey=True, squeeze=False)[0]
+        at = np.arange(len(names))
+        for panel, (precision, part) in zip(panels, largest.groupby("precision", sort=True), strict=True):
+            part = part.set_index("kernel").loc[names]
+            bars = panel.barh(at, part["ms"], height=0.6, color=stage_colors(["p2g"]), label="time")
+            panel.bar_label(bars, [number(ms) for ms in part["ms"]], padding=4, fontsize=8.5, color=INK)
+            panel.plot(part["floor_ms"], at, "|", ms=17, mew=2.4, color=INK, label="floor")
+            panel.set(title=f"{part['case'].iloc[0]}, {precision}", xlabel="time [ms]")
+            panel.set_yticks(at, names)
+            panel.set_ylim(len(names) - 0.5, -0.5)
+            panel.set_xlim(0, 1.16 * part["ms"].max())
+            panel.grid(axis="x")
+            panel.tick_params(axis="y", length=0)
+        handles, texts = panels[0].get_legend_handles_labels()
+        fig.legend(handles, texts, loc="outside upper left", ncols=2)
+    return fig
+
+
+def table(path: Path) -> Table:
+    """Rows of results.csv for a terminal."""
+    frame = pd.read_csv(path).drop(columns="commit").dropna(axis=1, how="all")
+    drawn = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for name in frame:
+        drawn.add_column(_HEADINGS.get(name, name), justify="left" if name in _TEXT else "right")
+    for row in _cells(frame):
+        drawn.add_row(*row)
+    return drawn
+
+
+def _solver(case: str) -> str:
+    """The kind of solver that a case times: its name without the size."""
+    return case.rpartition("_")[0].replace("_", "-")
+
+
+def _markdown(frame: pd.DataFrame) -> str:
+    frame = frame.dropna(axis=1, how="all")
+    return markdown_rows(
+        [_HEADINGS.get(name, name) for name in frame], _cells(frame), [name not in _TEXT for name in frame]
+    )
+
+
+def _cells(frame: pd.DataFrame) -> list[list[str]]:
+    return [[number(value) for value in row] for row in frame.itertuples(index=False, name=None)]

@@ -1,0 +1,105 @@
+"""What a benchmark is asked for, and what it gives."""
+
+from dataclasses import dataclass, field, fields
+
+from nsf.provenance import provenance
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What to measure.
+
+    Attributes:
+        particles: numbers of particles; empty for those that suit the benchmark and the device.
+        precisions: `fp32`, `fp64` or both, measured turn by turn.
+        device: `cpu` or `cuda:N`.
+        trials: measurements of each side.
+    """
+
+    particles: tuple[int, ...]
+    precisions: tuple[str, ...]
+    device: str
+    trials: int
+
+
+@dataclass(frozen=True)
+class Row:
+    """One side of a benchmark: a row of results.csv.
+
+    Attributes:
+        bench, case: the benchmark, and what of it.
+        particles, sample, integration: P, |S| and |N|; None where there is none.
+        batch: simulations that are stepped together.
+        precision, device: of the solver.
+        ms_median, ms_p10, ms_p90: over the trials, of the mean time of a step in one [ms].
+        peak_mib: what every allocator holds at most beyond what was held before the solver was built [MiB].
+        delta: δ of the run that is timed, a fraction; None for a full-order run.
+        commit: of the code.
+    """
+
+    bench: str
+    case: str
+    particles: int
+    sample: int | None
+    integration: int | None
+    batch: int
+    precision: str
+    device: str
+    ms_median: float
+    ms_p10: float
+    ms_p90: float
+    peak_mib: float
+    delta: float | None
+    commit: str
+
+
+@dataclass(frozen=True)
+class KernelRow:
+    """One pass of a step: a row of kernels.csv.
+
+    Attributes:
+        bench, case, particles, precision, device, commit: as in `Row`.
+        kernel: the pass.
+        ms: median time [ms].
+        mib: what it has to read and write, each value once [MiB].
+        gb_per_s: their ratio [GB/s].
+        floor_ms: the time that these bytes take a copy of this run [ms].
+    """
+
+    bench: str
+    case: str
+    particles: int
+    precision: str
+    device: str
+    kernel: str
+    ms: float
+    mib: float
+    gb_per_s: float
+    floor_ms: float
+    commit: str
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a benchmark found."""
+
+    rows: list[Row] = field(default_factory=list)
+    kernels: list[KernelRow] = field(default_factory=list)
+
+
+def columns(kind: type) -> list[str]:
+    """Names of a row's columns, in order."""
+    return [f.name for f in fields(kind)]
+
+
+def commit() -> str:
+    """The commit that runs, with a plus sign where files differ from it."""
+    found = provenance()
+    return str(found["commit"] or "unknown")[:12] + ("+" if found["dirty"] else "")
+
+
+def size_name(particles: int) -> str:
+    """`71k`, `200k`, `1m`; the number itself below 1000."""
+    if particles >= 1_000_000 and particles % 100_000 == 0:
+        return f"{particles / 1e6:g}m"
+    return f"{particles / 1e3:.0f}k" if particles >= 1000 else f"{particles}"

@@ -1,0 +1,164 @@
+"""`nsf bench`: rows, passes and the report; what a step takes is asserted nowhere."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from nsf.bench import BENCHES, bench
+from nsf.bench.full_order import collapse, measured, pass_times
+from nsf.bench.measure import bandwidth, step_times
+from nsf.bench.rows import KernelRow, Row, Settings, columns, size_name
+from nsf.cli import main
+from nsf.errors import ConfigError, DeviceError
+
+SMALL = {"particles": "200,500", "trials": "2", "device": "cpu", "precision": "fp32"}
+PASSES = ["clear", "p2g", "grid", "g2p_stress"]
+
+
+@pytest.fixture(scope="module")
+def speed(tmp_path_factory):
+    """The folder of a report of both benchmarks."""
+    folder = tmp_path_factory.mktemp("speed")
+    bench(folder, SMALL, lambda text: None)
+    return folder
+
+
+def test_every_benchmark_gives_its_rows(speed):
+    results, kernels = (pd.read_csv(speed / name) for name in ("results.csv", "kernels.csv"))
+    assert list(results) == columns(Row)
+    assert list(kernels) == columns(KernelRow)
+    assert set(results["bench"]) == set(BENCHES)
+    assert set(results["case"]) == {"full_order_200", "full_order_500"}
+    assert len(results) == 4
+    assert (results["ms_p10"] <= results["ms_median"]).all()
+    assert (results["ms_median"] <= results["ms_p90"]).all()
+    assert (results["peak_mib"] > 0).all()
+    assert kernels.groupby(["bench", "case"], sort=False)["kernel"].apply(list).tolist() == [PASSES] * 4
+    np.testing.assert_allclose(kernels["gb_per_s"], kernels["mib"] * 2**20 / kernels["ms"] / 1e6)
+
+
+def test_the_page_shows_every_row_and_chart(speed):
+    page = (speed / "index.md").read_text()
+    assert page.count("| full_order_200 |") == 2 + 8
+    for name in re.findall(r"\]\((.*?\.png)\)", page):
+        assert (speed / name).stat().st_size > 5000
+        assert (speed / name).with_suffix(".svg").is_file()
+    assert re.findall(r"\]\((.*?)\)", page) == ["step-cpu.png", "kernels-cpu.png"]
+
+
+def test_other_rows_are_kept(speed, tmp_path):
+    before = pd.read_csv(speed / "results.csv")
+    before.loc[0, ["device", "ms_median"]] = "cuda:0", 12.5
+    before.loc[1, ["ms_median", "commit"]] = 1e9, "old"
+    before.to_csv(tmp_path / "results.csv", index=False)
+    kernels = pd.read_csv(speed / "kernels.csv")
+    of_gpu = kernels[kernels["case"] == before.loc[0, "case"]].assign(device="cuda:0")
+    pd.concat([kernels, of_gpu]).to_csv(tmp_path / "kernels.csv", index=False)
+    page = bench(tmp_path, SMALL | {"benches": "full_order"}, lambda text: None)
+    after = pd.read_csv(tmp_path / "results.csv")
+    assert len(after) == 5
+    assert after.loc[after["device"] == "cuda:0", "ms_median"].tolist() == [12.5]
+    assert 1e9 not in after["ms_median"].tolist()
+    assert re.findall(r"\]\((.*?)\)", page.read_text())[2:] == ["step-cuda0.png", "kernels-cuda0.png"]
+
+
+def test_bytes_of_a_pass_grow_with_particles_and_precision():
+    sizes = {}
+    for particles, precision in [(400, "fp32"), (400, "fp64"), (1600, "fp32")]:
+        solver = collapse(particles, precision, "cpu")
+        sizes[particles, precision] = np.array([size for _, size in pass_times(solver).values()])
+    np.testing.assert_array_equal(sizes[400, "fp64"], 2 * sizes[400, "fp32"])
+    # Of 4 bytes: x, v, C, τ, m and V of every particle and, there and back, the nodes.
+    clear, p2g, grid, _ = sizes[400, "fp32"]
+    assert p2g - grid == 4 * 26 * 400
+    assert clear - grid // 2 == 4 * 3 * 400
+    assert (sizes[1600, "fp32"] > sizes[400, "fp32"]).all()
+
+
+def test_the_sand_falls_apart():
+    solver = collapse(800, "fp64", "cpu")
+    X = solver.constants.X
+    assert len(X) == 800
+    solver.step(400)
+    x = solver.state.numpy()["x"]
+    assert x[:, 2].max() < X[:, 2].max()
+    assert np.ptp(x[:, 0]) > np.ptp(X[:, 0])
+    assert solver.constants.volume0.sum() == pytest.approx(100 / 160**3)
+
+
+def test_sides_take_turns():
+    class Solver:
+        def __init__(self, name):
+            self.name = name
+
+        def step(self, n):
+            taken.append(self.name)
+
+    taken = []
+    found = step_times({"a": Solver("a"), "b": Solver("b")}, 3, "cpu")
+    assert taken[-6:] == ["a", "b"] * 3
+    assert [len(times) for times in found.values()] == [3, 3]
+
+
+def test_a_copy_has_a_bandwidth():
+    assert np.isfinite(bandwidth("cpu"))
+    assert bandwidth("cpu") > 0
+
+
+def test_a_floor_is_bytes_over_that_bandwidth(monkeypatch):
+    monkeypatch.setattr("nsf.bench.full_order.bandwidth", lambda device: 1e9)
+    said = []
+    found = measured("scaling", (300,), Settings((), ("fp64",), "cpu", 1), said.append)
+    assert [row.bench for row in found.rows] == ["scaling"]
+    for row in found.kernels:
+        assert row.floor_ms == pytest.approx(row.mib * 2**20 / 1e6)
+    assert "full_order_300 fp64" in said[-1]
+    assert dataclasses.asdict(found.rows[0])["sample"] is None
+
+
+@pytest.mark.parametrize(
+    ("count", "name"),
+    [(300, "300"), (71_363, "71k"), (200_000, "200k"), (1_000_000, "1m"), (1_500_000, "1.5m")],
+)
+def test_sizes_by_name(count, name):
+    assert size_name(count) == name
+
+
+@pytest.mark.parametrize(
+    ("asked", "error", "message"),
+    [
+        (
+            {"benches": "training,foo"},
+            ConfigError,
+            "benches=training is unknown; choose from full_order, scaling",
+        ),
+        ({"particles": "10q"}, ConfigError, "particles=10q is no number of particles"),
+        ({"particles": "0"}, ConfigError, "particles=0 is no number"),
+        ({"trials": "0"}, ConfigError, "trials=0 must be"),
+        ({"precision": "fp16"}, ConfigError, "precision='fp16' is unknown"),
+        ({"device": "tpu"}, DeviceError, "device=tpu"),
+    ],
+)
+def test_bad_values(asked, error, message, tmp_path):
+    with pytest.raises(error, match=re.escape(message)):
+        bench(tmp_path, asked, lambda text: None)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("NSF_REPORTS", str(tmp_path))
+    words = ["benches=full_order", "particles=0.2k", "trials=1", "device=cpu", "precision=fp64"]
+    with pytest.raises(SystemExit) as end:
+        main(["bench", *words])
+    assert not end.value.code
+    out, err = capsys.readouterr()
+    assert "full_order_200" in out
+    assert f"open {tmp_path / 'speed' / 'index.md'}" in out
+    assert "GB/s" in err
+    with pytest.raises(SystemExit) as end:
+        main(["bench", "size=3"])
+    assert end.value.code == 2
+    assert "nsf bench has no key 'size'" in capsys.readouterr().err

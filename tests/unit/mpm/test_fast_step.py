@@ -1,0 +1,143 @@
+"""The step as it is taken beside its simplest form: every node swept, Warp's own atomics, stage by stage."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import warp as wp
+
+from nsf.mpm import DomainWalls, FullOrderMPM, Grid, GridGeometry, HalfSpace, ParticleConstants, Transfer
+from nsf.mpm.materials import (
+    DruckerPrager,
+    FixedCorotated,
+    Hencky,
+    HerschelBulkley,
+    VonMisesHardening,
+    VonMisesSoftening,
+)
+from nsf.timing import untimed
+
+DX, DT = 1.0 / 16.0, 0.002
+GEOMETRY = GridGeometry(DX, (19, 17, 18))  # blocks that reach over the edge in each axis
+MATERIALS = [
+    FixedCorotated(100.0, 0.3),
+    Hencky(100.0, 0.3),
+    DruckerPrager(100.0, 0.3, 30.0),
+    VonMisesHardening(100.0, 0.3, 1.0, 0.2),
+    VonMisesSoftening(100.0, 0.3, 10.0, 2.0),
+    HerschelBulkley(100.0, 0.3, 1.0, 0.5),
+]
+# Relative to the largest value. A GPU adds in another order every time, which 40 steps of contact carry on.
+TOLERANCE = {("cpu", "fp64"): 1e-11, ("cpu", "fp32"): 2e-4, ("cuda", "fp64"): 1e-9, ("cuda", "fp32"): 5e-3}
+
+
+@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def device(request):
+    if request.param == "cuda" and not wp.is_cuda_available():
+        pytest.skip("no GPU")
+    return request.param
+
+
+@pytest.fixture
+def solver_on(block, rng, device):
+    """(material, transfer, precision) → a stretched body thrown against the floor near the walls."""
+
+    def build(material, transfer=Transfer(), precision="fp64"):
+        X = block - [0.05, 0.0, 0.1]
+        volume0 = np.full(len(X), (0.5 * DX) ** 3)
+        constants = ParticleConstants(
+            X, volume0, volume0, np.full(len(X), material.mu), np.full(len(X), material.lam)
+        )
+        v = np.array([2.0, 0.5, -3.0]) + 8.0 * (X - X.mean(0)) @ rng_matrix
+        floor = HalfSpace((0.0, 0.0, 0.28), (0.0, 0.0, 1.0), "separate", 0.3)
+        return FullOrderMPM(
+            constants, material, GEOMETRY, DT, (0.0, 0.0, -10.0), [floor], DomainWalls(), transfer,
+            v=v, precision=precision, device=device,
+        )  # fmt: skip
+
+    rng_matrix = rng.normal(size=(3, 3))
+    return build
+
+
+def simplest(solver):
+    """The same solver on a grid whose every node is listed, so that each is cleared and updated."""
+    grid = solver.grid.geometry
+    solver.grid = Grid(grid, solver.precision, solver.device, nodes=np.arange(grid.count))
+    solver.grid_step.grid = solver.grid
+    return solver
+
+
+def assert_same_run(fast, plain, precision, steps=40):
+    fast.step(steps)
+    for _ in range(steps):
+        plain.timed_step(untimed)
+    tolerance = TOLERANCE["cuda" if fast.device.is_cuda else "cpu", precision]
+    found, expected = fast.state.numpy(), plain.state.numpy()
+    for name, values in expected.items():
+        scale = max(np.abs(values).max(), 1e-300)
+        assert np.abs(found[name] - values).max() <= tolerance * scale, name
+    assert np.abs(expected["tau"]).max() > 0.1
+    np.testing.assert_allclose(fast.grid.mass.numpy(), plain.grid.mass.numpy(), atol=tolerance * DX**3)
+
+
+@pytest.mark.parametrize("precision", ["fp64", "fp32"])
+@pytest.mark.parametrize("material", MATERIALS, ids=lambda m: type(m).__name__)
+def test_every_law(material, precision, solver_on):
+    plain = simplest(solver_on(material, Transfer(deterministic=True), precision))
+    assert_same_run(solver_on(material, Transfer(), precision), plain, precision)
+
+
+@pytest.mark.parametrize("precision", ["fp64", "fp32"])
+@pytest.mark.parametrize("shape", ["quadratic", "cubic"])
+@pytest.mark.parametrize("scheme", ["pic", "apic", "rpic"])
+def test_every_transfer(scheme, shape, precision, solver_on):
+    transfer = Transfer(scheme, shape, 0.25 if scheme == "rpic" else 0.0)
+    ordered = dataclasses.replace(transfer, deterministic=True)
+    plain = simplest(solver_on(MATERIALS[0], ordered, precision))
+    assert_same_run(solver_on(MATERIALS[0], transfer, precision), plain, precision)
+
+
+def test_a_step_is_its_stages(solver_on):
+    """What a breakdown times is what a run does."""
+    whole, staged = solver_on(MATERIALS[2]), solver_on(MATERIALS[2])
+    whole.step(20)
+    for _ in range(20):
+        staged.timed_step(untimed)
+    assert staged.steps_taken == 20
+    a, b = whole.state.numpy(), staged.state.numpy()
+    for name in a:
+        np.testing.assert_allclose(a[name], b[name], atol=1e-9 * np.abs(b[name]).max())
+
+
+@pytest.mark.parametrize("shape", ["quadratic", "cubic"])
+def test_blocks_are_those_that_particles_reach(shape, solver_on):
+    solver = solver_on(MATERIALS[0], Transfer(shape=shape))
+    solver.step(10)
+    early = set(solver.grid.blocks.numpy()[: solver.grid.listed.numpy()[0]].tolist())
+    solver.step(90)
+    x = solver.state.numpy()["x"]
+    solver.p2g()
+    grid = solver.grid
+    width, offset = {"quadratic": (3, 0.5), "cubic": (4, 1.0)}[shape]
+    base = np.floor(x / DX - offset).astype(int)
+    corners = [(base + (width - 1) * np.array(corner)) // 4 for corner in np.ndindex(2, 2, 2)]
+    expected = {int(b) for c in corners for b in np.ravel_multi_index(tuple(c.T), tuple(grid.block_shape))}
+    listed = grid.blocks.numpy()[: grid.listed.numpy()[0]].tolist()
+    assert len(listed) == len(expected)
+    assert set(listed) == expected != early
+    assert set(np.flatnonzero(grid.marks.numpy())) == expected
+    # Nothing is left where the body was before.
+    assert grid.mass.numpy().sum() == pytest.approx(solver.constants.mass.sum(), rel=1e-12)
+    nodes = np.stack(np.unravel_index(np.flatnonzero(grid.mass.numpy()), GEOMETRY.nodes), 1) // 4
+    assert set(np.ravel_multi_index(tuple(nodes.T), tuple(grid.block_shape)).tolist()) <= expected
+
+
+def test_a_particle_off_the_grid_lists_no_block(solver_on):
+    solver = solver_on(MATERIALS[0])
+    x = solver.state.numpy()["x"]
+    x[:] = [-3.0, 0.5, 1e30]
+    x[0] = np.nan
+    solver.state.x.assign(x)
+    solver.p2g()
+    assert solver.grid.listed.numpy()[0] == 0
+    assert not solver.grid.values.numpy().any()
