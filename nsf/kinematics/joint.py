@@ -38,12 +38,13 @@ class JointField(BasisField):
 
     Attributes:
         stress_weight: w of the stress's variance in that of a joint snapshot, where that of positions is one.
+            Small, as the inversion sees positions alone: the more stress weighs, the less they tell of xhat.
 
     Raises:
         ConfigError: stress_weight is not positive.
     """
 
-    stress_weight: float = 1.0
+    stress_weight: float = 0.01
 
     def __post_init__(self) -> None:
         super().__post_init__()

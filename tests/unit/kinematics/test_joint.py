@@ -19,7 +19,7 @@ def built(field, snapshots):
 
 @pytest.fixture(scope="module")
 def joint(snapshots):
-    return built(JointField(modes=MODES, beta=4, depth=2), snapshots)
+    return built(JointField(modes=MODES, beta=4, depth=2, stress_weight=1.0), snapshots)
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def test_latents_are_the_coefficients_of_joint_snapshots(snapshots, frames, weig
 
 def test_positions_are_linear_in_them_with_a_closure_of_what_is_left(snapshots, frames):
     """Coefficients are orthogonal, and with as many modes as there are frames nothing is left."""
-    prepared = JointField(modes=60).prepare(snapshots, LATENT)["x"]
+    prepared = JointField(modes=60, stress_weight=1.0).prepare(snapshots, LATENT)["x"]
     a = prepared["coefficients"]
     gram = unit(a).T @ unit(a)
     assert torch.allclose(gram, torch.eye(len(gram), dtype=gram.dtype), atol=1e-6)
