@@ -9,7 +9,9 @@ snapshots
 over their deviation. As before, g(X, xhat) is linear in xhat plus a closure: its leading modes are now the
 parts of the joint modes that are displacements, and the closure's those of the displacements they leave out.
 So the inversion is as before, r unknowns and 3|S| equations; but a direction of xhat that is mostly stress
-moves few particles, and is told by positions as badly as it moves them.
+moves few particles, and is told by positions as badly as it moves them. At small scale that outweighs the
+gain: on metal and bread the stress of encoded frames comes out nearer than with `basis`, and reduced runs
+on these and on sand end further off (experiments/path_dependent.yaml).
 
 Source: an answer to the future work of Zong et al. 2023, a path-dependent latent space.
 """
