@@ -101,8 +101,8 @@ def asked_value(message: str | bytes) -> float:
 def _check_field(model: LiveModel) -> None:
     if model.manifold.field not in FIELDS:
         raise ConfigError(
-            f"{model.run.id} has field={model.manifold.field}, which each browser "
-            f"would have to evaluate at every particle; serve a deployment of field={FIELDS[0]}, or use nsf view"
+            f"{model.run.id} has field={model.manifold.field}, which each browser would have to evaluate "
+            f"at every particle; serve a deployment of field={FIELDS[0]}, or use nsf view"
         )
 
 
