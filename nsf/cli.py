@@ -271,7 +271,7 @@ def _experiment(name: str, stage: str, overrides: list[str], launcher: list[str]
     experiment = Experiment.load(name, overrides)
     code = 0
     if stage != "report":
-        code = _sweep(stage, experiment.sweeps, launcher)
+        code = _sweep(stage, experiment.sweeps, launcher, experiment.stages if stage == "run" else ())
     if stage in ("run", "report"):
         page, missing = experiment.report()
         _show(page)
@@ -292,11 +292,11 @@ def _multirun(stage: str, overrides: list[str], launcher: list[str]) -> int:
     return code
 
 
-def _sweep(stage: str, sweeps: Sequence[list[str]], launcher: list[str]) -> int:
-    """The stage of every job, or the chain up to the report, which is made once all are done."""
+def _sweep(stage: str, sweeps: Sequence[list[str]], launcher: list[str], more: Sequence[str] = ()) -> int:
+    """The stage of every job, or the chain up to the report, which is made once all are done, and `more`."""
     from nsf.pipeline.sweep import sweep
 
-    stages = tuple(s for s in _stages(stage) if s != "report")
+    stages = (*(s for s in _stages(stage) if s != "report"), *more)
     failed = sweep(sweeps, stages, launcher, _primary(stage))
     for failure in failed:
         print(f"failed: {failure}", file=sys.stderr)

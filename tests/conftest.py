@@ -1,6 +1,7 @@
 """What tests of several layers share: one tiny chain, simulated, trained, deployed and evaluated once."""
 
 import os
+import shutil
 import signal
 from dataclasses import dataclass
 from pathlib import Path
@@ -118,3 +119,21 @@ def tiny_manifold(chain):
     import nsf
 
     return nsf.Manifold.load(chain.checkpoint)
+
+
+@pytest.fixture
+def browser():
+    """A headless Chromium with software WebGL.
+
+    Of one test: while it is open its thread has a running event loop, which tests with `asyncio.run` refuse.
+    """
+    playwright = pytest.importorskip("playwright.sync_api", reason="the package playwright is not installed")
+    names = ("chromium", "chromium-browser", "google-chrome")
+    path = next(filter(None, map(shutil.which, names)), None)
+    if path is None:
+        pytest.skip("no Chromium is installed; apt install chromium")
+    software = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+    with playwright.sync_playwright() as started:
+        chromium = started.chromium.launch(executable_path=path, args=["--no-sandbox", *software])
+        yield chromium
+        chromium.close()

@@ -6,6 +6,7 @@ from nsf.dynamics.handover import go_on, hand_over
 from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
 from nsf.dynamics.latent import Decoder, LatentState, LatentTrajectory
 from nsf.dynamics.projection import STOP_REASONS, GaussNewton, ProjectionResult, Taylor, stop_reasons
+from nsf.dynamics.qdeim import QdeimSampler
 from nsf.dynamics.sampling import GreedySampler, RandomSampler, SamplePhase, Sampler, UnweightedSampler
 from nsf.dynamics.solver import NSF, ReducedMPM
 from nsf.dynamics.stress import Method
@@ -25,6 +26,7 @@ __all__ = [
     "NeighbourSearch",
     "ParticleSets",
     "ProjectionResult",
+    "QdeimSampler",
     "RandomSampler",
     "ReducedMPM",
     "Rollout",

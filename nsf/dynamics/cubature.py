@@ -155,7 +155,7 @@ def nonnegative_fit(columns: torch.Tensor, target: torch.Tensor, size: int) -> t
     """
     # A particle that no latent moves is never taken.
     norms = torch.linalg.vector_norm(columns, dim=0).clamp_min(torch.finfo(columns.dtype).tiny)
-    chosen, weights, residual = [], target.new_zeros(0), target
+    chosen, weights, residual, factors = [], target.new_zeros(0), target, _Factors(target)
     for _ in range(3 * size):  # Lawson and Hanson's bound; columns that left may come back
         # Not the steepest: a few particles whose x̂ moves them far would be taken for their length alone.
         cosine = columns.T @ residual / norms
@@ -165,23 +165,58 @@ def nonnegative_fit(columns: torch.Tensor, target: torch.Tensor, size: int) -> t
         if len(chosen) == size or exact or not cosine[best] > 0:
             break
         before = chosen
-        chosen, weights = _fitted(
-            columns, target, [*chosen, best], torch.cat([weights, weights.new_zeros(1)])
-        )
+        factors.join(columns[:, best])
+        chosen, weights = _fitted(factors, [*chosen, best], torch.cat([weights, weights.new_zeros(1)]))
         if chosen == before:
             break  # no column lowers the residual by more than round-off
         residual = target - columns[:, chosen] @ weights
     return np.array(chosen), weights.cpu().numpy()
 
 
-def _fitted(columns, target, chosen: list[int], weights: torch.Tensor) -> tuple[list[int], torch.Tensor]:
+def _fitted(factors: "_Factors", chosen: list[int], weights: torch.Tensor) -> tuple[list[int], torch.Tensor]:
     """Least squares over the chosen columns; from feasible weights, columns leave as theirs reach zero."""
     while True:
-        # QR on every device, as each column taken is independent of those before it.
-        fit = torch.linalg.lstsq(columns[:, chosen], target[:, None], driver="gels").solution[:, 0]
+        fit = factors.solution()
         if (fit > 0).all():
             return chosen, fit
         share = torch.where(fit > 0, torch.inf, weights / (weights - fit))
         keep = share > share.min()
         weights = (weights + share.min() * (fit - weights))[keep]
         chosen = [column for column, kept in zip(chosen, keep.tolist(), strict=True) if kept]
+        factors.keep(keep)
+
+
+class _Factors:
+    """Orthonormal rows Q [k, m] and R [k, k] of columns A = Qᵀ R, as these join and leave.
+
+    Each least-squares problem is the one before with a column more or less: a factorisation anew for each
+    took most of a deployment's time.
+
+    Args:
+        target: [m] of the least squares.
+    """
+
+    def __init__(self, target: torch.Tensor):
+        self.target = target
+        self.Q, self.R = target.new_zeros(0, len(target)), target.new_zeros(0, 0)
+
+    def join(self, column: torch.Tensor) -> None:
+        """Another column [m], independent of those there are, as what its residual tells it to be."""
+        k = len(self.Q)
+        along = self.Q @ column
+        rest = column - along @ self.Q
+        again = self.Q @ rest  # once more, without which Q would lose its orthogonality
+        rest = rest - again @ self.Q
+        norm = torch.linalg.vector_norm(rest)
+        R = self.R.new_zeros(k + 1, k + 1)
+        R[:k, :k], R[:k, k], R[k, k] = self.R, along + again, norm
+        self.Q, self.R = torch.cat([self.Q, (rest / norm)[None]]), R
+
+    def keep(self, kept: torch.Tensor) -> None:
+        """Only some of the columns [k]."""
+        turned, self.R = torch.linalg.qr(self.R[:, kept])
+        self.Q = turned.T @ self.Q
+
+    def solution(self) -> torch.Tensor:
+        """Weights [k] of least squares."""
+        return torch.linalg.solve_triangular(self.R, (self.Q @ self.target)[:, None], upper=True)[:, 0]

@@ -93,7 +93,9 @@ class ReducedMPM:
             )
         self.parameters = tensor([parameters[name] for name in manifold.parameter_names])
         self.initial_velocity = tensor(scene.initial_velocity())
-        start = tensor(manifold.encode(torch.as_tensor(self.scene_particles.X)[None])[0].cpu())
+        # A scene begins undeformed and free of stress.
+        X = torch.as_tensor(self.scene_particles.X)[None]
+        start = tensor(manifold.encode(X, X.new_zeros(*X.shape[:2], 6))[0].cpu())
         self.record = LatentRecord(start, self.total_steps, projector.iterations)
         self.steps_taken = 0
         self._setting = Setting(

@@ -125,7 +125,8 @@ def compare(
         if start == 0:
             v_rom[0] = v[0]
         previous = x_rom[-1]
-        encoded = manifold.encode(x.to(manifold.X.device)).to(device, solver.dtype)
+        home = manifold.X.device
+        encoded = manifold.encode(x.to(home), tau.to(home)).to(device, solver.dtype)
         x_rec, tau_rec = decoder.position(encoded), decoder.at.stress(encoded, parameters)
         note(
             x_error=metrics.frame_squares(x_rom - x),

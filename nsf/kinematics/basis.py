@@ -28,7 +28,7 @@ from nsf.kinematics.manifold import Manifold, Restriction
 from nsf.kinematics.networks import FullyConnected
 from nsf.kinematics.phases import PHASES, TARGETS, Fit, at_least, joined, per_phase, shaped
 
-ENCODED_ENTRIES = 1 << 26  # positions encoded at once
+ENCODED_ENTRIES = 1 << 26  # values encoded at once
 
 
 @dataclass(frozen=True)
@@ -250,6 +250,13 @@ class ModalFactors:
     network: FullyConnected | None
 
 
+def coefficients(values: Tensor, mean: Tensor, modes: Tensor) -> Tensor:
+    """Products [F, r] (float64) of the deviations of frames [F, P, c] from a mean with modes [P, c, r]."""
+    rows = modes.flatten(0, 1).double()
+    blocks = values.split(max(1, ENCODED_ENTRIES // mean.numel()))
+    return torch.cat([(block.to(mean) - mean).flatten(1) @ rows for block in blocks])
+
+
 class BasisManifold(Manifold):
     """Modal fields of x, tau and C."""
 
@@ -272,13 +279,11 @@ class BasisManifold(Manifold):
 
     @override
     @torch.no_grad()
-    def encode(self, x: Tensor) -> Tensor:
+    def encode(self, x: Tensor, tau: Tensor | None = None) -> Tensor:
         self.check_frames(x)
         field = self.fields["deformation"]
-        modes = field.modes[..., : self.latent_dim].flatten(0, 1).double() / field.leading
-        origin = self.X + field.mean
-        blocks = x.split(max(1, ENCODED_ENTRIES // self.X.numel()))
-        return torch.cat([(block.to(origin) - origin).flatten(1) @ modes for block in blocks])
+        modes = field.modes[..., : self.latent_dim].double() / field.leading
+        return coefficients(x, self.X + field.mean, modes)
 
     @override
     @torch.no_grad()

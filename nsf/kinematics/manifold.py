@@ -20,7 +20,11 @@ from nsf.storage import writing
 
 FORMAT = "nsf-manifold"
 FORMAT_VERSION = 1
-FIELDS = ("basis", "mlp")  # each is a module of this package that defines a Manifold with that `field`
+FIELDS = (
+    "basis",
+    "joint",
+    "mlp",
+)  # each is a module of this package that defines a Manifold with that `field`
 _KEYS = {
     "latent_dim",
     "x_sha256",
@@ -157,8 +161,13 @@ class Manifold(nn.Module, ABC):
         return begins.long().cumsum(0) - 1
 
     @abstractmethod
-    def encode(self, x: Tensor) -> Tensor:
-        """Latents xhat [F, r] (float64) of whole frames x [F, P, 3] m of the training particles."""
+    def encode(self, x: Tensor, tau: Tensor | None = None) -> Tensor:
+        """Latents xhat [F, r] (float64) of whole frames of the training particles.
+
+        Args:
+            x: [F, P, 3] m.
+            tau: Kirchhoff stress [F, P, 6] Pa; read only by a field that encodes it.
+        """
 
     @abstractmethod
     def restrict(

@@ -146,7 +146,7 @@ class MlpManifold(Manifold):
 
     @override
     @torch.no_grad()
-    def encode(self, x: Tensor) -> Tensor:
+    def encode(self, x: Tensor, tau: Tensor | None = None) -> Tensor:
         self.check_frames(x)
         frames = (frames.to(self.X.device).float() for frames in x.split(self._frames_at_once()))
         return torch.cat([self.encoder(self.standard["x"](frame)).double() for frame in frames])

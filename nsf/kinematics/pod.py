@@ -31,6 +31,7 @@ def decompose(snapshots: Snapshots, name: str, components: int, count: int) -> t
     that A ≈ a Bᵀ with B orthonormal. The M×M Gram matrix is summed over particle slabs.
 
     Args:
+        snapshots: of every training frame.
         name, components: field of the snapshots.
         count: modes wanted; fewer come back if the snapshots have a lower numerical rank.
 
@@ -38,17 +39,28 @@ def decompose(snapshots: Snapshots, name: str, components: int, count: int) -> t
         a [M, K] float64, largest mode first, in the field's unit times √(P c); and the unresolved share of
         the energy, 1 − Σ a² / ‖A‖².
     """
-    gram = torch.zeros(snapshots.M, snapshots.M, dtype=torch.float64, device=snapshots.X.device)
+    G = gram(snapshots, name, components)
+    a = leading(G, count)
+    total = float(G.diagonal().sum())
+    return a, max(0.0, 1 - float(a.square().sum()) / total) if total > 0 else 0.0
+
+
+def gram(snapshots: Snapshots, name: str, components: int) -> Tensor:
+    """A Aᵀ [M, M] of a field's deviations A [M, P c] from their mean."""
+    G = torch.zeros(snapshots.M, snapshots.M, dtype=torch.float64, device=snapshots.X.device)
     for _, _, deviations in slabs(snapshots, name, components):
         rows = deviations.flatten(1)
-        gram.addmm_(rows, rows.T)
-    energies, vectors = torch.linalg.eigh(gram)
+        G.addmm_(rows, rows.T)
+    return G
+
+
+def leading(G: Tensor, count: int) -> Tensor:
+    """The first coefficients [M, K ≤ count] of deviations whose Gram matrix [M, M] is given."""
+    energies, vectors = torch.linalg.eigh(G)
     energies, vectors = energies.flip(0), vectors.flip(1)
     rank = int((energies > RANK_TOLERANCE * energies[0].clamp_min(torch.finfo(torch.float64).tiny)).sum())
     kept = min(count, rank)
-    total = float(gram.diagonal().sum())
-    unresolved = max(0.0, 1 - float(energies[:kept].sum()) / total) if total > 0 else 0.0
-    return vectors[:, :kept] * energies[:kept].sqrt(), unresolved
+    return vectors[:, :kept] * energies[:kept].sqrt()
 
 
 def modes(

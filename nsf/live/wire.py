@@ -11,7 +11,7 @@ from nsf.live.model import LiveModel
 from nsf.live.player import Moment
 
 _LEVELS = 32767  # of a signed 16-bit number
-FIELD = "basis"
+FIELDS = ("basis", "joint")  # of linear modes
 
 
 def field_message(model: LiveModel) -> bytes:
@@ -99,10 +99,10 @@ def asked_value(message: str | bytes) -> float:
 
 
 def _check_field(model: LiveModel) -> None:
-    if model.manifold.field != FIELD:
+    if model.manifold.field not in FIELDS:
         raise ConfigError(
-            f"{model.run.id} has field={model.manifold.field}, which each browser "
-            f"would have to evaluate at every particle; serve a deployment of field={FIELD}, or use nsf view"
+            f"{model.run.id} has field={model.manifold.field}, which each browser would have to evaluate "
+            f"at every particle; serve a deployment of field={FIELDS[0]}, or use nsf view"
         )
 
 

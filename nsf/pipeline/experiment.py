@@ -14,6 +14,7 @@ from nsf.pipeline.plan import Plan
 from nsf.runs import Run
 
 _KEYS = {"title", "question", "paper", "jobs"}
+_MORE_STAGES = ("superresolve",)  # that a job may do after those of `nsf run`
 #: Keys that a column of results.csv tells of.
 _COLUMNS = ("scene", "method", "field", "latent_dim", "sampler.size", "precision", "device")
 
@@ -46,6 +47,7 @@ class Experiment:
         question: what it is to find out.
         paper: what the paper reports on it, with the place.
         grids: each a mapping from a key to its override with all values; every combination is a job.
+        stages: what each job does after `evaluate`.
     """
 
     name: str
@@ -53,6 +55,7 @@ class Experiment:
     question: str
     paper: str
     grids: tuple[dict[str, str], ...]
+    stages: tuple[str, ...] = ()
 
     @classmethod
     def load(cls, name: str, overrides: Sequence[str] = (), folder: Path = EXPERIMENTS) -> "Experiment":
@@ -77,15 +80,18 @@ class Experiment:
         except yaml.YAMLError as error:
             raise ConfigError(f"{path}: {error}; correct the yaml") from error
         found = set(content) if isinstance(content, dict) else set()
-        if found != _KEYS or not isinstance(content["jobs"], list):
+        if found - {"stages"} != _KEYS or not isinstance(content["jobs"], list):
             raise ConfigError(f"{path} must have the keys {', '.join(sorted(_KEYS))}; jobs is a list")
+        stages = content.get("stages", [])
+        if not isinstance(stages, list) or not set(stages) <= set(_MORE_STAGES):
+            raise ConfigError(f"{path}: stages={stages} must be a list of {', '.join(_MORE_STAGES)}")
         own = {override.split("=", 1)[0]: override for override in overrides}
         grids = tuple(
             {str(key): f"{key}={_values(value)}" for key, value in grid.items()} | own
             for grid in content["jobs"]
         )
         texts = {key: " ".join(str(content[key]).split()) for key in ("title", "question", "paper")}
-        return cls(name=name, grids=grids, **texts)
+        return cls(name=name, grids=grids, stages=tuple(stages), **texts)
 
     @property
     def sweeps(self) -> list[list[str]]:
@@ -118,6 +124,7 @@ class Experiment:
         from nsf.reporting.build import Study, build_report
 
         runs: dict[str, Run] = {}
+        fine: dict[str, Run] = {}
         settings, keys, missing, scales = {}, {}, [], set()
         for job in self.jobs:
             config = configuration.load(job.overrides)
@@ -129,12 +136,19 @@ class Experiment:
                 continue
             runs[run.id], settings[run.id], keys[run.id] = run, job.setting, job.keys
             scales.add(config.scale)
+            if "superresolve" in self.stages:
+                try:
+                    fine[run.id] = plan.superresolved()
+                except MissingRunError:
+                    missing.append(
+                        f"{' '.join(job.overrides)}: {_ended(plan.superresolution) or 'superresolve not run'}"
+                    )
         if not runs:
             raise MissingRunError(
                 f"no job of {self.name} was evaluated; run `nsf run +experiment={self.name}`"
             )
         folder = Path(config.report.folder) / (f"{self.name}_small" if scales == {"small"} else self.name)
-        study = Study(self.question, self.paper, settings, keys, missing)
+        study = Study(self.question, self.paper, settings, keys, missing, fine)
         page = build_report(list(runs.values()), folder, self.title, study=study)
         say(f"report: {len(runs)} jobs, {len(missing)} missing → {page}")
         return page, missing
@@ -142,17 +156,23 @@ class Experiment:
 
 def _why(plan: Plan) -> str:
     """What became of a job that has no result: the first stage that did not end well."""
-    needed = {
-        "simulate": [plan.simulation(v) for v in plan.split.train],
-        "train": [plan.training],
-        "deploy": [plan.deployment],
-        "evaluate": [plan.evaluation],
-    }
-    for stage, runs in needed.items():
+    needed = (
+        [plan.simulation(v) for v in plan.split.train],
+        [plan.training],
+        [plan.deployment],
+        [plan.evaluation],
+    )
+    for runs in needed:
         for run in runs:
-            if error := run.manifest.get("error"):
-                return f"{stage} {run.manifest.get('status')}: {error}"
+            if told := _ended(run):
+                return told
     return "not run"
+
+
+def _ended(run: Run) -> str | None:
+    """How a run ended that did not end well; None if it did, or was never begun."""
+    error = run.manifest.get("error")
+    return f"{run.stage} {run.manifest.get('status')}: {error}" if error else None
 
 
 def _values(value) -> str:

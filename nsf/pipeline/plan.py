@@ -203,12 +203,23 @@ class Plan:
         Raises:
             MissingRunError: there is none; says how far it came.
         """
+        return self._found("evaluation")
+
+    def superresolved(self) -> Run:
+        """The complete run of the deployed fields at more points, likewise.
+
+        Raises:
+            MissingRunError: there is none.
+        """
+        return self._found("superresolution")
+
+    def _found(self, name: str) -> Run:
         for device in (self.device, "cuda:0", "cpu"):
             there = copy(self)
             there.device = device
-            if there.evaluation.complete:
-                return there.evaluation
-        return self.evaluation.require()
+            if getattr(there, name).complete:
+                return getattr(there, name)
+        return getattr(self, name).require()
 
     @property
     def superresolution(self) -> Run:

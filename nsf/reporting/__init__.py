@@ -4,7 +4,21 @@ Reads manifests and the files of `evaluate` runs and nothing else; every number 
 one of them.
 """
 
-from nsf.reporting.build import build_report
-from nsf.reporting.tables import COLUMNS, console_table, merge_results
+import importlib
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from nsf.reporting.build import build_report
+    from nsf.reporting.columns import COLUMNS
+    from nsf.reporting.tables import console_table, merge_results
 
 __all__ = ["COLUMNS", "build_report", "console_table", "merge_results"]
+
+_HOMES = {"COLUMNS": "columns", "build_report": "build", "console_table": "tables", "merge_results": "tables"}
+
+
+def __getattr__(name: str):
+    # On demand, so that `nsf runs` does not wait for pandas and matplotlib.
+    if name in _HOMES:
+        return getattr(importlib.import_module(f"nsf.reporting.{_HOMES[name]}"), name)
+    raise AttributeError(f"module 'nsf.reporting' has no attribute {name!r}")

@@ -1,5 +1,6 @@
 """Builds a report: a folder with a page, tables, charts, pictures, and where each number comes from."""
 
+import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from nsf.reporting.page import Page, Table, html_page, markdown_page
 from nsf.reporting.pictures import draw
 from nsf.reporting.provenance import provenance_rows, sources_json
 from nsf.reporting.sources import Source, open_sources
+from nsf.reporting.superresolution import FineSource, fine_section, fine_table
 from nsf.reporting.swap import MARK, replaced
 from nsf.reporting.sweeps import swept
 from nsf.reporting.tables import Merged, console_table, means, merge, variants, without_constants
@@ -41,6 +43,7 @@ class Study:
         settings: by run id, what tells a run apart that no column of results.csv tells.
         keys: by run id, the keys of its job.
         missing: what was asked for and is not there, with the reason.
+        fine: by evaluate run id, the superresolve run of the same deployment, where there is one.
     """
 
     question: str
@@ -48,6 +51,7 @@ class Study:
     settings: Mapping[str, str]
     keys: Mapping[str, Mapping[str, str]]
     missing: Sequence[str]
+    fine: Mapping[str, object] = dataclasses.field(default_factory=dict)
 
 
 def build_report(evaluate_runs, folder, title: str, first=None, study: Study | None = None) -> Path:
@@ -75,19 +79,31 @@ def build_report(evaluate_runs, folder, title: str, first=None, study: Study | N
     merged = merge(open_sources(evaluate_runs, first), study.settings if study else None)
     with replaced(Path(folder)) as fresh:
         merged.csv.to_csv(fresh / "results.csv", index=False)
-        sections = [*(swept(merged, study.keys, fresh) if study else ()), *draw(merged, fresh)]
-        page = _page(title, merged, sections, study)
+        fine = _fine(merged, study)
+        sections = [
+            *([fine_section(fine, fresh)] if fine else []),
+            *(swept(merged, study.keys, fresh) if study else ()),
+            *draw(merged, fresh),
+        ]
+        more = [fine_table(fine, study.settings, fresh)] if fine else []
+        page = _page(title, merged, sections, study, more, fine)
         (fresh / "index.html").write_text(html_page(page), encoding="utf-8")
         (fresh / "index.md").write_text(markdown_page(page), encoding="utf-8")
         (fresh / "results.tex").write_text(
             latex_table(page.tables[0].content, title, page.tables[0].note), encoding="utf-8"
         )
-        told = sources_json(page, merged, fresh)
+        told = sources_json(page, merged, fresh, fine)
         (fresh / MARK).write_text(json.dumps(told, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
     return Path(folder) / "index.html"
 
 
-def _page(title: str, merged: Merged, sections, study: Study | None) -> Page:
+def _fine(merged: Merged, study: Study | None) -> list[FineSource]:
+    """The superresolve runs of what is shown, each once."""
+    shown = {source.id: source for source in merged.source}
+    return [FineSource(run, shown[of]) for of, run in (study.fine if study else {}).items() if of in shown]
+
+
+def _page(title: str, merged: Merged, sections, study: Study | None, more=(), fine=()) -> Page:
     headline, same = without_constants(means(merged))
     per_value, same_there = without_constants(merged.frame)
     methods = merged.frame[["scene", "method"]].drop_duplicates()
@@ -104,11 +120,12 @@ def _page(title: str, merged: Merged, sections, study: Study | None) -> Page:
         facts=[*_asked(study), *_facts(merged)],
         tables=[
             Table("Results beside the paper's", headline, note),
+            *more,
             Table("Each parameter value", per_value, _said(same_there), parameter),
             *([Table("Trust", trust, trust_note(trust), parameter | RENAMED)] if len(trust) else []),
         ],
         sections=sections,
-        provenance=Table("Where the numbers come from", provenance_rows(merged), _PROVENANCE),
+        provenance=Table("Where the numbers come from", provenance_rows(merged, fine), _PROVENANCE),
     )
 
 

@@ -86,11 +86,7 @@ class View:
         index, depth, tone, owner = _spheres(
             self._pixels(self.camera.project(x[alive]), scale), radius, scale, shape
         )
-        front = np.full(shape[0] * shape[1], -1)
-        order = np.argsort(depth)
-        front[index[order]] = (
-            order  # assignment keeps the last of equal indices: the one nearest to the viewer
-        )
+        front = _foremost(index, depth, shape[0] * shape[1])
         covered = front >= 0
         front = front[covered]
         if len(front):
@@ -161,6 +157,16 @@ def _spheres(centre: np.ndarray, radius: float, scale: float, shape, squash: flo
     depth = centre[:, 2:3] + bulge * radius
     owner = np.broadcast_to(np.arange(len(centre))[:, None], seen.shape)
     return (row * shape[1] + column)[seen], depth[seen], np.broadcast_to(tone, seen.shape)[seen], owner[seen]
+
+
+def _foremost(index: np.ndarray, depth: np.ndarray, pixels: int) -> np.ndarray:
+    """Of each pixel the entry nearest to the viewer, the last of equal ones; -1 where there is none."""
+    nearest = np.full(pixels, -np.inf)
+    np.maximum.at(nearest, index, depth)
+    seen = np.flatnonzero(depth == nearest[index])
+    front = np.full(pixels, -1)
+    front[index[seen]] = seen
+    return front
 
 
 def _occlusion(covered: np.ndarray, depth: np.ndarray, reach: float) -> np.ndarray:

@@ -14,8 +14,10 @@ from nsf.reporting.style import save
 from nsf.reporting.tables import Merged, mean_rows, paper_row, variant_labels, variants
 
 ROWS = 6  # parameter values in one picture of final shapes
-ANIMATED = 2
+ANIMATED, FRAMES = 2, 31  # parameter values and frames of an animation
 ANIMATIONS_BYTES = 8 * 2**20  # of all on a page
+# Of one on a page of many: to fit, it would give up half its frames and size, so these are never drawn.
+CROWDED_BYTES, CROWDED_ANIMATED, CROWDED_FRAMES = 2**19, 1, 16
 
 
 @dataclass(frozen=True)
@@ -134,9 +136,13 @@ def _of_variant(v: _Variant, folder: Path, prefix: str, gif_bytes: int) -> list[
     def add(stem: str, figure, caption: str, kinds=("svg", "png")) -> None:
         pictures.append(Picture(save(figure, folder, prefix + stem, kinds), caption, v.runs))
 
-    motions = v.motions(ANIMATED)
+    crowded = gif_bytes < CROWDED_BYTES
+    motions = v.motions(CROWDED_ANIMATED if crowded else ANIMATED)
     if motions:
-        render.animation(motions, folder / f"{prefix}animation.gif", name, unit, v.floor, max_bytes=gif_bytes)
+        render.animation(
+            motions, folder / f"{prefix}animation.gif", name, unit, v.floor,
+            frames=CROWDED_FRAMES if crowded else FRAMES, max_bytes=gif_bytes,
+        )  # fmt: skip
         cut = render.is_cut_open(motions)
         told = f"{name} " + " and ".join(parameter_text(m.parameter, "", unit) for m in motions)
         caption = (

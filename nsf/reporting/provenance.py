@@ -1,5 +1,6 @@
 """Where each number of a report comes from: for the page, and in full for `sources.json`."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 from nsf.reporting.columns import ABSENT
@@ -10,16 +11,16 @@ from nsf.reporting.tables import VARIANT, Merged
 _HEADINGS = ["run", "commit", "device", "precision", "seed", "made", "versions"]
 
 
-def used_sources(merged: Merged) -> list[Source]:
-    """The runs that rows come from, newest first."""
-    unique = {source.id: source for source in merged.source}
+def used_sources(merged: Merged, also: Sequence = ()) -> list[Source]:
+    """The runs that rows come from and those beside them, newest first."""
+    unique = {source.id: source for source in (*merged.source, *also)}
     return sorted(unique.values(), key=lambda source: (source.created, source.id), reverse=True)
 
 
-def provenance_rows(merged: Merged) -> Rows:
-    """Run, commit, device and versions of everything shown."""
+def provenance_rows(merged: Merged, also: Sequence = ()) -> Rows:
+    """Run, commit, device and versions of everything shown, and of runs that no row of `merged` is of."""
     body = []
-    for source in used_sources(merged):
+    for source in used_sources(merged, also):
         manifest = source.manifest
         versions = ", ".join(
             f"{name} {version}" for name, version in manifest.get("versions", {}).items() if version
@@ -38,13 +39,14 @@ def commit_text(manifest: dict) -> str:
     return f"{commit} + uncommitted changes" if manifest["dirty"] else commit
 
 
-def sources_json(page: Page, merged: Merged, folder: Path) -> dict:
+def sources_json(page: Page, merged: Merged, folder: Path, also: Sequence = ()) -> dict:
     """What a report is, the run, commit and file hashes behind every row and picture, and its files' hashes.
 
     Args:
         page: all of it.
         merged: its rows.
         folder: holds every other file of the report.
+        also: runs that no row of `merged` is of.
     """
     frame = merged.frame
     runs = {
@@ -65,7 +67,7 @@ def sources_json(page: Page, merged: Merged, folder: Path) -> dict:
             "files": source.hashes,
             "paper": source.summary.get("paper"),
         }
-        for source in used_sources(merged)
+        for source in used_sources(merged, also)
     }
     rows = [
         {"row": i, "run": source.id}

@@ -61,7 +61,7 @@ class Source:
 
     def __init__(self, run):
         self.run, self.id, self.manifest = run, run.id, run.manifest
-        self.hashes = {name: self._checked_hash(name) for name in FILES}
+        self.hashes = {name: checked_hash(run, name) for name in FILES}
         self.results = self._csv("results.csv", COLUMNS, text=TEXT)
         self.summary = json.loads(self._path("summary.json").read_text())
         self.cost = json.loads(self._path("cost.json").read_text())
@@ -115,20 +115,6 @@ class Source:
     def _path(self, name: str) -> Path:
         return Path(self.run.path) / name
 
-    def _checked_hash(self, name: str) -> str:
-        path = self._path(name)
-        if not path.is_file():
-            raise SchemaError(
-                f"{path} is missing from evaluate run {self.id}; run `nsf evaluate` for it again"
-            )
-        found, expected = file_hash(path), _recorded_hash(self.manifest, name)
-        if found != expected:
-            raise SchemaError(
-                f"{path} has sha256 {found[:12]} but the manifest of {self.id} records {str(expected)[:12]}: "
-                "it was changed after the run; delete the run folder and run `nsf evaluate` again"
-            )
-        return found
-
     def _csv(self, name: str, columns, text) -> pd.DataFrame:
         frame = pd.read_csv(self._path(name), dtype=dict.fromkeys(text, str))
         absent = [column for column in columns if column not in frame]
@@ -162,6 +148,26 @@ def same_parameter(a, b) -> bool:
         return bool(np.isclose(float(a), float(b), rtol=1e-5, atol=1e-9))
     except ValueError:
         return str(a) == str(b)
+
+
+def checked_hash(run, name: str) -> str:
+    """sha256 of a file of a run.
+
+    Raises:
+        SchemaError: the file is missing, or is not what the run's manifest records.
+    """
+    path = Path(run.path) / name
+    if not path.is_file():
+        raise SchemaError(
+            f"{path} is missing from {run.stage} run {run.id}; run `nsf {run.stage}` for it again"
+        )
+    found, expected = file_hash(path), _recorded_hash(run.manifest, name)
+    if found != expected:
+        raise SchemaError(
+            f"{path} has sha256 {found[:12]} but the manifest of {run.id} records {str(expected)[:12]}: "
+            f"it was changed after the run; delete the run folder and run `nsf {run.stage}` again"
+        )
+    return found
 
 
 def file_hash(path: Path) -> str:

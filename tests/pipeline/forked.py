@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 CONTEXT = multiprocessing.get_context("forkserver")
-CONTEXT.set_forkserver_preload(["nsf.pipeline", "nsf.reporting", "hydra"])
+CONTEXT.set_forkserver_preload(["nsf.pipeline", "nsf.reporting.build", "hydra"])
 
 
 @dataclass(frozen=True)

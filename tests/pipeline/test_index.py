@@ -7,8 +7,6 @@ import pytest
 from nsf.reporting.index import write_index
 from nsf.runs import Run
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-
 
 @pytest.fixture(scope="module")
 def page_of(chain, tmp_path_factory):
@@ -30,17 +28,6 @@ def test_thumbnails_are_drawn_once(page_of, chain):
     assert [picture.stat().st_mtime_ns for picture in pictures] == before
     assert chain.pipeline.evaluation.hash in page_of.read_text()
     assert "&lt;lost&gt;" in page_of.read_text()
-
-
-@pytest.fixture(scope="module")
-def browser():
-    sync = pytest.importorskip("playwright.sync_api", reason="the package playwright is not installed")
-    if CHROMIUM is None:
-        pytest.skip("no Chromium is installed; apt install chromium")
-    with sync.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture

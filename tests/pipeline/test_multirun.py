@@ -1,5 +1,8 @@
 """`nsf <stage> -m`: every combination of comma-separated values."""
 
+import json
+import shutil
+
 import pandas as pd
 import pytest
 from forked import PlainReport, SignalAt, run_nsf
@@ -94,6 +97,31 @@ def test_an_experiment_runs_its_jobs_and_reports_them(nsf, copied, tmp_path):
     again = nsf("report", root, *arguments, faults=[PlainReport()])
     assert again.code == 0
     assert "2 jobs, 0 missing" in again.out
+
+
+def test_an_experiment_may_ask_for_more_points(nsf, copied, tmp_path):
+    """experiments/super_resolution.yaml, made tiny and of one field."""
+    root = copied("simulate", "train")
+    tiny = ["field=basis", "evaluation.trials=1", "trainer.budget_minutes=null", "super_resolution.factor=2"]
+    arguments = ["+experiment=super_resolution", "scale=small", *tiny]
+    outcome = nsf("run", root, *arguments, faults=[PlainReport()])
+    assert outcome.code == 0, outcome.err
+    (run,) = Run.find("superresolve", root=root)
+    report = tmp_path / "work/reports/super_resolution_small"
+    table, own = (pd.read_csv(f / "superresolution.csv") for f in (report, run.path))
+    pd.testing.assert_frame_equal(table[list(own)], own)
+    assert list(table["scene"]) == ["sand"]
+    told = json.loads((report / "sources.json").read_text())
+    assert told["runs"][run.id]["files"]["superresolution.csv"]
+    assert told["pictures"]["sand-basis-superresolution.png"] == [run.id]
+    page = (report / "index.md").read_text()
+    assert "## At many more points" in page
+    assert run.id in page
+    shutil.rmtree(run.path)
+    without = nsf("report", root, *arguments, faults=[PlainReport()])
+    assert without.code == 2
+    assert "superresolve not run" in without.err
+    assert "## At many more points" not in (report / "index.md").read_text()
 
 
 def test_a_report_names_what_is_missing(nsf, copied, tmp_path):

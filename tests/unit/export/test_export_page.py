@@ -4,7 +4,6 @@ import base64
 import io
 import json
 import re
-import shutil
 import zlib
 from pathlib import Path
 
@@ -15,8 +14,6 @@ from PIL import Image
 from nsf.errors import ConfigError
 from nsf.export import html
 from nsf.export.playback import Playback
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
 @pytest.fixture(scope="module")
@@ -78,19 +75,6 @@ def test_text_of_a_run_cannot_end_the_script(played, tmp_path, monkeypatch):
     text = html.write(played(10), tmp_path).read_text()
     assert "</script><b>" not in text
     assert "<title>&lt;/script&gt;&lt;b&gt;</title>" in text
-
-
-@pytest.fixture(scope="module")
-def browser():
-    """Headless Chromium that cannot reach a network."""
-    api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    if CHROMIUM is None:
-        pytest.skip("no Chromium here (apt install chromium)")
-    with api.sync_playwright() as driver:
-        options = ["--no-sandbox", "--enable-unsafe-swiftshader"]
-        chromium = driver.chromium.launch(executable_path=CHROMIUM, args=options)
-        yield chromium
-        chromium.close()
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""Small snapshots on disk and quickly trained manifolds of both fields."""
+"""Small snapshots on disk and quickly trained manifolds of every field."""
 
 import numpy as np
 import pytest
@@ -6,12 +6,14 @@ import torch
 
 from nsf.data import Snapshots, TrajectoryWriter
 from nsf.kinematics.basis import BasisField
+from nsf.kinematics.joint import JointField
 from nsf.kinematics.mlp import MlpField
 from nsf.kinematics.schedules import FastTrainer
 from nsf.kinematics.training import train
 
 FIELDS = {
     "basis": BasisField(modes=[9, 7, 8], beta=4, depth=2),
+    "joint": JointField(modes=[9, 7, 8], beta=4, depth=2, stress_weight=1.0),
     "mlp": MlpField(beta=4, stress_parameters=True),
 }
 QUICK = FastTrainer(steps=250, learning_rate=1e-2, frames_per_batch=6, particles_per_batch=40)

@@ -117,7 +117,8 @@ def test_dtype(manifold):
 
 
 def test_encode(manifold, snapshots):
-    xhat = manifold.encode(snapshots.slab("x", slice(None)))
+    x, tau = (snapshots.slab(name, slice(None)) for name in ("x", "tau"))
+    xhat = manifold.encode(x, tau)
     assert xhat.dtype == torch.float64
     torch.testing.assert_close(xhat, manifold.training_latents, rtol=1e-5, atol=1e-5)
     with pytest.raises(ShapeError, match=r"\(1, 7, 3\).*150"):

@@ -1,7 +1,5 @@
 """The tiny chain's deployment, run live."""
 
-import shutil
-
 import pytest
 
 from nsf.live.model import LiveModel
@@ -18,17 +16,3 @@ def model(chain):
 def player(model):
     """A player whose worker is not started: tests do its work."""
     return Player(model)
-
-
-@pytest.fixture
-def browser():
-    """A headless Chromium with software WebGL."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    path = shutil.which("chromium") or shutil.which("google-chrome")
-    if path is None:
-        pytest.skip("there is no Chromium on the PATH")
-    software = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    with playwright.sync_playwright() as started:
-        chromium = started.chromium.launch(executable_path=path, args=["--no-sandbox", *software])
-        yield chromium
-        chromium.close()

@@ -347,7 +347,8 @@ def test_a_browser_decodes_what_the_server_does(browser, address, model):
     x = np.reshape(shown["x"], (-1, 3))
     expected = run.positions(round(shown["t"] / run.dt))
     moved = np.abs(expected - model.X).max()
-    assert np.abs(x - expected).max() < 1e-4 * moved
+    # The film may have begun anew since; early frames move so little that float32's own steps show.
+    assert np.abs(x - expected).max() < 1e-4 * moved + 1e-6
     assert math.isfinite(moved)
 
 

@@ -73,6 +73,7 @@ def test_equal_jobs_are_one(written):
         ("title: a", "must have the keys"),
         (TEXT.replace("question", "aim"), "must have the keys"),
         (TEXT[: TEXT.index("jobs")] + "jobs: 3", "jobs is a list"),
+        (TEXT + "stages: [point]\n", r"stages=\['point'\] must be a list of superresolve"),
         ("", "must have the keys"),
     ],
 )

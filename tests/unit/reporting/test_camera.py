@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from nsf.reporting import camera
 from nsf.reporting.camera import View
 from nsf.scenes import Box
 
@@ -20,3 +21,14 @@ def test_the_foremost_particles_make_the_same_picture():
     assert differs.mean() < 0.02
     fewer = view.picture(x[front[::3]], colors[front[::3]], radius)
     assert (np.abs(whole.astype(int) - fewer) > 8).any(axis=2).mean() > 0.1
+
+
+def test_each_pixel_shows_what_is_nearest():
+    rng = np.random.default_rng(0)
+    index, depth = rng.integers(0, 50, 400), rng.normal(size=400)
+    front = camera._foremost(index, depth, 60)
+    for pixel in range(60):
+        there = np.flatnonzero(index == pixel)
+        expected = there[depth[there].argmax()] if len(there) else -1
+        assert front[pixel] == expected
+    assert camera._foremost(np.array([3, 3]), np.array([1.0, 1.0]), 4).tolist() == [-1, -1, -1, 1]

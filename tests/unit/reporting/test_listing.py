@@ -1,5 +1,9 @@
 """Runs listed, filtered, sorted and compared, from manifests and configurations alone."""
 
+import os
+import subprocess
+import sys
+
 import pytest
 from rich.console import Console
 
@@ -111,3 +115,19 @@ def test_what_differs(root):
     assert any(row[-4:] == ["0.02", "0.001", "-95", "%"] and "delta" in row for row in rows)
     assert "trials" not in text
     assert "the same" in shown(difference_table(one.run, one.run))
+
+
+def test_listing_does_not_wait_for_pandas(root):
+    code = """
+import sys
+from nsf.cli import main
+try:
+    main(["runs"])
+except SystemExit as end:
+    assert not end.code
+assert not {"torch", "warp", "hydra", "matplotlib", "pandas"} & set(sys.modules)
+"""
+    environment = os.environ | {"NSF_RUNS": str(root)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "8 runs" in done.stderr

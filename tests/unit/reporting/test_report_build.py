@@ -9,7 +9,7 @@ from PIL import Image
 from synthetic import TEST, Made, seal, write_run
 
 from nsf.errors import ConfigError, StorageError
-from nsf.reporting import build, build_report
+from nsf.reporting import build, build_report, pictures
 from nsf.reporting.columns import number
 from nsf.reporting.pictures import _Variant
 from nsf.reporting.sources import Source, file_hash, open_sources
@@ -35,8 +35,8 @@ def test_report_has_every_file_and_links_only_what_is_there(report):
     page, markdown = (report / "index.html").read_text(), (report / "index.md").read_text()
     linked = set(re.findall(r'src="([^"]+)"', page)) | set(re.findall(r"\]\(([^)]+)\)", markdown))
     assert linked <= present
-    pictures = present - {"index.html", "index.md", "results.csv", "results.tex", "sources.json"}
-    assert {name.rsplit(".")[0] for name in pictures} == {name.rsplit(".")[0] for name in linked}
+    drawn = present - {"index.html", "index.md", "results.csv", "results.tex", "sources.json"}
+    assert {name.rsplit(".")[0] for name in drawn} == {name.rsplit(".")[0] for name in linked}
     assert "http" not in page.replace("http-equiv", "")
 
 
@@ -177,6 +177,20 @@ def test_animation_is_small_and_has_the_frames(report):
     with Image.open(path) as image:
         assert image.n_frames == Made().frames
         assert image.convert("RGB").getpixel((2, 2)) == (255, 255, 255)
+
+
+def test_animations_of_a_crowded_page_are_of_one_value_and_fewer_frames(tmp_path, monkeypatch):
+    monkeypatch.setattr(pictures, "CROWDED_BYTES", 2 * pictures.ANIMATIONS_BYTES)
+    monkeypatch.setattr(pictures, "CROWDED_FRAMES", 3)
+    drawn = []
+    monkeypatch.setattr(
+        pictures.render, "animation", lambda motions, *_, **keys: drawn.append((motions, keys))
+    )
+    run = write_run(tmp_path / "runs", TINY)
+    build_report([run], tmp_path / "report", "t")
+    ((motions, keys),) = drawn
+    assert [motion.parameter for motion in motions] == [TEST[0]]
+    assert keys["frames"] == 3
 
 
 def test_one_value_without_paper_or_costs(tmp_path):
