@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp
 
 from nsf.errors import ConfigError, InstabilityError, ShapeError
+from nsf.mpm.access import WARP
 from nsf.mpm.boundary import BoundaryArrays, DomainWalls
 from nsf.mpm.colliders import Collider
 from nsf.mpm.device import warp_device
@@ -93,7 +94,8 @@ class GridStep:
             self.dt,
             grid.values,
         ]
-        wp.launch(self._p2g, dim=x.shape[0], inputs=inputs, device=self.device)
+        whole_warps = -(-x.shape[0] // WARP) * WARP
+        wp.launch(self._p2g, dim=whole_warps, inputs=inputs, device=self.device)
 
     def update(self) -> None:
         """Momentum → velocity at the next time level, boundaries included, which move on by a step."""
