@@ -102,8 +102,8 @@ def pass_times(solver: FullOrderMPM) -> dict[str, tuple[float, int]]:
         "g2p_stress": (14 + H) * P + 4 * nodes + (33 + H) * P,  # x, F_e, h, μ̂, λ; v_i; x, v, C, F_e, h, τ
     }
     calls = {
-        "clear": lambda: step.clear(s.x),
-        "p2g": lambda: step.scatter(s.x, s.v, s.C, s.tau, solver.mass, solver.volume0),
+        "clear": lambda: step.clear(s.x.rows),
+        "p2g": lambda: step.scatter(s.x.rows, s.v.rows, s.C.rows, s.tau.rows, solver.mass, solver.volume0),
         "grid": step.update,
         "g2p_stress": solver.g2p_stress,
     }

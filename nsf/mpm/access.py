@@ -1,4 +1,4 @@
-"""Access to a node's four values at once: the transfers are bound by the number of accesses, not by bytes."""
+"""Access to a node's four values at once, and for many particles: accesses, not bytes, bind the transfers."""
 
 from functools import cache
 
@@ -36,6 +36,80 @@ _LOAD_FP64 = """
     return wp::index(values, slot);
 #endif
 """
+# All 32 lanes of a warp take part in what follows.
+_RUN = """
+#if defined(__CUDA_ARCH__)
+    const unsigned all = 0xffffffffu;
+    int lane = threadIdx.x & 31;
+    int before = __shfl_up_sync(all, key, 1);
+    bool first = lane == 0 || before != key;
+    unsigned others = __ballot_sync(all, first);
+    unsigned after = lane == 31 ? 0u : others >> (lane + 1);
+    int left = after ? __ffs(after) : 32 - lane;
+    return first ? left : -left;
+#else
+    return 1;
+#endif
+"""
+_SUM = """
+#if defined(__CUDA_ARCH__)
+    const unsigned all = 0xffffffffu;
+    int left = run < 0 ? -run : run;
+    int longest = __reduce_max_sync(all, left);
+    wp::vec_t<4, {real}> sum = value;
+    for (int offset = 1; offset < longest; offset *= 2) {{
+        {real} a = __shfl_down_sync(all, sum[0], offset);
+        {real} b = __shfl_down_sync(all, sum[1], offset);
+        {real} c = __shfl_down_sync(all, sum[2], offset);
+        {real} d = __shfl_down_sync(all, sum[3], offset);
+        if (offset < left) {{
+            sum[0] += a;
+            sum[1] += b;
+            sum[2] += c;
+            sum[3] += d;
+        }}
+    }}
+    return sum;
+#else
+    return value;
+#endif
+"""
+#: Threads that take every step together; a kernel with sums is launched over whole warps.
+WARP = 32
+
+
+@cache
+def make_sum(precision: Precision, deterministic: bool):
+    """Warp functions (run_of, sum) that add up values of neighbouring threads of a warp with the same key.
+
+    run_of: key → number of threads from this one to the last of those in a row that have its key; negative
+    where the thread before has it too. sum: (value, run) → the sum over these threads, of which the first,
+    whose run is positive, alone counts. On a CPU, or if deterministic, every thread is alone.
+
+    Args:
+        precision: of the values.
+        deterministic: see above.
+    """
+    vec4 = precision.vec4
+    if deterministic:
+
+        @wp.func
+        def run_of(key: int):
+            return 1
+
+        @wp.func
+        def total(value: vec4, run: int):
+            return value
+
+    else:
+
+        @wp.func_native(_RUN)
+        def run_of(key: int) -> int: ...
+
+        @wp.func_native(_SUM.format(real="float" if precision is FP32 else "double"))
+        def total(value: vec4, run: int) -> vec4: ...
+
+    return run_of, total
 
 
 @cache

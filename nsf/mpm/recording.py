@@ -25,15 +25,17 @@ def _make_pack(precision: Precision, stored: Precision):
         v: wp.array(dtype=vec3),
         C: wp.array(dtype=mat33),
         tau: wp.array(dtype=mat33),
+        order: wp.array(dtype=wp.int32),
         frame: wp.array2d(dtype=out),
     ):
-        p = wp.tid()
+        row = wp.tid()
+        p = order[row]
         for a in range(3):
-            frame[p, a] = out(x[p][a])
-            frame[p, 3 + a] = out(v[p][a])
+            frame[p, a] = out(x[row][a])
+            frame[p, 3 + a] = out(v[row][a])
             for b in range(3):
-                frame[p, 6 + 3 * a + b] = out(C[p][a, b])
-        t = tau[p]
+                frame[p, 6 + 3 * a + b] = out(C[row][a, b])
+        t = tau[row]
         frame[p, 15] = out(t[0, 0])
         frame[p, 16] = out(t[0, 1])
         frame[p, 17] = out(t[0, 2])
@@ -55,7 +57,7 @@ class FrameRecorder:
 
     def __init__(self, state: ParticleState, precision: Precision, stored: Precision = FP32):
         self._state = state
-        self._device = state.x.device
+        self._device = state.order.device
         frame_bytes = len(state) * _WIDTH * np.dtype(stored.numpy).itemsize
         self.capacity = max(1, _BLOCK_BYTES // frame_bytes)
         shape = (self.capacity, len(state), _WIDTH)
@@ -71,7 +73,7 @@ class FrameRecorder:
     def record(self) -> None:
         """Pack the current state as the next frame."""
         s = self._state
-        inputs = [s.x, s.v, s.C, s.tau, self._block[self.count]]
+        inputs = [s.x.rows, s.v.rows, s.C.rows, s.tau.rows, s.order, self._block[self.count]]
         wp.launch(self._pack, dim=len(s), inputs=inputs, device=self._device)
         self.count += 1
 

@@ -36,6 +36,11 @@ class ShapeFunctions:
         return (self.degree + 1) / 12.0
 
 
+def stencil_offset(name: str) -> float:
+    """From a particle down to its stencil, at least [dx]: 1/2 for `quadratic`, 1 for `cubic`."""
+    return 0.5 * (DEGREES[name] - 1)
+
+
 @cache
 def shape_functions(precision: Precision, name: str) -> ShapeFunctions:
     """Build the interpolation functions of B-spline `name`.
@@ -54,8 +59,7 @@ def shape_functions(precision: Precision, name: str) -> ShapeFunctions:
     degree = DEGREES[name]
     real, vec3 = precision.real, precision.vec3
     stencil = wp.types.matrix(shape=(3, degree + 1), dtype=real)
-    # The stencil starts this far (in cells) below the particle: 1/2 for quadratic, 1 for cubic.
-    offset = 0.5 * (degree - 1)
+    offset = stencil_offset(name)
 
     @wp.func
     def base_node(x: vec3, inv_dx: real):

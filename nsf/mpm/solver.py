@@ -7,12 +7,14 @@ import numpy as np
 import warp as wp
 
 from nsf.errors import ConfigError, InstabilityError, ShapeError
+from nsf.mpm.access import WARP
 from nsf.mpm.boundary import BoundaryArrays, DomainWalls
 from nsf.mpm.colliders import Collider
 from nsf.mpm.device import warp_device
 from nsf.mpm.grid import Grid, GridGeometry, make_grid_update, make_reach
 from nsf.mpm.materials import Material, make_elastic_stress, make_stress_update
 from nsf.mpm.precision import Precision, precision_of
+from nsf.mpm.shape import stencil_offset
 from nsf.mpm.stability import (
     MAX_ELASTIC_CFL,
     check_colliders,
@@ -20,7 +22,7 @@ from nsf.mpm.stability import (
     make_particle_check,
     wave_speed_at,
 )
-from nsf.mpm.state import ParticleConstants, ParticleState
+from nsf.mpm.state import ParticleConstants, ParticleState, cell_order
 from nsf.mpm.transfer import Transfer, make_g2p, make_g2p_stress, make_p2g
 from nsf.timing import StageTimer
 
@@ -92,7 +94,8 @@ class GridStep:
             self.dt,
             grid.values,
         ]
-        wp.launch(self._p2g, dim=x.shape[0], inputs=inputs, device=self.device)
+        whole_warps = -(-x.shape[0] // WARP) * WARP
+        wp.launch(self._p2g, dim=whole_warps, inputs=inputs, device=self.device)
 
     def update(self) -> None:
         """Momentum → velocity at the next time level, boundaries included, which move on by a step."""
@@ -175,13 +178,15 @@ class FullOrderMPM:
 
         real = self.precision.real
 
+        order = cell_order(x, grid.dx, stencil_offset(transfer.shape))
+
         def on_device(values):
-            return wp.array(values, dtype=real, device=self.device)
+            return wp.array(values[order], dtype=real, device=self.device)
 
         self.mass, self.volume0 = on_device(constants.mass), on_device(constants.volume0)
         self.mu, self.lam = on_device(constants.mu), on_device(constants.lam)
         history = material.initial_history(len(constants))
-        self.state = ParticleState(x, v, history, self.precision, self.device)
+        self.state = ParticleState(x, v, history, order, self.precision, self.device)
         self.grid = Grid(grid, self.precision, self.device)
         boundaries = BoundaryArrays(colliders, walls, self.precision, self.device)
         self.grid_step = GridStep(self.grid, boundaries, transfer, gravity, dt, self.precision, self.device)
@@ -281,29 +286,30 @@ class FullOrderMPM:
     def p2g(self) -> None:
         """Particles → grid."""
         s = self.state
-        self.grid_step.p2g(s.x, s.v, s.C, s.tau, self.mass, self.volume0)
+        self.grid_step.p2g(s.x.rows, s.v.rows, s.C.rows, s.tau.rows, self.mass, self.volume0)
 
     def g2p_stress(self) -> None:
         """Grid → particles, F_e ← returnMap(f F_e), τ ← τ(F_e)."""
         s = self.state
         inputs = [*self.grid_step.gathering, self.mu, self.lam, self._params]
-        inputs += [s.x, s.v, s.C, s.F_e, s.history, s.tau]
+        inputs += [a.rows for a in (s.x, s.v, s.C, s.F_e, s.history, s.tau)]
         wp.launch(self._g2p_stress, dim=len(s), inputs=inputs, device=self.device)
 
     @cached_property
     def increment(self) -> wp.array:
         """[P, 3, 3] f = I + Δt ∇v of the last step that was taken stage by stage; `step` needs none."""
-        return wp.empty_like(self.state.F_e)
+        return wp.empty_like(self.state.F_e.rows)
 
     def g2p(self) -> None:
         """Grid → particles."""
         s = self.state
-        self.grid_step.g2p(s.x, s.v, s.C, self.increment)
+        self.grid_step.g2p(s.x.rows, s.v.rows, s.C.rows, self.increment)
 
     def update_stress(self) -> None:
         """F_e ← returnMap(f F_e), τ ← τ(F_e)."""
         s = self.state
-        inputs = [self.increment, self.mu, self.lam, self._params, self.grid_step.dt, s.F_e, s.history, s.tau]
+        inputs = [self.increment, self.mu, self.lam, self._params, self.grid_step.dt]
+        inputs += [s.F_e.rows, s.history.rows, s.tau.rows]
         wp.launch(self._stress_update, dim=len(s), inputs=inputs, device=self.device)
 
     def elastic_cfl(self) -> float:
@@ -314,16 +320,17 @@ class FullOrderMPM:
         kernel = make_elastic_stress(
             self.material.functions(self.precision), self.precision, self.material.history_size
         )
-        tau = wp.empty_like(self.state.tau)
+        s = self.state
+        tau = wp.empty_like(s.tau.rows)
 
         def tau_of(F: np.ndarray) -> np.ndarray:
             stretched = wp.array(F, dtype=self.precision.mat33, device=self.device)
-            inputs = [stretched, self.state.history, self.mu, self.lam, tau]
+            inputs = [stretched, s.history.rows, self.mu, self.lam, tau]
             wp.launch(kernel, dim=len(F), inputs=inputs, device=self.device)
             return tau.numpy().astype(float)
 
-        density = self.constants.mass / self.constants.volume0
-        speed = wave_speed_at(tau_of, self.state.F_e.numpy().astype(float), density)
+        density = (self.constants.mass / self.constants.volume0)[s.order.numpy()]
+        speed = wave_speed_at(tau_of, s.F_e.rows.numpy().astype(float), density)
         return speed * self.dt / self.grid.geometry.dx
 
     def check(self) -> None:
@@ -335,9 +342,10 @@ class FullOrderMPM:
         s = self.state
         self._first_bad.fill_(_NEVER)
         inputs = [
-            s.x,
-            s.v,
-            s.tau,
+            s.x.rows,
+            s.v.rows,
+            s.tau.rows,
+            s.order,
             self.grid.shape,
             self.grid_step.dx,
             self._first_bad[0:1],

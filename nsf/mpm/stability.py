@@ -123,6 +123,7 @@ def make_particle_check(precision: Precision, shape_name: str):
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
         tau: wp.array(dtype=mat33),
+        order: wp.array(dtype=wp.int32),
         grid_shape: wp.vec3i,
         dx: real,
         first_non_finite: wp.array(dtype=wp.int32),
@@ -132,8 +133,8 @@ def make_particle_check(precision: Precision, shape_name: str):
         # The sum of squares is finite only if every entry is.
         size = wp.length_sq(x[p]) + wp.length_sq(v[p]) + wp.ddot(tau[p], tau[p])
         if not wp.isfinite(size):
-            wp.atomic_min(first_non_finite, 0, p)
+            wp.atomic_min(first_non_finite, 0, order[p])
         elif not inside(base_node(x[p], real(1.0) / dx), width, grid_shape):
-            wp.atomic_min(first_outside, 0, p)
+            wp.atomic_min(first_outside, 0, order[p])
 
     return check

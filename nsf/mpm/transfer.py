@@ -10,7 +10,7 @@ from functools import cache
 import warp as wp
 
 from nsf.errors import ConfigError
-from nsf.mpm.access import make_add, make_load
+from nsf.mpm.access import make_add, make_load, make_sum
 from nsf.mpm.grid import flat_index, inside, storage
 from nsf.mpm.materials import LawFunctions, make_law_update
 from nsf.mpm.precision import Precision
@@ -64,11 +64,12 @@ class Transfer:
 
 @cache
 def make_p2g(precision: Precision, shape_name: str, deterministic: bool = False):
-    """Kernel of P2G, one thread a particle.
+    """Kernel of P2G, one thread a particle, launched over whole warps of threads.
 
     m_i = Σ_p w_ip m_p and, with the explicit force's impulse added in the same sweep,
     m_i v_i = Σ_p w_ip m_p (v_p + C_p (x_i − x_p)) − Δt Σ_p τ_p ∇w_ip V_p⁰.
-    Particles off the grid are passed over; the solver's check reports them.
+    Particles off the grid are passed over; the solver's check reports them. Particles of one cell that
+    follow each other are added up before they reach the nodes.
 
     Source: paper section 3.3, steps 1 and 2.
     """
@@ -76,7 +77,7 @@ def make_p2g(precision: Precision, shape_name: str, deterministic: bool = False)
     shape = shape_functions(precision, shape_name)
     width = shape.degree + 1
     base_node, local, weights, gradients = shape.base_node, shape.local, shape.weights, shape.gradients
-    add = make_add(precision, deterministic)
+    add, (run_of, total) = make_add(precision, deterministic), make_sum(precision, deterministic)
     options = {"max_unroll": 4}
     if deterministic:
         options |= {"deterministic": wp.DeterministicMode.RUN_TO_RUN, "deterministic_max_records": width**3}
@@ -95,11 +96,14 @@ def make_p2g(precision: Precision, shape_name: str, deterministic: bool = False)
         dt: real,
         values: wp.array(dtype=vec4),
     ):
-        p = wp.tid()
+        p = wp.min(wp.tid(), x.shape[0] - 1)
         inv_dx = real(1.0) / dx
         base = base_node(x[p], inv_dx)
-        if not inside(base, width, grid_shape):
-            return
+        # No thread leaves early, as the sums need all of a warp.
+        cell = -1
+        if wp.tid() < x.shape[0] and inside(base, width, grid_shape):
+            cell = flat_index(base[0], base[1], base[2], grid_shape)
+        run = run_of(cell)
         f = local(x[p], inv_dx, base)
         w = weights(f)
         d = gradients(f)
@@ -113,13 +117,15 @@ def make_p2g(precision: Precision, shape_name: str, deterministic: bool = False)
                 da_b = d[0, a] * w[1, b]
                 a_db = w[0, a] * d[1, b]
                 for c in range(width):
-                    slot = storage(flat_index(base[0] + a, base[1] + b, base[2] + c, grid_shape), slots)
-                    if slot >= 0:
-                        weight = w_ab * w[2, c]
-                        reach = vec3(real(float(a)) - f[0], real(float(b)) - f[1], real(float(c)) - f[2])
-                        slope = vec3(da_b * w[2, c], a_db * w[2, c], w_ab * d[2, c])
-                        carried = weight * (momentum + affine * reach) + impulse * slope
-                        add(values, slot, vec4(carried[0], carried[1], carried[2], weight * m))
+                    weight = w_ab * w[2, c]
+                    reach = vec3(real(float(a)) - f[0], real(float(b)) - f[1], real(float(c)) - f[2])
+                    slope = vec3(da_b * w[2, c], a_db * w[2, c], w_ab * d[2, c])
+                    carried = weight * (momentum + affine * reach) + impulse * slope
+                    added = total(vec4(carried[0], carried[1], carried[2], weight * m), run)
+                    if run > 0 and cell >= 0:
+                        slot = storage(cell + flat_index(a, b, c, grid_shape), slots)
+                        if slot >= 0:
+                            add(values, slot, added)
 
     return p2g
 

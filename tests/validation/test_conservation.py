@@ -111,8 +111,8 @@ def test_virial_of_the_internal_force(shape, free_body, rng):
     tau = rng.normal(size=(len(solver.constants), 3, 3))
     s = solver.state
     s.tau.assign(tau)
-    s.v.zero_()
-    s.C.zero_()
+    s.v.assign(np.zeros_like(solver.constants.X))
+    s.C.assign(np.zeros((len(solver.constants), 3, 3)))
     solver.p2g()
     nodes = np.stack(np.unravel_index(np.arange(solver.grid.count), solver.grid.geometry.nodes), -1) * DX
     force = solver.grid.momentum.numpy() / solver.dt

@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 import warp as wp
 
-from nsf.mpm import DomainWalls, FullOrderMPM, Grid, GridGeometry, HalfSpace, ParticleConstants, Transfer
+from nsf.mpm import (
+    FP64,
+    DomainWalls,
+    FullOrderMPM,
+    Grid,
+    GridGeometry,
+    HalfSpace,
+    ParticleConstants,
+    Transfer,
+)
 from nsf.mpm.materials import (
     DruckerPrager,
     FixedCorotated,
@@ -15,6 +24,8 @@ from nsf.mpm.materials import (
     VonMisesHardening,
     VonMisesSoftening,
 )
+from nsf.mpm.recording import FrameRecorder, unpacked
+from nsf.mpm.state import cell_order
 from nsf.timing import untimed
 
 DX, DT = 1.0 / 16.0, 0.002
@@ -141,3 +152,40 @@ def test_a_particle_off_the_grid_lists_no_block(solver_on):
     solver.p2g()
     assert solver.grid.listed.numpy()[0] == 0
     assert not solver.grid.values.numpy().any()
+
+
+@pytest.mark.parametrize("shape", ["quadratic", "cubic"])
+def test_rows_lie_in_cell_order_and_nobody_sees_it(shape, block, solver_on):
+    solver = solver_on(MATERIALS[0], Transfer(shape=shape))
+    X, state = solver.constants.X, solver.state
+    np.testing.assert_array_equal(state.numpy()["x"], X)
+    order = state.order.numpy()
+    assert sorted(order) == list(range(len(X)))
+    assert (order != np.arange(len(X))).any()
+    np.testing.assert_array_equal(state.x.rows.numpy(), X[order])
+    cells = np.floor(X[order] / DX - {"quadratic": 0.5, "cubic": 1.0}[shape]).astype(int)
+    for of in (cells, cells // 4):
+        changes = 1 + (np.diff(of, axis=0) != 0).any(1).sum()
+        assert changes == len(np.unique(of, axis=0))  # no cell and no block is met twice
+    solver.step(3)
+    values = {"x": X + 0.25, "tau": np.arange(9.0 * len(X)).reshape(-1, 3, 3)}
+    for name, of in values.items():
+        getattr(state, name).assign(of)
+        np.testing.assert_array_equal(state.numpy()[name], of)
+
+
+def test_frames_are_in_the_particles_order(solver_on):
+    solver = solver_on(MATERIALS[2])
+    solver.step(5)
+    recorder = FrameRecorder(solver.state, solver.precision, FP64)
+    recorder.record()
+    x, v, C, tau = unpacked(recorder.take()[0])
+    state = solver.state.numpy()
+    for found, name in ((x, "x"), (v, "v"), (C, "C")):
+        np.testing.assert_array_equal(found, state[name].reshape(len(found), -1))
+    np.testing.assert_array_equal(tau[:, 1], state["tau"][:, 0, 1])
+
+
+def test_particles_of_no_cell_have_an_order():
+    x = np.array([[np.nan, 0.5, 0.5], [1e300, -1e300, 0.5], [0.5, 0.5, 0.5], [-1.0, np.inf, 0.0]])
+    assert sorted(cell_order(x, DX, 0.5)) == [0, 1, 2, 3]
