@@ -24,14 +24,11 @@ from nsf.dynamics.phase import Phase, Setting, Stages
 from nsf.dynamics.projection import Taylor
 from nsf.dynamics.stress import Method
 from nsf.kinematics.basis import ModalFactors
-from nsf.kinematics.interpolation import lying_together
 from nsf.mpm import GridStep
 from nsf.mpm.device import warp_device
 from nsf.mpm.grid import Grid
 from nsf.mpm.materials import Material, make_elastic_stress
 from nsf.mpm.shape import DEGREES
-
-_GROUP = 32  # particles that lie together in the arrays: a warp is needed, or passed over, as one
 
 
 class ModalPhase(Phase):
@@ -64,7 +61,7 @@ class ModalPhase(Phase):
         material: Material,
         weights: np.ndarray | None,
     ):
-        order = _lying_together(sets, setting.constants.X)
+        order = _by_cell(sets, setting.constants.X, grid_step.grid.geometry.dx)
         at_sample = manifold.restrict(sets.sample, dtype=setting.dtype, device=setting.device)
         super().__init__(setting, sets, order, grid_step, at_sample)
         self._arena = arena = Arena(setting.precision, warp_device(str(setting.device)))
@@ -216,14 +213,13 @@ class Projection:
         self.launches, self.evaluate = [gather, solve(projector.iterations)], solve(0)
 
 
-def _lying_together(sets: ParticleSets, X: np.ndarray) -> np.ndarray:
-    """N with S first, and the others in groups of neighbours."""
+def _by_cell(sets: ParticleSets, X: np.ndarray, dx: float) -> np.ndarray:
+    """N with S first, and the others cell by cell at rest: neighbours are needed together, and P2G adds up
+    those of one cell."""
     s = len(sets.sample)
     others = sets.integration[s:]
-    if not len(others):
-        return sets.integration
-    groups = lying_together(torch.as_tensor(X[others]), _GROUP)
-    return np.concatenate([sets.sample, others[torch.cat(groups).numpy()]])
+    cells = np.floor(X[others] / dx).astype(int)
+    return np.concatenate([sets.sample, others[np.lexsort(cells.T[::-1])]])
 
 
 def _placing(arena: Arena, state: Coefficients, mean: torch.Tensor, modes: torch.Tensor, phase: Phase):

@@ -512,18 +512,19 @@ def make_projection(precision: Precision, widths: tuple[int, ...], latents: int,
     #define NSF_SHARED
     #define NSF_SYNC
     const int lane = 0, lanes = 1, PARTS = 1;
-    auto rsqrt = [](double value) {{ return 1.0 / sqrt(value); }};
 #endif
     const int R = {latents}, K = {modes}, C = R + 1;
     const int ROW = (R + 3) / 4 * 4;  // whole vectors of four
     const int AHEAD = {min(18, -(-widest // _PARTS))};  // weights whose loads are under way together
     NSF_SHARED real value[2][{widest}];
     NSF_SHARED alignas(16) slope_t slope[2][{widest} * ROW];
-    NSF_SHARED double x[R], moved[K], at[K], A[K * R], q[K], M[K * R], g[R], H[R * R], error;
+    NSF_SHARED double x[R], moved[K], at[K], a_n[K], d[K + 1], A[K * R], q[K], M[K * R], g[R], E[2][R * C];
+    NSF_SHARED double error;
     NSF_SHARED int going;
     {"NSF_SHARED double gram[K * K];" if kept else "const double* gram = G.data;"}
 
     auto evaluate = [&]() {{
+        #pragma unroll 1
         for (int e = lane; e < R * R; e += lanes) {{
             const int i = e / R, c = e % R;
             slope[0][i * ROW + c] = i == c ? 1.0f : 0.0f;
@@ -538,11 +539,13 @@ def make_projection(precision: Precision, widths: tuple[int, ...], latents: int,
     }};
     // q = b - G da.
     auto residual = [&]() {{
-        for (int k = lane; k < K; k += lanes) moved[k] = at[k] - a.data[k];
+        #pragma unroll 1
+        for (int k = lane; k < K; k += lanes) moved[k] = at[k] - a_n[k];
         NSF_SYNC;
+        #pragma unroll 1
         for (int k = lane; k < K; k += lanes) {{
-            double sum = b.data[k];
-            #pragma unroll 8
+            double sum = d[k];
+            #pragma unroll 2
             for (int j = 0; j < K; ++j) sum -= gram[j * K + k] * moved[j];
             q[k] = sum;
         }}
@@ -550,14 +553,19 @@ def make_projection(precision: Precision, widths: tuple[int, ...], latents: int,
     }};
     // The squared error, of which q is known.
     auto left = [&]() {{
-        double sum = b.data[K];
-        #pragma unroll 8
-        for (int k = 0; k < K; ++k) sum -= moved[k] * (b.data[k] + q[k]);
+        double sum = d[K];
+        #pragma unroll 2
+        for (int k = 0; k < K; ++k) sum -= moved[k] * (d[k] + q[k]);
         return sum > 0.0 ? sum : (sum <= 0.0 ? 0.0 : sum);  // a NaN stays one
     }};
 
+    #pragma unroll 1
     for (int i = lane; i < R; i += lanes) x[i] = latent.data[i];
-    for (int k = lane; k < K; k += lanes) at[k] = a.data[k];
+    #pragma unroll 1
+    for (int k = lane; k < K; k += lanes) at[k] = a_n[k] = a.data[k];
+    #pragma unroll 1
+    for (int k = lane; k <= K; k += lanes) d[k] = b.data[k];
+    #pragma unroll 1
     for (int e = lane; e < K * R; e += lanes) A[e] = tangents.data[e];
     {"for (int e = lane; e < K * K; e += lanes) gram[e] = G.data[e];" if kept else ""}
     if (lane == 0) going = 1;
@@ -567,53 +575,46 @@ def make_projection(precision: Precision, widths: tuple[int, ...], latents: int,
     do {{
         if (iterations > 0) {{
             residual();
+            #pragma unroll 1
             for (int e = lane; e < K * R; e += lanes) {{
                 const int k = e / R, c = e % R;
                 double sum = 0.0;
-                #pragma unroll 8
+                #pragma unroll 2
                 for (int j = 0; j < K; ++j) sum += gram[j * K + k] * A[j * R + c];
                 M[e] = sum;
             }}
             if (lane == lanes - 1) error = left();
             NSF_SYNC;
+            #pragma unroll 1
             for (int e = lane; e < R * C; e += lanes) {{
-                const int c = e / C, d = e % C;
+                const int c = e / C, other = e % C;
                 double sum = 0.0;
-                #pragma unroll 8
-                for (int k = 0; k < K; ++k) sum += A[k * R + c] * (d < R ? M[k * R + d] : q[k]);
-                if (d < R) H[c * R + d] = sum; else g[c] = sum;
+                #pragma unroll 2
+                for (int k = 0; k < K; ++k) sum += A[k * R + c] * (other < R ? M[k * R + other] : q[k]);
+                E[0][e] = sum;
+                if (other == R) g[c] = sum;
             }}
             NSF_SYNC;
+            // Gauss and Jordan on [AᵀG A | Aᵀq]; it is positive definite, so that no pivot is sought.
+            #pragma unroll 1
+            for (int m = 0; m < R; ++m) {{
+                const double* from = E[m % 2];
+                #pragma unroll 1
+                for (int e = lane; e < R * C; e += lanes) {{
+                    const int i = e / C, c = e % C;
+                    const double row = from[m * C + c] / from[m * C + m];
+                    E[1 - m % 2][e] = i == m ? row : from[e] - from[i * C + m] * row;
+                }}
+                NSF_SYNC;
+            }}
             if (lane == 0) {{
-                // Cholesky; a matrix that is not positive definite gives a NaN, not a wrong update.
-                double L[R][R], inverse[R], u[R], length = 0.0, change = 0.0;
-                #pragma unroll
+                double length = 0.0, change = 0.0;
+                #pragma unroll 1
                 for (int i = 0; i < R; ++i) {{
-                    #pragma unroll
-                    for (int j = 0; j <= i; ++j) {{
-                        double sum = H[i * R + j];
-                        #pragma unroll
-                        for (int m = 0; m < j; ++m) sum -= L[i][m] * L[j][m];
-                        if (i == j) inverse[i] = rsqrt(sum);
-                        else L[i][j] = sum * inverse[j];
-                    }}
-                }}
-                #pragma unroll
-                for (int i = 0; i < R; ++i) {{
-                    double sum = g[i];
-                    #pragma unroll
-                    for (int m = 0; m < i; ++m) sum -= L[i][m] * u[m];
-                    u[i] = sum * inverse[i];
-                    change += u[i] * u[i];
-                }}
-                #pragma unroll
-                for (int i = R - 1; i >= 0; --i) {{
-                    double sum = u[i];
-                    #pragma unroll
-                    for (int m = i + 1; m < R; ++m) sum -= L[m][i] * u[m];
-                    u[i] = sum * inverse[i];
-                    length += u[i] * u[i];
-                    x[i] += u[i];
+                    const double u = E[R % 2][i * C + R];
+                    length += u * u;
+                    change += u * g[i];
+                    x[i] += u;
                 }}
                 length = sqrt(length);
                 residuals.data[n * (iterations + 1) + done] = real(sqrt(error / sample));
@@ -639,6 +640,7 @@ def make_projection(precision: Precision, widths: tuple[int, ...], latents: int,
             step.data[0] += 1;
         }}
     }}
+    #pragma unroll 1
     for (int i = lane; i < R; i += lanes) {{
         if (iterations > 0) {{
             xhat_previous.data[i] = xhat.data[i];
@@ -647,10 +649,12 @@ def make_projection(precision: Precision, widths: tuple[int, ...], latents: int,
         }}
         latent.data[i] = x[i];
     }}
+    #pragma unroll 1
     for (int k = lane; k < K; k += lanes) {{
-        rate.data[k] = (at[k] - a.data[k]) / dt;
+        rate.data[k] = (at[k] - a_n[k]) / dt;
         a.data[k] = at[k];
     }}
+    #pragma unroll 1
     for (int e = lane; e < K * R; e += lanes) tangents.data[e] = A[e];
     #undef NSF_SHARED
     #undef NSF_SYNC

@@ -39,6 +39,7 @@ _LOAD_FP64 = """
 # All 32 lanes of a warp take part in what follows.
 _RUN = """
 #if defined(__CUDA_ARCH__)
+    if (__all_sync(0xffffffffu, key < 0)) return 0;
     const unsigned all = 0xffffffffu;
     int lane = threadIdx.x & 31;
     int before = __shfl_up_sync(all, key, 1);
@@ -48,7 +49,7 @@ _RUN = """
     int left = after ? __ffs(after) : 32 - lane;
     return first ? left : -left;
 #else
-    return 1;
+    return key < 0 ? 0 : 1;
 #endif
 """
 _SUM = """
@@ -83,8 +84,9 @@ def make_sum(precision: Precision, deterministic: bool):
     """Warp functions (run_of, sum) that add up values of neighbouring threads of a warp with the same key.
 
     run_of: key → number of threads from this one to the last of those in a row that have its key; negative
-    where the thread before has it too. sum: (value, run) → the sum over these threads, of which the first,
-    whose run is positive, alone counts. On a CPU, or if deterministic, every thread is alone.
+    where the thread before has it too; 0 where no thread of the warp has a key ≥ 0, so that all may leave.
+    sum: (value, run) → the sum over these threads, of which the first, whose run is positive, alone counts.
+    On a CPU, or if deterministic, every thread is alone.
 
     Args:
         precision: of the values.
@@ -95,7 +97,7 @@ def make_sum(precision: Precision, deterministic: bool):
 
         @wp.func
         def run_of(key: int):
-            return 1
+            return wp.where(key < 0, 0, 1)
 
         @wp.func
         def total(value: vec4, run: int):

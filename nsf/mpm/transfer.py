@@ -99,11 +99,13 @@ def make_p2g(precision: Precision, shape_name: str, deterministic: bool = False)
         p = wp.min(wp.tid(), x.shape[0] - 1)
         inv_dx = real(1.0) / dx
         base = base_node(x[p], inv_dx)
-        # No thread leaves early, as the sums need all of a warp.
+        # Threads leave as a warp or not at all, as the sums need all of it.
         cell = -1
         if wp.tid() < x.shape[0] and inside(base, width, grid_shape):
             cell = flat_index(base[0], base[1], base[2], grid_shape)
         run = run_of(cell)
+        if run == 0:
+            return
         f = local(x[p], inv_dx, base)
         w = weights(f)
         d = gradients(f)
