@@ -25,7 +25,7 @@ from nsf.errors import ConfigError
 from nsf.kinematics import pod
 from nsf.kinematics.interpolation import Interpolation, interpolation
 from nsf.kinematics.manifold import Manifold, Restriction
-from nsf.kinematics.networks import FullyConnected
+from nsf.kinematics.networks import Committee, FullyConnected
 from nsf.kinematics.phases import PHASES, TARGETS, Fit, at_least, joined, per_phase, shaped
 
 ENCODED_ENTRIES = 1 << 26  # values encoded at once
@@ -39,6 +39,8 @@ class BasisField:
         modes: K of x, tau and C: one for all, [x, tau=C] or [x, tau, C]; cut to the snapshots' rank.
         beta: hidden widths over d (3, 6, 9) of the closure and the two heads, given like `modes`.
         depth: hidden layers of each network.
+        members: networks of each phase, trained side by side on noise of their own, and averaged; deployed as
+            one network of that many times the width.
         noise: deviation of the noise added to xhat in training, in units of xhat's deviation. It keeps the
             Jacobian and the heads regular beside the training trajectories.
         head_parameters: the heads see the (standardised) problem parameters beside xhat.
@@ -47,6 +49,7 @@ class BasisField:
     modes: int | Sequence[int] = (48, 64, 64)
     beta: int | Sequence[int] = (48, 48, 32)
     depth: int = 3
+    members: int = 1
     noise: float = 0.01
     head_parameters: bool = True
 
@@ -54,6 +57,7 @@ class BasisField:
         per_phase("modes", self.modes)
         per_phase("beta", self.beta)
         at_least("depth", self.depth, 1)
+        at_least("members", self.members, 1)
         at_least("noise", self.noise, 0)
 
     def prepare(self, snapshots: Snapshots, latent_dim: int) -> dict[str, Any]:
@@ -90,6 +94,7 @@ class BasisField:
             "modes": [prepared[name]["coefficients"].shape[1] for name, _ in TARGETS.values()],
             "beta": list(per_phase("beta", self.beta)),
             "depth": self.depth,
+            "members": self.members,
             "noise": self.noise,
             "head_parameters": self.head_parameters,
             "unresolved": [prepared[name]["unresolved"] for name, _ in TARGETS.values()],
@@ -133,9 +138,11 @@ class BasisField:
 
         def loss(rows: Tensor | slice, particles: Tensor | slice, generator: torch.Generator) -> Tensor:
             xhat = latents[rows]
-            inputs = xhat + self.noise * torch.randn(xhat.shape, generator=generator, device=xhat.device)
+            # A committee's members each see noise of their own.
+            shape = xhat.shape if self.members == 1 else (self.members, *xhat.shape)
+            inputs = xhat + self.noise * torch.randn(shape, generator=generator, device=xhat.device)
             if manifold.takes_parameters(phase):
-                inputs = torch.cat([inputs, parameters[rows]], -1)
+                inputs = torch.cat([inputs, parameters[rows].expand(*shape[:-1], -1)], -1)
             return (network(inputs) - targets[rows]).square().mean()
 
         return loss
@@ -151,10 +158,19 @@ class ModalField(nn.Module):
         modes: K.
         leading: how many coefficients are latents themselves (r for g, 0 for h and l).
         inputs, width, depth: of the network; there is none if no coefficient is left to it.
+        members: networks whose mean it is.
     """
 
     def __init__(
-        self, particles: int, components: int, modes: int, leading: int, inputs: int, width: int, depth: int
+        self,
+        particles: int,
+        components: int,
+        modes: int,
+        leading: int,
+        inputs: int,
+        width: int,
+        depth: int,
+        members: int,
     ):
         super().__init__()
         self.register_buffer("mean", torch.zeros(particles, components, dtype=torch.float64))
@@ -162,7 +178,11 @@ class ModalField(nn.Module):
         self.register_buffer("leading", torch.ones(leading, dtype=torch.float64))
         self.register_buffer("scale", torch.ones((), dtype=torch.float64))
         closed = modes - leading
-        self.network = FullyConnected((inputs, *[width] * depth, closed), "silu") if closed else None
+        widths = (inputs, *[width] * depth, closed)
+        self.network: FullyConnected | Committee | None = None
+        if closed:
+            several = members > 1
+            self.network = Committee(members, widths, "silu") if several else FullyConnected(widths, "silu")
 
     def calibrate(self, coefficients: Tensor) -> None:
         """Take the scales from the coefficients [M, K] of the training snapshots."""
@@ -270,7 +290,14 @@ class BasisManifold(Manifold):
             inputs = latent_dim + (len(self.parameter_names) if self.takes_parameters(phase) else 0)
             leading = latent_dim if phase == "deformation" else 0
             self.fields[phase] = ModalField(
-                hyperparameters["particles"], d, modes, leading, inputs, beta * d, hyperparameters["depth"]
+                hyperparameters["particles"],
+                d,
+                modes,
+                leading,
+                inputs,
+                beta * d,
+                hyperparameters["depth"],
+                hyperparameters.get("members", 1),  # files from before there were members
             )
 
     def takes_parameters(self, phase: str) -> bool:
@@ -345,7 +372,7 @@ class BasisManifold(Manifold):
         mean, std = [latent], [latent + 1]
         if self.takes_parameters(phase):
             mean, std = [latent, parameters.mean], [latent + 1, parameters.std]
-        scale = field.scale.expand(field.network.layers[-1].out_features)
+        scale = field.scale.expand(field.modes.shape[2] - len(field.leading))
         return field.network.in_raw_units(
             torch.cat(mean), torch.cat(std), torch.zeros_like(scale), scale, like.dtype, like.device
         )

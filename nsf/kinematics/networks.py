@@ -97,3 +97,64 @@ class FullyConnected(nn.Module):
         last.weight.mul_(scale[:, None])
         last.bias.mul_(scale).add_(shift)
         return raw.to(dtype=dtype, device=device)
+
+
+class Committee(nn.Module):
+    """Equal networks that differ in their first weights; what is deployed is their mean.
+
+    One fit of a small network to few trajectories errs between them by chance; the mean of several errs less.
+    The members' layers are stacked, so that a step of training is as many kernels as for one.
+
+    Args:
+        members: how many.
+        widths, activation: of each, as for `FullyConnected`.
+    """
+
+    def __init__(self, members: int, widths: Sequence[int], activation: str):
+        super().__init__()
+        self.widths, self.activation = tuple(widths), activation
+        pairs = list(itertools.pairwise(widths))
+        self.weights = nn.ParameterList(torch.zeros(members, o, i) for i, o in pairs)
+        self.biases = nn.ParameterList(torch.zeros(members, 1, o) for _, o in pairs)
+
+    def initialise(self, generator: torch.Generator) -> None:
+        """Draw every weight from `generator`, as `xavier` does."""
+        for weight, bias in zip(self.weights, self.biases, strict=True):
+            nn.init.zeros_(bias)
+            for member in weight:
+                nn.init.xavier_uniform_(member, generator=generator)
+
+    @property
+    def width(self) -> int:
+        """Values the widest layer of a member holds for one row of input."""
+        return max(self.widths[1:])
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """[members, n, inputs], rows of its own for each member → [members, n, outputs]."""
+        act, _ = ACTIVATIONS[self.activation]
+        *hidden, (weight, bias) = zip(self.weights, self.biases, strict=True)
+        for w, b in hidden:
+            inputs = act(torch.baddbmm(b, inputs, w.mT))
+        return torch.baddbmm(bias, inputs, weight.mT)
+
+    @torch.no_grad()
+    def mean(self) -> FullyConnected:
+        """The members' mean as one network in double precision: side by side, averaged by the last layer."""
+        members = len(self.weights[0])
+        inner = [members * width for width in self.widths[1:-1]]
+        merged = FullyConnected((self.widths[0], *inner, self.widths[-1]), self.activation)
+        merged.to(self.weights[0].device, torch.float64)
+        last = len(merged.layers) - 1
+        for k, (layer, w, b) in enumerate(zip(merged.layers, self.weights, self.biases, strict=True)):
+            weight, bias = w.double(), b.double()
+            if k == last:
+                layer.weight.copy_(torch.cat(list(weight), 1) / members)
+                layer.bias.copy_(bias.mean(0)[0])
+            else:
+                layer.weight.copy_(weight.flatten(0, 1) if k == 0 else torch.block_diag(*weight))
+                layer.bias.copy_(bias.flatten())
+        return merged
+
+    def in_raw_units(self, *standardisation, **place) -> FullyConnected:
+        """The mean, frozen, for raw inputs and outputs; arguments as for `FullyConnected.in_raw_units`."""
+        return self.mean().in_raw_units(*standardisation, **place)

@@ -202,6 +202,7 @@ def test_widths(snapshots):
         (lambda: BasisField(modes=[9, 0]), "modes="),
         (lambda: BasisField(depth=0), "depth=0"),
         (lambda: BasisField(noise=-0.1), "noise=-0.1"),
+        (lambda: BasisField(members=0), "members=0"),
         (lambda: FastTrainer(), "budget_minutes=null"),
         (lambda: FastTrainer(steps=0), "steps=0"),
         (lambda: FastTrainer(steps=5, learning_rate=0.0), "learning_rate=0.0"),
