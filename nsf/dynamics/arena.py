@@ -1,6 +1,7 @@
 """Arrays and packed kernel launches on one device, shared by torch and Warp."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import torch
 import warp as wp
@@ -21,6 +22,22 @@ class Arena:
         self.precision, self.device = precision, device
         self.real, self._torch = torch_dtype(precision), torch_device(device)
         self._held: list[torch.Tensor] = []
+        self._side = wp.Stream(device) if device.is_cuda else None
+
+    @contextmanager
+    def beside(self) -> Iterator[None]:
+        """What is launched inside may run beside what is launched after it, until `meet`."""
+        if self._side is None:
+            yield
+            return
+        self._side.wait_stream(self.device.stream)
+        with wp.ScopedStream(self._side, sync_enter=False, sync_exit=False):
+            yield
+
+    def meet(self) -> None:
+        """Wait, on the device, for what was launched beside."""
+        if self._side is not None:
+            self.device.stream.wait_stream(self._side)
 
     @property
     def nbytes(self) -> int:

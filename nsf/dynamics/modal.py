@@ -42,7 +42,7 @@ class ModalPhase(Phase):
         setting: of the solver; its projector is `GaussNewton` or `Taylor`.
         sets: S, N (the candidates) and I.
         grid_step: the shared P2G, grid update and G2P; shape: its B-spline.
-        manifold: a `BasisManifold`.
+        manifold: a `BasisManifold` whose networks are `layered`.
         method: which of τ and C come from fields.
         parameters: [n_parameters] μ.
         material: the law, for a τ that comes from ∂g/∂X.
@@ -61,7 +61,7 @@ class ModalPhase(Phase):
         material: Material,
         weights: np.ndarray | None,
     ):
-        order = _by_cell(sets, setting.constants.X, grid_step.grid.geometry.dx)
+        order = _by_cell(sets, setting.constants.X, grid_step.grid.geometry.dx, shape)
         at_sample = manifold.restrict(sets.sample, dtype=setting.dtype, device=setting.device)
         super().__init__(setting, sets, order, grid_step, at_sample)
         self._arena = arena = Arena(setting.precision, warp_device(str(setting.device)))
@@ -71,7 +71,7 @@ class ModalPhase(Phase):
         self._place = _placing(arena, state, deformation.mean, displacement, self)
         self._selection = Selection(arena, state, grid_step.grid, shape, sets, self.x)
         self.needed = self._selection.needed
-        self._fields = _fields(arena, self, manifold, method, order, parameters, material)
+        self._networks, self._fields = _fields(arena, self, manifold, method, order, parameters, material)
         self._projection = Projection(arena, state, deformation, displacement, self, weights)
 
     @property
@@ -80,7 +80,7 @@ class ModalPhase(Phase):
         return {
             "inference": self.infer,
             "p2g": self.p2g,
-            "grid": self.grid_step.update,
+            "grid": lambda: self.grid_step.update(followed=True),
             "g2p": self.g2p,
             "inversion": self.invert,
         }
@@ -97,7 +97,14 @@ class ModalPhase(Phase):
 
     def infer(self) -> None:
         """x and v, the particles that S needs, and their τ and C (paper sections 5.1 and 5.4)."""
-        for launch in (self._place, *self._selection.launches, *self._fields):
+        with self._arena.beside():
+            self.grid_step.follow()  # depends on the time alone
+            for launch in self._networks:
+                launch.launch()
+        for launch in (self._place, *self._selection.launches):
+            launch.launch()
+        self._arena.meet()
+        for launch in self._fields:
             launch.launch()
 
     def invert(self) -> None:
@@ -185,11 +192,8 @@ class Projection:
         B = of_sample.double().flatten(0, 1)
         G = arena.hold(B.T @ (w.repeat_interleave(3)[:, None] * B), torch.float64).flatten()
         b = arena.zeros(K + 1)
-        layers = [] if deformation.network is None else list(deformation.network.layers)
-        widths = (r, *(layer.out_features for layer in layers)) if layers else ()
-        weights = [torch.cat([layer.weight.flatten(), layer.bias]) for layer in layers] or [torch.zeros(1)]
-        weights[-1] = weights[-1] / deformation.scale  # as trained, so that fp32 holds them
-        weights = arena.hold(torch.cat(weights), torch.float32)
+        widths, weights = _closure(deformation)
+        weights = arena.hold(weights, torch.float32)
         lanes, velocity = arena.lanes(BLOCK), as_vectors(phase.v[:s], arena.precision)
         gather = arena.pack(
             make_gathering(arena.precision),
@@ -197,7 +201,7 @@ class Projection:
             [displacement, len(phase.x), -(-K // 4), velocity, w, wp.float64(setting.dt), lanes, b],
             BLOCK,
         )
-        kernel = make_projection(arena.precision, widths, r, K)
+        kernel = make_projection(arena.precision, widths, deformation.members, r, K)
         sigma = arena.hold(deformation.leading, torch.float64)
         block = projection_block(widths)
         linear = int(isinstance(projector, Taylor))
@@ -213,12 +217,29 @@ class Projection:
         self.launches, self.evaluate = [gather, solve(projector.iterations)], solve(0)
 
 
-def _by_cell(sets: ParticleSets, X: np.ndarray, dx: float) -> np.ndarray:
+def _closure(deformation: ModalFactors) -> tuple[tuple[int, ...], torch.Tensor]:
+    """Widths of a member of the closure, and the weights and biases of all, member by member, as trained."""
+    layers, members = deformation.layers, deformation.members
+    if not layers:
+        return (), torch.zeros(1)
+    *hidden, (W_last, b_last) = layers
+    widths = (len(deformation.leading), *(len(b) // members for _, b in hidden), len(b_last))
+    packed = []
+    for member in range(members):
+        for W, b in hidden:
+            packed += [part.unflatten(0, (members, -1))[member].flatten() for part in (W, b)]
+        # What is in the unit of the coefficients is divided by it, so that fp32 holds it; all share a bias.
+        packed.append(W_last.unflatten(1, (members, -1))[:, member].flatten() / deformation.scale)
+        packed.append(b_last / deformation.scale * (member == 0))
+    return widths, torch.cat(packed)
+
+
+def _by_cell(sets: ParticleSets, X: np.ndarray, dx: float, shape: str) -> np.ndarray:
     """N with S first, and the others cell by cell at rest: neighbours are needed together, and P2G adds up
     those of one cell."""
-    s = len(sets.sample)
+    s, offset = len(sets.sample), 0.5 * (DEGREES[shape] - 1)  # of a stencil's first node
     others = sets.integration[s:]
-    cells = np.floor(X[others] / dx).astype(int)
+    cells = np.floor(X[others] / dx - offset).astype(int)
     return np.concatenate([sets.sample, others[np.lexsort(cells.T[::-1])]])
 
 
@@ -230,14 +251,18 @@ def _placing(arena: Arena, state: Coefficients, mean: torch.Tensor, modes: torch
     return arena.pack(make_position(arena.precision, -(-len(state.a) // 4)), len(phase.x), inputs)
 
 
-def _fields(arena, phase: ModalPhase, manifold, method: Method, order, parameters, material) -> list:
-    """The launches that give τ and C at N, as the method takes them."""
+def _fields(
+    arena, phase: ModalPhase, manifold, method: Method, order, parameters, material
+) -> tuple[list, list]:
+    """The launches of the networks, and then those that give τ and C at N, as the method takes them."""
     options = {"dtype": arena.real, "device": phase.setting.device}
     taken = [("stress", method.neural_stress, phase.tau), ("affine", method.neural_affine, phase.C)]
     heads = [(manifold.factors(name, order, **options), found) for name, neural, found in taken if neural]
-    launches, coefficients = _networks(arena, [f.network for f, _ in heads], phase.setting.record, parameters)
-    for (factors, found), a in zip(heads, coefficients, strict=True):
-        launches.append(_contraction(arena, phase, factors, a, found))
+    networks, coefficients = _networks(arena, [f.layers for f, _ in heads], phase.setting.record, parameters)
+    launches = [
+        _contraction(arena, phase, factors, a, found)
+        for (factors, found), a in zip(heads, coefficients, strict=True)
+    ]
     if not method.neural_stress:
         F = arena.zeros(len(order), 3, 3, dtype=arena.real)
         factors = manifold.factors("gradient", order, **options)
@@ -245,18 +270,17 @@ def _fields(arena, phase: ModalPhase, manifold, method: Method, order, parameter
             _contraction(arena, phase, factors, phase.coefficients.a, F),
             _elastic(arena, phase, material, F),
         ]
-    return launches
+    return networks, launches
 
 
 def _networks(arena: Arena, networks: list, record: LatentRecord, parameters) -> tuple[list, list]:
     """The launches of the heads, layer by layer and both at once, and where they leave their coefficients."""
     inputs = [record.now] * len(networks)
     launches, lanes = [], arena.lanes(WARP)
-    for layers in zip(*(network.layers for network in networks), strict=True):
-        first, last = not launches, len(launches) == len(networks[0].layers) - 1
+    for layers in zip(*networks, strict=True):
+        first, last = not launches, len(launches) == len(networks[0]) - 1
         weights = []
-        for layer in layers:
-            W, b = layer.weight, layer.bias
+        for W, b in layers:
             if first:  # x̂ is followed by the problem parameters, which do not change in a run
                 r = len(record.now)
                 W, b = W[:, :r], b + W[:, r:] @ parameters.to(W)[: W.shape[1] - r]

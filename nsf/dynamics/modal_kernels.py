@@ -253,16 +253,18 @@ def make_contraction(precision: Precision, vectors: int, symmetric: bool, coeffi
 def make_layer(precision: Precision):
     """Kernel of one layer of two networks at once, one warp an output: act(W x + b), W [out, in].
 
-    SiLU where `active`, else the identity; the second network's outputs follow the first's.
+    SiLU where `active`, else the identity; the second network's outputs follow the first's. Where W has fewer
+    columns than x has entries, both are of several members, whose rows and entries follow each other.
     """
     real = precision.real
     snippet = f"""
     typedef {_scalar(precision)} real;
-    const int n = x.shape[0];
+    const int n = W.shape[1], members = x.shape[0] / n;
     const real* row = W.data + size_t(o) * n;
+    const real* inputs = x.data + o / (W.shape[0] / members) * n;
     real sum = 0;
     #pragma unroll 4
-    for (int i = lane; i < n; i += lanes) sum += row[i] * x.data[i];
+    for (int i = lane; i < n; i += lanes) sum += row[i] * inputs[i];
 #if defined(__CUDA_ARCH__)
     for (int d = 16; d > 0; d /= 2) sum += __shfl_xor_sync(0xffffffffu, sum, d);
 #endif
@@ -407,7 +409,17 @@ _CLOSURE = """
         const int width[] = {widths};
         int offset = 0;
         #pragma unroll 1
-        for (int l = 0; l < {layers}; ++l) {{
+        for (int n = 0; n < {layers} * {members}; ++n) {{
+            const int l = n % {layers};
+            const bool begun = n >= {layers};  // a member's share is there already
+            if (l == 0) {{
+                #pragma unroll 1
+                for (int e = lane; e < R * R; e += lanes) {{
+                    slope[0][e / R * ROW + e % R] = e / R == e % R ? 1.0f : 0.0f;
+                    if (e < R) value[0][e] = real(x[e]);
+                }}
+                NSF_SYNC;
+            }}
             const int in = width[l], out = width[l + 1], half = (out + 1) / 2, from = l % 2, to = 1 - from;
             const bool last = l == {layers} - 1;
             const slope_t* W = weights.data + offset;
@@ -463,10 +475,13 @@ _CLOSURE = """
                     const real z = (side == 0 ? v_1 : v_2) + real(bias[k]);
                     const real s = real(1) / (real(1) + exp(-z));
                     const slope_t rise = slope_t(s * (real(1) + z * (real(1) - s)));
-                    if (last) at[R + k] = scale * z; else value[to][k] = z * s;
+                    if (last) at[R + k] = (begun ? at[R + k] : 0.0) + scale * z; else value[to][k] = z * s;
                     for (int c = 0; c < R; ++c) {{
                         const slope_t u = side == 0 ? u_1[c] : u_2[c];
-                        if (last) A[(R + k) * R + c] = scale * u; else slope[to][k * ROW + c] = rise * u;
+                        if (last) {{
+                            double& tangent = A[(R + k) * R + c];
+                            tangent = (begun ? tangent : 0.0) + scale * u;
+                        }} else slope[to][k * ROW + c] = rise * u;
                     }}
                 }}
             }}
@@ -476,7 +491,7 @@ _CLOSURE = """
 
 
 @cache
-def make_projection(precision: Precision, widths: tuple[int, ...], latents: int, modes: int):
+def make_projection(precision: Precision, widths: tuple[int, ...], members: int, latents: int, modes: int):
     """Kernel of the inversion on one block: Gauss-Newton in the coefficients of the modes.
 
     With d = Δt v the displacement of S in the step and δa = a(x̂) − a(x̂_n), the error of the positions is
@@ -490,6 +505,7 @@ def make_projection(precision: Precision, widths: tuple[int, ...], latents: int,
     Args:
         precision: of the closure; sums over modes and the solution are fp64.
         widths: of the closure's layers (r, hidden..., K − r); empty without one.
+        members: networks of these widths whose shares in the closure are added up.
         latents: r.
         modes: K.
 
@@ -500,7 +516,8 @@ def make_projection(precision: Precision, widths: tuple[int, ...], latents: int,
     kept = 8 * modes**2 <= _GRAM_BYTES
     closure = ""
     if widths:
-        closure = _CLOSURE.format(layers=len(widths) - 1, widths="{" + ", ".join(map(str, widths)) + "}")
+        counts = "{" + ", ".join(map(str, widths)) + "}"
+        closure = _CLOSURE.format(layers=len(widths) - 1, members=members, widths=counts)
     snippet = f"""
     typedef {_scalar(precision)} real;
     typedef float slope_t;  // as Warp takes float(x) for its own
@@ -526,13 +543,8 @@ def make_projection(precision: Precision, widths: tuple[int, ...], latents: int,
     auto evaluate = [&]() {{
         #pragma unroll 1
         for (int e = lane; e < R * R; e += lanes) {{
-            const int i = e / R, c = e % R;
-            slope[0][i * ROW + c] = i == c ? 1.0f : 0.0f;
-            A[e] = i == c ? sigma.data[i] : 0.0;
-            if (c == 0) {{
-                value[0][i] = real(x[i]);
-                at[i] = sigma.data[i] * x[i];
-            }}
+            A[e] = e / R == e % R ? sigma.data[e / R] : 0.0;
+            if (e < R) at[e] = sigma.data[e] * x[e];
         }}
         NSF_SYNC;
         {closure}

@@ -179,8 +179,8 @@ class ReducedMPM:
         step = GridStep(
             grid, self.boundaries, self.transfer, self.gravity, self.dt, self.precision, self.device
         )
-        on_coefficients = isinstance(self.projector, GaussNewton | Taylor)
-        if isinstance(self.manifold, BasisManifold) and on_coefficients:
+        modal = isinstance(self.manifold, BasisManifold) and self.manifold.layered
+        if modal and isinstance(self.projector, GaussNewton | Taylor):
             return ModalPhase(
                 self._setting, sets, step, self.transfer.shape, self.manifold, self.method, self.parameters,
                 self.scene.material, weights,

@@ -261,6 +261,7 @@ class ModalFactors:
         leading: σ [r] of the coefficients that are latents; [0] for h and l.
         scale: of the others, with which the network's last layer was multiplied.
         network: of the others, in raw units; None if there is none.
+        members: how many networks it is the mean of.
     """
 
     mean: Tensor
@@ -268,6 +269,24 @@ class ModalFactors:
     leading: Tensor
     scale: float
     network: FullyConnected | None
+    members: int
+
+    @property
+    def layers(self) -> list[tuple[Tensor, Tensor]]:
+        """Weights [out, in] and biases [out] of the network, without the zeros between its members.
+
+        The first layer's rows and the last one's columns are member by member; in between, row o of a member
+        has the weights of that member's inputs alone.
+        """
+        layers = [] if self.network is None else list(self.network.layers)
+        found = []
+        for n, layer in enumerate(layers):
+            W = layer.weight
+            if 0 < n < len(layers) - 1:
+                blocks = W.unflatten(0, (self.members, -1)).unflatten(2, (self.members, -1))
+                W = blocks.diagonal(dim1=0, dim2=2).permute(2, 0, 1).flatten(0, 1)
+            found.append((W, layer.bias))
+        return found
 
 
 def coefficients(values: Tensor, mean: Tensor, modes: Tensor) -> Tensor:
@@ -299,6 +318,12 @@ class BasisManifold(Manifold):
                 hyperparameters["depth"],
                 hyperparameters.get("members", 1),  # files from before there were members
             )
+
+    @property
+    def layered(self) -> bool:
+        """Whether every network is one of layers with SiLU, or a mean of such, as `factors` takes apart."""
+        networks = [field.network for field in self.fields.values()]
+        return all(network is None or isinstance(network, FullyConnected | Committee) for network in networks)
 
     def takes_parameters(self, phase: str) -> bool:
         """Whether the phase's network sees the problem parameters."""
@@ -361,7 +386,8 @@ class BasisManifold(Manifold):
             base = points if name == "deformation" else 0
             mean, modes = field.mean[rows], field.modes[rows]
         network, scale = self._deployed(phase, like), float(field.scale)
-        return ModalFactors((base + mean).to(like), modes.to(device), field.leading, scale, network)
+        members = self.hyperparameters.get("members", 1)
+        return ModalFactors((base + mean).to(like), modes.to(device), field.leading, scale, network, members)
 
     def _deployed(self, phase: str, like: Tensor) -> FullyConnected | None:
         """The phase's network from (xhat, μ) to coefficients in the field's unit."""

@@ -97,10 +97,15 @@ class GridStep:
         whole_warps = -(-x.shape[0] // WARP) * WARP
         wp.launch(self._p2g, dim=whole_warps, inputs=inputs, device=self.device)
 
-    def update(self) -> None:
+    def follow(self) -> None:
+        """Move the boundaries on by a step; `update` does it, unless told that it is done."""
+        self.boundaries.advance(self._seconds)
+
+    def update(self, followed: bool = False) -> None:
         """Momentum → velocity at the next time level, boundaries included, which move on by a step."""
         grid = self.grid
-        self.boundaries.advance(self._seconds)
+        if not followed:
+            self.follow()
         inputs = [*grid.stored, grid.values, self.dx, self.dt, self.gravity]
         wp.launch(
             self._update, dim=grid.threads, inputs=inputs + self.boundaries.arguments, device=self.device

@@ -8,6 +8,7 @@ import warp as wp
 from nsf.dynamics import GaussNewton, Integration, Method, RandomSampler, SamplePhase, Taylor
 from nsf.dynamics.modal import ModalPhase
 from nsf.dynamics.phase import DecodedPhase
+from nsf.kinematics.basis import BasisManifold
 from nsf.kinematics.mlp import MlpManifold
 
 METHODS = [Method(f"{a}{b}", a, b) for a in (True, False) for b in (True, False)]
@@ -17,9 +18,9 @@ METHODS = [Method(f"{a}{b}", a, b) for a in (True, False) for b in (True, False)
 def pair(chain, tiny_manifold, monkeypatch):
     """options → a solver in coefficients and one that decodes, of the same fields."""
 
-    def build(sample=20, **options):
+    def build(sample=20, manifold=tiny_manifold, **options):
         def one():
-            return chain.scene.reduced(tiny_manifold, {"friction_angle": 26.0}, sample, **options)
+            return chain.scene.reduced(manifold, {"friction_angle": 26.0}, sample, **options)
 
         options.setdefault("device", "cpu")
         modal = one()
@@ -56,6 +57,22 @@ def test_every_method(pair, method):
 @pytest.mark.parametrize("strategy", ["superset", "search"])
 def test_every_integration(pair, strategy):
     same(*runs(pair(integration=Integration(strategy, 1))))
+
+
+@pytest.mark.parametrize(("members", "depth"), [(1, 3), (3, 2), (4, 3)])
+def test_deep_and_many_networks(pair, tiny_manifold, members, depth):
+    """Of random weights: the first steps say whether every layer and member is where it should be."""
+    hyperparameters = tiny_manifold.hyperparameters | {"members": members, "depth": depth, "beta": [5, 4, 3]}
+    manifold = BasisManifold(4, tiny_manifold.x_sha256, ["friction_angle"], hyperparameters)
+    learnt = {k: v for k, v in tiny_manifold.state_dict().items() if ".network." not in k}
+    manifold.load_state_dict(learnt, strict=False)
+    for seed, field in enumerate(manifold.fields.values()):
+        field.network.initialise(torch.Generator().manual_seed(seed))
+        for name, bias in field.network.named_parameters():
+            if "bias" in name:
+                torch.nn.init.normal_(bias, std=0.1, generator=torch.Generator().manual_seed(seed))
+        field.scale.mul_(0.01)
+    same(*runs(pair(manifold=manifold.requires_grad_(False)), steps=3), tolerance=1e-6)
 
 
 def test_taylor(pair):
