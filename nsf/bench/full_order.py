@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 
-from nsf.bench.measure import bandwidth, build, pass_time, step_times
+from nsf.bench.measure import bandwidth, build, name_of, pass_time, step_times
 from nsf.bench.rows import KernelRow, Result, Row, Settings, commit, size_name
 from nsf.mpm import (
     DomainWalls,
@@ -60,7 +60,7 @@ def measured(bench: str, sizes, settings: Settings, say: Callable[[str], None]) 
     """Steps and their passes at each size, under the name of a benchmark."""
     found, device = Result(), settings.device
     speed = bandwidth(device)
-    say(f"{bench}: a copy on {device} moves {speed / 1e9:.0f} GB/s")
+    say(f"{bench}: a copy on {name_of(device)} moves {speed / 1e9:.0f} GB/s")
     for particles in sizes:
         built = {p: build(partial(collapse, particles, p, device), device) for p in settings.precisions}
         solvers = {precision: solver for precision, (solver, _) in built.items()}
@@ -68,7 +68,7 @@ def measured(bench: str, sizes, settings: Settings, say: Callable[[str], None]) 
         for precision, (solver, peak_mib) in built.items():
             same = dict(
                 bench=bench, case=f"full_order_{size_name(particles)}", particles=particles,
-                precision=precision, device=device, commit=commit(),
+                precision=precision, device=name_of(device), commit=commit(),
             )  # fmt: skip
             p10, median, p90 = np.percentile(times[precision], [10, 50, 90]).tolist()
             row = Row(

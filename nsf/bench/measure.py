@@ -77,6 +77,12 @@ def pass_time(call: Callable[[], None], device: str, trials: int = 5) -> float:
     return float(np.median(times))
 
 
+def name_of(device: str) -> str:
+    """What a figure names as its device: the product for a GPU, else `cpu`."""
+    found = wp.get_device(device)
+    return found.name if found.is_cuda else "cpu"
+
+
 def bandwidth(device: str) -> float:
     """Bytes a second that a copy reads and writes on the device [B/s]."""
     size = _COPY_BYTES["cuda" if wp.get_device(device).is_cuda else "cpu"]

@@ -1,5 +1,6 @@
 """The report of all benchmarks: tables, and charts beside the floor that the memory sets."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -45,7 +46,7 @@ def write_report(folder: Path) -> Path:
     parts = ["# Speed", _LEAD]
     for device in results["device"].unique():
         rows, passes = (frame[frame["device"] == device] for frame in (results, kernels))
-        stem = device.replace(":", "")
+        stem = re.sub("[^a-z0-9]+", "-", device.lower())
         parts.append(f"## On {device}")
         with styled():
             save(step_over_particles(rows, passes), folder, f"step-{stem}")
