@@ -40,7 +40,7 @@ TOOLS = {
     ),
     "bench": (
         "time and memory of a step, kernel by kernel; writes reports/speed",
-        "[benches=full_order,scaling] [particles=10k,200k,1m] [precision=fp32,fp64] [device=auto]\n"
+        "[benches=full_order,scaling,reduced] [particles=10k,200k,1m] [precision=fp32,fp64] [device=auto]\n"
         "       [trials=10] [folder=PATH]; sizes that suit the device by default",
     ),
     "doctor": ("versions, devices, folders and extras of this installation", ""),

@@ -48,13 +48,23 @@ def write_report(folder: Path) -> Path:
         rows, passes = (frame[frame["device"] == device] for frame in (results, kernels))
         stem = re.sub("[^a-z0-9]+", "-", device.lower())
         parts.append(f"## On {device}")
-        with styled():
-            save(step_over_particles(rows, passes), folder, f"step-{stem}")
-            save(passes_beside_floor(passes), folder, f"kernels-{stem}")
-        caption = "Time of a step over the number of particles; dashed: the floor that the bandwidth sets."
-        parts += [f"![{caption}](step-{stem}.png)", caption, _markdown(rows)]
-        caption = "Time of each pass of a full-order step; the mark is its floor."
-        parts += [f"![{caption}](kernels-{stem}.png)", caption, _KERNELS, _markdown(passes)]
+        of_size = rows[rows["bench"] != "reduced"]
+        of_scene = rows[rows["bench"] == "reduced"]
+        if len(of_scene):
+            caption = "Time of a step of both solvers by scene; a bar names δ of its run."
+            with styled():
+                save(steps_by_scene(of_scene), folder, f"reduced-{stem}")
+            parts += [f"![{caption}](reduced-{stem}.png)", caption, _markdown(of_scene)]
+        if len(of_size):
+            with styled():
+                save(step_over_particles(of_size, passes), folder, f"step-{stem}")
+                save(passes_beside_floor(passes), folder, f"kernels-{stem}")
+            caption = (
+                "Time of a step over the number of particles; dashed: the floor that the bandwidth sets."
+            )
+            parts += [f"![{caption}](step-{stem}.png)", caption, _markdown(of_size)]
+            caption = "Time of each pass of a full-order step; the mark is its floor."
+            parts += [f"![{caption}](kernels-{stem}.png)", caption, _KERNELS, _markdown(passes)]
     page = folder / "index.md"
     with writing(page) as partial:
         partial.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
@@ -91,6 +101,37 @@ def step_over_particles(results: pd.DataFrame, kernels: pd.DataFrame) -> Figure:
         panel.set(xscale="log", yscale="log", xlabel="particles P [–]", ylabel="time of a step [ms]")
         panel.grid(which="major")
         fig.legend(loc="outside upper left", ncols=3, handlelength=2.6)
+    return fig
+
+
+def steps_by_scene(results: pd.DataFrame) -> Figure:
+    """Time of a step [ms] of the full-order and of the reduced solver, a bar each, a panel a scene.
+
+    Args:
+        results: rows of `reduced` of one device.
+    """
+    scene = results["case"].str.extract(r"^(?:full_order|reduced)_(.+?)(?:_[\d.]+dt)?$")[0]
+    panels_of = list(results.groupby(scene, sort=False))
+    with styled():
+        fig = figure(1.2 + 0.3 * max(len(part) for _, part in panels_of))
+        panels = fig.subplots(1, len(panels_of), squeeze=False)[0]
+        for panel, (name, part) in zip(panels, panels_of, strict=True):
+            at = np.arange(len(part))
+            full = part["case"].str.startswith("full_order").to_numpy()
+            colors = [line_style(0)["color"] if whole else line_style(1)["color"] for whole in full]
+            bars = panel.barh(at, part["ms_median"], height=0.7, color=colors)
+            texts = [
+                number(ms) if np.isnan(delta) else f"{number(ms)}, δ {number(100 * delta)} %"
+                for ms, delta in zip(part["ms_median"], part["delta"].astype(float), strict=True)
+            ]
+            panel.bar_label(bars, texts, padding=4, fontsize=8.5, color=INK)
+            kinds = part["case"].str.replace(f"_{name}", "").str.replace("_", " ")
+            panel.set_yticks(at, [f"{kind}, {p}" for kind, p in zip(kinds, part["precision"], strict=True)])
+            panel.set_ylim(len(part) - 0.5, -0.5)
+            panel.set_xlim(0, 1.5 * part["ms_median"].max())
+            panel.set(title=name, xlabel="time of a step [ms]")
+            panel.grid(axis="x")
+            panel.tick_params(axis="y", length=0)
     return fig
 
 

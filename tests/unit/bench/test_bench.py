@@ -10,11 +10,19 @@ import pytest
 from nsf.bench import BENCHES, bench
 from nsf.bench.full_order import collapse, measured, pass_times
 from nsf.bench.measure import bandwidth, step_times
-from nsf.bench.rows import KernelRow, Row, Settings, columns, size_name
+from nsf.bench.reduced import measured as measured_chain
+from nsf.bench.report import write_report
+from nsf.bench.rows import KernelRow, Result, Row, Settings, columns, size_name
 from nsf.cli import main
 from nsf.errors import ConfigError, DeviceError
 
-SMALL = {"particles": "200,500", "trials": "2", "device": "cpu", "precision": "fp32"}
+SMALL = {
+    "benches": "full_order,scaling",
+    "particles": "200,500",
+    "trials": "2",
+    "device": "cpu",
+    "precision": "fp32",
+}
 PASSES = ["clear", "p2g", "grid", "g2p_stress"]
 
 
@@ -30,7 +38,7 @@ def test_every_benchmark_gives_its_rows(speed):
     results, kernels = (pd.read_csv(speed / name) for name in ("results.csv", "kernels.csv"))
     assert list(results) == columns(Row)
     assert list(kernels) == columns(KernelRow)
-    assert set(results["bench"]) == set(BENCHES)
+    assert set(results["bench"]) == {"full_order", "scaling"} < set(BENCHES)
     assert set(results["case"]) == {"full_order_200", "full_order_500"}
     assert len(results) == 4
     assert (results["ms_p10"] <= results["ms_median"]).all()
@@ -163,3 +171,39 @@ def test_the_command(tmp_path, monkeypatch, capsys):
         main(["bench", "size=3"])
     assert end.value.code == 2
     assert "nsf bench has no key 'size'" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def reduced(chain):
+    """Rows of the tiny chain, as of a scene of the benchmark."""
+    found, said = Result(), []
+    settings = Settings(particles=(), precisions=("fp32", "fp64"), device="cpu", trials=2)
+    measured_chain(chain.pipeline, settings, found, said.append)
+    assert len(said) == 10
+    return pd.DataFrame(found.rows, columns=columns(Row))
+
+
+def test_both_solvers_of_a_scene_have_rows(reduced, chain):
+    assert reduced["case"].tolist() == 2 * [
+        "full_order_sand", "reduced_sand", "reduced_sand_1.5dt", "reduced_sand_2dt", "reduced_sand_3dt",
+    ]  # fmt: skip
+    full = reduced["case"] == "full_order_sand"
+    for name in ("sample", "integration", "delta"):
+        assert (reduced[name].isna() == full).all()
+    assert (reduced["ms_median"] > 0).all()
+
+
+def test_delta_of_the_benchmark_is_that_of_the_evaluation(reduced, chain):
+    evaluated = pd.read_csv(chain.pipeline.evaluation.path / "results.csv")["delta"][0]
+    row = reduced[(reduced["case"] == "reduced_sand") & (reduced["precision"] == "fp64")].iloc[0]
+    assert row["delta"] == pytest.approx(evaluated, rel=1e-6)
+    longer = reduced[(reduced["case"] == "reduced_sand_3dt") & (reduced["precision"] == "fp64")].iloc[0]
+    assert longer["delta"] != pytest.approx(evaluated, rel=1e-3)
+
+
+def test_a_report_of_scenes(reduced, tmp_path):
+    reduced.to_csv(tmp_path / "results.csv", index=False)
+    pd.DataFrame(columns=columns(KernelRow)).to_csv(tmp_path / "kernels.csv", index=False)
+    page = write_report(tmp_path)
+    assert "| reduced_sand_1.5dt |" in page.read_text()
+    assert (tmp_path / "reduced-cpu.png").stat().st_size > 5000

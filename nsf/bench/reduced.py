@@ -1,0 +1,102 @@
+"""A reduced step beside the full-order one, on the paper's cake and metal, and what a longer Δt costs."""
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from nsf import config
+from nsf.bench.measure import name_of
+from nsf.bench.rows import Result, Row, Settings, commit
+from nsf.data import Trajectory
+from nsf.dynamics.solver import reduced_steps
+from nsf.evaluation import metrics
+from nsf.evaluation.cost import SolverCost, Subject, measure
+from nsf.pipeline import Pipeline
+
+SCENES = ("cake", "metal")
+#: Steps of the deployment in units of the scene's Δt (paper section 6.1 has 1.5 on cake).
+MULTIPLIERS = (1.0, 1.5, 2.0, 3.0)
+_CHUNK = 2**26  # positions decoded at once
+
+
+def run(settings: Settings, say: Callable[[str], object]) -> Result:
+    """Both scenes: at the paper's size on a GPU, at small scale on a CPU.
+
+    Data and training are made, or reused, as by `nsf train`. A step of k Δt stands in the case's name; it
+    moves the scene by k times as much as the others.
+    """
+    scale = "paper" if settings.device.startswith("cuda") else "small"
+    found = Result()
+    for scene in SCENES:
+        overrides = [f"scene={scene}", f"scale={scale}", f"device={settings.device}"]
+        measured(Pipeline(config.load(overrides), say=say), settings, found, say)
+    return found
+
+
+def measured(chain: Pipeline, settings: Settings, found: Result, say: Callable[[str], object]) -> None:
+    """Add the rows of one scene at its first held-out value; every side of a precision turn by turn."""
+    chain.simulate()
+    chain.train()
+    manifold, scene, value = chain.manifold(), chain.scene, chain.held_out[0]
+    parameters, name = {scene.parameters.name: value}, scene.name
+    first = chain.solver_at(manifold, value)
+    truth = chain.truth(value).path / "trajectory.h5"
+
+    def reduced(precision: str, multiplier: float):
+        return scene.reduced(
+            manifold, parameters, first.phases, sets=first.sets, method=chain.method,
+            projector=chain.projector, integration=chain.integration, precision=precision,
+            device=settings.device, dt_multiplier=multiplier,
+        )  # fmt: skip
+
+    for precision in settings.precisions:
+        subjects = {
+            f"full_order_{name}": Subject(
+                lambda p=precision: scene.full_order(parameters, p, settings.device), scene.steps
+            )
+        }
+        for k in MULTIPLIERS:
+            case = f"reduced_{name}" if k == 1.0 else f"reduced_{name}_{k:g}dt"
+            subjects[case] = Subject(lambda p=precision, k=k: reduced(p, k), reduced_steps(scene.steps, k))
+        for case, cost in measure(subjects, settings.trials, settings.device).items():
+            solver = None
+            if case.startswith("reduced_"):
+                solver = subjects[case].build()
+                solver.step(solver.total_steps)
+            row = _row(case, len(scene.particles()), precision, settings.device, cost, solver, truth)
+            found.rows.append(row)
+            error = "" if row.delta is None else f", δ {100 * row.delta:.3g} %"
+            say(f"{case} {precision}: {row.ms_median:.4g} ms a step{error}")
+
+
+def _row(case, particles: int, precision: str, device: str, cost: SolverCost, solver, truth) -> Row:
+    return Row(
+        bench="reduced", case=case, particles=particles, batch=1, precision=precision,
+        sample=solver and solver.sample_size,
+        integration=solver and round(solver.integration_mean),
+        delta=solver and deformation_error(solver, truth),
+        device=name_of(device), ms_median=cost.step_ms, ms_p10=cost.step_ms_p10, ms_p90=cost.step_ms_p90,
+        peak_mib=cost.memory_mib, commit=commit(),
+    )  # fmt: skip
+
+
+@torch.no_grad()
+def deformation_error(solver, truth) -> float:
+    """δ of a reduced run that has ended, over the frames of a trajectory file after the first.
+
+    Between its steps a run of longer Δt counts by the latents between them.
+    """
+    run, decoder = solver.trajectory(), solver.decoder()
+    with Trajectory.open(truth) as trajectory:
+        t, frames = trajectory.t, trajectory.frames
+        between = np.stack([np.interp(t, run.t, column) for column in run.xhat.T], axis=1)
+        xhat = torch.as_tensor(between, dtype=solver.dtype, device=solver.torch_device)
+        rows = max(1, _CHUNK // (3 * trajectory.particles))
+        errors, norms = [], []
+        for start in range(1, frames, rows):
+            block = slice(start, min(start + rows, frames))
+            x = torch.as_tensor(np.asarray(trajectory.read("x", frames=block))).to(xhat)
+            errors.append(metrics.frame_squares(decoder.position(xhat[block]) - x))
+            norms.append(metrics.frame_squares(x))
+        return metrics.relative(torch.cat(errors), torch.cat(norms))
