@@ -72,7 +72,7 @@ def _count(text: str) -> int:
 
 def _merge(path: Path, kind: type, rows: list) -> None:
     """Put rows in place of those of the same benchmark, case, precision and device; keep the others."""
-    if not rows:
+    if not rows and path.is_file():
         return
     fresh = pd.DataFrame(rows, columns=columns(kind))
     if path.is_file():

@@ -12,6 +12,6 @@ SIZES = {
 
 
 def run(settings: Settings, say: Callable[[str], None]) -> Result:
-    """The full-order half: from 10 000 to 4 million particles on a GPU, to 40 000 on a CPU."""
+    """Full-order steps: from 10 000 to 4 million particles on a GPU, to 40 000 on a CPU."""
     kind = "cuda" if settings.device.startswith("cuda") else "cpu"
     return measured("scaling", settings.particles or SIZES[kind], settings, say)

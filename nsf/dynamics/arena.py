@@ -69,6 +69,11 @@ class Arena:
         """Threads that work on one result: `count` of a GPU, one of a CPU."""
         return count if self.device.is_cuda else 1
 
+    def whole_blocks(self, threads: int, block: int = 128) -> int:
+        """At least so many threads, those of whole blocks on a GPU: none of them leaves before it begins."""
+        lanes = self.lanes(block)
+        return -(-threads // lanes) * lanes
+
     def pack(self, kernel, dim: int | tuple[int, ...], arguments: Sequence, block: int = 128) -> wp.Launch:
         """A launch whose arguments are packed once; tensors among them are shown to Warp as they are."""
         inputs = [wp.from_torch(a) if isinstance(a, torch.Tensor) else a for a in arguments]

@@ -22,8 +22,9 @@ class Integration:
     """How the integration particles are found.
 
     Attributes:
-        strategy: `search` finds N anew at each step, exactly as the paper (a, b);
-            `superset` fixes it before the run as the union over the training trajectories.
+        strategy: `search` finds N anew at each step, exactly as the paper (a, b); `superset` fixes it
+            before the run as the union over the training trajectories. With `field=basis` that union holds
+            the candidates, among which N is found at each step; with `search` every particle is one.
         margin: nodes by which the superset's node set is widened, so that values between
             the training values stay inside.
 
@@ -49,7 +50,7 @@ class ParticleSets:
 
     Attributes:
         sample: [s] indices of S.
-        integration: [n] indices of N; its first s entries are S.
+        integration: [n] indices of N, or of its candidates; its first s entries are S.
         nodes: [k] flat indices of the grid nodes I, ascending.
     """
 

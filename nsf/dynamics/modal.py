@@ -1,17 +1,17 @@
-"""A phase whose fields are modes times coefficients: one step is a dozen kernels, and torch takes no part."""
+"""A phase whose fields are modes times coefficients: a step is a few kernels, and torch takes no part."""
 
 import numpy as np
 import torch
 import warp as wp
 from typing_extensions import override
 
+from nsf.data import TAU_MATRIX
 from nsf.dynamics.arena import Arena
 from nsf.dynamics.integration import ParticleSets
 from nsf.dynamics.interop import as_matrices, as_vectors, on_torch_stream
 from nsf.dynamics.latent import LatentRecord
 from nsf.dynamics.modal_kernels import (
-    BLOCK,
-    WARP,
+    THREADS,
     make_contraction,
     make_gathering,
     make_layer,
@@ -19,16 +19,30 @@ from nsf.dynamics.modal_kernels import (
     make_projection,
     make_selection,
     projection_block,
+    projection_fits,
 )
 from nsf.dynamics.phase import Phase, Setting, Stages
-from nsf.dynamics.projection import Taylor
+from nsf.dynamics.projection import GaussNewton, Taylor
 from nsf.dynamics.stress import Method
-from nsf.kinematics.basis import ModalFactors
-from nsf.mpm import GridStep
+from nsf.kinematics.basis import BasisManifold, ModalFactors
+from nsf.mpm import GridStep, Precision
+from nsf.mpm.access import WARP
 from nsf.mpm.device import warp_device
 from nsf.mpm.grid import Grid
 from nsf.mpm.materials import Material, make_elastic_stress
-from nsf.mpm.shape import DEGREES
+from nsf.mpm.shape import DEGREES, stencil_offset
+from nsf.mpm.state import cell_order
+
+
+def steps_in_coefficients(manifold, projector, precision: Precision, device) -> bool:
+    """Whether `ModalPhase` can step a manifold; a field or a projector of one's own may need positions."""
+    if not (isinstance(manifold, BasisManifold) and manifold.layered):
+        return False
+    if type(projector) not in (GaussNewton, Taylor):
+        return False
+    K, r = manifold.hyperparameters["modes"][0], manifold.latent_dim
+    widths = (r, *[3 * manifold.hyperparameters["beta"][0]] * manifold.hyperparameters["depth"], K - r)
+    return not device.is_cuda or projection_fits(precision, widths if r < K else (), r, K)
 
 
 class ModalPhase(Phase):
@@ -69,7 +83,7 @@ class ModalPhase(Phase):
         displacement = arena.modes(deformation.modes)
         self.coefficients = state = Coefficients(arena, deformation.modes.shape[2], manifold.latent_dim)
         self._place = _placing(arena, state, deformation.mean, displacement, self)
-        self._selection = Selection(arena, state, grid_step.grid, shape, sets, self.x)
+        self._selection = Selection(arena, state, grid_step.grid, shape, sets, self.x, self.v)
         self.needed = self._selection.needed
         self._networks, self._fields = _fields(arena, self, manifold, method, order, parameters, material)
         self._projection = Projection(arena, state, deformation, displacement, self, weights)
@@ -150,9 +164,7 @@ class Selection:
         launches: in order.
     """
 
-    def __init__(
-        self, arena: Arena, state: Coefficients, grid: Grid, shape: str, sets: ParticleSets, x: torch.Tensor
-    ):
+    def __init__(self, arena: Arena, state: Coefficients, grid: Grid, shape: str, sets: ParticleSets, x, v):
         precision, reach = arena.precision, DEGREES[shape]
         nodes = np.array(grid.geometry.nodes)
         lower, upper = np.zeros(3, int), nodes - 1
@@ -166,12 +178,16 @@ class Selection:
         self.count = arena.zeros(2, dtype=torch.int64)
         stamps = arena.zeros(int(extent.prod()), dtype=torch.int32)
         stamp, select = make_selection(precision, shape)
-        positions = as_vectors(x, precision)
+        positions, velocities = as_vectors(x, precision), as_vectors(v, precision)
         shared = [precision.real(1.0 / grid.geometry.dx), *box, state.step, stamps]
         around = (2 * reach + 1) ** 3
         self.launches = [
             arena.pack(stamp, len(sets.sample) * around, [positions, *shared]),
-            arena.pack(select, len(x), [*shared, positions, self.needed, self.count]),
+            arena.pack(
+                select,
+                len(x),
+                [*shared, len(sets.sample), grid.shape, positions, velocities, self.needed, self.count],
+            ),
         ]
 
 
@@ -194,12 +210,12 @@ class Projection:
         b = arena.zeros(K + 1)
         widths, weights = _closure(deformation)
         weights = arena.hold(weights, torch.float32)
-        lanes, velocity = arena.lanes(BLOCK), as_vectors(phase.v[:s], arena.precision)
+        lanes, velocity = arena.lanes(THREADS), as_vectors(phase.v[:s], arena.precision)
         gather = arena.pack(
             make_gathering(arena.precision),
             (K + 1) * lanes,
             [displacement, len(phase.x), -(-K // 4), velocity, w, wp.float64(setting.dt), lanes, b],
-            BLOCK,
+            THREADS,
         )
         kernel = make_projection(arena.precision, widths, deformation.members, r, K)
         sigma = arena.hold(deformation.leading, torch.float64)
@@ -235,12 +251,12 @@ def _closure(deformation: ModalFactors) -> tuple[tuple[int, ...], torch.Tensor]:
 
 
 def _by_cell(sets: ParticleSets, X: np.ndarray, dx: float, shape: str) -> np.ndarray:
-    """N with S first, and the others cell by cell at rest: neighbours are needed together, and P2G adds up
-    those of one cell."""
-    s, offset = len(sets.sample), 0.5 * (DEGREES[shape] - 1)  # of a stencil's first node
-    others = sets.integration[s:]
-    cells = np.floor(X[others] / dx - offset).astype(int)
-    return np.concatenate([sets.sample, others[np.lexsort(cells.T[::-1])]])
+    """N with S first and the others cell by cell at rest.
+
+    Neighbours are needed together, and P2G adds up those of one cell before they reach the grid.
+    """
+    others = sets.integration[len(sets.sample) :]
+    return np.concatenate([sets.sample, others[cell_order(X[others], dx, stencil_offset(shape))]])
 
 
 def _placing(arena: Arena, state: Coefficients, mean: torch.Tensor, modes: torch.Tensor, phase: Phase):
@@ -248,7 +264,9 @@ def _placing(arena: Arena, state: Coefficients, mean: torch.Tensor, modes: torch
     vectors = [as_vectors(a, arena.precision) for a in (phase.initial_velocity, phase.x, phase.v)]
     mean = as_vectors(arena.hold(mean, arena.real), arena.precision)
     inputs = [mean, modes, state.a, state.rate, vectors[0], state.first, *vectors[1:]]
-    return arena.pack(make_position(arena.precision, -(-len(state.a) // 4)), len(phase.x), inputs)
+    return arena.pack(
+        make_position(arena.precision, -(-len(state.a) // 4)), arena.whole_blocks(len(phase.x)), inputs
+    )
 
 
 def _fields(
@@ -256,8 +274,17 @@ def _fields(
 ) -> tuple[list, list]:
     """The launches of the networks, and then those that give τ and C at N, as the method takes them."""
     options = {"dtype": arena.real, "device": phase.setting.device}
-    taken = [("stress", method.neural_stress, phase.tau), ("affine", method.neural_affine, phase.C)]
-    heads = [(manifold.factors(name, order, **options), found) for name, neural, found in taken if neural]
+    heads = []
+    for name, neural, found in (
+        ("stress", method.neural_stress, phase.tau),
+        ("affine", method.neural_affine, phase.C),
+    ):
+        if neural:
+            factors = manifold.factors(name, order, **options)
+            if factors.modes.shape[2]:
+                heads.append((factors, found))
+            else:  # the same in every snapshot
+                found.copy_(_as_matrices(factors.mean))
     networks, coefficients = _networks(arena, [f.layers for f, _ in heads], phase.setting.record, parameters)
     launches = [
         _contraction(arena, phase, factors, a, found)
@@ -271,6 +298,11 @@ def _fields(
             _elastic(arena, phase, material, F),
         ]
     return networks, launches
+
+
+def _as_matrices(mean: torch.Tensor) -> torch.Tensor:
+    """[n, 6], symmetric, or [n, 9] → [n, 3, 3]."""
+    return (mean[:, np.ravel(TAU_MATRIX)] if mean.shape[1] == 6 else mean).unflatten(1, (3, 3))
 
 
 def _networks(arena: Arena, networks: list, record: LatentRecord, parameters) -> tuple[list, list]:
@@ -302,7 +334,9 @@ def _contraction(
     n, c, K = factors.modes.shape
     kernel = make_contraction(arena.precision, -(-K // 4), c == 6, wp.dtype_from_torch(a.dtype))
     mean = arena.hold(factors.mean, arena.real)
-    return arena.pack(kernel, c // 3 * n, [phase.needed, mean, arena.modes(factors.modes), a, found])
+    return arena.pack(
+        kernel, arena.whole_blocks(c // 3 * n), [phase.needed, mean, arena.modes(factors.modes), a, found]
+    )
 
 
 def _elastic(arena: Arena, phase: ModalPhase, material: Material, F: torch.Tensor):

@@ -12,8 +12,7 @@ from nsf.mpm import Precision
 from nsf.mpm.grid import inside
 from nsf.mpm.shape import shape_functions
 
-WARP = 32  # threads that share a dot product on a GPU
-BLOCK = 128  # threads that share a sum over S
+THREADS = 128  # of a block that shares coefficients, or a sum over S
 _AHEAD = 4  # vectors of modes whose loads are under way together
 
 
@@ -22,8 +21,9 @@ def _combination(names: str, coefficient: str) -> str:
 
     The K modes lie in vectors of four, on a GPU those of neighbouring particles side by side (`Arena.modes`):
     what is under way then covers the time that memory takes, even for few particles. A GPU first takes the
-    coefficients into shared memory; a particle that is not `live` only helps with that. A CPU may change the
-    order of additions, so that it works on several at once.
+    coefficients into shared memory, for which all threads of a block are needed, also those beyond the last
+    particle; one that is not `live` only helps with that. A CPU may change the order of additions, so that it
+    works on several at once.
     """
     names = names.split()
     each = "".join
@@ -74,7 +74,7 @@ def _scalar(precision: Precision) -> str:
 
 @cache
 def make_position(precision: Precision, vectors: int):
-    """Kernel of x and v at N, one thread a particle.
+    """Kernel of x and v at N, one thread a particle, launched over whole blocks.
 
     x = mean + Σ_k b_k a_k and v = Σ_k b_k ȧ_k, where ȧ is the backward difference of a (paper section 5.1:
     there is no v field); in the first step v is the initial velocity.
@@ -84,7 +84,7 @@ def make_position(precision: Precision, vectors: int):
     snippet = f"""
     typedef {_scalar(precision)} real;
     const int Q = {vectors}, c = 0, components = 3, particles = x.shape[0];
-    const bool live = true;
+    const bool live = p < particles;
     {_combination("a rate", "double")}
     return wp::vec_t<6, real>({{a_1, a_2, a_3, rate_1, rate_2, rate_3}});
     """
@@ -111,6 +111,8 @@ def make_position(precision: Precision, vectors: int):
     ):
         p = wp.tid()
         moved = combined(modes, a, rate, x, p)
+        if p >= x.shape[0]:
+            return
         x[p] = mean[p] + vec3(moved[0], moved[1], moved[2])
         if first[0] != 0:
             v[p] = initial_velocity[p]
@@ -125,7 +127,7 @@ def make_selection(precision: Precision, shape_name: str):
     """Kernels that find the particles which the step of S needs, exactly as in the paper.
 
     `stamp` writes the number of the step to every cell from which a stencil meets one of S's, `select` takes
-    the particles in these cells and moves the others off the grid, where the transfers pass over them.
+    S and the particles in these cells, and moves the others off the grid, where the transfers pass over them.
     Cells are those of a box that starts at `lower`.
 
     Source: paper section 5.4, a and b.
@@ -166,20 +168,28 @@ def make_selection(precision: Precision, shape_name: str):
         extent: wp.vec3i,
         step: wp.array(dtype=wp.int32),
         stamps: wp.array(dtype=wp.int32),
+        sample: int,
+        grid_shape: wp.vec3i,
         x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
         needed: wp.array(dtype=wp.int32),
         count: wp.array(dtype=wp.int64),
     ):
         p = wp.tid()
-        c = cell(base_node(x[p], inv_dx), lower, extent)
+        base = base_node(x[p], inv_dx)
         taken = 0
-        if c >= 0:  # noqa: SIM102 - Warp evaluates both sides of an `and`
-            if stamps[c] == step[0]:
-                taken = 1
-        needed[p] = taken
-        if taken == 0:
-            x[p] = vec3(real(-1.0), real(-1.0), real(-1.0))  # the grid starts at the origin
+        if p < sample:
+            taken = 1
+            if not inside(base, wp.static(reach + 1), grid_shape):
+                v[p] = vec3()  # no transfer will move it
         else:
+            c = cell(base, lower, extent)
+            if c >= 0 and stamps[c] == step[0]:
+                taken = 1
+            else:
+                x[p] = vec3(real(-1.0), real(-1.0), real(-1.0))  # the grid starts at the origin
+        needed[p] = taken
+        if taken != 0:
             wp.atomic_add(count, 0, wp.int64(1))
         if p == 0:
             count[1] = count[1] + wp.int64(1)
@@ -189,7 +199,7 @@ def make_selection(precision: Precision, shape_name: str):
 
 @cache
 def make_contraction(precision: Precision, vectors: int, symmetric: bool, coefficients):
-    """Kernel of a matrix field at N, mean + Σ_k modes_k a_k, three components a thread.
+    """Kernel of a matrix field at N, mean + Σ_k modes_k a_k, three components a thread, over whole blocks.
 
     The six components of a symmetric field are xx xy xz yy yz zz, the nine of another go row by row.
     Particles that are not needed are passed over. `coefficients` is the type of a.
@@ -225,7 +235,7 @@ def make_contraction(precision: Precision, vectors: int, symmetric: bool, coeffi
         n = needed.shape[0]
         group, p = t / n, t % n
         c = 3 * group
-        live = needed[p] != 0
+        live = c < mean.shape[1] and needed[p] != 0
         value = combined(modes, mean, a, p, c, live)
         if not live:
             return
@@ -302,7 +312,7 @@ def make_layer(precision: Precision):
         o, lane = t / lanes, t % lanes
         first = b_1.shape[0]
         z = real(0.0)
-        if o < first:  # noqa: SIM108 - Warp evaluates both sides of a conditional expression
+        if o < first:  # noqa: SIM108 - one call each, not one call of chosen arrays
             z = row(W_1, b_1, x_1, o, lane, lanes)
         else:
             z = row(W_2, b_2, x_2, o - first, lane, lanes)
@@ -399,12 +409,25 @@ def projection_block(widths: tuple[int, ...]) -> int:
 
 #: Threads that share a sum over a layer's inputs; each has two outputs, to read its inputs once for both.
 _PARTS = 8
-#: Bytes of shared memory that Bᵀw B may take; more of it stays where it is.
-_GRAM_BYTES = 20480
+#: Shared memory [byte] of a block without asking for more, and what Warp takes of it.
+_SHARED, _TAKEN = 49152, 4096
 
-# Native code of the closure and its tangents, all layers in one piece: a step comes to it once, so that code
-# is not yet at hand and must be short. Values are summed in the precision of the step, tangents in fp32: they
-# steer Gauss-Newton, and miss its fixed point by no more than their round-off times the residual.
+
+def shared_bytes(precision: Precision, widths: tuple[int, ...], latents: int, modes: int) -> int:
+    """Shared memory [byte] that the projection needs, without Bᵀw B."""
+    widest, row = max((*widths[:-1], latents)), -(-latents // 4) * 4
+    values = 2 * widest * precision.numpy().itemsize + 8 * widest * row
+    return values + 8 * (5 * modes + 2 * modes * latents + 2 * latents * (latents + 2) + 4)
+
+
+def projection_fits(precision: Precision, widths: tuple[int, ...], latents: int, modes: int) -> bool:
+    """Whether one block of a GPU can hold what the projection needs."""
+    return shared_bytes(precision, widths, latents, modes) <= _SHARED - _TAKEN
+
+
+# Native code of the closure and its tangents, all layers in one piece: code that a step meets for the first
+# time must be short. Values are summed in the precision of the step, tangents in fp32: they steer
+# Gauss-Newton, and miss its fixed point by no more than their round-off times the residual.
 _CLOSURE = """
         const int width[] = {widths};
         int offset = 0;
@@ -513,7 +536,7 @@ def make_projection(precision: Precision, widths: tuple[int, ...], members: int,
     """
     real = precision.real
     widest = max((*widths[:-1], latents))
-    kept = 8 * modes**2 <= _GRAM_BYTES
+    kept = shared_bytes(precision, widths, latents, modes) + 8 * modes**2 <= _SHARED - _TAKEN
     closure = ""
     if widths:
         counts = "{" + ", ".join(map(str, widths)) + "}"
@@ -563,12 +586,14 @@ def make_projection(precision: Precision, widths: tuple[int, ...], members: int,
         }}
         NSF_SYNC;
     }};
+    // Where sums cancel to less than their round-off, nothing is left; a NaN stays one.
+    auto least = [](double sum) {{ return sum < 0.0 ? 0.0 : sum; }};
     // The squared error, of which q is known.
     auto left = [&]() {{
         double sum = d[K];
         #pragma unroll 2
         for (int k = 0; k < K; ++k) sum -= moved[k] * (d[k] + q[k]);
-        return sum > 0.0 ? sum : (sum <= 0.0 ? 0.0 : sum);  // a NaN stays one
+        return least(sum);
     }};
 
     #pragma unroll 1
@@ -632,7 +657,7 @@ def make_projection(precision: Precision, widths: tuple[int, ...], members: int,
                 residuals.data[n * (iterations + 1) + done] = real(sqrt(error / sample));
                 updates.data[n * iterations + done] = real(length);
                 // What a linearised model leaves: |e - J u|² = |e|² - uᵀ(AᵀG A)u at the minimum.
-                if (linear) error = error > change ? error - change : 0.0;
+                if (linear) error = least(error - change);
                 going = !(length <= tolerance);
             }}
             NSF_SYNC;

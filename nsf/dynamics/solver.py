@@ -10,13 +10,12 @@ from nsf.data import hash_of_positions
 from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
 from nsf.dynamics.interop import captured, on_torch_stream, torch_device, torch_dtype
 from nsf.dynamics.latent import Decoder, LatentRecord, LatentState, LatentTrajectory
-from nsf.dynamics.modal import ModalPhase
+from nsf.dynamics.modal import ModalPhase, steps_in_coefficients
 from nsf.dynamics.phase import DecodedPhase, Phase, SearchingPhase, Setting, Stages
 from nsf.dynamics.projection import GaussNewton, Taylor
 from nsf.dynamics.sampling import RandomSampler, SamplePhase, Sampler, check_well_posed
 from nsf.dynamics.stress import Method
 from nsf.errors import ConfigError, ShapeError
-from nsf.kinematics.basis import BasisManifold
 from nsf.kinematics.manifold import Restriction
 from nsf.mpm import BoundaryArrays, Grid, GridStep, precision_of
 from nsf.mpm.device import warp_device
@@ -179,8 +178,7 @@ class ReducedMPM:
         step = GridStep(
             grid, self.boundaries, self.transfer, self.gravity, self.dt, self.precision, self.device
         )
-        modal = isinstance(self.manifold, BasisManifold) and self.manifold.layered
-        if modal and isinstance(self.projector, GaussNewton | Taylor):
+        if steps_in_coefficients(self.manifold, self.projector, self.precision, self.device):
             return ModalPhase(
                 self._setting, sets, step, self.transfer.shape, self.manifold, self.method, self.parameters,
                 self.scene.material, weights,

@@ -56,7 +56,13 @@ _SUM = """
 #if defined(__CUDA_ARCH__)
     const unsigned all = 0xffffffffu;
     int left = run < 0 ? -run : run;
+#if __CUDA_ARCH__ >= 800
     int longest = __reduce_max_sync(all, left);
+#else
+    int longest = left;
+    for (int offset = 16; offset > 0; offset /= 2)
+        longest = max(longest, __shfl_xor_sync(all, longest, offset));
+#endif
     wp::vec_t<4, {real}> sum = value;
     for (int offset = 1; offset < longest; offset *= 2) {{
         {real} a = __shfl_down_sync(all, sum[0], offset);

@@ -5,11 +5,13 @@ import pytest
 import torch
 import warp as wp
 
+import nsf.scenes
 from nsf.dynamics import GaussNewton, Integration, Method, RandomSampler, SamplePhase, Taylor
 from nsf.dynamics.modal import ModalPhase
+from nsf.dynamics.modal_kernels import projection_fits
 from nsf.dynamics.phase import DecodedPhase
 from nsf.kinematics.basis import BasisManifold
-from nsf.kinematics.mlp import MlpManifold
+from nsf.mpm import precision_of
 
 METHODS = [Method(f"{a}{b}", a, b) for a in (True, False) for b in (True, False)]
 
@@ -18,14 +20,14 @@ METHODS = [Method(f"{a}{b}", a, b) for a in (True, False) for b in (True, False)
 def pair(chain, tiny_manifold, monkeypatch):
     """options → a solver in coefficients and one that decodes, of the same fields."""
 
-    def build(sample=20, manifold=tiny_manifold, **options):
+    def build(sample=20, manifold=tiny_manifold, scene=chain.scene, **options):
         def one():
-            return chain.scene.reduced(manifold, {"friction_angle": 26.0}, sample, **options)
+            return scene.reduced(manifold, {"friction_angle": 26.0}, sample, **options)
 
         options.setdefault("device", "cpu")
         modal = one()
         with monkeypatch.context() as patch:
-            patch.setattr("nsf.dynamics.solver.BasisManifold", MlpManifold)
+            patch.setattr("nsf.dynamics.solver.steps_in_coefficients", lambda *arguments: False)
             decoded = one()
         assert isinstance(modal._phase, ModalPhase)
         assert isinstance(decoded._phase, DecodedPhase)
@@ -89,6 +91,45 @@ def test_weights_and_phases(pair):
     phases = [SamplePhase(0.0, np.arange(0, 500, 25), weights), SamplePhase(0.5, np.arange(7, 500, 50), None)]
     same(*runs(pair(phases)))
     same(*runs(pair(RandomSampler(20, phases=[{"start": 0.25, "size": 8}]))))
+
+
+def test_a_projector_of_ones_own_takes_positions(chain, tiny_manifold):
+    class Own(GaussNewton):
+        pass
+
+    solver = chain.scene.reduced(tiny_manifold, {"friction_angle": 26.0}, 20, device="cpu", projector=Own())
+    assert isinstance(solver._phase, DecodedPhase)
+
+
+def test_more_samples_than_a_block_has_threads(pair):
+    same(*runs(pair(200), steps=6))
+
+
+def test_cubic_splines(chain, tiny, pair):
+    scene = nsf.scenes.load("sand", [*tiny[1:], "transfer.shape=cubic"])
+    same(*runs(pair(scene=scene), steps=6))
+
+
+def test_samples_off_the_grid_stay(pair):
+    """Neither way of stepping moves them: they count as they are."""
+    solvers = pair(60)
+    for solver in solvers:
+        solver.record.now[0] += 400.0  # far enough that some particles leave
+        solver.record.before.copy_(solver.record.now)
+        solver._enter(solver._phase)
+        solver.step(2)
+    assert solvers[0].left_grid() == 1
+    one, other = (solver.trajectory() for solver in solvers)
+    np.testing.assert_allclose(one.xhat[1:3], other.xhat[1:3], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("r", "modes", "beta", "fits"),
+    [(6, 48, 48, True), (12, 48, 48, True), (6, 48, 200, False), (14, 96, 48, False)],
+)
+def test_what_a_block_of_a_gpu_holds(r, modes, beta, fits):
+    widths = (r, 3 * beta, 3 * beta, 3 * beta, modes - r)
+    assert projection_fits(precision_of("fp64"), widths, r, modes) == fits
 
 
 def test_a_longer_step(pair):
