@@ -304,6 +304,7 @@ class BasisManifold(Manifold):
     def __init__(self, latent_dim, x_sha256, parameter_names, hyperparameters):
         super().__init__(latent_dim, x_sha256, parameter_names, hyperparameters)
         self.fields = nn.ModuleDict()
+        self._kept_slopes: tuple[Tensor, Tensor] | None = None
         layout = zip(TARGETS.items(), hyperparameters["modes"], hyperparameters["beta"], strict=True)
         for (phase, (_, d)), modes, beta in layout:
             inputs = latent_dim + (len(self.parameter_names) if self.takes_parameters(phase) else 0)
@@ -379,15 +380,26 @@ class BasisManifold(Manifold):
         phase = "deformation" if name == "gradient" else name
         field = self.fields[phase]
         if name == "gradient":
-            local = interpolation(points, self.X)
             base = torch.eye(3, dtype=points.dtype, device=points.device).flatten()
-            mean, modes = _slope(local, field.mean), _slope(local, field.modes).float()
+            mean, modes = (values[rows] for values in self._slopes(device))
         else:
             base = points if name == "deformation" else 0
             mean, modes = field.mean[rows], field.modes[rows]
         network, scale = self._deployed(phase, like), float(field.scale)
         members = self.hyperparameters.get("members", 1)
         return ModalFactors((base + mean).to(like), modes.to(device), field.leading, scale, network, members)
+
+    def _slopes(self, device: torch.device | str) -> tuple[Tensor, Tensor]:
+        """∂/∂X of the deformation's mean [P, 9] and of its modes [P, 9, K], in fp32, at the particles.
+
+        Found on `device`, and once: every solver of the baseline asks for them.
+        """
+        if self._kept_slopes is None:
+            field, X = self.fields["deformation"], self.X.to(device)
+            local = interpolation(X, X)
+            mean, modes = (_slope(local, values.to(device)) for values in (field.mean, field.modes))
+            self._kept_slopes = mean.to(self.X.device), modes.float().to(self.X.device)
+        return self._kept_slopes
 
     def _deployed(self, phase: str, like: Tensor) -> FullyConnected | None:
         """The phase's network from (xhat, μ) to coefficients in the field's unit."""

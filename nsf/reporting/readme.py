@@ -14,7 +14,8 @@ from nsf.reporting.tables import VARIANT, markdown_table, without_constants
 
 BEGIN, END = "<!-- figures:begin -->", "<!-- figures:end -->"
 REPORT, EXPERIMENT = Path("reports/table1"), "table1"
-_PICTURES = ("bread-nsf-strip.png", "cake-nsf-strip.png")
+_PICTURE = "{}-nsf-strip.png"  # of a scene
+_ACROSS = 2  # pictures in a row
 _ERRORS = ("delta", "displacement_error", "stress_error")
 _COSTS = ("speedup_step", "memory_full_mib", "memory_reduced_mib")
 _PAPER = "paper_delta"
@@ -41,17 +42,34 @@ def figures(report: Path) -> str:
     means[_PAPER] = [_printed(row["scene"], row["method"]) for row in means.to_dict("records")]
     described = [name for name in means if name not in (*_ERRORS, *_COSTS, _PAPER)]
     table, same = without_constants(means[[*described, _PAPER, *_ERRORS, *_COSTS]], keep=("scene", "method"))
-    pictures = "".join(
-        f"![Full-order above, reduced below]({folder}/{name})\n\n"
-        for name in _PICTURES
-        if (report / name).is_file()
-    )
+    gallery = _gallery(report, list(dict.fromkeys(frame["scene"])))
     return (
-        f"{pictures}Means over held-out parameter values at the paper's size ({same}).\n\n"
+        f"{gallery}Means over held-out parameter values at the paper's size ({same}).\n\n"
         + markdown_table(table, {_PAPER: "paper's δ [%]"})
         + f"\n\nFrom [`{folder}/results.csv`]({folder}/results.csv); the whole report is "
         f"[`index.md`]({folder}/index.md)."
     )
+
+
+def _gallery(report: Path, scenes: list[str]) -> str:
+    """The strips of the scenes that have one, in a table; each leads to its full size."""
+    pictures = {scene: report / _PICTURE.format(scene) for scene in scenes}
+    cells = [
+        f'<td width="{100 // _ACROSS}%">{_title(scene)}<br>'
+        f'<a href="{path.as_posix()}"><img src="{path.as_posix()}" alt="{_title(scene)}: full-order above, '
+        f'reduced below"></a></td>'
+        for scene, path in pictures.items()
+        if path.is_file()
+    ]
+    if not cells:
+        return ""
+    rows = ["".join(cells[i : i + _ACROSS]) for i in range(0, len(cells), _ACROSS)]
+    told = "Full-order above, reduced below, at a parameter value that was not trained on."
+    return "\n".join([told, "", "<table>", *(f"<tr>{row}</tr>" for row in rows), "</table>", "", ""])
+
+
+def _title(scene: str) -> str:
+    return config.load([f"scene={scene}"]).scene.title
 
 
 def _printed(scene: str, method: str) -> float:

@@ -59,6 +59,7 @@ _RC = {
 }
 
 WIDTH = 9.6  # [inch] 960 px at 100 dpi: the width of a report's column
+_PIXELS = 120  # an inch of a png: sharp at that width, and a report of many pictures stays small
 
 
 def styled():
@@ -88,6 +89,6 @@ def save(fig: Figure, folder, stem: str, kinds=("svg", "png")) -> list[str]:
     with styled():
         for kind, name in zip(kinds, names, strict=True):
             metadata = {"Date": None} if kind == "svg" else {"Software": None}
-            fig.savefig(folder / name, dpi=160 if kind == "png" else 100, metadata=metadata)
+            fig.savefig(folder / name, dpi=_PIXELS if kind == "png" else 100, metadata=metadata)
             fig.set_layout_engine("none")  # the first file has laid it out; that takes as long as drawing
     return names

@@ -54,7 +54,8 @@ def test_readme_scene_builds(tmp_path, monkeypatch):
 
 
 def test_readme_links_lead_somewhere():
-    links = [link for link in re.findall(r"\]\(([^)]+)\)", README) if not link.startswith(("http", "#"))]
+    links = re.findall(r"\]\(([^)]+)\)", README) + re.findall(r'(?:href|src)="([^"]+)"', README)
+    links = [link for link in links if not link.startswith(("http", "#"))]
     named = re.findall(r"`((?:nsf|conf|docs|experiments)/[\w/.]+)`", README)
     assert links
     assert named
@@ -91,6 +92,14 @@ def test_figures_are_means_of_held_out_values(tmp_path):
     assert "| sand | nsf | 0.400 | 0.123 |" in text  # the paper's, then ours
     assert "| sand | deformation_only | – | 4.56 |" in text
     assert "paper's δ [%] | δ [%]" in text
+
+
+def test_figures_show_the_scenes_that_have_a_picture(tmp_path):
+    folder = results(tmp_path, {"nsf": 0.00123})
+    assert "<table>" not in figures(folder)
+    (folder / "sand-nsf-strip.png").touch()
+    assert figures(folder).count('<img src="') == 1
+    assert "Sand column" in figures(folder)
 
 
 def test_figures_do_not_hide_divergence(tmp_path):
