@@ -1,4 +1,4 @@
-"""Several simulations in the arrays of one: rows of particles, nodes and solids lie simulation by simulation."""
+"""Several simulations in the arrays of one: particles, nodes and solids lie simulation by simulation."""
 
 from functools import cache
 
