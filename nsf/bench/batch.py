@@ -1,7 +1,7 @@
 """Reduced simulations at many parameter values that take their steps together, by their number."""
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 import torch
@@ -10,10 +10,12 @@ from nsf import config
 from nsf.bench.measure import build, name_of, run_times
 from nsf.bench.reduced import SCENES, deformation_error
 from nsf.bench.rows import Result, Row, Settings, commit
+from nsf.dynamics import ReducedBatch, ReducedMPM, ReducedRun
 from nsf.pipeline import Pipeline
 
 #: Simulations of a batch.
 SIZES = {"cuda": (1, 4, 16, 64, 256), "cpu": (1, 2, 4)}
+_GOLDEN = 0.618034  # multiples of it, less whole numbers, fill an interval evenly however many there are
 _SHARE = 0.8  # of the free device memory that a batch may be expected to take
 
 
@@ -21,7 +23,7 @@ def run(settings: Settings, say: Callable[[str], object]) -> Result:
     """Each scene: at the paper's size on a GPU, at small scale on a CPU.
 
     Data and training are made, or reused, as by `nsf train`. The first simulation of a batch is that of the
-    first held-out value, of which δ is told; the others' values lie evenly in the range of training.
+    first held-out value, of which δ is told; the others' values fill the range of training.
     """
     kind = "cuda" if settings.device.startswith("cuda") else "cpu"
     scale, found = {"cuda": "paper", "cpu": "small"}[kind], Result()
@@ -35,19 +37,23 @@ def measured(chain: Pipeline, sizes, settings: Settings, found: Result, say: Cal
     """Add the rows of one scene; every batch of a precision turn by turn, in whole runs."""
     chain.simulate()
     chain.train()
-    manifold, scene = chain.manifold(), chain.scene
+    manifold, scene, name = chain.manifold(), chain.scene, chain.scene.parameters.name
     truth = chain.truth(chain.held_out[0]).path / "trajectory.h5"
     first = chain.solver_at(manifold, chain.held_out[0])
     phases, sets, particles = first.phases, first.sets, len(first.scene_particles)
     del first  # its arrays are on the device
     how = {"method": chain.method, "projector": chain.projector, "integration": chain.integration}
 
+    @cache
+    def scene_at(value: float):
+        return scene.with_parameters({name: value})
+
     def make(size: int, precision: str):
         options = how | {"sets": sets, "precision": precision, "device": settings.device}
-        own = [{scene.parameters.name: value} for value in values_of(chain, size)]
+        own = [(manifold, scene_at(value), phases, {name: value}) for value in values_of(chain, size)]
         if size == 1:
-            return scene.reduced(manifold, own[0], phases, **options)
-        return scene.reduced_batch(manifold, own, phases, **options)
+            return ReducedMPM(*own[0], **options)
+        return ReducedBatch([ReducedRun(*one, **options) for one in own])
 
     for precision in settings.precisions:
         built: dict[int, tuple] = {}
@@ -72,9 +78,12 @@ def measured(chain: Pipeline, sizes, settings: Settings, found: Result, say: Cal
 
 
 def values_of(chain: Pipeline, size: int) -> list[float]:
-    """Parameter values of a batch: the first held-out one, and others in the range of training."""
-    train = chain.split.train
-    return [chain.held_out[0], *np.linspace(min(train), max(train), size - 1).tolist()]
+    """Parameter values of a batch: the first held-out one, and others in the range of training.
+
+    Those of a small batch are the first ones of a large one: building a scene takes a moment.
+    """
+    low, high = min(chain.split.train), max(chain.split.train)
+    return [chain.held_out[0], *(low + (high - low) * (n * _GOLDEN % 1.0) for n in range(1, size))]
 
 
 def _too_large(size: int, nbytes: dict[int, int], device: str) -> bool:

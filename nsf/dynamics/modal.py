@@ -274,7 +274,8 @@ def _placing(arena: Arena, state: Coefficients, mean: torch.Tensor, modes: torch
     """The launch that gives x and v at N."""
     vectors = [as_vectors(a, arena.precision) for a in (phase.initial_velocity, phase.x, phase.v)]
     mean = as_vectors(arena.hold(mean, arena.real), arena.precision)
-    (tiles, tile), lanes = tiling(len(state)), arena.lanes(THREADS)
+    # Of a and ȧ, in whole vectors of four.
+    (tiles, tile), lanes = tiling(len(state), 16 * -(-state.a.shape[1] // 4) * 4), arena.lanes(THREADS)
     inputs = [mean, modes, state.a, state.rate, vectors[0], state.first, tiles, lanes, *vectors[1:]]
     kernel = make_position(arena.precision, -(-state.a.shape[1] // 4), tile, tiles > 1)
     return arena.pack(kernel, tiles * arena.whole_blocks(phase.size, THREADS), inputs, THREADS)
@@ -347,7 +348,7 @@ def _contraction(
 ):
     """The launch of a field with coefficients a [B, K] at the needed particles."""
     n, c, K = factors.modes.shape
-    (tiles, tile), lanes = tiling(len(a)), arena.lanes(THREADS)
+    (tiles, tile), lanes = tiling(len(a), a.element_size() * -(-K // 4) * 4), arena.lanes(THREADS)
     coefficients = wp.dtype_from_torch(a.dtype)
     kernel = make_contraction(arena.precision, -(-K // 4), c == 6, coefficients, tile, tiles > 1)
     mean = arena.hold(factors.mean, arena.real)

@@ -20,9 +20,19 @@ _AHEAD = 4  # vectors of modes whose loads are under way together
 _TILE = 8  # most simulations of one thread: their sums fill its registers
 
 
-def tiling(simulations: int) -> tuple[int, int]:
-    """Tiles, and simulations of a tile, so that none is much emptier than the others."""
-    tiles = -(-simulations // _TILE)
+#: Shared memory [byte] of a block without asking for more, and what Warp takes of it.
+_SHARED, _TAKEN = 49152, 4096
+
+
+def tiling(simulations: int, shared: int = 0) -> tuple[int, int]:
+    """Tiles, and simulations of a tile, so that none is much emptier than the others.
+
+    Args:
+        simulations: in all.
+        shared: memory [byte] that a block shares for each simulation of its tile.
+    """
+    most = max(1, min(_TILE, (_SHARED - _TAKEN) // max(shared, 1)))
+    tiles = -(-simulations // most)
     return tiles, -(-simulations // tiles)
 
 
@@ -182,6 +192,25 @@ def make_position(precision: Precision, vectors: int, tile: int = 1, several: bo
     return position
 
 
+# Adds `taken`, 0 or 1, to count[copy, 0]; threads of a warp that are of one simulation add together.
+_COUNT = """
+#if defined(__CUDA_ARCH__)
+    unsigned long long* at = (unsigned long long*)count.data + size_t(copy) * count.shape[1];
+#if __CUDA_ARCH__ >= 700
+    const unsigned there = __activemask();
+    const unsigned own = __match_any_sync(there, copy);
+    const unsigned takers = __ballot_sync(there, taken != 0) & own;
+    const bool first = (threadIdx.x & 31) == __ffs(own) - 1;
+    if (first && takers != 0) atomicAdd(at, (unsigned long long)__popc(takers));
+#else
+    if (taken != 0) atomicAdd(at, 1ull);
+#endif
+#else
+    count.data[size_t(copy) * count.shape[1]] += taken;
+#endif
+"""
+
+
 @cache
 def make_selection(precision: Precision, shape_name: str, several: bool = False):
     """Kernels that find the particles which the step of S needs, exactly as in the paper.
@@ -197,6 +226,9 @@ def make_selection(precision: Precision, shape_name: str, several: bool = False)
     base_node, reach = shape.base_node, shape.degree
     across = 2 * reach + 1
     share, copy_of = make_copies(several)
+
+    @wp.func_native(_COUNT)
+    def add_up(count: wp.array2d(dtype=wp.int64), copy: int, taken: int): ...
 
     @wp.func
     def cell(base: wp.vec3i, lower: wp.vec3i, extent: wp.vec3i):
@@ -255,8 +287,7 @@ def make_selection(precision: Precision, shape_name: str, several: bool = False)
             else:
                 x[p] = vec3(real(-1.0), real(-1.0), real(-1.0))  # the grid starts at the origin
         needed[copy, within] = taken
-        if taken != 0:
-            wp.atomic_add(count, copy, 0, wp.int64(1))
+        add_up(count, copy, taken)
         if within == 0:
             count[copy, 1] = count[copy, 1] + wp.int64(1)
 
@@ -524,8 +555,6 @@ def projection_block(widths: tuple[int, ...]) -> int:
 
 #: Threads that share a sum over a layer's inputs; each has two outputs, to read its inputs once for both.
 _PARTS = 8
-#: Shared memory [byte] of a block without asking for more, and what Warp takes of it.
-_SHARED, _TAKEN = 49152, 4096
 
 
 def shared_bytes(precision: Precision, widths: tuple[int, ...], latents: int, modes: int) -> int:

@@ -42,7 +42,8 @@ class Stepping(Phased):
         """Go back to t = 0; captured graphs stay good."""
         self.steps_taken = 0
         self.record.restart()
-        self.boundaries.start_from(0)
+        with on_torch_stream(self.device):
+            self.boundaries.start_from(0)
         self._enter(self._phases[0])
 
     def step(self, n: int = 1) -> None:

@@ -232,7 +232,10 @@ def test_batches_have_rows_by_their_size(batches, chain):
 
 def test_the_values_of_a_batch(chain):
     assert values_of(chain.pipeline, 1) == [26.0]
-    assert values_of(chain.pipeline, 4) == [26.0, 22.0, 30.0, 38.0]
+    many = values_of(chain.pipeline, 64)
+    assert many[:4] == values_of(chain.pipeline, 4)
+    assert len(set(many)) == 64
+    assert 22.0 <= min(many) < 22.5 < 37.5 < max(many) <= 38.0
 
 
 def test_a_batch_that_would_not_fit_is_left_out(monkeypatch):

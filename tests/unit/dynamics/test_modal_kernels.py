@@ -38,6 +38,8 @@ def test_tiles_hold_all():
         tiles, size = tiling(simulations)
         assert size <= 8
         assert 0 <= tiles * size - simulations < tiles
+    assert tiling(64, 8000) == (13, 5)  # 45 056 bytes hold five
+    assert tiling(64, 10**6) == (64, 1)
 
 
 @pytest.mark.parametrize(("n", "K", "simulations"), SIZES)
