@@ -223,7 +223,7 @@ class Projection:
             [displacement, phase.size, -(-K // 4), velocity, w, wp.float64(setting.dt), lanes, b],
             THREADS,
         )
-        kernel = make_projection(arena.precision, widths, deformation.members, r, K)
+        kernel = make_projection(arena.precision, widths, deformation.members, r, K, count > 1)
         sigma = arena.hold(deformation.leading, torch.float64)
         block = projection_block(widths)
         linear = int(isinstance(projector, Taylor))

@@ -658,7 +658,14 @@ _CLOSURE = """
 
 
 @cache
-def make_projection(precision: Precision, widths: tuple[int, ...], members: int, latents: int, modes: int):
+def make_projection(
+    precision: Precision,
+    widths: tuple[int, ...],
+    members: int,
+    latents: int,
+    modes: int,
+    several: bool = False,
+):
     """Kernel of the inversion, one block a simulation: Gauss-Newton in the coefficients of the modes.
 
     With d = Δt v the displacement of S in the step and δa = a(x̂) − a(x̂_n), the error of the positions is
@@ -679,6 +686,7 @@ def make_projection(precision: Precision, widths: tuple[int, ...], members: int,
     Source: paper section 5.3.
     """
     real = precision.real
+    _, copy_of = make_copies(several)
     widest = max((*widths[:-1], latents))
     kept = shared_bytes(precision, widths, latents, modes) + 8 * modes**2 <= _SHARED - _TAKEN
     closure = ""
@@ -895,7 +903,7 @@ def make_projection(precision: Precision, widths: tuple[int, ...], members: int,
         step: wp.array2d(dtype=wp.int32),
         lanes: int,
     ):
-        s = wp.tid() / lanes
+        s = copy_of(wp.tid(), lanes)
         solve(
             weights, scale, sigma, G, b[s], sample, iterations, tolerance, linear, dt, latent[s], a[s],
             tangents[s], rate[s], xhat[s], xhat_previous[s], xhats[s], residuals[s], updates[s], row[s],
