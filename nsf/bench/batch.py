@@ -14,7 +14,7 @@ from nsf.dynamics import ReducedBatch, ReducedMPM, ReducedRun
 from nsf.pipeline import Pipeline
 
 #: Simulations of a batch.
-SIZES = {"cuda": (1, 4, 16, 64, 256), "cpu": (1, 2, 4)}
+SIZES = {"cuda": (1, 4, 16, 64, 256), "cpu": (1, 4)}
 _GOLDEN = 0.618034  # multiples of it, less whole numbers, fill an interval evenly however many there are
 _SHARE = 0.8  # of the free device memory that a batch may be expected to take
 
