@@ -16,13 +16,16 @@ from nsf.dynamics.modal_kernels import (
     make_gathering,
     make_layer,
     make_position,
-    make_projection,
     make_selection,
-    projection_block,
-    projection_fits,
 )
 from nsf.dynamics.phase import Phase, Setting, Stages
 from nsf.dynamics.projection import GaussNewton, Taylor
+from nsf.dynamics.projection_kernel import (
+    make_projection,
+    packed_weights,
+    projection_block,
+    projection_fits,
+)
 from nsf.dynamics.stress import Method
 from nsf.kinematics.basis import BasisManifold, ModalFactors
 from nsf.mpm import GridStep, Precision
@@ -208,8 +211,9 @@ class Projection:
         B = of_sample.double().flatten(0, 1)
         G = arena.hold(B.T @ (w.repeat_interleave(3)[:, None] * B), torch.float64).flatten()
         b = arena.zeros(K + 1)
-        widths, weights = _closure(deformation)
+        widths, weights = _closure(deformation, arena.device.is_cuda)
         weights = arena.hold(weights, torch.float32)
+        members = deformation.members if widths else 1
         lanes, velocity = arena.lanes(THREADS), as_vectors(phase.v[:s], arena.precision)
         gather = arena.pack(
             make_gathering(arena.precision),
@@ -217,9 +221,11 @@ class Projection:
             [displacement, len(phase.x), -(-K // 4), velocity, w, wp.float64(setting.dt), lanes, b],
             THREADS,
         )
-        kernel = make_projection(arena.precision, widths, deformation.members, r, K)
+        kernel = make_projection(arena.precision, widths, members, r, K)
         sigma = arena.hold(deformation.leading, torch.float64)
         block = projection_block(widths)
+        threads = members * block if arena.device.is_cuda else 1
+        meeting = [arena.zeros(2 * members * (K - r) * (r + 1)), arena.zeros(2, dtype=torch.int32)]
         linear = int(isinstance(projector, Taylor))
 
         def solve(iterations: int) -> wp.Launch:
@@ -227,14 +233,14 @@ class Projection:
             latents = [state.latent, state.a, state.tangents, state.rate, record.now, record.before]
             kept = [record.xhat.flatten(), record.residuals.flatten(), record.updates.flatten(), record.row]
             sums = [weights, wp.float64(deformation.scale), sigma, G, b]
-            arguments = [*sums, *how, *latents, *kept, state.first, state.step]
-            return arena.pack(kernel, arena.lanes(block), arguments, block)
+            arguments = [*sums, *how, *latents, *kept, state.first, state.step, *meeting]
+            return arena.pack(kernel, threads, arguments, block)
 
         self.launches, self.evaluate = [gather, solve(projector.iterations)], solve(0)
 
 
-def _closure(deformation: ModalFactors) -> tuple[tuple[int, ...], torch.Tensor]:
-    """Widths of a member of the closure, and the weights and biases of all, member by member, as trained."""
+def _closure(deformation: ModalFactors, is_cuda: bool) -> tuple[tuple[int, ...], torch.Tensor]:
+    """Widths of a member of the closure, and the packed weights of all, member by member."""
     layers, members = deformation.layers, deformation.members
     if not layers:
         return (), torch.zeros(1)
@@ -242,11 +248,11 @@ def _closure(deformation: ModalFactors) -> tuple[tuple[int, ...], torch.Tensor]:
     widths = (len(deformation.leading), *(len(b) // members for _, b in hidden), len(b_last))
     packed = []
     for member in range(members):
-        for W, b in hidden:
-            packed += [part.unflatten(0, (members, -1))[member].flatten() for part in (W, b)]
+        own = [tuple(part.unflatten(0, (members, -1))[member] for part in layer) for layer in hidden]
         # What is in the unit of the coefficients is divided by it, so that fp32 holds it; all share a bias.
-        packed.append(W_last.unflatten(1, (members, -1))[:, member].flatten() / deformation.scale)
-        packed.append(b_last / deformation.scale * (member == 0))
+        last = W_last.unflatten(1, (members, -1))[:, member], b_last * (member == 0)
+        own.append(tuple(part / deformation.scale for part in last))
+        packed.append(packed_weights(own, is_cuda))
     return widths, torch.cat(packed)
 
 

@@ -8,8 +8,8 @@ import warp as wp
 import nsf.scenes
 from nsf.dynamics import GaussNewton, Integration, Method, RandomSampler, SamplePhase, Taylor
 from nsf.dynamics.modal import ModalPhase
-from nsf.dynamics.modal_kernels import projection_fits
 from nsf.dynamics.phase import DecodedPhase
+from nsf.dynamics.projection_kernel import projection_fits
 from nsf.kinematics.basis import BasisManifold
 from nsf.mpm import precision_of
 
