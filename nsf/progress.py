@@ -11,7 +11,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, Task, T
 from rich.progress import Progress as RichProgress
 from rich.text import Text
 
-
 class _Rate(ProgressColumn):
     def __init__(self, unit: str):
         super().__init__()
@@ -28,9 +27,10 @@ class Progress:
         stage: what is being done.
         total: units of work.
         unit: what is counted.
+        shown: whether this process shows it.
     """
 
-    def __init__(self, stage: str, total: int, unit: str):
+    def __init__(self, stage: str, total: int, unit: str, shown: bool = True):
         self._bar = RichProgress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -39,7 +39,7 @@ class Progress:
             TimeRemainingColumn(),
             TextColumn("left"),
             console=Console(stderr=True),
-            disable=not sys.stderr.isatty(),
+            disable=not (shown and sys.stderr.isatty()),
             transient=True,
         )
         self._stage = stage

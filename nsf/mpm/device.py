@@ -1,5 +1,7 @@
 """Devices by name."""
 
+import os
+
 import warp as wp
 
 from nsf.errors import DeviceError
@@ -22,3 +24,14 @@ def warp_device(name: str):
     if name not in known:
         raise DeviceError(f"device={name} is unknown; this machine has {', '.join(sorted(known - {'cuda'}))}")
     return wp.get_device(name)
+
+
+def visible_gpus() -> tuple[str, ...]:
+    """The GPUs that this process may use, each as CUDA_VISIBLE_DEVICES names it for a process of its own.
+
+    The first one is this process's `cuda:0`.
+    """
+    count = len(wp.get_cuda_devices())
+    named = os.environ.get("CUDA_VISIBLE_DEVICES")
+    names = named.split(",") if named else map(str, range(count))
+    return tuple(name.strip() for name in names)[:count]

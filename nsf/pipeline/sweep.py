@@ -48,6 +48,8 @@ def work(config: DictConfig, stages: Sequence[str], say: Callable[[str], object]
     pipeline = Pipeline(config, say)
     if len(stages) > 1:
         pipeline.check_held_out()  # before hours of simulation and training, not after
+    if "train" in stages:
+        pipeline.check_devices()
     for name in stages:
         result = pipeline.run(name)
     return result
