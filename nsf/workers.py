@@ -66,14 +66,13 @@ class Worker:
         """Have it stop, as by Ctrl-C."""
         self._process.terminate()
 
-    def close(self) -> None:
-        """Wait until it has stopped, which it is made to after a while."""
+    def join(self) -> None:
+        """Wait until it has ended, which it is made to after a while."""
         try:
             self._process.wait(_GRACE)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()
-        self._connection.close()
 
 
 @contextmanager
@@ -93,7 +92,7 @@ def working(calls: Sequence[Call], environments: Sequence[Mapping[str, str]]) ->
         for worker in workers:
             worker.stop()
         for worker in workers:
-            worker.close()
+            worker.join()
 
 
 def ended(

@@ -30,9 +30,10 @@ from nsf.evaluation import Comparison, Subject, compare, measure, superresolve
 from nsf.kinematics.manifold import Manifold
 from nsf.kinematics.ranks import train_together
 from nsf.kinematics.training import train
+from nsf.mpm.device import visible_gpus
 from nsf.pipeline import results
 from nsf.pipeline.plan import Plan
-from nsf.pipeline.simulation import Job, simulate
+from nsf.pipeline.simulation import Job, Shared, simulate
 from nsf.runs import Record, Run
 from nsf.scenes import Scene
 from nsf.storage import writing
@@ -109,9 +110,9 @@ class Pipeline(Plan):
             return Job(run, f"{name} {value:g}{unit}", parameters, build)
 
         jobs = [job(run, *needed) for run, needed in runs.items()]
-        return simulate(
-            jobs, self.scene.steps, self.scene.dx, self.stored, self.device, c.precision, self.say
-        )
+        shared = Shared(self.scene.steps, self.scene.dx, self.stored, self.device, c.precision)
+        further = visible_gpus()[1:] if c.device == "auto" else ()
+        return simulate(jobs, shared, self.say, further)
 
     def train(self) -> Run:
         """The manifold of the training trajectories."""
