@@ -104,18 +104,6 @@ def test_a_named_device_is_used_alone(on, monkeypatch):
     on("device=cpu").simulate()
 
 
-@pytest.mark.parametrize(
-    ("named", "count", "expected"),
-    [(None, 2, ("0", "1")), ("3, GPU-5a", 2, ("3", "GPU-5a")), ("0,-1,1", 1, ("0",)), ("", 0, ())],
-)
-def test_gpus_by_name(monkeypatch, named, count, expected):
-    monkeypatch.setattr("nsf.mpm.device.wp.get_cuda_devices", lambda: [object()] * count)
-    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-    if named is not None:
-        monkeypatch.setenv("CUDA_VISIBLE_DEVICES", named)
-    assert visible_gpus() == expected
-
-
 def test_one_device_is_the_training_that_it_was(on):
     """Runs of before there was the key, and of configurations that lack it, keep their names."""
     one, two = (on(*MLP, f"trainer.devices={n}") for n in (1, 2))
