@@ -133,14 +133,21 @@ def serve(number: int) -> None:
     try:
         call = pickle.loads(connection.recv_bytes())
         threading.Thread(target=_end_with, args=(connection,), daemon=True).start()
-        say("done", call(lambda amount: say("told", amount)))
+        last = "done", call(lambda amount: say("told", amount))
     except KeyboardInterrupt:
         sys.exit(130)
     except NSFError as error:
-        say("failed", error)
+        last = "failed", error
     except Exception as error:
         traceback.print_exc()
-        say("failed", LaunchError(f"{type(error).__name__}: {error}"))
+        last = "failed", LaunchError(f"{type(error).__name__}: {error}")
+    # Told to stop from here on, it has nothing left to do; and what tidies up at the end of Python, as
+    # torch's processes do among themselves, could wait for another process that has failed.
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    say(*last)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0)
 
 
 def _end_with(connection: Connection) -> None:

@@ -5,6 +5,7 @@ import time
 from functools import partial
 
 import pytest
+import warp as wp
 
 from nsf.mpm.device import take_gpu, visible_gpus
 from nsf.workers import ended, working
@@ -20,6 +21,27 @@ def test_gpus_by_name(monkeypatch, named, count, expected):
     if named is not None:
         monkeypatch.setenv("CUDA_VISIBLE_DEVICES", named)
     assert visible_gpus() == expected
+
+
+def uuid_taken(gpus, folder, tell):
+    taken(gpus, folder, tell)
+    return wp.get_device("cuda:0").uuid, len(wp.get_cuda_devices())
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(len(wp.get_cuda_devices()) < 2, reason="needs two GPUs")
+def test_processes_use_the_gpus_that_they_took(tmp_path):
+    told = []
+
+    def count(amount):
+        told.append(amount)
+        if len(told) == 2:
+            (tmp_path / "end").touch()
+
+    with working([partial(uuid_taken, visible_gpus()[:2], tmp_path)] * 2, [{}] * 2) as workers:
+        found = [outcome for _, outcome in ended(workers, count)]
+    assert {uuid for uuid, _ in found} == {device.uuid for device in wp.get_cuda_devices()[:2]}
+    assert [number for _, number in found] == [1, 1]
 
 
 def taken(gpus, folder, tell):
