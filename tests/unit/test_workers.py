@@ -30,8 +30,8 @@ def dies(tell):
 def waits(path, tell):
     """Say in a file who is at work, and how it ended."""
     path.write_text(str(os.getpid()))
-    tell(1)
     try:
+        tell(1)
         time.sleep(60)
     except KeyboardInterrupt:
         path.write_text("interrupted")
