@@ -14,7 +14,7 @@ from nsf.mpm.device import warp_device
 from nsf.mpm.precision import precision_of
 from nsf.storage import writing
 
-BENCHES = ("full_order", "scaling", "reduced")
+BENCHES = ("full_order", "scaling", "reduced", "multi_gpu")
 """Modules of this package that have `run(settings, say) -> Result`."""
 
 _UNITS = {"": 1, "k": 1_000, "m": 1_000_000}

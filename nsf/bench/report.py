@@ -19,6 +19,7 @@ _HEADINGS = {
     "ms_p10": "10 % [ms]",
     "ms_p90": "90 % [ms]",
     "peak_mib": "peak memory [MiB]",
+    "speed_up": "speed-up",
     "delta": "δ",
     "sample": "|S|",
     "integration": "|N|",
@@ -38,6 +39,11 @@ _KERNELS = (
     "Floor: the time that these bytes take a copy measured in the same run; a step cannot be faster than "
     "the floors of its passes together as long as its state does not fit into a cache."
 )
+_SEVERAL = (
+    "Several GPUs of the host; a case ends with their number. Simulate: the time of a data set, the start of "
+    "processes and the writing of files included, over the steps of all trajectories. Train: the time of an "
+    "optimiser step of field=mlp on as many points as the batch says, in whole. Speed-up: over one GPU."
+)
 
 
 def write_report(folder: Path) -> Path:
@@ -48,7 +54,7 @@ def write_report(folder: Path) -> Path:
         rows, passes = (frame[frame["device"] == device] for frame in (results, kernels))
         stem = re.sub("[^a-z0-9]+", "-", device.lower())
         parts.append(f"## On {device}")
-        of_size = rows[rows["bench"] != "reduced"]
+        of_size = rows[~rows["bench"].isin(["reduced", "multi_gpu"])]
         of_scene = rows[rows["bench"] == "reduced"]
         if len(of_scene):
             caption = "Time of a step of both solvers by scene; a bar names δ of its run."
@@ -65,10 +71,21 @@ def write_report(folder: Path) -> Path:
             parts += [f"![{caption}](step-{stem}.png)", caption, _markdown(of_size)]
             caption = "Time of each pass of a full-order step; the mark is its floor."
             parts += [f"![{caption}](kernels-{stem}.png)", caption, _KERNELS, _markdown(passes)]
+        of_several = rows[rows["bench"] == "multi_gpu"]
+        if len(of_several):
+            parts += [_SEVERAL, _markdown(with_speed_up(of_several))]
     page = folder / "index.md"
     with writing(page) as partial:
         partial.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
     return page
+
+
+def with_speed_up(results: pd.DataFrame) -> pd.DataFrame:
+    """Rows of `multi_gpu` of one device, each with the ratio of the time on one GPU to its own."""
+    work = results["case"].str.rpartition("_on_")
+    keys = pd.Series(list(zip(work[0], results["precision"], strict=True)), index=results.index)
+    alone = results["ms_median"][work[2] == "1"].groupby(keys).last()
+    return results.assign(speed_up=keys.map(alone) / results["ms_median"])
 
 
 def step_over_particles(results: pd.DataFrame, kernels: pd.DataFrame) -> Figure:

@@ -29,10 +29,11 @@ class Row:
     Attributes:
         bench, case: the benchmark, and what of it.
         particles, sample, integration: P, |S| and |N|; None where there is none.
-        batch: simulations that are stepped together.
+        batch: simulations that are stepped together, or points (particles of frames) of a training step.
         precision, device: of the solver.
         ms_median, ms_p10, ms_p90: over the trials, of the mean time of a step in one [ms].
-        peak_mib: what every allocator holds at most beyond what was held before the solver was built [MiB].
+        peak_mib: what every allocator holds at most beyond what was held before the solver was built [MiB];
+            None where several processes work.
         delta: δ of the run that is timed, a fraction; None for a full-order run.
         commit: of the code.
     """
@@ -48,7 +49,7 @@ class Row:
     ms_median: float
     ms_p10: float
     ms_p90: float
-    peak_mib: float
+    peak_mib: float | None
     delta: float | None
     commit: str
 

@@ -1,7 +1,9 @@
 """`nsf bench`: rows, passes and the report; what a step takes is asserted nowhere."""
 
 import dataclasses
+import os
 import re
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -10,8 +12,9 @@ import pytest
 from nsf.bench import BENCHES, bench
 from nsf.bench.full_order import collapse, measured, pass_times
 from nsf.bench.measure import bandwidth, step_times
+from nsf.bench.multi_gpu import measured as measured_on_several
 from nsf.bench.reduced import measured as measured_chain
-from nsf.bench.report import write_report
+from nsf.bench.report import with_speed_up, write_report
 from nsf.bench.rows import KernelRow, Result, Row, Settings, columns, size_name
 from nsf.cli import main
 from nsf.errors import ConfigError, DeviceError
@@ -209,3 +212,46 @@ def test_a_report_of_scenes(reduced, tmp_path):
     page = write_report(tmp_path)
     assert "| reduced_sand_1.5dt |" in page.read_text()
     assert (tmp_path / "reduced-cpu.png").stat().st_size > 5000
+
+
+@pytest.fixture(scope="module")
+def several(tiny, tmp_path_factory):
+    """Rows of two devices, for which processes on the CPU stand."""
+    found, said = Result(), []
+    mlp = ("field=mlp", "trainer.steps=150", "trainer.frames_per_batch=8", "trainer.particles_per_batch=4")
+    base = [o for o in tiny if not o.startswith(("field.modes", "field.depth", "trainer.steps", "device"))]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("NSF_RUNS", str(tmp_path_factory.mktemp("several")))
+        patch.setattr("nsf.pipeline.chain.visible_gpus", lambda: ("0", "1"))
+        measured_on_several([*base, *mlp], 2, Settings((), ("fp64",), "cpu", 1), found, said.append)
+        assert not list(Path(os.environ["NSF_RUNS"]).iterdir())
+    assert len(said) == 10
+    return pd.DataFrame(found.rows, columns=columns(Row))
+
+
+def test_several_devices_have_rows_beside_one(several, tmp_path):
+    cases = [f"train_mlp_{phase}" for phase in ("deformation", "stress", "affine")]
+    assert several["case"].tolist() == [
+        *(f"simulate_sand_on_{n}" for n in (1, 2)), *(f"{case}_on_{n}" for n in (1, 2) for case in cases)
+    ]  # fmt: skip
+    assert several["batch"].tolist() == [1, 2, *[32] * 6]
+    assert (several["ms_median"] > 0).all()
+    compared = with_speed_up(several)
+    alone, both = (compared[compared["case"].str.endswith(f"_on_{n}")] for n in (1, 2))
+    assert (alone["speed_up"] == 1).all()
+    np.testing.assert_allclose(both["speed_up"], alone["ms_median"].to_numpy() / both["ms_median"].to_numpy())
+    several.to_csv(tmp_path / "results.csv", index=False)
+    pd.DataFrame(columns=columns(KernelRow)).to_csv(tmp_path / "kernels.csv", index=False)
+    page = write_report(tmp_path).read_text()
+    assert "| train_mlp_stress_on_2 |" in page
+    assert "speed-up" in page
+    assert "png" not in page
+
+
+def test_several_gpus_are_needed(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("nsf.bench.multi_gpu.visible_gpus", lambda: ("0",))
+    with pytest.raises(SystemExit) as end:
+        main(["bench", "benches=multi_gpu", f"folder={tmp_path}", "device=cpu"])
+    assert not end.value.code
+    assert "multi_gpu: left out, as it needs two GPUs and this process has 1" in capsys.readouterr().err
+    assert pd.read_csv(tmp_path / "results.csv").empty
