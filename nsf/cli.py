@@ -40,8 +40,8 @@ TOOLS = {
     ),
     "bench": (
         "time and memory of a step, kernel by kernel; writes reports/speed",
-        "[benches=full_order,scaling,reduced,multi_gpu] [particles=10k,200k,1m] [precision=fp32,fp64]\n"
-        "       [device=auto] [trials=10] [folder=PATH]; sizes that suit the device by default",
+        "[benches=full_order,scaling,reduced,training,multi_gpu] [particles=10k,200k,1m]\n"
+        "       [precision=fp32,fp64] [device=auto] [trials=10] [folder=PATH]; sizes that suit it by default",
     ),
     "doctor": ("versions, devices, folders and extras of this installation", ""),
 }

@@ -10,6 +10,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from nsf.reporting.columns import number
+from nsf.reporting.cost_charts import rings
 from nsf.reporting.style import INK, figure, line_style, save, stage_colors, styled
 from nsf.reporting.tables import markdown_rows
 from nsf.storage import writing
@@ -28,7 +29,7 @@ _HEADINGS = {
     "gb_per_s": "bandwidth [GB/s]",
     "floor_ms": "floor [ms]",
 }
-_TEXT = ("bench", "case", "precision", "device", "kernel", "commit")
+_TEXT = ("bench", "case", "precision", "device", "kernel", "stage", "commit")
 _LEAD = (
     "Time of a step, both sides of a ratio measured in one process turn by turn, after a warm-up, around a "
     "synchronised device: the median over the trials, each the mean of many steps. Memory is the peak of "
@@ -39,6 +40,17 @@ _KERNELS = (
     "Floor: the time that these bytes take a copy measured in the same run; a step cannot be faster than "
     "the floors of its passes together as long as its state does not fit into a cache."
 )
+#: Of a reduced frame [ms]: the networks, the projection and copies between Warp and torch, and all of it
+#: (appendix of the paper, Runtime analysis; double precision, one Quadro P6000).
+_PAPER = {"reduced_cake": (1.95, 4.69), "reduced_metal": (1.78, 2.09)}
+_STAGES = (
+    "Where the time of a reduced step goes, each stage synchronised, so that the sum may exceed a step; "
+    "beside it a frame of the paper's reduced solver on a Quadro P6000 (its appendix, Runtime analysis)."
+)
+_TRAINING = (
+    "Training of all networks of a scene with field=basis: the time is that of a whole training, from "
+    "opening its files to the manifold, and the trials are seeds."
+)
 _SEVERAL = (
     "Several GPUs of the host; a case ends with their number. Simulate: the time of a data set, the start of "
     "processes and the writing of files included, over the steps of all trajectories. Train: the time of an "
@@ -47,20 +59,30 @@ _SEVERAL = (
 
 
 def write_report(folder: Path) -> Path:
-    """Charts and index.md from results.csv and kernels.csv of a folder."""
-    results, kernels = (pd.read_csv(folder / name) for name in ("results.csv", "kernels.csv"))
+    """Charts and index.md from results.csv, kernels.csv and stages.csv of a folder."""
+    results, kernels, stages = (
+        pd.read_csv(folder / name) for name in ("results.csv", "kernels.csv", "stages.csv")
+    )
     parts = ["# Speed", _LEAD]
     for device in results["device"].unique():
         rows, passes = (frame[frame["device"] == device] for frame in (results, kernels))
         stem = re.sub("[^a-z0-9]+", "-", device.lower())
         parts.append(f"## On {device}")
-        of_size = rows[~rows["bench"].isin(["reduced", "multi_gpu"])]
+        of_size = rows[rows["bench"].isin(["full_order", "scaling"])]
         of_scene = rows[rows["bench"] == "reduced"]
         if len(of_scene):
             caption = "Time of a step of both solvers by scene; a bar names δ of its run."
             with styled():
                 save(steps_by_scene(of_scene), folder, f"reduced-{stem}")
             parts += [f"![{caption}](reduced-{stem}.png)", caption, _markdown(of_scene)]
+        of_stages = stages[(stages["device"] == device) & stages["case"].isin(_PAPER)]
+        if len(of_stages):
+            with styled():
+                save(step_beside_paper(of_stages), folder, f"stages-{stem}")
+            parts += [f"![{_STAGES}](stages-{stem}.png)", _STAGES]
+        of_training = rows[rows["bench"] == "training"]
+        if len(of_training):
+            parts += [_TRAINING, _markdown(of_training)]
         if len(of_size):
             with styled():
                 save(step_over_particles(of_size, passes), folder, f"step-{stem}")
@@ -119,6 +141,26 @@ def step_over_particles(results: pd.DataFrame, kernels: pd.DataFrame) -> Figure:
         panel.grid(which="major")
         fig.legend(loc="outside upper left", ncols=3, handlelength=2.6)
     return fig
+
+
+def step_beside_paper(stages: pd.DataFrame) -> Figure:
+    """Rings of the stages of a reduced step [ms], a scene a row, and of the paper's.
+
+    Args:
+        stages: of one device, of cases of the paper; where there are two precisions, fp64 counts.
+    """
+    rows = []
+    for case, own in stages.groupby("case", sort=True):
+        precision, scene = own["precision"].max(), case.partition("_")[2]
+        own, (networks, whole) = own[own["precision"] == precision], _PAPER[case]
+        told = {"networks, projection, copies": networks, "MPM": whole - networks}
+        rows.append(
+            {
+                f"{scene}, reduced step, {precision}": dict(zip(own["stage"], own["ms"], strict=True)),
+                f"{scene}, the paper's frame": told,
+            }
+        )
+    return rings(rows)
 
 
 def steps_by_scene(results: pd.DataFrame) -> Figure:

@@ -81,11 +81,32 @@ class KernelRow:
 
 
 @dataclass(frozen=True)
+class StageRow:
+    """One stage of a step, synchronised before and after: a row of stages.csv.
+
+    Attributes:
+        bench, case, particles, precision, device, commit: as in `Row`.
+        stage: of the step.
+        ms: median time over steps spread through a run [ms].
+    """
+
+    bench: str
+    case: str
+    particles: int
+    precision: str
+    device: str
+    stage: str
+    ms: float
+    commit: str
+
+
+@dataclass(frozen=True)
 class Result:
     """What a benchmark found."""
 
     rows: list[Row] = field(default_factory=list)
     kernels: list[KernelRow] = field(default_factory=list)
+    stages: list[StageRow] = field(default_factory=list)
 
 
 def columns(kind: type) -> list[str]:

@@ -15,7 +15,8 @@ from nsf.bench.measure import bandwidth, step_times
 from nsf.bench.multi_gpu import measured as measured_on_several
 from nsf.bench.reduced import measured as measured_chain
 from nsf.bench.report import with_speed_up, write_report
-from nsf.bench.rows import KernelRow, Result, Row, Settings, columns, size_name
+from nsf.bench.rows import KernelRow, Result, Row, Settings, StageRow, columns, size_name
+from nsf.bench.training import measured as measured_training
 from nsf.cli import main
 from nsf.errors import ConfigError, DeviceError
 from nsf.pipeline import Pipeline
@@ -144,9 +145,9 @@ def test_sizes_by_name(count, name):
     ("asked", "error", "message"),
     [
         (
-            {"benches": "training,foo"},
+            {"benches": "sorting,foo"},
             ConfigError,
-            "benches=training is unknown; choose from full_order, scaling",
+            "benches=sorting is unknown; choose from full_order, scaling",
         ),
         ({"particles": "10q"}, ConfigError, "particles=10q is no number of particles"),
         ({"particles": "0"}, ConfigError, "particles=0 is no number"),
@@ -178,14 +179,38 @@ def test_the_command(tmp_path, monkeypatch, capsys):
 
 
 @pytest.fixture(scope="module")
-def reduced(chain):
+def found(chain):
     """Rows of the tiny chain, as of a scene of the benchmark."""
     found, said = Result(), []
     settings = Settings(particles=(), precisions=("fp32", "fp64"), device="cpu", trials=2)
     own = Pipeline(chain.pipeline.config, say=lambda line: None, root=chain.root)
     measured_chain(own, settings, found, said.append)
     assert len(said) == 10
+    return found
+
+
+@pytest.fixture(scope="module")
+def reduced(found):
+    """The rows."""
     return pd.DataFrame(found.rows, columns=columns(Row))
+
+
+def test_stages_of_both_solvers(found):
+    stages = pd.DataFrame(found.stages, columns=columns(StageRow))
+    of_case = stages.groupby(["case", "precision"], sort=False)["stage"].apply(list)
+    reduced = ["inference", "p2g", "grid", "g2p", "inversion"]
+    assert of_case.tolist() == 2 * [["p2g", "grid", "g2p", "stress"], reduced]
+    assert (stages["ms"] > 0).all()
+
+
+def test_training_is_timed_from_its_files(chain):
+    own = Pipeline(chain.pipeline.config, say=lambda line: None, root=chain.root)
+    found, said = Result(), []
+    measured_training(own, Settings((), (), "cpu", 2), found, said.append)
+    (row,) = found.rows
+    assert (row.case, row.particles, row.sample, row.delta) == ("training_sand", 500, None, None)
+    assert row.ms_p10 < row.ms_median < row.ms_p90
+    assert len(said) == 2
 
 
 def test_both_solvers_of_a_scene_have_rows(reduced, chain):
@@ -206,10 +231,15 @@ def test_delta_of_the_benchmark_is_that_of_the_evaluation(reduced, chain):
     assert longer["delta"] != pytest.approx(evaluated, rel=1e-3)
 
 
-def test_a_report_of_scenes(reduced, tmp_path):
+def test_a_report_of_scenes(reduced, found, tmp_path):
     reduced.to_csv(tmp_path / "results.csv", index=False)
     pd.DataFrame(columns=columns(KernelRow)).to_csv(tmp_path / "kernels.csv", index=False)
+    stages = pd.DataFrame(found.stages, columns=columns(StageRow))
+    stages.to_csv(tmp_path / "stages.csv", index=False)
     page = write_report(tmp_path)
+    assert not (tmp_path / "stages-cpu.png").exists()  # the paper has no figures of sand
+    stages.replace({"case": {"reduced_sand": "reduced_metal"}}).to_csv(tmp_path / "stages.csv", index=False)
+    assert "(stages-cpu.png)" in write_report(tmp_path).read_text()
     assert "| reduced_sand_1.5dt |" in page.read_text()
     assert (tmp_path / "reduced-cpu.png").stat().st_size > 5000
 
@@ -242,6 +272,7 @@ def test_several_devices_have_rows_beside_one(several, tmp_path):
     np.testing.assert_allclose(both["speed_up"], alone["ms_median"].to_numpy() / both["ms_median"].to_numpy())
     several.to_csv(tmp_path / "results.csv", index=False)
     pd.DataFrame(columns=columns(KernelRow)).to_csv(tmp_path / "kernels.csv", index=False)
+    pd.DataFrame(columns=columns(StageRow)).to_csv(tmp_path / "stages.csv", index=False)
     page = write_report(tmp_path).read_text()
     assert "| train_mlp_stress_on_2 |" in page
     assert "speed-up" in page
