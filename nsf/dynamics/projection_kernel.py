@@ -1,7 +1,7 @@
 """The kernel that inverts the deformation field in the coefficients of its modes (`field=basis`).
 
-A GPU takes a block for each network whose mean is the closure; all of them do the linear algebra alike, and
-only the first one writes. A CPU is one thread.
+A GPU takes for each simulation a block for each network whose mean is the closure; all of them do the linear
+algebra alike, and only the first one writes. A CPU is one thread.
 """
 
 from collections.abc import Sequence
@@ -201,6 +201,7 @@ def make_projection(precision: Precision, widths: tuple[int, ...], members: int,
         precision: of the closure; sums over modes and the solution are fp64.
         widths: of the closure's layers (r, hidden..., K − r); empty without one.
         members: networks of these widths whose shares in the closure are added up; of a GPU a block each.
+            The blocks of a simulation follow each other, and wait for each other.
         latents: r.
         modes: K.
 
@@ -222,7 +223,7 @@ def make_projection(precision: Precision, widths: tuple[int, ...], members: int,
     #define NSF_SHARED __shared__
     #define NSF_SYNC __syncthreads()
     const int lane = threadIdx.x, lanes = blockDim.x, PARTS = {_PARTS}, TILE = {_WARP};
-    const int block = blockIdx.x, blocks = {members};
+    const int blocks = {members}, block = blockIdx.x % blocks;
 #else
     #define NSF_SHARED
     #define NSF_SYNC
@@ -413,30 +414,33 @@ def make_projection(precision: Precision, widths: tuple[int, ...], members: int,
         scale: wp.float64,
         sigma: wp.array(dtype=wp.float64),
         G: wp.array(dtype=wp.float64),
-        b: wp.array(dtype=wp.float64),
+        b: wp.array2d(dtype=wp.float64),
         sample: wp.float64,
         iterations: int,
         tolerance: wp.float64,
         linear: int,
         dt: wp.float64,
-        latent: wp.array(dtype=wp.float64),
-        a: wp.array(dtype=wp.float64),
-        tangents: wp.array(dtype=wp.float64),
-        rate: wp.array(dtype=wp.float64),
-        xhat: wp.array(dtype=real),
-        xhat_previous: wp.array(dtype=real),
-        xhats: wp.array(dtype=real),
-        residuals: wp.array(dtype=real),
-        updates: wp.array(dtype=real),
-        row: wp.array(dtype=wp.int64),
-        first: wp.array(dtype=wp.int32),
-        step: wp.array(dtype=wp.int32),
-        shares: wp.array(dtype=wp.float64),
-        arrived: wp.array(dtype=wp.int32),
+        latent: wp.array2d(dtype=wp.float64),
+        a: wp.array2d(dtype=wp.float64),
+        tangents: wp.array2d(dtype=wp.float64),
+        rate: wp.array2d(dtype=wp.float64),
+        xhat: wp.array2d(dtype=real),
+        xhat_previous: wp.array2d(dtype=real),
+        xhats: wp.array2d(dtype=real),
+        residuals: wp.array2d(dtype=real),
+        updates: wp.array2d(dtype=real),
+        row: wp.array2d(dtype=wp.int64),
+        first: wp.array2d(dtype=wp.int32),
+        step: wp.array2d(dtype=wp.int32),
+        shares: wp.array2d(dtype=wp.float64),
+        arrived: wp.array2d(dtype=wp.int32),
+        threads: int,
     ):
+        s = wp.tid() / threads
         solve(
-            weights, scale, sigma, G, b, sample, iterations, tolerance, linear, dt, latent, a, tangents, rate,
-            xhat, xhat_previous, xhats, residuals, updates, row, first, step, shares, arrived,
+            weights, scale, sigma, G, b[s], sample, iterations, tolerance, linear, dt, latent[s], a[s],
+            tangents[s], rate[s], xhat[s], xhat_previous[s], xhats[s], residuals[s], updates[s], row[s],
+            first[s], step[s], shares[s], arrived[s],
         )  # fmt: skip
 
     return projection

@@ -27,7 +27,7 @@ def pair(chain, tiny_manifold, monkeypatch):
         options.setdefault("device", "cpu")
         modal = one()
         with monkeypatch.context() as patch:
-            patch.setattr("nsf.dynamics.solver.steps_in_coefficients", lambda *arguments: False)
+            patch.setattr("nsf.dynamics.stepping.steps_in_coefficients", lambda *arguments: False)
             decoded = one()
         assert isinstance(modal._phase, ModalPhase)
         assert isinstance(decoded._phase, DecodedPhase)
