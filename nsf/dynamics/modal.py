@@ -304,16 +304,18 @@ def _fields(
                 heads.append((factors, found))
             else:  # the same in every snapshot
                 found.unflatten(0, (-1, phase.size)).copy_(_as_matrices(factors.mean))
-    networks, coefficients = _networks(arena, [f.layers for f, _ in heads], phase.setting.record, parameters)
+    stored = [arena.halved(factors.modes) for factors, _ in heads]
+    layers = [_lengthened(f.layers, lengths) for (f, _), (_, lengths) in zip(heads, stored, strict=True)]
+    networks, coefficients = _networks(arena, layers, phase.setting.record, parameters)
     launches = [
-        _contraction(arena, phase, factors, a, found)
-        for (factors, found), a in zip(heads, coefficients, strict=True)
+        _contraction(arena, phase, factors, modes, a, found)
+        for (factors, found), (modes, _), a in zip(heads, stored, coefficients, strict=True)
     ]
     if not method.neural_stress:
         F = arena.zeros(len(phase.x), 3, 3, dtype=arena.real)
         factors = manifold.factors("gradient", order, **options)
         launches += [
-            _contraction(arena, phase, factors, phase.coefficients.a, F),
+            _contraction(arena, phase, factors, arena.modes(factors.modes), phase.coefficients.a, F),
             _elastic(arena, phase, materials, F),
         ]
     return networks, launches
@@ -322,6 +324,13 @@ def _fields(
 def _as_matrices(mean: torch.Tensor) -> torch.Tensor:
     """[n, 6], symmetric, or [n, 9] → [n, 3, 3]."""
     return (mean[:, np.ravel(TAU_MATRIX)] if mean.shape[1] == 6 else mean).unflatten(1, (3, 3))
+
+
+def _lengthened(layers: list, lengths: torch.Tensor) -> list:
+    """The layers of a network whose outputs are longer by these factors."""
+    *hidden, (W, b) = layers
+    lengths = lengths.to(W)
+    return [*hidden, (lengths[:, None] * W, lengths * b)]
 
 
 def _networks(arena: Arena, networks: list, record: LatentRecord, parameters) -> tuple[list, list]:
@@ -351,15 +360,20 @@ def _networks(arena: Arena, networks: list, record: LatentRecord, parameters) ->
 
 
 def _contraction(
-    arena: Arena, phase: ModalPhase, factors: ModalFactors, a: torch.Tensor, found: torch.Tensor
+    arena: Arena,
+    phase: ModalPhase,
+    factors: ModalFactors,
+    modes: torch.Tensor,
+    a: torch.Tensor,
+    found: torch.Tensor,
 ):
-    """The launch of a field with coefficients a [B, K] at the needed particles."""
+    """The launch of a field with coefficients a [B, K] of the arena's modes, at the needed particles."""
     n, c, K = factors.modes.shape
     (tiles, tile), lanes = tiling(len(a)), arena.lanes(THREADS)
-    coefficients = wp.dtype_from_torch(a.dtype)
-    kernel = make_contraction(arena.precision, -(-K // 4), c == 6, coefficients, tile, tiles > 1)
+    coefficients, stored = (wp.dtype_from_torch(values.dtype) for values in (a, modes))
+    kernel = make_contraction(arena.precision, -(-K // 4), c == 6, coefficients, tile, tiles > 1, stored)
     mean = arena.hold(factors.mean, arena.real)
-    inputs = [phase.needed, mean, arena.modes(factors.modes), a, tiles, lanes, found]
+    inputs = [phase.needed, mean, modes, a, tiles, lanes, found]
     return arena.pack(kernel, tiles * arena.whole_blocks(c // 3 * n, THREADS), inputs, THREADS)
 
 

@@ -56,7 +56,20 @@ def _make_placing(several: bool):
     return tile_of, within
 
 
-def _combination(names: str, coefficient: str, tile: int, several: bool) -> str:
+# Four numbers in half precision → float4.
+_WIDENED = """
+        auto widened = [](const uint2 four) {
+            float4 w;
+            asm("{.reg .f16 a, b; mov.b32 {a, b}, %2; cvt.f32.f16 %0, a; cvt.f32.f16 %1, b;}"
+                : "=f"(w.x), "=f"(w.y) : "r"(four.x));
+            asm("{.reg .f16 a, b; mov.b32 {a, b}, %2; cvt.f32.f16 %0, a; cvt.f32.f16 %1, b;}"
+                : "=f"(w.z), "=f"(w.w) : "r"(four.y));
+            return w;
+        };
+"""
+
+
+def _combination(names: str, coefficient: str, tile: int, several: bool, half: bool = False) -> str:
     """Native code of the sums Σ_k modes[p, c..c+2, k] name_k, for each simulation of a tile and each name.
 
     They are `sum`: three of the first name, three of the next, and so on for the next simulation; the first
@@ -64,9 +77,10 @@ def _combination(names: str, coefficient: str, tile: int, several: bool) -> str:
     by side (`Arena.modes`): what is under way then covers the time that memory takes, even for few particles.
     A GPU first takes the coefficients into shared memory, for which all threads of a block are needed, also
     those beyond the last particle; one that is not `live` only helps with that. A CPU may change the order of
-    additions, so that it works on several at once.
+    additions, so that it works on several at once. `half`: a GPU has the modes in half precision.
     """
     load = "__ldg" if several else "__ldcs"  # another tile will read the same modes, or nothing will
+    load, stored, ahead = (f"widened({load}", "uint2", 2 * _AHEAD) if half else (f"({load}", "float4", _AHEAD)
     names = names.split()
     each, size = "".join, 3 * len(names)
     totals = [(n, i, f"sum[{size} * s + {3 * m + i}]") for m, n in enumerate(names) for i in range(3)]
@@ -92,12 +106,13 @@ def _combination(names: str, coefficient: str, tile: int, several: bool) -> str:
     }}
     __syncthreads();
     if (live) {{
-        const float4* first = (const float4*)modes.data + size_t(c) * Q * particles + p;
-        #pragma unroll {_AHEAD}
+        {_WIDENED if half else ""}
+        const {stored}* first = (const {stored}*)modes.data + size_t(c) * Q * particles + p;
+        #pragma unroll {ahead}
         for (int q = 0; q < Q; ++q) {{
-            const float4 w0 = {load}(first + size_t(q) * particles);
-            const float4 w1 = {load}(first + size_t(Q + q) * particles);
-            const float4 w2 = {load}(first + size_t(2 * Q + q) * particles);
+            const float4 w0 = {load}(first + size_t(q) * particles));
+            const float4 w1 = {load}(first + size_t(Q + q) * particles));
+            const float4 w2 = {load}(first + size_t(2 * Q + q) * particles));
             #pragma unroll
             for (int s = 0; s < {tile}; ++s) {{ {of_four} }}
         }}
@@ -265,27 +280,33 @@ def make_selection(precision: Precision, shape_name: str, several: bool = False)
 
 @cache
 def make_contraction(
-    precision: Precision, vectors: int, symmetric: bool, coefficients, tile: int = 1, several: bool = False
+    precision: Precision,
+    vectors: int,
+    symmetric: bool,
+    coefficients,
+    tile: int = 1,
+    several: bool = False,
+    stored=wp.float32,
 ):
     """Kernel of a matrix field at N, mean + Σ_k modes_k a_k, over whole blocks.
 
     A thread has three components of a particle, in the simulations of a tile; `several` tiles have blocks in
     turn. The six components of a symmetric field are xx xy xz yy yz zz, the nine of another go row by row.
-    Particles that are not needed are passed over. `coefficients` is the type of a.
+    Particles that are not needed are passed over. `coefficients` is the type of a, `stored` that of modes.
     """
-    real = precision.real
+    real, half = precision.real, stored is wp.float16
     sums = wp.types.vector(length=3 * tile, dtype=real)
     tile_of, within = _make_placing(several)
     scalar = {wp.float32: "float", wp.float64: "double"}[coefficients]
     snippet = f"""
     typedef {_scalar(precision)} real;
     const int Q = {vectors}, components = mean.shape[1], particles = mean.shape[0];
-    {_combination("a", scalar, tile, several)}
+    {_combination("a", scalar, tile, several, half)}
     """
 
     @wp.func_native(snippet)
     def combined(
-        modes: wp.array(dtype=wp.float32),
+        modes: wp.array(dtype=stored),
         mean: wp.array2d(dtype=real),
         a: wp.array2d(dtype=coefficients),
         start: int,
@@ -298,7 +319,7 @@ def make_contraction(
     def contraction(
         needed: wp.array2d(dtype=wp.int32),
         mean: wp.array2d(dtype=real),
-        modes: wp.array(dtype=wp.float32),
+        modes: wp.array(dtype=stored),
         a: wp.array2d(dtype=coefficients),
         tiles: int,
         lanes: int,
