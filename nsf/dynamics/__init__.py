@@ -2,7 +2,15 @@
 
 from nsf.dynamics.batch import ReducedBatch
 from nsf.dynamics.cubature import CubatureSampler
-from nsf.dynamics.deployment import Rollout, calibrate, continuation_file, deploy, rollout, rollout_file
+from nsf.dynamics.deployment import (
+    Rollout,
+    calibrate,
+    continuation_file,
+    deploy,
+    rollout,
+    rollout_file,
+    rollouts,
+)
 from nsf.dynamics.handover import go_on, hand_over
 from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
 from nsf.dynamics.latent import Decoder, LatentState, LatentTrajectory
@@ -45,5 +53,6 @@ __all__ = [
     "hand_over",
     "rollout",
     "rollout_file",
+    "rollouts",
     "stop_reasons",
 ]

@@ -52,8 +52,9 @@ class ReducedBatch(Stepping):
         starts = torch.stack([run.record.now for run in self.runs])
         self.record = LatentRecord(starts, self.total_steps, first.projector.iterations)
         colliders = chain.from_iterable(run.scene.colliders for run in self.runs)
-        boundaries = BoundaryArrays(tuple(colliders), first.scene.walls, first.precision, first.device)
-        self._phases, self._starts = build_phases(self.runs, self.record, boundaries), first._starts
+        self.boundaries = BoundaryArrays(tuple(colliders), first.scene.walls, first.precision, first.device)
+        self._phases = build_phases(self.runs, self.record, self.boundaries)
+        self._starts = first._starts
         for index, run in enumerate(self.runs):
             run._index, run._phases, run.record = index, self._phases, self.record.of(index)
         self._enter(self._phases[0])
@@ -107,6 +108,11 @@ class ReducedBatch(Stepping):
     def nbytes(self) -> int:
         """Bytes that the arrays and fields take on the device."""
         return sum(phase.nbytes for phase in self._phases) + self.record.nbytes
+
+    @override
+    def restart(self) -> None:
+        super().restart()
+        self._tell()
 
     @override
     def step(self, n: int = 1) -> None:

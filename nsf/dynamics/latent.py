@@ -64,6 +64,12 @@ class LatentRecord:
             setattr(own, name, getattr(self, name)[run])
         return own
 
+    def restart(self) -> None:
+        """Go back to t = 0; what was recorded stays until it is written over."""
+        for latest in (self.now, self.before):
+            latest.copy_(self.xhat[..., 0, :])
+        self.row.zero_()
+
     @property
     def nbytes(self) -> int:
         """Bytes on the device."""

@@ -30,10 +30,20 @@ class Stepping(Phased):
     Attributes:
         steps_taken, total_steps: taken, and those to the end of the scene.
         device: Warp device.
+        record: of the latent vectors; boundaries: colliders and walls.
     """
 
     steps_taken: int
     total_steps: int
+    record: LatentRecord
+    boundaries: BoundaryArrays
+
+    def restart(self) -> None:
+        """Go back to t = 0; captured graphs stay good."""
+        self.steps_taken = 0
+        self.record.restart()
+        self.boundaries.start_from(0)
+        self._enter(self._phases[0])
 
     def step(self, n: int = 1) -> None:
         """Advance by n steps of Δt.

@@ -238,6 +238,21 @@ def test_each_is_asked_as_a_solver_is(chain, tiny_manifold, parameters):
         batch.step(19)
 
 
+def test_a_second_run_is_as_the_first(tiny, tiny_manifold, parameters):
+    scene = nsf.scenes.load("sand", [*tiny[1:], *PLATE])
+    sample = [SamplePhase(0.0, np.arange(0, 500, 25)), SamplePhase(0.5, np.arange(7, 500, 50))]
+    batch = scene.reduced_batch(tiny_manifold, parameters, sample, device="cpu")
+    single = scene.reduced(tiny_manifold, parameters[0], sample, device="cpu")
+    for solver in (batch, single):
+        solver.step(24)
+        xhat = solver.record.xhat.clone()
+        solver.restart()
+        assert solver.steps_taken == 0
+        assert batch.runs[0].steps_taken == 0 or solver is single
+        solver.step(24)
+        assert torch.equal(solver.record.xhat, xhat)
+
+
 def test_modes_are_held_once(chain, tiny_manifold):
     def nbytes(count):
         return chain.scene.reduced_batch(tiny_manifold, [{ANGLE: 26.0}] * count, 20, device="cpu").nbytes
