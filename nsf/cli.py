@@ -40,8 +40,8 @@ TOOLS = {
     ),
     "bench": (
         "time and memory of a step, kernel by kernel; writes reports/speed",
-        "[benches=full_order,scaling,reduced,batch] [particles=10k,200k,1m] [precision=fp32,fp64]\n"
-        "       [scenes=cake,metal] [device=auto] [trials=10] [folder=PATH]; "
+        "[benches=full_order,scaling,reduced,batch,training,multi_gpu] [particles=10k,200k,1m]\n"
+        "       [scenes=cake,metal] [precision=fp32,fp64] [device=auto] [trials=10] [folder=PATH]; "
         "sizes that suit the device by default",
     ),
     "doctor": ("versions, devices, folders and extras of this installation", ""),

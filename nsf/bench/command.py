@@ -8,13 +8,13 @@ from pathlib import Path
 import pandas as pd
 
 from nsf.bench.report import write_report
-from nsf.bench.rows import KernelRow, Row, Settings, columns
+from nsf.bench.rows import KernelRow, Row, Settings, StageRow, columns
 from nsf.errors import ConfigError
 from nsf.mpm.device import warp_device
 from nsf.mpm.precision import precision_of
 from nsf.storage import writing
 
-BENCHES = ("full_order", "scaling", "reduced", "batch")
+BENCHES = ("full_order", "scaling", "reduced", "batch", "training", "multi_gpu")
 """Modules of this package that have `run(settings, say) -> Result`."""
 
 _UNITS = {"": 1, "k": 1_000, "m": 1_000_000}
@@ -24,7 +24,7 @@ def bench(folder: str | Path, asked: Mapping[str, str], say: Callable[[str], obj
     """Run benchmarks, and write the report of these and of those that the folder has already.
 
     Args:
-        folder: results.csv, kernels.csv, index.md and charts; rows of other benchmarks or devices are kept.
+        folder: the csv files, index.md and charts; rows of other benchmarks or devices are kept.
         asked: `benches`, `particles`, `precision`, `device`, `trials`, `scenes`, as on the command line.
         say: told of every result.
 
@@ -44,6 +44,7 @@ def bench(folder: str | Path, asked: Mapping[str, str], say: Callable[[str], obj
         found = import_module(f"nsf.bench.{name}").run(settings, say)
         _merge(folder / "results.csv", Row, found.rows)
         _merge(folder / "kernels.csv", KernelRow, found.kernels)
+        _merge(folder / "stages.csv", StageRow, found.stages)
     return write_report(folder)
 
 

@@ -18,14 +18,31 @@ _REPEATS = 10  # of a pass in one graph, so that launching it costs nothing
 
 def build(make: Callable[[], object], device: str) -> tuple[object, float]:
     """A solver that has taken its first steps, and its peak memory [MiB] beyond what was held before."""
+    solver = None
+
+    def begin() -> None:
+        nonlocal solver
+        solver = make()
+        solver.step(_WARM_UP)
+
+    peak = peak_mib(begin, device, lambda: solver.nbytes)
+    return solver, peak
+
+
+def peak_mib(call: Callable[[], object], device: str, nbytes: int | Callable[[], int] = 0) -> float:
+    """Most memory [MiB] that a call holds beyond what was held before it.
+
+    Args:
+        call: made once.
+        device: `cpu` or `cuda:N`.
+        nbytes: what it left behind [byte]; stands for the peak where the device's allocators do not tell.
+    """
     gc.collect()
     with MemoryProbe(device) as before:
         pass
-    solver = None
-    with MemoryProbe(device, nbytes=lambda: solver.nbytes) as probe:
-        solver = make()
-        solver.step(_WARM_UP)
-    return solver, probe.peak_mib - before.peak_mib
+    with MemoryProbe(device, nbytes=nbytes) as probe:
+        call()
+    return probe.peak_mib - before.peak_mib
 
 
 def step_times(solvers: Mapping[str, object], trials: int, device: str) -> dict[str, np.ndarray]:

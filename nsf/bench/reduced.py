@@ -7,7 +7,7 @@ import torch
 
 from nsf import config
 from nsf.bench.measure import name_of
-from nsf.bench.rows import Result, Row, Settings, commit
+from nsf.bench.rows import Result, Row, Settings, StageRow, commit
 from nsf.data import Trajectory
 from nsf.dynamics.solver import reduced_steps
 from nsf.evaluation import metrics
@@ -26,12 +26,16 @@ def run(settings: Settings, say: Callable[[str], object]) -> Result:
     Data and training are made, or reused, as by `nsf train`. A step of k Δt stands in the case's name; it
     moves the scene by k times as much as the others.
     """
-    scale = "paper" if settings.device.startswith("cuda") else "small"
     found = Result()
     for scene in settings.scenes or SCENES:
-        overrides = [f"scene={scene}", f"scale={scale}", f"device={settings.device}"]
+        overrides = [f"scene={scene}", f"scale={scale_of(settings.device)}", f"device={settings.device}"]
         measured(Pipeline(config.load(overrides), say=say), settings, found, say)
     return found
+
+
+def scale_of(device: str) -> str:
+    """The size of the scenes that a device can be asked for: the paper's, or small."""
+    return "paper" if device.startswith("cuda") else "small"
 
 
 def measured(chain: Pipeline, settings: Settings, found: Result, say: Callable[[str], object]) -> None:
@@ -66,6 +70,11 @@ def measured(chain: Pipeline, settings: Settings, found: Result, say: Callable[[
                 solver.step(solver.total_steps)
             row = _row(case, len(scene.particles()), precision, settings.device, cost, solver, truth)
             found.rows.append(row)
+            if case in (f"full_order_{name}", f"reduced_{name}"):
+                found.stages.extend(
+                    StageRow(row.bench, case, row.particles, precision, row.device, stage, ms, row.commit)
+                    for stage, ms in cost.stages.items()
+                )
             error = "" if row.delta is None else f", δ {100 * row.delta:.3g} %"
             say(f"{case} {precision}: {row.ms_median:.4g} ms a step{error}")
 

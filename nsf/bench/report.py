@@ -11,6 +11,7 @@ from rich.table import Table
 
 from nsf.bench.rows import size_name
 from nsf.reporting.columns import number
+from nsf.reporting.cost_charts import rings
 from nsf.reporting.style import INK, figure, line_style, save, stage_colors, styled
 from nsf.reporting.tables import markdown_rows
 from nsf.storage import writing
@@ -20,6 +21,7 @@ _HEADINGS = {
     "ms_p10": "10 % [ms]",
     "ms_p90": "90 % [ms]",
     "peak_mib": "peak memory [MiB]",
+    "speed_up": "speed-up",
     "delta": "δ",
     "sample": "|S|",
     "integration": "|N|",
@@ -28,7 +30,7 @@ _HEADINGS = {
     "gb_per_s": "bandwidth [GB/s]",
     "floor_ms": "floor [ms]",
 }
-_TEXT = ("bench", "case", "precision", "device", "kernel", "commit")
+_TEXT = ("bench", "case", "precision", "device", "kernel", "stage", "commit")
 _LEAD = (
     "Time of a step, both sides of a ratio measured in one process turn by turn, after a warm-up, around a "
     "synchronised device: the median over the trials, each the mean of many steps. Memory is the peak of "
@@ -43,23 +45,49 @@ _KERNELS = (
     "Floor: the time that these bytes take a copy measured in the same run; a step cannot be faster than "
     "the floors of its passes together as long as its state does not fit into a cache."
 )
+#: Of a reduced frame [ms]: the networks, the projection and copies between Warp and torch, and all of it
+#: (appendix of the paper, Runtime analysis; double precision, one Quadro P6000).
+_PAPER = {"reduced_cake": (1.95, 4.69), "reduced_metal": (1.78, 2.09)}
+_STAGES = (
+    "Where the time of a reduced step goes, each stage synchronised, so that the sum may exceed a step; "
+    "beside it a frame of the paper's reduced solver on a Quadro P6000 (its appendix, Runtime analysis)."
+)
+_TRAINING = (
+    "Training of all networks of a scene with field=basis: the time is that of a whole training, from "
+    "opening its files to the manifold, and the trials are seeds."
+)
+_SEVERAL = (
+    "Several GPUs of the host; a case ends with their number. Simulate: the time of a data set, the start of "
+    "processes and the writing of files included, over the steps of all trajectories. Train: the time of an "
+    "optimiser step of field=mlp on as many points as the batch says, in whole. Speed-up: over one GPU."
+)
 
 
 def write_report(folder: Path) -> Path:
-    """Charts and index.md from results.csv and kernels.csv of a folder."""
-    results, kernels = (pd.read_csv(folder / name) for name in ("results.csv", "kernels.csv"))
+    """Charts and index.md from results.csv, kernels.csv and stages.csv of a folder."""
+    results, kernels, stages = (
+        pd.read_csv(folder / name) for name in ("results.csv", "kernels.csv", "stages.csv")
+    )
     parts = ["# Speed", _LEAD]
     for device in results["device"].unique():
         rows, passes = (frame[frame["device"] == device] for frame in (results, kernels))
         stem = re.sub("[^a-z0-9]+", "-", device.lower())
         parts.append(f"## On {device}")
+        of_size = rows[rows["bench"].isin(["full_order", "scaling"])]
         of_scene, of_batch = (rows[rows["bench"] == name] for name in ("reduced", "batch"))
-        of_size = rows[~rows["bench"].isin(("reduced", "batch"))]
         if len(of_scene):
             caption = "Time of a step of both solvers by scene; a bar names δ of its run."
             with styled():
                 save(steps_by_scene(of_scene), folder, f"reduced-{stem}")
             parts += [f"![{caption}](reduced-{stem}.png)", caption, _markdown(of_scene)]
+        of_stages = stages[(stages["device"] == device) & stages["case"].isin(_PAPER)]
+        if len(of_stages):
+            with styled():
+                save(step_beside_paper(of_stages), folder, f"stages-{stem}")
+            parts += [f"![{_STAGES}](stages-{stem}.png)", _STAGES]
+        of_training = rows[rows["bench"] == "training"]
+        if len(of_training):
+            parts += [_TRAINING, _markdown(of_training)]
         if len(of_batch):
             with styled():
                 save(step_over_batch(of_batch), folder, f"batch-{stem}")
@@ -74,10 +102,21 @@ def write_report(folder: Path) -> Path:
             parts += [f"![{caption}](step-{stem}.png)", caption, _markdown(of_size)]
             caption = "Time of each pass of a full-order step; the mark is its floor."
             parts += [f"![{caption}](kernels-{stem}.png)", caption, _KERNELS, _markdown(passes)]
+        of_several = rows[rows["bench"] == "multi_gpu"]
+        if len(of_several):
+            parts += [_SEVERAL, _markdown(with_speed_up(of_several))]
     page = folder / "index.md"
     with writing(page) as partial:
         partial.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
     return page
+
+
+def with_speed_up(results: pd.DataFrame) -> pd.DataFrame:
+    """Rows of `multi_gpu` of one device, each with the ratio of the time on one GPU to its own."""
+    work = results["case"].str.rpartition("_on_")
+    keys = pd.Series(list(zip(work[0], results["precision"], strict=True)), index=results.index)
+    alone = results["ms_median"][work[2] == "1"].groupby(keys).last()
+    return results.assign(speed_up=keys.map(alone) / results["ms_median"])
 
 
 def step_over_particles(results: pd.DataFrame, kernels: pd.DataFrame) -> Figure:
@@ -111,6 +150,26 @@ def step_over_particles(results: pd.DataFrame, kernels: pd.DataFrame) -> Figure:
         panel.grid(which="major")
         fig.legend(loc="outside upper left", ncols=3, handlelength=2.6)
     return fig
+
+
+def step_beside_paper(stages: pd.DataFrame) -> Figure:
+    """Rings of the stages of a reduced step [ms], a scene a row, and of the paper's.
+
+    Args:
+        stages: of one device, of cases of the paper; where there are two precisions, fp64 counts.
+    """
+    rows = []
+    for case, own in stages.groupby("case", sort=True):
+        precision, scene = own["precision"].max(), case.partition("_")[2]
+        own, (networks, whole) = own[own["precision"] == precision], _PAPER[case]
+        told = {"networks, projection, copies": networks, "MPM": whole - networks}
+        rows.append(
+            {
+                f"{scene}, reduced step, {precision}": dict(zip(own["stage"], own["ms"], strict=True)),
+                f"{scene}, the paper's frame": told,
+            }
+        )
+    return rings(rows)
 
 
 def step_over_batch(results: pd.DataFrame) -> Figure:

@@ -31,11 +31,12 @@ class Row:
     Attributes:
         bench, case: the benchmark, and what of it.
         particles, sample, integration: P, |S| and |N|; None where there is none.
-        batch: simulations that are stepped together.
+        batch: simulations that are stepped together, or points (particles of frames) of a training step.
         precision, device: of the solver.
         ms_median, ms_p10, ms_p90: over the trials, of the mean time of a step in one [ms]; that of one
             simulation, so the step of a batch over its size.
-        peak_mib: what every allocator holds at most beyond what was held before the solver was built [MiB].
+        peak_mib: what every allocator holds at most beyond what was held before the solver was built [MiB];
+            None where several processes work.
         delta: δ of the run that is timed, a fraction; None for a full-order run.
         commit: of the code.
     """
@@ -51,7 +52,7 @@ class Row:
     ms_median: float
     ms_p10: float
     ms_p90: float
-    peak_mib: float
+    peak_mib: float | None
     delta: float | None
     commit: str
 
@@ -83,11 +84,32 @@ class KernelRow:
 
 
 @dataclass(frozen=True)
+class StageRow:
+    """One stage of a step, synchronised before and after: a row of stages.csv.
+
+    Attributes:
+        bench, case, particles, precision, device, commit: as in `Row`.
+        stage: of the step.
+        ms: median time over steps spread through a run [ms].
+    """
+
+    bench: str
+    case: str
+    particles: int
+    precision: str
+    device: str
+    stage: str
+    ms: float
+    commit: str
+
+
+@dataclass(frozen=True)
 class Result:
     """What a benchmark found."""
 
     rows: list[Row] = field(default_factory=list)
     kernels: list[KernelRow] = field(default_factory=list)
+    stages: list[StageRow] = field(default_factory=list)
 
 
 def columns(kind: type) -> list[str]:

@@ -18,14 +18,17 @@ from nsf.dynamics.modal_kernels import (
     make_gathering,
     make_layer,
     make_position,
-    make_projection,
     make_selection,
-    projection_block,
-    projection_fits,
     tiling,
 )
 from nsf.dynamics.phase import Phase, Setting, Stages
 from nsf.dynamics.projection import GaussNewton, Taylor
+from nsf.dynamics.projection_kernel import (
+    make_projection,
+    packed_weights,
+    projection_block,
+    projection_fits,
+)
 from nsf.dynamics.stress import Method
 from nsf.kinematics.basis import BasisManifold, ModalFactors
 from nsf.mpm import GridStep, Precision
@@ -214,8 +217,9 @@ class Projection:
         B = of_sample.double().flatten(0, 1)
         G = arena.hold(B.T @ (w.repeat_interleave(3)[:, None] * B), torch.float64).flatten()
         b = arena.zeros(count, K + 1)
-        widths, weights = _closure(deformation)
+        widths, weights = _closure(deformation, arena.device.is_cuda)
         weights = arena.hold(weights, torch.float32)
+        members = deformation.members if widths else 1
         lanes, velocity = arena.lanes(THREADS), as_vectors(phase.v, arena.precision)
         gather = arena.pack(
             make_gathering(arena.precision, count > 1),
@@ -223,9 +227,14 @@ class Projection:
             [displacement, phase.size, -(-K // 4), velocity, w, wp.float64(setting.dt), lanes, b],
             THREADS,
         )
-        kernel = make_projection(arena.precision, widths, deformation.members, r, K, count > 1)
+        kernel = make_projection(arena.precision, widths, members, r, K, count > 1)
         sigma = arena.hold(deformation.leading, torch.float64)
         block = projection_block(widths)
+        threads = members * block if arena.device.is_cuda else 1
+        meeting = [
+            arena.zeros(count, 2 * members * (K - r) * (r + 1)),
+            arena.zeros(count, 2, dtype=torch.int32),
+        ]
         linear = int(isinstance(projector, Taylor))
 
         def of_each(values: torch.Tensor) -> torch.Tensor:
@@ -238,14 +247,13 @@ class Projection:
             kept = [record.xhat, record.residuals, record.updates, record.row]
             own = map(of_each, [*latents, *kept, state.first, state.step])
             sums = [weights, wp.float64(deformation.scale), sigma, G, b]
-            lanes = arena.lanes(block)
-            return arena.pack(kernel, count * lanes, [*sums, *how, *own, lanes], block)
+            return arena.pack(kernel, count * threads, [*sums, *how, *own, *meeting, threads], block)
 
         self.launches, self.evaluate = [gather, solve(projector.iterations)], solve(0)
 
 
-def _closure(deformation: ModalFactors) -> tuple[tuple[int, ...], torch.Tensor]:
-    """Widths of a member of the closure, and the weights and biases of all, member by member, as trained."""
+def _closure(deformation: ModalFactors, is_cuda: bool) -> tuple[tuple[int, ...], torch.Tensor]:
+    """Widths of a member of the closure, and the packed weights of all, member by member."""
     layers, members = deformation.layers, deformation.members
     if not layers:
         return (), torch.zeros(1)
@@ -253,11 +261,11 @@ def _closure(deformation: ModalFactors) -> tuple[tuple[int, ...], torch.Tensor]:
     widths = (len(deformation.leading), *(len(b) // members for _, b in hidden), len(b_last))
     packed = []
     for member in range(members):
-        for W, b in hidden:
-            packed += [part.unflatten(0, (members, -1))[member].flatten() for part in (W, b)]
+        own = [tuple(part.unflatten(0, (members, -1))[member] for part in layer) for layer in hidden]
         # What is in the unit of the coefficients is divided by it, so that fp32 holds it; all share a bias.
-        packed.append(W_last.unflatten(1, (members, -1))[:, member].flatten() / deformation.scale)
-        packed.append(b_last / deformation.scale * (member == 0))
+        last = W_last.unflatten(1, (members, -1))[:, member], b_last * (member == 0)
+        own.append(tuple(part / deformation.scale for part in last))
+        packed.append(packed_weights(own, is_cuda))
     return widths, torch.cat(packed)
 
 
@@ -297,16 +305,18 @@ def _fields(
                 heads.append((factors, found))
             else:  # the same in every snapshot
                 found.unflatten(0, (-1, phase.size)).copy_(_as_matrices(factors.mean))
-    networks, coefficients = _networks(arena, [f.layers for f, _ in heads], phase.setting.record, parameters)
+    stored = [arena.halved(factors.modes) for factors, _ in heads]
+    layers = [_lengthened(f.layers, lengths) for (f, _), (_, lengths) in zip(heads, stored, strict=True)]
+    networks, coefficients = _networks(arena, layers, phase.setting.record, parameters)
     launches = [
-        _contraction(arena, phase, factors, a, found)
-        for (factors, found), a in zip(heads, coefficients, strict=True)
+        _contraction(arena, phase, factors, modes, a, found)
+        for (factors, found), (modes, _), a in zip(heads, stored, coefficients, strict=True)
     ]
     if not method.neural_stress:
         F = arena.zeros(len(phase.x), 3, 3, dtype=arena.real)
         factors = manifold.factors("gradient", order, **options)
         launches += [
-            _contraction(arena, phase, factors, phase.coefficients.a, F),
+            _contraction(arena, phase, factors, arena.modes(factors.modes), phase.coefficients.a, F),
             _elastic(arena, phase, materials, F),
         ]
     return networks, launches
@@ -315,6 +325,13 @@ def _fields(
 def _as_matrices(mean: torch.Tensor) -> torch.Tensor:
     """[n, 6], symmetric, or [n, 9] → [n, 3, 3]."""
     return (mean[:, np.ravel(TAU_MATRIX)] if mean.shape[1] == 6 else mean).unflatten(1, (3, 3))
+
+
+def _lengthened(layers: list, lengths: torch.Tensor) -> list:
+    """The layers of a network whose outputs are longer by these factors."""
+    *hidden, (W, b) = layers
+    lengths = lengths.to(W)
+    return [*hidden, (lengths[:, None] * W, lengths * b)]
 
 
 def _networks(arena: Arena, networks: list, record: LatentRecord, parameters) -> tuple[list, list]:
@@ -344,15 +361,20 @@ def _networks(arena: Arena, networks: list, record: LatentRecord, parameters) ->
 
 
 def _contraction(
-    arena: Arena, phase: ModalPhase, factors: ModalFactors, a: torch.Tensor, found: torch.Tensor
+    arena: Arena,
+    phase: ModalPhase,
+    factors: ModalFactors,
+    modes: torch.Tensor,
+    a: torch.Tensor,
+    found: torch.Tensor,
 ):
-    """The launch of a field with coefficients a [B, K] at the needed particles."""
+    """The launch of a field with coefficients a [B, K] of the arena's modes, at the needed particles."""
     n, c, K = factors.modes.shape
     (tiles, tile), lanes = tiling(len(a), a.element_size() * -(-K // 4) * 4), arena.lanes(THREADS)
-    coefficients = wp.dtype_from_torch(a.dtype)
-    kernel = make_contraction(arena.precision, -(-K // 4), c == 6, coefficients, tile, tiles > 1)
+    coefficients, stored = (wp.dtype_from_torch(values.dtype) for values in (a, modes))
+    kernel = make_contraction(arena.precision, -(-K // 4), c == 6, coefficients, tile, tiles > 1, stored)
     mean = arena.hold(factors.mean, arena.real)
-    inputs = [phase.needed, mean, arena.modes(factors.modes), a, tiles, lanes, found]
+    inputs = [phase.needed, mean, modes, a, tiles, lanes, found]
     return arena.pack(kernel, tiles * arena.whole_blocks(c // 3 * n, THREADS), inputs, THREADS)
 
 

@@ -10,6 +10,7 @@ from functools import cache
 
 import warp as wp
 
+from nsf.dynamics.projection_kernel import SHARED, TAKEN
 from nsf.mpm import Precision
 from nsf.mpm.copies import make_copies
 from nsf.mpm.grid import inside
@@ -20,10 +21,6 @@ _AHEAD = 4  # vectors of modes whose loads are under way together
 _TILE = 8  # most simulations of one thread: their sums fill its registers
 
 
-#: Shared memory [byte] of a block without asking for more, and what Warp takes of it.
-_SHARED, _TAKEN = 49152, 4096
-
-
 def tiling(simulations: int, shared: int = 0) -> tuple[int, int]:
     """Tiles, and simulations of a tile, so that none is much emptier than the others.
 
@@ -31,7 +28,7 @@ def tiling(simulations: int, shared: int = 0) -> tuple[int, int]:
         simulations: in all.
         shared: memory [byte] that a block shares for each simulation of its tile.
     """
-    most = max(1, min(_TILE, (_SHARED - _TAKEN) // max(shared, 1)))
+    most = max(1, min(_TILE, (SHARED - TAKEN) // max(shared, 1)))
     tiles = -(-simulations // most)
     return tiles, -(-simulations // tiles)
 
@@ -66,7 +63,20 @@ def _make_placing(several: bool):
     return tile_of, within
 
 
-def _combination(names: str, coefficient: str, tile: int, several: bool) -> str:
+# Four numbers in half precision → float4.
+_WIDENED = """
+        auto widened = [](const uint2 four) {
+            float4 w;
+            asm("{.reg .f16 a, b; mov.b32 {a, b}, %2; cvt.f32.f16 %0, a; cvt.f32.f16 %1, b;}"
+                : "=f"(w.x), "=f"(w.y) : "r"(four.x));
+            asm("{.reg .f16 a, b; mov.b32 {a, b}, %2; cvt.f32.f16 %0, a; cvt.f32.f16 %1, b;}"
+                : "=f"(w.z), "=f"(w.w) : "r"(four.y));
+            return w;
+        };
+"""
+
+
+def _combination(names: str, coefficient: str, tile: int, several: bool, half: bool = False) -> str:
     """Native code of the sums Σ_k modes[p, c..c+2, k] name_k, for each simulation of a tile and each name.
 
     They are `sum`: three of the first name, three of the next, and so on for the next simulation; the first
@@ -74,9 +84,10 @@ def _combination(names: str, coefficient: str, tile: int, several: bool) -> str:
     by side (`Arena.modes`): what is under way then covers the time that memory takes, even for few particles.
     A GPU first takes the coefficients into shared memory, for which all threads of a block are needed, also
     those beyond the last particle; one that is not `live` only helps with that. A CPU may change the order of
-    additions, so that it works on several at once.
+    additions, so that it works on several at once. `half`: a GPU has the modes in half precision.
     """
     load = "__ldg" if several else "__ldcs"  # another tile will read the same modes, or nothing will
+    load, stored, ahead = (f"widened({load}", "uint2", 2 * _AHEAD) if half else (f"({load}", "float4", _AHEAD)
     names = names.split()
     each, size = "".join, 3 * len(names)
     totals = [(n, i, f"sum[{size} * s + {3 * m + i}]") for m, n in enumerate(names) for i in range(3)]
@@ -102,12 +113,13 @@ def _combination(names: str, coefficient: str, tile: int, several: bool) -> str:
     }}
     __syncthreads();
     if (live) {{
-        const float4* first = (const float4*)modes.data + size_t(c) * Q * particles + p;
-        #pragma unroll {_AHEAD}
+        {_WIDENED if half else ""}
+        const {stored}* first = (const {stored}*)modes.data + size_t(c) * Q * particles + p;
+        #pragma unroll {ahead}
         for (int q = 0; q < Q; ++q) {{
-            const float4 w0 = {load}(first + size_t(q) * particles);
-            const float4 w1 = {load}(first + size_t(Q + q) * particles);
-            const float4 w2 = {load}(first + size_t(2 * Q + q) * particles);
+            const float4 w0 = {load}(first + size_t(q) * particles));
+            const float4 w1 = {load}(first + size_t(Q + q) * particles));
+            const float4 w2 = {load}(first + size_t(2 * Q + q) * particles));
             #pragma unroll
             for (int s = 0; s < {tile}; ++s) {{ {of_four} }}
         }}
@@ -296,27 +308,33 @@ def make_selection(precision: Precision, shape_name: str, several: bool = False)
 
 @cache
 def make_contraction(
-    precision: Precision, vectors: int, symmetric: bool, coefficients, tile: int = 1, several: bool = False
+    precision: Precision,
+    vectors: int,
+    symmetric: bool,
+    coefficients,
+    tile: int = 1,
+    several: bool = False,
+    stored=wp.float32,
 ):
     """Kernel of a matrix field at N, mean + Σ_k modes_k a_k, over whole blocks.
 
     A thread has three components of a particle, in the simulations of a tile; `several` tiles have blocks in
     turn. The six components of a symmetric field are xx xy xz yy yz zz, the nine of another go row by row.
-    Particles that are not needed are passed over. `coefficients` is the type of a.
+    Particles that are not needed are passed over. `coefficients` is the type of a, `stored` that of modes.
     """
-    real = precision.real
+    real, half = precision.real, stored is wp.float16
     sums = wp.types.vector(length=3 * tile, dtype=real)
     tile_of, within = _make_placing(several)
     scalar = {wp.float32: "float", wp.float64: "double"}[coefficients]
     snippet = f"""
     typedef {_scalar(precision)} real;
     const int Q = {vectors}, components = mean.shape[1], particles = mean.shape[0];
-    {_combination("a", scalar, tile, several)}
+    {_combination("a", scalar, tile, several, half)}
     """
 
     @wp.func_native(snippet)
     def combined(
-        modes: wp.array(dtype=wp.float32),
+        modes: wp.array(dtype=stored),
         mean: wp.array2d(dtype=real),
         a: wp.array2d(dtype=coefficients),
         start: int,
@@ -329,7 +347,7 @@ def make_contraction(
     def contraction(
         needed: wp.array2d(dtype=wp.int32),
         mean: wp.array2d(dtype=real),
-        modes: wp.array(dtype=wp.float32),
+        modes: wp.array(dtype=stored),
         a: wp.array2d(dtype=coefficients),
         tiles: int,
         lanes: int,
@@ -545,369 +563,3 @@ def make_gathering(precision: Precision, several: bool = False):
             b[copy, k] = total
 
     return gathering
-
-
-def projection_block(widths: tuple[int, ...]) -> int:
-    """Threads of the block that projects: enough to take the widest layer in one turn, if there may be."""
-    widest = max((*widths[1:], 1))
-    return min(1024, 32 * -(-(-(-widest // 2) * _PARTS) // 32))
-
-
-#: Threads that share a sum over a layer's inputs; each has two outputs, to read its inputs once for both.
-_PARTS = 8
-
-
-def shared_bytes(precision: Precision, widths: tuple[int, ...], latents: int, modes: int) -> int:
-    """Shared memory [byte] that the projection needs, without Bᵀw B."""
-    widest, row = max((*widths[:-1], latents)), -(-latents // 4) * 4
-    values = 2 * widest * precision.numpy().itemsize + 8 * widest * row
-    return values + 8 * (5 * modes + 2 * modes * latents + 2 * latents * (latents + 2) + 4)
-
-
-def projection_fits(precision: Precision, widths: tuple[int, ...], latents: int, modes: int) -> bool:
-    """Whether one block of a GPU can hold what the projection needs."""
-    return shared_bytes(precision, widths, latents, modes) <= _SHARED - _TAKEN
-
-
-# Native code of the closure and its tangents, all layers in one piece: code that a step meets for the first
-# time must be short. Values are summed in the precision of the step, tangents in fp32: they steer
-# Gauss-Newton, and miss its fixed point by no more than their round-off times the residual.
-_CLOSURE = """
-        const int width[] = {widths};
-        int offset = 0;
-        #pragma unroll 1
-        for (int n = 0; n < {layers} * {members}; ++n) {{
-            const int l = n % {layers};
-            const bool begun = n >= {layers};  // a member's share is there already
-            if (l == 0) {{
-                #pragma unroll 1
-                for (int e = lane; e < R * R; e += lanes) {{
-                    slope[0][e / R * ROW + e % R] = e / R == e % R ? 1.0f : 0.0f;
-                    if (e < R) value[0][e] = real(x[e]);
-                }}
-                NSF_SYNC;
-            }}
-            const int in = width[l], out = width[l + 1], half = (out + 1) / 2, from = l % 2, to = 1 - from;
-            const bool last = l == {layers} - 1;
-            const slope_t* W = weights.data + offset;
-            const slope_t* bias = W + in * out;
-            offset += (in + 1) * out;
-            #pragma unroll 1
-            for (int e = lane; e < (half * PARTS + 31) / 32 * 32; e += lanes) {{
-                const int part = e % PARTS, o = e / PARTS;
-                const bool live = o < half, both = live && o + half < out;
-                const slope_t* row_1 = W + (live ? o : 0) * in;
-                const slope_t* row_2 = both ? row_1 + half * in : row_1;
-                real v_1 = 0, v_2 = 0;
-                slope_t u_1[R], u_2[R];
-                for (int c = 0; c < R; ++c) u_1[c] = u_2[c] = 0.0f;
-                #pragma unroll 1
-                for (int start = part; start < in; start += PARTS * AHEAD) {{
-                    slope_t w_1[AHEAD], w_2[AHEAD];
-                    #pragma unroll
-                    for (int j = 0; j < AHEAD; ++j) {{
-                        const int i = start + j * PARTS;
-                        w_1[j] = i < in ? row_1[i] : 0.0f;
-                        w_2[j] = i < in ? row_2[i] : 0.0f;
-                    }}
-                    #pragma unroll
-                    for (int j = 0; j < AHEAD; ++j) {{
-                        const int i = start + j * PARTS;
-                        if (i >= in) break;
-                        const real h = value[from][i];
-                        v_1 += real(w_1[j]) * h;
-                        v_2 += real(w_2[j]) * h;
-                        const slope_t* t = slope[from] + i * ROW;
-                        for (int c = 0; c < R; ++c) {{
-                            u_1[c] += w_1[j] * t[c];
-                            u_2[c] += w_2[j] * t[c];
-                        }}
-                    }}
-                }}
-#if defined(__CUDA_ARCH__)
-                #pragma unroll 1
-                for (int d = PARTS / 2; d > 0; d /= 2) {{
-                    v_1 += __shfl_xor_sync(0xffffffffu, v_1, d);
-                    v_2 += __shfl_xor_sync(0xffffffffu, v_2, d);
-                    for (int c = 0; c < R; ++c) {{
-                        u_1[c] += __shfl_xor_sync(0xffffffffu, u_1[c], d);
-                        u_2[c] += __shfl_xor_sync(0xffffffffu, u_2[c], d);
-                    }}
-                }}
-#endif
-                #pragma unroll 1
-                for (int side = part; side < 2; side += PARTS) {{
-                    if (side == 0 ? !live : !both) continue;
-                    const int k = o + side * half;
-                    const real z = (side == 0 ? v_1 : v_2) + real(bias[k]);
-                    const real s = real(1) / (real(1) + exp(-z));
-                    const slope_t rise = slope_t(s * (real(1) + z * (real(1) - s)));
-                    if (last) at[R + k] = (begun ? at[R + k] : 0.0) + scale * z; else value[to][k] = z * s;
-                    for (int c = 0; c < R; ++c) {{
-                        const slope_t u = side == 0 ? u_1[c] : u_2[c];
-                        if (last) {{
-                            double& tangent = A[(R + k) * R + c];
-                            tangent = (begun ? tangent : 0.0) + scale * u;
-                        }} else slope[to][k * ROW + c] = rise * u;
-                    }}
-                }}
-            }}
-            NSF_SYNC;
-        }}
-"""
-
-
-@cache
-def make_projection(
-    precision: Precision,
-    widths: tuple[int, ...],
-    members: int,
-    latents: int,
-    modes: int,
-    several: bool = False,
-):
-    """Kernel of the inversion, one block a simulation: Gauss-Newton in the coefficients of the modes.
-
-    With d = Δt v the displacement of S in the step and δa = a(x̂) − a(x̂_n), the error of the positions is
-    d − B δa, so that all the projection takes from S is b = Bᵀw d, G = Bᵀw B and dᵀw d: an iteration does
-    not depend on |S|. With A = ∂a/∂x̂ it solves (AᵀG A) u = Aᵀ(b − G δa), and the squared error is
-    dᵀw d − δa·b − δa·(b − G δa).
-
-    The coefficients are a = [σ x̂ ; closure(x̂)]; the closure is a network with SiLU between its layers, and
-    its derivative goes forward with its value. Without iterations the kernel only evaluates a and A.
-
-    Args:
-        precision: of the closure; sums over modes and the solution are fp64.
-        widths: of the closure's layers (r, hidden..., K − r); empty without one.
-        members: networks of these widths whose shares in the closure are added up.
-        latents: r.
-        modes: K.
-
-    Source: paper section 5.3.
-    """
-    real = precision.real
-    _, copy_of = make_copies(several)
-    widest = max((*widths[:-1], latents))
-    kept = shared_bytes(precision, widths, latents, modes) + 8 * modes**2 <= _SHARED - _TAKEN
-    closure = ""
-    if widths:
-        counts = "{" + ", ".join(map(str, widths)) + "}"
-        closure = _CLOSURE.format(layers=len(widths) - 1, members=members, widths=counts)
-    snippet = f"""
-    typedef {_scalar(precision)} real;
-    typedef float slope_t;  // as Warp takes float(x) for its own
-#if defined(__CUDA_ARCH__)
-    #define NSF_SHARED __shared__
-    #define NSF_SYNC __syncthreads()
-    const int lane = threadIdx.x, lanes = blockDim.x, PARTS = {_PARTS};
-#else
-    #define NSF_SHARED
-    #define NSF_SYNC
-    const int lane = 0, lanes = 1, PARTS = 1;
-#endif
-    const int R = {latents}, K = {modes}, C = R + 1;
-    const int ROW = (R + 3) / 4 * 4;  // whole vectors of four
-    const int AHEAD = {min(18, -(-widest // _PARTS))};  // weights whose loads are under way together
-    NSF_SHARED real value[2][{widest}];
-    NSF_SHARED alignas(16) slope_t slope[2][{widest} * ROW];
-    NSF_SHARED double x[R], moved[K], at[K], a_n[K], d[K + 1], A[K * R], q[K], M[K * R], g[R], E[2][R * C];
-    NSF_SHARED double error;
-    NSF_SHARED int going;
-    {"NSF_SHARED double gram[K * K];" if kept else "const double* gram = G.data;"}
-
-    auto evaluate = [&]() {{
-        #pragma unroll 1
-        for (int e = lane; e < R * R; e += lanes) {{
-            A[e] = e / R == e % R ? sigma.data[e / R] : 0.0;
-            if (e < R) at[e] = sigma.data[e] * x[e];
-        }}
-        NSF_SYNC;
-        {closure}
-    }};
-    // q = b - G da.
-    auto residual = [&]() {{
-        #pragma unroll 1
-        for (int k = lane; k < K; k += lanes) moved[k] = at[k] - a_n[k];
-        NSF_SYNC;
-        #pragma unroll 1
-        for (int k = lane; k < K; k += lanes) {{
-            double sum = d[k];
-            #pragma unroll 2
-            for (int j = 0; j < K; ++j) sum -= gram[j * K + k] * moved[j];
-            q[k] = sum;
-        }}
-        NSF_SYNC;
-    }};
-    // Where sums cancel to less than their round-off, nothing is left; a NaN stays one.
-    auto least = [](double sum) {{ return sum < 0.0 ? 0.0 : sum; }};
-    // The squared error, of which q is known.
-    auto left = [&]() {{
-        double sum = d[K];
-        #pragma unroll 2
-        for (int k = 0; k < K; ++k) sum -= moved[k] * (d[k] + q[k]);
-        return least(sum);
-    }};
-
-    #pragma unroll 1
-    for (int i = lane; i < R; i += lanes) x[i] = latent.data[i];
-    #pragma unroll 1
-    for (int k = lane; k < K; k += lanes) at[k] = a_n[k] = a.data[k];
-    #pragma unroll 1
-    for (int k = lane; k <= K; k += lanes) d[k] = b.data[k];
-    #pragma unroll 1
-    for (int e = lane; e < K * R; e += lanes) A[e] = tangents.data[e];
-    {"for (int e = lane; e < K * K; e += lanes) gram[e] = G.data[e];" if kept else ""}
-    if (lane == 0) going = 1;
-    NSF_SYNC;
-    const long long n = row.data[0];
-    int done = 0;
-    do {{
-        if (iterations > 0) {{
-            residual();
-            #pragma unroll 1
-            for (int e = lane; e < K * R; e += lanes) {{
-                const int k = e / R, c = e % R;
-                double sum = 0.0;
-                #pragma unroll 2
-                for (int j = 0; j < K; ++j) sum += gram[j * K + k] * A[j * R + c];
-                M[e] = sum;
-            }}
-            if (lane == lanes - 1) error = left();
-            NSF_SYNC;
-            #pragma unroll 1
-            for (int e = lane; e < R * C; e += lanes) {{
-                const int c = e / C, other = e % C;
-                double sum = 0.0;
-                #pragma unroll 2
-                for (int k = 0; k < K; ++k) sum += A[k * R + c] * (other < R ? M[k * R + other] : q[k]);
-                E[0][e] = sum;
-                if (other == R) g[c] = sum;
-            }}
-            NSF_SYNC;
-            // Gauss and Jordan on [AᵀG A | Aᵀq]; it is positive definite, so that no pivot is sought.
-            #pragma unroll 1
-            for (int m = 0; m < R; ++m) {{
-                const double* from = E[m % 2];
-                #pragma unroll 1
-                for (int e = lane; e < R * C; e += lanes) {{
-                    const int i = e / C, c = e % C;
-                    const double row = from[m * C + c] / from[m * C + m];
-                    E[1 - m % 2][e] = i == m ? row : from[e] - from[i * C + m] * row;
-                }}
-                NSF_SYNC;
-            }}
-            if (lane == 0) {{
-                double length = 0.0, change = 0.0;
-                #pragma unroll 1
-                for (int i = 0; i < R; ++i) {{
-                    const double u = E[R % 2][i * C + R];
-                    length += u * u;
-                    change += u * g[i];
-                    x[i] += u;
-                }}
-                length = sqrt(length);
-                residuals.data[n * (iterations + 1) + done] = real(sqrt(error / sample));
-                updates.data[n * iterations + done] = real(length);
-                // What a linearised model leaves: |e - J u|² = |e|² - uᵀ(AᵀG A)u at the minimum.
-                if (linear) error = least(error - change);
-                going = !(length <= tolerance);
-            }}
-            NSF_SYNC;
-        }}
-        evaluate();
-        ++done;
-    }} while (going && done < iterations);
-    if (iterations > 0) {{
-        residual();
-        if (lane == 0) {{
-            if (!linear) error = left();
-            for (int i = done; i <= iterations; ++i)
-                residuals.data[n * (iterations + 1) + i] = real(sqrt(error / sample));
-            for (int i = done; i < iterations; ++i) updates.data[n * iterations + i] = real(0);
-            row.data[0] = n + 1;
-            first.data[0] = 0;
-            step.data[0] += 1;
-        }}
-    }}
-    #pragma unroll 1
-    for (int i = lane; i < R; i += lanes) {{
-        if (iterations > 0) {{
-            xhat_previous.data[i] = xhat.data[i];
-            xhat.data[i] = real(x[i]);
-            xhats.data[(n + 1) * R + i] = real(x[i]);
-        }}
-        latent.data[i] = x[i];
-    }}
-    #pragma unroll 1
-    for (int k = lane; k < K; k += lanes) {{
-        rate.data[k] = (at[k] - a_n[k]) / dt;
-        a.data[k] = at[k];
-    }}
-    #pragma unroll 1
-    for (int e = lane; e < K * R; e += lanes) tangents.data[e] = A[e];
-    #undef NSF_SHARED
-    #undef NSF_SYNC
-    """
-
-    @wp.func_native(snippet)
-    def solve(
-        weights: wp.array(dtype=wp.float32),
-        scale: wp.float64,
-        sigma: wp.array(dtype=wp.float64),
-        G: wp.array(dtype=wp.float64),
-        b: wp.array(dtype=wp.float64),
-        sample: wp.float64,
-        iterations: int,
-        tolerance: wp.float64,
-        linear: int,
-        dt: wp.float64,
-        latent: wp.array(dtype=wp.float64),
-        a: wp.array(dtype=wp.float64),
-        tangents: wp.array(dtype=wp.float64),
-        rate: wp.array(dtype=wp.float64),
-        xhat: wp.array(dtype=real),
-        xhat_previous: wp.array(dtype=real),
-        xhats: wp.array(dtype=real),
-        residuals: wp.array(dtype=real),
-        updates: wp.array(dtype=real),
-        row: wp.array(dtype=wp.int64),
-        first: wp.array(dtype=wp.int32),
-        step: wp.array(dtype=wp.int32),
-    ): ...
-
-    @wp.kernel(
-        enable_backward=False, module="unique", grid_stride=False, launch_bounds=projection_block(widths)
-    )
-    def projection(
-        weights: wp.array(dtype=wp.float32),
-        scale: wp.float64,
-        sigma: wp.array(dtype=wp.float64),
-        G: wp.array(dtype=wp.float64),
-        b: wp.array2d(dtype=wp.float64),
-        sample: wp.float64,
-        iterations: int,
-        tolerance: wp.float64,
-        linear: int,
-        dt: wp.float64,
-        latent: wp.array2d(dtype=wp.float64),
-        a: wp.array2d(dtype=wp.float64),
-        tangents: wp.array2d(dtype=wp.float64),
-        rate: wp.array2d(dtype=wp.float64),
-        xhat: wp.array2d(dtype=real),
-        xhat_previous: wp.array2d(dtype=real),
-        xhats: wp.array2d(dtype=real),
-        residuals: wp.array2d(dtype=real),
-        updates: wp.array2d(dtype=real),
-        row: wp.array2d(dtype=wp.int64),
-        first: wp.array2d(dtype=wp.int32),
-        step: wp.array2d(dtype=wp.int32),
-        lanes: int,
-    ):
-        s = copy_of(wp.tid(), lanes)
-        solve(
-            weights, scale, sigma, G, b[s], sample, iterations, tolerance, linear, dt, latent[s], a[s],
-            tangents[s], rate[s], xhat[s], xhat_previous[s], xhats[s], residuals[s], updates[s], row[s],
-            first[s], step[s],
-        )  # fmt: skip
-
-    return projection

@@ -13,7 +13,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
@@ -45,6 +45,8 @@ class BasisField:
             Jacobian and the heads regular beside the training trajectories.
         head_parameters: the heads see the (standardised) problem parameters beside xhat.
     """
+
+    shardable: ClassVar[bool] = False
 
     modes: int | Sequence[int] = (48, 64, 64)
     beta: int | Sequence[int] = (48, 48, 32)

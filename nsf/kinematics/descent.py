@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytorch_lightning as pl
 import torch
+from pytorch_lightning.plugins.environments import LightningEnvironment
+from pytorch_lightning.strategies import DDPStrategy
 from torch import Tensor
 from typing_extensions import override
 
 from nsf.errors import InstabilityError
 from nsf.kinematics.phases import PHASES, Fit, seed_of
+from nsf.kinematics.ranks import ALONE, Rank
 from nsf.kinematics.schedules import Trainer
 from nsf.kinematics.tracking import loggers
 from nsf.progress import Progress, quiet_lightning
@@ -33,6 +38,7 @@ class Descent:
         fit, schedule: the network with its loss, and the batches and rates.
         frames, particles: M and P of the snapshots.
         resident: the snapshots lie on the device.
+        rank: which of several processes this is; `schedule`, `frames` and `seed` are its own.
     """
 
     fit: Fit
@@ -42,11 +48,12 @@ class Descent:
     resident: bool
     seed: int
     device: torch.device
+    rank: Rank = ALONE
 
     @property
     def replayable(self) -> bool:
-        """Whether every step is the same sequence of kernels, with no word from the host."""
-        local = self.resident or not self.fit.pointwise
+        """Whether every step is the same sequence of kernels, with no word from the host or other devices."""
+        local = (self.resident or not self.fit.pointwise) and self.rank.alone
         return self.device.type == "cuda" and self.schedule.stationary and local
 
     def optimizer(self) -> torch.optim.Optimizer:
@@ -66,10 +73,17 @@ class Steps:
         descent: the phase.
         optimizer: of its network, already in the state it starts from.
         steps: how many there are in all.
+        backward: fills the gradients of a loss.
     """
 
-    def __init__(self, descent: Descent, optimizer: torch.optim.Optimizer, steps: int):
-        self.descent, self.optimizer, self.steps = descent, optimizer, steps
+    def __init__(
+        self,
+        descent: Descent,
+        optimizer: torch.optim.Optimizer,
+        steps: int,
+        backward: Callable[[Tensor], None] = Tensor.backward,
+    ):
+        self.descent, self.optimizer, self.steps, self.backward = descent, optimizer, steps, backward
         self._rate = torch.zeros((), device=descent.device)
         for group in optimizer.param_groups:
             group["lr"] = self._rate
@@ -114,7 +128,7 @@ class Steps:
         with torch.autocast(descent.device.type, torch.bfloat16, enabled=low, cache_enabled=False):
             loss = descent.fit.loss(rows, particles, self._generator)
         self.optimizer.zero_grad()
-        loss.backward()
+        self.backward(loss)
         self.optimizer.step()
         return loss.detach()
 
@@ -145,13 +159,15 @@ class FieldTraining(pl.LightningModule):
     @override
     def on_train_start(self) -> None:
         # Lightning's wrapper of the optimizer adds a millisecond to every step.
-        self.taker = Steps(self.descent, self.optimizers(use_pl_optimizer=False), self.steps)
+        # Through Lightning where it has to exchange gradients, which costs a little.
+        backward = Tensor.backward if self.descent.rank.alone else self.manual_backward
+        self.taker = Steps(self.descent, self.optimizers(use_pl_optimizer=False), self.steps, backward)
         self.progress.advance(self.step)
 
     @override
     def training_step(self, batch: Any, index: int) -> None:
         first, last, started = self.step, min(self.step + self.block, self.steps), time.perf_counter()
-        self.loss = self.taker.take(first, last)
+        self.loss = self.descent.rank.mean(self.taker.take(first, last), self.descent.device)
         self.step, self.seconds = last, self.seconds + time.perf_counter() - started
         if not self.loss < float("inf"):
             raise InstabilityError(
@@ -171,7 +187,9 @@ class FieldTraining(pl.LightningModule):
 
     @override
     def on_train_epoch_end(self) -> None:
-        with writing(self.checkpoint) as partial:
+        # All ranks come here, and the first one writes.
+        target = writing(self.checkpoint) if self.descent.rank.first else nullcontext(self.checkpoint)
+        with target as partial:
             self.trainer.save_checkpoint(partial)
 
     @override
@@ -196,15 +214,14 @@ def descend(descent: Descent, steps: int, folder: Path, tracking: str | None) ->
     """
     checkpoint = folder / CHECKPOINT
     resumed = checkpoint.is_file()
-    device = descent.device
-    with quiet_lightning(), Progress(f"train {descent.fit.name}", steps, "steps") as progress:
+    shown = descent.rank.first
+    with quiet_lightning(), Progress(f"train {descent.fit.name}", steps, "steps", shown) as progress:
         module = FieldTraining(descent, steps, checkpoint, progress)
         trainer = pl.Trainer(
-            accelerator="gpu" if device.type == "cuda" else "cpu",
-            devices=[device.index or 0] if device.type == "cuda" else 1,
+            **_placement(descent),
             max_epochs=-1,
             enable_checkpointing=False,  # ModelCheckpoint counts the steps of Lightning's wrapped optimizer
-            logger=loggers(folder, tracking),
+            logger=loggers(folder, tracking) if descent.rank.first else False,
             log_every_n_steps=1,
             enable_progress_bar=False,
             enable_model_summary=False,
@@ -217,3 +234,13 @@ def descend(descent: Descent, steps: int, folder: Path, tracking: str | None) ->
             # Lightning answers an interrupt with exit code 1; the caller is to see the interrupt.
             raise KeyboardInterrupt from stop
     return module.loss, module.seconds
+
+
+def _placement(descent: Descent) -> dict[str, Any]:
+    """On which devices, and how, Lightning trains."""
+    device, rank = descent.device, descent.rank
+    accelerator = "gpu" if device.type == "cuda" else "cpu"
+    if rank.alone:
+        return {"accelerator": accelerator, "devices": [device.index or 0] if accelerator == "gpu" else 1}
+    together = DDPStrategy(cluster_environment=LightningEnvironment())
+    return {"accelerator": accelerator, "devices": rank.count, "strategy": together}

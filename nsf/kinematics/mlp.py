@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -32,6 +32,8 @@ class MlpField:
 
     Source: Zong et al. 2023, section 4.5, appendices "Training Details" and "Network architecture", table 1.
     """
+
+    shardable: ClassVar[bool] = True
 
     beta: int | Sequence[int] = (48, 72, 72)
     stress_parameters: bool = False
@@ -80,7 +82,7 @@ class MlpField:
 
         def decoded(phase):
             name = TARGETS[phase][0]
-            latents = manifold.decoder_latents(phase)
+            latents = manifold.decoder_latents(phase)[snapshots.rows]
 
             def loss(rows, particles, generator):
                 values = standard[name](snapshots.gather(name, rows, particles))
@@ -95,7 +97,7 @@ class MlpField:
 
         both = nn.ModuleList([manifold.encoder, decoders["deformation"]])
         yield Fit("deformation", both, deformation, pointwise=True)
-        manifold.encode_training(snapshots)
+        manifold.encode_training(snapshots.whole)
         for phase in PHASES[1:]:
             yield Fit(phase, decoders[phase], decoded(phase), pointwise=True)
 

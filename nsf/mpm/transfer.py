@@ -133,11 +133,11 @@ def make_p2g(precision: Precision, shape_name: str, deterministic: bool = False,
                     reach = vec3(real(float(a)) - f[0], real(float(b)) - f[1], real(float(c)) - f[2])
                     slope = vec3(da_b * w[2, c], a_db * w[2, c], w_ab * d[2, c])
                     carried = weight * (momentum + affine * reach) + impulse * slope
+                    # Looked up by every thread, so that nothing waits for it.
+                    slot = storage(wp.max(cell, 0) + flat_index(a, b, c, grid_shape), slots)
                     added = total(vec4(carried[0], carried[1], carried[2], weight * m), run)
-                    if run > 0 and cell >= 0:
-                        slot = storage(cell + flat_index(a, b, c, grid_shape), slots)
-                        if slot >= 0:
-                            add(values, start + slot, added)
+                    if run > 0 and cell >= 0 and slot >= 0:
+                        add(values, start + slot, added)
 
     return p2g
 
@@ -186,15 +186,15 @@ def make_gather(precision: Precision, shape_name: str):
                 a_db = w[0, a] * d[1, b]
                 for c in range(width):
                     slot = storage(flat_index(base[0] + a, base[1] + b, base[2] + c, grid_shape), slots)
-                    if slot >= 0:
-                        weight = w_ab * w[2, c]
-                        reach = vec3(real(float(a)) - f[0], real(float(b)) - f[1], real(float(c)) - f[2])
-                        slope = vec3(da_b * w[2, c], a_db * w[2, c], w_ab * d[2, c])
-                        value = load(values, start + slot)
-                        v_i = vec3(value[0], value[1], value[2])
-                        velocity += weight * v_i
-                        affine += wp.outer(v_i, weight * reach)
-                        gradient += wp.outer(v_i, slope)
+                    weight = w_ab * w[2, c]
+                    reach = vec3(real(float(a)) - f[0], real(float(b)) - f[1], real(float(c)) - f[2])
+                    slope = vec3(da_b * w[2, c], a_db * w[2, c], w_ab * d[2, c])
+                    # Without a branch, so that the loads of all nodes are under way together.
+                    value = wp.where(slot >= 0, load(values, start + wp.max(slot, 0)), vec4())
+                    v_i = vec3(value[0], value[1], value[2])
+                    velocity += weight * v_i
+                    affine += wp.outer(v_i, weight * reach)
+                    gradient += wp.outer(v_i, slope)
         affine = (real(inverse_inertia) * inv_dx) * affine
         transposed = wp.transpose(affine)
         C = real(0.5) * (symmetric * (affine + transposed) + skew * (affine - transposed))

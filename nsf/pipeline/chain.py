@@ -29,10 +29,12 @@ from nsf.dynamics.solver import reduced_steps
 from nsf.errors import MissingRunError
 from nsf.evaluation import Comparison, Subject, compare, measure, superresolve
 from nsf.kinematics.manifold import Manifold
+from nsf.kinematics.ranks import train_together
 from nsf.kinematics.training import train
+from nsf.mpm.device import visible_gpus
 from nsf.pipeline import results
 from nsf.pipeline.plan import Plan
-from nsf.pipeline.simulation import Job, simulate
+from nsf.pipeline.simulation import Job, Shared, simulate
 from nsf.runs import Record, Run
 from nsf.scenes import Scene
 from nsf.storage import writing
@@ -109,37 +111,31 @@ class Pipeline(Plan):
             return Job(run, f"{name} {value:g}{unit}", parameters, build)
 
         jobs = [job(run, *needed) for run, needed in runs.items()]
-        return simulate(
-            jobs, self.scene.steps, self.scene.dx, self.stored, self.device, c.precision, self.say
-        )
+        shared = Shared(self.scene.steps, self.scene.dx, self.stored, self.device, c.precision)
+        further = visible_gpus()[1:] if c.device == "auto" else ()
+        return simulate(jobs, shared, self.say, further)
 
     def train(self) -> Run:
         """The manifold of the training trajectories."""
         return self._made(self.training, self._train)
 
     def _train(self, run: Run) -> None:
+        self.check_devices()
         c = self.config
         paths = [self.simulation(v).path / "trajectory.h5" for v in self.split.train]
-        snapshots = Snapshots(
-            [Trajectory.open(p) for p in paths], device=self.device, resident=c.data.resident
-        )
+        own = {"field": self.field, "latent_dim": c.latent_dim, "seed": c.seed, "tracking": c.tracking}
+        one = partial(train, folder=run.path, **own)
         with run.record(device=self.device, seed=c.seed) as record:
-            manifold, metrics = train(
-                snapshots,
-                self.field,
-                self.trainer,
-                c.latent_dim,
-                c.seed,
-                run.path,
-                self.device,
-                tracking=c.tracking,
-            )
+            if self.trainer.devices > 1:
+                manifold, metrics = train_together(paths, one, self.trainer, self.device, c.data.resident)
+            else:
+                with contextlib.closing(Snapshots(paths, self.device, c.data.resident)) as snapshots:
+                    manifold, metrics = one(snapshots, trainer=self.trainer, device=self.device)
             manifold.datasets = [self.simulation(v).id for v in self.split.train]
             manifold.split = {"train": list(self.split.train), "test": list(self.split.test)}
             manifold.save(run.path / "manifold.pt")
             record.output("manifold.pt")
             record.metrics.update(metrics)
-        snapshots.close()
         seconds = metrics["training_seconds"]
         self.say(f"train: field={manifold.field}, r={c.latent_dim} in {seconds:.1f} s → {run.id}")
 

@@ -1,5 +1,6 @@
 """What a configuration asks for: everything that its stages need, checked, and the run of each stage."""
 
+import os
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
@@ -12,11 +13,11 @@ from nsf import config as configuration
 from nsf.data import Split
 from nsf.dynamics.interop import torch_device
 from nsf.dynamics.sampling import check_well_posed
-from nsf.errors import ConfigError
+from nsf.errors import ConfigError, DeviceError
 from nsf.kinematics.basis import BasisField
 from nsf.kinematics.tracking import check_tracking
 from nsf.mpm import FP32, FP64, Precision, precision_of
-from nsf.mpm.device import warp_device
+from nsf.mpm.device import visible_gpus, warp_device
 from nsf.mpm.stability import check_colliders, check_time_step
 from nsf.runs import Run
 from nsf.scenes import Scene
@@ -113,6 +114,11 @@ class Plan:
         if str(c.report.name) in ("", "..") or Path(str(c.report.name)).name != str(c.report.name):
             raise ConfigError(f"report.name={c.report.name} must be one folder's name; set report.folder")
         precision_of(c.precision)
+        if self.trainer.devices > 1 and not self.field.shardable:
+            raise ConfigError(
+                f"trainer.devices={self.trainer.devices} is for field=mlp; this field takes all snapshots in "
+                "every step, in seconds: set trainer.devices=1"
+            )
 
     def _changed(self, changes: DictConfig | None) -> Scene:
         """The scene of the held-out simulations and of deployment."""
@@ -150,6 +156,28 @@ class Plan:
         if not getattr(self.split, split):
             raise ConfigError(f"deploy.split={split} has no values; set scene.parameters.{split}")
 
+    def check_devices(self) -> None:
+        """Refuse to train on more devices than this machine has; what was trained elsewhere may be used.
+
+        Raises:
+            DeviceError: says how many there are.
+        """
+        asked, on_gpu = self.trainer.devices, self.device.startswith("cuda")
+        if asked == 1 or self.training.complete:
+            return
+        if self.device not in ("cpu", "cuda:0"):
+            raise DeviceError(
+                f"trainer.devices={asked} takes the first GPUs and not device={self.config.device}; "
+                "set device=auto"
+            )
+        there = len(visible_gpus()) if on_gpu else os.cpu_count() or 1
+        if asked > there:
+            raise DeviceError(
+                f"trainer.devices={asked} is more than this process has: {there} "
+                f"{'GPU' if on_gpu else 'processor core'}{'' if there == 1 else 's'}; "
+                f"set trainer.devices={there}"
+            )
+
     @property
     def stored(self) -> Precision:
         """Precision of the frames of trajectories."""
@@ -183,9 +211,12 @@ class Plan:
     @property
     def training(self) -> Run:
         """The run of the manifold."""
-        keys = ("field", "trainer", "latent_dim", "seed")
+        content = self._content(("field", "trainer", "latent_dim", "seed"))
+        if self.trainer.devices == 1:
+            # The bits, and so the name, of a training from before there was the key.
+            content["trainer"].pop("devices", None)
         parents = [self.simulation(v) for v in self.split.train]
-        return Run.open("train", self.scene.name, self._content(keys), parents, root=self.root)
+        return Run.open("train", self.scene.name, content, parents, root=self.root)
 
     @property
     def deployment(self) -> Run:

@@ -4,9 +4,11 @@ import contextlib
 import os
 import queue
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
+from threading import Thread
 
 import numpy as np
 
@@ -14,8 +16,9 @@ from nsf.data import TrajectoryWriter
 from nsf.errors import InstabilityError
 from nsf.mpm import FullOrderMPM, Precision, diagnosed
 from nsf.mpm.recording import blocks, unpacked
-from nsf.progress import Progress
+from nsf.progress import Progress, Told
 from nsf.runs import Run
+from nsf.workers import Call, ended, working
 
 # Trajectories that are written at once; each holds at most a few blocks of frames in memory.
 _WRITERS = min(4, os.cpu_count() or 1)
@@ -37,12 +40,18 @@ class Job:
     label: str
     parameters: dict[str, float]
     build: Callable[[], FullOrderMPM]
-    blocks: queue.Queue = field(default_factory=lambda: queue.Queue(_BLOCKS))
 
 
 @dataclass(frozen=True)
-class _Shared:
-    """What the jobs have in common; see `simulate`."""
+class Shared:
+    """What the jobs have in common.
+
+    Attributes:
+        steps: of each, one frame a step and one at t = 0.
+        dx: grid spacing [m], for the file.
+        stored: precision of the stored frames.
+        device, precision: of the physics, for the manifest.
+    """
 
     steps: int
     dx: float
@@ -52,43 +61,77 @@ class _Shared:
 
 
 def simulate(
-    jobs: Iterable[Job],
-    steps: int,
-    dx: float,
-    stored: Precision,
-    device: str,
-    precision: str,
-    say: Callable[[str], object],
+    jobs: Sequence[Job], shared: Shared, say: Callable[[str], object], gpus: Sequence[str] = ()
 ) -> int:
     """Run and store every job; each file appears when it is whole.
 
     Processes that are given the same jobs share them: what another one is making is left to it, and waited
-    for at the end.
+    for at the end. Further GPUs have such a process each; what one of them fails to make is made here.
 
     Args:
         jobs: trajectories to be made.
-        steps: of each, one frame a step and one at t = 0.
-        dx: grid spacing [m], for the file.
-        stored: precision of the stored frames.
-        device, precision: of the physics, for the manifest.
-        say: told which trajectory is waited for.
+        shared: what they have in common.
+        say: told which trajectory is waited for, and which error a process on a further GPU ended with.
+        gpus: further ones, as CUDA_VISIBLE_DEVICES names them; no more are used than there are jobs.
 
     Returns:
-        How many were made here.
+        How many were made here, the processes on further GPUs included.
 
     Raises:
         InstabilityError: a particle became non-finite or left the grid.
         StorageError: the disk refused a file.
         KeyboardInterrupt: passed on; what is whole stays, what is not is removed.
     """
-    jobs = list(jobs)
-    shared = _Shared(steps, dx, stored, device, precision)
-    with (
-        ThreadPoolExecutor(_WRITERS) as pool,
-        Progress("simulate", len(jobs) * (steps + 1), "frames") as progress,
-    ):
+    gpus = gpus[: max(0, len(jobs) - 1)]
+    with Progress("simulate", len(jobs) * (shared.steps + 1), "frames") as progress:
+        if not gpus:
+            return _simulate(jobs, shared, progress, (None, say))
+        with _beside(partial(_simulate_beside, jobs, shared), gpus, progress.advance, say):
+            _simulate(jobs, shared, progress, (None, lambda waiting: None))
+            return len(jobs)
+
+
+@contextlib.contextmanager
+def _beside(
+    call: Call, gpus: Sequence[str], told: Callable[[int], object], say: Callable[[str], object]
+) -> Iterator[None]:
+    """The call in a process on each GPU, which it sees as the only one, while the block works."""
+    errors: list[Exception] = []
+
+    def listen() -> None:
+        for _, outcome in ended(workers, told):
+            if isinstance(outcome, Exception) and not done:
+                errors.append(outcome)
+
+    done = False
+    with working([call] * len(gpus), [{"CUDA_VISIBLE_DEVICES": gpu} for gpu in gpus]) as workers:
+        listener = Thread(target=listen)
+        listener.start()
+        try:
+            yield
+        finally:
+            done = True  # those that are still at work are stopped, which is no error
+    listener.join()
+    for error in errors:
+        say(f"simulate: warning: a further GPU was left idle after an error: {error}")
+
+
+def _simulate_beside(jobs: Sequence[Job], shared: Shared, tell: Callable[[int], object]) -> None:
+    """What a process on a further GPU does."""
+    with Told(tell) as progress:
+        _simulate(jobs, shared, progress, (None,))
+
+
+def _simulate(
+    jobs: Sequence[Job],
+    shared: Shared,
+    progress: Progress | Told,
+    waits: Sequence[Callable[[str], object] | None],
+) -> int:
+    """Make the jobs that no other process makes, once for each way of waiting for it; gives their number."""
+    with ThreadPoolExecutor(_WRITERS) as pool:
         writing: list[Future] = []
-        for wait in (None, say):
+        for wait in waits:
             left = []
             for job in jobs:
                 with contextlib.ExitStack() as claim:
@@ -104,46 +147,52 @@ def simulate(
 
 
 def _start(
-    job: Job, claim: contextlib.ExitStack, pool: ThreadPoolExecutor, shared: _Shared, progress: Progress
+    job: Job,
+    claim: contextlib.ExitStack,
+    pool: ThreadPoolExecutor,
+    shared: Shared,
+    progress: Progress | Told,
 ) -> Future:
     """Compute one trajectory while its writer, which takes the claim over, and those of earlier ones work."""
-    solver = job.build()
+    solver, frames = job.build(), queue.Queue(_BLOCKS)
     try:
-        stored_by = pool.submit(_store, job, claim.pop_all(), solver, shared)
+        stored_by = pool.submit(_store, job, frames, claim.pop_all(), solver, shared)
         started = time.perf_counter()
         try:
             for block in blocks(solver, shared.steps, shared.stored, after=progress.advance):
-                _hand_over(job, block, stored_by)
+                _hand_over(frames, block, stored_by)
         except InstabilityError as error:
             raise diagnosed(error, job.build, solver.steps_taken) from error
-        _hand_over(job, time.perf_counter() - started, stored_by)
+        _hand_over(frames, time.perf_counter() - started, stored_by)
     except BaseException as error:
         # The writer leaves no half-written file, and its manifest says what happened.
-        _stop(job, error)
+        _stop(frames, error)
         raise
     return stored_by
 
 
-def _hand_over(job: Job, item, stored_by: Future) -> None:
+def _hand_over(frames: queue.Queue, item, stored_by: Future) -> None:
     """Wait for room in the queue, unless the writer has stopped."""
     while not stored_by.done():
         try:
-            job.blocks.put(item, timeout=0.1)
+            frames.put(item, timeout=0.1)
             return
         except queue.Full:
             continue
     stored_by.result()
 
 
-def _stop(job: Job, error: BaseException) -> None:
+def _stop(frames: queue.Queue, error: BaseException) -> None:
     """Tell the writer to give up, at once: nothing here may block, or a second interrupt would hang it."""
-    while not job.blocks.empty():
+    while not frames.empty():
         with contextlib.suppress(queue.Empty):
-            job.blocks.get_nowait()
-    job.blocks.put_nowait(error)
+            frames.get_nowait()
+    frames.put_nowait(error)
 
 
-def _store(job: Job, claim: contextlib.ExitStack, solver: FullOrderMPM, shared: _Shared) -> None:
+def _store(
+    job: Job, frames: queue.Queue, claim: contextlib.ExitStack, solver: FullOrderMPM, shared: Shared
+) -> None:
     constants = solver.constants
     with claim, job.run.record(device=shared.device, precision=shared.precision) as record:
         writer = TrajectoryWriter(
@@ -159,7 +208,7 @@ def _store(job: Job, claim: contextlib.ExitStack, solver: FullOrderMPM, shared: 
         )
         n = 0
         with writer:
-            while not isinstance(item := job.blocks.get(), float):
+            while not isinstance(item := frames.get(), float):
                 if isinstance(item, BaseException):
                     raise item
                 for frame in item:

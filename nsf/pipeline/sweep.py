@@ -2,7 +2,8 @@
 
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,11 +13,12 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
 from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from nsf import config as configuration
 from nsf.errors import LaunchError, NSFError
 from nsf.extras import optional
+from nsf.mpm.device import take_gpu, visible_gpus
 from nsf.pipeline.chain import Pipeline
 from nsf.pipeline.plan import Plan
 
@@ -48,6 +50,8 @@ def work(config: DictConfig, stages: Sequence[str], say: Callable[[str], object]
     pipeline = Pipeline(config, say)
     if len(stages) > 1:
         pipeline.check_held_out()  # before hours of simulation and training, not after
+    if "train" in stages:
+        pipeline.check_devices()
     for name in stages:
         result = pipeline.run(name)
     return result
@@ -61,6 +65,9 @@ def sweep(
     say: Callable[[str], object] = print,
 ) -> list[Failure]:
     """Stages of every job; one that fails is recorded in its run's manifest, and does not stop the others.
+
+    Jobs side by side on this machine (`hydra/launcher=joblib`) take a GPU each, in turn, where all of them
+    have device=auto and trainer.devices=1; each sees its own as cuda:0, so its runs are those of one GPU.
 
     Args:
         sweeps: overrides whose keys may have several values, without Hydra's own.
@@ -80,12 +87,24 @@ def sweep(
     config, loader = configuration.launching(launcher, config_name)
     plugin = ".".join(config.hydra.launcher._target_.split(".")[:2])
     optional(plugin, "sweep")
+    movable: list[bool] = []  # by configuration: whether it may see any one GPU
+
+    def check(one: DictConfig) -> None:
+        movable.append(one.device == "auto" and OmegaConf.select(one, "trainer.devices", default=1) == 1)
+        if "point" not in stages:
+            Plan(one)
+
     for overrides in sweeps:
-        configuration.check_sweep(overrides, config_name, None if "point" in stages else Plan)
+        configuration.check_sweep(overrides, config_name, check)
     jobs = configuration.jobs(sweeps, config_name)
     context = HydraContext(config_loader=loader, callbacks=Callbacks())
-    started = Plugins.instance().instantiate_launcher(context, partial(_job, stages=tuple(stages)), config)
-    errors = _launched(started, [list(job) for job in jobs], say)
+    task = partial(_job, stages=tuple(stages))
+    gpus = visible_gpus() if "joblib" in plugin and all(movable) else ()
+    if len(gpus) > 1:
+        task = partial(_on_a_gpu, task, gpus, Path(config.hydra.sweep.dir).resolve())
+    started = Plugins.instance().instantiate_launcher(context, task, config)
+    with _own_processes() if len(gpus) > 1 else nullcontext():
+        errors = _launched(started, [list(job) for job in jobs], say)
     common = set.intersection(*map(set, jobs))
     return [
         Failure(tuple(override for override in job if override not in common), error)
@@ -103,6 +122,24 @@ def reports(overrides: Sequence[str], say: Callable[[str], object] = print) -> l
     configs = [configuration.load(job) for job in configuration.jobs([overrides])]
     last = {(config.report.folder, config.report.name): config for config in configs}
     return [Pipeline(config, say).report() for config in last.values()]
+
+
+@contextmanager
+def _own_processes() -> Iterator[None]:
+    """Joblib's processes are of this block alone: those of an earlier sweep may use a GPU already."""
+    from joblib.externals.loky import get_reusable_executor
+
+    get_reusable_executor().shutdown()
+    try:
+        yield
+    finally:
+        get_reusable_executor().shutdown()
+
+
+def _on_a_gpu(task: Callable, gpus: tuple[str, ...], folder: Path, config: DictConfig) -> str | None:
+    """A job in a process that keeps to one GPU, which it does not share while there are enough."""
+    take_gpu(gpus, folder)
+    return task(config)
 
 
 def _job(config: DictConfig, stages: Sequence[str]) -> str | None:

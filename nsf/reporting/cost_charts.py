@@ -1,6 +1,7 @@
 """Charts of what the two solvers cost: where a step's time goes, speedup, memory."""
 
 import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -16,11 +17,22 @@ def runtime_breakdown(breakdown: dict[str, dict[str, float]]) -> Figure:
         breakdown: {"reduced": {stage: ms}, "full_order": {stage: ms}}. Each ring is one whole step; the
             sum of its stages stands in the middle.
     """
+    titles = {"reduced": "reduced step", "full_order": "full-order step"}
+    return rings([{title: breakdown.get(solver, {}) for solver, title in titles.items()}])
+
+
+def rings(rows: Sequence[Mapping[str, Mapping[str, float]]]) -> Figure:
+    """Where the time [ms] of a step goes, a ring each with its sum in the middle.
+
+    Args:
+        rows: of two rings, {title: {stage: ms}}; without stages it says that nothing was measured.
+    """
     with styled():
-        fig = figure(2.75)
-        panels = fig.subplots(1, 4, width_ratios=[1, 0.78, 1, 0.78])
-        _ring(panels[0], panels[1], breakdown.get("reduced", {}), "reduced step")
-        _ring(panels[2], panels[3], breakdown.get("full_order", {}), "full-order step")
+        fig = figure(2.75 * len(rows))
+        panels = fig.subplots(len(rows), 4, width_ratios=[1, 0.78, 1, 0.78], squeeze=False)
+        for across, row in zip(panels, rows, strict=True):
+            for ring, key, (title, stages) in zip(across[::2], across[1::2], row.items(), strict=True):
+                _ring(ring, key, stages, title)
     return fig
 
 
@@ -57,7 +69,7 @@ def speedup_and_memory(variants: list[dict]) -> Figure:
     return fig
 
 
-def _ring(pie, key, stages: dict[str, float], title: str) -> None:
+def _ring(pie, key, stages: Mapping[str, float], title: str) -> None:
     pie.set_title(title)
     key.axis("off")
     if not stages:

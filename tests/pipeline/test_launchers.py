@@ -42,6 +42,28 @@ def test_a_dead_process_takes_no_sibling_with_it(tmp_path, monkeypatch):
     ]
 
 
+def says_its_gpu(config, stages, folder):
+    (folder / f"{config.seed}").write_text(os.environ.get("CUDA_VISIBLE_DEVICES", "all"))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "launcher", "seen"),
+    [
+        (["device=auto"], JOBLIB, {"4", "7"}),
+        (["device=auto,cpu"], JOBLIB, {"all"}),
+        (["field=mlp", "trainer.devices=2"], JOBLIB, {"all"}),
+        (["device=auto"], [], {"all"}),
+    ],
+)
+def test_jobs_side_by_side_see_one_gpu_each(tmp_path, monkeypatch, overrides, launcher, seen):
+    monkeypatch.setenv("NSF_RUNS", str(tmp_path))
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    monkeypatch.setattr(module, "visible_gpus", lambda: ("4", "7"))
+    monkeypatch.setattr(module, "_job", partial(says_its_gpu, folder=tmp_path))
+    assert not sweep([["seed=1,2,3", *overrides]], ["train"], launcher)
+    assert {(tmp_path / f"{seed}").read_text() for seed in (1, 2, 3)} <= seen
+
+
 def raises(config, stages, say):
     raise ValueError("not foreseen")
 

@@ -1,7 +1,9 @@
 """`nsf bench`: rows, passes and the report; what a step takes is asserted nowhere."""
 
 import dataclasses
+import os
 import re
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -12,9 +14,11 @@ from nsf.bench.batch import _too_large, values_of
 from nsf.bench.batch import measured as measured_batches
 from nsf.bench.full_order import collapse, measured, pass_times
 from nsf.bench.measure import bandwidth, run_times, step_times
+from nsf.bench.multi_gpu import measured as measured_on_several
 from nsf.bench.reduced import measured as measured_chain
-from nsf.bench.report import step_over_batch, write_report
-from nsf.bench.rows import KernelRow, Result, Row, Settings, columns, size_name
+from nsf.bench.report import step_over_batch, with_speed_up, write_report
+from nsf.bench.rows import KernelRow, Result, Row, Settings, StageRow, columns, size_name
+from nsf.bench.training import measured as measured_training
 from nsf.cli import main
 from nsf.errors import ConfigError, DeviceError
 from nsf.pipeline import Pipeline
@@ -143,9 +147,9 @@ def test_sizes_by_name(count, name):
     ("asked", "error", "message"),
     [
         (
-            {"benches": "training,foo"},
+            {"benches": "sorting,foo"},
             ConfigError,
-            "benches=training is unknown; choose from full_order, scaling",
+            "benches=sorting is unknown; choose from full_order, scaling",
         ),
         ({"particles": "10q"}, ConfigError, "particles=10q is no number of particles"),
         ({"particles": "0"}, ConfigError, "particles=0 is no number"),
@@ -178,14 +182,38 @@ def test_the_command(tmp_path, monkeypatch, capsys):
 
 
 @pytest.fixture(scope="module")
-def reduced(chain):
+def found(chain):
     """Rows of the tiny chain, as of a scene of the benchmark."""
     found, said = Result(), []
     settings = Settings(particles=(), precisions=("fp32", "fp64"), device="cpu", trials=2)
     own = Pipeline(chain.pipeline.config, say=lambda line: None, root=chain.root)
     measured_chain(own, settings, found, said.append)
     assert len(said) == 10
+    return found
+
+
+@pytest.fixture(scope="module")
+def reduced(found):
+    """The rows."""
     return pd.DataFrame(found.rows, columns=columns(Row))
+
+
+def test_stages_of_both_solvers(found):
+    stages = pd.DataFrame(found.stages, columns=columns(StageRow))
+    of_case = stages.groupby(["case", "precision"], sort=False)["stage"].apply(list)
+    reduced = ["inference", "p2g", "grid", "g2p", "inversion"]
+    assert of_case.tolist() == 2 * [["p2g", "grid", "g2p", "stress"], reduced]
+    assert (stages["ms"] > 0).all()
+
+
+def test_training_is_timed_from_its_files(chain):
+    own = Pipeline(chain.pipeline.config, say=lambda line: None, root=chain.root)
+    found, said = Result(), []
+    measured_training(own, Settings((), (), "cpu", 2), found, said.append)
+    (row,) = found.rows
+    assert (row.case, row.particles, row.sample, row.delta) == ("training_sand", 500, None, None)
+    assert row.ms_p10 < row.ms_median < row.ms_p90
+    assert len(said) == 2
 
 
 def test_both_solvers_of_a_scene_have_rows(reduced, chain):
@@ -250,6 +278,7 @@ def test_a_batch_that_would_not_fit_is_left_out(monkeypatch):
 def test_a_report_of_batches(batches, tmp_path):
     batches.to_csv(tmp_path / "results.csv", index=False)
     pd.DataFrame(columns=columns(KernelRow)).to_csv(tmp_path / "kernels.csv", index=False)
+    pd.DataFrame(columns=columns(StageRow)).to_csv(tmp_path / "stages.csv", index=False)
     page = write_report(tmp_path).read_text()
     assert re.findall(r"\]\((.*?)\)", page) == ["batch-cpu.png"]
     assert page.count("| reduced_batch3 |") == 2
@@ -279,9 +308,58 @@ def test_whole_runs_take_turns():
     assert [len(times) for times in found.values()] == [2, 2]
 
 
-def test_a_report_of_scenes(reduced, tmp_path):
+def test_a_report_of_scenes(reduced, found, tmp_path):
     reduced.to_csv(tmp_path / "results.csv", index=False)
     pd.DataFrame(columns=columns(KernelRow)).to_csv(tmp_path / "kernels.csv", index=False)
+    stages = pd.DataFrame(found.stages, columns=columns(StageRow))
+    stages.to_csv(tmp_path / "stages.csv", index=False)
     page = write_report(tmp_path)
+    assert not (tmp_path / "stages-cpu.png").exists()  # the paper has no figures of sand
+    stages.replace({"case": {"reduced_sand": "reduced_metal"}}).to_csv(tmp_path / "stages.csv", index=False)
+    assert "(stages-cpu.png)" in write_report(tmp_path).read_text()
     assert "| reduced_sand_1.5dt |" in page.read_text()
     assert (tmp_path / "reduced-cpu.png").stat().st_size > 5000
+
+
+@pytest.fixture(scope="module")
+def several(tiny, tmp_path_factory):
+    """Rows of two devices, for which processes on the CPU stand."""
+    found, said = Result(), []
+    mlp = ("field=mlp", "trainer.steps=150", "trainer.frames_per_batch=8", "trainer.particles_per_batch=4")
+    base = [o for o in tiny if not o.startswith(("field.modes", "field.depth", "trainer.steps", "device"))]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("NSF_RUNS", str(tmp_path_factory.mktemp("several")))
+        patch.setattr("nsf.pipeline.chain.visible_gpus", lambda: ("0", "1"))
+        measured_on_several([*base, *mlp], 2, Settings((), ("fp64",), "cpu", 1), found, said.append)
+        assert not list(Path(os.environ["NSF_RUNS"]).iterdir())
+    assert len(said) == 10
+    return pd.DataFrame(found.rows, columns=columns(Row))
+
+
+def test_several_devices_have_rows_beside_one(several, tmp_path):
+    cases = [f"train_mlp_{phase}" for phase in ("deformation", "stress", "affine")]
+    assert several["case"].tolist() == [
+        *(f"simulate_sand_on_{n}" for n in (1, 2)), *(f"{case}_on_{n}" for n in (1, 2) for case in cases)
+    ]  # fmt: skip
+    assert several["batch"].tolist() == [1, 2, *[32] * 6]
+    assert (several["ms_median"] > 0).all()
+    compared = with_speed_up(several)
+    alone, both = (compared[compared["case"].str.endswith(f"_on_{n}")] for n in (1, 2))
+    assert (alone["speed_up"] == 1).all()
+    np.testing.assert_allclose(both["speed_up"], alone["ms_median"].to_numpy() / both["ms_median"].to_numpy())
+    several.to_csv(tmp_path / "results.csv", index=False)
+    pd.DataFrame(columns=columns(KernelRow)).to_csv(tmp_path / "kernels.csv", index=False)
+    pd.DataFrame(columns=columns(StageRow)).to_csv(tmp_path / "stages.csv", index=False)
+    page = write_report(tmp_path).read_text()
+    assert "| train_mlp_stress_on_2 |" in page
+    assert "speed-up" in page
+    assert "png" not in page
+
+
+def test_several_gpus_are_needed(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("nsf.bench.multi_gpu.visible_gpus", lambda: ("0",))
+    with pytest.raises(SystemExit) as end:
+        main(["bench", "benches=multi_gpu", f"folder={tmp_path}", "device=cpu"])
+    assert not end.value.code
+    assert "multi_gpu: left out, as it needs two GPUs and this process has 1" in capsys.readouterr().err
+    assert pd.read_csv(tmp_path / "results.csv").empty

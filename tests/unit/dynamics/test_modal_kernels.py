@@ -43,23 +43,41 @@ def test_tiles_hold_all():
 
 
 @pytest.mark.parametrize(("n", "K", "simulations"), SIZES)
-@pytest.mark.parametrize(("components", "coefficients"), [(6, torch.float64), (9, torch.float32)])
-def test_contraction(arena, rng, n, K, simulations, components, coefficients):
+@pytest.mark.parametrize(
+    ("components", "coefficients", "half"),
+    [(6, torch.float64, True), (9, torch.float32, True), (9, torch.float64, False)],
+)
+def test_contraction(arena, rng, n, K, simulations, components, coefficients, half):
     mean, modes = (values_of(arena, rng, n, components, *more).float() for more in ((), (K,)))
     a = arena.hold(rng.standard_normal((simulations, K)), coefficients)
     needed = arena.hold(rng.integers(0, 2, (simulations, n)), torch.int32)
     found = arena.zeros(simulations * n, 3, 3)
     (tiles, tile), of = tiling(simulations), wp.dtype_from_torch(coefficients)
-    kernel = make_contraction(arena.precision, -(-K // 4), components == 6, of, tile, tiles > 1)
+    stored, lengths = arena.halved(modes) if half else (arena.modes(modes), 1.0)
+    read = (modes / lengths).to(stored.dtype).double()
+    kind = wp.dtype_from_torch(stored.dtype)
+    kernel = make_contraction(arena.precision, -(-K // 4), components == 6, of, tile, tiles > 1, kind)
     lanes, threads = arena.lanes(THREADS), tiles * arena.whole_blocks(components // 3 * n, THREADS)
-    inputs = [needed, arena.hold(mean, torch.float64), arena.modes(modes), a, tiles, lanes, found]
+    inputs = [needed, arena.hold(mean, torch.float64), stored, a, tiles, lanes, found]
     arena.pack(kernel, threads, inputs, THREADS).launch()
     wp.synchronize_device(arena.device)
-    expected = mean.double() + torch.einsum("nck,bk->bnc", modes.double(), a.double())
+    expected = mean.double() + torch.einsum("nck,bk->bnc", read, a.double())
     expected = expected.cpu().numpy().reshape(simulations * n, components)
     expected = expected[:, TAU_MATRIX] if components == 6 else expected.reshape(-1, 3, 3)
     expected = expected * needed.cpu().numpy().reshape(-1, 1, 1)
     np.testing.assert_allclose(found.cpu().numpy(), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_half_precision_is_of_a_gpu_and_takes_lengths_out(arena, rng):
+    modes = values_of(arena, rng, 7, 9, 6).float() * torch.logspace(-8, 6, 6, device=arena.zeros(1).device)
+    stored, lengths = arena.halved(modes)
+    if not arena.device.is_cuda:
+        assert stored.dtype is torch.float32
+        assert (lengths == 1).all()
+        return
+    assert stored.dtype is torch.float16
+    found = stored.view(9, 2, 7, 4).permute(2, 0, 1, 3).flatten(2)[..., :6].float() * lengths
+    assert ((found - modes).abs().amax((0, 1)) < 1e-3 * modes.abs().amax((0, 1))).all()
 
 
 @pytest.mark.parametrize(("n", "K", "simulations"), SIZES)

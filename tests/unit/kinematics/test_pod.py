@@ -17,6 +17,10 @@ M, P, RANK = 30, 120, 4
 class LowRank(SimpleNamespace):
     """Snapshots of rank 4 in x and 3 in tau, and none in C; the methods of `nsf.data.Snapshots`."""
 
+    @property
+    def whole(self):
+        return self
+
     def slab(self, name, particles):
         return self.data[name][:, particles]
 

@@ -1,0 +1,456 @@
+"""The kernel that inverts the deformation field in the coefficients of its modes (`field=basis`).
+
+A GPU takes for each simulation a block for each network whose mean is the closure; all of them do the linear
+algebra alike, and only the first one writes. A CPU is one thread.
+"""
+
+from collections.abc import Sequence
+from functools import cache
+
+import torch
+import warp as wp
+
+from nsf.mpm import Precision
+from nsf.mpm.copies import make_copies
+
+#: Threads that share a sum over a layer's inputs; each has two outputs, to read its inputs once for both.
+_PARTS = 8
+#: Threads of a GPU whose weights lie side by side.
+_WARP = 32
+#: Shared memory [byte] of a block without asking for more, and what Warp takes of it.
+SHARED, TAKEN = 49152, 4096
+
+
+def projection_block(widths: tuple[int, ...]) -> int:
+    """Threads of a block: enough to take the widest layer in one turn, if there may be."""
+    widest = max((*widths[1:], 1))
+    return min(1024, _WARP * -(-(-(-widest // 2) * _PARTS) // _WARP))
+
+
+def shared_bytes(precision: Precision, widths: tuple[int, ...], latents: int, modes: int) -> int:
+    """Shared memory [byte] that a block needs, without Bᵀw B."""
+    rows, row = _rows(widths, latents), -(-latents // 4) * 4
+    values = 2 * rows * precision.numpy().itemsize + 8 * rows * row
+    return values + 8 * (5 * modes + 2 * modes * latents + 2 * latents * (latents + 2) + 4)
+
+
+def projection_fits(precision: Precision, widths: tuple[int, ...], latents: int, modes: int) -> bool:
+    """Whether a block of a GPU can hold what the projection needs."""
+    return shared_bytes(precision, widths, latents, modes) <= SHARED - TAKEN
+
+
+def packed_weights(layers: Sequence[tuple[torch.Tensor, torch.Tensor]], is_cuda: bool) -> torch.Tensor:
+    """Weights [out, in] and biases [out] of a network, layer by layer, in the order in which they are read.
+
+    A thread has two outputs, half of all apart, and every `_PARTS`-th input (on a CPU every one): what a warp
+    reads at once lies side by side.
+    """
+    parts, tile = (_PARTS, _WARP) if is_cuda else (1, 1)
+    found = []
+    for W, b in layers:
+        (out, inputs), across = W.shape, tile // parts
+        half, steps = -(-out // 2), -(-inputs // parts)
+        tiles = -(-half // across)
+        padded = W.new_zeros(2, tiles * across, steps * parts)
+        padded[0, :half, :inputs], padded[1, : out - half, :inputs] = W[:half], W[half:]
+        shaped = padded.unflatten(2, (steps, parts)).unflatten(1, (tiles, across))
+        found += [shaped.permute(1, 3, 2, 4, 0).flatten(), torch.nn.functional.pad(b, (0, out % 2))]
+    return torch.cat(found)
+
+
+def _rows(widths: tuple[int, ...], latents: int) -> int:
+    """Inputs of the widest layer, filled up to whole turns of the threads that share them."""
+    return -(-max((*widths[:-1], latents)) // _PARTS) * _PARTS
+
+
+# Native code of the closure and its tangents, all layers in one piece: code that a step meets for the first
+# time must be short. Values are summed in the precision of the step, tangents in fp32: they steer
+# Gauss-Newton, and miss its fixed point by no more than their round-off times the residual.
+_CLOSURE = """
+        const int width[] = {widths};
+        #pragma unroll 1
+        for (int member = block; member < {members}; member += blocks) {{
+            const slope_t* W = weights.data + size_t(member) * (weights.shape[0] / {members});
+            const bool begun = member > block;  // a share of another member is there already
+            #pragma unroll 1
+            for (int e = lane; e < R * R; e += lanes) {{
+                slope[0][e / R * ROW + e % R] = e / R == e % R ? 1.0f : 0.0f;
+                if (e < R) value[0][e] = real(x[e]);
+            }}
+            NSF_SYNC;
+            #pragma unroll 1
+            for (int l = 0; l < {layers}; ++l) {{
+                const int in = width[l], out = width[l + 1], half = (out + 1) / 2;
+                const int steps = (in + PARTS - 1) / PARTS, tiles = (half * PARTS + TILE - 1) / TILE;
+                const int from = l % 2, to = 1 - from;
+                const bool last = l == {layers} - 1;
+                const slope_t* bias = W + 2 * tiles * TILE * steps;
+                #pragma unroll 1
+                for (int e = lane; e < tiles * TILE; e += lanes) {{
+                    const int part = e % PARTS, o = e / PARTS;
+                    const pair_t* w = (const pair_t*)W + e / TILE * TILE * steps + e % TILE;
+                    real v_1 = 0, v_2 = 0;
+                    slope_t u_1[R], u_2[R];
+                    for (int c = 0; c < R; ++c) u_1[c] = u_2[c] = 0.0f;
+                    #pragma unroll 1
+                    for (int start = 0; start < steps; start += AHEAD) {{
+                        pair_t ahead[AHEAD];
+                        #pragma unroll
+                        for (int j = 0; j < AHEAD; ++j)
+                            if (start + j < steps) ahead[j] = w[(start + j) * TILE];
+                        #pragma unroll
+                        for (int j = 0; j < AHEAD; ++j) {{
+                            if (start + j >= steps) break;
+                            const int i = (start + j) * PARTS + part;
+                            const real h = value[from][i];
+                            v_1 += real(ahead[j].one) * h;
+                            v_2 += real(ahead[j].two) * h;
+                            const slope_t* t = slope[from] + i * ROW;
+                            for (int c = 0; c < R; ++c) {{
+                                u_1[c] += ahead[j].one * t[c];
+                                u_2[c] += ahead[j].two * t[c];
+                            }}
+                        }}
+                    }}
+#if defined(__CUDA_ARCH__)
+                    #pragma unroll 1
+                    for (int d = PARTS / 2; d > 0; d /= 2) {{
+                        v_1 += __shfl_xor_sync(0xffffffffu, v_1, d);
+                        v_2 += __shfl_xor_sync(0xffffffffu, v_2, d);
+                        for (int c = 0; c < R; ++c) {{
+                            u_1[c] += __shfl_xor_sync(0xffffffffu, u_1[c], d);
+                            u_2[c] += __shfl_xor_sync(0xffffffffu, u_2[c], d);
+                        }}
+                    }}
+#endif
+                    #pragma unroll 1
+                    for (int side = part; side < 2; side += PARTS) {{
+                        const int k = o + side * half;
+                        if (o >= half || k >= out) continue;
+                        const real z = (side == 0 ? v_1 : v_2) + real(bias[k]);
+                        const real s = real(1) / (real(1) + exp(-z));
+                        const slope_t rise = slope_t(s * (real(1) + z * (real(1) - s)));
+                        if (last) at[R + k] = (begun ? at[R + k] : 0.0) + scale * z;
+                        else value[to][k] = z * s;
+                        for (int c = 0; c < R; ++c) {{
+                            const slope_t u = side == 0 ? u_1[c] : u_2[c];
+                            if (last) {{
+                                double& tangent = A[(R + k) * R + c];
+                                tangent = (begun ? tangent : 0.0) + scale * u;
+                            }} else slope[to][k * ROW + c] = rise * u;
+                        }}
+                    }}
+                }}
+                W = bias + (out + 1) / 2 * 2;
+                NSF_SYNC;
+            }}
+        }}
+        if (blocks > 1) meet();
+"""
+
+# Native code of `meet`: the blocks add up their shares in the closure. They alternate between two places, as
+# a block may be in the next evaluation while another one still reads.
+_MEETING = """
+    auto meet = [&]() {
+#if defined(__CUDA_ARCH__)
+        const int count = (K - R) * C;
+        double* place = shares.data + size_t(met) * blocks * count;
+        for (int e = lane; e < count; e += lanes)
+            place[block * count + e] = e < K - R ? at[R + e] : A[R * R + e - (K - R)];
+        __threadfence();
+        __syncthreads();
+        if (lane == 0) {
+            volatile int* turn = arrived.data + 1;
+            const int before = *turn;
+            if (atomicAdd(arrived.data, 1) == blocks - 1) {
+                arrived.data[0] = 0;
+                __threadfence();
+                *turn = before + 1;
+            } else {
+                while (*turn == before) {}
+            }
+            __threadfence();
+        }
+        __syncthreads();
+        for (int e = lane; e < count; e += lanes) {
+            double sum = 0.0;
+            for (int other = 0; other < blocks; ++other) sum += __ldcg(place + other * count + e);
+            if (e < K - R) at[R + e] = sum; else A[R * R + e - (K - R)] = sum;
+        }
+        met = 1 - met;
+        __syncthreads();
+#endif
+    };
+"""
+
+
+@cache
+def make_projection(
+    precision: Precision,
+    widths: tuple[int, ...],
+    members: int,
+    latents: int,
+    modes: int,
+    several: bool = False,
+):
+    """Kernel of the inversion: Gauss-Newton in the coefficients of the modes.
+
+    With d = Δt v the displacement of S in the step and δa = a(x̂) − a(x̂_n), the error of the positions is
+    d − B δa, so that all the projection takes from S is b = Bᵀw d, G = Bᵀw B and dᵀw d: an iteration does
+    not depend on |S|. With A = ∂a/∂x̂ it solves (AᵀG A) u = Aᵀ(b − G δa), and the squared error is
+    dᵀw d − δa·b − δa·(b − G δa).
+
+    The coefficients are a = [σ x̂ ; closure(x̂)]; the closure is the sum of networks with SiLU between their
+    layers, and its derivative goes forward with its value. An update below the tolerance moves a by A u
+    alone, which misses by its square, unless it is the first of the step. Without iterations the kernel only
+    evaluates a and A.
+
+    Args:
+        precision: of the closure; sums over modes and the solution are fp64.
+        widths: of the closure's layers (r, hidden..., K − r); empty without one.
+        members: networks of these widths whose shares in the closure are added up; of a GPU a block each.
+            The blocks of a simulation follow each other, and wait for each other.
+        latents: r.
+        modes: K.
+        several: whether there are several simulations.
+
+    Source: paper section 5.3.
+    """
+    real = precision.real
+    _, copy_of = make_copies(several)
+    rows = _rows(widths, latents)
+    kept = shared_bytes(precision, widths, latents, modes) + 8 * modes**2 <= SHARED - TAKEN
+    closure = ""
+    if widths:
+        counts = "{" + ", ".join(map(str, widths)) + "}"
+        closure = _CLOSURE.format(layers=len(widths) - 1, members=members, widths=counts)
+    scalar = {"fp32": "float", "fp64": "double"}[precision.name]
+    snippet = f"""
+    typedef {scalar} real;
+    typedef float slope_t;  // as Warp takes float(x) for its own
+    struct alignas(8) pair_t {{ slope_t one, two; }};
+#if defined(__CUDA_ARCH__)
+    #define NSF_SHARED __shared__
+    #define NSF_SYNC __syncthreads()
+    const int lane = threadIdx.x, lanes = blockDim.x, PARTS = {_PARTS}, TILE = {_WARP};
+    const int blocks = {members}, block = blockIdx.x % blocks;
+#else
+    #define NSF_SHARED
+    #define NSF_SYNC
+    const int lane = 0, lanes = 1, PARTS = 1, TILE = 1;
+    const int block = 0, blocks = 1;
+#endif
+    const int R = {latents}, K = {modes}, C = R + 1;
+    const int ROW = (R + 3) / 4 * 4;  // whole vectors of four
+    const int AHEAD = {min(18, rows // _PARTS)};  // weights whose loads are under way together
+    NSF_SHARED real value[2][{rows}];
+    NSF_SHARED alignas(16) slope_t slope[2][{rows} * ROW];
+    NSF_SHARED double x[R], at[K], a_n[K], d[K + 1], A[K * R], q[K], M[K * R], g[R], E[2][R * C];
+    NSF_SHARED double error, length;
+    NSF_SHARED int going;
+    {"NSF_SHARED double gram[K * K];" if kept else "const double* gram = G.data;"}
+    int met = 0;
+    {_MEETING}
+    auto evaluate = [&]() {{
+        #pragma unroll 1
+        for (int e = lane; e < R * R; e += lanes) {{
+            A[e] = e / R == e % R ? sigma.data[e / R] : 0.0;
+            if (e < R) at[e] = sigma.data[e] * x[e];
+        }}
+        NSF_SYNC;
+        {closure}
+    }};
+    // q = b - G da, and with them the columns of M = G A.
+    auto residual = [&](int columns) {{
+        #pragma unroll 1
+        for (int e = lane; e < K * (columns + 1); e += lanes) {{
+            const int k = e % K, c = e / K;
+            double sum = 0.0;
+            #pragma unroll 8
+            for (int j = 0; j < K; ++j)
+                sum += gram[j * K + k] * (c == columns ? at[j] - a_n[j] : A[j * R + c]);
+            if (c == columns) q[k] = d[k] - sum; else M[k * R + c] = sum;
+        }}
+        NSF_SYNC;
+    }};
+    // Where sums cancel to less than their round-off, nothing is left; a NaN stays one.
+    auto least = [](double sum) {{ return sum < 0.0 ? 0.0 : sum; }};
+    // The squared error, of which q is known.
+    auto left = [&]() {{
+        double sum = d[K];
+        #pragma unroll 8
+        for (int k = 0; k < K; ++k) sum -= (at[k] - a_n[k]) * (d[k] + q[k]);
+        return least(sum);
+    }};
+
+    // Padding of the widest layer is read, times a weight of zero.
+    #pragma unroll 1
+    for (int e = lane; e < 2 * {rows}; e += lanes) (&value[0][0])[e] = 0;
+    #pragma unroll 1
+    for (int e = lane; e < 2 * {rows} * ROW; e += lanes) (&slope[0][0])[e] = 0.0f;
+    #pragma unroll 1
+    for (int i = lane; i < R; i += lanes) x[i] = latent.data[i];
+    #pragma unroll 1
+    for (int k = lane; k < K; k += lanes) at[k] = a_n[k] = a.data[k];
+    #pragma unroll 1
+    for (int k = lane; k <= K; k += lanes) d[k] = b.data[k];
+    #pragma unroll 1
+    for (int e = lane; e < K * R; e += lanes) A[e] = tangents.data[e];
+    {"for (int e = lane; e < K * K; e += lanes) gram[e] = G.data[e];" if kept else ""}
+    if (lane == 0) going = 1;
+    NSF_SYNC;
+    const long long n = row.data[0];
+    int done = 0;
+    do {{
+        if (iterations > 0) {{
+            residual(R);
+            #pragma unroll 1
+            for (int e = lane; e < R * C; e += lanes) {{
+                const int c = e / C, other = e % C;
+                double sum = 0.0;
+                #pragma unroll 8
+                for (int k = 0; k < K; ++k) sum += A[k * R + c] * (other < R ? M[k * R + other] : q[k]);
+                E[0][e] = sum;
+                if (other == R) g[c] = sum;
+            }}
+            if (lane == lanes - 1) error = left();
+            NSF_SYNC;
+            // Gauss and Jordan on [AᵀG A | Aᵀq]; it is positive definite, so that no pivot is sought.
+            #pragma unroll 1
+            for (int m = 0; m < R; ++m) {{
+                const double* from = E[m % 2];
+                #pragma unroll 1
+                for (int e = lane; e < R * C; e += lanes) {{
+                    const int i = e / C, c = e % C;
+                    const double row = from[m * C + c] / from[m * C + m];
+                    E[1 - m % 2][e] = i == m ? row : from[e] - from[i * C + m] * row;
+                }}
+                NSF_SYNC;
+            }}
+            const double* u = E[R % 2] + R;  // every C-th
+            #pragma unroll 1
+            for (int i = lane; i < R; i += lanes) x[i] += u[i * C];
+            if (lane == 0) {{
+                length = 0.0;
+                for (int i = 0; i < R; ++i) length += u[i * C] * u[i * C];
+                going = !(length <= tolerance * tolerance);
+            }}
+            NSF_SYNC;
+            if (lane == lanes - 1 && block == 0) {{
+                residuals.data[n * (iterations + 1) + done] = real(sqrt(error / sample));
+                updates.data[n * iterations + done] = real(sqrt(length));
+                // What a linearised model leaves: |e - J u|² = |e|² - uᵀ(AᵀG A)u at the minimum.
+                double change = 0.0;
+                for (int i = 0; i < R; ++i) change += u[i * C] * g[i];
+                if (linear) error = least(error - change);
+            }}
+        }}
+        if (going || done == 0) {{
+            evaluate();
+        }} else {{
+            #pragma unroll 1
+            for (int k = lane; k < K; k += lanes)
+                for (int c = 0; c < R; ++c) at[k] += A[k * R + c] * E[R % 2][c * C + R];
+            NSF_SYNC;
+        }}
+        ++done;
+    }} while (going && done < iterations);
+    if (block > 0) return;
+    if (iterations > 0) {{
+        residual(0);
+        if (lane == 0) {{
+            if (!linear) error = left();
+            for (int i = done; i <= iterations; ++i)
+                residuals.data[n * (iterations + 1) + i] = real(sqrt(error / sample));
+            for (int i = done; i < iterations; ++i) updates.data[n * iterations + i] = real(0);
+            row.data[0] = n + 1;
+            first.data[0] = 0;
+            step.data[0] += 1;
+        }}
+    }}
+    #pragma unroll 1
+    for (int i = lane; i < R; i += lanes) {{
+        if (iterations > 0) {{
+            xhat_previous.data[i] = xhat.data[i];
+            xhat.data[i] = real(x[i]);
+            xhats.data[(n + 1) * R + i] = real(x[i]);
+        }}
+        latent.data[i] = x[i];
+    }}
+    #pragma unroll 1
+    for (int k = lane; k < K; k += lanes) {{
+        rate.data[k] = (at[k] - a_n[k]) / dt;
+        a.data[k] = at[k];
+    }}
+    #pragma unroll 1
+    for (int e = lane; e < K * R; e += lanes) tangents.data[e] = A[e];
+    #undef NSF_SHARED
+    #undef NSF_SYNC
+    """
+
+    @wp.func_native(snippet)
+    def solve(
+        weights: wp.array(dtype=wp.float32),
+        scale: wp.float64,
+        sigma: wp.array(dtype=wp.float64),
+        G: wp.array(dtype=wp.float64),
+        b: wp.array(dtype=wp.float64),
+        sample: wp.float64,
+        iterations: int,
+        tolerance: wp.float64,
+        linear: int,
+        dt: wp.float64,
+        latent: wp.array(dtype=wp.float64),
+        a: wp.array(dtype=wp.float64),
+        tangents: wp.array(dtype=wp.float64),
+        rate: wp.array(dtype=wp.float64),
+        xhat: wp.array(dtype=real),
+        xhat_previous: wp.array(dtype=real),
+        xhats: wp.array(dtype=real),
+        residuals: wp.array(dtype=real),
+        updates: wp.array(dtype=real),
+        row: wp.array(dtype=wp.int64),
+        first: wp.array(dtype=wp.int32),
+        step: wp.array(dtype=wp.int32),
+        shares: wp.array(dtype=wp.float64),
+        arrived: wp.array(dtype=wp.int32),
+    ): ...
+
+    @wp.kernel(
+        enable_backward=False, module="unique", grid_stride=False, launch_bounds=projection_block(widths)
+    )
+    def projection(
+        weights: wp.array(dtype=wp.float32),
+        scale: wp.float64,
+        sigma: wp.array(dtype=wp.float64),
+        G: wp.array(dtype=wp.float64),
+        b: wp.array2d(dtype=wp.float64),
+        sample: wp.float64,
+        iterations: int,
+        tolerance: wp.float64,
+        linear: int,
+        dt: wp.float64,
+        latent: wp.array2d(dtype=wp.float64),
+        a: wp.array2d(dtype=wp.float64),
+        tangents: wp.array2d(dtype=wp.float64),
+        rate: wp.array2d(dtype=wp.float64),
+        xhat: wp.array2d(dtype=real),
+        xhat_previous: wp.array2d(dtype=real),
+        xhats: wp.array2d(dtype=real),
+        residuals: wp.array2d(dtype=real),
+        updates: wp.array2d(dtype=real),
+        row: wp.array2d(dtype=wp.int64),
+        first: wp.array2d(dtype=wp.int32),
+        step: wp.array2d(dtype=wp.int32),
+        shares: wp.array2d(dtype=wp.float64),
+        arrived: wp.array2d(dtype=wp.int32),
+        threads: int,
+    ):
+        s = copy_of(wp.tid(), threads)
+        solve(
+            weights, scale, sigma, G, b[s], sample, iterations, tolerance, linear, dt, latent[s], a[s],
+            tangents[s], rate[s], xhat[s], xhat_previous[s], xhats[s], residuals[s], updates[s], row[s],
+            first[s], step[s], shares[s], arrived[s],
+        )  # fmt: skip
+
+    return projection
