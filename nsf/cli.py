@@ -214,6 +214,8 @@ def _reports(words: list[str]) -> int:
     from nsf.reporting.committed import faults, write_list
 
     folder = Path(asked.get("folder", os.environ.get("NSF_REPORTS", "reports")))
+    if not folder.is_dir():
+        raise ConfigError(f"folder={folder} is no folder; name one that holds reports, or make one")
     if asked.get("check") != "true":
         print(f"open {write_list(folder).resolve()}")
         return 0

@@ -2,7 +2,10 @@
 
 import inspect
 import json
+import logging
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -69,13 +72,24 @@ def _check_size(module: nn.Module, points: int) -> None:
         )
 
 
+@contextmanager
+def _quiet(logger: logging.Logger) -> Iterator[None]:
+    """Errors alone: it also warns of packages that are absent and not needed."""
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
+
+
 def _graph(module: nn.Module, output: str, inputs: dict[str, np.ndarray]):
     """The module's graph with named axes and without the exporter's notes, which tell of paths."""
     names = list(inspect.signature(module.forward).parameters)
     axes = {"X": {0: "points"}, "xhat": {0: "frames"}, "parameters": {}}
     # To trace with: the graph does not depend on how many frames and points these are.
     example = {name: torch.zeros(4 if axes[name] else len(a), *a.shape[1:]) for name, a in inputs.items()}
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), _quiet(logging.getLogger("torch.onnx")):
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
             module,

@@ -19,7 +19,7 @@ from nsf.kinematics.phases import seed_of
 from nsf.kinematics.schedules import Trainer
 from nsf.workers import results, working
 
-SEED_STREAM = 1 << 10
+SEED_STREAM = 1 << 10  # the number of no phase, so that the seed of a rank is that of no step
 _TIMEOUT = timedelta(hours=6)  # rank 0 reads all snapshots once, while the others wait
 
 

@@ -24,6 +24,7 @@ class Trainer(ABC):
     """A schedule; every choice is a pure function of the step (and seed), so that training can be resumed.
 
     Attributes:
+        frames_per_batch: snapshots that a step sees, of all devices together.
         devices: GPUs that train together, or processes on a CPU; a batch and the data are shared among them.
         bf16: on a GPU, evaluate a field fitted to points in bfloat16 while it trains.
         stationary: batches have one shape and know the step through the generator alone, so a step can be
@@ -42,9 +43,10 @@ class Trainer(ABC):
     def _check_devices(self) -> None:
         at_least("devices", self.devices, 1)
         if self.frames_per_batch % self.devices:
+            even = max(1, self.frames_per_batch // self.devices) * self.devices
             raise ConfigError(
                 f"frames_per_batch={self.frames_per_batch} cannot be shared evenly among "
-                f"devices={self.devices}; choose a multiple"
+                f"devices={self.devices}; choose a multiple, as frames_per_batch={even}"
             )
 
     @abstractmethod

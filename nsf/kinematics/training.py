@@ -93,7 +93,7 @@ def train(
     check_tracking(tracking)
     if trainer.devices != rank.count:
         raise ConfigError(
-            f"trainer.devices={trainer.devices}, but {rank.count} process trains; call train_together"
+            f"trainer.devices={trainer.devices}, but processes that train: {rank.count}; call train_together"
         )
     device, folder = torch.device(device), Path(folder)
     with _determinism(deterministic):

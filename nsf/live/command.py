@@ -7,12 +7,18 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
+from nsf.errors import ConfigError
 from nsf.extras import optional
 from nsf.live import LOOPBACK
 from nsf.runs import Run
 
 if TYPE_CHECKING:
     from nsf.live.player import Player
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str):
+        raise ConfigError(f"{message}; see `{self.prog} --help`")
 
 
 _NEEDS = {"view": "viser", "serve": "websockets"}
@@ -122,7 +128,7 @@ def _bracketed(host: str) -> str:
 
 
 def _parser(command: str, text: str) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog=f"nsf {command}", description=text, formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
     add = parser.add_argument
@@ -148,15 +154,23 @@ def _parser(command: str, text: str) -> argparse.ArgumentParser:
     return parser
 
 
+def _number(kind: type, text: str):
+    try:
+        return kind(text)
+    except ValueError:
+        told = {int: "a whole number", float: "a number"}[kind]
+        raise argparse.ArgumentTypeError(f"{text!r} must be {told}") from None
+
+
 def _positive(text: str) -> float:
-    value = float(text)
+    value = _number(float, text)
     if not 0.0 < value < float("inf"):
         raise argparse.ArgumentTypeError(f"{text} must be positive and finite")
     return value
 
 
 def _count(text: str) -> int:
-    value = int(text)
+    value = _number(int, text)
     if value < 1:
         raise argparse.ArgumentTypeError(f"{text} must be at least 1")
     return value
@@ -167,7 +181,7 @@ def _counts(text: str) -> list[int]:
 
 
 def _port(text: str) -> int:
-    value = int(text)
+    value = _number(int, text)
     if not 0 <= value < 65536:
         raise argparse.ArgumentTypeError(f"{text} must lie in [0, 65535]; 0 takes a free one")
     return value

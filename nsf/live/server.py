@@ -86,7 +86,7 @@ class Stream:
             )
         except OSError as error:
             raise ConfigError(
-                f"cannot serve at {self._host}:{port} ({error}); give another --port"
+                f"cannot serve at {self._host}:{port} ({error}); give another --port or --host"
             ) from error
 
     async def play(self) -> None:

@@ -172,10 +172,11 @@ class Plan:
             )
         there = len(visible_gpus()) if on_gpu else os.cpu_count() or 1
         if asked > there:
+            most = max(n for n in range(1, there + 1) if self.trainer.frames_per_batch % n == 0)
             raise DeviceError(
                 f"trainer.devices={asked} is more than this process has: {there} "
                 f"{'GPU' if on_gpu else 'processor core'}{'' if there == 1 else 's'}; "
-                f"set trainer.devices={there}"
+                f"set trainer.devices={most}"
             )
 
     @property

@@ -38,7 +38,8 @@ def faults(folder: Path) -> list[str]:
     found = [fault for report in _reports(folder) for fault in _changed(report)]
     path = folder / LIST
     if not path.is_file() or path.read_text(encoding="utf-8") != _list(folder):
-        found.append(f"{path} does not list the reports as they are; write it with `nsf reports`")
+        command = f"nsf reports folder={folder}"
+        found.append(f"{path} does not list the reports as they are; write it with `{command}`")
     return found
 
 

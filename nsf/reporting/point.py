@@ -11,6 +11,7 @@ from nsf import config as configuration
 from nsf.errors import ConfigError
 from nsf.mpm.materials import deformation_path, drive
 from nsf.reporting.style import PALETTE, styled
+from nsf.storage import writing
 
 _COMPONENTS = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
 
@@ -61,16 +62,19 @@ def point_chart(response: pd.DataFrame, title: str) -> Figure:
 
 
 def plot_point(config: DictConfig) -> Path:
-    """Write chart and table of a material point; says where."""
+    """Write chart and table of a material point; says where.
+
+    Raises:
+        ConfigError: as `point_response`.
+        StorageError: the disk refused a file.
+    """
     response = point_response(config)
     name = config.material["_target_"].rsplit(".", 1)[-1]
-    folder = Path(config.point.folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    stem = folder / f"{name}_{config.path}"
-    response.to_csv(stem.with_suffix(".csv"), index=False)
-    point_chart(response, f"{name}, {config.path.replace('_', ' ')}").savefig(
-        stem.with_suffix(".png"), dpi=150
-    )
+    stem = Path(config.point.folder) / f"{name}_{config.path}"
+    with writing(stem.with_suffix(".csv")) as partial:
+        response.to_csv(partial, index=False)
+    with writing(stem.with_suffix(".png")) as partial:
+        point_chart(response, f"{name}, {config.path.replace('_', ' ')}").savefig(partial, dpi=150)
     last = response.iloc[-1]
     print(
         f"{name} at amplitude {last['amplitude']:g}: "

@@ -33,7 +33,10 @@ def replaced(folder: Path) -> Iterator[Path]:
         folder.parent.mkdir(parents=True, exist_ok=True)
         fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.new-", dir=folder.parent))
     except OSError as error:
-        raise StorageError(f"no report can be written to {folder}: {error}") from error
+        raise StorageError(
+            f"no report can be written to {folder}: {error.strerror}; make the folder above it writable, or "
+            "set report.folder or NSF_REPORTS"
+        ) from error
     try:
         yield fresh
         fresh.chmod(0o755)

@@ -135,6 +135,9 @@ def test_what_is_refused(on, monkeypatch):
     many = on(*MLP, "trainer.devices=8")
     with pytest.raises(DeviceError, match=r"trainer\.devices=8 is more than this process has: 4 processor"):
         many.check_devices()
+    monkeypatch.setattr(os, "cpu_count", lambda: 3)
+    with pytest.raises(DeviceError, match=r"3 processor cores; set trainer\.devices=2"):
+        many.check_devices()
     many.device = "cuda:0"
     monkeypatch.setattr("nsf.pipeline.plan.visible_gpus", lambda: ("0",))
     with pytest.raises(DeviceError, match=r"this process has: 1 GPU; set trainer\.devices=1"):

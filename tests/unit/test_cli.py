@@ -279,3 +279,19 @@ def test_point_on_every_path(nsf):
             nsf("point", "material=drucker_prager", f"path={path}", "point.points=11", tiny_scene=False)[0]
             == 0
         )
+
+
+def test_a_folder_that_cannot_be_written_is_told(nsf, tmp_path):
+    (tmp_path / "reports").touch()
+    code, _, err = nsf("point", tiny_scene=False)
+    assert code == 2
+    assert "cannot write" in err
+    assert "NSF_REPORTS" in err
+
+
+@pytest.mark.parametrize("check", ["false", "true"])
+def test_a_folder_of_reports_that_is_not_there(nsf, tmp_path, check):
+    code, _, err = nsf("reports", "folder=report", f"check={check}", tiny_scene=False)
+    assert code == 2
+    assert err.startswith("error: folder=report is no folder; name one")
+    assert not (tmp_path / "report").exists()

@@ -1,6 +1,9 @@
 """Exported files, opened in the programs that they are for."""
 
 import itertools
+import logging
+import logging.handlers
+import queue
 import re
 from importlib import import_module
 from pathlib import Path
@@ -144,6 +147,18 @@ def test_onnx_round_trip(graphs):
         assert told["tau_order"] == '["xx", "xy", "xz", "yy", "yz", "zz"]'
         (one,) = session.run(None, {name: inputs[name][:1] for name in names})  # one frame, one point
         np.testing.assert_allclose(one[0, 0], found[0, 0], rtol=1e-4, atol=1e-5 * np.abs(found).max())
+
+
+def test_onnx_passes_on_no_notes_of_the_exporter(graphs, tmp_path):
+    """torch warns of an absent torchvision, which no graph here needs."""
+    logger, notes = logging.getLogger("torch.onnx"), queue.SimpleQueue()
+    handler = logging.handlers.QueueHandler(notes)
+    logger.addHandler(handler)
+    try:
+        onnx.write(graphs[0], tmp_path)
+    finally:
+        logger.removeHandler(handler)
+    assert notes.empty()
 
 
 def test_onnx_depends_on_the_parameter(graphs):

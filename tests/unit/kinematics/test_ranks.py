@@ -157,11 +157,11 @@ def test_the_paper_sees_every_frame_of_each_shard_once_an_epoch(files):
 
 
 def test_what_is_refused(snapshots, fields, tmp_path):
-    with pytest.raises(ConfigError, match=r"frames_per_batch=32 cannot be shared evenly among devices=3"):
+    with pytest.raises(ConfigError, match=r"frames_per_batch=32 cannot be shared .* devices=3; .*=30$"):
         FastTrainer(steps=5, devices=3)
     with pytest.raises(ConfigError, match="devices=0 is below"):
         PaperTrainer(devices=0)
-    with pytest.raises(ConfigError, match=r"trainer\.devices=2, but 1 process"):
+    with pytest.raises(ConfigError, match=r"trainer\.devices=2, but processes that train: 1"):
         training.train(snapshots, fields["mlp"], TOGETHER, LATENT, 0, tmp_path, "cpu")
 
 

@@ -48,7 +48,7 @@ def test_help_names_the_commands(nsf):
 
 REFUSED = [
     (("view", "--port", "65536"), "65536 must lie in [0, 65535]"),
-    (("view", "--port", "abc"), "invalid"),
+    (("view", "--port", "abc"), "--port: 'abc' must be a whole number; see `nsf view --help`"),
     (("view", "--points", "0"), "must be at least 1"),
     (("view", "--rate", "30"), "unrecognized arguments"),
     (("view", "latent_dim=4"), "no deploy run is, or begins with, 'latent_dim=4'"),
@@ -58,7 +58,7 @@ REFUSED = [
     (("serve", "--rate", "nan"), "must be positive"),
     (("serve", "--patience", "-1"), "must be positive"),
     (("serve", "--bench", "0"), "must be at least 1"),
-    (("serve", "--bench", "1,x"), "invalid"),
+    (("serve", "--bench", "1,x"), "'x' must be a whole number"),
     (("serve", "--host", "no.such.host.invalid"), "cannot serve at no.such.host.invalid:8765"),
     (("veiw",), "did you mean view?"),
 ]
@@ -69,6 +69,7 @@ def test_bad_input_is_told(nsf, arguments, quoted):
     code, _, err = nsf(*arguments)
     assert code == 2
     assert quoted in err
+    assert err.startswith("error: ")
     assert "Traceback" not in err
 
 

@@ -280,7 +280,8 @@ def test_what_is_served(model):
 def test_a_port_that_is_taken_says_so(model):
     async def run():
         async with streaming(model) as (stream, _, port):
-            with pytest.raises(ConfigError, match=f"cannot serve at 127.0.0.1:{port} .*give another --port"):
+            told = f"cannot serve at 127.0.0.1:{port} .*give another --port or --host"
+            with pytest.raises(ConfigError, match=told):
                 await stream.listen(port)
 
     asyncio.run(run())

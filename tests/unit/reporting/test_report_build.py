@@ -142,6 +142,13 @@ def test_a_motion_knows_when_its_run_stopped(diverged):
     assert good.stopped is None
 
 
+def test_a_folder_that_cannot_be_made_names_the_remedy(tmp_path):
+    run = write_run(tmp_path / "runs", TINY)
+    (tmp_path / "reports").touch()
+    with pytest.raises(StorageError, match=r"sand: File exists; make the folder above .* set report\.folder"):
+        build_report([run], tmp_path / "reports" / "sand", "t")
+
+
 def test_equal_runs_give_equal_files(diverged, tmp_path):
     run, folder = diverged
     assert files(build_report([run], tmp_path / "again", "t").parent) == files(folder)
