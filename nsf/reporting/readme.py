@@ -4,9 +4,11 @@
 """
 
 import sys
+from functools import cache
 from pathlib import Path
 
 import pandas as pd
+from omegaconf import DictConfig
 
 from nsf import config
 from nsf.errors import ConfigError
@@ -69,13 +71,18 @@ def _gallery(report: Path, scenes: list[str]) -> str:
 
 
 def _title(scene: str) -> str:
-    return config.load([f"scene={scene}"]).scene.title
+    return _described(scene).title
 
 
 def _printed(scene: str, method: str) -> float:
     """δ [%] that the paper prints of a scene and method, NaN where it prints none."""
-    paper = config.load([f"scene={scene}", "scale=paper"]).scene.paper
-    return 100 * paper.get(method, {}).get("delta", float("nan"))
+    return 100 * _described(scene).paper.get(method, {}).get("delta", float("nan"))
+
+
+@cache
+def _described(scene: str) -> DictConfig:
+    """A scene's configuration at the paper's size."""
+    return config.load([f"scene={scene}", "scale=paper"]).scene
 
 
 def updated(text: str, report: Path) -> str:
