@@ -7,6 +7,8 @@ import pytest
 from expand import variants
 
 from nsf import config
+from nsf.bench import BENCHES
+from nsf.bench.rows import Result
 from nsf.cli import TOOLS, main
 from nsf.paths import EXPERIMENTS
 from nsf.pipeline import Pipeline
@@ -50,6 +52,8 @@ def try_command(command: str, folder: Path, monkeypatch, capsys, experiments: Pa
         # What is only checked are the committed reports.
         reports = ROOT / "reports" if "check=true" in words else folder / "reports"
         monkeypatch.setenv("NSF_REPORTS", str(reports))
+        for bench in BENCHES:  # minutes on a CPU, and on a GPU at the paper's size
+            monkeypatch.setattr(f"nsf.bench.{bench}.run", lambda settings, say: Result())
         with pytest.raises(SystemExit) as ended:
             main([name, *words])
         assert not ended.value.code or "no complete deploy run" in capsys.readouterr().err
