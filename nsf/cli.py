@@ -40,8 +40,9 @@ TOOLS = {
     ),
     "bench": (
         "time and memory of a step, kernel by kernel; writes reports/speed",
-        "[benches=full_order,scaling,reduced,training,multi_gpu] [particles=10k,200k,1m]\n"
-        "       [precision=fp32,fp64] [device=auto] [trials=10] [folder=PATH]; sizes that suit it by default",
+        "[benches=full_order,scaling,reduced,batch,training,multi_gpu] [particles=10k,200k,1m]\n"
+        "       [scenes=cake,metal] [precision=fp32,fp64] [device=auto] [trials=10] [folder=PATH]; "
+        "sizes that suit the device by default",
     ),
     "doctor": ("versions, devices, folders and extras of this installation", ""),
 }
@@ -162,7 +163,9 @@ def _tool(name: str, words: list[str]) -> int:
 
 def _bench(words: list[str]) -> int:
     """Benchmarks, and the report of all there are."""
-    asked = _asked("bench", words, "benches", "particles", "precision", "device", "trials", "folder")
+    asked = _asked(
+        "bench", words, "benches", "particles", "precision", "device", "trials", "scenes", "folder"
+    )
     from nsf.bench import bench, table
 
     folder = asked.pop("folder", os.path.join(os.environ.get("NSF_REPORTS", "reports"), "speed"))

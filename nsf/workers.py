@@ -118,6 +118,21 @@ def ended(
                 yield worker, value
 
 
+def results(workers: Sequence[Worker]) -> list[Any]:
+    """The results of all, in order.
+
+    Raises:
+        NSFError: what the first one to fail raised.
+        LaunchError: one died.
+    """
+    found = {}
+    for worker, outcome in ended(workers):
+        if isinstance(outcome, BaseException):
+            raise outcome
+        found[worker] = outcome
+    return [found[worker] for worker in workers]
+
+
 def serve(number: int) -> None:
     """What the process of a worker does.
 

@@ -14,7 +14,7 @@ from nsf.mpm.device import warp_device
 from nsf.mpm.precision import precision_of
 from nsf.storage import writing
 
-BENCHES = ("full_order", "scaling", "reduced", "training", "multi_gpu")
+BENCHES = ("full_order", "scaling", "reduced", "batch", "training", "multi_gpu")
 """Modules of this package that have `run(settings, say) -> Result`."""
 
 _UNITS = {"": 1, "k": 1_000, "m": 1_000_000}
@@ -25,7 +25,7 @@ def bench(folder: str | Path, asked: Mapping[str, str], say: Callable[[str], obj
 
     Args:
         folder: the csv files, index.md and charts; rows of other benchmarks or devices are kept.
-        asked: `benches`, `particles`, `precision`, `device`, `trials`, as on the command line.
+        asked: `benches`, `particles`, `precision`, `device`, `trials`, `scenes`, as on the command line.
         say: told of every result.
 
     Returns:
@@ -59,7 +59,18 @@ def _settings(asked: Mapping[str, str]) -> Settings:
         precisions=tuple(precision_of(name).name for name in precisions),
         device=str(warp_device(asked.get("device", "auto"))),
         trials=int(trials),
+        scenes=_scenes(asked.get("scenes", "")),
     )
+
+
+def _scenes(text: str) -> tuple[str, ...]:
+    """Scenes of benchmarks of reduced steps, by their names with commas in between."""
+    from nsf.bench.reduced import SCENES  # brings the whole chain, which others do not need
+
+    names = tuple(text.split(",")) if text else ()
+    if unknown := [name for name in names if name not in SCENES]:
+        raise ConfigError(f"scenes={unknown[0]} is not measured; choose from {', '.join(SCENES)}")
+    return names
 
 
 def _count(text: str) -> int:
@@ -72,13 +83,13 @@ def _count(text: str) -> int:
 
 
 def _merge(path: Path, kind: type, rows: list) -> None:
-    """Put rows in place of those of the same benchmark, case, precision and device; keep the others."""
+    """Put rows in place of those of the same benchmark, case, size, precision and device; keep the others."""
     if not rows and path.is_file():
         return
     fresh = pd.DataFrame(rows, columns=columns(kind))
     if path.is_file():
         kept = pd.read_csv(path)
-        key = ["bench", "case", "precision", "device"]
+        key = ["bench", "case", "particles", "precision", "device"]
         replaced = set(fresh[key].itertuples(index=False, name=None))
         known = kept[key].itertuples(index=False, name=None)
         kept = kept[[entry not in replaced for entry in known]]

@@ -67,6 +67,25 @@ def step_times(solvers: Mapping[str, object], trials: int, device: str) -> dict[
     return {name: np.array(times) for name, times in found.items()}
 
 
+def run_times(solvers: Mapping[str, object], trials: int, device: str) -> dict[str, np.ndarray]:
+    """[trials] mean time of a step [ms] over whole runs of each solver from t = 0, turn by turn.
+
+    A solver that has an end is restarted before each; its first run, which compiles, loads and captures, is
+    left out.
+    """
+    wait, found = synchronizer(device), {name: [] for name in solvers}
+    for trial in range(trials + 1):
+        for name, solver in solvers.items():
+            solver.restart()
+            wait()
+            begun = time.perf_counter()
+            solver.step(solver.total_steps)
+            wait()
+            if trial:
+                found[name].append(1e3 * (time.perf_counter() - begun) / solver.total_steps)
+    return {name: np.array(times) for name, times in found.items()}
+
+
 def pass_time(call: Callable[[], None], device: str, trials: int = 5) -> float:
     """Median time of one call of kernels [ms]; on a GPU from a graph of many."""
     wait = synchronizer(device)

@@ -21,13 +21,13 @@ _CHUNK = 2**26  # positions decoded at once
 
 
 def run(settings: Settings, say: Callable[[str], object]) -> Result:
-    """Both scenes: at the paper's size on a GPU, at small scale on a CPU.
+    """Each scene: at the paper's size on a GPU, at small scale on a CPU.
 
     Data and training are made, or reused, as by `nsf train`. A step of k Δt stands in the case's name; it
     moves the scene by k times as much as the others.
     """
     found = Result()
-    for scene in SCENES:
+    for scene in settings.scenes or SCENES:
         overrides = [f"scene={scene}", f"scale={scale_of(settings.device)}", f"device={settings.device}"]
         measured(Pipeline(config.load(overrides), say=say), settings, found, say)
     return found

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
+from nsf.bench.rows import size_name
 from nsf.reporting.columns import number
 from nsf.reporting.cost_charts import rings
 from nsf.reporting.style import INK, figure, line_style, save, stage_colors, styled
@@ -34,6 +35,10 @@ _LEAD = (
     "Time of a step, both sides of a ratio measured in one process turn by turn, after a warm-up, around a "
     "synchronised device: the median over the trials, each the mean of many steps. Memory is the peak of "
     "every allocator beyond what was held before the solver was built. `nsf bench` writes this report."
+)
+_BATCH = (
+    "Time of a simulation-step, which is the step of a batch over the simulations that take it together, by "
+    "their number; the band is from 10 % to 90 % of the trials. Dotted: half the time for twice as many."
 )
 _KERNELS = (
     "Each pass of a full-order step on its own. Moved: what it has to read and write, each value once. "
@@ -69,7 +74,7 @@ def write_report(folder: Path) -> Path:
         stem = re.sub("[^a-z0-9]+", "-", device.lower())
         parts.append(f"## On {device}")
         of_size = rows[rows["bench"].isin(["full_order", "scaling"])]
-        of_scene = rows[rows["bench"] == "reduced"]
+        of_scene, of_batch = (rows[rows["bench"] == name] for name in ("reduced", "batch"))
         if len(of_scene):
             caption = "Time of a step of both solvers by scene; a bar names δ of its run."
             with styled():
@@ -83,6 +88,10 @@ def write_report(folder: Path) -> Path:
         of_training = rows[rows["bench"] == "training"]
         if len(of_training):
             parts += [_TRAINING, _markdown(of_training)]
+        if len(of_batch):
+            with styled():
+                save(step_over_batch(of_batch), folder, f"batch-{stem}")
+            parts += [f"![{_BATCH}](batch-{stem}.png)", _BATCH, _markdown(of_batch)]
         if len(of_size):
             with styled():
                 save(step_over_particles(of_size, passes), folder, f"step-{stem}")
@@ -161,6 +170,34 @@ def step_beside_paper(stages: pd.DataFrame) -> Figure:
             }
         )
     return rings(rows)
+
+
+def step_over_batch(results: pd.DataFrame) -> Figure:
+    """Time of a simulation-step [ms] over the size of the batch, both axes logarithmic.
+
+    Args:
+        results: rows of `batch` of one device; a line for each number of particles and precision.
+    """
+    with styled():
+        fig = figure(4.4)
+        panel = fig.subplots()
+        lines = results.groupby(["particles", "precision"])
+        for i, ((particles, precision), part) in enumerate(lines):
+            part, style = part.sort_values("batch"), line_style(i)
+            B, median = part["batch"], part["ms_median"]
+            panel.fill_between(B, part["ms_p10"], part["ms_p90"], color=style["color"], alpha=0.18, lw=0)
+            name = f"{size_name(particles)} particles, {precision}"
+            panel.plot(B, median, marker="o", ms=4.5, label=name, **style)
+            shared = median.iloc[0] * B.iloc[0] / B
+            panel.plot(B, shared, ls=":", lw=1.2, color=style["color"])
+        panel.set(xscale="log", yscale="log")
+        panel.set(xlabel="simulations B [–]", ylabel="time of a simulation-step [ms]")
+        sizes = sorted(results["batch"].unique())
+        panel.set_xticks(sizes, [str(size) for size in sizes])
+        panel.minorticks_off()
+        panel.grid(which="major")
+        fig.legend(loc="outside upper left", ncols=2, handlelength=2.6)
+    return fig
 
 
 def steps_by_scene(results: pd.DataFrame) -> Figure:

@@ -14,12 +14,14 @@ class Settings:
         precisions: `fp32`, `fp64` or both, measured turn by turn.
         device: `cpu` or `cuda:N`.
         trials: measurements of each side.
+        scenes: of benchmarks of reduced steps; empty for all that these have.
     """
 
     particles: tuple[int, ...]
     precisions: tuple[str, ...]
     device: str
     trials: int
+    scenes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,8 @@ class Row:
         particles, sample, integration: P, |S| and |N|; None where there is none.
         batch: simulations that are stepped together, or points (particles of frames) of a training step.
         precision, device: of the solver.
-        ms_median, ms_p10, ms_p90: over the trials, of the mean time of a step in one [ms].
+        ms_median, ms_p10, ms_p90: over the trials, of the mean time of a step in one [ms]; that of one
+            simulation, so the step of a batch over its size.
         peak_mib: what every allocator holds at most beyond what was held before the solver was built [MiB];
             None where several processes work.
         delta: δ of the run that is timed, a fraction; None for a full-order run.

@@ -25,7 +25,7 @@ def run(settings: Settings, say: Callable[[str], object]) -> Result:
     Data are made, or reused, as by `nsf simulate`. A training goes from its files to the manifold.
     """
     found = Result()
-    for scene in SCENES:
+    for scene in settings.scenes or SCENES:
         overrides = [f"scene={scene}", f"scale={scale_of(settings.device)}", f"device={settings.device}"]
         measured(Pipeline(config.load(overrides), say=say), settings, found, say)
     return found

@@ -1,14 +1,23 @@
 """Reduced-order dynamics: latent time-stepping (paper section 5)."""
 
+from nsf.dynamics.batch import ReducedBatch
 from nsf.dynamics.cubature import CubatureSampler
-from nsf.dynamics.deployment import Rollout, calibrate, continuation_file, deploy, rollout, rollout_file
+from nsf.dynamics.deployment import (
+    Rollout,
+    calibrate,
+    continuation_file,
+    deploy,
+    rollout,
+    rollout_file,
+    rollouts,
+)
 from nsf.dynamics.handover import go_on, hand_over
 from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
 from nsf.dynamics.latent import Decoder, LatentState, LatentTrajectory
 from nsf.dynamics.projection import STOP_REASONS, GaussNewton, ProjectionResult, Taylor, stop_reasons
 from nsf.dynamics.qdeim import QdeimSampler
 from nsf.dynamics.sampling import GreedySampler, RandomSampler, SamplePhase, Sampler, UnweightedSampler
-from nsf.dynamics.solver import NSF, ReducedMPM
+from nsf.dynamics.solver import NSF, ReducedMPM, ReducedRun
 from nsf.dynamics.stress import Method
 from nsf.dynamics.trust import Trust
 
@@ -28,7 +37,9 @@ __all__ = [
     "ProjectionResult",
     "QdeimSampler",
     "RandomSampler",
+    "ReducedBatch",
     "ReducedMPM",
+    "ReducedRun",
     "Rollout",
     "SamplePhase",
     "Sampler",
@@ -42,5 +53,6 @@ __all__ = [
     "hand_over",
     "rollout",
     "rollout_file",
+    "rollouts",
     "stop_reasons",
 ]

@@ -54,7 +54,7 @@ class Arena:
         """Zeros."""
         return self.hold(torch.zeros(shape, device=self._torch), dtype)
 
-    def modes(self, modes: torch.Tensor) -> torch.Tensor:
+    def modes(self, modes: torch.Tensor, dtype: torch.dtype = torch.float32) -> torch.Tensor:
         """Modes [n, c, K] in vectors of four, in the order that the device reads best, flat.
 
         A GPU has the vectors of neighbouring particles side by side, [c, K/4, n, 4]; a CPU those of one
@@ -63,7 +63,17 @@ class Arena:
         modes = torch.nn.functional.pad(modes, (0, -modes.shape[2] % 4)).unflatten(2, (-1, 4))
         if self.device.is_cuda:
             modes = modes.permute(1, 2, 0, 3)
-        return self.hold(modes, torch.float32).flatten()
+        return self.hold(modes, dtype).flatten()
+
+    def halved(self, modes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """As `modes`, on a GPU in half precision, each over the length [K] that is given beside them.
+
+        A GPU reads them faster than anything else in a step; no entry exceeds 1, so that none is lost.
+        """
+        if not self.device.is_cuda:
+            return self.modes(modes), modes.new_ones(modes.shape[2])
+        lengths = modes.abs().amax((0, 1)).clamp_min(torch.finfo(modes.dtype).tiny)
+        return self.modes(modes / lengths, torch.float16), lengths
 
     def lanes(self, count: int) -> int:
         """Threads that work on one result: `count` of a GPU, one of a CPU."""

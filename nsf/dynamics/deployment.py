@@ -12,7 +12,8 @@ import pytorch_lightning as pl
 import torch
 from torch.utils.data import DataLoader
 
-from nsf.dynamics.solver import ReducedMPM
+from nsf.dynamics.batch import ReducedBatch
+from nsf.dynamics.solver import ReducedMPM, ReducedRun
 from nsf.dynamics.trust import LatentDistance, Trust, first_distrusted, training_values
 from nsf.errors import SchemaError
 from nsf.progress import Progress, quiet_lightning
@@ -41,9 +42,9 @@ class Rollout:
         residuals: [N, k + 1] projection residuals [m]; stops: [N] stop reasons.
         trust: [N + 1] how far each step is from the training data, in units of how far these are from
             themselves (`Trust.ratios`).
-        sample: |S| of the first phase; integration_mean: mean |N|.
+        sample: |S| of the first phase; integration_mean: mean |N| over all steps taken.
         needed_outside: most particles or nodes a step needed outside the superset.
-        seconds: wall time of the steps, without set-up.
+        seconds: wall time of the steps, without set-up; of a batch, an equal share of it.
         diverged: step at which x̂ ceased to be finite or a sample particle left the grid, −1 when neither did.
         handed_over: step from whose state the full-order solver goes on, −1 when it does not. The steps then
             end with the first distrusted one.
@@ -117,7 +118,7 @@ class Deployment(pl.LightningModule):
     """Lightning module whose prediction step is a reduced run a parameter value.
 
     Args:
-        solver_at: parameter value and device name → a `ReducedMPM` at t = 0.
+        solver_at, batch_at: as for `deploy`.
         trust: the estimate of whether to believe a run.
         until_distrusted: as for `rollout`.
         progress: told of each run done.
@@ -126,20 +127,23 @@ class Deployment(pl.LightningModule):
     def __init__(
         self,
         solver_at: Callable[[float, str], ReducedMPM],
+        batch_at: Callable[[Sequence[float], str], ReducedBatch] | None,
         trust: Trust,
         until_distrusted: bool,
         progress: Progress,
     ):
         super().__init__()
-        self._solver_at, self._trust, self._progress = solver_at, trust, progress
-        self._until_distrusted = until_distrusted
+        self._solver_at, self._batch_at, self._progress = solver_at, batch_at, progress
+        self._how = trust, until_distrusted
 
     def predict_step(self, batch: torch.Tensor, batch_idx: int) -> list[Rollout]:
-        """Run each parameter value of a batch [B] from t = 0 to T."""
-        runs = []
-        for value in batch.tolist():
-            solver = self._solver_at(value, str(self.device))
-            runs.append(rollout(solver, value, self._trust, self._until_distrusted))
+        """Run each parameter value of a batch [B] from t = 0 to T; several take their steps together."""
+        values = batch.tolist()
+        if len(values) > 1:
+            runs = rollouts(self._batch_at(values, str(self.device)), values, *self._how)
+        else:
+            runs = [rollout(self._solver_at(value, str(self.device)), value, *self._how) for value in values]
+        for _ in runs:
             self._progress.advance()
         return runs
 
@@ -154,7 +158,31 @@ def rollout(solver: ReducedMPM, parameter: float, trust: Trust, until_distrusted
         until_distrusted: stop at the first step that is not to be believed, and name the one before it from
             whose state a full-order run can go on: the last whose time is a whole number of the scene's Δt.
     """
-    seconds = _timed_run(solver, trust if until_distrusted else None)
+    seconds = _timed_run(solver, [solver], trust if until_distrusted else None)
+    return _rollout_of(solver, parameter, trust, until_distrusted, seconds)
+
+
+def rollouts(
+    batch: ReducedBatch, parameters: Sequence[float], trust: Trust, until_distrusted: bool = False
+) -> list[Rollout]:
+    """Run a batch to the end of its scene.
+
+    Args:
+        batch: at t = 0.
+        parameters: value of the problem parameter of each run, for the record.
+        trust, until_distrusted: as for `rollout`; steps are taken for as long as any run is to be believed.
+    """
+    seconds = _timed_run(batch, batch.runs, trust if until_distrusted else None) / len(batch)
+    return [
+        _rollout_of(run, value, trust, until_distrusted, seconds)
+        for run, value in zip(batch.runs, parameters, strict=True)
+    ]
+
+
+def _rollout_of(
+    solver: ReducedRun, parameter: float, trust: Trust, until_distrusted: bool, seconds: float
+) -> Rollout:
+    """What a run that has ended leaves."""
     taken = solver.steps_taken
     latent = solver.trajectory()
     diverged, handed_over, steps = solver.left_grid(), -1, taken
@@ -181,8 +209,8 @@ def rollout(solver: ReducedMPM, parameter: float, trust: Trust, until_distrusted
     )
 
 
-def _timed_run(solver: ReducedMPM, trust: Trust | None) -> float:
-    """Take every step, or with an estimate of trust stop soon after the first one it does not believe.
+def _timed_run(solver: ReducedMPM | ReducedBatch, runs: Sequence[ReducedRun], trust: Trust | None) -> float:
+    """Take every step, or with an estimate of trust stop soon after it believes none of the runs any more.
 
     Returns:
         Wall time [s] of the steps; the first, which compiles, loads and captures, counts as the others' mean.
@@ -190,12 +218,17 @@ def _timed_run(solver: ReducedMPM, trust: Trust | None) -> float:
     solver.step(1)
     wait = synchronizer(solver.device)
     wait()
-    looked, started = 0, time.perf_counter()
+    believed, looked, started = runs, 0, time.perf_counter()
     look = solver.total_steps if trust is None else _LOOK
     while solver.steps_taken < solver.total_steps:
         solver.step(min(look, solver.total_steps - solver.steps_taken))
         if trust is not None:
-            if first_distrusted(_ratios(solver, trust, solver.left_grid(since=looked + 1))) >= 0:
+            believed = [
+                run
+                for run in believed
+                if first_distrusted(_ratios(run, trust, run.left_grid(since=looked + 1))) < 0
+            ]
+            if not believed:
                 break
             looked = solver.steps_taken
     wait()
@@ -203,7 +236,7 @@ def _timed_run(solver: ReducedMPM, trust: Trust | None) -> float:
     return (time.perf_counter() - started) * taken / max(1, taken - 1)
 
 
-def _ratios(solver: ReducedMPM, trust: Trust, diverged: int) -> np.ndarray:
+def _ratios(solver: ReducedRun, trust: Trust, diverged: int) -> np.ndarray:
     """Trust of the steps taken [n + 1]; ∞ from the step at which the run diverged."""
     latent = solver.trajectory()
     ratios = trust.ratios(latent.xhat, latent.residuals[:, -1])
@@ -251,6 +284,8 @@ def deploy(
     device: str,
     trust: Trust,
     until_distrusted: bool = False,
+    batch_at: Callable[[Sequence[float], str], ReducedBatch] | None = None,
+    batch: int = 1,
 ) -> list[Rollout]:
     """Reduced runs at every parameter value, with a progress bar.
 
@@ -259,11 +294,13 @@ def deploy(
         values: parameter values.
         device: `cpu`, `cuda` or `cuda:N`.
         trust, until_distrusted: as for `rollout`.
+        batch_at: several parameter values and device name → a batch of them at t = 0.
+        batch: most values that take their steps together; more than one need `batch_at`.
 
     Raises:
         KeyboardInterrupt: passed on; Lightning would exit with code 1.
     """
-    loader = DataLoader(torch.tensor(list(values), dtype=torch.float64), batch_size=1, num_workers=0)
+    loader = DataLoader(torch.tensor(list(values), dtype=torch.float64), batch_size=batch, num_workers=0)
     cuda = torch.device(device).type == "cuda"
     with quiet_lightning(), Progress("deploy", len(values), "runs") as progress:
         trainer = pl.Trainer(
@@ -276,7 +313,8 @@ def deploy(
             inference_mode=False,  # torch's inference tensors could not be updated in place between steps
         )
         try:
-            batches = trainer.predict(Deployment(solver_at, trust, until_distrusted, progress), loader)
+            deployment = Deployment(solver_at, batch_at, trust, until_distrusted, progress)
+            batches = trainer.predict(deployment, loader)
         except SystemExit as stop:
             raise KeyboardInterrupt from stop
     return [run for batch in batches for run in batch]

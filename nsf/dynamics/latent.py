@@ -1,6 +1,7 @@
 """What a reduced run leaves: latent vectors, and the particle fields decoded from them."""
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -36,23 +37,38 @@ class LatentRecord:
     """Where a run is and what its steps leave, on the device: filled in place and without a read-back.
 
     Args:
-        xhat: [r] latent vector at t = 0.
+        xhat: [r] latent vector at t = 0, or [B, r] those of B runs, whose arrays then begin with B.
         steps: most steps.
         iterations: k, those of the projector.
 
     Attributes:
         now, before: [r] x̂_n and x̂_{n−1}.
-        row: [1] n.
+        row: [1] n, or [B].
         xhat: [steps + 1, r] latent vectors; zero where no step has been.
         residuals: [steps, k + 1] and updates: [steps, k], as in `ProjectionResult`.
     """
 
     def __init__(self, xhat: torch.Tensor, steps: int, iterations: int):
+        runs, r = xhat.shape[:-1], xhat.shape[-1]
         self.now, self.before = xhat.clone(), xhat.clone()
-        self.xhat = xhat.new_zeros(steps + 1, len(xhat))
-        self.xhat[0] = xhat
-        self.residuals, self.updates = (xhat.new_zeros(steps, k) for k in (iterations + 1, iterations))
-        self.row = torch.zeros(1, dtype=torch.int64, device=xhat.device)
+        self.xhat = xhat.new_zeros(*runs, steps + 1, r)
+        self.xhat[..., 0, :] = xhat
+        self.residuals, self.updates = (xhat.new_zeros(*runs, steps, k) for k in (iterations + 1, iterations))
+        self.row = torch.zeros(runs.numel(), dtype=torch.int64, device=xhat.device)
+
+    def of(self, run: int) -> "LatentRecord":
+        """That of one of several runs, sharing memory."""
+        own = copy(self)
+        own.row = self.row[run : run + 1]
+        for name in ("now", "before", "xhat", "residuals", "updates"):
+            setattr(own, name, getattr(self, name)[run])
+        return own
+
+    def restart(self) -> None:
+        """Go back to t = 0; what was recorded stays until it is written over."""
+        for latest in (self.now, self.before):
+            latest.copy_(self.xhat[..., 0, :])
+        self.row.zero_()
 
     @property
     def nbytes(self) -> int:

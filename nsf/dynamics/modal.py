@@ -1,5 +1,7 @@
 """A phase whose fields are modes times coefficients: a step is a few kernels, and torch takes no part."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 import warp as wp
@@ -17,6 +19,7 @@ from nsf.dynamics.modal_kernels import (
     make_layer,
     make_position,
     make_selection,
+    tiling,
 )
 from nsf.dynamics.phase import Phase, Setting, Stages
 from nsf.dynamics.projection import GaussNewton, Taylor
@@ -53,7 +56,8 @@ class ModalPhase(Phase):
 
     The networks run once a step, on x̂ alone; modes and coefficients are contracted at those particles of N
     that the step needs, which are found at each step among the sets'; and the projection works on
-    coefficients. Mathematically a step is that of `DecodedPhase`.
+    coefficients. Mathematically a step is that of `DecodedPhase`. Several simulations share modes, networks
+    and candidates, and every launch.
 
     Args:
         setting: of the solver; its projector is `GaussNewton` or `Taylor`.
@@ -61,8 +65,8 @@ class ModalPhase(Phase):
         grid_step: the shared P2G, grid update and G2P; shape: its B-spline.
         manifold: a `BasisManifold` whose networks are `layered`.
         method: which of τ and C come from fields.
-        parameters: [n_parameters] μ.
-        material: the law, for a τ that comes from ∂g/∂X.
+        parameters: [simulations, n_parameters] μ.
+        materials: the law in each simulation, for a τ that comes from ∂g/∂X.
         weights: [s] of S in the projection; None for all one.
     """
 
@@ -75,20 +79,22 @@ class ModalPhase(Phase):
         manifold,
         method: Method,
         parameters: torch.Tensor,
-        material: Material,
+        materials: Sequence[Material],
         weights: np.ndarray | None,
     ):
-        order = _by_cell(sets, setting.constants.X, grid_step.grid.geometry.dx, shape)
+        order = _by_cell(sets, setting.constants[0].X, grid_step.grid.geometry.dx, shape)
         at_sample = manifold.restrict(sets.sample, dtype=setting.dtype, device=setting.device)
         super().__init__(setting, sets, order, grid_step, at_sample)
         self._arena = arena = Arena(setting.precision, warp_device(str(setting.device)))
         deformation = manifold.factors("deformation", order, dtype=setting.dtype, device=setting.device)
         displacement = arena.modes(deformation.modes)
-        self.coefficients = state = Coefficients(arena, deformation.modes.shape[2], manifold.latent_dim)
+        self.coefficients = state = Coefficients(
+            arena, setting.simulations, deformation.modes.shape[2], manifold.latent_dim
+        )
         self._place = _placing(arena, state, deformation.mean, displacement, self)
         self._selection = Selection(arena, state, grid_step.grid, shape, sets, self.x, self.v)
         self.needed = self._selection.needed
-        self._networks, self._fields = _fields(arena, self, manifold, method, order, parameters, material)
+        self._networks, self._fields = _fields(arena, self, manifold, method, order, parameters, materials)
         self._projection = Projection(arena, state, deformation, displacement, self, weights)
 
     @property
@@ -106,7 +112,7 @@ class ModalPhase(Phase):
     def enter(self, first: bool) -> None:
         record, state = self.setting.record, self.coefficients
         for xhat in (record.before, record.now):
-            state.latent.copy_(xhat)
+            state.latent.copy_(xhat.view_as(state.latent))
             with on_torch_stream(self._arena.device):
                 self._projection.evaluate.launch()
         state.first.fill_(int(first))
@@ -131,9 +137,9 @@ class ModalPhase(Phase):
 
     @property
     @override
-    def mean_size(self) -> float:
-        found, steps = self._selection.count.tolist()
-        return found / steps if steps else float(self.size)
+    def mean_sizes(self) -> list[float]:
+        counts = self._selection.count.tolist()
+        return [found / steps if steps else float(self.size) for found, steps in counts]
 
     @property
     @override
@@ -142,28 +148,31 @@ class ModalPhase(Phase):
 
 
 class Coefficients:
-    """Where a run is, in coefficients, on the device.
+    """Where B simulations are, in coefficients, on the device.
 
     Attributes:
-        latent: [r] x̂_n in fp64.
-        a, rate: [K] coefficients of the displacement and their backward difference [1/s].
-        tangents: [K r] ∂a/∂x̂.
-        first: [1] whether the next step is the first of the run.
-        step: [1] a number that no two steps share.
+        latent: [B, r] x̂_n in fp64.
+        a, rate: [B, K] coefficients of the displacement and their backward difference [1/s].
+        tangents: [B, K r] ∂a/∂x̂.
+        first: [B] whether the next step is the first of the run.
+        step: [B] a number that no two steps share.
     """
 
-    def __init__(self, arena: Arena, modes: int, latents: int):
-        self.latent, self.a, self.rate = arena.zeros(latents), arena.zeros(modes), arena.zeros(modes)
-        self.tangents = arena.zeros(modes * latents)
-        self.first, self.step = (arena.zeros(1, dtype=torch.int32) for _ in range(2))
+    def __init__(self, arena: Arena, simulations: int, modes: int, latents: int):
+        sizes = (latents, modes, modes, modes * latents)
+        self.latent, self.a, self.rate, self.tangents = (arena.zeros(simulations, n) for n in sizes)
+        self.first, self.step = (arena.zeros(simulations, dtype=torch.int32) for _ in range(2))
+
+    def __len__(self) -> int:
+        return len(self.step)
 
 
 class Selection:
     """Finds at each step which candidates the step of S needs.
 
     Attributes:
-        needed: [n] whether a candidate is.
-        count: [2] particles needed in all steps taken, and the number of these.
+        needed: [B, n] whether a candidate is.
+        count: [B, 2] particles needed in all steps taken, and the number of these.
         launches: in order.
     """
 
@@ -177,20 +186,17 @@ class Selection:
             upper = np.minimum(stored.max(0) + reach, nodes - 1)
         extent = upper - lower + 1
         box = wp.vec3i(*lower.tolist()), wp.vec3i(*extent.tolist())
-        self.needed = arena.zeros(len(x), dtype=torch.int32)
-        self.count = arena.zeros(2, dtype=torch.int64)
-        stamps = arena.zeros(int(extent.prod()), dtype=torch.int32)
-        stamp, select = make_selection(precision, shape)
+        B, s = len(state), len(sets.sample)
+        self.needed = arena.zeros(B, len(x) // B, dtype=torch.int32)
+        self.count = arena.zeros(B, 2, dtype=torch.int64)
+        stamps = arena.zeros(B, int(extent.prod()), dtype=torch.int32)
+        stamp, select = make_selection(precision, shape, B > 1)
         positions, velocities = as_vectors(x, precision), as_vectors(v, precision)
-        shared = [precision.real(1.0 / grid.geometry.dx), *box, state.step, stamps]
+        shared = [precision.real(1.0 / grid.geometry.dx), *box, state.step, stamps, s]
         around = (2 * reach + 1) ** 3
         self.launches = [
-            arena.pack(stamp, len(sets.sample) * around, [positions, *shared]),
-            arena.pack(
-                select,
-                len(x),
-                [*shared, len(sets.sample), grid.shape, positions, velocities, self.needed, self.count],
-            ),
+            arena.pack(stamp, B * s * around, [positions, *shared]),
+            arena.pack(select, len(x), [*shared, grid.shape, positions, velocities, self.needed, self.count]),
         ]
 
 
@@ -203,38 +209,45 @@ class Projection:
     """
 
     def __init__(self, arena, state, deformation, displacement, phase: Phase, weights: np.ndarray | None):
-        setting, s, K = phase.setting, phase.s, len(state.a)
-        projector, record, r = setting.projector, setting.record, len(state.latent)
+        setting, s, (count, K) = phase.setting, phase.s, state.a.shape
+        projector, record, r = setting.projector, setting.record, state.latent.shape[1]
         of_sample = deformation.modes[:s]
         w = torch.ones(s) if weights is None else torch.as_tensor(weights / np.mean(weights))
         w = arena.hold(w, torch.float64)
         B = of_sample.double().flatten(0, 1)
         G = arena.hold(B.T @ (w.repeat_interleave(3)[:, None] * B), torch.float64).flatten()
-        b = arena.zeros(K + 1)
+        b = arena.zeros(count, K + 1)
         widths, weights = _closure(deformation, arena.device.is_cuda)
         weights = arena.hold(weights, torch.float32)
         members = deformation.members if widths else 1
-        lanes, velocity = arena.lanes(THREADS), as_vectors(phase.v[:s], arena.precision)
+        lanes, velocity = arena.lanes(THREADS), as_vectors(phase.v, arena.precision)
         gather = arena.pack(
-            make_gathering(arena.precision),
-            (K + 1) * lanes,
-            [displacement, len(phase.x), -(-K // 4), velocity, w, wp.float64(setting.dt), lanes, b],
+            make_gathering(arena.precision, count > 1),
+            count * (K + 1) * lanes,
+            [displacement, phase.size, -(-K // 4), velocity, w, wp.float64(setting.dt), lanes, b],
             THREADS,
         )
-        kernel = make_projection(arena.precision, widths, members, r, K)
+        kernel = make_projection(arena.precision, widths, members, r, K, count > 1)
         sigma = arena.hold(deformation.leading, torch.float64)
         block = projection_block(widths)
         threads = members * block if arena.device.is_cuda else 1
-        meeting = [arena.zeros(2 * members * (K - r) * (r + 1)), arena.zeros(2, dtype=torch.int32)]
+        meeting = [
+            arena.zeros(count, 2 * members * (K - r) * (r + 1)),
+            arena.zeros(count, 2, dtype=torch.int32),
+        ]
         linear = int(isinstance(projector, Taylor))
+
+        def of_each(values: torch.Tensor) -> torch.Tensor:
+            """[count, entries of a simulation], sharing memory."""
+            return values.view(count, -1)
 
         def solve(iterations: int) -> wp.Launch:
             how = [wp.float64(s), iterations, wp.float64(projector.tolerance), linear, wp.float64(setting.dt)]
             latents = [state.latent, state.a, state.tangents, state.rate, record.now, record.before]
-            kept = [record.xhat.flatten(), record.residuals.flatten(), record.updates.flatten(), record.row]
+            kept = [record.xhat, record.residuals, record.updates, record.row]
+            own = map(of_each, [*latents, *kept, state.first, state.step])
             sums = [weights, wp.float64(deformation.scale), sigma, G, b]
-            arguments = [*sums, *how, *latents, *kept, state.first, state.step, *meeting]
-            return arena.pack(kernel, threads, arguments, block)
+            return arena.pack(kernel, count * threads, [*sums, *how, *own, *meeting, threads], block)
 
         self.launches, self.evaluate = [gather, solve(projector.iterations)], solve(0)
 
@@ -269,14 +282,15 @@ def _placing(arena: Arena, state: Coefficients, mean: torch.Tensor, modes: torch
     """The launch that gives x and v at N."""
     vectors = [as_vectors(a, arena.precision) for a in (phase.initial_velocity, phase.x, phase.v)]
     mean = as_vectors(arena.hold(mean, arena.real), arena.precision)
-    inputs = [mean, modes, state.a, state.rate, vectors[0], state.first, *vectors[1:]]
-    return arena.pack(
-        make_position(arena.precision, -(-len(state.a) // 4)), arena.whole_blocks(len(phase.x)), inputs
-    )
+    # Of a and ȧ, in whole vectors of four.
+    (tiles, tile), lanes = tiling(len(state), 16 * -(-state.a.shape[1] // 4) * 4), arena.lanes(THREADS)
+    inputs = [mean, modes, state.a, state.rate, vectors[0], state.first, tiles, lanes, *vectors[1:]]
+    kernel = make_position(arena.precision, -(-state.a.shape[1] // 4), tile, tiles > 1)
+    return arena.pack(kernel, tiles * arena.whole_blocks(phase.size, THREADS), inputs, THREADS)
 
 
 def _fields(
-    arena, phase: ModalPhase, manifold, method: Method, order, parameters, material
+    arena, phase: ModalPhase, manifold, method: Method, order, parameters, materials
 ) -> tuple[list, list]:
     """The launches of the networks, and then those that give τ and C at N, as the method takes them."""
     options = {"dtype": arena.real, "device": phase.setting.device}
@@ -290,18 +304,20 @@ def _fields(
             if factors.modes.shape[2]:
                 heads.append((factors, found))
             else:  # the same in every snapshot
-                found.copy_(_as_matrices(factors.mean))
-    networks, coefficients = _networks(arena, [f.layers for f, _ in heads], phase.setting.record, parameters)
+                found.unflatten(0, (-1, phase.size)).copy_(_as_matrices(factors.mean))
+    stored = [arena.halved(factors.modes) for factors, _ in heads]
+    layers = [_lengthened(f.layers, lengths) for (f, _), (_, lengths) in zip(heads, stored, strict=True)]
+    networks, coefficients = _networks(arena, layers, phase.setting.record, parameters)
     launches = [
-        _contraction(arena, phase, factors, a, found)
-        for (factors, found), a in zip(heads, coefficients, strict=True)
+        _contraction(arena, phase, factors, modes, a, found)
+        for (factors, found), (modes, _), a in zip(heads, stored, coefficients, strict=True)
     ]
     if not method.neural_stress:
-        F = arena.zeros(len(order), 3, 3, dtype=arena.real)
+        F = arena.zeros(len(phase.x), 3, 3, dtype=arena.real)
         factors = manifold.factors("gradient", order, **options)
         launches += [
-            _contraction(arena, phase, factors, phase.coefficients.a, F),
-            _elastic(arena, phase, material, F),
+            _contraction(arena, phase, factors, arena.modes(factors.modes), phase.coefficients.a, F),
+            _elastic(arena, phase, materials, F),
         ]
     return networks, launches
 
@@ -311,44 +327,62 @@ def _as_matrices(mean: torch.Tensor) -> torch.Tensor:
     return (mean[:, np.ravel(TAU_MATRIX)] if mean.shape[1] == 6 else mean).unflatten(1, (3, 3))
 
 
+def _lengthened(layers: list, lengths: torch.Tensor) -> list:
+    """The layers of a network whose outputs are longer by these factors."""
+    *hidden, (W, b) = layers
+    lengths = lengths.to(W)
+    return [*hidden, (lengths[:, None] * W, lengths * b)]
+
+
 def _networks(arena: Arena, networks: list, record: LatentRecord, parameters) -> tuple[list, list]:
     """The launches of the heads, layer by layer and both at once, and where they leave their coefficients."""
-    inputs = [record.now] * len(networks)
-    launches, lanes = [], arena.lanes(WARP)
+    B = len(parameters)
+    inputs = [record.now.view(B, -1)] * len(networks)
+    launches, lanes, (tiles, tile) = [], arena.lanes(WARP), tiling(B)
     for layers in zip(*networks, strict=True):
         first, last = not launches, len(launches) == len(networks[0]) - 1
         weights = []
         for W, b in layers:
+            biases = [b] * B
             if first:  # x̂ is followed by the problem parameters, which do not change in a run
-                r = len(record.now)
-                W, b = W[:, :r], b + W[:, r:] @ parameters.to(W)[: W.shape[1] - r]
-            weights.append([arena.hold(W, arena.real), arena.hold(b, arena.real)])
-        outputs = [arena.zeros(len(b), dtype=arena.real) for _, b in weights]
+                r = inputs[0].shape[1]
+                biases = [b + W[:, r:] @ values.to(W)[: W.shape[1] - r] for values in parameters]
+                W = W[:, :r]
+            weights.append([arena.hold(W, arena.real), arena.hold(torch.stack(biases), arena.real)])
+        outputs = [arena.zeros(*b.shape, dtype=arena.real) for _, b in weights]
         sides = [[*w, x] for w, x in zip(weights, inputs, strict=True)]
+        count = sum(y.shape[1] for y in outputs)
         # One network alone stands on both sides; the second gets no thread.
-        arguments = [*sides[0], *sides[-1], int(not last), lanes, outputs[0], outputs[-1]]
-        threads = sum(len(y) for y in outputs) * lanes
-        launches.append(arena.pack(make_layer(arena.precision), threads, arguments))
+        arguments = [*sides[0], *sides[-1], int(not last), lanes, count, outputs[0], outputs[-1]]
+        kernel = make_layer(arena.precision, tile, tiles > 1)
+        launches.append(arena.pack(kernel, tiles * count * lanes, arguments))
         inputs = outputs
     return launches, inputs
 
 
 def _contraction(
-    arena: Arena, phase: ModalPhase, factors: ModalFactors, a: torch.Tensor, found: torch.Tensor
+    arena: Arena,
+    phase: ModalPhase,
+    factors: ModalFactors,
+    modes: torch.Tensor,
+    a: torch.Tensor,
+    found: torch.Tensor,
 ):
-    """The launch of a field with coefficients a at the needed particles."""
+    """The launch of a field with coefficients a [B, K] of the arena's modes, at the needed particles."""
     n, c, K = factors.modes.shape
-    kernel = make_contraction(arena.precision, -(-K // 4), c == 6, wp.dtype_from_torch(a.dtype))
+    (tiles, tile), lanes = tiling(len(a), a.element_size() * -(-K // 4) * 4), arena.lanes(THREADS)
+    coefficients, stored = (wp.dtype_from_torch(values.dtype) for values in (a, modes))
+    kernel = make_contraction(arena.precision, -(-K // 4), c == 6, coefficients, tile, tiles > 1, stored)
     mean = arena.hold(factors.mean, arena.real)
-    return arena.pack(
-        kernel, arena.whole_blocks(c // 3 * n), [phase.needed, mean, arena.modes(factors.modes), a, found]
-    )
+    inputs = [phase.needed, mean, modes, a, tiles, lanes, found]
+    return arena.pack(kernel, tiles * arena.whole_blocks(c // 3 * n, THREADS), inputs, THREADS)
 
 
-def _elastic(arena: Arena, phase: ModalPhase, material: Material, F: torch.Tensor):
+def _elastic(arena: Arena, phase: ModalPhase, materials: Sequence[Material], F: torch.Tensor):
     """The launch of τ = τ(F) at N; without flow the history keeps its values at rest."""
-    precision, n = arena.precision, len(F)
-    history = arena.hold(material.initial_history(n), arena.real)
+    precision, n, material = arena.precision, len(F), materials[0]
+    history = np.concatenate([one.initial_history(phase.size) for one in materials])
+    history = arena.hold(history, arena.real)
     vecH = wp.types.vector(length=material.history_size, dtype=precision.real)
     kernel = make_elastic_stress(material.functions(precision), precision, material.history_size)
     matrices = [as_matrices(a, precision) for a in (F, phase.tau)]

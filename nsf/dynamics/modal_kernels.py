@@ -2,69 +2,143 @@
 
 Nothing here is read back to the host, and no launch depends on a value, so a step is one CUDA graph.
 A few sums go over the threads of a block or of a warp by native code; on a CPU a block is one thread.
+What each of several simulations has of its own lies simulation by simulation in the arrays; modes and weights
+are common to all, and a thread reads them once for a tile of simulations.
 """
 
 from functools import cache
 
 import warp as wp
 
+from nsf.dynamics.projection_kernel import SHARED, TAKEN
 from nsf.mpm import Precision
+from nsf.mpm.copies import make_copies
 from nsf.mpm.grid import inside
 from nsf.mpm.shape import shape_functions
 
 THREADS = 128  # of a block that shares coefficients, or a sum over S
 _AHEAD = 4  # vectors of modes whose loads are under way together
+_TILE = 8  # most simulations of one thread: their sums fill its registers
 
 
-def _combination(names: str, coefficient: str) -> str:
-    """Native code of the sums name_1..name_3 = Σ_k modes[p, c..c+2, k] name_k, for each name.
+def tiling(simulations: int, shared: int = 0) -> tuple[int, int]:
+    """Tiles, and simulations of a tile, so that none is much emptier than the others.
 
-    The K modes lie in vectors of four, on a GPU those of neighbouring particles side by side (`Arena.modes`):
-    what is under way then covers the time that memory takes, even for few particles. A GPU first takes the
-    coefficients into shared memory, for which all threads of a block are needed, also those beyond the last
-    particle; one that is not `live` only helps with that. A CPU may change the order of additions, so that it
-    works on several at once.
+    Args:
+        simulations: in all.
+        shared: memory [byte] that a block shares for each simulation of its tile.
     """
+    most = max(1, min(_TILE, (SHARED - TAKEN) // max(shared, 1)))
+    tiles = -(-simulations // most)
+    return tiles, -(-simulations // tiles)
+
+
+@cache
+def _make_placing(several: bool):
+    """Warp functions (thread, tiles, lanes) → its tile, and its number among the threads of that tile.
+
+    Blocks of `lanes` threads are of one tile; those of the tiles follow each other, so that they find in a
+    cache the modes of the same particles.
+    """
+    if several:
+
+        @wp.func
+        def tile_of(thread: int, tiles: int, lanes: int):
+            return thread / lanes % tiles
+
+        @wp.func
+        def within(thread: int, tiles: int, lanes: int):
+            return thread / (lanes * tiles) * lanes + thread % lanes
+
+    else:
+
+        @wp.func
+        def tile_of(thread: int, tiles: int, lanes: int):
+            return 0
+
+        @wp.func
+        def within(thread: int, tiles: int, lanes: int):
+            return thread
+
+    return tile_of, within
+
+
+# Four numbers in half precision → float4.
+_WIDENED = """
+        auto widened = [](const uint2 four) {
+            float4 w;
+            asm("{.reg .f16 a, b; mov.b32 {a, b}, %2; cvt.f32.f16 %0, a; cvt.f32.f16 %1, b;}"
+                : "=f"(w.x), "=f"(w.y) : "r"(four.x));
+            asm("{.reg .f16 a, b; mov.b32 {a, b}, %2; cvt.f32.f16 %0, a; cvt.f32.f16 %1, b;}"
+                : "=f"(w.z), "=f"(w.w) : "r"(four.y));
+            return w;
+        };
+"""
+
+
+def _combination(names: str, coefficient: str, tile: int, several: bool, half: bool = False) -> str:
+    """Native code of the sums Σ_k modes[p, c..c+2, k] name_k, for each simulation of a tile and each name.
+
+    They are `sum`: three of the first name, three of the next, and so on for the next simulation; the first
+    of the tile is `start`. The K modes lie in vectors of four, on a GPU those of neighbouring particles side
+    by side (`Arena.modes`): what is under way then covers the time that memory takes, even for few particles.
+    A GPU first takes the coefficients into shared memory, for which all threads of a block are needed, also
+    those beyond the last particle; one that is not `live` only helps with that. A CPU may change the order of
+    additions, so that it works on several at once. `half`: a GPU has the modes in half precision.
+    """
+    load = "__ldg" if several else "__ldcs"  # another tile will read the same modes, or nothing will
+    load, stored, ahead = (f"widened({load}", "uint2", 2 * _AHEAD) if half else (f"({load}", "float4", _AHEAD)
     names = names.split()
-    each = "".join
-    sums = each(f"real {n}_1 = 0, {n}_2 = 0, {n}_3 = 0;" for n in names)
-
-    def terms(mode: str, coefficient: str) -> str:
-        return each(
-            f"{n}_{i + 1} += real({mode.format(i)}) * real({coefficient.format(n)});"
-            for n in names
-            for i in range(3)
-        )
-
-    of_four = each(terms(f"w{{}}.{x}", f"shared_{{}}[4 * q + {i}]") for i, x in enumerate("xyzw"))
-    shared = each(f"__shared__ {coefficient} shared_{n}[4 * Q];" for n in names)
-    filled = each(f"shared_{n}[k] = k < {n}.shape[0] ? {n}.data[k] : 0;" for n in names)
+    each, size = "".join, 3 * len(names)
+    totals = [(n, i, f"sum[{size} * s + {3 * m + i}]") for m, n in enumerate(names) for i in range(3)]
+    of_four = each(
+        f"{total} += real(w{i}.{x}) * real(shared_{n}[s][4 * q + {j}]);"
+        for j, x in enumerate("xyzw")
+        for n, i, total in totals
+    )
+    zero = each(f"real {n}_{i} = 0;" for n, i, _ in totals)
+    of_one = each(f"{n}_{i} += real(w{i}) * real({n}.data[(start + s) * K + k]);" for n, i, _ in totals)
+    kept = each(f"{total} = {n}_{i};" for n, i, total in totals)
+    shared = each(f"__shared__ {coefficient} shared_{n}[{tile}][4 * Q];" for n in names)
+    filled = each(f"shared_{n}[s][k] = known ? {n}.data[(start + s) * K + k] : 0;" for n in names)
     return f"""
-    {sums}
+    const int K = {names[0]}.shape[1], simulations = {names[0]}.shape[0];
+    wp::vec_t<{size * tile}, real> sum;
 #if defined(__CUDA_ARCH__)
     {shared}
-    for (int k = threadIdx.x; k < 4 * Q; k += blockDim.x) {{ {filled} }}
+    for (int e = threadIdx.x; e < {tile} * 4 * Q; e += blockDim.x) {{
+        const int s = e / (4 * Q), k = e % (4 * Q);
+        const bool known = k < K && start + s < simulations;
+        {filled}
+    }}
     __syncthreads();
     if (live) {{
-        const float4* first = (const float4*)modes.data + size_t(c) * Q * particles + p;
-        #pragma unroll {_AHEAD}
+        {_WIDENED if half else ""}
+        const {stored}* first = (const {stored}*)modes.data + size_t(c) * Q * particles + p;
+        #pragma unroll {ahead}
         for (int q = 0; q < Q; ++q) {{
-            const float4 w0 = __ldcs(first + size_t(q) * particles);
-            const float4 w1 = __ldcs(first + size_t(Q + q) * particles);
-            const float4 w2 = __ldcs(first + size_t(2 * Q + q) * particles);
-            {of_four}
+            const float4 w0 = {load}(first + size_t(q) * particles));
+            const float4 w1 = {load}(first + size_t(Q + q) * particles));
+            const float4 w2 = {load}(first + size_t(2 * Q + q) * particles));
+            #pragma unroll
+            for (int s = 0; s < {tile}; ++s) {{ {of_four} }}
         }}
     }}
 #else
     if (live) {{
         #pragma clang fp reassociate(on)
         const wp::float32* first = modes.data + (size_t(p) * components + c) * 4 * Q;
-        for (int k = 0; k < {names[0]}.shape[0]; ++k) {{
-            const wp::float32 w0 = first[k], w1 = first[4 * Q + k], w2 = first[8 * Q + k];
-            {terms("w{}", "{}.data[k]")}
+        for (int s = 0; s < {tile} && start + s < simulations; ++s) {{
+            {zero}
+            for (int k = 0; k < K; ++k) {{
+                const wp::float32 w0 = first[k], w1 = first[4 * Q + k], w2 = first[8 * Q + k];
+                {of_one}
+            }}
+            {kept}
         }}
     }}
 #endif
+    return sum;
 """
 
 
@@ -73,62 +147,89 @@ def _scalar(precision: Precision) -> str:
 
 
 @cache
-def make_position(precision: Precision, vectors: int):
-    """Kernel of x and v at N, one thread a particle, launched over whole blocks.
+def make_position(precision: Precision, vectors: int, tile: int = 1, several: bool = False):
+    """Kernel of x and v at N, one thread a particle and tile of simulations, launched over whole blocks.
 
     x = mean + Σ_k b_k a_k and v = Σ_k b_k ȧ_k, where ȧ is the backward difference of a (paper section 5.1:
-    there is no v field); in the first step v is the initial velocity.
+    there is no v field); in the first step v is the initial velocity. `several` tiles have blocks in turn.
     """
     real, vec3 = precision.real, precision.vec3
-    vec6 = wp.types.vector(length=6, dtype=real)
+    sums = wp.types.vector(length=6 * tile, dtype=real)
+    tile_of, within = _make_placing(several)
     snippet = f"""
     typedef {_scalar(precision)} real;
-    const int Q = {vectors}, c = 0, components = 3, particles = x.shape[0];
+    const int Q = {vectors}, c = 0, components = 3, particles = mean.shape[0];
     const bool live = p < particles;
-    {_combination("a rate", "double")}
-    return wp::vec_t<6, real>({{a_1, a_2, a_3, rate_1, rate_2, rate_3}});
+    {_combination("a rate", "double", tile, several)}
     """
 
     @wp.func_native(snippet)
     def combined(
         modes: wp.array(dtype=wp.float32),
-        a: wp.array(dtype=wp.float64),
-        rate: wp.array(dtype=wp.float64),
-        x: wp.array(dtype=vec3),
+        a: wp.array2d(dtype=wp.float64),
+        rate: wp.array2d(dtype=wp.float64),
+        mean: wp.array(dtype=vec3),
+        start: int,
         p: int,
-    ) -> vec6: ...
+    ) -> sums: ...
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def position(
         mean: wp.array(dtype=vec3),
         modes: wp.array(dtype=wp.float32),
-        a: wp.array(dtype=wp.float64),
-        rate: wp.array(dtype=wp.float64),
+        a: wp.array2d(dtype=wp.float64),
+        rate: wp.array2d(dtype=wp.float64),
         initial_velocity: wp.array(dtype=vec3),
         first: wp.array(dtype=wp.int32),
+        tiles: int,
+        lanes: int,
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
     ):
-        p = wp.tid()
-        moved = combined(modes, a, rate, x, p)
-        if p >= x.shape[0]:
+        p = within(wp.tid(), tiles, lanes)
+        start = tile_of(wp.tid(), tiles, lanes) * wp.static(tile)
+        moved = combined(modes, a, rate, mean, start, p)
+        n = mean.shape[0]
+        if p >= n:
             return
-        x[p] = mean[p] + vec3(moved[0], moved[1], moved[2])
-        if first[0] != 0:
-            v[p] = initial_velocity[p]
-        else:
-            v[p] = vec3(moved[3], moved[4], moved[5])
+        for s in range(wp.static(tile)):
+            if start + s < first.shape[0]:
+                row = (start + s) * n + p
+                x[row] = mean[p] + vec3(moved[6 * s], moved[6 * s + 1], moved[6 * s + 2])
+                if first[start + s] != 0:
+                    v[row] = initial_velocity[row]
+                else:
+                    v[row] = vec3(moved[6 * s + 3], moved[6 * s + 4], moved[6 * s + 5])
 
     return position
 
 
+# Adds `taken`, 0 or 1, to count[copy, 0]; threads of a warp that are of one simulation add together.
+_COUNT = """
+#if defined(__CUDA_ARCH__)
+    unsigned long long* at = (unsigned long long*)count.data + size_t(copy) * count.shape[1];
+#if __CUDA_ARCH__ >= 700
+    const unsigned there = __activemask();
+    const unsigned own = __match_any_sync(there, copy);
+    const unsigned takers = __ballot_sync(there, taken != 0) & own;
+    const bool first = (threadIdx.x & 31) == __ffs(own) - 1;
+    if (first && takers != 0) atomicAdd(at, (unsigned long long)__popc(takers));
+#else
+    if (taken != 0) atomicAdd(at, 1ull);
+#endif
+#else
+    count.data[size_t(copy) * count.shape[1]] += taken;
+#endif
+"""
+
+
 @cache
-def make_selection(precision: Precision, shape_name: str):
+def make_selection(precision: Precision, shape_name: str, several: bool = False):
     """Kernels that find the particles which the step of S needs, exactly as in the paper.
 
     `stamp` writes the number of the step to every cell from which a stencil meets one of S's, `select` takes
     S and the particles in these cells, and moves the others off the grid, where the transfers pass over them.
-    Cells are those of a box that starts at `lower`.
+    Cells are those of a box that starts at `lower`, of which each simulation has its own.
 
     Source: paper section 5.4, a and b.
     """
@@ -136,6 +237,10 @@ def make_selection(precision: Precision, shape_name: str):
     shape = shape_functions(precision, shape_name)
     base_node, reach = shape.base_node, shape.degree
     across = 2 * reach + 1
+    share, copy_of = make_copies(several)
+
+    @wp.func_native(_COUNT)
+    def add_up(count: wp.array2d(dtype=wp.int64), copy: int, taken: int): ...
 
     @wp.func
     def cell(base: wp.vec3i, lower: wp.vec3i, extent: wp.vec3i):
@@ -151,15 +256,18 @@ def make_selection(precision: Precision, shape_name: str):
         lower: wp.vec3i,
         extent: wp.vec3i,
         step: wp.array(dtype=wp.int32),
-        stamps: wp.array(dtype=wp.int32),
+        stamps: wp.array2d(dtype=wp.int32),
+        sample: int,
     ):
         t = wp.tid()
-        p, offset = t / wp.static(across**3), t % wp.static(across**3)
+        of_sample, offset = t / wp.static(across**3), t % wp.static(across**3)
+        copy = copy_of(of_sample, sample)
+        p = of_sample + copy * (share(x.shape[0], step.shape[0]) - sample)
         base = base_node(x[p], inv_dx)
         place = wp.vec3i(offset / (across * across), (offset / across) % across, offset % across)
         c = cell(base + place - wp.vec3i(reach, reach, reach), lower, extent)
         if c >= 0:
-            stamps[c] = step[0]
+            stamps[copy, c] = step[copy]
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def select(
@@ -167,129 +275,176 @@ def make_selection(precision: Precision, shape_name: str):
         lower: wp.vec3i,
         extent: wp.vec3i,
         step: wp.array(dtype=wp.int32),
-        stamps: wp.array(dtype=wp.int32),
+        stamps: wp.array2d(dtype=wp.int32),
         sample: int,
         grid_shape: wp.vec3i,
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
-        needed: wp.array(dtype=wp.int32),
-        count: wp.array(dtype=wp.int64),
+        needed: wp.array2d(dtype=wp.int32),
+        count: wp.array2d(dtype=wp.int64),
     ):
         p = wp.tid()
+        copy = copy_of(p, needed.shape[1])
+        within = p - copy * needed.shape[1]
         base = base_node(x[p], inv_dx)
         taken = 0
-        if p < sample:
+        if within < sample:
             taken = 1
             if not inside(base, wp.static(reach + 1), grid_shape):
                 v[p] = vec3()  # no transfer will move it
         else:
             c = cell(base, lower, extent)
-            if c >= 0 and stamps[c] == step[0]:
+            if c >= 0 and stamps[copy, c] == step[copy]:
                 taken = 1
             else:
                 x[p] = vec3(real(-1.0), real(-1.0), real(-1.0))  # the grid starts at the origin
-        needed[p] = taken
-        if taken != 0:
-            wp.atomic_add(count, 0, wp.int64(1))
-        if p == 0:
-            count[1] = count[1] + wp.int64(1)
+        needed[copy, within] = taken
+        add_up(count, copy, taken)
+        if within == 0:
+            count[copy, 1] = count[copy, 1] + wp.int64(1)
 
     return stamp, select
 
 
 @cache
-def make_contraction(precision: Precision, vectors: int, symmetric: bool, coefficients):
-    """Kernel of a matrix field at N, mean + Σ_k modes_k a_k, three components a thread, over whole blocks.
+def make_contraction(
+    precision: Precision,
+    vectors: int,
+    symmetric: bool,
+    coefficients,
+    tile: int = 1,
+    several: bool = False,
+    stored=wp.float32,
+):
+    """Kernel of a matrix field at N, mean + Σ_k modes_k a_k, over whole blocks.
 
-    The six components of a symmetric field are xx xy xz yy yz zz, the nine of another go row by row.
-    Particles that are not needed are passed over. `coefficients` is the type of a.
+    A thread has three components of a particle, in the simulations of a tile; `several` tiles have blocks in
+    turn. The six components of a symmetric field are xx xy xz yy yz zz, the nine of another go row by row.
+    Particles that are not needed are passed over. `coefficients` is the type of a, `stored` that of modes.
     """
-    real, vec3 = precision.real, precision.vec3
+    real, half = precision.real, stored is wp.float16
+    sums = wp.types.vector(length=3 * tile, dtype=real)
+    tile_of, within = _make_placing(several)
     scalar = {wp.float32: "float", wp.float64: "double"}[coefficients]
     snippet = f"""
     typedef {_scalar(precision)} real;
     const int Q = {vectors}, components = mean.shape[1], particles = mean.shape[0];
-    {_combination("a", scalar)}
-    return wp::vec_t<3, real>(a_1, a_2, a_3);
+    {_combination("a", scalar, tile, several, half)}
     """
 
     @wp.func_native(snippet)
     def combined(
-        modes: wp.array(dtype=wp.float32),
+        modes: wp.array(dtype=stored),
         mean: wp.array2d(dtype=real),
-        a: wp.array(dtype=coefficients),
+        a: wp.array2d(dtype=coefficients),
+        start: int,
         p: int,
         c: int,
         live: bool,
-    ) -> vec3: ...
+    ) -> sums: ...
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def contraction(
-        needed: wp.array(dtype=wp.int32),
+        needed: wp.array2d(dtype=wp.int32),
         mean: wp.array2d(dtype=real),
-        modes: wp.array(dtype=wp.float32),
-        a: wp.array(dtype=coefficients),
+        modes: wp.array(dtype=stored),
+        a: wp.array2d(dtype=coefficients),
+        tiles: int,
+        lanes: int,
         found: wp.array3d(dtype=real),
     ):
-        t = wp.tid()
-        n = needed.shape[0]
+        t = within(wp.tid(), tiles, lanes)
+        start = tile_of(wp.tid(), tiles, lanes) * wp.static(tile)
+        n = needed.shape[1]
         group, p = t / n, t % n
         c = 3 * group
-        live = c < mean.shape[1] and needed[p] != 0
-        value = combined(modes, mean, a, p, c, live)
+        live = False
+        if c < mean.shape[1]:
+            for s in range(wp.static(tile)):
+                if start + s < needed.shape[0] and needed[start + s, p] != 0:
+                    live = True
+        value = combined(modes, mean, a, start, p, c, live)
         if not live:
             return
-        one, two, three = value[0] + mean[p, c], value[1] + mean[p, c + 1], value[2] + mean[p, c + 2]
-        if wp.static(not symmetric):
-            found[p, group, 0] = one
-            found[p, group, 1] = two
-            found[p, group, 2] = three
-        elif group == 0:
-            found[p, 0, 0] = one
-            found[p, 0, 1] = two
-            found[p, 1, 0] = two
-            found[p, 0, 2] = three
-            found[p, 2, 0] = three
-        else:
-            found[p, 1, 1] = one
-            found[p, 1, 2] = two
-            found[p, 2, 1] = two
-            found[p, 2, 2] = three
+        for s in range(wp.static(tile)):
+            if start + s < needed.shape[0] and needed[start + s, p] != 0:
+                row = (start + s) * n + p
+                one = value[3 * s] + mean[p, c]
+                two = value[3 * s + 1] + mean[p, c + 1]
+                three = value[3 * s + 2] + mean[p, c + 2]
+                if wp.static(not symmetric):
+                    found[row, group, 0] = one
+                    found[row, group, 1] = two
+                    found[row, group, 2] = three
+                elif group == 0:
+                    found[row, 0, 0] = one
+                    found[row, 0, 1] = two
+                    found[row, 1, 0] = two
+                    found[row, 0, 2] = three
+                    found[row, 2, 0] = three
+                else:
+                    found[row, 1, 1] = one
+                    found[row, 1, 2] = two
+                    found[row, 2, 1] = two
+                    found[row, 2, 2] = three
 
     return contraction
 
 
 @cache
-def make_layer(precision: Precision):
-    """Kernel of one layer of two networks at once, one warp an output: act(W x + b), W [out, in].
+def make_layer(precision: Precision, tile: int = 1, several: bool = False):
+    """Kernel of one layer of two networks at once: act(W x + b), W [out, in], x and b of each simulation.
 
-    SiLU where `active`, else the identity; the second network's outputs follow the first's. Where W has fewer
-    columns than x has entries, both are of several members, whose rows and entries follow each other.
+    One warp has an output in the simulations of a tile. SiLU where `active`, else the identity; the second
+    network's outputs follow the first's, `outputs` in all. Where W has fewer columns than x has entries, both
+    are of several members, whose rows and entries follow each other.
     """
     real = precision.real
+    sums = wp.types.vector(length=tile, dtype=real)
+    _, copy_of = make_copies(several)
     snippet = f"""
     typedef {_scalar(precision)} real;
-    const int n = W.shape[1], members = x.shape[0] / n;
-    const real* row = W.data + size_t(o) * n;
-    const real* inputs = x.data + o / (W.shape[0] / members) * n;
-    real sum = 0;
+    const bool one = output < b_1.shape[1];
+    const int o = one ? output : output - b_1.shape[1], outputs = one ? b_1.shape[1] : b_2.shape[1];
+    const int n = one ? W_1.shape[1] : W_2.shape[1], entries = one ? x_1.shape[1] : x_2.shape[1];
+    const int at = o / (outputs / (entries / n)) * n;  // where the entries of the output's member begin
+    const real* row = (one ? W_1.data : W_2.data) + size_t(o) * n;
+    const real *inputs[{tile}], *bias[{tile}];
+    for (int s = 0; s < {tile}; ++s) {{
+        const int simulation = wp::min(start + s, x_1.shape[0] - 1);  // one beyond the last is done again
+        inputs[s] = (one ? x_1.data : x_2.data) + size_t(simulation) * entries + at;
+        bias[s] = (one ? b_1.data : b_2.data) + size_t(simulation) * outputs + o;
+    }}
+    wp::vec_t<{tile}, real> sum;
     #pragma unroll 4
-    for (int i = lane; i < n; i += lanes) sum += row[i] * inputs[i];
+    for (int i = lane; i < n; i += lanes) {{
+        const real w = row[i];
+        #pragma unroll
+        for (int s = 0; s < {tile}; ++s) sum[s] += w * inputs[s][i];
+    }}
+    #pragma unroll
+    for (int s = 0; s < {tile}; ++s) {{
 #if defined(__CUDA_ARCH__)
-    for (int d = 16; d > 0; d /= 2) sum += __shfl_xor_sync(0xffffffffu, sum, d);
+        for (int d = 16; d > 0; d /= 2) sum[s] += __shfl_xor_sync(0xffffffffu, sum[s], d);
 #endif
-    return sum + b.data[o];
+        sum[s] += *bias[s];
+    }}
+    return sum;
     """
 
     @wp.func_native(snippet)
     def row(
-        W: wp.array2d(dtype=real),
-        b: wp.array(dtype=real),
-        x: wp.array(dtype=real),
-        o: int,
+        W_1: wp.array2d(dtype=real),
+        b_1: wp.array2d(dtype=real),
+        x_1: wp.array2d(dtype=real),
+        W_2: wp.array2d(dtype=real),
+        b_2: wp.array2d(dtype=real),
+        x_2: wp.array2d(dtype=real),
+        start: int,
+        output: int,
         lane: int,
         lanes: int,
-    ) -> real: ...
+    ) -> sums: ...
 
     @wp.func
     def silu(z: real):
@@ -298,48 +453,53 @@ def make_layer(precision: Precision):
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def layer(
         W_1: wp.array2d(dtype=real),
-        b_1: wp.array(dtype=real),
-        x_1: wp.array(dtype=real),
+        b_1: wp.array2d(dtype=real),
+        x_1: wp.array2d(dtype=real),
         W_2: wp.array2d(dtype=real),
-        b_2: wp.array(dtype=real),
-        x_2: wp.array(dtype=real),
+        b_2: wp.array2d(dtype=real),
+        x_2: wp.array2d(dtype=real),
         active: int,
         lanes: int,
-        y_1: wp.array(dtype=real),
-        y_2: wp.array(dtype=real),
+        outputs: int,
+        y_1: wp.array2d(dtype=real),
+        y_2: wp.array2d(dtype=real),
     ):
         t = wp.tid()
-        o, lane = t / lanes, t % lanes
-        first = b_1.shape[0]
-        z = real(0.0)
-        if o < first:  # noqa: SIM108 - one call each, not one call of chosen arrays
-            z = row(W_1, b_1, x_1, o, lane, lanes)
-        else:
-            z = row(W_2, b_2, x_2, o - first, lane, lanes)
-        if active != 0:
-            z = silu(z)
-        if lane == 0:
-            if o < first:
-                y_1[o] = z
-            else:
-                y_2[o - first] = z
+        at = copy_of(t / lanes, outputs)
+        o, lane = t / lanes - at * outputs, t % lanes
+        start = at * wp.static(tile)
+        first = b_1.shape[1]
+        z = row(W_1, b_1, x_1, W_2, b_2, x_2, start, o, lane, lanes)
+        if lane != 0:
+            return
+        for s in range(wp.static(tile)):
+            if start + s < x_1.shape[0]:
+                y = z[s]
+                if active != 0:
+                    y = silu(y)
+                if o < first:
+                    y_1[start + s, o] = y
+                else:
+                    y_2[start + s, o - first] = y
 
     return layer
 
 
 @cache
-def make_gathering(precision: Precision):
-    """Kernel of what the projection needs of S, one block a mode: b_k = Σ_p w_p B_p,kᵀ Δt v_p.
+def make_gathering(precision: Precision, several: bool = False):
+    """Kernel of what the projection needs of S, one block a simulation and mode: b_k = Σ_p w_p B_p,kᵀ Δt v_p.
 
     The displacement of S in the step is Δt v_p, as its positions before it lie on the manifold. The last
-    block gives Σ_p w_p |Δt v_p|².
+    block of a simulation gives Σ_p w_p |Δt v_p|².
     """
     vec3 = precision.vec3
+    _, copy_of = make_copies(several)
     snippet = """
     double sum = 0.0;
     #pragma unroll 4
     for (int p = lane; p < weights.shape[0]; p += lanes) {
-        const double x = double(v.data[p][0]), y = double(v.data[p][1]), z = double(v.data[p][2]);
+        const double x = double(v.data[start + p][0]);
+        const double y = double(v.data[start + p][1]), z = double(v.data[start + p][2]);
         double one = dt * x, two = dt * y, three = dt * z;
         if (k < modes) {
 #if defined(__CUDA_ARCH__)
@@ -376,6 +536,7 @@ def make_gathering(precision: Precision):
         v: wp.array(dtype=vec3),
         weights: wp.array(dtype=wp.float64),
         dt: wp.float64,
+        start: int,
         k: int,
         lane: int,
         lanes: int,
@@ -390,12 +551,15 @@ def make_gathering(precision: Precision):
         weights: wp.array(dtype=wp.float64),
         dt: wp.float64,
         lanes: int,
-        b: wp.array(dtype=wp.float64),
+        b: wp.array2d(dtype=wp.float64),
     ):
         t = wp.tid()
-        k, lane = t / lanes, t % lanes
-        total = share(displacement, particles, vectors, b.shape[0] - 1, v, weights, dt, k, lane, lanes)
+        sums = b.shape[1]
+        copy = copy_of(t / lanes, sums)
+        k, lane = t / lanes - copy * sums, t % lanes
+        start = copy * particles
+        total = share(displacement, particles, vectors, sums - 1, v, weights, dt, start, k, lane, lanes)
         if lane == 0:
-            b[k] = total
+            b[copy, k] = total
 
     return gathering

@@ -1,7 +1,7 @@
 """Arrays of one phase of time: the particles that a reduced step moves, and their grid."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,15 +23,15 @@ class Setting:
     """What the phases of one solver share.
 
     Attributes:
-        constants: every particle of the scene; initial_velocity: [P, 3] theirs [m/s].
-        record: the latent state.
+        constants: every particle of the scene; initial_velocity: [P, 3] theirs [m/s]; of each simulation.
+        record: the latent state; of several simulations together.
         projector: of the inversion.
         dt: step [s].
         precision, dtype, device: of the arrays.
     """
 
-    constants: ParticleConstants
-    initial_velocity: torch.Tensor
+    constants: Sequence[ParticleConstants]
+    initial_velocity: Sequence[torch.Tensor]
     record: LatentRecord
     projector: GaussNewton | Taylor
     dt: float
@@ -39,9 +39,16 @@ class Setting:
     dtype: torch.dtype
     device: torch.device
 
+    @property
+    def simulations(self) -> int:
+        """How many advance together."""
+        return len(self.constants)
+
 
 class Phase(ABC):
     """What P2G reads and G2P moves; where the values come from is left to the kinds of field.
+
+    Of several simulations the arrays hold n rows of each, one by one.
 
     Args:
         setting: of the solver.
@@ -52,8 +59,8 @@ class Phase(ABC):
 
     Attributes:
         order: as given.
-        x, v, C, tau: what P2G reads; G2P moves the first |S| rows of x and v.
-        s: |S|.
+        x, v, C, tau: what P2G reads; G2P moves the first |S| rows of x and v of each simulation.
+        s: |S|; size: n.
     """
 
     capturable = True
@@ -62,37 +69,40 @@ class Phase(ABC):
     def __init__(
         self, setting: Setting, sets: ParticleSets, order: np.ndarray, grid_step: GridStep, at_sample
     ):
-        n, self.s = len(order), len(sets.sample)
+        self.s = len(sets.sample)
         self.setting, self.sets, self.order = setting, sets, order
         self.grid_step, self.at_sample = grid_step, at_sample
         dtype, device = setting.dtype, setting.device
 
-        def rows(values) -> torch.Tensor:
-            return torch.as_tensor(values[order], dtype=dtype, device=device)
+        def rows(values: Sequence) -> torch.Tensor:
+            return torch.cat(
+                [torch.as_tensor(of_one[order], dtype=dtype, device=device) for of_one in values]
+            )
 
-        constants = setting.constants
-        self.mass, self.volume0 = rows(constants.mass), rows(constants.volume0)
-        self.mu, self.lam = rows(constants.mu), rows(constants.lam)
+        self.mass, self.volume0, self.mu, self.lam = (
+            rows([getattr(constants, name) for constants in setting.constants])
+            for name in ("mass", "volume0", "mu", "lam")
+        )
         self.initial_velocity = rows(setting.initial_velocity)
+        n = len(self.mass)
         self.x, self.v = (torch.zeros(n, 3, dtype=dtype, device=device) for _ in range(2))
         self.C, self.tau = (torch.zeros(n, 3, 3, dtype=dtype, device=device) for _ in range(2))
         # G2P gives these of S too; the next step takes C from its source again.
         self._C_of_sample, self._increment = (
-            torch.zeros(self.s, 3, 3, dtype=dtype, device=device) for _ in range(2)
+            torch.zeros(setting.simulations * self.s, 3, 3, dtype=dtype, device=device) for _ in range(2)
         )
         self.bind(n)
 
     def bind(self, n: int) -> None:
-        """Show the first n rows to Warp."""
+        """Show the first n rows of the arrays to Warp."""
         precision = self.setting.precision
         vectors = [as_vectors(a[:n], precision) for a in (self.x, self.v)]
         matrices = [as_matrices(a[:n], precision) for a in (self.C, self.tau)]
         scalars = [as_scalars(a[:n]) for a in (self.mass, self.volume0)]
         self._integration = (*vectors, *matrices, *scalars)
-        vectors = [as_vectors(a[: self.s], precision) for a in (self.x, self.v)]
         matrices = [as_matrices(a, precision) for a in (self._C_of_sample, self._increment)]
         self._sample = (*vectors, *matrices)
-        self.size = n
+        self.size = n // self.setting.simulations
 
     @property
     @abstractmethod
@@ -104,9 +114,9 @@ class Phase(ABC):
         """Begin with the latents of the record; `first`: v is the initial velocity, not a difference."""
 
     @property
-    def mean_size(self) -> float:
-        """Mean |N| over the steps taken in this phase."""
-        return float(self.size)
+    def mean_sizes(self) -> list[float]:
+        """Mean |N| of each simulation over the steps taken in this phase."""
+        return [float(self.size)] * self.setting.simulations
 
     @property
     def nbytes(self) -> int:
@@ -221,8 +231,8 @@ class SearchingPhase(DecodedPhase):
 
     @property
     @override
-    def mean_size(self) -> float:
-        return float(np.mean(self._sizes)) if self._sizes else super().mean_size
+    def mean_sizes(self) -> list[float]:
+        return [float(np.mean(self._sizes))] if self._sizes else super().mean_sizes
 
     @override
     def load(self) -> None:

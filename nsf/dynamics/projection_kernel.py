@@ -1,7 +1,7 @@
 """The kernel that inverts the deformation field in the coefficients of its modes (`field=basis`).
 
-A GPU takes a block for each network whose mean is the closure; all of them do the linear algebra alike, and
-only the first one writes. A CPU is one thread.
+A GPU takes for each simulation a block for each network whose mean is the closure; all of them do the linear
+algebra alike, and only the first one writes. A CPU is one thread.
 """
 
 from collections.abc import Sequence
@@ -11,13 +11,14 @@ import torch
 import warp as wp
 
 from nsf.mpm import Precision
+from nsf.mpm.copies import make_copies
 
 #: Threads that share a sum over a layer's inputs; each has two outputs, to read its inputs once for both.
 _PARTS = 8
 #: Threads of a GPU whose weights lie side by side.
 _WARP = 32
 #: Shared memory [byte] of a block without asking for more, and what Warp takes of it.
-_SHARED, _TAKEN = 49152, 4096
+SHARED, TAKEN = 49152, 4096
 
 
 def projection_block(widths: tuple[int, ...]) -> int:
@@ -35,7 +36,7 @@ def shared_bytes(precision: Precision, widths: tuple[int, ...], latents: int, mo
 
 def projection_fits(precision: Precision, widths: tuple[int, ...], latents: int, modes: int) -> bool:
     """Whether a block of a GPU can hold what the projection needs."""
-    return shared_bytes(precision, widths, latents, modes) <= _SHARED - _TAKEN
+    return shared_bytes(precision, widths, latents, modes) <= SHARED - TAKEN
 
 
 def packed_weights(layers: Sequence[tuple[torch.Tensor, torch.Tensor]], is_cuda: bool) -> torch.Tensor:
@@ -184,7 +185,14 @@ _MEETING = """
 
 
 @cache
-def make_projection(precision: Precision, widths: tuple[int, ...], members: int, latents: int, modes: int):
+def make_projection(
+    precision: Precision,
+    widths: tuple[int, ...],
+    members: int,
+    latents: int,
+    modes: int,
+    several: bool = False,
+):
     """Kernel of the inversion: Gauss-Newton in the coefficients of the modes.
 
     With d = Δt v the displacement of S in the step and δa = a(x̂) − a(x̂_n), the error of the positions is
@@ -201,14 +209,17 @@ def make_projection(precision: Precision, widths: tuple[int, ...], members: int,
         precision: of the closure; sums over modes and the solution are fp64.
         widths: of the closure's layers (r, hidden..., K − r); empty without one.
         members: networks of these widths whose shares in the closure are added up; of a GPU a block each.
+            The blocks of a simulation follow each other, and wait for each other.
         latents: r.
         modes: K.
+        several: whether there are several simulations.
 
     Source: paper section 5.3.
     """
     real = precision.real
+    _, copy_of = make_copies(several)
     rows = _rows(widths, latents)
-    kept = shared_bytes(precision, widths, latents, modes) + 8 * modes**2 <= _SHARED - _TAKEN
+    kept = shared_bytes(precision, widths, latents, modes) + 8 * modes**2 <= SHARED - TAKEN
     closure = ""
     if widths:
         counts = "{" + ", ".join(map(str, widths)) + "}"
@@ -222,7 +233,7 @@ def make_projection(precision: Precision, widths: tuple[int, ...], members: int,
     #define NSF_SHARED __shared__
     #define NSF_SYNC __syncthreads()
     const int lane = threadIdx.x, lanes = blockDim.x, PARTS = {_PARTS}, TILE = {_WARP};
-    const int block = blockIdx.x, blocks = {members};
+    const int blocks = {members}, block = blockIdx.x % blocks;
 #else
     #define NSF_SHARED
     #define NSF_SYNC
@@ -413,30 +424,33 @@ def make_projection(precision: Precision, widths: tuple[int, ...], members: int,
         scale: wp.float64,
         sigma: wp.array(dtype=wp.float64),
         G: wp.array(dtype=wp.float64),
-        b: wp.array(dtype=wp.float64),
+        b: wp.array2d(dtype=wp.float64),
         sample: wp.float64,
         iterations: int,
         tolerance: wp.float64,
         linear: int,
         dt: wp.float64,
-        latent: wp.array(dtype=wp.float64),
-        a: wp.array(dtype=wp.float64),
-        tangents: wp.array(dtype=wp.float64),
-        rate: wp.array(dtype=wp.float64),
-        xhat: wp.array(dtype=real),
-        xhat_previous: wp.array(dtype=real),
-        xhats: wp.array(dtype=real),
-        residuals: wp.array(dtype=real),
-        updates: wp.array(dtype=real),
-        row: wp.array(dtype=wp.int64),
-        first: wp.array(dtype=wp.int32),
-        step: wp.array(dtype=wp.int32),
-        shares: wp.array(dtype=wp.float64),
-        arrived: wp.array(dtype=wp.int32),
+        latent: wp.array2d(dtype=wp.float64),
+        a: wp.array2d(dtype=wp.float64),
+        tangents: wp.array2d(dtype=wp.float64),
+        rate: wp.array2d(dtype=wp.float64),
+        xhat: wp.array2d(dtype=real),
+        xhat_previous: wp.array2d(dtype=real),
+        xhats: wp.array2d(dtype=real),
+        residuals: wp.array2d(dtype=real),
+        updates: wp.array2d(dtype=real),
+        row: wp.array2d(dtype=wp.int64),
+        first: wp.array2d(dtype=wp.int32),
+        step: wp.array2d(dtype=wp.int32),
+        shares: wp.array2d(dtype=wp.float64),
+        arrived: wp.array2d(dtype=wp.int32),
+        threads: int,
     ):
+        s = copy_of(wp.tid(), threads)
         solve(
-            weights, scale, sigma, G, b, sample, iterations, tolerance, linear, dt, latent, a, tangents, rate,
-            xhat, xhat_previous, xhats, residuals, updates, row, first, step, shares, arrived,
+            weights, scale, sigma, G, b[s], sample, iterations, tolerance, linear, dt, latent[s], a[s],
+            tangents[s], rate[s], xhat[s], xhat_previous[s], xhats[s], residuals[s], updates[s], row[s],
+            first[s], step[s], shares[s], arrived[s],
         )  # fmt: skip
 
     return projection

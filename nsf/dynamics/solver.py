@@ -1,34 +1,34 @@
 """The reduced-order solver: time-stepping in the latent space (paper section 5)."""
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from typing import Self
 
 import numpy as np
 import torch
 
 from nsf.data import hash_of_positions
 from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
-from nsf.dynamics.interop import captured, on_torch_stream, torch_device, torch_dtype
+from nsf.dynamics.interop import on_torch_stream, torch_device, torch_dtype
 from nsf.dynamics.latent import Decoder, LatentRecord, LatentState, LatentTrajectory
-from nsf.dynamics.modal import ModalPhase, steps_in_coefficients
-from nsf.dynamics.phase import DecodedPhase, Phase, SearchingPhase, Setting, Stages
 from nsf.dynamics.projection import GaussNewton, Taylor
 from nsf.dynamics.sampling import RandomSampler, SamplePhase, Sampler, check_well_posed
+from nsf.dynamics.stepping import Phased, Stepping, build_phases
 from nsf.dynamics.stress import Method
 from nsf.errors import ConfigError, ShapeError
 from nsf.kinematics.manifold import Restriction
-from nsf.mpm import BoundaryArrays, Grid, GridStep, precision_of
+from nsf.mpm import BoundaryArrays, precision_of
 from nsf.mpm.device import warp_device
 from nsf.mpm.shape import DEGREES
-from nsf.timing import StageTimer, untimed
 
 NSF = Method("nsf", neural_stress=True, neural_affine=True)
 #: Positions decoded at once when every particle is asked for [values].
 _CHUNK = 2**25
 
 
-class ReducedMPM:
-    """Steps a latent vector: infer fields on N, one MPM step, invert on S.
+class ReducedRun(Phased):
+    """A reduced simulation apart from its steps: where it starts, what it was given, and what it leaves.
+
+    `ReducedMPM` takes the steps of one, `ReducedBatch` those of several at once.
 
     Args:
         manifold: trained fields.
@@ -43,13 +43,14 @@ class ReducedMPM:
         dt_multiplier: deployment step in units of the scene's Δt (paper section 6.1: 1.5).
         sets: particle sets of each phase, as `sets` of an earlier solver of the same manifold and
             samples gives them; searched for when None.
+        xhat: [r] latent vector at t = 0; that of the undeformed body without stress when None.
+        velocity: [P, 3] initial velocity [m/s]; the scene's when None.
 
     Raises:
         ProjectionError: |S| < r/3.
         SchemaError: the manifold was trained for other particles.
+        ShapeError: xhat or velocity has another shape.
         ConfigError, DeviceError: a value or device is refused.
-
-    Source: paper section 5.
     """
 
     def __init__(
@@ -65,20 +66,22 @@ class ReducedMPM:
         device: str = "auto",
         dt_multiplier: float = 1.0,
         sets: Sequence[ParticleSets] | None = None,
+        xhat: np.ndarray | None = None,
+        velocity: np.ndarray | None = None,
     ):
         if not dt_multiplier > 0:
             raise ConfigError(f"dt_multiplier={dt_multiplier} must be positive")
         for phase in phases:
             check_well_posed(len(phase.particles), manifold.latent_dim)
         self.manifold, self.scene, self.method, self.projector = manifold, scene, method, projector
-        self.integration, self.phases = integration, phases
+        self.integration, self.phases, self.given = integration, phases, dict(parameters)
         self.precision, self.device = precision_of(precision), warp_device(device)
         self.dtype, self.torch_device = torch_dtype(self.precision), torch_device(self.device)
         self.dt = scene.dt * dt_multiplier
         self.total_steps = reduced_steps(scene.steps, dt_multiplier)
         self.geometry, self.transfer, self.gravity = scene.grid, scene.transfer, scene.gravity
-        self.boundaries = BoundaryArrays(scene.colliders, scene.walls, self.precision, self.device)
         self.scene_particles = scene.particles()
+        P = len(self.scene_particles)
         manifold.check_particles(hash_of_positions(self.scene_particles.X))
         self.search = NeighbourSearch(self.geometry, self.transfer.shape, self.precision, self.device)
 
@@ -91,20 +94,18 @@ class ReducedMPM:
                 f"parameters {dict(parameters)} lack {missing}, which the stress field was trained on"
             )
         self.parameters = tensor([parameters[name] for name in manifold.parameter_names])
-        self.initial_velocity = tensor(scene.initial_velocity())
-        # A scene begins undeformed and free of stress.
-        X = torch.as_tensor(self.scene_particles.X)[None]
-        start = tensor(manifold.encode(X, X.new_zeros(*X.shape[:2], 6))[0].cpu())
+        # On the host: a phase takes the rows that it needs.
+        velocity = _shaped("velocity", scene.initial_velocity() if velocity is None else velocity, (P, 3))
+        self.initial_velocity = torch.as_tensor(velocity, dtype=self.dtype)
+        if xhat is None:  # a scene begins undeformed and free of stress
+            X = torch.as_tensor(self.scene_particles.X)[None]
+            xhat = manifold.encode(X, X.new_zeros(*X.shape[:2], 6))[0].cpu()
+        start = tensor(_shaped("xhat", xhat, (manifold.latent_dim,)))
         self.record = LatentRecord(start, self.total_steps, projector.iterations)
         self.steps_taken = 0
-        self._setting = Setting(
-            self.scene_particles, self.initial_velocity, self.record, projector, self.dt, self.precision,
-            self.dtype, self.torch_device,
-        )  # fmt: skip
         self._starts = [round(p.start * self.total_steps) for p in phases]
         self.sets = self._sets_of(phases) if sets is None else list(sets)
-        self._phases = [self._build_phase(s, p.weights) for s, p in zip(self.sets, phases, strict=True)]
-        self._enter(self._phases[0])
+        self._index = 0  # among the runs that advance together
 
     @classmethod
     def of_scene(
@@ -114,8 +115,8 @@ class ReducedMPM:
         parameters: Mapping[str, float] | None = None,
         sample: int | Sequence[int] | Sampler | Sequence[SamplePhase] | None = None,
         **options,
-    ) -> "ReducedMPM":
-        """The reduced solver of a scene.
+    ) -> Self:
+        """That of a scene.
 
         Args:
             scene: an `nsf.scenes.Scene`.
@@ -142,7 +143,7 @@ class ReducedMPM:
             phases = sample.phases_of(
                 manifold,
                 device,
-                lambda training: cls.of_scene(
+                lambda training: ReducedMPM.of_scene(
                     scene, manifold, training, everyone, sets=[whole], **as_deployed
                 ),
             )
@@ -172,21 +173,6 @@ class ReducedMPM:
             frames = (everything.position(chunk) for chunk in of_phase.split(rows))
             found.append(self.search.superset(frames, phase.particles, self.integration.margin))
         return found
-
-    def _build_phase(self, sets: ParticleSets, weights: np.ndarray | None) -> Phase:
-        grid = Grid(self.geometry, self.precision, self.device, nodes=sets.nodes)
-        step = GridStep(
-            grid, self.boundaries, self.transfer, self.gravity, self.dt, self.precision, self.device
-        )
-        if steps_in_coefficients(self.manifold, self.projector, self.precision, self.device):
-            return ModalPhase(
-                self._setting, sets, step, self.transfer.shape, self.manifold, self.method, self.parameters,
-                self.scene.material, weights,
-            )  # fmt: skip
-        at = self.manifold.restrict(particles=sets.integration, dtype=self.dtype, device=self.torch_device)
-        search = self.integration.strategy == "search"
-        build = partial(SearchingPhase, search=self.search) if search else DecodedPhase
-        return build(self._setting, sets, step, at, self.stress_of, self.affine_of, weights)
 
     def stress_of(self, at, mu: torch.Tensor, lam: torch.Tensor) -> Callable[[torch.Tensor], torch.Tensor]:
         """The method's source of τ [n, 3, 3] [Pa] at restricted points."""
@@ -244,103 +230,14 @@ class ReducedMPM:
             max(0, min(self.steps_taken, end) - start) for start, end in zip(self._starts, ends, strict=True)
         ]
         if not self.steps_taken:
-            return float(self._phase.size)
-        return sum(n * p.mean_size for n, p in zip(taken, self._phases, strict=True)) / self.steps_taken
+            return float(len(self.sets[0].integration))
+        sizes = (p.mean_sizes[self._index] for p in self._phases)
+        return sum(n * size for n, size in zip(taken, sizes, strict=True)) / self.steps_taken
 
     @property
     def sample_size(self) -> int:
         """|S| of the first phase."""
-        return len(self._phases[0].sets.sample)
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes that the solver's arrays and fields take on the device."""
-        return sum(p.nbytes for p in self._phases) + self.record.nbytes + self.initial_velocity.nbytes
-
-    def step(self, n: int = 1) -> None:
-        """Advance by n steps of Δt.
-
-        Raises:
-            ConfigError: the steps would pass the scene's end.
-        """
-        if self.steps_taken + n > self.total_steps:
-            raise ConfigError(
-                f"{self.steps_taken} + {n} steps pass the end of the scene, {self.total_steps} steps"
-            )
-        with torch.no_grad():
-            for _ in range(n):
-                self._step(self._advance)
-
-    def timed_step(self, timer: StageTimer) -> None:
-        """One step, stage by stage under a timer; never from a captured graph."""
-        with torch.no_grad():
-            self._step(lambda: self._run_stages(timer))
-
-    def _step(self, advance: Callable[[], None]) -> None:
-        phase = self._phase_at(self.steps_taken)
-        if phase is not self._phase:
-            self._enter(phase)
-        advance()
-        self.steps_taken += 1
-
-    def _phase_at(self, step: int):
-        return self._phases[max(i for i, start in enumerate(self._starts) if start <= step)]
-
-    def _enter(self, phase: Phase) -> None:
-        """Give the phase the state one step back, which the backward difference needs."""
-        self._phase = phase
-        with torch.no_grad():
-            phase.enter(first=self.steps_taken == 0)  # the first velocity is the initial one
-
-    def _advance(self) -> None:
-        phase = self._phase
-        if not self.device.is_cuda or not phase.capturable:
-            self._run_stages()
-        elif phase.graph is None:
-            # The first step runs uncaptured, so that kernels and libraries are loaded.
-            self._run_stages()
-            with captured(self.device) as graph:
-                self._run_stages()
-            phase.graph = graph
-        else:
-            phase.graph.replay()
-
-    def _run_stages(self, timer: Callable = untimed) -> None:
-        with on_torch_stream(self.device):
-            for name, stage in self.stages.items():
-                with timer(name):
-                    stage()
-
-    @property
-    def stages(self) -> Stages:
-        """One step, stage by stage, in order."""
-        return self._phase.stages
-
-    def equations_at(
-        self, step: int, xhat: torch.Tensor, previous: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """What the projection at the end of a step is given, linearised where it starts.
-
-        Leaves the solver in the midst of that step.
-
-        Args:
-            step: steps before it, which set its moment.
-            xhat, previous: [r] x̂_n and x̂_{n−1}.
-
-        Returns:
-            Error x_S − g(X_S, x̂_n) [s, 3] [m] and Jacobian ∂g/∂x̂ [s, 3, r] [m].
-        """
-        self.steps_taken = step
-        self.record.now.copy_(xhat)
-        self.record.before.copy_(previous)
-        self._enter(self._phase_at(step))
-        with torch.no_grad(), on_torch_stream(self.device):
-            self.boundaries.start_from(step)
-            for name, stage in self.stages.items():
-                if name != "inversion":
-                    stage()
-            position, jacobian = self._phase.at_sample.position_and_jacobian(self.record.now)
-        return self._phase.x[: self._phase.s] - position, jacobian
+        return len(self.sets[0].sample)
 
     def trajectory(self) -> LatentTrajectory:
         """Everything recorded up to now, on the host."""
@@ -392,6 +289,53 @@ class ReducedMPM:
         return worst
 
 
+class ReducedMPM(ReducedRun, Stepping):
+    """Steps a latent vector: infer fields on N, one MPM step, invert on S.
+
+    Args and errors are those of `ReducedRun`.
+
+    Source: paper section 5.
+    """
+
+    def __init__(self, *arguments, **options):
+        super().__init__(*arguments, **options)
+        scene = self.scene
+        self.boundaries = BoundaryArrays(scene.colliders, scene.walls, self.precision, self.device)
+        self._phases = build_phases([self], self.record, self.boundaries)
+        self._enter(self._phases[0])
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the solver's arrays and fields take on the device."""
+        return sum(p.nbytes for p in self._phases) + self.record.nbytes
+
+    def equations_at(
+        self, step: int, xhat: torch.Tensor, previous: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """What the projection at the end of a step is given, linearised where it starts.
+
+        Leaves the solver in the midst of that step.
+
+        Args:
+            step: steps before it, which set its moment.
+            xhat, previous: [r] x̂_n and x̂_{n−1}.
+
+        Returns:
+            Error x_S − g(X_S, x̂_n) [s, 3] [m] and Jacobian ∂g/∂x̂ [s, 3, r] [m].
+        """
+        self.steps_taken = step
+        self.record.now.copy_(xhat)
+        self.record.before.copy_(previous)
+        self._enter(self._phase_at(step))
+        with torch.no_grad(), on_torch_stream(self.device):
+            self.boundaries.start_from(step)
+            for name, stage in self.stages.items():
+                if name != "inversion":
+                    stage()
+            position, jacobian = self._phase.at_sample.position_and_jacobian(self.record.now)
+        return self._phase.x[: self._phase.s] - position, jacobian
+
+
 def reduced_steps(steps: int, dt_multiplier: float) -> int:
     """Deployment steps that reach the end of a scene of `steps` steps."""
     return int(np.ceil(steps / dt_multiplier - 1e-9))
@@ -414,3 +358,9 @@ def _indices(sample, particles: int) -> np.ndarray:
     if sample[0] < 0 or sample[-1] >= particles:
         raise ShapeError(f"sample indices {sample[0]} … {sample[-1]} must lie in [0, {particles})")
     return sample
+
+
+def _shaped(name: str, values, shape: tuple[int, ...]):
+    if np.shape(values) != shape:
+        raise ShapeError(f"{name} must be {list(shape)}, not {list(np.shape(values))}")
+    return np.asarray(values)

@@ -17,7 +17,7 @@ from nsf.data import Snapshots
 from nsf.kinematics.manifold import Manifold
 from nsf.kinematics.phases import seed_of
 from nsf.kinematics.schedules import Trainer
-from nsf.workers import ended, working
+from nsf.workers import results, working
 
 SEED_STREAM = 1 << 10  # the number of no phase, so that the seed of a rank is that of no step
 _TIMEOUT = timedelta(hours=6)  # rank 0 reads all snapshots once, while the others wait
@@ -108,12 +108,7 @@ def train_together(
         # With this variable Lightning starts no processes of its own.
         environments = [{"LOCAL_RANK": str(rank.number)} for rank in ranks]
         with working(calls, environments) as workers:
-            found = {}
-            for worker, outcome in ended(workers):
-                if isinstance(outcome, BaseException):
-                    raise outcome
-                found[worker] = outcome
-            return found[workers[0]]
+            return results(workers)[0]
 
 
 def run_rank(

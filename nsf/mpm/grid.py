@@ -9,6 +9,7 @@ import warp as wp
 from nsf.errors import ConfigError
 from nsf.mpm.access import make_load
 from nsf.mpm.contact import SLIP, STICKY, make_contact
+from nsf.mpm.copies import make_copies
 from nsf.mpm.precision import Precision
 from nsf.mpm.shape import shape_functions
 
@@ -71,19 +72,39 @@ class Grid:
     Of a box, a step clears and updates only the blocks of 4³ nodes that particles reach. They are
     found on the device, so a captured step finds them anew; all other nodes stay zero.
 
-    Attributes:
+    Args:
         geometry: spacing and node counts.
-        values: [n, 4] m_i v_i [kg m/s] after P2G, v_i [m/s] after the update; last m_i [kg].
+        precision, device: of the values.
+        nodes: flat indices of the nodes to store; all by default.
+        copies: simulations that have values of their own at these nodes.
+
+    Attributes:
+        geometry, copies: as given.
+        values: [copies n, 4] m_i v_i [kg m/s] after P2G, v_i [m/s] after the update; last m_i [kg].
         nodes: [n] flat node index of each stored node; empty when every node is stored.
         slots: [all nodes] storage index or −1; empty when every node is stored.
         marks: [all blocks] 1 for a block that is listed; empty where nodes are listed, as the next two.
         blocks: [all blocks] flat indices of the listed blocks, in any order.
         listed: [1] their number.
+
+    Raises:
+        ConfigError: several copies of a grid that stores every node.
     """
 
-    def __init__(self, geometry: GridGeometry, precision: Precision, device, nodes: np.ndarray | None = None):
-        self.geometry = geometry
+    def __init__(
+        self,
+        geometry: GridGeometry,
+        precision: Precision,
+        device,
+        nodes: np.ndarray | None = None,
+        copies: int = 1,
+    ):
+        self.geometry, self.copies = geometry, copies
         self.sparse = nodes is not None
+        if copies > 1 and not self.sparse:
+            raise ConfigError(
+                f"{copies} simulations on one grid need a list of nodes; use integration=superset"
+            )
         count = len(nodes) if self.sparse else geometry.count
         slots = np.zeros(0, np.int32)
         if self.sparse:
@@ -92,7 +113,7 @@ class Grid:
         self.nodes = wp.array(nodes if self.sparse else np.zeros(0), dtype=wp.int32, device=device)
         self.slots = wp.array(slots, dtype=wp.int32, device=device)
         self.shape = wp.vec3i(*geometry.nodes)
-        self.values = wp.zeros(count, dtype=precision.vec4, device=device)
+        self.values = wp.zeros(copies * count, dtype=precision.vec4, device=device)
         edges = tuple(-(-n // BLOCK) for n in geometry.nodes)
         blocks = 0 if self.sparse else int(np.prod(edges))
         self.block_shape = wp.vec3i(*edges)
@@ -100,14 +121,14 @@ class Grid:
         self.listed = wp.zeros(min(blocks, 1), dtype=wp.int32, device=device)
         most = _THREADS["cuda" if self.values.device.is_cuda else "cpu"]
         #: Threads of a kernel over the nodes of a step.
-        self.threads = count if self.sparse else min(blocks * _BLOCK_NODES, most)
+        self.threads = copies * count if self.sparse else min(blocks * _BLOCK_NODES, most)
         self._precision = precision
         self._clear = make_clear(precision)
 
     @property
     def count(self) -> int:
-        """Number of stored nodes."""
-        return self.values.shape[0]
+        """Number of stored nodes of a simulation."""
+        return self.values.shape[0] // self.copies
 
     @property
     def mass(self) -> wp.array:
@@ -274,7 +295,7 @@ def make_reach(precision: Precision, shape_name: str):
 
 
 @cache
-def make_grid_update(precision: Precision):
+def make_grid_update(precision: Precision, several: bool = False):
     """Kernel of the grid update: momentum → velocity, gravity, walls, colliders.
 
     v_i = (m_i v_i − Δt Σ_p τ_p ∇w_ip V_p⁰)/m_i + Δt g, then the boundary conditions
@@ -282,13 +303,14 @@ def make_grid_update(precision: Precision):
     the force impulse to the momentum. A node belongs to a solid by the solid's pose at t^n, the
     time of the particles that P2G took here, and v_i^{n+1} meets the condition relative to the
     solid's mean velocity over the step (`make_follow`). Frames that move by whole cells a step
-    thus see the same contact.
+    thus see the same contact. With `several`, nodes, gravity and colliders are those of `copies` simulations.
 
     Source: paper section 3.3, step 2.
     """
     real, vec3, vec4, mat33 = precision.real, precision.vec3, precision.vec4, precision.mat33
     outward_normal, against = make_contact(precision)
     load = make_load(precision)
+    share, copy_of = make_copies(several)
 
     @wp.kernel(enable_backward=False, module="unique")
     def grid_update(
@@ -299,10 +321,11 @@ def make_grid_update(precision: Precision):
         shape: wp.vec3i,
         block_shape: wp.vec3i,
         threads: int,
+        copies: int,
         values: wp.array(dtype=vec4),
         dx: real,
         dt: real,
-        gravity: vec3,
+        gravity: wp.array(dtype=vec3),
         collider_shape: wp.array(dtype=wp.int32),
         collider_active: wp.array(dtype=wp.int32),
         collider_position: wp.array(dtype=vec3),
@@ -316,18 +339,24 @@ def make_grid_update(precision: Precision):
         wall_padding: int,
     ):
         index = wp.tid()
-        count = nodes_of_step(nodes, listed)
+        each = nodes_of_step(nodes, listed)
+        count = each
+        if wp.static(several):
+            count = copies * each
+        solids = share(collider_shape.shape[0], copies)
         while index < count:
-            flat = node_of_step(index, nodes, blocks, shape, block_shape)
+            copy = copy_of(index, each)
+            flat = node_of_step(index - copy * each, nodes, blocks, shape, block_shape)
             index += threads
+            start = copy * share(values.shape[0], copies)
             value = vec4()
             if flat >= 0:
-                value = load(values, storage(flat, slots))
+                value = load(values, start + storage(flat, slots))
             if value[3] > real(0.0):
                 node = node_of(flat, shape)
-                v = vec3(value[0], value[1], value[2]) / value[3] + dt * gravity
+                v = vec3(value[0], value[1], value[2]) / value[3] + dt * gravity[copy]
                 x = dx * vec3(real(node[0]), real(node[1]), real(node[2]))
-                for c in range(collider_shape.shape[0]):
+                for c in range(copy * solids, (copy + 1) * solids):
                     if collider_active[c] != 0:
                         arm = x - collider_position[c]
                         normal = outward_normal(
@@ -348,6 +377,6 @@ def make_grid_update(precision: Precision):
                             or (high and v[axis] > real(0.0))
                         ):
                             v[axis] = real(0.0)
-                values[storage(flat, slots)] = vec4(v[0], v[1], v[2], value[3])
+                values[start + storage(flat, slots)] = vec4(v[0], v[1], v[2], value[3])
 
     return grid_update

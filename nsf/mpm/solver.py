@@ -33,13 +33,14 @@ class GridStep:
     """P2G, grid update and G2P over given particle arrays.
 
     What the full-order and the reduced solver share: there is one sequence of these
-    kernels, so a reduced step is the full-order step on fewer particles.
+    kernels, so a reduced step is the full-order step on fewer particles. On a grid of several copies it is
+    a step of as many simulations; arrays of particles then hold as many rows of each, one by one.
 
     Args:
         grid: the nodes.
-        boundaries: colliders and walls.
+        boundaries: colliders and walls; of several simulations those of each, one by one, as many of each.
         transfer: transfer scheme and B-spline.
-        gravity: [3] [m/s²].
+        gravity: [3] [m/s²]; of several simulations [copies, 3].
         dt: step [s].
         precision: floating-point types.
         device: Warp device.
@@ -57,13 +58,15 @@ class GridStep:
         self.grid, self.device = grid, device
         self.dx, self.dt = real(grid.geometry.dx), real(dt)
         self._seconds = float(dt)  # the colliders' time is fp64 in either precision
-        self.gravity = precision.vec3(*gravity)
+        several = grid.copies > 1
+        gravity = np.broadcast_to(np.asarray(gravity, float).reshape(-1, 3), (grid.copies, 3))
+        self.gravity = wp.array(gravity, dtype=precision.vec3, device=device)
         self.boundaries = boundaries
         self.affine_shares = tuple(real(s) for s in transfer.affine_shares)
-        self._p2g = make_p2g(precision, transfer.shape, transfer.deterministic)
-        self._g2p = make_g2p(precision, transfer.shape)
+        self._p2g = make_p2g(precision, transfer.shape, transfer.deterministic, several)
+        self._g2p = make_g2p(precision, transfer.shape, several)
         self._reach = make_reach(precision, transfer.shape)
-        self._update = make_grid_update(precision)
+        self._update = make_grid_update(precision, several)
 
     def p2g(self, x, v, C, tau, mass, volume0) -> None:
         """Particles → grid: mass, momentum and the impulse of the stress."""
@@ -92,6 +95,7 @@ class GridStep:
             grid.slots,
             self.dx,
             self.dt,
+            grid.copies,
             grid.values,
         ]
         whole_warps = -(-x.shape[0] // WARP) * WARP
@@ -106,15 +110,18 @@ class GridStep:
         grid = self.grid
         if not followed:
             self.follow()
-        inputs = [*grid.stored, grid.values, self.dx, self.dt, self.gravity]
+        inputs = [*grid.stored, grid.copies, grid.values, self.dx, self.dt, self.gravity]
         wp.launch(
             self._update, dim=grid.threads, inputs=inputs + self.boundaries.arguments, device=self.device
         )
 
     def g2p(self, x, v, C, increment) -> None:
-        """Grid → particles: velocity, position, affine momentum, deformation increment."""
-        inputs = [*self.gathering, x, v, C, increment]
-        wp.launch(self._g2p, dim=x.shape[0], inputs=inputs, device=self.device)
+        """Grid → particles: velocity, position, affine momentum, deformation increment.
+
+        Of several simulations, the first particles of each move, as many as have a row in C.
+        """
+        inputs = [*self.gathering, self.grid.copies, x, v, C, increment]
+        wp.launch(self._g2p, dim=C.shape[0], inputs=inputs, device=self.device)
 
     @property
     def gathering(self) -> list:

@@ -11,6 +11,7 @@ import warp as wp
 
 from nsf.errors import ConfigError
 from nsf.mpm.access import make_add, make_load, make_sum
+from nsf.mpm.copies import make_copies
 from nsf.mpm.grid import flat_index, inside, storage
 from nsf.mpm.materials import LawFunctions, make_law_update
 from nsf.mpm.precision import Precision
@@ -63,13 +64,14 @@ class Transfer:
 
 
 @cache
-def make_p2g(precision: Precision, shape_name: str, deterministic: bool = False):
+def make_p2g(precision: Precision, shape_name: str, deterministic: bool = False, several: bool = False):
     """Kernel of P2G, one thread a particle, launched over whole warps of threads.
 
     m_i = Σ_p w_ip m_p and, with the explicit force's impulse added in the same sweep,
     m_i v_i = Σ_p w_ip m_p (v_p + C_p (x_i − x_p)) − Δt Σ_p τ_p ∇w_ip V_p⁰.
     Particles off the grid are passed over; the solver's check reports them. Particles of one cell that
-    follow each other are added up before they reach the nodes.
+    follow each other are added up before they reach the nodes. With `several`, rows of particles and nodes
+    are those of `copies` simulations.
 
     Source: paper section 3.3, steps 1 and 2.
     """
@@ -77,6 +79,7 @@ def make_p2g(precision: Precision, shape_name: str, deterministic: bool = False)
     shape = shape_functions(precision, shape_name)
     width = shape.degree + 1
     base_node, local, weights, gradients = shape.base_node, shape.local, shape.weights, shape.gradients
+    share, copy_of = make_copies(several)
     add, (run_of, total) = make_add(precision, deterministic), make_sum(precision, deterministic)
     options = {"max_unroll": 4}
     if deterministic:
@@ -94,16 +97,23 @@ def make_p2g(precision: Precision, shape_name: str, deterministic: bool = False)
         slots: wp.array(dtype=wp.int32),
         dx: real,
         dt: real,
+        copies: int,
         values: wp.array(dtype=vec4),
     ):
         p = wp.min(wp.tid(), x.shape[0] - 1)
+        copy = copy_of(p, share(x.shape[0], copies))
+        start = copy * share(values.shape[0], copies)
         inv_dx = real(1.0) / dx
         base = base_node(x[p], inv_dx)
         # Threads leave as a warp or not at all, as the sums need all of it.
         cell = -1
         if wp.tid() < x.shape[0] and inside(base, width, grid_shape):
             cell = flat_index(base[0], base[1], base[2], grid_shape)
-        run = run_of(cell)
+        # Neighbours in a warp that are of two simulations must not be added up: their keys differ in parity.
+        key = cell
+        if wp.static(several):
+            key = wp.where(cell < 0, cell, 2 * cell + copy % 2)
+        run = run_of(key)
         if run == 0:
             return
         f = local(x[p], inv_dx, base)
@@ -127,7 +137,7 @@ def make_p2g(precision: Precision, shape_name: str, deterministic: bool = False)
                     slot = storage(wp.max(cell, 0) + flat_index(a, b, c, grid_shape), slots)
                     added = total(vec4(carried[0], carried[1], carried[2], weight * m), run)
                     if run > 0 and cell >= 0 and slot >= 0:
-                        add(values, slot, added)
+                        add(values, start + slot, added)
 
     return p2g
 
@@ -137,7 +147,8 @@ def make_gather(precision: Precision, shape_name: str):
     """Warp function of G2P: what a particle's nodes give it, v_p, C_p and the deformation increment f_p.
 
     v_p = Σ_i w_ip v_i, x_p ← x_p + Δt v_p, C_p = 12/(Δx²(b+1)) Σ_i w_ip v_i (x_i − x_p)ᵀ,
-    f_p = I + Δt Σ_i v_i ∇w_ipᵀ, so that F_trial = f_p F_e.
+    f_p = I + Δt Σ_i v_i ∇w_ipᵀ, so that F_trial = f_p F_e. `start` is where the nodes of the particle's
+    simulation begin.
 
     Source: paper section 3.3, step 3.
     """
@@ -153,6 +164,7 @@ def make_gather(precision: Precision, shape_name: str):
         x: vec3,
         base: wp.vec3i,
         values: wp.array(dtype=vec4),
+        start: int,
         grid_shape: wp.vec3i,
         slots: wp.array(dtype=wp.int32),
         dx: real,
@@ -178,7 +190,7 @@ def make_gather(precision: Precision, shape_name: str):
                     reach = vec3(real(float(a)) - f[0], real(float(b)) - f[1], real(float(c)) - f[2])
                     slope = vec3(da_b * w[2, c], a_db * w[2, c], w_ab * d[2, c])
                     # Without a branch, so that the loads of all nodes are under way together.
-                    value = wp.where(slot >= 0, load(values, wp.max(slot, 0)), vec4())
+                    value = wp.where(slot >= 0, load(values, start + wp.max(slot, 0)), vec4())
                     v_i = vec3(value[0], value[1], value[2])
                     velocity += weight * v_i
                     affine += wp.outer(v_i, weight * reach)
@@ -192,8 +204,11 @@ def make_gather(precision: Precision, shape_name: str):
 
 
 @cache
-def make_g2p(precision: Precision, shape_name: str):
+def make_g2p(precision: Precision, shape_name: str, several: bool = False):
     """Kernel of G2P, one thread a particle: new v, x, C and the deformation increment.
+
+    With `several`, arrays are those of `copies` simulations, and of each the first particles alone are moved,
+    as many as have a row in C.
 
     Source: paper section 3.3, step 3.
     """
@@ -201,6 +216,7 @@ def make_g2p(precision: Precision, shape_name: str):
     shape = shape_functions(precision, shape_name)
     base_node, width = shape.base_node, shape.degree + 1
     gather = make_gather(precision, shape_name)
+    share, copy_of = make_copies(several)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 4})
     def g2p(
@@ -211,20 +227,25 @@ def make_g2p(precision: Precision, shape_name: str):
         dt: real,
         symmetric: real,
         skew: real,
+        copies: int,
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
         C: wp.array(dtype=mat33),
         increment: wp.array(dtype=mat33),
     ):
-        p = wp.tid()
+        t = wp.tid()
+        moved = share(C.shape[0], copies)
+        copy = copy_of(t, moved)
+        p = t + copy * (share(x.shape[0], copies) - moved)
+        start = copy * share(values.shape[0], copies)
         base = base_node(x[p], real(1.0) / dx)
         if not inside(base, width, grid_shape):
             return
-        velocity, affine, f = gather(x[p], base, values, grid_shape, slots, dx, dt, symmetric, skew)
+        velocity, affine, f = gather(x[p], base, values, start, grid_shape, slots, dx, dt, symmetric, skew)
         v[p] = velocity
         x[p] = x[p] + dt * velocity
-        C[p] = affine
-        increment[p] = f
+        C[t] = affine
+        increment[t] = f
 
     return g2p
 
@@ -267,7 +288,7 @@ def make_g2p_stress(precision: Precision, shape_name: str, law: LawFunctions, hi
         base = base_node(x[p], real(1.0) / dx)
         if not inside(base, width, grid_shape):
             return
-        velocity, affine, f = gather(x[p], base, values, grid_shape, slots, dx, dt, symmetric, skew)
+        velocity, affine, f = gather(x[p], base, values, 0, grid_shape, slots, dx, dt, symmetric, skew)
         v[p] = velocity
         x[p] = x[p] + dt * velocity
         C[p] = affine

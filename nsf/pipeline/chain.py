@@ -15,6 +15,7 @@ from omegaconf import DictConfig, OmegaConf
 from nsf.data import Snapshots, Trajectory
 from nsf.dynamics import (
     ParticleSets,
+    ReducedBatch,
     ReducedMPM,
     Rollout,
     SamplePhase,
@@ -150,21 +151,38 @@ class Pipeline(Plan):
         self, manifold: Manifold, value: float, device: str | None = None, precision: str | None = None
     ) -> ReducedMPM:
         """The reduced solver at a parameter value, at t = 0; device and precision as configured."""
-        solver = self.deployed.reduced(
-            manifold,
-            {self.scene.parameters.name: value},
-            self._phases or self.sampler,
-            method=self.method,
-            projector=self.projector,
-            integration=self.integration,
-            precision=precision or self.config.precision,
-            device=device or self.device,
-            dt_multiplier=self.config.deploy.dt_multiplier,
-            sets=self._sets,
-        )
-        # These depend on the manifold and the sampler alone: found once for all values.
+        parameters = {self.scene.parameters.name: value}
+        how = self._how(device, precision)
+        solver = self.deployed.reduced(manifold, parameters, self._phases or self.sampler, **how)
         self._phases, self._sets = solver.phases, solver.sets
         return solver
+
+    def batch_at(
+        self,
+        manifold: Manifold,
+        values: Sequence[float],
+        device: str | None = None,
+        precision: str | None = None,
+    ) -> ReducedBatch:
+        """Reduced solvers at several parameter values that take their steps together, likewise."""
+        parameters = [{self.scene.parameters.name: value} for value in values]
+        how = self._how(device, precision)
+        batch = self.deployed.reduced_batch(manifold, parameters, self._phases or self.sampler, **how)
+        self._phases, self._sets = batch.runs[0].phases, batch.runs[0].sets
+        return batch
+
+    def _how(self, device: str | None, precision: str | None) -> dict:
+        """Options of a reduced solver."""
+        return {
+            "method": self.method,
+            "projector": self.projector,
+            "integration": self.integration,
+            "precision": precision or self.config.precision,
+            "device": device or self.device,
+            "dt_multiplier": self.config.deploy.dt_multiplier,
+            # As the sample, these depend on the manifold and the sampler alone: found once for all values.
+            "sets": self._sets,
+        }
 
     def deploy(self) -> Run:
         """Reduced trajectories of the held-out values, through Lightning's `Trainer.predict`."""
@@ -182,7 +200,16 @@ class Pipeline(Plan):
                 "seconds": time.perf_counter() - started,
             }
             hand_over = self.config.deploy.on_distrust == "full_order"
-            rollouts = deploy(build, self.held_out, self.device, trust, until_distrusted=hand_over)
+            together = min(self.config.deploy.batch, len(self.held_out))
+            rollouts = deploy(
+                build,
+                self.held_out,
+                self.device,
+                trust,
+                hand_over,
+                partial(self.batch_at, manifold),
+                together,
+            )
             for index, rollout in enumerate(rollouts):
                 rollout.save(run.path / rollout_file(index))
                 record.output(rollout_file(index))
@@ -191,13 +218,16 @@ class Pipeline(Plan):
                     self._go_on(manifold, rollout, run.path / continuation_file(index))
                     record.output(continuation_file(index))
             self._write_configuration(record)
+            # Runs that took their steps together share the time of these equally.
+            record.metrics["batch"] = together
             record.metrics["seconds"] = [r.seconds for r in rollouts]
             record.metrics["needed_outside"] = max(r.needed_outside for r in rollouts)
             record.metrics["diverged"] = [r.parameter for r in rollouts if r.diverged >= 0]
             record.metrics["distrusted"] = [r.parameter for r in rollouts if r.distrusted >= 0]
+        at_once = f", {together} together" if together > 1 else ""
         self.say(
             f"deploy: method={self.config.method.name}, |S|={rollouts[0].sample}, "
-            f"{len(rollouts)} values → {run.id}"
+            f"{len(rollouts)} values{at_once} → {run.id}"
         )
 
     def _write_configuration(self, record: Record) -> None:

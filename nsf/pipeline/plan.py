@@ -14,6 +14,7 @@ from nsf.data import Split
 from nsf.dynamics.interop import torch_device
 from nsf.dynamics.sampling import check_well_posed
 from nsf.errors import ConfigError, DeviceError
+from nsf.kinematics.basis import BasisField
 from nsf.kinematics.tracking import check_tracking
 from nsf.mpm import FP32, FP64, Precision, precision_of
 from nsf.mpm.device import visible_gpus, warp_device
@@ -67,6 +68,7 @@ class Plan:
             setattr(self, name, configuration.build(c[name], name))
         self._check_numbers()
         self._check_words()
+        self._check_batch()
         self.deployed = self._changed(c.deploy.changes)
         X = self.scene.particles().X
         for region in self.sampler.regions:
@@ -87,6 +89,19 @@ class Plan:
         multiplier = c.deploy.dt_multiplier
         if not configuration.number("deploy.dt_multiplier", multiplier) > 0:
             raise ConfigError(f"deploy.dt_multiplier={multiplier} must be positive")
+
+    def _check_batch(self) -> None:
+        """What cannot be deployed at several values together, as far as it shows before any work."""
+        size = configuration.number("deploy.batch", self.config.deploy.batch, least=1, whole=True)
+        if size == 1:
+            return
+        if not isinstance(self.field, BasisField):
+            raise ConfigError(
+                f"deploy.batch={size} needs field=basis or joint, whose steps are taken in coefficients; "
+                "set deploy.batch=1"
+            )
+        if self.integration.strategy != "superset":
+            raise ConfigError(f"deploy.batch={size} needs integration=superset; set it, or deploy.batch=1")
 
     def _check_words(self) -> None:
         """Values that are one of a few, and the report's name."""

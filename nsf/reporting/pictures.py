@@ -1,7 +1,9 @@
 """Which charts and particle pictures a report holds, and the sentence under each."""
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +14,14 @@ from nsf.reporting.columns import MEASURED, parameter_text
 from nsf.reporting.sources import Motion, same_parameter
 from nsf.reporting.style import save
 from nsf.reporting.tables import Merged, mean_rows, paper_row, variant_labels, variants
+from nsf.workers import results, working
 
 ROWS = 6  # parameter values in one picture of final shapes
 ANIMATED, FRAMES = 2, 31  # parameter values and frames of an animation
 ANIMATIONS_BYTES = 8 * 2**20  # of all on a page
 # Of one on a page of many: to fit, it would give up half its frames and size, so these are never drawn.
 CROWDED_BYTES, CROWDED_ANIMATED, CROWDED_FRAMES = 2**19, 1, 16
+_FEW = 2  # variants that a process is not worth starting for
 
 
 @dataclass(frozen=True)
@@ -106,11 +110,8 @@ def draw(merged: Merged, folder: Path) -> list[Section]:
     known = [_Variant(merged, members, label) for members, label in zip(groups, labels, strict=True)]
     shown = _best_of_each_method(known)
     sections = [
-        Section(
-            _heading(v) if len(known) > 1 else "What was simulated",
-            _of_variant(v, folder, prefix, min(render.GIF_BYTES, ANIMATIONS_BYTES // len(shown))),
-        )
-        for v, prefix in zip(shown, _prefixes(shown), strict=True)
+        Section(_heading(v) if len(known) > 1 else "What was simulated", pictures)
+        for v, pictures in zip(shown, _of_variants(shown, folder), strict=True)
     ]
     return [
         *sections,
@@ -126,6 +127,27 @@ def _best_of_each_method(known: list[_Variant]) -> list[_Variant]:
         if other is None or not other.delta <= v.delta:
             best[v.scene, v.method] = v
     return list(best.values())
+
+
+def _of_variants(shown: list[_Variant], folder: Path) -> list[list[Picture]]:
+    """The pictures of each variant; where they are many, drawn in several processes."""
+    gif_bytes = min(render.GIF_BYTES, ANIMATIONS_BYTES // len(shown))
+    calls = [
+        partial(_of_variant, v, folder, prefix, gif_bytes)
+        for v, prefix in zip(shown, _prefixes(shown), strict=True)
+    ]
+    processes = min(os.cpu_count() or 1, len(shown) // _FEW)
+    if processes < 2:
+        return [call() for call in calls]
+    turns = [calls[first::processes] for first in range(processes)]
+    with working([partial(_each, turn) for turn in turns], [{}] * processes) as workers:
+        drawn = results(workers)
+    return [drawn[i % processes][i // processes] for i in range(len(shown))]
+
+
+def _each(calls: Sequence[Callable[[], list[Picture]]], tell) -> list[list[Picture]]:
+    """One process's share."""
+    return [call() for call in calls]
 
 
 def _of_variant(v: _Variant, folder: Path, prefix: str, gif_bytes: int) -> list[Picture]:

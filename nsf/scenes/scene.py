@@ -381,3 +381,15 @@ class Scene:
         from nsf.dynamics import ReducedMPM
 
         return ReducedMPM.of_scene(self, manifold, parameters, sample, **options)
+
+    def reduced_batch(self, manifold, parameters: Sequence[Mapping[str, float]], sample=None, **options):
+        """Reduced solvers at t = 0 that take their steps in the same launches, one for each `{name: value}`.
+
+        Args:
+            manifold, sample: as for `reduced`.
+            parameters: problem parameters of each.
+            **options: see `nsf.dynamics.ReducedBatch.of_scene`.
+        """
+        from nsf.dynamics import ReducedBatch
+
+        return ReducedBatch.of_scene(self, manifold, parameters, sample, **options)

@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from nsf.data import Trajectory
-from nsf.dynamics import NeighbourSearch, ParticleSets, ProjectionResult, Taylor
+from nsf.dynamics import NeighbourSearch, ParticleSets, ProjectionResult, Rollout, Taylor
 from nsf.errors import ConfigError, InstabilityError, MissingRunError
 from nsf.evaluation import superresolution
 from nsf.kinematics.manifold import Manifold
@@ -167,6 +167,26 @@ def test_another_test_value_simulates_only_that_one(copied, pipeline_at):
     assert {p: t for p, t in stamps(root).items() if p in before} == before
     results = pd.read_csv(pipeline.evaluation.path / "results.csv")
     assert results["parameter"].tolist() == [26.0, 34.0]
+
+
+def test_values_deployed_together_are_as_one_by_one(copied, pipeline_at):
+    root, keys = copied("simulate", "train"), ("scene.parameters.test=[26,34,36]", "evaluation.trials=1")
+    said_by(pipeline_at, root, *keys, stages=("simulate",))
+    found = {}
+    for batch in (1, 2):
+        shutil.rmtree(root / "deploy", ignore_errors=True)
+        pipeline, said = said_by(pipeline_at, root, *keys, f"deploy.batch={batch}", stages=("deploy",))
+        run = pipeline.deployment
+        found[batch] = run.hash, [Rollout.open(run.path / f"rollout_{i}.h5") for i in range(3)]
+        assert run.manifest["metrics"]["batch"] == batch
+        assert ("3 values, 2 together → " in said[-1]) == (batch == 2)
+    (one_hash, ones), (other_hash, others) = found.values()
+    assert one_hash == other_hash
+    for one, other in zip(ones, others, strict=True):
+        assert (one.parameter, one.stops, one.diverged) == (other.parameter, other.stops, other.diverged)
+        assert (one.sample, one.integration_mean) == (other.sample, other.integration_mean)
+        np.testing.assert_allclose(one.xhat, other.xhat, rtol=0, atol=1e-10)
+    assert pipeline.evaluate().complete
 
 
 def test_deploying_on_another_scene_than_the_one_trained_on(copied, pipeline_at):

@@ -126,6 +126,8 @@ BEFORE_ANY_WORK = [
     ("sampler.seed=abc", ["sampler.seed=abc"]),
     ("deploy.dt_multiplier=0", ["dt_multiplier=0"]),
     ("deploy.dt_multiplier=abc", ["dt_multiplier=abc"]),
+    ("deploy.batch=0", ["deploy.batch=0"]),
+    ("deploy.batch=1.5", ["deploy.batch=1.5"]),
     ("deploy.changes={scene.gravty:[0,0,-1]}", ["'scene.gravty'", "did you mean scene.gravity"]),
     ("deploy.changes={scene.bodies.column.particles:400}", ["column.particles", "other particles"]),
     ("deploy.changes={material.nu:0.6}", ["deploy.changes", "material.nu=0.6"]),
@@ -158,6 +160,17 @@ def chain_module():
     from nsf.pipeline import chain
 
     return chain
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [("field=mlp", "field=basis or joint"), ("integration=search", "integration=superset; set it")],
+)
+def test_what_is_not_deployed_together_is_refused_before_any_work(nsf, override, message):
+    code, _, err = nsf("run", "scene=sand", "device=cpu", "deploy.batch=2", override, tiny_scene=False)
+    assert code == 2
+    assert f"deploy.batch=2 needs {message}" in err
+    assert "deploy.batch=1" in err
 
 
 def test_the_example_of_the_style_guide(nsf, monkeypatch):

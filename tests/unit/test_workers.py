@@ -10,7 +10,7 @@ from functools import partial
 import pytest
 
 from nsf.errors import InstabilityError, LaunchError
-from nsf.workers import ended, working
+from nsf.workers import ended, results, working
 
 
 def doubled(number, tell):
@@ -83,7 +83,7 @@ from pathlib import Path
 from functools import partial
 sys.path.insert(0, {tests!r})
 from test_workers import waits
-from nsf.workers import ended, working
+from nsf.workers import ended, results, working
 with working([partial(waits, Path({path!r}))], [{{}}]) as workers:
     list(ended(workers, lambda amount: print("at work", flush=True)))
 """
@@ -100,3 +100,12 @@ def test_none_outlives_a_killed_program(tmp_path):
     while path.read_text() != "interrupted" and time.monotonic() - began < 20:
         time.sleep(0.05)
     assert path.read_text() == "interrupted"
+
+
+def test_results_are_in_order_and_an_error_is_raised():
+    environments = 2 * [{"NSF_TEST_NAME": "one"}]
+    with working([partial(doubled, 1), partial(doubled, 2)], environments) as workers:
+        assert results(workers) == [(2, "one"), (4, "one")]
+    calls = [partial(doubled, 1), partial(raises, InstabilityError("it left the grid"))]
+    with working(calls, environments) as workers, pytest.raises(InstabilityError, match="left the grid"):
+        results(workers)

@@ -10,11 +10,13 @@ import pandas as pd
 import pytest
 
 from nsf.bench import BENCHES, bench
+from nsf.bench.batch import _too_large, values_of
+from nsf.bench.batch import measured as measured_batches
 from nsf.bench.full_order import collapse, measured, pass_times
-from nsf.bench.measure import bandwidth, step_times
+from nsf.bench.measure import bandwidth, run_times, step_times
 from nsf.bench.multi_gpu import measured as measured_on_several
 from nsf.bench.reduced import measured as measured_chain
-from nsf.bench.report import with_speed_up, write_report
+from nsf.bench.report import step_over_batch, with_speed_up, write_report
 from nsf.bench.rows import KernelRow, Result, Row, Settings, StageRow, columns, size_name
 from nsf.bench.training import measured as measured_training
 from nsf.cli import main
@@ -152,6 +154,7 @@ def test_sizes_by_name(count, name):
         ({"particles": "10q"}, ConfigError, "particles=10q is no number of particles"),
         ({"particles": "0"}, ConfigError, "particles=0 is no number"),
         ({"trials": "0"}, ConfigError, "trials=0 must be"),
+        ({"scenes": "cake,tea"}, ConfigError, "scenes=tea is not measured; choose from cake, metal"),
         ({"precision": "fp16"}, ConfigError, "precision='fp16' is unknown"),
         ({"device": "tpu"}, DeviceError, "device=tpu"),
     ],
@@ -229,6 +232,80 @@ def test_delta_of_the_benchmark_is_that_of_the_evaluation(reduced, chain):
     assert row["delta"] == pytest.approx(evaluated, rel=1e-6)
     longer = reduced[(reduced["case"] == "reduced_sand_3dt") & (reduced["precision"] == "fp64")].iloc[0]
     assert longer["delta"] != pytest.approx(evaluated, rel=1e-3)
+
+
+@pytest.fixture(scope="module")
+def batches(chain):
+    """Rows of batches of the tiny chain."""
+    found, said = Result(), []
+    settings = Settings(particles=(), precisions=("fp32", "fp64"), device="cpu", trials=2)
+    own = Pipeline(chain.pipeline.config, say=lambda line: None, root=chain.root)
+    measured_batches(own, (1, 3, 2), settings, found, said.append)
+    assert len(said) == 6
+    return pd.DataFrame(found.rows, columns=columns(Row))
+
+
+def test_batches_have_rows_by_their_size(batches, chain):
+    assert batches["case"].tolist() == 2 * ["reduced_batch1", "reduced_batch2", "reduced_batch3"]
+    assert batches["batch"].tolist() == [1, 2, 3, 1, 2, 3]
+    assert (batches["ms_p10"] <= batches["ms_median"]).all()
+    assert (batches["ms_median"] <= batches["ms_p90"]).all()
+    # The first simulation of each is that of the evaluation.
+    evaluated = pd.read_csv(chain.pipeline.evaluation.path / "results.csv").iloc[0]
+    double = batches[batches["precision"] == "fp64"]
+    np.testing.assert_allclose(double["delta"], evaluated["delta"], rtol=1e-6)
+    assert (double["integration"] == round(evaluated["integration_mean"])).all()
+    assert batches["particles"].unique().tolist() == [500]
+
+
+def test_the_values_of_a_batch(chain):
+    assert values_of(chain.pipeline, 1) == [26.0]
+    many = values_of(chain.pipeline, 64)
+    assert many[:4] == values_of(chain.pipeline, 4)
+    assert len(set(many)) == 64
+    assert 22.0 <= min(many) < 22.5 < 37.5 < max(many) <= 38.0
+
+
+def test_a_batch_that_would_not_fit_is_left_out(monkeypatch):
+    monkeypatch.setattr("torch.cuda.mem_get_info", lambda device: (1000, 2000))
+    held = {1: 100, 4: 190}  # 70 and 30 for each
+    assert not _too_large(24, held, "cuda:0")
+    assert _too_large(25, held, "cuda:0")
+    assert not _too_large(25, held, "cpu")
+    assert not _too_large(256, {1: 100}, "cuda:0")
+
+
+def test_a_report_of_batches(batches, tmp_path):
+    batches.to_csv(tmp_path / "results.csv", index=False)
+    pd.DataFrame(columns=columns(KernelRow)).to_csv(tmp_path / "kernels.csv", index=False)
+    pd.DataFrame(columns=columns(StageRow)).to_csv(tmp_path / "stages.csv", index=False)
+    page = write_report(tmp_path).read_text()
+    assert re.findall(r"\]\((.*?)\)", page) == ["batch-cpu.png"]
+    assert page.count("| reduced_batch3 |") == 2
+    assert "simulation-step" in page
+    assert (tmp_path / "batch-cpu.png").stat().st_size > 5000
+    panel = step_over_batch(batches).axes[0]
+    assert panel.get_xscale() == panel.get_yscale() == "log"
+    assert [line.get_xdata().tolist() for line in panel.lines] == 4 * [[1, 2, 3]]
+
+
+def test_whole_runs_take_turns():
+    class Solver:
+        total_steps = 5
+
+        def __init__(self, name):
+            self.name = name
+
+        def restart(self):
+            done.append(f"restart {self.name}")
+
+        def step(self, n):
+            done.append((self.name, n))
+
+    done = []
+    found = run_times({"a": Solver("a"), "b": Solver("b")}, 2, "cpu")
+    assert done == 3 * ["restart a", ("a", 5), "restart b", ("b", 5)]
+    assert [len(times) for times in found.values()] == [2, 2]
 
 
 def test_a_report_of_scenes(reduced, found, tmp_path):

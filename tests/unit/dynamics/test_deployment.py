@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from nsf.dynamics import Rollout, Taylor, deploy, rollout
+from nsf.dynamics import Rollout, Taylor, deploy, rollout, rollouts
 from nsf.errors import SchemaError
 
 
@@ -66,6 +66,43 @@ def test_batches_are_parameter_values(made, solver_at, tiny_trust):
     assert [run.parameter for run in runs] == [26.0, 33.5]
     assert same(runs[0], made, timing=False)
     assert not np.array_equal(runs[0].xhat, runs[1].xhat)
+
+
+@pytest.fixture(scope="module")
+def batch_at(chain, tiny_manifold):
+    def build(values, device="cpu"):
+        taken.append(len(values))
+        parameters = [{"friction_angle": value} for value in values]
+        return chain.scene.reduced_batch(tiny_manifold, parameters, 20, device=device)
+
+    taken = build.taken = []
+    return build
+
+
+@pytest.mark.parametrize("until_distrusted", [False, True])
+def test_values_that_take_their_steps_together(solver_at, batch_at, tiny_trust, until_distrusted):
+    """One of them is far from training, so that it hands over in mid-run; the last has no other beside it."""
+    values = (26.0, 8.0, 33.5, 30.0, 22.5)
+    batch_at.taken.clear()
+    found = deploy(solver_at, values, "cpu", tiny_trust, until_distrusted, batch_at, 2)
+    assert batch_at.taken == [2, 2]
+    assert [run.parameter for run in found] == list(values)
+    assert found[0].seconds == found[1].seconds > 0
+    for run in found:
+        alone = rollout(solver_at(run.parameter), run.parameter, tiny_trust, until_distrusted)
+        if run.handed_over >= 0:  # the other one of its batch went on, so that more steps were taken
+            run = replace(run, integration_mean=alone.integration_mean)
+        assert same(run, alone, timing=False)
+    assert found[1].distrusted > 0
+    assert (found[1].handed_over > 0) == until_distrusted
+    assert found[0].handed_over < 0
+
+
+def test_a_batch_ends_when_no_run_is_believed(batch_at, tiny_trust):
+    for values, all_steps in (((8.0, 9.0), False), ((26.0, 8.0), True)):
+        batch = batch_at(values)
+        rollouts(batch, values, tiny_trust, until_distrusted=True)
+        assert (batch.steps_taken == batch.total_steps) == all_steps
 
 
 def test_round_trip(made, tmp_path):

@@ -61,7 +61,7 @@ def test_stress_and_affine_on_the_particles(solver, method, tiny_manifold):
     xhat = solver.xhat.clone()
     solver.stages["inference"]()
     phase = solver._phase
-    taken = phase.needed.bool()  # the others are not evaluated
+    taken = phase.needed[0].bool()  # the others are not evaluated
     assert taken[: phase.s].all()
     fields = tiny_manifold.restrict(particles=torch.as_tensor(phase.order)[taken])
     if method.neural_stress:

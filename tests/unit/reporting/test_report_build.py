@@ -15,6 +15,7 @@ from nsf.reporting.pictures import _Variant
 from nsf.reporting.sources import Source, file_hash, open_sources
 from nsf.reporting.tables import merge
 from nsf.reporting.trust import spearman, trust_note
+from nsf.workers import working
 
 TINY = Made(particles=30, frames=4, parameters=TEST[:2], splits=("test",) * 2)
 
@@ -69,6 +70,16 @@ def test_training_time_and_scale_are_told_by_field(tmp_path, no_pictures):
     assert "9 s (basis field)" in page
     assert "4.0 min (mlp field)" in page
     assert "these runs are of small scale" in page
+
+
+def test_pictures_of_many_variants_are_the_same_from_several_processes(sweep, report, tmp_path, monkeypatch):
+    monkeypatch.setattr(pictures, "_FEW", 1)
+    monkeypatch.setattr(pictures.os, "cpu_count", lambda: 2)
+    asked = []
+    monkeypatch.setattr(pictures, "working", lambda calls, e: asked.append(len(calls)) or working(calls, e))
+    again = build_report(sweep, tmp_path / "sand", "Sand & friends").parent
+    assert asked == [2]
+    assert files(again) == files(report)
 
 
 def test_pictures_are_of_the_best_sample_of_each_method(report):

@@ -1,0 +1,95 @@
+"""Reduced simulations at many parameter values that take their steps together, by their number."""
+
+from collections.abc import Callable
+from functools import cache, partial
+
+import numpy as np
+import torch
+
+from nsf import config
+from nsf.bench.measure import build, name_of, run_times
+from nsf.bench.reduced import SCENES, deformation_error
+from nsf.bench.rows import Result, Row, Settings, commit
+from nsf.dynamics import ReducedBatch, ReducedMPM, ReducedRun
+from nsf.pipeline import Pipeline
+
+#: Simulations of a batch.
+SIZES = {"cuda": (1, 4, 16, 64, 256), "cpu": (1, 4)}
+_GOLDEN = 0.618034  # multiples of it, less whole numbers, fill an interval evenly however many there are
+_SHARE = 0.8  # of the free device memory that a batch may be expected to take
+
+
+def run(settings: Settings, say: Callable[[str], object]) -> Result:
+    """Each scene: at the paper's size on a GPU, at small scale on a CPU.
+
+    Data and training are made, or reused, as by `nsf train`. The first simulation of a batch is that of the
+    first held-out value, of which δ is told; the others' values fill the range of training.
+    """
+    kind = "cuda" if settings.device.startswith("cuda") else "cpu"
+    scale, found = {"cuda": "paper", "cpu": "small"}[kind], Result()
+    for scene in settings.scenes or SCENES:
+        overrides = [f"scene={scene}", f"scale={scale}", f"device={settings.device}"]
+        measured(Pipeline(config.load(overrides), say=say), SIZES[kind], settings, found, say)
+    return found
+
+
+def measured(chain: Pipeline, sizes, settings: Settings, found: Result, say: Callable[[str], object]) -> None:
+    """Add the rows of one scene; every batch of a precision turn by turn, in whole runs."""
+    chain.simulate()
+    chain.train()
+    manifold, scene, name = chain.manifold(), chain.scene, chain.scene.parameters.name
+    truth = chain.truth(chain.held_out[0]).path / "trajectory.h5"
+    first = chain.solver_at(manifold, chain.held_out[0])
+    phases, sets, particles = first.phases, first.sets, len(first.scene_particles)
+    del first  # its arrays are on the device
+    how = {"method": chain.method, "projector": chain.projector, "integration": chain.integration}
+
+    @cache
+    def scene_at(value: float):
+        return scene.with_parameters({name: value})
+
+    def make(size: int, precision: str):
+        options = how | {"sets": sets, "precision": precision, "device": settings.device}
+        own = [(manifold, scene_at(value), phases, {name: value}) for value in values_of(chain, size)]
+        if size == 1:
+            return ReducedMPM(*own[0], **options)
+        return ReducedBatch([ReducedRun(*one, **options) for one in own])
+
+    for precision in settings.precisions:
+        built: dict[int, tuple] = {}
+        for size in sorted(sizes):
+            if _too_large(size, {n: solver.nbytes for n, (solver, _) in built.items()}, settings.device):
+                say(f"reduced_batch{size} {precision}: left out, the device has not the memory")
+                break
+            built[size] = build(partial(make, size, precision), settings.device)
+        times = run_times({n: solver for n, (solver, _) in built.items()}, settings.trials, settings.device)
+        for size, (solver, peak_mib) in built.items():
+            p10, median, p90 = (np.percentile(times[size], [10, 50, 90]) / size).tolist()
+            run = getattr(solver, "runs", (solver,))[0]
+            row = Row(
+                bench="batch", case=f"reduced_batch{size}", particles=particles, batch=size,
+                sample=run.sample_size, integration=round(run.integration_mean), precision=precision,
+                device=name_of(settings.device), ms_median=median, ms_p10=p10, ms_p90=p90,
+                peak_mib=peak_mib, delta=deformation_error(run, truth), commit=commit(),
+            )  # fmt: skip
+            found.rows.append(row)
+            error = f"δ {100 * row.delta:.3g} %"
+            say(f"{row.case} {scene.name} {precision}: {median:.4g} ms a simulation-step, {error}")
+
+
+def values_of(chain: Pipeline, size: int) -> list[float]:
+    """Parameter values of a batch: the first held-out one, and others in the range of training.
+
+    Those of a small batch are the first ones of a large one: building a scene takes a moment.
+    """
+    low, high = min(chain.split.train), max(chain.split.train)
+    return [chain.held_out[0], *(low + (high - low) * (n * _GOLDEN % 1.0) for n in range(1, size))]
+
+
+def _too_large(size: int, nbytes: dict[int, int], device: str) -> bool:
+    """Whether a batch would not fit on the device beside those built, by what the last two of them take."""
+    if not device.startswith("cuda") or len(nbytes) < 2:
+        return False
+    (one, few), (more, many) = list(nbytes.items())[-2:]
+    free, _ = torch.cuda.mem_get_info(device)
+    return many + (size - more) * (many - few) / (more - one) > _SHARE * free

@@ -1,0 +1,357 @@
+"""Simulations that take their steps together take those of their own."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+import nsf.scenes
+from nsf.dynamics import (
+    NSF,
+    GaussNewton,
+    Integration,
+    Method,
+    ReducedBatch,
+    ReducedMPM,
+    ReducedRun,
+    SamplePhase,
+    Taylor,
+)
+from nsf.errors import ConfigError, ShapeError
+from nsf.kinematics.basis import BasisManifold
+from nsf.mpm.materials import FixedCorotated, Hencky, VonMises
+from nsf.timing import StageTimer
+
+ANGLE = "friction_angle"
+ANGLES = (26.0, 22.0, 37.5)
+METHODS = [Method(f"{a}{b}", a, b) for a in (True, False) for b in (True, False)]
+#: A plate that comes down on the column within the first steps.
+PLATE = [
+    "+scene.colliders.plate._target_=nsf.mpm.Cuboid",
+    "+scene.colliders.plate.centre=[0.5,0.5,0.31]",
+    "+scene.colliders.plate.size=[0.2,0.2,0.1]",
+    "+scene.colliders.plate.kind=sticky",
+    "+scene.colliders.plate.motion._target_=nsf.mpm.Motion",
+    "+scene.colliders.plate.motion.times=[0.0,0.12]",
+    "+scene.colliders.plate.motion.translations=[[0,0,0],[0,0,-0.03]]",
+]
+
+
+@pytest.fixture
+def parameters():
+    return [{ANGLE: angle} for angle in ANGLES]
+
+
+@pytest.fixture
+def run_of(tiny_manifold):
+    """(scene, kind, **options) → a run or a solver of that scene at 26°, with the sample of the first."""
+    kept = {}
+
+    def build(scene, kind=ReducedRun, angle=26.0, **options):
+        first = (kept["phases"], kept["sets"]) if kept else (20, None)
+        options = {"device": "cpu", "sets": first[1]} | options
+        found = kind.of_scene(scene, tiny_manifold, {ANGLE: angle}, first[0], **options)
+        kept.setdefault("phases", found.phases), kept.setdefault("sets", found.sets)
+        return found
+
+    return build
+
+
+@pytest.fixture
+def with_law(chain, tiny_manifold, run_of):
+    """(law, method) → a run of the tiny scene with that law."""
+    first = run_of(chain.scene)
+
+    def build(law, method):
+        scene = replace(chain.scene, material=law)
+        options = {"method": method, "device": "cpu", "sets": first.sets}
+        return ReducedRun(tiny_manifold, scene, first.phases, {ANGLE: 26.0}, **options)
+
+    return build
+
+
+def same(run, single, tolerance=1e-10):
+    """A run of a batch and the solver that took the same steps alone."""
+    one, other = run.trajectory(), single.trajectory()
+    assert np.abs(other.xhat[1:] - other.xhat[0]).max() > 0.01  # something has moved
+    np.testing.assert_allclose(one.xhat, other.xhat, rtol=0, atol=tolerance)
+    np.testing.assert_allclose(one.residuals, other.residuals, rtol=1e-6, atol=1e-3 * tolerance)
+    assert one.stops == other.stops
+    assert np.array_equal(one.t, other.t)
+    assert run.integration_mean == single.integration_mean
+    assert (run.time, run.sample_size) == (single.time, single.sample_size)
+
+
+def assert_each_as_alone(batch, singles, steps, tolerance=1e-10):
+    batch.step(steps)
+    for run, single in zip(batch.runs, singles, strict=True):
+        single.step(steps)
+        same(run, single, tolerance)
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
+def test_every_method(chain, tiny_manifold, parameters, method):
+    options = {"method": method, "device": "cpu"}
+    batch = chain.scene.reduced_batch(tiny_manifold, parameters, 20, **options)
+    singles = [chain.scene.reduced(tiny_manifold, own, 20, **options) for own in parameters]
+    assert_each_as_alone(batch, singles, 24)
+    ends = batch.xhat.numpy()
+    # The friction angle enters by the heads; without it the test would show nothing.
+    assert (np.abs(ends[0] - ends[1]).max() > 1e-3) == (method.neural_stress or method.neural_affine)
+
+
+@pytest.mark.parametrize("count", [1, 8, 9, 19])
+def test_tiles_that_are_full_and_not(chain, tiny_manifold, count):
+    parameters = [{ANGLE: angle} for angle in np.linspace(22.0, 38.0, count)]
+    batch = chain.scene.reduced_batch(tiny_manifold, parameters, 20, device="cpu")
+    assert len(batch) == count
+    batch.step(6)
+    for index in {0, count // 2, count - 1}:
+        single = chain.scene.reduced(tiny_manifold, parameters[index], 20, device="cpu")
+        single.step(6)
+        same(batch.runs[index], single)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"projector": Taylor()},
+        {"projector": GaussNewton(iterations=4, tolerance=1e-14)},
+        {"dt_multiplier": 1.5},
+        {"precision": "fp32"},
+    ],
+    ids=lambda options: "".join(map(str, options.values()))[:20],
+)
+def test_every_way_of_stepping(chain, tiny_manifold, parameters, options):
+    options = {"device": "cpu"} | options
+    batch = chain.scene.reduced_batch(tiny_manifold, parameters, 20, **options)
+    singles = [chain.scene.reduced(tiny_manifold, own, 20, **options) for own in parameters]
+    assert_each_as_alone(batch, singles, 16, 1e-10 if batch.runs[0].precision.name == "fp64" else 1e-4)
+
+
+def test_weights_and_phases_of_time(chain, tiny_manifold, parameters):
+    weights = np.random.default_rng(0).uniform(0.1, 3.0, 20)
+    phases = [SamplePhase(0.0, np.arange(0, 500, 25), weights), SamplePhase(0.5, np.arange(7, 500, 50), None)]
+    batch = chain.scene.reduced_batch(tiny_manifold, parameters, phases, device="cpu")
+    singles = [chain.scene.reduced(tiny_manifold, own, phases, device="cpu") for own in parameters]
+    assert_each_as_alone(batch, singles, 24)
+
+
+def test_deep_networks_of_several_members(chain, tiny_manifold, parameters):
+    """Of random weights: the first steps say whether every layer and member is where it should be."""
+    hyperparameters = tiny_manifold.hyperparameters | {"members": 3, "depth": 2, "beta": [5, 4, 3]}
+    manifold = BasisManifold(4, tiny_manifold.x_sha256, [ANGLE], hyperparameters)
+    learnt = {k: v for k, v in tiny_manifold.state_dict().items() if ".network." not in k}
+    manifold.load_state_dict(learnt, strict=False)
+    for seed, field in enumerate(manifold.fields.values()):
+        field.network.initialise(torch.Generator().manual_seed(seed))
+        field.scale.mul_(0.01)
+    manifold.requires_grad_(False)
+    batch = chain.scene.reduced_batch(manifold, parameters, 20, device="cpu")
+    singles = [chain.scene.reduced(manifold, own, 20, device="cpu") for own in parameters]
+    assert_each_as_alone(batch, singles, 3)
+
+
+CHANGES = {
+    "gravity": [{}, {"scene.gravity": [1.5, 0.0, -3.0]}, {"scene.gravity": [0.0, -2.0, -6.0]}],
+    "velocity": [{}, {"scene.bodies.column.velocity": [0.2, 0.1, -0.3]}],
+    "stiffness": [{}, {"material.E": 3000.0}, {"material.E": 1200.0}],
+    "mass": [{}, {"scene.bodies.column.density": 320.0}],
+    "floor": [{}, {"scene.colliders.floor.kind": "separate"}, {"scene.colliders.floor.normal": [0.3, 0, 1]}],
+    "plate": [
+        {},
+        {"scene.colliders.plate.motion.translations": [[0, 0, 0], [0, 0, 0.05]]},
+        {"scene.colliders.plate.until": 0.05},
+    ],
+}
+
+
+@pytest.mark.parametrize("what", CHANGES)
+@pytest.mark.parametrize("method", [NSF, Method("deformation", False, False)], ids=lambda m: m.name)
+def test_what_a_parameter_changes_is_each_ones_own(tiny, run_of, what, method):
+    scene = nsf.scenes.load("sand", [*tiny[1:], *(PLATE if what == "plate" else [])])
+    scenes = [scene.with_changes(changes) if changes else scene for changes in CHANGES[what]]
+    batch = ReducedBatch([run_of(scene, method=method) for scene in scenes])
+    singles = [run_of(scene, ReducedMPM, method=method) for scene in scenes]
+    assert_each_as_alone(batch, singles, 24)
+    moved = np.abs(batch.xhat.numpy()[1:] - batch.xhat.numpy()[0]).max(1)
+    # With τ from its field, the moduli have no part in a step.
+    assert (moved > 1e-3).all() if what != "stiffness" or not method.neural_stress else (moved == 0.0).all()
+
+
+def test_the_history_at_rest_is_each_ones_own(with_law):
+    """Without flow it decides a stress where it is zero: such a particle is damaged."""
+    laws = [VonMises(E=2000.0, nu=0.2, yield_stress=value) for value in (20.0, 30.0)]
+    phase = ReducedBatch([with_law(law, METHODS[3]) for law in laws])._phases[0]
+    held = [a for a in phase._arena._held if a.shape == (2 * phase.size, 1)]
+    assert [a.flatten().tolist() for a in held] == [[20.0] * phase.size + [30.0] * phase.size]
+
+
+def test_initial_states_are_each_ones_own(chain, tiny_manifold):
+    rng = np.random.default_rng(0)
+    xhat = [None, *rng.normal(size=(2, 4))]
+    velocity = [rng.normal(scale=0.1, size=(500, 3)), None, rng.normal(scale=0.1, size=(500, 3))]
+    one = {ANGLE: 26.0}
+    batch = chain.scene.reduced_batch(
+        tiny_manifold, [one] * 3, 20, xhat=xhat, velocity=velocity, device="cpu"
+    )
+    singles = [
+        chain.scene.reduced(tiny_manifold, one, 20, xhat=x, velocity=v, device="cpu")
+        for x, v in zip(xhat, velocity, strict=True)
+    ]
+    np.testing.assert_array_equal(batch.runs[2].state.numpy()["v"], velocity[2])
+    np.testing.assert_array_equal(batch.runs[1].state.xhat, xhat[1])
+    assert_each_as_alone(batch, singles, 12)
+
+
+def test_one_that_goes_astray_leaves_the_others_alone(chain, tiny_manifold):
+    away = np.full(4, 0.0), np.full(4, np.nan), np.array([400.0, 0.0, 0.0, 0.0]), None
+    batch = chain.scene.reduced_batch(tiny_manifold, [{ANGLE: 26.0}] * 4, 60, xhat=away, device="cpu")
+    alone = chain.scene.reduced(tiny_manifold, {ANGLE: 26.0}, 60, device="cpu")
+    batch.step(8)
+    alone.step(8)
+    assert np.array_equal(batch.runs[3].trajectory().xhat, alone.trajectory().xhat)
+    assert batch.runs[3].integration_mean == alone.integration_mean
+    assert np.isnan(batch.runs[1].trajectory().xhat).all()
+    assert [run.left_grid() for run in batch.runs] == [-1, 1, 1, -1]
+
+
+def test_each_is_asked_as_a_solver_is(chain, tiny_manifold, parameters):
+    batch = chain.scene.reduced_batch(tiny_manifold, parameters, 20, device="cpu")
+    single = chain.scene.reduced(tiny_manifold, parameters[2], 20, device="cpu")
+    run = batch.runs[2]
+    assert run.integration_mean == single.integration_mean > 20
+    batch.step(5)
+    timer = StageTimer("cpu")
+    batch.timed_step(timer)
+    assert list(timer.per_step(1)) == ["inference", "p2g", "grid", "g2p", "inversion"]
+    single.step(6)
+    assert (run.steps_taken, batch.steps_taken, run.left_grid(), run.needed_outside()) == (6, 6, -1, 0)
+    found, expected = run.state.numpy(), single.state.numpy()
+    for name, values in expected.items():
+        np.testing.assert_allclose(found[name], values, rtol=1e-9, atol=1e-9)
+    assert run.trajectory().xhat.shape == (7, 4)
+    with pytest.raises(ConfigError, match=re.escape("6 + 19 steps pass the end of the scene, 24 steps")):
+        batch.step(19)
+
+
+def test_a_second_run_is_as_the_first(tiny, tiny_manifold, parameters):
+    scene = nsf.scenes.load("sand", [*tiny[1:], *PLATE])
+    sample = [SamplePhase(0.0, np.arange(0, 500, 25)), SamplePhase(0.5, np.arange(7, 500, 50))]
+    batch = scene.reduced_batch(tiny_manifold, parameters, sample, device="cpu")
+    single = scene.reduced(tiny_manifold, parameters[0], sample, device="cpu")
+    for solver in (batch, single):
+        solver.step(24)
+        xhat = solver.record.xhat.clone()
+        solver.restart()
+        assert solver.steps_taken == 0
+        assert batch.runs[0].steps_taken == 0 or solver is single
+        solver.step(24)
+        assert torch.equal(solver.record.xhat, xhat)
+
+
+def test_modes_are_held_once(chain, tiny_manifold):
+    def nbytes(count):
+        return chain.scene.reduced_batch(tiny_manifold, [{ANGLE: 26.0}] * count, 20, device="cpu").nbytes
+
+    one, two, three = (nbytes(count) for count in (1, 2, 3))
+    assert three - two == two - one < 0.6 * one
+
+
+# -- what is refused ------------------------------------------------------------------------------------
+
+
+class Own(GaussNewton):
+    pass
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"projector": Own()}, "field=basis with Own evaluates its fields for one simulation"),
+        ({"integration": Integration("search")}, "a batch needs integration=superset"),
+        ({"xhat": [None]}, "xhat is given for 1 of 3 simulations"),
+    ],
+)
+def test_what_cannot_be_stepped_together(chain, tiny_manifold, parameters, options, message):
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        chain.scene.reduced_batch(tiny_manifold, parameters, 20, device="cpu", **options)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "options", "message"),
+    [
+        (["scene.dt=0.004"], {}, "simulations of a batch share Δt or the number of steps, which differs"),
+        (["scene.walls.padding=4"], {}, "share the domain's walls"),
+        (["scene.dx=0.025"], {"sets": None}, "share the grid"),
+        (PLATE, {}, "share the number of colliders, which differs between friction_angle=26 and"),
+        ([], {"method": METHODS[1]}, "share the method"),
+        ([], {"precision": "fp32"}, "share the precision"),
+        ([], {"projector": Taylor()}, "share the projector"),
+        (["transfer=pic"], {}, "share the transfer"),
+    ],
+)  # fmt: skip
+def test_what_must_be_the_same(tiny, run_of, overrides, options, message):
+    scenes = [nsf.scenes.load("sand", [*tiny[1:], *more]) for more in ([], overrides)]
+    runs = [run_of(scenes[0]), run_of(scenes[1], angle=30.0, **options)]
+    with pytest.raises(ConfigError, match=re.escape(message)) as error:
+        ReducedBatch(runs)
+    assert "friction_angle=30" in str(error.value)
+
+
+def test_another_law_is_refused_where_it_is_asked(with_law):
+    laws = [Hencky(E=2000.0, nu=0.2), FixedCorotated(E=2000.0, nu=0.2)]
+    ReducedBatch([with_law(law, NSF) for law in laws])  # with neural stress nobody asks it
+    with pytest.raises(ConfigError, match="share the law"):
+        ReducedBatch([with_law(law, METHODS[3]) for law in laws])
+
+
+def test_other_samples_are_refused(chain, tiny_manifold):
+    runs = [
+        ReducedRun.of_scene(chain.scene, tiny_manifold, {ANGLE: 26.0}, sample, device="cpu")
+        for sample in (range(20), range(1, 21))
+    ]
+    with pytest.raises(ConfigError, match="share the sample"):
+        ReducedBatch(runs)
+
+
+def test_a_run_has_one_that_steps_it(chain, tiny_manifold, run_of):
+    with pytest.raises(ConfigError, match="must be a ReducedRun at t = 0"):
+        ReducedBatch([run_of(chain.scene, ReducedMPM)])
+    run = run_of(chain.scene)
+    ReducedBatch([run])
+    with pytest.raises(ConfigError, match="that no other solver steps"):
+        ReducedBatch([run])
+    with pytest.raises(ConfigError, match="at least one run"):
+        ReducedBatch([])
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"xhat": np.zeros(3)}, "xhat must be [4], not [3]"),
+        ({"velocity": np.zeros(3)}, "velocity must be [500, 3]"),
+    ],
+)
+def test_bad_states(run_of, chain, options, message):
+    with pytest.raises(ShapeError, match=re.escape(message)):
+        run_of(chain.scene, **options)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
+@pytest.mark.parametrize("count", [3, 19])
+def test_on_a_gpu(chain, tiny_manifold, method, count):
+    if not (torch.cuda.is_available() and wp.is_cuda_available()):
+        pytest.skip("needs a GPU")
+    parameters = [{ANGLE: angle} for angle in np.linspace(22.0, 38.0, count)]
+    options = {"method": method, "device": "cuda"}
+    batch = chain.scene.reduced_batch(tiny_manifold, parameters, 60, **options)
+    batch.step(24)
+    for index in {0, 1, count - 1}:
+        single = chain.scene.reduced(tiny_manifold, parameters[index], 60, **options)
+        single.step(24)
+        same(batch.runs[index], single, 1e-7)  # of a GPU's sums the order is not fixed
