@@ -60,7 +60,7 @@ def try_command(command: str, folder: Path, monkeypatch, capsys, experiments: Pa
 
 
 def _quick(words: list[str]) -> list[str]:
-    """What `nsf bench` is asked for, of a benchmark that takes a second; the others have tests of their own."""
+    """What `nsf bench` is asked for, with one that takes a second; the others have tests of their own."""
     asked = dict(word.split("=", 1) for word in words)
     assert set(asked.get("benches", BENCHES[0]).split(",")) <= set(BENCHES)
     quick = {"benches": "full_order", "particles": "200", "trials": "1", "device": "cpu"}
