@@ -3,6 +3,7 @@
 import os
 import signal
 import sys
+import time
 from functools import partial
 
 import pytest
@@ -42,8 +43,12 @@ def test_a_dead_process_takes_no_sibling_with_it(tmp_path, monkeypatch):
     ]
 
 
-def says_its_gpu(config, stages, folder):
+def says_its_gpu(config, stages, folder, beside):
     (folder / f"{config.seed}").write_text(os.environ.get("CUDA_VISIBLE_DEVICES", "all"))
+    # The first job ends only once the other process has begun one, so that neither takes them all.
+    began = time.monotonic()
+    while beside and len(list(folder.glob("[123]"))) < 2 and time.monotonic() - began < 60:
+        time.sleep(0.02)
 
 
 @pytest.mark.parametrize(
@@ -59,9 +64,9 @@ def test_jobs_side_by_side_see_one_gpu_each(tmp_path, monkeypatch, overrides, la
     monkeypatch.setenv("NSF_RUNS", str(tmp_path))
     monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
     monkeypatch.setattr(module, "visible_gpus", lambda: ("4", "7"))
-    monkeypatch.setattr(module, "_job", partial(says_its_gpu, folder=tmp_path))
+    monkeypatch.setattr(module, "_job", partial(says_its_gpu, folder=tmp_path, beside=bool(launcher)))
     assert not sweep([["seed=1,2,3", *overrides]], ["train"], launcher)
-    assert {(tmp_path / f"{seed}").read_text() for seed in (1, 2, 3)} <= seen
+    assert {(tmp_path / f"{seed}").read_text() for seed in (1, 2, 3)} == seen
 
 
 def raises(config, stages, say):
