@@ -2,7 +2,7 @@
 
 attributes   schema_version units tau_order x_sha256 dt dx complete
 /particles   X [P,3]  mass [P]  volume0 [P]                           float64
-/frames      t [F] float64;  x v [F,P,3]  C [F,P,9]  tau [F,P,6], one chunk a frame
+/frames      t [F] float64;  x v [F,P,3]  C [F,P,9]  tau [F,P,6], each in one piece
 /parameters  one float64 scalar a problem parameter
 /cost        one float64 scalar a measured cost
 """

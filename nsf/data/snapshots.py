@@ -1,7 +1,10 @@
 """Every frame of several trajectories as one set of training snapshots."""
 
+import collections
 import os
+import threading
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -19,7 +22,9 @@ from nsf.errors import ConfigError, DeviceError, SchemaError, ShapeError
 RESIDENT_FIELDS = ("x", "tau", "C")
 # Of the free memory: the rest is for networks, their gradients and what else runs.
 _RESIDENT_SHARE = 0.6
-_STAGING_BYTES = 256 * 2**20
+# Threads that read side by side, and what each holds between the file and the device.
+_READERS = min(4, os.cpu_count() or 1)
+_STAGING_BYTES = 64 * 2**20
 
 Indices = slice | Sequence[int] | np.ndarray | Tensor
 
@@ -166,15 +171,28 @@ class Snapshots:
 
     def _load(self, field: str) -> Tensor:
         data = torch.empty((self.M, self.P, COMPONENTS[field]), device=self.device)
-        # The host reads files straight into the tensor; a device gets them a few frames at a time.
-        frames = max(1, _STAGING_BYTES // (4 * self.P * COMPONENTS[field]))
-        for rows, trajectory, wanted in self._runs():
-            if self.device.type == "cpu":
-                trajectory.read(field, _slice(wanted), out=data[rows].numpy())
-                continue
-            for first in range(0, len(wanted), frames):
-                block = slice(first, first + frames)
-                data[rows][block].copy_(torch.from_numpy(trajectory.read(field, _slice(wanted[block]))))
+        together = max(1, _STAGING_BYTES // (4 * self.P * COMPONENTS[field]))
+        pieces = [
+            (data[rows][first : first + together], trajectory, _slice(frames[first : first + together]))
+            for rows, trajectory, frames in self._runs()
+            for first in range(0, len(frames), together)
+        ]
+        staging = threading.local()
+
+        def read(piece: tuple[Tensor, Trajectory, slice]) -> None:
+            part, trajectory, frames = piece
+            if part.device.type == "cpu":
+                trajectory.read(field, frames, out=part.numpy())
+                return
+            # Pinned memory, taken once a thread, is what a GPU copies from at full speed.
+            if not hasattr(staging, "memory"):
+                staging.memory = torch.empty((together, *data.shape[1:]), pin_memory=True)
+            host = staging.memory[: len(part)]
+            trajectory.read(field, frames, out=host.numpy())
+            part.copy_(host)
+
+        with ThreadPoolExecutor(_READERS) as pool:
+            collections.deque(pool.map(read, pieces), maxlen=0)  # raises what one of them raised
         return data
 
     def _runs(self) -> Iterator[tuple[slice, Trajectory, range]]:

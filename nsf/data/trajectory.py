@@ -1,8 +1,10 @@
 """One full-order simulation on disk: written once and whole, read in pieces."""
 
 import json
+import os
 from collections.abc import Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -15,9 +17,7 @@ from nsf.data.sink import Sink
 from nsf.errors import InstabilityError, MissingRunError, SchemaError, ShapeError
 from nsf.storage import require_space, writing
 
-# Chunks are written whole and read in parts, and never compressed: HDF5's chunk cache would only make it
-# read every whole frame for a few particles.
-_NO_CHUNK_CACHE = {"rdcc_nbytes": 0}
+_READ_BYTES = 2**30  # at once; the system reads no more than 2 GiB
 
 
 class TrajectoryWriter:
@@ -59,8 +59,8 @@ class TrajectoryWriter:
         self.path = Path(path)
         self.frames = frames
         self.cost: dict[str, float] = {}
-        self._written = 0
-        self._dtype = np.dtype(dtype)
+        self._t: list[float] = []
+        self._dtype = np.dtype(dtype).newbyteorder("<")
         self._particles = {
             name: np.asarray(values, dtype="<f8")
             for name, values in {"X": X, "mass": mass, "volume0": volume0}.items()
@@ -87,15 +87,15 @@ class TrajectoryWriter:
             require_space(partial, particles * self.frames * sum(COMPONENTS.values()) * self._dtype.itemsize)
             self._sink = stack.enter_context(Sink(partial, "w+"))
             stack.push(self._sink.settle)
-            self._file = stack.enter_context(h5py.File(self._sink, "w", **_NO_CHUNK_CACHE))
+            self._file = stack.enter_context(h5py.File(self._sink, "w"))
             self._file.attrs.update(self._attributes)
             for name, values in self._particles.items():
                 self._file[f"particles/{name}"] = values
             frames = self._file.create_group("frames")
-            frames.create_dataset("t", (self.frames,), "<f8")
-            for name, c in COMPONENTS.items():
-                shape = (self.frames, particles, c)
-                frames.create_dataset(name, shape, self._dtype.newbyteorder("<"), chunks=(1, particles, c))
+            self._frames = {
+                name: _reserved(frames, name, (self.frames, particles, c), self._dtype)
+                for name, c in COMPONENTS.items()
+            }
             _write_scalars(self._file.create_group("parameters"), self._parameters)
             self._stack = stack.pop_all()
         return self
@@ -114,11 +114,11 @@ class TrajectoryWriter:
             InstabilityError: a value is not finite.
             ShapeError: an array is not of all particles, or every frame is written.
         """
-        frame = self._written
+        frame = len(self._t)
         if frame == self.frames:
             raise ShapeError(f"{self.path} holds frames={frame} already; open the writer with more")
         for name, values in {"x": x, "v": v, "C": C, "tau": tau}.items():
-            dataset = self._file["frames"][name]
+            dataset = self._frames[name]
             row = packed(name, values)
             if row.shape != dataset.shape[1:]:
                 raise ShapeError(f"{name} has shape {list(row.shape)}; give {list(dataset.shape[1:])}")
@@ -126,10 +126,10 @@ class TrajectoryWriter:
                 raise InstabilityError(
                     f"frame {frame} has {bad} non-finite values of {name}; take a smaller dt"
                 )
-            dataset[frame] = row
-        self._file["frames/t"][frame] = t
+            row = np.ascontiguousarray(row, dataset.dtype)
+            self._sink.place(row, dataset.offset + frame * row.nbytes)
         self._sink.settle()
-        self._written += 1
+        self._t.append(t)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -137,11 +137,12 @@ class TrajectoryWriter:
         with self._stack:
             if error is not None:
                 raise error
-            if self._written < self.frames:
+            if len(self._t) < self.frames:
                 raise ShapeError(
-                    f"{self.path} got {self._written} of frames={self.frames}; append the rest, "
+                    f"{self.path} got {len(self._t)} of frames={self.frames}; append the rest, "
                     "or open it for fewer"
                 )
+            self._file["frames/t"] = np.asarray(self._t, "<f8")
             _write_scalars(self._file.create_group("cost"), self.cost)
             self._file.attrs["complete"] = True
 
@@ -201,7 +202,7 @@ class Trajectory:
         if not path.exists():
             raise MissingRunError(f"no trajectory at {path}; run `nsf simulate` first")
         try:
-            file = h5py.File(path, "r", **_NO_CHUNK_CACHE)
+            file = h5py.File(path, "r")
         except PermissionError:
             raise
         except OSError as error:
@@ -253,12 +254,14 @@ class Trajectory:
         if 0 in shape:
             return out
         try:
-            if isinstance(rows, range) and isinstance(columns, range):
+            if particles is None and isinstance(rows, range) and _in_one_piece(dataset, out):
+                _read_frames(self._file.id.get_vfd_handle(), dataset, rows, out)
+            elif isinstance(rows, range) and isinstance(columns, range):
                 dataset.read_direct(out, np.s_[_hyperslab(rows), _hyperslab(columns)])
             else:
                 for i, row in enumerate(rows):
                     out[i] = _read_frame(dataset, int(row), columns)
-        except (OSError, RuntimeError) as error:
+        except (OSError, OverflowError, RuntimeError) as error:
             raise SchemaError(f"{self.path} is damaged in {field}; simulate again ({error})") from error
         return out
 
@@ -285,6 +288,49 @@ class Trajectory:
         for name, shape in expected.items():
             if (found := self._file[name].shape) != shape:
                 raise SchemaError(f"has {name} of shape {list(found)}, not {list(shape)}; simulate again")
+
+
+@dataclass(frozen=True)
+class _Reserved:
+    """Where a field's frames are to lie: its shape, the type of its values, its place in the file [byte]."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    offset: int
+
+
+def _reserved(group: h5py.Group, name: str, shape: tuple[int, ...], dtype: np.dtype) -> _Reserved:
+    """Reserve one piece of the file for a field, which HDF5 leaves as it is."""
+    how = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    how.set_layout(h5py.h5d.CONTIGUOUS)
+    how.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+    how.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
+    created = h5py.h5d.create(
+        group.id, name.encode(), h5py.h5t.py_create(dtype), h5py.h5s.create_simple(shape), how
+    )
+    return _Reserved(shape, dtype, created.get_offset())
+
+
+def _in_one_piece(dataset: h5py.Dataset, out: np.ndarray) -> bool:
+    """Whether the bytes of whole frames in the file are those of the array they go to."""
+    return out.dtype == dataset.dtype and out.flags.c_contiguous and dataset.id.get_offset() is not None
+
+
+def _read_frames(file: int, dataset: h5py.Dataset, rows: range, out: np.ndarray) -> None:
+    """Whole frames straight from the file: under HDF5's lock one thread at a time could read.
+
+    Raises:
+        OSError: the file is shorter than it says.
+    """
+    begin, size = dataset.id.get_offset(), out[0].nbytes
+    together = len(out) if rows.step == 1 else 1  # neighbours lie side by side
+    for i in range(0, len(out), together):
+        rest, offset = memoryview(out[i : i + together]).cast("B"), begin + rows[i] * size
+        while rest:
+            read = os.preadv(file, [rest[:_READ_BYTES]], offset)
+            if not read:
+                raise OSError("it ends before its frames do")
+            rest, offset = rest[read:], offset + read
 
 
 def _check_version(attributes: h5py.AttributeManager) -> None:

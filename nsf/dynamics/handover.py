@@ -11,7 +11,7 @@ from nsf.dynamics.deployment import Rollout
 from nsf.dynamics.solver import ReducedMPM
 from nsf.errors import InstabilityError
 from nsf.mpm import FP32, FullOrderMPM, Precision
-from nsf.mpm.recording import blocks, unpacked
+from nsf.mpm.recording import blocks, frames_of
 
 
 def hand_over(solver: ReducedMPM, rollout: Rollout) -> FullOrderMPM:
@@ -75,9 +75,9 @@ def go_on(solver: ReducedMPM, rollout: Rollout, path: Path, stored: Precision = 
         )
         # The last check falls inside, before the file gets its name: only a run that went well leaves one.
         with writer:
-            frames = itertools.chain.from_iterable(blocks(full, scene.steps - begin, stored))
-            for n, frame in enumerate(frames, begin):
-                writer.append(n * full.dt, *unpacked(frame))
+            recorded = blocks(full, scene.steps - begin, stored)
+            for n, frame in enumerate(itertools.chain.from_iterable(map(frames_of, recorded)), begin):
+                writer.append(n * full.dt, **frame)
         return full.beyond_law
     except InstabilityError as error:
         raise InstabilityError(

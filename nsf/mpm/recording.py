@@ -9,10 +9,12 @@ import warp as wp
 from nsf.mpm.precision import FP32, Precision
 from nsf.mpm.state import ParticleState
 
-#: Columns of a packed frame: x (3), v (3), C (9, row major), tau (6: xx, xy, xz, yy, yz, zz).
-COLUMNS = {"x": slice(0, 3), "v": slice(3, 6), "C": slice(6, 15), "tau": slice(15, 21)}
-_WIDTH = 21
+#: Components of a recorded field: C by rows, tau as xx, xy, xz, yy, yz, zz.
+COMPONENTS = {"x": 3, "v": 3, "C": 9, "tau": 6}
 _BLOCK_BYTES = 2**28
+
+#: Frames by field: x, v [n, P, 3], C [n, P, 9] and τ [n, P, 6].
+Block = dict[str, np.ndarray]
 
 
 @cache
@@ -26,22 +28,25 @@ def _make_pack(precision: Precision, stored: Precision):
         C: wp.array(dtype=mat33),
         tau: wp.array(dtype=mat33),
         order: wp.array(dtype=wp.int32),
-        frame: wp.array2d(dtype=out),
+        frame_x: wp.array2d(dtype=out),
+        frame_v: wp.array2d(dtype=out),
+        frame_C: wp.array2d(dtype=out),
+        frame_tau: wp.array2d(dtype=out),
     ):
         row = wp.tid()
         p = order[row]
         for a in range(3):
-            frame[p, a] = out(x[row][a])
-            frame[p, 3 + a] = out(v[row][a])
+            frame_x[p, a] = out(x[row][a])
+            frame_v[p, a] = out(v[row][a])
             for b in range(3):
-                frame[p, 6 + 3 * a + b] = out(C[row][a, b])
+                frame_C[p, 3 * a + b] = out(C[row][a, b])
         t = tau[row]
-        frame[p, 15] = out(t[0, 0])
-        frame[p, 16] = out(t[0, 1])
-        frame[p, 17] = out(t[0, 2])
-        frame[p, 18] = out(t[1, 1])
-        frame[p, 19] = out(t[1, 2])
-        frame[p, 20] = out(t[2, 2])
+        frame_tau[p, 0] = out(t[0, 0])
+        frame_tau[p, 1] = out(t[0, 1])
+        frame_tau[p, 2] = out(t[0, 2])
+        frame_tau[p, 3] = out(t[1, 1])
+        frame_tau[p, 4] = out(t[1, 2])
+        frame_tau[p, 5] = out(t[2, 2])
 
     return pack
 
@@ -58,10 +63,13 @@ class FrameRecorder:
     def __init__(self, state: ParticleState, precision: Precision, stored: Precision = FP32):
         self._state = state
         self._device = state.order.device
-        frame_bytes = len(state) * _WIDTH * np.dtype(stored.numpy).itemsize
+        frame_bytes = len(state) * sum(COMPONENTS.values()) * np.dtype(stored.numpy).itemsize
         self.capacity = max(1, _BLOCK_BYTES // frame_bytes)
-        shape = (self.capacity, len(state), _WIDTH)
-        self._block = wp.empty(shape, dtype=stored.real, device=self._device)
+        # A field lies in one piece, as on disk, so that a frame of it is written without another copy.
+        self._block = {
+            name: wp.empty((self.capacity, len(state), c), dtype=stored.real, device=self._device)
+            for name, c in COMPONENTS.items()
+        }
         self._pack = _make_pack(precision, stored)
         self.count = 0
 
@@ -73,19 +81,21 @@ class FrameRecorder:
     def record(self) -> None:
         """Pack the current state as the next frame."""
         s = self._state
-        inputs = [s.x.rows, s.v.rows, s.C.rows, s.tau.rows, s.order, self._block[self.count]]
+        outputs = [block[self.count] for block in self._block.values()]
+        inputs = [s.x.rows, s.v.rows, s.C.rows, s.tau.rows, s.order, *outputs]
         wp.launch(self._pack, dim=len(s), inputs=inputs, device=self._device)
         self.count += 1
 
-    def take(self) -> np.ndarray:
-        """Host copy of the frames [n, P, 21] recorded since the last call."""
-        block = self._block[: self.count].numpy().copy()
+    def take(self) -> Block:
+        """Host copy of the frames recorded since the last call."""
+        taken = {name: block[: self.count].numpy() for name, block in self._block.items()}
         self.count = 0
-        return block
+        # From a GPU they are a copy already.
+        return {name: block.copy() for name, block in taken.items()} if self._device.is_cpu else taken
 
 
-def blocks(solver, steps: int, stored: Precision, after=lambda: None) -> Iterator[np.ndarray]:
-    """The state as it stands and after each of `steps` steps, in blocks of packed frames [n, P, 21].
+def blocks(solver, steps: int, stored: Precision, after=lambda: None) -> Iterator[Block]:
+    """The state as it stands and after each of `steps` steps, in blocks of frames.
 
     Args:
         solver: a `FullOrderMPM`.
@@ -107,6 +117,7 @@ def blocks(solver, steps: int, stored: Precision, after=lambda: None) -> Iterato
     solver.check()
 
 
-def unpacked(frame: np.ndarray) -> tuple[np.ndarray, ...]:
-    """x, v [P, 3], C [P, 9] and τ [P, 6] of a packed frame [P, 21]."""
-    return tuple(frame[:, columns] for columns in COLUMNS.values())
+def frames_of(block: Block) -> Iterator[dict[str, np.ndarray]]:
+    """x, v [P, 3], C [P, 9] and τ [P, 6] of each frame."""
+    for frame in zip(*block.values(), strict=True):
+        yield dict(zip(block, frame, strict=True))

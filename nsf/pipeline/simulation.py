@@ -15,7 +15,7 @@ import numpy as np
 from nsf.data import TrajectoryWriter
 from nsf.errors import InstabilityError
 from nsf.mpm import FullOrderMPM, Precision, diagnosed
-from nsf.mpm.recording import blocks, unpacked
+from nsf.mpm.recording import blocks, frames_of
 from nsf.progress import Progress, Told
 from nsf.runs import Run
 from nsf.workers import Call, ended, working
@@ -211,8 +211,8 @@ def _store(
             while not isinstance(item := frames.get(), float):
                 if isinstance(item, BaseException):
                     raise item
-                for frame in item:
-                    writer.append(n * solver.dt, *unpacked(frame))
+                for frame in frames_of(item):
+                    writer.append(n * solver.dt, **frame)
                     n += 1
             writer.cost.update(seconds=item, bytes=solver.nbytes)
         record.metrics["seconds"] = item

@@ -47,7 +47,7 @@ def test_the_file_says_what_it_holds(write):
         assert file.attrs["schema_version"] == 1
         assert file.attrs["tau_order"] == "xx,xy,xz,yy,yz,zz"
         assert '"tau": "Pa"' in file.attrs["units"]
-        assert file["frames/tau"].chunks == (1, 11, 6)
+        assert file["frames/tau"].chunks is None
         assert file["particles/X"].dtype == "<f8"
 
 
@@ -96,6 +96,30 @@ def test_reads_outside(write, field, frames, particles, message):
     path, _ = write()
     with Trajectory.open(path) as trajectory, pytest.raises(ShapeError, match=message):
         trajectory.read(field, frames, particles)
+
+
+def test_frames_in_chunks_are_read_alike(write):
+    path, values = write()
+    with h5py.File(path, "r+") as file:
+        stored = file["frames/C"][()]
+        del file["frames/C"]
+        file.create_dataset("frames/C", data=stored, chunks=(1, 11, 9))
+    with Trajectory.open(path) as trajectory:
+        assert np.array_equal(trajectory.read("C"), stacked(values, "C").astype("f4"))
+
+
+def test_frames_come_in_as_many_pieces_as_the_system_gives(write, monkeypatch):
+    path, values = write()
+    plain = os.preadv
+    monkeypatch.setattr(os, "preadv", lambda file, into, offset: plain(file, [into[0][:100]], offset))
+    with Trajectory.open(path) as trajectory:
+        assert np.array_equal(trajectory.read("tau"), stacked(values, "tau").astype("f4"))
+        assert np.array_equal(
+            trajectory.read("tau", slice(1, None, 2)), stacked(values, "tau").astype("f4")[1::2]
+        )
+        monkeypatch.setattr(os, "preadv", lambda *_: 0)
+        with pytest.raises(SchemaError, match="damaged in tau"):
+            trajectory.read("tau")
 
 
 def test_another_process_gets_its_own_file(write):
@@ -315,6 +339,24 @@ def test_a_fault_in_any_write_of_hdf5_is_raised_and_leaves_no_file(tmp_path, con
         with pytest.raises(expected):
             write_frames(tmp_path / "a.h5", constants, 3, *[one_frame()] * 3)
     assert os.listdir(tmp_path) == ["whole.h5"]
+
+
+def test_frames_go_in_as_many_pieces_as_the_disk_takes(write, monkeypatch):
+    plain = os.pwrite
+    monkeypatch.setattr(os, "pwrite", lambda file, data, offset: plain(file, data[:100], offset))
+    path, values = write()
+    with Trajectory.open(path) as trajectory:
+        assert np.array_equal(trajectory.read("x"), stacked(values, "x").astype("f4"))
+
+
+def test_a_disk_that_is_full_at_a_frame_leaves_no_file(tmp_path, constants, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "pwrite", full)
+    with pytest.raises(StorageError, match="No space"):
+        write_frames(tmp_path / "a.h5", constants, 1, one_frame())
+    assert os.listdir(tmp_path) == []
 
 
 def test_a_fault_ends_the_simulation_at_the_frame_it_struck(tmp_path, constants):

@@ -24,7 +24,7 @@ from nsf.mpm.materials import (
     VonMisesHardening,
     VonMisesSoftening,
 )
-from nsf.mpm.recording import FrameRecorder, unpacked
+from nsf.mpm.recording import FrameRecorder, frames_of
 from nsf.mpm.state import cell_order
 from nsf.timing import untimed
 
@@ -179,11 +179,11 @@ def test_frames_are_in_the_particles_order(solver_on):
     solver.step(5)
     recorder = FrameRecorder(solver.state, solver.precision, FP64)
     recorder.record()
-    x, v, C, tau = unpacked(recorder.take()[0])
+    (frame,) = frames_of(recorder.take())
     state = solver.state.numpy()
-    for found, name in ((x, "x"), (v, "v"), (C, "C")):
-        np.testing.assert_array_equal(found, state[name].reshape(len(found), -1))
-    np.testing.assert_array_equal(tau[:, 1], state["tau"][:, 0, 1])
+    for name in ("x", "v", "C"):
+        np.testing.assert_array_equal(frame[name], state[name].reshape(len(frame[name]), -1))
+    np.testing.assert_array_equal(frame["tau"][:, 1], state["tau"][:, 0, 1])
 
 
 def test_particles_of_no_cell_have_an_order():
