@@ -309,6 +309,8 @@ class Pipeline(Plan):
         trials, value = self.config.evaluation.trials, self.held_out[0]
         name = self.scene.parameters.name
         scene, multiplier = self.deployed, self.config.deploy.dt_multiplier
+        if not trials:
+            return results.costs({})
         cost = measure(
             {
                 "full_order": Subject(
@@ -321,7 +323,7 @@ class Pipeline(Plan):
             trials,
             self.device,
         )
-        return results.costs(cost["full_order"], cost["reduced"])
+        return results.costs(cost)
 
     def report(self) -> Path:
         """The report of every evaluated variant of this scene at these held-out trajectories."""

@@ -82,8 +82,8 @@ class Plan:
         c = self.config
         for key, least in (("latent_dim", 1), ("seed", 0)):
             configuration.number(key, c[key], least=least, whole=True)
-        for key in ("trials", "picture_particles", "picture_frames"):
-            configuration.number(f"evaluation.{key}", c.evaluation[key], least=1, whole=True)
+        for key, least in (("trials", 0), ("picture_particles", 1), ("picture_frames", 1)):
+            configuration.number(f"evaluation.{key}", c.evaluation[key], least=least, whole=True)
         for key, least in (("factor", 2), ("substeps", 1), ("frames", 1)):
             configuration.number(f"super_resolution.{key}", c.super_resolution[key], least=least, whole=True)
         multiplier = c.deploy.dt_multiplier

@@ -1,7 +1,7 @@
 """The files of an evaluate run: one place that knows what reporting reads (docs/design.md)."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
@@ -16,8 +16,11 @@ from nsf.scenes import Scene
 from nsf.storage import write_json, writing
 
 
-def costs(full: SolverCost, reduced: SolverCost) -> dict:
-    """Content of `cost.json`."""
+def costs(measured: Mapping[str, SolverCost]) -> dict:
+    """Content of `cost.json`, by solver; without a solver, that nothing was measured."""
+    if not measured:
+        return {"trials": 0}
+    full, reduced = measured["full_order"], measured["reduced"]
     return {
         "full_order": full.as_dict(),
         "reduced": reduced.as_dict(),
@@ -49,12 +52,7 @@ def rows(
     }
     measured = {
         "gamma": reduction_ratio(len(manifold.X), manifold.latent_dim),
-        "step_ms_full": cost["step_ms_full"],
-        "step_ms_reduced": cost["step_ms_reduced"],
-        "speedup_step": cost["step_ms_full"] / cost["step_ms_reduced"],
-        "speedup_total": cost["full_order"]["total_ms"] / cost["reduced"]["total_ms"],
-        "memory_full_mib": cost["memory_full_mib"],
-        "memory_reduced_mib": cost["memory_reduced_mib"],
+        **_costs_in_a_row(cost),
         "precision": config.precision,
         "device": torch.cuda.get_device_name(device) if device.startswith("cuda") else "cpu",
         "commit": commit,
@@ -76,6 +74,23 @@ def rows(
         reduced = rollout.diverged < 0 and rollout.handed_over < 0
         found.append(variant | own | (measured if reduced else lost))
     return pd.DataFrame(found)
+
+
+def _costs_in_a_row(cost: dict) -> dict[str, float]:
+    """Columns of `results.csv`; NaN where nothing was measured."""
+
+    def pair(key: str) -> tuple[float, float]:
+        return tuple(cost.get(solver, {}).get(key, math.nan) for solver in ("full_order", "reduced"))
+
+    step, total, memory = pair("step_ms"), pair("total_ms"), pair("memory_mib")
+    return {
+        "step_ms_full": step[0],
+        "step_ms_reduced": step[1],
+        "speedup_step": step[0] / step[1],
+        "speedup_total": total[0] / total[1],
+        "memory_full_mib": memory[0],
+        "memory_reduced_mib": memory[1],
+    }
 
 
 def trust_of(rollout: Rollout) -> dict:

@@ -126,6 +126,10 @@ def _asked(config: DictConfig) -> tuple[list[str], int]:
     known = isinstance(objectives, list) and objectives and set(objectives) <= set(OBJECTIVES)
     if not known or len(set(objectives)) < len(objectives):
         raise ConfigError(f"search.objectives={objectives} must list one or more of {', '.join(OBJECTIVES)}")
+    if "step_ms" in objectives and not config.evaluation.trials:
+        raise ConfigError(
+            "search.objectives has step_ms, but evaluation.trials=0 measures none; give 1 or more"
+        )
     return objectives, configuration.number("search.trials", asked["trials"], least=1, whole=True)
 
 

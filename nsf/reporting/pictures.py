@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from nsf.reporting import charts, cost_charts, render
-from nsf.reporting.columns import MEASURED, parameter_text
+from nsf.reporting.columns import COSTS, MEASURED, parameter_text
 from nsf.reporting.sources import Motion, same_parameter
 from nsf.reporting.style import save
 from nsf.reporting.tables import Merged, mean_rows, paper_row, variant_labels, variants
@@ -236,6 +236,8 @@ def _comparison(known: list[_Variant], folder: Path) -> list[Picture]:
         ("speedup-memory", cost_charts.speedup_and_memory,
          "Speedup of the reduced over the full-order model (line: 1×), and the peak memory of both."),
     )  # fmt: skip
+    if all(pd.isna(entry[name]) for entry in entries for name in COSTS):
+        drawings = drawings[:1]  # evaluation.trials=0
     return [Picture(save(drawn(entries), folder, stem), caption, runs) for stem, drawn, caption in drawings]
 
 

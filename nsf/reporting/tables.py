@@ -181,6 +181,7 @@ def without_constants(
     said = {name: {v for v in frame[name].astype(str) if v not in ("", ABSENT, "nan")} for name in describing}
     constant = [name for name in describing if name not in keep and len(said[name]) == 1]
     empty = [name for name in (SETTING, PLACE) if name in frame and set(frame[name]) <= {"", ABSENT}]
+    empty += [name for name in COSTS if name in frame and frame[name].isna().all()]  # evaluation.trials=0
     first = {name: next(v for v in frame[name] if str(v) in said[name]) for name in constant}
     told = (f"{COLUMN[n].title} {_cell(n, first[n])} {COLUMN[n].unit}".strip() for n in constant)
     return frame.drop(columns=[*constant, *empty]), ", ".join(told)

@@ -327,6 +327,19 @@ def test_training_values_can_be_deployed(copied, pipeline_at):
     assert results["parameter"].tolist() == [22.0, 30.0, 38.0]
 
 
+def test_a_run_without_timings_is_reported(copied, pipeline_at, tmp_path):
+    root = copied("simulate", "train", "deploy")
+    pipeline = pipeline_at(root, "evaluation.trials=0", f"report.folder={tmp_path}")
+    pipeline.evaluate()
+    results = pd.read_csv(pipeline.evaluation.path / "results.csv")
+    assert 0 < results["delta"][0] < 0.03
+    assert results[["step_ms_full", "speedup_total", "memory_reduced_mib"]].isna().all(axis=None)
+    folder = pipeline.report().parent
+    assert (folder / "delta.png").exists()
+    assert not {"speedup-memory.png", "runtime.png"} & {path.name for path in folder.iterdir()}
+    assert "speedup, step" not in (folder / "index.md").read_text()
+
+
 def test_a_split_without_values(pipeline_at, tmp_path):
     with pytest.raises(ConfigError, match=r"deploy\.split=validation has no values"):
         pipeline_at(tmp_path, "deploy.split=validation").deploy()

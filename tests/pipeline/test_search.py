@@ -77,6 +77,7 @@ def test_a_failed_trial_is_kept_and_the_others_go_on(tried, monkeypatch):
         (["latent_dim=4..6", "search.objectives=[speed]"], "delta, step_ms"),
         (["latent_dim=4..6", "search.objectives=delta"], "delta, step_ms"),
         (["latent_dim=4..6", "search.trials=0"], "search.trials=0"),
+        (["latent_dim=4..6", "search.objectives=[step_ms]", "evaluation.trials=0"], "evaluation.trials=0"),
     ],
 )
 def test_bad_input_is_refused_before_any_trial(tried, words, quoted):

@@ -132,7 +132,7 @@ BEFORE_ANY_WORK = [
     ("deploy.changes={scene.bodies.column.particles:400}", ["column.particles", "other particles"]),
     ("deploy.changes={material.nu:0.6}", ["deploy.changes", "material.nu=0.6"]),
     ("deploy.changes=3", ["deploy.changes=3", "{material.nu:0.25}"]),
-    ("evaluation.trials=0", ["evaluation.trials=0"]),
+    ("evaluation.trials=-1", ["evaluation.trials=-1"]),
     ("evaluation.trials=abc", ["evaluation.trials=abc"]),
     ("super_resolution.factor=1", ["super_resolution.factor=1", "at least 2"]),
     ("super_resolution.frames=0", ["super_resolution.frames=0"]),
