@@ -252,11 +252,15 @@ def launching(overrides: Sequence[str], config_name: str = "config") -> tuple[Di
 def jobs(sweeps: Sequence[Sequence[str]], config_name: str = "config") -> list[tuple[str, ...]]:
     """The overrides of every job of sweeps, each job once: every combination of a sweep's values.
 
+    Jobs of one scene follow each other, so that its trajectories can go when the next one's come.
+
     Raises:
         ConfigError: a syntax error, or an interval of values.
     """
     options = [_options(overrides, config_name) for overrides in sweeps]
-    return list(dict.fromkeys(job for values in options for job in itertools.product(*values)))
+    found = list(dict.fromkeys(job for values in options for job in itertools.product(*values)))
+    scenes = [next((o for o in job if o.startswith("scene=")), "") for job in found]
+    return [job for _, job in sorted(zip(scenes, found, strict=True), key=lambda one: scenes.index(one[0]))]
 
 
 def _options(overrides: Sequence[str], config_name: str) -> list[list[str]]:

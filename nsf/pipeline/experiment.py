@@ -14,6 +14,7 @@ from nsf.pipeline.plan import Plan
 from nsf.runs import Run
 
 _KEYS = {"title", "question", "paper", "jobs"}
+_OPTIONAL = {"stages", "each"}
 _MORE_STAGES = ("superresolve",)  # that a job may do after those of `nsf run`
 #: Keys that a column of results.csv tells of.
 _COLUMNS = ("scene", "method", "field", "latent_dim", "sampler.size", "precision", "device")
@@ -80,15 +81,17 @@ class Experiment:
         except yaml.YAMLError as error:
             raise ConfigError(f"{path}: {error}; correct the yaml") from error
         found = set(content) if isinstance(content, dict) else set()
-        if found - {"stages"} != _KEYS or not isinstance(content["jobs"], list):
+        if found - _OPTIONAL != _KEYS or not isinstance(content["jobs"], list):
             raise ConfigError(f"{path} must have the keys {', '.join(sorted(_KEYS))}; jobs is a list")
         stages = content.get("stages", [])
         if not isinstance(stages, list) or not set(stages) <= set(_MORE_STAGES):
             raise ConfigError(f"{path}: stages={stages} must be a list of {', '.join(_MORE_STAGES)}")
+        if not isinstance(content.get("each", {}), dict):
+            raise ConfigError(f"{path}: each={content['each']} must be keys with their values")
         own = {override.split("=", 1)[0]: override for override in overrides}
         grids = tuple(
             {str(key): f"{key}={_values(value)}" for key, value in grid.items()} | own
-            for grid in content["jobs"]
+            for grid in (content.get("each", {}) | grid for grid in content["jobs"])
         )
         texts = {key: " ".join(str(content[key]).split()) for key in ("title", "question", "paper")}
         return cls(name=name, grids=grids, stages=tuple(stages), **texts)

@@ -1,15 +1,22 @@
 """Every experiment can be run: each of its jobs composes and builds."""
 
+import itertools
+
 import pytest
 
 from nsf import config
 from nsf.paths import EXPERIMENTS
 from nsf.pipeline import Pipeline
 from nsf.pipeline.experiment import Experiment
+from nsf.pipeline.plan import Plan
 
 NAMES = sorted(path.stem for path in EXPERIMENTS.glob("*.yaml"))
 # At small scale, whose particles are placed at once; the scenes at the paper's are built in test_groups.py.
 JOBS = sorted({job.overrides for name in NAMES for job in Experiment.load(name, ["scale=small"]).jobs})
+
+
+def _small(name):
+    return Experiment.load(name, ["scale=small"]).jobs
 
 
 def test_there_are_experiments():
@@ -17,12 +24,19 @@ def test_there_are_experiments():
 
 
 def test_the_ablation_is_every_method_on_every_scene():
-    jobs = {job.overrides for job in Experiment.load("ablation").jobs}
+    jobs = [job.keys for job in Experiment.load("ablation").jobs]
     methods = {path.stem for path in (config.CONF / "method").glob("*.yaml")}
     scenes = {path.stem for path in (config.CONF / "scene").glob("*.yaml")} - {"drop"}  # not of the paper
-    assert jobs == {
-        (f"scene={scene}", "scale=paper", f"method={method}") for scene in scenes for method in methods
-    }
+    assert sorted((job["scene"], job["method"]) for job in jobs) == sorted(itertools.product(scenes, methods))
+    assert {job["scale"] for job in jobs} == {"paper"}
+
+
+def test_the_experiments_of_table1s_scenes_share_its_runs():
+    """Hours of work are done once: an evaluate run has one identity in all of them."""
+    table1 = {Plan(config.load(job.overrides)).evaluation.id for job in _small("table1")}
+    for name, keys in (("ablation", {"method": "nsf"}), ("field", {})):
+        jobs = [job for job in _small(name) if keys.items() <= job.keys.items()]
+        assert {Plan(config.load(job.overrides)).evaluation.id for job in jobs} <= table1
 
 
 @pytest.mark.parametrize("overrides", JOBS, ids=" ".join)

@@ -196,6 +196,8 @@ def test_jobs_are_every_combination_once():
         ("scene=bread", "latent_dim=4", "field=mlp"),
     ]
     assert config.jobs([["seed=range(0,3)", "seed=1,2"]]) == [("seed=1",), ("seed=2",)]
+    mixed = config.jobs([["scene=sand,bread"], ["scene=bread,sand", "latent_dim=4"]])
+    assert [job[0] for job in mixed] == ["scene=sand"] * 2 + ["scene=bread"] * 2
     assert config.jobs([sweeps[0], sweeps[0]]) == config.jobs([sweeps[0]])
 
 
