@@ -1,6 +1,5 @@
 """A reduced run that is no longer believed goes on at full order."""
 
-import itertools
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +10,7 @@ from nsf.dynamics.deployment import Rollout
 from nsf.dynamics.solver import ReducedMPM
 from nsf.errors import InstabilityError
 from nsf.mpm import FP32, FullOrderMPM, Precision
-from nsf.mpm.recording import blocks, frames_of
+from nsf.mpm.recording import blocks
 
 
 def hand_over(solver: ReducedMPM, rollout: Rollout) -> FullOrderMPM:
@@ -75,9 +74,12 @@ def go_on(solver: ReducedMPM, rollout: Rollout, path: Path, stored: Precision = 
         )
         # The last check falls inside, before the file gets its name: only a run that went well leaves one.
         with writer:
-            recorded = blocks(full, scene.steps - begin, stored)
-            for n, frame in enumerate(itertools.chain.from_iterable(map(frames_of, recorded)), begin):
-                writer.append(n * full.dt, **frame)
+            n = begin
+            for block in blocks(full, scene.steps - begin, stored):
+                for frame in block:
+                    writer.append(n * full.dt, **frame)
+                    n += 1
+                block.done()
         return full.beyond_law
     except InstabilityError as error:
         raise InstabilityError(

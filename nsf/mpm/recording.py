@@ -1,7 +1,10 @@
 """Frames of a run, packed on the device and copied to the host in blocks."""
 
-from collections.abc import Iterator
-from functools import cache
+import contextlib
+import queue
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache, partial
 
 import numpy as np
 import warp as wp
@@ -11,10 +14,55 @@ from nsf.mpm.state import ParticleState
 
 #: Components of a recorded field: C by rows, tau as xx, xy, xz, yy, yz, zz.
 COMPONENTS = {"x": 3, "v": 3, "C": 9, "tau": 6}
-_BLOCK_BYTES = 2**28
+_BLOCK_BYTES = 2**26
 
-#: Frames by field: x, v [n, P, 3], C [n, P, 9] and τ [n, P, 6].
-Block = dict[str, np.ndarray]
+_Memory = dict[str, wp.array]
+
+
+class HostMemory:
+    """Memory of the host that blocks of frames are copied to, and that is used again once they are done.
+
+    Blocks of several recorders may share it, and be done in other threads: to fill fresh pages is slower than
+    to write what is in them. For a GPU it is pinned.
+    """
+
+    def __init__(self):
+        self._free: queue.SimpleQueue[_Memory] = queue.SimpleQueue()
+
+    def take(self, like: _Memory) -> _Memory:
+        """Arrays of the shapes and types of these."""
+        with contextlib.suppress(queue.Empty):
+            memory = self._free.get_nowait()
+            if _kinds(memory) == _kinds(like):
+                return memory
+        pinned = any(a.device.is_cuda for a in like.values())
+        return {name: wp.empty(a.shape, a.dtype, device="cpu", pinned=pinned) for name, a in like.items()}
+
+    def give_back(self, memory: _Memory) -> None:
+        """Let another block have it."""
+        self._free.put(memory)
+
+
+def _kinds(memory: _Memory) -> list[tuple]:
+    return [(array.shape, array.dtype) for array in memory.values()]
+
+
+@dataclass(frozen=True)
+class Block:
+    """Frames on the host.
+
+    Attributes:
+        fields: x, v [n, P, 3], C [n, P, 9] and τ [n, P, 6].
+        done: to be called once the frames are not needed any more; they are lost then.
+    """
+
+    fields: dict[str, np.ndarray]
+    done: Callable[[], None]
+
+    def __iter__(self) -> Iterator[dict[str, np.ndarray]]:
+        """The fields of each frame."""
+        for frame in zip(*self.fields.values(), strict=True):
+            yield dict(zip(self.fields, frame, strict=True))
 
 
 @cache
@@ -58,9 +106,17 @@ class FrameRecorder:
         state: what is recorded.
         precision: of the state.
         stored: precision of the recorded values.
+        memory: of the blocks.
     """
 
-    def __init__(self, state: ParticleState, precision: Precision, stored: Precision = FP32):
+    def __init__(
+        self,
+        state: ParticleState,
+        precision: Precision,
+        stored: Precision = FP32,
+        memory: HostMemory | None = None,
+    ):
+        self._memory = memory or HostMemory()
         self._state = state
         self._device = state.order.device
         frame_bytes = len(state) * sum(COMPONENTS.values()) * np.dtype(stored.numpy).itemsize
@@ -88,13 +144,18 @@ class FrameRecorder:
 
     def take(self) -> Block:
         """Host copy of the frames recorded since the last call."""
-        taken = {name: block[: self.count].numpy() for name, block in self._block.items()}
+        memory, count = self._memory.take(self._block), self.count
+        for name, block in self._block.items():
+            wp.copy(memory[name], block, count=count * block[0].size)
+        wp.synchronize_device(self._device)
         self.count = 0
-        # From a GPU they are a copy already.
-        return {name: block.copy() for name, block in taken.items()} if self._device.is_cpu else taken
+        fields = {name: values.numpy()[:count] for name, values in memory.items()}
+        return Block(fields, partial(self._memory.give_back, memory))
 
 
-def blocks(solver, steps: int, stored: Precision, after=lambda: None) -> Iterator[Block]:
+def blocks(
+    solver, steps: int, stored: Precision, after=lambda: None, memory: HostMemory | None = None
+) -> Iterator[Block]:
     """The state as it stands and after each of `steps` steps, in blocks of frames.
 
     Args:
@@ -102,11 +163,12 @@ def blocks(solver, steps: int, stored: Precision, after=lambda: None) -> Iterato
         steps: to be taken.
         stored: precision of the frames.
         after: called after each frame.
+        memory: of the blocks; shared with other runs, or their own.
 
     Raises:
         InstabilityError: the solver loses stability; after the last block, if its last check finds it.
     """
-    recorder = FrameRecorder(solver.state, solver.precision, stored)
+    recorder = FrameRecorder(solver.state, solver.precision, stored, memory)
     for n in range(steps + 1):
         if n:
             solver.step()
@@ -115,9 +177,3 @@ def blocks(solver, steps: int, stored: Precision, after=lambda: None) -> Iterato
         if recorder.full or n == steps:
             yield recorder.take()
     solver.check()
-
-
-def frames_of(block: Block) -> Iterator[dict[str, np.ndarray]]:
-    """x, v [P, 3], C [P, 9] and τ [P, 6] of each frame."""
-    for frame in zip(*block.values(), strict=True):
-        yield dict(zip(block, frame, strict=True))

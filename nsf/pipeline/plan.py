@@ -10,6 +10,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError
 
 from nsf import config as configuration
+from nsf.canonical import content_hash
 from nsf.data import Split
 from nsf.dynamics.interop import torch_device
 from nsf.dynamics.sampling import check_well_posed
@@ -27,6 +28,10 @@ from nsf.scenes.scene import NOT_PHYSICS
 _SCENE_KEYS = ("scale", "material", "transfer")
 #: Precision of stored frames by the name of their type.
 _STORED = {"float32": FP32, "float64": FP64}
+#: Keys that no scene is built from, without their values.
+_REST = dict.fromkeys(("field", "trainer", "method", "sampler", "evaluation", "report", "latent_dim"))
+#: What this process has checked; the jobs of a sweep ask the same thing again and again, for seconds.
+_PASSED: set[str] = set()
 
 
 @dataclass
@@ -133,12 +138,18 @@ class Plan:
 
     def _check_parameter_values(self) -> None:
         """Build the scene at every parameter value: one out of range fails before any work."""
+        asked = content_hash(
+            [OmegaConf.to_container(of, resolve=False) | _REST for of in (self.config, self.scene.template)]
+        )
+        if asked in _PASSED:
+            return
         for value, scene in self.needed():
             scene = scene.with_parameters({self.scene.parameters.name: value})
             grid = scene.grid
             check_time_step(scene.particles(), scene.initial_velocity(), grid.dx, scene.dt)
             for multiplier in (1.0, self.config.deploy.dt_multiplier):
                 check_colliders(scene.colliders, grid, multiplier * scene.dt)
+        _PASSED.add(asked)
 
     @property
     def held_out(self) -> tuple[float, ...]:

@@ -15,14 +15,14 @@ import numpy as np
 from nsf.data import TrajectoryWriter
 from nsf.errors import InstabilityError
 from nsf.mpm import FullOrderMPM, Precision, diagnosed
-from nsf.mpm.recording import blocks, frames_of
+from nsf.mpm.recording import HostMemory, blocks
 from nsf.progress import Progress, Told
 from nsf.runs import Run
 from nsf.workers import Call, ended, working
 
 # Trajectories that are written at once; each holds at most a few blocks of frames in memory.
-_WRITERS = min(4, os.cpu_count() or 1)
-_BLOCKS = 2
+_WRITERS = min(8, os.cpu_count() or 1)
+_BLOCKS = 8
 
 
 @dataclass
@@ -130,7 +130,7 @@ def _simulate(
 ) -> int:
     """Make the jobs that no other process makes, once for each way of waiting for it; gives their number."""
     with ThreadPoolExecutor(_WRITERS) as pool:
-        writing: list[Future] = []
+        memory, writing = HostMemory(), []
         for wait in waits:
             left = []
             for job in jobs:
@@ -139,7 +139,7 @@ def _simulate(
                         left.append(job)
                     elif not job.run.complete:
                         progress.describe(job.label)
-                        writing.append(_start(job, claim, pool, shared, progress))
+                        writing.append(_start(job, claim, pool, shared, progress, memory))
             jobs = left
         for future in writing:
             future.result()
@@ -152,6 +152,7 @@ def _start(
     pool: ThreadPoolExecutor,
     shared: Shared,
     progress: Progress | Told,
+    memory: HostMemory,
 ) -> Future:
     """Compute one trajectory while its writer, which takes the claim over, and those of earlier ones work."""
     solver, frames = job.build(), queue.Queue(_BLOCKS)
@@ -159,7 +160,7 @@ def _start(
         stored_by = pool.submit(_store, job, frames, claim.pop_all(), solver, shared)
         started = time.perf_counter()
         try:
-            for block in blocks(solver, shared.steps, shared.stored, after=progress.advance):
+            for block in blocks(solver, shared.steps, shared.stored, progress.advance, memory):
                 _hand_over(frames, block, stored_by)
         except InstabilityError as error:
             raise diagnosed(error, job.build, solver.steps_taken) from error
@@ -211,9 +212,10 @@ def _store(
             while not isinstance(item := frames.get(), float):
                 if isinstance(item, BaseException):
                     raise item
-                for frame in frames_of(item):
+                for frame in item:
                     writer.append(n * solver.dt, **frame)
                     n += 1
+                item.done()
             writer.cost.update(seconds=item, bytes=solver.nbytes)
         record.metrics["seconds"] = item
         record.output("trajectory.h5")

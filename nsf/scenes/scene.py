@@ -179,6 +179,7 @@ class Scene:
     parameters: ParameterRange
     config: DictConfig = field(repr=False, compare=False)
     template: DictConfig = field(repr=False, compare=False)
+    _at: dict[tuple, "Scene"] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @classmethod
     def from_config(cls, config: DictConfig) -> "Scene":
@@ -225,6 +226,8 @@ class Scene:
         Raises:
             ConfigError: a name is not the scene's parameter, or the value is refused.
         """
+        if (asked := tuple(parameters.items())) in self._at:
+            return self._at[asked]
         config = self.template.copy()
         for name, value in parameters.items():
             if name != self.parameters.name:
@@ -238,7 +241,8 @@ class Scene:
                     f"scene.parameters.key={self.parameters.key} names no key of the configuration"
                 )
             OmegaConf.update(config, self.parameters.key, float(value))
-        return Scene.from_config(config)
+        self._at[asked] = Scene.from_config(config)
+        return self._at[asked]
 
     def with_changes(self, changes: Mapping[str, Any]) -> "Scene":
         """The scene with other values of some configuration keys, and the same particles at rest and steps.

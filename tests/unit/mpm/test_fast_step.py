@@ -24,7 +24,7 @@ from nsf.mpm.materials import (
     VonMisesHardening,
     VonMisesSoftening,
 )
-from nsf.mpm.recording import FrameRecorder, frames_of
+from nsf.mpm.recording import FrameRecorder
 from nsf.mpm.state import cell_order
 from nsf.timing import untimed
 
@@ -179,11 +179,30 @@ def test_frames_are_in_the_particles_order(solver_on):
     solver.step(5)
     recorder = FrameRecorder(solver.state, solver.precision, FP64)
     recorder.record()
-    (frame,) = frames_of(recorder.take())
+    block = recorder.take()
+    (frame,) = block
     state = solver.state.numpy()
     for name in ("x", "v", "C"):
         np.testing.assert_array_equal(frame[name], state[name].reshape(len(frame[name]), -1))
     np.testing.assert_array_equal(frame["tau"][:, 1], state["tau"][:, 0, 1])
+
+
+def test_memory_of_a_block_is_used_again_once_it_is_done(solver_on):
+    solver = solver_on(MATERIALS[2])
+    recorder = FrameRecorder(solver.state, solver.precision, FP64)
+
+    def taken():
+        recorder.record()
+        solver.step()
+        return recorder.take()
+
+    first, second = taken(), taken()
+    kept = first.fields["x"].copy()
+    assert not np.shares_memory(first.fields["x"], second.fields["x"])
+    assert (second.fields["x"] != kept).any()
+    np.testing.assert_array_equal(first.fields["x"], kept)
+    first.done()
+    assert np.shares_memory(first.fields["x"], taken().fields["x"])
 
 
 def test_particles_of_no_cell_have_an_order():
