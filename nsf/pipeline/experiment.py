@@ -14,7 +14,7 @@ from nsf.pipeline.plan import Plan
 from nsf.runs import Run
 
 _KEYS = {"title", "question", "paper", "jobs"}
-_OPTIONAL = {"stages", "each"}
+_OPTIONAL = {"stages", "each", "printed"}
 _MORE_STAGES = ("superresolve",)  # that a job may do after those of `nsf run`
 #: Keys that a column of results.csv tells of.
 _COLUMNS = ("scene", "method", "field", "latent_dim", "sampler.size", "precision", "device")
@@ -49,6 +49,8 @@ class Experiment:
         paper: what the paper reports on it, with the place.
         grids: each a mapping from a key to its override with all values; every combination is a job.
         stages: what each job does after `evaluate`.
+        printed: δ that the paper prints of single jobs, as `Study` has them; None where it prints one a scene
+            and method, which the scene's file has.
     """
 
     name: str
@@ -57,6 +59,7 @@ class Experiment:
     paper: str
     grids: tuple[dict[str, str], ...]
     stages: tuple[str, ...] = ()
+    printed: tuple[dict, ...] | None = None
 
     @classmethod
     def load(cls, name: str, overrides: Sequence[str] = (), folder: Path = EXPERIMENTS) -> "Experiment":
@@ -94,7 +97,8 @@ class Experiment:
             for grid in (content.get("each", {}) | grid for grid in content["jobs"])
         )
         texts = {key: " ".join(str(content[key]).split()) for key in ("title", "question", "paper")}
-        return cls(name=name, grids=grids, stages=tuple(stages), **texts)
+        printed = _printed(content.get("printed"), path)
+        return cls(name=name, grids=grids, stages=tuple(stages), printed=printed, **texts)
 
     @property
     def sweeps(self) -> list[list[str]]:
@@ -124,7 +128,8 @@ class Experiment:
         Raises:
             MissingRunError: no job was evaluated.
         """
-        from nsf.reporting.build import Study, build_report
+        from nsf.reporting.build import build_report
+        from nsf.reporting.study import Study
 
         runs: dict[str, Run] = {}
         fine: dict[str, Run] = {}
@@ -151,7 +156,7 @@ class Experiment:
                 f"no job of {self.name} was evaluated; run `nsf run +experiment={self.name}`"
             )
         folder = Path(config.report.folder) / (f"{self.name}_small" if scales == {"small"} else self.name)
-        study = Study(self.question, self.paper, settings, keys, missing, fine)
+        study = Study(self.question, self.paper, settings, keys, missing, self.printed, fine)
         page = build_report(list(runs.values()), folder, self.title, study=study)
         say(f"report: {len(runs)} jobs, {len(missing)} missing → {page}")
         return page, missing
@@ -176,6 +181,20 @@ def _ended(run: Run) -> str | None:
     """How a run ended that did not end well; None if it did, or was never begun."""
     error = run.manifest.get("error")
     return f"{run.stage} {run.manifest.get('status')}: {error}" if error else None
+
+
+def _printed(entries, path: Path) -> tuple[dict, ...] | None:
+    """Figures of the paper: δ as a number, all else as the text that keys of jobs have."""
+    if entries is None:
+        return None
+    if not isinstance(entries, list) or not all(
+        isinstance(entry, dict) and isinstance(entry.get("delta"), float) for entry in entries
+    ):
+        raise ConfigError(f"{path}: printed must be a list of mappings, each with a number delta")
+    return tuple(
+        {str(key): value if key == "delta" else _text(value) for key, value in entry.items()}
+        for entry in entries
+    )
 
 
 def _values(value) -> str:

@@ -170,7 +170,10 @@ def write(
 
 def write_superresolution(record: Record, scene: Scene, fine: Sequence[SuperResolution]) -> pd.DataFrame:
     """Write `superresolution.csv` and `superresolution.png` into a run's folder; gives the table."""
+    from nsf.reporting.colors import STRESS_COLORS
+    from nsf.reporting.png import write_png
     from nsf.reporting.render import fine_shapes
+    from nsf.reporting.style import PIXELS
 
     table = pd.DataFrame([f.row for f in fine])
     with writing(record.path / "superresolution.csv") as partial:
@@ -179,7 +182,7 @@ def write_superresolution(record: Record, scene: Scene, fine: Sequence[SuperReso
         fine, scene.parameters.name.replace("_", " "), scene.parameters.unit, floor_height(scene.colliders)
     )
     with writing(record.path / "superresolution.png") as partial:
-        picture.savefig(partial)
+        write_png(picture, partial, PIXELS, [STRESS_COLORS])
     for name in ("superresolution.csv", "superresolution.png"):
         record.output(name)
     record.metrics.update(table.drop(columns="parameter").mean().to_dict())

@@ -1,9 +1,6 @@
 """Builds a report: a folder with a page, tables, charts, pictures, and where each number comes from."""
 
-import dataclasses
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from nsf.reporting.columns import axis, parameter_text
@@ -12,13 +9,14 @@ from nsf.reporting.page import Page, Table, html_page, markdown_page
 from nsf.reporting.pictures import draw
 from nsf.reporting.provenance import provenance_rows, sources_json
 from nsf.reporting.sources import Source, open_sources
+from nsf.reporting.study import Study
 from nsf.reporting.superresolution import FineSource, fine_section, fine_table
 from nsf.reporting.swap import MARK, replaced
 from nsf.reporting.sweeps import swept
 from nsf.reporting.tables import Merged, console_table, means, merge, variants, without_constants
 from nsf.reporting.trust import RENAMED, trust_note, trust_rows
 
-__all__ = ["Study", "build_report", "console_table"]
+__all__ = ["build_report", "console_table"]
 
 _LEAD = (
     "A reduced-order model of elastoplastic material (Neural Stress Fields) runs beside the full-order "
@@ -31,27 +29,6 @@ _PROVENANCE = (
     "hash of each file read or written; results.csv holds the rows in full precision, results.tex the first "
     "table."
 )
-
-
-@dataclass(frozen=True)
-class Study:
-    """What a report is about, where it is of more than one scene's variants.
-
-    Attributes:
-        question: what it was made to find out.
-        paper: what the paper reports on it.
-        settings: by run id, what tells a run apart that no column of results.csv tells.
-        keys: by run id, the keys of its job.
-        missing: what was asked for and is not there, with the reason.
-        fine: by evaluate run id, the superresolve run of the same deployment, where there is one.
-    """
-
-    question: str
-    paper: str
-    settings: Mapping[str, str]
-    keys: Mapping[str, Mapping[str, str]]
-    missing: Sequence[str]
-    fine: Mapping[str, object] = dataclasses.field(default_factory=dict)
 
 
 def build_report(evaluate_runs, folder, title: str, first=None, study: Study | None = None) -> Path:
@@ -80,19 +57,20 @@ def build_report(evaluate_runs, folder, title: str, first=None, study: Study | N
     with replaced(Path(folder)) as fresh:
         merged.csv.to_csv(fresh / "results.csv", index=False)
         fine = _fine(merged, study)
-        sections = [
-            *([fine_section(fine, fresh)] if fine else []),
-            *(swept(merged, study.keys, fresh) if study else ()),
-            *draw(merged, fresh),
-        ]
+        own = [fine_section(fine, fresh)] if fine else []
+        sweep = swept(merged, study.keys, fresh) if study else []
+        sections = [*own, *sweep, *draw(merged, fresh, sweep=bool(sweep))]
         more = [fine_table(fine, study.settings, fresh)] if fine else []
-        page = _page(title, merged, sections, study, more, fine)
+        page = _page(title, merged, sections, study, more, fine, bool(sweep))
         (fresh / "index.html").write_text(html_page(page), encoding="utf-8")
         (fresh / "index.md").write_text(markdown_page(page), encoding="utf-8")
         (fresh / "results.tex").write_text(
             latex_table(page.tables[0].content, title, page.tables[0].note), encoding="utf-8"
         )
-        told = sources_json(page, merged, fresh, fine)
+        told = sources_json(page, merged, fresh, fine, study)
+        # What the list of reports shows of this one; the last section compares all variants.
+        shown = [picture for section in (*sweep, *own, *sections[-1:]) for picture in section.pictures][:1]
+        told["chart"] = {"file": shown[0].files[-1], "caption": shown[0].caption} if shown else None
         (fresh / MARK).write_text(json.dumps(told, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
     return Path(folder) / "index.html"
 
@@ -103,13 +81,13 @@ def _fine(merged: Merged, study: Study | None) -> list[FineSource]:
     return [FineSource(run, shown[of]) for of, run in (study.fine if study else {}).items() if of in shown]
 
 
-def _page(title: str, merged: Merged, sections, study: Study | None, more=(), fine=()) -> Page:
+def _page(title: str, merged: Merged, sections, study: Study | None, more, fine, sweep: bool) -> Page:
     headline, same = without_constants(means(merged))
     per_value, same_there = without_constants(merged.frame)
-    methods = merged.frame[["scene", "method"]].drop_duplicates()
+    alike = merged.frame[["scene"] if sweep else ["scene", "method"]].drop_duplicates()
     chosen = (
-        "Of each method, the pictures show the variant with the smallest mean held-out δ. "
-        if len(variants(merged)) > len(methods)
+        f"Of each {alike.columns[-1]}, the pictures show the variant with the smallest mean held-out δ. "
+        if len(variants(merged)) > len(alike)
         else ""
     )
     parameter, trust = _parameter_heading(merged), trust_rows(merged)

@@ -1,18 +1,37 @@
-"""The reports of a folder: a list of them, and whether they are still as they were generated."""
+"""The reports of a folder: what they found, in the order of a paper, and whether they are as generated."""
 
 import json
+import re
 from pathlib import Path
+
+import pandas as pd
 
 from nsf.errors import SchemaError
 from nsf.provenance import not_ignored
+from nsf.reporting.headline import Report, headline
+from nsf.reporting.page import DEFINITIONS
 from nsf.reporting.provenance import commit_text
 from nsf.reporting.sources import file_hash
+from nsf.reporting.superresolution import fine_means
 from nsf.reporting.swap import MARK
-from nsf.reporting.tables import markdown_rows
 from nsf.storage import writing
 
 LIST = "index.md"
-_HEADINGS = ["report", "question", "runs", "made", "commit"]
+CHAPTERS = {
+    "Main results": ("table1",),
+    "What the method needs": (
+        "ablation", "field", "width", "latent_dim", "sample_size", "sampler", "timestep", "seeds",
+    ),
+    "Beyond what was trained": ("extrapolation", "weak_elements", "super_resolution", "path_dependent"),
+    "One scene in detail, and speed": ("sand", "speed"),
+}  # fmt: skip
+"""Headings, and the folders under each in their order; the last heading is of all others."""
+_OTHERS = "Further reports"
+_LEAD = (
+    "Every number here is computed from the files of the reports, and every report from the runs that its "
+    "sources.json names; `nsf reports` writes this page. Each report has all values, charts and pictures."
+)
+_CHART = {"file": "delta.png", "caption": "Mean δ, each value, and the paper's."}  # of reports that name none
 _REBUILD = "build it again with `nsf report`"
 
 
@@ -30,17 +49,19 @@ def write_list(folder: Path) -> Path:
 
 
 def faults(folder: Path) -> list[str]:
-    """What differs from what was generated, each with its remedy: files of reports, and the list of them.
+    """What differs from what was generated, each with its remedy: files of reports, or the list of them.
 
     Raises:
         SchemaError: a report's sources.json lacks the hashes.
     """
     found = [fault for report in _reports(folder) for fault in _changed(report)]
+    if found:
+        return found  # a list made from changed files would be no better
     path = folder / LIST
     if not path.is_file() or path.read_text(encoding="utf-8") != _list(folder):
         command = f"nsf reports folder={folder}"
-        found.append(f"{path} does not list the reports as they are; write it with `{command}`")
-    return found
+        return [f"{path} does not list the reports as they are; write it with `{command}`"]
+    return []
 
 
 def _changed(report: Path) -> list[str]:
@@ -56,17 +77,76 @@ def _changed(report: Path) -> list[str]:
 
 
 def _list(folder: Path) -> str:
-    body = []
-    for report in _reports(folder):
-        told = _sources(report)
-        runs = told["runs"].values()
-        days = sorted({str(run["created"])[:10] for run in runs})
-        commits = sorted({commit_text(run) for run in runs})
-        made = " to ".join(dict.fromkeys((days[0], days[-1])))
-        title = f"[{told['title']}]({report.name}/index.md)"
-        body.append([title, told["question"], f"{len(runs)}", made, ", ".join(commits)])
-    table = markdown_rows(_HEADINGS, body, [name == "runs" for name in _HEADINGS])
-    return f"# Reports\n\nMade of evaluate runs alone; `nsf reports` writes this list.\n\n{table}\n"
+    sections = {report.name: _section(report, _sources(report)) for report in _reports(folder)}
+    sections |= {report.name: _bench_section(report) for report in _benches(folder)}
+    chapters: dict[str, list[str]] = {heading: [] for heading in (*CHAPTERS, _OTHERS)}
+    for name in sorted(sections, key=_place):
+        chapters[_place(name)[1]].append(name)
+    contents = [
+        f"- {heading}: " + ", ".join(f"[{sections[name][0]}](#{name})" for name in names)
+        for heading, names in chapters.items()
+        if names
+    ]
+    terms = "\n".join(f"- **{term}**: {text}" for term, text in DEFINITIONS)
+    parts = ["# Results", _LEAD, "\n".join(contents), "What is measured:", terms]
+    for heading, names in chapters.items():
+        parts += [f"## {heading}"] if names else []
+        for name in names:
+            title, body = sections[name]
+            parts += [f'<a id="{name}"></a>', f"### {title}", *body]
+    return "\n\n".join(parts) + "\n"
+
+
+def _place(name: str) -> tuple[int, str, int, str]:
+    """Number and heading of a report's chapter, its place in there, and its name."""
+    for number, (heading, names) in enumerate(CHAPTERS.items()):
+        if (whole := name.removesuffix("_small")) in names:
+            return number, heading, names.index(whole), name
+    return len(CHAPTERS), _OTHERS, 0, name
+
+
+def _section(folder: Path, told: dict) -> tuple[str, list[str]]:
+    """Title and paragraphs of a report."""
+    report = Report(folder, told)
+    body = [told["question"]]
+    if told.get("paper"):
+        body.append(f"**The paper:** {told['paper']}")
+    body.append(headline(report))
+    if (folder / "superresolution.csv").is_file():
+        body.append(fine_means(folder))
+    chart = told.get("chart") or _CHART
+    if chart["file"] in told["files"]:
+        body.append(f"![{told['title']}]({folder.name}/{chart['file']})\n\n{chart['caption']}")
+    return told["title"], [*body, f"{_made(report)} [The whole report]({folder.name}/index.md)."]
+
+
+def _made(report: Report) -> str:
+    """How many runs, where, when and from what code, as sentences."""
+    runs = report.told["runs"].values()
+    days = sorted({str(run["created"])[:10] for run in runs})
+    scales = sorted({f"{run['scale']} scale" for run in runs if run.get("scale")})
+    where = [
+        *(["at " + " and ".join(scales)] if scales else []),
+        "on " + ", ".join(sorted(set(report.rows["device"].astype(str)))),
+        "in " + ", ".join(sorted(set(report.rows["precision"].astype(str)))),
+    ]
+    commits = ", ".join(sorted({commit_text(run) for run in runs}))
+    count = "1 run" if len(runs) == 1 else f"{len(runs)} runs"
+    made = f"{count} {' '.join(where)}, {' to '.join(dict.fromkeys((days[0], days[-1])))}, {commits}."
+    missing = len(report.told.get("missing") or ())
+    return f"{made} Missing jobs: {missing}, with the reasons in the report." if missing else made
+
+
+def _bench_section(folder: Path) -> tuple[str, list[str]]:
+    """Title, first lines and first chart of a page of benchmarks."""
+    page = (folder / LIST).read_text(encoding="utf-8")
+    title, lead = page.split("\n\n")[:2]
+    rows = pd.read_csv(folder / "results.csv")
+    charts = re.findall(r"!\[([^\]]*)\]\(([^)]+)\)", page)
+    devices, commits = (", ".join(sorted(rows[name].astype(str).unique())) for name in ("device", "commit"))
+    body = [lead, *(f"![{caption}]({folder.name}/{file})\n\n{caption}" for caption, file in charts[:1])]
+    made = f"{len(rows)} rows on {devices}, {commits}."
+    return title.removeprefix("# "), [*body, f"{made} [The whole report]({folder.name}/index.md)."]
 
 
 def _reports(folder: Path) -> list[Path]:
@@ -75,9 +155,15 @@ def _reports(folder: Path) -> list[Path]:
     return [mark.parent for mark in marks]
 
 
+def _benches(folder: Path) -> list[Path]:
+    """The same of what `nsf bench` wrote."""
+    marks = not_ignored(sorted(folder.glob("*/kernels.csv")))
+    return [mark.parent for mark in marks]
+
+
 def _sources(report: Path) -> dict:
     told = json.loads((report / MARK).read_text(encoding="utf-8"))
-    absent = [key for key in ("title", "question", "runs", "files") if key not in told]
+    absent = [key for key in ("title", "question", "runs", "rows", "files") if key not in told]
     if absent:
         raise SchemaError(f"{report / MARK} lacks {', '.join(absent)}; {_REBUILD}")
     return told

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 
 from nsf.reporting import charts, cost_charts, render
+from nsf.reporting.colors import DIFFERENCE_COLORS, STRESS_COLORS
 from nsf.reporting.columns import COSTS, MEASURED, parameter_text
 from nsf.reporting.sources import Motion, same_parameter
 from nsf.reporting.style import save
@@ -18,9 +19,10 @@ from nsf.workers import results, working
 
 ROWS = 6  # parameter values in one picture of final shapes
 ANIMATED, FRAMES = 2, 31  # parameter values and frames of an animation
-ANIMATIONS_BYTES = 8 * 2**20  # of all on a page
+ANIMATIONS_BYTES = 6 * 2**20  # of all on a page
 # Of one on a page of many: to fit, it would give up half its frames and size, so these are never drawn.
 CROWDED_BYTES, CROWDED_ANIMATED, CROWDED_FRAMES = 2**19, 1, 16
+MANY = 16  # scenes and methods beyond which each has only what shows that it fails: strip and error
 _FEW = 2  # variants that a process is not worth starting for
 
 
@@ -103,15 +105,22 @@ class _Variant:
         return self.summary.get("floor")
 
 
-def draw(merged: Merged, folder: Path) -> list[Section]:
-    """Draw every picture of a report into folder."""
+def draw(merged: Merged, folder: Path, sweep: bool = False) -> list[Section]:
+    """Draw every picture of a report into folder.
+
+    Args:
+        merged: results.
+        folder: of the report.
+        sweep: what varies is a number or a seed, so that bodies move alike: those of one variant a scene
+            are shown, and not animated.
+    """
     groups = variants(merged)
     labels = variant_labels([merged.frame.iloc[members[0]].to_dict() for members in groups])
     known = [_Variant(merged, members, label) for members, label in zip(groups, labels, strict=True)]
-    shown = _best_of_each_method(known)
+    shown = _best(known, ("scene",) if sweep else ("scene", "method"))
     sections = [
         Section(_heading(v) if len(known) > 1 else "What was simulated", pictures)
-        for v, pictures in zip(shown, _of_variants(shown, folder), strict=True)
+        for v, pictures in zip(shown, _of_variants(shown, folder, animated=not sweep), strict=True)
     ]
     return [
         *sections,
@@ -119,21 +128,21 @@ def draw(merged: Merged, folder: Path) -> list[Section]:
     ]
 
 
-def _best_of_each_method(known: list[_Variant]) -> list[_Variant]:
-    """The variant of each scene and method with the smallest mean held-out δ; all would drown the page."""
+def _best(known: list[_Variant], alike: Sequence[str]) -> list[_Variant]:
+    """Of variants alike in these columns the one of the smallest mean held-out δ: all would drown a page."""
     best: dict[tuple, _Variant] = {}
     for v in known:
-        other = best.get((v.scene, v.method))
-        if other is None or not other.delta <= v.delta:
-            best[v.scene, v.method] = v
+        key = tuple(v.rows[name].iloc[0] for name in alike)
+        if key not in best or not best[key].delta <= v.delta:
+            best[key] = v
     return list(best.values())
 
 
-def _of_variants(shown: list[_Variant], folder: Path) -> list[list[Picture]]:
+def _of_variants(shown: list[_Variant], folder: Path, animated: bool) -> list[list[Picture]]:
     """The pictures of each variant; where they are many, drawn in several processes."""
-    gif_bytes = min(render.GIF_BYTES, ANIMATIONS_BYTES // len(shown))
+    gif_bytes = min(render.GIF_BYTES, ANIMATIONS_BYTES // len(shown)) if animated else 0
     calls = [
-        partial(_of_variant, v, folder, prefix, gif_bytes)
+        partial(_of_variant, v, folder, prefix, gif_bytes, brief=len(shown) > MANY)
         for v, prefix in zip(shown, _prefixes(shown), strict=True)
     ]
     processes = min(os.cpu_count() or 1, len(shown) // _FEW)
@@ -150,44 +159,73 @@ def _each(calls: Sequence[Callable[[], list[Picture]]], tell) -> list[list[Pictu
     return [call() for call in calls]
 
 
-def _of_variant(v: _Variant, folder: Path, prefix: str, gif_bytes: int) -> list[Picture]:
+def _of_variant(v: _Variant, folder: Path, prefix: str, gif_bytes: int, brief: bool) -> list[Picture]:
+    """Bodies, then charts; no animation for 0 bytes, and of a brief one strip and error alone."""
+    animation = [] if brief or not gif_bytes else _animation(v, folder, prefix, gif_bytes)
+    return [*animation, *_stills(v, folder, prefix, brief), *_charts(v, folder, prefix, brief)]
+
+
+def _animation(v: _Variant, folder: Path, prefix: str, gif_bytes: int) -> list[Picture]:
     name, unit = v.parameter
-    held_out, everything = v.series(held_out_only=True), v.series(held_out_only=False)
-    pictures, continued = [], v.continued()
-
-    def add(stem: str, figure, caption: str, kinds=("svg", "png")) -> None:
-        pictures.append(Picture(save(figure, folder, prefix + stem, kinds), caption, v.runs))
-
     crowded = gif_bytes < CROWDED_BYTES
     motions = v.motions(CROWDED_ANIMATED if crowded else ANIMATED)
-    if motions:
-        render.animation(
-            motions, folder / f"{prefix}animation.gif", name, unit, v.floor,
-            frames=CROWDED_FRAMES if crowded else FRAMES, max_bytes=gif_bytes,
-        )  # fmt: skip
-        cut = render.is_cut_open(motions)
-        told = f"{name} " + " and ".join(parameter_text(m.parameter, "", unit) for m in motions)
-        caption = (
-            f"The full-order model (left) and the reduced one (right) at {told}, held out from training"
-            f"{'; the front half is cut away' if cut else ''}.{continued}"
-        )
-        pictures.append(Picture([f"{prefix}animation.gif"], _held_out(caption, v), v.runs))
-        add(
-            "strip", render.strip(motions[0], name, unit, v.floor),
-            f"Whole bodies over time at {name} {parameter_text(motions[0].parameter, '', unit)}: full-order "
-            f"above, reduced below.{continued}", kinds=("png",),
-        )  # fmt: skip
-        add(
-            "final-shapes", render.final_shapes(v.motions(ROWS), name, unit, v.floor),
-            f"The last frame of each parameter value{', the front half cut away' if cut else ''}; "
-            "the right column shows how far each particle of the reduced model lies from where the "
-            f"full-order one puts it.{continued}", kinds=("png",),
-        )  # fmt: skip
+    if not motions:
+        return []
+    render.animation(
+        motions, folder / f"{prefix}animation.gif", name, unit, v.floor,
+        frames=CROWDED_FRAMES if crowded else FRAMES, max_bytes=gif_bytes,
+    )  # fmt: skip
+    told = f"{name} " + " and ".join(parameter_text(m.parameter, "", unit) for m in motions)
+    caption = (
+        f"The full-order model (left) and the reduced one (right) at {told}, held out from training"
+        f"{'; the front half is cut away' if render.is_cut_open(motions) else ''}.{v.continued()}"
+    )
+    return [Picture([f"{prefix}animation.gif"], _held_out(caption, v), v.runs)]
+
+
+def _stills(v: _Variant, folder: Path, prefix: str, brief: bool) -> list[Picture]:
+    name, unit = v.parameter
+    motions, continued = v.motions(ROWS), v.continued()
+    if not motions:
+        return []
+    strip = save(
+        render.strip(motions[0], name, unit, v.floor), folder, f"{prefix}strip", ("png",), [STRESS_COLORS]
+    )
+    told = (
+        f"Whole bodies over time at {name} {parameter_text(motions[0].parameter, '', unit)}: full-order "
+        f"above, reduced below.{continued}"
+    )
+    pictures = [Picture(strip, told, v.runs)]
+    if brief:
+        return pictures
+    shapes = save(
+        render.final_shapes(motions, name, unit, v.floor),
+        folder, f"{prefix}final-shapes", ("png",), [STRESS_COLORS, DIFFERENCE_COLORS],
+    )  # fmt: skip
+    cut = render.is_cut_open(motions)
+    told = (
+        f"The last frame of each parameter value{', the front half cut away' if cut else ''}; "
+        "the right column shows how far each particle of the reduced model lies from where the "
+        f"full-order one puts it.{continued}"
+    )
+    return [*pictures, Picture(shapes, told, v.runs)]
+
+
+def _charts(v: _Variant, folder: Path, prefix: str, brief: bool) -> list[Picture]:
+    name, unit = v.parameter
+    held_out, everything = v.series(held_out_only=True), v.series(held_out_only=False)
+    pictures = []
+
+    def add(stem: str, figure, caption: str) -> None:
+        pictures.append(Picture(save(figure, folder, prefix + stem), caption, v.runs))
+
     add(
         "error-over-time", charts.error_over_time(held_out, name=name, unit=unit),
         "The paper's error δ and the displacement error, frame by frame; the displacement error divides by "
-        f"the distance moved, so it starts high where little has moved yet.{continued}",
+        f"the distance moved, so it starts high where little has moved yet.{v.continued()}",
     )  # fmt: skip
+    if brief:
+        return pictures
     physics = [
         c for c in ("stress_error", "linear_momentum_error", "angular_momentum_error") if _has(held_out, c)
     ]

@@ -6,6 +6,7 @@ from pathlib import Path
 from nsf.reporting.columns import ABSENT
 from nsf.reporting.page import Page, Rows
 from nsf.reporting.sources import Source, file_hash
+from nsf.reporting.study import Study
 from nsf.reporting.tables import VARIANT, Merged
 
 _HEADINGS = ["run", "commit", "device", "precision", "seed", "made", "versions"]
@@ -39,7 +40,9 @@ def commit_text(manifest: dict) -> str:
     return f"{commit} + uncommitted changes" if manifest["dirty"] else commit
 
 
-def sources_json(page: Page, merged: Merged, folder: Path, also: Sequence = ()) -> dict:
+def sources_json(
+    page: Page, merged: Merged, folder: Path, also: Sequence = (), study: Study | None = None
+) -> dict:
     """What a report is, the run, commit and file hashes behind every row and picture, and its files' hashes.
 
     Args:
@@ -47,6 +50,7 @@ def sources_json(page: Page, merged: Merged, folder: Path, also: Sequence = ()) 
         merged: its rows.
         folder: holds every other file of the report.
         also: runs that no row of `merged` is of.
+        study: what the report is about, if it is of an experiment.
     """
     frame = merged.frame
     runs = {
@@ -66,6 +70,8 @@ def sources_json(page: Page, merged: Merged, folder: Path, also: Sequence = ()) 
             },
             "files": source.hashes,
             "paper": source.summary.get("paper"),
+            "scale": source.summary.get("scale"),
+            "keys": dict(study.keys.get(source.id, {})) if study else {},
         }
         for source in used_sources(merged, also)
     }
@@ -77,6 +83,9 @@ def sources_json(page: Page, merged: Merged, folder: Path, also: Sequence = ()) 
     return {
         "title": page.title,
         "question": page.lead,
+        "paper": study.paper if study else None,
+        "printed": list(study.printed) if study and study.printed is not None else None,
+        "missing": list(study.missing) if study else [],
         "files": {path.name: file_hash(path) for path in sorted(folder.iterdir())},
         "runs": runs,
         "rows": rows,

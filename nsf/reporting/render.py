@@ -20,7 +20,7 @@ from nsf.reporting.style import INK, MUTED, WARNING, WIDTH, styled
 if TYPE_CHECKING:
     from nsf.evaluation import SuperResolution
 
-GIF_BYTES = int(2.5 * 2**20)
+GIF_BYTES = 2**20
 _THIN = 0.5  # of the larger horizontal extent: below it a body, as a slice or a frame, counts as thin
 
 

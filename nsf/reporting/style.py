@@ -5,6 +5,8 @@ import itertools
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
+from nsf.reporting.png import write_png
+
 INK, MUTED, GRID, WARNING = "#222222", "#666666", "#dddddd", "#B04A00"
 
 # Okabe and Ito 2008, without the yellow that vanishes on white; black last.
@@ -59,7 +61,7 @@ _RC = {
 }
 
 WIDTH = 9.6  # [inch] 960 px at 100 dpi: the width of a report's column
-_PIXELS = 120  # an inch of a png: sharp at that width, and a report of many pictures stays small
+PIXELS = 120  # an inch of a png: sharp at that width, and a report of many pictures stays small
 
 
 def styled():
@@ -83,12 +85,20 @@ def stage_colors(stages) -> list[str]:
     return [STAGE_COLORS[stage] if stage in STAGE_COLORS else next(greys) for stage in stages]
 
 
-def save(fig: Figure, folder, stem: str, kinds=("svg", "png")) -> list[str]:
-    """Write a figure as `stem.svg` and `stem.png`, without dates, so that equal data gives equal files."""
+def save(fig: Figure, folder, stem: str, kinds=("svg", "png"), ramps=()) -> list[str]:
+    """Write a figure as `stem.svg` and `stem.png`, without dates, so that equal data gives equal files.
+
+    Args:
+        fig, folder, stem: what is written where.
+        kinds: which files.
+        ramps: names of the colour scales in it, whose bars show no steps then.
+    """
     names = [f"{stem}.{kind}" for kind in kinds]
     with styled():
         for kind, name in zip(kinds, names, strict=True):
-            metadata = {"Date": None} if kind == "svg" else {"Software": None}
-            fig.savefig(folder / name, dpi=_PIXELS if kind == "png" else 100, metadata=metadata)
+            if kind == "png":
+                write_png(fig, folder / name, PIXELS, ramps)
+            else:
+                fig.savefig(folder / name, dpi=100, metadata={"Date": None})
             fig.set_layout_engine("none")  # the first file has laid it out; that takes as long as drawing
     return names

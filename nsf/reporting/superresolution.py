@@ -10,6 +10,7 @@ from nsf.reporting.columns import Column, parameter_text
 from nsf.reporting.page import Rows, Table
 from nsf.reporting.pictures import Picture, Section
 from nsf.reporting.sources import Source, checked_hash
+from nsf.reporting.tables import markdown_rows
 
 _TABLE, _PICTURE = "superresolution.csv", "superresolution.png"
 _HEADING = "At many more points"
@@ -36,6 +37,7 @@ _NOTE = (
     "these that interpolation puts more than half a grid cell away in the last frame. The query is of all "
     "these frames together."
 )
+_MEANS = ("points", "delta", "particles_delta", "full_order_difference", "interpolation_error", "seconds")
 _TOLD = ("scene", "method", "field", "r", "sample")  # of a variant, in results.csv
 
 
@@ -82,6 +84,20 @@ def fine_table(fine: Sequence[FineSource], settings, folder: Path) -> Table:
         for row in frame.to_dict("records")
     ]
     return Table(_HEADING, Rows([*known, "parameter", *(c.heading for c in _COLUMNS)], body), _NOTE)
+
+
+def fine_means(folder: Path) -> str:
+    """Means over parameter values of a report's `superresolution.csv`, a row a variant, as markdown."""
+    frame = pd.read_csv(folder / _TABLE)
+    known = list(frame.columns[: frame.columns.get_loc("parameter")])
+    columns = [column for column in _COLUMNS if column.name in _MEANS]
+    means = frame.groupby(known, sort=False, as_index=False)[[column.name for column in columns]].mean()
+    body = [
+        [*(str(row[name]) for name in known), *(column.text(row[column.name]) for column in columns)]
+        for row in means.to_dict("records")
+    ]
+    headings = [*known, *(column.heading for column in columns)]
+    return markdown_rows(headings, body, [i >= len(known) for i in range(len(headings))])
 
 
 def _variant(f: FineSource, settings) -> dict:

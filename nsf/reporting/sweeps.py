@@ -12,8 +12,8 @@ from nsf.reporting.style import save
 from nsf.reporting.tables import Merged, paper_row
 
 _SCENE, _RUN = "scene", "run"
-_SEEDS = ("seed", "sampler.seed")
-_AXES = {
+SEEDS = ("seed", "sampler.seed")
+AXES = {
     "sampler.size": ("sample particles |S|", "–", "sample"),
     "latent_dim": ("latent coordinates r", "–", "r"),
     "field.beta": ("hidden width β over d", "–", None),
@@ -31,8 +31,8 @@ def swept(merged: Merged, keys: Mapping[str, Mapping[str, str]], folder: Path) -
         folder: of the report.
     """
     frame = _held_out(merged, keys)
-    varied = [key for key in frame.columns if key in (*_AXES, *_SEEDS) and frame[key].nunique() > 1]
-    pictures = [_over(key, frame, merged, folder) for key in varied if key in _AXES]
+    varied = [key for key in frame.columns if key in (*AXES, *SEEDS) and frame[key].nunique() > 1]
+    pictures = [_over(key, frame, merged, folder) for key in varied if key in AXES]
     if not pictures and varied:
         pictures = [_scatter(frame, merged, folder)]
     return [Section("What is varied", pictures)] if pictures else []
@@ -50,7 +50,7 @@ def _held_out(merged: Merged, keys: Mapping[str, Mapping[str, str]]) -> pd.DataF
 
 def _over(key: str, frame: pd.DataFrame, merged: Merged, folder: Path) -> Picture:
     """δ over one key, a panel a scene, a line for each setting of the other keys."""
-    title, unit, column = _AXES[key]
+    title, unit, column = AXES[key]
     shown = frame[frame[key].notna()]
     source = merged.frame[column].loc[shown["row"]].array if column else shown[key]
     shown = shown.assign(x=pd.to_numeric(pd.Series(source, index=shown.index), errors="coerce"))
@@ -58,13 +58,13 @@ def _over(key: str, frame: pd.DataFrame, merged: Merged, folder: Path) -> Pictur
     for scene, part in shown.dropna(subset="x").groupby(_SCENE, sort=False):
         panels[scene] = {
             name: group.groupby("x")["delta"].apply(list).to_dict()
-            for name, group in _settings(part, (key, *_SEEDS), alone="mean")
+            for name, group in _settings(part, (key, *SEEDS), alone="mean")
         }
         printed = paper_row(merged, [part["row"].iloc[0]]) or {}
         paper = tuple(pd.to_numeric(printed.get(name), errors="coerce") for name in (column, "delta"))
         if not any(map(pd.isna, paper)):
             papers[scene] = paper
-    seeds = any(shown[seed].nunique() > 1 for seed in _SEEDS if seed in shown)
+    seeds = any(shown[seed].nunique() > 1 for seed in SEEDS if seed in shown)
     figure = charts.delta_over(panels, axis(title, unit), papers)
     caption = (
         f"Mean δ (line) against {title}, and from the smallest to the largest over the held-out values"
@@ -78,9 +78,9 @@ def _over(key: str, frame: pd.DataFrame, merged: Merged, folder: Path) -> Pictur
 def _scatter(frame: pd.DataFrame, merged: Merged, folder: Path) -> Picture:
     """Mean δ of each seed, a row for each setting of the other keys."""
     entries = []
-    for seed in _SEEDS:
+    for seed in SEEDS:
         part = frame[frame[seed].notna()] if seed in frame else frame.iloc[:0]
-        for name, group in _settings(part, _SEEDS, alone=merged.frame["scene"].iloc[0]):
+        for name, group in _settings(part, SEEDS, alone=merged.frame["scene"].iloc[0]):
             values = group.groupby(seed)["delta"].apply(lambda deltas: deltas.mean(skipna=False))
             printed = (paper_row(merged, [group["row"].iloc[0]]) or {}).get("delta")
             told = {"mean": values.mean(skipna=False), "values": list(values)}

@@ -56,6 +56,15 @@ def test_jobs_are_told_apart(name):
     assert len(told) == len(experiment.jobs)
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_what_the_paper_prints_is_of_a_job(name):
+    experiment = Experiment.load(name)
+    jobs = [job.keys for job in experiment.jobs]
+    for entry in experiment.printed or ():
+        wanted = {key: value for key, value in entry.items() if key not in ("delta", "parameter")}
+        assert any(all(job.get(key, "null") == wanted[key] for key in wanted) for job in jobs), entry
+
+
 def test_table1_has_the_papers_seven_scenes():
     jobs = [set(job.overrides) for job in Experiment.load("table1").jobs]
     scenes = {"bread", "cake", "sand", "metal", "toothpaste", "jelly_cube", "squishy_ball"}

@@ -53,6 +53,16 @@ def test_keys_of_a_job(written):
     assert last.keys["scene.parameters.test"] == "[44,55]"
 
 
+def test_what_the_paper_prints_is_text_as_in_the_keys_of_jobs(written):
+    assert written(TEXT).printed is None
+    assert written(TEXT + "printed: []\n").printed == ()
+    (entry,) = written(
+        TEXT + "printed: [{parameter: 44, deploy.changes: {a.b: 0.3}, field.modes: null, delta: 0.02}]\n"
+    ).printed
+    changes = {"parameter": "44", "deploy.changes": "{a.b:0.3}", "field.modes": "null"}
+    assert entry == changes | {"delta": 0.02}
+
+
 def test_overrides_take_the_place_of_the_files(written):
     experiment = written(TEXT, "field=mlp", "seed=1,2")
     assert [job.overrides for job in experiment.jobs][:2] == [
@@ -74,6 +84,8 @@ def test_equal_jobs_are_one(written):
         (TEXT.replace("question", "aim"), "must have the keys"),
         (TEXT[: TEXT.index("jobs")] + "jobs: 3", "jobs is a list"),
         (TEXT + "stages: [point]\n", r"stages=\['point'\] must be a list of superresolve"),
+        (TEXT + "printed: [0.2]\n", "printed must be a list of mappings"),
+        (TEXT + "printed: [{scene: sand}]\n", "each with a number delta"),
         ("", "must have the keys"),
     ],
 )

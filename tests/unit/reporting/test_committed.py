@@ -1,13 +1,17 @@
 """The list of reports, and what it notices."""
 
 import json
+import re
 import subprocess
 
+import pandas as pd
 import pytest
+from finished import job, write_report
 
 from nsf.cli import main
 from nsf.errors import SchemaError
-from nsf.reporting import committed
+from nsf.paths import EXPERIMENTS
+from nsf.reporting import committed, superresolution
 
 
 @pytest.fixture
@@ -32,10 +36,93 @@ def check(folder, capsys) -> tuple[int, str]:
     return ended.value.code or 0, capsys.readouterr().err
 
 
-def test_the_list(folder):
-    (line, _) = (folder / "index.md").read_text().splitlines()[-2:]
-    assert line.startswith("| [Sand & friends](sand/index.md) | A reduced-order model")
-    assert line.endswith("| 3 | 2024-05-01 | 1f2e3d4c5b6a, 1f2e3d4c5b6a + uncommitted changes |")
+def test_a_section_has_question_table_chart_origin_and_link(folder):
+    text = (folder / "index.md").read_text()
+    section = text[text.index('<a id="sand"></a>') : text.index('<a id="sand_small"></a>')]
+    marks = [
+        "### Sand & friends",
+        "A reduced-order model",
+        "| scene | method | \\|S\\| |",
+        "| sand | nsf | 50 |",
+    ]
+    marks += ["Shown: means", "3 runs at paper scale on cuda:0 in fp64, 2024-05-01, 1f2e3d4c5b6a, 1f2e"]
+    marks += ["[The whole report](sand/index.md)"]
+    places = [section.index(mark) for mark in marks]
+    assert places == sorted(places)
+
+
+def test_order_is_that_of_a_paper_whatever_the_names(tmp_path):
+    names = ("apples", "sand", "latent_dim", "width", "extrapolation", "ablation_small", "table1", "ablation")
+    for name in names:
+        write_report(tmp_path / name, [job()])
+    text = committed.write_list(tmp_path).read_text()
+    found = re.findall(r'^(?:## (.*)|<a id="(.*)"></a>)$', text, re.MULTILINE)
+    assert ["".join(pair) for pair in found] == [
+        "Main results", "table1",
+        "What the method needs", "ablation", "ablation_small", "width", "latent_dim",
+        "Beyond what was trained", "extrapolation",
+        "One scene in detail, and speed", "sand",
+        "Further reports", "apples",
+    ]  # fmt: skip
+    assert "- Main results: [Table1](#table1)\n" in text
+
+
+def test_every_experiment_has_its_place():
+    placed = {name for names in committed.CHAPTERS.values() for name in names}
+    assert placed == {path.stem for path in EXPERIMENTS.glob("*.yaml")} | {"speed"}
+
+
+def test_the_paper_the_chart_and_what_is_missing(tmp_path):
+    jobs = [job(**{"sampler.size": "50"}), job(**{"sampler.size": "20"}) | {"delta": float("inf")}]
+    told = {"paper": "Section 6.3: 0.2 %.", "missing": ["a: not run", "b: not run"]}
+    write_report(tmp_path / "sampler", jobs, chart="delta-over-sampler-size.png", **told)
+    text = committed.write_list(tmp_path).read_text()
+    assert "**The paper:** Section 6.3: 0.2 %." in text
+    assert "![Sampler](sampler/delta-over-sampler-size.png)\n\nWhat the chart shows." in text
+    assert "Missing jobs: 2" in text
+    assert "∞: 1 of the 2 reduced runs diverged." in text
+
+
+def test_a_report_of_before_these_keys_is_listed(tmp_path):
+    """Such as tell neither paper, scale, keys, chart nor what is missing."""
+    folder = write_report(tmp_path / "table1", [job(), job("bread")], chart="delta.png")
+    told = json.loads((folder / "sources.json").read_text())
+    del told["chart"]
+    for run in told["runs"].values():
+        del run["keys"], run["scale"]
+    (folder / "sources.json").write_text(json.dumps(told))
+    text = committed.write_list(tmp_path).read_text()
+    assert "| sand | 0.400 | 0.100 |" in text
+    assert "![Table1](table1/delta.png)" in text
+    assert "2 runs on NVIDIA H200" in text
+    assert committed.faults(tmp_path) == []
+
+
+def test_benchmarks_are_listed_by_their_first_lines(tmp_path):
+    folder = tmp_path / "speed"
+    folder.mkdir()
+    (folder / "index.md").write_text("# Speed\n\nTime of a step.\n\n## On X\n\n![Over P.](step.png)\n")
+    (folder / "results.csv").write_text("bench,device,commit\nscaling,X,1f2e\nbatch,X,3d4c+\n")
+    (folder / "kernels.csv").touch()
+    text = committed.write_list(tmp_path).read_text()
+    assert "### Speed\n\nTime of a step.\n\n![Over P.](speed/step.png)\n\nOver P.\n\n2 rows on X" in text
+    assert "1f2e, 3d4c+. [The whole report](speed/index.md)." in text
+
+
+def test_points_beyond_the_particles_have_their_means(tmp_path):
+    folder = write_report(tmp_path / "super_resolution", [job(field="basis"), job(field="mlp")])
+    rows = [
+        dict.fromkeys((c.name for c in superresolution._COLUMNS), value) | {"field": field, "parameter": 1.0}
+        for field, value in (("basis", 0.01), ("basis", 0.03), ("mlp", 0.5))
+    ]
+    frame = pd.DataFrame(rows)
+    frame[["field", "parameter", *(c.name for c in superresolution._COLUMNS)]].to_csv(
+        folder / "superresolution.csv", index=False
+    )
+    text = committed.write_list(tmp_path).read_text()
+    assert "| field | points | δ at the points [%] |" in text
+    assert "| basis | 0.0200 | 2 |" in text
+    assert "| mlp | 0.500 | 50 |" in text
 
 
 def test_every_file_of_a_report_has_its_hash(report):
@@ -82,7 +169,7 @@ def test_what_git_ignores_is_not_listed(folder, capsys):
 
 
 def test_a_report_without_hashes_says_how_to_get_them(folder):
-    (folder / "sand/sources.json").write_text('{"title": "a", "question": "b", "runs": {}}')
+    (folder / "sand/sources.json").write_text('{"title": "a", "question": "b", "runs": {}, "rows": []}')
     with pytest.raises(SchemaError, match=r"lacks files; build it again with `nsf report`"):
         committed.faults(folder)
 

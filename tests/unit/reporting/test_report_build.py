@@ -13,17 +13,19 @@ from nsf.reporting import build, build_report, pictures
 from nsf.reporting.columns import number
 from nsf.reporting.pictures import _Variant
 from nsf.reporting.sources import Source, file_hash, open_sources
+from nsf.reporting.study import Study
 from nsf.reporting.tables import merge
 from nsf.reporting.trust import spearman, trust_note
 from nsf.workers import working
 
+ERRORS = ("error-over-time.png", "error-over-time.svg")
 TINY = Made(particles=30, frames=4, parameters=TEST[:2], splits=("test",) * 2)
 
 
 @pytest.fixture
 def no_pictures(monkeypatch):
     """Drawing takes seconds, and some tests are about the rest."""
-    monkeypatch.setattr(build, "draw", lambda merged, folder: [])
+    monkeypatch.setattr(build, "draw", lambda merged, folder, sweep: [])
 
 
 def files(folder):
@@ -209,6 +211,31 @@ def test_animations_of_a_crowded_page_are_of_one_value_and_fewer_frames(tmp_path
     ((motions, keys),) = drawn
     assert [motion.parameter for motion in motions] == [TEST[0]]
     assert keys["frames"] == 3
+
+
+def test_a_sweep_shows_the_best_variant_of_a_scene_and_does_not_animate_it(tmp_path):
+    found, keys = [], {}
+    for size, noise, method in ((20, 0.02, "nsf"), (50, 0.004, "nsf"), (50, 0.05, "neural_stress_only")):
+        run = write_run(
+            tmp_path / "runs", Made(**vars(TINY) | {"sample": size, "noise": noise, "method": method})
+        )
+        found.append(run)
+        keys[run.id] = {"scene": "sand", "method": method, "sampler.size": str(size)}
+    study = Study("How many?", "Two.", {}, keys, [])
+    folder = build_report(found, tmp_path / "report", "t", study=study).parent
+    assert {path.name for path in folder.glob("*strip*")} == {"strip.png"}
+    assert not list(folder.glob("*.gif"))
+    page = (folder / "index.md").read_text()
+    assert "Of each scene, the pictures show" in page
+    assert "## sand · nsf · |S| 50" in page
+
+
+def test_of_very_many_methods_each_has_its_strip_and_its_error(sweep, tmp_path, monkeypatch):
+    monkeypatch.setattr(pictures, "MANY", 1)
+    folder = build_report(sweep, tmp_path / "report", "t").parent
+    for method in ("nsf", "deformation_only"):
+        drawn = {path.name for path in folder.glob(f"{method}-*")}
+        assert drawn == {f"{method}-{name}" for name in ("strip.png", *ERRORS)}
 
 
 def test_one_value_without_paper_or_costs(tmp_path):

@@ -1,5 +1,6 @@
 """What an experiment varies: δ over numbers with bands, over seeds; and the table for LaTeX."""
 
+import json
 import re
 
 import numpy as np
@@ -8,9 +9,9 @@ import pytest
 from synthetic import Made, write_run
 
 from nsf.reporting import build_report, charts, sweeps
-from nsf.reporting.build import Study
 from nsf.reporting.latex import escaped, latex_table
 from nsf.reporting.sources import open_sources
+from nsf.reporting.study import Study
 from nsf.reporting.tables import means, merge
 
 VALUES = (22.5, 27.5)
@@ -116,6 +117,26 @@ def test_latex_is_the_first_table_of_the_page(tmp_path):
     assert any("the paper" in line for line in body)
     assert {len(line.split(" & ")) for line in body} == {len(rows[0].replace("\\|", "").split("|"))}
     assert lines[-1] == r"\end{tabular}"
+
+
+def test_sources_tell_what_a_study_varied_and_its_chart(tmp_path):
+    found, keys, settings = runs(tmp_path, sizes={20: 0.02, 150: 0.004})
+    printed = ({"sampler.size": "20", "delta": 0.005},)
+    study = Study("How many?", "Two.", settings, keys, ["one: not run"], printed)
+    folder = build_report(found, tmp_path / "report", "t", study=study).parent
+    told = json.loads((folder / "sources.json").read_text())
+    assert {run: told["runs"][run]["keys"] for run in keys} == keys
+    assert {entry["scale"] for entry in told["runs"].values()} == {"paper"}
+    assert (told["paper"], told["missing"], told["printed"]) == ("Two.", ["one: not run"], list(printed))
+    assert told["chart"]["file"] == "delta-over-sampler-size.png"
+    assert told["chart"]["caption"].startswith("Mean δ")
+
+
+def test_sources_without_a_study(report):
+    told = json.loads((report / "sources.json").read_text())
+    assert (told["paper"], told["missing"], told["printed"]) == (None, [], None)
+    assert {json.dumps(entry["keys"]) for entry in told["runs"].values()} == {"{}"}
+    assert told["chart"]["file"] == "delta.png"
 
 
 def test_latex_escapes():

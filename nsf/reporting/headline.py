@@ -1,0 +1,283 @@
+"""What a finished report comes to, in one small table: from its results.csv and sources.json alone."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from nsf.errors import SchemaError
+from nsf.reporting.columns import ABSENT, COLUMN, TEXT, axis, number, parameter_text
+from nsf.reporting.sweeps import AXES, SEEDS
+from nsf.reporting.tables import markdown_rows
+
+FEW = 15  # rows of a table in which a number is varied; of more, settings and scenes go down and across
+MANY = 24  # rows where none is, as in the paper's Table 1
+_VALUES = "scene.parameters.test"  # jobs with this key are about certain held-out values, so each counts
+_PAPER, _COUNT = "paper", "values"
+_MEASURED = ("delta", "displacement_error", "stress_error", "speedup_step", "speedup_total")
+_COLUMN_OF = {
+    "scene": "scene",
+    "method": "method",
+    "field": "field",
+    "latent_dim": "r",
+    "sampler.size": "sample",
+}
+_NUMBERS = {column or key for key, (_, _, column) in AXES.items()}
+_TITLES = {key: axis(title, unit.strip("–")) for key, (title, unit, _) in AXES.items()}
+
+
+@dataclass(frozen=True)
+class Report:
+    """A report's folder, and what its sources.json tells; a key that an older one lacks counts as empty."""
+
+    folder: Path
+    told: Mapping
+
+    @cached_property
+    def rows(self) -> pd.DataFrame:
+        """Held-out rows of results.csv, the keys of their jobs, and the paper's δ (a fraction, or NaN).
+
+        Raises:
+            SchemaError: results.csv is missing, or its rows are not those of sources.json.
+        """
+        path = self.folder / "results.csv"
+        frame = pd.read_csv(path, dtype=dict.fromkeys((*TEXT, "r"), str)) if path.is_file() else ()
+        if len(frame) != len(self.told["rows"]):
+            raise SchemaError(
+                f"{path} has not the {len(self.told['rows'])} rows that sources.json tells of; "
+                "build the report again with `nsf report`"
+            )
+        runs = [self.told["runs"][row["run"]] for row in self.told["rows"]]
+        keys = pd.DataFrame([_own(run) for run in runs], index=frame.index).replace("null", np.nan)
+        frame = frame.join(keys)
+        records = frame.to_dict("records")
+        frame[_PAPER] = [self._printed(row, run) for row, run in zip(records, runs, strict=True)]
+        held_out = frame["split"] != "train"
+        return frame[held_out] if held_out.any() else frame
+
+    @cached_property
+    def settings(self) -> list[str]:
+        """Columns of `rows` that tell apart what is compared within a scene, as few as can."""
+        keys = list(dict.fromkeys(key for run in self.told["runs"].values() for key in _own(run)))
+        jobs = [key for key in keys if key not in SEEDS] if keys else ["setting"]
+        known = ["method", "field", *jobs, "r", "sample", *(["parameter"] if _VALUES in keys else [])]
+        found: set[str] = set()
+        for _, rows in self.rows.groupby("scene", sort=False):
+            told: list[str] = []
+            for key in known:
+                if key in rows and len(rows.drop_duplicates([*told, key])) > max(1, _kinds(rows, told)):
+                    told.append(key)
+            found |= set(told)
+        return [key for key in known if key in found]
+
+    @cached_property
+    def seeds(self) -> list[str]:
+        """Keys of seeds that take several values."""
+        return [seed for seed in SEEDS if seed in self.rows and self.rows[seed].nunique() > 1]
+
+    @cached_property
+    def groups(self) -> pd.DataFrame:
+        """A row a scene and setting, with means over held-out values and seeds.
+
+        One that is missing leaves the mean empty; a run that diverged makes it ∞.
+        """
+        alike = ["scene", *self.settings]
+        others = [name for name in _COLUMN_OF.values() if name not in alike]
+        rows = []
+        for values, part in self.rows.fillna(dict.fromkeys(alike, ABSENT)).groupby(alike, sort=False):
+            row = dict(zip(alike, values, strict=True))
+            row |= {name: part[name].iloc[0] if part[name].nunique() == 1 else ABSENT for name in others}
+            rows.append(row | {name: part[name].mean(skipna=False) for name in (*_MEASURED, _PAPER)})
+        frame = pd.DataFrame(rows)
+        ranks = [frame[key].map(_ranks(frame[key])) for key in alike]
+        return frame.iloc[np.lexsort(ranks[::-1])].reset_index(drop=True)
+
+    @property
+    def small(self) -> set[str]:
+        """Scales of its runs that are not the paper's."""
+        return {str(run["scale"]) for run in self.told["runs"].values() if run.get("scale")} - {"paper"}
+
+    def _printed(self, row: Mapping, run: Mapping) -> float:
+        """The paper's δ of a row: the entry of it, else the scene's where r and |S| are its; or NaN."""
+        entries = self.told.get("printed")
+        if entries is None:
+            stated = (run.get("paper") or {}).get(row["method"], {})
+            same = all(str(stated[name]) == row[name] for name in ("r", "sample") if name in stated)
+            return stated.get("delta", np.nan) if same else np.nan
+        known = (run.get("keys") or {}) | {name: row[name] for name in ("scene", "method", "field")}
+        known |= {"parameter": parameter_text(row["parameter"])}
+        fits = [e["delta"] for e in entries if all(known.get(k, "null") == e[k] for k in e if k != "delta")]
+        return fits[0] if fits else np.nan
+
+
+def headline(report: Report) -> str:
+    """The table and what is to be said of it, as markdown."""
+    varied = [key for key in report.settings if key in _NUMBERS]
+    if not report.settings and report.seeds:
+        table, said = _over_seeds(report), "Shown: of each seed the mean over held-out values."
+    elif len(report.groups) <= (FEW if varied else MANY):
+        table, said = _flat(report), f"Shown: {_averaged(report)}."
+    else:
+        table = _pivot(report, varied)
+        said = f"Shown: δ [%], in brackets the stress error [%]; {_averaged(report)}.{_best(report)}"
+    return f"{table}\n\n{said}{_beside_paper(report)}{_diverged(report)}"
+
+
+def _flat(report: Report) -> str:
+    """A row a scene and setting, with every measure."""
+    groups = report.groups
+    order = dict.fromkeys(("scene", "method", "field", *report.settings, "r", "sample"))
+    shown = [key for key in order if key == "scene" or groups[key].nunique() > 1]
+    measured = [name for name in _MEASURED if groups[name].notna().any()]
+    paper = ["paper's δ [%]"] if groups[_PAPER].notna().any() else []
+    body = [
+        [_text(key, row[key]) for key in shown]
+        + [number(row[_PAPER], 100) for _ in paper]
+        + [COLUMN[name].text(row[name]) for name in measured]
+        for row in groups.to_dict("records")
+    ]
+    headings = [*map(_title, shown), *paper, *(COLUMN[name].heading for name in measured)]
+    return markdown_rows(headings, body, [*map(_is_number, shown), *(True for _ in (*paper, *measured))])
+
+
+def _pivot(report: Report, varied: Sequence[str]) -> str:
+    """Mean δ and stress error, settings down and scenes across, or as it takes fewer rows."""
+    groups, settings = report.groups, report.settings
+    kinds = _kinds(groups, settings)
+    if groups["scene"].nunique() > kinds:
+        down, across = ["scene"], settings
+    elif kinds <= FEW or not varied:
+        down, across = settings, ["scene"]
+    else:
+        down, across = [varied[0]], ["scene", *(key for key in settings if key != varied[0])]
+    found = {
+        (tuple(row[k] for k in down), tuple(row[k] for k in across)): row for row in groups.to_dict("records")
+    }
+    columns = _sorted(groups, across)
+    printed = {at for (_, at), row in found.items() if not np.isnan(row[_PAPER])}
+    headings = [_title(key) for key in down]
+    for at in columns:
+        name = " · ".join(
+            _named(key, value) for key, value in zip(across, at, strict=True) if value != ABSENT
+        )
+        headings += [name, f"{name}, the paper"] if at in printed else [name]
+    body = []
+    for label in _sorted(groups, down):
+        body.append([_text(key, value) for key, value in zip(down, label, strict=True)])
+        for at in columns:
+            row = found.get((label, at))
+            body[-1].append(
+                f"{number(row['delta'], 100)} ({number(row['stress_error'], 100)})" if row else ""
+            )
+            if at in printed:
+                body[-1].append(number(row[_PAPER], 100) if row else "")
+    numeric = [*map(_is_number, down), *(True for _ in headings[len(down) :])]
+    return markdown_rows(headings, body, numeric)
+
+
+def _over_seeds(report: Report) -> str:
+    """δ of the seeds of each scene, a row for training and one for the sample."""
+    body = []
+    for seed in report.seeds:
+        for scene, part in report.rows[report.rows[seed].notna()].groupby("scene", sort=False):
+            delta = part.groupby(seed)["delta"].agg(lambda values: values.mean(skipna=False))
+            told = (delta.mean(skipna=False), delta.min(skipna=False), delta.max(skipna=False))
+            paper = part[_PAPER].mean(skipna=False)
+            body.append([scene, seed, f"{len(delta)}", *(number(value, 100) for value in (*told, paper))])
+    headings = ["scene", "varied", "seeds", "mean δ [%]", "smallest [%]", "largest [%]", "paper's δ [%]"]
+    return markdown_rows(headings, body, [i > 1 for i in range(len(headings))])
+
+
+def _averaged(report: Report) -> str:
+    """What the numbers are means over."""
+    told = "each held-out value by itself" if "parameter" in report.settings else "means over held-out values"
+    return f"{told} and, where several were run, seeds" if report.seeds else told
+
+
+def _best(report: Report) -> str:
+    """The smallest δ of each scene, and where."""
+    told = []
+    for scene, part in report.groups.groupby("scene", sort=False):
+        finite = part[np.isfinite(part["delta"])]
+        if len(finite):
+            row = finite.loc[finite["delta"].idxmin()]
+            where = [_named(key, row[key]) for key in report.settings if row[key] != ABSENT]
+            told.append(f"{number(row['delta'], 100)} % on {scene} ({', '.join(where)})")
+    return f" Smallest δ: {'; '.join(told)}." if told else ""
+
+
+def _beside_paper(report: Report) -> str:
+    """How often δ is below the paper's; of small runs only that they are not comparable."""
+    known = report.groups.dropna(subset=_PAPER)
+    if not len(known):
+        return ""
+    if report.small:
+        return f" The paper's δ is of its full size, these runs are of {min(report.small)} scale."
+    told = []
+    for (method, field), part in known.groupby(["method", "field"], sort=False):
+        below = int((part["delta"] < part[_PAPER]).sum())
+        told.append(f"{below} of {len(part)} ({method}, {field})")
+    return f" δ is below the paper's in {', '.join(told)}, of the cases in which the paper prints one."
+
+
+def _diverged(report: Report) -> str:
+    count = int(np.isinf(report.rows["delta"]).sum())
+    return f" ∞: {count} of the {len(report.rows)} reduced runs diverged." if count else ""
+
+
+def _own(run: Mapping) -> dict[str, str]:
+    """Keys of a run's job that no column of results.csv tells."""
+    return {key: value for key, value in (run.get("keys") or {}).items() if key not in _COLUMN_OF}
+
+
+def _kinds(rows: pd.DataFrame, columns: Sequence[str]) -> int:
+    return len(rows.drop_duplicates(list(columns))) if columns else 0
+
+
+def _sorted(groups: pd.DataFrame, keys: Sequence[str]) -> list[tuple]:
+    """The combinations of values that are there, by the keys in turn."""
+    ranks = [_ranks(groups[key]) for key in keys]
+    known = dict.fromkeys(groups[list(keys)].itertuples(index=False, name=None))
+    return sorted(known, key=lambda values: [rank[v] for rank, v in zip(ranks, values, strict=True)])
+
+
+def _ranks(values: pd.Series) -> dict:
+    """What is not set, then numbers by size, then text as it comes."""
+    known = list(dict.fromkeys(values))
+
+    def key(value) -> tuple[int, float]:
+        if value == ABSENT:
+            return (0, 0.0)
+        try:
+            return (1, float(value))
+        except ValueError:
+            return (2, float(known.index(value)))
+
+    return {value: rank for rank, value in enumerate(sorted(known, key=key))}
+
+
+def _title(key: str) -> str:
+    return COLUMN[key].title if key in COLUMN else _TITLES.get(key, key.rpartition(".")[2].replace("_", " "))
+
+
+def _text(key: str, value) -> str:
+    """A setting in a cell; of a mapping of dotted keys the last part of each."""
+    if not isinstance(value, str):
+        return parameter_text(value)
+    if not value.startswith("{"):
+        return value
+    entries = (entry.partition(":") for entry in value.strip("{}").split(","))
+    return ", ".join(f"{name.rpartition('.')[2]} {changed}" for name, _, changed in entries)
+
+
+def _named(key: str, value) -> str:
+    """A setting away from its heading: numbers need their title."""
+    text = _text(key, value)
+    return f"{_title(key)} {text}" if _is_number(key) else text
+
+
+def _is_number(key: str) -> bool:
+    return key in _NUMBERS or key == "parameter"

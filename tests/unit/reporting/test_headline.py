@@ -1,0 +1,158 @@
+"""What a report comes to: its table, laid out by what is varied, beside what the paper prints."""
+
+import numpy as np
+import pytest
+from finished import job, write_report
+
+from nsf.errors import SchemaError
+from nsf.reporting import headline as module
+from nsf.reporting.committed import _sources
+from nsf.reporting.headline import Report, headline
+
+
+def told(folder) -> tuple[list[list[str]], str]:
+    """Cells of the table, and the sentences under it."""
+    table, _, said = headline(Report(folder, _sources(folder))).partition("\n\n")
+    plain = table.replace("\\|S\\|", "S")
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in plain.splitlines()]
+    return [rows[0], *rows[2:]], said
+
+
+def test_means_over_values_and_seeds_a_row_a_scene_and_setting(tmp_path):
+    jobs = [
+        job(scene, delta=0.001 * (value + seed), parameter=value, seed=str(seed), method=method)
+        for scene in ("sand", "bread")
+        for method in ("nsf", "deformation_only")
+        for value in (1.0, 2.0)
+        for seed in (0, 1)
+    ]
+    rows, said = told(write_report(tmp_path / "a", jobs))
+    assert rows[0][:5] == ["scene", "method", "paper's δ [%]", "δ [%]", "displacement error [%]"]
+    assert rows[1][:5] == ["sand", "nsf", "0.400", "0.200", "2"]
+    assert [row[:3] for row in rows[2:]] == [
+        ["sand", "deformation_only", "5"], ["bread", "nsf", "–"], ["bread", "deformation_only", "–"],
+    ]  # fmt: skip
+    assert said == (
+        "Shown: means over held-out values and, where several were run, seeds. δ is below the paper's in "
+        "1 of 1 (nsf, basis), 1 of 1 (deformation_only, basis), of the cases in which the paper prints one."
+    )
+
+
+def test_training_values_count_only_where_there_are_no_others(tmp_path):
+    jobs = [job(delta=0.001), job(delta=0.5, parameter=3.0) | {"split": "train"}]
+    assert told(write_report(tmp_path / "a", jobs))[0][1][2] == "0.100"
+    jobs[0]["split"] = "train"
+    assert told(write_report(tmp_path / "b", jobs))[0][1][2] == "25.1"
+
+
+def test_the_paper_is_shown_at_its_own_number_of_particles_and_coordinates(tmp_path):
+    jobs = [job(**{"sampler.size": size}) for size in ("50", "150")] + [job(latent_dim="4")]
+    report = Report(write_report(tmp_path / "a", jobs), _sources(tmp_path / "a"))
+    np.testing.assert_array_equal(report.rows["paper"], [np.nan, 0.004, np.nan])
+
+
+@pytest.mark.parametrize(
+    ("entry", "expected"),
+    [
+        ({"sampler.size": "50"}, [0.002, np.nan, np.nan]),
+        ({"parameter": "44", "deploy.on_distrust": "null"}, [np.nan, 0.002, np.nan]),
+        ({"parameter": "44"}, [np.nan, 0.002, 0.002]),
+        ({"scene": "bread"}, [np.nan, np.nan, np.nan]),
+    ],
+)
+def test_what_is_printed_of_single_jobs_takes_the_place_of_the_scenes(tmp_path, entry, expected):
+    jobs = [
+        job(**{"sampler.size": "50"}),
+        job(parameter=44.0),
+        job(parameter=44.0, **{"deploy.on_distrust": "full_order"}),
+    ]
+    write_report(tmp_path / "a", jobs, printed=[entry | {"delta": 0.002}])
+    np.testing.assert_array_equal(Report(tmp_path / "a", _sources(tmp_path / "a")).rows["paper"], expected)
+
+
+def test_a_sweep_of_numbers_is_condensed_with_scenes_across(tmp_path):
+    jobs = [
+        job(scene, delta=0.001 * int(r), stress=0.1, latent_dim=r)
+        for scene in ("sand", "bread")
+        for r in ("10", "2", "3", "4", "5", "6", "8", "12")
+    ]
+    rows, said = told(write_report(tmp_path / "a", jobs))
+    assert rows[0] == ["r", "sand", "sand, the paper", "bread"]
+    assert [row[0] for row in rows[1:]] == ["2", "3", "4", "5", "6", "8", "10", "12"]
+    assert rows[1] == ["2", "0.200 (10)", "–", "0.200 (10)"]
+    assert rows[5][2] == "0.400"
+    assert "Smallest δ: 0.200 % on sand (r 2); 0.200 % on bread (r 2)." in said
+
+
+def test_more_scenes_than_settings_put_the_settings_across(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "MANY", 5)
+    jobs = [job(scene, method=m) for scene in ("a", "b", "sand") for m in ("nsf", "deformation_only")]
+    rows, _ = told(write_report(tmp_path / "a", jobs))
+    assert rows[0] == ["scene", "nsf", "nsf, the paper", "deformation_only", "deformation_only, the paper"]
+    assert [row[0] for row in rows[1:]] == ["a", "b", "sand"]
+    assert (rows[1][2], rows[3][2]) == ("–", "0.400")
+
+
+def test_very_many_settings_have_the_number_down_and_the_rest_across(tmp_path):
+    sizes = [str(10 * k) for k in range(1, 10)]
+    jobs = [job(sampler=s, **{"sampler.size": size}) for s in ("random", "cubature") for size in sizes]
+    jobs.append(job("bread", sampler="random", **{"sampler.size": "15"}))
+    rows, _ = told(write_report(tmp_path / "a", jobs))
+    assert rows[0] == ["S", "sand · random", "sand · cubature", "bread · random"]
+    assert [row[0] for row in rows[1:4]] == ["10", "15", "20"]
+    assert rows[2] == ["15", "", "", "0.100 (2)"]
+
+
+def test_seeds_alone_show_their_scatter(tmp_path):
+    jobs = [job(delta=0.001 * k, parameter=v, seed=str(k)) for k in (1, 2, 6) for v in (1.0, 2.0)]
+    jobs += [job(delta=0.004, **{"sampler.seed": k}) for k in ("1", "2")]
+    rows, _ = told(write_report(tmp_path / "a", jobs))
+    assert rows[1:] == [
+        ["sand", "seed", "3", "0.300", "0.100", "0.600", "0.400"],
+        ["sand", "sampler.seed", "2", "0.400", "0.400", "0.400", "0.400"],
+    ]
+
+
+def test_values_that_the_jobs_name_count_one_by_one(tmp_path):
+    jobs = [job(parameter=v, **{"scene.parameters.test": "[41,44]"}) for v in (44.0, 41.0)]
+    rows, said = told(write_report(tmp_path / "a", jobs))
+    assert [row[:2] for row in rows] == [["scene", "parameter"], ["sand", "41"], ["sand", "44"]]
+    assert "each held-out value by itself" in said
+
+
+def test_changes_are_named_by_the_last_part_of_their_keys(tmp_path):
+    changes = ("null", "{scene.bodies.slice.weakness.perturbation:0.08,a.b:2}")
+    rows, _ = told(write_report(tmp_path / "a", [job(**{"deploy.changes": c}) for c in changes]))
+    assert [row[1] for row in rows] == ["changes", "–", "perturbation 0.08, b 2"]
+
+
+def test_small_runs_are_not_held_to_the_paper(tmp_path):
+    folder = write_report(tmp_path / "a", [job()])
+    sources = _sources(folder)
+    sources["runs"]["run0"]["scale"] = "small"
+    said = headline(Report(folder, sources))
+    assert "these runs are of small scale" in said
+    assert "below the paper's" not in said
+
+
+def test_a_setting_of_an_older_report_tells_rows_apart(tmp_path):
+    """One whose runs have no keys, but whose results.csv has a column for what no other tells."""
+    jobs = [job() | {"setting": f"seed={k}", "delta": 0.001 * k} for k in (1, 2)]
+    folder = write_report(tmp_path / "a", jobs)
+    sources = _sources(folder)
+    for run in sources["runs"].values():
+        del run["keys"]
+    table = headline(Report(folder, sources))
+    assert "| sand | seed=1 | 0.400 | 0.100 |" in table
+
+
+def test_rows_that_are_not_those_of_the_sources_are_refused(tmp_path):
+    folder = write_report(tmp_path / "a", [job(), job("bread")])
+    report = Report(folder, _sources(folder))
+    lines = (folder / "results.csv").read_text().splitlines()
+    (folder / "results.csv").write_text("\n".join(lines[:-1]))
+    with pytest.raises(SchemaError, match=r"has not the 2 rows .* build the report again"):
+        headline(report)
+    (folder / "results.csv").unlink()
+    with pytest.raises(SchemaError, match="has not the 2 rows"):
+        headline(report)
