@@ -259,8 +259,13 @@ def jobs(sweeps: Sequence[Sequence[str]], config_name: str = "config") -> list[t
     """
     options = [_options(overrides, config_name) for overrides in sweeps]
     found = list(dict.fromkeys(job for values in options for job in itertools.product(*values)))
-    scenes = [next((o for o in job if o.startswith("scene=")), "") for job in found]
+    scenes = [scene_of(job) for job in found]
     return [job for _, job in sorted(zip(scenes, found, strict=True), key=lambda one: scenes.index(one[0]))]
+
+
+def scene_of(job: Sequence[str]) -> str:
+    """The override of a job that names its scene; empty where none does."""
+    return next((override for override in job if override.startswith("scene=")), "")
 
 
 def _options(overrides: Sequence[str], config_name: str) -> list[list[str]]:

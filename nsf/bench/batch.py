@@ -10,6 +10,7 @@ from nsf import config
 from nsf.bench.measure import build, name_of, run_times
 from nsf.bench.reduced import SCENES, deformation_error
 from nsf.bench.rows import Result, Row, Settings, commit
+from nsf.data.schema import TRAJECTORY
 from nsf.dynamics import ReducedBatch, ReducedMPM, ReducedRun
 from nsf.pipeline import Pipeline
 
@@ -38,7 +39,7 @@ def measured(chain: Pipeline, sizes, settings: Settings, found: Result, say: Cal
     chain.simulate()
     chain.train()
     manifold, scene, name = chain.manifold(), chain.scene, chain.scene.parameters.name
-    truth = chain.truth(chain.held_out[0]).path / "trajectory.h5"
+    truth = chain.truth(chain.held_out[0]).path / TRAJECTORY
     first = chain.solver_at(manifold, chain.held_out[0])
     phases, sets, particles = first.phases, first.sets, len(first.scene_particles)
     del first  # its arrays are on the device

@@ -9,6 +9,7 @@ from nsf import config
 from nsf.bench.measure import name_of
 from nsf.bench.rows import Result, Row, Settings, StageRow, commit
 from nsf.data import Trajectory
+from nsf.data.schema import TRAJECTORY
 from nsf.dynamics.solver import reduced_steps
 from nsf.evaluation import metrics
 from nsf.evaluation.cost import SolverCost, Subject, measure
@@ -45,7 +46,7 @@ def measured(chain: Pipeline, settings: Settings, found: Result, say: Callable[[
     manifold, scene, value = chain.manifold(), chain.scene, chain.held_out[0]
     parameters, name = {scene.parameters.name: value}, scene.name
     first = chain.solver_at(manifold, value)
-    truth = chain.truth(value).path / "trajectory.h5"
+    truth = chain.truth(value).path / TRAJECTORY
 
     def reduced(precision: str, multiplier: float):
         return scene.reduced(

@@ -13,6 +13,7 @@ from nsf.bench.measure import name_of, peak_mib
 from nsf.bench.reduced import SCENES, scale_of
 from nsf.bench.rows import Result, Row, Settings, commit
 from nsf.data import Snapshots
+from nsf.data.schema import TRAJECTORY
 from nsf.kinematics.training import train
 from nsf.pipeline import Pipeline
 
@@ -34,7 +35,7 @@ def run(settings: Settings, say: Callable[[str], object]) -> Result:
 def measured(chain: Pipeline, settings: Settings, found: Result, say: Callable[[str], object]) -> None:
     """Add the row of one scene, whose time is that of a whole training [ms]."""
     chain.simulate()
-    paths = [chain.simulation(value).path / "trajectory.h5" for value in chain.split.train]
+    paths = [chain.simulation(value).path / TRAJECTORY for value in chain.split.train]
     times, peaks, name = [], [], chain.scene.name
 
     def once(seed: int, folder: str) -> None:

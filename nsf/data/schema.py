@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike
 from nsf.errors import ShapeError
 
 SCHEMA_VERSION = 1
+#: Name of the file in the folder of a simulate run.
+TRAJECTORY = "trajectory.h5"
 
 # Kirchhoff stress is symmetric: its upper triangle, by rows.
 TAU_ORDER = ("xx", "xy", "xz", "yy", "yz", "zz")

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from nsf.data import Trajectory
-from nsf.data.schema import packed
+from nsf.data.schema import TRAJECTORY, packed
 from nsf.dynamics import Decoder, ReducedMPM, Trust
 from nsf.dynamics.trust import LatentDistance
 from nsf.errors import ConfigError, InstabilityError
@@ -223,7 +223,7 @@ class LiveModel:
     def truth(self, value: float) -> Truth | None:
         """The full-order run at a known value; None elsewhere."""
         run = self._truths.get(value)
-        return Truth(Trajectory.open(run.path / "trajectory.h5"), self.shown) if run else None
+        return Truth(Trajectory.open(run.path / TRAJECTORY), self.shown) if run else None
 
     def roles(self, step: int) -> np.ndarray:
         """[n] of each shown particle in the step that begins there: 2 in S, 1 in N only, 0 in neither."""

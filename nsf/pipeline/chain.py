@@ -13,6 +13,7 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from nsf.data import Snapshots, Trajectory
+from nsf.data.schema import TRAJECTORY
 from nsf.dynamics import (
     ParticleSets,
     ReducedBatch,
@@ -88,19 +89,54 @@ class Pipeline(Plan):
         """
         return getattr(self, stage)()
 
-    def simulate(self) -> list[Run]:
-        """Full-order trajectories of every training, validation and held-out value."""
+    def simulate(self, later: Sequence[str] = ()) -> list[Run]:
+        """Full-order trajectories of every training, validation and held-out value.
+
+        Args:
+            later: the stages that they are for, if no others: trajectories that only read are in these
+                stages' results, where those are there, are not made again.
+        """
         # A changed scene that changes nothing, or trains on what it deploys, names one run twice.
         runs = {self.simulation(value, scene): (value, scene) for value, scene in self.needed()}
         missing = {run: needed for run, needed in runs.items() if not run.complete}
-        if len(missing) < len(runs):
-            self.say(f"simulate: {len(runs) - len(missing)} of {len(runs)} trajectories are there, reused")
+        there, spare = len(runs) - len(missing), self._spare(later) if later else set()
+        needless = [run for run in missing if run.id in spare]
+        if there:
+            self.say(f"simulate: {there} of {len(runs)} trajectories are there, reused")
+        if needless:
+            self.say(
+                f"simulate: {len(needless)} of {len(runs)} trajectories are gone, and nothing needs them"
+            )
+            missing = {run: needed for run, needed in missing.items() if run not in needless}
         if missing:
             started = time.perf_counter()
             made = self._simulate(missing)
             elsewhere = f", {len(missing) - made} by another process" if made < len(missing) else ""
             self.say(f"simulate: {made} trajectories in {time.perf_counter() - started:.1f} s{elsewhere}")
         return list(runs)
+
+    def _spare(self, later: Sequence[str]) -> set[str]:
+        """Trajectories, by id, that the stages need not read, as their results are there."""
+        truths = {self.truth(value).id for value in self.held_out}
+        read = {"evaluate": self.evaluation, "superresolve": self.superresolution}
+        over = "evaluate" in later and all(run.complete for name, run in read.items() if name in later)
+        trained = {run.id for run in self._of_training} if self.training.complete else set()
+        return trained | truths if over else trained - truths
+
+    @property
+    def _of_training(self) -> list[Run]:
+        return [self.simulation(value) for value in self.split.train]
+
+    def drop_training(self) -> None:
+        """Delete the training trajectories, but for those that are deployed and for what others make now.
+
+        Their manifests stay; `nsf simulate` makes the trajectories again.
+        """
+        truths = {self.truth(value).id for value in self.held_out}
+        for run in self._of_training:
+            with run.claimed() as claimed:
+                if claimed and run.id not in truths:
+                    (run.path / TRAJECTORY).unlink(missing_ok=True)
 
     def _simulate(self, runs: dict[Run, tuple[float, Scene]]) -> int:
         c, name, unit = self.config, self.scene.parameters.name, self.scene.parameters.unit
@@ -122,7 +158,7 @@ class Pipeline(Plan):
     def _train(self, run: Run) -> None:
         self.check_devices()
         c = self.config
-        paths = [self.simulation(v).path / "trajectory.h5" for v in self.split.train]
+        paths = [run.path / TRAJECTORY for run in self._of_training]
         own = {"field": self.field, "latent_dim": c.latent_dim, "seed": c.seed, "tracking": c.tracking}
         one = partial(train, folder=run.path, **own)
         with run.record(device=self.device, seed=c.seed) as record:
@@ -131,7 +167,7 @@ class Pipeline(Plan):
             else:
                 with contextlib.closing(Snapshots(paths, self.device, c.data.resident)) as snapshots:
                     manifold, metrics = one(snapshots, trainer=self.trainer, device=self.device)
-            manifold.datasets = [self.simulation(v).id for v in self.split.train]
+            manifold.datasets = [run.id for run in self._of_training]
             manifold.split = {"train": list(self.split.train), "test": list(self.split.test)}
             manifold.save(run.path / "manifold.pt")
             record.output("manifold.pt")
@@ -294,7 +330,7 @@ class Pipeline(Plan):
 
     def _truths(self) -> list[Path]:
         """Files of the full-order trajectories that the deployed ones are held to."""
-        return [self.truth(value).path / "trajectory.h5" for value in self.held_out]
+        return [self.truth(value).path / TRAJECTORY for value in self.held_out]
 
     def _compare(self, manifold: Manifold, rollout: Rollout, truth: Path, continuation: Path) -> Comparison:
         shown = (self.config.evaluation.picture_particles, self.config.evaluation.picture_frames)

@@ -115,6 +115,7 @@ class Plan:
         _one_of("deploy.on_distrust", c.deploy.on_distrust, ("report", "full_order"))
         check_tracking(c.tracking)
         _one_of("data.resident", c.data.resident, (True, False, "auto"))
+        _one_of("data.keep", c.data.keep, ("all", "held_out"))
         _one_of("data.dtype", c.data.dtype, tuple(_STORED))
         if str(c.report.name) in ("", "..") or Path(str(c.report.name)).name != str(c.report.name):
             raise ConfigError(f"report.name={c.report.name} must be one folder's name; set report.folder")

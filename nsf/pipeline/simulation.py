@@ -13,6 +13,7 @@ from threading import Thread
 import numpy as np
 
 from nsf.data import TrajectoryWriter
+from nsf.data.schema import TRAJECTORY
 from nsf.errors import InstabilityError
 from nsf.mpm import FullOrderMPM, Precision, diagnosed
 from nsf.mpm.recording import HostMemory, blocks
@@ -197,7 +198,7 @@ def _store(
     constants = solver.constants
     with claim, job.run.record(device=shared.device, precision=shared.precision) as record:
         writer = TrajectoryWriter(
-            job.run.path / "trajectory.h5",
+            job.run.path / TRAJECTORY,
             X=constants.X,
             mass=constants.mass,
             volume0=constants.volume0,
@@ -218,4 +219,4 @@ def _store(
                 item.done()
             writer.cost.update(seconds=item, bytes=solver.nbytes)
         record.metrics["seconds"] = item
-        record.output("trajectory.h5")
+        record.output(TRAJECTORY)

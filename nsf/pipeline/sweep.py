@@ -1,5 +1,6 @@
 """Sweeps: the stages of many configurations, by one of Hydra's launchers."""
 
+import itertools
 import sys
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -52,8 +53,8 @@ def work(config: DictConfig, stages: Sequence[str], say: Callable[[str], object]
         pipeline.check_held_out()  # before hours of simulation and training, not after
     if "train" in stages:
         pipeline.check_devices()
-    for name in stages:
-        result = pipeline.run(name)
+    for at, name in enumerate(stages):
+        result = pipeline.simulate(stages[at + 1 :]) if name == "simulate" else pipeline.run(name)
     return result
 
 
@@ -65,6 +66,9 @@ def sweep(
     say: Callable[[str], object] = print,
 ) -> list[Failure]:
     """Stages of every job; one that fails is recorded in its run's manifest, and does not stop the others.
+
+    Where all of them have data.keep=held_out, the scenes come one after the other, and the training
+    trajectories of a scene go once each of its jobs has gone well.
 
     Jobs side by side on this machine (`hydra/launcher=joblib`) take a GPU each, in turn, where all of them
     have device=auto and trainer.devices=1; each sees its own as cuda:0, so its runs are those of one GPU.
@@ -88,11 +92,12 @@ def sweep(
     plugin = ".".join(config.hydra.launcher._target_.split(".")[:2])
     optional(plugin, "sweep")
     movable: list[bool] = []  # by configuration: whether it may see any one GPU
+    kept: set[str] = set()  # data.keep of all
 
     def check(one: DictConfig) -> None:
         movable.append(one.device == "auto" and OmegaConf.select(one, "trainer.devices", default=1) == 1)
         if "point" not in stages:
-            Plan(one)
+            kept.add(Plan(one).config.data.keep)
 
     for overrides in sweeps:
         configuration.check_sweep(overrides, config_name, check)
@@ -103,8 +108,15 @@ def sweep(
     if len(gpus) > 1:
         task = partial(_on_a_gpu, task, gpus, Path(config.hydra.sweep.dir).resolve())
     started = Plugins.instance().instantiate_launcher(context, task, config)
+    dropped = kept == {"held_out"} and "train" in stages
+    errors: list[str | None] = []
     with _own_processes() if len(gpus) > 1 else nullcontext():
-        errors = _launched(started, [list(job) for job in jobs], say)
+        for scene in _scenes(jobs) if dropped else [jobs]:
+            found = _launched(started, [list(job) for job in scene], say, len(errors))
+            if dropped and not any(found):
+                for job in scene:
+                    Pipeline(configuration.load(job, config_name), say).drop_training()
+            errors += found
     common = set.intersection(*map(set, jobs))
     return [
         Failure(tuple(override for override in job if override not in common), error)
@@ -156,14 +168,21 @@ def _job(config: DictConfig, stages: Sequence[str]) -> str | None:
     return None
 
 
-def _launched(launcher: Launcher, jobs: list[list[str]], say: Callable[[str], object]) -> list[str | None]:
-    """The error of each job, None for one that ended well."""
+def _scenes(jobs: Sequence[tuple[str, ...]]) -> list[list[tuple[str, ...]]]:
+    """The jobs of each scene, which follow each other."""
+    return [list(group) for _, group in itertools.groupby(jobs, configuration.scene_of)]
+
+
+def _launched(
+    launcher: Launcher, jobs: list[list[str]], say: Callable[[str], object], first: int = 0
+) -> list[str | None]:
+    """The error of each job, None for one that ended well; `first` is the number of the first one."""
     kind, logs = type(launcher).__name__, Path()
     if kind == "SlurmLauncher":
         logs = Path(launcher.params["submitit_folder"]).parent
         say(f"{len(jobs)} jobs go into Slurm's queue, which squeue shows; their logs are in {logs}")
     try:
-        return [launched.return_value for launched in launcher.launch(jobs, 0)]
+        return [launched.return_value for launched in launcher.launch(jobs, first)]
     except KeyboardInterrupt:
         if kind == "SlurmLauncher":
             say("the jobs stay in Slurm's queue, and go on; scancel ends them")
@@ -171,7 +190,7 @@ def _launched(launcher: Launcher, jobs: list[list[str]], say: Callable[[str], ob
     except Exception as error:
         # A process that dies takes with it what the launcher would have returned of the others.
         if kind == "JoblibLauncher" and _died(error):
-            return _one_by_one(launcher, jobs)
+            return _one_by_one(launcher, jobs, first)
         if kind == "SlurmLauncher" and any(logs.glob(_SUBMITTED)):
             return _from_slurm(logs, len(jobs))
         told = [line for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
@@ -186,10 +205,10 @@ def _died(error: Exception) -> bool:
     return isinstance(error, BrokenProcessPool)
 
 
-def _one_by_one(launcher: Launcher, jobs: list[list[str]]) -> list[str | None]:
+def _one_by_one(launcher: Launcher, jobs: list[list[str]], first: int) -> list[str | None]:
     """Each job launched alone, so that one whose process dies takes no other with it."""
     errors: list[str | None] = []
-    for index, job in enumerate(jobs):
+    for index, job in enumerate(jobs, first):
         try:
             errors += [launched.return_value for launched in launcher.launch([job], index)]
         except Exception as error:
@@ -200,12 +219,14 @@ def _one_by_one(launcher: Launcher, jobs: list[list[str]]) -> list[str | None]:
 
 
 def _from_slurm(logs: Path, count: int) -> list[str | None]:
-    """What each job of an array left, once all have ended."""
+    """What each job of the last array left, once all have ended."""
     from submitit import SlurmJob
     from submitit.core.utils import UncompletedJobError
 
     errors: list[str | None] = [_DIED] * count
-    for job_id in {pickle.parent.name for pickle in logs.glob(_SUBMITTED)}:
+    submitted = {pickle.parent.name for pickle in logs.glob(_SUBMITTED)}
+    arrays = {job_id: int(job_id.partition("_")[0]) for job_id in submitted}
+    for job_id in [job_id for job_id, array in arrays.items() if array == max(arrays.values())]:
         job = SlurmJob(logs / "%j", job_id, tasks=[0])
         index = int(job_id.partition("_")[2] or 0)
         try:

@@ -178,7 +178,7 @@ def without_constants(
         The frame that is left, and what the dropped columns say.
     """
     describing = [name for name in (*VARIANT, "gamma", "integration_mean", "commit", *also) if name in frame]
-    said = {name: {v for v in frame[name].astype(str) if v not in ("", ABSENT, "nan")} for name in describing}
+    said = {name: {v for v in frame[name].map(str) if v not in ("", ABSENT, "nan")} for name in describing}
     constant = [name for name in describing if name not in keep and len(said[name]) == 1]
     empty = [name for name in (SETTING, PLACE) if name in frame and set(frame[name]) <= {"", ABSENT}]
     empty += [name for name in COSTS if name in frame and frame[name].isna().all()]  # evaluation.trials=0

@@ -9,6 +9,7 @@ from matplotlib.axes import Axes
 from PIL import Image
 
 from nsf.data import Trajectory
+from nsf.data.schema import TRAJECTORY
 from nsf.dynamics import Rollout
 from nsf.errors import NSFError
 from nsf.reporting.style import FULL, PALETTE, REDUCED, figure, styled
@@ -46,7 +47,7 @@ def thumbnail(run: Run, path: Path) -> bool:
 
 def _simulated(ax: Axes, folder: Path) -> None:
     """The particles at the end."""
-    with Trajectory.open(folder / "trajectory.h5") as trajectory:
+    with Trajectory.open(folder / TRAJECTORY) as trajectory:
         step = max(1, trajectory.particles // _POINTS)
         x = trajectory.read("x", trajectory.frames - 1, slice(None, None, step)).reshape(-1, 3)
     _scatter(ax, x, FULL)

@@ -137,3 +137,26 @@ def test_an_experiment_without_results_says_how_to_get_them(nsf, copied):
     outcome = nsf("report", copied("simulate"), "+experiment=sand", "scale=small", "field=basis")
     assert outcome.code == 2
     assert "run `nsf run +experiment=sand`" in outcome.err
+
+
+def test_training_trajectories_go_once_their_jobs_are_done(nsf, copied):
+    root = copied("simulate")
+    arguments = ["latent_dim=3,4", "data.keep=held_out", "evaluation.trials=0"]
+
+    def kept():
+        runs = Run.find("simulate", root=root)
+        return sorted(r.config["parameter"]["value"] for r in runs if (r.path / "trajectory.h5").exists())
+
+    failed = nsf("run", root, "latent_dim=9,3", *arguments[1:], faults=[PlainReport()], multirun=True)
+    assert failed.code != 0
+    assert kept() == [22.0, 26.0, 30.0, 38.0]  # a job that failed may be repeated
+    outcome = nsf("run", root, *arguments, faults=[PlainReport()], multirun=True)
+    assert outcome.code == 0, outcome.err
+    assert kept() == [26.0]
+    again = nsf("run", root, *arguments, faults=[PlainReport()], multirun=True)
+    assert again.code == 0, again.err
+    assert "3 of 4 trajectories are gone, and nothing needs them" in again.out
+    assert kept() == [26.0]
+    other = nsf("run", root, "latent_dim=2", "evaluation.trials=0", faults=[PlainReport()])
+    assert other.code == 0, other.err
+    assert kept() == [22.0, 26.0, 30.0, 38.0]
