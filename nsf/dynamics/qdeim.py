@@ -78,7 +78,8 @@ def pivots(U: torch.Tensor, size: int) -> list[int]:
 def oversampled(U: torch.Tensor, chosen: list[int], size: int) -> list[int]:
     """Further particles, up to `size` with those chosen, each of the largest `eigenvalue_gain`."""
     # In axes of its own, the three rows of a particle are orthogonal.
-    squares, axes = torch.linalg.eigh(U @ U.mT)
+    # On the host: cuSOLVER fails on as many small matrices as there are particles.
+    squares, axes = (found.to(U.device) for found in torch.linalg.eigh((U @ U.mT).cpu()))
     U = axes.mT @ U
     gram = torch.einsum("pim,pin->mn", U[chosen], U[chosen])
     left = torch.ones(len(U), dtype=torch.bool, device=U.device)
