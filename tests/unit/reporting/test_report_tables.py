@@ -121,6 +121,14 @@ def test_console_table_states_constants_once(sweep):
     assert text.count("sand") == 1
 
 
+def test_a_setting_stays_beside_the_one_without_a_name(sweep):
+    frame = merge_results(sweep).assign(setting="")
+    assert "setting" not in without_constants(frame)[0]
+    named = frame.copy()
+    named.loc[named.index[0], "setting"] = "deploy.on_distrust=full_order"
+    assert list(without_constants(named)[0]["setting"]) == list(named["setting"])
+
+
 def test_without_constants_keeps_what_varies(sweep):
     shown, said = without_constants(merge_results(sweep))
     assert {"method", "sample", "parameter", "delta"} <= set(shown)
