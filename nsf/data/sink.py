@@ -34,7 +34,7 @@ class Sink(io.FileIO):
             offset: from the file's beginning [byte].
 
         Raises:
-            OSError: the disk refused it; HDF5 is not at work here, so this is no risk.
+            OSError: the disk refused it; no call of HDF5 on this file is under way that could be hurt.
         """
         rest = memoryview(data).cast("B")
         while rest:

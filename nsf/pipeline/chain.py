@@ -120,23 +120,9 @@ class Pipeline(Plan):
         truths = {self.truth(value).id for value in self.held_out}
         read = {"evaluate": self.evaluation, "superresolve": self.superresolution}
         over = "evaluate" in later and all(run.complete for name, run in read.items() if name in later)
-        trained = {run.id for run in self._of_training} if self.training.complete else set()
-        return trained | truths if over else trained - truths
-
-    @property
-    def _of_training(self) -> list[Run]:
-        return [self.simulation(value) for value in self.split.train]
-
-    def drop_training(self) -> None:
-        """Delete the training trajectories, but for those that are deployed and for what others make now.
-
-        Their manifests stay; `nsf simulate` makes the trajectories again.
-        """
-        truths = {self.truth(value).id for value in self.held_out}
-        for run in self._of_training:
-            with run.claimed() as claimed:
-                if claimed and run.id not in truths:
-                    (run.path / TRAJECTORY).unlink(missing_ok=True)
+        trained = {run.id for run in self.training_data}
+        needed = (set() if over else truths) | (set() if self.training.complete else trained)
+        return (truths | trained) - needed
 
     def _simulate(self, runs: dict[Run, tuple[float, Scene]]) -> int:
         c, name, unit = self.config, self.scene.parameters.name, self.scene.parameters.unit
@@ -158,7 +144,7 @@ class Pipeline(Plan):
     def _train(self, run: Run) -> None:
         self.check_devices()
         c = self.config
-        paths = [run.path / TRAJECTORY for run in self._of_training]
+        paths = [run.path / TRAJECTORY for run in self.training_data]
         own = {"field": self.field, "latent_dim": c.latent_dim, "seed": c.seed, "tracking": c.tracking}
         one = partial(train, folder=run.path, **own)
         with run.record(device=self.device, seed=c.seed) as record:
@@ -167,7 +153,7 @@ class Pipeline(Plan):
             else:
                 with contextlib.closing(Snapshots(paths, self.device, c.data.resident)) as snapshots:
                     manifold, metrics = one(snapshots, trainer=self.trainer, device=self.device)
-            manifold.datasets = [run.id for run in self._of_training]
+            manifold.datasets = [run.id for run in self.training_data]
             manifold.split = {"train": list(self.split.train), "test": list(self.split.test)}
             manifold.save(run.path / "manifold.pt")
             record.output("manifold.pt")

@@ -10,7 +10,6 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigKeyError
 
 from nsf import config as configuration
-from nsf.canonical import content_hash
 from nsf.data import Split
 from nsf.dynamics.interop import torch_device
 from nsf.dynamics.sampling import check_well_posed
@@ -139,7 +138,7 @@ class Plan:
 
     def _check_parameter_values(self) -> None:
         """Build the scene at every parameter value: one out of range fails before any work."""
-        asked = content_hash(
+        asked = repr(
             [OmegaConf.to_container(of, resolve=False) | _REST for of in (self.config, self.scene.template)]
         )
         if asked in _PASSED:
@@ -222,14 +221,18 @@ class Plan:
         return self.simulation(value, self.deployed)
 
     @property
+    def training_data(self) -> list[Run]:
+        """The runs of the trajectories that are trained on."""
+        return [self.simulation(value) for value in self.split.train]
+
+    @property
     def training(self) -> Run:
         """The run of the manifold."""
         content = self._content(("field", "trainer", "latent_dim", "seed"))
         if self.trainer.devices == 1:
             # The bits, and so the name, of a training from before there was the key.
             content["trainer"].pop("devices", None)
-        parents = [self.simulation(v) for v in self.split.train]
-        return Run.open("train", self.scene.name, content, parents, root=self.root)
+        return Run.open("train", self.scene.name, content, self.training_data, root=self.root)
 
     @property
     def deployment(self) -> Run:

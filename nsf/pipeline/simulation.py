@@ -21,7 +21,7 @@ from nsf.progress import Progress, Told
 from nsf.runs import Run
 from nsf.workers import Call, ended, working
 
-# Trajectories that are written at once; each holds at most a few blocks of frames in memory.
+# Trajectories that are written at once; each holds about ten blocks of frames (64 MiB) at most.
 _WRITERS = min(8, os.cpu_count() or 1)
 _BLOCKS = 8
 

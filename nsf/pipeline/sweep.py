@@ -3,7 +3,7 @@
 import itertools
 import sys
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -17,6 +17,7 @@ from hydra.types import HydraContext
 from omegaconf import DictConfig, OmegaConf
 
 from nsf import config as configuration
+from nsf.data.schema import TRAJECTORY
 from nsf.errors import LaunchError, NSFError
 from nsf.extras import optional
 from nsf.mpm.device import take_gpu, visible_gpus
@@ -108,14 +109,18 @@ def sweep(
     if len(gpus) > 1:
         task = partial(_on_a_gpu, task, gpus, Path(config.hydra.sweep.dir).resolve())
     started = Plugins.instance().instantiate_launcher(context, task, config)
-    dropped = kept == {"held_out"} and "train" in stages
+    dropped = kept == {"held_out"} and {"train", "evaluate"} <= set(stages)
     errors: list[str | None] = []
     with _own_processes() if len(gpus) > 1 else nullcontext():
         for scene in _scenes(jobs) if dropped else [jobs]:
-            found = _launched(started, [list(job) for job in scene], say, len(errors))
+            try:
+                found = _launched(started, [list(job) for job in scene], say, len(errors))
+            except LaunchError as error:
+                if not errors:
+                    raise
+                found = [str(error)] * len(scene)
             if dropped and not any(found):
-                for job in scene:
-                    Pipeline(configuration.load(job, config_name), say).drop_training()
+                _drop_training([Plan(configuration.load(job, config_name)) for job in scene], say)
             errors += found
     common = set.intersection(*map(set, jobs))
     return [
@@ -173,6 +178,21 @@ def _scenes(jobs: Sequence[tuple[str, ...]]) -> list[list[tuple[str, ...]]]:
     return [list(group) for _, group in itertools.groupby(jobs, configuration.scene_of)]
 
 
+def _drop_training(plans: Sequence[Plan], say: Callable[[str], object]) -> None:
+    """Delete the trajectories that the jobs trained on, but for those that one of them is held to.
+
+    Their manifests stay; `nsf simulate` makes the trajectories again. What another process makes is left.
+    """
+    truths = {plan.truth(value).id for plan in plans for value in plan.held_out}
+    for run in {run for plan in plans for run in plan.training_data if run.id not in truths}:
+        try:
+            with run.claimed() as claimed:
+                if claimed:
+                    (run.path / TRAJECTORY).unlink(missing_ok=True)
+        except (NSFError, OSError) as error:
+            say(f"warning: the trajectory of {run.id} stays: {error}")
+
+
 def _launched(
     launcher: Launcher, jobs: list[list[str]], say: Callable[[str], object], first: int = 0
 ) -> list[str | None]:
@@ -181,6 +201,7 @@ def _launched(
     if kind == "SlurmLauncher":
         logs = Path(launcher.params["submitit_folder"]).parent
         say(f"{len(jobs)} jobs go into Slurm's queue, which squeue shows; their logs are in {logs}")
+    before = set(logs.glob(_SUBMITTED)) if kind == "SlurmLauncher" else set()
     try:
         return [launched.return_value for launched in launcher.launch(jobs, first)]
     except KeyboardInterrupt:
@@ -191,8 +212,8 @@ def _launched(
         # A process that dies takes with it what the launcher would have returned of the others.
         if kind == "JoblibLauncher" and _died(error):
             return _one_by_one(launcher, jobs, first)
-        if kind == "SlurmLauncher" and any(logs.glob(_SUBMITTED)):
-            return _from_slurm(logs, len(jobs))
+        if kind == "SlurmLauncher" and (submitted := set(logs.glob(_SUBMITTED)) - before):
+            return _from_slurm(logs, {pickle.parent.name for pickle in submitted}, len(jobs))
         told = [line for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
         raise LaunchError(
             f"no job could be launched: {told[-1]}; correct the keys of hydra.launcher"
@@ -218,15 +239,13 @@ def _one_by_one(launcher: Launcher, jobs: list[list[str]], first: int) -> list[s
     return errors
 
 
-def _from_slurm(logs: Path, count: int) -> list[str | None]:
-    """What each job of the last array left, once all have ended."""
+def _from_slurm(logs: Path, submitted: Iterable[str], count: int) -> list[str | None]:
+    """What each job of an array left, once all have ended."""
     from submitit import SlurmJob
     from submitit.core.utils import UncompletedJobError
 
     errors: list[str | None] = [_DIED] * count
-    submitted = {pickle.parent.name for pickle in logs.glob(_SUBMITTED)}
-    arrays = {job_id: int(job_id.partition("_")[0]) for job_id in submitted}
-    for job_id in [job_id for job_id, array in arrays.items() if array == max(arrays.values())]:
+    for job_id in submitted:
         job = SlurmJob(logs / "%j", job_id, tasks=[0])
         index = int(job_id.partition("_")[2] or 0)
         try:

@@ -17,6 +17,7 @@ from nsf.reporting.swap import MARK
 from nsf.storage import writing
 
 LIST = "index.md"
+#: Headings, and the folders under each in their order; the last heading is of all others.
 CHAPTERS = {
     "Main results": ("table1",),
     "What the method needs": (
@@ -25,7 +26,6 @@ CHAPTERS = {
     "Beyond what was trained": ("extrapolation", "weak_elements", "super_resolution", "path_dependent"),
     "One scene in detail, and speed": ("sand", "speed"),
 }  # fmt: skip
-"""Headings, and the folders under each in their order; the last heading is of all others."""
 _OTHERS = "Further reports"
 _LEAD = (
     "Every number here is computed from the files of the reports, and every report from the runs that its "

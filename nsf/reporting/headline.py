@@ -165,10 +165,10 @@ def _pivot(report: Report, varied: Sequence[str]) -> str:
         )
         headings += [name, f"{name}, the paper"] if at in printed else [name]
     body = []
-    for label in _sorted(groups, down):
-        body.append([_text(key, value) for key, value in zip(down, label, strict=True)])
+    for values in _sorted(groups, down):
+        body.append([_text(key, value) for key, value in zip(down, values, strict=True)])
         for at in columns:
-            row = found.get((label, at))
+            row = found.get((values, at))
             body[-1].append(
                 f"{number(row['delta'], 100)} ({number(row['stress_error'], 100)})" if row else ""
             )

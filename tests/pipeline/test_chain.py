@@ -1,5 +1,6 @@
 """The whole chain on a tiny scene: files, reuse, what a change runs again."""
 
+import contextlib
 import json
 import os
 import shutil
@@ -14,7 +15,7 @@ import torch
 
 from nsf.data import Trajectory
 from nsf.dynamics import NeighbourSearch, ParticleSets, ProjectionResult, Rollout, Taylor
-from nsf.errors import ConfigError, InstabilityError, MissingRunError
+from nsf.errors import ConfigError, InstabilityError, MissingRunError, NSFError
 from nsf.evaluation import superresolution
 from nsf.kinematics.manifold import Manifold
 from nsf.mpm import FullOrderMPM
@@ -325,6 +326,24 @@ def test_training_values_can_be_deployed(copied, pipeline_at):
     results = pd.read_csv(pipeline.evaluation.path / "results.csv")
     assert results["split"].tolist() == ["train"] * 3
     assert results["parameter"].tolist() == [22.0, 30.0, 38.0]
+
+
+def test_what_a_lost_training_needs_is_made_again(copied, pipeline_at):
+    root = copied("simulate", "train", "deploy", "evaluate")
+    stages = ("train", "deploy", "evaluate")
+    pipeline = pipeline_at(root)
+    assert pipeline._spare(stages) == {run.id for run in (*pipeline.training_data, pipeline.truth(26.0))}
+    shutil.rmtree(pipeline.training.path)
+    assert pipeline._spare(stages) == {pipeline.truth(26.0).id}
+    same, _ = said_by(pipeline_at, root, "deploy.split=train", "evaluation.trials=0")
+    shutil.rmtree(same.training.path)
+    assert not same._spare(stages)
+
+
+@pytest.mark.parametrize("override", ["material.E=inf", "scene.dt=inf", "projector.tolerance=nan"])
+def test_a_number_that_is_not_finite_is_refused_or_taken_as_before(pipeline_at, tmp_path, override):
+    with contextlib.suppress(NSFError):  # and no other error
+        pipeline_at(tmp_path, override)
 
 
 def test_a_run_without_timings_is_reported(copied, pipeline_at, tmp_path):

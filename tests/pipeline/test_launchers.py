@@ -43,6 +43,21 @@ def test_a_dead_process_takes_no_sibling_with_it(tmp_path, monkeypatch):
     ]
 
 
+def test_an_array_that_slurm_refuses_has_no_results_of_an_earlier_one(tmp_path):
+    earlier = tmp_path / "71_0"
+    earlier.mkdir()
+    (earlier / "71_0_submitted.pkl").touch()
+
+    class SlurmLauncher:
+        params = {"submitit_folder": str(tmp_path / "%j")}
+
+        def launch(self, jobs, first):
+            raise RuntimeError("sbatch: error: Batch job submission failed")
+
+    with pytest.raises(LaunchError, match="submission failed"):
+        module._launched(SlurmLauncher(), [["scene=sand"]], print, 1)
+
+
 def says_its_gpu(config, stages, folder, beside):
     (folder / f"{config.seed}").write_text(os.environ.get("CUDA_VISIBLE_DEVICES", "all"))
     # The first job ends only once the other process has begun one, so that neither takes them all.

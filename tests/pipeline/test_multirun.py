@@ -160,3 +160,11 @@ def test_training_trajectories_go_once_their_jobs_are_done(nsf, copied):
     other = nsf("run", root, "latent_dim=2", "evaluation.trials=0", faults=[PlainReport()])
     assert other.code == 0, other.err
     assert kept() == [22.0, 26.0, 30.0, 38.0]
+
+
+def test_trajectories_that_a_job_is_held_to_stay(nsf, copied):
+    root = copied("simulate", "train")
+    arguments = ["deploy.split=test,train", "data.keep=held_out", "evaluation.trials=0"]
+    outcome = nsf("run", root, *arguments, faults=[PlainReport()], multirun=True)
+    assert outcome.code == 0, outcome.err
+    assert all(run.complete for run in Run.find("simulate", root=root))
