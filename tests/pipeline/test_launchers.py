@@ -49,7 +49,8 @@ def test_an_array_that_slurm_refuses_has_no_results_of_an_earlier_one(tmp_path):
     (earlier / "71_0_submitted.pkl").touch()
 
     class SlurmLauncher:
-        params = {"submitit_folder": str(tmp_path / "%j")}
+        def __init__(self):
+            self.params = {"submitit_folder": str(tmp_path / "%j")}
 
         def launch(self, jobs, first):
             raise RuntimeError("sbatch: error: Batch job submission failed")
