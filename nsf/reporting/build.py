@@ -59,7 +59,7 @@ def build_report(evaluate_runs, folder, title: str, first=None, study: Study | N
         fine = _fine(merged, study)
         own = [fine_section(fine, fresh)] if fine else []
         sweep = swept(merged, study.keys, fresh) if study else []
-        sections = [*own, *sweep, *draw(merged, fresh, sweep=bool(sweep))]
+        sections = [*own, *sweep, *draw(merged, fresh, sweep=bool(sweep), study=study)]
         more = [fine_table(fine, study.settings, fresh)] if fine else []
         page = _page(title, merged, sections, study, more, fine, bool(sweep))
         (fresh / "index.html").write_text(html_page(page), encoding="utf-8")

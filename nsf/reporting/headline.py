@@ -10,6 +10,7 @@ import pandas as pd
 
 from nsf.errors import SchemaError
 from nsf.reporting.columns import ABSENT, COLUMN, TEXT, axis, number, parameter_text
+from nsf.reporting.study import printed_delta
 from nsf.reporting.sweeps import AXES, SEEDS
 from nsf.reporting.tables import markdown_rows
 
@@ -109,8 +110,7 @@ class Report:
             return stated.get("delta", np.nan) if same else np.nan
         known = (run.get("keys") or {}) | {name: row[name] for name in ("scene", "method", "field")}
         known |= {"parameter": parameter_text(row["parameter"])}
-        fits = [e["delta"] for e in entries if all(known.get(k, "null") == e[k] for k in e if k != "delta")]
-        return fits[0] if fits else np.nan
+        return printed_delta(entries, known)
 
 
 def headline(report: Report) -> str:

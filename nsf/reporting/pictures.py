@@ -13,6 +13,7 @@ from nsf.reporting import charts, cost_charts, render
 from nsf.reporting.colors import DIFFERENCE_COLORS, STRESS_COLORS
 from nsf.reporting.columns import COSTS, MEASURED, parameter_text
 from nsf.reporting.sources import Motion, same_parameter
+from nsf.reporting.study import Study, printed_delta
 from nsf.reporting.style import save
 from nsf.reporting.tables import Merged, mean_rows, paper_row, variant_labels, variants
 from nsf.workers import results, working
@@ -105,7 +106,7 @@ class _Variant:
         return self.summary.get("floor")
 
 
-def draw(merged: Merged, folder: Path, sweep: bool = False) -> list[Section]:
+def draw(merged: Merged, folder: Path, sweep: bool = False, study: Study | None = None) -> list[Section]:
     """Draw every picture of a report into folder.
 
     Args:
@@ -113,6 +114,7 @@ def draw(merged: Merged, folder: Path, sweep: bool = False) -> list[Section]:
         folder: of the report.
         sweep: what varies is a number or a seed, so that bodies move alike: those of one variant a scene
             are shown, and not animated.
+        study: what the report is about, which may say what the paper prints of a variant.
     """
     groups = variants(merged)
     labels = variant_labels([merged.frame.iloc[members[0]].to_dict() for members in groups])
@@ -124,7 +126,7 @@ def draw(merged: Merged, folder: Path, sweep: bool = False) -> list[Section]:
     ]
     return [
         *sections,
-        Section("All variants" if len(known) > 1 else "Error and cost", _comparison(known, folder)),
+        Section("All variants" if len(known) > 1 else "Error and cost", _comparison(known, folder, study)),
     ]
 
 
@@ -255,13 +257,16 @@ def _charts(v: _Variant, folder: Path, prefix: str, brief: bool) -> list[Picture
     return pictures
 
 
-def _comparison(known: list[_Variant], folder: Path) -> list[Picture]:
+def _comparison(known: list[_Variant], folder: Path, study: Study | None) -> list[Picture]:
     entries = []
     for v in known:
         row = next(row for row in mean_rows(v.merged, v.members) if row["split"] == v.held_out)
         values = v.rows.loc[v.rows["split"] == v.held_out, "delta"]
-        printed = paper_row(v.merged, v.members) or {}
-        paper = None if pd.isna(printed.get("delta")) else printed["delta"]
+        printed = (paper_row(v.merged, v.members) or {}).get("delta")
+        if study and study.printed is not None:
+            named = {name: str(row[name]) for name in ("scene", "method", "field")}
+            printed = printed_delta(study.printed, {**study.keys.get(v.runs[0], {}), **named})
+        paper = None if pd.isna(printed) else printed
         measured = {name: row[name] for name in MEASURED}
         entries.append(
             measured | {"label": v.label, "mean": row["delta"], "values": list(values), "paper": paper}

@@ -1,8 +1,20 @@
 """What a report of an experiment is about."""
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+
+
+def printed_delta(entries: Sequence[Mapping], known: Mapping[str, str]) -> float:
+    """δ of the first entry of `Study.printed` that is of this, a fraction; NaN where none is.
+
+    Args:
+        entries: as of `Study`.
+        known: what it is of, as text, by the entries' keys; an entry may say `null` of what is not there.
+    """
+    fits = (e["delta"] for e in entries if all(known.get(k, "null") == e[k] for k in e if k != "delta"))
+    return next(fits, math.nan)
 
 
 @dataclass(frozen=True)

@@ -8,6 +8,7 @@ from nsf.errors import SchemaError
 from nsf.reporting import headline as module
 from nsf.reporting.committed import _sources
 from nsf.reporting.headline import Report, headline
+from nsf.reporting.study import printed_delta
 
 
 def told(folder) -> tuple[list[list[str]], str]:
@@ -156,3 +157,14 @@ def test_rows_that_are_not_those_of_the_sources_are_refused(tmp_path):
     (folder / "results.csv").unlink()
     with pytest.raises(SchemaError, match="has not the 2 rows"):
         headline(report)
+
+
+def test_what_the_paper_prints_of_a_job_is_found_by_its_keys():
+    entries = [
+        {"scene": "metal", "sampler.size": "20", "delta": 0.005},
+        {"deploy.changes": "null", "delta": 0.012},
+    ]
+    metal = {"scene": "metal", "sampler.size": "20", "sampler": "random"}
+    assert printed_delta(entries, metal) == 0.005
+    assert printed_delta(entries, {"scene": "bread"}) == 0.012
+    assert np.isnan(printed_delta(entries, {"scene": "bread", "deploy.changes": "{a:1}"}))
