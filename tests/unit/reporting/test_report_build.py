@@ -25,7 +25,7 @@ TINY = Made(particles=30, frames=4, parameters=TEST[:2], splits=("test",) * 2)
 @pytest.fixture
 def no_pictures(monkeypatch):
     """Drawing takes seconds, and some tests are about the rest."""
-    monkeypatch.setattr(build, "draw", lambda merged, folder, sweep: [])
+    monkeypatch.setattr(build, "draw", lambda merged, folder, **_: [])
 
 
 def files(folder):
