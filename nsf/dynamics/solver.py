@@ -98,7 +98,7 @@ class ReducedRun(Phased):
         velocity = _shaped("velocity", scene.initial_velocity() if velocity is None else velocity, (P, 3))
         self.initial_velocity = torch.as_tensor(velocity, dtype=self.dtype)
         if xhat is None:  # a scene begins undeformed and free of stress
-            X = torch.as_tensor(self.scene_particles.X)[None]
+            X = torch.as_tensor(self.scene_particles.X, device=manifold.X.device)[None]
             xhat = manifold.encode(X, X.new_zeros(*X.shape[:2], 6))[0].cpu()
         start = tensor(_shaped("xhat", xhat, (manifold.latent_dim,)))
         self.record = LatentRecord(start, self.total_steps, projector.iterations)

@@ -87,7 +87,8 @@ def compare(
         solver.parameters,
     )
     manifold.check_particles(trajectory.x_sha256)
-    manifold = copy.deepcopy(manifold).to(device)  # frames are encoded where they are
+    if manifold.X.device != device:  # frames are encoded where they are
+        manifold = copy.deepcopy(manifold).to(device)
     decoder = solver.decoder()
     frames = trajectory.frames
     xhat = at_frames(rollout, trajectory.t)

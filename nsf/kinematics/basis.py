@@ -354,9 +354,6 @@ class BasisManifold(Manifold):
                 place, points if phase == "deformation" else 0, networks[phase], like
             )
         )
-        if rows is not None:
-            for phase in PHASES:
-                fields[phase]  # what a deployed model holds is all there from the start
 
         def gradient() -> RestrictedField:
             base = torch.eye(3, dtype=points.dtype, device=points.device).flatten()
@@ -419,7 +416,7 @@ class BasisManifold(Manifold):
 
 
 class PlacedFields(dict):
-    """Restricted fields by phase, each made when first asked for: points in between may need but one."""
+    """Restricted fields by phase, each made when first asked for: most need that of the deformation alone."""
 
     def __init__(self, make: Callable[[str], RestrictedField]):
         self._make = make
@@ -482,7 +479,7 @@ class BasisRestriction(Restriction):
 
     @override
     def subset(self, rows):
-        fields = {phase: self.fields[phase].subset(rows) for phase in PHASES}
+        fields = PlacedFields(lambda phase: self.fields[phase].subset(rows))
         return BasisRestriction(
             fields, lambda: self._gradient.subset(rows), self.latent_dim, self._takes_parameters
         )

@@ -13,7 +13,7 @@ from typing_extensions import override
 from nsf.data import Snapshots, Standardizer
 from nsf.kinematics.encoder import Encoder
 from nsf.kinematics.manifold import Manifold, Restriction, identity
-from nsf.kinematics.networks import FullyConnected
+from nsf.kinematics.networks import FullyConnected, TensorCores
 from nsf.kinematics.phases import PHASES, TARGETS, Fit, joined, per_phase, shaped
 
 HIDDEN_LAYERS = 5
@@ -109,9 +109,15 @@ def pair(X: Tensor, latents: Tensor) -> Tensor:
 
 
 class MlpManifold(Manifold):
-    """Encoder and decoders with the standardisation of their inputs and outputs."""
+    """Encoder and decoders with the standardisation of their inputs and outputs.
+
+    Attributes:
+        arithmetic: of h and l where they are deployed on a GPU, whose own errors are far larger: a key of
+            `networks.ARITHMETIC`, or None for that of g, which is the type asked for.
+    """
 
     field = "mlp"
+    arithmetic: str | None = "tf32"
 
     def __init__(self, latent_dim, x_sha256, parameter_names, hyperparameters):
         super().__init__(latent_dim, x_sha256, parameter_names, hyperparameters)
@@ -159,30 +165,33 @@ class MlpManifold(Manifold):
         return MlpRestriction(
             points.to(dtype=dtype, device=device),
             {phase: self._deployed(phase, dtype, device) for phase in PHASES},
+            self._has_parameters("stress"),
             self.latent_dim,
         )
 
-    def _deployed(self, phase: str, dtype: torch.dtype, device: torch.device | str) -> FullyConnected:
+    def _deployed(self, phase: str, dtype: torch.dtype, device: torch.device | str) -> nn.Module:
         """The decoder from (X [m], xhat, μ) to the field in its own unit."""
         X, parameters, values = self.standard["X"], self.standard_parameters, self.standard[TARGETS[phase][0]]
         latent = torch.zeros(self.latent_dim, device=X.mean.device)
         mean, std = [X.mean, latent], [X.std, latent + 1]
         if self._has_parameters(phase):
             mean, std = [*mean, parameters.mean], [*std, parameters.std]
-        return self.decoders[phase].in_raw_units(
+        raw = self.decoders[phase].in_raw_units(
             torch.cat(mean), torch.cat(std), values.mean, values.std, dtype, device
         )
+        exact = phase == "deformation" or self.arithmetic is None or torch.device(device).type != "cuda"
+        return raw if exact else TensorCores(raw, self.arithmetic)
 
 
 class MlpRestriction(Restriction):
     """The three decoders at points X [n, 3]; they take and give raw units."""
 
-    def __init__(self, X: Tensor, decoders: dict[str, FullyConnected], latent_dim: int):
+    def __init__(self, X: Tensor, decoders: dict[str, nn.Module], takes_parameters: bool, latent_dim: int):
         self.X, self.decoders, self.latent_dim = X, decoders, latent_dim
         self.points, self.dtype, self.device = X.shape[0], X.dtype, X.device
         inputs = torch.eye(3 + latent_dim, dtype=X.dtype, device=X.device)
         self._along_X, self._along_xhat = inputs[:3], inputs[3:]
-        self._takes_parameters = decoders["stress"].layers[0].in_features > 3 + latent_dim
+        self._takes_parameters = takes_parameters
 
     @override
     def position(self, xhat):
@@ -212,7 +221,7 @@ class MlpRestriction(Restriction):
 
     @override
     def subset(self, rows):
-        return MlpRestriction(self.X[rows], self.decoders, self.latent_dim)
+        return MlpRestriction(self.X[rows], self.decoders, self._takes_parameters, self.latent_dim)
 
     def _decode(self, phase: str, latents: Tensor) -> Tensor:
         decoder = self.decoders[phase]

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -18,6 +19,10 @@ def _push_elu(tangents: Tensor, z: Tensor) -> Tensor:
 # name → (activation, its tangent map t ↦ act'(z) t). For a pointwise function the forward derivative is the
 # same product as the backward one, so torch's fused backward kernels serve; they broadcast z over tangents.
 ACTIVATIONS = {"elu": (F.elu, _push_elu), "silu": (F.silu, torch.ops.aten.silu_backward)}
+
+
+# What tensor cores multiply, by the type of the values between layers: 10 and 7 bits after the leading one.
+ARITHMETIC = {"tf32": torch.float32, "bf16": torch.bfloat16}
 
 
 def xavier(layer: nn.Linear | nn.Conv1d, generator: torch.Generator) -> None:
@@ -97,6 +102,43 @@ class FullyConnected(nn.Module):
         last.weight.mul_(scale[:, None])
         last.bias.mul_(scale).add_(shift)
         return raw.to(dtype=dtype, device=device)
+
+
+class TensorCores(nn.Module):
+    """A network whose hidden layers are multiplied on a GPU's tensor cores, for what needs few digits.
+
+    The end layers are in fp32: inputs in raw units may differ in their last digits alone.
+
+    Args:
+        network: in raw units.
+        arithmetic: a key of `ARITHMETIC`.
+    """
+
+    def __init__(self, network: FullyConnected, arithmetic: str):
+        super().__init__()
+        self.activation, self.width, self.low = network.activation, network.width, ARITHMETIC[arithmetic]
+        first, *hidden, last = network.layers
+        self.ends = nn.ModuleList([first, last]).float()
+        self.hidden = nn.ModuleList(hidden).to(self.low)
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """[..., inputs] → [..., outputs], of the inputs' type."""
+        first, last = self.ends
+        z = self.activation(first(inputs.float())).to(self.low)
+        with _tf32():
+            for layer in self.hidden:
+                z = self.activation(layer(z))
+        return last(z.float()).to(inputs.dtype)
+
+
+@contextlib.contextmanager
+def _tf32() -> Iterator[None]:
+    matmul = torch.backends.cuda.matmul
+    before, matmul.allow_tf32 = matmul.allow_tf32, True
+    try:
+        yield
+    finally:
+        matmul.allow_tf32 = before
 
 
 class Committee(nn.Module):

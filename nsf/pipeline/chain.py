@@ -211,7 +211,7 @@ class Pipeline(Plan):
         return self._made(self.deployment, self._deploy)
 
     def _deploy(self, run: Run) -> None:
-        manifold = self.manifold()
+        manifold = self.manifold().to(self.device)  # many solvers take their rows from it
         with run.record(device=self.device, precision=self.config.precision) as record:
             build = partial(self.solver_at, manifold)
             started = time.perf_counter()
@@ -298,7 +298,8 @@ class Pipeline(Plan):
         return self._made(self.evaluation, self._evaluate)
 
     def _evaluate(self, run: Run) -> None:
-        deployment, truths, manifold = self.deployment, self._truths(), self.manifold()
+        deployment, truths = self.deployment, self._truths()
+        manifold = self.manifold().to(self.device)  # as in deployment
         with run.record(device=self.device, precision=self.config.precision) as record:
             rollouts = [Rollout.open(deployment.path / rollout_file(index)) for index in range(len(truths))]
             comparisons = [
