@@ -36,7 +36,7 @@ def run(settings: Settings, say: Callable[[str], object]) -> Result:
 
 def measured(chain: Pipeline, sizes, settings: Settings, found: Result, say: Callable[[str], object]) -> None:
     """Add the rows of one scene; every batch of a precision turn by turn, in whole runs."""
-    chain.simulate()
+    chain.simulate(("train",))
     chain.train()
     manifold, scene, name = chain.manifold(), chain.scene, chain.scene.parameters.name
     truth = chain.truth(chain.held_out[0]).path / TRAJECTORY

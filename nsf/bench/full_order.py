@@ -52,37 +52,37 @@ def collapse(particles: int, precision: str, device: str) -> FullOrderMPM:
 
 def run(settings: Settings, say: Callable[[str], None]) -> Result:
     """Every size; the precisions of a size turn by turn."""
-    kind = "cuda" if settings.device.startswith("cuda") else "cpu"
-    return measured("full_order", settings.particles or SIZES[kind], settings, say)
-
-
-def measured(bench: str, sizes, settings: Settings, say: Callable[[str], None]) -> Result:
-    """Steps and their passes at each size, under the name of a benchmark."""
     found, device = Result(), settings.device
     speed = bandwidth(device)
-    say(f"{bench}: a copy on {name_of(device)} moves {speed / 1e9:.0f} GB/s")
-    for particles in sizes:
+    say(f"full_order: a copy on {name_of(device)} moves {speed / 1e9:.0f} GB/s")
+    for particles in settings.particles or SIZES["cuda" if device.startswith("cuda") else "cpu"]:
         built = {p: build(partial(collapse, particles, p, device), device) for p in settings.precisions}
         solvers = {precision: solver for precision, (solver, _) in built.items()}
         times = step_times(solvers, settings.trials, device)
         for precision, (solver, peak_mib) in built.items():
-            same = dict(
-                bench=bench, case=f"full_order_{size_name(particles)}", particles=particles,
-                precision=precision, device=name_of(device), commit=commit(),
-            )  # fmt: skip
+            case = f"full_order_{size_name(particles)}"
             p10, median, p90 = np.percentile(times[precision], [10, 50, 90]).tolist()
             row = Row(
-                **same, sample=None, integration=None, batch=1, delta=None,
+                bench="full_order", case=case, particles=particles, precision=precision,
+                device=name_of(device), commit=commit(), sample=None, integration=None, batch=1, delta=None,
                 ms_median=median, ms_p10=p10, ms_p90=p90, peak_mib=peak_mib,
             )  # fmt: skip
             found.rows.append(row)
-            say(f"{row.case} {precision}: {median:.4g} ms a step")
-            for kernel, (ms, size) in pass_times(solver).items():
-                mib, gb_per_s, floor_ms = size / 2**20, size / ms / 1e6, 1e3 * size / speed
-                found.kernels.append(
-                    KernelRow(**same, kernel=kernel, ms=ms, mib=mib, gb_per_s=gb_per_s, floor_ms=floor_ms)
-                )
+            say(f"{case} {precision}: {median:.4g} ms a step")
+            found.kernels.extend(kernel_rows("full_order", case, precision, solver, speed))
     return found
+
+
+def kernel_rows(bench: str, case: str, precision: str, solver: FullOrderMPM, speed: float) -> list[KernelRow]:
+    """The passes of a solver's step, beside what a copy of `speed` [B/s] takes; ends the solver's use."""
+    return [
+        KernelRow(
+            bench=bench, case=case, particles=len(solver.state), precision=precision, kernel=kernel, ms=ms,
+            device=name_of(str(solver.device)), mib=size / 2**20, gb_per_s=size / ms / 1e6,
+            floor_ms=1e3 * size / speed, commit=commit(),
+        )
+        for kernel, (ms, size) in pass_times(solver).items()
+    ]  # fmt: skip
 
 
 def pass_times(solver: FullOrderMPM) -> dict[str, tuple[float, int]]:

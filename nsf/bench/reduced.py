@@ -1,6 +1,7 @@
 """A reduced step beside the full-order one, on the paper's cake and metal, and what a longer Δt costs."""
 
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import torch
@@ -13,11 +14,17 @@ from nsf.data.schema import TRAJECTORY
 from nsf.dynamics.solver import reduced_steps
 from nsf.evaluation import metrics
 from nsf.evaluation.cost import SolverCost, Subject, measure
+from nsf.kinematics.networks import ARITHMETIC as TENSOR_CORES
 from nsf.pipeline import Pipeline
 
 SCENES = ("cake", "metal")
 #: Steps of the deployment in units of the scene's Δt (paper section 6.1 has 1.5 on cake).
 MULTIPLIERS = (1.0, 1.5, 2.0, 3.0)
+#: Of the networks of stress and affine momentum with field=mlp; a CPU has no tensor cores.
+ARITHMETIC = {"cuda": (None, *TENSOR_CORES), "cpu": (None,)}
+_MOST = 3  # trials of networks, whose runs take seconds
+#: As in the experiment table1.
+MLP_TRAINING = ("trainer.steps=null", "trainer.budget_minutes=1")
 _CHUNK = 2**26  # positions decoded at once
 
 
@@ -25,12 +32,16 @@ def run(settings: Settings, say: Callable[[str], object]) -> Result:
     """Each scene: at the paper's size on a GPU, at small scale on a CPU.
 
     Data and training are made, or reused, as by `nsf train`. A step of k Δt stands in the case's name; it
-    moves the scene by k times as much as the others.
+    moves the scene by k times as much as the others. With field=mlp it names what multiplies the hidden
+    layers of h and l: tf32 or bf16 on tensor cores, or nothing where they are in the precision of the step.
     """
     found = Result()
     for scene in settings.scenes or SCENES:
-        overrides = [f"scene={scene}", f"scale={scale_of(settings.device)}", f"device={settings.device}"]
+        scale = scale_of(settings.device)
+        overrides = [f"scene={scene}", f"scale={scale}", f"device={settings.device}"]
         measured(Pipeline(config.load(overrides), say=say), settings, found, say)
+        overrides += ["field=mlp", *(MLP_TRAINING if scale == "paper" else ())]
+        measured_networks(Pipeline(config.load(overrides), say=say), settings, found, say)
     return found
 
 
@@ -41,7 +52,7 @@ def scale_of(device: str) -> str:
 
 def measured(chain: Pipeline, settings: Settings, found: Result, say: Callable[[str], object]) -> None:
     """Add the rows of one scene at its first held-out value; every side of a precision turn by turn."""
-    chain.simulate()
+    chain.simulate(("train",))
     chain.train()
     manifold, scene, value = chain.manifold(), chain.scene, chain.held_out[0]
     parameters, name = {scene.parameters.name: value}, scene.name
@@ -78,6 +89,38 @@ def measured(chain: Pipeline, settings: Settings, found: Result, say: Callable[[
                 )
             error = "" if row.delta is None else f", δ {100 * row.delta:.3g} %"
             say(f"{case} {precision}: {row.ms_median:.4g} ms a step{error}")
+
+
+def measured_networks(
+    chain: Pipeline, settings: Settings, found: Result, say: Callable[[str], object]
+) -> None:
+    """Add the rows of one scene with field=mlp, likewise; in each arithmetic of the networks."""
+    chain.simulate(("train",))
+    chain.train()
+    manifold, value, name = chain.manifold(), chain.held_out[0], chain.scene.name
+    truth, particles = chain.truth(value).path / TRAJECTORY, len(manifold.X)
+    first = chain.solver_at(manifold, value)
+    options = {"sample": first.phases, "sets": first.sets, "device": settings.device, "method": chain.method}
+    options |= {"projector": chain.projector, "integration": chain.integration}
+    kind = "cuda" if settings.device.startswith("cuda") else "cpu"
+
+    def reduced(arithmetic: str | None, precision: str):
+        manifold.arithmetic = arithmetic
+        parameters = {chain.scene.parameters.name: value}
+        return chain.scene.reduced(manifold, parameters, precision=precision, **options)
+
+    for precision in settings.precisions:
+        subjects = {
+            f"reduced_{name}_mlp" + (f"_{arithmetic}" if arithmetic else ""): Subject(
+                partial(reduced, arithmetic, precision), chain.scene.steps
+            )
+            for arithmetic in ARITHMETIC[kind]
+        }
+        for case, cost in measure(subjects, min(settings.trials, _MOST), settings.device).items():
+            solver = subjects[case].build()
+            solver.step(solver.total_steps)
+            found.rows.append(_row(case, particles, precision, settings.device, cost, solver, truth))
+            say(f"{case} {precision}: {cost.step_ms:.4g} ms a step, δ {100 * found.rows[-1].delta:.3g} %")
 
 
 def _row(case, particles: int, precision: str, device: str, cost: SolverCost, solver, truth) -> Row:

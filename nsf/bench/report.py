@@ -40,6 +40,15 @@ _BATCH = (
     "Time of a simulation-step, which is the step of a batch over the simulations that take it together, by "
     "their number; the band is from 10 % to 90 % of the trials. Dotted: half the time for twice as many."
 )
+_SIZES = (
+    "Time of a step over the number of particles; dashed: the floor that the bandwidth sets a full-order "
+    "step. `full_order`: a block of sand on the paper's grid. `scaling`: the sand column, whose reduced runs "
+    "evaluate one training's fields at every number of particles, and have as many samples at each."
+)
+_SAMPLES = (
+    "Time of a reduced step of the sand column over the number of sample particles, beside the full-order "
+    "step of the same scene; a mark names δ of its run."
+)
 _KERNELS = (
     "Each pass of a full-order step on its own. Moved: what it has to read and write, each value once. "
     "Floor: the time that these bytes take a copy measured in the same run; a step cannot be faster than "
@@ -63,6 +72,10 @@ _SEVERAL = (
 )
 
 
+#: A case of one of several numbers of samples.
+_OF_SAMPLE = r"_s\d+$"
+
+
 def write_report(folder: Path) -> Path:
     """Charts and index.md from results.csv, kernels.csv and stages.csv of a folder."""
     results, kernels, stages = (
@@ -74,6 +87,8 @@ def write_report(folder: Path) -> Path:
         stem = re.sub("[^a-z0-9]+", "-", device.lower())
         parts.append(f"## On {device}")
         of_size = rows[rows["bench"].isin(["full_order", "scaling"])]
+        by_sample = of_size["case"].str.contains(_OF_SAMPLE)
+        of_sample = of_size[by_sample]
         of_scene, of_batch = (rows[rows["bench"] == name] for name in ("reduced", "batch"))
         if len(of_scene):
             caption = "Time of a step of both solvers by scene; a bar names δ of its run."
@@ -94,12 +109,15 @@ def write_report(folder: Path) -> Path:
             parts += [f"![{_BATCH}](batch-{stem}.png)", _BATCH, _markdown(of_batch)]
         if len(of_size):
             with styled():
-                save(step_over_particles(of_size, passes), folder, f"step-{stem}")
+                save(step_over_particles(of_size[~by_sample], passes), folder, f"step-{stem}")
                 save(passes_beside_floor(passes), folder, f"kernels-{stem}")
-            caption = (
-                "Time of a step over the number of particles; dashed: the floor that the bandwidth sets."
-            )
-            parts += [f"![{caption}](step-{stem}.png)", caption, _markdown(of_size)]
+            parts += [f"![{_SIZES}](step-{stem}.png)", _SIZES, _markdown(of_size[~by_sample])]
+        if len(of_sample):
+            full_order = of_size[~by_sample & of_size["particles"].isin(of_sample["particles"])]
+            with styled():
+                save(step_over_sample(of_sample, full_order), folder, f"sample-{stem}")
+            parts += [f"![{_SAMPLES}](sample-{stem}.png)", _SAMPLES, _markdown(of_sample)]
+        if len(of_size):
             caption = "Time of each pass of a full-order step; the mark is its floor."
             parts += [f"![{caption}](kernels-{stem}.png)", caption, _KERNELS, _markdown(passes)]
         of_several = rows[rows["bench"] == "multi_gpu"]
@@ -126,25 +144,26 @@ def step_over_particles(results: pd.DataFrame, kernels: pd.DataFrame) -> Figure:
         results: rows of one device.
         kernels: passes of its full-order steps, whose floors add up to that of a step.
     """
-    series = results.assign(solver=[_solver(case) for case in results["case"]])
+    of_block = results["bench"].eq("full_order").map({True: " of a block", False: ""})
+    series = results.assign(solver=[_solver(case) for case in results["case"]] + of_block)
     with styled():
         fig = figure(4.4)
         panel = fig.subplots()
         colors = {}
         lines = series.groupby(["solver", "precision"], sort=False)
         for i, ((solver, precision), part) in enumerate(lines):
-            # A size that two benchmarks have counts by its best median.
-            part = part.sort_values("ms_median").drop_duplicates("particles").sort_values("particles")
+            part = part.sort_values("particles")
             style = line_style(i)
             P, median = part["particles"], part["ms_median"]
             panel.fill_between(P, part["ms_p10"], part["ms_p90"], color=style["color"], alpha=0.18, lw=0)
             panel.plot(P, median, marker="o", ms=4.5, label=f"{solver}, {precision}", **style)
-            colors[solver, precision] = style["color"]
+            if solver.startswith("full-order"):
+                colors[precision] = style["color"]
         for precision, part in kernels.groupby("precision", sort=True):
             floor = part.groupby(["bench", "particles"])["floor_ms"].sum().groupby("particles").mean()
             panel.plot(
-                floor.index, floor, ls=(0, (5, 2)), lw=1.2, color=colors["full-order", precision],
-                label=f"full-order floor, {precision}",
+                floor.index, floor, ls=(0, (5, 2)), lw=1.2, label=f"full-order floor, {precision}",
+                color=colors[precision],
             )  # fmt: skip
         panel.set(xscale="log", yscale="log", xlabel="particles P [–]", ylabel="time of a step [ms]")
         panel.grid(which="major")
@@ -170,6 +189,38 @@ def step_beside_paper(stages: pd.DataFrame) -> Figure:
             }
         )
     return rings(rows)
+
+
+def step_over_sample(results: pd.DataFrame, full_order: pd.DataFrame) -> Figure:
+    """Time of a reduced step [ms] over |S|, both axes logarithmic, a line for each precision.
+
+    Args:
+        results: rows of one device and one number of particles.
+        full_order: rows of as many particles.
+    """
+    with styled():
+        fig = figure(4.4)
+        panel = fig.subplots()
+        for i, (precision, part) in enumerate(results.groupby("precision")):
+            part, style = part.sort_values("sample"), line_style(i)
+            S, median = part["sample"], part["ms_median"]
+            panel.fill_between(S, part["ms_p10"], part["ms_p90"], color=style["color"], alpha=0.18, lw=0)
+            panel.plot(S, median, marker="o", ms=4.5, label=f"reduced, {precision}", **style)
+            for at, ms, delta in zip(S, median, part["delta"].astype(float), strict=True):
+                panel.annotate(
+                    f"{number(100 * delta)} %", (at, ms), (0, 6 - 18 * (i == 0)), ha="center",
+                    textcoords="offset points", fontsize=8.5, color=style["color"],
+                )  # fmt: skip
+            for ms in full_order.loc[full_order["precision"] == precision, "ms_median"]:
+                panel.axhline(ms, ls=":", lw=1.4, color=style["color"], label=f"full-order, {precision}")
+        panel.set(xscale="log", yscale="log")
+        panel.set(xlabel="sample particles |S| [–]", ylabel="time of a step [ms]")
+        sizes = sorted(results["sample"].astype(int).unique())
+        panel.set_xticks(sizes, [str(size) for size in sizes])
+        panel.minorticks_off()
+        panel.grid(which="major")
+        fig.legend(loc="outside upper left", ncols=2, handlelength=2.6)
+    return fig
 
 
 def step_over_batch(results: pd.DataFrame) -> Figure:
@@ -206,7 +257,7 @@ def steps_by_scene(results: pd.DataFrame) -> Figure:
     Args:
         results: rows of `reduced` of one device.
     """
-    scene = results["case"].str.extract(r"^(?:full_order|reduced)_(.+?)(?:_[\d.]+dt)?$")[0]
+    scene = results["case"].str.extract(r"^(?:full_order|reduced)_(.+?)(?:_[\d.]+dt|_mlp\w*)?$")[0]
     panels_of = list(results.groupby(scene, sort=False))
     with styled():
         fig = figure(1.2 + 0.3 * max(len(part) for _, part in panels_of))

@@ -8,23 +8,29 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import torch
 
+from nsf import config
 from nsf.bench import BENCHES, bench
 from nsf.bench.batch import _too_large, values_of
 from nsf.bench.batch import measured as measured_batches
-from nsf.bench.full_order import collapse, measured, pass_times
+from nsf.bench.full_order import collapse, pass_times
+from nsf.bench.full_order import run as full_order
 from nsf.bench.measure import bandwidth, run_times, step_times
 from nsf.bench.multi_gpu import measured as measured_on_several
 from nsf.bench.reduced import measured as measured_chain
-from nsf.bench.report import step_over_batch, with_speed_up, write_report
+from nsf.bench.reduced import measured_networks
+from nsf.bench.report import step_over_batch, step_over_sample, with_speed_up, write_report
 from nsf.bench.rows import KernelRow, Result, Row, Settings, StageRow, columns, size_name
+from nsf.bench.scaling import at_size, carried_over
+from nsf.bench.scaling import measured as measured_sizes
 from nsf.bench.training import measured as measured_training
 from nsf.cli import main
 from nsf.errors import ConfigError, DeviceError
 from nsf.pipeline import Pipeline
 
 SMALL = {
-    "benches": "full_order,scaling",
+    "benches": "full_order",
     "particles": "200,500",
     "trials": "2",
     "device": "cpu",
@@ -35,7 +41,7 @@ PASSES = ["clear", "p2g", "grid", "g2p_stress"]
 
 @pytest.fixture(scope="module")
 def speed(tmp_path_factory):
-    """The folder of a report of both benchmarks."""
+    """The folder of a report of one benchmark."""
     folder = tmp_path_factory.mktemp("speed")
     bench(folder, SMALL, lambda text: None)
     return folder
@@ -45,19 +51,18 @@ def test_every_benchmark_gives_its_rows(speed):
     results, kernels = (pd.read_csv(speed / name) for name in ("results.csv", "kernels.csv"))
     assert list(results) == columns(Row)
     assert list(kernels) == columns(KernelRow)
-    assert set(results["bench"]) == {"full_order", "scaling"} < set(BENCHES)
-    assert set(results["case"]) == {"full_order_200", "full_order_500"}
-    assert len(results) == 4
+    assert set(results["bench"]) == {"full_order"} < set(BENCHES)
+    assert results["case"].tolist() == ["full_order_200", "full_order_500"]
     assert (results["ms_p10"] <= results["ms_median"]).all()
     assert (results["ms_median"] <= results["ms_p90"]).all()
     assert (results["peak_mib"] > 0).all()
-    assert kernels.groupby(["bench", "case"], sort=False)["kernel"].apply(list).tolist() == [PASSES] * 4
+    assert kernels.groupby(["bench", "case"], sort=False)["kernel"].apply(list).tolist() == [PASSES] * 2
     np.testing.assert_allclose(kernels["gb_per_s"], kernels["mib"] * 2**20 / kernels["ms"] / 1e6)
 
 
 def test_the_page_shows_every_row_and_chart(speed):
     page = (speed / "index.md").read_text()
-    assert page.count("| full_order_200 |") == 2 + 8
+    assert page.count("| full_order_200 |") == 1 + 4
     for name in re.findall(r"\]\((.*?\.png)\)", page):
         assert (speed / name).stat().st_size > 5000
         assert (speed / name).with_suffix(".svg").is_file()
@@ -66,15 +71,17 @@ def test_the_page_shows_every_row_and_chart(speed):
 
 def test_other_rows_are_kept(speed, tmp_path):
     before = pd.read_csv(speed / "results.csv")
+    before = pd.concat([before, before.iloc[:1].assign(bench="scaling", commit="old")], ignore_index=True)
     before.loc[0, ["device", "ms_median"]] = "NVIDIA H200", 12.5
     before.loc[1, ["ms_median", "commit"]] = 1e9, "old"
     before.to_csv(tmp_path / "results.csv", index=False)
     kernels = pd.read_csv(speed / "kernels.csv")
     of_gpu = kernels[kernels["case"] == before.loc[0, "case"]].assign(device="NVIDIA H200")
     pd.concat([kernels, of_gpu]).to_csv(tmp_path / "kernels.csv", index=False)
-    page = bench(tmp_path, SMALL | {"benches": "full_order"}, lambda text: None)
+    page = bench(tmp_path, SMALL, lambda text: None)
     after = pd.read_csv(tmp_path / "results.csv")
-    assert len(after) == 5
+    assert len(after) == 4
+    assert after.loc[after["bench"] == "scaling", "commit"].tolist() == ["old"]
     assert after.loc[after["device"] == "NVIDIA H200", "ms_median"].tolist() == [12.5]
     assert 1e9 not in after["ms_median"].tolist()
     pictures = ["step-nvidia-h200.png", "kernels-nvidia-h200.png"]
@@ -127,8 +134,8 @@ def test_a_copy_has_a_bandwidth():
 def test_a_floor_is_bytes_over_that_bandwidth(monkeypatch):
     monkeypatch.setattr("nsf.bench.full_order.bandwidth", lambda device: 1e9)
     said = []
-    found = measured("scaling", (300,), Settings((), ("fp64",), "cpu", 1), said.append)
-    assert [row.bench for row in found.rows] == ["scaling"]
+    found = full_order(Settings((300,), ("fp64",), "cpu", 1), said.append)
+    assert [row.bench for row in found.rows] == ["full_order"]
     for row in found.kernels:
         assert row.floor_ms == pytest.approx(row.mib * 2**20 / 1e6)
     assert "full_order_300 fp64" in said[-1]
@@ -232,6 +239,84 @@ def test_delta_of_the_benchmark_is_that_of_the_evaluation(reduced, chain):
     assert row["delta"] == pytest.approx(evaluated, rel=1e-6)
     longer = reduced[(reduced["case"] == "reduced_sand_3dt") & (reduced["precision"] == "fp64")].iloc[0]
     assert longer["delta"] != pytest.approx(evaluated, rel=1e-3)
+
+
+def test_networks_have_a_row(tiny, chain):
+    mlp = ("field=mlp", "trainer.steps=20", "trainer.frames_per_batch=8", "trainer.particles_per_batch=4")
+    base = [o for o in tiny if not o.startswith(("field.modes", "field.depth", "trainer.steps"))]
+    found, said = Result(), []
+    own = Pipeline(config.load([*base, *mlp]), say=lambda line: None, root=chain.root)
+    measured_networks(own, Settings((), ("fp32",), "cpu", 1), found, said.append)
+    (row,) = found.rows
+    assert (row.case, row.integration) == ("reduced_sand_mlp", 500)
+    own.deploy()
+    own.evaluate()
+    evaluated = pd.read_csv(own.evaluation.path / "results.csv")["delta"][0]
+    assert row.delta == pytest.approx(evaluated, rel=1e-3)
+
+
+@pytest.fixture(scope="module")
+def sizes(chain):
+    """Rows of the tiny chain at other numbers of particles and samples."""
+    found, said = Result(), []
+    settings = Settings(particles=(), precisions=("fp32", "fp64"), device="cpu", trials=1)
+    own = Pipeline(chain.pipeline.config, say=lambda line: None, root=chain.root)
+    measured_sizes(own, (300, 1200), (15, 40), settings, found, said.append)
+    return found
+
+
+def test_both_solvers_have_rows_at_every_size(sizes):
+    rows = pd.DataFrame(sizes.rows, columns=columns(Row))
+    assert rows["case"].tolist() == [
+        *np.repeat(["full_order_300", "reduced_300", "full_order_1k", "reduced_1k"], 2),
+        *np.repeat(["full_order_500", "reduced_500_s15", "reduced_500_s40"], 2),
+    ]
+    full = rows["case"].str.startswith("full_order")
+    for name in ("sample", "integration", "delta"):
+        assert (rows[name].isna() == full).all()
+    assert rows["sample"].dropna().tolist() == [20] * 4 + [15] * 2 + [40] * 2
+    assert rows["particles"].tolist() == [300] * 4 + [1200] * 4 + [500] * 6
+    # The fields of one training serve at every size, where the body is another only by its grid.
+    assert (rows["delta"].dropna() < 0.01).all()
+    passes = pd.DataFrame(sizes.kernels, columns=columns(KernelRow))
+    assert passes.groupby(["case", "precision"])["kernel"].apply(list).tolist() == [PASSES] * 4
+
+
+def test_fields_carried_over_are_those_between_the_particles(chain):
+    scene, manifold = at_size(chain.pipeline.scene, 1200), chain.pipeline.manifold()
+    fine = carried_over(manifold, scene, "cpu")
+    X, xhat, mu = fine.X, manifold.training_latents[7], manifold.training_parameters[7]
+    here, there = fine.restrict(np.arange(1200)), manifold.restrict(X=X)
+    # Modes are kept in fp32.
+    torch.testing.assert_close(here.position(xhat), there.position(xhat), rtol=0, atol=1e-6)
+    torch.testing.assert_close(here.stress(xhat, mu), there.stress(xhat, mu), rtol=1e-4, atol=1e-2)
+    np.testing.assert_array_equal(X.numpy(), scene.particles().X)
+
+
+def test_a_body_of_another_size_stands_alike_on_its_grid(chain):
+    scene = chain.pipeline.scene
+    (floor,) = scene.colliders
+    for particles in (300, 1200, 40_000):
+        other = at_size(scene, particles)
+        assert len(other.particles()) == particles
+        assert other.dt / other.dx == pytest.approx(scene.dt / scene.dx)
+        assert other.dt * other.steps == pytest.approx(scene.dt * scene.steps, rel=0.05)
+        below = floor.point[2] / other.dx
+        assert below % 1 == pytest.approx(floor.point[2] / scene.dx % 1)
+        assert particles * other.dx**3 == pytest.approx(len(scene.particles()) * scene.dx**3, rel=0.35)
+
+
+def test_a_report_of_sizes(sizes, tmp_path):
+    rows = pd.DataFrame(sizes.rows, columns=columns(Row))
+    rows.to_csv(tmp_path / "results.csv", index=False)
+    pd.DataFrame(sizes.kernels, columns=columns(KernelRow)).to_csv(tmp_path / "kernels.csv", index=False)
+    pd.DataFrame(columns=columns(StageRow)).to_csv(tmp_path / "stages.csv", index=False)
+    page = write_report(tmp_path).read_text()
+    assert re.findall(r"\]\((.*?)\)", page) == ["step-cpu.png", "sample-cpu.png", "kernels-cpu.png"]
+    assert page.count("| reduced_500_s40 |") == 2
+    of_sample = rows[rows["case"].str.contains("_s")]
+    panel = step_over_sample(of_sample, rows[rows["case"] == "full_order_500"]).axes[0]
+    assert [len(line.get_xdata()) for line in panel.lines] == 4 * [2]
 
 
 @pytest.fixture(scope="module")
