@@ -30,6 +30,11 @@ def as_scalars(tensor: torch.Tensor) -> wp.array:
     return wp.from_torch(tensor)
 
 
+def as_tensor(array: wp.array) -> torch.Tensor:
+    """View a Warp array as a tensor, without a copy; vectors and matrices are its last axes."""
+    return wp.to_torch(array)
+
+
 def torch_device(device) -> torch.device:
     """The torch device of a Warp device."""
     return torch.device(str(device)) if device.is_cuda else torch.device("cpu")

@@ -10,7 +10,7 @@ import torch
 
 from nsf.data import Trajectory
 from nsf.dynamics import Rollout
-from nsf.dynamics.interop import torch_device, torch_dtype
+from nsf.dynamics.interop import as_tensor, torch_device, torch_dtype
 from nsf.errors import ConfigError, InstabilityError
 from nsf.evaluation import metrics
 from nsf.evaluation.compare import at_frames
@@ -40,7 +40,8 @@ class SuperResolution:
             smeared: share of those that end more than half a grid cell away in the last frame;
             query_difference [m]: largest distance between the fields at a training particle and at a
             point in its place;
-            seconds: of all queries; full_order_seconds: of the fine full-order run.
+            seconds: of the query of all values together, shared equally; full_order_seconds: of the fine
+            full-order run, its set-up included.
         X: [n, 3] points at rest [m]; x_reduced, x_full: [n, 3] in the last frame [m].
         particles: [P] rows of the training particles among the points.
     """
@@ -53,155 +54,199 @@ class SuperResolution:
 
 
 def query(manifold, X: torch.Tensor, xhat: torch.Tensor) -> torch.Tensor:
-    """g(X, x̂) on the host, by groups of points, so that neither modes nor weights of all are held at once.
+    """g(X, x̂), by groups of points, so that neither modes nor weights of all are held at once.
 
     Args:
-        manifold: trained fields, on the device of x̂.
+        manifold: trained fields.
         X: [n, 3] points at rest [m], anywhere in Ω₀.
-        xhat: [F, r] latent vectors.
+        xhat: [F, r] latent vectors; all three are on one device.
 
     Returns:
         [F, n, 3] positions [m], in the type of x̂.
 
     Source: paper section 6.2, "evaluating the neural deformation fields at more X_p ∈ Ω₀".
     """
-    x = torch.empty(len(xhat), *X.shape, dtype=xhat.dtype)
+    x = xhat.new_empty(len(xhat), *X.shape)
     for rows in lying_together(X, POINTS):
-        at = manifold.restrict(X=X[rows], dtype=xhat.dtype, device=xhat.device)
-        x[:, rows.cpu()] = at.position(xhat).cpu()
+        x[:, rows] = manifold.restrict(X=X[rows], dtype=xhat.dtype, device=xhat.device).position(xhat)
     return x
 
 
-def interpolated(X: torch.Tensor, particles: torch.Tensor, values: torch.Tensor, device) -> torch.Tensor:
-    """Values [F, P, 3] at particles [P, 3] interpolated to points X [n, 3]: [F, n, 3], on the host."""
-    found = torch.empty(len(values), *X.shape, dtype=values.dtype)
-    particles, values = particles.to(device), values.to(device).movedim(0, 1)
+def interpolated(X: torch.Tensor, particles: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    """Values [F, P, 3] at particles [P, 3] interpolated to points X [n, 3]: [F, n, 3], all on one device."""
+    found = values.new_empty(len(values), *X.shape)
+    values = values.movedim(0, 1)
     for rows in lying_together(X, POINTS):
-        at_rows = interpolation(X[rows].to(device), particles).value(values)
-        found[:, rows] = at_rows.movedim(1, 0).cpu()
+        found[:, rows] = interpolation(X[rows], particles).value(values).movedim(1, 0)
     return found
 
 
 def superresolve(
     manifold,
     scene,
-    trajectory: Trajectory,
-    rollout: Rollout,
+    trajectories: Sequence[Trajectory],
+    rollouts: Sequence[Rollout],
     factor: int,
     frames: Sequence[int],
     substeps: int = 1,
     precision: str = "fp64",
     device: str = "auto",
-) -> SuperResolution:
-    """Query a rollout at factor × the particles and compare with a full-order run of as many.
+    say: Callable[[str], object] = lambda line: None,
+) -> list[SuperResolution]:
+    """Query rollouts at factor × the particles and compare each with a full-order run of as many.
 
-    The fine run is made here and not stored: at the paper's size its trajectory would fill a disk.
+    The fine runs are made here and not stored: at the paper's size their trajectories would fill a disk.
+    Neighbours, weights and modes depend on the points alone and are found once for all rollouts. Frames stay
+    on the device, of all rollouts at once: 48 bytes a point, frame and rollout.
 
     Args:
-        manifold: of the rollout.
+        manifold: of the rollouts.
         scene: that was deployed on.
-        trajectory: its full-order run at the rollout's parameter.
-        rollout: the reduced run.
+        trajectories: its full-order run at each rollout's parameter.
+        rollouts: the reduced runs.
         factor: points for each particle.
-        frames: of the trajectory, in ascending order, without frame 0.
+        frames: of the trajectories, in ascending order, without frame 0.
         substeps: steps of the fine run for each step; its Δt is as much smaller.
-        precision, device: of both.
+        precision, device: of all.
+        say: told of each fine run.
 
     Raises:
-        ConfigError: the rollout was handed over to the full-order solver, so its fields end before the scene.
-        InstabilityError: the fine run is unstable where the coarse one is not, as more particles meet
+        ConfigError: a rollout was handed over to the full-order solver, so its fields end before the scene.
+        InstabilityError: a fine run is unstable where the coarse one is not, as more particles meet
             more extreme strains; names the remedy.
     """
     name = scene.parameters.name
+    for rollout in rollouts:
+        _check_own(rollout, name)
+    fine = scene.refined(factor, substeps)
+    where = torch_device(warp_device(device))
+    wait = synchronizer(where)
+    points, particles = fine.particles().X, _rows_in(fine, scene)
+    X, shared = (torch.as_tensor(a, device=where) for a in (points, particles))
+
+    x_full, full_order_seconds = [], []
+    for rollout in rollouts:
+        started = time.perf_counter()
+        build = partial(fine.full_order, {name: rollout.parameter}, precision, device)
+        x_full.append(_full_order_frames(build, substeps * np.array(frames)))
+        full_order_seconds.append(time.perf_counter() - started)
+        took = f"{len(X):,} full-order particles in {full_order_seconds[-1]:.1f} s"
+        say(f"superresolve: {name}={rollout.parameter:g}: {took}")
+    interpolation_errors = _interpolation_errors(X, x_full, shared, 0.5 * scene.dx)
+
+    dtype = torch_dtype(precision_of(precision))
+    latents = [_latents(*run, frames) for run in zip(rollouts, trajectories, strict=True)]
+    xhat = torch.as_tensor(np.concatenate(latents), dtype=dtype, device=where)
+    manifold = manifold.to(where)
+    wait()
+    started = time.perf_counter()
+    x = query(manifold, X, xhat)
+    wait()
+    seconds = (time.perf_counter() - started) / len(rollouts)
+    at_particles = manifold.restrict(dtype=dtype, device=where).position(xhat)
+
+    found = []
+    of_each = zip(x.split(len(frames)), at_particles.split(len(frames)), x_full, strict=True)
+    for k, (x_k, at_particles_k, x_full_k) in enumerate(of_each):
+        own = {"parameter": rollouts[k].parameter, "factor": factor, "points": len(X)}
+        errors = _errors(rollouts[k], trajectories[k], frames, x_k, x_full_k, X, shared)
+        interpolation_error, smeared = interpolation_errors[k]
+        rest = {
+            "interpolation_error": interpolation_error,
+            "smeared": smeared,
+            "query_difference": float((x_k[:, shared] - at_particles_k).norm(dim=2).max()),
+            "seconds": seconds,
+            "full_order_seconds": full_order_seconds[k],
+        }
+        last = (frames_k[-1].cpu().numpy() for frames_k in (x_k, x_full_k))
+        found.append(SuperResolution(own | errors | rest, points, *last, particles))
+    return found
+
+
+def _check_own(rollout: Rollout, name: str) -> None:
+    """Refuse a rollout whose last frames are the full-order solver's."""
     if rollout.handed_over >= 0:
         raise ConfigError(
             f"the reduced run at {name}={rollout.parameter:g} was handed over to the full-order solver at "
             f"t = {rollout.t[rollout.handed_over]:.4g} s and has no fields beyond; "
             "deploy with deploy.on_distrust=report"
         )
-    fine = scene.refined(factor, substeps)
-    where = torch_device(warp_device(device))
-    wait = synchronizer(where)
-    X = fine.particles().X
-    shared = _rows_in(fine, scene)
 
-    started = time.perf_counter()
-    x_full = _full_order_frames(
-        partial(fine.full_order, {name: rollout.parameter}, precision, device), substeps * np.array(frames)
-    )
-    full_order_seconds = time.perf_counter() - started
 
-    dtype = torch_dtype(precision_of(precision))
-    t = trajectory.t[list(frames)]
+def _latents(rollout: Rollout, trajectory: Trajectory, frames: Sequence[int]) -> np.ndarray:
+    """Latent vectors [F, r] at frames; the last good one after a divergence."""
     good = rollout.t if rollout.diverged < 0 else rollout.t[: rollout.diverged]
-    xhat = torch.as_tensor(at_frames(rollout, np.minimum(t, good[-1])), dtype=dtype, device=where)
-    manifold = manifold.to(where)
-    wait()
-    started = time.perf_counter()
-    x = query(manifold, torch.as_tensor(X, device=where), xhat)
-    wait()
-    seconds = time.perf_counter() - started
+    return at_frames(rollout, np.minimum(trajectory.t[list(frames)], good[-1]))
 
-    x_full, X_all = torch.as_tensor(x_full), torch.as_tensor(X)
-    interpolation_error, smeared = _interpolation_errors(X_all, x_full, shared, 0.5 * scene.dx, where)
-    at_particles = manifold.restrict(dtype=dtype, device=where).position(xhat).cpu()
-    coarse = torch.as_tensor(np.stack([trajectory.read("x", frame)[0] for frame in frames]))
 
-    def errors(of) -> tuple[float, float]:
-        if rollout.diverged >= 0 and rollout.t[rollout.diverged] <= t[-1]:
-            return np.inf, np.inf
-        found = metrics.displacement_error(x[:, of], x_full[:, of], X_all[of])
-        return metrics.deformation_error(x[:, of], x_full[:, of]), found
+def _errors(
+    rollout: Rollout,
+    trajectory: Trajectory,
+    frames: Sequence[int],
+    x: torch.Tensor,
+    x_full: torch.Tensor,
+    X: torch.Tensor,
+    shared: torch.Tensor,
+) -> dict[str, float]:
+    """Columns of `SuperResolution.row` from delta to full_order_difference.
 
-    delta, displacement_error = errors(slice(None))
-    particles_delta, particles_displacement_error = errors(shared)
-    row = {
-        "parameter": rollout.parameter,
-        "factor": factor,
-        "points": len(X),
-        "delta": delta,
-        "displacement_error": displacement_error,
-        "particles_delta": particles_delta,
-        "particles_displacement_error": particles_displacement_error,
-        "full_order_difference": metrics.displacement_error(coarse, x_full[:, shared], X_all[shared]),
-        "interpolation_error": interpolation_error,
-        "smeared": smeared,
-        "query_difference": float((x[:, shared] - at_particles).norm(dim=2).max()),
-        "seconds": seconds,
-        "full_order_seconds": full_order_seconds,
+    Args:
+        rollout, trajectory: at one parameter value.
+        frames: of the trajectory.
+        x, x_full: [F, n, 3] of the fields and of the fine run [m].
+        X: [n, 3] points at rest [m].
+        shared: [P] rows of the training particles.
+    """
+    last = trajectory.t[frames[-1]]
+    lost = rollout.diverged >= 0 and rollout.t[rollout.diverged] <= last
+    coarse = torch.as_tensor(np.stack([trajectory.read("x", frame)[0] for frame in frames])).to(X.device)
+    few = (x[:, shared], x_full[:, shared])
+    errors = {
+        "delta": metrics.deformation_error(x, x_full),
+        "displacement_error": metrics.displacement_error(x, x_full, X),
+        "particles_delta": metrics.deformation_error(*few),
+        "particles_displacement_error": metrics.displacement_error(*few, X[shared]),
     }
-    return SuperResolution(row, X, x[-1].numpy(), x_full[-1].numpy(), shared)
+    difference = metrics.displacement_error(coarse, few[1], X[shared])
+    return (dict.fromkeys(errors, np.inf) if lost else errors) | {"full_order_difference": difference}
 
 
 def _interpolation_errors(
-    X: torch.Tensor, x: torch.Tensor, shared: np.ndarray, far: float, device
-) -> tuple[float, float]:
-    """Displacement error of the points that are not shared, interpolated from those that are.
+    X: torch.Tensor, x: Sequence[torch.Tensor], shared: torch.Tensor, far: float
+) -> list[tuple[float, float]]:
+    """Displacement errors of the points that are not shared, interpolated from those that are.
 
     Args:
-        X: [n, 3] points at rest [m]; x: [F, n, 3] [m].
+        X: [n, 3] points at rest [m]; x: [F, n, 3] [m] of each run, on one device.
         shared: [P] rows to interpolate from.
         far: distance [m] beyond which a point counts as smeared.
-        device: where the interpolation is made.
 
     Returns:
-        The error, and the share of points smeared in the last frame.
+        Of each run the error, and the share of points smeared in the last frame.
     """
-    left_out = np.setdiff1d(np.arange(len(X)), shared)
-    X_left, x_left = X[left_out], x[:, left_out]
-    x_between = interpolated(X_left, X[shared], x[:, shared], device)
-    smeared = ((x_between[-1] - x_left[-1]).norm(dim=1) > far).double().mean()
-    return metrics.displacement_error(x_between, x_left, X_left), float(smeared)
+    left_out = torch.ones(len(X), dtype=torch.bool, device=X.device).index_fill(0, shared, False)
+    left_out = left_out.nonzero()[:, 0]
+    X_left, found = X[left_out], []
+    x_between = interpolated(X_left, X[shared], torch.cat([run[:, shared] for run in x]))
+    for run, run_between in zip(x, x_between.chunk(len(x)), strict=True):
+        x_left = run[:, left_out]
+        smeared = ((run_between[-1] - x_left[-1]).norm(dim=1) > far).double().mean()
+        found.append((metrics.displacement_error(run_between, x_left, X_left), float(smeared)))
+    return found
 
 
-def _full_order_frames(build: Callable[[], FullOrderMPM], steps: Sequence[int]) -> np.ndarray:
-    """Positions [F, n, 3] [m] after some numbers of steps."""
+def _full_order_frames(build: Callable[[], FullOrderMPM], steps: Sequence[int]) -> torch.Tensor:
+    """Positions [F, n, 3] [m] after some numbers of steps, in fp64 on the solver's device."""
     solver = build()
-    x = np.empty((len(steps), len(solver.constants), 3))
+    wait = synchronizer(solver.device)
+    rows, order = as_tensor(solver.state.x.rows), as_tensor(solver.state.order)
+    x = torch.empty(len(steps), *rows.shape, dtype=torch.float64, device=rows.device)
     try:
         for k, step in enumerate(steps):
             solver.step(step - solver.steps_taken)
-            x[k] = solver.state.x.numpy()
+            wait()  # the solver's stream and torch's do not wait for each other
+            x[k, order.long()] = rows.double()
+            wait()
         solver.check()
     except InstabilityError as error:
         found = diagnosed(error, build, solver.steps_taken)

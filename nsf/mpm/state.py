@@ -47,18 +47,12 @@ class ParticleArray:
     """A device array whose rows lie in an order of their own; read and written in the particles' order.
 
     Args:
-        values: [P, ...] in the particles' order.
-        dtype: of a row.
-        order: [P] particle of each row.
-        device: Warp device.
-
-    Attributes:
         rows: [P] what kernels work on.
+        order: [P] particle of each row.
     """
 
-    def __init__(self, values: np.ndarray, dtype, order: np.ndarray, device):
-        self._order = order
-        self.rows = wp.array(np.asarray(values)[order], dtype=dtype, device=device)
+    def __init__(self, rows: wp.array, order: np.ndarray):
+        self.rows, self._order = rows, order
 
     def numpy(self) -> np.ndarray:
         """Host copy."""
@@ -102,11 +96,16 @@ class ParticleState:
     ):
         real, vec3, mat33 = precision.real, precision.vec3, precision.mat33
         vecH = wp.types.vector(length=history.shape[1], dtype=real)
-        zero = np.zeros((len(x), 3, 3), precision.numpy)
-        values = {"x": (x, vec3), "v": (v, vec3), "C": (zero, mat33), "F_e": (zero + np.eye(3), mat33)}
-        values |= {"tau": (zero, mat33), "history": (history, vecH)}
-        for name, (initial, dtype) in values.items():
-            setattr(self, name, ParticleArray(initial, dtype, order, device))
+
+        def taken(values: np.ndarray, dtype) -> ParticleArray:
+            return ParticleArray(wp.array(values[order], dtype=dtype, device=device), order)
+
+        def filled(value) -> ParticleArray:
+            return ParticleArray(wp.full(len(x), value, dtype=mat33, device=device), order)
+
+        self.x, self.v, self.history = taken(x, vec3), taken(v, vec3), taken(history, vecH)
+        # Made on the device: of millions of particles these are gigabytes, of one value.
+        self.C, self.tau, self.F_e = filled(mat33()), filled(mat33()), filled(mat33(np.eye(3)))
         self.order = wp.array(order, dtype=wp.int32, device=device)
 
     def __len__(self) -> int:

@@ -377,23 +377,20 @@ class Pipeline(Plan):
         steps = self.scene.steps
         frames = np.unique(np.linspace(0, steps, min(asked.frames, steps) + 1).round().astype(int))[1:]
         with run.record(device=self.device, precision=c.precision) as record:
-            fine = []
-            for index, truth in enumerate(truths):
-                rollout = Rollout.open(deployment.path / rollout_file(index))
-                with Trajectory.open(truth) as trajectory:
-                    fine.append(
-                        superresolve(
-                            manifold,
-                            self.deployed,
-                            trajectory,
-                            rollout,
-                            asked.factor,
-                            frames.tolist(),
-                            asked.substeps,
-                            c.precision,
-                            self.device,
-                        )
-                    )
+            rollouts = [Rollout.open(deployment.path / rollout_file(index)) for index in range(len(truths))]
+            with contextlib.ExitStack() as files:
+                fine = superresolve(
+                    manifold,
+                    self.deployed,
+                    [files.enter_context(Trajectory.open(truth)) for truth in truths],
+                    rollouts,
+                    asked.factor,
+                    frames.tolist(),
+                    asked.substeps,
+                    c.precision,
+                    self.device,
+                    self.say,
+                )
             table = results.write_superresolution(record, self.deployed, fine)
         self.say(
             f"superresolve: {table['points'][0]:,} points, mean δ {100 * table['delta'].mean():.3g} % "

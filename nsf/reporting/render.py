@@ -74,13 +74,14 @@ def fine_shapes(
     view = View.around(np.concatenate([f.x_full for f in fine]), width=520, floor=floor)
     count, more = len(fine[0].particles), len(fine[0].X)
     titles = (f"reduced, {count:,} particles", f"reduced, {more:,} points", f"full-order, {more:,} particles")
+    few, many = (_radius(fine[0].X[rows]) for rows in (fine[0].particles, ...))
     with styled():
         sheet = _Sheet(view, rows=len(fine), columns=3, titles=titles)
         for row, f in enumerate(fine):
             sheet.name_row(row, parameter_text(f.row["parameter"], name, unit))
-            shown = ((f.x_reduced, f.particles), (f.x_reduced, ...), (f.x_full, ...))
-            for column, (x, rows) in enumerate(shown):
-                X, x, radius = f.X[rows], x[rows], _radius(f.X[rows])
+            shown = ((f.x_reduced, f.particles, few), (f.x_reduced, ..., many), (f.x_full, ..., many))
+            for column, (x, rows, radius) in enumerate(shown):
+                X, x = f.X[rows], x[rows]
                 front = view.front(x, radius)
                 colors = moved.colors(np.linalg.norm(x[front] - X[front], axis=1))
                 sheet.show(row, column, view.picture(x[front], colors, radius))

@@ -35,7 +35,7 @@ _NOTE = (
     "they share, which is what no field can know (few beside many); and of the fine run's own positions at "
     "the training particles, interpolated to the points left out (interpolation). Smeared is the share of "
     "these that interpolation puts more than half a grid cell away in the last frame. The query is of all "
-    "these frames together."
+    "these frames together; values are queried together too, and share its time equally."
 )
 _MEANS = ("points", "delta", "particles_delta", "full_order_difference", "interpolation_error", "seconds")
 _TOLD = ("scene", "method", "field", "r", "sample")  # of a variant, in results.csv

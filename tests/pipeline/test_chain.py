@@ -452,8 +452,10 @@ def test_super_resolution_of_a_deployment(copied, pipeline_at):
     pipeline, said = said_by(pipeline_at, root, *options, stages=["superresolve"])
     run = pipeline.superresolution
     assert run.manifest["parents"] == [pipeline.deployment.id, pipeline.truth(26.0).id]
-    assert "1,000 points" in said[0]
-    assert "at the 500 particles" in said[0]
+    run_line, line = said
+    assert run_line.startswith("superresolve: friction_angle=26: 1,000 full-order particles in ")
+    assert "1,000 points" in line
+    assert "at the 500 particles" in line
     table = pd.read_csv(run.path / "superresolution.csv")
     assert list(table)[:5] == ["parameter", "factor", "points", "delta", "displacement_error"]
     assert table[["parameter", "factor", "points"]].to_numpy().tolist() == [[26.0, 2, 1000]]

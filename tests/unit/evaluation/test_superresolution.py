@@ -16,7 +16,8 @@ FRAMES = [12, 24]
 
 @pytest.fixture(scope="module")
 def fine(chain, tiny_manifold, truth, made):
-    return superresolve(tiny_manifold, chain.scene, truth, made, 3, FRAMES, device="cpu")
+    (found,) = superresolve(tiny_manifold, chain.scene, [truth], [made], 3, FRAMES, device="cpu")
+    return found
 
 
 def test_a_refined_scene_begins_with_the_same_particles():
@@ -72,11 +73,30 @@ def test_row_against_a_fine_run_of_its_own(fine, chain, tiny_manifold, made, tru
     np.testing.assert_allclose(fine.x_reduced, x[-1], atol=1e-12)
 
 
+def test_runs_together_are_those_alone(fine, chain, tiny_manifold, truth, made):
+    other = replace(made, parameter=34.0, xhat=0.9 * made.xhat)
+    together, said = [other, made], []
+    both = superresolve(
+        tiny_manifold, chain.scene, [truth, truth], together, 3, FRAMES, device="cpu", say=said.append
+    )
+    (alone,) = superresolve(tiny_manifold, chain.scene, [truth], [other], 3, FRAMES, device="cpu")
+    for found, expected in zip(both, (alone, fine), strict=True):
+        measured = {name for name in found.row if not name.endswith("seconds")}
+        for name in measured:
+            assert found.row[name] == pytest.approx(expected.row[name], rel=1e-9, abs=1e-13)
+        np.testing.assert_allclose(found.x_full, expected.x_full)
+        np.testing.assert_allclose(found.x_reduced, expected.x_reduced, atol=1e-12)
+    assert not np.allclose(alone.x_full, fine.x_full)
+    assert [line.split(" in ")[0] for line in said] == [
+        f"superresolve: friction_angle={value}: 1,500 full-order particles" for value in (34, 26)
+    ]
+
+
 def test_a_tear_is_smeared(chain):
     """Two halves apart by 1 m: points left out at the tear land in between, others where they belong."""
     X = torch.tensor(chain.scene.refined(4).particles().X)
     moved = X + (X[:, :1] > 0.5) * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
-    found = superresolution.interpolated(X[500:], X[:500], moved[None, :500], "cpu")[0]
+    found = superresolution.interpolated(X[500:], X[:500], moved[None, :500])[0]
     apart = (found - moved[500:]).norm(dim=1)
     near = (X[500:, 0] - 0.5).abs() < 0.01
     assert apart[near].max() > 0.3
@@ -85,7 +105,7 @@ def test_a_tear_is_smeared(chain):
 
 def test_a_diverged_run_has_no_finite_error(chain, tiny_manifold, truth, made):
     lost = rollout_of(made.t, np.where(np.arange(25)[:, None] < 20, made.xhat, np.nan), diverged=20)
-    found = superresolve(tiny_manifold, chain.scene, truth, lost, 2, FRAMES, device="cpu")
+    (found,) = superresolve(tiny_manifold, chain.scene, [truth], [lost], 2, FRAMES, device="cpu")
     assert found.row["delta"] == found.row["particles_displacement_error"] == np.inf
     assert np.isfinite(found.x_reduced).all()  # its last good state, for pictures
     assert np.isfinite(found.row["interpolation_error"])
@@ -95,4 +115,4 @@ def test_a_run_that_was_handed_over_is_refused(chain, tiny_manifold, truth, made
     """Its fields end at the hand-over; the frames after it are not theirs."""
     handed = replace(made, handed_over=8)
     with pytest.raises(ConfigError, match=r"handed over .* deploy with deploy\.on_distrust=report"):
-        superresolve(tiny_manifold, chain.scene, truth, handed, 2, FRAMES, device="cpu")
+        superresolve(tiny_manifold, chain.scene, [truth, truth], [made, handed], 2, FRAMES, device="cpu")
