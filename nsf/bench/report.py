@@ -10,6 +10,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from nsf.bench.rows import size_name
+from nsf.reporting.charts import plain_ticks
 from nsf.reporting.columns import number
 from nsf.reporting.cost_charts import rings
 from nsf.reporting.style import INK, figure, line_style, save, stage_colors, styled
@@ -218,6 +219,7 @@ def step_over_sample(results: pd.DataFrame, full_order: pd.DataFrame) -> Figure:
         sizes = sorted(results["sample"].astype(int).unique())
         panel.set_xticks(sizes, [str(size) for size in sizes])
         panel.minorticks_off()
+        plain_ticks(panel.yaxis)
         panel.grid(which="major")
         fig.legend(loc="outside upper left", ncols=2, handlelength=2.6)
     return fig

@@ -58,7 +58,7 @@ def build_report(evaluate_runs, folder, title: str, first=None, study: Study | N
         merged.csv.to_csv(fresh / "results.csv", index=False)
         fine = _fine(merged, study)
         own = [fine_section(fine, fresh)] if fine else []
-        sweep = swept(merged, study.keys, fresh) if study else []
+        sweep = swept(merged, study, fresh) if study else []
         sections = [*own, *sweep, *draw(merged, fresh, sweep=bool(sweep), study=study)]
         more = [fine_table(fine, study.settings, fresh)] if fine else []
         page = _page(title, merged, sections, study, more, fine, bool(sweep))
@@ -82,7 +82,7 @@ def _fine(merged: Merged, study: Study | None) -> list[FineSource]:
 
 
 def _page(title: str, merged: Merged, sections, study: Study | None, more, fine, sweep: bool) -> Page:
-    headline, same = without_constants(means(merged))
+    headline, same = without_constants(means(merged, study))
     per_value, same_there = without_constants(merged.frame)
     alike = merged.frame[["scene"] if sweep else ["scene", "method"]].drop_duplicates()
     chosen = (
@@ -154,7 +154,7 @@ def _training(merged: Merged, rows) -> str:
     """How long the networks of each field took; a range where several were trained."""
     told = []
     for field, part in rows.groupby("field", sort=False):
-        found = {merged.source[i].summary.get("training_seconds") for i in part.index} - {None}
+        found = {merged.source[i].training_seconds for i in part.index} - {None}
         if found:
             shown = dict.fromkeys(_duration(seconds) for seconds in (min(found), max(found)))
             told.append(f"{' to '.join(shown)} ({field} field)")

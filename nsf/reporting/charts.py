@@ -144,7 +144,7 @@ def delta_per_variant(variants: list[dict], dots: str = "one parameter value") -
         logarithmic = len(shown) > 0 and shown.min() > 0 and shown.max() > 30 * shown.min()
         if logarithmic:
             panel.set_xscale("log")
-            _plain_ticks(panel.xaxis)
+            plain_ticks(panel.xaxis)
         average = 100 * _finite([v["mean"] for v in variants])
         for y in np.flatnonzero(np.isnan(average)):
             panel.text(0.01, float(y), "diverged", transform=panel.get_yaxis_transform(), va="center")
@@ -162,14 +162,16 @@ def delta_per_variant(variants: list[dict], dots: str = "one parameter value") -
 
 
 def delta_over(
-    panels: dict[str, dict[str, dict[float, list[float]]]], x: str, papers: dict[str, tuple[float, float]]
+    panels: dict[str, dict[str, dict[float, list[float]]]],
+    x: str,
+    papers: dict[str, list[tuple[float, float]]],
 ) -> Figure:
     """δ [%] over a number: the mean as a line, from the smallest to the largest value as a band.
 
     Args:
         panels: by scene, a panel each: by the name of a line, the values of δ (fractions) at each x.
         x: label of that axis.
-        papers: by scene, the x and δ (a fraction) that the paper prints.
+        papers: by scene, each x and δ (a fraction) that the paper prints.
     """
     names = list(dict.fromkeys(name for lines in panels.values() for name in lines))
     known = {x for lines in panels.values() for line in lines.values() for x in line}
@@ -186,8 +188,7 @@ def delta_over(
                 panel.fill_between(at, low, high, color=style["color"], alpha=0.18, linewidth=0)
                 panel.plot(at, _finite([v.mean() for v in values]), marker="o", ms=4, label=name, **style)
                 every += [*low, *high]
-            if scene in papers:
-                value, delta = papers[scene]
+            for value, delta in papers.get(scene, ()):
                 panel.plot(value, 100 * delta, "X", ms=8, color=PAPER, label="the paper")
                 every.append(100 * delta)
                 known.add(value)
@@ -195,7 +196,7 @@ def delta_over(
             _error_scale(panel, every)
         if max(known) > 10 * min(known):
             drawn[0].set_xscale("log")
-            _plain_ticks(drawn[0].xaxis)
+            plain_ticks(drawn[0].xaxis)
         told = {line.get_label(): line for panel in drawn for line in panel.lines}
         told |= {name: told.pop(name) for name in ("the paper",) if name in told}  # last
         if len(told) > 1:
@@ -232,13 +233,13 @@ def _error_scale(panel, values) -> None:
     if len(values) and np.max(values) > 30 * np.quantile(values, 0.05):
         panel.set_yscale("log")
         panel.set_ylim(np.quantile(values, 0.02) / 1.6, np.max(values) * 1.6)
-        _plain_ticks(panel.yaxis)
+        plain_ticks(panel.yaxis)
     else:
         panel.set_ylim(0, 1.08 * np.max(values, initial=1e-12))
 
 
-def _plain_ticks(axis_line) -> None:
-    """Ticks at 1, 2 and 5 of each decade, written as plain numbers."""
+def plain_ticks(axis_line) -> None:
+    """Give a logarithmic axis ticks at 1, 2 and 5 of each decade, written as plain numbers."""
     axis_line.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axis_line.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
     axis_line.set_minor_formatter(NullFormatter())

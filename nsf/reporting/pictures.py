@@ -13,9 +13,9 @@ from nsf.reporting import charts, cost_charts, render
 from nsf.reporting.colors import DIFFERENCE_COLORS, STRESS_COLORS
 from nsf.reporting.columns import COSTS, MEASURED, parameter_text
 from nsf.reporting.sources import Motion, same_parameter
-from nsf.reporting.study import Study, printed_delta
+from nsf.reporting.study import Study
 from nsf.reporting.style import save
-from nsf.reporting.tables import Merged, mean_rows, paper_row, variant_labels, variants
+from nsf.reporting.tables import Merged, mean_rows, printed_of, variant_labels, variants
 from nsf.workers import results, working
 
 ROWS = 6  # parameter values in one picture of final shapes
@@ -262,10 +262,7 @@ def _comparison(known: list[_Variant], folder: Path, study: Study | None) -> lis
     for v in known:
         row = next(row for row in mean_rows(v.merged, v.members) if row["split"] == v.held_out)
         values = v.rows.loc[v.rows["split"] == v.held_out, "delta"]
-        printed = (paper_row(v.merged, v.members) or {}).get("delta")
-        if study and study.printed is not None:
-            named = {name: str(row[name]) for name in ("scene", "method", "field")}
-            printed = printed_delta(study.printed, {**study.keys.get(v.runs[0], {}), **named})
+        printed = printed_of(v.merged, v.members, study)
         paper = None if pd.isna(printed) else printed
         measured = {name: row[name] for name in MEASURED}
         entries.append(

@@ -77,6 +77,14 @@ class Source:
         """When the run was made (ISO), by its manifest."""
         return str(self.manifest.get("created", ""))
 
+    @property
+    def training_seconds(self) -> float | None:
+        """How long its training took [s]; None of a run whose costs are not asked for.
+
+        Such jobs go side by side, and their trainings tell nothing of what one costs.
+        """
+        return self.summary.get("training_seconds") if self.cost.get("trials") else None
+
     @cached_property
     def series(self) -> pd.DataFrame:
         """Errors and latent coordinates, one row a frame and parameter value."""

@@ -88,6 +88,8 @@ def stage_colors(stages) -> list[str]:
 def save(fig: Figure, folder, stem: str, kinds=("svg", "png"), ramps=()) -> list[str]:
     """Write a figure as `stem.svg` and `stem.png`, without dates, so that equal data gives equal files.
 
+    It is laid out for the png, whose text is a little wider than the svg's.
+
     Args:
         fig, folder, stem: what is written where.
         kinds: which files.
@@ -95,10 +97,10 @@ def save(fig: Figure, folder, stem: str, kinds=("svg", "png"), ramps=()) -> list
     """
     names = [f"{stem}.{kind}" for kind in kinds]
     with styled():
-        for kind, name in zip(kinds, names, strict=True):
+        for kind in sorted(kinds):
             if kind == "png":
-                write_png(fig, folder / name, PIXELS, ramps)
+                write_png(fig, folder / f"{stem}.png", PIXELS, ramps)
             else:
-                fig.savefig(folder / name, dpi=100, metadata={"Date": None})
+                fig.savefig(folder / f"{stem}.{kind}", dpi=100, metadata={"Date": None})
             fig.set_layout_engine("none")  # the first file has laid it out; that takes as long as drawing
     return names

@@ -1,6 +1,6 @@
 """How δ depends on what an experiment varies: a number, or nothing but seeds."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -8,10 +8,11 @@ import pandas as pd
 from nsf.reporting import charts
 from nsf.reporting.columns import axis
 from nsf.reporting.pictures import Picture, Section
+from nsf.reporting.study import Study
 from nsf.reporting.style import save
-from nsf.reporting.tables import Merged, paper_row
+from nsf.reporting.tables import Merged, paper_row, printed_of, variants
 
-_SCENE, _RUN = "scene", "run"
+_SCENE, _RUN, _PAPER = "scene", "run", "the paper's δ"
 SEEDS = ("seed", "sampler.seed")
 AXES = {
     "sampler.size": ("sample particles |S|", "–", "sample"),
@@ -22,33 +23,36 @@ AXES = {
 """Keys that are an axis: its title and unit, and the column of results.csv that tells what became of it."""
 
 
-def swept(merged: Merged, keys: Mapping[str, Mapping[str, str]], folder: Path) -> list[Section]:
+def swept(merged: Merged, study: Study, folder: Path) -> list[Section]:
     """Draw δ over each number that the jobs vary; over the seeds where they vary nothing else.
 
     Args:
         merged: results.
-        keys: by run id, the keys of its job.
+        study: whose jobs they are.
         folder: of the report.
     """
-    frame = _held_out(merged, keys)
+    frame = _held_out(merged, study)
     varied = [key for key in frame.columns if key in (*AXES, *SEEDS) and frame[key].nunique() > 1]
-    pictures = [_over(key, frame, merged, folder) for key in varied if key in AXES]
+    pictures = [_over(key, frame, merged, study, folder) for key in varied if key in AXES]
     if not pictures and varied:
         pictures = [_scatter(frame, merged, folder)]
     return [Section("What is varied", pictures)] if pictures else []
 
 
-def _held_out(merged: Merged, keys: Mapping[str, Mapping[str, str]]) -> pd.DataFrame:
-    """One row a job and held-out value: the job's keys, its run, δ, and the row of `merged`."""
+def _held_out(merged: Merged, study: Study) -> pd.DataFrame:
+    """One row a job and held-out value: the job's keys, its run, δ, the paper's, and the row of `merged`."""
+    printed = {i: printed_of(merged, members, study) for members in variants(merged) for i in members}
     rows = [
-        {_SCENE: row["scene"]} | keys.get(source.id, {}) | {_RUN: source.id, "delta": row["delta"], "row": i}
+        {_SCENE: row["scene"]}
+        | study.keys.get(source.id, {})
+        | {_RUN: source.id, "delta": row["delta"], _PAPER: printed[i], "row": i}
         for i, (row, source) in enumerate(zip(merged.frame.to_dict("records"), merged.source, strict=True))
         if row["split"] != "train"
     ]
     return pd.DataFrame(rows)
 
 
-def _over(key: str, frame: pd.DataFrame, merged: Merged, folder: Path) -> Picture:
+def _over(key: str, frame: pd.DataFrame, merged: Merged, study: Study, folder: Path) -> Picture:
     """δ over one key, a panel a scene, a line for each setting of the other keys."""
     title, unit, column = AXES[key]
     shown = frame[frame[key].notna()]
@@ -60,16 +64,18 @@ def _over(key: str, frame: pd.DataFrame, merged: Merged, folder: Path) -> Pictur
             name: group.groupby("x")["delta"].apply(list).to_dict()
             for name, group in _settings(part, (key, *SEEDS), alone="mean")
         }
-        printed = paper_row(merged, [part["row"].iloc[0]]) or {}
-        paper = tuple(pd.to_numeric(printed.get(name), errors="coerce") for name in (column, "delta"))
-        if not any(map(pd.isna, paper)):
-            papers[scene] = paper
+        if study.printed is not None:
+            papers[scene] = part[["x", _PAPER]].dropna().drop_duplicates().to_numpy().tolist()
+        else:
+            printed = paper_row(merged, [part["row"].iloc[0]]) or {}
+            paper = [pd.to_numeric(printed.get(name), errors="coerce") for name in (column, "delta")]
+            papers[scene] = [] if any(map(pd.isna, paper)) else [paper]
     seeds = any(shown[seed].nunique() > 1 for seed in SEEDS if seed in shown)
     figure = charts.delta_over(panels, axis(title, unit), papers)
     caption = (
         f"Mean δ (line) against {title}, and from the smallest to the largest over the held-out values"
         f"{' and seeds' if seeds else ''} (band). Where a run diverged, the line has a gap."
-        + (" The cross is what the paper prints." if papers else "")
+        + (" The cross is what the paper prints." if any(papers.values()) else "")
     )
     stem = f"delta-over-{key.replace('.', '-').replace('_', '-')}"
     return Picture(save(figure, folder, stem), caption, sorted(set(shown[_RUN])))
@@ -82,7 +88,7 @@ def _scatter(frame: pd.DataFrame, merged: Merged, folder: Path) -> Picture:
         part = frame[frame[seed].notna()] if seed in frame else frame.iloc[:0]
         for name, group in _settings(part, SEEDS, alone=merged.frame["scene"].iloc[0]):
             values = group.groupby(seed)["delta"].apply(lambda deltas: deltas.mean(skipna=False))
-            printed = (paper_row(merged, [group["row"].iloc[0]]) or {}).get("delta")
+            printed = group[_PAPER].iloc[0]
             told = {"mean": values.mean(skipna=False), "values": list(values)}
             paper = None if pd.isna(printed) else printed
             entries.append({"label": f"{name} · {len(values)} × {seed}", "paper": paper} | told)
@@ -104,7 +110,7 @@ def _settings(frame: pd.DataFrame, without: Sequence[str], alone: str) -> list[t
     """
     told: list[str] = []
     groups = 1
-    for key in frame.columns.drop([_RUN, "delta", "row", "x", *without], errors="ignore"):
+    for key in frame.columns.drop([_RUN, "delta", _PAPER, "row", "x", *without], errors="ignore"):
         found = frame.groupby([*told, key], dropna=False).ngroups
         if found > groups:
             told, groups = [*told, key], found

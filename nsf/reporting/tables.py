@@ -26,6 +26,7 @@ from nsf.reporting.columns import (
     split_rank,
 )
 from nsf.reporting.sources import Source, open_sources
+from nsf.reporting.study import Study, printed_delta
 
 VARIANT = ("scene", "method", "field", "r", "sample", SETTING, "precision", "device")
 """The visible key of a variant; `device` counts by its type."""
@@ -101,10 +102,11 @@ def variants(merged: Merged) -> list[list[int]]:
     return list(groups.values())
 
 
-def means(merged: Merged) -> pd.DataFrame:
+def means(merged: Merged, study: Study | None = None) -> pd.DataFrame:
     """Mean over parameter values, a row a variant and split; the paper's figures follow those of its method.
 
-    A value that was not measured or not finite leaves the mean empty: it is never averaged around.
+    A value that was not measured or not finite leaves the mean empty: it is never averaged around. What the
+    paper prints of single jobs of a study takes the place of what it prints of the scene.
     """
     groups: dict[tuple, list[list[int]]] = {}
     for members in variants(merged):
@@ -113,8 +115,7 @@ def means(merged: Merged) -> pd.DataFrame:
     rows = []
     for same in groups.values():
         rows += [row for members in same for row in mean_rows(merged, members)]
-        if printed := paper_row(merged, same[0]):
-            rows.append(printed)
+        rows += paper_rows(merged, same, study)
     columns = [*VARIANT[:-2], "split", VALUES, *_SHOWN, TRAINING, *VARIANT[-2:], PLACE]
     return pd.DataFrame(rows, columns=columns)
 
@@ -122,14 +123,14 @@ def means(merged: Merged) -> pd.DataFrame:
 def mean_rows(merged: Merged, members: list[int]) -> list[dict]:
     """The means of one variant, a dict a split, held-out ones first."""
     part = merged.frame.iloc[members]
-    seconds = [merged.source[i].summary.get(TRAINING) for i in members]
+    seconds = merged.source[members[0]].training_seconds
     rows = []
     for split in sorted(part["split"].unique(), key=split_rank):
         chosen = part[part["split"] == split]
         row = {name: chosen[name].iloc[0] for name in VARIANT} | {"split": split, VALUES: len(chosen)}
         averaged = dict.fromkeys((*_SHOWN, *MEASURED))
         row |= {name: pd.to_numeric(chosen[name]).mean(skipna=False) for name in averaged}
-        rows.append(row | {TRAINING: seconds[0], PLACE: ABSENT})
+        rows.append(row | {TRAINING: seconds, PLACE: ABSENT})
     return rows
 
 
@@ -145,6 +146,36 @@ def paper_row(merged: Merged, members: list[int]) -> dict | None:
         (*_SHOWN, *MEASURED, VALUES, TRAINING), math.nan
     )
     return absent | paper[row["method"]] | known | {PLACE: paper.get("place", ABSENT)}
+
+
+def paper_rows(merged: Merged, same: list[list[int]], study: Study | None) -> list[dict]:
+    """What the paper prints of variants of one scene and method: a row for each number of samples and δ."""
+    if study is None or study.printed is None:
+        return [row] if (row := paper_row(merged, same[0])) else []
+    found: dict[tuple, set] = {}
+    for members in same:
+        row, delta = merged.frame.iloc[members[0]], printed_of(merged, members, study)
+        if not math.isnan(delta):
+            found.setdefault((row["scene"], row["method"], row["sample"], delta), set()).add(row[SETTING])
+    absent = dict.fromkeys((*VARIANT, PLACE), ABSENT) | dict.fromkeys(
+        (*_SHOWN, *MEASURED, VALUES, TRAINING), math.nan
+    )
+    return [
+        absent
+        | {"scene": scene, "method": method, "field": PAPER, "split": "test", "sample": sample}
+        | {"delta": delta, SETTING: min(settings) if len(settings) == 1 else ABSENT}
+        for (scene, method, sample, delta), settings in found.items()
+    ]
+
+
+def printed_of(merged: Merged, members: list[int], study: Study | None) -> float:
+    """δ that the paper prints of a variant, a fraction; NaN if none."""
+    if study is None or study.printed is None:
+        return float((paper_row(merged, members) or {}).get("delta", math.nan))
+    row, job = merged.frame.iloc[members[0]], study.keys.get(merged.source[members[0]].id, {})
+    return printed_delta(
+        study.printed, {**job, **{name: str(row[name]) for name in ("scene", "method", "field")}}
+    )
 
 
 def variant_labels(rows: list[dict]) -> list[str]:
@@ -183,7 +214,8 @@ def without_constants(
         said[SETTING].add("")  # as the scene has it, which is another setting than one that is named
     constant = [name for name in describing if name not in keep and len(said[name]) == 1]
     empty = [name for name in (SETTING, PLACE) if name in frame and set(frame[name]) <= {"", ABSENT}]
-    empty += [name for name in COSTS if name in frame and frame[name].isna().all()]  # evaluation.trials=0
+    costs = (*COSTS, TRAINING)  # none with evaluation.trials=0
+    empty += [name for name in costs if name in frame and frame[name].isna().all()]
     first = {name: next(v for v in frame[name] if str(v) in said[name]) for name in constant}
     told = (f"{COLUMN[n].title} {_cell(n, first[n])} {COLUMN[n].unit}".strip() for n in constant)
     return frame.drop(columns=[*constant, *empty]), ", ".join(told)

@@ -35,6 +35,11 @@ def runs(root, **made):
     return found, keys, settings
 
 
+def of(keys, printed=None):
+    """The study of these jobs."""
+    return Study("?", "", {}, keys, (), printed)
+
+
 @pytest.fixture
 def drawn(monkeypatch):
     """The arguments of each chart drawn."""
@@ -52,10 +57,10 @@ def drawn(monkeypatch):
 def test_delta_over_what_varies_with_every_value_and_seed(tmp_path, drawn):
     found, keys, settings = runs(tmp_path, sizes={20: 0.02, 50: 0.008, 150: 0.004}, seeds=("0", "1", "2"))
     merged = merge(open_sources(found), settings)
-    (section,) = sweeps.swept(merged, keys, tmp_path)
+    (section,) = sweeps.swept(merged, of(keys), tmp_path)
     ((name, (panels, x, papers)),) = drawn
     assert (name, x) == ("delta_over", "sample particles |S| [–]")
-    assert (list(panels), list(panels["sand"]), papers["sand"][0]) == (["sand"], ["mean"], 150)
+    assert (list(panels), list(panels["sand"]), papers["sand"][0][0]) == (["sand"], ["mean"], 150)
     line = panels["sand"]["mean"]
     assert {at: len(values) for at, values in line.items()} == {20: 6, 50: 6, 150: 6}
     assert sorted(line[20]) == sorted(merged.frame.loc[merged.frame["sample"] == "20", "delta"])
@@ -65,10 +70,26 @@ def test_delta_over_what_varies_with_every_value_and_seed(tmp_path, drawn):
     assert set(picture.runs) == {run.id for run in found}
 
 
+def test_what_the_paper_prints_of_single_jobs_stands_beside_them(tmp_path, drawn):
+    found, keys, settings = runs(tmp_path, sizes={20: 0.02, 50: 0.008, 150: 0.004}, seeds=("0", "1"))
+    merged = merge(open_sources(found), settings)
+    entries = [
+        {"scene": "sand", "sampler.size": size, "delta": at} for size, at in (("20", 0.03), ("50", 0.01))
+    ]
+    study = of(keys, entries)
+    sweeps.swept(merged, study, tmp_path)
+    ((_, (_, _, papers)),) = drawn
+    assert sorted(papers["sand"]) == [[20.0, 0.03], [50.0, 0.01]]
+    table = means(merged, study)
+    printed = table[table["field"] == "the paper"]
+    assert printed[["sample", "delta"]].to_numpy().tolist() == [["20", 0.03], ["50", 0.01]]
+    assert len(means(merged)) == len(table) - 1  # the scene's figure alone
+
+
 def test_seeds_alone_are_dots(tmp_path, drawn):
     found, keys, settings = runs(tmp_path, seeds=("0", "1", "2"))
     merged = merge(open_sources(found), settings)
-    (section,) = sweeps.swept(merged, keys, tmp_path)
+    (section,) = sweeps.swept(merged, of(keys), tmp_path)
     ((name, (entries,)),) = drawn
     assert name == "delta_per_variant"
     (entry,) = entries
@@ -79,7 +100,7 @@ def test_seeds_alone_are_dots(tmp_path, drawn):
 
 def test_nothing_varied_draws_nothing(tmp_path):
     found, keys, _ = runs(tmp_path)
-    assert sweeps.swept(merge(open_sources(found)), keys, tmp_path) == []
+    assert sweeps.swept(merge(open_sources(found)), of(keys), tmp_path) == []
 
 
 def test_lines_are_named_by_what_tells_them_apart():
