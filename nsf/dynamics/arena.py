@@ -9,6 +9,8 @@ import warp as wp
 from nsf.dynamics.interop import torch_device, torch_dtype
 from nsf.mpm import Precision
 
+_ENTRIES = 2**23  # values of modes taken at once
+
 
 class Arena:
     """Holds what packed launches point to, and counts it.
@@ -54,26 +56,52 @@ class Arena:
         """Zeros."""
         return self.hold(torch.zeros(shape, device=self._torch), dtype)
 
-    def modes(self, modes: torch.Tensor, dtype: torch.dtype = torch.float32) -> torch.Tensor:
-        """Modes [n, c, K] in vectors of four, in the order that the device reads best, flat.
+    def modes(
+        self,
+        table: torch.Tensor,
+        rows: torch.Tensor | None = None,
+        dtype: torch.dtype = torch.float32,
+        lengths: torch.Tensor | float = 1.0,
+    ) -> torch.Tensor:
+        """Modes of particles in vectors of four, in the order that the device reads best, flat.
 
         A GPU has the vectors of neighbouring particles side by side, [c, K/4, n, 4]; a CPU those of one
-        particle, [n, c, K/4, 4].
-        """
-        modes = torch.nn.functional.pad(modes, (0, -modes.shape[2] % 4)).unflatten(2, (-1, 4))
-        if self.device.is_cuda:
-            modes = modes.permute(1, 2, 0, 3)
-        return self.hold(modes, dtype).flatten()
+        particle, [n, c, K/4, 4]. They are taken bit by bit, so that nothing else of their size is held.
 
-    def halved(self, modes: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        Args:
+            table: [P, c, K].
+            rows: [n] of the particles; all by default.
+            dtype: of what is held.
+            lengths: [K], of which the modes are multiples then.
+        """
+        n, (c, K) = len(table) if rows is None else len(rows), table.shape[1:]
+        four = -(-K // 4)
+        shape = (c, four, n, 4) if self.device.is_cuda else (n, c, four, 4)
+        held = self.hold(torch.zeros(shape, dtype=dtype, device=self._torch), dtype)
+        by_particle = held.permute(2, 0, 1, 3) if self.device.is_cuda else held
+        for part in self._parts(table, rows):
+            values = _rows(table, rows, part).to(self._torch) / lengths
+            by_particle[part] = torch.nn.functional.pad(values, (0, -K % 4)).unflatten(2, (four, 4)).to(dtype)
+        return held.flatten()
+
+    def halved(
+        self, table: torch.Tensor, rows: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
         """As `modes`, on a GPU in half precision, each over the length [K] that is given beside them.
 
         A GPU reads them faster than anything else in a step; no entry exceeds 1, so that none is lost.
         """
         if not self.device.is_cuda:
-            return self.modes(modes), modes.new_ones(modes.shape[2])
-        lengths = modes.abs().amax((0, 1)).clamp_min(torch.finfo(modes.dtype).tiny)
-        return self.modes(modes / lengths, torch.float16), lengths
+            return self.modes(table, rows), table.new_ones(table.shape[2])
+        largest = [_rows(table, rows, part).abs().amax((0, 1)) for part in self._parts(table, rows)]
+        lengths = torch.stack(largest).amax(0).clamp_min(torch.finfo(table.dtype).tiny).to(self._torch)
+        return self.modes(table, rows, torch.float16, lengths), lengths
+
+    @staticmethod
+    def _parts(table: torch.Tensor, rows: torch.Tensor | None) -> list[slice]:
+        """Parts of the rows that are taken at once."""
+        n, size = len(table) if rows is None else len(rows), max(1, _ENTRIES // max(1, table[0].numel()))
+        return [slice(start, min(start + size, n)) for start in range(0, n, size)]
 
     def lanes(self, count: int) -> int:
         """Threads that work on one result: `count` of a GPU, one of a CPU."""
@@ -90,3 +118,7 @@ class Arena:
         return wp.launch(
             kernel, dim=dim, inputs=inputs, device=self.device, block_dim=self.lanes(block), record_cmd=True
         )
+
+
+def _rows(table: torch.Tensor, rows: torch.Tensor | None, part: slice) -> torch.Tensor:
+    return table[part] if rows is None else table[rows[part]]

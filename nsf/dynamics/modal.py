@@ -87,9 +87,9 @@ class ModalPhase(Phase):
         super().__init__(setting, sets, order, grid_step, at_sample)
         self._arena = arena = Arena(setting.precision, warp_device(str(setting.device)))
         deformation = manifold.factors("deformation", order, dtype=setting.dtype, device=setting.device)
-        displacement = arena.modes(deformation.modes)
+        displacement = arena.modes(deformation.table, deformation.rows)
         self.coefficients = state = Coefficients(
-            arena, setting.simulations, deformation.modes.shape[2], manifold.latent_dim
+            arena, setting.simulations, deformation.table.shape[2], manifold.latent_dim
         )
         self._place = _placing(arena, state, deformation.mean, displacement, self)
         self._selection = Selection(arena, state, grid_step.grid, shape, sets, self.x, self.v)
@@ -211,7 +211,7 @@ class Projection:
     def __init__(self, arena, state, deformation, displacement, phase: Phase, weights: np.ndarray | None):
         setting, s, (count, K) = phase.setting, phase.s, state.a.shape
         projector, record, r = setting.projector, setting.record, state.latent.shape[1]
-        of_sample = deformation.modes[:s]
+        of_sample = deformation.table[deformation.rows[:s]]
         w = torch.ones(s) if weights is None else torch.as_tensor(weights / np.mean(weights))
         w = arena.hold(w, torch.float64)
         B = of_sample.double().flatten(0, 1)
@@ -301,11 +301,11 @@ def _fields(
     ):
         if neural:
             factors = manifold.factors(name, order, **options)
-            if factors.modes.shape[2]:
+            if factors.table.shape[2]:
                 heads.append((factors, found))
             else:  # the same in every snapshot
                 found.unflatten(0, (-1, phase.size)).copy_(_as_matrices(factors.mean))
-    stored = [arena.halved(factors.modes) for factors, _ in heads]
+    stored = [arena.halved(factors.table, factors.rows) for factors, _ in heads]
     layers = [_lengthened(f.layers, lengths) for (f, _), (_, lengths) in zip(heads, stored, strict=True)]
     networks, coefficients = _networks(arena, layers, phase.setting.record, parameters)
     launches = [
@@ -316,7 +316,9 @@ def _fields(
         F = arena.zeros(len(phase.x), 3, 3, dtype=arena.real)
         factors = manifold.factors("gradient", order, **options)
         launches += [
-            _contraction(arena, phase, factors, arena.modes(factors.modes), phase.coefficients.a, F),
+            _contraction(
+                arena, phase, factors, arena.modes(factors.table, factors.rows), phase.coefficients.a, F
+            ),
             _elastic(arena, phase, materials, F),
         ]
     return networks, launches
@@ -369,7 +371,7 @@ def _contraction(
     found: torch.Tensor,
 ):
     """The launch of a field with coefficients a [B, K] of the arena's modes, at the needed particles."""
-    n, c, K = factors.modes.shape
+    n, (c, K) = len(factors.rows), factors.table.shape[1:]
     (tiles, tile), lanes = tiling(len(a), a.element_size() * -(-K // 4) * 4), arena.lanes(THREADS)
     coefficients, stored = (wp.dtype_from_torch(values.dtype) for values in (a, modes))
     kernel = make_contraction(arena.precision, -(-K // 4), c == 6, coefficients, tile, tiles > 1, stored)

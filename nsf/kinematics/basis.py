@@ -259,7 +259,9 @@ class ModalFactors:
     """A field at n points, mean + modes · [leading · xhat ; network(xhat, μ)].
 
     Attributes:
-        mean: [n, c] in the unit of the field; modes: [n, c, K] as trained, in fp32.
+        mean: [n, c] in the unit of the field.
+        table: [P, c, K] modes of every particle as trained, in fp32, where the manifold is.
+        rows: [n] of the points among them.
         leading: σ [r] of the coefficients that are latents; [0] for h and l.
         scale: of the others, with which the network's last layer was multiplied.
         network: of the others, in raw units; None if there is none.
@@ -267,7 +269,8 @@ class ModalFactors:
     """
 
     mean: Tensor
-    modes: Tensor
+    table: Tensor
+    rows: Tensor
     leading: Tensor
     scale: float
     network: FullyConnected | None
@@ -371,8 +374,7 @@ class BasisManifold(Manifold):
             name: `deformation`, `stress`, `affine`, or `gradient` for ∂g/∂X, whose coefficients are the
                 deformation's.
             particles: [n] indices.
-            dtype: of the mean and the network.
-            device: of all.
+            dtype, device: of the mean and the network.
         """
         rows, points = self.points(particles, None)
         like = torch.empty(0, dtype=dtype, device=device)
@@ -380,13 +382,14 @@ class BasisManifold(Manifold):
         field = self.fields[phase]
         if name == "gradient":
             base = torch.eye(3, dtype=points.dtype, device=points.device).flatten()
-            mean, modes = (values[rows] for values in self._slopes(device))
+            mean, table = self._slopes(device)
         else:
             base = points if name == "deformation" else 0
-            mean, modes = field.mean[rows], field.modes[rows]
+            mean, table = field.mean, field.modes
         network, scale = self._deployed(phase, like), float(field.scale)
         members = self.hyperparameters.get("members", 1)
-        return ModalFactors((base + mean).to(like), modes.to(device), field.leading, scale, network, members)
+        mean = (base + mean[rows]).to(like)
+        return ModalFactors(mean, table, rows, field.leading, scale, network, members)
 
     def _slopes(self, device: torch.device | str) -> tuple[Tensor, Tensor]:
         """∂/∂X of the deformation's mean [P, 9] and of its modes [P, 9, K], in fp32, at the particles.

@@ -80,6 +80,20 @@ def test_half_precision_is_of_a_gpu_and_takes_lengths_out(arena, rng):
     assert ((found - modes).abs().amax((0, 1)) < 1e-3 * modes.abs().amax((0, 1))).all()
 
 
+def test_modes_are_those_of_the_rows_however_many_are_taken_at_once(arena, rng, monkeypatch):
+    table = values_of(arena, rng, 11, 3, 6).float()
+    rows = torch.tensor([4, 0, 9, 9, 2], device=table.device)
+    whole = [arena.modes(table[rows]), *arena.halved(table[rows])]
+    for entries in (1, 50):  # a particle, and two of them, at once
+        monkeypatch.setattr("nsf.dynamics.arena._ENTRIES", entries)
+        for found, expected in zip(
+            [arena.modes(table, rows), *arena.halved(table, rows)], whole, strict=True
+        ):
+            torch.testing.assert_close(found, expected, rtol=0, atol=0)
+    first = whole[0].view(3, 2, 5, 4)[:, :, 0] if arena.device.is_cuda else whole[0].view(5, 3, 2, 4)[0]
+    torch.testing.assert_close(first.flatten(1)[:, :6], table[4], rtol=0, atol=0)
+
+
 @pytest.mark.parametrize(("n", "K", "simulations"), SIZES)
 def test_position(arena, rng, n, K, simulations):
     modes = values_of(arena, rng, n, 3, K).float()

@@ -165,7 +165,9 @@ def test_the_gpu_takes_the_same_steps(chain, tiny_manifold, method, half, monkey
         pytest.skip("needs a GPU")
     if not half:
         monkeypatch.setattr(
-            Arena, "halved", lambda arena, modes: (arena.modes(modes), modes.new_ones(modes.shape[2]))
+            Arena,
+            "halved",
+            lambda arena, table, rows: (arena.modes(table, rows), table.new_ones(table.shape[2])),
         )
     found = []
     for device in ("cuda", "cpu"):
