@@ -24,7 +24,7 @@ MULTIPLIERS = (1.0, 1.5, 2.0, 3.0)
 ARITHMETIC = {"cuda": (None, *TENSOR_CORES), "cpu": (None,)}
 _MOST = 3  # trials of networks, whose runs take seconds
 #: As in the experiment table1.
-MLP_TRAINING = ("trainer.steps=null", "trainer.budget_minutes=1")
+MLP_TRAINING = ("trainer.steps=null", "trainer.budget_minutes=0.5")
 _CHUNK = 2**26  # positions decoded at once
 
 

@@ -119,6 +119,10 @@ def sweep(
                 if not errors:
                     raise
                 found = [str(error)] * len(scene)
+            except KeyboardInterrupt:
+                if later := len(jobs) - len(errors) - len(scene):
+                    say(f"{later} jobs of later scenes were not started; the same command goes on with them")
+                raise
             if dropped and not any(found):
                 _drop_training([Plan(configuration.load(job, config_name)) for job in scene], say)
             errors += found

@@ -24,7 +24,7 @@ ANIMATIONS_BYTES = 6 * 2**20  # of all on a page
 # Of one on a page of many: to fit, it would give up half its frames and size, so these are never drawn.
 CROWDED_BYTES, CROWDED_ANIMATED, CROWDED_FRAMES = 2**19, 1, 16
 MANY = 16  # scenes and methods beyond which each has only what shows that it fails: strip and error
-_FEW = 2  # variants that a process is not worth starting for
+_FEW = 3  # variants that processes are not worth starting for
 
 
 @dataclass(frozen=True)
@@ -147,8 +147,8 @@ def _of_variants(shown: list[_Variant], folder: Path, animated: bool) -> list[li
         partial(_of_variant, v, folder, prefix, gif_bytes, brief=len(shown) > MANY)
         for v, prefix in zip(shown, _prefixes(shown), strict=True)
     ]
-    processes = min(os.cpu_count() or 1, len(shown) // _FEW)
-    if processes < 2:
+    processes = min(os.cpu_count() or 1, len(shown))
+    if processes < 2 or len(shown) <= _FEW:
         return [call() for call in calls]
     turns = [calls[first::processes] for first in range(processes)]
     with working([partial(_each, turn) for turn in turns], [{}] * processes) as workers:

@@ -31,6 +31,7 @@ def test_the_ablation_is_every_method_on_every_scene():
     assert {job["scale"] for job in jobs} == {"paper"}
 
 
+@pytest.mark.slow
 def test_the_experiments_of_table1s_scenes_share_its_runs():
     """Hours of work are done once: an evaluate run has one identity in all of them."""
     table1 = {Plan(config.load(job.overrides)).evaluation.id for job in _small("table1")}
@@ -44,6 +45,7 @@ def test_every_job_builds(overrides):
     Pipeline(config.load([*overrides, "device=cpu"]))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_jobs_are_told_apart(name):
     """By a column of results.csv or by their setting."""

@@ -71,7 +71,7 @@ def says_its_gpu(config, stages, folder, beside):
     ("overrides", "launcher", "seen"),
     [
         (["device=auto"], JOBLIB, {"4", "7"}),
-        (["device=auto,cpu"], JOBLIB, {"all"}),
+        pytest.param(["device=auto,cpu"], JOBLIB, {"all"}, marks=pytest.mark.slow),
         (["field=mlp", "trainer.devices=2"], JOBLIB, {"all"}),
         (["device=auto"], [], {"all"}),
     ],

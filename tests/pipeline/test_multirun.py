@@ -99,6 +99,7 @@ def test_an_experiment_runs_its_jobs_and_reports_them(nsf, copied, tmp_path):
     assert "2 jobs, 0 missing" in again.out
 
 
+@pytest.mark.slow
 def test_an_experiment_may_ask_for_more_points(nsf, copied, tmp_path):
     """experiments/super_resolution.yaml, made tiny and of one field."""
     root = copied("simulate", "train")
@@ -139,6 +140,7 @@ def test_an_experiment_without_results_says_how_to_get_them(nsf, copied):
     assert "run `nsf run +experiment=sand`" in outcome.err
 
 
+@pytest.mark.slow
 def test_training_trajectories_go_once_their_jobs_are_done(nsf, copied):
     root = copied("simulate")
     arguments = ["latent_dim=3,4", "data.keep=held_out", "evaluation.trials=0"]

@@ -248,6 +248,8 @@ def test_a_damaged_run_is_not_complete(run, damage):
         case "outputs":
             manifest.write_text(json.dumps(run.manifest | {"outputs": [1]}))
     assert not run.complete
+    if damage in ("shrink", "remove"):
+        assert run.status == "dropped"
     with pytest.raises(MissingRunError, match=run.hash):
         run.require()
     assert Run.find("simulate", root=run.root) == [run]

@@ -125,7 +125,7 @@ def vortex_error(solver_of):
     return run
 
 
-@pytest.mark.parametrize("shape", ["quadratic", "cubic"])
+@pytest.mark.parametrize("shape", ["quadratic", pytest.param("cubic", marks=pytest.mark.slow)])
 def test_order_of_convergence(shape, vortex_error):
     """At least 1.5 with Δt ∝ Δx and 4 particles a cell, before the plateau (from 1/64 on)."""
     cells = np.array([8, 16, 32])

@@ -421,6 +421,7 @@ def several(tiny, tmp_path_factory):
     return pd.DataFrame(found.rows, columns=columns(Row))
 
 
+@pytest.mark.slow
 def test_several_devices_have_rows_beside_one(several, tmp_path):
     cases = [f"train_mlp_{phase}" for phase in ("deformation", "stress", "affine")]
     assert several["case"].tolist() == [

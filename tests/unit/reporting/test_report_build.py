@@ -74,6 +74,7 @@ def test_training_time_and_scale_are_told_by_field(tmp_path, no_pictures):
     assert "these runs are of small scale" in page
 
 
+@pytest.mark.slow
 def test_pictures_of_many_variants_are_the_same_from_several_processes(sweep, report, tmp_path, monkeypatch):
     monkeypatch.setattr(pictures, "_FEW", 1)
     monkeypatch.setattr(pictures.os, "cpu_count", lambda: 2)
