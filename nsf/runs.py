@@ -185,13 +185,13 @@ class Run:
     def status(self) -> str:
         """The manifest's status.
 
-        Instead "killed" where it says "running" and no process holds the run's lock, and "dropped" where it
-        says "complete" and files of the run are gone, as those that data.keep=held_out leaves out.
+        Instead "killed" where it says "running" and no process holds the run's lock, and "incomplete" where
+        it says "complete" and files of the run are gone or cut short: data.keep=held_out deletes some.
         """
         manifest = self.manifest
         status = manifest.get("status", "missing")
         if status == "complete" and self._lost(manifest):
-            return "dropped"
+            return "incomplete"
         if status != "running":
             return status
         with suppress(StorageError):  # of someone else's folder
@@ -231,7 +231,9 @@ class Run:
         manifest = self.manifest
         status = self.status if manifest else "not there"
         lost = ", ".join(self._lost(manifest))
-        state = f"not whole ({lost} missing or cut short)" if status == "dropped" else status
+        state = f"not whole ({lost} missing or cut short)" if status == "incomplete" else status
+        if status == "complete":
+            state = "not whole (its manifest is of another run)"
         why = f" ({manifest['error']})" if manifest.get("error") else ""
         raise MissingRunError(
             f"{self.path} is {state}{why}; run `nsf {self.stage} scene={self.scene}` with the same keys"

@@ -1,6 +1,7 @@
 """Times of calls: turn by turn, after a warm-up, around a synchronised device."""
 
 import gc
+import itertools
 import time
 from collections.abc import Callable, Mapping
 
@@ -46,15 +47,10 @@ def peak_mib(call: Callable[[], object], device: str, nbytes: int | Callable[[],
 
 
 def step_times(solvers: Mapping[str, object], trials: int, device: str) -> dict[str, np.ndarray]:
-    """[trials] mean time of a step [ms] of each solver, turn by turn, so that what slows one slows all.
-
-    A solver that has an end (`steps_taken`, `total_steps`) begins anew before it would pass it.
-    """
+    """[trials] mean time of a step [ms] of each solver, turn by turn, so that what slows one slows all."""
     wait = synchronizer(device)
 
     def trial(solver, steps: int) -> float:
-        if steps > _left(solver):
-            solver.restart()
         wait()
         begun = time.perf_counter()
         solver.step(steps)
@@ -64,8 +60,7 @@ def step_times(solvers: Mapping[str, object], trials: int, device: str) -> dict[
     steps = {}
     for name, solver in solvers.items():
         once = min(trial(solver, 1) for _ in range(2))
-        most = min(_MOST_STEPS, getattr(solver, "total_steps", _MOST_STEPS))
-        steps[name] = int(np.clip(np.ceil(1e3 * _TRIAL_SECONDS / once), 1, most))
+        steps[name] = int(np.clip(np.ceil(1e3 * _TRIAL_SECONDS / once), 1, _MOST_STEPS))
     found = {name: [] for name in solvers}
     for _ in range(trials):
         for name, solver in solvers.items():
@@ -73,9 +68,29 @@ def step_times(solvers: Mapping[str, object], trials: int, device: str) -> dict[
     return {name: np.array(times) for name, times in found.items()}
 
 
-def _left(solver) -> float:
-    """Steps to the end of a solver that has one."""
-    return solver.total_steps - solver.steps_taken if hasattr(solver, "total_steps") else np.inf
+def window_times(
+    solvers: Mapping[str, object], total: int, trials: int, device: str
+) -> dict[str, np.ndarray]:
+    """[trials] mean time of a step [ms] in windows spread over a run, the same of every solver, in turns.
+
+    Args:
+        solvers: by name; each has taken its warm-up steps (`build`) and no others.
+        total: steps of the run, more than the warm-up's.
+        trials: windows; fewer where there are not so many steps.
+        device: of all.
+    """
+    wait, found = synchronizer(device), {name: [] for name in solvers}
+    edges = np.unique(np.linspace(_WARM_UP, total, trials + 1).round().astype(int)).tolist()
+    for start, end in itertools.pairwise(edges):
+        steps = min(end - start, _MOST_STEPS)
+        for name, solver in solvers.items():
+            solver.step(start - solver.steps_taken)
+            wait()
+            begun = time.perf_counter()
+            solver.step(steps)
+            wait()
+            found[name].append(1e3 * (time.perf_counter() - begun) / steps)
+    return {name: np.array(times) for name, times in found.items()}
 
 
 def run_times(solvers: Mapping[str, object], trials: int, device: str) -> dict[str, np.ndarray]:

@@ -114,7 +114,8 @@ def write_report(folder: Path) -> Path:
                 save(passes_beside_floor(passes), folder, f"kernels-{stem}")
             parts += [f"![{_SIZES}](step-{stem}.png)", _SIZES, _markdown(of_size[~by_sample])]
         if len(of_sample):
-            full_order = of_size[~by_sample & of_size["particles"].isin(of_sample["particles"])]
+            same = (of_size["bench"] == "scaling") & of_size["particles"].isin(of_sample["particles"])
+            full_order = of_size[same & ~by_sample]
             with styled():
                 save(step_over_sample(of_sample, full_order), folder, f"sample-{stem}")
             parts += [f"![{_SAMPLES}](sample-{stem}.png)", _SAMPLES, _markdown(of_sample)]

@@ -8,7 +8,7 @@ import torch
 
 from nsf import config
 from nsf.bench.full_order import kernel_rows
-from nsf.bench.measure import bandwidth, build, name_of, step_times
+from nsf.bench.measure import bandwidth, build, name_of, window_times
 from nsf.bench.reduced import scale_of
 from nsf.bench.rows import Result, Row, Settings, commit, size_name
 from nsf.data import hash_of_positions
@@ -34,8 +34,8 @@ def run(settings: Settings, say: Callable[[str], object]) -> Result:
     """The sand column: from 10 000 to 4 million particles on a GPU, to 20 000 on a CPU.
 
     The fields are trained once, at the paper's size on a GPU and at small scale on a CPU, and evaluated
-    between their particles at all other numbers, as in the paper's super-resolution. Data and training are
-    made, or reused, as by `nsf train`.
+    between their particles at all other numbers, where the dynamics run on them with another Δx and Δt: how
+    far that goes, δ tells. Data and training are made, or reused, as by `nsf train`.
     """
     kind, found = "cuda" if settings.device.startswith("cuda") else "cpu", Result()
     overrides = ["scene=sand", f"scale={scale_of(settings.device)}", f"device={settings.device}"]
@@ -57,10 +57,13 @@ def measured(
         found: gets the rows.
         say: told of every result.
     """
-    chain.simulate(("train",))
+    if not chain.training.complete:
+        chain.simulate(("train",))
     chain.train()
     manifold, speed = chain.manifold(), bandwidth(settings.device)
     for particles in sizes:
+        if particles == len(manifold.X):
+            continue  # measured below
         scene = at_size(chain.scene, particles)
         fields = carried_over(manifold, scene, settings.device)
         full_order = _compared(chain, scene, fields, (_SAMPLE,), settings, found, say)
@@ -88,7 +91,8 @@ def at_size(scene: Scene, particles: int) -> Scene:
 def carried_over(manifold: BasisManifold, scene: Scene, device: str) -> BasisManifold:
     """The same fields and latent space on another number of particles of the same body, on the device.
 
-    Its encoder is of no use: modes that are orthonormal over some particles are not over others.
+    Its encoder is of no use: modes that are orthonormal over some particles are not over others. The manifold
+    given is moved to the device.
     """
     X = torch.as_tensor(scene.particles().X, device=device)
     state = dict(manifold.to(device).state_dict(), X=X)
@@ -134,9 +138,10 @@ def _compared(
         del first  # its arrays are on the device
         for p in settings.precisions:
             built[case, p] = build(partial(make, **how, precision=p), device)
-    times = step_times({key: solver for key, (solver, _) in built.items()}, settings.trials, device)
+    solvers = {key: solver for key, (solver, _) in built.items()}
+    times = window_times(solvers, scene.steps, settings.trials, device)
     steps = np.unique(np.linspace(0, scene.steps, _FRAMES + 1).round().astype(int))[1:]
-    truth = _positions(full_order[-1](), steps)
+    truth = _positions(scene.full_order(precision=max(settings.precisions), device=device), steps)
     for (case, precision), (solver, peak_mib) in built.items():
         p10, median, p90 = np.percentile(times[case, precision], [10, 50, 90]).tolist()
         reduced = isinstance(solver, ReducedMPM)
@@ -164,9 +169,11 @@ def _positions(solver: FullOrderMPM, steps: Sequence[int]) -> list[torch.Tensor]
 
 @torch.no_grad()
 def _error(solver: ReducedMPM, steps: Sequence[int], truth: Sequence[torch.Tensor]) -> float:
-    """δ of a whole run against positions after some of its steps."""
+    """δ of a whole run against positions after some of its steps; ∞ if it diverged."""
     solver.restart()
     solver.step(solver.total_steps)
+    if solver.left_grid() >= 0:
+        return float("inf")
     decoder, errors, norms = solver.decoder(), [], []
     for step, x in zip(steps, truth, strict=True):
         x = x.to(solver.torch_device, solver.dtype)[None]

@@ -211,7 +211,7 @@ class Projection:
     def __init__(self, arena, state, deformation, displacement, phase: Phase, weights: np.ndarray | None):
         setting, s, (count, K) = phase.setting, phase.s, state.a.shape
         projector, record, r = setting.projector, setting.record, state.latent.shape[1]
-        of_sample = deformation.table[deformation.rows[:s]]
+        of_sample = deformation.table[deformation.rows[:s]].to(setting.device)
         w = torch.ones(s) if weights is None else torch.as_tensor(weights / np.mean(weights))
         w = arena.hold(w, torch.float64)
         B = of_sample.double().flatten(0, 1)

@@ -97,7 +97,7 @@ def superresolve(
 
     The fine runs are made here and not stored: at the paper's size their trajectories would fill a disk.
     Neighbours, weights and modes depend on the points alone and are found once for all rollouts. Frames stay
-    on the device, of all rollouts at once: 48 bytes a point, frame and rollout.
+    on the device, of all rollouts at once: about 100 bytes a point, frame and rollout at the most.
 
     Args:
         manifold: of the rollouts.

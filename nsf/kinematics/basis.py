@@ -400,7 +400,8 @@ class BasisManifold(Manifold):
             field, X = self.fields["deformation"], self.X.to(device)
             local = interpolation(X, X)
             mean, modes = (_slope(local, values.to(device)) for values in (field.mean, field.modes))
-            self._kept_slopes = mean.to(self.X.device), modes.float().to(self.X.device)
+            self._kept_slopes = mean, modes.float()
+        self._kept_slopes = tuple(values.to(self.X.device) for values in self._kept_slopes)
         return self._kept_slopes
 
     def _deployed(self, phase: str, like: Tensor) -> FullyConnected | None:

@@ -11,9 +11,10 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from nsf.data import Snapshots, Standardizer
+from nsf.errors import ConfigError
 from nsf.kinematics.encoder import Encoder
 from nsf.kinematics.manifold import Manifold, Restriction, identity
-from nsf.kinematics.networks import FullyConnected, TensorCores
+from nsf.kinematics.networks import ARITHMETIC, FullyConnected, TensorCores
 from nsf.kinematics.phases import PHASES, TARGETS, Fit, joined, per_phase, shaped
 
 HIDDEN_LAYERS = 5
@@ -29,6 +30,8 @@ class MlpField:
         beta: β, the hidden layers' width over d (3, 6, 9 for g, h, l): one for all, [g, h=l] or [g, h, l].
         stress_parameters: h depends on the problem parameters too, for scenes whose μ enters the return map
             (section 4.5, last paragraph).
+        arithmetic: of h and l where they are deployed on a GPU (`MlpManifold.arithmetic`); training does not
+            depend on it.
 
     Source: Zong et al. 2023, section 4.5, appendices "Training Details" and "Network architecture", table 1.
     """
@@ -37,9 +40,13 @@ class MlpField:
 
     beta: int | Sequence[int] = (48, 72, 72)
     stress_parameters: bool = False
+    arithmetic: str | None = "tf32"
 
     def __post_init__(self) -> None:
         per_phase("beta", self.beta)
+        if self.arithmetic not in (None, *ARITHMETIC):
+            known = ", ".join(ARITHMETIC)
+            raise ConfigError(f"field.arithmetic={self.arithmetic} is unknown; choose {known} or null")
 
     def prepare(self, snapshots: Snapshots, latent_dim: int) -> dict[str, Any]:
         """What the snapshots determine before training: mean and deviation of X, x, tau and C."""
@@ -117,7 +124,7 @@ class MlpManifold(Manifold):
     """
 
     field = "mlp"
-    arithmetic: str | None = "tf32"
+    arithmetic: str | None = None
 
     def __init__(self, latent_dim, x_sha256, parameter_names, hyperparameters):
         super().__init__(latent_dim, x_sha256, parameter_names, hyperparameters)

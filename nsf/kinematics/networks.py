@@ -110,7 +110,7 @@ class TensorCores(nn.Module):
     The end layers are in fp32: inputs in raw units may differ in their last digits alone.
 
     Args:
-        network: in raw units.
+        network: in raw units; its layers are taken over.
         arithmetic: a key of `ARITHMETIC`.
     """
 
@@ -134,11 +134,14 @@ class TensorCores(nn.Module):
 @contextlib.contextmanager
 def _tf32() -> Iterator[None]:
     matmul = torch.backends.cuda.matmul
-    before, matmul.allow_tf32 = matmul.allow_tf32, True
+    # From torch 2.9 on the two names must not be mixed.
+    name, on = ("fp32_precision", "tf32") if hasattr(matmul, "fp32_precision") else ("allow_tf32", True)
+    before = getattr(matmul, name)
+    setattr(matmul, name, on)
     try:
         yield
     finally:
-        matmul.allow_tf32 = before
+        setattr(matmul, name, before)
 
 
 class Committee(nn.Module):

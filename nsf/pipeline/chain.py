@@ -30,6 +30,7 @@ from nsf.dynamics.solver import reduced_steps
 from nsf.errors import MissingRunError
 from nsf.evaluation import Comparison, Subject, compare, measure, superresolve
 from nsf.kinematics.manifold import Manifold
+from nsf.kinematics.mlp import MlpField
 from nsf.kinematics.ranks import train_together
 from nsf.kinematics.training import train
 from nsf.mpm.device import visible_gpus
@@ -167,7 +168,10 @@ class Pipeline(Plan):
         Raises:
             MissingRunError: it is not trained.
         """
-        return Manifold.load(self.training.require().path / "manifold.pt")
+        manifold = Manifold.load(self.training.require().path / "manifold.pt")
+        if isinstance(self.field, MlpField):
+            manifold.arithmetic = self.field.arithmetic
+        return manifold
 
     def solver_at(
         self, manifold: Manifold, value: float, device: str | None = None, precision: str | None = None

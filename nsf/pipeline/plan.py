@@ -15,6 +15,7 @@ from nsf.dynamics.interop import torch_device
 from nsf.dynamics.sampling import check_well_posed
 from nsf.errors import ConfigError, DeviceError
 from nsf.kinematics.basis import BasisField
+from nsf.kinematics.mlp import MlpField
 from nsf.kinematics.tracking import check_tracking
 from nsf.mpm import FP32, FP64, Precision, precision_of
 from nsf.mpm.device import visible_gpus, warp_device
@@ -232,6 +233,7 @@ class Plan:
         if self.trainer.devices == 1:
             # The bits, and so the name, of a training from before there was the key.
             content["trainer"].pop("devices", None)
+        content["field"].pop("arithmetic", None)  # of deployment
         return Run.open("train", self.scene.name, content, self.training_data, root=self.root)
 
     @property
@@ -249,6 +251,8 @@ class Plan:
                 "device": self.device,
             }
         )
+        if isinstance(self.field, MlpField):
+            content["arithmetic"] = self.field.arithmetic
         return Run.open("deploy", self.scene.name, content, [self.training], root=self.root)
 
     @property

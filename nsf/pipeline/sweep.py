@@ -121,7 +121,7 @@ def sweep(
                 found = [str(error)] * len(scene)
             except KeyboardInterrupt:
                 if later := len(jobs) - len(errors) - len(scene):
-                    say(f"{later} jobs of later scenes were not started; the same command goes on with them")
+                    say(f"not started: the jobs of later scenes, {later}; the same command goes on with them")
                 raise
             if dropped and not any(found):
                 _drop_training([Plan(configuration.load(job, config_name)) for job in scene], say)

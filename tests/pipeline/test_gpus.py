@@ -114,6 +114,15 @@ def test_one_device_is_the_training_that_it_was(on):
     assert one.training == on(*MLP).training
 
 
+def test_how_networks_are_multiplied_is_of_deployment(on):
+    one, two = (on(*MLP, f"field.arithmetic={name}") for name in ("tf32", "null"))
+    assert one.training == two.training == on(*MLP).training
+    assert one.deployment != two.deployment
+    assert one.deployment == on(*MLP).deployment
+    with pytest.raises(ConfigError, match=r"field\.arithmetic=fp8 is unknown; choose tf32, bf16 or null"):
+        on(*MLP, "field.arithmetic=fp8")
+
+
 @pytest.mark.skipif(os.cpu_count() == 1, reason="two processes want two cores")
 def test_training_on_two_devices(on, tmp_path):
     said = []

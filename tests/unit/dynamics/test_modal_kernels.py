@@ -90,6 +90,8 @@ def test_modes_are_those_of_the_rows_however_many_are_taken_at_once(arena, rng, 
             [arena.modes(table, rows), *arena.halved(table, rows)], whole, strict=True
         ):
             torch.testing.assert_close(found, expected, rtol=0, atol=0)
+        halves = arena.modes(table, rows, torch.float16, table.new_full((6,), 3.0))
+        torch.testing.assert_close(halves, (whole[0] / 3.0).half(), rtol=0, atol=0)
     first = whole[0].view(3, 2, 5, 4)[:, :, 0] if arena.device.is_cuda else whole[0].view(5, 3, 2, 4)[0]
     torch.testing.assert_close(first.flatten(1)[:, :6], table[4], rtol=0, atol=0)
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from nsf.kinematics.basis import BasisField
-from nsf.kinematics.networks import Committee, FullyConnected
+from nsf.kinematics.networks import Committee, FullyConnected, TensorCores
 from nsf.kinematics.schedules import FastTrainer
 from nsf.kinematics.training import train
 
@@ -83,3 +83,21 @@ def test_trained_manifold_survives_its_file(snapshots, tmp_path):
         strict=True,
     ):
         assert torch.equal(one, other)
+
+
+@pytest.mark.parametrize(("arithmetic", "smallest", "largest"), [("tf32", 0.0, 1e-2), ("bf16", 1e-5, 3e-2)])
+def test_tensor_cores_change_few_digits(arithmetic, smallest, largest):
+    """A CPU has no tf32: there the first is fp32."""
+    generator = torch.Generator().manual_seed(0)
+    network = FullyConnected((9, 64, 64, 64, 6), "elu")
+    network.initialise(generator)
+    # Raw units: inputs that differ in their last digits alone.
+    mean, std = torch.full((9,), 500.0), torch.full((9,), 1e-2)
+    exact = network.in_raw_units(mean, std, torch.zeros(6), torch.full((6,), 1e4), torch.float64, "cpu")
+    inputs = mean + std * torch.randn(40, 9, dtype=torch.float64, generator=generator)
+    expected = exact(inputs)
+    before = torch.backends.cuda.matmul.allow_tf32
+    found = TensorCores(copy.deepcopy(exact), arithmetic)(inputs)
+    assert torch.backends.cuda.matmul.allow_tf32 == before
+    assert (found.shape, found.dtype) == (expected.shape, torch.float64)
+    assert smallest < (found - expected).norm() / expected.norm() < largest

@@ -1,6 +1,7 @@
 """Tables: which rows survive a merge, what is averaged, and how a number is written."""
 
 import io
+import json
 from dataclasses import replace
 
 import pandas as pd
@@ -80,6 +81,18 @@ def test_means_are_per_variant_and_split_and_beside_the_paper(tmp_path):
     assert (paper["split"], paper["delta"], paper["sample"]) == ("test", 0.004, 150)
     assert paper["place"] == "Table 1, Sand"
     assert pd.isna(paper["speedup_total"])  # the paper prints none
+
+
+@pytest.mark.parametrize("trials", [0, 10])
+def test_a_training_is_timed_only_with_the_runs(tmp_path, trials):
+    run = write_run(tmp_path, Made(training_seconds=77.0))
+    cost = json.loads((run.path / "cost.json").read_text())
+    (run.path / "cost.json").write_text(json.dumps(cost | {"trials": trials}))
+    seal(run)
+    (source,) = open_sources([run])
+    assert source.training_seconds == (77.0 if trials else None)
+    shown, _ = without_constants(means(merge([source])))
+    assert ("training_seconds" in shown) == bool(trials)
 
 
 def test_the_papers_figure_stands_beside_the_papers_method_only(sweep):
