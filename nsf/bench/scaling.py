@@ -62,15 +62,11 @@ def measured(
     chain.train()
     manifold, speed = chain.manifold(), bandwidth(settings.device)
     for particles in sizes:
-        if particles == len(manifold.X):
-            continue  # measured below
-        scene = at_size(chain.scene, particles)
-        fields = carried_over(manifold, scene, settings.device)
-        full_order = _compared(chain, scene, fields, (_SAMPLE,), settings, found, say)
-        for precision, solver in full_order.items():
-            case = f"full_order_{size_name(particles)}"
-            found.kernels.extend(kernel_rows("scaling", case, precision, solver, speed))
-    _compared(chain, chain.scene, manifold, samples, settings, found, say)
+        if particles != len(manifold.X):  # measured below
+            scene = at_size(chain.scene, particles)
+            fields = partial(carried_over, manifold, scene, settings.device)
+            _compared(chain, scene, fields, (_SAMPLE,), settings, speed, found, say)
+    _compared(chain, chain.scene, lambda: manifold, samples, settings, speed, found, say)
 
 
 def at_size(scene: Scene, particles: int) -> Scene:
@@ -115,47 +111,63 @@ def carried_over(manifold: BasisManifold, scene: Scene, device: str) -> BasisMan
 
 
 def _compared(
-    chain: Pipeline, scene: Scene, fields, samples: Sequence[int], settings: Settings, found: Result, say
-) -> dict[str, FullOrderMPM]:
-    """Add both solvers of a scene in every precision, all turn by turn; gives the full-order ones."""
-    value, name, device = chain.held_out[0], size_name(len(fields.X)), settings.device
-    scene = scene.with_parameters({scene.parameters.name: value})
-    rest = torch.as_tensor(chain.scene.particles().X)[None]
-    xhat = chain.manifold().encode(rest, rest.new_zeros(*rest.shape[:2], 6))[0].numpy()
-    make = partial(
-        scene.reduced, fields, {scene.parameters.name: value}, method=chain.method, device=device,
-        projector=chain.projector, integration=chain.integration, xhat=xhat,
-    )  # fmt: skip
-    full_order = [partial(scene.full_order, precision=p, device=device) for p in settings.precisions]
-    built = {
-        (f"full_order_{name}", p): build(of, device)
-        for p, of in zip(settings.precisions, full_order, strict=True)
-    }
-    for size in samples:
-        case = f"reduced_{name}" if len(samples) == 1 else f"reduced_{name}_s{size}"
-        first = make(sample=size)
-        how = {"sample": first.phases, "sets": first.sets}
-        del first  # its arrays are on the device
-        for p in settings.precisions:
-            built[case, p] = build(partial(make, **how, precision=p), device)
-    solvers = {key: solver for key, (solver, _) in built.items()}
-    times = window_times(solvers, scene.steps, settings.trials, device)
+    chain: Pipeline,
+    scene: Scene,
+    fields: Callable[[], BasisManifold],
+    samples: Sequence[int],
+    settings: Settings,
+    speed: float,
+    found: Result,
+    say: Callable[[str], object],
+) -> None:
+    """Add both solvers of a scene in every precision, all in turns; nothing of them stays on the device."""
+    device, name = settings.device, scene.parameters.name
+    scene = scene.with_parameters({name: chain.held_out[0]})
+    built = _built(chain, scene, fields(), samples, settings)
+    times = window_times(
+        {of: solver for of, (solver, _) in built.items()}, scene.steps, settings.trials, device
+    )
     steps = np.unique(np.linspace(0, scene.steps, _FRAMES + 1).round().astype(int))[1:]
     truth = _positions(scene.full_order(precision=max(settings.precisions), device=device), steps)
     for (case, precision), (solver, peak_mib) in built.items():
-        p10, median, p90 = np.percentile(times[case, precision], [10, 50, 90]).tolist()
         reduced = isinstance(solver, ReducedMPM)
         delta = _error(solver, steps, truth) if reduced else None
+        p10, median, p90 = np.percentile(times[case, precision], [10, 50, 90]).tolist()
         row = Row(
-            bench="scaling", case=case, particles=len(fields.X), batch=1, precision=precision, delta=delta,
+            bench="scaling", case=case, particles=len(truth[0]), batch=1, precision=precision, delta=delta,
             sample=solver.sample_size if reduced else None, device=name_of(device), ms_median=median,
             integration=round(solver.integration_mean) if reduced else None, ms_p10=p10, ms_p90=p90,
             peak_mib=peak_mib, commit=commit(),
         )  # fmt: skip
         found.rows.append(row)
-        error = "" if delta is None else f", δ {100 * delta:.3g} %"
-        say(f"{case} {precision}: {median:.4g} ms a step{error}")
-    return {p: solver for (_, p), (solver, _) in built.items() if isinstance(solver, FullOrderMPM)}
+        say(f"{case} {precision}: {median:.4g} ms a step" + (f", δ {100 * delta:.3g} %" if reduced else ""))
+        if not reduced:
+            found.kernels.extend(kernel_rows("scaling", case, precision, solver, speed))
+
+
+def _built(
+    chain: Pipeline, scene: Scene, fields: BasisManifold, samples: Sequence[int], settings: Settings
+) -> dict[tuple[str, str], tuple[FullOrderMPM | ReducedMPM, float]]:
+    """By case and precision, each solver after its warm-up and the most memory it took [MiB]."""
+    device, size = settings.device, size_name(len(fields.X))
+    found = {
+        (f"full_order_{size}", p): build(partial(scene.full_order, precision=p, device=device), device)
+        for p in settings.precisions
+    }
+    rest = torch.as_tensor(chain.scene.particles().X)[None]
+    xhat = chain.manifold().encode(rest, rest.new_zeros(*rest.shape[:2], 6))[0].numpy()
+    make = partial(
+        scene.reduced, fields, {scene.parameters.name: chain.held_out[0]}, method=chain.method, device=device,
+        projector=chain.projector, integration=chain.integration, xhat=xhat,
+    )  # fmt: skip
+    for number in samples:
+        case = f"reduced_{size}" if len(samples) == 1 else f"reduced_{size}_s{number}"
+        first = make(sample=number)
+        how = {"sample": first.phases, "sets": first.sets}
+        del first  # its arrays are on the device
+        for p in settings.precisions:
+            found[case, p] = build(partial(make, **how, precision=p), device)
+    return found
 
 
 def _positions(solver: FullOrderMPM, steps: Sequence[int]) -> list[torch.Tensor]:

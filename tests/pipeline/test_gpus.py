@@ -124,6 +124,7 @@ def test_how_networks_are_multiplied_is_of_deployment(on):
 
 
 @pytest.mark.skipif(os.cpu_count() == 1, reason="two processes want two cores")
+@pytest.mark.slow
 def test_training_on_two_devices(on, tmp_path):
     said = []
     pipeline = on(*MLP, "trainer.devices=2", "trainer.steps=20", said=said)

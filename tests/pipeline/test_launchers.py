@@ -18,6 +18,7 @@ pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="hydra-joblib-
 JOBLIB = ["hydra/launcher=joblib"]
 
 
+@pytest.mark.slow
 def test_a_failure_crosses_from_another_process(copied, tiny, monkeypatch):
     root = copied("simulate")
     monkeypatch.setenv("NSF_RUNS", str(root))
@@ -72,7 +73,7 @@ def says_its_gpu(config, stages, folder, beside):
     [
         (["device=auto"], JOBLIB, {"4", "7"}),
         pytest.param(["device=auto,cpu"], JOBLIB, {"all"}, marks=pytest.mark.slow),
-        (["field=mlp", "trainer.devices=2"], JOBLIB, {"all"}),
+        pytest.param(["field=mlp", "trainer.devices=2"], JOBLIB, {"all"}, marks=pytest.mark.slow),
         (["device=auto"], [], {"all"}),
     ],
 )

@@ -29,7 +29,7 @@ def test_every_combination_of_the_issues_grammar(nsf, copied, tmp_path):
         assert all(part in outcome.out for part in overrides.split())
 
 
-@pytest.mark.parametrize("values", ["9,3", "3,9"])
+@pytest.mark.parametrize("values", ["9,3", pytest.param("3,9", marks=pytest.mark.slow)])
 def test_a_failing_job_does_not_stop_its_siblings(nsf, copied, values):
     root = copied("simulate")
     outcome = nsf("train", root, f"latent_dim={values}", multirun=True)
@@ -164,6 +164,7 @@ def test_training_trajectories_go_once_their_jobs_are_done(nsf, copied):
     assert kept() == [22.0, 26.0, 30.0, 38.0]
 
 
+@pytest.mark.slow
 def test_trajectories_that_a_job_is_held_to_stay(nsf, copied):
     root = copied("simulate", "train")
     arguments = ["deploy.split=test,train", "data.keep=held_out", "evaluation.trials=0"]

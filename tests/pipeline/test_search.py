@@ -30,6 +30,7 @@ def tried(copied, tiny, tmp_path):
     return call
 
 
+@pytest.mark.slow
 def test_the_front_of_two_objectives(tried):
     words = ("scene.parameters.validation=[25]", "latent_dim=3..5", "field.noise=0.001..0.1:log")
     table, said = tried(*words, "search.objectives=[delta,step_ms]", "search.trials=3")

@@ -1,5 +1,7 @@
 """The squeezed frame springs back the more, the more it hardens (paper section 6.3)."""
 
+import pytest
+
 from nsf import scenes
 
 
@@ -18,6 +20,7 @@ def spring_back(hardening):
     return (heights[-1] - min(heights)) / (heights[0] - min(heights))
 
 
+@pytest.mark.slow
 def test_frame_springs_back_more_the_more_it_hardens():
     none, some, much = (spring_back(xi) for xi in (0.0, 0.1, 0.2))
     assert 0.0 < none < 0.75 * some

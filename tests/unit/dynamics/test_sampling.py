@@ -144,6 +144,7 @@ def test_greedy_tells_more_than_any_of_many_random_samples(tiny_manifold, size):
     assert information(tiny_manifold, chosen) > max(information(tiny_manifold, draw) for draw in draws)
 
 
+@pytest.mark.slow
 def test_greedy_takes_the_best_particle_at_each_turn(tiny_manifold):
     everything = np.arange(500)
     order = GreedySampler(3, modes=12).choose(tiny_manifold, everything, 3)

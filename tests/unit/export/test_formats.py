@@ -149,6 +149,7 @@ def test_onnx_round_trip(graphs):
         np.testing.assert_allclose(one[0, 0], found[0, 0], rtol=1e-4, atol=1e-5 * np.abs(found).max())
 
 
+@pytest.mark.slow
 def test_onnx_passes_on_no_notes_of_the_exporter(graphs, tmp_path):
     """torch warns of an absent torchvision, which no graph here needs."""
     logger, notes = logging.getLogger("torch.onnx"), queue.SimpleQueue()

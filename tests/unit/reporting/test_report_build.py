@@ -200,6 +200,7 @@ def test_animation_is_small_and_has_the_frames(report):
         assert image.convert("RGB").getpixel((2, 2)) == (255, 255, 255)
 
 
+@pytest.mark.slow
 def test_animations_of_a_crowded_page_are_of_one_value_and_fewer_frames(tmp_path, monkeypatch):
     monkeypatch.setattr(pictures, "CROWDED_BYTES", 2 * pictures.ANIMATIONS_BYTES)
     monkeypatch.setattr(pictures, "CROWDED_FRAMES", 3)
@@ -231,6 +232,7 @@ def test_a_sweep_shows_the_best_variant_of_a_scene_and_does_not_animate_it(tmp_p
     assert "## sand · nsf · |S| 50" in page
 
 
+@pytest.mark.slow
 def test_of_very_many_methods_each_has_its_strip_and_its_error(sweep, tmp_path, monkeypatch):
     monkeypatch.setattr(pictures, "MANY", 1)
     folder = build_report(sweep, tmp_path / "report", "t").parent
