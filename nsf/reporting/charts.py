@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from nsf.reporting.columns import axis, parameter_text
 from nsf.reporting.style import INK, PAPER, REDUCED, figure, line_style, styled
@@ -44,6 +44,7 @@ def error_over_time(
             _error_scale(panel, 100 * series[column])
             # The whole time span, where runs diverged early too.
             panel.set_xlim(-0.01 * series["t"].max(), 1.01 * series["t"].max())
+            panel.xaxis.set_major_locator(MaxNLocator(5))  # three panels have no room for more
         _legend_above(fig, panels[0], axis(name, unit))
     return fig
 
@@ -239,8 +240,9 @@ def _error_scale(panel, values) -> None:
 
 
 def plain_ticks(axis_line) -> None:
-    """Give a logarithmic axis ticks at 1, 2 and 5 of each decade, written as plain numbers."""
-    axis_line.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    """Give a logarithmic axis ticks at 1, 2 and 5 of a decade, or at 1 of many decades, as plain numbers."""
+    low, high = axis_line.get_view_interval()
+    axis_line.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 1e4 * low else (1,)))
     axis_line.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
     axis_line.set_minor_formatter(NullFormatter())
 

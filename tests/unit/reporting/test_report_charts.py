@@ -189,3 +189,14 @@ def test_material_point_shows_no_rounding():
     np.testing.assert_allclose(plane.lines[0].get_ydata(), response["dev_norm"], atol=1e-3)
     np.testing.assert_allclose(along.lines[-1].get_ydata(), response["tau_xy"], atol=1e-3)
     np.testing.assert_array_equal(along.lines[-1].get_xdata(), response["amplitude"])
+
+
+@pytest.mark.parametrize("largest", [2.0, 1e3, 1e14])
+def test_an_axis_of_errors_has_ticks_however_many_decades_it_spans(largest):
+    t = np.linspace(0.0, 0.16, 50)
+    frame = pd.DataFrame({"parameter": 6.0, "t": t, "delta": np.geomspace(1e-2, largest, 50)})
+    (panel,) = charts.error_over_time(frame, columns=("delta",)).axes
+    low, high = panel.get_ylim()
+    shown = [tick for tick in panel.get_yticks() if low <= tick <= high]
+    assert 3 <= len(shown) <= 12
+    assert len(panel.get_xticks()) <= 7
