@@ -66,7 +66,7 @@ class Arena:
         """Modes of particles in vectors of four, in the order that the device reads best, flat.
 
         A GPU has the vectors of neighbouring particles side by side, [c, K/4, n, 4]; a CPU those of one
-        particle, [n, c, K/4, 4]. They are taken bit by bit, so that nothing else of their size is held.
+        particle, [n, c, K/4, 4]. They are taken part by part, so that nothing else of their size is held.
 
         Args:
             table: [P, c, K].
