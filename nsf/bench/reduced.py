@@ -22,7 +22,8 @@ SCENES = ("cake", "metal")
 MULTIPLIERS = (1.0, 1.5, 2.0, 3.0)
 #: Of the networks of stress and affine momentum with field=mlp; a CPU has no tensor cores.
 ARITHMETICS = {"cuda": (None, *ARITHMETIC), "cpu": (None,)}
-_MOST = 3  # trials of networks, whose runs take seconds
+#: Trials of networks at most, and steps of one: theirs cost alike from the first to the last.
+_MOST, _FEW = 3, 200
 #: As in the experiment table1.
 MLP_TRAINING = ("trainer.steps=null", "trainer.budget_minutes=0.5")
 _CHUNK = 2**26  # positions decoded at once
@@ -94,7 +95,10 @@ def measured(chain: Pipeline, settings: Settings, found: Result, say: Callable[[
 def measured_networks(
     chain: Pipeline, settings: Settings, found: Result, say: Callable[[str], object]
 ) -> None:
-    """Add the rows of one scene with field=mlp, likewise; in each arithmetic of the networks."""
+    """Add the rows of one scene with field=mlp, likewise, in each arithmetic of the networks.
+
+    A step's time is that of the first ones of a run, δ that of a whole one.
+    """
     chain.simulate(("train",))
     chain.train()
     manifold, value, name = chain.manifold(), chain.held_out[0], chain.scene.name
@@ -113,7 +117,7 @@ def measured_networks(
     for precision in settings.precisions:
         subjects = {
             f"reduced_{name}_mlp" + (f"_{arithmetic}" if arithmetic else ""): Subject(
-                partial(reduced, arithmetic, precision), chain.scene.steps
+                partial(reduced, arithmetic, precision), min(chain.scene.steps, _FEW)
             )
             for arithmetic in ARITHMETICS[kind]
         }
