@@ -24,22 +24,22 @@ class Arena:
         self.precision, self.device = precision, device
         self.real, self._torch = torch_dtype(precision), torch_device(device)
         self._held: list[torch.Tensor] = []
-        self._side = wp.Stream(device) if device.is_cuda else None
+        self._sides = [wp.Stream(device) for _ in range(2)] if device.is_cuda else []
 
     @contextmanager
-    def beside(self) -> Iterator[None]:
-        """What is launched inside may run beside what is launched after it, until `meet`."""
-        if self._side is None:
+    def beside(self, side: int = 0) -> Iterator[None]:
+        """What is launched inside may run beside what is launched after it, until `meet` of that side."""
+        if not self._sides:
             yield
             return
-        self._side.wait_stream(self.device.stream)
-        with wp.ScopedStream(self._side, sync_enter=False, sync_exit=False):
+        self._sides[side].wait_stream(self.device.stream)
+        with wp.ScopedStream(self._sides[side], sync_enter=False, sync_exit=False):
             yield
 
-    def meet(self) -> None:
+    def meet(self, side: int = 0) -> None:
         """Wait, on the device, for what was launched beside."""
-        if self._side is not None:
-            self.device.stream.wait_stream(self._side)
+        if self._sides:
+            self.device.stream.wait_stream(self._sides[side])
 
     @property
     def nbytes(self) -> int:

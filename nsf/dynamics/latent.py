@@ -71,6 +71,14 @@ class LatentRecord:
         self.row.zero_()
 
     @property
+    def predicted(self) -> torch.Tensor:
+        """[r] x̂_{n+1} on the parabola through the last three, or the line through two, or x̂_0; of one run."""
+        change = self.now - self.before
+        older = self.xhat.index_select(0, (self.row - 2).clamp_min(0))[0]
+        bend = change - self.before + older
+        return self.now + change + torch.where(self.row > 1, bend, 0.0)
+
+    @property
     def nbytes(self) -> int:
         """Bytes on the device."""
         return sum(a.nbytes for a in (self.xhat, self.residuals, self.updates))

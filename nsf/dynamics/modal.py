@@ -1,6 +1,7 @@
 """A phase whose fields are modes times coefficients: a step is a few kernels, and torch takes no part."""
 
 from collections.abc import Sequence
+from itertools import chain
 
 import numpy as np
 import torch
@@ -24,8 +25,12 @@ from nsf.dynamics.modal_kernels import (
 from nsf.dynamics.phase import Phase, Setting, Stages
 from nsf.dynamics.projection import GaussNewton, Taylor
 from nsf.dynamics.projection_kernel import (
+    EVALUATE,
+    PREPARE,
+    SOLVE,
     make_projection,
     packed_weights,
+    prepared_size,
     projection_block,
     projection_fits,
 )
@@ -103,7 +108,7 @@ class ModalPhase(Phase):
         return {
             "inference": self.infer,
             "p2g": self.p2g,
-            "grid": lambda: self.grid_step.update(followed=True),
+            "grid": self.update,
             "g2p": self.g2p,
             "inversion": self.invert,
         }
@@ -120,20 +125,32 @@ class ModalPhase(Phase):
 
     def infer(self) -> None:
         """x and v, the particles that S needs, and their τ and C (paper sections 5.1 and 5.4)."""
+        with self._arena.beside(1):  # what nothing needs before the grid is updated
+            self.grid_step.follow()
+            self._projection.prepare.launch()
         with self._arena.beside():
-            self.grid_step.follow()  # depends on the time alone
             for launch in self._networks:
                 launch.launch()
         for launch in (self._place, *self._selection.launches):
             launch.launch()
         self._arena.meet()
-        for launch in self._fields:
+        first, *others = self._fields or [[]]
+        with self._arena.beside():
+            for launch in chain.from_iterable(others):
+                launch.launch()
+        for launch in first:
             launch.launch()
+        self._arena.meet()
+
+    def update(self) -> None:
+        """Momentum → velocity at the nodes."""
+        self._arena.meet(1)
+        self.grid_step.update(followed=True)
 
     def invert(self) -> None:
         """x̂_{n+1} from the displacement of S (paper section 5.3)."""
-        for launch in self._projection.launches:
-            launch.launch()
+        self._projection.gather.launch()
+        self._projection.solve.launch()
 
     @property
     @override
@@ -153,14 +170,12 @@ class Coefficients:
     Attributes:
         latent: [B, r] x̂_n in fp64.
         a, rate: [B, K] coefficients of the displacement and their backward difference [1/s].
-        tangents: [B, K r] ∂a/∂x̂.
         first: [B] whether the next step is the first of the run.
         step: [B] a number that no two steps share.
     """
 
     def __init__(self, arena: Arena, simulations: int, modes: int, latents: int):
-        sizes = (latents, modes, modes, modes * latents)
-        self.latent, self.a, self.rate, self.tangents = (arena.zeros(simulations, n) for n in sizes)
+        self.latent, self.a, self.rate = (arena.zeros(simulations, n) for n in (latents, modes, modes))
         self.first, self.step = (arena.zeros(simulations, dtype=torch.int32) for _ in range(2))
 
     def __len__(self) -> int:
@@ -204,8 +219,9 @@ class Projection:
     """The inversion of the deformation field (paper section 5.3).
 
     Attributes:
-        launches: those of a step.
-        evaluate: gives a, ȧ and ∂a/∂x̂ at the latent vector of the state.
+        evaluate: gives a and ȧ at the latent vector of the state, for a run that begins.
+        prepare: the part of a step's inversion that needs nothing of S, which may run beside the rest.
+        gather, solve: the others, in this order.
     """
 
     def __init__(self, arena, state, deformation, displacement, phase: Phase, weights: np.ndarray | None):
@@ -221,7 +237,7 @@ class Projection:
         weights = arena.hold(weights, torch.float32)
         members = deformation.members if widths else 1
         lanes, velocity = arena.lanes(THREADS), as_vectors(phase.v, arena.precision)
-        gather = arena.pack(
+        self.gather = arena.pack(
             make_gathering(arena.precision, count > 1),
             count * (K + 1) * lanes,
             [displacement, phase.size, -(-K // 4), velocity, w, wp.float64(setting.dt), lanes, b],
@@ -231,7 +247,8 @@ class Projection:
         sigma = arena.hold(deformation.leading, torch.float64)
         block = projection_block(widths)
         threads = members * block if arena.device.is_cuda else 1
-        meeting = [
+        between = [
+            arena.zeros(count, prepared_size(r, K)),
             arena.zeros(count, 2 * members * (K - r) * (r + 1)),
             arena.zeros(count, 2, dtype=torch.int32),
         ]
@@ -241,15 +258,16 @@ class Projection:
             """[count, entries of a simulation], sharing memory."""
             return values.view(count, -1)
 
-        def solve(iterations: int) -> wp.Launch:
-            how = [wp.float64(s), iterations, wp.float64(projector.tolerance), linear, wp.float64(setting.dt)]
-            latents = [state.latent, state.a, state.tangents, state.rate, record.now, record.before]
+        def launch(mode: int) -> wp.Launch:
+            how = [wp.float64(s), mode, projector.iterations, wp.float64(projector.tolerance), linear]
+            latents = [state.latent, state.a, state.rate, record.now, record.before]
             kept = [record.xhat, record.residuals, record.updates, record.row]
             own = map(of_each, [*latents, *kept, state.first, state.step])
             sums = [weights, wp.float64(deformation.scale), sigma, G, b]
-            return arena.pack(kernel, count * threads, [*sums, *how, *own, *meeting, threads], block)
+            inputs = [*sums, *how, wp.float64(setting.dt), *own, *between, threads]
+            return arena.pack(kernel, count * threads, inputs, block)
 
-        self.launches, self.evaluate = [gather, solve(projector.iterations)], solve(0)
+        self.evaluate, self.prepare, self.solve = (launch(mode) for mode in (EVALUATE, PREPARE, SOLVE))
 
 
 def _closure(deformation: ModalFactors, is_cuda: bool) -> tuple[tuple[int, ...], torch.Tensor]:
@@ -292,7 +310,10 @@ def _placing(arena: Arena, state: Coefficients, mean: torch.Tensor, modes: torch
 def _fields(
     arena, phase: ModalPhase, manifold, method: Method, order, parameters, materials
 ) -> tuple[list, list]:
-    """The launches of the networks, and then those that give τ and C at N, as the method takes them."""
+    """The launches of the networks, and those that then give τ and C at N, as the method takes them.
+
+    The latter are lists that do not wait for each other.
+    """
     options = {"dtype": arena.real, "device": phase.setting.device}
     heads = []
     for name, neural, found in (
@@ -309,18 +330,15 @@ def _fields(
     layers = [_lengthened(f.layers, lengths) for (f, _), (_, lengths) in zip(heads, stored, strict=True)]
     networks, coefficients = _networks(arena, layers, phase.setting.record, parameters)
     launches = [
-        _contraction(arena, phase, factors, modes, a, found)
+        [_contraction(arena, phase, factors, modes, a, found)]
         for (factors, found), (modes, _), a in zip(heads, stored, coefficients, strict=True)
     ]
     if not method.neural_stress:
         F = arena.zeros(len(phase.x), 3, 3, dtype=arena.real)
         factors = manifold.factors("gradient", order, **options)
-        launches += [
-            _contraction(
-                arena, phase, factors, arena.modes(factors.table, factors.rows), phase.coefficients.a, F
-            ),
-            _elastic(arena, phase, materials, F),
-        ]
+        modes = arena.modes(factors.table, factors.rows)
+        gradient = _contraction(arena, phase, factors, modes, phase.coefficients.a, F)
+        launches.append([gradient, _elastic(arena, phase, materials, F)])
     return networks, launches
 
 

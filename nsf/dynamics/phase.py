@@ -208,8 +208,9 @@ class DecodedPhase(Phase):
 
     def invert(self) -> None:
         """x̂_{n+1} from the new positions of S (paper section 5.3)."""
-        record = self.setting.record
-        result = self.setting.projector.solve(self.at_sample, self.x[: self.s], record.now, self.weights)
+        record, projector = self.setting.record, self.setting.projector
+        start = projector.start(record)
+        result = projector.solve(self.at_sample, self.x[: self.s], start, self.weights)
         record.add(result)
 
 

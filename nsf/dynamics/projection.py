@@ -29,12 +29,14 @@ class ProjectionResult:
 
 @dataclass(frozen=True)
 class GaussNewton:
-    """Gauss-Newton on Σ w_p ‖g(X_p, x̂) − x_p‖² over S, started at x̂_n.
+    """Gauss-Newton on Σ w_p ‖g(X_p, x̂) − x_p‖² over S.
+
+    It starts on the parabola through the last three latent vectors.
 
     Attributes:
-        iterations: fixed number of iterations (the paper needs 2-3); a step whose update
-            falls below the tolerance changes nothing afterwards.
-        tolerance: length of an update (x̂ has unit variance) that counts as converged.
+        iterations: most iterations (the paper needs 2-3).
+        tolerance: length of an update (x̂ has unit variance) that is of no account. An update is the last one
+            where its square, of whose order the next one is, does not exceed it.
 
     Raises:
         ConfigError: a value outside its range.
@@ -50,6 +52,10 @@ class GaussNewton:
             raise ConfigError(f"projector.iterations={self.iterations} must be at least 1")
         if not self.tolerance > 0:
             raise ConfigError(f"projector.tolerance={self.tolerance} must be positive")
+
+    def start(self, record) -> torch.Tensor:
+        """Where the inversion begins, by the `LatentRecord` of the steps before it."""
+        return record.predicted
 
     def solve(
         self, at, target: torch.Tensor, xhat: torch.Tensor, weights: torch.Tensor | None = None
@@ -70,7 +76,7 @@ class GaussNewton:
             residuals.append(_rms(error))
             updates.append(torch.linalg.vector_norm(update))
             xhat = torch.where(active, xhat + update, xhat)
-            active = active & (updates[-1] > self.tolerance)
+            active = active & (updates[-1] ** 2 > self.tolerance)
         residuals.append(_rms(_weighted(target - at.position(xhat), weights)))
         return ProjectionResult(xhat, torch.stack(residuals), torch.stack(updates))
 
@@ -86,6 +92,10 @@ class Taylor:
 
     iterations: ClassVar[int] = 1
     tolerance: ClassVar[float] = 0.0  # it checks nothing, so it never claims convergence
+
+    def start(self, record) -> torch.Tensor:
+        """Where the deformation field is linearised: x̂_n."""
+        return record.now
 
     def solve(
         self, at, target: torch.Tensor, xhat: torch.Tensor, weights: torch.Tensor | None = None
@@ -132,11 +142,11 @@ def stop_reasons(residuals: torch.Tensor, updates: torch.Tensor, tolerance: floa
         tolerance: of the projector.
 
     Returns:
-        One of `STOP_REASONS` a step: `diverged` (non-finite), `converged` (an update below the
-        tolerance), `stagnated` (the residual grew), else `max_iterations`.
+        One of `STOP_REASONS` a step: `diverged` (non-finite), `converged` (the square of an update does
+        not exceed the tolerance), `stagnated` (the residual grew), else `max_iterations`.
     """
     finite = torch.isfinite(residuals).all(1) & torch.isfinite(updates).all(1)
-    converged = (updates <= tolerance).any(1)
+    converged = (updates**2 <= tolerance).any(1)
     grew = residuals[:, -1] > residuals[:, 0]
     code = torch.where(~finite, 3, torch.where(converged, 0, torch.where(grew, 2, 1)))
     return [STOP_REASONS[c] for c in code.tolist()]

@@ -13,6 +13,8 @@ import warp as wp
 from nsf.mpm import Precision
 from nsf.mpm.copies import make_copies
 
+#: What a launch does: a and ȧ at x̂_n, the linearisation where the next inversion begins, or that inversion.
+EVALUATE, PREPARE, SOLVE = range(3)
 #: Threads that share a sum over a layer's inputs; each has two outputs, to read its inputs once for both.
 _PARTS = 8
 #: Threads of a GPU whose weights lie side by side.
@@ -31,7 +33,12 @@ def shared_bytes(precision: Precision, widths: tuple[int, ...], latents: int, mo
     """Shared memory [byte] that a block needs, without Bᵀw B."""
     rows, row = _rows(widths, latents), -(-latents // 4) * 4
     values = 2 * rows * precision.numpy().itemsize + 8 * rows * row
-    return values + 8 * (5 * modes + 2 * modes * latents + 2 * latents * (latents + 2) + 4)
+    return values + 8 * (5 * modes + 2 * modes * latents + 4 * latents * (latents + 1) + 4)
+
+
+def prepared_size(latents: int, modes: int) -> int:
+    """Numbers that `PREPARE` leaves of a simulation: x̂*, a, q, A, G A and (AᵀG A)⁻¹."""
+    return latents + 2 * modes + 2 * modes * latents + latents**2
 
 
 def projection_fits(precision: Precision, widths: tuple[int, ...], latents: int, modes: int) -> bool:
@@ -153,7 +160,7 @@ _CLOSURE = """
 _MEETING = """
     auto meet = [&]() {
 #if defined(__CUDA_ARCH__)
-        const int count = (K - R) * C;
+        const int count = (K - R) * (R + 1);
         double* place = shares.data + size_t(met) * blocks * count;
         for (int e = lane; e < count; e += lanes)
             place[block * count + e] = e < K - R ? at[R + e] : A[R * R + e - (K - R)];
@@ -197,13 +204,17 @@ def make_projection(
 
     With d = Δt v the displacement of S in the step and δa = a(x̂) − a(x̂_n), the error of the positions is
     d − B δa, so that all the projection takes from S is b = Bᵀw d, G = Bᵀw B and dᵀw d: an iteration does
-    not depend on |S|. With A = ∂a/∂x̂ it solves (AᵀG A) u = Aᵀ(b − G δa), and the squared error is
-    dᵀw d − δa·b − δa·(b − G δa).
+    not depend on |S|. With A = ∂a/∂x̂ and q = b − G δa it solves (AᵀG A) u = Aᵀq, and the squared error is
+    dᵀw d − δa·(b + q).
 
     The coefficients are a = [σ x̂ ; closure(x̂)]; the closure is the sum of networks with SiLU between their
-    layers, and its derivative goes forward with its value. An update below the tolerance moves a by A u
-    alone, which misses by its square, unless it is the first of the step. Without iterations the kernel only
-    evaluates a and A.
+    layers, and its derivative goes forward with its value.
+
+    `PREPARE` evaluates both at the start x̂*, which is known before the step: on the parabola through the last
+    three latent vectors, or x̂_n if linear. So a GPU does it beside the rest of the step, and what is left for
+    `SOLVE` is a product with (AᵀG A)⁻¹, as long as one update is enough. The next one is of the order of its
+    square: where that is below the tolerance, a moves by A u, which misses by as much. `EVALUATE` gives a and
+    ȧ at x̂_n, for a run that begins.
 
     Args:
         precision: of the closure; sums over modes and the solution are fp64.
@@ -240,16 +251,17 @@ def make_projection(
     const int lane = 0, lanes = 1, PARTS = 1, TILE = 1;
     const int block = 0, blocks = 1;
 #endif
-    const int R = {latents}, K = {modes}, C = R + 1;
+    const int R = {latents}, K = {modes};
     const int ROW = (R + 3) / 4 * 4;  // whole vectors of four
     const int AHEAD = {min(18, rows // _PARTS)};  // weights whose loads are under way together
     NSF_SHARED real value[2][{rows}];
     NSF_SHARED alignas(16) slope_t slope[2][{rows} * ROW];
-    NSF_SHARED double x[R], at[K], a_n[K], d[K + 1], A[K * R], q[K], M[K * R], g[R], E[2][R * C];
-    NSF_SHARED double error, length;
-    NSF_SHARED int going;
+    NSF_SHARED double x[R], at[K], a_n[K], d[K + 1], A[K * R], q[K], M[K * R], g[R], u[R], E[2][2 * R * R];
+    NSF_SHARED double error;
     {"NSF_SHARED double gram[K * K];" if kept else "const double* gram = G.data;"}
     int met = 0;
+    double *const x_0 = prepared.data, *const a_0 = x_0 + R, *const q_0 = a_0 + K;
+    double *const A_0 = q_0 + K, *const M_0 = A_0 + K * R, *const inverse = M_0 + K * R;
     {_MEETING}
     auto evaluate = [&]() {{
         #pragma unroll 1
@@ -260,7 +272,16 @@ def make_projection(
         NSF_SYNC;
         {closure}
     }};
-    // q = b - G da, and with them the columns of M = G A.
+    // Once, before anything is evaluated. Padding of the widest layer is read, times a weight of zero.
+    auto begin = [&]() {{
+        #pragma unroll 1
+        for (int e = lane; e < 2 * {rows}; e += lanes) (&value[0][0])[e] = 0;
+        #pragma unroll 1
+        for (int e = lane; e < 2 * {rows} * ROW; e += lanes) (&slope[0][0])[e] = 0.0f;
+        {"for (int e = lane; e < K * K; e += lanes) gram[e] = G.data[e];" if kept else ""}
+        NSF_SYNC;
+    }};
+    // q = d - G da, and with them the columns of M = G A.
     auto residual = [&](int columns) {{
         #pragma unroll 1
         for (int e = lane; e < K * (columns + 1); e += lanes) {{
@@ -273,6 +294,38 @@ def make_projection(
         }}
         NSF_SYNC;
     }};
+    // E[0] = [AᵀG A | Aᵀq], or beside AᵀG A the identity; g = Aᵀq.
+    auto assemble = [&](int right) {{
+        const int C = R + right;
+        #pragma unroll 1
+        for (int e = lane; e < R * (R + 1); e += lanes) {{
+            const int c = e / (R + 1), other = e % (R + 1);
+            double sum = 0.0;
+            #pragma unroll 8
+            for (int k = 0; k < K; ++k) sum += A[k * R + c] * (other < R ? M[k * R + other] : q[k]);
+            if (other < R) E[0][c * C + other] = sum;
+            else g[c] = sum;
+            if (other == R)
+                for (int i = 0; i < right; ++i) E[0][c * C + R + i] = right == 1 ? sum : i == c ? 1.0 : 0.0;
+        }}
+        NSF_SYNC;
+    }};
+    // Gauss and Jordan; AᵀG A is positive definite, so that no pivot is sought. Gives what is on the right.
+    auto eliminate = [&](int right) {{
+        const int C = R + right;
+        #pragma unroll 1
+        for (int m = 0; m < R; ++m) {{
+            const double* from = E[m % 2];
+            #pragma unroll 1
+            for (int e = lane; e < R * C; e += lanes) {{
+                const int i = e / C, c = e % C;
+                const double row = from[m * C + c] / from[m * C + m];
+                E[1 - m % 2][e] = i == m ? row : from[e] - from[i * C + m] * row;
+            }}
+            NSF_SYNC;
+        }}
+        return E[R % 2] + R;
+    }};
     // Where sums cancel to less than their round-off, nothing is left; a NaN stays one.
     auto least = [](double sum) {{ return sum < 0.0 ? 0.0 : sum; }};
     // The squared error, of which q is known.
@@ -283,83 +336,126 @@ def make_projection(
         return least(sum);
     }};
 
-    // Padding of the widest layer is read, times a weight of zero.
     #pragma unroll 1
-    for (int e = lane; e < 2 * {rows}; e += lanes) (&value[0][0])[e] = 0;
-    #pragma unroll 1
-    for (int e = lane; e < 2 * {rows} * ROW; e += lanes) (&slope[0][0])[e] = 0.0f;
-    #pragma unroll 1
-    for (int i = lane; i < R; i += lanes) x[i] = latent.data[i];
-    #pragma unroll 1
-    for (int k = lane; k < K; k += lanes) at[k] = a_n[k] = a.data[k];
-    #pragma unroll 1
-    for (int k = lane; k <= K; k += lanes) d[k] = b.data[k];
-    #pragma unroll 1
-    for (int e = lane; e < K * R; e += lanes) A[e] = tangents.data[e];
-    {"for (int e = lane; e < K * K; e += lanes) gram[e] = G.data[e];" if kept else ""}
-    if (lane == 0) going = 1;
-    NSF_SYNC;
-    const long long n = row.data[0];
-    int done = 0;
-    do {{
-        if (iterations > 0) {{
+    for (int k = lane; k < K; k += lanes) a_n[k] = a.data[k];
+    if (mode != {SOLVE}) {{
+        #pragma unroll 1
+        for (int i = lane; i < R; i += lanes) {{
+            x[i] = latent.data[i];
+            if (mode == {PREPARE} && !linear) {{
+                const double before = xhat_previous.data[i], change = latent.data[i] - before;
+                x[i] += change;
+                if (row.data[0] > 1) x[i] += change - before + xhats.data[(row.data[0] - 2) * R + i];
+            }}
+        }}
+        #pragma unroll 1
+        for (int k = lane; k <= K; k += lanes) d[k] = 0.0;
+        begin();
+        evaluate();
+        if (mode == {PREPARE}) {{
             residual(R);
+            assemble(R);
+            const double* found = eliminate(R);
+            if (block > 0) return;
             #pragma unroll 1
-            for (int e = lane; e < R * C; e += lanes) {{
-                const int c = e / C, other = e % C;
-                double sum = 0.0;
-                #pragma unroll 8
-                for (int k = 0; k < K; ++k) sum += A[k * R + c] * (other < R ? M[k * R + other] : q[k]);
-                E[0][e] = sum;
-                if (other == R) g[c] = sum;
+            for (int e = lane; e < K * R; e += lanes) {{
+                A_0[e] = A[e];
+                M_0[e] = M[e];
+                if (e < K) {{ a_0[e] = at[e]; q_0[e] = q[e]; }}
+                if (e < R * R) inverse[e] = found[e / R * 2 * R + e % R];
+                if (e < R) x_0[e] = x[e];
             }}
-            if (lane == lanes - 1) error = left();
-            NSF_SYNC;
-            // Gauss and Jordan on [AᵀG A | Aᵀq]; it is positive definite, so that no pivot is sought.
+            return;
+        }}
+        if (block > 0) return;
+    }} else {{
+        // What a block takes its decisions from, the first one, which may be done before, does not change.
+        #pragma unroll 1
+        for (int e = lane; e < K * R; e += lanes) {{
+            A[e] = A_0[e];
+            M[e] = M_0[e];
+            if (e < K) {{ at[e] = a_0[e]; q[e] = b.data[e] + q_0[e]; }}
+            if (e < R) x[e] = x_0[e];
+        }}
+        #pragma unroll 1
+        for (int k = lane; k <= K; k += lanes) d[k] = b.data[k];
+        NSF_SYNC;
+        // g = Aᵀq, and the squared error at the start; a warp for each.
+#if defined(__CUDA_ARCH__)
+        const int each = 32;
+#else
+        const int each = 1;
+#endif
+        #pragma unroll 1
+        for (int c = lane / each; c <= R; c += lanes / each) {{
+            double sum = 0.0;
             #pragma unroll 1
-            for (int m = 0; m < R; ++m) {{
-                const double* from = E[m % 2];
-                #pragma unroll 1
-                for (int e = lane; e < R * C; e += lanes) {{
-                    const int i = e / C, c = e % C;
-                    const double row = from[m * C + c] / from[m * C + m];
-                    E[1 - m % 2][e] = i == m ? row : from[e] - from[i * C + m] * row;
-                }}
-                NSF_SYNC;
+            for (int k = lane % each; k < K; k += each)
+                sum += c < R ? A[k * R + c] * q[k] : -(at[k] - a_n[k]) * (d[k] + q[k]);
+#if defined(__CUDA_ARCH__)
+            for (int half = 16; half > 0; half /= 2) sum += __shfl_xor_sync(0xffffffffu, sum, half);
+#endif
+            if (lane % each == 0) {{
+                if (c < R) g[c] = sum;
+                else error = least(d[K] + sum);
             }}
-            const double* u = E[R % 2] + R;  // every C-th
-            #pragma unroll 1
-            for (int i = lane; i < R; i += lanes) x[i] += u[i * C];
-            if (lane == 0) {{
-                length = 0.0;
-                for (int i = 0; i < R; ++i) length += u[i * C] * u[i * C];
-                going = !(length <= tolerance * tolerance);
+        }}
+        NSF_SYNC;
+        #pragma unroll 1
+        for (int i = lane; i < R; i += lanes) {{
+            double sum = 0.0;
+            for (int c = 0; c < R; ++c) sum += inverse[i * R + c] * g[c];
+            u[i] = sum;
+        }}
+        NSF_SYNC;
+        const long long n = row.data[0];
+        int done = 0;
+        bool going = true;
+        while (true) {{
+            double length = 0.0, change = 0.0;
+            for (int i = 0; i < R; ++i) {{
+                length += u[i] * u[i];
+                change += u[i] * g[i];
             }}
-            NSF_SYNC;
-            if (lane == lanes - 1 && block == 0) {{
+            going = !(length <= tolerance);
+            if (block == 0 && lane == 0) {{
                 residuals.data[n * (iterations + 1) + done] = real(sqrt(error / sample));
                 updates.data[n * iterations + done] = real(sqrt(length));
-                // What a linearised model leaves: |e - J u|² = |e|² - uᵀ(AᵀG A)u at the minimum.
-                double change = 0.0;
-                for (int i = 0; i < R; ++i) change += u[i * C] * g[i];
-                if (linear) error = least(error - change);
             }}
-        }}
-        if (going || done == 0) {{
-            evaluate();
-        }} else {{
             #pragma unroll 1
-            for (int k = lane; k < K; k += lanes)
-                for (int c = 0; c < R; ++c) at[k] += A[k * R + c] * E[R % 2][c * C + R];
+            for (int i = lane; i < R; i += lanes) x[i] += u[i];
+            ++done;
+            if (!going) break;
+            if (done == 1) begin(); else NSF_SYNC;
+            evaluate();
+            if (done == iterations) {{
+                // What a linearised model leaves: |e - J u|² = |e|² - uᵀ(AᵀG A)u at the minimum.
+                if (linear && lane == 0) error = least(error - change);
+                break;
+            }}
+            residual(R);
+            assemble(1);
+            const double* found = eliminate(1);
+            #pragma unroll 1
+            for (int i = lane; i < R; i += lanes) u[i] = found[i * (R + 1)];
+            if (lane == 0) error = left();
             NSF_SYNC;
         }}
-        ++done;
-    }} while (going && done < iterations);
-    if (block > 0) return;
-    if (iterations > 0) {{
-        residual(0);
+        if (block > 0) return;
+        if (going) {{
+            residual(0);
+        }} else {{
+            #pragma unroll 1
+            for (int k = lane; k < K; k += lanes) {{
+                for (int c = 0; c < R; ++c) {{
+                    at[k] += A[k * R + c] * u[c];
+                    q[k] -= M[k * R + c] * u[c];
+                }}
+            }}
+            NSF_SYNC;
+        }}
         if (lane == 0) {{
-            if (!linear) error = left();
+            if (!linear || !going) error = left();
             for (int i = done; i <= iterations; ++i)
                 residuals.data[n * (iterations + 1) + i] = real(sqrt(error / sample));
             for (int i = done; i < iterations; ++i) updates.data[n * iterations + i] = real(0);
@@ -367,23 +463,19 @@ def make_projection(
             first.data[0] = 0;
             step.data[0] += 1;
         }}
-    }}
-    #pragma unroll 1
-    for (int i = lane; i < R; i += lanes) {{
-        if (iterations > 0) {{
+        #pragma unroll 1
+        for (int i = lane; i < R; i += lanes) {{
             xhat_previous.data[i] = xhat.data[i];
             xhat.data[i] = real(x[i]);
             xhats.data[(n + 1) * R + i] = real(x[i]);
+            latent.data[i] = x[i];
         }}
-        latent.data[i] = x[i];
     }}
     #pragma unroll 1
     for (int k = lane; k < K; k += lanes) {{
         rate.data[k] = (at[k] - a_n[k]) / dt;
         a.data[k] = at[k];
     }}
-    #pragma unroll 1
-    for (int e = lane; e < K * R; e += lanes) tangents.data[e] = A[e];
     #undef NSF_SHARED
     #undef NSF_SYNC
     """
@@ -396,13 +488,13 @@ def make_projection(
         G: wp.array(dtype=wp.float64),
         b: wp.array(dtype=wp.float64),
         sample: wp.float64,
+        mode: int,
         iterations: int,
         tolerance: wp.float64,
         linear: int,
         dt: wp.float64,
         latent: wp.array(dtype=wp.float64),
         a: wp.array(dtype=wp.float64),
-        tangents: wp.array(dtype=wp.float64),
         rate: wp.array(dtype=wp.float64),
         xhat: wp.array(dtype=real),
         xhat_previous: wp.array(dtype=real),
@@ -412,6 +504,7 @@ def make_projection(
         row: wp.array(dtype=wp.int64),
         first: wp.array(dtype=wp.int32),
         step: wp.array(dtype=wp.int32),
+        prepared: wp.array(dtype=wp.float64),
         shares: wp.array(dtype=wp.float64),
         arrived: wp.array(dtype=wp.int32),
     ): ...
@@ -426,13 +519,13 @@ def make_projection(
         G: wp.array(dtype=wp.float64),
         b: wp.array2d(dtype=wp.float64),
         sample: wp.float64,
+        mode: int,
         iterations: int,
         tolerance: wp.float64,
         linear: int,
         dt: wp.float64,
         latent: wp.array2d(dtype=wp.float64),
         a: wp.array2d(dtype=wp.float64),
-        tangents: wp.array2d(dtype=wp.float64),
         rate: wp.array2d(dtype=wp.float64),
         xhat: wp.array2d(dtype=real),
         xhat_previous: wp.array2d(dtype=real),
@@ -442,15 +535,16 @@ def make_projection(
         row: wp.array2d(dtype=wp.int64),
         first: wp.array2d(dtype=wp.int32),
         step: wp.array2d(dtype=wp.int32),
+        prepared: wp.array2d(dtype=wp.float64),
         shares: wp.array2d(dtype=wp.float64),
         arrived: wp.array2d(dtype=wp.int32),
         threads: int,
     ):
         s = copy_of(wp.tid(), threads)
         solve(
-            weights, scale, sigma, G, b[s], sample, iterations, tolerance, linear, dt, latent[s], a[s],
-            tangents[s], rate[s], xhat[s], xhat_previous[s], xhats[s], residuals[s], updates[s], row[s],
-            first[s], step[s], shares[s], arrived[s],
+            weights, scale, sigma, G, b[s], sample, mode, iterations, tolerance, linear, dt, latent[s], a[s],
+            rate[s], xhat[s], xhat_previous[s], xhats[s], residuals[s], updates[s], row[s], first[s], step[s],
+            prepared[s], shares[s], arrived[s],
         )  # fmt: skip
 
     return projection

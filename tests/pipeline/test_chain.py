@@ -398,6 +398,8 @@ class Breaks:
 
     iterations, tolerance = 1, 1e-6
 
+    start = Taylor.start
+
     def solve(self, at, target, xhat, weights=None):
         result = Taylor().solve(at, target, xhat)
         lost = (at.position(xhat)[:, 2].mean() - self.first(at, xhat)) < -1e-4

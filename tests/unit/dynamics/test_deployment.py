@@ -47,6 +47,8 @@ class Thrown:
 
     iterations, tolerance, calls = 1, 0.0, 0
 
+    start = Taylor.start
+
     def solve(self, at, target, xhat, weights=None):
         self.calls += 1
         result = Taylor().solve(at, target, xhat, weights)

@@ -29,6 +29,8 @@ from nsf.timing import StageTimer
 
 ANGLE = {"friction_angle": 26.0}
 SEARCH = Integration("search", 0)
+#: Never converged, so that coefficients are not carried along by their derivative.
+EXACT = GaussNewton(tolerance=1e-14)
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +135,7 @@ def test_the_initial_velocity_moves_the_sample(tiny, solver_of):
 
 @pytest.mark.parametrize("integration", [Integration(), SEARCH], ids=["superset", "search"])
 def test_afterwards_velocities_are_backward_differences(solver_of, tiny_manifold, integration):
-    solver = solver_of(integration=integration)
+    solver = solver_of(integration=integration, projector=EXACT)
     history = torch.as_tensor(run(solver, 6).xhat)
     x, before = (tiny_manifold.restrict().position(history[n]) for n in (6, 5))
     expected = ((x - before) / solver.dt).numpy()
@@ -280,7 +282,7 @@ def test_a_change_of_phase_keeps_the_velocity(solver_of, chain):
     """A second phase of the same particles changes nothing: the backward difference goes across it."""
     plain = RandomSampler(20, seed=3)
     phased = RandomSampler(20, seed=3, phases=[{"start": 0.25, "size": 20}, {"start": 0.7, "size": 20}])
-    one, other = run(solver_of(plain)), run(solver_of(phased))
+    one, other = (run(solver_of(sample, projector=EXACT)) for sample in (plain, phased))
     np.testing.assert_allclose(one.xhat, other.xhat, rtol=0, atol=1e-12)
 
 
@@ -385,6 +387,8 @@ class Fails:
 
     def __init__(self, at):
         self.left = at
+
+    start = Taylor.start
 
     def solve(self, at, target, xhat, weights=None):
         self.left -= 1
