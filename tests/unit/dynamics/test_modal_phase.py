@@ -89,6 +89,25 @@ def test_one_iteration_and_none_converged(pair):
     same(*runs(pair(projector=GaussNewton(iterations=4, tolerance=1e-14))))
 
 
+def test_one_update_is_enough_where_fields_are_linear(pair, tiny_manifold):
+    """Without a closure an update misses nothing, so what it carries along is exact."""
+    r = tiny_manifold.latent_dim
+    hyperparameters = tiny_manifold.hyperparameters | {
+        "modes": [r, *tiny_manifold.hyperparameters["modes"][1:]]
+    }
+    manifold = BasisManifold(r, tiny_manifold.x_sha256, ["friction_angle"], hyperparameters)
+    kept = manifold.state_dict()
+    for name, values in tiny_manifold.state_dict().items():
+        if name in kept:
+            kept[name] = values[..., :r] if kept[name].shape != values.shape else values
+    manifold.load_state_dict(kept)
+    solvers = pair(manifold=manifold.requires_grad_(False), projector=GaussNewton(tolerance=1.0))
+    one, other = runs(solvers)
+    same(one, other, tolerance=1e-9)
+    assert (one.updates[:, 0] > 1e-4).all()
+    assert (one.updates[:, 1:] == 0).all()
+
+
 def test_weights_and_phases(pair):
     weights = np.random.default_rng(0).uniform(0.1, 3.0, 20)
     phases = [SamplePhase(0.0, np.arange(0, 500, 25), weights), SamplePhase(0.5, np.arange(7, 500, 50), None)]

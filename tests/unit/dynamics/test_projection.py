@@ -5,7 +5,8 @@ import math
 import pytest
 import torch
 
-from nsf.dynamics import STOP_REASONS, GaussNewton, Taylor, stop_reasons
+from nsf.dynamics import STOP_REASONS, GaussNewton, ProjectionResult, Taylor, stop_reasons
+from nsf.dynamics.latent import LatentRecord
 from nsf.errors import ConfigError
 
 R = 2
@@ -122,6 +123,19 @@ def test_weights_count_points(projector, start, goal):
     assert (one.xhat - plain.xhat).norm() > 1e-4  # otherwise the test shows nothing
 
 
+def test_the_start_lies_on_the_parabola_through_the_last_three():
+    """As the record holds them; before there are three, on the line through two, and at first on x̂_0."""
+    record = LatentRecord(torch.tensor([1.0, -2.0], dtype=torch.float64), 6, 1)
+    path = [torch.tensor([1.0 + 0.3 * n + 0.5 * n * n, -2.0 + n - 0.1 * n * n]).double() for n in range(6)]
+    nothing = torch.zeros(2).double(), torch.zeros(1).double()
+    assert torch.equal(GaussNewton().start(record), path[0])
+    for n in range(1, 5):
+        record.add(ProjectionResult(path[n], *nothing))
+        expected = path[n + 1] if n > 1 else 2.0 * path[1] - path[0]
+        torch.testing.assert_close(GaussNewton().start(record), expected)
+        assert torch.equal(Taylor().start(record), path[n])
+
+
 def test_converged(start, goal):
     at = Bent()
     result = GaussNewton(6).solve(at, at.position(goal), start)
@@ -135,6 +149,18 @@ def test_after_convergence_nothing_changes(start):
     one, many = (GaussNewton(k, tolerance=10.0).solve(at, target, start) for k in (1, 5))
     assert torch.equal(one.xhat, many.xhat)
     assert reason(many, 10.0) == "converged"
+
+
+def test_the_last_update_is_that_whose_square_does_not_exceed_the_tolerance(start, goal):
+    at = Bent()
+    target = at.position(goal)
+    lengths = GaussNewton(4, tolerance=1e-30).solve(at, target, start).updates
+    for last in (0, 1):
+        square = float(lengths[last] ** 2)
+        for tolerance, taken in ((1.01 * square, last + 1), (0.99 * square, last + 2)):
+            found = GaussNewton(4, tolerance).solve(at, target, start).xhat
+            of_so_many = [GaussNewton(k, 1e-30).solve(at, target, start).xhat for k in range(1, 5)]
+            assert [torch.equal(found, xhat) for xhat in of_so_many].index(True) + 1 == taken
 
 
 def test_max_iterations(start, goal):
