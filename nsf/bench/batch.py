@@ -8,7 +8,7 @@ import torch
 
 from nsf import config
 from nsf.bench.measure import build, name_of, run_times
-from nsf.bench.reduced import SCENES, deformation_error
+from nsf.bench.reduced import SAMPLERS, SCENES, deformation_error
 from nsf.bench.rows import Result, Row, Settings, commit
 from nsf.data.schema import TRAJECTORY
 from nsf.dynamics import ReducedBatch, ReducedMPM, ReducedRun
@@ -24,18 +24,22 @@ def run(settings: Settings, say: Callable[[str], object]) -> Result:
     """Each scene: at the paper's size on a GPU, at small scale on a CPU.
 
     Data and training are made, or reused, as by `nsf train`. The first simulation of a batch is that of the
-    first held-out value, of which δ is told; the others' values fill the range of training.
+    first held-out value, of which δ is told; the others' values fill the range of training. Sample particles
+    are the scene's own, and in another case chosen so that a step needs few others (`sampler=cells`).
     """
     kind = "cuda" if settings.device.startswith("cuda") else "cpu"
     scale, found = {"cuda": "paper", "cpu": "small"}[kind], Result()
     for scene in settings.scenes or SCENES:
-        overrides = [f"scene={scene}", f"scale={scale}", f"device={settings.device}"]
-        measured(Pipeline(config.load(overrides), say=say), SIZES[kind], settings, found, say)
+        for end, own in SAMPLERS.items():
+            overrides = [f"scene={scene}", f"scale={scale}", f"device={settings.device}", *own]
+            measured(Pipeline(config.load(overrides), say=say), SIZES[kind], settings, found, say, end)
     return found
 
 
-def measured(chain: Pipeline, sizes, settings: Settings, found: Result, say: Callable[[str], object]) -> None:
-    """Add the rows of one scene; every batch of a precision turn by turn, in whole runs."""
+def measured(
+    chain: Pipeline, sizes, settings: Settings, found: Result, say: Callable[[str], object], end: str = ""
+) -> None:
+    """Add the rows of one scene, whose cases end so; all of a precision turn by turn, in whole runs."""
     chain.simulate(("train",))
     chain.train()
     manifold, scene, name = chain.manifold(), chain.scene, chain.scene.parameters.name
@@ -60,7 +64,7 @@ def measured(chain: Pipeline, sizes, settings: Settings, found: Result, say: Cal
         built: dict[int, tuple] = {}
         for size in sorted(sizes):
             if _too_large(size, {n: solver.nbytes for n, (solver, _) in built.items()}, settings.device):
-                say(f"reduced_batch{size} {precision}: left out, the device has not the memory")
+                say(f"reduced_batch{size}{end} {precision}: left out, the device has not the memory")
                 break
             built[size] = build(partial(make, size, precision), settings.device)
         times = run_times({n: solver for n, (solver, _) in built.items()}, settings.trials, settings.device)
@@ -68,7 +72,7 @@ def measured(chain: Pipeline, sizes, settings: Settings, found: Result, say: Cal
             p10, median, p90 = (np.percentile(times[size], [10, 50, 90]) / size).tolist()
             run = getattr(solver, "runs", (solver,))[0]
             row = Row(
-                bench="batch", case=f"reduced_batch{size}", particles=particles, batch=size,
+                bench="batch", case=f"reduced_batch{size}{end}", particles=particles, batch=size,
                 sample=run.sample_size, integration=round(run.integration_mean), precision=precision,
                 device=name_of(settings.device), ms_median=median, ms_p10=p10, ms_p90=p90,
                 peak_mib=peak_mib, delta=deformation_error(run, truth), commit=commit(),

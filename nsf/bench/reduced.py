@@ -1,6 +1,6 @@
 """A reduced step beside the full-order one, on the paper's cake and metal, and what a longer Δt costs."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 
 import numpy as np
@@ -18,8 +18,10 @@ from nsf.kinematics.networks import ARITHMETIC
 from nsf.pipeline import Pipeline
 
 SCENES = ("cake", "metal")
+#: The end of a case's name, and how its sample particles are chosen.
+SAMPLERS = {"": (), "_cells": ("sampler=cells",)}
 #: Steps of the deployment in units of the scene's Δt (paper section 6.1 has 1.5 on cake).
-MULTIPLIERS = (1.0, 1.5, 2.0, 3.0)
+MULTIPLIERS = (1.5, 2.0, 3.0)
 #: Of the networks of stress and affine momentum with field=mlp; a CPU has no tensor cores.
 ARITHMETICS = {"cuda": (None, *ARITHMETIC), "cpu": (None,)}
 #: Trials of networks at most, and steps of one: theirs cost alike from the first to the last.
@@ -33,14 +35,17 @@ def run(settings: Settings, say: Callable[[str], object]) -> Result:
     """Each scene: at the paper's size on a GPU, at small scale on a CPU.
 
     Data and training are made, or reused, as by `nsf train`. A step of k Δt stands in the case's name; it
-    moves the scene by k times as much as the others. With field=mlp it names what multiplies the hidden
-    layers of h and l: tf32 or bf16 on tensor cores, or nothing where they are in the precision of the step.
+    moves the scene by k times as much as the others. So does `cells`, where the sample particles are chosen
+    so that a step needs few others (`sampler=cells`); else they are the scene's own. With field=mlp it
+    names what multiplies the hidden layers of h and l: tf32 or bf16 on tensor cores, or nothing where they
+    are in the precision of the step.
     """
     found = Result()
     for scene in settings.scenes or SCENES:
         scale = scale_of(settings.device)
         overrides = [f"scene={scene}", f"scale={scale}", f"device={settings.device}"]
-        measured(Pipeline(config.load(overrides), say=say), settings, found, say)
+        chains = {name: Pipeline(config.load([*overrides, *own]), say=say) for name, own in SAMPLERS.items()}
+        measured(chains, settings, found, say)
         overrides += ["field=mlp", *(MLP_TRAINING if scale == "paper" else ())]
         measured_networks(Pipeline(config.load(overrides), say=say), settings, found, say)
     return found
@@ -51,20 +56,32 @@ def scale_of(device: str) -> str:
     return "paper" if device.startswith("cuda") else "small"
 
 
-def measured(chain: Pipeline, settings: Settings, found: Result, say: Callable[[str], object]) -> None:
-    """Add the rows of one scene at its first held-out value; every side of a precision turn by turn."""
+def measured(
+    chains: Mapping[str, Pipeline], settings: Settings, found: Result, say: Callable[[str], object]
+) -> None:
+    """Add the rows of one scene at its first held-out value; every side of a precision turn by turn.
+
+    Args:
+        chains: by the end of a case's name, configurations that differ in the sampler alone; longer steps are
+            those of the first.
+        settings, found, say: as for `run`.
+    """
+    chain = next(iter(chains.values()))
     chain.simulate(("train",))
     chain.train()
     manifold, scene, value = chain.manifold(), chain.scene, chain.held_out[0]
     parameters, name = {scene.parameters.name: value}, scene.name
-    first = chain.solver_at(manifold, value)
+    built = {end: one.solver_at(manifold, value) for end, one in chains.items()}
+    sets = {end: (solver.phases, solver.sets) for end, solver in built.items()}
+    del built  # their arrays are on the device
     truth = chain.truth(value).path / TRAJECTORY
 
-    def reduced(precision: str, multiplier: float):
+    def reduced(precision: str, multiplier: float, end: str = ""):
+        phases, own = sets[end]
         return scene.reduced(
-            manifold, parameters, first.phases, sets=first.sets, method=chain.method,
-            projector=chain.projector, integration=chain.integration, precision=precision,
-            device=settings.device, dt_multiplier=multiplier,
+            manifold, parameters, phases, sets=own, method=chain.method, projector=chain.projector,
+            integration=chain.integration, precision=precision, device=settings.device,
+            dt_multiplier=multiplier,
         )  # fmt: skip
 
     for precision in settings.precisions:
@@ -73,9 +90,12 @@ def measured(chain: Pipeline, settings: Settings, found: Result, say: Callable[[
                 lambda p=precision: scene.full_order(parameters, p, settings.device), scene.steps
             )
         }
+        for end in chains:
+            subjects[f"reduced_{name}{end}"] = Subject(partial(reduced, precision, 1.0, end), scene.steps)
         for k in MULTIPLIERS:
-            case = f"reduced_{name}" if k == 1.0 else f"reduced_{name}_{k:g}dt"
-            subjects[case] = Subject(lambda p=precision, k=k: reduced(p, k), reduced_steps(scene.steps, k))
+            subjects[f"reduced_{name}_{k:g}dt"] = Subject(
+                partial(reduced, precision, k), reduced_steps(scene.steps, k)
+            )
         for case, cost in measure(subjects, settings.trials, settings.device).items():
             solver = None
             if case.startswith("reduced_"):
@@ -83,7 +103,7 @@ def measured(chain: Pipeline, settings: Settings, found: Result, say: Callable[[
                 solver.step(solver.total_steps)
             row = _row(case, len(scene.particles()), precision, settings.device, cost, solver, truth)
             found.rows.append(row)
-            if case in (f"full_order_{name}", f"reduced_{name}"):
+            if case in (f"full_order_{name}", *(f"reduced_{name}{end}" for end in chains)):
                 found.stages.extend(
                     StageRow(row.bench, case, row.particles, precision, row.device, stage, ms, row.commit)
                     for stage, ms in cost.stages.items()

@@ -230,17 +230,20 @@ def step_over_batch(results: pd.DataFrame) -> Figure:
     """Time of a simulation-step [ms] over the size of the batch, both axes logarithmic.
 
     Args:
-        results: rows of `batch` of one device; a line for each number of particles and precision.
+        results: rows of `batch` of one device; a line for each number of particles, end of the case and
+            precision.
     """
     with styled():
         fig = figure(4.4)
         panel = fig.subplots()
-        lines = results.groupby(["particles", "precision"])
-        for i, ((particles, precision), part) in enumerate(lines):
+        ends = results["case"].str.extract(r"\d+(.*)$")[0].rename("end")
+        for i, ((particles, end, precision), part) in enumerate(
+            results.groupby(["particles", ends, "precision"])
+        ):
             part, style = part.sort_values("batch"), line_style(i)
             B, median = part["batch"], part["ms_median"]
             panel.fill_between(B, part["ms_p10"], part["ms_p90"], color=style["color"], alpha=0.18, lw=0)
-            name = f"{size_name(particles)} particles, {precision}"
+            name = f"{size_name(particles)} particles{end.replace('_', ', ')}, {precision}"
             panel.plot(B, median, marker="o", ms=4.5, label=name, **style)
             shared = median.iloc[0] * B.iloc[0] / B
             panel.plot(B, shared, ls=":", lw=1.2, color=style["color"])
@@ -260,7 +263,7 @@ def steps_by_scene(results: pd.DataFrame) -> Figure:
     Args:
         results: rows of `reduced` of one device.
     """
-    scene = results["case"].str.extract(r"^(?:full_order|reduced)_(.+?)(?:_[\d.]+dt|_mlp\w*)?$")[0]
+    scene = results["case"].str.extract(r"^(?:full_order|reduced)_(.+?)(?:_[\d.]+dt|_mlp\w*|_cells)?$")[0]
     panels_of = list(results.groupby(scene, sort=False))
     with styled():
         fig = figure(1.2 + 0.3 * max(len(part) for _, part in panels_of))

@@ -1,6 +1,7 @@
 """Reduced-order dynamics: latent time-stepping (paper section 5)."""
 
 from nsf.dynamics.batch import ReducedBatch
+from nsf.dynamics.cells import CellSampler
 from nsf.dynamics.cubature import CubatureSampler
 from nsf.dynamics.deployment import (
     Rollout,
@@ -24,6 +25,7 @@ from nsf.dynamics.trust import Trust
 __all__ = [
     "NSF",
     "STOP_REASONS",
+    "CellSampler",
     "CubatureSampler",
     "Decoder",
     "GaussNewton",

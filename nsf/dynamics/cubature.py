@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -52,10 +52,29 @@ class CubatureSampler(Sampler):
     def phase_of(self, region, end, manifold, device="cpu", whole=None):
         candidates = region.candidates(manifold.X.cpu().numpy())
         rows = training_rows(manifold, region.start, end, self.states)
-        columns, target = normal_equations(manifold, rows, candidates, whole)
-        chosen, weights = nonnegative_fit(columns, target, region.size)
+        equations = normal_equations(manifold, rows, candidates, whole)
+        among = self.among(manifold.X.cpu().numpy()[candidates], equations)
+        chosen, weights = nonnegative_fit(equations.columns[:, among], equations.target, region.size)
         order = np.argsort(chosen)
-        return SamplePhase(region.start, candidates[chosen][order], weights[order])
+        return SamplePhase(region.start, candidates[among][chosen][order], weights[order])
+
+    def among(self, X: np.ndarray, equations: "Equations") -> np.ndarray:
+        """Which of the candidates, at rest at X [c, 3] [m], may be taken; all of them."""
+        return np.arange(len(X))
+
+
+class Equations(NamedTuple):
+    """Shares of particles in sums over all of them.
+
+    Attributes:
+        columns: [m, c] of each candidate.
+        target: [m] sums.
+        dx: spacing of the grid [m].
+    """
+
+    columns: torch.Tensor
+    target: torch.Tensor
+    dx: float
 
 
 def training_rows(manifold, start: float, end: float, count: int) -> torch.Tensor:
@@ -79,7 +98,7 @@ def training_rows(manifold, start: float, end: float, count: int) -> torch.Tenso
 @torch.no_grad()
 def normal_equations(
     manifold, rows: torch.Tensor, candidates: np.ndarray, whole: "Callable[[Mapping[str, float]], ReducedMPM]"
-) -> tuple[torch.Tensor, torch.Tensor]:
+) -> Equations:
     """Each particle's share in the normal equations of one projection step from training states.
 
     A state has r equations of the right-hand side and r (r + 1)/2 of the matrix, in the latent coordinates
@@ -93,7 +112,7 @@ def normal_equations(
         whole: problem parameters → reduced solver whose sample is every particle.
 
     Returns:
-        Columns [k (r + r (r + 1)/2), c] and the sum of those of every particle.
+        k (r + r (r + 1)/2) of them.
 
     Raises:
         ProjectionError: a particle is not finite after a step.
@@ -117,7 +136,7 @@ def normal_equations(
         for shares in _shares(error.double(), J.double(), least):
             columns.append(shares[chosen].T)
             target.append(shares.sum(0))
-    return torch.cat(columns), torch.cat(target)
+    return Equations(torch.cat(columns), torch.cat(target), solver.geometry.dx)
 
 
 def _shares(error: torch.Tensor, J: torch.Tensor, least: float) -> tuple[torch.Tensor, torch.Tensor]:

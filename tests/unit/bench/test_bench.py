@@ -189,13 +189,14 @@ def test_the_command(tmp_path, monkeypatch, capsys):
 
 
 @pytest.fixture(scope="module")
-def found(chain):
+def found(chain, pipeline_at):
     """Rows of the tiny chain, as of a scene of the benchmark."""
     found, said = Result(), []
     settings = Settings(particles=(), precisions=("fp32", "fp64"), device="cpu", trials=2)
-    own = Pipeline(chain.pipeline.config, say=lambda line: None, root=chain.root)
-    measured_chain(own, settings, found, said.append)
-    assert len(said) == 10
+    few_cells = ("sampler=cells", "sampler.size=9", "sampler.cells=2", "sampler.states=4")
+    chains = {"": pipeline_at(chain.root), "_cells": pipeline_at(chain.root, *few_cells)}
+    measured_chain(chains, settings, found, said.append)
+    assert len(said) == 12
     return found
 
 
@@ -209,7 +210,7 @@ def test_stages_of_both_solvers(found):
     stages = pd.DataFrame(found.stages, columns=columns(StageRow))
     of_case = stages.groupby(["case", "precision"], sort=False)["stage"].apply(list)
     reduced = ["inference", "p2g", "grid", "g2p", "inversion"]
-    assert of_case.tolist() == 2 * [["p2g", "grid", "g2p", "stress"], reduced]
+    assert of_case.tolist() == 2 * [["p2g", "grid", "g2p", "stress"], reduced, reduced]
     assert (stages["ms"] > 0).all()
 
 
@@ -225,8 +226,12 @@ def test_training_is_timed_from_its_files(chain):
 
 def test_both_solvers_of_a_scene_have_rows(reduced, chain):
     assert reduced["case"].tolist() == 2 * [
-        "full_order_sand", "reduced_sand", "reduced_sand_1.5dt", "reduced_sand_2dt", "reduced_sand_3dt",
+        "full_order_sand", "reduced_sand", "reduced_sand_cells", "reduced_sand_1.5dt", "reduced_sand_2dt",
+        "reduced_sand_3dt",
     ]  # fmt: skip
+    own, cells = (reduced[reduced["case"] == f"reduced_sand{end}"] for end in ("", "_cells"))
+    assert (cells["integration"].to_numpy() < own["integration"].to_numpy()).all()
+    assert (cells["sample"] <= 9).all()
     full = reduced["case"] == "full_order_sand"
     for name in ("sample", "integration", "delta"):
         assert (reduced[name].isna() == full).all()
@@ -373,6 +378,11 @@ def test_a_report_of_batches(batches, tmp_path):
     panel = step_over_batch(batches).axes[0]
     assert panel.get_xscale() == panel.get_yscale() == "log"
     assert [line.get_xdata().tolist() for line in panel.lines] == 4 * [[1, 2, 3]]
+    cells = batches.assign(case=batches["case"] + "_cells")
+    legend = step_over_batch(pd.concat([batches, cells])).legends[0]
+    assert [text.get_text() for text in legend.get_texts()] == [
+        f"500 particles{end}, {precision}" for end in ("", ", cells") for precision in ("fp32", "fp64")
+    ]
 
 
 def test_whole_runs_take_turns():

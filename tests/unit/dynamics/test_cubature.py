@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from nsf.dynamics import CubatureSampler, ParticleSets, SamplePhase
+from nsf.dynamics import CellSampler, CubatureSampler, ParticleSets, SamplePhase
 from nsf.dynamics.cubature import nonnegative_fit, normal_equations, training_rows
 from nsf.errors import ConfigError, ProjectionError
 
@@ -40,7 +40,7 @@ def phase_of(tiny_manifold, whole):
 
 def residual(equations, phase) -> float:
     """How far the weighted sums over S are from those over every particle, relative."""
-    columns, target = equations
+    columns, target, _ = equations
     weighted = columns[:, torch.as_tensor(phase.particles)] @ torch.as_tensor(phase.weights)
     return float((weighted - target).norm() / target.norm())
 
@@ -63,7 +63,7 @@ def test_training_rows_are_inside_trajectories_and_in_their_time(tiny_manifold):
 
 def test_both_sums_of_a_state_have_norm_one(equations):
     """And the matrix's is the identity, over √r."""
-    columns, target = equations
+    columns, target, _ = equations
     assert columns.shape == (STATES * 14, 500)
     torch.testing.assert_close(columns.sum(1), target)
     for state in target.view(STATES, 14):
@@ -93,7 +93,7 @@ def test_a_body_at_rest_is_told_by_its_matrix_alone(tiny_manifold):
     rows = training_rows(tiny_manifold, 0.0, 1.0, 3)
     for motion, at_rest in ((0.0, True), (1e-14, True), (1e-3, False)):
         body = Still(motion)
-        columns, target = normal_equations(tiny_manifold, rows, np.arange(40), lambda values, b=body: b)
+        columns, target, _ = normal_equations(tiny_manifold, rows, np.arange(40), lambda values, b=body: b)
         assert (float(target.view(3, 5)[:, :2].norm()) < 1e-5) == at_rest
         chosen, weights = nonnegative_fit(columns, target, 40)
         assert min(chosen) >= 10
@@ -146,7 +146,7 @@ def test_a_cubature_of_any_size_takes_the_step_of_every_particle(tiny_manifold, 
 
 def test_the_residual_falls_with_size_and_beats_random_samples(equations, phase_of):
     """Every one of those with equal weights, and on average those with weights fitted as well as these."""
-    columns, target = equations
+    columns, target, _ = equations
     before = np.inf
     for size in (4, 8, 16, 32):
         ours = residual(equations, phase_of(size))
@@ -158,6 +158,26 @@ def test_the_residual_falls_with_size_and_beats_random_samples(equations, phase_
             chosen, weights = nonnegative_fit(columns[:, draw], target, size)
             fitted.append(residual(equations, SamplePhase(0.0, draw[chosen], weights)))
         assert ours < np.mean(fitted)
+
+
+def test_a_cubature_out_of_cells_needs_fewer_integration_particles(chain, tiny_manifold, whole, equations):
+    """All of S is in the cells that are allowed, and weights bring the sums nearer than equal ones there."""
+    X, dx = tiny_manifold.X.numpy(), chain.scene.dx
+    few, any_cell = (
+        kind(24, states=STATES, **own).phases_of(tiny_manifold, whole=whole)
+        for kind, own in ((CellSampler, {"cells": 3}), (CubatureSampler, {}))
+    )
+    cells = {tuple(cell) for cell in np.floor(X / dx).astype(int)[few[0].particles]}
+    assert 1 < len(cells) <= 3
+    inside = np.flatnonzero([tuple(cell) in cells for cell in np.floor(X / dx).astype(int)])
+    equal = SamplePhase(0.0, inside, np.full(len(inside), len(X) / len(inside)))
+    assert residual(equations, few[0]) < residual(equations, equal)
+    sizes = []
+    for phases in (few, any_cell):
+        solver = chain.scene.reduced(tiny_manifold, ANGLE, phases, device="cpu")
+        solver.step(6)
+        sizes.append(solver.integration_mean)
+    assert sizes[0] < 0.8 * sizes[1]
 
 
 def test_the_choice_is_bitwise_the_same(phase_of):
@@ -198,3 +218,8 @@ def test_refused(phase_of):
     for states in (0, 2.5):
         with pytest.raises(ConfigError, match=rf"sampler\.states={states}"):
             CubatureSampler(10, states=states)
+    for cells in (0, 2.5):
+        with pytest.raises(
+            ConfigError, match=rf"sampler\.cells={cells} must be a whole number of at least 1"
+        ):
+            CellSampler(10, cells=cells)
