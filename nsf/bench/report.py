@@ -92,7 +92,7 @@ def write_report(folder: Path) -> Path:
         of_sample = of_size[by_sample]
         of_scene, of_batch = (rows[rows["bench"] == name] for name in ("reduced", "batch"))
         if len(of_scene):
-            caption = "Time of a step of both solvers by scene; a bar names δ of its run."
+            caption = "Time of a step of both solvers by scene; a point names δ of its run."
             with styled():
                 save(steps_by_scene(of_scene), folder, f"reduced-{stem}")
             parts += [f"![{caption}](reduced-{stem}.png)", caption, _markdown(of_scene)]
@@ -258,7 +258,7 @@ def step_over_batch(results: pd.DataFrame) -> Figure:
 
 
 def steps_by_scene(results: pd.DataFrame) -> Figure:
-    """Time of a step [ms] of the full-order and of the reduced solver, a bar each, a panel a scene.
+    """Time of a step [ms] of the full-order and of the reduced solver, a point each, a panel a scene.
 
     Args:
         results: rows of `reduced` of one device.
@@ -271,19 +271,21 @@ def steps_by_scene(results: pd.DataFrame) -> Figure:
         for panel, (name, part) in zip(panels, panels_of, strict=True):
             at = np.arange(len(part))
             full = part["case"].str.startswith("full_order").to_numpy()
+            median = part["ms_median"].to_numpy()
             colors = [line_style(0)["color"] if whole else line_style(1)["color"] for whole in full]
-            bars = panel.barh(at, part["ms_median"], height=0.7, color=colors)
-            texts = [
-                number(ms) if np.isnan(delta) else f"{number(ms)}, δ {number(100 * delta)} %"
-                for ms, delta in zip(part["ms_median"], part["delta"].astype(float), strict=True)
-            ]
-            panel.bar_label(bars, texts, padding=4, fontsize=8.5, color=INK)
+            panel.scatter(median, at, s=42, color=colors)
+            for ms, delta, y in zip(median, part["delta"].astype(float), at, strict=True):
+                text = number(ms) if np.isnan(delta) else f"{number(ms)}, δ {number(100 * delta)} %"
+                place = {"xytext": (9, 0), "textcoords": "offset points", "va": "center_baseline"}
+                panel.annotate(text, (ms, y), fontsize=8.5, color=INK, **place)
             kinds = part["case"].str.replace(f"_{name}", "").str.replace("_", " ")
             panel.set_yticks(at, [f"{kind}, {p}" for kind, p in zip(kinds, part["precision"], strict=True)])
             panel.set_ylim(len(part) - 0.5, -0.5)
-            panel.set_xlim(0, 1.5 * part["ms_median"].max())
-            panel.set(title=name, xlabel="time of a step [ms]")
-            panel.grid(axis="x")
+            low, high = median.min(), median.max()
+            panel.set(xscale="log", title=name, xlabel="time of a step [ms]")
+            panel.set_xlim(low / (high / low) ** 0.1, high * (high / low) ** 0.75 * 1.5)
+            panel.xaxis.set_major_formatter("{x:g}")
+            panel.grid()
             panel.tick_params(axis="y", length=0)
     return fig
 
