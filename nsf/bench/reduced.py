@@ -35,7 +35,7 @@ def run(settings: Settings, say: Callable[[str], object]) -> Result:
     """Each scene: at the paper's size on a GPU, at small scale on a CPU.
 
     Data and training are made, or reused, as by `nsf train`. A step of k Δt stands in the case's name; it
-    moves the scene by k times as much as the others. So does `cells`, where the sample particles are chosen
+    moves the scene by k times as much as the others. `cells` there means that sample particles are chosen
     so that a step needs few others (`sampler=cells`); else they are the scene's own. With field=mlp it
     names what multiplies the hidden layers of h and l: tf32 or bf16 on tensor cores, or nothing where they
     are in the precision of the step.

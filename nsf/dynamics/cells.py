@@ -14,15 +14,18 @@ from nsf.errors import ConfigError
 class CellSampler(CubatureSampler):
     """A cubature whose particles are all from few cells of the grid, as the body lies in it at rest.
 
-    N are the particles that share a node with S, hundreds for each of S where these are far apart; those of
-    one cell have nearly all of theirs in common. First cells are taken, each with the sums over all its
-    particles, as the cubature takes particles, and then particles with weights among those in these cells.
+    N are the particles that share a node with S, many for each of S where these are far apart. Particles
+    whose stencils begin at the same node at rest need the same ones then, and mostly so later. First such
+    cells are taken, each with the sums over its candidates, as the cubature takes particles, and then
+    particles with weights among those in these cells.
 
     Attributes:
         cells: number of cells at most.
 
     Raises:
         ConfigError: cells is not a positive whole number.
+
+    Source: the choice of particles is that of `CubatureSampler`; cells before them are our own.
     """
 
     cells: int = 12
@@ -33,10 +36,20 @@ class CellSampler(CubatureSampler):
             raise ConfigError(f"sampler.cells={self.cells} must be a whole number of at least 1")
 
     @override
-    def among(self, X: np.ndarray, equations: Equations) -> np.ndarray:
-        _, cell = np.unique(np.floor(X / equations.dx).astype(int), axis=0, return_inverse=True)
-        columns = equations.columns
-        of_cells = columns.new_zeros(len(columns), int(cell.max()) + 1)
-        of_cells.index_add_(1, torch.as_tensor(cell.ravel(), device=columns.device), columns)
-        chosen, _ = nonnegative_fit(of_cells, equations.target, self.cells)
-        return np.flatnonzero(np.isin(cell.ravel(), chosen))
+    def among(self, equations: Equations) -> np.ndarray:
+        _, cell = np.unique(equations.cells, axis=0, return_inverse=True)
+        cell = cell.ravel()
+        chosen, _ = nonnegative_fit(added_up(equations.columns, cell), equations.target, self.cells)
+        return np.flatnonzero(np.isin(cell, chosen))
+
+
+def added_up(columns: torch.Tensor, cell: np.ndarray) -> torch.Tensor:
+    """Sums [m, cells] of the columns [m, c] of each cell, in the order of the columns on any device."""
+    order = np.argsort(cell, kind="stable")
+    _, first, count = np.unique(cell[order], return_index=True, return_counts=True)
+    sums = columns.new_zeros(len(columns), len(first))
+    for turn in range(count.max()):  # one of each cell at a time
+        more = count > turn
+        rows, own = (torch.as_tensor(a, device=columns.device) for a in (order[first[more] + turn], more))
+        sums[:, own] += columns[:, rows]
+    return sums

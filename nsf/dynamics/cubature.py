@@ -10,6 +10,7 @@ from typing_extensions import override
 
 from nsf.dynamics.sampling import SamplePhase, Sampler
 from nsf.errors import ConfigError, ProjectionError
+from nsf.mpm.shape import stencil_offset
 
 if TYPE_CHECKING:
     from nsf.dynamics.solver import ReducedMPM
@@ -53,14 +54,14 @@ class CubatureSampler(Sampler):
         candidates = region.candidates(manifold.X.cpu().numpy())
         rows = training_rows(manifold, region.start, end, self.states)
         equations = normal_equations(manifold, rows, candidates, whole)
-        among = self.among(manifold.X.cpu().numpy()[candidates], equations)
+        among = self.among(equations)
         chosen, weights = nonnegative_fit(equations.columns[:, among], equations.target, region.size)
         order = np.argsort(chosen)
         return SamplePhase(region.start, candidates[among][chosen][order], weights[order])
 
-    def among(self, X: np.ndarray, equations: "Equations") -> np.ndarray:
-        """Which of the candidates, at rest at X [c, 3] [m], may be taken; all of them."""
-        return np.arange(len(X))
+    def among(self, equations: "Equations") -> np.ndarray | slice:
+        """Which of the candidates may be taken; all of them."""
+        return slice(None)
 
 
 class Equations(NamedTuple):
@@ -68,13 +69,13 @@ class Equations(NamedTuple):
 
     Attributes:
         columns: [m, c] of each candidate.
-        target: [m] sums.
-        dx: spacing of the grid [m].
+        target: [m] sums over all particles.
+        cells: [c, 3] node of the grid at which each candidate's stencil begins at rest.
     """
 
     columns: torch.Tensor
     target: torch.Tensor
-    dx: float
+    cells: np.ndarray
 
 
 def training_rows(manifold, start: float, end: float, count: int) -> torch.Tensor:
@@ -91,7 +92,7 @@ def training_rows(manifold, start: float, end: float, count: int) -> torch.Tenso
     inner[1:-1] = trajectory[:-2] == trajectory[2:]
     rows = torch.nonzero(inner & (t >= start * t.max()) & (t < end * t.max())).flatten()
     if not len(rows):
-        raise ConfigError(f"no training state lies in [{start:g}, {end:g}) of T; sampler=cubature needs one")
+        raise ConfigError(f"no training state lies in [{start:g}, {end:g}) of T; a cubature needs one")
     return rows[torch.linspace(0, len(rows) - 1, min(count, len(rows))).round().long()]
 
 
@@ -130,13 +131,15 @@ def normal_equations(
         if not error.isfinite().all():
             raise ProjectionError(
                 f"a step from training frame {step} at {values} is not finite; "
-                "sampler=cubature has nothing to learn from it"
+                "a cubature has nothing to learn from it"
             )
         least = _STILL * solver.geometry.dx * len(error) ** 0.5
         for shares in _shares(error.double(), J.double(), least):
             columns.append(shares[chosen].T)
             target.append(shares.sum(0))
-    return Equations(torch.cat(columns), torch.cat(target), solver.geometry.dx)
+    X, below = manifold.X.cpu().numpy()[candidates], stencil_offset(solver.transfer.shape)
+    cells = np.floor(X / solver.geometry.dx - below).astype(int)
+    return Equations(torch.cat(columns), torch.cat(target), cells)
 
 
 def _shares(error: torch.Tensor, J: torch.Tensor, least: float) -> tuple[torch.Tensor, torch.Tensor]:

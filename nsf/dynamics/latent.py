@@ -72,7 +72,10 @@ class LatentRecord:
 
     @property
     def predicted(self) -> torch.Tensor:
-        """[r] x̂_{n+1} on the parabola through the last three, or the line through two, or x̂_0; of one run."""
+        """[r] x̂_{n+1} on the parabola through the last three, or the line through two, or x̂_0.
+
+        Of one run: in several each has its own number of steps.
+        """
         change = self.now - self.before
         older = self.xhat.index_select(0, (self.row - 2).clamp_min(0))[0]
         bend = change - self.before + older

@@ -116,6 +116,7 @@ class ModalPhase(Phase):
     @override
     def enter(self, first: bool) -> None:
         record, state = self.setting.record, self.coefficients
+        self._arena.meet(1)  # where a step was left in its midst
         for xhat in (record.before, record.now):
             state.latent.copy_(xhat.view_as(state.latent))
             with on_torch_stream(self._arena.device):
@@ -124,7 +125,10 @@ class ModalPhase(Phase):
         state.step += 1  # what an earlier step stamped is of no account
 
     def infer(self) -> None:
-        """x and v, the particles that S needs, and their τ and C (paper sections 5.1 and 5.4)."""
+        """x and v, the particles that S needs, and their τ and C (paper sections 5.1 and 5.4).
+
+        Beside them, where the boundaries will be, and what of the inversion is known before the step.
+        """
         with self._arena.beside(1):  # what nothing needs before the grid is updated
             self.grid_step.follow()
             self._projection.prepare.launch()

@@ -1,11 +1,14 @@
 """Network inversion: the latent vector of given sample positions (paper section 5.3)."""
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 
 from nsf.errors import ConfigError
+
+if TYPE_CHECKING:
+    from nsf.dynamics.latent import LatentRecord
 
 #: Named reasons to stop, in the order of the codes that `stop_reasons` gives.
 STOP_REASONS = ("converged", "max_iterations", "stagnated", "diverged")
@@ -19,7 +22,7 @@ class ProjectionResult:
         xhat: [r] latent vector.
         residuals: [k + 1] RMS distance [m] of g(X_S, x̂) to the target, before each iteration and at the end;
             weighted where the particles are.
-        updates: [k] Euclidean length of each latent update.
+        updates: [k] Euclidean length of each latent update; 0 where none was needed.
     """
 
     xhat: torch.Tensor
@@ -31,12 +34,13 @@ class ProjectionResult:
 class GaussNewton:
     """Gauss-Newton on Σ w_p ‖g(X_p, x̂) − x_p‖² over S.
 
-    It starts on the parabola through the last three latent vectors.
+    The paper starts it at x̂_n, this on the parabola through the last three latent vectors.
 
     Attributes:
         iterations: most iterations (the paper needs 2-3).
-        tolerance: length of an update (x̂ has unit variance) that is of no account. An update is the last one
-            where its square, of whose order the next one is, does not exceed it.
+        tolerance: an update (x̂ has unit variance) is the last one where its square does not exceed this. A
+            further one would be of the order of that square where S can reach its target; as S leaves the
+            manifold in a step, it is a share of the update, mostly a few thousandths, instead.
 
     Raises:
         ConfigError: a value outside its range.
@@ -53,8 +57,8 @@ class GaussNewton:
         if not self.tolerance > 0:
             raise ConfigError(f"projector.tolerance={self.tolerance} must be positive")
 
-    def start(self, record) -> torch.Tensor:
-        """Where the inversion begins, by the `LatentRecord` of the steps before it."""
+    def start(self, record: "LatentRecord") -> torch.Tensor:
+        """Where the inversion begins, by what the steps before it left."""
         return record.predicted
 
     def solve(
@@ -74,7 +78,7 @@ class GaussNewton:
             error, J = _equations(at, target, xhat, weights)
             update = _normal_equations(J, error)
             residuals.append(_rms(error))
-            updates.append(torch.linalg.vector_norm(update))
+            updates.append(torch.where(active, torch.linalg.vector_norm(update), 0.0))
             xhat = torch.where(active, xhat + update, xhat)
             active = active & (updates[-1] ** 2 > self.tolerance)
         residuals.append(_rms(_weighted(target - at.position(xhat), weights)))
@@ -93,7 +97,7 @@ class Taylor:
     iterations: ClassVar[int] = 1
     tolerance: ClassVar[float] = 0.0  # it checks nothing, so it never claims convergence
 
-    def start(self, record) -> torch.Tensor:
+    def start(self, record: "LatentRecord") -> torch.Tensor:
         """Where the deformation field is linearised: x̂_n."""
         return record.now
 

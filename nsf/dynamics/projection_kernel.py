@@ -212,9 +212,9 @@ def make_projection(
 
     `PREPARE` evaluates both at the start x̂*, which is known before the step: on the parabola through the last
     three latent vectors, or x̂_n if linear. So a GPU does it beside the rest of the step, and what is left for
-    `SOLVE` is a product with (AᵀG A)⁻¹, as long as one update is enough. The next one is of the order of its
-    square: where that is below the tolerance, a moves by A u, which misses by as much. `EVALUATE` gives a and
-    ȧ at x̂_n, for a run that begins.
+    `SOLVE` is a product with (AᵀG A)⁻¹, as long as one update is enough. Where the square of an update does
+    not exceed the tolerance, it is the last (see `GaussNewton`), and a moves by A u, which misses by that
+    order. `EVALUATE` gives a and ȧ at x̂_n, for a run that begins.
 
     Args:
         precision: of the closure; sums over modes and the solution are fp64.
@@ -442,9 +442,9 @@ def make_projection(
             NSF_SYNC;
         }}
         if (block > 0) return;
-        if (going) {{
+        if (going && !linear) {{
             residual(0);
-        }} else {{
+        }} else if (!going) {{
             #pragma unroll 1
             for (int k = lane; k < K; k += lanes) {{
                 for (int c = 0; c < R; ++c) {{

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from nsf.dynamics import CellSampler, CubatureSampler, ParticleSets, SamplePhase
+from nsf.dynamics.cells import added_up
 from nsf.dynamics.cubature import nonnegative_fit, normal_equations, training_rows
 from nsf.errors import ConfigError, ProjectionError
 
@@ -40,7 +41,7 @@ def phase_of(tiny_manifold, whole):
 
 def residual(equations, phase) -> float:
     """How far the weighted sums over S are from those over every particle, relative."""
-    columns, target, _ = equations
+    columns, target = equations.columns, equations.target
     weighted = columns[:, torch.as_tensor(phase.particles)] @ torch.as_tensor(phase.weights)
     return float((weighted - target).norm() / target.norm())
 
@@ -77,6 +78,7 @@ class Still:
     """A whole body of two latents in which some particles never move, and the others move by `motion` [m]."""
 
     torch_device, dtype, dt, geometry = torch.device("cpu"), torch.float64, 0.005, SimpleNamespace(dx=0.02)
+    transfer = SimpleNamespace(shape="quadratic")
 
     def __init__(self, motion):
         generator = torch.Generator().manual_seed(2)
@@ -162,22 +164,35 @@ def test_the_residual_falls_with_size_and_beats_random_samples(equations, phase_
 
 def test_a_cubature_out_of_cells_needs_fewer_integration_particles(chain, tiny_manifold, whole, equations):
     """All of S is in the cells that are allowed, and weights bring the sums nearer than equal ones there."""
-    X, dx = tiny_manifold.X.numpy(), chain.scene.dx
     few, any_cell = (
         kind(24, states=STATES, **own).phases_of(tiny_manifold, whole=whole)
         for kind, own in ((CellSampler, {"cells": 3}), (CubatureSampler, {}))
     )
-    cells = {tuple(cell) for cell in np.floor(X / dx).astype(int)[few[0].particles]}
-    assert 1 < len(cells) <= 3
-    inside = np.flatnonzero([tuple(cell) in cells for cell in np.floor(X / dx).astype(int)])
-    equal = SamplePhase(0.0, inside, np.full(len(inside), len(X) / len(inside)))
-    assert residual(equations, few[0]) < residual(equations, equal)
+    # A quadratic stencil begins half a spacing below its particle.
+    every, cell = np.unique(
+        np.floor(tiny_manifold.X.numpy() / chain.scene.dx - 0.5), axis=0, return_inverse=True
+    )
+    assert np.array_equal(np.unique(equations.cells, axis=0), every)
+    assert 1 < len(set(cell.ravel()[few[0].particles])) <= 3
+    others = []
+    for seed in range(20):
+        three = np.random.default_rng(seed).permutation(len(every))[:3]
+        inside = np.flatnonzero(np.isin(cell.ravel(), three))
+        chosen, weights = nonnegative_fit(equations.columns[:, inside], equations.target, 24)
+        others.append(residual(equations, SamplePhase(0.0, inside[chosen], weights)))
+    assert residual(equations, few[0]) < 0.7 * np.mean(others)
     sizes = []
     for phases in (few, any_cell):
         solver = chain.scene.reduced(tiny_manifold, ANGLE, phases, device="cpu")
         solver.step(6)
         sizes.append(solver.integration_mean)
     assert sizes[0] < 0.8 * sizes[1]
+
+
+def test_sums_over_cells(equations):
+    cell = np.unique(equations.cells, axis=0, return_inverse=True)[1].ravel()
+    expected = np.stack([equations.columns[:, cell == c].numpy().sum(1) for c in range(cell.max() + 1)], 1)
+    np.testing.assert_allclose(added_up(equations.columns, cell), expected, rtol=0, atol=1e-14)
 
 
 def test_the_choice_is_bitwise_the_same(phase_of):

@@ -134,6 +134,10 @@ def test_the_start_lies_on_the_parabola_through_the_last_three():
         expected = path[n + 1] if n > 1 else 2.0 * path[1] - path[0]
         torch.testing.assert_close(GaussNewton().start(record), expected)
         assert torch.equal(Taylor().start(record), path[n])
+    record.restart()  # what was recorded stays, and is of no account
+    assert torch.equal(GaussNewton().start(record), path[0])
+    record.add(ProjectionResult(path[2], *nothing))
+    torch.testing.assert_close(GaussNewton().start(record), 2.0 * path[2] - path[0])
 
 
 def test_converged(start, goal):
