@@ -14,10 +14,11 @@ from nsf.errors import ConfigError
 class CellSampler(CubatureSampler):
     """A cubature whose particles are all from few cells of the grid, as the body lies in it at rest.
 
-    N are the particles that share a node with S, many for each of S where these are far apart. Particles
-    whose stencils begin at the same node at rest need the same ones then, and mostly so later. First such
-    cells are taken, each with the sums over its candidates, as the cubature takes particles, and then
-    particles with weights among those in these cells.
+    N are the particles that share a node with S, many for each of S where these are far apart; those of a
+    cell share most of theirs. First cells are taken, each with the sums over its candidates, as the cubature
+    takes particles, and then particles with weights among those in these cells. Cells lie between nodes:
+    particles whose stencils are the same would need still fewer others, but all see the same nodes, and tell
+    less of the motion.
 
     Attributes:
         cells: number of cells at most.

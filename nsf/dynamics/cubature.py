@@ -10,7 +10,6 @@ from typing_extensions import override
 
 from nsf.dynamics.sampling import SamplePhase, Sampler
 from nsf.errors import ConfigError, ProjectionError
-from nsf.mpm.shape import stencil_offset
 
 if TYPE_CHECKING:
     from nsf.dynamics.solver import ReducedMPM
@@ -70,7 +69,7 @@ class Equations(NamedTuple):
     Attributes:
         columns: [m, c] of each candidate.
         target: [m] sums over all particles.
-        cells: [c, 3] node of the grid at which each candidate's stencil begins at rest.
+        cells: [c, 3] cell of the grid, between its nodes, in which each candidate is at rest.
     """
 
     columns: torch.Tensor
@@ -137,8 +136,7 @@ def normal_equations(
         for shares in _shares(error.double(), J.double(), least):
             columns.append(shares[chosen].T)
             target.append(shares.sum(0))
-    X, below = manifold.X.cpu().numpy()[candidates], stencil_offset(solver.transfer.shape)
-    cells = np.floor(X / solver.geometry.dx - below).astype(int)
+    cells = np.floor(manifold.X.cpu().numpy()[candidates] / solver.geometry.dx).astype(int)
     return Equations(torch.cat(columns), torch.cat(target), cells)
 
 

@@ -78,7 +78,6 @@ class Still:
     """A whole body of two latents in which some particles never move, and the others move by `motion` [m]."""
 
     torch_device, dtype, dt, geometry = torch.device("cpu"), torch.float64, 0.005, SimpleNamespace(dx=0.02)
-    transfer = SimpleNamespace(shape="quadratic")
 
     def __init__(self, motion):
         generator = torch.Generator().manual_seed(2)
@@ -168,10 +167,7 @@ def test_a_cubature_out_of_cells_needs_fewer_integration_particles(chain, tiny_m
         kind(24, states=STATES, **own).phases_of(tiny_manifold, whole=whole)
         for kind, own in ((CellSampler, {"cells": 3}), (CubatureSampler, {}))
     )
-    # A quadratic stencil begins half a spacing below its particle.
-    every, cell = np.unique(
-        np.floor(tiny_manifold.X.numpy() / chain.scene.dx - 0.5), axis=0, return_inverse=True
-    )
+    every, cell = np.unique(np.floor(tiny_manifold.X.numpy() / chain.scene.dx), axis=0, return_inverse=True)
     assert np.array_equal(np.unique(equations.cells, axis=0), every)
     assert 1 < len(set(cell.ravel()[few[0].particles])) <= 3
     others = []
