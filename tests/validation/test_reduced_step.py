@@ -120,7 +120,7 @@ class OfPositions:
     """A projector that a step in coefficients cannot take."""
 
     iterations, tolerance = GaussNewton.iterations, GaussNewton.tolerance
-    solve = GaussNewton().solve
+    start, solve = GaussNewton().start, GaussNewton().solve
 
 
 @pytest.mark.parametrize("multiplier", [1.0, 1.5])
