@@ -4,6 +4,7 @@ No array library is imported here, so that layers which must not import one
 can be timed: a device is reached through the library that is already loaded.
 """
 
+import itertools
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -44,16 +45,25 @@ def untimed(stage: str) -> AbstractContextManager[None]:
 
 
 class StageTimer:
-    """Wall time a named stage, by the host's clock around a synchronised device.
+    """Wall time a named stage.
 
         timer = StageTimer(device)
         with timer("p2g"):
             ...
         timer.per_step(200)   # {"p2g": milliseconds}
 
-    Synchronising keeps stages from overlapping, so their sum exceeds an
-    untimed step: publish the time of the whole step beside a breakdown. It is
-    not allowed while a CUDA graph is being captured.
+    A call takes the host's clock around a synchronised device. Synchronising
+    keeps stages from overlapping, so their sum exceeds an untimed step, and
+    on a GPU the wait for launches counts: publish the time of the whole step
+    beside such a breakdown. Within a CUDA graph there are no launches to wait
+    for: there `captured` takes the place of a call, and the graph's own events
+    tell where the time of a launch went.
+
+        with capture() as graph:
+            with timer.captured("p2g"):
+                ...
+        launch(graph)
+        timer.add_launch()
 
     Args:
         device: "cpu", "cuda:0" or a library's device object.
@@ -63,7 +73,9 @@ class StageTimer:
     def __init__(self, device: Any = "cpu", synchronize: Synchronize | None = None) -> None:
         self.milliseconds: dict[str, float] = {}
         self.calls: dict[str, int] = {}
+        self._device = device
         self._synchronize = synchronize or synchronizer(device)
+        self._marks: list[tuple[str, Any]] = []
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:
@@ -72,9 +84,29 @@ class StageTimer:
         start = time.perf_counter()
         yield
         self._synchronize()
-        elapsed = 1e3 * (time.perf_counter() - start)
-        self.milliseconds[stage] = self.milliseconds.get(stage, 0.0) + elapsed
-        self.calls[stage] = self.calls.get(stage, 0) + 1
+        self._add(stage, 1e3 * (time.perf_counter() - start))
+
+    @contextmanager
+    def captured(self, stage: str) -> Iterator[None]:
+        """Mark the end of `stage` in the graph that is being captured on Warp's stream of the device.
+
+        A stage begins where the one before it ended. What the block puts on other streams counts where
+        the device's stream waits for it.
+
+        Raises:
+            DeviceError: torch or Warp is not loaded.
+        """
+        if not self._marks:
+            self._marks.append(("", self._mark()))
+        yield
+        self._marks.append((stage, self._mark()))
+
+    def add_launch(self) -> None:
+        """Add the times [ms] of the stages of a captured graph, once it has been launched."""
+        self._synchronize()
+        for (_, start), (stage, end) in itertools.pairwise(self._marks):
+            self._add(stage, start.elapsed_time(end))
+        self._marks.clear()
 
     def per_step(self, steps: int) -> dict[str, float]:
         """Mean time [ms] a step of every stage, in the order they first ran."""
@@ -84,6 +116,22 @@ class StageTimer:
         """Forget what was measured, such as a warm-up."""
         self.milliseconds.clear()
         self.calls.clear()
+
+    def _add(self, stage: str, ms: float) -> None:
+        self.milliseconds[stage] = self.milliseconds.get(stage, 0.0) + ms
+        self.calls[stage] = self.calls.get(stage, 0) + 1
+
+    def _mark(self) -> Any:
+        torch = _loaded("torch", lambda torch: torch.cuda.is_available())
+        warp = _loaded("warp", lambda warp: warp.is_cuda_available())
+        if not (torch and warp):
+            raise DeviceError("stages within a CUDA graph are timed by torch on Warp's stream; import both")
+        held = warp.get_device(str(self._device)).stream.cuda_stream
+        stream = torch.cuda.ExternalStream(held, device=str(self._device))
+        event = torch.cuda.Event(enable_timing=True, external=True)
+        with torch.cuda.stream(stream):  # torch asks its own current stream whether it is being captured
+            event.record(stream)
+        return event
 
 
 class MemoryProbe:

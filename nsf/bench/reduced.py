@@ -27,7 +27,7 @@ ARITHMETICS = {"cuda": (None, *ARITHMETIC), "cpu": (None,)}
 #: Trials of networks at most, and steps of one: theirs cost alike from the first to the last.
 _MOST, _FEW = 3, 200
 #: As in the experiment table1.
-MLP_TRAINING = ("trainer.steps=null", "trainer.budget_minutes=0.5")
+MLP_TRAINING = ("trainer.steps=null", "trainer.budget_minutes=1")
 _CHUNK = 2**26  # positions decoded at once
 
 

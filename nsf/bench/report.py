@@ -59,9 +59,9 @@ _KERNELS = (
 #: (appendix of the paper, Runtime analysis; double precision, one Quadro P6000).
 _PAPER = {"reduced_cake": (1.95, 4.69), "reduced_metal": (1.78, 2.09)}
 _STAGES = (
-    "Where the time of a reduced step goes, each stage synchronised, so that the sum may exceed a step "
-    "and inference has the part of the inversion that goes beside it otherwise; "
-    "beside it a frame of the paper's reduced solver on a Quadro P6000 (its appendix, Runtime analysis)."
+    "Where the time of a reduced step goes, by events within the captured step, which take a little time of "
+    "their own; what of the inversion is prepared on another stream counts where the step waits for it. "
+    "Beside it a frame of the paper's reduced solver on a Quadro P6000 (its appendix, Runtime analysis)."
 )
 _TRAINING = (
     "Training of all networks of a scene with field=basis: the time is that of a whole training, from "

@@ -85,7 +85,7 @@ class KernelRow:
 
 @dataclass(frozen=True)
 class StageRow:
-    """One stage of a step, synchronised before and after: a row of stages.csv.
+    """One stage of a step, on a GPU within the captured one: a row of stages.csv.
 
     Attributes:
         bench, case, particles, precision, device, commit: as in `Row`.

@@ -61,9 +61,9 @@ class Stepping(Phased):
                 self._step(self._advance)
 
     def timed_step(self, timer: StageTimer) -> None:
-        """One step, stage by stage under a timer; never from a captured graph."""
+        """One step, stage by stage under a timer; captured anew where steps are captured."""
         with torch.no_grad():
-            self._step(lambda: self._run_stages(timer))
+            self._step(partial(self._advance_timed, timer))
 
     @property
     def stages(self) -> Stages:
@@ -95,6 +95,15 @@ class Stepping(Phased):
             phase.graph = graph
         else:
             phase.graph.replay()
+
+    def _advance_timed(self, timer: StageTimer) -> None:
+        if self._phase.graph is None:
+            self._run_stages(timer)
+        else:
+            with captured(self.device) as graph:
+                self._run_stages(timer.captured)
+            graph.replay()
+            timer.add_launch()
 
     def _run_stages(self, timer: Callable = untimed) -> None:
         with on_torch_stream(self.device):

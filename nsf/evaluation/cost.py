@@ -34,8 +34,8 @@ class SolverCost:
             nothing timed inside [ms]; step_ms_p10, step_ms_p90: quantiles.
         total_ms: median over the trials of the time of all steps of a run, the first ones, which load
             and capture, included [ms]; building the solver is not.
-        stages: median over steps spread through a run of each stage's time [ms], synchronised, so
-            their sum may exceed a step.
+        stages: median over steps spread through a run of each stage's time [ms]; on a GPU within the
+            captured step, where steps are captured, else synchronised, so that their sum may exceed a step.
         memory_mib: peak of every allocator during the first run, beyond what was held before it [MiB].
         allocators: the same by allocator [MiB].
         trials: number of runs.
@@ -117,7 +117,7 @@ def _times(solver, steps: int, device: str) -> tuple[float, float]:
 
 
 def _stages(subject: Subject, samples: int, device: str) -> dict[str, float]:
-    """Median time of each stage [ms] over uncaptured steps spread evenly through a run."""
+    """Median time of each stage [ms] over steps spread evenly through a run."""
     solver = subject.build()
     chosen = np.unique(np.linspace(min(_WARM_UP, subject.steps - 1), subject.steps - 1, samples).astype(int))
     found: dict[str, list[float]] = {}

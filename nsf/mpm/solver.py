@@ -284,11 +284,21 @@ class FullOrderMPM:
         self.g2p_stress()
 
     def timed_step(self, timer: StageTimer) -> None:
-        """One step, stage by stage under a timer; never from a captured graph."""
+        """One step, stage by stage under a timer; captured anew where steps are captured."""
+        if self._graph is None:
+            self._run_stages(timer)
+        else:
+            _ = self.increment  # allocated outside the graph
+            with wp.ScopedCapture(device=self.device) as capture:
+                self._run_stages(timer.captured)
+            wp.capture_launch(capture.graph)
+            timer.add_launch()
+        self.steps_taken += 1
+
+    def _run_stages(self, timer: Callable) -> None:
         for name, stage in self.stages.items():
             with timer(name):
                 stage()
-        self.steps_taken += 1
 
     @property
     def stages(self) -> dict[str, Callable[[], None]]:

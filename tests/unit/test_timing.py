@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import pytest
@@ -130,6 +131,46 @@ def test_a_gpu_is_waited_for_through_the_loaded_library(monkeypatch, torch):
     assert gpu.waits == ["cuda:1"] * 2
 
 
+def test_a_launch_adds_the_times_between_the_marks_of_its_graph(monkeypatch):
+    now = iter([10.0, 12.0, 15.0, 20.0, 21.0, 25.0])
+
+    class Event:
+        def __init__(self, enable_timing, external):
+            assert (enable_timing, external) == (True, True)
+
+        def record(self, stream):
+            assert stream == "torch's view of Warp's stream"
+            self.at = next(now)
+
+        def elapsed_time(self, end):
+            return end.at - self.at
+
+    def view(held, device):
+        assert (held, device) == ("Warp's stream", "cuda:0")
+        return "torch's view of Warp's stream"
+
+    gpu = FakeGpu(monkeypatch)
+    torch, warp = (timing.sys.modules[name] for name in ("torch", "warp"))
+    torch.cuda.Event, torch.cuda.ExternalStream, torch.cuda.stream = Event, view, nullcontext
+    warp.get_device = lambda device: SimpleNamespace(stream=SimpleNamespace(cuda_stream="Warp's stream"))
+    timer = StageTimer("cuda:0")
+    for launch in (1, 2):
+        for stage in ("p2g", "grid"):
+            with timer.captured(stage):
+                pass
+        assert not gpu.waits or launch == 2  # nothing may be waited for while a graph is captured
+        timer.add_launch()
+        assert len(gpu.waits) == launch
+    assert timer.milliseconds == {"p2g": 2.0 + 1.0, "grid": 3.0 + 4.0}
+    assert timer.calls == {"p2g": 2, "grid": 2}
+
+
+def test_a_captured_stage_needs_both_libraries(monkeypatch):
+    FakeGpu(monkeypatch, torch=False)
+    with pytest.raises(DeviceError, match="import both"), StageTimer("cuda:0").captured("p2g"):
+        pass
+
+
 def test_a_gpu_that_is_not_there(monkeypatch):
     FakeGpu(monkeypatch, torch=False, warp=False)
     for make in (synchronizer, StageTimer, MemoryProbe):
@@ -156,3 +197,20 @@ def test_a_real_gpu(device):
     assert probe.grown_mib == pytest.approx(len(held) / MIB + len(array) / MIB, abs=4)
     assert probe.peak_mib >= probe.grown_mib
     assert probe.allocators["driver"] > 96
+
+
+@pytest.mark.gpu
+def test_stages_of_a_real_graph():
+    torch, wp = pytest.importorskip("torch"), pytest.importorskip("warp")
+    if not (torch.cuda.is_available() and wp.is_cuda_available()):
+        pytest.skip("needs a GPU")
+    timer, array = StageTimer("cuda:0"), wp.zeros(256 * MIB, dtype=wp.uint8, device="cuda:0")
+    with wp.ScopedCapture(device="cuda:0") as capture:
+        for stage, times in {"once": 1, "ten times": 10}.items():
+            with timer.captured(stage):
+                for _ in range(times):
+                    array.fill_(1)
+    wp.capture_launch(capture.graph)
+    timer.add_launch()
+    assert list(timer.milliseconds) == ["once", "ten times"]
+    assert 0 < timer.milliseconds["once"] < timer.milliseconds["ten times"]

@@ -13,6 +13,7 @@ from nsf.dynamics.phase import DecodedPhase
 from nsf.dynamics.projection_kernel import projection_fits
 from nsf.kinematics.basis import BasisManifold
 from nsf.mpm import precision_of
+from nsf.timing import StageTimer
 
 METHODS = [Method(f"{a}{b}", a, b) for a in (True, False) for b in (True, False)]
 
@@ -237,3 +238,23 @@ def test_the_gpu_takes_the_same_steps(chain, tiny_manifold, method, half, tolera
         np.testing.assert_allclose(gpu, cpu, rtol=0, atol=1e-3 * np.ptp(cpu))
     else:
         same(*found, tolerance=1e-6)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("phases", [(), [{"start": 0.5, "size": 20}]], ids=["one phase", "two"])
+def test_steps_timed_on_the_gpu_are_steps(chain, tiny_manifold, phases):
+    if not (torch.cuda.is_available() and wp.is_cuda_available()):
+        pytest.skip("needs a GPU")
+    sampler = RandomSampler(40, phases=phases)
+    timed, plain = (
+        chain.scene.reduced(tiny_manifold, {"friction_angle": 26.0}, sampler, device="cuda") for _ in range(2)
+    )
+    plain.step(16)
+    timer = StageTimer("cuda")
+    for part in (2, 10):  # so that each phase takes some steps of both kinds
+        timed.step(part)
+        for _ in range(2):
+            timed.timed_step(timer)
+    np.testing.assert_allclose(timed.xhat.cpu(), plain.xhat.cpu(), rtol=0, atol=1e-6)
+    assert list(timer.calls.items()) == [(n, 4) for n in ("inference", "p2g", "grid", "g2p", "inversion")]
+    assert min(timer.milliseconds.values()) > 0
