@@ -251,8 +251,8 @@ def _charts(v: _Variant, folder: Path, prefix: str, brief: bool) -> list[Picture
     if any(v.breakdown.values()):
         add(
             "runtime", cost_charts.runtime_breakdown(v.breakdown),
-            "Where a step's time goes, stage by stage; measuring takes a little time too, so that the sum may "
-            "exceed the step in the table.",
+            "Where a step's time goes, stage by stage; measuring takes a little time too, so that the sum "
+            "may exceed the step in the table.",
         )  # fmt: skip
     return pictures
 
