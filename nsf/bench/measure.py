@@ -139,6 +139,17 @@ def pass_time(call: Callable[[], None], device: str, trials: int = 5) -> float:
     return float(np.median(times))
 
 
+def launch_time(device: str, count: int) -> float:
+    """Median time [ms] of so many launches of nothing, each of which waits for the one before it."""
+    launch = wp.launch(_nothing, dim=1, device=device, record_cmd=True)
+    return pass_time(lambda: [launch.launch() for _ in range(count)], device)
+
+
+@wp.kernel(module="unique")
+def _nothing():
+    pass
+
+
 def name_of(device: str) -> str:
     """What a figure names as its device: the product for a GPU, else `cpu`."""
     found = wp.get_device(device)

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 
 from nsf import config
-from nsf.bench.measure import name_of
-from nsf.bench.rows import Result, Row, Settings, StageRow, commit
+from nsf.bench.measure import bandwidth, launch_time, name_of
+from nsf.bench.rows import KernelRow, Result, Row, Settings, StageRow, commit
 from nsf.data import Trajectory
 from nsf.data.schema import TRAJECTORY
 from nsf.dynamics.solver import reduced_steps
@@ -29,6 +29,9 @@ _MOST, _FEW = 3, 200
 #: As in the experiment table1.
 MLP_TRAINING = ("trainer.steps=null", "trainer.budget_minutes=1")
 _CHUNK = 2**26  # positions decoded at once
+#: Passes of a step each of which needs the one before it: x and v, the nodes under S, the particles that
+#: touch them, τ and C, P2G, the grid, G2P, the projection.
+_DEPENDENT = 8
 
 
 def run(settings: Settings, say: Callable[[str], object]) -> Result:
@@ -75,6 +78,7 @@ def measured(
     sets = {end: (solver.phases, solver.sets) for end, solver in built.items()}
     del built  # their arrays are on the device
     truth = chain.truth(value).path / TRAJECTORY
+    speed, launches = bandwidth(settings.device), launch_time(settings.device, _DEPENDENT)
 
     def reduced(precision: str, multiplier: float, end: str = ""):
         phases, own = sets[end]
@@ -108,8 +112,38 @@ def measured(
                     StageRow(row.bench, case, row.particles, precision, row.device, stage, ms, row.commit)
                     for stage, ms in cost.stages.items()
                 )
+                if solver:
+                    found.kernels.extend(floors(row, solver, cost.stages, speed, launches))
             error = "" if row.delta is None else f", δ {100 * row.delta:.3g} %"
             say(f"{case} {precision}: {row.ms_median:.4g} ms a step{error}")
+
+
+def floors(row: Row, solver, stages: Mapping[str, float], speed: float, launches: float) -> list[KernelRow]:
+    """What no reduced step of this design goes below: its largest passes over memory, and empty launches.
+
+    Args:
+        row: of the step.
+        solver: a `ReducedMPM` that has taken its steps.
+        stages: time of each stage [ms].
+        speed: of a copy [B/s].
+        launches: what as many launches of nothing as a step has passes that wait for each other take [ms].
+    """
+    N, nodes, real = row.integration, len(solver.sets[0].nodes), np.dtype(solver.precision.numpy).itemsize
+    moved = {
+        "inference": N * (solver.mode_bytes + 24 * real),  # the modes; x, v, C, τ
+        "p2g": real * (26 * N + 8 * nodes),  # x, v, C, τ, m, V; the nodes, there and back
+        "grid": real * 8 * nodes,
+    }
+    found = {name: (stages[name], size, 1e3 * size / speed) for name, size in moved.items()}
+    found[f"{_DEPENDENT} empty launches"] = launches, 0.0, launches
+    return [
+        KernelRow(
+            bench=row.bench, case=row.case, particles=row.particles, precision=row.precision, kernel=name,
+            ms=ms, device=row.device, mib=size / 2**20, gb_per_s=size / ms / 1e6, floor_ms=floor,
+            commit=row.commit,
+        )
+        for name, (ms, size, floor) in found.items()
+    ]  # fmt: skip
 
 
 def measured_networks(

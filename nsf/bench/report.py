@@ -55,6 +55,11 @@ _KERNELS = (
     "Floor: the time that these bytes take a copy measured in the same run; a step cannot be faster than "
     "the floors of its passes together as long as its state does not fit into a cache."
 )
+_FLOORS = (
+    "Passes of a reduced step within the captured step, and what cannot be less: the time that a copy takes "
+    "for the modes and the state of the particles that a step needs, each value once, and that of empty "
+    "launches, as many as a step has passes that wait for each other."
+)
 #: Of a reduced frame [ms]: the networks, the projection and copies between Warp and torch, and all of it
 #: (appendix of the paper, Runtime analysis; double precision, one Quadro P6000).
 _PAPER = {"reduced_cake": (1.95, 4.69), "reduced_metal": (1.78, 2.09)}
@@ -86,6 +91,8 @@ def write_report(folder: Path) -> Path:
     parts = ["# Speed", _LEAD]
     for device in results["device"].unique():
         rows, passes = (frame[frame["device"] == device] for frame in (results, kernels))
+        of_reduced = passes["bench"] == "reduced"
+        passes, floors = passes[~of_reduced], passes[of_reduced]
         stem = re.sub("[^a-z0-9]+", "-", device.lower())
         parts.append(f"## On {device}")
         of_size = rows[rows["bench"].isin(["full_order", "scaling"])]
@@ -102,6 +109,8 @@ def write_report(folder: Path) -> Path:
             with styled():
                 save(step_beside_paper(of_stages), folder, f"stages-{stem}")
             parts += [f"![{_STAGES}](stages-{stem}.png)", _STAGES]
+        if len(floors):
+            parts += [_FLOORS, _markdown(floors)]
         of_training = rows[rows["bench"] == "training"]
         if len(of_training):
             parts += [_TRAINING, _markdown(of_training)]

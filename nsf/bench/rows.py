@@ -63,11 +63,11 @@ class KernelRow:
 
     Attributes:
         bench, case, particles, precision, device, commit: as in `Row`.
-        kernel: the pass.
+        kernel: the pass, or how many launches of nothing.
         ms: median time [ms].
         mib: what it has to read and write, each value once [MiB].
         gb_per_s: their ratio [GB/s].
-        floor_ms: the time that these bytes take a copy of this run [ms].
+        floor_ms: the time that these bytes take a copy of this run; of empty launches their own [ms].
     """
 
     bench: str

@@ -18,11 +18,15 @@ class Arena:
     Args:
         precision: of the floating-point arrays that are of the model.
         device: Warp device.
+
+    Attributes:
+        mode_bytes: of the modes that are held.
     """
 
     def __init__(self, precision: Precision, device):
         self.precision, self.device = precision, device
         self.real, self._torch = torch_dtype(precision), torch_device(device)
+        self.mode_bytes = 0
         self._held: list[torch.Tensor] = []
         self._sides = [wp.Stream(device) for _ in range(2)] if device.is_cuda else []
 
@@ -78,6 +82,7 @@ class Arena:
         four = -(-K // 4)
         shape = (c, four, n, 4) if self.device.is_cuda else (n, c, four, 4)
         held = self.hold(torch.zeros(shape, dtype=dtype, device=self._torch), dtype)
+        self.mode_bytes += held.nbytes
         by_particle = held.permute(2, 0, 1, 3) if self.device.is_cuda else held
         for part in self._parts(table, rows):
             values = _rows(table, rows, part).to(self._torch) / lengths

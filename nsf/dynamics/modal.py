@@ -167,6 +167,11 @@ class ModalPhase(Phase):
     def nbytes(self) -> int:
         return super().nbytes + self._arena.nbytes
 
+    @property
+    @override
+    def mode_bytes(self) -> float:
+        return self._arena.mode_bytes / self.size
+
 
 class Coefficients:
     """Where B simulations are, in coefficients, on the device.

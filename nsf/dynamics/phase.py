@@ -125,6 +125,11 @@ class Phase(ABC):
         own += (self.C, self.tau, self._C_of_sample, self._increment)
         return self.at_sample.nbytes + self.grid_step.grid.nbytes + sum(a.nbytes for a in own)
 
+    @property
+    def mode_bytes(self) -> float:
+        """Bytes of the modes of one particle that a step reads; 0 where it reads none."""
+        return 0.0
+
     def p2g(self) -> None:
         """N → grid (paper section 5.2)."""
         self.grid_step.p2g(*self._integration)

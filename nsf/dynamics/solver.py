@@ -309,6 +309,11 @@ class ReducedMPM(ReducedRun, Stepping):
         """Bytes that the solver's arrays and fields take on the device."""
         return sum(p.nbytes for p in self._phases) + self.record.nbytes
 
+    @property
+    def mode_bytes(self) -> float:
+        """Bytes of the modes of one particle that a step reads; 0 where torch decodes it."""
+        return self._phase.mode_bytes
+
     def equations_at(
         self, step: int, xhat: torch.Tensor, previous: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:

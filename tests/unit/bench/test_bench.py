@@ -214,6 +214,18 @@ def test_stages_of_both_solvers(found):
     assert (stages["ms"] > 0).all()
 
 
+def test_a_reduced_step_stands_beside_its_floor(found, reduced):
+    kernels = pd.DataFrame(found.kernels, columns=columns(KernelRow))
+    names = ["inference", "p2g", "grid", "8 empty launches"]
+    assert kernels["kernel"].tolist() == 4 * names
+    read = kernels[kernels["kernel"] == "inference"].set_index(["case", "precision"])["mib"]
+    N = reduced.set_index(["case", "precision"])["integration"].reindex(read.index)
+    real = np.where(read.index.get_level_values("precision") == "fp64", 8, 4)
+    modes = 8 * (3 + 6 + 9)  # of a particle, in fp32
+    np.testing.assert_allclose(read, N * (4 * modes + 24 * real) / 2**20)
+    assert (kernels["floor_ms"] > 0).all()
+
+
 def test_training_is_timed_from_its_files(chain):
     own = Pipeline(chain.pipeline.config, say=lambda line: None, root=chain.root)
     found, said = Result(), []
@@ -406,7 +418,8 @@ def test_whole_runs_take_turns():
 
 def test_a_report_of_scenes(reduced, found, tmp_path):
     reduced.to_csv(tmp_path / "results.csv", index=False)
-    pd.DataFrame(columns=columns(KernelRow)).to_csv(tmp_path / "kernels.csv", index=False)
+    kernels = pd.DataFrame(found.kernels, columns=columns(KernelRow))
+    kernels.to_csv(tmp_path / "kernels.csv", index=False)
     stages = pd.DataFrame(found.stages, columns=columns(StageRow))
     stages.to_csv(tmp_path / "stages.csv", index=False)
     page = write_report(tmp_path)
@@ -414,6 +427,7 @@ def test_a_report_of_scenes(reduced, found, tmp_path):
     stages.replace({"case": {"reduced_sand": "reduced_metal"}}).to_csv(tmp_path / "stages.csv", index=False)
     assert "(stages-cpu.png)" in write_report(tmp_path).read_text()
     assert "| reduced_sand_1.5dt |" in page.read_text()
+    assert page.read_text().count("| 8 empty launches |") == 4
     assert (tmp_path / "reduced-cpu.png").stat().st_size > 5000
 
 
