@@ -172,6 +172,7 @@ class MemoryProbe:
 
     def __enter__(self) -> "MemoryProbe":
         if self._torch:
+            self._torch.cuda.init()  # before its allocator is asked: where nothing has been on the GPU yet
             self._torch.cuda.reset_peak_memory_stats(str(self.device))
         if self._warp:
             self._mark = self._warp.get_mempool_used_mem_high(str(self.device))

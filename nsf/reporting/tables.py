@@ -210,7 +210,7 @@ def without_constants(
     """
     describing = [name for name in (*VARIANT, "gamma", "integration_mean", "commit", *also) if name in frame]
     said = {name: {v for v in frame[name].map(str) if v not in ("", ABSENT, "nan")} for name in describing}
-    if SETTING in said and (frame[SETTING].eq("") & frame["field"].ne(PAPER)).any():
+    if said.get(SETTING) and (frame[SETTING].eq("") & frame["field"].ne(PAPER)).any():
         said[SETTING].add("")  # as the scene has it, which is another setting than one that is named
     constant = [name for name in describing if name not in keep and len(said[name]) == 1]
     empty = [name for name in (SETTING, PLACE) if name in frame and set(frame[name]) <= {"", ABSENT}]

@@ -84,10 +84,12 @@ class FakeGpu:
 
     def __init__(self, monkeypatch, torch=True, warp=True):
         self.torch, self.torch_peak, self.warp, self.warp_mark, self.waits = 10, 50, 20, 40, []
+        self.begun = False
         cuda = SimpleNamespace(
             is_available=lambda: True,
+            init=lambda: setattr(self, "begun", True),
             synchronize=lambda device: self.waits.append(device),
-            reset_peak_memory_stats=lambda device: setattr(self, "torch_peak", self.torch),
+            reset_peak_memory_stats=self.reset,
             memory_allocated=lambda device: self.torch * MIB,
             max_memory_allocated=lambda device: self.torch_peak * MIB,
             mem_get_info=lambda device: (900 * MIB, 1000 * MIB),
@@ -105,6 +107,11 @@ class FakeGpu:
             "warp": fake_warp if warp else None,
         }
         monkeypatch.setattr(timing, "sys", SimpleNamespace(modules=modules))
+
+    def reset(self, device):
+        if not self.begun:  # as torch does
+            raise RuntimeError("Invalid device argument")
+        self.torch_peak = self.torch
 
 
 def test_a_gpu_adds_both_allocators_over_the_region_alone(monkeypatch):
