@@ -30,6 +30,20 @@ class ProjectionResult:
     updates: torch.Tensor
 
 
+def check_projector(projector) -> None:
+    """Whether a projector, which may be one's own, has all that a reduced run asks of it.
+
+    Raises:
+        ConfigError: it lacks one of `start`, `solve`, `iterations` and `tolerance` of `GaussNewton`.
+    """
+    missing = [n for n in ("start", "solve", "iterations", "tolerance") if not hasattr(projector, n)]
+    if missing:
+        raise ConfigError(
+            f"{type(projector).__name__} is no projector: it lacks {', '.join(missing)}; "
+            "nsf.dynamics.GaussNewton has what one needs"
+        )
+
+
 @dataclass(frozen=True)
 class GaussNewton:
     """Gauss-Newton on Σ w_p ‖g(X_p, x̂) − x_p‖² over S.

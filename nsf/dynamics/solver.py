@@ -10,7 +10,7 @@ from nsf.data import hash_of_positions
 from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
 from nsf.dynamics.interop import on_torch_stream, torch_device, torch_dtype
 from nsf.dynamics.latent import Decoder, LatentRecord, LatentState, LatentTrajectory
-from nsf.dynamics.projection import GaussNewton, Taylor
+from nsf.dynamics.projection import GaussNewton, Taylor, check_projector
 from nsf.dynamics.sampling import RandomSampler, SamplePhase, Sampler, check_well_posed
 from nsf.dynamics.stepping import Phased, Stepping, build_phases
 from nsf.dynamics.stress import Method
@@ -50,7 +50,7 @@ class ReducedRun(Phased):
         ProjectionError: |S| < r/3.
         SchemaError: the manifold was trained for other particles.
         ShapeError: xhat or velocity has another shape.
-        ConfigError, DeviceError: a value or device is refused.
+        ConfigError, DeviceError: a value, a projector or a device is refused.
     """
 
     def __init__(
@@ -71,6 +71,7 @@ class ReducedRun(Phased):
     ):
         if not dt_multiplier > 0:
             raise ConfigError(f"dt_multiplier={dt_multiplier} must be positive")
+        check_projector(projector)
         for phase in phases:
             check_well_posed(len(phase.particles), manifold.latent_dim)
         self.manifold, self.scene, self.method, self.projector = manifold, scene, method, projector

@@ -297,6 +297,16 @@ def test_phases_begin_when_they_say(solver_of):
     assert solver.needed_outside() == 0
 
 
+def test_a_projector_of_ones_own_needs_all_of_one(solver_of):
+    class Half:
+        iterations, tolerance = 1, 0.0
+
+        def solve(self, at, target, xhat, weights=None): ...
+
+    with pytest.raises(ConfigError, match=r"Half is no projector: it lacks start; .*GaussNewton"):
+        solver_of(20, projector=Half())
+
+
 def test_every_phase_needs_enough_particles(solver_of):
     with pytest.raises(ProjectionError, match=r"\|S\|=1 gives 3 equations for r=4"):
         solver_of(RandomSampler(40, phases=[{"start": 0.5, "size": 1}]))
