@@ -17,11 +17,10 @@ from nsf.dynamics.modal_kernels import (
     THREADS,
     make_contraction,
     make_gathering,
-    make_layer,
     make_position,
-    make_selection,
     tiling,
 )
+from nsf.dynamics.network_kernel import make_layer
 from nsf.dynamics.phase import Phase, Setting, Stages
 from nsf.dynamics.projection import GaussNewton, Taylor
 from nsf.dynamics.projection_kernel import (
@@ -34,6 +33,7 @@ from nsf.dynamics.projection_kernel import (
     projection_block,
     projection_fits,
 )
+from nsf.dynamics.selection_kernels import make_selection
 from nsf.dynamics.stress import Method
 from nsf.kinematics.basis import BasisManifold, ModalFactors
 from nsf.mpm import GridStep, Precision

@@ -13,8 +13,6 @@ import warp as wp
 from nsf.dynamics.projection_kernel import SHARED, TAKEN
 from nsf.mpm import Precision
 from nsf.mpm.copies import make_copies
-from nsf.mpm.grid import inside
-from nsf.mpm.shape import shape_functions
 
 THREADS = 128  # of a block that shares coefficients, or a sum over S
 _AHEAD = 4  # vectors of modes whose loads are under way together
@@ -142,10 +140,6 @@ def _combination(names: str, coefficient: str, tile: int, several: bool, half: b
 """
 
 
-def _scalar(precision: Precision) -> str:
-    return {"fp32": "float", "fp64": "double"}[precision.name]
-
-
 @cache
 def make_position(precision: Precision, vectors: int, tile: int = 1, several: bool = False):
     """Kernel of x and v at N, one thread a particle and tile of simulations, launched over whole blocks.
@@ -157,7 +151,7 @@ def make_position(precision: Precision, vectors: int, tile: int = 1, several: bo
     sums = wp.types.vector(length=6 * tile, dtype=real)
     tile_of, within = _make_placing(several)
     snippet = f"""
-    typedef {_scalar(precision)} real;
+    typedef {precision.native} real;
     const int Q = {vectors}, c = 0, components = 3, particles = mean.shape[0];
     const bool live = p < particles;
     {_combination("a rate", "double", tile, several)}
@@ -204,108 +198,6 @@ def make_position(precision: Precision, vectors: int, tile: int = 1, several: bo
     return position
 
 
-# Adds `taken`, 0 or 1, to count[copy, 0]; threads of a warp that are of one simulation add together.
-_COUNT = """
-#if defined(__CUDA_ARCH__)
-    unsigned long long* at = (unsigned long long*)count.data + size_t(copy) * count.shape[1];
-#if __CUDA_ARCH__ >= 700
-    const unsigned there = __activemask();
-    const unsigned own = __match_any_sync(there, copy);
-    const unsigned takers = __ballot_sync(there, taken != 0) & own;
-    const bool first = (threadIdx.x & 31) == __ffs(own) - 1;
-    if (first && takers != 0) atomicAdd(at, (unsigned long long)__popc(takers));
-#else
-    if (taken != 0) atomicAdd(at, 1ull);
-#endif
-#else
-    count.data[size_t(copy) * count.shape[1]] += taken;
-#endif
-"""
-
-
-@cache
-def make_selection(precision: Precision, shape_name: str, several: bool = False):
-    """Kernels that find the particles which the step of S needs, exactly as in the paper.
-
-    `stamp` writes the number of the step to every cell from which a stencil meets one of S's, `select` takes
-    S and the particles in these cells, and moves the others off the grid, where the transfers pass over them.
-    Cells are those of a box that starts at `lower`, of which each simulation has its own.
-
-    Source: paper section 5.4, a and b.
-    """
-    real, vec3 = precision.real, precision.vec3
-    shape = shape_functions(precision, shape_name)
-    base_node, reach = shape.base_node, shape.degree
-    across = 2 * reach + 1
-    share, copy_of = make_copies(several)
-
-    @wp.func_native(_COUNT)
-    def add_up(count: wp.array2d(dtype=wp.int64), copy: int, taken: int): ...
-
-    @wp.func
-    def cell(base: wp.vec3i, lower: wp.vec3i, extent: wp.vec3i):
-        at = base - lower
-        if not inside(at, 1, extent):
-            return -1
-        return (at[0] * extent[1] + at[1]) * extent[2] + at[2]
-
-    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
-    def stamp(
-        x: wp.array(dtype=vec3),
-        inv_dx: real,
-        lower: wp.vec3i,
-        extent: wp.vec3i,
-        step: wp.array(dtype=wp.int32),
-        stamps: wp.array2d(dtype=wp.int32),
-        sample: int,
-    ):
-        t = wp.tid()
-        of_sample, offset = t / wp.static(across**3), t % wp.static(across**3)
-        copy = copy_of(of_sample, sample)
-        p = of_sample + copy * (share(x.shape[0], step.shape[0]) - sample)
-        base = base_node(x[p], inv_dx)
-        place = wp.vec3i(offset / (across * across), (offset / across) % across, offset % across)
-        c = cell(base + place - wp.vec3i(reach, reach, reach), lower, extent)
-        if c >= 0:
-            stamps[copy, c] = step[copy]
-
-    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
-    def select(
-        inv_dx: real,
-        lower: wp.vec3i,
-        extent: wp.vec3i,
-        step: wp.array(dtype=wp.int32),
-        stamps: wp.array2d(dtype=wp.int32),
-        sample: int,
-        grid_shape: wp.vec3i,
-        x: wp.array(dtype=vec3),
-        v: wp.array(dtype=vec3),
-        needed: wp.array2d(dtype=wp.int32),
-        count: wp.array2d(dtype=wp.int64),
-    ):
-        p = wp.tid()
-        copy = copy_of(p, needed.shape[1])
-        within = p - copy * needed.shape[1]
-        base = base_node(x[p], inv_dx)
-        taken = 0
-        if within < sample:
-            taken = 1
-            if not inside(base, wp.static(reach + 1), grid_shape):
-                v[p] = vec3()  # no transfer will move it
-        else:
-            c = cell(base, lower, extent)
-            if c >= 0 and stamps[copy, c] == step[copy]:
-                taken = 1
-            else:
-                x[p] = vec3(real(-1.0), real(-1.0), real(-1.0))  # the grid starts at the origin
-        needed[copy, within] = taken
-        add_up(count, copy, taken)
-        if within == 0:
-            count[copy, 1] = count[copy, 1] + wp.int64(1)
-
-    return stamp, select
-
-
 @cache
 def make_contraction(
     precision: Precision,
@@ -327,7 +219,7 @@ def make_contraction(
     tile_of, within = _make_placing(several)
     scalar = {wp.float32: "float", wp.float64: "double"}[coefficients]
     snippet = f"""
-    typedef {_scalar(precision)} real;
+    typedef {precision.native} real;
     const int Q = {vectors}, components = mean.shape[1], particles = mean.shape[0];
     {_combination("a", scalar, tile, several, half)}
     """
@@ -389,100 +281,6 @@ def make_contraction(
                     found[row, 2, 2] = three
 
     return contraction
-
-
-@cache
-def make_layer(precision: Precision, tile: int = 1, several: bool = False):
-    """Kernel of one layer of two networks at once: act(W x + b), W [out, in], x and b of each simulation.
-
-    One warp has an output in the simulations of a tile. SiLU where `active`, else the identity; the second
-    network's outputs follow the first's, `outputs` in all. Where W has fewer columns than x has entries, both
-    are of several members, whose rows and entries follow each other.
-    """
-    real = precision.real
-    sums = wp.types.vector(length=tile, dtype=real)
-    _, copy_of = make_copies(several)
-    snippet = f"""
-    typedef {_scalar(precision)} real;
-    const bool one = output < b_1.shape[1];
-    const int o = one ? output : output - b_1.shape[1], outputs = one ? b_1.shape[1] : b_2.shape[1];
-    const int n = one ? W_1.shape[1] : W_2.shape[1], entries = one ? x_1.shape[1] : x_2.shape[1];
-    const int at = o / (outputs / (entries / n)) * n;  // where the entries of the output's member begin
-    const real* row = (one ? W_1.data : W_2.data) + size_t(o) * n;
-    const real *inputs[{tile}], *bias[{tile}];
-    for (int s = 0; s < {tile}; ++s) {{
-        const int simulation = wp::min(start + s, x_1.shape[0] - 1);  // one beyond the last is done again
-        inputs[s] = (one ? x_1.data : x_2.data) + size_t(simulation) * entries + at;
-        bias[s] = (one ? b_1.data : b_2.data) + size_t(simulation) * outputs + o;
-    }}
-    wp::vec_t<{tile}, real> sum;
-    #pragma unroll 4
-    for (int i = lane; i < n; i += lanes) {{
-        const real w = row[i];
-        #pragma unroll
-        for (int s = 0; s < {tile}; ++s) sum[s] += w * inputs[s][i];
-    }}
-    #pragma unroll
-    for (int s = 0; s < {tile}; ++s) {{
-#if defined(__CUDA_ARCH__)
-        for (int d = 16; d > 0; d /= 2) sum[s] += __shfl_xor_sync(0xffffffffu, sum[s], d);
-#endif
-        sum[s] += *bias[s];
-    }}
-    return sum;
-    """
-
-    @wp.func_native(snippet)
-    def row(
-        W_1: wp.array2d(dtype=real),
-        b_1: wp.array2d(dtype=real),
-        x_1: wp.array2d(dtype=real),
-        W_2: wp.array2d(dtype=real),
-        b_2: wp.array2d(dtype=real),
-        x_2: wp.array2d(dtype=real),
-        start: int,
-        output: int,
-        lane: int,
-        lanes: int,
-    ) -> sums: ...
-
-    @wp.func
-    def silu(z: real):
-        return z / (real(1.0) + wp.exp(-z))
-
-    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
-    def layer(
-        W_1: wp.array2d(dtype=real),
-        b_1: wp.array2d(dtype=real),
-        x_1: wp.array2d(dtype=real),
-        W_2: wp.array2d(dtype=real),
-        b_2: wp.array2d(dtype=real),
-        x_2: wp.array2d(dtype=real),
-        active: int,
-        lanes: int,
-        outputs: int,
-        y_1: wp.array2d(dtype=real),
-        y_2: wp.array2d(dtype=real),
-    ):
-        t = wp.tid()
-        at = copy_of(t / lanes, outputs)
-        o, lane = t / lanes - at * outputs, t % lanes
-        start = at * wp.static(tile)
-        first = b_1.shape[1]
-        z = row(W_1, b_1, x_1, W_2, b_2, x_2, start, o, lane, lanes)
-        if lane != 0:
-            return
-        for s in range(wp.static(tile)):
-            if start + s < x_1.shape[0]:
-                y = z[s]
-                if active != 0:
-                    y = silu(y)
-                if o < first:
-                    y_1[start + s, o] = y
-                else:
-                    y_2[start + s, o - first] = y
-
-    return layer
 
 
 @cache

@@ -235,7 +235,7 @@ def make_projection(
     if widths:
         counts = "{" + ", ".join(map(str, widths)) + "}"
         closure = _CLOSURE.format(layers=len(widths) - 1, members=members, widths=counts)
-    scalar = {"fp32": "float", "fp64": "double"}[precision.name]
+    scalar = precision.native
     snippet = f"""
     typedef {scalar} real;
     typedef float slope_t;  // as Warp takes float(x) for its own

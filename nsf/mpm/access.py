@@ -114,7 +114,7 @@ def make_sum(precision: Precision, deterministic: bool):
         @wp.func_native(_RUN)
         def run_of(key: int) -> int: ...
 
-        @wp.func_native(_SUM.format(real="float" if precision is FP32 else "double"))
+        @wp.func_native(_SUM.format(real=precision.native))
         def total(value: vec4, run: int) -> vec4: ...
 
     return run_of, total

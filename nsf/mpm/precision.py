@@ -20,6 +20,7 @@ class Precision:
         vec4: Warp 4-vector.
         mat33: Warp 3×3 matrix, row major.
         numpy: NumPy scalar type.
+        native: scalar in code of C++ and CUDA.
     """
 
     name: str
@@ -28,10 +29,11 @@ class Precision:
     vec4: Any
     mat33: Any
     numpy: Any
+    native: str
 
 
-FP32 = Precision("fp32", wp.float32, wp.vec3f, wp.vec4f, wp.mat33f, np.float32)
-FP64 = Precision("fp64", wp.float64, wp.vec3d, wp.vec4d, wp.mat33d, np.float64)
+FP32 = Precision("fp32", wp.float32, wp.vec3f, wp.vec4f, wp.mat33f, np.float32, "float")
+FP64 = Precision("fp64", wp.float64, wp.vec3d, wp.vec4d, wp.mat33d, np.float64, "double")
 _BY_NAME = {"fp32": FP32, "fp64": FP64}
 
 
