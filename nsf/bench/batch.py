@@ -8,7 +8,7 @@ import torch
 
 from nsf import config
 from nsf.bench.measure import build, name_of, run_times
-from nsf.bench.reduced import SAMPLERS, SCENES, deformation_error
+from nsf.bench.reduced import SCENES, deformation_error, samplers
 from nsf.bench.rows import Result, Row, Settings, commit
 from nsf.data.schema import TRAJECTORY
 from nsf.dynamics import ReducedBatch, ReducedMPM, ReducedRun
@@ -25,12 +25,12 @@ def run(settings: Settings, say: Callable[[str], object]) -> Result:
 
     Data and training are made, or reused, as by `nsf train`. The first simulation of a batch is that of the
     first held-out value, of which δ is told; the others' values fill the range of training. Sample particles
-    are the scene's own, and in another case chosen so that a step needs few others (`sampler=cells`).
+    are chosen in the scene's own way, or as the name of a case says.
     """
     kind = "cuda" if settings.device.startswith("cuda") else "cpu"
     scale, found = {"cuda": "paper", "cpu": "small"}[kind], Result()
     for scene in settings.scenes or SCENES:
-        for end, own in SAMPLERS.items():
+        for end, own in samplers(scene).items():
             overrides = [f"scene={scene}", f"scale={scale}", f"device={settings.device}", *own]
             measured(Pipeline(config.load(overrides), say=say), SIZES[kind], settings, found, say, end)
     return found

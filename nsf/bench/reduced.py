@@ -18,8 +18,8 @@ from nsf.kinematics.networks import ARITHMETIC
 from nsf.pipeline import Pipeline
 
 SCENES = ("cake", "metal")
-#: The end of a case's name, and how its sample particles are chosen.
-SAMPLERS = {"": (), "_cells": ("sampler=cells",)}
+#: How sample particles are chosen in another case of a scene, beside the scene's own way.
+OTHER_SAMPLER = {"cake": "region", "metal": "cells"}
 #: Steps of the deployment in units of the scene's Δt (paper section 6.1 has 1.5 on cake).
 MULTIPLIERS = (1.5, 2.0, 3.0)
 #: Of the networks of stress and affine momentum with field=mlp; a CPU has no tensor cores.
@@ -38,20 +38,27 @@ def run(settings: Settings, say: Callable[[str], object]) -> Result:
     """Each scene: at the paper's size on a GPU, at small scale on a CPU.
 
     Data and training are made, or reused, as by `nsf train`. A step of k Δt stands in the case's name; it
-    moves the scene by k times as much as the others. `cells` there means that sample particles are chosen
-    so that a step needs few others (`sampler=cells`); else they are the scene's own. With field=mlp it
-    names what multiplies the hidden layers of h and l: tf32 or bf16 on tensor cores, or nothing where they
-    are in the precision of the step.
+    moves the scene by k times as much as the others. The name of a sampler there is how sample particles are
+    chosen, else in the scene's own way. With field=mlp it names what multiplies the hidden layers of h and
+    l: tf32 or bf16 on tensor cores, or nothing where they are in the precision of the step.
     """
     found = Result()
     for scene in settings.scenes or SCENES:
         scale = scale_of(settings.device)
         overrides = [f"scene={scene}", f"scale={scale}", f"device={settings.device}"]
-        chains = {name: Pipeline(config.load([*overrides, *own]), say=say) for name, own in SAMPLERS.items()}
+        chains = {
+            end: Pipeline(config.load([*overrides, *own]), say=say) for end, own in samplers(scene).items()
+        }
         measured(chains, settings, found, say)
         overrides += ["field=mlp", *(MLP_TRAINING if scale == "paper" else ())]
         measured_networks(Pipeline(config.load(overrides), say=say), settings, found, say)
     return found
+
+
+def samplers(scene: str) -> dict[str, tuple[str, ...]]:
+    """The end of a case's name, and the overrides by which its sample particles are chosen."""
+    other = OTHER_SAMPLER[scene]
+    return {"": (), f"_{other}": (f"sampler={other}",)}
 
 
 def scale_of(device: str) -> str:

@@ -273,7 +273,9 @@ def steps_by_scene(results: pd.DataFrame) -> Figure:
     Args:
         results: rows of `reduced` of one device.
     """
-    scene = results["case"].str.extract(r"^(?:full_order|reduced)_(.+?)(?:_[\d.]+dt|_mlp\w*|_cells)?$")[0]
+    scene = results["case"].str.extract(
+        r"^(?:full_order|reduced)_(.+?)(?:_[\d.]+dt|_mlp\w*|_cells|_region)?$"
+    )[0]
     panels_of = list(results.groupby(scene, sort=False))
     with styled():
         fig = figure(1.2 + 0.3 * max(len(part) for _, part in panels_of))

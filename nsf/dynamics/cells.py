@@ -29,7 +29,7 @@ class CellSampler(CubatureSampler):
     Source: the choice of particles is that of `CubatureSampler`; cells before them are our own.
     """
 
-    cells: int = 12
+    cells: int = 16
 
     def __post_init__(self):
         super().__post_init__()

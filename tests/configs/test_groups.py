@@ -40,8 +40,8 @@ def test_material_follows_a_path(name, path):
 
 
 def test_a_scene_may_state_its_sample_regions():
-    """`sampler=region` is cake's default, a choice for every scene, and can be turned off."""
-    cake = Pipeline(config.load(["scene=cake", "device=cpu"])).sampler
+    """`sampler=region` has cake's regions, as the paper; it is a choice for every scene."""
+    cake = Pipeline(config.load(["scene=cake", "sampler=region", "device=cpu"])).sampler
     assert [r.size for r in cake.regions] == [700, 400]
     assert [r.start for r in cake.regions] == [0.0, 0.5]
     assert cake.regions[0].lower == cake.regions[1].lower == [0.45, 0.45, 0.0]
