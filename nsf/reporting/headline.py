@@ -55,7 +55,9 @@ class Report:
         keys = pd.DataFrame([_own(run) for run in runs], index=frame.index).replace("null", np.nan)
         frame = frame.join(keys)
         records = frame.to_dict("records")
-        frame[_PAPER] = [self._printed(row, run) for row, run in zip(records, runs, strict=True)]
+        numbers = frame.groupby(["scene", "method", "field"])["sample"].transform("nunique")
+        told = zip(records, runs, numbers > 1, strict=True)
+        frame[_PAPER] = [self._printed(row, run, compared) for row, run, compared in told]
         held_out = frame["split"] != "train"
         return frame[held_out] if held_out.any() else frame
 
@@ -101,12 +103,16 @@ class Report:
         """Scales of its runs that are not the paper's."""
         return {str(run["scale"]) for run in self.told["runs"].values() if run.get("scale")} - {"paper"}
 
-    def _printed(self, row: Mapping, run: Mapping) -> float:
-        """The paper's δ of a row: the entry of it, else the scene's where r and |S| are its; or NaN."""
+    def _printed(self, row: Mapping, run: Mapping, compared: bool) -> float:
+        """The paper's δ of a row: the entry of it, else the scene's where r is its; or NaN.
+
+        Where several |S| of a method are compared, the scene's stands beside its own.
+        """
         entries = self.told.get("printed")
         if entries is None:
             stated = (run.get("paper") or {}).get(row["method"], {})
-            same = all(str(stated[name]) == row[name] for name in ("r", "sample") if name in stated)
+            own = ("r", "sample") if compared else ("r",)
+            same = all(str(stated[name]) == row[name] for name in own if name in stated)
             return stated.get("delta", np.nan) if same else np.nan
         known = (run.get("keys") or {}) | {name: row[name] for name in ("scene", "method", "field")}
         known |= {"parameter": parameter_text(row["parameter"])}

@@ -52,6 +52,12 @@ def test_the_paper_is_shown_at_its_own_number_of_particles_and_coordinates(tmp_p
     np.testing.assert_array_equal(report.rows["paper"], [np.nan, 0.004, np.nan])
 
 
+def test_the_paper_is_shown_beside_the_one_number_of_particles_that_a_scene_has(tmp_path):
+    jobs = [job(parameter=value, **{"sampler.size": "40"}) for value in (1.0, 2.0)]
+    report = Report(write_report(tmp_path / "a", jobs), _sources(tmp_path / "a"))
+    np.testing.assert_array_equal(report.rows["paper"], [0.004, 0.004])
+
+
 @pytest.mark.parametrize(
     ("entry", "expected"),
     [
