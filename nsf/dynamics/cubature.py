@@ -103,7 +103,8 @@ def normal_equations(
 
     A state has r equations of the right-hand side and r (r + 1)/2 of the matrix, in the latent coordinates
     in which Σ_P JᵀJ is the identity, so that they do not depend on the coordinates; both sums have norm one,
-    but for the right-hand side's of a body at rest.
+    but for the right-hand side's of a body at rest. States from which a step is not finite, as those of a
+    method that diverges may be, are left out.
 
     Args:
         manifold: trained fields.
@@ -112,10 +113,10 @@ def normal_equations(
         whole: problem parameters → reduced solver whose sample is every particle.
 
     Returns:
-        k (r + r (r + 1)/2) of them.
+        r + r (r + 1)/2 of them for each state that counts.
 
     Raises:
-        ProjectionError: a particle is not finite after a step.
+        ProjectionError: no step is finite.
     """
     columns, target, solver, parameters = [], [], None, None
     for row in rows.tolist():
@@ -128,14 +129,16 @@ def normal_equations(
         step = round(float(manifold.training_times[row]) / solver.dt)
         error, J = solver.equations_at(step, xhat, previous)
         if not error.isfinite().all():
-            raise ProjectionError(
-                f"a step from training frame {step} at {values} is not finite; "
-                "a cubature has nothing to learn from it"
-            )
+            continue
         least = _STILL * solver.geometry.dx * len(error) ** 0.5
         for shares in _shares(error.double(), J.double(), least):
             columns.append(shares[chosen].T)
             target.append(shares.sum(0))
+    if not columns:
+        raise ProjectionError(
+            f"of the steps from {len(rows)} training states none is finite; a cubature has nothing to learn "
+            "from; choose another sampler"
+        )
     cells = np.floor(manifold.X.cpu().numpy()[candidates] / solver.geometry.dx).astype(int)
     return Equations(torch.cat(columns), torch.cat(target), cells)
 
