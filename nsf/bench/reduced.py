@@ -126,7 +126,7 @@ def measured(
 
 
 def floors(row: Row, solver, stages: Mapping[str, float], speed: float, launches: float) -> list[KernelRow]:
-    """What no reduced step of this design goes below: its largest passes over memory, and empty launches.
+    """What bounds a reduced step: its largest passes over memory, if no cache holds that, and empty launches.
 
     Args:
         row: of the step.

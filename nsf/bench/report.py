@@ -56,9 +56,9 @@ _KERNELS = (
     "the floors of its passes together as long as its state does not fit into a cache."
 )
 _FLOORS = (
-    "Passes of a reduced step within the captured step, and what cannot be less: the time that a copy takes "
-    "for the modes and the state of the particles that a step needs, each value once, and that of empty "
-    "launches, as many as a step has passes that wait for each other."
+    "Passes of a reduced step within the captured step, beside the time that a copy takes for the modes and "
+    "the state of the particles that a step needs, each value once, which bounds what does not fit into a "
+    "cache, and that of empty launches, as many as a step has passes that wait for each other."
 )
 #: Of a reduced frame [ms]: the networks, the projection and copies between Warp and torch, and all of it
 #: (appendix of the paper, Runtime analysis; double precision, one Quadro P6000).
