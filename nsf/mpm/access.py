@@ -7,7 +7,8 @@ import warp as wp
 from nsf.mpm.precision import FP32, Precision
 
 # One reduction of 16 bytes (compute capability 9.0) in place of four of 4 bytes.
-_ADD = """
+_ADD_FP32 = """
+    if (turns == 0 || slot < 0) return;
 #if defined(__CUDA_ARCH__) && __CUDA_ARCH__ >= 900
     asm volatile(
         "red.global.add.v4.f32 [%0], {%1, %2, %3, %4};"
@@ -16,6 +17,39 @@ _ADD = """
     );
 #else
     wp::atomic_add(values, slot, added);
+#endif
+"""
+# There is none of 32 bytes: four lanes take one value each, so that they are one access to memory.
+_ADD_FP64 = """
+#if defined(__CUDA_ARCH__)
+    const unsigned all = 0xffffffffu;
+    int own = threadIdx.x & 3;
+    for (int turn = 0; turn < 4; ++turn) {
+        unsigned from = (static_cast<unsigned>(turns) >> (8 * turn)) & 0xffu;
+        if (!__any_sync(all, from != 0xffu)) return;
+        double a = __shfl_sync(all, added[0], from & 31u);
+        double b = __shfl_sync(all, added[1], from & 31u);
+        double c = __shfl_sync(all, added[2], from & 31u);
+        double d = __shfl_sync(all, added[3], from & 31u);
+        int at = __shfl_sync(all, slot, from & 31u);
+        if (from == 0xffu || at < 0) continue;
+        double one = own == 0 ? a : own == 1 ? b : own == 2 ? c : d;
+        atomicAdd(reinterpret_cast<double*>(&wp::index(values, at)) + own, one);
+    }
+#else
+    if (turns && slot >= 0) wp::atomic_add(values, slot, added);
+#endif
+"""
+_TURNS_FP64 = """
+#if defined(__CUDA_ARCH__)
+    unsigned found = 0xffffffffu;
+    int group = (threadIdx.x & 31) >> 2, rank = 0;
+    for (unsigned left = __ballot_sync(0xffffffffu, adds); left; left &= left - 1, ++rank)
+        if ((rank & 7) == group)
+            found ^= (0xffu ^ static_cast<unsigned>(__ffs(left) - 1)) << (8 * (rank >> 3));
+    return static_cast<int>(found);
+#else
+    return adds;
 #endif
 """
 _LOAD_FP32 = """
@@ -122,7 +156,12 @@ def make_sum(precision: Precision, deterministic: bool):
 
 @cache
 def make_add(precision: Precision, deterministic: bool):
-    """Warp function (values, slot, added): values[slot] += added, atomically.
+    """Warp functions (turns_of, add) that add to a node's values, atomically.
+
+    turns_of: whether this thread has something to add → its part in the warp's additions, for `add`: in fp64
+    on a GPU the lane whose values it helps to add, turn by turn, a byte each (255: none); else 1 or 0.
+    add: (values, slot, added, turns): values[slot] += added; nothing where slot is negative. On a GPU all
+    threads of a warp call both together.
 
     The array starts where an allocation does, so that every entry is aligned.
 
@@ -131,18 +170,30 @@ def make_add(precision: Precision, deterministic: bool):
         deterministic: through Warp's own atomic, whose order it can fix.
     """
     vec4 = precision.vec4
-    if precision is FP32 and not deterministic:
+    if deterministic or precision is FP32:
 
-        @wp.func_native(_ADD)
-        def add(values: wp.array(dtype=vec4), slot: int, added: vec4): ...
+        @wp.func
+        def turns_of(adds: bool):
+            return wp.where(adds, 1, 0)
 
     else:
 
-        @wp.func
-        def add(values: wp.array(dtype=vec4), slot: int, added: vec4):
-            wp.atomic_add(values, slot, added)
+        @wp.func_native(_TURNS_FP64)
+        def turns_of(adds: bool) -> int: ...
 
-    return add
+    if deterministic:
+
+        @wp.func
+        def add(values: wp.array(dtype=vec4), slot: int, added: vec4, turns: int):
+            if turns > 0 and slot >= 0:
+                wp.atomic_add(values, slot, added)
+
+    else:
+
+        @wp.func_native(_ADD_FP32 if precision is FP32 else _ADD_FP64)
+        def add(values: wp.array(dtype=vec4), slot: int, added: vec4, turns: int): ...
+
+    return turns_of, add
 
 
 @cache

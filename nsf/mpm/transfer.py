@@ -80,7 +80,7 @@ def make_p2g(precision: Precision, shape_name: str, deterministic: bool = False,
     width = shape.degree + 1
     base_node, local, weights, gradients = shape.base_node, shape.local, shape.weights, shape.gradients
     share, copy_of = make_copies(several)
-    add, (run_of, total) = make_add(precision, deterministic), make_sum(precision, deterministic)
+    (turns_of, add), (run_of, total) = make_add(precision, deterministic), make_sum(precision, deterministic)
     options = {"max_unroll": 4}
     if deterministic:
         options |= {"deterministic": wp.DeterministicMode.RUN_TO_RUN, "deterministic_max_records": width**3}
@@ -116,6 +116,7 @@ def make_p2g(precision: Precision, shape_name: str, deterministic: bool = False,
         run = run_of(key)
         if run == 0:
             return
+        turns = turns_of(run > 0 and cell >= 0)
         f = local(x[p], inv_dx, base)
         w = weights(f)
         d = gradients(f)
@@ -136,8 +137,7 @@ def make_p2g(precision: Precision, shape_name: str, deterministic: bool = False,
                     # Looked up by every thread, so that nothing waits for it.
                     slot = storage(wp.max(cell, 0) + flat_index(a, b, c, grid_shape), slots)
                     added = total(vec4(carried[0], carried[1], carried[2], weight * m), run)
-                    if run > 0 and cell >= 0 and slot >= 0:
-                        add(values, start + slot, added)
+                    add(values, wp.where(slot < 0, slot, start + slot), added, turns)
 
     return p2g
 
