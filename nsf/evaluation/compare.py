@@ -15,6 +15,7 @@ from nsf.mpm.shape import DEGREES
 
 _CHUNK = 2**24  # values of one field decoded at once
 _SAME_TIME = 1e-9  # [s]
+_HARDLY = 1e-4  # of the most in a run
 _UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])  # entries xx, xy, xz, yy, yz, zz of a symmetric matrix
 
 
@@ -200,10 +201,9 @@ def _series(
         return (column[error] / column[norm]).sqrt().masked_fill(bad, torch.inf)
 
     def moving(error: str, norm: str) -> torch.Tensor:
-        # At t = 0 nothing has moved and nothing is loaded: what stands there is round-off of the file.
-        errors = by_frame(error, norm)
-        errors[0] = torch.nan
-        return errors
+        # Where hardly anything has moved or is loaded yet, as at t = 0, a ratio to that tells nothing.
+        hardly = column[norm] <= _HARDLY**2 * column[norm].max()
+        return by_frame(error, norm).masked_fill(hardly, torch.nan)
 
     def momentum(name: str) -> torch.Tensor:
         errors = metrics.momentum_error(column[f"{name}_rom"], column[f"{name}_fom"], column[f"{name}_scale"])

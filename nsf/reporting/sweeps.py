@@ -59,10 +59,12 @@ def _over(key: str, frame: pd.DataFrame, merged: Merged, study: Study, folder: P
     source = merged.frame[column].loc[shown["row"]].array if column else shown[key]
     shown = shown.assign(x=pd.to_numeric(pd.Series(source, index=shown.index), errors="coerce"))
     panels, papers = {}, {}
-    for scene, part in shown.dropna(subset="x").groupby(_SCENE, sort=False):
+    by_scene = list(shown.dropna(subset="x").groupby(_SCENE, sort=False))
+    told = list(dict.fromkeys(name for _, part in by_scene for name in _told(part, (key, *SEEDS))))
+    for scene, part in by_scene:
         panels[scene] = {
             name: group.groupby("x")["delta"].apply(list).to_dict()
-            for name, group in _settings(part, (key, *SEEDS), alone="mean")
+            for name, group in _settings(part, told, alone="mean")
         }
         if study.printed is not None:
             papers[scene] = part[["x", _PAPER]].dropna().drop_duplicates().to_numpy().tolist()
@@ -86,7 +88,7 @@ def _scatter(frame: pd.DataFrame, merged: Merged, folder: Path) -> Picture:
     entries = []
     for seed in SEEDS:
         part = frame[frame[seed].notna()] if seed in frame else frame.iloc[:0]
-        for name, group in _settings(part, SEEDS, alone=merged.frame["scene"].iloc[0]):
+        for name, group in _settings(part, _told(part, SEEDS), alone=merged.frame["scene"].iloc[0]):
             values = group.groupby(seed)["delta"].apply(lambda deltas: deltas.mean(skipna=False))
             printed = group[_PAPER].iloc[0]
             told = {"mean": values.mean(skipna=False), "values": list(values)}
@@ -100,20 +102,25 @@ def _scatter(frame: pd.DataFrame, merged: Merged, folder: Path) -> Picture:
     return Picture(save(figure, folder, "delta-over-seeds"), caption, sorted(set(frame[_RUN])))
 
 
-def _settings(frame: pd.DataFrame, without: Sequence[str], alone: str) -> list[tuple[str, pd.DataFrame]]:
-    """The rows of each setting of the job's keys, by a name of those keys that tell settings apart.
-
-    Args:
-        frame: rows of `_held_out`.
-        without: keys that are no setting.
-        alone: the name of all rows where they have one setting.
-    """
+def _told(frame: pd.DataFrame, without: Sequence[str]) -> list[str]:
+    """Keys of the jobs that tell the settings in rows of `_held_out` apart; `without` are no setting."""
     told: list[str] = []
     groups = 1
     for key in frame.columns.drop([_RUN, "delta", _PAPER, "row", "x", *without], errors="ignore"):
         found = frame.groupby([*told, key], dropna=False).ngroups
         if found > groups:
             told, groups = [*told, key], found
+    return told
+
+
+def _settings(frame: pd.DataFrame, told: Sequence[str], alone: str) -> list[tuple[str, pd.DataFrame]]:
+    """The rows of each setting, by a name of the keys that tell settings apart.
+
+    Args:
+        frame: rows of `_held_out`.
+        told: these keys.
+        alone: the name of all rows where there are none.
+    """
     if not told:
         return [(alone, frame)] if len(frame) else []
     return [

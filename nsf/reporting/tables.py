@@ -2,6 +2,7 @@
 
 import html
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -290,8 +291,8 @@ def _sort_key(row) -> tuple:
 
 
 def _natural(value) -> tuple[int, float, str]:
-    """Numbers by size, then text."""
+    """Numbers by size, then text, with the numbers in it by size."""
     try:
         return (0, float(value), "")
     except ValueError:
-        return (1, 0.0, str(value))
+        return (1, 0.0, re.sub(r"\d+(\.\d+)?", lambda found: f"{float(found[0]):024.9f}", str(value)))

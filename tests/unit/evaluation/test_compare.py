@@ -99,6 +99,17 @@ def test_series(comparison_of, made, truth):
     assert errors.min() <= comparison_of(made).delta <= errors.max()
 
 
+def test_a_ratio_to_hardly_anything_is_a_gap(made, comparison_of, monkeypatch):
+    """The column has fallen by less than 30 % of its fall, say."""
+    most = comparison_of(made).series
+    monkeypatch.setattr(sys.modules[compare.__module__], "_HARDLY", 0.3)
+    some = comparison_of(made).series
+    gaps = some["displacement_error"].isna().to_numpy()
+    assert 1 < gaps.sum() < len(gaps)
+    assert np.array_equal(gaps, np.arange(len(gaps)) < gaps.sum())  # a falling column moves ever further
+    np.testing.assert_array_equal(some["displacement_error"][~gaps], most["displacement_error"][~gaps])
+
+
 def test_pictures(comparison_of, made, truth):
     kept = comparison_of(made, pictures=(50, 4)).pictures
     assert kept["x_full"].shape == kept["x_reduced"].shape == (4, 50, 3)

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -108,7 +109,31 @@ def test_lines_are_named_by_what_tells_them_apart():
     frame = pd.DataFrame(
         {"scene": "sand", "field": ["basis", "mlp"], "trainer.steps": [None, "null"], "x": 1.0, "run": "a"}
     )
-    assert [name for name, _ in sweeps._settings(frame, (), "mean")] == ["basis", "mlp"]
+    told = sweeps._told(frame, ())
+    assert told == ["field"]
+    assert [name for name, _ in sweeps._settings(frame, told, "mean")] == ["basis", "mlp"]
+
+
+def test_a_setting_has_one_name_in_every_scene(tmp_path, drawn):
+    """Also in a scene that has it alone."""
+    found, keys, settings = [], {}, {}
+    for scene, fields in (("metal", ["basis"]), ("sand", ["basis", "mlp"])):
+        for field in fields:
+            for beta in ("16", "8"):
+                own = Made(particles=30, frames=4, parameters=VALUES, splits=("test",) * 2, scene=scene)
+                run = write_run(tmp_path, replace(own, field=field, seed=int(beta)))
+                found.append(run)
+                keys[run.id] = {"scene": scene, "field": field, "field.beta": beta}
+                settings[run.id] = f"field.beta={beta}"
+    merged = merge(open_sources(found), settings)
+    sweeps.swept(merged, of(keys), tmp_path)
+    ((name, (panels, *_)),) = drawn
+    assert name == "delta_over"
+    assert {scene: list(lines) for scene, lines in panels.items()} == {
+        "metal": ["basis"],
+        "sand": ["basis", "mlp"],
+    }
+    assert list(dict.fromkeys(merged.frame["setting"])) == ["field.beta=8", "field.beta=16"]
 
 
 def test_the_band_spans_the_values_and_a_diverged_run_leaves_a_gap():
