@@ -1,5 +1,6 @@
 """The only door between torch and Warp: shared memory, shared stream."""
 
+import gc
 from contextlib import contextmanager, nullcontext
 
 import torch
@@ -57,7 +58,22 @@ def on_torch_stream(device):
 
 @contextmanager
 def captured(device):
-    """Capture what torch and Warp launch inside into one CUDA graph, which is yielded."""
+    """Capture what torch and Warp launch inside into one CUDA graph, which is yielded.
+
+    Garbage is left alone until it is over: Warp does not see a capture of torch, in which its arrays cannot
+    be freed.
+    """
     graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph), on_torch_stream(device):
+    with torch.cuda.graph(graph), on_torch_stream(device), _without_collection():
         yield graph
+
+
+@contextmanager
+def _without_collection():
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()

@@ -1,5 +1,6 @@
 """Torch and Warp on one stream, and steps captured as a CUDA graph."""
 
+import gc
 from contextlib import nullcontext
 from types import SimpleNamespace
 
@@ -9,7 +10,7 @@ import torch
 import warp as wp
 
 from nsf.dynamics import Method
-from nsf.dynamics.interop import on_torch_stream
+from nsf.dynamics.interop import _without_collection, on_torch_stream
 
 METHODS = [(a, b) for a in (True, False) for b in (True, False)]
 
@@ -63,3 +64,15 @@ def test_captured_steps_are_the_steps_themselves(neural_stress, neural_affine, c
         solver.step(8)
         found.append(solver.trajectory().xhat)
     np.testing.assert_allclose(*found, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("collects", [True, False])
+def test_no_garbage_is_collected_within_a_capture(collects):
+    before = gc.isenabled()
+    (gc.enable if collects else gc.disable)()
+    try:
+        with _without_collection():
+            assert not gc.isenabled()
+        assert gc.isenabled() == collects
+    finally:
+        (gc.enable if before else gc.disable)()
