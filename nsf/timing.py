@@ -98,7 +98,11 @@ class StageTimer:
         """
         if not self._marks:
             self._marks.append(("", self._mark()))
-        yield
+        try:
+            yield
+        except BaseException:
+            self._marks.clear()  # of a graph that will never be launched
+            raise
         self._marks.append((stage, self._mark()))
 
     def add_launch(self) -> None:

@@ -8,7 +8,7 @@ import torch
 
 from nsf import config
 from nsf.bench.measure import bandwidth, launch_time, name_of
-from nsf.bench.rows import KernelRow, Result, Row, Settings, StageRow, commit
+from nsf.bench.rows import OTHER_SAMPLER, KernelRow, Result, Row, Settings, StageRow, commit
 from nsf.data import Trajectory
 from nsf.data.schema import TRAJECTORY
 from nsf.dynamics.solver import reduced_steps
@@ -18,8 +18,6 @@ from nsf.kinematics.networks import ARITHMETIC
 from nsf.pipeline import Pipeline
 
 SCENES = ("cake", "metal")
-#: How sample particles are chosen in another case of a scene, beside the scene's own way.
-OTHER_SAMPLER = {"cake": "region", "metal": "cells"}
 #: Steps of the deployment in units of the scene's Δt (paper section 6.1 has 1.5 on cake).
 MULTIPLIERS = (1.5, 2.0, 3.0)
 #: Of the networks of stress and affine momentum with field=mlp; a CPU has no tensor cores.
@@ -127,6 +125,9 @@ def measured(
 
 def floors(row: Row, solver, stages: Mapping[str, float], speed: float, launches: float) -> list[KernelRow]:
     """What bounds a reduced step: its largest passes over memory, if no cache holds that, and empty launches.
+
+    Where samples change in a run, as cake's region does, modes are those of the last phase and nodes of the
+    first.
 
     Args:
         row: of the step.

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from nsf.bench.rows import size_name
+from nsf.bench.rows import OTHER_SAMPLER, size_name
 from nsf.reporting.charts import plain_ticks
 from nsf.reporting.columns import number
 from nsf.reporting.cost_charts import rings
@@ -273,9 +273,8 @@ def steps_by_scene(results: pd.DataFrame) -> Figure:
     Args:
         results: rows of `reduced` of one device.
     """
-    scene = results["case"].str.extract(
-        r"^(?:full_order|reduced)_(.+?)(?:_[\d.]+dt|_mlp\w*|_cells|_region)?$"
-    )[0]
+    ends = "|".join([r"[\d.]+dt", r"mlp\w*", *OTHER_SAMPLER.values()])
+    scene = results["case"].str.extract(rf"^(?:full_order|reduced)_(.+?)(?:_(?:{ends}))?$")[0]
     panels_of = list(results.groupby(scene, sort=False))
     with styled():
         fig = figure(1.2 + 0.3 * max(len(part) for _, part in panels_of))

@@ -24,6 +24,10 @@ class Settings:
     scenes: tuple[str, ...] = ()
 
 
+#: How sample particles are chosen in another case of a scene, beside the scene's own way.
+OTHER_SAMPLER = {"cake": "region", "metal": "cells"}
+
+
 @dataclass(frozen=True)
 class Row:
     """One side of a benchmark: a row of results.csv.
@@ -37,7 +41,8 @@ class Row:
             simulation, so the step of a batch over its size.
         peak_mib: what every allocator holds at most beyond what was held before the solver was built [MiB];
             None where several processes work.
-        delta: δ of the run that is timed, a fraction; None for a full-order run.
+        delta: δ of the run that is timed, or begun for the time of its first steps, a fraction; None for a
+            full-order run.
         commit: of the code.
     """
 

@@ -64,7 +64,7 @@ def captured(device):
     be freed.
     """
     graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph), on_torch_stream(device), _without_collection():
+    with _without_collection(), torch.cuda.graph(graph), on_torch_stream(device):
         yield graph
 
 

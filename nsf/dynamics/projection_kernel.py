@@ -281,7 +281,7 @@ def make_projection(
         {"for (int e = lane; e < K * K; e += lanes) gram[e] = G.data[e];" if kept else ""}
         NSF_SYNC;
     }};
-    // q = d - G da, and with them the columns of M = G A.
+    // q = d - G da, where d holds b, or zeros while b is not known; with them the columns of M = G A.
     auto residual = [&](int columns) {{
         #pragma unroll 1
         for (int e = lane; e < K * (columns + 1); e += lanes) {{
@@ -295,8 +295,8 @@ def make_projection(
         NSF_SYNC;
     }};
     // E[0] = [AᵀG A | Aᵀq], or beside AᵀG A the identity; g = Aᵀq.
-    auto assemble = [&](int right) {{
-        const int C = R + right;
+    auto assemble = [&](bool identity) {{
+        const int right = identity ? R : 1, C = R + right;
         #pragma unroll 1
         for (int e = lane; e < R * (R + 1); e += lanes) {{
             const int c = e / (R + 1), other = e % (R + 1);
@@ -306,7 +306,7 @@ def make_projection(
             if (other < R) E[0][c * C + other] = sum;
             else g[c] = sum;
             if (other == R)
-                for (int i = 0; i < right; ++i) E[0][c * C + R + i] = right == 1 ? sum : i == c ? 1.0 : 0.0;
+                for (int i = 0; i < right; ++i) E[0][c * C + R + i] = !identity ? sum : i == c ? 1.0 : 0.0;
         }}
         NSF_SYNC;
     }};
@@ -354,7 +354,7 @@ def make_projection(
         evaluate();
         if (mode == {PREPARE}) {{
             residual(R);
-            assemble(R);
+            assemble(true);
             const double* found = eliminate(R);
             if (block > 0) return;
             #pragma unroll 1
@@ -434,7 +434,7 @@ def make_projection(
                 break;
             }}
             residual(R);
-            assemble(1);
+            assemble(false);
             const double* found = eliminate(1);
             #pragma unroll 1
             for (int i = lane; i < R; i += lanes) u[i] = found[i * (R + 1)];

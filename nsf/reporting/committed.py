@@ -29,7 +29,9 @@ CHAPTERS = {
 _OTHERS = "Further reports"
 _LEAD = (
     "Every number here is computed from the files of the reports, and every report from the runs that its "
-    "sources.json names; `nsf reports` writes this page. Each report has all values, charts and pictures."
+    "sources.json names; `nsf reports` writes this page. Each report has all values, charts and pictures. "
+    "Reports were made at different commits and seeds, so that the same setting differs from one to another "
+    "as it does from seed to seed. The state of the tree is unknown where the code ran outside of git."
 )
 _CHART = {"file": "delta.png", "caption": "Mean δ, each value, and the paper's."}  # of reports that name none
 _REBUILD = "build it again with `nsf report`"

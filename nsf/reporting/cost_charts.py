@@ -82,7 +82,7 @@ def _ring(pie, key, stages: Mapping[str, float], title: str) -> None:
         list(stages.values()), colors=stage_colors(stages), startangle=90, counterclock=False,
         wedgeprops={"width": 0.36, "edgecolor": "white", "linewidth": 1.5},
     )  # fmt: skip
-    pie.text(0, 0, f"{number(total)}\nms a step", ha="center", va="center", fontsize=11)
+    pie.text(0, 0, f"{number(total)} ms,\nall stages", ha="center", va="center", fontsize=11)
     labels = [
         f"{STAGE_TITLES.get(stage, stage.replace('_', ' '))}  {ms:.{decimals}f} ms, {100 * ms / total:.0f} %"
         for stage, ms in stages.items()

@@ -18,6 +18,7 @@ FEW = 15  # rows of a table in which a number is varied; of more, settings and s
 MANY = 24  # rows where none is, as in the paper's Table 1
 _VALUES = "scene.parameters.test"  # jobs with this key are about certain held-out values, so each counts
 _PAPER, _COUNT = "paper", "values"
+_RUNS, _DIVERGED, _SEEDS = "runs", "diverged", "seeds"  # how many are in a row of `groups`
 _MEASURED = ("delta", "displacement_error", "stress_error", "speedup_step", "speedup_total")
 _COLUMN_OF = {
     "scene": "scene",
@@ -83,7 +84,7 @@ class Report:
 
     @cached_property
     def groups(self) -> pd.DataFrame:
-        """A row a scene and setting, with means over held-out values and seeds.
+        """A row a scene and setting, with means over held-out values and seeds, and how many these are.
 
         One that is missing leaves the mean empty; a run that diverged makes it ∞.
         """
@@ -93,7 +94,9 @@ class Report:
         for values, part in self.rows.fillna(dict.fromkeys(alike, ABSENT)).groupby(alike, sort=False):
             row = dict(zip(alike, values, strict=True))
             row |= {name: part[name].iloc[0] if part[name].nunique() == 1 else ABSENT for name in others}
-            rows.append(row | {name: part[name].mean(skipna=False) for name in (*_MEASURED, _PAPER)})
+            row |= {name: part[name].mean(skipna=False) for name in (*_MEASURED, _PAPER)}
+            row |= {_RUNS: len(part), _DIVERGED: int(np.isinf(part["delta"]).sum())}
+            rows.append(row | {_SEEDS: len(part[self.seeds].drop_duplicates()) if self.seeds else 1})
         frame = pd.DataFrame(rows)
         ranks = [frame[key].map(_ranks(frame[key])) for key in alike]
         return frame.iloc[np.lexsort(ranks[::-1])].reset_index(drop=True)
@@ -124,7 +127,8 @@ def headline(report: Report) -> str:
     varied = [key for key in report.settings if key in _NUMBERS]
     if not report.settings and report.seeds:
         table, said = _over_seeds(report), "Shown: of each seed the mean over held-out values."
-    elif len(report.groups) <= (FEW if varied else MANY):
+        return f"{table}\n\n{said}{_diverged(report)}"  # the paper's figure stands in each row
+    if len(report.groups) <= (FEW if varied else MANY):
         table, said = _flat(report), f"Shown: {_averaged(report)}."
     else:
         table = _pivot(report, varied)
@@ -138,15 +142,18 @@ def _flat(report: Report) -> str:
     order = dict.fromkeys(("scene", "method", "field", *report.settings, "r", "sample"))
     shown = [key for key in order if key == "scene" or groups[key].nunique() > 1]
     measured = [name for name in _MEASURED if groups[name].notna().any()]
+    seeds = [_SEEDS] if groups[_SEEDS].nunique() > 1 else []
     paper = ["paper's δ [%]"] if groups[_PAPER].notna().any() else []
     body = [
         [_text(key, row[key]) for key in shown]
+        + [f"{row[name]}" for name in seeds]
         + [number(row[_PAPER], 100) for _ in paper]
         + [COLUMN[name].text(row[name]) for name in measured]
         for row in groups.to_dict("records")
     ]
-    headings = [*map(_title, shown), *paper, *(COLUMN[name].heading for name in measured)]
-    return markdown_rows(headings, body, [*map(_is_number, shown), *(True for _ in (*paper, *measured))])
+    headings = [*map(_title, shown), *seeds, *paper, *(COLUMN[name].heading for name in measured)]
+    numeric = [*map(_is_number, shown), *(True for _ in (*seeds, *paper, *measured))]
+    return markdown_rows(headings, body, numeric)
 
 
 def _pivot(report: Report, varied: Sequence[str]) -> str:
@@ -175,13 +182,18 @@ def _pivot(report: Report, varied: Sequence[str]) -> str:
         body.append([_text(key, value) for key, value in zip(down, values, strict=True)])
         for at in columns:
             row = found.get((values, at))
-            body[-1].append(
-                f"{number(row['delta'], 100)} ({number(row['stress_error'], 100)})" if row else ""
-            )
+            body[-1].append(_both_errors(row) if row else "")
             if at in printed:
                 body[-1].append(number(row[_PAPER], 100) if row else "")
     numeric = [*map(_is_number, down), *(True for _ in headings[len(down) :])]
     return markdown_rows(headings, body, numeric)
+
+
+def _both_errors(row: Mapping) -> str:
+    """δ and the stress error of a row of `groups`, or how many of its runs diverged."""
+    if row[_DIVERGED]:
+        return f"{row[_DIVERGED]} of {row[_RUNS]} diverged"
+    return f"{number(row['delta'], 100)} ({number(row['stress_error'], 100)})"
 
 
 def _over_seeds(report: Report) -> str:

@@ -19,6 +19,11 @@ DEFINITIONS = (
     ),
     ("stress error", "‖τ_rom − τ_fom‖ / ‖τ_fom‖ of the Kirchhoff stress."),
     ("r, |S|, |N|, γ", "latent dimension, sample and integration particles, and γ = 3·particles / r."),
+    (
+        "method",
+        "nsf takes stress and affine momentum from their fields, neural_stress_only the stress alone "
+        "(C = 0), neural_affine_only the affine momentum alone (τ from ∂g/∂X), deformation_only neither.",
+    ),
     ("speedup", "full-order over reduced wall time, of one step and of the whole simulation."),
 )
 

@@ -139,7 +139,7 @@ def test_a_gpu_is_waited_for_through_the_loaded_library(monkeypatch, torch):
 
 
 def test_a_launch_adds_the_times_between_the_marks_of_its_graph(monkeypatch):
-    now = iter([10.0, 12.0, 15.0, 20.0, 21.0, 25.0])
+    now = iter([1.0, 10.0, 12.0, 15.0, 20.0, 21.0, 25.0])
 
     class Event:
         def __init__(self, enable_timing, external):
@@ -161,6 +161,8 @@ def test_a_launch_adds_the_times_between_the_marks_of_its_graph(monkeypatch):
     torch.cuda.Event, torch.cuda.ExternalStream, torch.cuda.stream = Event, view, nullcontext
     warp.get_device = lambda device: SimpleNamespace(stream=SimpleNamespace(cuda_stream="Warp's stream"))
     timer = StageTimer("cuda:0")
+    with pytest.raises(ValueError, match="fails"), timer.captured("p2g"):
+        raise ValueError("a stage fails")
     for launch in (1, 2):
         for stage in ("p2g", "grid"):
             with timer.captured(stage):

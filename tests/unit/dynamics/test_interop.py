@@ -1,7 +1,7 @@
 """Torch and Warp on one stream, and steps captured as a CUDA graph."""
 
 import gc
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 from types import SimpleNamespace
 
 import numpy as np
@@ -10,7 +10,7 @@ import torch
 import warp as wp
 
 from nsf.dynamics import Method
-from nsf.dynamics.interop import _without_collection, on_torch_stream
+from nsf.dynamics.interop import captured, on_torch_stream
 
 METHODS = [(a, b) for a in (True, False) for b in (True, False)]
 
@@ -55,24 +55,35 @@ def test_captured_steps_are_the_steps_themselves(neural_stress, neural_affine, c
         pytest.skip("needs a GPU")
     method = Method("one", neural_stress, neural_affine)
     found = []
-    for captured in (True, False):
+    for capturable in (True, False):
         solver = chain.pipeline.scene.reduced(
             tiny_manifold, {"friction_angle": 26.0}, 60, method=method, device="cuda"
         )
         for phase in solver._phases:
-            phase.capturable = captured
+            phase.capturable = capturable
         solver.step(8)
         found.append(solver.trajectory().xhat)
     np.testing.assert_allclose(*found, rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize("collects", [True, False])
-def test_no_garbage_is_collected_within_a_capture(collects):
+def test_no_garbage_is_collected_within_a_capture(collects, monkeypatch):
+    begins_and_ends = []
+
+    @contextmanager
+    def graph(_):
+        begins_and_ends.append(gc.isenabled())
+        yield
+        begins_and_ends.append(gc.isenabled())
+
+    monkeypatch.setattr(torch.cuda, "CUDAGraph", object)
+    monkeypatch.setattr(torch.cuda, "graph", graph)
     before = gc.isenabled()
     (gc.enable if collects else gc.disable)()
     try:
-        with _without_collection():
+        with captured(SimpleNamespace(is_cuda=False)):
             assert not gc.isenabled()
+        assert begins_and_ends == [False, False]
         assert gc.isenabled() == collects
     finally:
         (gc.enable if before else gc.disable)()

@@ -69,6 +69,12 @@ def test_deep_and_many_networks(pair, untrained, members, depth):
     same(*runs(pair(manifold=untrained(members, depth)), steps=3), tolerance=1e-6)
 
 
+def test_a_latent_vector_of_one_number(pair, untrained):
+    one, other = runs(pair(manifold=untrained(1, 3, latents=1)), steps=3)
+    same(one, other, tolerance=1e-6)
+    assert np.abs(np.diff(one.xhat[:, 0])).min() > 1e-4
+
+
 @pytest.mark.parametrize("members", [1, 3])
 def test_a_single_update_moves_the_coefficients_by_their_derivative(pair, untrained, members):
     """From the start of each step, which the latent vectors before it tell, to the one that was found."""
@@ -98,14 +104,16 @@ def test_a_single_update_moves_the_coefficients_by_their_derivative(pair, untrai
 
 @pytest.fixture
 def untrained(tiny_manifold):
-    """Members and depth → the tiny manifold with closures and heads of random weights."""
-    return lambda members, depth: _untrained(tiny_manifold, members, depth)
+    """Members, depth and r → the tiny manifold with closures and heads of random weights."""
+    return lambda members, depth, latents=4: _untrained(tiny_manifold, members, depth, latents)
 
 
-def _untrained(tiny_manifold, members, depth):
+def _untrained(tiny_manifold, members, depth, latents):
     hyperparameters = tiny_manifold.hyperparameters | {"members": members, "depth": depth, "beta": [5, 4, 3]}
-    manifold = BasisManifold(4, tiny_manifold.x_sha256, ["friction_angle"], hyperparameters)
+    manifold = BasisManifold(latents, tiny_manifold.x_sha256, ["friction_angle"], hyperparameters)
     learnt = {k: v for k, v in tiny_manifold.state_dict().items() if ".network." not in k}
+    for name in ("training_latents", "fields.deformation.leading"):
+        learnt[name] = learnt[name][..., :latents]
     manifold.load_state_dict(learnt, strict=False)
     for seed, field in enumerate(manifold.fields.values()):
         field.network.initialise(torch.Generator().manual_seed(seed))

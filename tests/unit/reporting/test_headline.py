@@ -120,6 +120,24 @@ def test_seeds_alone_show_their_scatter(tmp_path):
     ]
 
 
+def test_settings_of_unlike_numbers_of_seeds_say_how_many(tmp_path):
+    jobs = [job(seed=str(k), **{"field.beta": "8"}) for k in (0, 1)] + [job(seed="0", **{"field.beta": "16"})]
+    rows, _ = told(write_report(tmp_path / "a", jobs))
+    at = rows[0].index("seeds")
+    assert [row[at] for row in rows[1:]] == ["2", "1"]
+
+
+def test_a_cell_says_how_many_of_its_runs_diverged(tmp_path):
+    jobs = [
+        job(scene, delta=np.inf if value == 2.0 and k == 3 else 0.001, parameter=value, method=f"m{k}")
+        for scene in ("sand", "bread", "cake", "metal", "drop", "jelly_cube")
+        for value in (1.0, 2.0)
+        for k in range(5)
+    ]
+    rows, _ = told(write_report(tmp_path / "a", jobs))
+    assert [row[rows[0].index("m3")] for row in rows[1:]] == ["1 of 2 diverged"] * 6
+
+
 def test_values_that_the_jobs_name_count_one_by_one(tmp_path):
     jobs = [job(parameter=v, **{"scene.parameters.test": "[41,44]"}) for v in (44.0, 41.0)]
     rows, said = told(write_report(tmp_path / "a", jobs))

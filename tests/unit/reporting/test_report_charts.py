@@ -100,7 +100,7 @@ def test_reconstruction_and_rollout_are_rms_over_frames(series):
 def test_runtime_rings_say_the_sum():
     figure = cost_charts.runtime_breakdown({"reduced": {"p2g": 1.5, "transfer": 0.5}, "full_order": {}})
     told = [text.get_text() for panel in figure.axes for text in panel.texts]
-    assert "2\nms a step" in told
+    assert "2 ms,\nall stages" in told
     assert "not measured" in told
 
 
