@@ -9,6 +9,7 @@ import difflib
 import inspect
 import itertools
 import math
+import pkgutil
 import re
 import types
 import typing
@@ -125,24 +126,45 @@ def resolve(config: DictConfig) -> DictConfig:
     return config
 
 
-def check_targets(config: DictConfig) -> None:
-    """Refuse an `_target_` that is not part of this package: configuration is not code.
+_REFUSED = "_target_: {} is refused; only nsf.* classes are built from a configuration"
+
+
+def check_targets(config: DictConfig) -> list[str]:
+    """Refuse an `_target_` whose name is not of this package: configuration is not code.
+
+    Returns:
+        Every target.
 
     Raises:
         ConfigError: names the target.
     """
-    stack = [OmegaConf.to_container(config, resolve=False)]
+    stack, found = [OmegaConf.to_container(config, resolve=False)], []
     while stack:
         node = stack.pop()
         if isinstance(node, dict):
-            target = node.get("_target_")
-            if target is not None and not re.fullmatch(r"nsf(\.\w+)+", str(target)):
-                raise ConfigError(
-                    f"_target_: {target} is refused; only nsf.* classes are built from a configuration"
-                )
+            if (target := node.get("_target_")) is not None:
+                if not re.fullmatch(r"nsf(\.\w+)+", str(target)):
+                    raise ConfigError(_REFUSED.format(target))
+                found.append(target)
             stack.extend(node.values())
         elif isinstance(node, list):
             stack.extend(node)
+    return found
+
+
+def _load_targets(config: DictConfig, where: str) -> None:
+    """Load every `_target_`; what a module of this package only imports is not part of it.
+
+    Raises:
+        ConfigError: one does not exist, or is refused.
+    """
+    for target in check_targets(config):
+        try:
+            found = pkgutil.resolve_name(target)
+        except (ImportError, AttributeError) as error:
+            raise ConfigError(f"{where}: _target_: {target} does not exist ({error})") from error
+        if not str(getattr(found, "__module__", "")).startswith("nsf."):
+            raise ConfigError(_REFUSED.format(target))
 
 
 def build(config: DictConfig, where: str):
@@ -151,7 +173,7 @@ def build(config: DictConfig, where: str):
     Raises:
         ConfigError: a misspelt key, or a value that the class refuses; names the node.
     """
-    check_targets(config)
+    _load_targets(config, where)
     _check_types(config, where)
     try:
         return instantiate(config, _convert_="all")
@@ -181,10 +203,7 @@ def _check_types(config: DictConfig, where: str) -> None:
     Raises:
         ConfigError: names the key and the value.
     """
-    try:
-        target = get_class(config._target_)
-    except Exception:  # a target that does not load is reported where it is built
-        return
+    target = get_class(config._target_)
     hints = typing.get_type_hints(target) if dataclasses.is_dataclass(target) else {}
     for name, hint in hints.items():
         kinds = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
@@ -359,6 +378,8 @@ def _explain(error: Exception, config_name: str, overrides: Sequence[str]) -> st
     missing = re.search(r"Could not override '([^']+)'", text)
     if missing:
         key = missing.group(1)
+        if key == "experiment":
+            return "an experiment is named with a plus: +experiment=NAME"
         others = [o for o in overrides if not o.lstrip("+~").startswith(key)]
         known = _known_keys(config_name, others, of_launcher(key))
         if key in known:

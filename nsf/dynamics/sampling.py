@@ -71,9 +71,11 @@ class Region:
         upper = np.inf if self.upper is None else np.asarray(self.upper, float)
         inside = np.flatnonzero(((lower <= X) & (upper >= X)).all(1))
         if len(inside) < self.size:
+            whole = self.lower is None and self.upper is None
+            where, more = ("scene has", "more particles") if whole else ("region holds", "a larger region")
             raise ConfigError(
-                f"sampler.size={self.size}, but the region holds {len(inside)} particles; "
-                "choose a smaller size or a larger region"
+                f"sampler.size={self.size}, but the {where} {len(inside)} particles; "
+                f"choose a smaller size or {more}"
             )
         return inside
 
@@ -265,5 +267,5 @@ def check_well_posed(sample: int, latent_dim: int) -> None:
     if 3 * sample < latent_dim:
         raise ProjectionError(
             f"|S|={sample} gives {3 * sample} equations for r={latent_dim} unknowns; "
-            f"choose |S| >= {-(-latent_dim // 3)}"
+            f"choose sampler.size >= {-(-latent_dim // 3)} or latent_dim <= {3 * sample}"
         )

@@ -352,6 +352,21 @@ class Pipeline(Plan):
         )
         return results.costs(cost)
 
+    @property
+    def _report_folder(self) -> Path:
+        return Path(self.config.report.folder) / self.config.report.name
+
+    def check_report_folder(self) -> None:
+        """Refuse a place where no report could be written.
+
+        Raises:
+            ConfigError: something else stands there.
+            StorageError: the folder above it cannot be written.
+        """
+        from nsf.reporting.swap import check_place
+
+        check_place(self._report_folder)
+
     def report(self) -> Path:
         """The report of every evaluated variant of this scene at these held-out trajectories."""
         from nsf.reporting.build import build_report
@@ -365,8 +380,7 @@ class Pipeline(Plan):
             raise MissingRunError(
                 "no evaluate run of these held-out values is there; run `nsf run` with the same keys"
             )
-        folder = Path(self.config.report.folder) / self.config.report.name
-        page = build_report(runs, folder, self.config.scene.title, first=self.evaluation)
+        page = build_report(runs, self._report_folder, self.config.scene.title, first=self.evaluation)
         self.say(f"report: {len(runs)} evaluated variants → {page}")
         return page
 

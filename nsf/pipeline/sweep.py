@@ -18,7 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nsf import config as configuration
 from nsf.data.schema import TRAJECTORY
-from nsf.errors import LaunchError, NSFError
+from nsf.errors import ConfigError, LaunchError, NSFError
 from nsf.extras import optional
 from nsf.mpm.device import take_gpu, visible_gpus
 from nsf.pipeline.chain import Pipeline
@@ -52,6 +52,8 @@ def work(config: DictConfig, stages: Sequence[str], say: Callable[[str], object]
     pipeline = Pipeline(config, say)
     if len(stages) > 1:
         pipeline.check_held_out()  # before hours of simulation and training, not after
+    if "report" in stages:
+        pipeline.check_report_folder()
     if "train" in stages:
         pipeline.check_devices()
     for at, name in enumerate(stages):
@@ -85,12 +87,17 @@ def sweep(
         What failed.
 
     Raises:
-        NSFError: a value is refused, which shows before the first job.
+        NSFError: a value or a launcher is refused, which shows before the first job.
         MissingExtraError: the launcher is not installed.
         LaunchError: no job could be started.
     """
     config, loader = configuration.launching(launcher, config_name)
     plugin = ".".join(config.hydra.launcher._target_.split(".")[:2])
+    if not plugin.startswith(("hydra_plugins.", "hydra._internal")):
+        raise ConfigError(
+            f"hydra.launcher._target_={config.hydra.launcher._target_} is refused; "
+            "choose a launcher, as hydra/launcher=joblib"
+        )
     optional(plugin, "sweep")
     movable: list[bool] = []  # by configuration: whether it may see any one GPU
     kept: set[str] = set()  # data.keep of all

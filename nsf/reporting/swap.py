@@ -13,6 +13,28 @@ MARK = "sources.json"
 """The file by which a folder is known as a report and may be replaced."""
 
 
+def check_place(folder: Path) -> None:
+    """Refuse a place where `replaced` could not put a report; the folder above it is made.
+
+    Raises:
+        ConfigError: `folder` holds something that is not a report.
+        StorageError: the folder above it cannot be made or written.
+    """
+    folder = Path(folder).absolute()
+    if folder.exists() and not (folder / MARK).is_file() and (not folder.is_dir() or any(folder.iterdir())):
+        raise ConfigError(
+            f"{folder} exists and is not a report (it has no {MARK}); name another folder or remove it"
+        )
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder.parent).close()
+    except OSError as error:
+        raise StorageError(
+            f"no report can be written to {folder}: {error.strerror}; make the folder above it writable, or "
+            "set report.folder or NSF_REPORTS"
+        ) from error
+
+
 @contextmanager
 def replaced(folder: Path) -> Iterator[Path]:
     """An empty sibling folder to write into; it takes `folder`'s place once the block ends without an error.
@@ -25,18 +47,8 @@ def replaced(folder: Path) -> Iterator[Path]:
         StorageError: the disk refused a file.
     """
     folder = Path(folder).absolute()
-    if folder.exists() and not (folder / MARK).is_file() and (not folder.is_dir() or any(folder.iterdir())):
-        raise ConfigError(
-            f"{folder} exists and is not a report (it has no {MARK}); name another folder or remove it"
-        )
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.new-", dir=folder.parent))
-    except OSError as error:
-        raise StorageError(
-            f"no report can be written to {folder}: {error.strerror}; make the folder above it writable, or "
-            "set report.folder or NSF_REPORTS"
-        ) from error
+    check_place(folder)
+    fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.new-", dir=folder.parent))
     try:
         yield fresh
         fresh.chmod(0o755)

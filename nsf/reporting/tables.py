@@ -213,6 +213,10 @@ def without_constants(
     said = {name: {v for v in frame[name].map(str) if v not in ("", ABSENT, "nan")} for name in describing}
     if said.get(SETTING) and (frame[SETTING].eq("") & frame["field"].ne(PAPER)).any():
         said[SETTING].add("")  # as the scene has it, which is another setting than one that is named
+    computed = frame[frame["field"].ne(PAPER)] if "field" in frame else frame
+    for name in also:
+        if said.get(name) and computed[name].isna().any():
+            said[name].add("")  # what was not measured of one row is not said of it by the others
     constant = [name for name in describing if name not in keep and len(said[name]) == 1]
     empty = [name for name in (SETTING, PLACE) if name in frame and set(frame[name]) <= {"", ABSENT}]
     costs = (*COSTS, TRAINING)  # none with evaluation.trials=0

@@ -206,7 +206,7 @@ class Scene:
             dx=dx,
             dt=float(configuration.number("scene.dt", s.dt)),
             steps=configuration.number("scene.steps", s.steps, least=1, whole=True),
-            size=vector("scene.size", s.size, "m"),
+            size=tuple(configuration.length("scene.size", a) for a in vector("scene.size", s.size, "m")),
             gravity=vector("scene.gravity", s.gravity, "m/s²"),
             bodies=tuple(
                 configuration.build(b, f"scene.bodies.{n}").counted(dx) for n, b in s.bodies.items()

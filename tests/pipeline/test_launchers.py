@@ -1,6 +1,7 @@
 """The launchers of a sweep: what crosses from one process to another, and what is left of one that died."""
 
 import os
+import re
 import signal
 import sys
 import time
@@ -133,3 +134,8 @@ def test_a_launcher_is_for_sweeps(nsf, copied):
     outcome = nsf("train", copied("simulate"), *JOBLIB)
     assert outcome.code == 2
     assert "add -m" in outcome.err
+
+
+def test_a_launcher_that_is_not_hydras():
+    with pytest.raises(ConfigError, match=re.escape("hydra.launcher._target_=os.system is refused")):
+        sweep([["seed=1"]], ["train"], ["hydra.launcher._target_=os.system"])

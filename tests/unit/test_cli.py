@@ -103,6 +103,7 @@ REFUSED = [
     ("point", "point.rate=0", ["point.rate=0"]),
     ("point", "material.E=0", ["material.E=0"]),
     ("point", "precision=fp16", ["precision='fp16'"]),
+    ("run", "scene.size=[-1,1,1]", ["scene.size=-1", "must be positive"]),
 ]
 
 
@@ -120,7 +121,10 @@ def test_bad_input_is_one_clear_line(nsf, tmp_path, stage, override, quoted):
 # What later stages need is known from the start: minutes of simulating and training must not be spent first.
 BEFORE_ANY_WORK = [
     ("sampler.size=0", ["sampler.size"]),
-    ("sampler.size=1", ["|S|=1 gives 3 equations for r=4 unknowns; choose |S| >= 2"]),
+    (
+        "sampler.size=1",
+        ["|S|=1 gives 3 equations for r=4 unknowns; choose sampler.size >= 2 or latent_dim <= 3"],
+    ),
     ("sampler.size=2.5", ["sampler.size=2.5"]),
     ("sampler.size=501", ["sampler.size=501", "500 particles"]),
     ("sampler.seed=abc", ["sampler.seed=abc"]),
@@ -140,6 +144,7 @@ BEFORE_ANY_WORK = [
     ("evaluation.picture_frames=0", ["evaluation.picture_frames=0"]),
     ("report.name=../elsewhere", ["report.name=../elsewhere", "report.folder"]),
     ("report.name=..", ["report.name=.."]),
+    ("report.folder=/proc/reports", ["no report can be written to /proc/reports", "set report.folder"]),
     ("tracking=wandb", ["tracking=wandb", "tensorboard"]),
     ("data.resident=maybe", ["resident=maybe"]),
     ("method.neural_stress=maybe", ["neural_stress=maybe"]),
@@ -178,7 +183,7 @@ def test_the_example_of_the_style_guide(nsf, monkeypatch):
     monkeypatch.setattr(chain_module(), "simulate", lambda *arguments: pytest.fail("simulate began"))
     code, _, err = nsf("run", "latent_dim=6", "sampler.size=1")
     assert code == 2
-    assert "|S|=1 gives 3 equations for r=6 unknowns; choose |S| >= 2" in err
+    assert "|S|=1 gives 3 equations for r=6 unknowns; choose sampler.size >= 2 or latent_dim <= 3" in err
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")

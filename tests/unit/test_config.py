@@ -173,9 +173,21 @@ def test_a_misspelt_key_in_a_node_is_named():
         config.build(config.load(["+sampler.sise=3"]).sampler, "sampler")
 
 
-def test_a_target_that_does_not_exist():
-    with pytest.raises(ConfigError, match=r"nsf\.nothing\.Here"):
+def test_a_target_that_does_not_exist(capsys):
+    with pytest.raises(ConfigError, match=r"field: _target_: nsf\.nothing\.Here does not exist"):
         config.build(config.load(["field._target_=nsf.nothing.Here"]).field, "field")
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("target", ["nsf.runs.os.system", "nsf.config.re.compile", "nsf.runs.os"])
+def test_what_a_module_imports_is_not_of_this_package(target):
+    with pytest.raises(ConfigError, match=re.escape(f"_target_: {target} is refused")):
+        config.build(config.load([f"field._target_={target}"]).field, "field")
+
+
+def test_an_experiment_takes_a_plus():
+    with pytest.raises(ConfigError, match=re.escape("+experiment=NAME")):
+        config.load(["experiment=table1"])
 
 
 def test_broken_yaml_names_file_and_line(tmp_path, monkeypatch):

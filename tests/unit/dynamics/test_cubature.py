@@ -234,7 +234,7 @@ def test_a_scene_is_reduced_with_a_cubature(chain, tiny_manifold, precision):
 
 
 def test_refused(phase_of):
-    with pytest.raises(ConfigError, match=re.escape("sampler.size=501, but the region holds 500 particles")):
+    with pytest.raises(ConfigError, match=re.escape("sampler.size=501, but the scene has 500 particles")):
         phase_of(501)
     for states in (0, 2.5):
         with pytest.raises(ConfigError, match=rf"sampler\.states={states}"):

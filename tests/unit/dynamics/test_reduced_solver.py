@@ -420,7 +420,10 @@ def test_too_small_a_sample(chain, tiny_manifold):
     for sample in (1, [7], RandomSampler(1)):
         with pytest.raises(ProjectionError) as refusal:
             chain.scene.reduced(tiny_manifold, ANGLE, sample, device="cpu")
-        assert str(refusal.value) == "|S|=1 gives 3 equations for r=4 unknowns; choose |S| >= 2"
+        assert (
+            str(refusal.value)
+            == "|S|=1 gives 3 equations for r=4 unknowns; choose sampler.size >= 2 or latent_dim <= 3"
+        )
 
 
 def test_other_particles_are_refused(tiny, tiny_manifold):
@@ -446,7 +449,7 @@ def test_samples_out_of_range(chain, tiny_manifold, sample):
 
 
 def test_more_particles_than_there_are(chain, tiny_manifold):
-    with pytest.raises(ConfigError, match=re.escape("sampler.size=501, but the region holds 500 particles")):
+    with pytest.raises(ConfigError, match=re.escape("sampler.size=501, but the scene has 500 particles")):
         chain.scene.reduced(tiny_manifold, ANGLE, 501, device="cpu")
 
 

@@ -11,7 +11,7 @@ from synthetic import TEST, Made, seal, write_run
 
 from nsf.errors import MissingRunError, SchemaError
 from nsf.reporting import COLUMNS, console_table, merge_results
-from nsf.reporting.columns import number, parameter_text
+from nsf.reporting.columns import COSTS, number, parameter_text
 from nsf.reporting.sources import open_sources
 from nsf.reporting.tables import (
     PAPER,
@@ -216,3 +216,15 @@ def test_console_table_of_one_variant_fits_a_terminal(sweep):
     cost = number(frame["step_ms_full"].iloc[0])
     assert f"full-order step {cost} ms" in text
     assert max(map(len, text.split("\n\n")[0].splitlines())) < 100
+
+
+def test_a_cost_of_one_row_is_not_said_of_others(sweep):
+    frame = merge_results(sweep)
+    assert len(frame) > 1
+    frame["step_ms_full"] = [8.97] + [float("nan")] * (len(frame) - 1)
+    shown, said = without_constants(frame, also=COSTS)
+    assert "8.97" not in said
+    assert "step_ms_full" in shown
+    assert "8.97 ms" in without_constants(frame.assign(step_ms_full=8.97), also=COSTS)[1]
+    without = without_constants(frame.assign(step_ms_full=float("nan")), also=COSTS)
+    assert "step_ms_full" not in without[0]
