@@ -22,7 +22,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, OverrideParseException
 from hydra.types import RunMode
-from hydra.utils import get_class, instantiate
+from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import MarkedYAMLError
@@ -161,7 +161,7 @@ def _load_targets(config: DictConfig, where: str) -> None:
     for target in check_targets(config):
         try:
             found = pkgutil.resolve_name(target)
-        except (ImportError, AttributeError) as error:
+        except (ImportError, AttributeError, ValueError) as error:
             raise ConfigError(f"{where}: _target_: {target} does not exist ({error})") from error
         if not str(getattr(found, "__module__", "")).startswith("nsf."):
             raise ConfigError(_REFUSED.format(target))
@@ -171,9 +171,11 @@ def build(config: DictConfig, where: str):
     """Instantiate the `_target_` of a configuration node.
 
     Raises:
-        ConfigError: a misspelt key, or a value that the class refuses; names the node.
+        ConfigError: no `_target_`, a misspelt key, or a value that the class refuses; names the node.
     """
     _load_targets(config, where)
+    if "_target_" not in config:
+        raise ConfigError(f"{where} names no class; give it a _target_: nsf.…")
     _check_types(config, where)
     try:
         return instantiate(config, _convert_="all")
@@ -190,8 +192,8 @@ def build(config: DictConfig, where: str):
 
 
 def _known(config: DictConfig) -> list[str]:
-    """Keys that the class of a configuration node takes."""
-    return list(inspect.signature(get_class(config._target_)).parameters)
+    """Keys that the target of a configuration node takes."""
+    return list(inspect.signature(pkgutil.resolve_name(config._target_)).parameters)
 
 
 _KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
@@ -203,7 +205,7 @@ def _check_types(config: DictConfig, where: str) -> None:
     Raises:
         ConfigError: names the key and the value.
     """
-    target = get_class(config._target_)
+    target = pkgutil.resolve_name(config._target_)
     hints = typing.get_type_hints(target) if dataclasses.is_dataclass(target) else {}
     for name, hint in hints.items():
         kinds = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)

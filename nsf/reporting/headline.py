@@ -17,7 +17,7 @@ from nsf.reporting.tables import markdown_rows
 FEW = 15  # rows of a table in which a number is varied; of more, settings and scenes go down and across
 MANY = 24  # rows where none is, as in the paper's Table 1
 _VALUES = "scene.parameters.test"  # jobs with this key are about certain held-out values, so each counts
-_PAPER, _COUNT = "paper", "values"
+_PAPER = "paper"
 _RUNS, _DIVERGED, _SEEDS = "runs", "diverged", "seeds"  # how many are in a row of `groups`
 _MEASURED = ("delta", "displacement_error", "stress_error", "speedup_step", "speedup_total")
 _COLUMN_OF = {

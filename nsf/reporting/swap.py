@@ -29,10 +29,14 @@ def check_place(folder: Path) -> None:
         folder.parent.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder.parent).close()
     except OSError as error:
-        raise StorageError(
-            f"no report can be written to {folder}: {error.strerror}; make the folder above it writable, or "
-            "set report.folder or NSF_REPORTS"
-        ) from error
+        raise _no_place(folder, error) from error
+
+
+def _no_place(folder: Path, error: OSError) -> StorageError:
+    return StorageError(
+        f"no report can be written to {folder}: {error.strerror}; make the folder above it writable, or "
+        "set report.folder or NSF_REPORTS"
+    )
 
 
 @contextmanager
@@ -48,7 +52,10 @@ def replaced(folder: Path) -> Iterator[Path]:
     """
     folder = Path(folder).absolute()
     check_place(folder)
-    fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.new-", dir=folder.parent))
+    try:
+        fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.new-", dir=folder.parent))
+    except OSError as error:
+        raise _no_place(folder, error) from error
     try:
         yield fresh
         fresh.chmod(0o755)

@@ -179,6 +179,19 @@ def test_a_target_that_does_not_exist(capsys):
     assert capsys.readouterr().err == ""
 
 
+@pytest.mark.parametrize(
+    ("override", "told"),
+    [
+        ("field._target_=nsf.1x", "field: _target_: nsf.1x does not exist"),
+        ("field._target_=nsf.config.number", "field: "),
+        ("~field._target_", "field names no class"),
+    ],
+)
+def test_a_target_that_is_no_class(override, told):
+    with pytest.raises(ConfigError, match=re.escape(told)):
+        config.build(config.load([override]).field, "field")
+
+
 @pytest.mark.parametrize("target", ["nsf.runs.os.system", "nsf.config.re.compile", "nsf.runs.os"])
 def test_what_a_module_imports_is_not_of_this_package(target):
     with pytest.raises(ConfigError, match=re.escape(f"_target_: {target} is refused")):
