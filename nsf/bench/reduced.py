@@ -27,9 +27,9 @@ _MOST, _FEW = 3, 200
 #: As in the experiment table1.
 MLP_TRAINING = ("trainer.steps=null", "trainer.budget_minutes=1")
 _CHUNK = 2**26  # positions decoded at once
-#: Passes of a step each of which needs the one before it: x and v, the nodes under S, the particles that
-#: touch them, τ and C, P2G, the grid, G2P, the projection.
-_DEPENDENT = 8
+#: Passes of a step each of which needs the one before it: x and v at S, those of the particles that its nodes
+#: need, their τ and C, P2G, G2P, what the projection takes from S, and its solution.
+_DEPENDENT = 7
 
 
 def run(settings: Settings, say: Callable[[str], object]) -> Result:
@@ -140,7 +140,6 @@ def floors(row: Row, solver, stages: Mapping[str, float], speed: float, launches
     moved = {
         "inference": N * (solver.mode_bytes + 24 * real),  # the modes; x, v, C, τ
         "p2g": real * (26 * N + 8 * nodes),  # x, v, C, τ, m, V; the nodes, there and back
-        "grid": real * 8 * nodes,
     }
     found = {name: (stages[name], size, 1e3 * size / speed) for name, size in moved.items()}
     found[f"{_DEPENDENT} empty launches"] = launches, 0.0, launches

@@ -28,7 +28,7 @@ class Arena:
         self.real, self._torch = torch_dtype(precision), torch_device(device)
         self.mode_bytes = 0
         self._held: list[torch.Tensor] = []
-        self._sides = [wp.Stream(device) for _ in range(2)] if device.is_cuda else []
+        self._sides = [wp.Stream(device) for _ in range(3)] if device.is_cuda else []
 
     @contextmanager
     def beside(self, side: int = 0) -> Iterator[None]:
@@ -97,9 +97,10 @@ class Arena:
         A GPU reads them faster than anything else in a step; no entry exceeds 1, so that none is lost.
         """
         if not self.device.is_cuda:
-            return self.modes(table, rows), table.new_ones(table.shape[2])
+            return self.modes(table, rows), self.hold(torch.ones(table.shape[2]), self.real)
         largest = [_rows(table, rows, part).abs().amax((0, 1)) for part in self._parts(table, rows)]
-        lengths = torch.stack(largest).amax(0).clamp_min(torch.finfo(table.dtype).tiny).to(self._torch)
+        lengths = torch.stack(largest).amax(0).clamp_min(torch.finfo(table.dtype).tiny)
+        lengths = self.hold(lengths, self.real)
         return self.modes(table, rows, torch.float16, lengths), lengths
 
     @staticmethod

@@ -1,7 +1,6 @@
 """A phase whose fields are modes times coefficients: a step is a few kernels, and torch takes no part."""
 
 from collections.abc import Sequence
-from itertools import chain
 
 import numpy as np
 import torch
@@ -13,15 +12,10 @@ from nsf.dynamics.arena import Arena
 from nsf.dynamics.integration import ParticleSets
 from nsf.dynamics.interop import as_matrices, as_vectors, on_torch_stream
 from nsf.dynamics.latent import LatentRecord
-from nsf.dynamics.modal_kernels import (
-    THREADS,
-    make_contraction,
-    make_gathering,
-    make_position,
-    tiling,
-)
+from nsf.dynamics.modal_kernels import THREADS, make_contraction, make_gathering, tiling
 from nsf.dynamics.network_kernel import make_layer
 from nsf.dynamics.phase import Phase, Setting, Stages
+from nsf.dynamics.placing_kernels import make_others, make_sample
 from nsf.dynamics.projection import GaussNewton, Taylor
 from nsf.dynamics.projection_kernel import (
     EVALUATE,
@@ -33,7 +27,6 @@ from nsf.dynamics.projection_kernel import (
     projection_block,
     projection_fits,
 )
-from nsf.dynamics.selection_kernels import make_selection
 from nsf.dynamics.stress import Method
 from nsf.kinematics.basis import BasisManifold, ModalFactors
 from nsf.mpm import GridStep, Precision
@@ -90,17 +83,17 @@ class ModalPhase(Phase):
         order = _by_cell(sets, setting.constants[0].X, grid_step.grid.geometry.dx, shape)
         at_sample = manifold.restrict(sets.sample, dtype=setting.dtype, device=setting.device)
         super().__init__(setting, sets, order, grid_step, at_sample)
+        self._clears_ahead = grid_step.grid.sparse  # else what is cleared depends on where particles are
         self._arena = arena = Arena(setting.precision, warp_device(str(setting.device)))
         deformation = manifold.factors("deformation", order, dtype=setting.dtype, device=setting.device)
-        displacement = arena.modes(deformation.table, deformation.rows)
+        of_sample = arena.modes(deformation.table, deformation.rows[: self.s])
         self.coefficients = state = Coefficients(
             arena, setting.simulations, deformation.table.shape[2], manifold.latent_dim
         )
-        self._place = _placing(arena, state, deformation.mean, displacement, self)
-        self._selection = Selection(arena, state, grid_step.grid, shape, sets, self.x, self.v)
-        self.needed = self._selection.needed
+        self._placing = Placing(arena, state, deformation, of_sample, grid_step.grid, shape, self)
+        self.needed = self._placing.needed
         self._networks, self._fields = _fields(arena, self, manifold, method, order, parameters, materials)
-        self._projection = Projection(arena, state, deformation, displacement, self, weights)
+        self._projection = Projection(arena, state, deformation, of_sample, self, weights)
 
     @property
     @override
@@ -108,7 +101,6 @@ class ModalPhase(Phase):
         return {
             "inference": self.infer,
             "p2g": self.p2g,
-            "grid": self.update,
             "g2p": self.g2p,
             "inversion": self.invert,
         }
@@ -116,7 +108,8 @@ class ModalPhase(Phase):
     @override
     def enter(self, first: bool) -> None:
         record, state = self.setting.record, self.coefficients
-        self._arena.meet(1)  # where a step was left in its midst
+        for side in (1, 2):  # where a step was left in its midst
+            self._arena.meet(side)
         for xhat in (record.before, record.now):
             state.latent.copy_(xhat.view_as(state.latent))
             with on_torch_stream(self._arena.device):
@@ -129,27 +122,34 @@ class ModalPhase(Phase):
 
         Beside them, where the boundaries will be, and what of the inversion is known before the step.
         """
+        if self._clears_ahead:
+            with self._arena.beside(2):
+                self.grid_step.clear(self._integration[0])
         with self._arena.beside(1):  # what nothing needs before the grid is updated
             self.grid_step.follow()
             self._projection.prepare.launch()
         with self._arena.beside():
             for launch in self._networks:
                 launch.launch()
-        for launch in (self._place, *self._selection.launches):
+        for launch in self._placing.launches:
             launch.launch()
         self._arena.meet()
-        first, *others = self._fields or [[]]
-        with self._arena.beside():
-            for launch in chain.from_iterable(others):
-                launch.launch()
-        for launch in first:
+        if self._clears_ahead:
+            self._arena.meet(2)
+        for launch in self._fields:
             launch.launch()
-        self._arena.meet()
 
-    def update(self) -> None:
-        """Momentum → velocity at the nodes."""
+    @override
+    def p2g(self) -> None:
+        if self._clears_ahead:
+            self.grid_step.scatter(*self._integration)
+        else:
+            super().p2g()
+
+    @override
+    def g2p(self) -> None:
         self._arena.meet(1)
-        self.grid_step.update(followed=True)
+        self._move_sample()
 
     def invert(self) -> None:
         """x̂_{n+1} from the displacement of S (paper section 5.3)."""
@@ -159,7 +159,7 @@ class ModalPhase(Phase):
     @property
     @override
     def mean_sizes(self) -> list[float]:
-        counts = self._selection.count.tolist()
+        counts = self._placing.count.tolist()
         return [found / steps if steps else float(self.size) for found, steps in counts]
 
     @property
@@ -191,17 +191,19 @@ class Coefficients:
         return len(self.step)
 
 
-class Selection:
-    """Finds at each step which candidates the step of S needs.
+class Placing:
+    """Finds x and v at S, and at each step which others its step needs, and theirs.
 
     Attributes:
-        needed: [B, n] whether a candidate is.
+        needed: [B, n] whether a particle is.
         count: [B, 2] particles needed in all steps taken, and the number of these.
         launches: in order.
     """
 
-    def __init__(self, arena: Arena, state: Coefficients, grid: Grid, shape: str, sets: ParticleSets, x, v):
-        precision, reach = arena.precision, DEGREES[shape]
+    def __init__(
+        self, arena, state, deformation, of_sample: torch.Tensor, grid: Grid, shape: str, phase: Phase
+    ):
+        precision, reach, sets = arena.precision, DEGREES[shape], phase.sets
         nodes = np.array(grid.geometry.nodes)
         lower, upper = np.zeros(3, int), nodes - 1
         if grid.sparse:
@@ -210,18 +212,26 @@ class Selection:
             upper = np.minimum(stored.max(0) + reach, nodes - 1)
         extent = upper - lower + 1
         box = wp.vec3i(*lower.tolist()), wp.vec3i(*extent.tolist())
-        B, s = len(state), len(sets.sample)
-        self.needed = arena.zeros(B, len(x) // B, dtype=torch.int32)
+        B, s, n = len(state), phase.s, phase.size
+        self.needed = arena.hold(torch.ones(B, n), torch.int32)
         self.count = arena.zeros(B, 2, dtype=torch.int64)
         stamps = arena.zeros(B, int(extent.prod()), dtype=torch.int32)
-        stamp, select = make_selection(precision, shape, B > 1)
-        positions, velocities = as_vectors(x, precision), as_vectors(v, precision)
-        shared = [precision.real(1.0 / grid.geometry.dx), *box, state.step, stamps, s]
-        around = (2 * reach + 1) ** 3
-        self.launches = [
-            arena.pack(stamp, B * s * around, [positions, *shared]),
-            arena.pack(select, len(x), [*shared, grid.shape, positions, velocities, self.needed, self.count]),
-        ]
+        mean = as_vectors(arena.hold(deformation.mean, arena.real), precision)
+        initial, x, v = (as_vectors(a, precision) for a in (phase.initial_velocity, phase.x, phase.v))
+        latest = [state.a, state.rate, initial, state.first, state.step, stamps]
+        found = [precision.real(1.0 / grid.geometry.dx), *box, self.count, x, v]
+        lanes = arena.lanes(WARP)
+        inputs = [mean, of_sample, *latest, *found, grid.shape, s, lanes]
+        self.launches = [arena.pack(make_sample(precision, shape, B > 1), B * s * lanes, inputs)]
+        if n == s:
+            return
+        modes, lengths = arena.halved(deformation.table, deformation.rows[s:])
+        four = -(-state.a.shape[1] // 4)
+        shared = 2 * 4 * four * arena.real.itemsize
+        (tiles, tile), lanes = tiling(B, shared), arena.lanes(THREADS)
+        kernel = make_others(precision, shape, four, tile, tiles > 1, wp.dtype_from_torch(modes.dtype))
+        inputs = [mean, modes, lengths, *latest, *found, self.needed, s, tiles, lanes]
+        self.launches.append(arena.pack(kernel, tiles * arena.whole_blocks(n - s, THREADS), inputs, THREADS))
 
 
 class Projection:
@@ -305,24 +315,10 @@ def _by_cell(sets: ParticleSets, X: np.ndarray, dx: float, shape: str) -> np.nda
     return np.concatenate([sets.sample, others[cell_order(X[others], dx, stencil_offset(shape))]])
 
 
-def _placing(arena: Arena, state: Coefficients, mean: torch.Tensor, modes: torch.Tensor, phase: Phase):
-    """The launch that gives x and v at N."""
-    vectors = [as_vectors(a, arena.precision) for a in (phase.initial_velocity, phase.x, phase.v)]
-    mean = as_vectors(arena.hold(mean, arena.real), arena.precision)
-    # Of a and ȧ, in whole vectors of four.
-    (tiles, tile), lanes = tiling(len(state), 16 * -(-state.a.shape[1] // 4) * 4), arena.lanes(THREADS)
-    inputs = [mean, modes, state.a, state.rate, vectors[0], state.first, tiles, lanes, *vectors[1:]]
-    kernel = make_position(arena.precision, -(-state.a.shape[1] // 4), tile, tiles > 1)
-    return arena.pack(kernel, tiles * arena.whole_blocks(phase.size, THREADS), inputs, THREADS)
-
-
 def _fields(
     arena, phase: ModalPhase, manifold, method: Method, order, parameters, materials
 ) -> tuple[list, list]:
-    """The launches of the networks, and those that then give τ and C at N, as the method takes them.
-
-    The latter are lists that do not wait for each other.
-    """
+    """The launches of the networks, and those that then give τ and C at N, as the method takes them."""
     options = {"dtype": arena.real, "device": phase.setting.device}
     heads = []
     for name, neural, found in (
@@ -336,18 +332,18 @@ def _fields(
             else:  # the same in every snapshot
                 found.unflatten(0, (-1, phase.size)).copy_(_as_matrices(factors.mean))
     stored = [arena.halved(factors.table, factors.rows) for factors, _ in heads]
-    layers = [_lengthened(f.layers, lengths) for (f, _), (_, lengths) in zip(heads, stored, strict=True)]
-    networks, coefficients = _networks(arena, layers, phase.setting.record, parameters)
-    launches = [
-        [_contraction(arena, phase, factors, modes, a, found)]
-        for (factors, found), (modes, _), a in zip(heads, stored, coefficients, strict=True)
+    networks, coefficients = _networks(arena, [f.layers for f, _ in heads], phase.setting.record, parameters)
+    fields = [
+        (factors, *modes, a, found)
+        for (factors, found), modes, a in zip(heads, stored, coefficients, strict=True)
     ]
+    launches = [_contraction(arena, phase, fields)] if fields else []
     if not method.neural_stress:
         F = arena.zeros(len(phase.x), 3, 3, dtype=arena.real)
         factors = manifold.factors("gradient", order, **options)
-        modes = arena.modes(factors.table, factors.rows)
-        gradient = _contraction(arena, phase, factors, modes, phase.coefficients.a, F)
-        launches.append([gradient, _elastic(arena, phase, materials, F)])
+        whole = arena.modes(factors.table, factors.rows), arena.zeros(1, dtype=arena.real)  # over no lengths
+        launches.append(_contraction(arena, phase, [(factors, *whole, phase.coefficients.a, F)]))
+        launches.append(_elastic(arena, phase, materials, F))
     return networks, launches
 
 
@@ -356,55 +352,54 @@ def _as_matrices(mean: torch.Tensor) -> torch.Tensor:
     return (mean[:, np.ravel(TAU_MATRIX)] if mean.shape[1] == 6 else mean).unflatten(1, (3, 3))
 
 
-def _lengthened(layers: list, lengths: torch.Tensor) -> list:
-    """The layers of a network whose outputs are longer by these factors."""
-    *hidden, (W, b) = layers
-    lengths = lengths.to(W)
-    return [*hidden, (lengths[:, None] * W, lengths * b)]
-
-
 def _networks(arena: Arena, networks: list, record: LatentRecord, parameters) -> tuple[list, list]:
-    """The launches of the heads, layer by layer and both at once, and where they leave their coefficients."""
-    B = len(parameters)
-    inputs = [record.now.view(B, -1)] * len(networks)
+    """The launches of the heads, layer by layer and both at once, and where they leave their coefficients.
+
+    A GPU takes their first two layers in one.
+    """
+    B, r = len(parameters), record.now.shape[-1]
     launches, lanes, (tiles, tile) = [], arena.lanes(WARP), tiling(B)
+    inputs, before = [record.now.view(B, r)] * len(networks), []
     for layers in zip(*networks, strict=True):
-        first, last = not launches, len(launches) == len(networks[0]) - 1
         weights = []
         for W, b in layers:
             biases = [b] * B
-            if first:  # x̂ is followed by the problem parameters, which do not change in a run
-                r = inputs[0].shape[1]
+            if not (launches or before):  # x̂ is followed by the parameters, which do not change in a run
                 biases = [b + W[:, r:] @ values.to(W)[: W.shape[1] - r] for values in parameters]
                 W = W[:, :r]
             weights.append([arena.hold(W, arena.real), arena.hold(torch.stack(biases), arena.real)])
+        last = layers[0] is networks[0][-1]
+        if arena.device.is_cuda and not (launches or before or last):
+            before = weights
+            continue
         outputs = [arena.zeros(*b.shape, dtype=arena.real) for _, b in weights]
-        sides = [[*w, x] for w, x in zip(weights, inputs, strict=True)]
+        sides = [[*w_0, *w, x] for w_0, w, x in zip(before or weights, weights, inputs, strict=True)]
         count = sum(y.shape[1] for y in outputs)
         # One network alone stands on both sides; the second gets no thread.
         arguments = [*sides[0], *sides[-1], int(not last), lanes, count, outputs[0], outputs[-1]]
-        kernel = make_layer(arena.precision, tile, tiles > 1)
+        kernel = make_layer(arena.precision, tile, tiles > 1, r if before and not launches else 0)
         launches.append(arena.pack(kernel, tiles * count * lanes, arguments))
         inputs = outputs
     return launches, inputs
 
 
-def _contraction(
-    arena: Arena,
-    phase: ModalPhase,
-    factors: ModalFactors,
-    modes: torch.Tensor,
-    a: torch.Tensor,
-    found: torch.Tensor,
-):
-    """The launch of a field with coefficients a [B, K] of the arena's modes, at the needed particles."""
-    n, (c, K) = len(factors.rows), factors.table.shape[1:]
-    (tiles, tile), lanes = tiling(len(a), a.element_size() * -(-K // 4) * 4), arena.lanes(THREADS)
-    coefficients, stored = (wp.dtype_from_torch(values.dtype) for values in (a, modes))
-    kernel = make_contraction(arena.precision, -(-K // 4), c == 6, coefficients, tile, tiles > 1, stored)
-    mean = arena.hold(factors.mean, arena.real)
-    inputs = [phase.needed, mean, modes, a, tiles, lanes, found]
-    return arena.pack(kernel, tiles * arena.whole_blocks(c // 3 * n, THREADS), inputs, THREADS)
+def _contraction(arena: Arena, phase: ModalPhase, fields: Sequence[tuple]):
+    """The launch of one or two fields at the needed particles.
+
+    A field is its factors, the arena's modes, their lengths, coefficients a [B, K], and where it goes.
+    """
+    a, lanes = fields[0][3], arena.lanes(THREADS)
+    four = [-(-factors.table.shape[2] // 4) for factors, *_ in fields]
+    tiles, tile = tiling(len(a), arena.real.itemsize * sum(four) * 4)
+    threads, inputs = [], [phase.needed]
+    for factors, *rest in fields:
+        threads.append(arena.whole_blocks(factors.table.shape[1] // 3 * len(factors.rows), THREADS))
+        inputs += [arena.hold(factors.mean, arena.real), *rest]
+    # One field alone stands on both sides; the second gets no thread.
+    inputs += inputs[-5:] * (2 - len(fields)) + [threads[0], tiles, lanes]
+    coefficients, stored = (wp.dtype_from_torch(values.dtype) for values in (a, fields[0][1]))
+    kernel = make_contraction(arena.precision, (four[0], four[-1]), coefficients, tile, tiles > 1, stored)
+    return arena.pack(kernel, tiles * sum(threads), inputs, THREADS)
 
 
 def _elastic(arena: Arena, phase: ModalPhase, materials: Sequence[Material], F: torch.Tensor):

@@ -32,7 +32,7 @@ def tiling(simulations: int, shared: int = 0) -> tuple[int, int]:
 
 
 @cache
-def _make_placing(several: bool):
+def make_tiles(several: bool):
     """Warp functions (thread, tiles, lanes) → its tile, and its number among the threads of that tile.
 
     Blocks of `lanes` threads are of one tile; those of the tiles follow each other, so that they find in a
@@ -74,7 +74,7 @@ _WIDENED = """
 """
 
 
-def _combination(names: str, coefficient: str, tile: int, several: bool, half: bool = False) -> str:
+def combination(names: str, tile: int, several: bool, half: bool = False) -> str:
     """Native code of the sums Σ_k modes[p, c..c+2, k] name_k, for each simulation of a tile and each name.
 
     They are `sum`: three of the first name, three of the next, and so on for the next simulation; the first
@@ -82,23 +82,27 @@ def _combination(names: str, coefficient: str, tile: int, several: bool, half: b
     by side (`Arena.modes`): what is under way then covers the time that memory takes, even for few particles.
     A GPU first takes the coefficients into shared memory, for which all threads of a block are needed, also
     those beyond the last particle; one that is not `live` only helps with that. A CPU may change the order of
-    additions, so that it works on several at once. `half`: a GPU has the modes in half precision.
+    additions, so that it works on several at once. `half`: a GPU has the modes in half precision, each over
+    its length (`Arena.halved`).
     """
     load = "__ldg" if several else "__ldcs"  # another tile will read the same modes, or nothing will
-    load, stored, ahead = (f"widened({load}", "uint2", 2 * _AHEAD) if half else (f"({load}", "float4", _AHEAD)
+    widened, stored, ahead = ("widened", "uint2", 2 * _AHEAD) if half else ("", "float4", _AHEAD)
     names = names.split()
     each, size = "".join, 3 * len(names)
     totals = [(n, i, f"sum[{size} * s + {3 * m + i}]") for m, n in enumerate(names) for i in range(3)]
     of_four = each(
-        f"{total} += real(w{i}.{x}) * real(shared_{n}[s][4 * q + {j}]);"
+        f"{total} += real(w{i}.{x}) * shared_{n}[s][4 * q + {j}];"
         for j, x in enumerate("xyzw")
         for n, i, total in totals
     )
     zero = each(f"real {n}_{i} = 0;" for n, i, _ in totals)
     of_one = each(f"{n}_{i} += real(w{i}) * real({n}.data[(start + s) * K + k]);" for n, i, _ in totals)
     kept = each(f"{total} = {n}_{i};" for n, i, total in totals)
-    shared = each(f"__shared__ {coefficient} shared_{n}[{tile}][4 * Q];" for n in names)
-    filled = each(f"shared_{n}[s][k] = known ? {n}.data[(start + s) * K + k] : 0;" for n in names)
+    shared = each(f"__shared__ real shared_{n}[{tile}][4 * Q];" for n in names)
+    length = " * lengths.data[k]" if half else ""
+    filled = each(
+        f"shared_{n}[s][k] = known ? real({n}.data[(start + s) * K + k]{length}) : real(0);" for n in names
+    )
     return f"""
     const int K = {names[0]}.shape[1], simulations = {names[0]}.shape[0];
     wp::vec_t<{size * tile}, real> sum;
@@ -113,13 +117,25 @@ def _combination(names: str, coefficient: str, tile: int, several: bool, half: b
     if (live) {{
         {_WIDENED if half else ""}
         const {stored}* first = (const {stored}*)modes.data + size_t(c) * Q * particles + p;
-        #pragma unroll {ahead}
-        for (int q = 0; q < Q; ++q) {{
-            const float4 w0 = {load}(first + size_t(q) * particles));
-            const float4 w1 = {load}(first + size_t(Q + q) * particles));
-            const float4 w2 = {load}(first + size_t(2 * Q + q) * particles));
+        const int ahead = {ahead};
+        #pragma unroll 1
+        for (int begin = 0; begin < Q; begin += ahead) {{
+            {stored} under_way[ahead][3];
             #pragma unroll
-            for (int s = 0; s < {tile}; ++s) {{ {of_four} }}
+            for (int j = 0; j < ahead; ++j)
+                for (int i = 0; i < 3; ++i)
+                    if (begin + j < Q)
+                        under_way[j][i] = {load}(first + size_t(i * Q + begin + j) * particles);
+            __syncwarp(__activemask());  // else the compiler puts each load beside its use
+            #pragma unroll
+            for (int j = 0; j < ahead; ++j) {{
+                const int q = begin + j;
+                if (q >= Q) break;
+                const float4 w0 = {widened}(under_way[j][0]), w1 = {widened}(under_way[j][1]);
+                const float4 w2 = {widened}(under_way[j][2]);
+                #pragma unroll
+                for (int s = 0; s < {tile}; ++s) {{ {of_four} }}
+            }}
         }}
     }}
 #else
@@ -141,92 +157,20 @@ def _combination(names: str, coefficient: str, tile: int, several: bool, half: b
 
 
 @cache
-def make_position(precision: Precision, vectors: int, tile: int = 1, several: bool = False):
-    """Kernel of x and v at N, one thread a particle and tile of simulations, launched over whole blocks.
-
-    x = mean + Σ_k b_k a_k and v = Σ_k b_k ȧ_k, where ȧ is the backward difference of a (paper section 5.1:
-    there is no v field); in the first step v is the initial velocity. `several` tiles have blocks in turn.
-    """
-    real, vec3 = precision.real, precision.vec3
-    sums = wp.types.vector(length=6 * tile, dtype=real)
-    tile_of, within = _make_placing(several)
-    snippet = f"""
-    typedef {precision.native} real;
-    const int Q = {vectors}, c = 0, components = 3, particles = mean.shape[0];
-    const bool live = p < particles;
-    {_combination("a rate", "double", tile, several)}
-    """
-
-    @wp.func_native(snippet)
-    def combined(
-        modes: wp.array(dtype=wp.float32),
-        a: wp.array2d(dtype=wp.float64),
-        rate: wp.array2d(dtype=wp.float64),
-        mean: wp.array(dtype=vec3),
-        start: int,
-        p: int,
-    ) -> sums: ...
-
-    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
-    def position(
-        mean: wp.array(dtype=vec3),
-        modes: wp.array(dtype=wp.float32),
-        a: wp.array2d(dtype=wp.float64),
-        rate: wp.array2d(dtype=wp.float64),
-        initial_velocity: wp.array(dtype=vec3),
-        first: wp.array(dtype=wp.int32),
-        tiles: int,
-        lanes: int,
-        x: wp.array(dtype=vec3),
-        v: wp.array(dtype=vec3),
-    ):
-        p = within(wp.tid(), tiles, lanes)
-        start = tile_of(wp.tid(), tiles, lanes) * wp.static(tile)
-        moved = combined(modes, a, rate, mean, start, p)
-        n = mean.shape[0]
-        if p >= n:
-            return
-        for s in range(wp.static(tile)):
-            if start + s < first.shape[0]:
-                row = (start + s) * n + p
-                x[row] = mean[p] + vec3(moved[6 * s], moved[6 * s + 1], moved[6 * s + 2])
-                if first[start + s] != 0:
-                    v[row] = initial_velocity[row]
-                else:
-                    v[row] = vec3(moved[6 * s + 3], moved[6 * s + 4], moved[6 * s + 5])
-
-    return position
-
-
-@cache
-def make_contraction(
-    precision: Precision,
-    vectors: int,
-    symmetric: bool,
-    coefficients,
-    tile: int = 1,
-    several: bool = False,
-    stored=wp.float32,
-):
-    """Kernel of a matrix field at N, mean + Σ_k modes_k a_k, over whole blocks.
-
-    A thread has three components of a particle, in the simulations of a tile; `several` tiles have blocks in
-    turn. The six components of a symmetric field are xx xy xz yy yz zz, the nine of another go row by row.
-    Particles that are not needed are passed over. `coefficients` is the type of a, `stored` that of modes.
-    """
-    real, half = precision.real, stored is wp.float16
+def _make_field(precision: Precision, vectors: int, coefficients, tile: int, several: bool, stored):
+    """Warp function of `make_contraction` for one of its fields; t is a thread's number in the field."""
+    real, vec3, half = precision.real, precision.vec3, stored is wp.float16
     sums = wp.types.vector(length=3 * tile, dtype=real)
-    tile_of, within = _make_placing(several)
-    scalar = {wp.float32: "float", wp.float64: "double"}[coefficients]
     snippet = f"""
     typedef {precision.native} real;
     const int Q = {vectors}, components = mean.shape[1], particles = mean.shape[0];
-    {_combination("a", scalar, tile, several, half)}
+    {combination("a", tile, several, half)}
     """
 
     @wp.func_native(snippet)
     def combined(
         modes: wp.array(dtype=stored),
+        lengths: wp.array(dtype=real),
         mean: wp.array2d(dtype=real),
         a: wp.array2d(dtype=coefficients),
         start: int,
@@ -235,18 +179,17 @@ def make_contraction(
         live: bool,
     ) -> sums: ...
 
-    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
-    def contraction(
+    @wp.func
+    def field(
         needed: wp.array2d(dtype=wp.int32),
         mean: wp.array2d(dtype=real),
         modes: wp.array(dtype=stored),
+        lengths: wp.array(dtype=real),
         a: wp.array2d(dtype=coefficients),
-        tiles: int,
-        lanes: int,
         found: wp.array3d(dtype=real),
+        start: int,
+        t: int,
     ):
-        t = within(wp.tid(), tiles, lanes)
-        start = tile_of(wp.tid(), tiles, lanes) * wp.static(tile)
         n = needed.shape[1]
         group, p = t / n, t % n
         c = 3 * group
@@ -255,16 +198,19 @@ def make_contraction(
             for s in range(wp.static(tile)):
                 if start + s < needed.shape[0] and needed[start + s, p] != 0:
                     live = True
-        value = combined(modes, mean, a, start, p, c, live)
+        middle = vec3()
+        if live:  # loaded before all that is waited for below
+            middle = vec3(mean[p, c], mean[p, c + 1], mean[p, c + 2])
+        value = combined(modes, lengths, mean, a, start, p, c, live)
         if not live:
             return
         for s in range(wp.static(tile)):
             if start + s < needed.shape[0] and needed[start + s, p] != 0:
                 row = (start + s) * n + p
-                one = value[3 * s] + mean[p, c]
-                two = value[3 * s + 1] + mean[p, c + 1]
-                three = value[3 * s + 2] + mean[p, c + 2]
-                if wp.static(not symmetric):
+                one = value[3 * s] + middle[0]
+                two = value[3 * s + 1] + middle[1]
+                three = value[3 * s + 2] + middle[2]
+                if mean.shape[1] == 9:
                     found[row, group, 0] = one
                     found[row, group, 1] = two
                     found[row, group, 2] = three
@@ -280,6 +226,53 @@ def make_contraction(
                     found[row, 2, 1] = two
                     found[row, 2, 2] = three
 
+    return field
+
+
+@cache
+def make_contraction(
+    precision: Precision,
+    vectors: tuple[int, int],
+    coefficients,
+    tile: int = 1,
+    several: bool = False,
+    stored=wp.float32,
+):
+    """Kernel of two matrix fields at N at once, each mean + Σ_k modes_k a_k, over whole blocks.
+
+    A thread has three components of a particle, in the simulations of a tile; `several` tiles have blocks in
+    turn. The first `threads` are those of the first field. The six components of a symmetric field are xx xy
+    xz yy yz zz, the nine of another go row by row. Particles that are not needed are passed over. `vectors`
+    are those of four modes of either field, `coefficients` is the type of a, `stored` that of modes.
+    """
+    real = precision.real
+    tile_of, within = make_tiles(several)
+    first, second = (_make_field(precision, Q, coefficients, tile, several, stored) for Q in vectors)
+
+    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
+    def contraction(
+        needed: wp.array2d(dtype=wp.int32),
+        mean_1: wp.array2d(dtype=real),
+        modes_1: wp.array(dtype=stored),
+        lengths_1: wp.array(dtype=real),
+        a_1: wp.array2d(dtype=coefficients),
+        found_1: wp.array3d(dtype=real),
+        mean_2: wp.array2d(dtype=real),
+        modes_2: wp.array(dtype=stored),
+        lengths_2: wp.array(dtype=real),
+        a_2: wp.array2d(dtype=coefficients),
+        found_2: wp.array3d(dtype=real),
+        threads: int,
+        tiles: int,
+        lanes: int,
+    ):
+        t = within(wp.tid(), tiles, lanes)
+        start = tile_of(wp.tid(), tiles, lanes) * wp.static(tile)
+        if t < threads:  # whole blocks
+            first(needed, mean_1, modes_1, lengths_1, a_1, found_1, start, t)
+        else:
+            second(needed, mean_2, modes_2, lengths_2, a_2, found_2, start, t - threads)
+
     return contraction
 
 
@@ -288,7 +281,8 @@ def make_gathering(precision: Precision, several: bool = False):
     """Kernel of what the projection needs of S, one block a simulation and mode: b_k = Σ_p w_p B_p,kᵀ Δt v_p.
 
     The displacement of S in the step is Δt v_p, as its positions before it lie on the manifold. The last
-    block of a simulation gives Σ_p w_p |Δt v_p|².
+    block of a simulation gives Σ_p w_p |Δt v_p|². `displacement` holds the modes of S alone; v has rows of
+    `particles` of each simulation, S first.
     """
     vec3 = precision.vec3
     _, copy_of = make_copies(several)
@@ -301,8 +295,8 @@ def make_gathering(precision: Precision, several: bool = False):
         double one = dt * x, two = dt * y, three = dt * z;
         if (k < modes) {
 #if defined(__CUDA_ARCH__)
-            const size_t next = size_t(vectors) * particles * 4;
-            const wp::float32* at = displacement.data + (size_t(k / 4) * particles + p) * 4 + k % 4;
+            const size_t next = size_t(vectors) * weights.shape[0] * 4;
+            const wp::float32* at = displacement.data + (size_t(k / 4) * weights.shape[0] + p) * 4 + k % 4;
 #else
             const size_t next = 4 * vectors;
             const wp::float32* at = displacement.data + size_t(p) * 3 * next + k;
@@ -328,7 +322,6 @@ def make_gathering(precision: Precision, several: bool = False):
     @wp.func_native(snippet)
     def share(
         displacement: wp.array(dtype=wp.float32),
-        particles: int,
         vectors: int,
         modes: int,
         v: wp.array(dtype=vec3),
@@ -356,7 +349,7 @@ def make_gathering(precision: Precision, several: bool = False):
         copy = copy_of(t / lanes, sums)
         k, lane = t / lanes - copy * sums, t % lanes
         start = copy * particles
-        total = share(displacement, particles, vectors, sums - 1, v, weights, dt, start, k, lane, lanes)
+        total = share(displacement, vectors, sums - 1, v, weights, dt, start, k, lane, lanes)
         if lane == 0:
             b[copy, k] = total
 

@@ -87,10 +87,6 @@ class Phase(ABC):
         n = len(self.mass)
         self.x, self.v = (torch.zeros(n, 3, dtype=dtype, device=device) for _ in range(2))
         self.C, self.tau = (torch.zeros(n, 3, 3, dtype=dtype, device=device) for _ in range(2))
-        # G2P gives these of S too; the next step takes C from its source again.
-        self._C_of_sample, self._increment = (
-            torch.zeros(setting.simulations * self.s, 3, 3, dtype=dtype, device=device) for _ in range(2)
-        )
         self.bind(n)
 
     def bind(self, n: int) -> None:
@@ -100,8 +96,6 @@ class Phase(ABC):
         matrices = [as_matrices(a[:n], precision) for a in (self.C, self.tau)]
         scalars = [as_scalars(a[:n]) for a in (self.mass, self.volume0)]
         self._integration = (*vectors, *matrices, *scalars)
-        matrices = [as_matrices(a, precision) for a in (self._C_of_sample, self._increment)]
-        self._sample = (*vectors, *matrices)
         self.size = n // self.setting.simulations
 
     @property
@@ -122,7 +116,7 @@ class Phase(ABC):
     def nbytes(self) -> int:
         """Bytes of arrays and fields on the device."""
         own = (self.mass, self.volume0, self.mu, self.lam, self.initial_velocity, self.x, self.v)
-        own += (self.C, self.tau, self._C_of_sample, self._increment)
+        own += (self.C, self.tau)
         return self.at_sample.nbytes + self.grid_step.grid.nbytes + sum(a.nbytes for a in own)
 
     @property
@@ -135,8 +129,12 @@ class Phase(ABC):
         self.grid_step.p2g(*self._integration)
 
     def g2p(self) -> None:
-        """Grid → S."""
-        self.grid_step.g2p(*self._sample)
+        """Grid → S, where nodes are updated only as S needs them."""
+        self.grid_step.follow()
+        self._move_sample()
+
+    def _move_sample(self) -> None:
+        self.grid_step.update_g2p(*self._integration[:2], self.s)
 
 
 class DecodedPhase(Phase):
@@ -174,7 +172,6 @@ class DecodedPhase(Phase):
             "inference": self.infer,
             "transfer": self.load,
             "p2g": self.p2g,
-            "grid": self.grid_step.update,
             "g2p": self.g2p,
             "inversion": self.invert,
         }

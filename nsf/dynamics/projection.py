@@ -63,7 +63,7 @@ class GaussNewton:
     """
 
     iterations: int = 3
-    tolerance: float = 1e-6
+    tolerance: float = 1e-4
 
     def __post_init__(self):
         if self.iterations < 1:

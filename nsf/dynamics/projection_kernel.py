@@ -336,6 +336,7 @@ def make_projection(
         return least(sum);
     }};
 
+    const long long n = row.data[0];
     #pragma unroll 1
     for (int k = lane; k < K; k += lanes) a_n[k] = a.data[k];
     if (mode != {SOLVE}) {{
@@ -345,7 +346,7 @@ def make_projection(
             if (mode == {PREPARE} && !linear) {{
                 const double before = xhat_previous.data[i], change = latent.data[i] - before;
                 x[i] += change;
-                if (row.data[0] > 1) x[i] += change - before + xhats.data[(row.data[0] - 2) * R + i];
+                if (n > 1) x[i] += change - before + xhats.data[(n - 2) * R + i];
             }}
         }}
         #pragma unroll 1
@@ -408,7 +409,6 @@ def make_projection(
             u[i] = sum;
         }}
         NSF_SYNC;
-        const long long n = row.data[0];
         int done = 0;
         bool going = true;
         while (true) {{

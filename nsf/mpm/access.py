@@ -81,7 +81,14 @@ _RUN = """
     unsigned others = __ballot_sync(all, first);
     unsigned after = lane == 31 ? 0u : others >> (lane + 1);
     int left = after ? __ffs(after) : 32 - lane;
-    return first ? left : -left;
+    int longest = left;
+#if __CUDA_ARCH__ >= 800
+    longest = __reduce_max_sync(all, left);
+#else
+    for (int offset = 16; offset > 0; offset /= 2)
+        longest = max(longest, __shfl_xor_sync(all, longest, offset));
+#endif
+    return (first ? 1 : -1) * (left + 64 * longest);
 #else
     return key < 0 ? 0 : 1;
 #endif
@@ -89,14 +96,7 @@ _RUN = """
 _SUM = """
 #if defined(__CUDA_ARCH__)
     const unsigned all = 0xffffffffu;
-    int left = run < 0 ? -run : run;
-#if __CUDA_ARCH__ >= 800
-    int longest = __reduce_max_sync(all, left);
-#else
-    int longest = left;
-    for (int offset = 16; offset > 0; offset /= 2)
-        longest = max(longest, __shfl_xor_sync(all, longest, offset));
-#endif
+    const int left = abs(run) % 64, longest = abs(run) / 64;
     wp::vec_t<4, {real}> sum = value;
     for (int offset = 1; offset < longest; offset *= 2) {{
         {real} a = __shfl_down_sync(all, sum[0], offset);
@@ -119,12 +119,19 @@ _SUM = """
 WARP = 32
 
 
+@wp.func
+def whole_warps(threads: int):
+    """Threads of so many whole warps as these threads need."""
+    return (threads + 31) / 32 * 32
+
+
 @cache
 def make_sum(precision: Precision, deterministic: bool):
     """Warp functions (run_of, sum) that add up values of neighbouring threads of a warp with the same key.
 
-    run_of: key → number of threads from this one to the last of those in a row that have its key; negative
-    where the thread before has it too; 0 where no thread of the warp has a key ≥ 0, so that all may leave.
+    run_of: key → number of threads from this one to the last of those in a row that have its key, plus 64
+    times the most of any thread of the warp; negative where the thread before has it too; 0 where no thread
+    of the warp has a key ≥ 0, so that all may leave.
     sum: (value, run) → the sum over these threads, of which the first, whose run is positive, alone counts.
     On a CPU, or if deterministic, every thread is alone.
 
@@ -152,6 +159,28 @@ def make_sum(precision: Precision, deterministic: bool):
         def total(value: vec4, run: int) -> vec4: ...
 
     return run_of, total
+
+
+@cache
+def make_warp_sum(precision: Precision):
+    """Warp function (value [3], lanes) → the sum over the lanes of a warp, in each; of one lane its value."""
+    vec3 = precision.vec3
+    snippet = f"""
+#if defined(__CUDA_ARCH__)
+    wp::vec_t<3, {precision.native}> sum = value;
+    if (lanes > 1)
+        for (int d = 16; d > 0; d /= 2)
+            for (int i = 0; i < 3; ++i) sum[i] += __shfl_xor_sync(0xffffffffu, sum[i], d);
+    return sum;
+#else
+    return value;
+#endif
+"""
+
+    @wp.func_native(snippet)
+    def total(value: vec3, lanes: int) -> vec3: ...
+
+    return total
 
 
 @cache

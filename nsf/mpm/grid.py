@@ -1,4 +1,4 @@
-"""The background grid: where nodes are stored, and the update of their velocities (paper section 3.3)."""
+"""The background grid: where nodes are stored, and which of them a step works on (paper section 3.3)."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -7,9 +7,6 @@ import numpy as np
 import warp as wp
 
 from nsf.errors import ConfigError
-from nsf.mpm.access import make_load
-from nsf.mpm.contact import SLIP, STICKY, make_contact
-from nsf.mpm.copies import make_copies
 from nsf.mpm.precision import Precision
 from nsf.mpm.shape import shape_functions
 
@@ -292,91 +289,3 @@ def make_reach(precision: Precision, shape_name: str):
                         blocks[wp.atomic_add(listed, 0, 1)] = block
 
     return reach
-
-
-@cache
-def make_grid_update(precision: Precision, several: bool = False):
-    """Kernel of the grid update: momentum → velocity, gravity, walls, colliders.
-
-    v_i = (m_i v_i − Δt Σ_p τ_p ∇w_ip V_p⁰)/m_i + Δt g, then the boundary conditions
-    in order: each collider that acts, then the walls of the domain. P2G has already added
-    the force impulse to the momentum. A node belongs to a solid by the solid's pose at t^n, the
-    time of the particles that P2G took here, and v_i^{n+1} meets the condition relative to the
-    solid's mean velocity over the step (`make_follow`). Frames that move by whole cells a step
-    thus see the same contact. With `several`, nodes, gravity and colliders are those of `copies` simulations.
-
-    Source: paper section 3.3, step 2.
-    """
-    real, vec3, vec4, mat33 = precision.real, precision.vec3, precision.vec4, precision.mat33
-    outward_normal, against = make_contact(precision)
-    load = make_load(precision)
-    share, copy_of = make_copies(several)
-
-    @wp.kernel(enable_backward=False, module="unique")
-    def grid_update(
-        nodes: wp.array(dtype=wp.int32),
-        slots: wp.array(dtype=wp.int32),
-        blocks: wp.array(dtype=wp.int32),
-        listed: wp.array(dtype=wp.int32),
-        shape: wp.vec3i,
-        block_shape: wp.vec3i,
-        threads: int,
-        copies: int,
-        values: wp.array(dtype=vec4),
-        dx: real,
-        dt: real,
-        gravity: wp.array(dtype=vec3),
-        collider_shape: wp.array(dtype=wp.int32),
-        collider_active: wp.array(dtype=wp.int32),
-        collider_position: wp.array(dtype=vec3),
-        collider_orientation: wp.array(dtype=mat33),
-        collider_extents: wp.array(dtype=vec3),
-        collider_velocity: wp.array(dtype=vec3),
-        collider_gradient: wp.array(dtype=mat33),
-        collider_kind: wp.array(dtype=wp.int32),
-        collider_friction: wp.array(dtype=real),
-        wall_kind: int,
-        wall_padding: int,
-    ):
-        index = wp.tid()
-        each = nodes_of_step(nodes, listed)
-        count = each
-        if wp.static(several):
-            count = copies * each
-        solids = share(collider_shape.shape[0], copies)
-        while index < count:
-            copy = copy_of(index, each)
-            flat = node_of_step(index - copy * each, nodes, blocks, shape, block_shape)
-            index += threads
-            start = copy * share(values.shape[0], copies)
-            value = vec4()
-            if flat >= 0:
-                value = load(values, start + storage(flat, slots))
-            if value[3] > real(0.0):
-                node = node_of(flat, shape)
-                v = vec3(value[0], value[1], value[2]) / value[3] + dt * gravity[copy]
-                x = dx * vec3(real(node[0]), real(node[1]), real(node[2]))
-                for c in range(copy * solids, (copy + 1) * solids):
-                    if collider_active[c] != 0:
-                        arm = x - collider_position[c]
-                        normal = outward_normal(
-                            collider_shape[c], arm, collider_orientation[c], collider_extents[c], dx
-                        )
-                        if wp.length_sq(normal) > real(0.0):
-                            solid = collider_velocity[c] + collider_gradient[c] * arm
-                            v = solid + against(v - solid, normal, collider_kind[c], collider_friction[c])
-                for axis in range(3):
-                    low = node[axis] < wall_padding
-                    high = node[axis] >= shape[axis] - wall_padding
-                    if low or high:
-                        if wall_kind == wp.static(STICKY):
-                            v = vec3()
-                        elif (
-                            wall_kind == wp.static(SLIP)
-                            or (low and v[axis] < real(0.0))
-                            or (high and v[axis] > real(0.0))
-                        ):
-                            v[axis] = real(0.0)
-                values[start + storage(flat, slots)] = vec4(v[0], v[1], v[2], value[3])
-
-    return grid_update

@@ -22,6 +22,7 @@ class ShapeFunctions:
         local: (x [m], 1/dx, base) → position relative to the base node [dx].
         weights: local position → [3, b + 1] weights w, one row an axis.
         gradients: local position → [3, b + 1] derivatives dw/d(x/dx).
+        entry: (weights or gradients, axis, i) → entry i of an axis, where i is known only when it runs.
     """
 
     degree: int
@@ -29,6 +30,7 @@ class ShapeFunctions:
     local: Any
     weights: Any
     gradients: Any
+    entry: Any
 
     @property
     def affine_inertia(self) -> float:
@@ -74,6 +76,13 @@ def shape_functions(precision: Precision, name: str) -> ShapeFunctions:
         return vec3(
             x[0] * inv_dx - real(base[0]), x[1] * inv_dx - real(base[1]), x[2] * inv_dx - real(base[2])
         )
+
+    @wp.func
+    def entry(values: stencil, axis: int, i: int):
+        value = values[axis, 0]
+        for j in range(1, wp.static(degree + 1)):  # a matrix whose index is unknown would lie in memory
+            value = wp.where(i == j, values[axis, j], value)
+        return value
 
     if degree == 2:
 
@@ -124,4 +133,4 @@ def shape_functions(precision: Precision, name: str) -> ShapeFunctions:
                 d[axis, 3] = real(0.5) * s * s
             return d
 
-    return ShapeFunctions(degree, base_node, local, weights, gradients)
+    return ShapeFunctions(degree, base_node, local, weights, gradients, entry)

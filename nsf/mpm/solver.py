@@ -11,10 +11,10 @@ from nsf.mpm.access import WARP
 from nsf.mpm.boundary import BoundaryArrays, DomainWalls
 from nsf.mpm.colliders import Collider
 from nsf.mpm.device import warp_device
-from nsf.mpm.grid import Grid, GridGeometry, make_grid_update, make_reach
+from nsf.mpm.grid import Grid, GridGeometry, make_reach
 from nsf.mpm.materials import Material, make_elastic_stress, make_stress_update
 from nsf.mpm.precision import Precision, precision_of
-from nsf.mpm.shape import stencil_offset
+from nsf.mpm.shape import DEGREES, stencil_offset
 from nsf.mpm.stability import (
     MAX_ELASTIC_CFL,
     check_colliders,
@@ -24,6 +24,7 @@ from nsf.mpm.stability import (
 )
 from nsf.mpm.state import ParticleConstants, ParticleState, cell_order
 from nsf.mpm.transfer import Transfer, make_g2p, make_g2p_stress, make_p2g
+from nsf.mpm.update import make_grid_update, make_update_g2p
 from nsf.timing import StageTimer
 
 _NEVER = 2**31 - 1
@@ -63,10 +64,13 @@ class GridStep:
         self.gravity = wp.array(gravity, dtype=precision.vec3, device=device)
         self.boundaries = boundaries
         self.affine_shares = tuple(real(s) for s in transfer.affine_shares)
-        self._p2g = make_p2g(precision, transfer.shape, transfer.deterministic, several)
-        self._g2p = make_g2p(precision, transfer.shape, several)
+        by_plane = device.is_cuda and not transfer.deterministic
+        self._p2g = make_p2g(precision, transfer.shape, transfer.deterministic, several, by_plane)
+        self._threads = DEGREES[transfer.shape] + 1 if by_plane else 1  # of a particle in P2G
+        self._g2p = make_g2p(precision, transfer.shape)
         self._reach = make_reach(precision, transfer.shape)
         self._update = make_grid_update(precision, several)
+        self._update_g2p = make_update_g2p(precision, transfer.shape, several)
 
     def p2g(self, x, v, C, tau, mass, volume0) -> None:
         """Particles → grid: mass, momentum and the impulse of the stress."""
@@ -99,29 +103,41 @@ class GridStep:
             grid.values,
         ]
         whole_warps = -(-x.shape[0] // WARP) * WARP
-        wp.launch(self._p2g, dim=whole_warps, inputs=inputs, device=self.device)
+        wp.launch(self._p2g, dim=self._threads * whole_warps, inputs=inputs, device=self.device)
 
     def follow(self) -> None:
-        """Move the boundaries on by a step; `update` does it, unless told that it is done."""
+        """Move the boundaries on by a step; `update` does it, `update_g2p` does not."""
         self.boundaries.advance(self._seconds)
 
-    def update(self, followed: bool = False) -> None:
+    def update(self) -> None:
         """Momentum → velocity at the next time level, boundaries included, which move on by a step."""
-        grid = self.grid
-        if not followed:
-            self.follow()
-        inputs = [*grid.stored, grid.copies, grid.values, self.dx, self.dt, self.gravity]
-        wp.launch(
-            self._update, dim=grid.threads, inputs=inputs + self.boundaries.arguments, device=self.device
-        )
+        self.follow()
+        inputs = [*self.grid.stored, *self._updating]
+        wp.launch(self._update, dim=self.grid.threads, inputs=inputs, device=self.device)
 
     def g2p(self, x, v, C, increment) -> None:
-        """Grid → particles: velocity, position, affine momentum, deformation increment.
-
-        Of several simulations, the first particles of each move, as many as have a row in C.
-        """
-        inputs = [*self.gathering, self.grid.copies, x, v, C, increment]
+        """Grid → particles: velocity, position, affine momentum, deformation increment."""
+        inputs = [*self.gathering, x, v, C, increment]
         wp.launch(self._g2p, dim=C.shape[0], inputs=inputs, device=self.device)
+
+    def update_g2p(self, x, v, moved: int) -> None:
+        """Velocity and position of the first particles of each simulation, in place of `update` and `g2p`.
+
+        For few particles: nothing is updated but what they need, and the nodes keep their momentum.
+
+        Args:
+            x, v: as they were for P2G.
+            moved: particles of a simulation.
+        """
+        lanes, grid = WARP if self.device.is_cuda else 1, self.grid
+        inputs = [grid.shape, grid.slots, moved, lanes, x, v, *self._updating]
+        wp.launch(self._update_g2p, dim=grid.copies * moved * lanes, inputs=inputs, device=self.device)
+
+    @property
+    def _updating(self) -> list:
+        """What the velocity of nodes is found from, in the kernels' order."""
+        grid = self.grid
+        return [grid.copies, grid.values, self.dx, self.dt, self.gravity, *self.boundaries.arguments]
 
     @property
     def gathering(self) -> list:

@@ -1,7 +1,7 @@
 """Transfers between particles and grid: P2G and G2P (paper section 3.3, steps 1 and 3).
 
-One pair of kernels serves the full-order and the reduced solver: the reduced one
-launches P2G over its integration particles and G2P over its sample particles.
+One P2G serves the full-order and the reduced solver, which launches it over its integration particles. G2P
+of its few sample particles needs neither C nor the deformation increment: see `update.py`.
 """
 
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from functools import cache
 import warp as wp
 
 from nsf.errors import ConfigError
-from nsf.mpm.access import make_add, make_load, make_sum
+from nsf.mpm.access import make_add, make_load, make_sum, whole_warps
 from nsf.mpm.copies import make_copies
 from nsf.mpm.grid import flat_index, inside, storage
 from nsf.mpm.materials import LawFunctions, make_law_update
@@ -64,14 +64,21 @@ class Transfer:
 
 
 @cache
-def make_p2g(precision: Precision, shape_name: str, deterministic: bool = False, several: bool = False):
-    """Kernel of P2G, one thread a particle, launched over whole warps of threads.
+def make_p2g(
+    precision: Precision,
+    shape_name: str,
+    deterministic: bool = False,
+    several: bool = False,
+    by_plane: bool = False,
+):
+    """Kernel of P2G, a thread a particle or a plane of its stencil, launched over whole warps of threads.
 
     m_i = Σ_p w_ip m_p and, with the explicit force's impulse added in the same sweep,
     m_i v_i = Σ_p w_ip m_p (v_p + C_p (x_i − x_p)) − Δt Σ_p τ_p ∇w_ip V_p⁰.
     Particles off the grid are passed over; the solver's check reports them. Particles of one cell that
     follow each other are added up before they reach the nodes. With `several`, rows of particles and nodes
-    are those of `copies` simulations.
+    are those of `copies` simulations. With `by_plane` the warps are those of the first plane, then of the
+    next, as many as a stencil has nodes along an axis: few particles then keep a GPU busy.
 
     Source: paper section 3.3, steps 1 and 2.
     """
@@ -100,14 +107,19 @@ def make_p2g(precision: Precision, shape_name: str, deterministic: bool = False,
         copies: int,
         values: wp.array(dtype=vec4),
     ):
-        p = wp.min(wp.tid(), x.shape[0] - 1)
+        t, first = wp.tid(), 0
+        if wp.static(by_plane):
+            whole = whole_warps(x.shape[0])
+            first = t / whole
+            t -= first * whole
+        p = wp.min(t, x.shape[0] - 1)
         copy = copy_of(p, share(x.shape[0], copies))
         start = copy * share(values.shape[0], copies)
         inv_dx = real(1.0) / dx
         base = base_node(x[p], inv_dx)
         # Threads leave as a warp or not at all, as the sums need all of it.
         cell = -1
-        if wp.tid() < x.shape[0] and inside(base, width, grid_shape):
+        if t < x.shape[0] and inside(base, width, grid_shape):
             cell = flat_index(base[0], base[1], base[2], grid_shape)
         # Neighbours in a warp that are of two simulations must not be added up: their keys differ in parity.
         key = cell
@@ -124,11 +136,14 @@ def make_p2g(precision: Precision, shape_name: str, deterministic: bool = False,
         momentum = m * v[p]
         affine = (m * dx) * C[p]
         impulse = (-dt * volume0[p] * inv_dx) * tau[p]
-        for a in range(width):
+        for step in range(wp.static(1 if by_plane else width)):
+            a = first + step
+            w_a = shape.entry(w, 0, a)
+            d_a = shape.entry(d, 0, a)
             for b in range(width):
-                w_ab = w[0, a] * w[1, b]
-                da_b = d[0, a] * w[1, b]
-                a_db = w[0, a] * d[1, b]
+                w_ab = w_a * w[1, b]
+                da_b = d_a * w[1, b]
+                a_db = w_a * d[1, b]
                 for c in range(width):
                     weight = w_ab * w[2, c]
                     reach = vec3(real(float(a)) - f[0], real(float(b)) - f[1], real(float(c)) - f[2])
@@ -147,8 +162,7 @@ def make_gather(precision: Precision, shape_name: str):
     """Warp function of G2P: what a particle's nodes give it, v_p, C_p and the deformation increment f_p.
 
     v_p = Σ_i w_ip v_i, x_p ← x_p + Δt v_p, C_p = 12/(Δx²(b+1)) Σ_i w_ip v_i (x_i − x_p)ᵀ,
-    f_p = I + Δt Σ_i v_i ∇w_ipᵀ, so that F_trial = f_p F_e. `start` is where the nodes of the particle's
-    simulation begin.
+    f_p = I + Δt Σ_i v_i ∇w_ipᵀ, so that F_trial = f_p F_e.
 
     Source: paper section 3.3, step 3.
     """
@@ -164,7 +178,6 @@ def make_gather(precision: Precision, shape_name: str):
         x: vec3,
         base: wp.vec3i,
         values: wp.array(dtype=vec4),
-        start: int,
         grid_shape: wp.vec3i,
         slots: wp.array(dtype=wp.int32),
         dx: real,
@@ -190,7 +203,7 @@ def make_gather(precision: Precision, shape_name: str):
                     reach = vec3(real(float(a)) - f[0], real(float(b)) - f[1], real(float(c)) - f[2])
                     slope = vec3(da_b * w[2, c], a_db * w[2, c], w_ab * d[2, c])
                     # Without a branch, so that the loads of all nodes are under way together.
-                    value = wp.where(slot >= 0, load(values, start + wp.max(slot, 0)), vec4())
+                    value = wp.where(slot >= 0, load(values, wp.max(slot, 0)), vec4())
                     v_i = vec3(value[0], value[1], value[2])
                     velocity += weight * v_i
                     affine += wp.outer(v_i, weight * reach)
@@ -204,11 +217,8 @@ def make_gather(precision: Precision, shape_name: str):
 
 
 @cache
-def make_g2p(precision: Precision, shape_name: str, several: bool = False):
+def make_g2p(precision: Precision, shape_name: str):
     """Kernel of G2P, one thread a particle: new v, x, C and the deformation increment.
-
-    With `several`, arrays are those of `copies` simulations, and of each the first particles alone are moved,
-    as many as have a row in C.
 
     Source: paper section 3.3, step 3.
     """
@@ -216,7 +226,6 @@ def make_g2p(precision: Precision, shape_name: str, several: bool = False):
     shape = shape_functions(precision, shape_name)
     base_node, width = shape.base_node, shape.degree + 1
     gather = make_gather(precision, shape_name)
-    share, copy_of = make_copies(several)
 
     @wp.kernel(enable_backward=False, module="unique", module_options={"max_unroll": 4})
     def g2p(
@@ -227,25 +236,20 @@ def make_g2p(precision: Precision, shape_name: str, several: bool = False):
         dt: real,
         symmetric: real,
         skew: real,
-        copies: int,
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
         C: wp.array(dtype=mat33),
         increment: wp.array(dtype=mat33),
     ):
-        t = wp.tid()
-        moved = share(C.shape[0], copies)
-        copy = copy_of(t, moved)
-        p = t + copy * (share(x.shape[0], copies) - moved)
-        start = copy * share(values.shape[0], copies)
+        p = wp.tid()
         base = base_node(x[p], real(1.0) / dx)
         if not inside(base, width, grid_shape):
             return
-        velocity, affine, f = gather(x[p], base, values, start, grid_shape, slots, dx, dt, symmetric, skew)
+        velocity, affine, f = gather(x[p], base, values, grid_shape, slots, dx, dt, symmetric, skew)
         v[p] = velocity
         x[p] = x[p] + dt * velocity
-        C[t] = affine
-        increment[t] = f
+        C[p] = affine
+        increment[p] = f
 
     return g2p
 
@@ -288,7 +292,7 @@ def make_g2p_stress(precision: Precision, shape_name: str, law: LawFunctions, hi
         base = base_node(x[p], real(1.0) / dx)
         if not inside(base, width, grid_shape):
             return
-        velocity, affine, f = gather(x[p], base, values, 0, grid_shape, slots, dx, dt, symmetric, skew)
+        velocity, affine, f = gather(x[p], base, values, grid_shape, slots, dx, dt, symmetric, skew)
         v[p] = velocity
         x[p] = x[p] + dt * velocity
         C[p] = affine

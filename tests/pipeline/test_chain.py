@@ -107,7 +107,7 @@ def test_files_of_an_evaluation(chain):
     assert frames["x_full"].shape == frames["x_reduced"].shape == (1, 3, 100, 3)
     assert frames["stress_full"].shape == frames["stress_reduced"].shape == (1, 3, 100)
     cost = json.loads((path / "cost.json").read_text())
-    assert set(cost["breakdown"]["reduced"]) == {"inference", "p2g", "grid", "g2p", "inversion"}
+    assert set(cost["breakdown"]["reduced"]) == {"inference", "p2g", "g2p", "inversion"}
     assert cost["trials"] == 2
     summary = json.loads((path / "summary.json").read_text())
     assert summary["reconstruction_delta"] < summary["delta"]

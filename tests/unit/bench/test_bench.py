@@ -209,14 +209,14 @@ def reduced(found):
 def test_stages_of_both_solvers(found):
     stages = pd.DataFrame(found.stages, columns=columns(StageRow))
     of_case = stages.groupby(["case", "precision"], sort=False)["stage"].apply(list)
-    reduced = ["inference", "p2g", "grid", "g2p", "inversion"]
+    reduced = ["inference", "p2g", "g2p", "inversion"]
     assert of_case.tolist() == 2 * [["p2g", "grid", "g2p", "stress"], reduced, reduced]
     assert (stages["ms"] > 0).all()
 
 
 def test_a_reduced_step_stands_beside_its_floor(found, reduced):
     kernels = pd.DataFrame(found.kernels, columns=columns(KernelRow))
-    names = ["inference", "p2g", "grid", "8 empty launches"]
+    names = ["inference", "p2g", "7 empty launches"]
     assert kernels["kernel"].tolist() == 4 * names
     read = kernels[kernels["kernel"] == "inference"].set_index(["case", "precision"])["mib"]
     N = reduced.set_index(["case", "precision"])["integration"].reindex(read.index)
@@ -427,7 +427,7 @@ def test_a_report_of_scenes(reduced, found, tmp_path):
     stages.replace({"case": {"reduced_sand": "reduced_metal"}}).to_csv(tmp_path / "stages.csv", index=False)
     assert "(stages-cpu.png)" in write_report(tmp_path).read_text()
     assert "| reduced_sand_1.5dt |" in page.read_text()
-    assert page.read_text().count("| 8 empty launches |") == 4
+    assert page.read_text().count("| 7 empty launches |") == 4
     assert (tmp_path / "reduced-cpu.png").stat().st_size > 5000
 
 

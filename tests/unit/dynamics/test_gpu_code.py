@@ -3,23 +3,30 @@
 import pytest
 import warp as wp
 
-from nsf.dynamics.modal_kernels import make_contraction, make_gathering, make_position
+from nsf.dynamics.modal_kernels import make_contraction, make_gathering
 from nsf.dynamics.network_kernel import make_layer
+from nsf.dynamics.placing_kernels import make_others, make_sample
 from nsf.dynamics.projection_kernel import make_projection
-from nsf.dynamics.selection_kernels import make_selection
 from nsf.mpm import precision_of
 from nsf.mpm.transfer import make_g2p, make_p2g
+from nsf.mpm.update import make_grid_update, make_update_g2p
 
 ARCH = 90  # compute capability 9.0, which has reductions of its own in P2G
 KERNELS = {
     "p2g": lambda precision, several: make_p2g(precision, "quadratic", several=several),
-    "g2p": lambda precision, several: make_g2p(precision, "quadratic", several=several),
-    "position": lambda precision, several: make_position(precision, 9, 2, several),
-    "selection": lambda precision, several: make_selection(precision, "quadratic", several),
+    "p2g_by_plane": lambda precision, several: make_p2g(
+        precision, "quadratic", several=several, by_plane=True
+    ),
+    "grid_update": lambda precision, several: make_grid_update(precision, several),
+    "g2p": lambda precision, several: make_g2p(precision, "quadratic"),
+    "update_g2p": lambda precision, several: make_update_g2p(precision, "quadratic", several),
+    "sample": lambda precision, several: make_sample(precision, "quadratic", several),
+    "others": lambda precision, several: make_others(precision, "quadratic", 9, 2, several, wp.float16),
     "contraction": lambda precision, several: make_contraction(
-        precision, 9, True, precision.real, 2, several, wp.float16
+        precision, (9, 8), precision.real, 2, several, wp.float16
     ),
     "layer": lambda precision, several: make_layer(precision, 2, several),
+    "first_layers": lambda precision, several: make_layer(precision, 2, several, 5),
     "gathering": lambda precision, several: make_gathering(precision, several),
     "projection": lambda precision, several: make_projection(precision, (5, 48, 48, 31), 2, 5, 36, several),
 }

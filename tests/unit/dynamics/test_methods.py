@@ -93,12 +93,10 @@ def test_a_law_with_history_gives_its_stress_at_rest():
 
 
 def test_no_affine_field_means_zero_at_every_step(chain, tiny_manifold, tiny):
-    """G2P gives C of the sample particles; the next step must not see it."""
     solver = chain.scene.reduced(
         tiny_manifold, ANGLE, 20, method=configured("deformation_only", tiny), device="cpu"
     )
     solver.step(5)
-    assert solver._phase._C_of_sample.abs().max() > 1e-3
     solver.stages["inference"]()
     assert solver._phase.C.abs().max() == 0.0
 

@@ -8,7 +8,9 @@ import warp as wp
 from nsf.data import TAU_MATRIX
 from nsf.dynamics.arena import Arena
 from nsf.dynamics.interop import as_vectors
-from nsf.dynamics.modal_kernels import THREADS, make_contraction, make_position, tiling
+from nsf.dynamics.modal_kernels import THREADS, make_contraction, make_gathering, tiling
+from nsf.dynamics.network_kernel import make_layer
+from nsf.dynamics.placing_kernels import make_others, make_sample
 from nsf.mpm import precision_of
 from nsf.mpm.device import warp_device
 
@@ -44,28 +46,36 @@ def test_tiles_hold_all():
 
 @pytest.mark.parametrize(("n", "K", "simulations"), SIZES)
 @pytest.mark.parametrize(
-    ("components", "coefficients", "half"),
-    [(6, torch.float64, True), (9, torch.float32, True), (9, torch.float64, False)],
+    ("coefficients", "half"), [(torch.float64, True), (torch.float32, True), (torch.float64, False)]
 )
-def test_contraction(arena, rng, n, K, simulations, components, coefficients, half):
-    mean, modes = (values_of(arena, rng, n, components, *more).float() for more in ((), (K,)))
-    a = arena.hold(rng.standard_normal((simulations, K)), coefficients)
+@pytest.mark.parametrize("fields", [(6,), (9,), (6, 9)])
+def test_contraction(arena, rng, n, K, simulations, fields, coefficients, half):
     needed = arena.hold(rng.integers(0, 2, (simulations, n)), torch.int32)
-    found = arena.zeros(simulations * n, 3, 3)
     (tiles, tile), of = tiling(simulations), wp.dtype_from_torch(coefficients)
-    stored, lengths = arena.halved(modes) if half else (arena.modes(modes), 1.0)
-    read = (modes / lengths).to(stored.dtype).double()
+    inputs, threads, sizes, results = [needed], [], [], []
+    for more, components in enumerate(fields):
+        k = K + 5 * more
+        mean, modes = (values_of(arena, rng, n, components, *last).float() for last in ((), (k,)))
+        a = arena.hold(rng.standard_normal((simulations, k)), coefficients)
+        whole = arena.modes(modes), arena.hold(np.ones(k), torch.float64)
+        stored, lengths = arena.halved(modes) if half else whole
+        read = (modes / lengths).to(stored.dtype).double() * lengths
+        expected = mean.double() + torch.einsum("nck,bk->bnc", read, a.double())
+        found = arena.zeros(simulations * n, 3, 3)
+        inputs += [arena.hold(mean, torch.float64), stored, lengths, a, found]
+        threads.append(arena.whole_blocks(components // 3 * n, THREADS))
+        sizes.append(-(-k // 4))
+        results.append((found, expected.cpu().numpy().reshape(simulations * n, components)))
+    inputs += inputs[-5:] * (2 - len(fields)) + [threads[0], tiles, arena.lanes(THREADS)]
     kind = wp.dtype_from_torch(stored.dtype)
-    kernel = make_contraction(arena.precision, -(-K // 4), components == 6, of, tile, tiles > 1, kind)
-    lanes, threads = arena.lanes(THREADS), tiles * arena.whole_blocks(components // 3 * n, THREADS)
-    inputs = [needed, arena.hold(mean, torch.float64), stored, a, tiles, lanes, found]
-    arena.pack(kernel, threads, inputs, THREADS).launch()
+    kernel = make_contraction(arena.precision, (sizes[0], sizes[-1]), of, tile, tiles > 1, kind)
+    arena.pack(kernel, tiles * sum(threads), inputs, THREADS).launch()
     wp.synchronize_device(arena.device)
-    expected = mean.double() + torch.einsum("nck,bk->bnc", read, a.double())
-    expected = expected.cpu().numpy().reshape(simulations * n, components)
-    expected = expected[:, TAU_MATRIX] if components == 6 else expected.reshape(-1, 3, 3)
-    expected = expected * needed.cpu().numpy().reshape(-1, 1, 1)
-    np.testing.assert_allclose(found.cpu().numpy(), expected, rtol=1e-12, atol=1e-12)
+    for found, expected in results:
+        symmetric = expected.shape[1] == 6
+        expected = expected[:, TAU_MATRIX] if symmetric else expected.reshape(-1, 3, 3)
+        expected = expected * needed.cpu().numpy().reshape(-1, 1, 1)
+        np.testing.assert_allclose(found.cpu().numpy(), expected, rtol=1e-12, atol=1e-12)
 
 
 def test_half_precision_is_of_a_gpu_and_takes_lengths_out(arena, rng):
@@ -97,21 +107,100 @@ def test_modes_are_those_of_the_rows_however_many_are_taken_at_once(arena, rng, 
 
 
 @pytest.mark.parametrize(("n", "K", "simulations"), SIZES)
-def test_position(arena, rng, n, K, simulations):
-    modes = values_of(arena, rng, n, 3, K).float()
-    mean, start = values_of(arena, rng, n, 3), values_of(arena, rng, simulations * n, 3)
+def test_where_the_sample_and_its_neighbours_are(arena, rng, n, K, simulations):
+    """x and v are mean + Σ_k b_k a_k and its rate; others are needed if their stencil meets one of S's."""
+    s, dx, nodes, scale = 7, 0.5, 40, 0.02
+    modes = scale * values_of(arena, rng, n, 3, K).float()
+    mean = arena.hold(8.0 + 3.0 * rng.random((n, 3)), torch.float64)
+    start = values_of(arena, rng, simulations * n, 3)
     a, rate = (values_of(arena, rng, simulations, K) for _ in range(2))
     x, v = (arena.zeros(simulations * n, 3) for _ in range(2))
+    shown = [as_vectors(values, arena.precision) for values in (mean, start, x, v)]
+    lower, extent, shape = wp.vec3i(4, 4, 4), wp.vec3i(32, 32, 32), wp.vec3i(nodes, nodes, nodes)
+    needed = arena.zeros(simulations, n, dtype=torch.int32)
+    count = arena.zeros(simulations, 2, dtype=torch.int64)
+    stamps = arena.zeros(simulations, 32**3, dtype=torch.int32)
+    step = arena.hold(np.arange(1, simulations + 1), torch.int32)
+    (tiles, tile), lanes, warp = tiling(simulations), arena.lanes(THREADS), arena.lanes(32)
+    stored, lengths = arena.halved(modes[s:])
+    read = modes.double()
+    read[s:] = (modes[s:] / lengths).to(stored.dtype).double() * lengths
+    kind, several = wp.dtype_from_torch(stored.dtype), simulations > 1
+    taken = 0
     for first in (np.arange(simulations) % 2, np.arange(1, simulations + 1) % 2):
-        shown = [as_vectors(values, arena.precision) for values in (mean, start, x, v)]
-        (tiles, tile), lanes = tiling(simulations), arena.lanes(THREADS)
-        inputs = [shown[0], arena.modes(modes), a, rate, shown[1], arena.hold(first, torch.int32)]
-        kernel = make_position(arena.precision, -(-K // 4), tile, tiles > 1)
-        threads = tiles * arena.whole_blocks(n, THREADS)
-        arena.pack(kernel, threads, [*inputs, tiles, lanes, *shown[2:]], THREADS).launch()
+        latest = [a, rate, shown[1], arena.hold(first, torch.int32), step, stamps]
+        found = [wp.float64(1.0 / dx), lower, extent, count, *shown[2:]]
+        sample, others = (
+            make_sample(arena.precision, "quadratic", several),
+            make_others(arena.precision, "quadratic", -(-K // 4), tile, tiles > 1, kind),
+        )
+        inputs = [shown[0], arena.modes(modes[:s]), *latest, *found, shape, s, warp]
+        arena.pack(sample, simulations * s * warp, inputs).launch()
+        inputs = [shown[0], stored, lengths, *latest, *found, needed, s, tiles, lanes]
+        arena.pack(others, tiles * arena.whole_blocks(n - s, THREADS), inputs, THREADS).launch()
         wp.synchronize_device(arena.device)
-        places, moved = (torch.einsum("nck,bk->bnc", modes.double(), c).cpu() for c in (a, rate))
-        np.testing.assert_allclose(x.cpu().view(-1, n, 3), mean.cpu() + places, rtol=1e-12, atol=1e-12)
-        begun = torch.as_tensor(first == 1)[:, None, None]
-        expected = torch.where(begun, start.cpu().view(-1, n, 3), moved)
-        np.testing.assert_allclose(v.cpu().view(-1, n, 3), expected, rtol=1e-12, atol=1e-12)
+        places, moved = (torch.einsum("nck,bk->bnc", read, c).cpu().numpy() for c in (a, rate))
+        places += mean.cpu().numpy()
+        base = np.floor(places / dx - 0.5)
+        apart = np.abs(base[:, :, None] - base[:, None, :s]).max(-1)
+        near = (apart <= 2).any(-1)
+        assert near.any()
+        assert not near.all()
+        taken += near.sum(1)
+        expected = np.where((first == 1)[:, None, None], start.cpu().view(-1, n, 3).numpy(), moved)
+        options = {"rtol": 1e-12, "atol": 1e-12}
+        np.testing.assert_allclose(x.cpu().view(-1, n, 3), np.where(near[..., None], places, -1.0), **options)
+        np.testing.assert_allclose(v.cpu().view(-1, n, 3).numpy()[near], expected[near], **options)
+        np.testing.assert_array_equal(needed.cpu()[:, s:], near[:, s:])
+    np.testing.assert_array_equal(count.cpu(), np.stack([taken, np.full(simulations, 2)], 1))
+
+
+@pytest.mark.parametrize(("n", "K", "simulations"), SIZES)
+def test_what_the_projection_takes_from_the_sample(arena, rng, n, K, simulations):
+    s, dt = 90, 0.25
+    modes = values_of(arena, rng, s, 3, K).float()
+    w = arena.hold(rng.random(s), torch.float64)
+    v = values_of(arena, rng, simulations, n, 3)
+    b, lanes = arena.zeros(simulations, K + 1), arena.lanes(THREADS)
+    velocity = as_vectors(v.flatten(0, 1), arena.precision)
+    inputs = [arena.modes(modes), n, -(-K // 4), velocity, w, wp.float64(dt), lanes, b]
+    kernel = make_gathering(arena.precision, simulations > 1)
+    arena.pack(kernel, simulations * (K + 1) * lanes, inputs, THREADS).launch()
+    wp.synchronize_device(arena.device)
+    moved = dt * v[:, :s]
+    expected = torch.einsum("p,pck,bpc->bk", w, modes.double(), moved)
+    squares = torch.einsum("p,bpc->b", w, moved**2)
+    np.testing.assert_allclose(
+        b.cpu(), torch.cat([expected, squares[:, None]], 1).cpu(), rtol=1e-12, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize("simulations", [1, 11])
+@pytest.mark.parametrize("fused", [False, True])
+def test_layers_of_two_networks(arena, rng, simulations, fused):
+    """Of two members, whose rows see their own entries alone; the first layer may come with the second."""
+    r, hidden, outs = 5, 37, (12, 10)  # of a member
+
+    def silu(z):
+        return z * torch.sigmoid(z)
+
+    def pair(*shape):
+        return values_of(arena, rng, *shape), values_of(arena, rng, *shape)
+
+    x = values_of(arena, rng, simulations, r)
+    W_0, b_0 = pair(2 * hidden, r), pair(simulations, 2 * hidden)
+    W = [values_of(arena, rng, 2 * out, hidden) for out in outs]
+    b = [values_of(arena, rng, simulations, 2 * out) for out in outs]
+    entries = [silu(x @ one.T + other) for one, other in zip(W_0, b_0, strict=True)]
+    found = [arena.zeros(simulations, 2 * out) for out in outs]
+    sides = [
+        [W_0[i], b_0[i], W[i], b[i], x if fused else arena.hold(entries[i], torch.float64)] for i in (0, 1)
+    ]
+    (tiles, tile), lanes, count = tiling(simulations), arena.lanes(32), 2 * sum(outs)
+    kernel = make_layer(arena.precision, tile, tiles > 1, r if fused else 0)
+    arena.pack(kernel, tiles * count * lanes, [*sides[0], *sides[1], 1, lanes, count, *found]).launch()
+    wp.synchronize_device(arena.device)
+    for i in (0, 1):
+        of_members = entries[i].unflatten(1, (2, -1)), W[i].unflatten(0, (2, -1))
+        expected = silu(torch.einsum("bme,moe->bmo", *of_members).flatten(1) + b[i])
+        np.testing.assert_allclose(found[i].cpu(), expected.cpu(), rtol=1e-11, atol=1e-11)

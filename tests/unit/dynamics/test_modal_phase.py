@@ -27,6 +27,8 @@ def pair(chain, tiny_manifold, monkeypatch):
             return scene.reduced(manifold, {"friction_angle": 26.0}, sample, **options)
 
         options.setdefault("device", "cpu")
+        # Of the default, a hundred times as much, the two ways of the last update differ visibly.
+        options.setdefault("projector", GaussNewton(tolerance=1e-6))
         modal = one()
         with monkeypatch.context() as patch:
             patch.setattr("nsf.dynamics.stepping.steps_in_coefficients", lambda *arguments: False)
@@ -129,7 +131,7 @@ def test_taylor(pair):
 
 
 def test_one_iteration_and_none_converged(pair):
-    same(*runs(pair(projector=GaussNewton(iterations=1))))
+    same(*runs(pair(projector=GaussNewton(iterations=1, tolerance=1e-6))))
     same(*runs(pair(projector=GaussNewton(iterations=4, tolerance=1e-14))))
 
 
@@ -234,7 +236,10 @@ def test_the_gpu_takes_the_same_steps(chain, tiny_manifold, method, half, tolera
         monkeypatch.setattr(
             Arena,
             "halved",
-            lambda arena, table, rows: (arena.modes(table, rows), table.new_ones(table.shape[2])),
+            lambda arena, table, rows: (
+                arena.modes(table, rows),
+                arena.hold(torch.ones(table.shape[2]), arena.real),
+            ),
         )
     found = []
     for device in ("cuda", "cpu"):
@@ -264,5 +269,5 @@ def test_steps_timed_on_the_gpu_are_steps(chain, tiny_manifold, phases):
         for _ in range(2):
             timed.timed_step(timer)
     np.testing.assert_allclose(timed.xhat.cpu(), plain.xhat.cpu(), rtol=0, atol=1e-6)
-    assert list(timer.calls.items()) == [(n, 4) for n in ("inference", "p2g", "grid", "g2p", "inversion")]
+    assert list(timer.calls.items()) == [(n, 4) for n in ("inference", "p2g", "g2p", "inversion")]
     assert min(timer.milliseconds.values()) > 0

@@ -68,7 +68,7 @@ def test_gauss_newton_converges_quadratically(start, goal):
     at = Bent()
     errors = [float((start - goal).norm())]
     for iterations in (1, 2, 3):
-        xhat = GaussNewton(iterations).solve(at, at.position(goal), start).xhat
+        xhat = GaussNewton(iterations, tolerance=1e-14).solve(at, at.position(goal), start).xhat
         errors.append(float((xhat - goal).norm()))
     orders = [math.log(errors[k + 1] / errors[k]) / math.log(errors[k] / errors[k - 1]) for k in (1, 2)]
     assert errors[-1] < 1e-7

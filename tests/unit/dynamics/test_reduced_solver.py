@@ -111,9 +111,9 @@ def test_the_first_velocity_is_the_initial_one(tiny, solver_of):
     solver = solver_of(scene=scene)
     np.testing.assert_array_equal(solver.state.numpy()["v"], np.tile(velocity, (500, 1)))
     solver.stages["inference"]()
-    np.testing.assert_allclose(
-        solver._phase.v.numpy(), np.tile(velocity, (solver._phase.size, 1)), rtol=1e-12
-    )
+    v = solver._phase.v[solver._phase.needed[0].bool()].numpy()
+    assert len(v) > len(solver.sets[0].sample)
+    np.testing.assert_allclose(v, np.tile(velocity, (len(v), 1)), rtol=1e-12)
 
 
 def test_the_initial_velocity_moves_the_sample(tiny, solver_of):
@@ -322,7 +322,7 @@ def test_timed_steps_are_steps(solver_of, sample):
         timed.timed_step(timer)
     plain.step(10)
     np.testing.assert_array_equal(timed.state.xhat, plain.state.xhat)
-    assert list(timer.per_step(10)) == ["inference", "p2g", "grid", "g2p", "inversion"]
+    assert list(timer.per_step(10)) == ["inference", "p2g", "g2p", "inversion"]
 
 
 # -- weights ---------------------------------------------------------------------------------------------

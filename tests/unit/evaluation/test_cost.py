@@ -6,7 +6,7 @@ import pytest
 
 from nsf.evaluation import Subject, measure
 
-REDUCED = ["inference", "p2g", "grid", "g2p", "inversion"]
+REDUCED = ["inference", "p2g", "g2p", "inversion"]
 FULL = ["p2g", "grid", "g2p", "stress"]
 
 

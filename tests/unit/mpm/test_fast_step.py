@@ -108,6 +108,33 @@ def test_every_transfer(scheme, shape, precision, solver_on):
     assert_same_run(solver_on(MATERIALS[0], transfer, precision), plain, precision)
 
 
+@pytest.mark.parametrize("precision", ["fp64", "fp32"])
+@pytest.mark.parametrize("shape", ["quadratic", "cubic"])
+def test_few_particles_get_from_momenta_what_update_and_g2p_give(shape, precision, solver_on):
+    solver = solver_on(MATERIALS[0], Transfer(shape=shape), precision)
+    solver.step(40)
+    solver.p2g()
+    grid, state = solver.grid, solver.state
+    lowest = np.argsort(state.x.rows.numpy()[:, 2])[:30]
+    x, v = (
+        wp.array(a.rows.numpy()[lowest], dtype=solver.precision.vec3, device=solver.device)
+        for a in (state.x, state.v)
+    )
+    moved, started, momenta = 20, [a.numpy() for a in (x, v)], grid.values.numpy()
+    solver.grid_step.update_g2p(x, v, moved)
+    np.testing.assert_array_equal(grid.values.numpy(), momenta)
+    solver.grid_step.update()
+    assert np.abs(grid.momentum.numpy()[momenta[:, 3] > 0, 2]).min() == 0.0  # the floor holds some nodes
+    solver.g2p()
+    tolerance = {"fp64": 1e-13, "fp32": 1e-5}[precision]
+    for found, before, expected in zip((x, v), started, (state.x, state.v), strict=True):
+        values = expected.rows.numpy()[lowest]
+        np.testing.assert_allclose(
+            found.numpy()[:moved], values[:moved], atol=tolerance * np.abs(values).max()
+        )
+        np.testing.assert_array_equal(found.numpy()[moved:], before[moved:])
+
+
 def test_a_step_is_its_stages(solver_on):
     """What a breakdown times is what a run does."""
     whole, staged = solver_on(MATERIALS[2]), solver_on(MATERIALS[2])

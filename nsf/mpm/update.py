@@ -1,0 +1,222 @@
+"""Momentum → velocity at the nodes (paper section 3.3, step 2), everywhere or where few particles need it."""
+
+from functools import cache
+
+import warp as wp
+
+from nsf.mpm.access import make_load, make_warp_sum
+from nsf.mpm.contact import SLIP, STICKY, make_contact
+from nsf.mpm.copies import make_copies
+from nsf.mpm.grid import flat_index, inside, node_of, node_of_step, nodes_of_step, storage
+from nsf.mpm.precision import Precision
+from nsf.mpm.shape import shape_functions
+
+
+@cache
+def make_node_velocity(precision: Precision):
+    """Warp function (values of a node, node, ...) → its velocity; of no use where there is no mass.
+
+    v_i = (m_i v_i − Δt Σ_p τ_p ∇w_ip V_p⁰)/m_i + Δt g, then the boundary conditions
+    in order: each collider that acts, then the walls of the domain. P2G has already added
+    the force impulse to the momentum. A node belongs to a solid by the solid's pose at t^n, the
+    time of the particles that P2G took here, and v_i^{n+1} meets the condition relative to the
+    solid's mean velocity over the step (`make_follow`). Frames that move by whole cells a step
+    thus see the same contact. Of all colliders those from `first` up to `end` are the node's simulation's.
+
+    Source: paper section 3.3, step 2.
+    """
+    real, vec3, vec4, mat33 = precision.real, precision.vec3, precision.vec4, precision.mat33
+    outward_normal, against = make_contact(precision)
+
+    @wp.func
+    def node_velocity(
+        value: vec4,
+        node: wp.vec3i,
+        shape: wp.vec3i,
+        dx: real,
+        impulse: vec3,
+        first: int,
+        end: int,
+        collider_shape: wp.array(dtype=wp.int32),
+        collider_active: wp.array(dtype=wp.int32),
+        collider_position: wp.array(dtype=vec3),
+        collider_orientation: wp.array(dtype=mat33),
+        collider_extents: wp.array(dtype=vec3),
+        collider_velocity: wp.array(dtype=vec3),
+        collider_gradient: wp.array(dtype=mat33),
+        collider_kind: wp.array(dtype=wp.int32),
+        collider_friction: wp.array(dtype=real),
+        wall_kind: int,
+        wall_padding: int,
+    ):
+        v = vec3(value[0], value[1], value[2]) / value[3] + impulse
+        x = dx * vec3(real(node[0]), real(node[1]), real(node[2]))
+        for c in range(first, end):
+            if collider_active[c] != 0:
+                arm = x - collider_position[c]
+                normal = outward_normal(
+                    collider_shape[c], arm, collider_orientation[c], collider_extents[c], dx
+                )
+                if wp.length_sq(normal) > real(0.0):
+                    solid = collider_velocity[c] + collider_gradient[c] * arm
+                    v = solid + against(v - solid, normal, collider_kind[c], collider_friction[c])
+        for axis in range(3):
+            low = node[axis] < wall_padding
+            high = node[axis] >= shape[axis] - wall_padding
+            if low or high:
+                if wall_kind == wp.static(STICKY):
+                    v = vec3()
+                elif (
+                    wall_kind == wp.static(SLIP)
+                    or (low and v[axis] < real(0.0))
+                    or (high and v[axis] > real(0.0))
+                ):
+                    v[axis] = real(0.0)
+        return v
+
+    return node_velocity
+
+
+@cache
+def make_grid_update(precision: Precision, several: bool = False):
+    """Kernel of the grid update: momentum → velocity at every node of a step, see `make_node_velocity`.
+
+    With `several`, nodes, gravity and colliders are those of `copies` simulations.
+
+    Source: paper section 3.3, step 2.
+    """
+    real, vec3, vec4, mat33 = precision.real, precision.vec3, precision.vec4, precision.mat33
+    node_velocity, load = make_node_velocity(precision), make_load(precision)
+    share, copy_of = make_copies(several)
+
+    @wp.kernel(enable_backward=False, module="unique")
+    def grid_update(
+        nodes: wp.array(dtype=wp.int32),
+        slots: wp.array(dtype=wp.int32),
+        blocks: wp.array(dtype=wp.int32),
+        listed: wp.array(dtype=wp.int32),
+        shape: wp.vec3i,
+        block_shape: wp.vec3i,
+        threads: int,
+        copies: int,
+        values: wp.array(dtype=vec4),
+        dx: real,
+        dt: real,
+        gravity: wp.array(dtype=vec3),
+        collider_shape: wp.array(dtype=wp.int32),
+        collider_active: wp.array(dtype=wp.int32),
+        collider_position: wp.array(dtype=vec3),
+        collider_orientation: wp.array(dtype=mat33),
+        collider_extents: wp.array(dtype=vec3),
+        collider_velocity: wp.array(dtype=vec3),
+        collider_gradient: wp.array(dtype=mat33),
+        collider_kind: wp.array(dtype=wp.int32),
+        collider_friction: wp.array(dtype=real),
+        wall_kind: int,
+        wall_padding: int,
+    ):
+        index = wp.tid()
+        each = nodes_of_step(nodes, listed)
+        count = each
+        if wp.static(several):
+            count = copies * each
+        solids = share(collider_shape.shape[0], copies)
+        while index < count:
+            copy = copy_of(index, each)
+            flat = node_of_step(index - copy * each, nodes, blocks, shape, block_shape)
+            index += threads
+            slot = copy * share(values.shape[0], copies)
+            value = vec4()
+            if flat >= 0:
+                slot += storage(flat, slots)
+                value = load(values, slot)
+            if value[3] > real(0.0):
+                v = node_velocity(
+                    value, node_of(flat, shape), shape, dx, dt * gravity[copy], copy * solids,
+                    (copy + 1) * solids, collider_shape, collider_active, collider_position,
+                    collider_orientation, collider_extents, collider_velocity, collider_gradient,
+                    collider_kind, collider_friction, wall_kind, wall_padding,
+                )  # fmt: skip
+                values[slot] = vec4(v[0], v[1], v[2], value[3])
+
+    return grid_update
+
+
+@cache
+def make_update_g2p(precision: Precision, shape_name: str, several: bool = False):
+    """Kernel of v and x after a step for few particles, from nodes that hold momenta still.
+
+    What `make_grid_update` and then `make_g2p` give them but C and the increment, in one pass: `lanes`
+    threads, a warp or one, share the nodes of a particle's stencil and update each of them on the way.
+    Nothing is written to the grid. With `several`, arrays are those of `copies` simulations, and of each the
+    first `moved` particles are moved.
+
+    Source: paper section 3.3, steps 2 and 3.
+    """
+    real, vec3, vec4, mat33 = precision.real, precision.vec3, precision.vec4, precision.mat33
+    shape = shape_functions(precision, shape_name)
+    base_node, local, weights, entry = shape.base_node, shape.local, shape.weights, shape.entry
+    width = shape.degree + 1
+    node_velocity, load = make_node_velocity(precision), make_load(precision)
+    total = make_warp_sum(precision)
+    share, copy_of = make_copies(several)
+
+    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
+    def update_g2p(
+        grid_shape: wp.vec3i,
+        slots: wp.array(dtype=wp.int32),
+        moved: int,
+        lanes: int,
+        x: wp.array(dtype=vec3),
+        v: wp.array(dtype=vec3),
+        copies: int,
+        values: wp.array(dtype=vec4),
+        dx: real,
+        dt: real,
+        gravity: wp.array(dtype=vec3),
+        collider_shape: wp.array(dtype=wp.int32),
+        collider_active: wp.array(dtype=wp.int32),
+        collider_position: wp.array(dtype=vec3),
+        collider_orientation: wp.array(dtype=mat33),
+        collider_extents: wp.array(dtype=vec3),
+        collider_velocity: wp.array(dtype=vec3),
+        collider_gradient: wp.array(dtype=mat33),
+        collider_kind: wp.array(dtype=wp.int32),
+        collider_friction: wp.array(dtype=real),
+        wall_kind: int,
+        wall_padding: int,
+    ):
+        t = wp.tid() / lanes
+        copy = copy_of(t, moved)
+        p = t + copy * (share(x.shape[0], copies) - moved)
+        start = copy * share(values.shape[0], copies)
+        solids = share(collider_shape.shape[0], copies)
+        at = x[p]
+        inv_dx = real(1.0) / dx
+        base = base_node(at, inv_dx)
+        if not inside(base, width, grid_shape):
+            return
+        w = weights(local(at, inv_dx, base))
+        velocity = vec3()
+        n = wp.tid() % lanes
+        while n < wp.static(width**3):
+            a, b, c = n / wp.static(width**2), n / width % width, n % width
+            n += lanes
+            node = base + wp.vec3i(a, b, c)
+            slot = storage(flat_index(node[0], node[1], node[2], grid_shape), slots)
+            # Without a branch, so that a solid's data is under way together with the node's.
+            value = wp.where(slot >= 0, load(values, start + wp.max(slot, 0)), vec4())
+            v_i = node_velocity(
+                value, node, grid_shape, dx, dt * gravity[copy], copy * solids, (copy + 1) * solids,
+                collider_shape, collider_active, collider_position, collider_orientation, collider_extents,
+                collider_velocity, collider_gradient, collider_kind, collider_friction,
+                wall_kind, wall_padding,
+            )  # fmt: skip
+            if value[3] > real(0.0):
+                velocity += entry(w, 0, a) * entry(w, 1, b) * entry(w, 2, c) * v_i
+        velocity = total(velocity, lanes)
+        if wp.tid() % lanes == 0:
+            v[p] = velocity
+            x[p] = at + dt * velocity
+
+    return update_g2p
