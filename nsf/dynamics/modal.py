@@ -355,7 +355,8 @@ def _as_matrices(mean: torch.Tensor) -> torch.Tensor:
 def _networks(arena: Arena, networks: list, record: LatentRecord, parameters) -> tuple[list, list]:
     """The launches of the heads, layer by layer and both at once, and where they leave their coefficients.
 
-    A GPU takes their first two layers in one.
+    A GPU takes the first two layers of one simulation in one launch; for many, what each output finds anew
+    would cost more than a launch.
     """
     B, r = len(parameters), record.now.shape[-1]
     launches, lanes, (tiles, tile) = [], arena.lanes(WARP), tiling(B)
@@ -369,7 +370,7 @@ def _networks(arena: Arena, networks: list, record: LatentRecord, parameters) ->
                 W = W[:, :r]
             weights.append([arena.hold(W, arena.real), arena.hold(torch.stack(biases), arena.real)])
         last = layers[0] is networks[0][-1]
-        if arena.device.is_cuda and not (launches or before or last):
+        if arena.device.is_cuda and B == 1 and not (launches or before or last):
             before = weights
             continue
         outputs = [arena.zeros(*b.shape, dtype=arena.real) for _, b in weights]

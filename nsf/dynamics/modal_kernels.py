@@ -85,7 +85,7 @@ def combination(names: str, tile: int, several: bool, half: bool = False) -> str
     additions, so that it works on several at once. `half`: a GPU has the modes in half precision, each over
     its length (`Arena.halved`).
     """
-    load = "__ldg" if several else "__ldcs"  # another tile will read the same modes, or nothing will
+    load = "__ldcg" if several else "__ldcs"  # another tile will read the same modes, or nothing will
     widened, stored, ahead = ("widened", "uint2", 2 * _AHEAD) if half else ("", "float4", _AHEAD)
     names = names.split()
     each, size = "".join, 3 * len(names)
