@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import warp as wp
@@ -33,8 +34,30 @@ class DomainWalls:
             raise ConfigError(f"walls.padding={self.padding} must be at least 1 node")
 
 
+@cache
+def make_solids(precision: Precision):
+    """Warp struct of colliders and walls for `make_node_velocity`, whose fields are as in `BoundaryArrays`."""
+    real, vec3, mat33 = precision.real, precision.vec3, precision.mat33
+
+    @wp.struct
+    class Solids:
+        shape: wp.array(dtype=wp.int32)
+        active: wp.array(dtype=wp.int32)
+        position: wp.array(dtype=vec3)
+        orientation: wp.array(dtype=mat33)
+        extents: wp.array(dtype=vec3)
+        velocity: wp.array(dtype=vec3)
+        gradient: wp.array(dtype=mat33)
+        kind: wp.array(dtype=wp.int32)
+        friction: wp.array(dtype=real)
+        wall_kind: wp.int32
+        wall_padding: wp.int32
+
+    return Solids
+
+
 class BoundaryArrays:
-    """Colliders and walls as the arguments of the grid-update kernel.
+    """Colliders and walls on the device.
 
     Time lives in `steps`, on the device, so that a step captured in a graph moves the colliders too. Solvers
     that take turns at one simulation (the phases of a reduced run) share one object.
@@ -55,6 +78,7 @@ class BoundaryArrays:
         gradient: [c, 3, 3] of that velocity in space [1/s].
         kind: [c] code of the contact; friction: [c].
         steps: [c] steps taken.
+        solids: all of these but the last, and the walls, as the kernels take them.
     """
 
     def __init__(self, colliders: Sequence[Collider], walls: DomainWalls, precision: Precision, device):
@@ -76,6 +100,11 @@ class BoundaryArrays:
         self.kind = wp.array([KINDS[c.kind] for c in self.colliders], dtype=wp.int32, device=device)
         self.friction = array([c.friction for c in self.colliders], precision.real)
         self.steps = wp.zeros(count, dtype=wp.int32, device=device)
+        self.solids = make_solids(precision)()
+        for name in ("shape", "active", "position", "orientation", "extents", "velocity", "gradient"):
+            setattr(self.solids, name, getattr(self, name))
+        self.solids.kind, self.solids.friction = self.kind, self.friction
+        self.solids.wall_kind, self.solids.wall_padding = KINDS[walls.kind], walls.padding
         self._changes = any(c.changes for c in self.colliders)
         if not self._changes:
             return
@@ -108,10 +137,3 @@ class BoundaryArrays:
         found = [self.active, self.position, self.orientation, self.velocity, self.gradient]
         inputs = [*self._prescribed, dt, self.steps, *found]
         wp.launch(self._follow, dim=len(self.colliders), inputs=inputs, device=self._device)
-
-    @property
-    def arguments(self) -> list:
-        """In the kernel's order."""
-        solids = [self.shape, self.active, self.position, self.orientation, self.extents]
-        solids += [self.velocity, self.gradient, self.kind, self.friction]
-        return [*solids, KINDS[self.walls.kind], self.walls.padding]

@@ -137,7 +137,7 @@ class GridStep:
     def _updating(self) -> list:
         """What the velocity of nodes is found from, in the kernels' order."""
         grid = self.grid
-        return [grid.copies, grid.values, self.dx, self.dt, self.gravity, *self.boundaries.arguments]
+        return [grid.copies, grid.values, self.dx, self.dt, self.gravity, self.boundaries.solids]
 
     @property
     def gathering(self) -> list:

@@ -5,6 +5,7 @@ from functools import cache
 import warp as wp
 
 from nsf.mpm.access import make_load, make_warp_sum
+from nsf.mpm.boundary import make_solids
 from nsf.mpm.contact import SLIP, STICKY, make_contact
 from nsf.mpm.copies import make_copies
 from nsf.mpm.grid import flat_index, inside, node_of, node_of_step, nodes_of_step, storage
@@ -14,19 +15,20 @@ from nsf.mpm.shape import shape_functions
 
 @cache
 def make_node_velocity(precision: Precision):
-    """Warp function (values of a node, node, ...) → its velocity; of no use where there is no mass.
+    """Warp function (values of a node, node, ..., Δt g, ...) → its velocity; of no use where there is no mass.
 
     v_i = (m_i v_i − Δt Σ_p τ_p ∇w_ip V_p⁰)/m_i + Δt g, then the boundary conditions
     in order: each collider that acts, then the walls of the domain. P2G has already added
     the force impulse to the momentum. A node belongs to a solid by the solid's pose at t^n, the
     time of the particles that P2G took here, and v_i^{n+1} meets the condition relative to the
     solid's mean velocity over the step (`make_follow`). Frames that move by whole cells a step
-    thus see the same contact. Of all colliders those from `first` up to `end` are the node's simulation's.
+    thus see the same contact. Of all solids those from `first` up to `end` are the node's simulation's.
 
     Source: paper section 3.3, step 2.
     """
-    real, vec3, vec4, mat33 = precision.real, precision.vec3, precision.vec4, precision.mat33
+    real, vec3, vec4 = precision.real, precision.vec3, precision.vec4
     outward_normal, against = make_contact(precision)
+    Solids = make_solids(precision)
 
     @wp.func
     def node_velocity(
@@ -34,40 +36,28 @@ def make_node_velocity(precision: Precision):
         node: wp.vec3i,
         shape: wp.vec3i,
         dx: real,
-        impulse: vec3,
+        fall: vec3,
         first: int,
         end: int,
-        collider_shape: wp.array(dtype=wp.int32),
-        collider_active: wp.array(dtype=wp.int32),
-        collider_position: wp.array(dtype=vec3),
-        collider_orientation: wp.array(dtype=mat33),
-        collider_extents: wp.array(dtype=vec3),
-        collider_velocity: wp.array(dtype=vec3),
-        collider_gradient: wp.array(dtype=mat33),
-        collider_kind: wp.array(dtype=wp.int32),
-        collider_friction: wp.array(dtype=real),
-        wall_kind: int,
-        wall_padding: int,
+        solids: Solids,
     ):
-        v = vec3(value[0], value[1], value[2]) / value[3] + impulse
+        v = vec3(value[0], value[1], value[2]) / value[3] + fall
         x = dx * vec3(real(node[0]), real(node[1]), real(node[2]))
         for c in range(first, end):
-            if collider_active[c] != 0:
-                arm = x - collider_position[c]
-                normal = outward_normal(
-                    collider_shape[c], arm, collider_orientation[c], collider_extents[c], dx
-                )
+            if solids.active[c] != 0:
+                arm = x - solids.position[c]
+                normal = outward_normal(solids.shape[c], arm, solids.orientation[c], solids.extents[c], dx)
                 if wp.length_sq(normal) > real(0.0):
-                    solid = collider_velocity[c] + collider_gradient[c] * arm
-                    v = solid + against(v - solid, normal, collider_kind[c], collider_friction[c])
+                    solid = solids.velocity[c] + solids.gradient[c] * arm
+                    v = solid + against(v - solid, normal, solids.kind[c], solids.friction[c])
         for axis in range(3):
-            low = node[axis] < wall_padding
-            high = node[axis] >= shape[axis] - wall_padding
+            low = node[axis] < solids.wall_padding
+            high = node[axis] >= shape[axis] - solids.wall_padding
             if low or high:
-                if wall_kind == wp.static(STICKY):
+                if solids.wall_kind == wp.static(STICKY):
                     v = vec3()
                 elif (
-                    wall_kind == wp.static(SLIP)
+                    solids.wall_kind == wp.static(SLIP)
                     or (low and v[axis] < real(0.0))
                     or (high and v[axis] > real(0.0))
                 ):
@@ -85,9 +75,10 @@ def make_grid_update(precision: Precision, several: bool = False):
 
     Source: paper section 3.3, step 2.
     """
-    real, vec3, vec4, mat33 = precision.real, precision.vec3, precision.vec4, precision.mat33
+    real, vec3, vec4 = precision.real, precision.vec3, precision.vec4
     node_velocity, load = make_node_velocity(precision), make_load(precision)
     share, copy_of = make_copies(several)
+    Solids = make_solids(precision)
 
     @wp.kernel(enable_backward=False, module="unique")
     def grid_update(
@@ -103,24 +94,14 @@ def make_grid_update(precision: Precision, several: bool = False):
         dx: real,
         dt: real,
         gravity: wp.array(dtype=vec3),
-        collider_shape: wp.array(dtype=wp.int32),
-        collider_active: wp.array(dtype=wp.int32),
-        collider_position: wp.array(dtype=vec3),
-        collider_orientation: wp.array(dtype=mat33),
-        collider_extents: wp.array(dtype=vec3),
-        collider_velocity: wp.array(dtype=vec3),
-        collider_gradient: wp.array(dtype=mat33),
-        collider_kind: wp.array(dtype=wp.int32),
-        collider_friction: wp.array(dtype=real),
-        wall_kind: int,
-        wall_padding: int,
+        solids: Solids,
     ):
         index = wp.tid()
         each = nodes_of_step(nodes, listed)
         count = each
         if wp.static(several):
             count = copies * each
-        solids = share(collider_shape.shape[0], copies)
+        count_of_solids = share(solids.kind.shape[0], copies)
         while index < count:
             copy = copy_of(index, each)
             flat = node_of_step(index - copy * each, nodes, blocks, shape, block_shape)
@@ -131,12 +112,17 @@ def make_grid_update(precision: Precision, several: bool = False):
                 slot += storage(flat, slots)
                 value = load(values, slot)
             if value[3] > real(0.0):
+                first = copy * count_of_solids
                 v = node_velocity(
-                    value, node_of(flat, shape), shape, dx, dt * gravity[copy], copy * solids,
-                    (copy + 1) * solids, collider_shape, collider_active, collider_position,
-                    collider_orientation, collider_extents, collider_velocity, collider_gradient,
-                    collider_kind, collider_friction, wall_kind, wall_padding,
-                )  # fmt: skip
+                    value,
+                    node_of(flat, shape),
+                    shape,
+                    dx,
+                    dt * gravity[copy],
+                    first,
+                    first + count_of_solids,
+                    solids,
+                )
                 values[slot] = vec4(v[0], v[1], v[2], value[3])
 
     return grid_update
@@ -153,13 +139,14 @@ def make_update_g2p(precision: Precision, shape_name: str, several: bool = False
 
     Source: paper section 3.3, steps 2 and 3.
     """
-    real, vec3, vec4, mat33 = precision.real, precision.vec3, precision.vec4, precision.mat33
+    real, vec3, vec4 = precision.real, precision.vec3, precision.vec4
     shape = shape_functions(precision, shape_name)
     base_node, local, weights, entry = shape.base_node, shape.local, shape.weights, shape.entry
     width = shape.degree + 1
     node_velocity, load = make_node_velocity(precision), make_load(precision)
     total = make_warp_sum(precision)
     share, copy_of = make_copies(several)
+    Solids = make_solids(precision)
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def update_g2p(
@@ -174,23 +161,15 @@ def make_update_g2p(precision: Precision, shape_name: str, several: bool = False
         dx: real,
         dt: real,
         gravity: wp.array(dtype=vec3),
-        collider_shape: wp.array(dtype=wp.int32),
-        collider_active: wp.array(dtype=wp.int32),
-        collider_position: wp.array(dtype=vec3),
-        collider_orientation: wp.array(dtype=mat33),
-        collider_extents: wp.array(dtype=vec3),
-        collider_velocity: wp.array(dtype=vec3),
-        collider_gradient: wp.array(dtype=mat33),
-        collider_kind: wp.array(dtype=wp.int32),
-        collider_friction: wp.array(dtype=real),
-        wall_kind: int,
-        wall_padding: int,
+        solids: Solids,
     ):
         t = wp.tid() / lanes
         copy = copy_of(t, moved)
         p = t + copy * (share(x.shape[0], copies) - moved)
         start = copy * share(values.shape[0], copies)
-        solids = share(collider_shape.shape[0], copies)
+        count_of_solids = share(solids.kind.shape[0], copies)
+        first = copy * count_of_solids
+        fall = dt * gravity[copy]
         at = x[p]
         inv_dx = real(1.0) / dx
         base = base_node(at, inv_dx)
@@ -206,12 +185,7 @@ def make_update_g2p(precision: Precision, shape_name: str, several: bool = False
             slot = storage(flat_index(node[0], node[1], node[2], grid_shape), slots)
             # Without a branch, so that a solid's data is under way together with the node's.
             value = wp.where(slot >= 0, load(values, start + wp.max(slot, 0)), vec4())
-            v_i = node_velocity(
-                value, node, grid_shape, dx, dt * gravity[copy], copy * solids, (copy + 1) * solids,
-                collider_shape, collider_active, collider_position, collider_orientation, collider_extents,
-                collider_velocity, collider_gradient, collider_kind, collider_friction,
-                wall_kind, wall_padding,
-            )  # fmt: skip
+            v_i = node_velocity(value, node, grid_shape, dx, fall, first, first + count_of_solids, solids)
             if value[3] > real(0.0):
                 velocity += entry(w, 0, a) * entry(w, 1, b) * entry(w, 2, c) * v_i
         velocity = total(velocity, lanes)
