@@ -7,13 +7,11 @@ import torch
 import warp as wp
 from typing_extensions import override
 
-from nsf.data import TAU_MATRIX
 from nsf.dynamics.arena import Arena
 from nsf.dynamics.integration import ParticleSets
-from nsf.dynamics.interop import as_matrices, as_vectors, on_torch_stream
-from nsf.dynamics.latent import LatentRecord
-from nsf.dynamics.modal_kernels import THREADS, make_contraction, make_gathering, tiling
-from nsf.dynamics.network_kernel import make_layer
+from nsf.dynamics.interop import as_vectors, on_torch_stream
+from nsf.dynamics.modal_fields import field_launches
+from nsf.dynamics.modal_kernels import THREADS, make_gathering, tiling
 from nsf.dynamics.phase import Phase, Setting, Stages
 from nsf.dynamics.placing_kernels import make_others, make_sample
 from nsf.dynamics.projection import GaussNewton, Taylor
@@ -33,7 +31,7 @@ from nsf.mpm import GridStep, Precision
 from nsf.mpm.access import WARP
 from nsf.mpm.device import warp_device
 from nsf.mpm.grid import Grid
-from nsf.mpm.materials import Material, make_elastic_stress
+from nsf.mpm.materials import Material
 from nsf.mpm.shape import DEGREES, stencil_offset
 from nsf.mpm.state import cell_order
 
@@ -92,7 +90,9 @@ class ModalPhase(Phase):
         )
         self._placing = Placing(arena, state, deformation, of_sample, grid_step.grid, shape, self)
         self.needed = self._placing.needed
-        self._networks, self._fields = _fields(arena, self, manifold, method, order, parameters, materials)
+        self._networks, self._fields = field_launches(
+            arena, self, manifold, method, order, parameters, materials
+        )
         self._projection = Projection(arena, state, deformation, of_sample, self, weights)
 
     @property
@@ -313,103 +313,3 @@ def _by_cell(sets: ParticleSets, X: np.ndarray, dx: float, shape: str) -> np.nda
     """
     others = sets.integration[len(sets.sample) :]
     return np.concatenate([sets.sample, others[cell_order(X[others], dx, stencil_offset(shape))]])
-
-
-def _fields(
-    arena, phase: ModalPhase, manifold, method: Method, order, parameters, materials
-) -> tuple[list, list]:
-    """The launches of the networks, and those that then give τ and C at N, as the method takes them."""
-    options = {"dtype": arena.real, "device": phase.setting.device}
-    heads = []
-    for name, neural, found in (
-        ("stress", method.neural_stress, phase.tau),
-        ("affine", method.neural_affine, phase.C),
-    ):
-        if neural:
-            factors = manifold.factors(name, order, **options)
-            if factors.table.shape[2]:
-                heads.append((factors, found))
-            else:  # the same in every snapshot
-                found.unflatten(0, (-1, phase.size)).copy_(_as_matrices(factors.mean))
-    stored = [arena.halved(factors.table, factors.rows) for factors, _ in heads]
-    networks, coefficients = _networks(arena, [f.layers for f, _ in heads], phase.setting.record, parameters)
-    fields = [
-        (factors, *modes, a, found)
-        for (factors, found), modes, a in zip(heads, stored, coefficients, strict=True)
-    ]
-    launches = [_contraction(arena, phase, fields)] if fields else []
-    if not method.neural_stress:
-        F = arena.zeros(len(phase.x), 3, 3, dtype=arena.real)
-        factors = manifold.factors("gradient", order, **options)
-        whole = arena.modes(factors.table, factors.rows), arena.zeros(1, dtype=arena.real)  # over no lengths
-        launches.append(_contraction(arena, phase, [(factors, *whole, phase.coefficients.a, F)]))
-        launches.append(_elastic(arena, phase, materials, F))
-    return networks, launches
-
-
-def _as_matrices(mean: torch.Tensor) -> torch.Tensor:
-    """[n, 6], symmetric, or [n, 9] → [n, 3, 3]."""
-    return (mean[:, np.ravel(TAU_MATRIX)] if mean.shape[1] == 6 else mean).unflatten(1, (3, 3))
-
-
-def _networks(arena: Arena, networks: list, record: LatentRecord, parameters) -> tuple[list, list]:
-    """The launches of the heads, layer by layer and both at once, and where they leave their coefficients.
-
-    A GPU takes the first two layers of one simulation in one launch; for many, what each output finds anew
-    would cost more than a launch.
-    """
-    B, r = len(parameters), record.now.shape[-1]
-    launches, lanes, (tiles, tile) = [], arena.lanes(WARP), tiling(B)
-    inputs, before = [record.now.view(B, r)] * len(networks), []
-    for layers in zip(*networks, strict=True):
-        weights = []
-        for W, b in layers:
-            biases = [b] * B
-            if not (launches or before):  # x̂ is followed by the parameters, which do not change in a run
-                biases = [b + W[:, r:] @ values.to(W)[: W.shape[1] - r] for values in parameters]
-                W = W[:, :r]
-            weights.append([arena.hold(W, arena.real), arena.hold(torch.stack(biases), arena.real)])
-        last = layers[0] is networks[0][-1]
-        if arena.device.is_cuda and B == 1 and not (launches or before or last):
-            before = weights
-            continue
-        outputs = [arena.zeros(*b.shape, dtype=arena.real) for _, b in weights]
-        sides = [[*w_0, *w, x] for w_0, w, x in zip(before or weights, weights, inputs, strict=True)]
-        count = sum(y.shape[1] for y in outputs)
-        # One network alone stands on both sides; the second gets no thread.
-        arguments = [*sides[0], *sides[-1], int(not last), lanes, count, outputs[0], outputs[-1]]
-        kernel = make_layer(arena.precision, tile, tiles > 1, r if before and not launches else 0)
-        launches.append(arena.pack(kernel, tiles * count * lanes, arguments))
-        inputs = outputs
-    return launches, inputs
-
-
-def _contraction(arena: Arena, phase: ModalPhase, fields: Sequence[tuple]):
-    """The launch of one or two fields at the needed particles.
-
-    A field is its factors, the arena's modes, their lengths, coefficients a [B, K], and where it goes.
-    """
-    a, lanes = fields[0][3], arena.lanes(THREADS)
-    four = [-(-factors.table.shape[2] // 4) for factors, *_ in fields]
-    tiles, tile = tiling(len(a), arena.real.itemsize * sum(four) * 4)
-    threads, inputs = [], [phase.needed]
-    for factors, *rest in fields:
-        threads.append(arena.whole_blocks(factors.table.shape[1] // 3 * len(factors.rows), THREADS))
-        inputs += [arena.hold(factors.mean, arena.real), *rest]
-    # One field alone stands on both sides; the second gets no thread.
-    inputs += inputs[-5:] * (2 - len(fields)) + [threads[0], tiles, lanes]
-    coefficients, stored = (wp.dtype_from_torch(values.dtype) for values in (a, fields[0][1]))
-    kernel = make_contraction(arena.precision, (four[0], four[-1]), coefficients, tile, tiles > 1, stored)
-    return arena.pack(kernel, tiles * sum(threads), inputs, THREADS)
-
-
-def _elastic(arena: Arena, phase: ModalPhase, materials: Sequence[Material], F: torch.Tensor):
-    """The launch of τ = τ(F) at N; without flow the history keeps its values at rest."""
-    precision, n, material = arena.precision, len(F), materials[0]
-    history = np.concatenate([one.initial_history(phase.size) for one in materials])
-    history = arena.hold(history, arena.real)
-    vecH = wp.types.vector(length=material.history_size, dtype=precision.real)
-    kernel = make_elastic_stress(material.functions(precision), precision, material.history_size)
-    matrices = [as_matrices(a, precision) for a in (F, phase.tau)]
-    inputs = [matrices[0], wp.from_torch(history, dtype=vecH), phase.mu, phase.lam, matrices[1]]
-    return arena.pack(kernel, n, inputs)

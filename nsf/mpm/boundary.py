@@ -36,7 +36,7 @@ class DomainWalls:
 
 @cache
 def make_solids(precision: Precision):
-    """Warp struct of colliders and walls for `make_node_velocity`, whose fields are as in `BoundaryArrays`."""
+    """Warp struct of colliders and walls for kernels; fields as in `BoundaryArrays`."""
     real, vec3, mat33 = precision.real, precision.vec3, precision.mat33
 
     @wp.struct

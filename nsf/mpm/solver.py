@@ -7,143 +7,25 @@ import numpy as np
 import warp as wp
 
 from nsf.errors import ConfigError, InstabilityError, ShapeError
-from nsf.mpm.access import WARP
 from nsf.mpm.boundary import BoundaryArrays, DomainWalls
 from nsf.mpm.colliders import Collider
 from nsf.mpm.device import warp_device
-from nsf.mpm.grid import Grid, GridGeometry, make_reach
+from nsf.mpm.grid import Grid, GridGeometry
 from nsf.mpm.materials import Material, make_elastic_stress, make_stress_update
 from nsf.mpm.precision import Precision, precision_of
-from nsf.mpm.shape import DEGREES, stencil_offset
+from nsf.mpm.shape import stencil_offset
 from nsf.mpm.stability import (
     MAX_ELASTIC_CFL,
-    check_colliders,
     check_time_step,
     make_particle_check,
     wave_speed_at,
 )
 from nsf.mpm.state import ParticleConstants, ParticleState, cell_order
-from nsf.mpm.transfer import Transfer, make_g2p, make_g2p_stress, make_p2g
-from nsf.mpm.update import make_grid_update, make_update_g2p
+from nsf.mpm.step import GridStep
+from nsf.mpm.transfer import Transfer, make_g2p_stress
 from nsf.timing import StageTimer
 
 _NEVER = 2**31 - 1
-
-
-class GridStep:
-    """P2G, grid update and G2P over given particle arrays.
-
-    What the full-order and the reduced solver share: there is one sequence of these
-    kernels, so a reduced step is the full-order step on fewer particles. On a grid of several copies it is
-    a step of as many simulations; arrays of particles then hold as many rows of each, one by one.
-
-    Args:
-        grid: the nodes.
-        boundaries: colliders and walls; of several simulations those of each, one by one, as many of each.
-        transfer: transfer scheme and B-spline.
-        gravity: [3] [m/s²]; of several simulations [copies, 3].
-        dt: step [s].
-        precision: floating-point types.
-        device: Warp device.
-
-    Raises:
-        ConfigError: the grid does not resolve a collider.
-        InstabilityError: a collider crosses more than a cell in a step.
-    """
-
-    def __init__(
-        self, grid: Grid, boundaries: BoundaryArrays, transfer: Transfer, gravity, dt, precision, device
-    ):
-        real = precision.real
-        check_colliders(boundaries.colliders, grid.geometry, dt)
-        self.grid, self.device = grid, device
-        self.dx, self.dt = real(grid.geometry.dx), real(dt)
-        self._seconds = float(dt)  # the colliders' time is fp64 in either precision
-        several = grid.copies > 1
-        gravity = np.broadcast_to(np.asarray(gravity, float).reshape(-1, 3), (grid.copies, 3))
-        self.gravity = wp.array(gravity, dtype=precision.vec3, device=device)
-        self.boundaries = boundaries
-        self.affine_shares = tuple(real(s) for s in transfer.affine_shares)
-        by_plane = device.is_cuda and not transfer.deterministic
-        self._p2g = make_p2g(precision, transfer.shape, transfer.deterministic, several, by_plane)
-        self._threads = DEGREES[transfer.shape] + 1 if by_plane else 1  # of a particle in P2G
-        self._g2p = make_g2p(precision, transfer.shape)
-        self._reach = make_reach(precision, transfer.shape)
-        self._update = make_grid_update(precision, several)
-        self._update_g2p = make_update_g2p(precision, transfer.shape, several)
-
-    def p2g(self, x, v, C, tau, mass, volume0) -> None:
-        """Particles → grid: mass, momentum and the impulse of the stress."""
-        self.clear(x)
-        self.scatter(x, v, C, tau, mass, volume0)
-
-    def clear(self, x) -> None:
-        """Zero the nodes of the last step and list the blocks that particles at x reach."""
-        grid = self.grid
-        grid.clear()
-        if not grid.sparse:
-            inputs = [x, grid.shape, grid.block_shape, self.dx, grid.marks, grid.blocks, grid.listed]
-            wp.launch(self._reach, dim=x.shape[0], inputs=inputs, device=self.device)
-
-    def scatter(self, x, v, C, tau, mass, volume0) -> None:
-        """Add what particles carry to their nodes, which are clear."""
-        grid = self.grid
-        inputs = [
-            x,
-            v,
-            C,
-            tau,
-            mass,
-            volume0,
-            grid.shape,
-            grid.slots,
-            self.dx,
-            self.dt,
-            grid.copies,
-            grid.values,
-        ]
-        whole_warps = -(-x.shape[0] // WARP) * WARP
-        wp.launch(self._p2g, dim=self._threads * whole_warps, inputs=inputs, device=self.device)
-
-    def follow(self) -> None:
-        """Move the boundaries on by a step; `update` does it, `update_g2p` does not."""
-        self.boundaries.advance(self._seconds)
-
-    def update(self) -> None:
-        """Momentum → velocity at the next time level, boundaries included, which move on by a step."""
-        self.follow()
-        inputs = [*self.grid.stored, *self._updating]
-        wp.launch(self._update, dim=self.grid.threads, inputs=inputs, device=self.device)
-
-    def g2p(self, x, v, C, increment) -> None:
-        """Grid → particles: velocity, position, affine momentum, deformation increment."""
-        inputs = [*self.gathering, x, v, C, increment]
-        wp.launch(self._g2p, dim=C.shape[0], inputs=inputs, device=self.device)
-
-    def update_g2p(self, x, v, moved: int) -> None:
-        """Velocity and position of the first particles of each simulation, in place of `update` and `g2p`.
-
-        For few particles: nothing is updated but what they need, and the nodes keep their momentum.
-
-        Args:
-            x, v: as they were for P2G.
-            moved: particles of a simulation.
-        """
-        lanes, grid = WARP if self.device.is_cuda else 1, self.grid
-        inputs = [grid.shape, grid.slots, moved, lanes, x, v, *self._updating]
-        wp.launch(self._update_g2p, dim=grid.copies * moved * lanes, inputs=inputs, device=self.device)
-
-    @property
-    def _updating(self) -> list:
-        """What the velocity of nodes is found from, in the kernels' order."""
-        grid = self.grid
-        return [grid.copies, grid.values, self.dx, self.dt, self.gravity, self.boundaries.solids]
-
-    @property
-    def gathering(self) -> list:
-        """What G2P gathers from and with, in the kernels' order."""
-        grid = self.grid
-        return [grid.values, grid.shape, grid.slots, self.dx, self.dt, *self.affine_shares]
 
 
 class FullOrderMPM:

@@ -15,7 +15,7 @@ from nsf.mpm.shape import shape_functions
 
 @cache
 def make_node_velocity(precision: Precision):
-    """Warp function (values of a node, node, ..., Δt g, ...) → its velocity; of no use where there is no mass.
+    """Warp function (values of a node, node, ...) → its velocity; of no use without mass. `fall` is Δt g.
 
     v_i = (m_i v_i − Δt Σ_p τ_p ∇w_ip V_p⁰)/m_i + Δt g, then the boundary conditions
     in order: each collider that acts, then the walls of the domain. P2G has already added
