@@ -275,6 +275,8 @@ def _experiment(name: str, stage: str, overrides: list[str], launcher: list[str]
         raise ConfigError("experiments have no material points; leave +experiment out")
     experiment = Experiment.load(name, overrides)
     code = 0
+    if stage == "run":
+        experiment.check_report_folder()
     if stage != "report":
         code = _sweep(stage, experiment.sweeps, launcher, experiment.stages if stage == "run" else ())
     if stage in ("run", "report"):
@@ -288,8 +290,10 @@ def _experiment(name: str, stage: str, overrides: list[str], launcher: list[str]
 
 def _multirun(stage: str, overrides: list[str], launcher: list[str]) -> int:
     """Every combination of comma-separated values, and the report of each scene; 2 if a job failed."""
-    from nsf.pipeline.sweep import reports
+    from nsf.pipeline.sweep import check_report_folders, reports
 
+    if stage == "run":
+        check_report_folders(overrides)
     code = 0 if stage == "report" else _sweep(stage, [overrides], launcher)
     if stage in ("run", "report"):
         for page in reports(overrides):

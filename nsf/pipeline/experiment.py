@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import yaml
+from omegaconf import DictConfig
 
 from nsf import config as configuration
 from nsf.errors import ConfigError, MissingRunError
@@ -155,11 +156,27 @@ class Experiment:
             raise MissingRunError(
                 f"no job of {self.name} was evaluated; run `nsf run +experiment={self.name}`"
             )
-        folder = Path(config.report.folder) / (f"{self.name}_small" if scales == {"small"} else self.name)
+        folder = self._folder(config, scales)
         study = Study(self.question, self.paper, settings, keys, missing, self.printed, fine)
         page = build_report(list(runs.values()), folder, self.title, study=study)
         say(f"report: {len(runs)} jobs, {len(missing)} missing → {page}")
         return page, missing
+
+
+    def check_report_folder(self) -> None:
+        """Refuse a place where no report could be written, before the jobs.
+
+        Raises:
+            ConfigError: something else stands there.
+            StorageError: the folder above it cannot be written.
+        """
+        from nsf.reporting.swap import check_place
+
+        config = configuration.load(self.jobs[0].overrides)
+        check_place(self._folder(config, {config.scale}))
+
+    def _folder(self, config: DictConfig, scales: set[str]) -> Path:
+        return Path(config.report.folder) / (f"{self.name}_small" if scales == {"small"} else self.name)
 
 
 def _why(plan: Plan) -> str:

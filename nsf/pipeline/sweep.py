@@ -147,9 +147,25 @@ def reports(overrides: Sequence[str], say: Callable[[str], object] = print) -> l
     Raises:
         MissingRunError: no job of a scene was evaluated.
     """
+    return [pipeline.report() for pipeline in _reporting(overrides, say)]
+
+
+def check_report_folders(overrides: Sequence[str]) -> None:
+    """Refuse a place where no page of a sweep could be written, before its jobs.
+
+    Raises:
+        ConfigError: something else stands there.
+        StorageError: the folder above it cannot be written.
+    """
+    for pipeline in _reporting(overrides, print):
+        pipeline.check_report_folder()
+
+
+def _reporting(overrides: Sequence[str], say: Callable[[str], object]) -> list[Pipeline]:
+    """One for each page."""
     configs = [configuration.load(job) for job in configuration.jobs([overrides])]
     last = {(config.report.folder, config.report.name): config for config in configs}
-    return [Pipeline(config, say).report() for config in last.values()]
+    return [Pipeline(config, say) for config in last.values()]
 
 
 @contextmanager
