@@ -162,7 +162,6 @@ class Experiment:
         say(f"report: {len(runs)} jobs, {len(missing)} missing → {page}")
         return page, missing
 
-
     def check_report_folder(self) -> None:
         """Refuse a place where no report could be written, before the jobs.
 
