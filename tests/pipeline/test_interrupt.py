@@ -93,6 +93,7 @@ def test_another_seed_gives_other_bits(copied, pipeline_at, chain):
     assert not same_weights(pipeline.training.path / "manifold.pt", chain.checkpoint)
 
 
+@pytest.mark.slow
 def test_control_c_from_outside(tiny, tmp_path, pipeline_at):
     """The real command, interrupted from another process as soon as it works."""
     root = tmp_path / "runs"

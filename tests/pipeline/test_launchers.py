@@ -36,6 +36,7 @@ def dies_at(config, stages, seed):
         os.kill(os.getpid(), signal.SIGKILL)
 
 
+@pytest.mark.slow
 def test_a_dead_process_takes_no_sibling_with_it(tmp_path, monkeypatch):
     monkeypatch.setenv("NSF_RUNS", str(tmp_path))
     monkeypatch.setattr(module, "_job", partial(dies_at, seed=2))

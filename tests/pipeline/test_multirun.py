@@ -10,6 +10,7 @@ from forked import PlainReport, SignalAt, run_nsf
 from nsf.runs import Run
 
 
+@pytest.mark.slow
 def test_every_combination_of_the_issues_grammar(nsf, copied, tmp_path):
     """nsf run -m scene=sand field.beta=[24,48] latent_dim=4,6 sampler.size=50,150"""
     root = copied("simulate")

@@ -55,6 +55,7 @@ def test_only_validation_values_are_deployed_and_the_search_goes_on(tried):
     assert all(run.config["values"] == [25] for run in Run.find("deploy", root=tried.root))
 
 
+@pytest.mark.slow
 def test_a_failed_trial_is_kept_and_the_others_go_on(tried, monkeypatch):
     words = ("scene.parameters.validation=[25]", "latent_dim=7..9", "search.trials=3", "seed=1")
     table, said = tried(*words)

@@ -206,6 +206,7 @@ def reduced(found):
     return pd.DataFrame(found.rows, columns=columns(Row))
 
 
+@pytest.mark.slow
 def test_stages_of_both_solvers(found):
     stages = pd.DataFrame(found.stages, columns=columns(StageRow))
     of_case = stages.groupby(["case", "precision"], sort=False)["stage"].apply(list)
@@ -214,6 +215,7 @@ def test_stages_of_both_solvers(found):
     assert (stages["ms"] > 0).all()
 
 
+@pytest.mark.slow
 def test_a_reduced_step_stands_beside_its_floor(found, reduced):
     kernels = pd.DataFrame(found.kernels, columns=columns(KernelRow))
     names = ["inference", "p2g", "7 empty launches"]
@@ -236,6 +238,7 @@ def test_training_is_timed_from_its_files(chain):
     assert len(said) == 2
 
 
+@pytest.mark.slow
 def test_both_solvers_of_a_scene_have_rows(reduced, chain):
     assert reduced["case"].tolist() == 2 * [
         "full_order_sand", "reduced_sand", "reduced_sand_cells", "reduced_sand_1.5dt", "reduced_sand_2dt",
@@ -250,6 +253,7 @@ def test_both_solvers_of_a_scene_have_rows(reduced, chain):
     assert (reduced["ms_median"] > 0).all()
 
 
+@pytest.mark.slow
 def test_delta_of_the_benchmark_is_that_of_the_evaluation(reduced, chain):
     evaluated = pd.read_csv(chain.pipeline.evaluation.path / "results.csv")["delta"][0]
     row = reduced[(reduced["case"] == "reduced_sand") & (reduced["precision"] == "fp64")].iloc[0]
@@ -416,6 +420,7 @@ def test_whole_runs_take_turns():
     assert [len(times) for times in found.values()] == [2, 2]
 
 
+@pytest.mark.slow
 def test_a_report_of_scenes(reduced, found, tmp_path):
     reduced.to_csv(tmp_path / "results.csv", index=False)
     kernels = pd.DataFrame(found.kernels, columns=columns(KernelRow))

@@ -129,6 +129,7 @@ def test_a_shard_has_the_losses_of_its_rows(files, fields):
         assert loss != of_all.loss(rows, particles, None)
 
 
+@pytest.mark.slow
 def test_resumed_training_has_the_same_bits(both, files, training_in, tmp_path):
     with pytest.raises(StorageError, match="the disk is full"):
         train_together(files, training_in(tmp_path, ("stress", 7)), TOGETHER, "cpu")
