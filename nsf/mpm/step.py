@@ -7,9 +7,7 @@ from nsf.mpm.access import WARP
 from nsf.mpm.boundary import BoundaryArrays
 from nsf.mpm.grid import Grid, make_reach
 from nsf.mpm.shape import DEGREES
-from nsf.mpm.stability import (
-    check_colliders,
-)
+from nsf.mpm.stability import check_colliders
 from nsf.mpm.transfer import Transfer, make_g2p, make_p2g
 from nsf.mpm.update import make_grid_update, make_update_g2p
 
@@ -17,9 +15,10 @@ from nsf.mpm.update import make_grid_update, make_update_g2p
 class GridStep:
     """P2G, grid update and G2P over given particle arrays.
 
-    What the full-order and the reduced solver share: there is one sequence of these
-    kernels, so a reduced step is the full-order step on fewer particles. On a grid of several copies it is
-    a step of as many simulations; arrays of particles then hold as many rows of each, one by one.
+    What the full-order and the reduced solver share: one P2G, and one rule by which a node's momentum becomes
+    its velocity. Every particle is moved by `update` and `g2p`, few of them by `update_g2p`, which gives the
+    same, so a reduced step is the full-order step on fewer particles. On a grid of several copies it is a
+    step of as many simulations; arrays of particles then hold as many rows of each, one by one.
 
     Args:
         grid: the nodes.
