@@ -125,7 +125,7 @@ class ModalPhase(Phase):
         if self._clears_ahead:
             with self._arena.beside(2):
                 self.grid_step.clear(self._integration[0])
-        with self._arena.beside(1):  # what nothing needs before the grid is updated
+        with self._arena.beside(1):  # what nothing needs before S is moved
             self.grid_step.follow()
             self._projection.prepare.launch()
         with self._arena.beside():

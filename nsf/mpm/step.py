@@ -1,4 +1,4 @@
-"""One sequence of P2G, grid update and G2P, which the full-order and the reduced solver share."""
+"""P2G, grid update and G2P, of which the full-order and the reduced solver share what `GridStep` says."""
 
 import numpy as np
 import warp as wp

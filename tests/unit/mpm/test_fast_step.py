@@ -120,7 +120,7 @@ def test_few_particles_get_from_momenta_what_update_and_g2p_give(shape, precisio
         wp.array(a.rows.numpy()[lowest], dtype=solver.precision.vec3, device=solver.device)
         for a in (state.x, state.v)
     )
-    moved, started, momenta = 20, [a.numpy() for a in (x, v)], grid.values.numpy()
+    moved, started, momenta = 20, [a.numpy().copy() for a in (x, v)], grid.values.numpy().copy()
     solver.grid_step.update_g2p(x, v, moved)
     np.testing.assert_array_equal(grid.values.numpy(), momenta)
     solver.grid_step.update()
