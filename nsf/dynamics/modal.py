@@ -52,8 +52,9 @@ class ModalPhase(Phase):
 
     The networks run once a step, on x̂ alone; modes and coefficients are contracted at those particles of N
     that the step needs, which are found at each step among the sets'; and the projection works on
-    coefficients. Mathematically a step is that of `DecodedPhase`. Several simulations share modes, networks
-    and candidates, and every launch.
+    coefficients. A step is that of `DecodedPhase`, but that a last update moves coefficients along their
+    derivative, which misses the manifold by the order of the projector's tolerance. Several simulations share
+    modes, networks and candidates, and every launch.
 
     Args:
         setting: of the solver; its projector is `GaussNewton` or `Taylor`.

@@ -130,6 +130,14 @@ def test_taylor(pair):
     same(*runs(pair(projector=Taylor())))
 
 
+def test_the_default_tolerance_leaves_little_between_the_two(pair):
+    """A last update moves coefficients along their derivative in one, and is decoded in the other."""
+    one, other = runs(pair(projector=GaussNewton()))
+    assert ((one.updates[:, 1] > 0) == (other.updates[:, 1] > 0)).all()
+    assert (one.updates[:, 1] == 0).any()  # some steps end with one update
+    np.testing.assert_allclose(one.xhat, other.xhat, rtol=0, atol=5e-5)
+
+
 def test_one_iteration_and_none_converged(pair):
     same(*runs(pair(projector=GaussNewton(iterations=1, tolerance=1e-6))))
     same(*runs(pair(projector=GaussNewton(iterations=4, tolerance=1e-14))))
