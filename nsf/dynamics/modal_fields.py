@@ -12,7 +12,7 @@ from nsf.dynamics.arena import Arena
 from nsf.dynamics.interop import as_matrices
 from nsf.dynamics.latent import LatentRecord
 from nsf.dynamics.modal_kernels import THREADS, make_contraction, tiling
-from nsf.dynamics.network_kernel import make_layer
+from nsf.dynamics.network_kernel import make_layer, make_product, product_blocks
 from nsf.dynamics.stress import Method
 from nsf.mpm.access import WARP
 from nsf.mpm.materials import Material, make_elastic_stress
@@ -62,11 +62,10 @@ def _networks(arena: Arena, networks: list, record: LatentRecord, parameters) ->
     """The launches of the heads, layer by layer and both at once, and where they leave their coefficients.
 
     A GPU takes the first two layers of one simulation in one launch; for many, what each output finds anew
-    would cost more than a launch.
+    would cost more than a launch, and a layer is a product of matrices.
     """
     B, r = len(parameters), record.now.shape[-1]
-    launches, lanes, (tiles, tile) = [], arena.lanes(WARP), tiling(B)
-    inputs, before = [record.now.view(B, r)] * len(networks), []
+    launches, inputs, before = [], [record.now.view(B, r)] * len(networks), []
     for layers in zip(*networks, strict=True):
         weights = []
         for W, b in layers:
@@ -80,14 +79,32 @@ def _networks(arena: Arena, networks: list, record: LatentRecord, parameters) ->
             before = weights
             continue
         outputs = [arena.zeros(*b.shape, dtype=arena.real) for _, b in weights]
-        sides = [[*w_0, *w, x] for w_0, w, x in zip(before or weights, weights, inputs, strict=True)]
-        count = sum(y.shape[1] for y in outputs)
-        # One network alone stands on both sides; the second gets no thread.
-        arguments = [*sides[0], *sides[-1], int(not last), lanes, count, outputs[0], outputs[-1]]
-        kernel = make_layer(arena.precision, tile, tiles > 1, r if before and not launches else 0)
-        launches.append(arena.pack(kernel, tiles * count * lanes, arguments))
-        inputs = outputs
+        together = arena.device.is_cuda and B > 1
+        launches.append((_product if together else _layer)(arena, before, weights, inputs, not last, outputs))
+        inputs, before = outputs, []
     return launches, inputs
+
+
+def _layer(arena: Arena, before: list, weights: list, inputs: list, active: bool, outputs: list) -> wp.Launch:
+    """The launch of a layer of one or two networks, after the one `before` it, if it is given."""
+    (tiles, tile), lanes = tiling(len(outputs[0])), arena.lanes(WARP)
+    sides = [[*first, *own, x] for first, own, x in zip(before or weights, weights, inputs, strict=True)]
+    count = sum(y.shape[1] for y in outputs)
+    # One network alone stands on both sides; the second gets no thread.
+    arguments = [*sides[0], *sides[-1], int(active), lanes, count, outputs[0], outputs[-1]]
+    kernel = make_layer(arena.precision, tile, tiles > 1, inputs[0].shape[1] if before else 0)
+    return arena.pack(kernel, tiles * count * lanes, arguments)
+
+
+def _product(
+    arena: Arena, before: list, weights: list, inputs: list, active: bool, outputs: list
+) -> wp.Launch:
+    """As `_layer`, for many simulations of a GPU; nothing is before it."""
+    sides = [[*own, x] for own, x in zip(weights, inputs, strict=True)]
+    members = [(y.shape[1], x.shape[1] // W.shape[1]) for (W, _, x), y in zip(sides, outputs, strict=True)]
+    first, blocks = product_blocks(members, len(outputs[0]))
+    arguments = [*sides[0], *sides[-1], int(active), first, blocks, outputs[0], outputs[-1]]
+    return arena.pack(make_product(arena.precision), blocks * THREADS, arguments, THREADS)
 
 
 def _contraction(arena: Arena, phase: "ModalPhase", fields: Sequence[tuple]):

@@ -126,7 +126,8 @@ def combination(names: str, tile: int, several: bool, half: bool = False) -> str
                 for (int i = 0; i < 3; ++i)
                     if (begin + j < Q)
                         under_way[j][i] = {load}(first + size_t(i * Q + begin + j) * particles);
-            __syncwarp(__activemask());  // else the compiler puts each load beside its use
+            // Else the compiler puts each load beside its use, which is of no harm in fp64.
+            if (sizeof(real) == 4) __syncwarp(__activemask());
             #pragma unroll
             for (int j = 0; j < ahead; ++j) {{
                 const int q = begin + j;
@@ -192,9 +193,12 @@ def _make_field(precision: Precision, vectors: int, coefficients, tile: int, sev
     ):
         n = needed.shape[1]
         group, p = t / n, t % n
+        if wp.static(several):
+            group = t % (mean.shape[1] / 3)
+            p = t / (mean.shape[1] / 3)
         c = 3 * group
         live = False
-        if c < mean.shape[1]:
+        if c < mean.shape[1] and p < n:
             for s in range(wp.static(tile)):
                 if start + s < needed.shape[0] and needed[start + s, p] != 0:
                     live = True

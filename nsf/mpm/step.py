@@ -6,7 +6,7 @@ import warp as wp
 from nsf.mpm.access import WARP
 from nsf.mpm.boundary import BoundaryArrays
 from nsf.mpm.grid import Grid, make_reach
-from nsf.mpm.shape import DEGREES
+from nsf.mpm.scatter import BLOCK, particles_of_warp
 from nsf.mpm.stability import check_colliders
 from nsf.mpm.transfer import Transfer, make_g2p, make_p2g
 from nsf.mpm.update import make_grid_update, make_update_g2p
@@ -47,9 +47,8 @@ class GridStep:
         self.gravity = wp.array(gravity, dtype=precision.vec3, device=device)
         self.boundaries = boundaries
         self.affine_shares = tuple(real(s) for s in transfer.affine_shares)
-        by_plane = device.is_cuda and not transfer.deterministic
-        self._p2g = make_p2g(precision, transfer.shape, transfer.deterministic, several, by_plane)
-        self._threads = DEGREES[transfer.shape] + 1 if by_plane else 1  # of a particle in P2G
+        self._by_warp = device.is_cuda and not transfer.deterministic
+        self._p2g = make_p2g(precision, transfer.shape, transfer.deterministic, several, self._by_warp)
         self._g2p = make_g2p(precision, transfer.shape)
         self._reach = make_reach(precision, transfer.shape)
         self._update = make_grid_update(precision, several)
@@ -70,7 +69,7 @@ class GridStep:
 
     def scatter(self, x, v, C, tau, mass, volume0) -> None:
         """Add what particles carry to their nodes, which are clear."""
-        grid = self.grid
+        grid, each = self.grid, particles_of_warp(x.shape[0]) if self._by_warp else WARP
         inputs = [
             x,
             v,
@@ -84,9 +83,11 @@ class GridStep:
             self.dt,
             grid.copies,
             grid.values,
+            each,
         ]
-        whole_warps = -(-x.shape[0] // WARP) * WARP
-        wp.launch(self._p2g, dim=self._threads * whole_warps, inputs=inputs, device=self.device)
+        wp.launch(
+            self._p2g, dim=-(-x.shape[0] // each) * WARP, inputs=inputs, device=self.device, block_dim=BLOCK
+        )
 
     def follow(self) -> None:
         """Move the boundaries on by a step; `update` does it, `update_g2p` does not."""

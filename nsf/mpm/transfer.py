@@ -10,11 +10,12 @@ from functools import cache
 import warp as wp
 
 from nsf.errors import ConfigError
-from nsf.mpm.access import make_add, make_load, make_sum, whole_warps
+from nsf.mpm.access import WARP, make_load
 from nsf.mpm.copies import make_copies
 from nsf.mpm.grid import flat_index, inside, storage
 from nsf.mpm.materials import LawFunctions, make_law_update
 from nsf.mpm.precision import Precision
+from nsf.mpm.scatter import any_of_warp, make_scatter
 from nsf.mpm.shape import DEGREES, shape_functions
 
 SCHEMES = ("pic", "apic", "rpic")
@@ -69,16 +70,15 @@ def make_p2g(
     shape_name: str,
     deterministic: bool = False,
     several: bool = False,
-    by_plane: bool = False,
+    by_warp: bool = False,
 ):
-    """Kernel of P2G, a thread a particle or a plane of its stencil, launched over whole warps of threads.
+    """Kernel of P2G, launched over whole warps, whose first `each` threads have a particle.
 
     m_i = Σ_p w_ip m_p and, with the explicit force's impulse added in the same sweep,
     m_i v_i = Σ_p w_ip m_p (v_p + C_p (x_i − x_p)) − Δt Σ_p τ_p ∇w_ip V_p⁰.
-    Particles off the grid are passed over; the solver's check reports them. Particles of one cell that
-    follow each other are added up before they reach the nodes. With `several`, rows of particles and nodes
-    are those of `copies` simulations. With `by_plane` the warps are those of the first plane, then of the
-    next, as many as a stencil has nodes along an axis: few particles then keep a GPU busy.
+    Particles off the grid are passed over; the solver's check reports them. With `several`, rows of particles
+    and nodes are those of `copies` simulations. `by_warp` is for a GPU: the threads of a warp share the nodes
+    of its particles (`make_scatter`), and add up what those of one cell give before it reaches memory.
 
     Source: paper section 3.3, steps 1 and 2.
     """
@@ -87,12 +87,12 @@ def make_p2g(
     width = shape.degree + 1
     base_node, local, weights, gradients = shape.base_node, shape.local, shape.weights, shape.gradients
     share, copy_of = make_copies(several)
-    (turns_of, add), (run_of, total) = make_add(precision, deterministic), make_sum(precision, deterministic)
+    scatter = make_scatter(precision, width)
     options = {"max_unroll": 4}
     if deterministic:
         options |= {"deterministic": wp.DeterministicMode.RUN_TO_RUN, "deterministic_max_records": width**3}
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=options)
+    @wp.kernel(enable_backward=False, module="unique", module_options=options, grid_stride=False)
     def p2g(
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
@@ -106,53 +106,46 @@ def make_p2g(
         dt: real,
         copies: int,
         values: wp.array(dtype=vec4),
+        each: int,
     ):
-        t, first = wp.tid(), 0
-        if wp.static(by_plane):
-            whole = whole_warps(x.shape[0])
-            first = t / whole
-            t -= first * whole
-        p = wp.min(t, x.shape[0] - 1)
+        warp, lane = wp.tid() / WARP, wp.tid() % WARP
+        p = wp.min(warp * each + lane, x.shape[0] - 1)
         copy = copy_of(p, share(x.shape[0], copies))
         start = copy * share(values.shape[0], copies)
         inv_dx = real(1.0) / dx
         base = base_node(x[p], inv_dx)
-        # Threads leave as a warp or not at all, as the sums need all of it.
         cell = -1
-        if t < x.shape[0] and inside(base, width, grid_shape):
+        if lane < each and warp * each + lane < x.shape[0] and inside(base, width, grid_shape):
             cell = flat_index(base[0], base[1], base[2], grid_shape)
-        # Neighbours in a warp that are of two simulations must not be added up: their keys differ in parity.
-        key = cell
-        if wp.static(several):
-            key = wp.where(cell < 0, cell, 2 * cell + copy % 2)
-        run = run_of(key)
-        if run == 0:
+        if wp.static(by_warp):
+            if not any_of_warp(cell >= 0):
+                return
+        elif cell < 0:
             return
-        turns = turns_of(run > 0 and cell >= 0)
         f = local(x[p], inv_dx, base)
         w = weights(f)
         d = gradients(f)
         m = mass[p]
-        momentum = m * v[p]
         affine = (m * dx) * C[p]
+        momentum = m * v[p] - affine * f  # at the first node
         impulse = (-dt * volume0[p] * inv_dx) * tau[p]
-        for step in range(wp.static(1 if by_plane else width)):
-            a = first + step
-            w_a = shape.entry(w, 0, a)
-            d_a = shape.entry(d, 0, a)
-            for b in range(width):
-                w_ab = w_a * w[1, b]
-                da_b = d_a * w[1, b]
-                a_db = w_a * d[1, b]
-                for c in range(width):
-                    weight = w_ab * w[2, c]
-                    reach = vec3(real(float(a)) - f[0], real(float(b)) - f[1], real(float(c)) - f[2])
-                    slope = vec3(da_b * w[2, c], a_db * w[2, c], w_ab * d[2, c])
-                    carried = weight * (momentum + affine * reach) + impulse * slope
-                    # Looked up by every thread, so that nothing waits for it.
-                    slot = storage(wp.max(cell, 0) + flat_index(a, b, c, grid_shape), slots)
-                    added = total(vec4(carried[0], carried[1], carried[2], weight * m), run)
-                    add(values, wp.where(slot < 0, slot, start + slot), added, turns)
+        if wp.static(by_warp):
+            scatter(cell, start, w, d, m, momentum, affine, impulse, grid_shape, slots, values)
+        else:
+            for a in range(width):
+                for b in range(width):
+                    w_ab = w[0, a] * w[1, b]
+                    da_b = d[0, a] * w[1, b]
+                    a_db = w[0, a] * d[1, b]
+                    for c in range(width):
+                        weight = w_ab * w[2, c]
+                        node = vec3(real(float(a)), real(float(b)), real(float(c)))
+                        slope = vec3(da_b * w[2, c], a_db * w[2, c], w_ab * d[2, c])
+                        carried = weight * (momentum + affine * node) + impulse * slope
+                        slot = storage(cell + flat_index(a, b, c, grid_shape), slots)
+                        if slot >= 0:
+                            added = vec4(carried[0], carried[1], carried[2], weight * m)
+                            wp.atomic_add(values, start + slot, added)
 
     return p2g
 

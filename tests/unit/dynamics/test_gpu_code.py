@@ -4,7 +4,7 @@ import pytest
 import warp as wp
 
 from nsf.dynamics.modal_kernels import make_contraction, make_gathering
-from nsf.dynamics.network_kernel import make_layer
+from nsf.dynamics.network_kernel import make_layer, make_product
 from nsf.dynamics.placing_kernels import make_others, make_sample
 from nsf.dynamics.projection_kernel import make_projection
 from nsf.mpm import precision_of
@@ -14,9 +14,8 @@ from nsf.mpm.update import make_grid_update, make_update_g2p
 ARCH = 90  # compute capability 9.0, which has reductions of its own in P2G
 KERNELS = {
     "p2g": lambda precision, several: make_p2g(precision, "quadratic", several=several),
-    "p2g_by_plane": lambda precision, several: make_p2g(
-        precision, "quadratic", several=several, by_plane=True
-    ),
+    "p2g_by_warp": lambda precision, several: make_p2g(precision, "quadratic", False, several, by_warp=True),
+    "p2g_cubic": lambda precision, several: make_p2g(precision, "cubic", False, several, by_warp=True),
     "grid_update": lambda precision, several: make_grid_update(precision, several),
     "g2p": lambda precision, several: make_g2p(precision, "quadratic"),
     "update_g2p": lambda precision, several: make_update_g2p(precision, "quadratic", several),
@@ -27,6 +26,7 @@ KERNELS = {
     ),
     "layer": lambda precision, several: make_layer(precision, 2, several),
     "first_layers": lambda precision, several: make_layer(precision, 2, several, 5),
+    "product": lambda precision, several: make_product(precision),
     "gathering": lambda precision, several: make_gathering(precision, several),
     "projection": lambda precision, several: make_projection(precision, (5, 48, 48, 31), 2, 5, 36, several),
 }

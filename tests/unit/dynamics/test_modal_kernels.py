@@ -9,7 +9,7 @@ from nsf.data import TAU_MATRIX
 from nsf.dynamics.arena import Arena
 from nsf.dynamics.interop import as_vectors
 from nsf.dynamics.modal_kernels import THREADS, make_contraction, make_gathering, tiling
-from nsf.dynamics.network_kernel import make_layer
+from nsf.dynamics.network_kernel import make_layer, make_product, product_blocks
 from nsf.dynamics.placing_kernels import make_others, make_sample
 from nsf.mpm import precision_of
 from nsf.mpm.device import warp_device
@@ -175,11 +175,13 @@ def test_what_the_projection_takes_from_the_sample(arena, rng, n, K, simulations
     )
 
 
-@pytest.mark.parametrize("simulations", [1, 11])
-@pytest.mark.parametrize("fused", [False, True])
-def test_layers_of_two_networks(arena, rng, simulations, fused):
+@pytest.mark.parametrize("simulations", [1, 19])
+@pytest.mark.parametrize("way", ["layer", "first_layers", "product"])
+def test_layers_of_two_networks(arena, rng, simulations, way):
     """Of two members, whose rows see their own entries alone; the first layer may come with the second."""
-    r, hidden, outs = 5, 37, (12, 10)  # of a member
+    if way == "product" and not arena.device.is_cuda:
+        pytest.skip("products are of a GPU")
+    r, hidden, outs, fused = 5, 137, (20, 10), way == "first_layers"  # of a member
 
     def silu(z):
         return z * torch.sigmoid(z)
@@ -197,8 +199,13 @@ def test_layers_of_two_networks(arena, rng, simulations, fused):
         [W_0[i], b_0[i], W[i], b[i], x if fused else arena.hold(entries[i], torch.float64)] for i in (0, 1)
     ]
     (tiles, tile), lanes, count = tiling(simulations), arena.lanes(32), 2 * sum(outs)
-    kernel = make_layer(arena.precision, tile, tiles > 1, r if fused else 0)
-    arena.pack(kernel, tiles * count * lanes, [*sides[0], *sides[1], 1, lanes, count, *found]).launch()
+    if way == "product":
+        first, blocks = product_blocks([(2 * out, 2) for out in outs], simulations)
+        arguments = [*sides[0][2:], *sides[1][2:], 1, first, blocks, *found]
+        arena.pack(make_product(arena.precision), blocks * THREADS, arguments, THREADS).launch()
+    else:
+        kernel = make_layer(arena.precision, tile, tiles > 1, r if fused else 0)
+        arena.pack(kernel, tiles * count * lanes, [*sides[0], *sides[1], 1, lanes, count, *found]).launch()
     wp.synchronize_device(arena.device)
     for i in (0, 1):
         of_members = entries[i].unflatten(1, (2, -1)), W[i].unflatten(0, (2, -1))

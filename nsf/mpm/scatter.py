@@ -1,0 +1,172 @@
+"""Adds what particles carry to the nodes of a GPU's grid: a thread a node, for the particles of a warp."""
+
+from functools import cache
+
+import warp as wp
+
+from nsf.mpm.access import WARP
+from nsf.mpm.precision import FP32, Precision
+
+#: Threads of a block, whose shared memory holds what each of its particles carries.
+BLOCK = 64
+_FEWEST, _WARPS = 8, 2**14  # particles of a warp; warps that keep a GPU busy
+_RUNS = 4  # runs of particles whose nodes are looked up together
+
+_SCATTER = """
+#if defined(__CUDA_ARCH__)
+    typedef {real} real;
+    const int WIDTH = {width}, NODES = WIDTH * WIDTH * WIDTH;
+    struct alignas(2 * sizeof(real)) weight_t {{ real value, slope; }};
+    struct alignas(16) four_t {{ real of[4]; }};
+    struct particle_t {{
+        weight_t weights[3][WIDTH];
+        four_t affine[3], impulse[3];  // rows; beside them the momentum at the first node, and the mass
+        {padding}
+    }};
+    __shared__ particle_t carried[{warps}][32];
+    __shared__ int cells[{warps}][32], starts[{warps}][32], places[{warps}][{runs}][32];
+    const unsigned all = 0xffffffffu;
+    const int lane = threadIdx.x % 32, warp = threadIdx.x / 32;
+    const unsigned live = __ballot_sync(all, cell >= 0);
+    // Where another cell or another simulation begins.
+    const int before = __shfl_up_sync(all, cell, 1), start_before = __shfl_up_sync(all, start, 1);
+    const bool another = lane == 0 || before != cell || start_before != start;
+    const unsigned heads = __ballot_sync(all, cell >= 0 && another);
+    if (cell >= 0) {{
+        particle_t& own = carried[warp][lane];
+        for (int axis = 0; axis < 3; ++axis)
+            for (int j = 0; j < WIDTH; ++j) own.weights[axis][j] = {{w.data[axis][j], d.data[axis][j]}};
+        for (int i = 0; i < 3; ++i) {{
+            own.affine[i] = {{affine.data[i][0], affine.data[i][1], affine.data[i][2], momentum[i]}};
+            own.impulse[i] = {{impulse.data[i][0], impulse.data[i][1], impulse.data[i][2], mass}};
+        }}
+        cells[warp][lane] = cell;
+        starts[warp][lane] = start;
+    }}
+    __syncwarp();
+    for (int turn = 0; turn < NODES; turn += 32) {{
+        const bool own = turn + lane < NODES;
+        const int node = wp::min(turn + lane, NODES - 1);
+        const int a = node / (WIDTH * WIDTH), b = node / WIDTH % WIDTH, c = node % WIDTH;
+        const int offset = (a * shape[1] + b) * shape[2] + c;
+        const real n_x = real(a), n_y = real(b), n_z = real(c);
+        #pragma unroll 1
+        for (unsigned left = heads; left;) {{
+            // Where the nodes of the next runs are stored is looked up at once: it is what takes longest.
+            unsigned runs = left;
+            #pragma unroll
+            for (int r = 0; r < {runs}; ++r) {{
+                const int first = __ffs(left ? left : runs) - 1, flat = cells[warp][first] + offset;
+                const int slot = slots.shape[0] > 0 ? slots.data[flat] : flat;
+                places[warp][r][lane] = own && slot >= 0 ? slot + starts[warp][first] : -1;
+                left &= left - 1;
+            }}
+            __syncwarp();
+            #pragma unroll 1
+            for (int r = 0; r < {runs} && runs; ++r, runs &= runs - 1) {{
+                const int first = __ffs(runs) - 1;
+                const unsigned after = (heads | ~live) & ~(all >> (31 - first));
+                const int end = after ? __ffs(after) - 1 : 32;
+                real sum[4] = {{}};
+                #pragma unroll 2
+                for (int p = first; p < end; ++p) {{
+                    const particle_t& at = carried[warp][p];
+                    const weight_t x = at.weights[0][a], y = at.weights[1][b], z = at.weights[2][c];
+                    const real plane = x.value * y.value, weight = plane * z.value;
+                    const real s_x = x.slope * y.value * z.value, s_y = x.value * y.slope * z.value;
+                    for (int i = 0; i < 3; ++i) {{
+                        const four_t m = at.affine[i], f = at.impulse[i];
+                        sum[i] += weight * (m.of[3] + m.of[0] * n_x + m.of[1] * n_y + m.of[2] * n_z);
+                        sum[i] += f.of[0] * s_x + f.of[1] * s_y + f.of[2] * (plane * z.slope);
+                    }}
+                    sum[3] += weight * at.impulse[0].of[3];
+                }}
+                {add}
+            }}
+        }}
+    }}
+#endif
+"""
+# One reduction of 16 bytes (compute capability 9.0) in place of four of 4 bytes.
+_ADD_FP32 = """
+                const int slot = places[warp][r][lane];
+#if __CUDA_ARCH__ >= 900
+                if (slot >= 0)
+                    asm volatile(
+                        "red.global.add.v4.f32 [%0], {%1, %2, %3, %4};"
+                        :: "l"(&wp::index(values, slot)), "f"(sum[0]), "f"(sum[1]), "f"(sum[2]), "f"(sum[3])
+                        : "memory"
+                    );
+#else
+                const wp::vec_t<4, real> added(sum[0], sum[1], sum[2], sum[3]);
+                if (slot >= 0) wp::atomic_add(values, slot, added);
+#endif
+"""
+# There is none of 32 bytes: four lanes take one value each, so that they are one access to memory.
+_ADD_FP64 = """
+                __shared__ double sums[{warps}][32][4];
+                for (int i = 0; i < 4; ++i) sums[warp][lane][i] = sum[i];
+                __syncwarp();
+                for (int e = lane; e < 128; e += 32) {{
+                    const int slot = places[warp][r][e / 4];
+                    if (slot < 0) continue;
+                    atomicAdd((double*)&wp::index(values, slot) + e % 4, sums[warp][e / 4][e % 4]);
+                }}
+                __syncwarp();
+"""
+
+
+def particles_of_warp(particles: int) -> int:
+    """How many particles each warp has: the fewer, the sooner it is done; and the more of a cell, the better.
+
+    Args:
+        particles: of all warps.
+    """
+    each = WARP
+    while each > _FEWEST and particles <= each // 2 * _WARPS:
+        each //= 2
+    return each
+
+
+@cache
+def make_scatter(precision: Precision, width: int):
+    """Warp function of what the particles of a warp give to the nodes of their stencils.
+
+    All threads of a warp call it, each with a particle's cell, or −1 without one. A thread then takes a node,
+    and adds up what particles of one cell that follow each other give it, before it adds to memory:
+    w_ip m_p and w_ip (momentum + affine (i, j, k)) + impulse ∇w_ip for node (i, j, k) of the stencil. Nodes
+    are stored at `start` + `slots`. Blocks have `BLOCK` threads.
+
+    Args:
+        precision: of the values, whose array starts where an allocation does, so that each is aligned.
+        width: nodes of a stencil along an axis; weights w and their derivatives d are [3, width].
+    """
+    real, vec3, vec4, mat33 = precision.real, precision.vec3, precision.vec4, precision.mat33
+    stencil = wp.types.matrix(shape=(3, width), dtype=real)
+    sizes = {"warps": BLOCK // WARP, "runs": _RUNS}
+    add = _ADD_FP32 if precision is FP32 else _ADD_FP64.format(**sizes)
+    padding = "four_t unused;" if width == 4 else ""  # so that neighbours begin in different banks
+    snippet = _SCATTER.format(real=precision.native, width=width, padding=padding, add=add, **sizes)
+
+    @wp.func_native(snippet)
+    def scatter(
+        cell: int,
+        start: int,
+        w: stencil,
+        d: stencil,
+        mass: real,
+        momentum: vec3,
+        affine: mat33,
+        impulse: mat33,
+        shape: wp.vec3i,
+        slots: wp.array(dtype=wp.int32),
+        values: wp.array(dtype=vec4),
+    ): ...
+
+    return scatter
+
+
+@wp.func_native("return __any_sync(0xffffffffu, mine);")
+def any_of_warp(mine: bool) -> bool:
+    """Whether it is so for any thread of a warp, all of which call it."""
+    ...
