@@ -118,7 +118,7 @@ class Grid:
         self.listed = wp.zeros(min(blocks, 1), dtype=wp.int32, device=device)
         most = _THREADS["cuda" if self.values.device.is_cuda else "cpu"]
         #: Threads of a kernel over the nodes of a step.
-        self.threads = copies * count if self.sparse else min(blocks * _BLOCK_NODES, most)
+        self.threads = count if self.sparse else min(blocks * _BLOCK_NODES, most)
         self._precision = precision
         self._clear = make_clear(precision)
 

@@ -51,7 +51,7 @@ class GridStep:
         self._p2g = make_p2g(precision, transfer.shape, transfer.deterministic, several, self._by_warp)
         self._g2p = make_g2p(precision, transfer.shape)
         self._reach = make_reach(precision, transfer.shape)
-        self._update = make_grid_update(precision, several)
+        self._update = make_grid_update(precision)
         self._update_g2p = make_update_g2p(precision, transfer.shape, several)
 
     def p2g(self, x, v, C, tau, mass, volume0) -> None:
@@ -94,7 +94,10 @@ class GridStep:
         self.boundaries.advance(self._seconds)
 
     def update(self) -> None:
-        """Momentum → velocity at the next time level, boundaries included, which move on by a step."""
+        """Momentum → velocity at the next time level, boundaries included, which move on by a step.
+
+        For the nodes of one simulation.
+        """
         self.follow()
         inputs = [*self.grid.stored, *self._updating]
         wp.launch(self._update, dim=self.grid.threads, inputs=inputs, device=self.device)
@@ -114,14 +117,14 @@ class GridStep:
             moved: particles of a simulation.
         """
         lanes, grid = WARP if self.device.is_cuda else 1, self.grid
-        inputs = [grid.shape, grid.slots, moved, lanes, x, v, *self._updating]
+        inputs = [grid.shape, grid.slots, moved, lanes, grid.copies, x, v, *self._updating]
         wp.launch(self._update_g2p, dim=grid.copies * moved * lanes, inputs=inputs, device=self.device)
 
     @property
     def _updating(self) -> list:
         """What the velocity of nodes is found from, in the kernels' order."""
         grid = self.grid
-        return [grid.copies, grid.values, self.dx, self.dt, self.gravity, self.boundaries.solids]
+        return [grid.values, self.dx, self.dt, self.gravity, self.boundaries.solids]
 
     @property
     def gathering(self) -> list:

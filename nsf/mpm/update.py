@@ -68,16 +68,13 @@ def make_node_velocity(precision: Precision):
 
 
 @cache
-def make_grid_update(precision: Precision, several: bool = False):
+def make_grid_update(precision: Precision):
     """Kernel of the grid update: momentum → velocity at every node of a step, see `make_node_velocity`.
-
-    With `several`, nodes, gravity and colliders are those of `copies` simulations.
 
     Source: paper section 3.3, step 2.
     """
     real, vec3, vec4 = precision.real, precision.vec3, precision.vec4
     node_velocity, load = make_node_velocity(precision), make_load(precision)
-    share, copy_of = make_copies(several)
     Solids = make_solids(precision)
 
     @wp.kernel(enable_backward=False, module="unique")
@@ -89,7 +86,6 @@ def make_grid_update(precision: Precision, several: bool = False):
         shape: wp.vec3i,
         block_shape: wp.vec3i,
         threads: int,
-        copies: int,
         values: wp.array(dtype=vec4),
         dx: real,
         dt: real,
@@ -97,32 +93,19 @@ def make_grid_update(precision: Precision, several: bool = False):
         solids: Solids,
     ):
         index = wp.tid()
-        each = nodes_of_step(nodes, listed)
-        count = each
-        if wp.static(several):
-            count = copies * each
-        count_of_solids = share(solids.kind.shape[0], copies)
+        count = nodes_of_step(nodes, listed)
+        end = solids.kind.shape[0]
         while index < count:
-            copy = copy_of(index, each)
-            flat = node_of_step(index - copy * each, nodes, blocks, shape, block_shape)
+            flat = node_of_step(index, nodes, blocks, shape, block_shape)
             index += threads
-            slot = copy * share(values.shape[0], copies)
+            slot = int(0)
             value = vec4()
             if flat >= 0:
-                slot += storage(flat, slots)
+                slot = storage(flat, slots)
                 value = load(values, slot)
             if value[3] > real(0.0):
-                first = copy * count_of_solids
-                v = node_velocity(
-                    value,
-                    node_of(flat, shape),
-                    shape,
-                    dx,
-                    dt * gravity[copy],
-                    first,
-                    first + count_of_solids,
-                    solids,
-                )
+                node = node_of(flat, shape)
+                v = node_velocity(value, node, shape, dx, dt * gravity[0], 0, end, solids)
                 values[slot] = vec4(v[0], v[1], v[2], value[3])
 
     return grid_update
@@ -154,9 +137,9 @@ def make_update_g2p(precision: Precision, shape_name: str, several: bool = False
         slots: wp.array(dtype=wp.int32),
         moved: int,
         lanes: int,
+        copies: int,
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
-        copies: int,
         values: wp.array(dtype=vec4),
         dx: real,
         dt: real,

@@ -51,12 +51,9 @@ def moved_sample(scene, state, rows, sample, nodes, steps=STEPS, dt=None):
     vectors = [as_vectors(chosen[k], FP64) for k in ("x", "v")]
     matrices = [as_matrices(chosen[k], FP64) for k in ("C", "tau")]
     step.p2g(*vectors, *matrices, as_scalars(mass), as_scalars(volume0))
-    step.update()
-    s = len(sample)
-    increment = torch.zeros(s, 3, 3, dtype=torch.float64)
-    heads = [as_vectors(chosen[k][:s], FP64) for k in ("x", "v")]
-    step.g2p(*heads, as_matrices(chosen["C"][:s], FP64), as_matrices(increment, FP64))
-    return chosen["x"][:s]
+    step.follow()
+    step.update_g2p(*vectors, len(sample))
+    return chosen["x"][: len(sample)]
 
 
 def sets_of(scene, x, sample):

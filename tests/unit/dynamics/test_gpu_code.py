@@ -16,7 +16,7 @@ KERNELS = {
     "p2g": lambda precision, several: make_p2g(precision, "quadratic", several=several),
     "p2g_by_warp": lambda precision, several: make_p2g(precision, "quadratic", False, several, by_warp=True),
     "p2g_cubic": lambda precision, several: make_p2g(precision, "cubic", False, several, by_warp=True),
-    "grid_update": lambda precision, several: make_grid_update(precision, several),
+    "grid_update": lambda precision, several: make_grid_update(precision),
     "g2p": lambda precision, several: make_g2p(precision, "quadratic"),
     "update_g2p": lambda precision, several: make_update_g2p(precision, "quadratic", several),
     "sample": lambda precision, several: make_sample(precision, "quadratic", several),
