@@ -98,7 +98,7 @@ def make_grid_update(precision: Precision):
         while index < count:
             flat = node_of_step(index, nodes, blocks, shape, block_shape)
             index += threads
-            slot = int(0)
+            slot = 0
             value = vec4()
             if flat >= 0:
                 slot = storage(flat, slots)

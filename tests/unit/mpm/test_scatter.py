@@ -1,4 +1,4 @@
-"""Particles are shared out among warps so that none is left over, and no warp has more than it has threads."""
+"""Particles are shared out among warps so that none is left over and none has more than threads."""
 
 import pytest
 
