@@ -31,7 +31,7 @@ class Arena:
         self._sides = [wp.Stream(device) for _ in range(3)] if device.is_cuda else []
 
     @contextmanager
-    def beside(self, side: int = 0) -> Iterator[None]:
+    def beside(self, side: int) -> Iterator[None]:
         """What is launched inside may run beside what is launched after it, until `meet` of that side."""
         if not self._sides:
             yield
@@ -40,7 +40,7 @@ class Arena:
         with wp.ScopedStream(self._sides[side], sync_enter=False, sync_exit=False):
             yield
 
-    def meet(self, side: int = 0) -> None:
+    def meet(self, side: int) -> None:
         """Wait, on the device, for what was launched beside."""
         if self._sides:
             self.device.stream.wait_stream(self._sides[side])

@@ -8,6 +8,7 @@ import warp as wp
 from typing_extensions import override
 
 from nsf.dynamics.arena import Arena
+from nsf.dynamics.closure_kernel import packed_weights, projection_block
 from nsf.dynamics.integration import ParticleSets
 from nsf.dynamics.interop import as_vectors, on_torch_stream
 from nsf.dynamics.modal_fields import field_launches
@@ -20,9 +21,7 @@ from nsf.dynamics.projection_kernel import (
     PREPARE,
     SOLVE,
     make_projection,
-    packed_weights,
     prepared_size,
-    projection_block,
     projection_fits,
 )
 from nsf.dynamics.stress import Method
@@ -34,6 +33,8 @@ from nsf.mpm.grid import Grid
 from nsf.mpm.materials import Material
 from nsf.mpm.shape import DEGREES, stencil_offset
 from nsf.mpm.state import cell_order
+
+_HEADS, _PREPARING, _CLEARING = range(3)  # what of a step runs beside the rest
 
 
 def steps_in_coefficients(manifold, projector, precision: Precision, device) -> bool:
@@ -59,7 +60,7 @@ class ModalPhase(Phase):
     Args:
         setting: of the solver; its projector is `GaussNewton` or `Taylor`.
         sets: S, N (the candidates) and I.
-        grid_step: the shared P2G, grid update and G2P; shape: its B-spline.
+        grid_step: the shared P2G, and G2P of S, which updates nodes on its way; shape: its B-spline.
         manifold: a `BasisManifold` whose networks are `layered`.
         method: which of τ and C come from fields.
         parameters: [simulations, n_parameters] μ.
@@ -109,14 +110,14 @@ class ModalPhase(Phase):
     @override
     def enter(self, first: bool) -> None:
         record, state = self.setting.record, self.coefficients
-        for side in (1, 2):  # where a step was left in its midst
-            self._arena.meet(side)
-        for xhat in (record.before, record.now):
-            state.latent.copy_(xhat.view_as(state.latent))
-            with on_torch_stream(self._arena.device):
+        with on_torch_stream(self._arena.device):
+            for side in (_PREPARING, _CLEARING):  # where a step was left in its midst
+                self._arena.meet(side)
+            for xhat in (record.before, record.now):
+                state.latent.copy_(xhat.view_as(state.latent))
                 self._projection.evaluate.launch()
-        state.first.fill_(int(first))
-        state.step += 1  # what an earlier step stamped is of no account
+            state.first.fill_(int(first))
+            state.step += 1  # what an earlier step stamped is of no account
 
     def infer(self) -> None:
         """x and v, the particles that S needs, and their τ and C (paper sections 5.1 and 5.4).
@@ -124,19 +125,19 @@ class ModalPhase(Phase):
         Beside them, where the boundaries will be, and what of the inversion is known before the step.
         """
         if self._clears_ahead:
-            with self._arena.beside(2):
+            with self._arena.beside(_CLEARING):
                 self.grid_step.clear(self._integration[0])
-        with self._arena.beside(1):  # what nothing needs before S is moved
+        with self._arena.beside(_PREPARING):  # what nothing needs before S is moved
             self.grid_step.follow()
             self._projection.prepare.launch()
-        with self._arena.beside():
+        with self._arena.beside(_HEADS):
             for launch in self._networks:
                 launch.launch()
         for launch in self._placing.launches:
             launch.launch()
-        self._arena.meet()
+        self._arena.meet(_HEADS)
         if self._clears_ahead:
-            self._arena.meet(2)
+            self._arena.meet(_CLEARING)
         for launch in self._fields:
             launch.launch()
 
@@ -149,7 +150,7 @@ class ModalPhase(Phase):
 
     @override
     def g2p(self) -> None:
-        self._arena.meet(1)
+        self._arena.meet(_PREPARING)
         self._move_sample()
 
     def invert(self) -> None:

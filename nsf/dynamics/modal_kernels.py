@@ -10,8 +10,8 @@ from functools import cache
 
 import warp as wp
 
-from nsf.dynamics.projection_kernel import SHARED, TAKEN
 from nsf.mpm import Precision
+from nsf.mpm.access import SHARED, TAKEN
 from nsf.mpm.copies import make_copies
 
 THREADS = 128  # of a block that shares coefficients, or a sum over S

@@ -54,7 +54,7 @@ class Phase(ABC):
         setting: of the solver.
         sets: S, N and I.
         order: [n] the particles of N in the order of the arrays, S first.
-        grid_step: the shared P2G, grid update and G2P.
+        grid_step: the shared P2G, and G2P of S, which updates nodes on its way.
         at_sample: the manifold restricted to S.
 
     Attributes:

@@ -4,34 +4,22 @@ A GPU takes for each simulation a block for each network whose mean is the closu
 algebra alike, and only the first one writes. A CPU is one thread.
 """
 
-from collections.abc import Sequence
 from functools import cache
 
-import torch
 import warp as wp
 
+from nsf.dynamics.closure_kernel import CLOSURE, MEETING, PARTS, inputs_of_widest, projection_block
 from nsf.mpm import Precision
+from nsf.mpm.access import SHARED, TAKEN, WARP
 from nsf.mpm.copies import make_copies
 
 #: What a launch does: a and ȧ at x̂_n, the linearisation where the next inversion begins, or that inversion.
 EVALUATE, PREPARE, SOLVE = range(3)
-#: Threads that share a sum over a layer's inputs; each has two outputs, to read its inputs once for both.
-_PARTS = 8
-#: Threads of a GPU whose weights lie side by side.
-_WARP = 32
-#: Shared memory [byte] of a block without asking for more, and what Warp takes of it.
-SHARED, TAKEN = 49152, 4096
-
-
-def projection_block(widths: tuple[int, ...]) -> int:
-    """Threads of a block: enough to take the widest layer in one turn, if there may be."""
-    widest = max((*widths[1:], 1))
-    return min(1024, _WARP * -(-(-(-widest // 2) * _PARTS) // _WARP))
 
 
 def shared_bytes(precision: Precision, widths: tuple[int, ...], latents: int, modes: int) -> int:
     """Shared memory [byte] that a block needs, without Bᵀw B."""
-    rows, row = _rows(widths, latents), -(-latents // 4) * 4
+    rows, row = inputs_of_widest(widths, latents), -(-latents // 4) * 4
     values = 2 * rows * precision.numpy().itemsize + 8 * rows * row
     return values + 8 * (5 * modes + 2 * modes * latents + 4 * latents * (latents + 1) + 4)
 
@@ -44,151 +32,6 @@ def prepared_size(latents: int, modes: int) -> int:
 def projection_fits(precision: Precision, widths: tuple[int, ...], latents: int, modes: int) -> bool:
     """Whether a block of a GPU can hold what the projection needs."""
     return shared_bytes(precision, widths, latents, modes) <= SHARED - TAKEN
-
-
-def packed_weights(layers: Sequence[tuple[torch.Tensor, torch.Tensor]], is_cuda: bool) -> torch.Tensor:
-    """Weights [out, in] and biases [out] of a network, layer by layer, in the order in which they are read.
-
-    A thread has two outputs, half of all apart, and every `_PARTS`-th input (on a CPU every one): what a warp
-    reads at once lies side by side.
-    """
-    parts, tile = (_PARTS, _WARP) if is_cuda else (1, 1)
-    found = []
-    for W, b in layers:
-        (out, inputs), across = W.shape, tile // parts
-        half, steps = -(-out // 2), -(-inputs // parts)
-        tiles = -(-half // across)
-        padded = W.new_zeros(2, tiles * across, steps * parts)
-        padded[0, :half, :inputs], padded[1, : out - half, :inputs] = W[:half], W[half:]
-        shaped = padded.unflatten(2, (steps, parts)).unflatten(1, (tiles, across))
-        found += [shaped.permute(1, 3, 2, 4, 0).flatten(), torch.nn.functional.pad(b, (0, out % 2))]
-    return torch.cat(found)
-
-
-def _rows(widths: tuple[int, ...], latents: int) -> int:
-    """Inputs of the widest layer, filled up to whole turns of the threads that share them."""
-    return -(-max((*widths[:-1], latents)) // _PARTS) * _PARTS
-
-
-# Native code of the closure and its tangents, all layers in one piece: code that a step meets for the first
-# time must be short. Values are summed in the precision of the step, tangents in fp32: they steer
-# Gauss-Newton, and miss its fixed point by no more than their round-off times the residual.
-_CLOSURE = """
-        const int width[] = {widths};
-        #pragma unroll 1
-        for (int member = block; member < {members}; member += blocks) {{
-            const slope_t* W = weights.data + size_t(member) * (weights.shape[0] / {members});
-            const bool begun = member > block;  // a share of another member is there already
-            #pragma unroll 1
-            for (int e = lane; e < R * R; e += lanes) {{
-                slope[0][e / R * ROW + e % R] = e / R == e % R ? 1.0f : 0.0f;
-                if (e < R) value[0][e] = real(x[e]);
-            }}
-            NSF_SYNC;
-            #pragma unroll 1
-            for (int l = 0; l < {layers}; ++l) {{
-                const int in = width[l], out = width[l + 1], half = (out + 1) / 2;
-                const int steps = (in + PARTS - 1) / PARTS, tiles = (half * PARTS + TILE - 1) / TILE;
-                const int from = l % 2, to = 1 - from;
-                const bool last = l == {layers} - 1;
-                const slope_t* bias = W + 2 * tiles * TILE * steps;
-                #pragma unroll 1
-                for (int e = lane; e < tiles * TILE; e += lanes) {{
-                    const int part = e % PARTS, o = e / PARTS;
-                    const pair_t* w = (const pair_t*)W + e / TILE * TILE * steps + e % TILE;
-                    real v_1 = 0, v_2 = 0;
-                    slope_t u_1[R], u_2[R];
-                    for (int c = 0; c < R; ++c) u_1[c] = u_2[c] = 0.0f;
-                    #pragma unroll 1
-                    for (int start = 0; start < steps; start += AHEAD) {{
-                        pair_t ahead[AHEAD];
-                        #pragma unroll
-                        for (int j = 0; j < AHEAD; ++j)
-                            if (start + j < steps) ahead[j] = w[(start + j) * TILE];
-                        #pragma unroll
-                        for (int j = 0; j < AHEAD; ++j) {{
-                            if (start + j >= steps) break;
-                            const int i = (start + j) * PARTS + part;
-                            const real h = value[from][i];
-                            v_1 += real(ahead[j].one) * h;
-                            v_2 += real(ahead[j].two) * h;
-                            const slope_t* t = slope[from] + i * ROW;
-                            for (int c = 0; c < R; ++c) {{
-                                u_1[c] += ahead[j].one * t[c];
-                                u_2[c] += ahead[j].two * t[c];
-                            }}
-                        }}
-                    }}
-#if defined(__CUDA_ARCH__)
-                    #pragma unroll 1
-                    for (int d = PARTS / 2; d > 0; d /= 2) {{
-                        v_1 += __shfl_xor_sync(0xffffffffu, v_1, d);
-                        v_2 += __shfl_xor_sync(0xffffffffu, v_2, d);
-                        for (int c = 0; c < R; ++c) {{
-                            u_1[c] += __shfl_xor_sync(0xffffffffu, u_1[c], d);
-                            u_2[c] += __shfl_xor_sync(0xffffffffu, u_2[c], d);
-                        }}
-                    }}
-#endif
-                    #pragma unroll 1
-                    for (int side = part; side < 2; side += PARTS) {{
-                        const int k = o + side * half;
-                        if (o >= half || k >= out) continue;
-                        const real z = (side == 0 ? v_1 : v_2) + real(bias[k]);
-                        const real s = real(1) / (real(1) + exp(-z));
-                        const slope_t rise = slope_t(s * (real(1) + z * (real(1) - s)));
-                        if (last) at[R + k] = (begun ? at[R + k] : 0.0) + scale * z;
-                        else value[to][k] = z * s;
-                        for (int c = 0; c < R; ++c) {{
-                            const slope_t u = side == 0 ? u_1[c] : u_2[c];
-                            if (last) {{
-                                double& tangent = A[(R + k) * R + c];
-                                tangent = (begun ? tangent : 0.0) + scale * u;
-                            }} else slope[to][k * ROW + c] = rise * u;
-                        }}
-                    }}
-                }}
-                W = bias + (out + 1) / 2 * 2;
-                NSF_SYNC;
-            }}
-        }}
-        if (blocks > 1) meet();
-"""
-
-# Native code of `meet`: the blocks add up their shares in the closure. They alternate between two places, as
-# a block may be in the next evaluation while another one still reads.
-_MEETING = """
-    auto meet = [&]() {
-#if defined(__CUDA_ARCH__)
-        const int count = (K - R) * (R + 1);
-        double* place = shares.data + size_t(met) * blocks * count;
-        for (int e = lane; e < count; e += lanes)
-            place[block * count + e] = e < K - R ? at[R + e] : A[R * R + e - (K - R)];
-        __threadfence();
-        __syncthreads();
-        if (lane == 0) {
-            volatile int* turn = arrived.data + 1;
-            const int before = *turn;
-            if (atomicAdd(arrived.data, 1) == blocks - 1) {
-                arrived.data[0] = 0;
-                __threadfence();
-                *turn = before + 1;
-            } else {
-                while (*turn == before) {}
-            }
-            __threadfence();
-        }
-        __syncthreads();
-        for (int e = lane; e < count; e += lanes) {
-            double sum = 0.0;
-            for (int other = 0; other < blocks; ++other) sum += __ldcg(place + other * count + e);
-            if (e < K - R) at[R + e] = sum; else A[R * R + e - (K - R)] = sum;
-        }
-        met = 1 - met;
-        __syncthreads();
-#endif
-    };
-"""
 
 
 @cache
@@ -229,12 +72,12 @@ def make_projection(
     """
     real = precision.real
     _, copy_of = make_copies(several)
-    rows = _rows(widths, latents)
+    rows = inputs_of_widest(widths, latents)
     kept = shared_bytes(precision, widths, latents, modes) + 8 * modes**2 <= SHARED - TAKEN
     closure = ""
     if widths:
         counts = "{" + ", ".join(map(str, widths)) + "}"
-        closure = _CLOSURE.format(layers=len(widths) - 1, members=members, widths=counts)
+        closure = CLOSURE.format(layers=len(widths) - 1, members=members, widths=counts)
     scalar = precision.native
     snippet = f"""
     typedef {scalar} real;
@@ -243,7 +86,7 @@ def make_projection(
 #if defined(__CUDA_ARCH__)
     #define NSF_SHARED __shared__
     #define NSF_SYNC __syncthreads()
-    const int lane = threadIdx.x, lanes = blockDim.x, PARTS = {_PARTS}, TILE = {_WARP};
+    const int lane = threadIdx.x, lanes = blockDim.x, PARTS = {PARTS}, TILE = {WARP};
     const int blocks = {members}, block = blockIdx.x % blocks;
 #else
     #define NSF_SHARED
@@ -253,7 +96,7 @@ def make_projection(
 #endif
     const int R = {latents}, K = {modes};
     const int ROW = (R + 3) / 4 * 4;  // whole vectors of four
-    const int AHEAD = {min(18, rows // _PARTS)};  // weights whose loads are under way together
+    const int AHEAD = {min(18, rows // PARTS)};  // weights whose loads are under way together
     NSF_SHARED real value[2][{rows}];
     NSF_SHARED alignas(16) slope_t slope[2][{rows} * ROW];
     NSF_SHARED double x[R], at[K], a_n[K], d[K + 1], A[K * R], q[K], M[K * R], g[R], u[R], E[2][2 * R * R];
@@ -262,7 +105,7 @@ def make_projection(
     int met = 0;
     double *const x_0 = prepared.data, *const a_0 = x_0 + R, *const q_0 = a_0 + K;
     double *const A_0 = q_0 + K, *const M_0 = A_0 + K * R, *const inverse = M_0 + K * R;
-    {_MEETING}
+    {MEETING}
     auto evaluate = [&]() {{
         #pragma unroll 1
         for (int e = lane; e < R * R; e += lanes) {{

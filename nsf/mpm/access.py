@@ -24,8 +24,10 @@ _LOAD_FP64 = """
     return wp::index(values, slot);
 #endif
 """
-#: Threads that take every step together; a kernel with sums is launched over whole warps.
+#: Threads of a GPU that take every step together; where they share work, a launch is over whole warps.
 WARP = 32
+#: Shared memory [byte] of a GPU's block without asking for more, and what Warp takes of it.
+SHARED, TAKEN = 49152, 4096
 
 
 @cache
@@ -52,7 +54,7 @@ def make_warp_sum(precision: Precision):
 
 @cache
 def make_load(precision: Precision):
-    """Warp function (values, slot) → values[slot], aligned as for `make_add`."""
+    """Warp function (values, slot) → values[slot]; values start where an allocation does, and are aligned."""
     vec4 = precision.vec4
 
     @wp.func_native(_LOAD_FP32 if precision is FP32 else _LOAD_FP64)

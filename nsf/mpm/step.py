@@ -55,12 +55,19 @@ class GridStep:
         self._update_g2p = make_update_g2p(precision, transfer.shape, several)
 
     def p2g(self, x, v, C, tau, mass, volume0) -> None:
-        """Particles → grid: mass, momentum and the impulse of the stress."""
+        """Particles → grid: mass, momentum and the impulse of the stress.
+
+        Args:
+            x, v: [n] position [m] and velocity [m/s].
+            C: [n] affine momentum [1/s].
+            tau: [n] Kirchhoff stress [Pa].
+            mass, volume0: [n] mass [kg] and volume at rest [m³].
+        """
         self.clear(x)
         self.scatter(x, v, C, tau, mass, volume0)
 
     def clear(self, x) -> None:
-        """Zero the nodes of the last step and list the blocks that particles at x reach."""
+        """Zero the nodes of the last step and list the blocks that particles at x [n] [m] reach."""
         grid = self.grid
         grid.clear()
         if not grid.sparse:
@@ -68,7 +75,7 @@ class GridStep:
             wp.launch(self._reach, dim=x.shape[0], inputs=inputs, device=self.device)
 
     def scatter(self, x, v, C, tau, mass, volume0) -> None:
-        """Add what particles carry to their nodes, which are clear."""
+        """Add what particles carry to their nodes, which are clear; arguments as of `p2g`."""
         grid, each = self.grid, particles_of_warp(x.shape[0]) if self._by_warp else WARP
         inputs = [
             x,
@@ -113,8 +120,8 @@ class GridStep:
         For few particles: nothing is updated but what they need, and the nodes keep their momentum.
 
         Args:
-            x, v: as they were for P2G.
-            moved: particles of a simulation.
+            x, v: [n] position [m] and velocity [m/s] as they were for P2G.
+            moved: how many of each simulation.
         """
         lanes, grid = WARP if self.device.is_cuda else 1, self.grid
         inputs = [grid.shape, grid.slots, moved, lanes, grid.copies, x, v, *self._updating]
