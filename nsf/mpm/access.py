@@ -1,4 +1,4 @@
-"""Access to a node's four values at once, and for many particles: accesses, not bytes, bind the transfers."""
+"""Access to a node's four values at once, and what threads of a GPU share: accesses bind the transfers."""
 
 from functools import cache
 
