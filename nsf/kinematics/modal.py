@@ -1,0 +1,169 @@
+"""A field of `field=basis`: its mean and modes times coefficients, of which a small network finds most."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from typing_extensions import override
+
+from nsf.kinematics.networks import Committee, FullyConnected
+from nsf.kinematics.phases import joined, shaped
+
+
+class ModalField(nn.Module):
+    """mean(X) + Σ_k modes_k(X) a_k with a = [leading · xhat ; scale · network(inputs)].
+
+    For the deformation this is the displacement x − X.
+
+    Args:
+        particles, components: P and c.
+        modes: K.
+        leading: how many coefficients are latents themselves (r for g, 0 for h and l).
+        inputs, width, depth: of the network; there is none if no coefficient is left to it.
+        members: networks whose mean it is.
+    """
+
+    def __init__(
+        self,
+        particles: int,
+        components: int,
+        modes: int,
+        leading: int,
+        inputs: int,
+        width: int,
+        depth: int,
+        members: int,
+    ):
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(particles, components, dtype=torch.float64))
+        self.register_buffer("modes", torch.zeros(particles, components, modes))
+        self.register_buffer("leading", torch.ones(leading, dtype=torch.float64))
+        self.register_buffer("scale", torch.ones((), dtype=torch.float64))
+        closed = modes - leading
+        widths = (inputs, *[width] * depth, closed)
+        self.network: FullyConnected | Committee | None = None
+        if closed:
+            several = members > 1
+            self.network = Committee(members, widths, "silu") if several else FullyConnected(widths, "silu")
+
+    def calibrate(self, coefficients: Tensor) -> None:
+        """Take the scales from the coefficients [M, K] of the training snapshots."""
+        leading, closed = coefficients.tensor_split([self.leading.numel()], 1)
+        self.leading.copy_(leading.square().mean(0).sqrt())
+        if closed.numel():
+            self.scale.copy_(closed.square().mean().sqrt())
+
+    def at(
+        self,
+        place: Callable[[Tensor], Tensor],
+        base: Tensor | float,
+        network: FullyConnected | None,
+        like: Tensor,
+    ) -> RestrictedField:
+        """base + the field where `place` takes its mean and modes, in dtype and device as `like`."""
+        unscaled = self.modes.shape[2] - len(self.leading)
+        factors = torch.cat([self.leading, self.leading.new_ones(unscaled)]).to(like)
+        return RestrictedField(
+            (base + place(self.mean)).to(like),
+            place(self.modes).to(like) * factors,
+            len(self.leading),
+            network,
+        )
+
+
+@dataclass(frozen=True)
+class RestrictedField:
+    """mean + modes · a at n points; a = [xhat (the leading coefficients) ; network(inputs)].
+
+    Attributes:
+        mean: [n, c]; modes: [n, c, K], both in the unit of the field.
+    """
+
+    mean: Tensor
+    modes: Tensor
+    leading: int
+    network: FullyConnected | None
+
+    def subset(self, rows: slice) -> RestrictedField:
+        """The same field at some of the points, sharing memory."""
+        return RestrictedField(self.mean[rows], self.modes[rows], self.leading, self.network)
+
+    def values(self, inputs: Tensor) -> Tensor:
+        """[..., inputs] → [..., n, c]."""
+        a = [inputs[..., : self.leading]] if self.leading or self.network is None else []
+        if self.network is not None:
+            a.append(self.network(inputs))
+        coefficients = torch.cat(a, -1) if len(a) > 1 else a[0]
+        return F.linear(coefficients, self.modes.flatten(0, 1), self.mean.flatten()).unflatten(
+            -1, self.mean.shape
+        )
+
+    def values_and_jacobian(self, xhat: Tensor, identity: Tensor) -> tuple[Tensor, Tensor]:
+        """[..., r] and the identity [r, r] → [..., n, c] and [..., n, c, r], in one product."""
+        a, along = xhat, identity.expand(*xhat.shape[:-1], *identity.shape)
+        if self.network is not None:
+            closed, closed_along = self.network.forward_and_tangents(xhat, identity)
+            a, along = torch.cat([a, closed], -1), torch.cat([along, closed_along], -1)
+        rows = F.linear(torch.cat([a.unsqueeze(-2), along], -2), self.modes.flatten(0, 1))
+        rows = rows.unflatten(-1, self.mean.shape)
+        return rows[..., 0, :, :] + self.mean, rows[..., 1:, :, :].movedim(-3, -1)
+
+
+@dataclass(frozen=True)
+class ModalFactors:
+    """A field at n points, mean + modes · [leading · xhat ; network(xhat, μ)].
+
+    Attributes:
+        mean: [n, c] in the unit of the field.
+        table: [P, c, K] modes of every particle as trained, in fp32, where the manifold is.
+        rows: [n] of the points among them.
+        leading: σ [r] of the coefficients that are latents; [0] for h and l.
+        scale: of the others, with which the network's last layer was multiplied.
+        network: of the others, in raw units; None if there is none.
+        members: how many networks it is the mean of.
+    """
+
+    mean: Tensor
+    table: Tensor
+    rows: Tensor
+    leading: Tensor
+    scale: float
+    network: FullyConnected | None
+    members: int
+
+    @property
+    def layers(self) -> list[tuple[Tensor, Tensor]]:
+        """Weights [out, in] and biases [out] of the network, without the zeros between its members.
+
+        The first layer's rows and the last one's columns are member by member; in between, row o of a member
+        has the weights of that member's inputs alone.
+        """
+        layers = [] if self.network is None else list(self.network.layers)
+        found = []
+        for n, layer in enumerate(layers):
+            W = layer.weight
+            if 0 < n < len(layers) - 1:
+                blocks = W.unflatten(0, (self.members, -1)).unflatten(2, (self.members, -1))
+                W = blocks.diagonal(dim1=0, dim2=2).permute(2, 0, 1).flatten(0, 1)
+            found.append((W, layer.bias))
+        return found
+
+
+class ModalModule(nn.Module):
+    """A restricted field as a module: its tensors are buffers."""
+
+    def __init__(self, field: RestrictedField, phase: str, takes_parameters: bool):
+        super().__init__()
+        self.register_buffer("mean", field.mean)
+        self.register_buffer("modes", field.modes)
+        self.leading, self.network = field.leading, field.network
+        self.phase, self.takes_parameters = phase, takes_parameters
+
+    @override
+    def forward(self, xhat: Tensor, parameters: Tensor) -> Tensor:
+        field = RestrictedField(self.mean, self.modes, self.leading, self.network)
+        return shaped(self.phase, field.values(joined(xhat, parameters) if self.takes_parameters else xhat))
