@@ -192,10 +192,11 @@ def _make_field(precision: Precision, vectors: int, coefficients, tile: int, sev
         t: int,
     ):
         n = needed.shape[1]
-        group, p = t / n, t % n
-        if wp.static(several):
-            group = t % (mean.shape[1] / 3)
-            p = t / (mean.shape[1] / 3)
+        groups = mean.shape[1] / 3
+        if wp.static(several):  # what a warp stores then lies together, which gains more than its loads lose
+            group, p = t % groups, t / groups
+        else:
+            group, p = t / n, t % n
         c = 3 * group
         live = False
         if c < mean.shape[1] and p < n:

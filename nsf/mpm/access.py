@@ -26,8 +26,8 @@ _LOAD_FP64 = """
 """
 #: Threads of a GPU that take every step together; where they share work, a launch is over whole warps.
 WARP = 32
-#: Shared memory [byte] of a GPU's block without asking for more, and what Warp takes of it.
-SHARED, TAKEN = 49152, 4096
+SHARED = 49152  #: Memory [byte] that threads of a GPU's block share without asking for more.
+TAKEN = 4096  #: What Warp takes of it [byte].
 
 
 @cache

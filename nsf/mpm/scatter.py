@@ -8,7 +8,7 @@ from nsf.mpm.access import WARP
 from nsf.mpm.precision import FP32, Precision
 
 #: Threads of a block, whose shared memory holds what each of its particles carries.
-BLOCK = 64
+THREADS = 64
 _FEWEST, _WARPS = 8, 2**14  # particles of a warp; warps that keep a GPU busy
 _RUNS = 4  # runs of particles whose nodes are looked up together
 
@@ -132,18 +132,22 @@ def particles_of_warp(particles: int) -> int:
 def make_scatter(precision: Precision, width: int):
     """Warp function of what the particles of a warp give to the nodes of their stencils.
 
-    All threads of a warp call it, each with a particle's cell, or −1 without one. A thread then takes a node,
-    and adds up what particles of one cell that follow each other give it, before it adds to memory:
-    w_ip m_p and w_ip (momentum + affine (i, j, k)) + impulse ∇w_ip for node (i, j, k) of the stencil. Nodes
-    are stored at `start` + `slots`. Blocks have `BLOCK` threads.
+    All threads of a warp call it, each with a particle and the flat index of its cell, the first node of the
+    stencil, or −1 without one. A thread then takes a node, and adds up what particles of one cell that follow
+    each other give it, before it adds to memory: to node (i, j, k) of the stencil w_ip m_p [kg] and
+    w_ip (momentum + affine (i, j, k)) + impulse ∇w_ip [kg m/s]. The momentum is m_p (v_p + C_p (x_0 − x_p)), that
+    at the first node x_0; affine is m_p Δx C_p, impulse −Δt V_p⁰ τ_p/Δx, and ∇ is along x/Δx. Nodes are stored
+    at `start` + `slots`. Blocks have `THREADS` threads.
 
     Args:
         precision: of the values, whose array starts where an allocation does, so that each is aligned.
         width: nodes of a stencil along an axis; weights w and their derivatives d are [3, width].
+
+    Source: paper section 3.3, steps 1 and 2.
     """
     real, vec3, vec4, mat33 = precision.real, precision.vec3, precision.vec4, precision.mat33
     stencil = wp.types.matrix(shape=(3, width), dtype=real)
-    sizes = {"warps": BLOCK // WARP, "runs": _RUNS}
+    sizes = {"warps": THREADS // WARP, "runs": _RUNS}
     add = _ADD_FP32 if precision is FP32 else _ADD_FP64.format(**sizes)
     padding = "four_t unused;" if width == 4 else ""  # so that neighbours begin in different banks
     snippet = _SCATTER.format(real=precision.native, width=width, padding=padding, add=add, **sizes)

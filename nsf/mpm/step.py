@@ -3,10 +3,11 @@
 import numpy as np
 import warp as wp
 
+from nsf.errors import ConfigError
 from nsf.mpm.access import WARP
 from nsf.mpm.boundary import BoundaryArrays
 from nsf.mpm.grid import Grid, make_reach
-from nsf.mpm.scatter import BLOCK, particles_of_warp
+from nsf.mpm.scatter import THREADS, particles_of_warp
 from nsf.mpm.stability import check_colliders
 from nsf.mpm.transfer import Transfer, make_g2p, make_p2g
 from nsf.mpm.update import make_grid_update, make_update_g2p
@@ -17,8 +18,8 @@ class GridStep:
 
     What the full-order and the reduced solver share: one P2G, and one rule by which a node's momentum becomes
     its velocity. Every particle is moved by `update` and `g2p`, few of them by `update_g2p`, which gives the
-    same, so a reduced step is the full-order step on fewer particles. On a grid of several copies it is a
-    step of as many simulations; arrays of particles then hold as many rows of each, one by one.
+    same, so a reduced step is the full-order step on fewer particles. On a grid of several copies P2G and
+    `update_g2p` are those of as many simulations; arrays of particles then hold as many rows of each.
 
     Args:
         grid: the nodes.
@@ -93,7 +94,7 @@ class GridStep:
             each,
         ]
         wp.launch(
-            self._p2g, dim=-(-x.shape[0] // each) * WARP, inputs=inputs, device=self.device, block_dim=BLOCK
+            self._p2g, dim=-(-x.shape[0] // each) * WARP, inputs=inputs, device=self.device, block_dim=THREADS
         )
 
     def follow(self) -> None:
@@ -103,14 +104,19 @@ class GridStep:
     def update(self) -> None:
         """Momentum → velocity at the next time level, boundaries included, which move on by a step.
 
-        For the nodes of one simulation.
+        Raises:
+            ConfigError: the grid is of several simulations, of which `update_g2p` moves few particles each.
         """
+        if self.grid.copies > 1:
+            raise ConfigError(
+                f"a grid of {self.grid.copies} simulations is not updated as a whole; use update_g2p"
+            )
         self.follow()
         inputs = [*self.grid.stored, *self._updating]
         wp.launch(self._update, dim=self.grid.threads, inputs=inputs, device=self.device)
 
     def g2p(self, x, v, C, increment) -> None:
-        """Grid → particles: velocity, position, affine momentum, deformation increment."""
+        """Grid → particles, after `update`: velocity, position, affine momentum, deformation increment."""
         inputs = [*self.gathering, x, v, C, increment]
         wp.launch(self._g2p, dim=C.shape[0], inputs=inputs, device=self.device)
 

@@ -78,7 +78,8 @@ def make_p2g(
     m_i v_i = Σ_p w_ip m_p (v_p + C_p (x_i − x_p)) − Δt Σ_p τ_p ∇w_ip V_p⁰.
     Particles off the grid are passed over; the solver's check reports them. With `several`, rows of particles
     and nodes are those of `copies` simulations. `by_warp` is for a GPU: the threads of a warp share the nodes
-    of its particles (`make_scatter`), and add up what those of one cell give before it reaches memory.
+    of its particles (`make_scatter`), and add up what those of one cell give before it reaches memory, in no
+    fixed order; not with `deterministic`.
 
     Source: paper section 3.3, steps 1 and 2.
     """
@@ -108,14 +109,17 @@ def make_p2g(
         values: wp.array(dtype=vec4),
         each: int,
     ):
-        warp, lane = wp.tid() / WARP, wp.tid() % WARP
-        p = wp.min(warp * each + lane, x.shape[0] - 1)
+        lane = wp.tid() % WARP
+        t = wp.tid() / WARP * each + wp.min(
+            lane, each - 1
+        )  # a thread without a particle reads its neighbour's
+        p = wp.min(t, x.shape[0] - 1)
         copy = copy_of(p, share(x.shape[0], copies))
         start = copy * share(values.shape[0], copies)
         inv_dx = real(1.0) / dx
         base = base_node(x[p], inv_dx)
         cell = -1
-        if lane < each and warp * each + lane < x.shape[0] and inside(base, width, grid_shape):
+        if lane < each and t < x.shape[0] and inside(base, width, grid_shape):
             cell = flat_index(base[0], base[1], base[2], grid_shape)
         if wp.static(by_warp):
             if not any_of_warp(cell >= 0):

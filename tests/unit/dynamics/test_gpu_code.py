@@ -41,3 +41,11 @@ def test_a_kernel_compiles_for_a_gpu(name, precision, several, tmp_path):
     for kernel in made if isinstance(made, tuple) else (made,):
         wp.compile_aot_module(kernel.module, arch=ARCH, module_dir=tmp_path, use_ptx=True)
     assert list(tmp_path.glob("*.ptx"))
+
+
+@pytest.mark.skipif(80 not in wp.get_cuda_supported_archs(), reason="Warp was built without CUDA")
+@pytest.mark.parametrize("precision", ["fp32", "fp64"])
+def test_p2g_compiles_for_a_gpu_without_reductions_of_vectors(precision, tmp_path):
+    kernel = make_p2g(precision_of(precision), "quadratic", by_warp=True)
+    wp.compile_aot_module(kernel.module, arch=80, module_dir=tmp_path, use_ptx=True)
+    assert list(tmp_path.glob("*.ptx"))

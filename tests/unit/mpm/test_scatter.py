@@ -1,4 +1,4 @@
-"""Particles are shared out among warps so that none is left over and none has more than threads."""
+"""How many particles a warp has: fewer where there are few, at most one for each of its threads."""
 
 import pytest
 

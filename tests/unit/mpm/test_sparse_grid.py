@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import warp as wp
 
+from nsf.errors import ConfigError
 from nsf.mpm import FP64, BoundaryArrays, DomainWalls, Grid, GridGeometry, GridStep, HalfSpace, Transfer
 from nsf.mpm.grid import inside
 
@@ -92,6 +93,14 @@ def test_a_step_over_the_neighbours_is_exact(shape, particles):
     dropped = needed[needed != 3][0]
     _, _, wrong = step(particles, shape, needed[needed != dropped], sample, nodes)
     assert max(np.abs(a - b).max() for a, b in zip(wrong, expected, strict=True)) > 1e-9
+
+
+def test_a_grid_of_several_simulations_is_not_updated_as_a_whole():
+    grid = Grid(GEOMETRY, FP64, DEVICE, np.arange(5), copies=2)
+    boundaries = BoundaryArrays([], DomainWalls(), FP64, DEVICE)
+    work = GridStep(grid, boundaries, Transfer(), np.zeros((2, 3)), DT, FP64, wp.get_device(DEVICE))
+    with pytest.raises(ConfigError, match="use update_g2p"):
+        work.update()
 
 
 def test_clear(particles):
