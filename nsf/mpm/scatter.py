@@ -135,9 +135,9 @@ def make_scatter(precision: Precision, width: int):
     All threads of a warp call it, each with a particle and the flat index of its cell, the first node of the
     stencil, or −1 without one. A thread then takes a node, and adds up what particles of one cell that follow
     each other give it, before it adds to memory: to node (i, j, k) of the stencil w_ip m_p [kg] and
-    w_ip (momentum + affine (i, j, k)) + impulse ∇w_ip [kg m/s]. The momentum is m_p (v_p + C_p (x_0 − x_p)), that
-    at the first node x_0; affine is m_p Δx C_p, impulse −Δt V_p⁰ τ_p/Δx, and ∇ is along x/Δx. Nodes are stored
-    at `start` + `slots`. Blocks have `THREADS` threads.
+    w_ip (momentum + affine (i, j, k)) + impulse ∇w_ip [kg m/s]. The momentum is that at the first node x_0,
+    m_p (v_p + C_p (x_0 − x_p)); affine is m_p Δx C_p, impulse −Δt V_p⁰ τ_p/Δx, and ∇ is along x/Δx. Nodes are
+    stored at `start` + `slots`. Blocks have `THREADS` threads.
 
     Args:
         precision: of the values, whose array starts where an allocation does, so that each is aligned.

@@ -110,9 +110,8 @@ def make_p2g(
         each: int,
     ):
         lane = wp.tid() % WARP
-        t = wp.tid() / WARP * each + wp.min(
-            lane, each - 1
-        )  # a thread without a particle reads its neighbour's
+        # A thread without a particle reads its neighbour's.
+        t = wp.tid() / WARP * each + wp.min(lane, each - 1)
         p = wp.min(t, x.shape[0] - 1)
         copy = copy_of(p, share(x.shape[0], copies))
         start = copy * share(values.shape[0], copies)
