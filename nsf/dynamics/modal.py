@@ -67,6 +67,10 @@ class ModalPhase(Phase):
         parameters: [simulations, n_parameters] μ.
         materials: the law in each simulation, for a τ that comes from ∂g/∂X.
         weights: [s] of S in the projection; None for all one.
+
+    Attributes:
+        tiling: tiles, and simulations of a tile, whose bits `needed` holds.
+        needed: see `Placing`.
     """
 
     def __init__(
@@ -91,6 +95,9 @@ class ModalPhase(Phase):
         self.coefficients = state = Coefficients(
             arena, setting.simulations, deformation.table.shape[2], manifold.latent_dim
         )
+        # What a block shares for a simulation, at most: coefficients of x and of its rate, or of two fields.
+        of_x, *of_heads = (-(-modes // 4) for modes in manifold.hyperparameters["modes"])
+        self.tiling = tiling(setting.simulations, arena.real.itemsize * 4 * max(2 * of_x, sum(of_heads)))
         self._placing = Placing(arena, state, deformation, of_sample, grid_step.grid, shape, self)
         self.needed = self._placing.needed
         self._networks, self._fields = field_launches(
@@ -198,7 +205,7 @@ class Placing:
     """Finds x and v at S, and at each step which others its step needs, and theirs.
 
     Attributes:
-        needed: [B, n] whether a particle is.
+        needed: [tiles, n] in which simulations of a tile a particle is, as bits.
         count: [B, 2] particles needed in all steps taken, and the number of these.
         launches: in order.
     """
@@ -216,7 +223,9 @@ class Placing:
         extent = upper - lower + 1
         box = wp.vec3i(*lower.tolist()), wp.vec3i(*extent.tolist())
         B, s, n = len(state), phase.s, phase.size
-        self.needed = arena.hold(torch.ones(B, n), torch.int32)
+        tiles, tile = phase.tiling
+        whole = [2 ** min(tile, B - tile * number) - 1 for number in range(tiles)]
+        self.needed = arena.hold(torch.tensor(whole)[:, None].expand(tiles, n), torch.int32)
         self.count = arena.zeros(B, 2, dtype=torch.int64)
         stamps = arena.zeros(B, int(extent.prod()), dtype=torch.int32)
         mean = as_vectors(arena.hold(deformation.mean, arena.real), precision)
@@ -230,8 +239,7 @@ class Placing:
             return
         modes, lengths = arena.halved(deformation.table, deformation.rows[s:])
         four = -(-state.a.shape[1] // 4)
-        shared = 2 * 4 * four * arena.real.itemsize
-        (tiles, tile), lanes = tiling(B, shared), arena.lanes(THREADS)
+        lanes = arena.lanes(THREADS)
         kernel = make_others(precision, shape, four, tile, tiles > 1, wp.dtype_from_torch(modes.dtype))
         inputs = [mean, modes, lengths, *latest, *found, self.needed, s, tiles, lanes]
         self.launches.append(arena.pack(kernel, tiles * arena.whole_blocks(n - s, THREADS), inputs, THREADS))

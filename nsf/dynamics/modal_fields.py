@@ -114,7 +114,7 @@ def _contraction(arena: Arena, phase: "ModalPhase", fields: Sequence[tuple]):
     """
     a, lanes = fields[0][3], arena.lanes(THREADS)
     four = [-(-factors.table.shape[2] // 4) for factors, *_ in fields]
-    tiles, tile = tiling(len(a), arena.real.itemsize * sum(four) * 4)
+    tiles, tile = phase.tiling
     threads, inputs = [], [phase.needed]
     for factors, *rest in fields:
         threads.append(arena.whole_blocks(factors.table.shape[1] // 3 * len(factors.rows), THREADS))

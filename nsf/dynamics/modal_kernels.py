@@ -198,11 +198,10 @@ def _make_field(precision: Precision, vectors: int, coefficients, tile: int, sev
         else:
             group, p = t / n, t % n
         c = 3 * group
-        live = False
+        bits = 0
         if c < mean.shape[1] and p < n:
-            for s in range(wp.static(tile)):
-                if start + s < needed.shape[0] and needed[start + s, p] != 0:
-                    live = True
+            bits = needed[start / wp.static(tile), p]
+        live = bits != 0
         middle = vec3()
         if live:  # loaded before all that is waited for below
             middle = vec3(mean[p, c], mean[p, c + 1], mean[p, c + 2])
@@ -210,7 +209,7 @@ def _make_field(precision: Precision, vectors: int, coefficients, tile: int, sev
         if not live:
             return
         for s in range(wp.static(tile)):
-            if start + s < needed.shape[0] and needed[start + s, p] != 0:
+            if (bits & wp.static(1 << s)) != 0:
                 row = (start + s) * n + p
                 one = value[3 * s] + middle[0]
                 two = value[3 * s + 1] + middle[1]
@@ -247,8 +246,9 @@ def make_contraction(
 
     A thread has three components of a particle, in the simulations of a tile; `several` tiles have blocks in
     turn. The first `threads` are those of the first field. The six components of a symmetric field are xx xy
-    xz yy yz zz, the nine of another go row by row. Particles that are not needed are passed over. `vectors`
-    are those of four modes of either field, `coefficients` is the type of a, `stored` that of modes.
+    xz yy yz zz, the nine of another go row by row. Nothing is found where the bit of a simulation in `needed`
+    is not set, see `make_others`. `vectors` are those of four modes of either field, `coefficients` is the
+    type of a, `stored` that of modes.
     """
     real = precision.real
     tile_of, within = make_tiles(several)

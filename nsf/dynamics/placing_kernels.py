@@ -162,13 +162,13 @@ def make_others(
 
     It is launched over whole blocks; `several` tiles have blocks in turn. Only particles in the cells that
     `make_sample` has stamped are needed; it moves the rest off the grid, where the transfers pass over it.
-    `stored` is the type of the modes.
+    Which simulations of a tile need a particle are the bits of `needed`. `stored` is the type of the modes.
 
     Source: paper section 5.4, b.
     """
     real, vec3 = precision.real, precision.vec3
     base_node = shape_functions(precision, shape_name).base_node
-    sums = wp.types.vector(length=6 * tile, dtype=real)
+    sums, places = wp.types.vector(length=6 * tile, dtype=real), wp.types.vector(length=tile, dtype=wp.int32)
     tile_of, within = make_tiles(several)
     snippet = f"""
     typedef {precision.native} real;
@@ -220,23 +220,30 @@ def make_others(
         p = of_sample + t
         if p >= n:
             return
+        taken, beginning = places(), places()
+        # Before anything is written, so that all loads are under way together.
+        for s in range(wp.static(tile)):
+            copy = wp.min(start + s, first.shape[0] - 1)
+            at = mean[p] + vec3(moved[6 * s], moved[6 * s + 1], moved[6 * s + 2])
+            c = _cell(base_node(at, inv_dx), lower, extent)
+            stamp = stamps[copy, wp.max(c, 0)]
+            taken[s] = wp.where(c >= 0 and stamp == step[copy], 1, 0)
+            beginning[s] = first[copy]
+        bits = 0
         for s in range(wp.static(tile)):
             copy = start + s
             if copy < first.shape[0]:
                 row = copy * n + p
-                at = mean[p] + vec3(moved[6 * s], moved[6 * s + 1], moved[6 * s + 2])
-                c = _cell(base_node(at, inv_dx), lower, extent)
-                taken = 0
-                if c >= 0 and stamps[copy, c] == step[copy]:
-                    taken = 1
-                    if first[copy] != 0:
+                at = vec3(real(-1.0), real(-1.0), real(-1.0))  # the grid starts at the origin
+                if taken[s] != 0:
+                    bits += wp.static(1 << s)
+                    at = mean[p] + vec3(moved[6 * s], moved[6 * s + 1], moved[6 * s + 2])
+                    if beginning[s] != 0:
                         v[row] = initial_velocity[row]
                     else:
                         v[row] = vec3(moved[6 * s + 3], moved[6 * s + 4], moved[6 * s + 5])
-                else:
-                    at = vec3(real(-1.0), real(-1.0), real(-1.0))  # the grid starts at the origin
                 x[row] = at
-                needed[copy, p] = taken
-                add_up(count, copy, taken)
+                add_up(count, copy, taken[s])
+        needed[start / wp.static(tile), p] = bits
 
     return others

@@ -35,6 +35,13 @@ def values_of(arena, rng, *shape):
     return arena.hold(rng.standard_normal(shape), torch.float64)
 
 
+def as_bits(flags, tiles, tile):
+    """[simulations, n] of 0 and 1 → [tiles, n], a bit a simulation of a tile."""
+    padded = np.zeros((tiles * tile, flags.shape[1]), int)
+    padded[: len(flags)] = flags
+    return np.einsum("tsn,s->tn", padded.reshape(tiles, tile, -1), 2 ** np.arange(tile))
+
+
 def test_tiles_hold_all():
     for simulations in range(1, 300):
         tiles, size = tiling(simulations)
@@ -50,9 +57,10 @@ def test_tiles_hold_all():
 )
 @pytest.mark.parametrize("fields", [(6,), (9,), (6, 9)])
 def test_contraction(arena, rng, n, K, simulations, fields, coefficients, half):
-    needed = arena.hold(rng.integers(0, 2, (simulations, n)), torch.int32)
+    needed = rng.integers(0, 2, (simulations, n))
     (tiles, tile), of = tiling(simulations), wp.dtype_from_torch(coefficients)
-    inputs, threads, sizes, results = [needed], [], [], []
+    bits = arena.hold(as_bits(needed, tiles, tile), torch.int32)
+    inputs, threads, sizes, results = [bits], [], [], []
     for more, components in enumerate(fields):
         k = K + 5 * more
         mean, modes = (values_of(arena, rng, n, components, *last).float() for last in ((), (k,)))
@@ -74,7 +82,7 @@ def test_contraction(arena, rng, n, K, simulations, fields, coefficients, half):
     for found, expected in results:
         symmetric = expected.shape[1] == 6
         expected = expected[:, TAU_MATRIX] if symmetric else expected.reshape(-1, 3, 3)
-        expected = expected * needed.cpu().numpy().reshape(-1, 1, 1)
+        expected = expected * needed.reshape(-1, 1, 1)
         np.testing.assert_allclose(found.cpu().numpy(), expected, rtol=1e-12, atol=1e-12)
 
 
@@ -117,11 +125,11 @@ def test_where_the_sample_and_its_neighbours_are(arena, rng, n, K, simulations):
     x, v = (arena.zeros(simulations * n, 3) for _ in range(2))
     shown = [as_vectors(values, arena.precision) for values in (mean, start, x, v)]
     lower, extent, shape = wp.vec3i(4, 4, 4), wp.vec3i(32, 32, 32), wp.vec3i(nodes, nodes, nodes)
-    needed = arena.zeros(simulations, n, dtype=torch.int32)
     count = arena.zeros(simulations, 2, dtype=torch.int64)
     stamps = arena.zeros(simulations, 32**3, dtype=torch.int32)
     step = arena.hold(np.arange(1, simulations + 1), torch.int32)
     (tiles, tile), lanes, warp = tiling(simulations), arena.lanes(THREADS), arena.lanes(32)
+    needed = arena.zeros(tiles, n, dtype=torch.int32)
     stored, lengths = arena.halved(modes[s:])
     read = modes.double()
     read[s:] = (modes[s:] / lengths).to(stored.dtype).double() * lengths
@@ -151,7 +159,7 @@ def test_where_the_sample_and_its_neighbours_are(arena, rng, n, K, simulations):
         options = {"rtol": 1e-12, "atol": 1e-12}
         np.testing.assert_allclose(x.cpu().view(-1, n, 3), np.where(near[..., None], places, -1.0), **options)
         np.testing.assert_allclose(v.cpu().view(-1, n, 3).numpy()[near], expected[near], **options)
-        np.testing.assert_array_equal(needed.cpu()[:, s:], near[:, s:])
+        np.testing.assert_array_equal(needed.cpu()[:, s:], as_bits(near, tiles, tile)[:, s:])
     np.testing.assert_array_equal(count.cpu(), np.stack([taken, np.full(simulations, 2)], 1))
 
 
