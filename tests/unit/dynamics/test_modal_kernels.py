@@ -183,13 +183,24 @@ def test_what_the_projection_takes_from_the_sample(arena, rng, n, K, simulations
     )
 
 
-@pytest.mark.parametrize("simulations", [1, 19])
+def test_blocks_of_a_product_hold_all():
+    for outputs, members, simulations in [(40, 2, 1), (32, 1, 16), (34, 2, 17), (7, 7, 300)]:
+        first, blocks = product_blocks([(outputs, members), (5, 1)], simulations)
+        tiles, rest = divmod(blocks, first + 1)  # one block of five outputs
+        assert rest == 0
+        assert 16 * tiles >= simulations > 16 * (tiles - 1)
+        own, chunks = outputs // members, first // members
+        assert 16 * chunks >= own > 16 * (chunks - 1)
+
+
+@pytest.mark.parametrize("simulations", [1, 19, 37])
+@pytest.mark.parametrize("outs", [(20, 10), (40, 10)])
 @pytest.mark.parametrize("way", ["layer", "first_layers", "product"])
-def test_layers_of_two_networks(arena, rng, simulations, way):
+def test_layers_of_two_networks(arena, rng, simulations, outs, way):
     """Of two members, whose rows see their own entries alone; the first layer may come with the second."""
     if way == "product" and not arena.device.is_cuda:
         pytest.skip("products are of a GPU")
-    r, hidden, outs, fused = 5, 137, (20, 10), way == "first_layers"  # of a member
+    r, hidden, fused = 5, 137, way == "first_layers"  # outputs are of a member
 
     def silu(z):
         return z * torch.sigmoid(z)

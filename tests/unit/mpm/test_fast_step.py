@@ -42,13 +42,6 @@ MATERIALS = [
 TOLERANCE = {("cpu", "fp64"): 1e-11, ("cpu", "fp32"): 2e-4, ("cuda", "fp64"): 1e-9, ("cuda", "fp32"): 5e-3}
 
 
-@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
-def device(request):
-    if request.param == "cuda" and not wp.is_cuda_available():
-        pytest.skip("no GPU")
-    return request.param
-
-
 @pytest.fixture
 def solver_on(block, rng, device):
     """(material, transfer, precision) → a stretched body thrown against the floor near the walls."""
