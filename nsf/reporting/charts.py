@@ -240,9 +240,11 @@ def _error_scale(panel, values) -> None:
 
 
 def plain_ticks(axis_line) -> None:
-    """Give a logarithmic axis ticks at 1, 2 and 5 of a decade, or at 1 of many decades, as plain numbers."""
+    """Give a logarithmic axis ticks as plain numbers: at 1, 2 and 5 of a decade, or more or fewer of it."""
     low, high = axis_line.get_view_interval()
-    axis_line.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 1e4 * low else (1,)))
+    few = (1, 2, 5) if high < 1e4 * low else (1,)
+    subs = (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8) if high < 4 * low else few
+    axis_line.set_major_locator(LogLocator(subs=subs))
     axis_line.set_major_formatter(FuncFormatter(lambda v, _: f"{v:g}"))
     axis_line.set_minor_formatter(NullFormatter())
 
