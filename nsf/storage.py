@@ -50,9 +50,7 @@ def writing(path: str | Path) -> Iterator[Path]:
         path.parent.mkdir(parents=True, exist_ok=True)
         folder = Path(tempfile.mkdtemp(prefix=_PARTIAL, dir=path.parent))
     except OSError as error:
-        raise _storage_error(
-            path, error.strerror or str(error), _REMEDIES.get(error.errno or 0, _ACCESS)
-        ) from error
+        raise _refused(path, error) from error
     try:
         partial = folder / path.name
         yield partial
@@ -145,6 +143,19 @@ def write_json(path: str | Path, value: Any) -> None:
         partial.write_text(text + "\n", encoding="utf-8")
 
 
+def require_folder(folder: str | Path) -> None:
+    """Make a folder, or refuse one that takes no file, before the work whose results go there.
+
+    Raises:
+        StorageError: it cannot be made or written.
+    """
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise _refused(Path(folder), error) from error
+
+
 def require_space(path: str | Path, size: int) -> None:
     """Refuse to begin a file that its disk cannot hold.
 
@@ -178,6 +189,10 @@ def _fault(error: OSError | RuntimeError, folder: Path) -> int | None:
     named = (number for number in _REMEDIES if os.strerror(number) in str(error))
     full = shutil.disk_usage(folder).free < _FULL_BYTES
     return next(named, errno.ENOSPC if full else None)
+
+
+def _refused(path: Path, error: OSError) -> StorageError:
+    return _storage_error(path, error.strerror or str(error), _REMEDIES.get(error.errno or 0, _ACCESS))
 
 
 def _storage_error(path: Path, fault: str, remedy: str) -> StorageError:

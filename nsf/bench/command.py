@@ -12,7 +12,7 @@ from nsf.bench.rows import KernelRow, Row, Settings, StageRow, columns
 from nsf.errors import ConfigError
 from nsf.mpm.device import warp_device
 from nsf.mpm.precision import precision_of
-from nsf.storage import writing
+from nsf.storage import require_folder, writing
 
 BENCHES = ("full_order", "scaling", "reduced", "batch", "training", "multi_gpu")
 """Modules of this package that have `run(settings, say) -> Result`."""
@@ -34,12 +34,14 @@ def bench(folder: str | Path, asked: Mapping[str, str], say: Callable[[str], obj
     Raises:
         ConfigError: a value is not one of those there are.
         DeviceError: the device does not exist.
+        StorageError: the folder cannot be made or written.
     """
     folder = Path(folder)
     names = asked.get("benches", ",".join(BENCHES)).split(",")
     if unknown := [name for name in names if name not in BENCHES]:
         raise ConfigError(f"benches={unknown[0]} is unknown; choose from {', '.join(BENCHES)}")
     settings = _settings(asked)
+    require_folder(folder)
     for name in names:
         found = import_module(f"nsf.bench.{name}").run(settings, say)
         _merge(folder / "results.csv", Row, found.rows)

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from nsf.errors import StorageError
-from nsf.storage import require_space, write_json, writing
+from nsf.storage import require_folder, require_space, write_json, writing
 
 
 @pytest.fixture
@@ -122,6 +122,14 @@ def test_require_space(tmp_path):
     require_space(tmp_path / "a", 1)
     with pytest.raises(StorageError, match="MiB free"):
         require_space(tmp_path / "a", 2**62)
+
+
+def test_a_folder_is_made_or_refused(tmp_path):
+    require_folder(tmp_path / "a/b")
+    assert list(tmp_path.rglob("*")) == [tmp_path / "a", tmp_path / "a/b"]
+    (tmp_path / "file").touch()
+    with pytest.raises(StorageError, match="file: File exists; make the folder writable"):
+        require_folder(tmp_path / "file")
 
 
 def test_write_json_refuses_what_json_cannot_hold(tmp_path):

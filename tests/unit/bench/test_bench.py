@@ -26,7 +26,7 @@ from nsf.bench.scaling import at_size, carried_over
 from nsf.bench.scaling import measured as measured_sizes
 from nsf.bench.training import measured as measured_training
 from nsf.cli import main
-from nsf.errors import ConfigError, DeviceError
+from nsf.errors import ConfigError, DeviceError, StorageError
 from nsf.pipeline import Pipeline
 
 SMALL = {
@@ -170,6 +170,12 @@ def test_bad_values(asked, error, message, tmp_path):
     with pytest.raises(error, match=re.escape(message)):
         bench(tmp_path, asked, lambda text: None)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_takes_no_file_is_refused_before_anything_is_measured(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(StorageError, match="file/speed: Not a directory"):
+        bench(tmp_path / "file/speed", SMALL, pytest.fail)
 
 
 def test_the_command(tmp_path, monkeypatch, capsys):
