@@ -16,6 +16,7 @@ from nsf.errors import StorageError
 
 _SPACE = "free some space, or write to another disk (NSF_RUNS, NSF_REPORTS)"
 _ACCESS = "make the folder writable, or write elsewhere (NSF_RUNS, NSF_REPORTS)"
+_PLACE = "a file stands where a folder is needed; name another folder"
 _REMEDIES = {
     errno.ENOSPC: _SPACE,
     errno.EDQUOT: _SPACE,
@@ -192,7 +193,9 @@ def _fault(error: OSError | RuntimeError, folder: Path) -> int | None:
 
 
 def _refused(path: Path, error: OSError) -> StorageError:
-    return _storage_error(path, error.strerror or str(error), _REMEDIES.get(error.errno or 0, _ACCESS))
+    stands_there = isinstance(error, FileExistsError | NotADirectoryError)
+    remedy = _PLACE if stands_there else _REMEDIES.get(error.errno or 0, _ACCESS)
+    return _storage_error(path, error.strerror or str(error), remedy)
 
 
 def _storage_error(path: Path, fault: str, remedy: str) -> StorageError:

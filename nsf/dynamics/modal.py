@@ -69,7 +69,7 @@ class ModalPhase(Phase):
         weights: [s] of S in the projection; None for all one.
 
     Attributes:
-        tiling: tiles, and simulations of a tile, whose bits `needed` holds.
+        tiling: number of tiles, and of simulations in a tile; each of these has a bit in `needed`.
         needed: see `Placing`.
     """
 

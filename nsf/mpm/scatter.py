@@ -44,14 +44,14 @@ _SCATTER = """
     }}
     __syncwarp();
     for (int turn = 0; turn < NODES; turn += 32) {{
-        const bool own = turn + lane < NODES;
+        const bool has_node = turn + lane < NODES;
         const int node = wp::min(turn + lane, NODES - 1);
         const int a = node / (WIDTH * WIDTH), b = node / WIDTH % WIDTH, c = node % WIDTH;
         const int offset = (a * shape[1] + b) * shape[2] + c;
         const real n_x = real(a), n_y = real(b), n_z = real(c);
         auto stored = [&](int p) {{
-            const int flat = cells[warp][p] + offset, slot = slots.shape[0] > 0 ? slots.data[flat] : flat;
-            return own && slot >= 0 ? starts[warp][p] + slot : -1;
+            const int flat = cells[warp][p] + offset, at = slots.shape[0] > 0 ? slots.data[flat] : flat;
+            return has_node && at >= 0 ? starts[warp][p] + at : -1;
         }};
         real sum[4] = {{}};
         int first = __ffs(heads) - 1, place = stored(first);
@@ -74,7 +74,8 @@ _SCATTER = """
                 }}
                 sum[3] += weight * at.impulse[0].of[3];
             }}
-            // The next cell along the last axis has every node of this one but the first of each column.
+            // The next cell along the last axis has every node of this one but the first of each column. It
+            // is in the same row: no stencil begins where it would reach over a row's end.
             const bool goes_on =
                 cells[warp][next] == cells[warp][first] + 1 && starts[warp][next] == starts[warp][first];
             const int slot = goes_on && c > 0 ? -1 : place;
