@@ -16,7 +16,7 @@ from nsf.errors import StorageError
 
 _SPACE = "free some space, or write to another disk (NSF_RUNS, NSF_REPORTS)"
 _ACCESS = "make the folder writable, or write elsewhere (NSF_RUNS, NSF_REPORTS)"
-_PLACE = "a file stands where a folder is needed; name another folder"
+_PLACE = "a file stands where a folder is needed; write elsewhere (NSF_RUNS, NSF_REPORTS)"
 _REMEDIES = {
     errno.ENOSPC: _SPACE,
     errno.EDQUOT: _SPACE,

@@ -128,7 +128,7 @@ def test_a_folder_is_made_or_refused(tmp_path):
     require_folder(tmp_path / "a/b")
     assert list(tmp_path.rglob("*")) == [tmp_path / "a", tmp_path / "a/b"]
     (tmp_path / "file").touch()
-    with pytest.raises(StorageError, match=r"file: File exists; .* name another folder"):
+    with pytest.raises(StorageError, match=r"file: File exists; .* write elsewhere"):
         require_folder(tmp_path / "file")
 
 
