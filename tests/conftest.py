@@ -108,7 +108,7 @@ def tiny_trust(chain, tiny_manifold):
     """The estimate of trust of the tiny chain's reduced runs."""
     from functools import partial
 
-    from nsf.dynamics import calibrate
+    from nsf.deployment import calibrate
 
     return calibrate(partial(chain.pipeline.solver_at, tiny_manifold), tiny_manifold, "cpu")
 

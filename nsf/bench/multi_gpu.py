@@ -12,7 +12,7 @@ import pandas as pd
 from nsf import config
 from nsf.bench.measure import name_of
 from nsf.bench.rows import Result, Row, Settings, commit
-from nsf.kinematics.phases import PHASES
+from nsf.kinematics.training.phases import PHASES
 from nsf.mpm.device import visible_gpus
 from nsf.pipeline import Pipeline
 

@@ -14,7 +14,7 @@ from nsf.data.schema import TRAJECTORY
 from nsf.dynamics.solver import reduced_steps
 from nsf.evaluation import metrics
 from nsf.evaluation.cost import SolverCost, Subject, measure
-from nsf.kinematics.networks import ARITHMETIC
+from nsf.kinematics.fields.networks import ARITHMETIC
 from nsf.pipeline import Pipeline
 
 SCENES = ("cake", "metal")

@@ -15,7 +15,7 @@ from nsf.data import hash_of_positions
 from nsf.dynamics import ReducedMPM
 from nsf.evaluation import metrics
 from nsf.evaluation.superresolution import POINTS
-from nsf.kinematics.basis import BasisManifold
+from nsf.kinematics.fields.basis import BasisManifold
 from nsf.kinematics.interpolation import interpolation, lying_together
 from nsf.mpm import FullOrderMPM
 from nsf.pipeline import Pipeline

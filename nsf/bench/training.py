@@ -14,7 +14,7 @@ from nsf.bench.reduced import SCENES, scale_of
 from nsf.bench.rows import Result, Row, Settings, commit
 from nsf.data import Snapshots
 from nsf.data.schema import TRAJECTORY
-from nsf.kinematics.training import train
+from nsf.kinematics.training.train import train
 from nsf.pipeline import Pipeline
 
 _MOST = 3  # trainings of a scene; a seed each

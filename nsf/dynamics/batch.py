@@ -9,11 +9,11 @@ from typing_extensions import override
 
 from nsf.dynamics.latent import LatentRecord
 from nsf.dynamics.modal import steps_in_coefficients
-from nsf.dynamics.sampling import SamplePhase, Sampler
 from nsf.dynamics.solver import ReducedRun
 from nsf.dynamics.stepping import Stepping, build_phases
 from nsf.errors import ConfigError
 from nsf.mpm import BoundaryArrays
+from nsf.sampling.sampler import SamplePhase, Sampler
 from nsf.timing import StageTimer
 
 

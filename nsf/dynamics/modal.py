@@ -25,8 +25,8 @@ from nsf.dynamics.projection_kernel import (
     projection_fits,
 )
 from nsf.dynamics.stress import Method
-from nsf.kinematics.basis import BasisManifold
-from nsf.kinematics.modal import ModalFactors
+from nsf.kinematics.fields.basis import BasisManifold
+from nsf.kinematics.fields.modal import ModalFactors
 from nsf.mpm import GridStep, Precision
 from nsf.mpm.access import WARP
 from nsf.mpm.device import warp_device

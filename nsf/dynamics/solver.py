@@ -11,7 +11,6 @@ from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
 from nsf.dynamics.interop import on_torch_stream, torch_device, torch_dtype
 from nsf.dynamics.latent import Decoder, LatentRecord, LatentState, LatentTrajectory
 from nsf.dynamics.projection import GaussNewton, Taylor, check_projector
-from nsf.dynamics.sampling import RandomSampler, SamplePhase, Sampler, check_well_posed
 from nsf.dynamics.stepping import Phased, Stepping, build_phases
 from nsf.dynamics.stress import Method
 from nsf.errors import ConfigError, ShapeError
@@ -19,6 +18,7 @@ from nsf.kinematics.manifold import Restriction
 from nsf.mpm import BoundaryArrays, precision_of
 from nsf.mpm.device import warp_device
 from nsf.mpm.shape import DEGREES
+from nsf.sampling.sampler import RandomSampler, SamplePhase, Sampler, check_well_posed
 
 NSF = Method("nsf", neural_stress=True, neural_affine=True)
 #: Positions decoded at once when every particle is asked for [values].

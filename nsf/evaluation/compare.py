@@ -8,7 +8,8 @@ import pandas as pd
 import torch
 
 from nsf.data import Trajectory
-from nsf.dynamics import Decoder, ReducedMPM, Rollout
+from nsf.deployment import Rollout
+from nsf.dynamics import Decoder, ReducedMPM
 from nsf.errors import SchemaError
 from nsf.evaluation import metrics
 from nsf.mpm.shape import DEGREES

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from nsf.data import Trajectory
-from nsf.dynamics import Rollout
+from nsf.deployment import Rollout
 from nsf.dynamics.interop import as_tensor, torch_device, torch_dtype
 from nsf.errors import ConfigError, InstabilityError
 from nsf.evaluation import metrics

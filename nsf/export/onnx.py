@@ -16,7 +16,7 @@ from nsf.data.schema import TAU_ORDER, UNITS
 from nsf.errors import ConfigError
 from nsf.export.playback import Playback
 from nsf.extras import optional
-from nsf.kinematics.phases import PHASES, TARGETS
+from nsf.kinematics.training.phases import PHASES, TARGETS
 from nsf.storage import writing
 
 NEEDS = ("onnx", "onnxscript")

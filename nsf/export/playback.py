@@ -12,7 +12,8 @@ from omegaconf import OmegaConf
 from nsf import config as configuration
 from nsf.data import Trajectory
 from nsf.data.schema import TAU_COLUMNS, TAU_ROWS
-from nsf.dynamics import Decoder, Rollout, continuation_file, rollout_file
+from nsf.deployment import Rollout, continuation_file, rollout_file
+from nsf.dynamics import Decoder
 from nsf.dynamics.interop import torch_device, torch_dtype
 from nsf.errors import ConfigError, MissingRunError
 from nsf.evaluation import metrics

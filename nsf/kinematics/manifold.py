@@ -277,7 +277,7 @@ def identity(components: int) -> Standardizer:
 
 
 def _manifold_class(field: str) -> type[Manifold]:
-    module = importlib.import_module(f"nsf.kinematics.{field}")
+    module = importlib.import_module(f"nsf.kinematics.fields.{field}")
     return next(
         kind
         for kind in vars(module).values()

@@ -10,8 +10,9 @@ import torch
 
 from nsf.data import Trajectory
 from nsf.data.schema import TRAJECTORY, packed
-from nsf.dynamics import Decoder, ReducedMPM, Trust
-from nsf.dynamics.trust import LatentDistance
+from nsf.deployment import Trust
+from nsf.deployment.trust import LatentDistance
+from nsf.dynamics import Decoder, ReducedMPM
 from nsf.errors import ConfigError, InstabilityError
 from nsf.mpm.stability import check_time_step
 from nsf.pipeline import Pipeline

@@ -14,30 +14,21 @@ from omegaconf import DictConfig, OmegaConf
 
 from nsf.data import Snapshots, Trajectory
 from nsf.data.schema import TRAJECTORY
-from nsf.dynamics import (
-    ParticleSets,
-    ReducedBatch,
-    ReducedMPM,
-    Rollout,
-    SamplePhase,
-    calibrate,
-    continuation_file,
-    deploy,
-    go_on,
-    rollout_file,
-)
+from nsf.deployment import Rollout, calibrate, continuation_file, deploy, go_on, rollout_file
+from nsf.dynamics import ParticleSets, ReducedBatch, ReducedMPM
 from nsf.dynamics.solver import reduced_steps
 from nsf.errors import MissingRunError
 from nsf.evaluation import Comparison, Subject, compare, measure, superresolve
+from nsf.kinematics.fields.mlp import MlpField
 from nsf.kinematics.manifold import Manifold
-from nsf.kinematics.mlp import MlpField
-from nsf.kinematics.ranks import train_together
-from nsf.kinematics.training import train
+from nsf.kinematics.training.ranks import train_together
+from nsf.kinematics.training.train import train
 from nsf.mpm.device import visible_gpus
 from nsf.pipeline import results
 from nsf.pipeline.plan import Plan
 from nsf.pipeline.simulation import Job, Shared, simulate
 from nsf.runs import Record, Run
+from nsf.sampling import SamplePhase
 from nsf.scenes import Scene
 from nsf.storage import writing
 

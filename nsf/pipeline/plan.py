@@ -12,15 +12,15 @@ from omegaconf.errors import ConfigKeyError
 from nsf import config as configuration
 from nsf.data import Split
 from nsf.dynamics.interop import torch_device
-from nsf.dynamics.sampling import check_well_posed
 from nsf.errors import ConfigError, DeviceError
-from nsf.kinematics.basis import BasisField
-from nsf.kinematics.mlp import MlpField
-from nsf.kinematics.tracking import check_tracking
+from nsf.kinematics.fields.basis import BasisField
+from nsf.kinematics.fields.mlp import MlpField
+from nsf.kinematics.training.tracking import check_tracking
 from nsf.mpm import FP32, FP64, Precision, precision_of
 from nsf.mpm.device import visible_gpus, warp_device
 from nsf.mpm.stability import check_colliders, check_time_step
 from nsf.runs import Run
+from nsf.sampling.sampler import check_well_posed
 from nsf.scenes import Scene
 from nsf.scenes.scene import NOT_PHYSICS
 

@@ -8,7 +8,7 @@ import pandas as pd
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from nsf.dynamics import Rollout
+from nsf.deployment import Rollout
 from nsf.evaluation import Comparison, SolverCost, SuperResolution, reduction_ratio
 from nsf.mpm import floor_height
 from nsf.runs import Record

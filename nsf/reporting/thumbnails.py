@@ -10,7 +10,7 @@ from PIL import Image
 
 from nsf.data import Trajectory
 from nsf.data.schema import TRAJECTORY
-from nsf.dynamics import Rollout
+from nsf.deployment import Rollout
 from nsf.errors import NSFError
 from nsf.reporting.style import FULL, PALETTE, REDUCED, figure, styled
 from nsf.runs import Run

@@ -30,7 +30,7 @@ def project(tmp_path, monkeypatch):
     monkeypatch.setenv("NSF_RUNS", str(tmp_path / "runs"))
     monkeypatch.setenv("NSF_REPORTS", str(tmp_path / "reports"))
     before = set(sys.modules)
-    for package in ("nsf.mpm.materials", "nsf.kinematics"):
+    for package in ("nsf.mpm.materials", "nsf.kinematics.fields"):
         folder = tmp_path / package.replace(".", "/")
         folder.mkdir(parents=True)
         path = importlib.import_module(package).__path__
@@ -49,7 +49,7 @@ def add(file: str, content: str, project: Path, monkeypatch) -> None:
     if path.suffix == ".py":
         importlib.invalidate_caches()
         importlib.import_module(file.removesuffix(".py").replace("/", "."))
-        if group == "nsf/kinematics":  # as the page says
+        if group == "nsf/kinematics/fields":  # as the page says
             monkeypatch.setattr(manifold, "FIELDS", (*manifold.FIELDS, name))
     elif group == "experiments":
         for job in Experiment.load(name, folder=project / "experiments").jobs:

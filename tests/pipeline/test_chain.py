@@ -14,7 +14,8 @@ import pytest
 import torch
 
 from nsf.data import Trajectory
-from nsf.dynamics import NeighbourSearch, ParticleSets, ProjectionResult, Rollout, Taylor
+from nsf.deployment import Rollout
+from nsf.dynamics import NeighbourSearch, ParticleSets, ProjectionResult, Taylor
 from nsf.errors import ConfigError, InstabilityError, MissingRunError, NSFError
 from nsf.evaluation import superresolution
 from nsf.kinematics.manifold import Manifold

@@ -11,7 +11,7 @@ import torch
 from forked import SignalAt
 
 from nsf.data import Trajectory
-from nsf.dynamics import Rollout
+from nsf.deployment import Rollout
 from nsf.kinematics.manifold import Manifold
 from nsf.runs import Run
 
@@ -19,7 +19,7 @@ STAGES = ("simulate", "train", "deploy", "evaluate")
 #: Where the signal comes, and what is there already: in the middle of the stage's own work.
 MOMENTS = {
     "simulate": SignalAt("nsf.mpm:FullOrderMPM.step", 40),
-    "train": SignalAt("nsf.kinematics.descent:Steps._take", 330),
+    "train": SignalAt("nsf.kinematics.training.descent:Steps._take", 330),
     "deploy": SignalAt("nsf.dynamics.modal:ModalPhase.invert", 10),
     "evaluate": SignalAt("nsf.evaluation.cost:_stages"),
 }
@@ -80,7 +80,9 @@ def test_control_c(nsf, copied, pipeline_at, chain, stage):
 def test_a_resumed_training_ends_with_the_same_bits(nsf, copied, pipeline_at, chain, call):
     """In the first block of the first phase, in the second phase, and in the last block of it."""
     root = copied("simulate")
-    assert nsf("train", root, faults=[SignalAt("nsf.kinematics.descent:Steps._take", call)]).code == 130
+    assert (
+        nsf("train", root, faults=[SignalAt("nsf.kinematics.training.descent:Steps._take", call)]).code == 130
+    )
     pipeline = pipeline_at(root)
     pipeline.run("train")
     assert same_weights(pipeline.training.path / "manifold.pt", chain.checkpoint)

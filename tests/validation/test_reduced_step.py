@@ -8,10 +8,11 @@ import torch
 import warp as wp
 
 import nsf.scenes
-from nsf.dynamics import GaussNewton, Integration, NeighbourSearch, RandomSampler, Taylor
+from nsf.dynamics import GaussNewton, Integration, NeighbourSearch, Taylor
 from nsf.dynamics.integration import particle_sets
 from nsf.dynamics.interop import as_matrices, as_scalars, as_vectors
 from nsf.mpm import FP64, BoundaryArrays, Grid, GridStep
+from nsf.sampling import RandomSampler
 
 STEPS = 40
 # A plate that turns as it pushes the column, and a ball that comes later.

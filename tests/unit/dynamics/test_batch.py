@@ -9,20 +9,11 @@ import torch
 import warp as wp
 
 import nsf.scenes
-from nsf.dynamics import (
-    NSF,
-    GaussNewton,
-    Integration,
-    Method,
-    ReducedBatch,
-    ReducedMPM,
-    ReducedRun,
-    SamplePhase,
-    Taylor,
-)
+from nsf.dynamics import NSF, GaussNewton, Integration, Method, ReducedBatch, ReducedMPM, ReducedRun, Taylor
 from nsf.errors import ConfigError, ShapeError
-from nsf.kinematics.basis import BasisManifold
+from nsf.kinematics.fields.basis import BasisManifold
 from nsf.mpm.materials import FixedCorotated, Hencky, VonMises
+from nsf.sampling import SamplePhase
 from nsf.timing import StageTimer
 
 ANGLE = "friction_angle"

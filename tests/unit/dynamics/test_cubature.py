@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from nsf.dynamics import CellSampler, CubatureSampler, ParticleSets, SamplePhase
-from nsf.dynamics.cells import added_up
-from nsf.dynamics.cubature import nonnegative_fit, normal_equations, training_rows
+from nsf.dynamics import ParticleSets
 from nsf.errors import ConfigError, ProjectionError
+from nsf.sampling import CellSampler, CubatureSampler, SamplePhase
+from nsf.sampling.cells import added_up
+from nsf.sampling.cubature import nonnegative_fit, normal_equations, training_rows
 
 ANGLE = {"friction_angle": 26.0}
 EVERYONE = np.arange(500)

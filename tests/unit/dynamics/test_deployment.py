@@ -6,7 +6,8 @@ import h5py
 import numpy as np
 import pytest
 
-from nsf.dynamics import Rollout, Taylor, deploy, rollout, rollouts
+from nsf.deployment import Rollout, deploy, rollout, rollouts
+from nsf.dynamics import Taylor
 from nsf.errors import SchemaError
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nsf.data import Trajectory
-from nsf.dynamics import go_on, hand_over, rollout
+from nsf.deployment import go_on, hand_over, rollout
 from nsf.errors import InstabilityError
 from nsf.mpm import FP64, FullOrderMPM
 
@@ -93,7 +93,7 @@ def test_a_run_lost_at_its_end_leaves_no_file(solver, made, tmp_path, monkeypatc
         return full
 
     monkeypatch.setattr(FullOrderMPM, "check", check)
-    monkeypatch.setattr("nsf.dynamics.handover.hand_over", seldom_checked)
+    monkeypatch.setattr("nsf.deployment.handover.hand_over", seldom_checked)
     with pytest.raises(InstabilityError, match="lost stability: off the grid"):
         go_on(solver, replace(made, handed_over=12), tmp_path / "rest.h5")
     assert not list(tmp_path.iterdir())

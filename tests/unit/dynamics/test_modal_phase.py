@@ -6,13 +6,14 @@ import torch
 import warp as wp
 
 import nsf.scenes
-from nsf.dynamics import GaussNewton, Integration, Method, RandomSampler, SamplePhase, Taylor
+from nsf.dynamics import GaussNewton, Integration, Method, Taylor
 from nsf.dynamics.arena import Arena
 from nsf.dynamics.modal import ModalPhase
 from nsf.dynamics.phase import DecodedPhase
 from nsf.dynamics.projection_kernel import projection_fits
-from nsf.kinematics.basis import BasisManifold
+from nsf.kinematics.fields.basis import BasisManifold
 from nsf.mpm import precision_of
+from nsf.sampling import RandomSampler, SamplePhase
 from nsf.timing import StageTimer
 
 METHODS = [Method(f"{a}{b}", a, b) for a in (True, False) for b in (True, False)]

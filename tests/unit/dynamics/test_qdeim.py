@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from nsf.dynamics import QdeimSampler
-from nsf.dynamics.qdeim import eigenvalue_gain, orthonormal, oversampled, pivots
-from nsf.dynamics.sampling import displacement_components
 from nsf.errors import ConfigError
+from nsf.sampling import QdeimSampler
+from nsf.sampling.qdeim import eigenvalue_gain, orthonormal, oversampled, pivots
+from nsf.sampling.sampler import displacement_components
 
 MODES = 8  # all that the tiny manifold has
 

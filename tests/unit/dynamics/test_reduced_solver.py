@@ -8,6 +8,7 @@ import torch
 
 import nsf
 import nsf.scenes
+from nsf.deployment import rollout
 from nsf.dynamics import (
     NSF,
     GaussNewton,
@@ -16,14 +17,12 @@ from nsf.dynamics import (
     NeighbourSearch,
     ParticleSets,
     ProjectionResult,
-    RandomSampler,
     ReducedMPM,
-    SamplePhase,
     Taylor,
-    rollout,
 )
 from nsf.errors import ConfigError, NSFError, ProjectionError, SchemaError, ShapeError
 from nsf.mpm import FullOrderMPM, ParticleConstants
+from nsf.sampling import RandomSampler, SamplePhase
 from nsf.scenes import Scene
 from nsf.timing import StageTimer
 

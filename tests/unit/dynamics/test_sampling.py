@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from nsf.dynamics import GreedySampler, RandomSampler
-from nsf.dynamics.sampling import check_well_posed, displacement_components
 from nsf.errors import ConfigError, ProjectionError
+from nsf.sampling import GreedySampler, RandomSampler
+from nsf.sampling.sampler import check_well_posed, displacement_components
 
 
 @pytest.fixture(scope="module")

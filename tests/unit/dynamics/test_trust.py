@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 
-from nsf.dynamics import Taylor, Trust, calibrate, rollout
-from nsf.dynamics.deployment import _whole_step_before
-from nsf.dynamics.trust import QUANTILE, STRAY, LatentDistance, training_values
+from nsf.deployment import Trust, calibrate, rollout
+from nsf.deployment.rollout import _whole_step_before
+from nsf.deployment.trust import QUANTILE, STRAY, LatentDistance, training_values
+from nsf.dynamics import Taylor
 from nsf.kinematics.manifold import Manifold
 
 

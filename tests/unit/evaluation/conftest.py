@@ -3,7 +3,7 @@
 import pytest
 
 from nsf.data import Trajectory
-from nsf.dynamics import Rollout
+from nsf.deployment import Rollout
 
 
 @pytest.fixture(scope="module")

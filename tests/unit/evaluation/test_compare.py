@@ -9,7 +9,8 @@ import torch
 
 import nsf.scenes
 from nsf.data import Trajectory
-from nsf.dynamics import Method, Rollout, go_on
+from nsf.deployment import Rollout, go_on
+from nsf.dynamics import Method
 from nsf.errors import SchemaError
 from nsf.evaluation import at_frames, compare, metrics
 from nsf.evaluation.compare import trust_at_frames
@@ -134,7 +135,7 @@ def test_frames_at_deployment_steps_are_exact(made):
 
 
 def test_a_multiplied_step_is_compared_at_the_frames(chain, tiny_manifold, tiny_trust, comparison_of, made):
-    from nsf.dynamics import rollout
+    from nsf.deployment import rollout
 
     value = {"friction_angle": 26.0}
     solver = chain.scene.reduced(tiny_manifold, value, 20, device="cpu", dt_multiplier=1.5)

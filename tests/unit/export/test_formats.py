@@ -19,7 +19,7 @@ from nsf.errors import ConfigError, MissingExtraError
 from nsf.evaluation import metrics
 from nsf.export import FORMATS, frames, onnx, playback, usd, vtk
 from nsf.export.playback import Playback
-from nsf.kinematics.phases import PHASES
+from nsf.kinematics.training.phases import PHASES
 from nsf.pipeline import Pipeline
 
 # -- VTK ----------------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import pytest
 import torch
 from decoded import whole
 
-from nsf.dynamics import Rollout, go_on
+from nsf.deployment import Rollout, go_on
 from nsf.errors import ConfigError, DeviceError, MissingRunError
 from nsf.evaluation import metrics
 from nsf.export import playback

@@ -5,11 +5,11 @@ import pytest
 import torch
 
 from nsf.data import Snapshots, TrajectoryWriter
-from nsf.kinematics.basis import BasisField
-from nsf.kinematics.joint import JointField
-from nsf.kinematics.mlp import MlpField
-from nsf.kinematics.schedules import FastTrainer
-from nsf.kinematics.training import train
+from nsf.kinematics.fields.basis import BasisField
+from nsf.kinematics.fields.joint import JointField
+from nsf.kinematics.fields.mlp import MlpField
+from nsf.kinematics.training.schedules import FastTrainer
+from nsf.kinematics.training.train import train
 
 FIELDS = {
     "basis": BasisField(modes=[9, 7, 8], beta=4, depth=2),

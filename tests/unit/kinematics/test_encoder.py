@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from nsf.kinematics.encoder import Encoder, convolved_lengths
+from nsf.kinematics.fields.encoder import Encoder, convolved_lengths
 
 
 # By hand: floor((L - 6) / 4) + 1 until L <= 12.

@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from nsf.errors import ConfigError, ShapeError
-from nsf.kinematics import pod
-from nsf.kinematics.basis import BasisField
-from nsf.kinematics.joint import JointField
+from nsf.kinematics.fields import pod
+from nsf.kinematics.fields.basis import BasisField
+from nsf.kinematics.fields.joint import JointField
 from nsf.kinematics.manifold import Manifold
-from nsf.kinematics.phases import seeded
+from nsf.kinematics.training.phases import seeded
 
 MODES, LATENT = [9, 7, 8], 3
 

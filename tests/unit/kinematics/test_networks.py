@@ -5,10 +5,10 @@ import copy
 import pytest
 import torch
 
-from nsf.kinematics.basis import BasisField
-from nsf.kinematics.networks import Committee, FullyConnected, TensorCores
-from nsf.kinematics.schedules import FastTrainer
-from nsf.kinematics.training import train
+from nsf.kinematics.fields.basis import BasisField
+from nsf.kinematics.fields.networks import Committee, FullyConnected, TensorCores
+from nsf.kinematics.training.schedules import FastTrainer
+from nsf.kinematics.training.train import train
 
 MEMBERS, WIDTHS = 3, (4, 7, 5, 2)
 

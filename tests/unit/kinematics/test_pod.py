@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from nsf.errors import ConfigError
-from nsf.kinematics import pod
-from nsf.kinematics.basis import BasisField
-from nsf.kinematics.schedules import FastTrainer
-from nsf.kinematics.training import train
+from nsf.kinematics.fields import pod
+from nsf.kinematics.fields.basis import BasisField
+from nsf.kinematics.training.schedules import FastTrainer
+from nsf.kinematics.training.train import train
 
 M, P, RANK = 30, 120, 4
 

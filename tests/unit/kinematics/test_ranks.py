@@ -8,11 +8,12 @@ import torch
 
 from nsf.data import Snapshots
 from nsf.errors import ConfigError, StorageError
-from nsf.kinematics import descent, training
-from nsf.kinematics.phases import PHASES, seeded
-from nsf.kinematics.ranks import SEED_STREAM, Rank, run_rank, train_together
-from nsf.kinematics.schedules import FastTrainer, PaperTrainer
-from nsf.kinematics.training import WEIGHTS_STREAM, train
+from nsf.kinematics.training import descent
+from nsf.kinematics.training import train as training
+from nsf.kinematics.training.phases import PHASES, seeded
+from nsf.kinematics.training.ranks import SEED_STREAM, Rank, run_rank, train_together
+from nsf.kinematics.training.schedules import FastTrainer, PaperTrainer
+from nsf.kinematics.training.train import WEIGHTS_STREAM, train
 from nsf.workers import ended, working
 
 LATENT, SEED = 2, 3

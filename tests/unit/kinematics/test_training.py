@@ -8,11 +8,12 @@ import pytest
 import torch
 
 from nsf.errors import ConfigError, InstabilityError, MissingExtraError
-from nsf.kinematics import descent, training
-from nsf.kinematics.basis import BasisField
-from nsf.kinematics.mlp import MlpField
-from nsf.kinematics.phases import PHASES, Fit, per_phase, seeded
-from nsf.kinematics.schedules import FastTrainer, PaperTrainer
+from nsf.kinematics.fields.basis import BasisField
+from nsf.kinematics.fields.mlp import MlpField
+from nsf.kinematics.training import descent
+from nsf.kinematics.training import train as training
+from nsf.kinematics.training.phases import PHASES, Fit, per_phase, seeded
+from nsf.kinematics.training.schedules import FastTrainer, PaperTrainer
 
 LATENT = 2
 FIELDS = ["basis", "mlp"]

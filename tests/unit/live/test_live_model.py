@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from nsf.data import Trajectory
-from nsf.dynamics import Rollout
+from nsf.deployment import Rollout
 from nsf.errors import ConfigError, MissingRunError
 from nsf.live.model import LiveModel
 

@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from nsf.kinematics.networks import xavier
+from nsf.kinematics.fields.networks import xavier
 
 KERNEL, STRIDE, CHANNELS = 6, 4, 3
 LONGEST = 12  # convolutions stop once the length is at most this

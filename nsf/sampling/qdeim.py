@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import torch
 from typing_extensions import override
 
-from nsf.dynamics.sampling import UnweightedSampler, displacement_components
 from nsf.errors import ConfigError
+from nsf.sampling.sampler import UnweightedSampler, displacement_components
 
 _RANK = 1e-8  # singular value, of orthonormal modes' rows, below which a direction counts as told
 _NEWTON = 8  # steps; from below, on a convex function of slope -3/4 or less

@@ -12,9 +12,9 @@ import pytorch_lightning as pl
 import torch
 from torch.utils.data import DataLoader
 
+from nsf.deployment.trust import LatentDistance, Trust, first_distrusted, training_values
 from nsf.dynamics.batch import ReducedBatch
 from nsf.dynamics.solver import ReducedMPM, ReducedRun
-from nsf.dynamics.trust import LatentDistance, Trust, first_distrusted, training_values
 from nsf.errors import SchemaError
 from nsf.progress import Progress, quiet_lightning
 from nsf.storage import writing

@@ -27,9 +27,9 @@ from typing_extensions import override
 
 from nsf.data import Snapshots
 from nsf.errors import ConfigError, ShapeError
-from nsf.kinematics import pod
-from nsf.kinematics.basis import BasisField, BasisManifold, coefficients
-from nsf.kinematics.phases import TARGETS, per_phase
+from nsf.kinematics.fields import pod
+from nsf.kinematics.fields.basis import BasisField, BasisManifold, coefficients
+from nsf.kinematics.training.phases import TARGETS, per_phase
 
 _PHASES = ("deformation", "stress")  # whose fields x̂ encodes
 

@@ -13,12 +13,12 @@ import torch
 
 from nsf.data import Snapshots
 from nsf.errors import ConfigError
-from nsf.kinematics.descent import CHECKPOINT, Descent, Steps, descend
 from nsf.kinematics.manifold import Manifold
-from nsf.kinematics.phases import Fit, at_least, seeded
-from nsf.kinematics.ranks import ALONE, Rank
-from nsf.kinematics.schedules import Trainer
-from nsf.kinematics.tracking import check_tracking
+from nsf.kinematics.training.descent import CHECKPOINT, Descent, Steps, descend
+from nsf.kinematics.training.phases import Fit, at_least, seeded
+from nsf.kinematics.training.ranks import ALONE, Rank
+from nsf.kinematics.training.schedules import Trainer
+from nsf.kinematics.training.tracking import check_tracking
 from nsf.storage import writing
 
 WEIGHTS_STREAM = 1 << 30  # apart from the phases' streams

@@ -12,10 +12,10 @@ from typing_extensions import override
 
 from nsf.data import Snapshots, Standardizer
 from nsf.errors import ConfigError
-from nsf.kinematics.encoder import Encoder
+from nsf.kinematics.fields.encoder import Encoder
+from nsf.kinematics.fields.networks import ARITHMETIC, FullyConnected, TensorCores
 from nsf.kinematics.manifold import Manifold, Restriction, identity
-from nsf.kinematics.networks import ARITHMETIC, FullyConnected, TensorCores
-from nsf.kinematics.phases import PHASES, TARGETS, Fit, joined, per_phase, shaped
+from nsf.kinematics.training.phases import PHASES, TARGETS, Fit, joined, per_phase, shaped
 
 HIDDEN_LAYERS = 5
 ENCODED_POINTS = 1 << 22  # particles of whole frames encoded at once

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from nsf.dynamics.sampling import SamplePhase, Sampler
 from nsf.errors import ConfigError, ProjectionError
+from nsf.sampling.sampler import SamplePhase, Sampler
 
 if TYPE_CHECKING:
     from nsf.dynamics.solver import ReducedMPM

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from nsf.data import TrajectoryWriter
-from nsf.dynamics.deployment import Rollout
+from nsf.deployment.rollout import Rollout
 from nsf.dynamics.solver import ReducedMPM
 from nsf.errors import InstabilityError
 from nsf.mpm import FP32, FullOrderMPM, Precision

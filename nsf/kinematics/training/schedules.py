@@ -13,7 +13,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from nsf.errors import ConfigError
-from nsf.kinematics.phases import PHASES, Fit, at_least, per_phase, seeded
+from nsf.kinematics.training.phases import PHASES, Fit, at_least, per_phase, seeded
 
 # Budget of g with e, h and l: as the paper's epochs.
 SHARES = {"deformation": 0.2, "stress": 0.4, "affine": 0.4}

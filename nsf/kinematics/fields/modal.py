@@ -10,8 +10,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from typing_extensions import override
 
-from nsf.kinematics.networks import Committee, FullyConnected
-from nsf.kinematics.phases import joined, shaped
+from nsf.kinematics.fields.networks import Committee, FullyConnected
+from nsf.kinematics.training.phases import joined, shaped
 
 
 class ModalField(nn.Module):

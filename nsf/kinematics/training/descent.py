@@ -17,10 +17,10 @@ from torch import Tensor
 from typing_extensions import override
 
 from nsf.errors import InstabilityError
-from nsf.kinematics.phases import PHASES, Fit, seed_of
-from nsf.kinematics.ranks import ALONE, Rank
-from nsf.kinematics.schedules import Trainer
-from nsf.kinematics.tracking import loggers
+from nsf.kinematics.training.phases import PHASES, Fit, seed_of
+from nsf.kinematics.training.ranks import ALONE, Rank
+from nsf.kinematics.training.schedules import Trainer
+from nsf.kinematics.training.tracking import loggers
 from nsf.progress import Progress, quiet_lightning
 from nsf.storage import writing
 

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from nsf.dynamics.cubature import CubatureSampler, Equations, nonnegative_fit
 from nsf.errors import ConfigError
+from nsf.sampling.cubature import CubatureSampler, Equations, nonnegative_fit
 
 
 @dataclass(frozen=True)

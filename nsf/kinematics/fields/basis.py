@@ -21,12 +21,12 @@ from typing_extensions import override
 
 from nsf.data import Snapshots
 from nsf.errors import ConfigError
-from nsf.kinematics import pod
+from nsf.kinematics.fields import pod
+from nsf.kinematics.fields.modal import ModalFactors, ModalField, ModalModule, RestrictedField
+from nsf.kinematics.fields.networks import Committee, FullyConnected
 from nsf.kinematics.interpolation import Interpolation, interpolation
 from nsf.kinematics.manifold import Manifold, Restriction
-from nsf.kinematics.modal import ModalFactors, ModalField, ModalModule, RestrictedField
-from nsf.kinematics.networks import Committee, FullyConnected
-from nsf.kinematics.phases import PHASES, TARGETS, Fit, at_least, joined, per_phase
+from nsf.kinematics.training.phases import PHASES, TARGETS, Fit, at_least, joined, per_phase
 
 ENCODED_ENTRIES = 1 << 26  # values encoded at once
 

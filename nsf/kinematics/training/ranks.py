@@ -15,8 +15,8 @@ from torch import distributed
 
 from nsf.data import Snapshots
 from nsf.kinematics.manifold import Manifold
-from nsf.kinematics.phases import seed_of
-from nsf.kinematics.schedules import Trainer
+from nsf.kinematics.training.phases import seed_of
+from nsf.kinematics.training.schedules import Trainer
 from nsf.workers import results, working
 
 SEED_STREAM = 1 << 10  # the number of no phase, so that the seed of a rank is that of no step
@@ -88,8 +88,8 @@ def train_together(
 
     Args:
         trajectories: files of the training parameter values.
-        train: `nsf.kinematics.training.train` with all arguments but `snapshots`, `trainer`, `device` and
-            `rank`; it is pickled.
+        train: `nsf.kinematics.training.train.train` with all arguments but `snapshots`, `trainer`, `device`
+            and `rank`; it is pickled.
         trainer: the schedule of all processes together.
         device: "cpu" or "cuda:0".
         resident: as for `Snapshots`, of each process's shard.

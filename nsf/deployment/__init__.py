@@ -1,0 +1,26 @@
+"""Reduced runs at held-out values: their rollouts, whether to believe them, who goes on where not."""
+
+from nsf.deployment.handover import go_on, hand_over
+from nsf.deployment.rollout import (
+    Rollout,
+    calibrate,
+    continuation_file,
+    deploy,
+    rollout,
+    rollout_file,
+    rollouts,
+)
+from nsf.deployment.trust import Trust
+
+__all__ = [
+    "Rollout",
+    "Trust",
+    "calibrate",
+    "continuation_file",
+    "deploy",
+    "go_on",
+    "hand_over",
+    "rollout",
+    "rollout_file",
+    "rollouts",
+]

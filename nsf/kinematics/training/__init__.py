@@ -1,0 +1,1 @@
+"""Training of a manifold (paper section 4.5)."""

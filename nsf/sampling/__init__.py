@@ -1,0 +1,17 @@
+"""Sample particles S: those whose new positions determine the latent vector (paper section 5.4)."""
+
+from nsf.sampling.cells import CellSampler
+from nsf.sampling.cubature import CubatureSampler
+from nsf.sampling.qdeim import QdeimSampler
+from nsf.sampling.sampler import GreedySampler, RandomSampler, SamplePhase, Sampler, UnweightedSampler
+
+__all__ = [
+    "CellSampler",
+    "CubatureSampler",
+    "GreedySampler",
+    "QdeimSampler",
+    "RandomSampler",
+    "SamplePhase",
+    "Sampler",
+    "UnweightedSampler",
+]
