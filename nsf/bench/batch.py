@@ -1,7 +1,7 @@
 """Reduced simulations at many parameter values that take their steps together, by their number."""
 
 from collections.abc import Callable
-from functools import cache, partial
+from functools import partial
 
 import numpy as np
 import torch
@@ -11,7 +11,6 @@ from nsf.bench.measure import build, name_of, run_times
 from nsf.bench.reduced import SCENES, deformation_error, samplers
 from nsf.bench.rows import Result, Row, Settings, commit
 from nsf.data.schema import TRAJECTORY
-from nsf.dynamics import ReducedBatch, ReducedMPM, ReducedRun
 from nsf.pipeline import Pipeline
 
 #: Simulations of a batch.
@@ -45,20 +44,15 @@ def measured(
     manifold, scene, name = chain.manifold(), chain.scene, chain.scene.parameters.name
     truth = chain.truth(chain.held_out[0]).path / TRAJECTORY
     first = chain.solver_at(manifold, chain.held_out[0])
-    phases, sets, particles = first.phases, first.sets, len(first.scene_particles)
+    samples, sets, particles = first.samples, first.sets, len(first.state)
     del first  # its arrays are on the device
     how = {"method": chain.method, "projector": chain.projector, "integration": chain.integration}
 
-    @cache
-    def scene_at(value: float):
-        return scene.with_parameters({name: value})
-
     def make(size: int, precision: str):
         options = how | {"sets": sets, "precision": precision, "device": settings.device}
-        own = [(manifold, scene_at(value), phases, {name: value}) for value in values_of(chain, size)]
-        if size == 1:
-            return ReducedMPM(*own[0], **options)
-        return ReducedBatch([ReducedRun(*one, **options) for one in own])
+        return scene.reduced_batch(
+            manifold, [{name: value} for value in values_of(chain, size)], samples, **options
+        )
 
     for precision in settings.precisions:
         built: dict[int, tuple] = {}
@@ -70,7 +64,7 @@ def measured(
         times = run_times({n: solver for n, (solver, _) in built.items()}, settings.trials, settings.device)
         for size, (solver, peak_mib) in built.items():
             p10, median, p90 = (np.percentile(times[size], [10, 50, 90]) / size).tolist()
-            run = getattr(solver, "runs", (solver,))[0]
+            run = solver.runs[0]
             row = Row(
                 bench="batch", case=f"reduced_batch{size}{end}", particles=particles, batch=size,
                 sample=run.sample_size, integration=round(run.integration_mean), precision=precision,

@@ -11,7 +11,7 @@ from nsf.bench.measure import bandwidth, launch_time, name_of
 from nsf.bench.rows import OTHER_SAMPLER, KernelRow, Result, Row, Settings, StageRow, commit
 from nsf.data import Trajectory
 from nsf.data.schema import TRAJECTORY
-from nsf.dynamics.solver import reduced_steps
+from nsf.dynamics.setup import reduced_steps
 from nsf.evaluation import metrics
 from nsf.evaluation.cost import SolverCost, Subject, measure
 from nsf.kinematics.fields.networks import ARITHMETIC
@@ -80,15 +80,15 @@ def measured(
     manifold, scene, value = chain.manifold(), chain.scene, chain.held_out[0]
     parameters, name = {scene.parameters.name: value}, scene.name
     built = {end: one.solver_at(manifold, value) for end, one in chains.items()}
-    sets = {end: (solver.phases, solver.sets) for end, solver in built.items()}
+    sets = {end: (solver.samples, solver.sets) for end, solver in built.items()}
     del built  # their arrays are on the device
     truth = chain.truth(value).path / TRAJECTORY
     speed, launches = bandwidth(settings.device), launch_time(settings.device, _DEPENDENT)
 
     def reduced(precision: str, multiplier: float, end: str = ""):
-        phases, own = sets[end]
+        samples, own = sets[end]
         return scene.reduced(
-            manifold, parameters, phases, sets=own, method=chain.method, projector=chain.projector,
+            manifold, parameters, samples, sets=own, method=chain.method, projector=chain.projector,
             integration=chain.integration, precision=precision, device=settings.device,
             dt_multiplier=multiplier,
         )  # fmt: skip
@@ -126,7 +126,7 @@ def measured(
 def floors(row: Row, solver, stages: Mapping[str, float], speed: float, launches: float) -> list[KernelRow]:
     """What bounds a reduced step: its largest passes over memory, if no cache holds that, and empty launches.
 
-    Where samples change in a run, as cake's region does, modes are those of the last phase and nodes of the
+    Where samples change in a run, as cake's region does, modes are those of the last span and nodes of the
     first.
 
     Args:
@@ -136,9 +136,10 @@ def floors(row: Row, solver, stages: Mapping[str, float], speed: float, launches
         speed: of a copy [B/s].
         launches: what as many launches of nothing as a step has passes that wait for each other take [ms].
     """
-    N, nodes, real = row.integration, len(solver.sets[0].nodes), np.dtype(solver.precision.numpy).itemsize
+    N, nodes = row.integration, len(solver.sets[0].nodes)
+    real = np.dtype(solver.setup.precision.numpy).itemsize
     moved = {
-        "inference": N * (solver.mode_bytes + 24 * real),  # the modes; x, v, C, τ
+        "inference": N * (solver.span.mode_bytes + 24 * real),  # the modes; x, v, C, τ
         "p2g": real * (26 * N + 8 * nodes),  # x, v, C, τ, m, V; the nodes, there and back
     }
     found = {name: (stages[name], size, 1e3 * size / speed) for name, size in moved.items()}
@@ -165,7 +166,7 @@ def measured_networks(
     manifold, value, name = chain.manifold(), chain.held_out[0], chain.scene.name
     truth, particles = chain.truth(value).path / TRAJECTORY, len(manifold.X)
     first = chain.solver_at(manifold, value)
-    options = {"sample": first.phases, "sets": first.sets, "device": settings.device, "method": chain.method}
+    options = {"sample": first.samples, "sets": first.sets, "device": settings.device, "method": chain.method}
     options |= {"projector": chain.projector, "integration": chain.integration}
     del first  # its arrays are on the device
     kind = "cuda" if settings.device.startswith("cuda") else "cpu"
@@ -212,7 +213,7 @@ def deformation_error(solver, truth) -> float:
     with Trajectory.open(truth) as trajectory:
         t, frames = trajectory.t, trajectory.frames
         between = np.stack([np.interp(t, run.t, column) for column in run.xhat.T], axis=1)
-        xhat = torch.as_tensor(between, dtype=solver.dtype, device=solver.torch_device)
+        xhat = torch.as_tensor(between, dtype=decoder.at.dtype, device=decoder.at.device)
         rows = max(1, _CHUNK // (3 * trajectory.particles))
         errors, norms = [], []
         for start in range(1, frames, rows):

@@ -163,7 +163,7 @@ def _built(
     for number in samples:
         case = f"reduced_{size}" if len(samples) == 1 else f"reduced_{size}_s{number}"
         first = make(sample=number)
-        how = {"sample": first.phases, "sets": first.sets}
+        how = {"sample": first.samples, "sets": first.sets}
         del first  # its arrays are on the device
         for p in settings.precisions:
             found[case, p] = build(partial(make, **how, precision=p), device)
@@ -188,7 +188,7 @@ def _error(solver: ReducedMPM, steps: Sequence[int], truth: Sequence[torch.Tenso
         return float("inf")
     decoder, errors, norms = solver.decoder(), [], []
     for step, x in zip(steps, truth, strict=True):
-        x = x.to(solver.torch_device, solver.dtype)[None]
+        x = x.to(decoder.at.device, decoder.at.dtype)[None]
         errors.append(metrics.frame_squares(decoder.position(solver.record.xhat[step])[None] - x))
         norms.append(metrics.frame_squares(x))
     return metrics.relative(torch.cat(errors), torch.cat(norms))

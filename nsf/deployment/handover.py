@@ -7,7 +7,7 @@ import torch
 
 from nsf.data import TrajectoryWriter
 from nsf.deployment.rollout import Rollout
-from nsf.dynamics.solver import ReducedMPM
+from nsf.dynamics import ReducedMPM
 from nsf.errors import InstabilityError
 from nsf.mpm import FP32, FullOrderMPM, Precision
 from nsf.mpm.recording import blocks
@@ -27,12 +27,12 @@ def hand_over(solver: ReducedMPM, rollout: Rollout) -> FullOrderMPM:
     Raises:
         InstabilityError: the decoded state is none of the full-order solver's; see `FullOrderMPM.resume`.
     """
-    scene, n = solver.scene, rollout.handed_over
-    full = scene.full_order(precision=solver.precision.name, device=str(solver.device))
+    scene, setup, n = solver.scene, solver.setup, rollout.handed_over
+    full = scene.full_order(precision=setup.precision.name, device=str(solver.device))
     if n == 0:
         return full
     decoder = solver.decoder()
-    before, now = torch.as_tensor(rollout.xhat[n - 1 : n + 1], dtype=solver.dtype, device=solver.torch_device)
+    before, now = torch.as_tensor(rollout.xhat[n - 1 : n + 1], dtype=setup.dtype, device=setup.torch_device)
     with torch.no_grad():
         x = decoder.position(now)
         v = (x - decoder.position(before)) / solver.dt

@@ -13,8 +13,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from nsf.deployment.trust import LatentDistance, Trust, first_distrusted, training_values
-from nsf.dynamics.batch import ReducedBatch
-from nsf.dynamics.solver import ReducedMPM, ReducedRun
+from nsf.dynamics import ReducedBatch, ReducedMPM
 from nsf.errors import SchemaError
 from nsf.progress import Progress, quiet_lightning
 from nsf.storage import writing
@@ -42,7 +41,7 @@ class Rollout:
         residuals: [N, k + 1] projection residuals [m]; stops: [N] stop reasons.
         trust: [N + 1] how far each step is from the training data, in units of how far these are from
             themselves (`Trust.ratios`).
-        sample: |S| of the first phase; integration_mean: mean |N| over all steps taken.
+        sample: |S| of the first span of time; integration_mean: mean |N| over all steps taken.
         needed_outside: most particles or nodes a step needed outside the superset.
         seconds: wall time of the steps, without set-up; of a batch, an equal share of it.
         diverged: step at which x̂ ceased to be finite or a sample particle left the grid, −1 when neither did.
@@ -118,7 +117,7 @@ class Deployment(pl.LightningModule):
     """Lightning module whose prediction step is a reduced run a parameter value.
 
     Args:
-        solver_at, batch_at: as for `deploy`.
+        batch_at: as for `deploy`.
         trust: the estimate of whether to believe a run.
         until_distrusted: as for `rollout`.
         progress: told of each run done.
@@ -126,23 +125,19 @@ class Deployment(pl.LightningModule):
 
     def __init__(
         self,
-        solver_at: Callable[[float, str], ReducedMPM],
-        batch_at: Callable[[Sequence[float], str], ReducedBatch] | None,
+        batch_at: Callable[[Sequence[float], str], ReducedBatch],
         trust: Trust,
         until_distrusted: bool,
         progress: Progress,
     ):
         super().__init__()
-        self._solver_at, self._batch_at, self._progress = solver_at, batch_at, progress
+        self._batch_at, self._progress = batch_at, progress
         self._how = trust, until_distrusted
 
     def predict_step(self, batch: torch.Tensor, batch_idx: int) -> list[Rollout]:
-        """Run each parameter value of a batch [B] from t = 0 to T; several take their steps together."""
+        """Run each parameter value of a batch [B] from t = 0 to T; they take their steps together."""
         values = batch.tolist()
-        if len(values) > 1:
-            runs = rollouts(self._batch_at(values, str(self.device)), values, *self._how)
-        else:
-            runs = [rollout(self._solver_at(value, str(self.device)), value, *self._how) for value in values]
+        runs = rollouts(self._batch_at(values, str(self.device)), values, *self._how)
         for _ in runs:
             self._progress.advance()
         return runs
@@ -152,14 +147,13 @@ def rollout(solver: ReducedMPM, parameter: float, trust: Trust, until_distrusted
     """Run a reduced solver to the end of its scene.
 
     Args:
-        solver: at t = 0.
+        solver: at t = 0; the only one of its batch.
         parameter: value of the problem parameter, for the record.
         trust: the estimate of whether to believe the run.
         until_distrusted: stop at the first step that is not to be believed, and name the one before it from
             whose state a full-order run can go on: the last whose time is a whole number of the scene's Δt.
     """
-    seconds = _timed_run(solver, [solver], trust if until_distrusted else None)
-    return _rollout_of(solver, parameter, trust, until_distrusted, seconds)
+    return rollouts(solver.together, [parameter], trust, until_distrusted)[0]
 
 
 def rollouts(
@@ -172,7 +166,7 @@ def rollouts(
         parameters: value of the problem parameter of each run, for the record.
         trust, until_distrusted: as for `rollout`; steps are taken for as long as any run is to be believed.
     """
-    seconds = _timed_run(batch, batch.runs, trust if until_distrusted else None) / len(batch)
+    seconds = _timed_run(batch, trust if until_distrusted else None) / len(batch)
     return [
         _rollout_of(run, value, trust, until_distrusted, seconds)
         for run, value in zip(batch.runs, parameters, strict=True)
@@ -180,7 +174,7 @@ def rollouts(
 
 
 def _rollout_of(
-    solver: ReducedRun, parameter: float, trust: Trust, until_distrusted: bool, seconds: float
+    solver: ReducedMPM, parameter: float, trust: Trust, until_distrusted: bool, seconds: float
 ) -> Rollout:
     """What a run that has ended leaves."""
     taken = solver.steps_taken
@@ -209,7 +203,7 @@ def _rollout_of(
     )
 
 
-def _timed_run(solver: ReducedMPM | ReducedBatch, runs: Sequence[ReducedRun], trust: Trust | None) -> float:
+def _timed_run(solver: ReducedBatch, trust: Trust | None) -> float:
     """Take every step, or with an estimate of trust stop soon after it believes none of the runs any more.
 
     Returns:
@@ -218,7 +212,7 @@ def _timed_run(solver: ReducedMPM | ReducedBatch, runs: Sequence[ReducedRun], tr
     solver.step(1)
     wait = synchronizer(solver.device)
     wait()
-    believed, looked, started = runs, 0, time.perf_counter()
+    believed, looked, started = solver.runs, 0, time.perf_counter()
     look = solver.total_steps if trust is None else _LOOK
     while solver.steps_taken < solver.total_steps:
         solver.step(min(look, solver.total_steps - solver.steps_taken))
@@ -236,7 +230,7 @@ def _timed_run(solver: ReducedMPM | ReducedBatch, runs: Sequence[ReducedRun], tr
     return (time.perf_counter() - started) * taken / max(1, taken - 1)
 
 
-def _ratios(solver: ReducedRun, trust: Trust, diverged: int) -> np.ndarray:
+def _ratios(solver: ReducedMPM, trust: Trust, diverged: int) -> np.ndarray:
     """Trust of the steps taken [n + 1]; ∞ from the step at which the run diverged."""
     latent = solver.trajectory()
     ratios = trust.ratios(latent.xhat, latent.residuals[:, -1])
@@ -274,28 +268,26 @@ def calibrate(solver_at: Callable[[float, str], ReducedMPM], manifold, device: s
             good = diverged if diverged >= 0 else len(latent.xhat)
             runs.append((latent.xhat[:good], latent.residuals[: good - 1, -1]))
             progress.advance()
-    particles = np.unique(np.concatenate([phase.particles for phase in solver.phases]))
+    particles = np.unique(np.concatenate([span.particles for span in solver.samples]))
     return Trust.calibrated(LatentDistance(manifold, particles, device), runs)
 
 
 def deploy(
-    solver_at: Callable[[float, str], ReducedMPM],
+    batch_at: Callable[[Sequence[float], str], ReducedBatch],
     values: Sequence[float],
     device: str,
     trust: Trust,
     until_distrusted: bool = False,
-    batch_at: Callable[[Sequence[float], str], ReducedBatch] | None = None,
     batch: int = 1,
 ) -> list[Rollout]:
     """Reduced runs at every parameter value, with a progress bar.
 
     Args:
-        solver_at: parameter value and device name → solver at t = 0.
+        batch_at: some parameter values and device name → their runs at t = 0.
         values: parameter values.
         device: `cpu`, `cuda` or `cuda:N`.
         trust, until_distrusted: as for `rollout`.
-        batch_at: several parameter values and device name → a batch of them at t = 0.
-        batch: most values that take their steps together; more than one need `batch_at`.
+        batch: most values that take their steps together.
 
     Raises:
         KeyboardInterrupt: passed on; Lightning would exit with code 1.
@@ -313,7 +305,7 @@ def deploy(
             inference_mode=False,  # torch's inference tensors could not be updated in place between steps
         )
         try:
-            deployment = Deployment(solver_at, batch_at, trust, until_distrusted, progress)
+            deployment = Deployment(batch_at, trust, until_distrusted, progress)
             batches = trainer.predict(deployment, loader)
         except SystemExit as stop:
             raise KeyboardInterrupt from stop

@@ -1,15 +1,18 @@
-"""Reduced-order dynamics: latent time-stepping (paper section 5)."""
+"""Reduced-order dynamics: the reference that every engine is held to (paper section 5)."""
 
-from nsf.dynamics.batch import ReducedBatch
+from nsf.dynamics.batch import Batch
+from nsf.dynamics.inference import Decoder
 from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
-from nsf.dynamics.latent import Decoder, LatentState, LatentTrajectory
+from nsf.dynamics.latent import LatentTrajectory
+from nsf.dynamics.methods import Method
 from nsf.dynamics.projection import STOP_REASONS, GaussNewton, ProjectionResult, Taylor, stop_reasons
-from nsf.dynamics.solver import NSF, ReducedMPM, ReducedRun
-from nsf.dynamics.stress import Method
+from nsf.dynamics.setup import NSF, Setup
+from nsf.dynamics.solver import LatentState, ReducedBatch, ReducedMPM
 
 __all__ = [
     "NSF",
     "STOP_REASONS",
+    "Batch",
     "Decoder",
     "GaussNewton",
     "Integration",
@@ -21,7 +24,7 @@ __all__ = [
     "ProjectionResult",
     "ReducedBatch",
     "ReducedMPM",
-    "ReducedRun",
+    "Setup",
     "Taylor",
     "stop_reasons",
 ]

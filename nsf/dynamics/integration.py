@@ -46,7 +46,7 @@ class Integration:
 
 @dataclass(frozen=True)
 class ParticleSets:
-    """The sets of one phase.
+    """The sets of one span of time.
 
     Attributes:
         sample: [s] indices of S.

@@ -1,18 +1,12 @@
-"""What a reduced run leaves: latent vectors, and the particle fields decoded from them."""
+"""What a reduced run leaves: latent vectors, and how well each step's inversion went."""
 
-from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from nsf.dynamics.projection import ProjectionResult, stop_reasons
-from nsf.kinematics.manifold import Restriction
-
-if TYPE_CHECKING:
-    from nsf.dynamics.solver import ReducedMPM
 
 
 @dataclass(frozen=True)
@@ -101,61 +95,3 @@ class LatentRecord:
         stops = stop_reasons(residuals, updates, tolerance)
         t, xhat = np.arange(steps + 1) * dt, self.xhat[: steps + 1].cpu().numpy()
         return LatentTrajectory(t, xhat, residuals.numpy(), updates.numpy(), stops)
-
-
-class Decoder:
-    """x, τ and C at the points of a restriction, as a method takes them.
-
-    Without a stress field τ comes from ∂g/∂X, without an affine field C is 0: what the run
-    used, not what the manifold could have given.
-
-    Args:
-        at: fields restricted to n points.
-        stress, affine: the sources of τ and C (`Method.stress_of`, `Method.affine_of`).
-    """
-
-    def __init__(
-        self,
-        at: Restriction,
-        stress: Callable[[torch.Tensor], torch.Tensor],
-        affine: Callable[[torch.Tensor], torch.Tensor | None],
-    ):
-        self.at, self._stress, self._affine = at, stress, affine
-
-    def position(self, xhat: torch.Tensor) -> torch.Tensor:
-        """x = g(X, x̂), [n, 3] of x̂ [r] or [F, n, 3] of x̂ [F, r], in metres."""
-        return self.at.position(xhat)
-
-    def stress(self, xhat: torch.Tensor) -> torch.Tensor:
-        """τ [F, n, 3, 3] of x̂ [F, r], in pascals."""
-        return torch.stack([self._stress(row).clone() for row in xhat])
-
-    def affine(self, xhat: torch.Tensor) -> torch.Tensor:
-        """C [F, n, 3, 3] of x̂ [F, r], in 1/s."""
-        found = [self._affine(row) for row in xhat]
-        empty = torch.zeros(self.at.points, 3, 3, dtype=self.at.dtype, device=self.at.device)
-        return torch.stack([empty if C is None else C for C in found])
-
-
-class LatentState:
-    """The state of a reduced run; particle fields are decoded when they are asked for."""
-
-    def __init__(self, solver: "ReducedMPM"):
-        self._solver = solver
-
-    @property
-    def xhat(self) -> np.ndarray:
-        """[r] latent vector."""
-        return self._solver.xhat.cpu().numpy()
-
-    def __len__(self) -> int:
-        return len(self._solver.scene_particles)
-
-    def numpy(self) -> dict[str, np.ndarray]:
-        """Every particle's x, v [P, 3], C, tau [P, 3, 3], as of the full-order state, and xhat [r]."""
-        s = self._solver
-        decoder, now = s.decoder(), s.xhat[None]
-        x = decoder.position(s.xhat)
-        v = s.initial_velocity if s.steps_taken == 0 else (x - decoder.position(s.record.before)) / s.dt
-        fields = {"x": x, "v": v, "C": decoder.affine(now)[0], "tau": decoder.stress(now)[0]}
-        return {name: value.cpu().numpy() for name, value in fields.items()} | {"xhat": self.xhat}

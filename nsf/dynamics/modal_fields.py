@@ -1,7 +1,6 @@
 """Launches that give τ and C where a `ModalPhase` needs them: the heads, then modes times what these find."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -11,21 +10,19 @@ from nsf.data import TAU_MATRIX
 from nsf.dynamics.arena import Arena
 from nsf.dynamics.interop import as_matrices
 from nsf.dynamics.latent import LatentRecord
+from nsf.dynamics.methods import Method
 from nsf.dynamics.modal_kernels import THREADS, make_contraction, tiling
 from nsf.dynamics.network_kernel import make_layer, make_product, product_blocks
-from nsf.dynamics.stress import Method
+from nsf.dynamics.span import Span
 from nsf.mpm.access import WARP
 from nsf.mpm.materials import Material, make_elastic_stress
 
-if TYPE_CHECKING:
-    from nsf.dynamics.modal import ModalPhase
-
 
 def field_launches(
-    arena, phase: "ModalPhase", manifold, method: Method, order, parameters, materials
+    arena, phase: Span, manifold, method: Method, order, parameters, materials
 ) -> tuple[list, list]:
     """The launches of the networks, and those that then give τ and C at N, as the method takes them."""
-    options = {"dtype": arena.real, "device": phase.setting.device}
+    options = {"dtype": arena.real, "device": phase.batch.shared.torch_device}
     heads = []
     for name, neural, found in (
         ("stress", method.neural_stress, phase.tau),
@@ -38,7 +35,7 @@ def field_launches(
             else:  # the same in every snapshot
                 found.unflatten(0, (-1, phase.size)).copy_(_as_matrices(factors.mean))
     stored = [arena.halved(factors.table, factors.rows) for factors, _ in heads]
-    networks, coefficients = _networks(arena, [f.layers for f, _ in heads], phase.setting.record, parameters)
+    networks, coefficients = _networks(arena, [f.layers for f, _ in heads], phase.record, parameters)
     fields = [
         (factors, *modes, a, found)
         for (factors, found), modes, a in zip(heads, stored, coefficients, strict=True)
@@ -107,7 +104,7 @@ def _product(
     return arena.pack(make_product(arena.precision), blocks * THREADS, arguments, THREADS)
 
 
-def _contraction(arena: Arena, phase: "ModalPhase", fields: Sequence[tuple]):
+def _contraction(arena: Arena, phase: Span, fields: Sequence[tuple]):
     """The launch of one or two fields at the needed particles.
 
     A field is its factors, the arena's modes, their lengths, coefficients a [B, K], and where it goes.
@@ -126,7 +123,7 @@ def _contraction(arena: Arena, phase: "ModalPhase", fields: Sequence[tuple]):
     return arena.pack(kernel, tiles * sum(threads), inputs, THREADS)
 
 
-def _elastic(arena: Arena, phase: "ModalPhase", materials: Sequence[Material], F: torch.Tensor):
+def _elastic(arena: Arena, phase: Span, materials: Sequence[Material], F: torch.Tensor):
     """The launch of τ = τ(F) at N; without flow the history keeps its values at rest."""
     precision, n, material = arena.precision, len(F), materials[0]
     history = np.concatenate([one.initial_history(phase.size) for one in materials])

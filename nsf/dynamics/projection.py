@@ -1,14 +1,11 @@
 """Network inversion: the latent vector of given sample positions (paper section 5.3)."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar, Protocol
 
 import torch
 
 from nsf.errors import ConfigError
-
-if TYPE_CHECKING:
-    from nsf.dynamics.latent import LatentRecord
 
 #: Named reasons to stop, in the order of the codes that `stop_reasons` gives.
 STOP_REASONS = ("converged", "max_iterations", "stagnated", "diverged")
@@ -28,6 +25,21 @@ class ProjectionResult:
     xhat: torch.Tensor
     residuals: torch.Tensor
     updates: torch.Tensor
+
+
+class Latents(Protocol):
+    """What the steps before left, from which an inversion may begin.
+
+    Attributes:
+        now, before: [r] x̂_n and x̂_{n−1}.
+        predicted: [r] x̂_{n+1} on the parabola through the last three.
+    """
+
+    now: torch.Tensor
+    before: torch.Tensor
+
+    @property
+    def predicted(self) -> torch.Tensor: ...  # noqa: D102
 
 
 def check_projector(projector) -> None:
@@ -71,7 +83,7 @@ class GaussNewton:
         if not self.tolerance > 0:
             raise ConfigError(f"projector.tolerance={self.tolerance} must be positive")
 
-    def start(self, record: "LatentRecord") -> torch.Tensor:
+    def start(self, record: Latents) -> torch.Tensor:
         """Where the inversion begins, by what the steps before it left."""
         return record.predicted
 
@@ -111,7 +123,7 @@ class Taylor:
     iterations: ClassVar[int] = 1
     tolerance: ClassVar[float] = 0.0  # it checks nothing, so it never claims convergence
 
-    def start(self, record: "LatentRecord") -> torch.Tensor:
+    def start(self, record: Latents) -> torch.Tensor:
         """Where the deformation field is linearised: x̂_n."""
         return record.now
 

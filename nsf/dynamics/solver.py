@@ -1,215 +1,243 @@
-"""The reduced-order solver: time-stepping in the latent space (paper section 5)."""
+"""The reduced-order solver: what a user holds (paper section 5)."""
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Self
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 import torch
 
-from nsf.data import hash_of_positions
-from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
-from nsf.dynamics.interop import on_torch_stream, torch_device, torch_dtype
-from nsf.dynamics.latent import Decoder, LatentRecord, LatentState, LatentTrajectory
-from nsf.dynamics.projection import GaussNewton, Taylor, check_projector
-from nsf.dynamics.stepping import Phased, Stepping, build_phases
-from nsf.dynamics.stress import Method
-from nsf.errors import ConfigError, ShapeError
+from nsf.dynamics.batch import Batch
+from nsf.dynamics.inference import Decoder
+from nsf.dynamics.integration import ParticleSets
+from nsf.dynamics.interop import captured, on_torch_stream
+from nsf.dynamics.latent import LatentTrajectory
+from nsf.dynamics.setup import Setup
+from nsf.dynamics.span import Span, Stages
+from nsf.dynamics.step import steps_of
+from nsf.errors import ConfigError
 from nsf.kinematics.manifold import Restriction
-from nsf.mpm import BoundaryArrays, precision_of
-from nsf.mpm.device import warp_device
 from nsf.mpm.shape import DEGREES
-from nsf.sampling.sampler import RandomSampler, SamplePhase, Sampler, check_well_posed
-
-NSF = Method("nsf", neural_stress=True, neural_affine=True)
-#: Positions decoded at once when every particle is asked for [values].
-_CHUNK = 2**25
+from nsf.timing import StageTimer, untimed
 
 
-class ReducedRun(Phased):
-    """A reduced simulation apart from its steps: where it starts, what it was given, and what it leaves.
+class ReducedBatch:
+    """Steps the latent vectors of B runs together; one run is a batch of one.
 
-    `ReducedMPM` takes the steps of one, `ReducedBatch` those of several at once.
+    Nothing that one run does reaches another, and each takes the steps that it would take alone, but for
+    round-off.
 
     Args:
-        manifold: trained fields.
-        scene: the scene at its problem parameters.
-        phases: sample particles by phase of time.
-        parameters: problem parameters by name.
-        method: which of τ and C come from fields.
-        projector: `GaussNewton` or `Taylor`.
-        integration: how N is found.
-        precision: `fp64` or `fp32`.
-        device: `cpu`, `cuda`, `cuda:N` or `auto`.
-        dt_multiplier: deployment step in units of the scene's Δt (paper section 6.1: 1.5).
-        sets: particle sets of each phase, as `sets` of an earlier solver of the same manifold and
-            samples gives them; searched for when None.
-        xhat: [r] latent vector at t = 0; that of the undeformed body without stress when None.
-        velocity: [P, 3] initial velocity [m/s]; the scene's when None.
+        setups: what each run is given; see `Batch` for what they share.
+        spans_of: gives what takes the steps of each span of time, as `Engine.spans`; those of the reference
+            by default.
+        engine, why: name of the engine that gives them, and the reason for its choice; for the record.
+
+    Attributes:
+        batch: setups, record of the latent vectors, colliders and walls.
+        engine, why: as given.
+        steps_taken, total_steps: taken, and those to the end of the scene.
+        dt: step [s]; device: Warp device.
 
     Raises:
-        ProjectionError: |S| < r/3.
-        SchemaError: the manifold was trained for other particles.
-        ShapeError: xhat or velocity has another shape.
-        ConfigError, DeviceError: a value, a projector or a device is refused.
+        ConfigError: see `Batch.of`.
+
+    Source: paper section 5.
     """
 
     def __init__(
         self,
-        manifold,
-        scene,
-        phases: Sequence[SamplePhase],
-        parameters: Mapping[str, float],
-        method: Method = NSF,
-        projector: GaussNewton | Taylor = GaussNewton(),
-        integration: Integration = Integration(),
-        precision: str = "fp64",
-        device: str = "auto",
-        dt_multiplier: float = 1.0,
-        sets: Sequence[ParticleSets] | None = None,
-        xhat: np.ndarray | None = None,
-        velocity: np.ndarray | None = None,
+        setups: Sequence[Setup],
+        spans_of: Callable[[Batch], Sequence[Span]] = steps_of,
+        engine: str = "reference",
+        why: str = "",
     ):
-        if not dt_multiplier > 0:
-            raise ConfigError(f"dt_multiplier={dt_multiplier} must be positive")
-        check_projector(projector)
-        for phase in phases:
-            check_well_posed(len(phase.particles), manifold.latent_dim)
-        self.manifold, self.scene, self.method, self.projector = manifold, scene, method, projector
-        self.integration, self.phases, self.given = integration, phases, dict(parameters)
-        self.precision, self.device = precision_of(precision), warp_device(device)
-        self.dtype, self.torch_device = torch_dtype(self.precision), torch_device(self.device)
-        self.dt = scene.dt * dt_multiplier
-        self.total_steps = reduced_steps(scene.steps, dt_multiplier)
-        self.geometry, self.transfer, self.gravity = scene.grid, scene.transfer, scene.gravity
-        self.scene_particles = scene.particles()
-        P = len(self.scene_particles)
-        manifold.check_particles(hash_of_positions(self.scene_particles.X))
-        self.search = NeighbourSearch(self.geometry, self.transfer.shape, self.precision, self.device)
-
-        def tensor(values):
-            return torch.as_tensor(np.asarray(values), dtype=self.dtype, device=self.torch_device)
-
-        missing = [name for name in manifold.parameter_names if name not in parameters]
-        if missing:
-            raise ConfigError(
-                f"parameters {dict(parameters)} lack {missing}, which the stress field was trained on"
-            )
-        self.parameters = tensor([parameters[name] for name in manifold.parameter_names])
-        # On the host: a phase takes the rows that it needs.
-        velocity = _shaped("velocity", scene.initial_velocity() if velocity is None else velocity, (P, 3))
-        self.initial_velocity = torch.as_tensor(velocity, dtype=self.dtype)
-        if xhat is None:  # a scene begins undeformed and free of stress
-            X = torch.as_tensor(self.scene_particles.X, device=manifold.X.device)[None]
-            xhat = manifold.encode(X, X.new_zeros(*X.shape[:2], 6))[0].cpu()
-        start = tensor(_shaped("xhat", xhat, (manifold.latent_dim,)))
-        self.record = LatentRecord(start, self.total_steps, projector.iterations)
+        self.batch = Batch.of(setups)
+        self.engine, self.why = engine, why
+        shared = self.batch.shared
+        self.dt, self.total_steps, self.device = shared.dt, shared.total_steps, shared.device
         self.steps_taken = 0
-        self._starts = [round(p.start * self.total_steps) for p in phases]
-        self.sets = self._sets_of(phases) if sets is None else list(sets)
-        self._index = 0  # among the runs that advance together
+        self._starts, self._spans = shared.starts, spans_of(self.batch)
+        self._enter(self._spans[0])
 
-    @classmethod
-    def of_scene(
-        cls,
-        scene,
-        manifold,
-        parameters: Mapping[str, float] | None = None,
-        sample: int | Sequence[int] | Sampler | Sequence[SamplePhase] | None = None,
-        **options,
-    ) -> Self:
-        """That of a scene.
-
-        Args:
-            scene: an `nsf.scenes.Scene`.
-            manifold: trained fields.
-            parameters: `{name: value}`; the configured value by default.
-            sample: particle indices, a number (drawn at random), a `Sampler`, the `phases` of an earlier
-                solver, or None for the scene's number.
-            **options: further arguments of the constructor.
-        """
-        name = scene.parameters.name
-        if not parameters:
-            parameters = {name: _configured(scene)}
-        scene = scene.with_parameters(parameters)
-        if sample is None:
-            sample = int(scene.config.scene.reduced.sample)
-        if isinstance(sample, int | np.integer):
-            check_well_posed(int(sample), manifold.latent_dim)
-            sample = RandomSampler(size=int(sample))
-        if isinstance(sample, Sampler):
-            device = torch_device(warp_device(options.get("device", "auto")))
-            everyone = np.arange(len(manifold.X))
-            whole = ParticleSets(everyone, everyone, None)
-            as_deployed = {k: options[k] for k in ("method", "precision", "device") if k in options}
-            phases = sample.phases_of(
-                manifold,
-                device,
-                lambda training: ReducedMPM.of_scene(
-                    scene, manifold, training, everyone, sets=[whole], **as_deployed
-                ),
-            )
-        elif len(sample) and isinstance(sample[0], SamplePhase):
-            phases = list(sample)
-        else:
-            phases = [SamplePhase(0.0, _indices(sample, len(manifold.X)))]
-        return cls(manifold, scene, phases, parameters, **options)
-
-    def _sets_of(self, phases: Sequence[SamplePhase]) -> list[ParticleSets]:
-        """Particle sets of each phase; supersets go over the training trajectories, decoded from latents."""
-        P = len(self.scene_particles)
-        if self.integration.strategy == "search":
-            return [
-                ParticleSets(p.particles, np.append(p.particles, np.delete(np.arange(P), p.particles)), None)
-                for p in phases
-            ]
-        everything = self.decoder()
-        latents = self.manifold.training_latents.to(self.torch_device, self.dtype)
-        fraction = self.manifold.training_times.to(self.torch_device) / (self.scene.dt * self.scene.steps)
-        rows = max(1, _CHUNK // (3 * P))
-        ends = [p.start for p in phases[1:]] + [1.0]
-        slack = 2.0 / self.scene.steps  # a phase also meets the frames just before and after it
-        found = []
-        for phase, end in zip(phases, ends, strict=True):
-            of_phase = latents[(fraction >= phase.start - slack) & (fraction <= end + slack)]
-            frames = (everything.position(chunk) for chunk in of_phase.split(rows))
-            found.append(self.search.superset(frames, phase.particles, self.integration.margin))
-        return found
-
-    def stress_of(self, at, mu: torch.Tensor, lam: torch.Tensor) -> Callable[[torch.Tensor], torch.Tensor]:
-        """The method's source of τ [n, 3, 3] [Pa] at restricted points."""
-        return self.method.stress_of(
-            at, self.parameters, self.scene.material, mu, lam, self.precision, self.device
-        )
-
-    def affine_of(self, at) -> Callable[[torch.Tensor], torch.Tensor | None]:
-        """The method's source of C [n, 3, 3] [1/s] at restricted points; gives None for C = 0."""
-        return self.method.affine_of(at, self.parameters)
-
-    def decoder(self, particles: np.ndarray | None = None, at: Restriction | None = None) -> Decoder:
-        """The fields at particles, as the method takes them.
-
-        Args:
-            particles: [n] their indices; every particle by default.
-            at: fields of the same particles, as of another decoder's `at`; restricted anew if None.
-        """
-        constants = self.scene_particles
-        if particles is None:
-            particles = np.arange(len(constants))
-        if at is None:
-            at = self.manifold.restrict(particles, dtype=self.dtype, device=self.torch_device)
-
-        def tensor(values: np.ndarray) -> torch.Tensor:
-            return torch.as_tensor(values[particles], dtype=self.dtype, device=self.torch_device)
-
-        stress = self.stress_of(at, tensor(constants.mu), tensor(constants.lam))
-        return Decoder(at, stress, self.affine_of(at))
-
-    def sets_at(self, step: int) -> ParticleSets:
-        """S, N and I of the step that starts `step` steps after t = 0."""
-        return self._phase_at(step).sets
+    def __len__(self) -> int:
+        return len(self.batch)
 
     @property
-    def state(self) -> LatentState:
+    def runs(self) -> tuple["ReducedMPM", ...]:
+        """Each run, to be asked for its own state and trajectory."""
+        return tuple(ReducedMPM(self, index) for index in range(len(self)))
+
+    @property
+    def xhat(self) -> torch.Tensor:
+        """[B, r] latent vectors, on the device."""
+        return self.batch.record.now
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the arrays and fields take on the device."""
+        return sum(span.nbytes for span in self._spans) + self.batch.record.nbytes
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s]."""
+        return self.steps_taken * self.dt
+
+    @property
+    def span(self) -> Span:
+        """What takes the steps now."""
+        return self._span
+
+    def span_at(self, step: int) -> Span:
+        """What takes the step that starts `step` steps after t = 0."""
+        return self._spans[max(i for i, start in enumerate(self._starts) if start <= step)]
+
+    def steps_by_span(self) -> list[tuple[int, Span]]:
+        """How many of the steps taken each span of time has had."""
+        ends = [*self._starts[1:], self.total_steps]
+        counts = (
+            max(0, min(self.steps_taken, end) - start) for start, end in zip(self._starts, ends, strict=True)
+        )
+        return list(zip(counts, self._spans, strict=True))
+
+    def restart(self) -> None:
+        """Go back to t = 0; captured graphs stay good."""
+        self.batch.record.restart()
+        self.resume(0)
+
+    def resume(self, step: int) -> None:
+        """Go on from the latent vectors of the record as the end of so many steps."""
+        self.steps_taken = step
+        self._enter(self.span_at(step))
+        with on_torch_stream(self.device):
+            self.batch.boundaries.start_from(step)
+
+    def step(self, n: int = 1) -> None:
+        """Advance by n steps of Δt.
+
+        Raises:
+            ConfigError: the steps would pass the scene's end.
+        """
+        if self.steps_taken + n > self.total_steps:
+            raise ConfigError(
+                f"{self.steps_taken} + {n} steps pass the end of the scene, {self.total_steps} steps"
+            )
+        with torch.no_grad():
+            for _ in range(n):
+                self._step(self._advance)
+
+    def timed_step(self, timer: StageTimer) -> None:
+        """One step, stage by stage under a timer; captured anew where steps are captured."""
+        with torch.no_grad():
+            self._step(partial(self._advance_timed, timer))
+
+    @property
+    def stages(self) -> Stages:
+        """One step, stage by stage, in order."""
+        return self._span.stages
+
+    def _step(self, advance: Callable[[], None]) -> None:
+        span = self.span_at(self.steps_taken)
+        if span is not self._span:
+            self._enter(span)
+        advance()
+        self.steps_taken += 1
+
+    def _enter(self, span: Span) -> None:
+        """Give the span the state one step back, which the backward difference needs."""
+        self._span = span
+        with torch.no_grad():
+            span.enter(first=self.steps_taken == 0)  # the first velocity is the initial one
+
+    def _advance(self) -> None:
+        span = self._span
+        if not self.device.is_cuda or not span.capturable:
+            self._run_stages()
+        elif span.graph is None:
+            # The first step runs uncaptured, so that kernels and libraries are loaded.
+            self._run_stages()
+            with captured(self.device) as graph:
+                self._run_stages()
+            span.graph = graph
+        else:
+            span.graph.replay()
+
+    def _advance_timed(self, timer: StageTimer) -> None:
+        if self._span.graph is None:
+            self._run_stages(timer)
+        else:
+            with captured(self.device) as graph:
+                self._run_stages(timer.captured)
+            graph.replay()
+            timer.add_launch()
+
+    def _run_stages(self, timer: Callable = untimed) -> None:
+        with on_torch_stream(self.device):
+            for name, stage in self.stages.items():
+                with timer(name):
+                    stage()
+
+
+class ReducedMPM:
+    """One reduced run: stepped and asked as `FullOrderMPM` is, and for its latent vectors.
+
+    Of a batch every run is stepped with the others.
+
+    Args:
+        together: the batch that it is of.
+        index: which of its runs.
+
+    Attributes:
+        setup: what the run was given; scene, manifold, device, dt, total_steps, samples and sets are the
+            setup's; dx: grid spacing [m].
+        record: latent vectors, residuals and updates, on the device.
+    """
+
+    def __init__(self, together: ReducedBatch, index: int = 0):
+        self.together, self.index = together, index
+        self.setup, self.record = together.batch.setups[index], together.batch.record.of(index)
+        self.scene, self.manifold, self.device = self.setup.scene, self.setup.manifold, self.setup.device
+        self.dt, self.dx, self.total_steps = together.dt, self.setup.geometry.dx, together.total_steps
+        self.samples, self.sets = self.setup.samples, self.setup.sets
+
+    def step(self, n: int = 1) -> None:
+        """Advance by n steps of Δt, with the runs that it advances with; see `ReducedBatch.step`."""
+        self.together.step(n)
+
+    def timed_step(self, timer: StageTimer) -> None:
+        """One step, stage by stage under a timer."""
+        self.together.timed_step(timer)
+
+    def restart(self) -> None:
+        """Go back to t = 0."""
+        self.together.restart()
+
+    @property
+    def stages(self) -> Stages:
+        """One step, stage by stage, in order."""
+        return self.together.stages
+
+    @property
+    def steps_taken(self) -> int:
+        """Number of steps taken."""
+        return self.together.steps_taken
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s]."""
+        return self.together.time
+
+    @property
+    def engine(self) -> str:
+        """Name of the engine that takes the steps."""
+        return self.together.engine
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the solver's arrays and fields take on the device, of the whole batch."""
+        return self.together.nbytes
+
+    @property
+    def state(self) -> "LatentState":
         """The latent state; `state.numpy()` decodes every particle."""
         return LatentState(self)
 
@@ -218,31 +246,35 @@ class ReducedRun(Phased):
         """[r] latent vector, on the device."""
         return self.record.now
 
+    def trajectory(self) -> LatentTrajectory:
+        """Everything recorded up to now, on the host."""
+        return self.record.trajectory(self.steps_taken, self.dt, self.setup.projector.tolerance)
+
     @property
-    def time(self) -> float:
-        """Simulated time [s]."""
-        return self.steps_taken * self.dt
+    def sample_size(self) -> int:
+        """|S| of the first span of time."""
+        return len(self.sets[0].sample)
 
     @property
     def integration_mean(self) -> float:
         """Mean |N| over the steps taken; before them, how many there may be."""
-        ends = [*self._starts[1:], self.total_steps]
-        taken = [
-            max(0, min(self.steps_taken, end) - start) for start, end in zip(self._starts, ends, strict=True)
-        ]
         if not self.steps_taken:
             return float(len(self.sets[0].integration))
-        sizes = (p.mean_sizes[self._index] for p in self._phases)
-        return sum(n * size for n, size in zip(taken, sizes, strict=True)) / self.steps_taken
+        taken = self.together.steps_by_span()
+        return sum(n * span.mean_sizes[self.index] for n, span in taken) / self.steps_taken
 
     @property
-    def sample_size(self) -> int:
-        """|S| of the first phase."""
-        return len(self.sets[0].sample)
+    def span(self) -> Span:
+        """What takes the steps now: its S, N and arrays."""
+        return self.together.span
 
-    def trajectory(self) -> LatentTrajectory:
-        """Everything recorded up to now, on the host."""
-        return self.record.trajectory(self.steps_taken, self.dt, self.projector.tolerance)
+    def decoder(self, particles: np.ndarray | None = None, at: Restriction | None = None) -> Decoder:
+        """The fields at particles [n], or at all, as the method takes them; see `Setup.decoder`."""
+        return self.setup.decoder(particles, at)
+
+    def sets_at(self, step: int) -> ParticleSets:
+        """S, N and I of the step that starts `step` steps after t = 0."""
+        return self.together.span_at(step).sets
 
     def left_grid(self, since: int = 1) -> int:
         """First step that ended with a sample particle off the grid, or non-finite; −1 when none did.
@@ -252,15 +284,16 @@ class ReducedRun(Phased):
         the full-order solver stops there. For after a run.
         """
         for n in range(since, self.steps_taken + 1):
-            x = self._phase_at(n - 1).at_sample.position(self.record.xhat[n])
+            x = self.together.span_at(n - 1).at_sample.position(self.record.xhat[n])
             if not bool(self._on_grid(x).all()):
                 return n
         return -1
 
     def _on_grid(self, x: torch.Tensor) -> torch.Tensor:
         """[n] whether the stencils of particles at x [n, 3] lie on the grid; False where x is not finite."""
-        reach = 0.5 * (DEGREES[self.transfer.shape] - 1) * self.geometry.dx  # of a stencil below its particle
-        upper = torch.tensor(self.geometry.upper, dtype=self.dtype, device=self.torch_device) - reach
+        geometry = self.setup.geometry
+        reach = 0.5 * (DEGREES[self.setup.transfer.shape] - 1) * geometry.dx  # of a stencil, downwards
+        upper = torch.tensor(geometry.upper, dtype=x.dtype, device=x.device) - reach
         return ((x >= reach) & (x < upper)).all(1)
 
     def needed_outside(self, steps: int | None = None) -> int:
@@ -272,55 +305,31 @@ class ReducedRun(Phased):
 
         Source: paper section 5.4, b.
         """
-        if self.integration.strategy == "search":
+        if self.setup.integration.strategy == "search":
             return 0
-        everything = self.decoder()
-        worst = 0
+        everything, search, worst = self.decoder(), self.setup.search, 0
         for n in range(self.steps_taken if steps is None else steps):
-            phase = self._phase_at(n)
+            sets = self.sets_at(n)
             x = everything.position(self.record.xhat[n])
-            sample = torch.as_tensor(phase.sets.sample, device=self.torch_device)
-            needed = self.search.needed(x, sample)
-            needed[torch.as_tensor(phase.sets.integration, device=self.torch_device)] = False
-            marked = self.search.no_nodes(self.torch_device)
-            self.search.mark_nodes(x[sample].contiguous(), marked)
-            marked[torch.as_tensor(phase.sets.nodes, device=self.torch_device).long()] = 0
+            sample, integration, nodes = (
+                torch.as_tensor(of, device=x.device).long()
+                for of in (sets.sample, sets.integration, sets.nodes)
+            )
+            needed = search.needed(x, sample)
+            needed[integration] = False
+            marked = search.no_nodes(x.device)
+            search.mark_nodes(x[sample].contiguous(), marked)
+            marked[nodes] = 0
             lost = ~self._on_grid(x)
             worst = max(worst, int(needed.sum()) + int(marked.sum()) + int(lost.sum()))
         return worst
-
-
-class ReducedMPM(ReducedRun, Stepping):
-    """Steps a latent vector: infer fields on N, one MPM step, invert on S.
-
-    Args and errors are those of `ReducedRun`.
-
-    Source: paper section 5.
-    """
-
-    def __init__(self, *arguments, **options):
-        super().__init__(*arguments, **options)
-        scene = self.scene
-        self.boundaries = BoundaryArrays(scene.colliders, scene.walls, self.precision, self.device)
-        self._phases = build_phases([self], self.record, self.boundaries)
-        self._enter(self._phases[0])
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes that the solver's arrays and fields take on the device."""
-        return sum(p.nbytes for p in self._phases) + self.record.nbytes
-
-    @property
-    def mode_bytes(self) -> float:
-        """Bytes of the modes of one particle that a step reads; 0 where torch decodes it."""
-        return self._phase.mode_bytes
 
     def equations_at(
         self, step: int, xhat: torch.Tensor, previous: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """What the projection at the end of a step is given, linearised where it starts.
 
-        Leaves the solver in the midst of that step.
+        Leaves the solver in the midst of that step. Of a batch of one.
 
         Args:
             step: steps before it, which set its moment.
@@ -329,44 +338,40 @@ class ReducedMPM(ReducedRun, Stepping):
         Returns:
             Error x_S − g(X_S, x̂_n) [s, 3] [m] and Jacobian ∂g/∂x̂ [s, 3, r] [m].
         """
-        self.steps_taken = step
         self.record.now.copy_(xhat)
         self.record.before.copy_(previous)
-        self._enter(self._phase_at(step))
+        self.together.resume(step)
+        span = self.together.span
         with torch.no_grad(), on_torch_stream(self.device):
-            self.boundaries.start_from(step)
-            for name, stage in self.stages.items():
+            for name, stage in span.stages.items():
                 if name != "inversion":
                     stage()
-            position, jacobian = self._phase.at_sample.position_and_jacobian(self.record.now)
-        return self._phase.x[: self._phase.s] - position, jacobian
+            position, jacobian = span.at_sample.position_and_jacobian(self.record.now)
+        return span.x[: span.s] - position, jacobian
 
 
-def reduced_steps(steps: int, dt_multiplier: float) -> int:
-    """Deployment steps that reach the end of a scene of `steps` steps."""
-    return int(np.ceil(steps / dt_multiplier - 1e-9))
+class LatentState:
+    """The state of a reduced run; particle fields are decoded when they are asked for."""
 
+    def __init__(self, run: ReducedMPM):
+        self._run = run
 
-def _configured(scene) -> float:
-    from omegaconf import OmegaConf
+    @property
+    def xhat(self) -> np.ndarray:
+        """[r] latent vector."""
+        return self._run.xhat.cpu().numpy()
 
-    return float(OmegaConf.select(scene.config, scene.parameters.key))
+    def __len__(self) -> int:
+        return len(self._run.setup.constants)
 
-
-def _indices(sample, particles: int) -> np.ndarray:
-    sample = np.asarray(sample)
-    if sample.ndim != 1 or not np.issubdtype(sample.dtype, np.integer) or not len(sample):
-        raise ShapeError(
-            "sample must be a number or a non-empty list of particle indices; "
-            f"got {sample.dtype} {sample.shape}; give np.flatnonzero(mask) for a mask"
-        )
-    sample = np.unique(sample)
-    if sample[0] < 0 or sample[-1] >= particles:
-        raise ShapeError(f"sample indices {sample[0]} … {sample[-1]} must lie in [0, {particles})")
-    return sample
-
-
-def _shaped(name: str, values, shape: tuple[int, ...]):
-    if np.shape(values) != shape:
-        raise ShapeError(f"{name} must be {list(shape)}, not {list(np.shape(values))}")
-    return np.asarray(values)
+    def numpy(self) -> dict[str, np.ndarray]:
+        """Every particle's x, v [P, 3], C, tau [P, 3, 3], as of the full-order state, and xhat [r]."""
+        run = self._run
+        decoder, now = run.decoder(), run.xhat[None]
+        x = decoder.position(run.xhat)
+        if run.steps_taken == 0:
+            v = run.setup.initial_velocity
+        else:
+            v = (x - decoder.position(run.record.before)) / run.dt
+        fields = {"x": x, "v": v, "C": decoder.affine(now)[0], "tau": decoder.stress(now)[0]}
+        return {name: value.cpu().numpy() for name, value in fields.items()} | {"xhat": self.xhat}

@@ -82,12 +82,8 @@ def compare(
     Raises:
         SchemaError: the trajectory is of other particles, or a continuation is missing or too short.
     """
-    scene, manifold, device, parameters = (
-        solver.scene,
-        solver.manifold,
-        solver.torch_device,
-        solver.parameters,
-    )
+    scene, manifold, setup = solver.scene, solver.manifold, solver.setup
+    device, parameters = setup.torch_device, setup.parameters
     manifold.check_particles(trajectory.x_sha256)
     if manifold.X.device != device:  # frames are encoded where they are
         manifold = copy.deepcopy(manifold).to(device)
@@ -108,7 +104,7 @@ def compare(
 
     def tensor(values) -> torch.Tensor:
         # To the device before the wider type: half the bytes travel, and the device converts.
-        return torch.as_tensor(np.asarray(values)).to(device).to(solver.dtype)
+        return torch.as_tensor(np.asarray(values)).to(device).to(setup.dtype)
 
     xhat, X, mass = tensor(xhat), tensor(trajectory.X), tensor(trajectory.mass)
     inertia = scene.dx**2 * (DEGREES[scene.transfer.shape] + 1) / 12.0
@@ -131,7 +127,7 @@ def compare(
         if start == 0:
             v_rom[0] = v[0]
         previous = x_rom[-1]
-        encoded = manifold.encode(x, tau).to(solver.dtype)
+        encoded = manifold.encode(x, tau).to(setup.dtype)
         x_rec, tau_rec = decoder.position(encoded), decoder.at.stress(encoded, parameters)
         note(
             x_error=metrics.frame_squares(x_rom - x),

@@ -209,7 +209,7 @@ class LiveModel:
         self.shown = _shown(self.particles, sample, points)
         self.at = self.manifold.restrict(self.shown, dtype=torch.float32, device=self._pipeline.device)
         self.X = self.manifold.X[self.shown].numpy().astype(np.float32)
-        self.spacing = float((solver.scene_particles.volume0.sum() / len(self.shown)) ** (1 / 3))
+        self.spacing = float((solver.setup.constants.volume0.sum() / len(self.shown)) ** (1 / 3))
 
     @property
     def initial(self) -> float:

@@ -16,7 +16,7 @@ from nsf.data import Snapshots, Trajectory
 from nsf.data.schema import TRAJECTORY
 from nsf.deployment import Rollout, calibrate, continuation_file, deploy, go_on, rollout_file
 from nsf.dynamics import ParticleSets, ReducedBatch, ReducedMPM
-from nsf.dynamics.solver import reduced_steps
+from nsf.dynamics.setup import reduced_steps
 from nsf.errors import MissingRunError
 from nsf.evaluation import Comparison, Subject, compare, measure, superresolve
 from nsf.kinematics.fields.mlp import MlpField
@@ -28,7 +28,7 @@ from nsf.pipeline import results
 from nsf.pipeline.plan import Plan
 from nsf.pipeline.simulation import Job, Shared, simulate
 from nsf.runs import Record, Run
-from nsf.sampling import SamplePhase
+from nsf.sampling import SampleSpan
 from nsf.scenes import Scene
 from nsf.storage import writing
 
@@ -48,7 +48,7 @@ class Pipeline(Plan):
     def __init__(self, config: DictConfig, say: Callable[[str], None] = print, root: Path | None = None):
         super().__init__(config, root)
         self.say = say
-        self._phases: Sequence[SamplePhase] | None = None
+        self._samples: Sequence[SampleSpan] | None = None
         self._sets: Sequence[ParticleSets] | None = None
 
     @classmethod
@@ -168,11 +168,7 @@ class Pipeline(Plan):
         self, manifold: Manifold, value: float, device: str | None = None, precision: str | None = None
     ) -> ReducedMPM:
         """The reduced solver at a parameter value, at t = 0; device and precision as configured."""
-        parameters = {self.scene.parameters.name: value}
-        how = self._how(device, precision)
-        solver = self.deployed.reduced(manifold, parameters, self._phases or self.sampler, **how)
-        self._phases, self._sets = solver.phases, solver.sets
-        return solver
+        return self.batch_at(manifold, [value], device, precision).runs[0]
 
     def batch_at(
         self,
@@ -181,25 +177,23 @@ class Pipeline(Plan):
         device: str | None = None,
         precision: str | None = None,
     ) -> ReducedBatch:
-        """Reduced solvers at several parameter values that take their steps together, likewise."""
-        parameters = [{self.scene.parameters.name: value} for value in values]
-        how = self._how(device, precision)
-        batch = self.deployed.reduced_batch(manifold, parameters, self._phases or self.sampler, **how)
-        self._phases, self._sets = batch.runs[0].phases, batch.runs[0].sets
-        return batch
-
-    def _how(self, device: str | None, precision: str | None) -> dict:
-        """Options of a reduced solver."""
-        return {
-            "method": self.method,
-            "projector": self.projector,
-            "integration": self.integration,
-            "precision": precision or self.config.precision,
-            "device": device or self.device,
-            "dt_multiplier": self.config.deploy.dt_multiplier,
+        """Reduced runs at several parameter values that take their steps together, likewise."""
+        batch = self.deployed.reduced_batch(
+            manifold,
+            [{self.scene.parameters.name: value} for value in values],
+            self._samples or self.sampler,
+            engine=self.engine,
+            method=self.method,
+            projector=self.projector,
+            integration=self.integration,
+            precision=precision or self.config.precision,
+            device=device or self.device,
+            dt_multiplier=self.config.deploy.dt_multiplier,
             # As the sample, these depend on the manifold and the sampler alone: found once for all values.
-            "sets": self._sets,
-        }
+            sets=self._sets,
+        )
+        self._samples, self._sets = batch.batch.shared.samples, batch.batch.shared.sets
+        return batch
 
     def deploy(self) -> Run:
         """Reduced trajectories of the held-out values, through Lightning's `Trainer.predict`."""
@@ -208,9 +202,8 @@ class Pipeline(Plan):
     def _deploy(self, run: Run) -> None:
         manifold = self.manifold().to(self.device)  # many solvers take their rows from it
         with run.record(device=self.device, precision=self.config.precision) as record:
-            build = partial(self.solver_at, manifold)
             started = time.perf_counter()
-            trust = calibrate(build, manifold, self.device)
+            trust = calibrate(partial(self.solver_at, manifold), manifold, self.device)
             record.metrics["trust"] = {
                 "residual_m": trust.residual,
                 "distance_m": trust.distance,
@@ -218,15 +211,15 @@ class Pipeline(Plan):
             }
             hand_over = self.config.deploy.on_distrust == "full_order"
             together = min(self.config.deploy.batch, len(self.held_out))
-            rollouts = deploy(
-                build,
-                self.held_out,
-                self.device,
-                trust,
-                hand_over,
-                partial(self.batch_at, manifold),
-                together,
-            )
+
+            def batch_at(values: Sequence[float], device: str) -> ReducedBatch:
+                batch = self.batch_at(manifold, values, device)
+                record.metrics |= {"engine": batch.engine, "engine_why": batch.why}
+                return batch
+
+            rollouts = deploy(batch_at, self.held_out, self.device, trust, hand_over, together)
+            engine, why = record.metrics["engine"], record.metrics["engine_why"]
+            self.say(f"deploy: engine {engine}" + (f", since {why}" if why else ""))
             for index, rollout in enumerate(rollouts):
                 rollout.save(run.path / rollout_file(index))
                 record.output(rollout_file(index))

@@ -12,6 +12,8 @@ from omegaconf.errors import ConfigKeyError
 from nsf import config as configuration
 from nsf.data import Split
 from nsf.dynamics.interop import torch_device
+from nsf.engines import NAMES as ENGINES
+from nsf.engines.modal.mirrors import edits
 from nsf.errors import ConfigError, DeviceError
 from nsf.kinematics.fields.basis import BasisField
 from nsf.kinematics.fields.mlp import MlpField
@@ -44,6 +46,7 @@ class Plan:
 
     Attributes:
         scene: that is trained on; deployed: that of the held-out simulations and of deployment.
+        engine: name of the engine that is asked for.
         split: parameter values by their use.
         device: found once, so that a missing GPU is reported before any work.
 
@@ -71,6 +74,8 @@ class Plan:
         self.split = Split(train=tuple(p.train), validation=tuple(p.validation), test=tuple(p.test))
         for name in ("field", "trainer", "method", "sampler", "projector", "integration"):
             setattr(self, name, configuration.build(c[name], name))
+        # A configuration from before there were engines has no such key.
+        self.engine = OmegaConf.select(c, "engine.name", default="auto")
         self._check_numbers()
         self._check_words()
         self._check_batch()
@@ -105,12 +110,15 @@ class Plan:
                 f"deploy.batch={size} needs field=basis or joint, whose steps are taken in coefficients; "
                 "set deploy.batch=1"
             )
+        if self.engine == "reference":
+            raise ConfigError(f"deploy.batch={size} needs engine=modal, or auto; set it, or deploy.batch=1")
         if self.integration.strategy != "superset":
             raise ConfigError(f"deploy.batch={size} needs integration=superset; set it, or deploy.batch=1")
 
     def _check_words(self) -> None:
         """Values that are one of a few, and the report's name."""
         c = self.config
+        _one_of("engine.name", self.engine, ENGINES)
         _one_of("deploy.split", c.deploy.split, ("test", "validation", "train"))
         _one_of("deploy.on_distrust", c.deploy.on_distrust, ("report", "full_order"))
         check_tracking(c.tracking)
@@ -253,6 +261,10 @@ class Plan:
         )
         if isinstance(self.field, MlpField):
             content["arithmetic"] = self.field.arithmetic
+        if self.engine != "auto":
+            content["engine"] = self.engine
+        if changed := edits():  # an edited step is another run, whose result is not there yet
+            content["edited"] = changed
         return Run.open("deploy", self.scene.name, content, [self.training], root=self.root)
 
     @property

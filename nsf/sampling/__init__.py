@@ -3,7 +3,7 @@
 from nsf.sampling.cells import CellSampler
 from nsf.sampling.cubature import CubatureSampler
 from nsf.sampling.qdeim import QdeimSampler
-from nsf.sampling.sampler import GreedySampler, RandomSampler, SamplePhase, Sampler, UnweightedSampler
+from nsf.sampling.sampler import GreedySampler, RandomSampler, Sampler, SampleSpan, UnweightedSampler
 
 __all__ = [
     "CellSampler",
@@ -11,7 +11,7 @@ __all__ = [
     "GreedySampler",
     "QdeimSampler",
     "RandomSampler",
-    "SamplePhase",
+    "SampleSpan",
     "Sampler",
     "UnweightedSampler",
 ]

@@ -2,17 +2,14 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from typing_extensions import override
 
 from nsf.errors import ConfigError, ProjectionError
-from nsf.sampling.sampler import SamplePhase, Sampler
-
-if TYPE_CHECKING:
-    from nsf.dynamics.solver import ReducedMPM
+from nsf.sampling.sampler import Sampler, SampleSpan, Teacher
 
 _EXACT = 1e-9  # residual over target at which a cubature counts as exact
 _STILL = 1e-6  # root mean square motion in a step over Δx, below which a body counts as at rest
@@ -26,12 +23,12 @@ class CubatureSampler(Sampler):
     of them takes a Gauss-Newton step from the sums Σ J_pᵀ J_p and Σ J_pᵀ (x_p − g(X_p, x̂)), J_p = ∂g/∂x̂.
     S and its positive weights are found so that the weighted sums over S come near to both in many states,
     by least squares with a growing set of particles. No random number is drawn. |S| may end below `size`,
-    when fewer particles give the sums exactly; a smaller sample is not a part of a larger. A phase of time
+    when fewer particles give the sums exactly; a smaller sample is not a part of a larger. A span of time
     learns from the states of its own time.
 
     Attributes:
         size: |S| at most.
-        states: number of training states, evenly spread over those of the phase.
+        states: number of training states, evenly spread over those of the span.
 
     Raises:
         ConfigError: states is not a positive whole number.
@@ -49,14 +46,14 @@ class CubatureSampler(Sampler):
             raise ConfigError(f"sampler.states={self.states} must be a whole number of at least 1")
 
     @override
-    def phase_of(self, region, end, manifold, device="cpu", whole=None):
+    def span_of(self, region, end, manifold, device="cpu", whole=None):
         candidates = region.candidates(manifold.X.cpu().numpy())
         rows = training_rows(manifold, region.start, end, self.states)
         equations = normal_equations(manifold, rows, candidates, whole)
         among = self.among(equations)
         chosen, weights = nonnegative_fit(equations.columns[:, among], equations.target, region.size)
         order = np.argsort(chosen)
-        return SamplePhase(region.start, candidates[among][chosen][order], weights[order])
+        return SampleSpan(region.start, candidates[among][chosen][order], weights[order])
 
     def among(self, equations: "Equations") -> np.ndarray | slice:
         """Which of the candidates may be taken; all of them."""
@@ -97,7 +94,7 @@ def training_rows(manifold, start: float, end: float, count: int) -> torch.Tenso
 
 @torch.no_grad()
 def normal_equations(
-    manifold, rows: torch.Tensor, candidates: np.ndarray, whole: "Callable[[Mapping[str, float]], ReducedMPM]"
+    manifold, rows: torch.Tensor, candidates: np.ndarray, whole: Callable[[Mapping[str, float]], Teacher]
 ) -> Equations:
     """Each particle's share in the normal equations of one projection step from training states.
 
@@ -124,13 +121,13 @@ def normal_equations(
             parameters = manifold.training_parameters[row]
             values = dict(zip(manifold.parameter_names, parameters.tolist(), strict=True))
             solver = whole(values)
-            chosen = torch.as_tensor(candidates, device=solver.torch_device)
-        previous, xhat = manifold.training_latents[row - 1 : row + 1].to(solver.torch_device, solver.dtype)
+        previous, xhat = manifold.training_latents[row - 1 : row + 1]
         step = round(float(manifold.training_times[row]) / solver.dt)
         error, J = solver.equations_at(step, xhat, previous)
         if not error.isfinite().all():
             continue
-        least = _STILL * solver.geometry.dx * len(error) ** 0.5
+        chosen = torch.as_tensor(candidates, device=error.device)
+        least = _STILL * solver.dx * len(error) ** 0.5
         for shares in _shares(error.double(), J.double(), least):
             columns.append(shares[chosen].T)
             target.append(shares.sum(0))
@@ -139,7 +136,7 @@ def normal_equations(
             f"of the steps from {len(rows)} training states none is finite; a cubature has nothing to learn "
             "from; choose another sampler"
         )
-    cells = np.floor(manifold.X.cpu().numpy()[candidates] / solver.geometry.dx).astype(int)
+    cells = np.floor(manifold.X.cpu().numpy()[candidates] / solver.dx).astype(int)
     return Equations(torch.cat(columns), torch.cat(target), cells)
 
 

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -11,15 +11,28 @@ from typing_extensions import override
 
 from nsf.errors import ConfigError, ProjectionError
 
-if TYPE_CHECKING:
-    from nsf.dynamics.solver import ReducedMPM
-
 _CHUNK = 2**25  # values decoded at once
 _SNAPSHOTS = 256  # latents that displacement modes are taken from
 
 
+class Teacher(Protocol):
+    """A reduced solver whose sample is every particle, for a sampler that learns from its steps.
+
+    Attributes:
+        dt: step [s]; dx: grid spacing [m].
+    """
+
+    dt: float
+    dx: float
+
+    def equations_at(
+        self, step: int, xhat: torch.Tensor, previous: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Error [P, 3] and Jacobian [P, 3, r] [m] of the projection that ends a step from x̂_n and x̂_{n−1}."""
+
+
 @dataclass(frozen=True)
-class SamplePhase:
+class SampleSpan:
     """Sample particles that hold from a moment on.
 
     Attributes:
@@ -82,17 +95,17 @@ class Region:
 
 @dataclass(frozen=True)
 class Sampler(ABC):
-    """A choice of sample particles, by region and by phase of time.
+    """A choice of sample particles, by region and by span of time.
 
     Attributes:
-        size: |S| of the first phase.
-        lower, upper: box of reference positions [m] of the first phase.
-        phases: later phases, each with keys size, start and optionally lower, upper.
+        size: |S| of the first span.
+        lower, upper: box of reference positions [m] of the first span.
+        phases: later spans, each with keys size, start and optionally lower, upper.
 
     Raises:
-        ConfigError: a size is not positive, or phases are out of order.
+        ConfigError: a size is not positive, or spans are out of order.
 
-    Source: paper section 5.4; phases: section 6.1 (cake, 700 then 400 particles).
+    Source: paper section 5.4; spans of time: section 6.1 (cake, 700 then 400 particles).
     """
 
     size: int
@@ -120,16 +133,16 @@ class Sampler(ABC):
 
     @property
     def regions(self) -> list[Region]:
-        """Every phase, the first included."""
+        """Every span, the first included."""
         return [Region(self.size, self.lower, self.upper), *(Region(**p) for p in self.phases)]
 
-    def phases_of(
+    def spans_of(
         self,
         manifold,
         device: str | torch.device = "cpu",
-        whole: "Callable[[Mapping[str, float]], ReducedMPM] | None" = None,
-    ) -> list[SamplePhase]:
-        """Choose the sample particles of each phase.
+        whole: Callable[[Mapping[str, float]], Teacher] | None = None,
+    ) -> list[SampleSpan]:
+        """Choose the sample particles of each span.
 
         Args:
             manifold: trained fields of the particles.
@@ -142,22 +155,22 @@ class Sampler(ABC):
         """
         ends = [region.start for region in self.regions[1:]] + [1.0]
         return [
-            self.phase_of(region, end, manifold, device, whole)
+            self.span_of(region, end, manifold, device, whole)
             for region, end in zip(self.regions, ends, strict=True)
         ]
 
     @abstractmethod
-    def phase_of(self, region: Region, end: float, manifold, device="cpu", whole=None) -> SamplePhase:
-        """The sample particles of one phase, which ends at a fraction of T; the rest as for `phases_of`."""
+    def span_of(self, region: Region, end: float, manifold, device="cpu", whole=None) -> SampleSpan:
+        """The sample particles of one span, which ends at a fraction of T; the rest as for `spans_of`."""
 
 
 class UnweightedSampler(Sampler):
     """A choice of particles that all weigh the same."""
 
     @override
-    def phase_of(self, region, end, manifold, device="cpu", whole=None):
+    def span_of(self, region, end, manifold, device="cpu", whole=None):
         candidates = region.candidates(manifold.X.cpu().numpy())
-        return SamplePhase(region.start, np.sort(self.choose(manifold, candidates, region.size, device)))
+        return SampleSpan(region.start, np.sort(self.choose(manifold, candidates, region.size, device)))
 
     @abstractmethod
     def choose(self, manifold, candidates: np.ndarray, size: int, device="cpu") -> np.ndarray:

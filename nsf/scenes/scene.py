@@ -380,20 +380,20 @@ class Scene:
             manifold: a trained `nsf.Manifold` of these particles.
             parameters: problem parameters `{name: value}`.
             sample: indices of the sample particles S, or their number.
-            **options: see `nsf.dynamics.ReducedMPM.of_scene`.
+            **options: see `nsf.engines.reduced`; `engine` says how steps are computed.
         """
-        from nsf.dynamics import ReducedMPM
+        from nsf import engines
 
-        return ReducedMPM.of_scene(self, manifold, parameters, sample, **options)
+        return engines.reduced(self, manifold, parameters, sample, **options)
 
     def reduced_batch(self, manifold, parameters: Sequence[Mapping[str, float]], sample=None, **options):
-        """Reduced solvers at t = 0 that take their steps in the same launches, one for each `{name: value}`.
+        """Reduced runs at t = 0 that take their steps together, one for each `{name: value}`.
 
         Args:
             manifold, sample: as for `reduced`.
             parameters: problem parameters of each.
-            **options: see `nsf.dynamics.ReducedBatch.of_scene`.
+            **options: see `nsf.engines.reduced_batch`.
         """
-        from nsf.dynamics import ReducedBatch
+        from nsf import engines
 
-        return ReducedBatch.of_scene(self, manifold, parameters, sample, **options)
+        return engines.reduced_batch(self, manifold, parameters, sample, **options)

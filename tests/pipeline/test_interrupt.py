@@ -20,7 +20,7 @@ STAGES = ("simulate", "train", "deploy", "evaluate")
 MOMENTS = {
     "simulate": SignalAt("nsf.mpm:FullOrderMPM.step", 40),
     "train": SignalAt("nsf.kinematics.training.descent:Steps._take", 330),
-    "deploy": SignalAt("nsf.dynamics.modal:ModalPhase.invert", 10),
+    "deploy": SignalAt("nsf.engines.modal.span:ModalSpan.project", 10),
     "evaluate": SignalAt("nsf.evaluation.cost:_stages"),
 }
 

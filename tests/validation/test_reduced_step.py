@@ -11,6 +11,7 @@ import nsf.scenes
 from nsf.dynamics import GaussNewton, Integration, NeighbourSearch, Taylor
 from nsf.dynamics.integration import particle_sets
 from nsf.dynamics.interop import as_matrices, as_scalars, as_vectors
+from nsf.engines import ENGINES
 from nsf.mpm import FP64, BoundaryArrays, Grid, GridStep
 from nsf.sampling import RandomSampler
 
@@ -114,22 +115,13 @@ def test_moving_colliders_are_felt_at_their_time(mid_run):
     assert (late - after).abs().max() > 1e-6
 
 
-class OfPositions:
-    """A projector that a step in coefficients cannot take."""
-
-    iterations, tolerance = GaussNewton.iterations, GaussNewton.tolerance
-    start, solve = GaussNewton().start, GaussNewton().solve
-
-
 @pytest.mark.parametrize("multiplier", [1.0, 1.5])
 @pytest.mark.parametrize("strategy", ["superset", "search"])
-@pytest.mark.parametrize(
-    "projector", [GaussNewton(tolerance=1e-14), OfPositions()], ids=["coefficients", "positions"]
-)
-def test_a_reduced_run_meets_moving_colliders_in_every_phase(
-    projector, strategy, multiplier, tiny, tiny_manifold
+@pytest.mark.parametrize("engine", [engine.name for engine in ENGINES])
+def test_a_reduced_run_meets_moving_colliders_in_every_span(
+    engine, strategy, multiplier, tiny, tiny_manifold
 ):
-    """S moves as in a step over every particle, with its Δt, at any time and after a change of phase."""
+    """S moves as in a step over every particle, with its Δt, at any time and after a change of sample."""
     scene = nsf.scenes.load("sand", [*tiny[1:], *MOVING]).with_parameters({"friction_angle": 26.0})
     sampler = RandomSampler(20, phases=[{"start": 0.5, "size": 8}])
     solver = scene.reduced(
@@ -139,15 +131,16 @@ def test_a_reduced_run_meets_moving_colliders_in_every_phase(
         device="cpu",
         integration=Integration(strategy),
         dt_multiplier=multiplier,
-        projector=projector,
+        projector=GaussNewton(tolerance=1e-14),
+        engine=engine,
     )
     half = round(0.5 * solver.total_steps)
     sizes, felt = set(), 0.0
     for n in range(solver.total_steps):
         if n in (3, half - 1, half, half + 4):
             state = {name: torch.tensor(value) for name, value in solver.state.numpy().items()}
-            phase = solver._phase_at(n)
-            sample, others = phase.sets.sample, np.arange(len(solver.state))
+            span = solver.together.span_at(n)
+            sample, others = span.sets.sample, np.arange(len(solver.state))
             rows = np.concatenate([sample, np.setdiff1d(others, sample)])
             expected = moved_sample(scene, state, rows, sample, None, n, solver.dt)
             still = replace(scene, colliders=scene.colliders[:1])
@@ -155,7 +148,7 @@ def test_a_reduced_run_meets_moving_colliders_in_every_phase(
             felt = max(felt, (without - expected).abs().max())
             solver.step()
             # What G2P gave is there until the next step.
-            assert (phase.x[: phase.s] - expected).abs().max() <= 1e-12
+            assert (span.x[: span.s] - expected).abs().max() <= 1e-12
             sizes.add(len(sample))
         else:
             solver.step()
@@ -165,7 +158,7 @@ def test_a_reduced_run_meets_moving_colliders_in_every_phase(
 
 @pytest.mark.parametrize("strategy", ["superset", "search"])
 def test_a_step_started_from_latents_is_the_one_of_the_run(strategy, tiny, tiny_manifold):
-    """At its moment, which moving colliders feel, and in its phase: the same Gauss-Newton step."""
+    """At its moment, which moving colliders feel, and with its sample: the same Gauss-Newton step."""
     scene = nsf.scenes.load("sand", [*tiny[1:], *MOVING]).with_parameters({"friction_angle": 26.0})
     sampler = RandomSampler(20, phases=[{"start": 0.5, "size": 8}])
     options = {"device": "cpu", "integration": Integration(strategy), "projector": Taylor()}

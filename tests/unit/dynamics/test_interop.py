@@ -59,8 +59,7 @@ def test_captured_steps_are_the_steps_themselves(neural_stress, neural_affine, c
         solver = chain.pipeline.scene.reduced(
             tiny_manifold, {"friction_angle": 26.0}, 60, method=method, device="cuda"
         )
-        for phase in solver._phases:
-            phase.capturable = capturable
+        solver.span.capturable = capturable
         solver.step(8)
         found.append(solver.trajectory().xhat)
     np.testing.assert_allclose(*found, rtol=1e-6, atol=1e-8)

@@ -8,7 +8,7 @@ import torch
 
 from nsf import config
 from nsf.dynamics import Method
-from nsf.dynamics.stress import StressFromDeformation
+from nsf.dynamics.methods import StressFromDeformation
 from nsf.mpm import precision_of
 from nsf.mpm.device import warp_device
 from nsf.mpm.materials import VonMisesSoftening
@@ -52,7 +52,7 @@ def test_the_four_are_all_there(tiny):
 def test_runs_to_the_end(solver):
     solver.step(solver.total_steps)
     assert np.isfinite(solver.trajectory().xhat).all()
-    assert solver.state.numpy()["x"][:, 2].mean() < solver.scene_particles.X[:, 2].mean() - 1e-3
+    assert solver.state.numpy()["x"][:, 2].mean() < solver.setup.constants.X[:, 2].mean() - 1e-3
 
 
 def test_stress_and_affine_on_the_particles(solver, method, tiny_manifold):
@@ -60,7 +60,7 @@ def test_stress_and_affine_on_the_particles(solver, method, tiny_manifold):
     solver.step(12)
     xhat = solver.xhat.clone()
     solver.stages["inference"]()
-    phase = solver._phase
+    phase = solver.span
     taken = phase.needed[0].bool()  # the others are not evaluated
     assert taken[: phase.s].all()
     fields = tiny_manifold.restrict(particles=torch.as_tensor(phase.order)[taken])

@@ -18,11 +18,12 @@ from nsf.dynamics import (
     ParticleSets,
     ProjectionResult,
     ReducedMPM,
+    Setup,
     Taylor,
 )
 from nsf.errors import ConfigError, NSFError, ProjectionError, SchemaError, ShapeError
 from nsf.mpm import FullOrderMPM, ParticleConstants
-from nsf.sampling import RandomSampler, SamplePhase
+from nsf.sampling import RandomSampler, SampleSpan
 from nsf.scenes import Scene
 from nsf.timing import StageTimer
 
@@ -91,7 +92,7 @@ def test_samples_are_indices_a_number_or_a_sampler(solver_of, sample):
 def test_the_configured_sample_and_value_are_the_defaults(chain, tiny_manifold):
     solver = chain.scene.reduced(tiny_manifold, device="cpu")
     assert solver.sample_size == chain.scene.config.scene.reduced.sample == 150
-    assert solver.parameters.tolist() == [chain.scene.config.material.friction_angle]
+    assert solver.setup.parameters.tolist() == [chain.scene.config.material.friction_angle]
 
 
 def test_single_precision(solver_of):
@@ -110,7 +111,7 @@ def test_the_first_velocity_is_the_initial_one(tiny, solver_of):
     solver = solver_of(scene=scene)
     np.testing.assert_array_equal(solver.state.numpy()["v"], np.tile(velocity, (500, 1)))
     solver.stages["inference"]()
-    v = solver._phase.v[solver._phase.needed[0].bool()].numpy()
+    v = solver.span.v[solver.span.needed[0].bool()].numpy()
     assert len(v) > len(solver.sets[0].sample)
     np.testing.assert_allclose(v, np.tile(velocity, (len(v), 1)), rtol=1e-12)
 
@@ -126,7 +127,7 @@ def test_the_initial_velocity_moves_the_sample(tiny, solver_of):
         for name, stage in solver.stages.items():
             if name != "inversion":
                 stage()
-        moved.append(solver._phase.x[: len(sample)].numpy())
+        moved.append(solver.span.x[: len(sample)].numpy())
     np.testing.assert_allclose(
         moved[1] - moved[0], np.tile([0, 0, 0.2 * still.dt], (len(sample), 1)), atol=1e-12
     )
@@ -141,7 +142,7 @@ def test_afterwards_velocities_are_backward_differences(solver_of, tiny_manifold
     np.testing.assert_allclose(solver.state.numpy()["v"], expected, rtol=1e-9, atol=1e-12)
     solver.stages["inference"]()
     # S comes first in N, whichever way N is found.
-    rows, found = solver._phase.sets.sample, solver._phase.v.numpy()[: solver.sample_size]
+    rows, found = solver.span.sets.sample, solver.span.v.numpy()[: solver.sample_size]
     np.testing.assert_allclose(found, expected[rows], rtol=1e-9, atol=1e-12)
 
 
@@ -163,7 +164,7 @@ def test_a_longer_step_follows_the_same_motion(solver_of):
     one, other = solver_of(), solver_of(dt_multiplier=1.5)
     assert run(one).t[-1] == pytest.approx(run(other).t[-1])
     ends = [solver.state.numpy()["x"] for solver in (one, other)]
-    assert np.linalg.norm(ends[0] - ends[1]) < 0.2 * np.linalg.norm(ends[0] - one.scene_particles.X)
+    assert np.linalg.norm(ends[0] - ends[1]) < 0.2 * np.linalg.norm(ends[0] - one.setup.constants.X)
 
 
 @pytest.mark.parametrize("multiplier", [0.0, -1.0, float("nan")])
@@ -188,8 +189,8 @@ def test_search_and_superset_are_the_same_run(solver_of, corner):
     """Superset and searched N move S alike: 'there is no approximation in this step'."""
     searching, fixed = solver_of(corner, integration=SEARCH), solver_of(corner)
     one, other = run(searching), run(fixed)
-    assert len(corner) < searching.integration_mean == fixed.integration_mean < fixed._phase.size < 500
-    assert searching._phase.size == 500
+    assert len(corner) < searching.integration_mean == fixed.integration_mean < fixed.span.size < 500
+    assert searching.span.size == 500
     difference = searching.state.numpy()["x"] - fixed.state.numpy()["x"]
     assert np.abs(difference).max() < 1e-10
     np.testing.assert_allclose(one.xhat, other.xhat, atol=1e-8)
@@ -255,7 +256,7 @@ def test_a_node_outside_the_superset_is_reported(solver_of, corner, monkeypatch)
         lost = int(marked.nonzero()[0, 0])
         return ParticleSets(sets.sample, sets.integration, sets.nodes[sets.nodes != lost])
 
-    chain_X = solver_of(corner).scene_particles.X
+    chain_X = solver_of(corner).setup.constants.X
     monkeypatch.setattr(NeighbourSearch, "superset", incomplete)
     solver = solver_of(corner)
     run(solver, 2)
@@ -268,30 +269,30 @@ def test_a_wider_margin_gives_a_larger_superset(solver_of, corner):
 
 
 def test_sets_start_with_the_sample(solver_of, corner):
-    sets = solver_of(corner)._phase.sets
+    sets = solver_of(corner).span.sets
     assert sets.integration[: len(corner)].tolist() == corner.tolist()
     assert len(set(sets.integration)) == len(sets.integration)
     assert (np.diff(sets.nodes) > 0).all()
 
 
-# -- phases ---------------------------------------------------------------------------------------------
+# -- spans ----------------------------------------------------------------------------------------------
 
 
-def test_a_change_of_phase_keeps_the_velocity(solver_of, chain):
-    """A second phase of the same particles changes nothing: the backward difference goes across it."""
+def test_a_change_of_span_keeps_the_velocity(solver_of, chain):
+    """A second span of the same particles changes nothing: the backward difference goes across it."""
     plain = RandomSampler(20, seed=3)
     phased = RandomSampler(20, seed=3, phases=[{"start": 0.25, "size": 20}, {"start": 0.7, "size": 20}])
     one, other = (run(solver_of(sample, projector=EXACT)) for sample in (plain, phased))
     np.testing.assert_allclose(one.xhat, other.xhat, rtol=0, atol=1e-12)
 
 
-def test_phases_begin_when_they_say(solver_of):
+def test_spans_begin_when_they_say(solver_of):
     solver = solver_of(RandomSampler(40, phases=[{"start": 0.5, "size": 8}]))
     assert solver.sample_size == 40
     solver.step(12)
-    assert solver._phase.s == 40
+    assert solver.span.s == 40
     solver.step(1)
-    assert solver._phase.s == 8
+    assert solver.span.s == 8
     run(solver, 11)
     assert solver.needed_outside() == 0
 
@@ -306,7 +307,7 @@ def test_a_projector_of_ones_own_needs_all_of_one(solver_of):
         solver_of(20, projector=Half())
 
 
-def test_every_phase_needs_enough_particles(solver_of):
+def test_every_span_needs_enough_particles(solver_of):
     with pytest.raises(ProjectionError, match=r"\|S\|=1 gives 3 equations for r=4"):
         solver_of(RandomSampler(40, phases=[{"start": 0.5, "size": 1}]))
 
@@ -331,7 +332,7 @@ def test_timed_steps_are_steps(solver_of, sample):
 def weighted_run(solver_of):
     """Weights of 20 sample particles, options → the first half of a run."""
     particles = np.arange(0, 500, 25)
-    return lambda weights, **options: run(solver_of([SamplePhase(0.0, particles, weights)], **options), 12)
+    return lambda weights, **options: run(solver_of([SampleSpan(0.0, particles, weights)], **options), 12)
 
 
 @pytest.mark.parametrize("projector", [GaussNewton(), Taylor()], ids=["gauss_newton", "taylor"])
@@ -357,7 +358,7 @@ def test_a_common_factor_of_the_weights_changes_nothing(weighted_run):
 )
 def test_weights_out_of_range(weights):
     with pytest.raises(ConfigError, match=r"weights of 20 sample particles must be as many positive numbers"):
-        SamplePhase(0.0, np.arange(20), weights)
+        SampleSpan(0.0, np.arange(20), weights)
 
 
 # -- records --------------------------------------------------------------------------------------------
@@ -438,7 +439,7 @@ def test_a_mask_is_not_taken_for_indices(chain, tiny_manifold):
         solver = chain.scene.reduced(tiny_manifold, ANGLE, mask, device="cpu")
     except NSFError:
         return
-    assert solver._phase.sets.sample.tolist() == np.flatnonzero(mask).tolist()
+    assert solver.span.sets.sample.tolist() == np.flatnonzero(mask).tolist()
 
 
 @pytest.mark.parametrize("sample", [[], [-1], [500], [0.5, 1.0], "many", 0], ids=str)
@@ -458,9 +459,9 @@ def test_unknown_parameter(chain, tiny_manifold):
 
 
 def test_a_parameter_that_the_fields_need_is_missing(chain, tiny_manifold):
-    phases = [SamplePhase(0.0, np.arange(20))]
+    samples = [SampleSpan(0.0, np.arange(20))]
     with pytest.raises(ConfigError, match=r"lack \['friction_angle'\]"):
-        ReducedMPM(tiny_manifold, chain.scene, phases, {}, device="cpu")
+        Setup(tiny_manifold, chain.scene, samples, {}, device="cpu")
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """Cubature of the projection: weighted sample particles that stand for all (the paper's future work)."""
 
 import re
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,7 +8,7 @@ import torch
 
 from nsf.dynamics import ParticleSets
 from nsf.errors import ConfigError, ProjectionError
-from nsf.sampling import CellSampler, CubatureSampler, SamplePhase
+from nsf.sampling import CellSampler, CubatureSampler, SampleSpan
 from nsf.sampling.cells import added_up
 from nsf.sampling.cubature import nonnegative_fit, normal_equations, training_rows
 
@@ -33,9 +32,9 @@ def equations(tiny_manifold, whole):
 
 
 @pytest.fixture(scope="module")
-def phase_of(tiny_manifold, whole):
+def span_of(tiny_manifold, whole):
     """Size and settings → the first phase."""
-    return lambda size, **settings: CubatureSampler(size, states=STATES, **settings).phases_of(
+    return lambda size, **settings: CubatureSampler(size, states=STATES, **settings).spans_of(
         tiny_manifold, whole=whole
     )[0]
 
@@ -78,7 +77,7 @@ def test_both_sums_of_a_state_have_norm_one(equations):
 class Still:
     """A whole body of two latents in which some particles never move, and the others move by `motion` [m]."""
 
-    torch_device, dtype, dt, geometry = torch.device("cpu"), torch.float64, 0.005, SimpleNamespace(dx=0.02)
+    dt, dx = 0.005, 0.02
 
     def __init__(self, motion):
         generator = torch.Generator().manual_seed(2)
@@ -137,9 +136,9 @@ def test_nonnegative_fit_meets_the_conditions_of_an_optimum():
 # -- the choice -----------------------------------------------------------------------------------------
 
 
-def test_a_cubature_of_any_size_takes_the_step_of_every_particle(tiny_manifold, whole, phase_of):
+def test_a_cubature_of_any_size_takes_the_step_of_every_particle(tiny_manifold, whole, span_of):
     """With as many particles as wanted the sums are exact, and so is the Gauss-Newton step."""
-    phase = phase_of(500)
+    phase = span_of(500)
     assert 14 <= len(phase.particles) <= STATES * 14
     few = torch.as_tensor(phase.particles)
     root = torch.as_tensor(phase.weights).sqrt()[:, None]
@@ -156,26 +155,26 @@ def test_a_cubature_of_any_size_takes_the_step_of_every_particle(tiny_manifold, 
         assert float((sample - everyone).norm() / everyone.norm()) < 1e-5
 
 
-def test_the_residual_falls_with_size_and_beats_random_samples(equations, phase_of):
+def test_the_residual_falls_with_size_and_beats_random_samples(equations, span_of):
     """Every one of those with equal weights, and on average those with weights fitted as well as these."""
     columns, target, _ = equations
     before = np.inf
     for size in (4, 8, 16, 32):
-        ours = residual(equations, phase_of(size))
+        ours = residual(equations, span_of(size))
         assert ours < 0.8 * before
         before, fitted = ours, []
         for seed in range(20):
             draw = np.random.default_rng(seed).permutation(500)[:size]
-            assert ours < residual(equations, SamplePhase(0.0, draw, np.full(size, 500 / size)))
+            assert ours < residual(equations, SampleSpan(0.0, draw, np.full(size, 500 / size)))
             chosen, weights = nonnegative_fit(columns[:, draw], target, size)
-            fitted.append(residual(equations, SamplePhase(0.0, draw[chosen], weights)))
+            fitted.append(residual(equations, SampleSpan(0.0, draw[chosen], weights)))
         assert ours < np.mean(fitted)
 
 
 def test_a_cubature_out_of_cells_needs_fewer_integration_particles(chain, tiny_manifold, whole, equations):
     """All of S is in the cells that are allowed, and weights bring the sums nearer than equal ones there."""
     few, any_cell = (
-        kind(24, states=STATES, **own).phases_of(tiny_manifold, whole=whole)
+        kind(24, states=STATES, **own).spans_of(tiny_manifold, whole=whole)
         for kind, own in ((CellSampler, {"cells": 3}), (CubatureSampler, {}))
     )
     every, cell = np.unique(np.floor(tiny_manifold.X.numpy() / chain.scene.dx), axis=0, return_inverse=True)
@@ -186,7 +185,7 @@ def test_a_cubature_out_of_cells_needs_fewer_integration_particles(chain, tiny_m
         three = np.random.default_rng(seed).permutation(len(every))[:3]
         inside = np.flatnonzero(np.isin(cell.ravel(), three))
         chosen, weights = nonnegative_fit(equations.columns[:, inside], equations.target, 24)
-        others.append(residual(equations, SamplePhase(0.0, inside[chosen], weights)))
+        others.append(residual(equations, SampleSpan(0.0, inside[chosen], weights)))
     assert residual(equations, few[0]) < 0.7 * np.mean(others)
     sizes = []
     for phases in (few, any_cell):
@@ -202,19 +201,19 @@ def test_sums_over_cells(equations):
     np.testing.assert_allclose(added_up(equations.columns, cell), expected, rtol=0, atol=1e-14)
 
 
-def test_the_choice_is_bitwise_the_same(phase_of):
-    one, other = phase_of(20), phase_of(20)
+def test_the_choice_is_bitwise_the_same(span_of):
+    one, other = span_of(20), span_of(20)
     assert np.array_equal(one.particles, other.particles)
     assert np.array_equal(one.weights, other.weights)
     assert len(one.particles) == 20
     assert (np.diff(one.particles) > 0).all()
 
 
-def test_regions_and_phases(tiny_manifold, whole):
+def test_regions_and_spans(tiny_manifold, whole):
     X = tiny_manifold.X.numpy()
     middle = float(np.median(X[:, 0]))
     sampler = CubatureSampler(9, lower=[middle, 0, 0], states=6, phases=[{"start": 0.5, "size": 7}])
-    first, later = sampler.phases_of(tiny_manifold, whole=whole)
+    first, later = sampler.spans_of(tiny_manifold, whole=whole)
     assert (X[first.particles][:, 0] >= middle).all()
     assert (X[later.particles][:, 0] < middle).any()
     assert (first.start, later.start) == (0.0, 0.5)
@@ -223,20 +222,20 @@ def test_regions_and_phases(tiny_manifold, whole):
 
 @pytest.mark.parametrize("precision", ["fp64", "fp32"])
 def test_a_scene_is_reduced_with_a_cubature(chain, tiny_manifold, precision):
-    """Through the front door, with weights in every phase of the run."""
+    """Through the front door, with weights in every span of the run."""
     sampler = CubatureSampler(10, states=6, phases=[{"start": 0.5, "size": 8}])
     options = {"device": "cpu", "precision": precision, "dt_multiplier": 1.5}
     solver = chain.scene.reduced(tiny_manifold, ANGLE, sampler, **options)
     solver.step(solver.total_steps)
     assert solver.left_grid() == -1
-    for phase, sets in zip(solver.phases, solver.sets, strict=True):
-        assert np.array_equal(phase.particles, sets.sample)
-        assert (phase.weights > 0).all()
+    for span, sets in zip(solver.samples, solver.sets, strict=True):
+        assert np.array_equal(span.particles, sets.sample)
+        assert (span.weights > 0).all()
 
 
-def test_refused(phase_of):
+def test_refused(span_of):
     with pytest.raises(ConfigError, match=re.escape("sampler.size=501, but the scene has 500 particles")):
-        phase_of(501)
+        span_of(501)
     for states in (0, 2.5):
         with pytest.raises(ConfigError, match=rf"sampler\.states={states}"):
             CubatureSampler(10, states=states)

@@ -1,6 +1,4 @@
-"""A phase whose fields are modes times coefficients: a step is a few kernels, and torch takes no part."""
-
-from collections.abc import Sequence
+"""Steps of fields that are modes times coefficients: a few kernels, in which torch takes no part."""
 
 import numpy as np
 import torch
@@ -8,102 +6,75 @@ import warp as wp
 from typing_extensions import override
 
 from nsf.dynamics.arena import Arena
+from nsf.dynamics.batch import Batch
 from nsf.dynamics.closure_kernel import packed_weights, projection_block
 from nsf.dynamics.integration import ParticleSets
 from nsf.dynamics.interop import as_vectors, on_torch_stream
 from nsf.dynamics.modal_fields import field_launches
 from nsf.dynamics.modal_kernels import THREADS, make_gathering, tiling
-from nsf.dynamics.phase import Phase, Setting, Stages
 from nsf.dynamics.placing_kernels import make_others, make_sample
-from nsf.dynamics.projection import GaussNewton, Taylor
+from nsf.dynamics.projection import Taylor
 from nsf.dynamics.projection_kernel import (
     EVALUATE,
     PREPARE,
     SOLVE,
     make_projection,
     prepared_size,
-    projection_fits,
 )
-from nsf.dynamics.stress import Method
-from nsf.kinematics.fields.basis import BasisManifold
+from nsf.dynamics.span import Span, Stages
 from nsf.kinematics.fields.modal import ModalFactors
-from nsf.mpm import GridStep, Precision
 from nsf.mpm.access import WARP
-from nsf.mpm.device import warp_device
 from nsf.mpm.grid import Grid
-from nsf.mpm.materials import Material
 from nsf.mpm.shape import DEGREES, stencil_offset
 from nsf.mpm.state import cell_order
+from nsf.sampling.sampler import SampleSpan
 
 _HEADS, _PREPARING, _CLEARING = range(3)  # what of a step runs beside the rest
 
 
-def steps_in_coefficients(manifold, projector, precision: Precision, device) -> bool:
-    """Whether `ModalPhase` can step a manifold; a field or a projector of one's own may need positions."""
-    if not (isinstance(manifold, BasisManifold) and manifold.layered):
-        return False
-    if type(projector) not in (GaussNewton, Taylor):
-        return False
-    K, r = manifold.hyperparameters["modes"][0], manifold.latent_dim
-    widths = (r, *[3 * manifold.hyperparameters["beta"][0]] * manifold.hyperparameters["depth"], K - r)
-    return not device.is_cuda or projection_fits(precision, widths if r < K else (), r, K)
-
-
-class ModalPhase(Phase):
-    """Fields of `field=basis`.
+class ModalSpan(Span):
+    """Fields of `field=basis` and `joint`, of one run or of several.
 
     The networks run once a step, on x̂ alone; modes and coefficients are contracted at those particles of N
     that the step needs, which are found at each step among the sets'; and the projection works on
-    coefficients. A step is that of `DecodedPhase`, but that a last update moves coefficients along their
-    derivative, which misses the manifold by the order of the projector's tolerance. Several simulations share
-    modes, networks and candidates, and every launch.
+    coefficients. A step is that of the reference, but that a last update moves coefficients along their
+    derivative, which misses the manifold by the order of the projector's tolerance. Several runs share modes,
+    networks and candidates, and every launch.
 
     Args:
-        setting: of the solver; its projector is `GaussNewton` or `Taylor`.
+        batch: the runs.
+        sample: S and its weights.
         sets: S, N (the candidates) and I.
-        grid_step: the shared P2G, and G2P of S, which updates nodes on its way; shape: its B-spline.
-        manifold: a `BasisManifold` whose networks are `layered`.
-        method: which of τ and C come from fields.
-        parameters: [simulations, n_parameters] μ.
-        materials: the law in each simulation, for a τ that comes from ∂g/∂X.
-        weights: [s] of S in the projection; None for all one.
 
     Attributes:
-        tiling: number of tiles, and of simulations in a tile; each of these has a bit in `needed`.
+        tiling: number of tiles, and of runs in a tile; each of these has a bit in `needed`.
         needed: see `Placing`.
     """
 
-    def __init__(
-        self,
-        setting: Setting,
-        sets: ParticleSets,
-        grid_step: GridStep,
-        shape: str,
-        manifold,
-        method: Method,
-        parameters: torch.Tensor,
-        materials: Sequence[Material],
-        weights: np.ndarray | None,
-    ):
-        order = _by_cell(sets, setting.constants[0].X, grid_step.grid.geometry.dx, shape)
-        at_sample = manifold.restrict(sets.sample, dtype=setting.dtype, device=setting.device)
-        super().__init__(setting, sets, order, grid_step, at_sample)
-        self._clears_ahead = grid_step.grid.sparse  # else what is cleared depends on where particles are
-        self._arena = arena = Arena(setting.precision, warp_device(str(setting.device)))
-        deformation = manifold.factors("deformation", order, dtype=setting.dtype, device=setting.device)
+    def __init__(self, batch: Batch, sample: SampleSpan, sets: ParticleSets):
+        one = batch.shared
+        manifold, shape = one.manifold, one.transfer.shape
+        like = {"dtype": one.dtype, "device": one.torch_device}
+        order = _by_cell(sets, one.constants.X, one.geometry.dx, shape)
+        super().__init__(batch, sets, order, manifold.restrict(sets.sample, **like))
+        self._clears_ahead = self.grid_step.grid.sparse  # else what is cleared depends on where particles are
+        self._arena = arena = Arena(one.precision, one.device)
+        deformation = manifold.factors("deformation", order, **like)
         of_sample = arena.modes(deformation.table, deformation.rows[: self.s])
         self.coefficients = state = Coefficients(
-            arena, setting.simulations, deformation.table.shape[2], manifold.latent_dim
+            arena, len(batch), deformation.table.shape[2], manifold.latent_dim
         )
-        # What a block shares for a simulation, at most: coefficients of x and of its rate, or of two fields.
+        # What a block shares for a run, at most: coefficients of x and of its rate, or of two fields.
         of_x, *of_heads = (-(-modes // 4) for modes in manifold.hyperparameters["modes"])
-        self.tiling = tiling(setting.simulations, arena.real.itemsize * 4 * max(2 * of_x, sum(of_heads)))
-        self._placing = Placing(arena, state, deformation, of_sample, grid_step.grid, shape, self)
+        self.tiling = tiling(len(batch), arena.real.itemsize * 4 * max(2 * of_x, sum(of_heads)))
+        self._placing = Placing(arena, state, deformation, of_sample, self.grid_step.grid, shape, self)
         self.needed = self._placing.needed
+        parameters = torch.stack([setup.parameters for setup in batch.setups])
+        materials = [setup.scene.material for setup in batch.setups]
         self._networks, self._fields = field_launches(
-            arena, self, manifold, method, order, parameters, materials
+            arena, self, manifold, one.method, order, parameters, materials
         )
-        self._projection = Projection(arena, state, deformation, of_sample, self, weights)
+        self._projection = Projection(arena, state, deformation, of_sample, self, sample.weights)
 
     @property
     @override
@@ -112,12 +83,12 @@ class ModalPhase(Phase):
             "inference": self.infer,
             "p2g": self.p2g,
             "g2p": self.g2p,
-            "inversion": self.invert,
+            "inversion": self.project,
         }
 
     @override
     def enter(self, first: bool) -> None:
-        record, state = self.setting.record, self.coefficients
+        record, state = self.record, self.coefficients
         with on_torch_stream(self._arena.device):
             for side in (_PREPARING, _CLEARING):  # where a step was left in its midst
                 self._arena.meet(side)
@@ -134,7 +105,7 @@ class ModalPhase(Phase):
         """
         if self._clears_ahead:
             with self._arena.beside(_CLEARING):
-                self.grid_step.clear(self._integration[0])
+                self.grid_step.clear(self.particles[0])
         with self._arena.beside(_PREPARING):  # what nothing needs before S is moved
             self.grid_step.follow()
             self._projection.prepare.launch()
@@ -152,16 +123,16 @@ class ModalPhase(Phase):
     @override
     def p2g(self) -> None:
         if self._clears_ahead:
-            self.grid_step.scatter(*self._integration)
+            self.grid_step.scatter(*self.particles)
         else:
             super().p2g()
 
     @override
     def g2p(self) -> None:
         self._arena.meet(_PREPARING)
-        self._move_sample()
+        self.move_sample()
 
-    def invert(self) -> None:
+    def project(self) -> None:
         """x̂_{n+1} from the displacement of S (paper section 5.3)."""
         self._projection.gather.launch()
         self._projection.solve.launch()
@@ -184,7 +155,7 @@ class ModalPhase(Phase):
 
 
 class Coefficients:
-    """Where B simulations are, in coefficients, on the device.
+    """Where B runs are, in coefficients, on the device.
 
     Attributes:
         latent: [B, r] x̂_n in fp64.
@@ -193,9 +164,9 @@ class Coefficients:
         step: [B] a number that no two steps share.
     """
 
-    def __init__(self, arena: Arena, simulations: int, modes: int, latents: int):
-        self.latent, self.a, self.rate = (arena.zeros(simulations, n) for n in (latents, modes, modes))
-        self.first, self.step = (arena.zeros(simulations, dtype=torch.int32) for _ in range(2))
+    def __init__(self, arena: Arena, runs: int, modes: int, latents: int):
+        self.latent, self.a, self.rate = (arena.zeros(runs, n) for n in (latents, modes, modes))
+        self.first, self.step = (arena.zeros(runs, dtype=torch.int32) for _ in range(2))
 
     def __len__(self) -> int:
         return len(self.step)
@@ -205,15 +176,15 @@ class Placing:
     """Finds x and v at S, and at each step which others its step needs, and theirs.
 
     Attributes:
-        needed: [tiles, n] in which simulations of a tile a particle is, as bits.
+        needed: [tiles, n] in which runs of a tile a particle is, as bits.
         count: [B, 2] particles needed in all steps taken, and the number of these.
         launches: in order.
     """
 
     def __init__(
-        self, arena, state, deformation, of_sample: torch.Tensor, grid: Grid, shape: str, phase: Phase
+        self, arena, state, deformation, of_sample: torch.Tensor, grid: Grid, shape: str, span: Span
     ):
-        precision, reach, sets = arena.precision, DEGREES[shape], phase.sets
+        precision, reach, sets = arena.precision, DEGREES[shape], span.sets
         nodes = np.array(grid.geometry.nodes)
         lower, upper = np.zeros(3, int), nodes - 1
         if grid.sparse:
@@ -222,14 +193,14 @@ class Placing:
             upper = np.minimum(stored.max(0) + reach, nodes - 1)
         extent = upper - lower + 1
         box = wp.vec3i(*lower.tolist()), wp.vec3i(*extent.tolist())
-        B, s, n = len(state), phase.s, phase.size
-        tiles, tile = phase.tiling
+        B, s, n = len(state), span.s, span.size
+        tiles, tile = span.tiling
         whole = [2 ** min(tile, B - tile * number) - 1 for number in range(tiles)]
         self.needed = arena.hold(torch.tensor(whole)[:, None].expand(tiles, n), torch.int32)
         self.count = arena.zeros(B, 2, dtype=torch.int64)
         stamps = arena.zeros(B, int(extent.prod()), dtype=torch.int32)
         mean = as_vectors(arena.hold(deformation.mean, arena.real), precision)
-        initial, x, v = (as_vectors(a, precision) for a in (phase.initial_velocity, phase.x, phase.v))
+        initial, x, v = (as_vectors(a, precision) for a in (span.initial_velocity, span.x, span.v))
         latest = [state.a, state.rate, initial, state.first, state.step, stamps]
         found = [precision.real(1.0 / grid.geometry.dx), *box, self.count, x, v]
         lanes = arena.lanes(WARP)
@@ -254,10 +225,10 @@ class Projection:
         gather, solve: the others, in this order.
     """
 
-    def __init__(self, arena, state, deformation, displacement, phase: Phase, weights: np.ndarray | None):
-        setting, s, (count, K) = phase.setting, phase.s, state.a.shape
-        projector, record, r = setting.projector, setting.record, state.latent.shape[1]
-        of_sample = deformation.table[deformation.rows[:s]].to(setting.device)
+    def __init__(self, arena, state, deformation, displacement, span: Span, weights: np.ndarray | None):
+        one, s, (count, K) = span.batch.shared, span.s, state.a.shape
+        projector, record, r = one.projector, span.record, state.latent.shape[1]
+        of_sample = deformation.table[deformation.rows[:s]].to(one.torch_device)
         w = torch.ones(s) if weights is None else torch.as_tensor(weights / np.mean(weights))
         w = arena.hold(w, torch.float64)
         B = of_sample.double().flatten(0, 1)
@@ -266,11 +237,11 @@ class Projection:
         widths, weights = _closure(deformation, arena.device.is_cuda)
         weights = arena.hold(weights, torch.float32)
         members = deformation.members if widths else 1
-        lanes, velocity = arena.lanes(THREADS), as_vectors(phase.v, arena.precision)
+        lanes, velocity = arena.lanes(THREADS), as_vectors(span.v, arena.precision)
         self.gather = arena.pack(
             make_gathering(arena.precision, count > 1),
             count * (K + 1) * lanes,
-            [displacement, phase.size, -(-K // 4), velocity, w, wp.float64(setting.dt), lanes, b],
+            [displacement, span.size, -(-K // 4), velocity, w, wp.float64(one.dt), lanes, b],
             THREADS,
         )
         kernel = make_projection(arena.precision, widths, members, r, K, count > 1)
@@ -285,7 +256,7 @@ class Projection:
         linear = int(isinstance(projector, Taylor))
 
         def of_each(values: torch.Tensor) -> torch.Tensor:
-            """[count, entries of a simulation], sharing memory."""
+            """[count, entries of a run], sharing memory."""
             return values.view(count, -1)
 
         def launch(mode: int) -> wp.Launch:
@@ -294,7 +265,7 @@ class Projection:
             kept = [record.xhat, record.residuals, record.updates, record.row]
             own = map(of_each, [*latents, *kept, state.first, state.step])
             sums = [weights, wp.float64(deformation.scale), sigma, G, b]
-            inputs = [*sums, *how, wp.float64(setting.dt), *own, *between, threads]
+            inputs = [*sums, *how, wp.float64(one.dt), *own, *between, threads]
             return arena.pack(kernel, count * threads, inputs, block)
 
         self.evaluate, self.prepare, self.solve = (launch(mode) for mode in (EVALUATE, PREPARE, SOLVE))

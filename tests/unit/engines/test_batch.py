@@ -9,11 +9,12 @@ import torch
 import warp as wp
 
 import nsf.scenes
-from nsf.dynamics import NSF, GaussNewton, Integration, Method, ReducedBatch, ReducedMPM, ReducedRun, Taylor
+from nsf.dynamics import NSF, GaussNewton, Integration, Method, ReducedBatch, Setup, Taylor
+from nsf.engines import Modal
 from nsf.errors import ConfigError, ShapeError
 from nsf.kinematics.fields.basis import BasisManifold
 from nsf.mpm.materials import FixedCorotated, Hencky, VonMises
-from nsf.sampling import SamplePhase
+from nsf.sampling import SampleSpan
 from nsf.timing import StageTimer
 
 ANGLE = "friction_angle"
@@ -37,29 +38,33 @@ def parameters():
 
 
 @pytest.fixture
-def run_of(tiny_manifold):
-    """(scene, kind, **options) → a run or a solver of that scene at 26°, with the sample of the first."""
+def setup_of(tiny_manifold):
+    """(scene, **options) → the setup of a run of that scene at 26°, with the sample of the first."""
     kept = {}
 
-    def build(scene, kind=ReducedRun, angle=26.0, **options):
-        first = (kept["phases"], kept["sets"]) if kept else (20, None)
+    def build(scene, angle=26.0, **options):
+        first = (kept["samples"], kept["sets"]) if kept else (20, None)
         options = {"device": "cpu", "sets": first[1]} | options
-        found = kind.of_scene(scene, tiny_manifold, {ANGLE: angle}, first[0], **options)
-        kept.setdefault("phases", found.phases), kept.setdefault("sets", found.sets)
+        found = scene.reduced(tiny_manifold, {ANGLE: angle}, first[0], **options).setup
+        kept.setdefault("samples", found.samples), kept.setdefault("sets", found.sets)
         return found
 
     return build
 
 
+def together(*setups):
+    return ReducedBatch(setups, Modal().spans)
+
+
 @pytest.fixture
-def with_law(chain, tiny_manifold, run_of):
-    """(law, method) → a run of the tiny scene with that law."""
-    first = run_of(chain.scene)
+def with_law(chain, tiny_manifold, setup_of):
+    """(law, method) → the setup of a run of the tiny scene with that law."""
+    first = setup_of(chain.scene)
 
     def build(law, method):
         scene = replace(chain.scene, material=law)
         options = {"method": method, "device": "cpu", "sets": first.sets}
-        return ReducedRun(tiny_manifold, scene, first.phases, {ANGLE: 26.0}, **options)
+        return Setup(tiny_manifold, scene, first.samples, {ANGLE: 26.0}, **options)
 
     return build
 
@@ -120,12 +125,12 @@ def test_every_way_of_stepping(chain, tiny_manifold, parameters, options):
     options = {"device": "cpu"} | options
     batch = chain.scene.reduced_batch(tiny_manifold, parameters, 20, **options)
     singles = [chain.scene.reduced(tiny_manifold, own, 20, **options) for own in parameters]
-    assert_each_as_alone(batch, singles, 16, 1e-10 if batch.runs[0].precision.name == "fp64" else 1e-4)
+    assert_each_as_alone(batch, singles, 16, 1e-10 if batch.runs[0].setup.precision.name == "fp64" else 1e-4)
 
 
-def test_weights_and_phases_of_time(chain, tiny_manifold, parameters):
+def test_weights_and_spans_of_time(chain, tiny_manifold, parameters):
     weights = np.random.default_rng(0).uniform(0.1, 3.0, 20)
-    phases = [SamplePhase(0.0, np.arange(0, 500, 25), weights), SamplePhase(0.5, np.arange(7, 500, 50), None)]
+    phases = [SampleSpan(0.0, np.arange(0, 500, 25), weights), SampleSpan(0.5, np.arange(7, 500, 50), None)]
     batch = chain.scene.reduced_batch(tiny_manifold, parameters, phases, device="cpu")
     singles = [chain.scene.reduced(tiny_manifold, own, phases, device="cpu") for own in parameters]
     assert_each_as_alone(batch, singles, 24)
@@ -162,11 +167,11 @@ CHANGES = {
 
 @pytest.mark.parametrize("what", CHANGES)
 @pytest.mark.parametrize("method", [NSF, Method("deformation", False, False)], ids=lambda m: m.name)
-def test_what_a_parameter_changes_is_each_ones_own(tiny, run_of, what, method):
+def test_what_a_parameter_changes_is_each_ones_own(tiny, setup_of, what, method):
     scene = nsf.scenes.load("sand", [*tiny[1:], *(PLATE if what == "plate" else [])])
     scenes = [scene.with_changes(changes) if changes else scene for changes in CHANGES[what]]
-    batch = ReducedBatch([run_of(scene, method=method) for scene in scenes])
-    singles = [run_of(scene, ReducedMPM, method=method) for scene in scenes]
+    setups = [setup_of(scene, method=method) for scene in scenes]
+    batch, singles = together(*setups), [together(setup).runs[0] for setup in setups]
     assert_each_as_alone(batch, singles, 24)
     moved = np.abs(batch.xhat.numpy()[1:] - batch.xhat.numpy()[0]).max(1)
     # With τ from its field, the moduli have no part in a step.
@@ -176,9 +181,9 @@ def test_what_a_parameter_changes_is_each_ones_own(tiny, run_of, what, method):
 def test_the_history_at_rest_is_each_ones_own(with_law):
     """Without flow it decides a stress where it is zero: such a particle is damaged."""
     laws = [VonMises(E=2000.0, nu=0.2, yield_stress=value) for value in (20.0, 30.0)]
-    phase = ReducedBatch([with_law(law, METHODS[3]) for law in laws])._phases[0]
-    held = [a for a in phase._arena._held if a.shape == (2 * phase.size, 1)]
-    assert [a.flatten().tolist() for a in held] == [[20.0] * phase.size + [30.0] * phase.size]
+    span = together(*(with_law(law, METHODS[3]) for law in laws)).span
+    held = [a for a in span._arena._held if a.shape == (2 * span.size, 1)]
+    assert [a.flatten().tolist() for a in held] == [[20.0] * span.size + [30.0] * span.size]
 
 
 def test_initial_states_are_each_ones_own(chain, tiny_manifold):
@@ -231,17 +236,16 @@ def test_each_is_asked_as_a_solver_is(chain, tiny_manifold, parameters):
 
 def test_a_second_run_is_as_the_first(tiny, tiny_manifold, parameters):
     scene = nsf.scenes.load("sand", [*tiny[1:], *PLATE])
-    sample = [SamplePhase(0.0, np.arange(0, 500, 25)), SamplePhase(0.5, np.arange(7, 500, 50))]
+    sample = [SampleSpan(0.0, np.arange(0, 500, 25)), SampleSpan(0.5, np.arange(7, 500, 50))]
     batch = scene.reduced_batch(tiny_manifold, parameters, sample, device="cpu")
     single = scene.reduced(tiny_manifold, parameters[0], sample, device="cpu")
-    for solver in (batch, single):
+    for solver, runs in ((batch, batch.runs), (single, (single,))):
         solver.step(24)
-        xhat = solver.record.xhat.clone()
+        before = [run.record.xhat.clone() for run in runs]
         solver.restart()
-        assert solver.steps_taken == 0
-        assert batch.runs[0].steps_taken == 0 or solver is single
+        assert {run.steps_taken for run in runs} == {0}
         solver.step(24)
-        assert torch.equal(solver.record.xhat, xhat)
+        assert all(torch.equal(run.record.xhat, xhat) for run, xhat in zip(runs, before, strict=True))
 
 
 def test_modes_are_held_once(chain, tiny_manifold):
@@ -262,9 +266,12 @@ class Own(GaussNewton):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"projector": Own()}, "field=basis with Own evaluates its fields for one simulation"),
-        ({"integration": Integration("search")}, "a batch needs integration=superset"),
-        ({"xhat": [None]}, "xhat is given for 1 of 3 simulations"),
+        (
+            {"projector": Own()},
+            "projector Own is not known to modal; engine reference: it evaluates fields for one run",
+        ),
+        ({"integration": Integration("search")}, "integration=search needs a whole grid for each of 3 runs"),
+        ({"xhat": [None]}, "xhat is given for 1 of 3 runs"),
     ],
 )
 def test_what_cannot_be_stepped_together(chain, tiny_manifold, parameters, options, message):
@@ -275,7 +282,7 @@ def test_what_cannot_be_stepped_together(chain, tiny_manifold, parameters, optio
 @pytest.mark.parametrize(
     ("overrides", "options", "message"),
     [
-        (["scene.dt=0.004"], {}, "simulations of a batch share Δt or the number of steps, which differs"),
+        (["scene.dt=0.004"], {}, "runs of a batch share Δt or the number of steps, which differs"),
         (["scene.walls.padding=4"], {}, "share the domain's walls"),
         (["scene.dx=0.025"], {"sets": None}, "share the grid"),
         (PLATE, {}, "share the number of colliders, which differs between friction_angle=26 and"),
@@ -285,39 +292,33 @@ def test_what_cannot_be_stepped_together(chain, tiny_manifold, parameters, optio
         (["transfer=pic"], {}, "share the transfer"),
     ],
 )  # fmt: skip
-def test_what_must_be_the_same(tiny, run_of, overrides, options, message):
+def test_what_must_be_the_same(tiny, setup_of, overrides, options, message):
     scenes = [nsf.scenes.load("sand", [*tiny[1:], *more]) for more in ([], overrides)]
-    runs = [run_of(scenes[0]), run_of(scenes[1], angle=30.0, **options)]
+    setups = [setup_of(scenes[0]), setup_of(scenes[1], angle=30.0, **options)]
     with pytest.raises(ConfigError, match=re.escape(message)) as error:
-        ReducedBatch(runs)
+        together(*setups)
     assert "friction_angle=30" in str(error.value)
 
 
 def test_another_law_is_refused_where_it_is_asked(with_law):
     laws = [Hencky(E=2000.0, nu=0.2), FixedCorotated(E=2000.0, nu=0.2)]
-    ReducedBatch([with_law(law, NSF) for law in laws])  # with neural stress nobody asks it
+    together(*(with_law(law, NSF) for law in laws))  # with neural stress nobody asks it
     with pytest.raises(ConfigError, match="share the law"):
-        ReducedBatch([with_law(law, METHODS[3]) for law in laws])
+        together(*(with_law(law, METHODS[3]) for law in laws))
 
 
 def test_other_samples_are_refused(chain, tiny_manifold):
-    runs = [
-        ReducedRun.of_scene(chain.scene, tiny_manifold, {ANGLE: 26.0}, sample, device="cpu")
+    setups = [
+        chain.scene.reduced(tiny_manifold, {ANGLE: 26.0}, sample, device="cpu").setup
         for sample in (range(20), range(1, 21))
     ]
     with pytest.raises(ConfigError, match="share the sample"):
-        ReducedBatch(runs)
+        together(*setups)
 
 
-def test_a_run_has_one_that_steps_it(chain, tiny_manifold, run_of):
-    with pytest.raises(ConfigError, match="must be a ReducedRun at t = 0"):
-        ReducedBatch([run_of(chain.scene, ReducedMPM)])
-    run = run_of(chain.scene)
-    ReducedBatch([run])
-    with pytest.raises(ConfigError, match="that no other solver steps"):
-        ReducedBatch([run])
+def test_a_batch_has_runs():
     with pytest.raises(ConfigError, match="at least one run"):
-        ReducedBatch([])
+        together()
 
 
 @pytest.mark.parametrize(
@@ -327,9 +328,9 @@ def test_a_run_has_one_that_steps_it(chain, tiny_manifold, run_of):
         ({"velocity": np.zeros(3)}, "velocity must be [500, 3]"),
     ],
 )
-def test_bad_states(run_of, chain, options, message):
+def test_bad_states(setup_of, chain, options, message):
     with pytest.raises(ShapeError, match=re.escape(message)):
-        run_of(chain.scene, **options)
+        setup_of(chain.scene, **options)
 
 
 @pytest.mark.gpu

@@ -1,4 +1,4 @@
-"""Where the reduced step takes τ and C from: the methods of the 2×2 ablation."""
+"""Where the reduced step takes τ and C from: the four methods of the ablation (paper section 6.1)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

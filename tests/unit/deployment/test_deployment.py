@@ -64,8 +64,8 @@ def test_a_run_that_leaves_the_grid_has_diverged(chain, tiny_manifold, tiny_trus
     assert made.diverged == 5
 
 
-def test_batches_are_parameter_values(made, solver_at, tiny_trust):
-    runs = deploy(solver_at, (26.0, 33.5), "cpu", tiny_trust)
+def test_batches_are_parameter_values(made, batch_at, tiny_trust):
+    runs = deploy(batch_at, (26.0, 33.5), "cpu", tiny_trust)
     assert [run.parameter for run in runs] == [26.0, 33.5]
     assert same(runs[0], made, timing=False)
     assert not np.array_equal(runs[0].xhat, runs[1].xhat)
@@ -87,8 +87,8 @@ def test_values_that_take_their_steps_together(solver_at, batch_at, tiny_trust, 
     """One of them is far from training, so that it hands over in mid-run; the last has no other beside it."""
     values = (26.0, 8.0, 33.5, 30.0, 22.5)
     batch_at.taken.clear()
-    found = deploy(solver_at, values, "cpu", tiny_trust, until_distrusted, batch_at, 2)
-    assert batch_at.taken == [2, 2]
+    found = deploy(batch_at, values, "cpu", tiny_trust, until_distrusted, 2)
+    assert batch_at.taken == [2, 2, 1]
     assert [run.parameter for run in found] == list(values)
     assert found[0].seconds == found[1].seconds > 0
     for run in found:

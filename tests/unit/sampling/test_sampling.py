@@ -23,7 +23,7 @@ def of(X):
 
 
 def drawn(X, **settings):
-    return [phase.particles for phase in RandomSampler(**settings).phases_of(of(X))]
+    return [phase.particles for phase in RandomSampler(**settings).spans_of(of(X))]
 
 
 def test_size_and_range(X):
@@ -60,7 +60,7 @@ def test_region(X):
 
 def test_a_later_smaller_phase_is_a_part_of_the_earlier(X):
     sampler = RandomSampler(size=60, phases=[{"start": 0.5, "size": 25}])
-    first, later = sampler.phases_of(of(X))
+    first, later = sampler.spans_of(of(X))
     assert (first.start, later.start) == (0.0, 0.5)
     assert (len(first.particles), len(later.particles)) == (60, 25)
     assert set(later.particles) < set(first.particles)
@@ -142,7 +142,7 @@ def information(manifold, particles, modes=12, noise=1e-3) -> float:
 
 @pytest.mark.parametrize("size", [1, 2, 8, 30])
 def test_greedy_tells_more_than_any_of_many_random_samples(tiny_manifold, size):
-    chosen = GreedySampler(size, modes=12).phases_of(tiny_manifold)[0].particles
+    chosen = GreedySampler(size, modes=12).spans_of(tiny_manifold)[0].particles
     draws = [np.random.default_rng(seed).permutation(500)[:size] for seed in range(200)]
     assert information(tiny_manifold, chosen) > max(information(tiny_manifold, draw) for draw in draws)
 
@@ -159,7 +159,7 @@ def test_greedy_takes_the_best_particle_at_each_turn(tiny_manifold):
 
 
 def test_a_smaller_greedy_sample_is_a_part_of_a_larger(tiny_manifold):
-    few, many = (GreedySampler(n, modes=6).phases_of(tiny_manifold)[0].particles for n in (5, 40))
+    few, many = (GreedySampler(n, modes=6).spans_of(tiny_manifold)[0].particles for n in (5, 40))
     assert len(set(many)) == 40
     assert set(few) < set(many)
 
@@ -168,7 +168,7 @@ def test_greedy_keeps_to_its_region(tiny_manifold):
     X = tiny_manifold.X.numpy()
     middle = float(np.median(X[:, 0]))
     sampler = GreedySampler(9, lower=[middle, 0.0, 0.0], phases=[{"start": 0.5, "size": 4}])
-    first, later = sampler.phases_of(tiny_manifold)
+    first, later = sampler.spans_of(tiny_manifold)
     assert (X[first.particles][:, 0] >= middle).all()
     assert len(later.particles) == 4
 

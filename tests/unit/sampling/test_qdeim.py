@@ -53,7 +53,7 @@ def test_pivots_end_where_their_rows_span_the_modes(U):
 
 @pytest.mark.parametrize("size", [8, 30, 100])
 def test_they_are_better_conditioned_than_any_of_many_random_samples(tiny_manifold, U, size):
-    chosen = QdeimSampler(size, modes=MODES).phases_of(tiny_manifold)[0].particles
+    chosen = QdeimSampler(size, modes=MODES).spans_of(tiny_manifold)[0].particles
     draws = [np.random.default_rng(seed).permutation(500)[:size] for seed in range(200)]
     assert smallest(U, chosen) > max(smallest(U, draw) for draw in draws)
 
@@ -89,7 +89,7 @@ def test_one_mode_is_told_by_the_particle_that_moves_most():
 
 
 def test_a_smaller_sample_is_a_part_of_a_larger(tiny_manifold):
-    few, many = (QdeimSampler(n, modes=MODES).phases_of(tiny_manifold)[0].particles for n in (5, 40))
+    few, many = (QdeimSampler(n, modes=MODES).spans_of(tiny_manifold)[0].particles for n in (5, 40))
     assert len(set(many)) == 40
     assert set(few) < set(many)
 
@@ -98,7 +98,7 @@ def test_it_keeps_to_its_region(tiny_manifold):
     X = tiny_manifold.X.numpy()
     middle = float(np.median(X[:, 0]))
     sampler = QdeimSampler(9, lower=[middle, 0.0, 0.0], phases=[{"start": 0.5, "size": 4}])
-    first, later = sampler.phases_of(tiny_manifold)
+    first, later = sampler.spans_of(tiny_manifold)
     assert (X[first.particles][:, 0] >= middle).all()
     assert len(later.particles) == 4
 

@@ -1,0 +1,116 @@
+"""A span of time with one sample: the particles that a step moves, and their grid."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from nsf.dynamics.batch import Batch
+from nsf.dynamics.integration import ParticleSets
+from nsf.dynamics.interop import as_matrices, as_scalars, as_vectors
+from nsf.kinematics.manifold import Restriction
+from nsf.mpm import Grid, GridStep
+
+#: The stages of one step in the order of the paper's section 5: name → what it does.
+Stages = dict[str, Callable[[], None]]
+
+
+class Span(ABC):
+    """Takes the steps of a batch in a span of time; each engine has its own.
+
+    Holds what P2G reads and G2P moves: n rows of each run, one run after the other, S first. Where their
+    values come from, and how x̂ follows from S, is left to the engine.
+
+    Args:
+        batch: the runs.
+        sets: S, N and I.
+        order: [n] the particles of N in the order of the rows, S first.
+        at_sample: the manifold restricted to S.
+
+    Attributes:
+        batch, sets, order, at_sample: as given; record: the batch's.
+        x, v: [B n, 3] position [m] and velocity [m/s]; G2P moves the first |S| rows of each run.
+        C, tau: [B n, 3, 3] affine momentum [1/s] and Kirchhoff stress [Pa].
+        mass, volume0, mu, lam: [B n] of the particles [kg, m³, Pa, Pa].
+        s: |S|; size: n.
+        grid_step: P2G, and G2P of S.
+        capturable: whether a step is the same launches each time; graph: of a step, where it is captured.
+    """
+
+    capturable = True
+    graph = None
+
+    def __init__(self, batch: Batch, sets: ParticleSets, order: np.ndarray, at_sample: Restriction):
+        self.batch, self.record, self.sets, self.order = batch, batch.record, sets, order
+        self.at_sample, self.s = at_sample, len(sets.sample)
+        one = batch.shared
+        grid = Grid(one.geometry, one.precision, one.device, sets.nodes, copies=len(batch))
+        # The forcing of the moment is on the device: gravity here, the colliders' time in the boundaries.
+        gravity = [setup.gravity for setup in batch.setups]
+        self.grid_step = GridStep(
+            grid, batch.boundaries, one.transfer, gravity, one.dt, one.precision, one.device
+        )
+
+        def rows(of) -> torch.Tensor:
+            return torch.cat(
+                [
+                    torch.as_tensor(of(setup)[order], dtype=one.dtype, device=one.torch_device)
+                    for setup in batch.setups
+                ]
+            )
+
+        self.mass, self.volume0 = rows(lambda s: s.constants.mass), rows(lambda s: s.constants.volume0)
+        self.mu, self.lam = rows(lambda s: s.constants.mu), rows(lambda s: s.constants.lam)
+        self.initial_velocity = rows(lambda s: s.initial_velocity)
+        self.x, self.v = (torch.zeros_like(self.initial_velocity) for _ in range(2))
+        self.C, self.tau = (self.x.new_zeros(len(self.x), 3, 3) for _ in range(2))
+        self.bind(len(self.x))
+
+    def bind(self, n: int) -> None:
+        """Show the first n rows of the arrays to Warp."""
+        precision = self.batch.shared.precision
+        vectors = [as_vectors(a[:n], precision) for a in (self.x, self.v)]
+        matrices = [as_matrices(a[:n], precision) for a in (self.C, self.tau)]
+        scalars = [as_scalars(a[:n]) for a in (self.mass, self.volume0)]
+        self.particles = (*vectors, *matrices, *scalars)
+        self.size = n // len(self.batch)
+
+    @property
+    @abstractmethod
+    def stages(self) -> Stages:
+        """One step, stage by stage, in order."""
+
+    @abstractmethod
+    def enter(self, first: bool) -> None:
+        """Begin with the latents of the record; `first`: v is the initial velocity, not a difference."""
+
+    def p2g(self) -> None:
+        """N → grid (paper section 5.2)."""
+        self.grid_step.p2g(*self.particles)
+
+    def g2p(self) -> None:
+        """Grid → x and v of S; nodes are updated as S needs them (paper section 5.2)."""
+        self.grid_step.follow()
+        self.move_sample()
+
+    def move_sample(self) -> None:
+        """`g2p` once the boundaries are where they will be."""
+        self.grid_step.update_g2p(*self.particles[:2], self.s)
+
+    @property
+    def mean_sizes(self) -> list[float]:
+        """Mean |N| of each run over the steps taken in this span."""
+        return [float(self.size)] * len(self.batch)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of arrays and fields on the device."""
+        own = (self.mass, self.volume0, self.mu, self.lam, self.initial_velocity, self.x, self.v)
+        own += (self.C, self.tau)
+        return self.at_sample.nbytes + self.grid_step.grid.nbytes + sum(a.nbytes for a in own)
+
+    @property
+    def mode_bytes(self) -> float:
+        """Bytes of the modes of one particle that a step reads; 0 where it reads none."""
+        return 0.0

@@ -1,0 +1,49 @@
+"""Which engine takes the steps of some runs, and why."""
+
+from collections.abc import Sequence
+
+from nsf.dynamics.setup import Setup
+from nsf.engines.base import Engine
+from nsf.engines.modal import Modal
+from nsf.engines.reference import Reference
+from nsf.errors import ConfigError
+
+#: From the fastest to the one that steps whatever can be stepped.
+ENGINES: tuple[Engine, ...] = (Modal(), Reference())
+#: What `engine=` may be.
+NAMES = ("auto", *(engine.name for engine in ENGINES))
+
+
+def choose(wanted: str | Engine, setups: Sequence[Setup]) -> tuple[Engine, str]:
+    """The engine for runs that take their steps together.
+
+    Args:
+        wanted: one of `NAMES`, of which `auto` is the fastest that can; or an engine of one's own.
+        setups: of the runs.
+
+    Returns:
+        The engine, and why it is not a faster one; empty where none is faster.
+
+    Raises:
+        ConfigError: an unknown name, or no engine that was asked for can take the steps: says why.
+    """
+    known = {engine.name: engine for engine in ENGINES}
+    if isinstance(wanted, Engine):
+        candidates = [wanted]
+    elif wanted == "auto":
+        candidates = list(ENGINES)
+    elif wanted in known:
+        candidates = [known[wanted]]
+    else:
+        raise ConfigError(f"engine={wanted} is unknown; choose one of {', '.join(NAMES)}")
+    refusals = []
+    for engine in candidates:
+        refusal = engine.refusal(setups)
+        if not refusal:
+            asked = candidates[0] is not ENGINES[0]
+            return engine, "; ".join(refusals) or ("it was asked for" if asked else "")
+        refusals.append(refusal)
+    detail = "; ".join(
+        f"engine {engine.name}: {why}" for engine, why in zip(candidates, refusals, strict=True)
+    )
+    raise ConfigError(f"no engine can take these steps: {detail}")

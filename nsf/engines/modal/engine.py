@@ -1,0 +1,66 @@
+"""What the modal engine can run, and why not the rest."""
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+from typing_extensions import override
+
+from nsf.dynamics.batch import Batch
+from nsf.dynamics.integration import Integration
+from nsf.dynamics.methods import Method
+from nsf.dynamics.projection import GaussNewton, Taylor
+from nsf.dynamics.projection_kernel import projection_fits
+from nsf.dynamics.setup import Setup
+from nsf.dynamics.span import Span
+from nsf.engines.base import Engine
+from nsf.engines.modal.mirrors import edits
+from nsf.engines.modal.span import ModalSpan
+from nsf.kinematics.fields.basis import BasisManifold
+from nsf.kinematics.fields.joint import JointManifold
+
+#: The classes whose code the kernels mirror; one derived from them may do anything.
+_KNOWN = {
+    "manifold": (BasisManifold, JointManifold),
+    "projector": (GaussNewton, Taylor),
+    "method": (Method,),
+    "integration": (Integration,),
+}
+
+
+class Modal(Engine):
+    """Fields that are modes times coefficients, several runs at once, as compiled kernels.
+
+    It mirrors the text of the reference, and steps nothing while that text is another (`mirrors`).
+    """
+
+    name: ClassVar[str] = "modal"
+
+    @override
+    def refusal(self, setups: Sequence[Setup]) -> str:
+        one = setups[0]
+        for role, known in _KNOWN.items():
+            found = type(getattr(one, role))
+            if found not in known:
+                return f"{role} {found.__name__} is not known to modal"
+        if not one.manifold.layered:
+            return "a network of the field is not one of layers, as modal needs it"
+        if len(setups) > 1 and one.integration.strategy != "superset":
+            return f"integration={one.integration.strategy} needs a whole grid for each of {len(setups)} runs"
+        if one.device.is_cuda and not _closure_fits(one):
+            return "a block of the GPU does not hold the networks of the field"
+        if changed := [name.replace(":", ".") for name in edits()]:
+            return f"modal mirrors another text of {', '.join(changed)}"
+        return ""
+
+    @override
+    def spans(self, batch: Batch) -> Sequence[Span]:
+        one = batch.shared
+        return [ModalSpan(batch, sample, sets) for sample, sets in zip(one.samples, one.sets, strict=True)]
+
+
+def _closure_fits(one: Setup) -> bool:
+    """Whether a block of a GPU holds what the projection needs of the closure."""
+    sizes, r = one.manifold.hyperparameters, one.manifold.latent_dim
+    K = sizes["modes"][0]
+    widths = (r, *[3 * sizes["beta"][0]] * sizes["depth"], K - r)
+    return projection_fits(one.precision, widths if r < K else (), r, K)

@@ -1,0 +1,97 @@
+"""The text that the modal engine mirrors: where the reference is edited, the edit is what runs.
+
+The kernels compute what the reference said when they were written. `mirrors.json` has the sha256 of each
+function that they stand for, docstrings, comments and white space apart. Where one reads otherwise, in its
+file or replaced in a running program, the engine refuses, and the reference steps instead. Once the kernels
+follow the new text, `make mirrors` writes the table anew.
+"""
+
+import hashlib
+import inspect
+import json
+import pkgutil
+import re
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+
+TABLE = Path(__file__).with_name("mirrors.json")
+#: What the kernels stand for: classes, of which every function counts, and functions.
+MIRRORED = (
+    "nsf.dynamics.step:Step",
+    "nsf.dynamics.step:SearchingStep",
+    "nsf.dynamics.step:steps_of",
+    "nsf.dynamics.span:Span.p2g",
+    "nsf.dynamics.span:Span.g2p",
+    "nsf.dynamics.span:Span.move_sample",
+    "nsf.dynamics.inference:Inference",
+    "nsf.dynamics.methods:Method",
+    "nsf.dynamics.methods:StressNeural",
+    "nsf.dynamics.methods:StressFromDeformation",
+    "nsf.dynamics.integration:NeighbourSearch.needed",
+    "nsf.dynamics.integration:NeighbourSearch.mark_nodes",
+    "nsf.dynamics.integration:NeighbourSearch.flag_particles",
+    "nsf.dynamics.integration:_kernels",
+    "nsf.dynamics.projection:GaussNewton",
+    "nsf.dynamics.projection:Taylor",
+    "nsf.dynamics.projection:_equations",
+    "nsf.dynamics.projection:_weighted",
+    "nsf.dynamics.projection:_normal_equations",
+    "nsf.dynamics.projection:_rms",
+    "nsf.dynamics.latent:LatentRecord.add",
+    "nsf.dynamics.latent:LatentRecord.predicted",
+    "nsf.kinematics.fields.basis:BasisManifold.restrict",
+    "nsf.kinematics.fields.basis:BasisRestriction",
+    "nsf.kinematics.fields.modal:ModalField.at",
+    "nsf.kinematics.fields.modal:RestrictedField",
+    "nsf.kinematics.fields.networks:FullyConnected.forward",
+    "nsf.kinematics.fields.networks:FullyConnected.forward_and_tangents",
+)
+
+
+def edits() -> dict[str, str]:
+    """sha256 of the functions that do not read as in the table, by name; of one that is gone, empty."""
+    recorded, now = _recorded(), _digests()
+    names = sorted(recorded.keys() | now.keys())
+    return {name: now.get(name, "") for name in names if recorded.get(name) != now.get(name)}
+
+
+def write() -> None:
+    """Make the table of the texts as they are."""
+    TABLE.write_text(json.dumps(_digests(), indent=1) + "\n", encoding="utf-8")
+
+
+@cache
+def _recorded() -> dict[str, str]:
+    return json.loads(TABLE.read_text(encoding="utf-8"))
+
+
+def _digests() -> dict[str, str]:
+    return {name: _digest(function) for mirrored in MIRRORED for name, function in _functions(mirrored)}
+
+
+def _functions(mirrored: str) -> Iterator[tuple[str, Callable]]:
+    """Names and functions of an entry of `MIRRORED`."""
+    found = pkgutil.resolve_name(mirrored)
+    members = vars(found) if isinstance(found, type) else {"": found}
+    for name, member in members.items():
+        # Of a property, a cached one, or what functools wraps, the function within.
+        function = inspect.unwrap(getattr(member, "fget", None) or getattr(member, "func", None) or member)
+        if callable(function) and not _generated(function):
+            yield f"{mirrored}.{name}".rstrip("."), function
+
+
+def _generated(function: Callable) -> bool:
+    """Whether no file has its text: a method that a dataclass wrote."""
+    return getattr(getattr(function, "__code__", None), "co_filename", "") == "<string>"
+
+
+@cache
+def _digest(function: Callable) -> str:
+    """sha256 of a function's text; another for each that has none."""
+    try:
+        text = inspect.getsource(function)
+    except (OSError, TypeError):
+        text = repr(function)
+    text = re.sub(r'(?s:""".*?""")|#.*', "", text)
+    return hashlib.sha256("".join(text.split()).encode()).hexdigest()[:16]

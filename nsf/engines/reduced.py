@@ -1,0 +1,131 @@
+"""From a scene and its fields to a reduced solver at t = 0."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from nsf.dynamics import ParticleSets, ReducedBatch, ReducedMPM, Setup
+from nsf.dynamics.interop import torch_device
+from nsf.engines.base import Engine
+from nsf.engines.choice import choose
+from nsf.errors import ConfigError, ShapeError
+from nsf.mpm.device import warp_device
+from nsf.sampling.sampler import RandomSampler, Sampler, SampleSpan, check_well_posed
+
+#: What `sample=` may be: particle indices, their number, a sampler, or the `samples` of an earlier solver.
+Sample = int | Sequence[int] | Sampler | Sequence[SampleSpan] | None
+
+
+def reduced(
+    scene,
+    manifold,
+    parameters: Mapping[str, float] | None = None,
+    sample: Sample = None,
+    engine: str | Engine = "auto",
+    **options,
+) -> ReducedMPM:
+    """The reduced solver of a scene, at t = 0.
+
+    Args:
+        scene: an `nsf.scenes.Scene`.
+        manifold: trained fields.
+        parameters: `{name: value}`; the configured value by default.
+        sample: particle indices, a number (drawn at random), a `Sampler`, the `samples` of an earlier
+            solver, or None for the scene's number.
+        engine: how steps are computed: `auto`, the fastest engine that can; `reference`, `modal`, or an
+            engine of one's own.
+        **options: further arguments of `nsf.dynamics.Setup`.
+
+    Raises:
+        ConfigError: the engine cannot take the steps; and see `nsf.dynamics.Setup`.
+    """
+    return _together([_setup(scene, manifold, parameters, sample, engine, options)], engine).runs[0]
+
+
+def reduced_batch(
+    scene,
+    manifold,
+    parameters: Sequence[Mapping[str, float]],
+    sample: Sample = None,
+    engine: str | Engine = "auto",
+    xhat: Sequence | None = None,
+    velocity: Sequence | None = None,
+    **options,
+) -> ReducedBatch:
+    """Reduced runs of one scene that take their steps together, at t = 0.
+
+    Args:
+        scene, manifold, sample, engine, options: as for `reduced`.
+        parameters: `{name: value}` of each run.
+        xhat, velocity: [B, r] and [B, P, 3], as for `nsf.dynamics.Setup`; None in place of one for its
+            default.
+
+    Raises:
+        ConfigError: no parameters, or another number of xhat or velocity; and as for `reduced`.
+    """
+    own: list[dict] = [{} for _ in parameters]
+    for name, values in (("xhat", xhat), ("velocity", velocity)):
+        if values is not None and len(values) != len(own):
+            raise ConfigError(f"{name} is given for {len(values)} of {len(own)} runs")
+        for start, value in zip(own, values or (), strict=False):
+            start[name] = value
+    setups: list[Setup] = []
+    for values, start in zip(parameters, own, strict=True):
+        if setups:  # the sample and the sets depend on the manifold alone: found once
+            sample, options = setups[0].samples, options | {"sets": setups[0].sets}
+        setups.append(_setup(scene, manifold, values, sample, engine, options | start))
+    return _together(setups, engine)
+
+
+def _together(setups: Sequence[Setup], wanted: str | Engine) -> ReducedBatch:
+    engine, why = choose(wanted, setups)
+    return ReducedBatch(setups, engine.spans, engine.name, why)
+
+
+def _setup(scene, manifold, parameters, sample: Sample, engine: str | Engine, options: dict) -> Setup:
+    """The setup of one run of a scene."""
+    if not parameters:
+        parameters = {scene.parameters.name: _configured(scene)}
+    scene = scene.with_parameters(parameters)
+    if sample is None:
+        sample = int(scene.config.scene.reduced.sample)
+    if isinstance(sample, int | np.integer):
+        check_well_posed(int(sample), manifold.latent_dim)
+        sample = RandomSampler(size=int(sample))
+    if isinstance(sample, Sampler):
+        samples = _sampled(scene, manifold, sample, engine, options)
+    elif len(sample) and isinstance(sample[0], SampleSpan):
+        samples = list(sample)
+    else:
+        samples = [SampleSpan(0.0, _indices(sample, len(manifold.X)))]
+    return Setup(manifold, scene, samples, parameters, **options)
+
+
+def _sampled(scene, manifold, sampler: Sampler, engine: str | Engine, options: dict) -> list[SampleSpan]:
+    """What a sampler chooses; one that learns from steps is given a solver whose sample is every particle."""
+    everyone = np.arange(len(manifold.X))
+    whole = {"sample": everyone, "sets": [ParticleSets(everyone, everyone, None)], "engine": engine}
+    whole |= {k: options[k] for k in ("method", "precision", "device") if k in options}
+    device = torch_device(warp_device(options.get("device", "auto")))
+    return sampler.spans_of(
+        manifold, device, lambda parameters: reduced(scene, manifold, parameters, **whole)
+    )
+
+
+def _configured(scene) -> float:
+    from omegaconf import OmegaConf
+
+    return float(OmegaConf.select(scene.config, scene.parameters.key))
+
+
+def _indices(sample, particles: int) -> np.ndarray:
+    sample = np.asarray(sample)
+    if sample.ndim != 1 or not np.issubdtype(sample.dtype, np.integer) or not len(sample):
+        raise ShapeError(
+            "sample must be a number or a non-empty list of particle indices; "
+            f"got {sample.dtype} {sample.shape}; give np.flatnonzero(mask) for a mask"
+        )
+    sample = np.unique(sample)
+    if sample[0] < 0 or sample[-1] >= particles:
+        raise ShapeError(f"sample indices {sample[0]} … {sample[-1]} must lie in [0, {particles})")
+    return sample

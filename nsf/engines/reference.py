@@ -1,0 +1,28 @@
+"""The engine that computes a step as section 5 says it: fields by torch, the grid by Warp."""
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+from typing_extensions import override
+
+from nsf.dynamics.batch import Batch
+from nsf.dynamics.setup import Setup
+from nsf.dynamics.span import Span
+from nsf.dynamics.step import steps_of
+from nsf.engines.base import Engine
+
+
+class Reference(Engine):
+    """Any field, projector and integration, one run at a time (`nsf.dynamics.step`)."""
+
+    name: ClassVar[str] = "reference"
+
+    @override
+    def refusal(self, setups: Sequence[Setup]) -> str:
+        if len(setups) > 1:
+            return f"it evaluates fields for one run at a time, not {len(setups)}: set deploy.batch=1"
+        return ""
+
+    @override
+    def spans(self, batch: Batch) -> Sequence[Span]:
+        return steps_of(batch)
