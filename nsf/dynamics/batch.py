@@ -8,7 +8,6 @@ import torch
 from typing_extensions import override
 
 from nsf.dynamics.latent import LatentRecord
-from nsf.dynamics.modal import steps_in_coefficients
 from nsf.dynamics.solver import ReducedRun
 from nsf.dynamics.stepping import Stepping, build_phases
 from nsf.errors import ConfigError
@@ -131,6 +130,8 @@ class ReducedBatch(Stepping):
 
 def _check_steps(run: ReducedRun) -> None:
     """Refuse a model whose steps several simulations cannot share."""
+    from nsf.dynamics.modal import steps_in_coefficients  # which needs this package
+
     if not steps_in_coefficients(run.manifold, run.projector, run.precision, run.device):
         raise ConfigError(
             f"field={run.manifold.field} with {type(run.projector).__name__} evaluates its fields for one "

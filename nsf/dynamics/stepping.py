@@ -7,7 +7,6 @@ import torch
 
 from nsf.dynamics.interop import captured, on_torch_stream
 from nsf.dynamics.latent import LatentRecord
-from nsf.dynamics.modal import ModalPhase, steps_in_coefficients
 from nsf.dynamics.phase import DecodedPhase, Phase, SearchingPhase, Setting, Stages
 from nsf.errors import ConfigError
 from nsf.mpm import BoundaryArrays, Grid, GridStep
@@ -121,6 +120,8 @@ def build_phases(runs: Sequence, record: LatentRecord, boundaries: BoundaryArray
         record: theirs, of one or of several.
         boundaries: colliders and walls; of several runs those of each, one by one.
     """
+    from nsf.dynamics.modal import ModalPhase, steps_in_coefficients  # which needs this package
+
     run = runs[0]
     setting = Setting(
         [each.scene_particles for each in runs], [each.initial_velocity for each in runs], record,

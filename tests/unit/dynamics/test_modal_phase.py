@@ -7,10 +7,10 @@ import warp as wp
 
 import nsf.scenes
 from nsf.dynamics import GaussNewton, Integration, Method, Taylor
-from nsf.dynamics.arena import Arena
 from nsf.dynamics.modal import ModalPhase
 from nsf.dynamics.phase import DecodedPhase
-from nsf.dynamics.projection_kernel import projection_fits
+from nsf.engines.modal.arena import Arena
+from nsf.engines.modal.projection import projection_fits
 from nsf.kinematics.fields.basis import BasisManifold
 from nsf.mpm import precision_of
 from nsf.sampling import RandomSampler, SamplePhase
@@ -32,7 +32,7 @@ def pair(chain, tiny_manifold, monkeypatch):
         options.setdefault("projector", GaussNewton(tolerance=1e-6))
         modal = one()
         with monkeypatch.context() as patch:
-            patch.setattr("nsf.dynamics.stepping.steps_in_coefficients", lambda *arguments: False)
+            patch.setattr("nsf.dynamics.modal.steps_in_coefficients", lambda *arguments: False)
             decoded = one()
         assert isinstance(modal._phase, ModalPhase)
         assert isinstance(decoded._phase, DecodedPhase)

@@ -8,12 +8,12 @@ import torch
 import warp as wp
 
 from nsf.data import TAU_MATRIX
-from nsf.dynamics.arena import Arena
 from nsf.dynamics.interop import as_matrices
 from nsf.dynamics.latent import LatentRecord
-from nsf.dynamics.modal_kernels import THREADS, make_contraction, tiling
-from nsf.dynamics.network_kernel import make_layer, make_product, product_blocks
 from nsf.dynamics.stress import Method
+from nsf.engines.modal.arena import Arena
+from nsf.engines.modal.gathering import THREADS, make_contraction, tiling
+from nsf.engines.modal.networks import make_layer, make_product, product_blocks
 from nsf.mpm.access import WARP
 from nsf.mpm.materials import Material, make_elastic_stress
 
@@ -88,23 +88,33 @@ def _networks(arena: Arena, networks: list, record: LatentRecord, parameters) ->
 def _layer(arena: Arena, before: list, weights: list, inputs: list, active: bool, outputs: list) -> wp.Launch:
     """The launch of a layer of one or two networks, after the one `before` it, if it is given."""
     (tiles, tile), lanes = tiling(len(outputs[0])), arena.lanes(WARP)
-    sides = [[*first, *own, x] for first, own, x in zip(before or weights, weights, inputs, strict=True)]
+    sides = _sides(weights, inputs, outputs)
+    for side, (W, b) in zip(sides, before, strict=bool(before)):
+        side |= {"W_0": W, "b_0": b}
     count = sum(y.shape[1] for y in outputs)
-    # One network alone stands on both sides; the second gets no thread.
-    arguments = [*sides[0], *sides[-1], int(active), lanes, count, outputs[0], outputs[-1]]
     kernel = make_layer(arena.precision, tile, tiles > 1, inputs[0].shape[1] if before else 0)
-    return arena.pack(kernel, tiles * count * lanes, arguments)
+    return arena.pack(
+        kernel, tiles * count * lanes, one=sides[0], two=sides[-1], active=active, lanes=lanes, outputs=count
+    )
 
 
 def _product(
     arena: Arena, before: list, weights: list, inputs: list, active: bool, outputs: list
 ) -> wp.Launch:
     """As `_layer`, for many simulations of a GPU; nothing is before it."""
-    sides = [[*own, x] for own, x in zip(weights, inputs, strict=True)]
-    members = [(y.shape[1], x.shape[1] // W.shape[1]) for (W, _, x), y in zip(sides, outputs, strict=True)]
+    sides = _sides(weights, inputs, outputs)
+    members = [(side["y"].shape[1], side["x"].shape[1] // side["W"].shape[1]) for side in sides]
     first, blocks = product_blocks(members, len(outputs[0]))
-    arguments = [*sides[0], *sides[-1], int(active), first, blocks, outputs[0], outputs[-1]]
-    return arena.pack(make_product(arena.precision), blocks * THREADS, arguments, THREADS)
+    return arena.pack(
+        make_product(arena.precision), blocks * THREADS, THREADS,
+        one=sides[0], two=sides[-1], active=active, first=first, blocks=blocks,
+    )  # fmt: skip
+
+
+def _sides(weights: list, inputs: list, outputs: list) -> list[dict]:
+    """Arguments of a layer for each network; of one network alone both sides are the same one."""
+    layers = zip(weights, inputs, outputs, strict=True)
+    return [{"W": W, "b": b, "x": x, "y": y} for (W, b), x, y in layers]
 
 
 def _contraction(arena: Arena, phase: "ModalPhase", fields: Sequence[tuple]):
@@ -112,18 +122,20 @@ def _contraction(arena: Arena, phase: "ModalPhase", fields: Sequence[tuple]):
 
     A field is its factors, the arena's modes, their lengths, coefficients a [B, K], and where it goes.
     """
-    a, lanes = fields[0][3], arena.lanes(THREADS)
-    four = [-(-factors.table.shape[2] // 4) for factors, *_ in fields]
     tiles, tile = phase.tiling
-    threads, inputs = [], [phase.needed]
-    for factors, *rest in fields:
-        threads.append(arena.whole_blocks(factors.table.shape[1] // 3 * len(factors.rows), THREADS))
-        inputs += [arena.hold(factors.mean, arena.real), *rest]
-    # One field alone stands on both sides; the second gets no thread.
-    inputs += inputs[-5:] * (2 - len(fields)) + [threads[0], tiles, lanes]
-    coefficients, stored = (wp.dtype_from_torch(values.dtype) for values in (a, fields[0][1]))
+    sides = []
+    for factors, modes, lengths, a, found in fields:
+        mean = arena.hold(factors.mean, arena.real)
+        sides.append({"mean": mean, "modes": modes, "lengths": lengths, "a": a, "found": found})
+    threads = [arena.whole_blocks(f.table.shape[1] // 3 * len(f.rows), THREADS) for f, *_ in fields]
+    four = [-(-a.shape[1] // 4) for *_, a, _ in fields]
+    coefficients, stored = (wp.dtype_from_torch(sides[0][name].dtype) for name in ("a", "modes"))
     kernel = make_contraction(arena.precision, (four[0], four[-1]), coefficients, tile, tiles > 1, stored)
-    return arena.pack(kernel, tiles * sum(threads), inputs, THREADS)
+    # One field alone stands on both sides; the second gets no thread.
+    return arena.pack(
+        kernel, tiles * sum(threads), THREADS, needed=phase.needed, one=sides[0], two=sides[-1],
+        threads=threads[0], tiles=tiles, lanes=arena.lanes(THREADS),
+    )  # fmt: skip
 
 
 def _elastic(arena: Arena, phase: "ModalPhase", materials: Sequence[Material], F: torch.Tensor):
@@ -133,6 +145,6 @@ def _elastic(arena: Arena, phase: "ModalPhase", materials: Sequence[Material], F
     history = arena.hold(history, arena.real)
     vecH = wp.types.vector(length=material.history_size, dtype=precision.real)
     kernel = make_elastic_stress(material.functions(precision), precision, material.history_size)
-    matrices = [as_matrices(a, precision) for a in (F, phase.tau)]
-    inputs = [matrices[0], wp.from_torch(history, dtype=vecH), phase.mu, phase.lam, matrices[1]]
-    return arena.pack(kernel, n, inputs)
+    F, tau = (as_matrices(a, precision) for a in (F, phase.tau))
+    history = wp.from_torch(history, dtype=vecH)
+    return arena.pack(kernel, n, F=F, history=history, mu=phase.mu, lam=phase.lam, tau=tau)

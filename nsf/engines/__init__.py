@@ -1,0 +1,1 @@
+"""Engines: how a reduced step is computed."""
