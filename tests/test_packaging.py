@@ -27,7 +27,7 @@ def test_imports_only_point_down():
 
 def test_every_module_has_a_layer():
     contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
-    layers = {name.strip() for layer in contracts[0]["layers"] for name in layer.split("|")}
+    layers = {name.strip() for layer in contracts[0]["layers"] for name in re.split("[|:]", layer)}
     modules = {path.stem for path in (ROOT / "nsf").glob("*.py")} - {"__init__"}
     packages = {path.parent.name for path in (ROOT / "nsf").glob("*/__init__.py")}
     assert {f"nsf.{name}" for name in modules | packages} == layers

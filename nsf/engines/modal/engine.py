@@ -9,11 +9,11 @@ from nsf.dynamics.batch import Batch
 from nsf.dynamics.integration import Integration
 from nsf.dynamics.methods import Method
 from nsf.dynamics.projection import GaussNewton, Taylor
-from nsf.dynamics.projection_kernel import projection_fits
 from nsf.dynamics.setup import Setup
 from nsf.dynamics.span import Span
 from nsf.engines.base import Engine
 from nsf.engines.modal.mirrors import edits
+from nsf.engines.modal.projection import projection_fits
 from nsf.engines.modal.span import ModalSpan
 from nsf.kinematics.fields.basis import BasisManifold
 from nsf.kinematics.fields.joint import JointManifold

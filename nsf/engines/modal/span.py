@@ -5,26 +5,25 @@ import torch
 import warp as wp
 from typing_extensions import override
 
-from nsf.dynamics.arena import Arena
 from nsf.dynamics.batch import Batch
-from nsf.dynamics.closure_kernel import packed_weights, projection_block
 from nsf.dynamics.integration import ParticleSets
 from nsf.dynamics.interop import as_vectors, on_torch_stream
-from nsf.dynamics.modal_fields import field_launches
-from nsf.dynamics.modal_kernels import THREADS, make_gathering, tiling
-from nsf.dynamics.placing_kernels import make_others, make_sample
 from nsf.dynamics.projection import Taylor
-from nsf.dynamics.projection_kernel import (
+from nsf.dynamics.span import Span, Stages
+from nsf.engines.modal.arena import Arena
+from nsf.engines.modal.closure import packed_weights, projection_block
+from nsf.engines.modal.fields import field_launches
+from nsf.engines.modal.gathering import THREADS, make_gathering, tiling
+from nsf.engines.modal.placing import make_others, make_sample
+from nsf.engines.modal.projection import (
     EVALUATE,
     PREPARE,
     SOLVE,
     make_projection,
     prepared_size,
 )
-from nsf.dynamics.span import Span, Stages
 from nsf.kinematics.fields.modal import ModalFactors
 from nsf.mpm.access import WARP
-from nsf.mpm.grid import Grid
 from nsf.mpm.shape import DEGREES, stencil_offset
 from nsf.mpm.state import cell_order
 from nsf.sampling.sampler import SampleSpan
@@ -47,7 +46,7 @@ class ModalSpan(Span):
         sets: S, N (the candidates) and I.
 
     Attributes:
-        tiling: number of tiles, and of runs in a tile; each of these has a bit in `needed`.
+        coefficients: where the runs are.
         needed: see `Placing`.
     """
 
@@ -66,14 +65,11 @@ class ModalSpan(Span):
         )
         # What a block shares for a run, at most: coefficients of x and of its rate, or of two fields.
         of_x, *of_heads = (-(-modes // 4) for modes in manifold.hyperparameters["modes"])
-        self.tiling = tiling(len(batch), arena.real.itemsize * 4 * max(2 * of_x, sum(of_heads)))
-        self._placing = Placing(arena, state, deformation, of_sample, self.grid_step.grid, shape, self)
+        tiles = tiling(len(batch), arena.real.itemsize * 4 * max(2 * of_x, sum(of_heads)))
+        # What is handed on is the span of every engine, which is whole by now.
+        self._placing = Placing(arena, state, deformation, of_sample, self, tiles)
         self.needed = self._placing.needed
-        parameters = torch.stack([setup.parameters for setup in batch.setups])
-        materials = [setup.scene.material for setup in batch.setups]
-        self._networks, self._fields = field_launches(
-            arena, self, manifold, one.method, order, parameters, materials
-        )
+        self._networks, self._fields = field_launches(arena, self, state.a, self.needed, tiles)
         self._projection = Projection(arena, state, deformation, of_sample, self, sample.weights)
 
     @property
@@ -175,6 +171,12 @@ class Coefficients:
 class Placing:
     """Finds x and v at S, and at each step which others its step needs, and theirs.
 
+    Args:
+        arena, state: of the batch.
+        deformation: factors of g at N; of_sample: its modes at S.
+        span: whose rows of x and v are found.
+        tiles: number of tiles, and of runs in a tile; each of these has a bit in `needed`.
+
     Attributes:
         needed: [tiles, n] in which runs of a tile a particle is, as bits.
         count: [B, 2] particles needed in all steps taken, and the number of these.
@@ -182,8 +184,15 @@ class Placing:
     """
 
     def __init__(
-        self, arena, state, deformation, of_sample: torch.Tensor, grid: Grid, shape: str, span: Span
+        self,
+        arena: Arena,
+        state: Coefficients,
+        deformation: ModalFactors,
+        of_sample: torch.Tensor,
+        span: Span,
+        tiles: tuple[int, int],
     ):
+        shape, grid = span.batch.shared.transfer.shape, span.grid_step.grid
         precision, reach, sets = arena.precision, DEGREES[shape], span.sets
         nodes = np.array(grid.geometry.nodes)
         lower, upper = np.zeros(3, int), nodes - 1
@@ -192,28 +201,32 @@ class Placing:
             lower = np.maximum(stored.min(0) - reach, 0)
             upper = np.minimum(stored.max(0) + reach, nodes - 1)
         extent = upper - lower + 1
-        box = wp.vec3i(*lower.tolist()), wp.vec3i(*extent.tolist())
         B, s, n = len(state), span.s, span.size
-        tiles, tile = span.tiling
-        whole = [2 ** min(tile, B - tile * number) - 1 for number in range(tiles)]
-        self.needed = arena.hold(torch.tensor(whole)[:, None].expand(tiles, n), torch.int32)
+        number, tile = tiles
+        whole = [2 ** min(tile, B - tile * before) - 1 for before in range(number)]
+        self.needed = arena.hold(torch.tensor(whole)[:, None].expand(number, n), torch.int32)
         self.count = arena.zeros(B, 2, dtype=torch.int64)
         stamps = arena.zeros(B, int(extent.prod()), dtype=torch.int32)
         mean = as_vectors(arena.hold(deformation.mean, arena.real), precision)
         initial, x, v = (as_vectors(a, precision) for a in (span.initial_velocity, span.x, span.v))
-        latest = [state.a, state.rate, initial, state.first, state.step, stamps]
-        found = [precision.real(1.0 / grid.geometry.dx), *box, self.count, x, v]
-        lanes = arena.lanes(WARP)
-        inputs = [mean, of_sample, *latest, *found, grid.shape, s, lanes]
-        self.launches = [arena.pack(make_sample(precision, shape, B > 1), B * s * lanes, inputs)]
+        motion = {
+            "mean": mean, "a": state.a, "rate": state.rate, "initial_velocity": initial, "x": x, "v": v,
+            "first": state.first, "step": state.step, "stamps": stamps, "count": self.count,
+            "inv_dx": precision.real(1.0 / grid.geometry.dx), "lower": wp.vec3i(*lower.tolist()),
+            "extent": wp.vec3i(*extent.tolist()), "of_sample": s,
+        }  # fmt: skip
+        lanes, kernel = arena.lanes(WARP), make_sample(precision, shape, B > 1)
+        own = {"modes": of_sample, "grid_shape": grid.shape, "lanes": lanes}
+        self.launches = [arena.pack(kernel, B * s * lanes, at=motion, **own)]
         if n == s:
             return
         modes, lengths = arena.halved(deformation.table, deformation.rows[s:])
-        four = -(-state.a.shape[1] // 4)
-        lanes = arena.lanes(THREADS)
-        kernel = make_others(precision, shape, four, tile, tiles > 1, wp.dtype_from_torch(modes.dtype))
-        inputs = [mean, modes, lengths, *latest, *found, self.needed, s, tiles, lanes]
-        self.launches.append(arena.pack(kernel, tiles * arena.whole_blocks(n - s, THREADS), inputs, THREADS))
+        four, kind = -(-state.a.shape[1] // 4), wp.dtype_from_torch(modes.dtype)
+        kernel = make_others(precision, shape, four, tile, number > 1, kind)
+        threads = number * arena.whole_blocks(n - s, THREADS)
+        own = {"modes": modes, "lengths": lengths, "needed": self.needed, "tiles": number}
+        own["lanes"] = arena.lanes(THREADS)
+        self.launches.append(arena.pack(kernel, threads, THREADS, at=motion, **own))
 
 
 class Projection:
@@ -239,36 +252,30 @@ class Projection:
         members = deformation.members if widths else 1
         lanes, velocity = arena.lanes(THREADS), as_vectors(span.v, arena.precision)
         self.gather = arena.pack(
-            make_gathering(arena.precision, count > 1),
-            count * (K + 1) * lanes,
-            [displacement, span.size, -(-K // 4), velocity, w, wp.float64(one.dt), lanes, b],
-            THREADS,
-        )
+            make_gathering(arena.precision, count > 1), count * (K + 1) * lanes, THREADS, lanes=lanes,
+            given={
+                "displacement": displacement, "v": velocity, "rows": span.size, "weights": w,
+                "dt": one.dt, "b": b,
+            },
+        )  # fmt: skip
         kernel = make_projection(arena.precision, widths, members, r, K, count > 1)
-        sigma = arena.hold(deformation.leading, torch.float64)
         block = projection_block(widths)
-        threads = members * block if arena.device.is_cuda else 1
-        between = [
-            arena.zeros(count, prepared_size(r, K)),
-            arena.zeros(count, 2 * members * (K - r) * (r + 1)),
-            arena.zeros(count, 2, dtype=torch.int32),
-        ]
-        linear = int(isinstance(projector, Taylor))
-
-        def of_each(values: torch.Tensor) -> torch.Tensor:
-            """[count, entries of a run], sharing memory."""
-            return values.view(count, -1)
-
-        def launch(mode: int) -> wp.Launch:
-            how = [wp.float64(s), mode, projector.iterations, wp.float64(projector.tolerance), linear]
-            latents = [state.latent, state.a, state.rate, record.now, record.before]
-            kept = [record.xhat, record.residuals, record.updates, record.row]
-            own = map(of_each, [*latents, *kept, state.first, state.step])
-            sums = [weights, wp.float64(deformation.scale), sigma, G, b]
-            inputs = [*sums, *how, wp.float64(one.dt), *own, *between, threads]
-            return arena.pack(kernel, count * threads, inputs, block)
-
-        self.evaluate, self.prepare, self.solve = (launch(mode) for mode in (EVALUATE, PREPARE, SOLVE))
+        threads = arena.lanes(block)
+        of_each = {
+            "latent": state.latent, "a": state.a, "rate": state.rate, "xhat": record.now,
+            "xhat_previous": record.before, "xhats": record.xhat, "residuals": record.residuals,
+            "updates": record.updates, "row": record.row, "first": state.first, "step": state.step,
+            "prepared": arena.zeros(count, prepared_size(r, K)), "b": b,
+        }  # fmt: skip
+        given = {name: values.view(count, -1) for name, values in of_each.items()} | {
+            "weights": weights, "scale": deformation.scale, "G": G, "sample": s, "dt": one.dt,
+            "sigma": arena.hold(deformation.leading, torch.float64), "iterations": projector.iterations,
+            "tolerance": projector.tolerance, "linear": isinstance(projector, Taylor),
+        }  # fmt: skip
+        self.evaluate, self.prepare, self.solve = (
+            arena.pack(kernel, count * threads, block, given=given, mode=mode, threads=threads)
+            for mode in (EVALUATE, PREPARE, SOLVE)
+        )
 
 
 def _closure(deformation: ModalFactors, is_cuda: bool) -> tuple[tuple[int, ...], torch.Tensor]:

@@ -3,10 +3,10 @@
 import pytest
 import warp as wp
 
-from nsf.dynamics.modal_kernels import make_contraction, make_gathering
-from nsf.dynamics.network_kernel import make_layer, make_product
-from nsf.dynamics.placing_kernels import make_others, make_sample
-from nsf.dynamics.projection_kernel import make_projection
+from nsf.engines.modal.gathering import make_contraction, make_gathering
+from nsf.engines.modal.networks import make_layer, make_product
+from nsf.engines.modal.placing import make_others, make_sample
+from nsf.engines.modal.projection import make_projection
 from nsf.mpm import precision_of
 from nsf.mpm.transfer import make_g2p, make_p2g
 from nsf.mpm.update import make_grid_update, make_update_g2p

@@ -7,8 +7,8 @@ import warp as wp
 
 import nsf.scenes
 from nsf.dynamics import GaussNewton, Integration, Method, Taylor
-from nsf.dynamics.arena import Arena
-from nsf.dynamics.projection_kernel import projection_fits
+from nsf.engines.modal.arena import Arena
+from nsf.engines.modal.projection import projection_fits
 from nsf.kinematics.fields.basis import BasisManifold
 from nsf.mpm import precision_of
 from nsf.sampling import RandomSampler, SampleSpan

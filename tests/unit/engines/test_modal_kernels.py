@@ -6,11 +6,11 @@ import torch
 import warp as wp
 
 from nsf.data import TAU_MATRIX
-from nsf.dynamics.arena import Arena
 from nsf.dynamics.interop import as_vectors
-from nsf.dynamics.modal_kernels import THREADS, make_contraction, make_gathering, tiling
-from nsf.dynamics.network_kernel import make_layer, make_product, product_blocks
-from nsf.dynamics.placing_kernels import make_others, make_sample
+from nsf.engines.modal.arena import Arena
+from nsf.engines.modal.gathering import THREADS, make_contraction, make_gathering, tiling
+from nsf.engines.modal.networks import make_layer, make_product, product_blocks
+from nsf.engines.modal.placing import make_others, make_sample
 from nsf.mpm import precision_of
 from nsf.mpm.device import warp_device
 
@@ -60,7 +60,7 @@ def test_contraction(arena, rng, n, K, simulations, fields, coefficients, half):
     needed = rng.integers(0, 2, (simulations, n))
     (tiles, tile), of = tiling(simulations), wp.dtype_from_torch(coefficients)
     bits = arena.hold(as_bits(needed, tiles, tile), torch.int32)
-    inputs, threads, sizes, results = [bits], [], [], []
+    sides, threads, sizes, results = [], [], [], []
     for more, components in enumerate(fields):
         k = K + 5 * more
         mean, modes = (values_of(arena, rng, n, components, *last).float() for last in ((), (k,)))
@@ -70,14 +70,17 @@ def test_contraction(arena, rng, n, K, simulations, fields, coefficients, half):
         read = (modes / lengths).to(stored.dtype).double() * lengths
         expected = mean.double() + torch.einsum("nck,bk->bnc", read, a.double())
         found = arena.zeros(simulations * n, 3, 3)
-        inputs += [arena.hold(mean, torch.float64), stored, lengths, a, found]
+        mean = arena.hold(mean, torch.float64)
+        sides.append({"mean": mean, "modes": stored, "lengths": lengths, "a": a, "found": found})
         threads.append(arena.whole_blocks(components // 3 * n, THREADS))
         sizes.append(-(-k // 4))
         results.append((found, expected.cpu().numpy().reshape(simulations * n, components)))
-    inputs += inputs[-5:] * (2 - len(fields)) + [threads[0], tiles, arena.lanes(THREADS)]
     kind = wp.dtype_from_torch(stored.dtype)
     kernel = make_contraction(arena.precision, (sizes[0], sizes[-1]), of, tile, tiles > 1, kind)
-    arena.pack(kernel, tiles * sum(threads), inputs, THREADS).launch()
+    arena.pack(
+        kernel, tiles * sum(threads), THREADS, needed=bits, one=sides[0], two=sides[-1], threads=threads[0],
+        tiles=tiles, lanes=arena.lanes(THREADS),
+    ).launch()  # fmt: skip
     wp.synchronize_device(arena.device)
     for found, expected in results:
         symmetric = expected.shape[1] == 6
@@ -103,7 +106,7 @@ def test_modes_are_those_of_the_rows_however_many_are_taken_at_once(arena, rng, 
     rows = torch.tensor([4, 0, 9, 9, 2], device=table.device)
     whole = [arena.modes(table[rows]), *arena.halved(table[rows])]
     for entries in (1, 50):  # a particle, and two of them, at once
-        monkeypatch.setattr("nsf.dynamics.arena._ENTRIES", entries)
+        monkeypatch.setattr("nsf.engines.modal.arena._ENTRIES", entries)
         for found, expected in zip(
             [arena.modes(table, rows), *arena.halved(table, rows)], whole, strict=True
         ):
@@ -136,16 +139,23 @@ def test_where_the_sample_and_its_neighbours_are(arena, rng, n, K, simulations):
     kind, several = wp.dtype_from_torch(stored.dtype), simulations > 1
     taken = 0
     for first in (np.arange(simulations) % 2, np.arange(1, simulations + 1) % 2):
-        latest = [a, rate, shown[1], arena.hold(first, torch.int32), step, stamps]
-        found = [wp.float64(1.0 / dx), lower, extent, count, *shown[2:]]
+        motion = {
+            "mean": shown[0], "initial_velocity": shown[1], "x": shown[2], "v": shown[3], "a": a,
+            "step": step, "stamps": stamps, "count": count, "lower": lower, "extent": extent, "of_sample": s,
+            "rate": rate, "first": arena.hold(first, torch.int32), "inv_dx": wp.float64(1.0 / dx),
+        }  # fmt: skip
         sample, others = (
             make_sample(arena.precision, "quadratic", several),
             make_others(arena.precision, "quadratic", -(-K // 4), tile, tiles > 1, kind),
         )
-        inputs = [shown[0], arena.modes(modes[:s]), *latest, *found, shape, s, warp]
-        arena.pack(sample, simulations * s * warp, inputs).launch()
-        inputs = [shown[0], stored, lengths, *latest, *found, needed, s, tiles, lanes]
-        arena.pack(others, tiles * arena.whole_blocks(n - s, THREADS), inputs, THREADS).launch()
+        arena.pack(
+            sample, simulations * s * warp, at=motion, modes=arena.modes(modes[:s]), grid_shape=shape,
+            lanes=warp,
+        ).launch()  # fmt: skip
+        arena.pack(
+            others, tiles * arena.whole_blocks(n - s, THREADS), THREADS, at=motion, modes=stored,
+            lengths=lengths, needed=needed, tiles=tiles, lanes=lanes,
+        ).launch()  # fmt: skip
         wp.synchronize_device(arena.device)
         places, moved = (torch.einsum("nck,bk->bnc", read, c).cpu().numpy() for c in (a, rate))
         places += mean.cpu().numpy()
@@ -171,9 +181,9 @@ def test_what_the_projection_takes_from_the_sample(arena, rng, n, K, simulations
     v = values_of(arena, rng, simulations, n, 3)
     b, lanes = arena.zeros(simulations, K + 1), arena.lanes(THREADS)
     velocity = as_vectors(v.flatten(0, 1), arena.precision)
-    inputs = [arena.modes(modes), n, -(-K // 4), velocity, w, wp.float64(dt), lanes, b]
+    given = {"displacement": arena.modes(modes), "v": velocity, "rows": n, "weights": w, "dt": dt, "b": b}
     kernel = make_gathering(arena.precision, simulations > 1)
-    arena.pack(kernel, simulations * (K + 1) * lanes, inputs, THREADS).launch()
+    arena.pack(kernel, simulations * (K + 1) * lanes, THREADS, given=given, lanes=lanes).launch()
     wp.synchronize_device(arena.device)
     moved = dt * v[:, :s]
     expected = torch.einsum("p,pck,bpc->bk", w, modes.double(), moved)
@@ -215,16 +225,23 @@ def test_layers_of_two_networks(arena, rng, simulations, outs, way):
     entries = [silu(x @ one.T + other) for one, other in zip(W_0, b_0, strict=True)]
     found = [arena.zeros(simulations, 2 * out) for out in outs]
     sides = [
-        [W_0[i], b_0[i], W[i], b[i], x if fused else arena.hold(entries[i], torch.float64)] for i in (0, 1)
+        {"W": W[i], "b": b[i], "x": arena.hold(entries[i], torch.float64), "y": found[i]} for i in (0, 1)
     ]
+    for i in range(2 if fused else 0):
+        sides[i] |= {"W_0": W_0[i], "b_0": b_0[i], "x": x}
+    one, two = sides
     (tiles, tile), lanes, count = tiling(simulations), arena.lanes(32), 2 * sum(outs)
     if way == "product":
         first, blocks = product_blocks([(2 * out, 2) for out in outs], simulations)
-        arguments = [*sides[0][2:], *sides[1][2:], 1, first, blocks, *found]
-        arena.pack(make_product(arena.precision), blocks * THREADS, arguments, THREADS).launch()
+        kernel, threads, how = (
+            make_product(arena.precision),
+            blocks * THREADS,
+            {"first": first, "blocks": blocks},
+        )
     else:
         kernel = make_layer(arena.precision, tile, tiles > 1, r if fused else 0)
-        arena.pack(kernel, tiles * count * lanes, [*sides[0], *sides[1], 1, lanes, count, *found]).launch()
+        threads, how = tiles * count * lanes, {"lanes": lanes, "outputs": count}
+    arena.pack(kernel, threads, THREADS, one=one, two=two, active=True, **how).launch()
     wp.synchronize_device(arena.device)
     for i in (0, 1):
         of_members = entries[i].unflatten(1, (2, -1)), W[i].unflatten(0, (2, -1))

@@ -1,6 +1,6 @@
 """Arrays and packed kernel launches on one device, shared by torch and Warp."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
@@ -118,12 +118,32 @@ class Arena:
         lanes = self.lanes(block)
         return -(-threads // lanes) * lanes
 
-    def pack(self, kernel, dim: int | tuple[int, ...], arguments: Sequence, block: int = 128) -> wp.Launch:
-        """A launch whose arguments are packed once; tensors among them are shown to Warp as they are."""
-        inputs = [wp.from_torch(a) if isinstance(a, torch.Tensor) else a for a in arguments]
+    def pack(self, kernel, dim: int, block: int = 128, **arguments) -> wp.Launch:
+        """A launch whose arguments are packed once; tensors among them are shown to Warp as they are.
+
+        Args:
+            kernel, dim, block: as for `wp.launch`; a block of a CPU is one thread.
+            arguments: of the kernel by name, those of a struct as a dictionary.
+        """
+        kinds = kernel.func.__annotations__
+        if kinds.keys() != arguments.keys():
+            raise TypeError(f"{kernel.key} takes {', '.join(kinds)}, not {', '.join(arguments)}")
+        inputs = [_shown(kind, arguments[name]) for name, kind in kinds.items()]
         return wp.launch(
             kernel, dim=dim, inputs=inputs, device=self.device, block_dim=self.lanes(block), record_cmd=True
         )
+
+
+def _shown(kind, value):
+    """A kernel's argument: a tensor as Warp's array, a dictionary as the struct of its kind."""
+    if isinstance(value, torch.Tensor):
+        return wp.from_torch(value)
+    if not isinstance(value, dict):
+        return value
+    filled = kind()
+    for name, part in value.items():
+        setattr(filled, name, _shown(None, part))
+    return filled
 
 
 def _rows(table: torch.Tensor, rows: torch.Tensor | None, part: slice) -> torch.Tensor:

@@ -1,0 +1,183 @@
+"""Kernels that give x and v where a reduced step needs them: at S, and at those of N that touch its nodes."""
+
+from functools import cache
+
+import warp as wp
+
+from nsf.engines.modal.gathering import make_combination, make_tiles
+from nsf.mpm import Precision
+from nsf.mpm.copies import make_copies
+from nsf.mpm.grid import inside
+from nsf.mpm.native import native_code
+from nsf.mpm.shape import shape_functions
+
+
+@wp.func
+def _cell(base: wp.vec3i, lower: wp.vec3i, extent: wp.vec3i):
+    """Flat index of a stencil's cell in a box that starts at `lower`, −1 outside it."""
+    at = base - lower
+    if not inside(at, 1, extent):
+        return -1
+    return (at[0] * extent[1] + at[1]) * extent[2] + at[2]
+
+
+@cache
+def _make_motion(precision: Precision):
+    """Warp struct of what tells where particles are, and of what is found.
+
+    The coefficients a and their rate are of each simulation, as are whether its step is the `first`, the
+    number of the `step`, the `stamps` of cells, and `count`: particles needed in all steps, and the steps.
+    `mean` and the box of cells, which begins at `lower`, are common to all. x, v and the initial velocity
+    have a row for each particle of each simulation, the `of_sample` of S first.
+    """
+    real, vec3 = precision.real, precision.vec3
+
+    @wp.struct
+    class Motion:
+        mean: wp.array(dtype=vec3)
+        a: wp.array2d(dtype=wp.float64)
+        rate: wp.array2d(dtype=wp.float64)
+        initial_velocity: wp.array(dtype=vec3)
+        first: wp.array(dtype=wp.int32)
+        step: wp.array(dtype=wp.int32)
+        stamps: wp.array2d(dtype=wp.int32)
+        inv_dx: real
+        lower: wp.vec3i
+        extent: wp.vec3i
+        count: wp.array2d(dtype=wp.int64)
+        x: wp.array(dtype=vec3)
+        v: wp.array(dtype=vec3)
+        of_sample: int
+
+    return Motion
+
+
+@cache
+def make_sample(precision: Precision, shape_name: str, several: bool = False):
+    """Kernel of x and v at S, `lanes` threads a particle, a warp or one.
+
+    x = mean + Σ_k b_k a_k and v = Σ_k b_k ȧ_k, where ȧ is the backward difference of a (paper section 5.1:
+    there is no v field); in the first step v is the initial velocity. It writes the number of the step to
+    every cell from which a stencil meets one of S's; each simulation has cells of its own. A particle off
+    the grid, which no transfer will move, gets no velocity.
+
+    Source: paper section 5.4, a.
+    """
+    real, vec3 = precision.real, precision.vec3
+    shape = shape_functions(precision, shape_name)
+    base_node, reach = shape.base_node, shape.degree
+    across = 2 * reach + 1
+    sums = wp.types.vector(length=6, dtype=real)
+    share, copy_of = make_copies(several)
+    Motion = _make_motion(precision)
+
+    @wp.func_native(native_code(__package__, "sample", real=precision.native))
+    def combined(given: Motion, modes: wp.array(dtype=wp.float32), p: int, copy: int, lane: int) -> sums: ...
+
+    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
+    def sample(
+        at: Motion,
+        modes: wp.array(dtype=wp.float32),
+        grid_shape: wp.vec3i,
+        lanes: int,
+    ):
+        t, lane = wp.tid() / lanes, wp.tid() % lanes
+        copy = copy_of(t, at.of_sample)
+        p = t - copy * at.of_sample
+        row = p + copy * share(at.x.shape[0], at.first.shape[0])
+        moved = combined(at, modes, p, copy, lane)
+        x = at.mean[p] + vec3(moved[0], moved[1], moved[2])
+        base = base_node(x, at.inv_dx)
+        if lane == 0:
+            at.x[row] = x
+            if not inside(base, wp.static(reach + 1), grid_shape):
+                at.v[row] = vec3()
+            elif at.first[copy] != 0:
+                at.v[row] = at.initial_velocity[row]
+            else:
+                at.v[row] = vec3(moved[3], moved[4], moved[5])
+            if p == 0:
+                at.count[copy, 0] = at.count[copy, 0] + wp.int64(at.of_sample)
+                at.count[copy, 1] = at.count[copy, 1] + wp.int64(1)
+        offset = lane
+        while offset < wp.static(across**3):
+            place = wp.vec3i(offset / (across * across), (offset / across) % across, offset % across)
+            c = _cell(base + place - wp.vec3i(reach, reach, reach), at.lower, at.extent)
+            if c >= 0:
+                at.stamps[copy, c] = at.step[copy]
+            offset += lanes
+
+    return sample
+
+
+@cache
+def make_others(
+    precision: Precision,
+    shape_name: str,
+    vectors: int,
+    tile: int = 1,
+    several: bool = False,
+    stored=wp.float32,
+):
+    """Kernel of x and v at N without S, as `make_sample`, one thread a particle and tile of simulations.
+
+    It is launched over whole blocks; `several` tiles have blocks in turn. Only particles in the cells that
+    `make_sample` has stamped are needed; it moves the rest off the grid, where the transfers pass over it.
+    Which simulations of a tile need a particle are the bits of `needed`. `stored` is the type of the modes.
+
+    Source: paper section 5.4, b.
+    """
+    real, vec3 = precision.real, precision.vec3
+    base_node = shape_functions(precision, shape_name).base_node
+    places = wp.types.vector(length=tile, dtype=wp.int32)
+    tile_of, within = make_tiles(several)
+    Motion = _make_motion(precision)
+    combined = make_combination(precision, vectors, 2, tile, several, wp.float64, stored)
+
+    @wp.func_native(native_code(__package__, "count"))
+    def add_up(count: wp.array2d(dtype=wp.int64), copy: int, taken: int): ...
+
+    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
+    def others(
+        at: Motion,
+        modes: wp.array(dtype=stored),
+        lengths: wp.array(dtype=real),
+        needed: wp.array2d(dtype=wp.int32),
+        tiles: int,
+        lanes: int,
+    ):
+        t = within(wp.tid(), tiles, lanes)
+        start = tile_of(wp.tid(), tiles, lanes) * wp.static(tile)
+        n, of_sample = at.mean.shape[0], at.of_sample
+        live = t < n - of_sample
+        moved = combined(modes, lengths, at.a, at.rate, n - of_sample, 3, start, t, 0, live)
+        if not live:
+            return
+        p = of_sample + t
+        taken, beginning = places(), places()
+        # Before anything is written, so that all loads are under way together.
+        for s in range(wp.static(tile)):
+            copy = wp.min(start + s, at.first.shape[0] - 1)
+            x = at.mean[p] + vec3(moved[6 * s], moved[6 * s + 1], moved[6 * s + 2])
+            c = _cell(base_node(x, at.inv_dx), at.lower, at.extent)
+            stamp = at.stamps[copy, wp.max(c, 0)]
+            taken[s] = wp.where(c >= 0 and stamp == at.step[copy], 1, 0)
+            beginning[s] = at.first[copy]
+        bits = 0
+        for s in range(wp.static(tile)):
+            copy = start + s
+            if copy < at.first.shape[0]:
+                row = copy * n + p
+                x = vec3(real(-1.0), real(-1.0), real(-1.0))  # the grid starts at the origin
+                if taken[s] != 0:
+                    bits += wp.static(1 << s)
+                    x = at.mean[p] + vec3(moved[6 * s], moved[6 * s + 1], moved[6 * s + 2])
+                    if beginning[s] != 0:
+                        at.v[row] = at.initial_velocity[row]
+                    else:
+                        at.v[row] = vec3(moved[6 * s + 3], moved[6 * s + 4], moved[6 * s + 5])
+                at.x[row] = x
+                add_up(at.count, copy, taken[s])
+        needed[start / wp.static(tile), p] = bits
+
+    return others
