@@ -1,7 +1,8 @@
 """The full-order material point method (paper section 3.3)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import warp as wp
@@ -26,6 +27,59 @@ from nsf.mpm.transfer import Transfer, make_g2p_stress
 from nsf.timing import StageTimer
 
 _NEVER = 2**31 - 1
+
+
+class State(Protocol):
+    """The state of a simulation, on its device."""
+
+    def __len__(self) -> int:
+        """Number of particles P."""
+
+    def numpy(self) -> dict[str, np.ndarray]:
+        """Host copies by name: x, v [P, 3] m and m/s, C, tau [P, 3, 3] 1/s and Pa, and what else there is."""
+
+
+@runtime_checkable
+class Solver(Protocol):
+    """What a user holds of a simulation, at full order or reduced, whatever computes its steps.
+
+    A step takes no argument: the forcing of its moment, gravity and where colliders are, is on the device.
+
+    Attributes:
+        dt: step [s]; device: Warp device.
+    """
+
+    dt: float
+    device: object
+
+    @property
+    def state(self) -> State:
+        """Where the particles are."""
+
+    @property
+    def steps_taken(self) -> int:
+        """Number of steps since t = 0."""
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s]."""
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the arrays take on the device."""
+
+    @property
+    def stages(self) -> Mapping[str, Callable[[], None]]:
+        """One step, stage by stage, in order."""
+
+    def step(self, n: int = 1) -> None:
+        """Advance by n steps of Δt."""
+
+    def timed_step(self, timer: StageTimer) -> None:
+        """One step, stage by stage under a timer."""
+
+    def restart(self) -> None:
+        """Go back to t = 0."""
 
 
 class FullOrderMPM:
@@ -96,6 +150,7 @@ class FullOrderMPM:
         self.mass, self.volume0 = on_device(constants.mass), on_device(constants.volume0)
         self.mu, self.lam = on_device(constants.mu), on_device(constants.lam)
         history = material.initial_history(len(constants))
+        self._start = {"x": x, "v": v, "history": history}
         self.state = ParticleState(x, v, history, order, self.precision, self.device)
         self.grid = Grid(grid, self.precision, self.device)
         boundaries = BoundaryArrays(colliders, walls, self.precision, self.device)
@@ -119,6 +174,14 @@ class FullOrderMPM:
         """Bytes that the solver's arrays take on the device."""
         own = (self.mass, self.volume0, self.mu, self.lam, self._first_bad)
         return self.state.nbytes + self.grid.nbytes + sum(a.capacity for a in own)
+
+    def restart(self) -> None:
+        """Go back to t = 0; captured graphs stay good."""
+        for name, values in self._start.items():
+            getattr(self.state, name).assign(values)
+        self.state.unload()
+        self.grid_step.boundaries.start_from(0)
+        self.steps_taken = self.beyond_law = 0
 
     def resume(self, steps: int, x: np.ndarray, v: np.ndarray, C: np.ndarray, tau: np.ndarray) -> None:
         """Go on from a state that is known by its positions, velocities and stresses alone.

@@ -111,6 +111,12 @@ class ParticleState:
     def __len__(self) -> int:
         return self.order.shape[0]
 
+    def unload(self) -> None:
+        """Let no particle be deformed, stressed or turning: F_e = 1, τ = 0, C = 0."""
+        for array in (self.C, self.tau):
+            array.rows.zero_()
+        self.F_e.rows.fill_(self.F_e.rows.dtype(np.eye(3)))
+
     @property
     def nbytes(self) -> int:
         """Bytes on the device."""
