@@ -83,7 +83,7 @@ class Solver(Protocol):
 
 
 class FullOrderMPM:
-    """Explicit symplectic MPM over every particle.
+    """Explicit symplectic MPM over all particles.
 
     Args:
         constants: particles.
@@ -103,7 +103,7 @@ class FullOrderMPM:
         beyond_law: particles whose stress `resume` had to scale down.
 
     Raises:
-        InstabilityError: Δt is unstable or a collider too fast; the message names the largest stable one.
+        InstabilityError: Δt is unstable, or a collider too fast; the message names the largest stable Δt.
         ConfigError: the grid does not resolve a collider.
         ShapeError: x or v is not [P, 3].
         DeviceError: the device does not exist.
@@ -184,11 +184,12 @@ class FullOrderMPM:
         self.steps_taken = self.beyond_law = 0
 
     def resume(self, steps: int, x: np.ndarray, v: np.ndarray, C: np.ndarray, tau: np.ndarray) -> None:
-        """Go on from a state that is known by its positions, velocities and stresses alone.
+        """Continue from a state that is known by its positions, velocities and stresses alone.
 
-        F_e is the stretch that carries τ (`Material.stretch_of`), the history variables are those that the
-        law assumes for τ (`Material.history_of`), and the colliders are where they are at that time. A
-        stress beyond the law is scaled down to what it carries; `beyond_law` counts them.
+        F_e becomes the stretch that carries τ (`Material.stretch_of`), and the history variables those that
+        the law assumes for τ (`Material.history_of`). The colliders go to their pose at that time. A stress
+        beyond the law is scaled down to the largest one that the law carries; `beyond_law` counts such
+        particles.
 
         Args:
             steps: time of the state in steps of Δt.
@@ -245,7 +246,7 @@ class FullOrderMPM:
         self.g2p_stress()
 
     def timed_step(self, timer: StageTimer) -> None:
-        """One step, stage by stage under a timer; captured anew where steps are captured."""
+        """Take one step, stage by stage under a timer; on a GPU, as a graph that is captured anew."""
         if self._graph is None:
             self._run_stages(timer)
         else:
@@ -263,7 +264,7 @@ class FullOrderMPM:
 
     @property
     def stages(self) -> dict[str, Callable[[], None]]:
-        """One step, stage by stage, in order; `step` makes one pass of the last two."""
+        """The stages of one step, in order. `step` does the last two in one pass."""
         return {"p2g": self.p2g, "grid": self.grid_step.update, "g2p": self.g2p, "stress": self.update_stress}
 
     def p2g(self) -> None:
@@ -280,7 +281,7 @@ class FullOrderMPM:
 
     @cached_property
     def increment(self) -> wp.array:
-        """[P, 3, 3] f = I + Δt ∇v of the last step that was taken stage by stage; `step` needs none."""
+        """[P, 3, 3] f = I + Δt ∇v of the last step taken stage by stage; `step` does not store it."""
         return wp.empty_like(self.state.F_e.rows)
 
     def g2p(self) -> None:
@@ -317,7 +318,7 @@ class FullOrderMPM:
         return speed * self.dt / self.grid.geometry.dx
 
     def check(self) -> None:
-        """Stop if a particle is non-finite or off the grid.
+        """Raise if a particle is non-finite or off the grid.
 
         Raises:
             InstabilityError: names the particle, the step and the time.
@@ -356,13 +357,13 @@ def diagnosed(
 ) -> InstabilityError:
     """The error of a run that failed a check, with the elastic CFL number at the check before it.
 
-    The check of Δt before a run knows the material at rest only; a law that stiffens in tension outgrows it.
-    The run is made again up to there, which costs nothing where nothing fails.
+    The check of Δt before a run knows the material at rest only, and a law that stiffens in tension outgrows
+    it. The number is found by making the failed run again, so that runs without a failure pay nothing.
 
     Args:
-        error: of the check that failed.
+        error: error of the check that failed.
         build: gives the solver at t = 0.
-        steps_taken: up to the check that failed.
+        steps_taken: number of steps up to the check that failed.
     """
     solver = build()
     rest = solver.elastic_cfl()
