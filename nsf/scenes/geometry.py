@@ -84,14 +84,15 @@ class Box(Shape):
         lower, upper: opposite corners [m].
 
     Raises:
-        ConfigError: a corner is not below the other.
+        ConfigError: a corner is not 3 finite numbers, or not below the other.
     """
 
     lower: Sequence[float]
     upper: Sequence[float]
 
     def __post_init__(self):
-        if len(self.lower) != 3 or len(self.upper) != 3 or not np.all(np.less(self.lower, self.upper)):
+        lower, upper = vector("box lower", self.lower, "m"), vector("box upper", self.upper, "m")
+        if not np.all(np.less(lower, upper)):
             raise ConfigError(f"box lower={self.lower} must lie below upper={self.upper} in each of 3 axes")
 
     @property
@@ -119,7 +120,7 @@ class Cylinder(Shape):
         radius, height: [m].
 
     Raises:
-        ConfigError: radius or height is not positive.
+        ConfigError: the base is not 3 finite numbers, or radius or height not positive and finite.
     """
 
     base: Sequence[float]
@@ -127,10 +128,9 @@ class Cylinder(Shape):
     height: float
 
     def __post_init__(self):
-        if len(self.base) != 3 or not (self.radius > 0 and self.height > 0):
-            raise ConfigError(
-                f"cylinder base={self.base} radius={self.radius} height={self.height}: give positive lengths"
-            )
+        vector("cylinder base", self.base, "m")
+        length("cylinder radius", self.radius)
+        length("cylinder height", self.height)
 
     @property
     def volume(self) -> float:

@@ -16,7 +16,7 @@ from nsf.mpm import Collider, DomainWalls, FullOrderMPM, GridGeometry, ParticleC
 from nsf.mpm.materials import Material
 from nsf.scenes.geometry import Shape
 from nsf.scenes.weakness import Weakness
-from nsf.vectors import vector
+from nsf.vectors import is_finite, vector
 
 #: Keys of a scene that its simulation does not depend on.
 NOT_PHYSICS = ("parameters", "reduced", "paper", "title")
@@ -37,7 +37,7 @@ class Body:
 
     Raises:
         ConfigError: not one of the two numbers, or one that is not positive; a density that is not
-            positive; a velocity that is not 3 numbers.
+            positive and finite; a velocity that is not 3 numbers.
     """
 
     shape: Shape
@@ -54,7 +54,9 @@ class Body:
                 f"particles={self.particles} and particles_per_cell={self.particles_per_cell}: "
                 "give exactly one, the other null"
             )
-        if self.particles is not None and (self.particles < 1 or self.particles != int(self.particles)):
+        if self.particles is not None and not (
+            is_finite(self.particles) and self.particles >= 1 and self.particles == int(self.particles)
+        ):
             raise ConfigError(f"particles={self.particles} must be a whole number, at least 1")
         if self.particles_per_cell is not None and not 0 < self.particles_per_cell < math.inf:
             raise ConfigError(f"particles_per_cell={self.particles_per_cell} must be positive and finite")
@@ -63,8 +65,8 @@ class Body:
                 raise ConfigError(
                     f"{key}={getattr(self, key)} must be built; give it a _target_: nsf.scenes.…"
                 )
-        if not self.density > 0:
-            raise ConfigError(f"density={self.density} kg/m³ must be positive")
+        if not 0 < self.density < math.inf:
+            raise ConfigError(f"density={self.density} kg/m³ must be positive and finite")
         vector("velocity", self.velocity, "m/s")
 
     def counted(self, dx: float) -> "Body":
