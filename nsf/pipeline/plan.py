@@ -23,7 +23,7 @@ from nsf.mpm.stability import check_colliders, check_time_step
 from nsf.runs import Run
 from nsf.sampling.sampler import check_well_posed
 from nsf.scenes import Scene
-from nsf.scenes.checks import check_memory
+from nsf.scenes.checks import check_memory, check_physics
 from nsf.scenes.scene import NOT_PHYSICS
 from nsf.storage import require_folder, require_space
 
@@ -150,6 +150,7 @@ class Plan:
         for value, scene in self.needed():
             scene = scene.with_parameters({self.scene.parameters.name: value})
             grid = scene.grid
+            check_physics(scene)
             check_time_step(scene.particles(), scene.initial_velocity(), grid.dx, scene.dt)
             for multiplier in (1.0, self.config.deploy.dt_multiplier):
                 check_colliders(scene.colliders, grid, multiplier * scene.dt)

@@ -14,7 +14,7 @@ from nsf.errors import ConfigError
 from nsf.mpm import Collider, DomainWalls, FullOrderMPM, GridGeometry, ParticleConstants, Transfer
 from nsf.mpm.materials import Material
 from nsf.scenes.body import Body
-from nsf.scenes.checks import check_memory, check_particles
+from nsf.scenes.checks import check_memory, check_particles, check_physics
 from nsf.vectors import vector
 
 #: Keys of a scene that its simulation does not depend on.
@@ -269,11 +269,13 @@ class Scene:
             device: `cpu`, `cuda`, `cuda:N` or `auto`.
 
         Raises:
-            ConfigError: the simulation does not fit into memory; and see `FullOrderMPM`.
+            ConfigError: the simulation does not fit into memory, or the scene cannot be meant
+                (`nsf.scenes.checks`); and see `FullOrderMPM`.
             InstabilityError, DeviceError: see `FullOrderMPM`.
         """
         scene = self.with_parameters(parameters or {})
         check_memory(scene, precision, device)
+        check_physics(scene)
         return FullOrderMPM(
             scene.particles(),
             scene.material,
