@@ -3,16 +3,13 @@
 import contextlib
 import logging
 import sys
-import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as RichProgress
 from rich.text import Text
-
-_TOLD_SECONDS = 0.1  # between two words from another process
 
 
 class _Rate(ProgressColumn):
@@ -63,33 +60,6 @@ class Progress:
     def advance(self, amount: int = 1) -> None:
         """Count work done."""
         self._bar.advance(self._task, amount)
-
-
-class Told:
-    """Progress that another process shows: it is told the work done, some times a second.
-
-    Args:
-        tell: hands an amount of work over.
-    """
-
-    def __init__(self, tell: Callable[[int], object]):
-        self._tell, self._amount, self._since = tell, 0, time.monotonic()
-
-    def __enter__(self) -> "Told":
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._tell(self._amount)
-
-    def describe(self, what: str) -> None:
-        """Nothing: the other process works on several things."""
-
-    def advance(self, amount: int = 1) -> None:
-        """Count work done."""
-        self._amount += amount
-        if time.monotonic() - self._since > _TOLD_SECONDS:
-            self._tell(self._amount)
-            self._amount, self._since = 0, time.monotonic()
 
 
 # What Lightning says about choices made on purpose here.

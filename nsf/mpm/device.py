@@ -1,17 +1,10 @@
-"""Devices by name, and the GPUs of a host shared out among processes."""
+"""Devices by name, and the GPUs of a host."""
 
-import itertools
 import os
-from contextlib import ExitStack
-from functools import cache
-from pathlib import Path
 
 import warp as wp
 
 from nsf.errors import DeviceError
-from nsf.storage import locked
-
-_held = ExitStack()  # the lock of this process's GPU, which the operating system frees when the process ends
 
 
 def warp_device(name: str):
@@ -42,22 +35,3 @@ def visible_gpus() -> tuple[str, ...]:
     named = os.environ.get("CUDA_VISIBLE_DEVICES")
     names = named.split(",") if named else map(str, range(count))
     return tuple(name.strip() for name in names)[:count]
-
-
-@cache
-def take_gpu(gpus: tuple[str, ...], folder: Path) -> None:
-    """See one GPU alone from now on, as `cuda:0`; call it before CUDA is used.
-
-    Processes that call it take the GPUs in turn; what one had is free again once it has ended.
-
-    Args:
-        gpus: as `visible_gpus` names them.
-        folder: of the locks that the processes share.
-
-    Raises:
-        StorageError: the folder cannot be written.
-    """
-    for turn in itertools.count():
-        if _held.enter_context(locked(folder / f".gpu_{turn}.lock")):
-            os.environ["CUDA_VISIBLE_DEVICES"] = gpus[turn % len(gpus)]
-            return
