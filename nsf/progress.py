@@ -3,16 +3,13 @@
 import contextlib
 import logging
 import sys
-import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as RichProgress
 from rich.text import Text
-
-_TOLD_SECONDS = 0.1  # between two messages to another process
 
 
 class _Rate(ProgressColumn):
@@ -65,34 +62,7 @@ class Progress:
         self._bar.advance(self._task, amount)
 
 
-class Told:
-    """Progress that another process shows: it tells that process the work done, some times a second.
-
-    Args:
-        tell: called with an amount of work.
-    """
-
-    def __init__(self, tell: Callable[[int], object]):
-        self._tell, self._amount, self._since = tell, 0, time.monotonic()
-
-    def __enter__(self) -> "Told":
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self._tell(self._amount)
-
-    def describe(self, what: str) -> None:
-        """Do nothing: the bar is for several pieces of work at once."""
-
-    def advance(self, amount: int = 1) -> None:
-        """Count work done."""
-        self._amount += amount
-        if time.monotonic() - self._since > _TOLD_SECONDS:
-            self._tell(self._amount)
-            self._amount, self._since = 0, time.monotonic()
-
-
-# Lightning's remarks on choices that are made on purpose here.
+# What Lightning says about choices made on purpose here.
 _EXPECTED_WARNINGS = (
     r".*GPU available but not used",
     r".*`isinstance\(treespec, LeafSpec\)` is deprecated",

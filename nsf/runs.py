@@ -15,7 +15,7 @@ from typing import Any
 from nsf.canonical import content_hash, plain
 from nsf.errors import ConfigError, MissingRunError, StorageError
 from nsf.provenance import provenance
-from nsf.storage import clear_partial, in_use, locked, write_json, writing
+from nsf.storage import AGAIN, clear_partial, in_use, locked, write_json, writing
 
 FORMAT = 1  # of the folder's layout; a new value gives every run a new hash
 _NAME = re.compile(r"[A-Za-z0-9][\w.+-]*", re.ASCII)
@@ -275,9 +275,8 @@ class Run:
             precision: such as "fp64".
 
         Raises:
-            StorageError: the folder cannot be written.
+            StorageError: the folder cannot be written, or was deleted or moved meanwhile.
         """
-        record = Record(self.path)
         manifest: dict[str, Any] = {
             "format": FORMAT,
             "stage": self.stage,
@@ -290,6 +289,7 @@ class Run:
             "precision": precision,
             "created": datetime.now(UTC).isoformat(timespec="microseconds"),
         }
+        record = Record(self, manifest["created"])
         start = time.perf_counter()
 
         def close(status: str, metrics: dict[str, Any], **more: Any) -> None:
@@ -308,14 +308,18 @@ class Run:
             write_json(self.path / "manifest.json", {**manifest, "status": "running"})
             try:
                 yield record
+                record.require_folder()
                 close("complete", record.plain_metrics())
             except BaseException as error:
+                if isinstance(error, Exception):
+                    record.require_folder()
                 status = "failed" if isinstance(error, Exception) else "interrupted"
                 metrics: dict[str, Any] = {}
                 # A full disk, or a metric that no manifest can hold, must not hide the first error.
                 with suppress(ConfigError):
                     metrics = record.plain_metrics()
                 with suppress(StorageError):
+                    record.require_folder()
                     close(status, metrics, error=f"{type(error).__name__}: {error}")
                 raise
 
@@ -331,10 +335,20 @@ class Run:
 class Record:
     """What a running stage says about itself: `metrics`, and the files it made."""
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, run: Run, created: str) -> None:
+        self.path = run.path
+        self._run, self._created = run, created
         self.metrics: dict[str, Any] = {}
         self.outputs: dict[str, dict[str, Any]] = {}
+
+    def require_folder(self) -> None:
+        """Refuse to go on where the folder is no longer the one that the run began with.
+
+        Raises:
+            StorageError: it was deleted or moved.
+        """
+        if self._run.manifest.get("created") != self._created:
+            raise StorageError(f"{self.path} was deleted or moved while its files were being made; {AGAIN}")
 
     def output(self, path: str | Path) -> Path:
         """Enter a finished file, or every file of a folder, into the manifest.
@@ -344,7 +358,9 @@ class Record:
 
         Raises:
             ConfigError: the path leaves the run's folder or does not exist.
+            StorageError: the folder was deleted or moved.
         """
+        self.require_folder()
         path = self.path / path
         files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
         if not files or not path.resolve().is_relative_to(self.path.resolve()):

@@ -17,6 +17,8 @@ from nsf.errors import StorageError
 _SPACE = "free some space, or write to another disk (NSF_RUNS, NSF_REPORTS)"
 _ACCESS = "make the folder writable, or write elsewhere (NSF_RUNS, NSF_REPORTS)"
 _PLACE = "a file stands where a folder is needed; write elsewhere (NSF_RUNS, NSF_REPORTS)"
+#: What to do where a folder has gone as it was written.
+AGAIN = "run the same command again, and leave the folder until it is done"
 _REMEDIES = {
     errno.ENOSPC: _SPACE,
     errno.EDQUOT: _SPACE,
@@ -44,7 +46,7 @@ def writing(path: str | Path) -> Iterator[Path]:
         path: where the file shall be; missing folders are made.
 
     Raises:
-        StorageError: no space, no permission or no writable file system.
+        StorageError: no space, no permission or no writable file system, or the folder was deleted meanwhile.
     """
     path = Path(path)
     try:
@@ -58,12 +60,29 @@ def writing(path: str | Path) -> Iterator[Path]:
         _flush(partial)
         os.replace(partial, path)
     except (OSError, RuntimeError) as error:
+        if not folder.is_dir():
+            raise _storage_error(path, "its folder was deleted or moved meanwhile", AGAIN) from error
         fault = _fault(error, folder)
         if fault is None:
             raise
         raise _storage_error(path, os.strerror(fault), _REMEDIES[fault]) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def refusals(folder: Path) -> Iterator[None]:
+    """Tell in one line that the disk refused a file below a folder, whoever wrote it.
+
+    Raises:
+        StorageError: no space, no permission or no writable file system.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _REMEDIES or (fault := _fault(error, folder)) is None:
+            raise
+        raise _storage_error(folder, os.strerror(fault), _REMEDIES[fault]) from error
 
 
 def clear_partial(folder: Path) -> None:
@@ -186,6 +205,9 @@ def _fault(error: OSError | RuntimeError, folder: Path) -> int | None:
         filename = getattr(error, "filename", None)
         elsewhere = isinstance(filename, str) and folder not in Path(filename).parents
         return None if elsewhere else number
+    context = error.__context__  # torch.save ends in an error of its own
+    if isinstance(context, OSError | RuntimeError) and (fault := _fault(context, folder)):
+        return fault
     # h5py wraps the cause into its own text, as OSError or RuntimeError.
     named = (number for number in _REMEDIES if os.strerror(number) in str(error))
     full = shutil.disk_usage(folder).free < _FULL_BYTES

@@ -1,7 +1,6 @@
-"""What several GPUs of a host save: a data set's trajectories, and the training of `field=mlp`."""
+"""What several GPUs of a host save in the training of `field=mlp`."""
 
 import os
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -16,18 +15,16 @@ from nsf.kinematics.training.phases import PHASES
 from nsf.mpm.device import visible_gpus
 from nsf.pipeline import Pipeline
 
-#: Twelve of the paper's 20 values of sand; training, which needs no more data to be timed, is on four.
+#: Of the paper's 20 values of sand; a step of training takes no longer with more.
 _TRAIN = (21.0, 26.53, 32.05, 38.5)
-_TEST = (22.84, 23.76, 24.68, 28.37, 30.21, 32.97, 34.82, 36.66)
 _STEPS = 600  # of each phase
 _FRAMES = 32  # of a batch, at most: as many as can be shared evenly
 
 
 def run(settings: Settings, say: Callable[[str], object]) -> Result:
-    """One GPU beside all, at the paper's size: a data set of sand, written to disk, and its networks.
+    """One GPU beside all: the networks of sand at the paper's size, whose steps are timed in blocks.
 
-    Each data set is made once, whatever the trials; the training's steps are timed in blocks. Where there are
-    no two GPUs this says so, and has no rows.
+    Where there are no two GPUs this says so, and has no rows.
     """
     gpus, found = len(visible_gpus()), Result()
     if gpus < 2:
@@ -36,7 +33,7 @@ def run(settings: Settings, say: Callable[[str], object]) -> Result:
     overrides = (
         "scene=sand", "scale=paper", "field=mlp", f"trainer.steps={_STEPS}",
         f"trainer.frames_per_batch={_FRAMES // gpus * gpus}",
-        f"scene.parameters.train={list(_TRAIN)}", f"scene.parameters.test={list(_TEST)}",
+        f"scene.parameters.train={list(_TRAIN)}", "scene.parameters.test=[]",
     )  # fmt: skip
     measured(overrides, gpus, settings, found, say)
     return found
@@ -45,52 +42,28 @@ def run(settings: Settings, say: Callable[[str], object]) -> Result:
 def measured(
     overrides: Sequence[str], devices: int, settings: Settings, found: Result, say: Callable[[str], object]
 ) -> None:
-    """Add the rows of one configuration: each precision's data set, and the training on the last of them.
+    """Add the rows of one configuration, whose trajectories are made first.
 
     Args:
         overrides: of the configuration, with `field=mlp`; several blocks of steps.
         devices: how many there are.
-        settings: precisions, and the device that is alone.
+        settings: the device that is alone, and the precisions, of which the last is that of the trajectories.
         found: gets the rows.
         say: told of every result.
     """
     root = Path(os.environ.get("NSF_RUNS") or "runs").expanduser()
     root.mkdir(parents=True, exist_ok=True)
+    with TemporaryDirectory(prefix=".bench-", dir=root) as folder:
 
-    def chain(folder: str, *own: str) -> Pipeline:
-        return Pipeline(config.load([*overrides, *own]), lambda line: None, Path(folder))
+        def chain(*own: str) -> Pipeline:
+            keys = [*overrides, f"precision={settings.precisions[-1]}", *own]
+            return Pipeline(config.load(keys), lambda line: None, Path(folder))
 
-    for precision in settings.precisions:
-        alone, every = ((f"device={name}", f"precision={precision}") for name in (settings.device, "auto"))
-        with TemporaryDirectory(prefix=".bench-", dir=root) as folder:
-            _warm_up(chain(folder, *alone))
-            first = _simulated(chain(folder, *alone), 1, settings, found, say)
-        with TemporaryDirectory(prefix=".bench-", dir=root) as folder:
-            last = _simulated(chain(folder, *every), devices, settings, found, say)
-            say(f"simulate {precision}: {first / last:.3g} times as fast on {devices} devices")
-            if precision == settings.precisions[-1]:
-                first = _trained(chain(folder, *alone), 1, settings, found, say)
-                several = chain(folder, *every, f"trainer.devices={devices}")
-                last = _trained(several, devices, settings, found, say)
-                say(f"train_mlp: {first / last:.3g} times as fast on {devices} devices")
-
-
-def _warm_up(pipeline: Pipeline) -> None:
-    """Compile and load the kernels."""
-    value, scene = pipeline.needed()[0]
-    scene.full_order({scene.parameters.name: value}, pipeline.config.precision, pipeline.device).step(3)
-
-
-def _simulated(pipeline: Pipeline, devices: int, settings: Settings, found: Result, say) -> float:
-    """Seconds that a data set takes, processes' start and files included."""
-    begun = time.perf_counter()
-    runs = pipeline.simulate()
-    seconds = time.perf_counter() - begun
-    ms = np.array([1e3 * seconds / (len(runs) * pipeline.scene.steps)])
-    case, precision = f"simulate_{pipeline.scene.name}_on_{devices}", pipeline.config.precision
-    found.rows.append(_row(case, pipeline, devices, precision, settings, ms))
-    say(f"{case} {precision}: {len(runs)} trajectories in {seconds:.3g} s")
-    return seconds
+        alone = chain(f"device={settings.device}")
+        alone.simulate()
+        first = _trained(alone, 1, settings, found, say)
+        last = _trained(chain("device=auto", f"trainer.devices={devices}"), devices, settings, found, say)
+        say(f"train_mlp: {first / last:.3g} times as fast on {devices} devices")
 
 
 def _trained(pipeline: Pipeline, devices: int, settings: Settings, found: Result, say) -> float:

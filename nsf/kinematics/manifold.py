@@ -238,8 +238,8 @@ class Manifold(nn.Module, ABC):
             "split": self.split,
             "state": dict(self.state_dict()),
         }
-        with writing(Path(path)) as temporary:
-            torch.save(content, temporary)
+        with writing(Path(path)) as temporary, temporary.open("wb") as file:
+            torch.save(content, file)
 
     @staticmethod
     def load(path: Path | str) -> Manifold:

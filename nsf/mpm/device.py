@@ -1,17 +1,10 @@
-"""Devices by name, and the sharing of a host's GPUs among processes."""
+"""Devices by name, and the GPUs of a host."""
 
-import itertools
 import os
-from contextlib import ExitStack
-from functools import cache
-from pathlib import Path
 
 import warp as wp
 
 from nsf.errors import DeviceError
-from nsf.storage import locked
-
-_held = ExitStack()  # the lock of this process's GPU, which the operating system frees when the process ends
 
 
 def warp_device(name: str):
@@ -42,23 +35,3 @@ def visible_gpus() -> tuple[str, ...]:
     named = os.environ.get("CUDA_VISIBLE_DEVICES")
     names = named.split(",") if named else map(str, range(count))
     return tuple(name.strip() for name in names)[:count]
-
-
-@cache
-def take_gpu(gpus: tuple[str, ...], folder: Path) -> None:
-    """Make this process see one GPU alone, as `cuda:0`. Call it before CUDA is used.
-
-    Processes that call it take the GPUs in turn. The GPU of a process is free again once the process has
-    ended.
-
-    Args:
-        gpus: names from `visible_gpus`.
-        folder: holds the locks that the processes share.
-
-    Raises:
-        StorageError: the folder cannot be written.
-    """
-    for turn in itertools.count():
-        if _held.enter_context(locked(folder / f".gpu_{turn}.lock")):
-            os.environ["CUDA_VISIBLE_DEVICES"] = gpus[turn % len(gpus)]
-            return

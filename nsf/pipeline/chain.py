@@ -23,7 +23,6 @@ from nsf.kinematics.fields.mlp import MlpField
 from nsf.kinematics.manifold import Manifold
 from nsf.kinematics.training.ranks import train_together
 from nsf.kinematics.training.train import train
-from nsf.mpm.device import visible_gpus
 from nsf.pipeline import results
 from nsf.pipeline.plan import Plan
 from nsf.pipeline.simulation import Job, Shared, simulate
@@ -127,8 +126,7 @@ class Pipeline(Plan):
         self.check_room(runs)
         jobs = [job(run, *needed) for run, needed in runs.items()]
         shared = Shared(self.scene.steps, self.scene.dx, self.stored, self.device, c.precision)
-        further = visible_gpus()[1:] if c.device == "auto" else ()
-        return simulate(jobs, shared, self.say, further)
+        return simulate(jobs, shared, self.say)
 
     def train(self) -> Run:
         """The manifold of the training trajectories."""

@@ -4,11 +4,9 @@ import contextlib
 import os
 import queue
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
-from threading import Thread
 
 import numpy as np
 
@@ -17,9 +15,8 @@ from nsf.data.schema import TRAJECTORY
 from nsf.errors import InstabilityError
 from nsf.mpm import FullOrderMPM, Precision, diagnosed
 from nsf.mpm.recording import HostMemory, blocks
-from nsf.progress import Progress, Told
+from nsf.progress import Progress
 from nsf.runs import Run
-from nsf.workers import Call, ended, working
 
 # Trajectories that are written at once; each holds about ten blocks of frames (64 MiB) at most.
 _WRITERS = min(8, os.cpu_count() or 1)
@@ -61,78 +58,29 @@ class Shared:
     precision: str
 
 
-def simulate(
-    jobs: Sequence[Job], shared: Shared, say: Callable[[str], object], gpus: Sequence[str] = ()
-) -> int:
+def simulate(jobs: Sequence[Job], shared: Shared, say: Callable[[str], object]) -> int:
     """Run and store every job; each file appears when it is whole.
 
     Processes that are given the same jobs share them: what another one is making is left to it, and waited
-    for at the end. Further GPUs have such a process each; what one of them fails to make is made here.
+    for at the end.
 
     Args:
         jobs: trajectories to be made.
         shared: what they have in common.
-        say: told which trajectory is waited for, and which error a process on a further GPU ended with.
-        gpus: further ones, as CUDA_VISIBLE_DEVICES names them; no more are used than there are jobs.
+        say: told which trajectory is waited for.
 
     Returns:
-        How many were made here, the processes on further GPUs included.
+        How many were made here.
 
     Raises:
         InstabilityError: a particle became non-finite or left the grid.
         StorageError: the disk refused a file.
         KeyboardInterrupt: passed on; what is whole stays, what is not is removed.
     """
-    gpus = gpus[: max(0, len(jobs) - 1)]
-    with Progress("simulate", len(jobs) * (shared.steps + 1), "frames") as progress:
-        if not gpus:
-            return _simulate(jobs, shared, progress, (None, say))
-        with _beside(partial(_simulate_beside, jobs, shared), gpus, progress.advance, say):
-            _simulate(jobs, shared, progress, (None, lambda waiting: None))
-            return len(jobs)
-
-
-@contextlib.contextmanager
-def _beside(
-    call: Call, gpus: Sequence[str], told: Callable[[int], object], say: Callable[[str], object]
-) -> Iterator[None]:
-    """The call in a process on each GPU, which it sees as the only one, while the block works."""
-    errors: list[Exception] = []
-
-    def listen() -> None:
-        for _, outcome in ended(workers, told):
-            if isinstance(outcome, Exception) and not done:
-                errors.append(outcome)
-
-    done = False
-    with working([call] * len(gpus), [{"CUDA_VISIBLE_DEVICES": gpu} for gpu in gpus]) as workers:
-        listener = Thread(target=listen)
-        listener.start()
-        try:
-            yield
-        finally:
-            done = True  # those that are still at work are stopped, which is no error
-    listener.join()
-    for error in errors:
-        say(f"simulate: warning: a further GPU was left idle after an error: {error}")
-
-
-def _simulate_beside(jobs: Sequence[Job], shared: Shared, tell: Callable[[int], object]) -> None:
-    """What a process on a further GPU does."""
-    with Told(tell) as progress:
-        _simulate(jobs, shared, progress, (None,))
-
-
-def _simulate(
-    jobs: Sequence[Job],
-    shared: Shared,
-    progress: Progress | Told,
-    waits: Sequence[Callable[[str], object] | None],
-) -> int:
-    """Make the jobs that no other process makes, once for each way of waiting for it; gives their number."""
-    with ThreadPoolExecutor(_WRITERS) as pool:
+    frames = len(jobs) * (shared.steps + 1)
+    with Progress("simulate", frames, "frames") as progress, ThreadPoolExecutor(_WRITERS) as pool:
         memory, writing = HostMemory(), []
-        for wait in waits:
+        for wait in (None, say):
             left = []
             for job in jobs:
                 with contextlib.ExitStack() as claim:
@@ -152,7 +100,7 @@ def _start(
     claim: contextlib.ExitStack,
     pool: ThreadPoolExecutor,
     shared: Shared,
-    progress: Progress | Told,
+    progress: Progress,
     memory: HostMemory,
 ) -> Future:
     """Compute one trajectory while its writer, which takes the claim over, and those of earlier ones work."""

@@ -1,12 +1,13 @@
 """Sweeps: the stages of many configurations, by one of Hydra's launchers."""
 
 import itertools
+import os
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 from hydra._internal.callbacks import Callbacks
@@ -20,7 +21,7 @@ from nsf import config as configuration
 from nsf.data.schema import TRAJECTORY
 from nsf.errors import ConfigError, LaunchError, NSFError
 from nsf.extras import optional
-from nsf.mpm.device import take_gpu, visible_gpus
+from nsf.mpm.device import visible_gpus
 from nsf.pipeline.chain import Pipeline
 from nsf.pipeline.plan import Plan
 
@@ -73,8 +74,8 @@ def sweep(
     Where all of them have data.keep=held_out, the scenes come one after the other, and the training
     trajectories of a scene go once each of its jobs has gone well.
 
-    Jobs side by side on this machine (`hydra/launcher=joblib`) take a GPU each, in turn, where all of them
-    have device=auto and trainer.devices=1; each sees its own as cuda:0, so its runs are those of one GPU.
+    Jobs side by side on this machine (`hydra/launcher=joblib`) see one GPU each, where all of them have
+    device=auto and trainer.devices=1: it is cuda:0 to them, so their runs are those of one GPU.
 
     Args:
         sweeps: overrides whose keys may have several values, without Hydra's own.
@@ -114,7 +115,7 @@ def sweep(
     task = partial(_job, stages=tuple(stages))
     gpus = visible_gpus() if "joblib" in plugin and all(movable) else ()
     if len(gpus) > 1:
-        task = partial(_on_a_gpu, task, gpus, Path(config.hydra.sweep.dir).resolve())
+        task = partial(_on_a_gpu, task, gpus)
     started = Plugins.instance().instantiate_launcher(context, task, config)
     dropped = kept == {"held_out"} and {"train", "evaluate"} <= set(stages)
     errors: list[str | None] = []
@@ -180,10 +181,16 @@ def _own_processes() -> Iterator[None]:
         get_reusable_executor().shutdown()
 
 
-def _on_a_gpu(task: Callable, gpus: tuple[str, ...], folder: Path, config: DictConfig) -> str | None:
-    """A job in a process that keeps to one GPU, which it does not share while there are enough."""
-    take_gpu(gpus, folder)
+def _on_a_gpu(task: Callable, gpus: tuple[str, ...], config: DictConfig) -> str | None:
+    """A job in a process that keeps to one GPU."""
+    _see_one_gpu(gpus)
     return task(config)
+
+
+@cache
+def _see_one_gpu(gpus: tuple[str, ...]) -> None:
+    """Choose this process's GPU by the number of its first job; later ones find CUDA at work on it."""
+    os.environ["CUDA_VISIBLE_DEVICES"] = gpus[HydraConfig.get().job.num % len(gpus)]
 
 
 def _job(config: DictConfig, stages: Sequence[str]) -> str | None:

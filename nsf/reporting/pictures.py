@@ -1,5 +1,6 @@
 """Which charts and particle pictures a report holds, and the sentence under each."""
 
+import operator
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -8,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from joblib.externals.loky import ProcessPoolExecutor
 
 from nsf.reporting import charts, cost_charts, render
 from nsf.reporting.colors import DIFFERENCE_COLORS, STRESS_COLORS
@@ -16,7 +18,6 @@ from nsf.reporting.sources import Motion, same_parameter
 from nsf.reporting.study import Study
 from nsf.reporting.style import save
 from nsf.reporting.tables import Merged, mean_rows, printed_of, variant_labels, variants
-from nsf.workers import results, working
 
 ROWS = 6  # parameter values in one picture of final shapes
 ANIMATED, FRAMES = 2, 31  # parameter values and frames of an animation
@@ -25,6 +26,7 @@ ANIMATIONS_BYTES = 6 * 2**20  # of all on a page
 CROWDED_BYTES, CROWDED_ANIMATED, CROWDED_FRAMES = 2**19, 1, 16
 MANY = 16  # scenes and methods beyond which each has only what shows that it fails: strip and error
 _FEW = 3  # variants that processes are not worth starting for
+_IDLE = 60  # [s] after which one of them ends that nobody asks any more
 
 
 @dataclass(frozen=True)
@@ -150,15 +152,8 @@ def _of_variants(shown: list[_Variant], folder: Path, animated: bool) -> list[li
     processes = min(os.cpu_count() or 1, len(shown))
     if processes < 2 or len(shown) <= _FEW:
         return [call() for call in calls]
-    turns = [calls[first::processes] for first in range(processes)]
-    with working([partial(_each, turn) for turn in turns], [{}] * processes) as workers:
-        drawn = results(workers)
-    return [drawn[i % processes][i // processes] for i in range(len(shown))]
-
-
-def _each(calls: Sequence[Callable[[], list[Picture]]], tell) -> list[list[Picture]]:
-    """One process's share."""
-    return [call() for call in calls]
+    with ProcessPoolExecutor(processes, timeout=_IDLE) as pool:
+        return list(pool.map(operator.call, calls))
 
 
 def _of_variant(v: _Variant, folder: Path, prefix: str, gif_bytes: int, brief: bool) -> list[Picture]:

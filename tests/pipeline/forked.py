@@ -8,6 +8,7 @@ import importlib
 import multiprocessing
 import os
 import resource
+import shutil
 import signal
 import sys
 from dataclasses import dataclass
@@ -35,16 +36,26 @@ class SignalAt:
     signal: int = signal.SIGINT
 
     def __call__(self):
-        owner, name = _owner(self.where)
-        original, calls = getattr(owner, name), []
+        _at(self.where, self.call, lambda: os.kill(os.getpid(), self.signal))
 
-        def counted(*arguments, **named):
-            calls.append(None)
-            if len(calls) == self.call:
-                os.kill(os.getpid(), self.signal)
-            return original(*arguments, **named)
 
-        setattr(owner, name, counted)
+@dataclass(frozen=True)
+class GoneAt:
+    """Deletes a folder at the n-th call of a function, or moves it."""
+
+    where: str
+    call: int
+    folder: Path
+    moved: Path | None = None
+
+    def __call__(self):
+        _at(self.where, self.call, self._go)
+
+    def _go(self):
+        if self.moved:
+            self.folder.rename(self.moved)
+        else:
+            shutil.rmtree(self.folder)
 
 
 @dataclass(frozen=True)
@@ -65,6 +76,19 @@ class PlainReport:
     def __call__(self):
         module = importlib.import_module("nsf.reporting.build")
         module.draw = lambda merged, folder, **_: []
+
+
+def _at(where, call, act):
+    owner, name = _owner(where)
+    original, calls = getattr(owner, name), []
+
+    def counted(*arguments, **named):
+        calls.append(None)
+        if len(calls) == call:
+            act()
+        return original(*arguments, **named)
+
+    setattr(owner, name, counted)
 
 
 def _owner(where):

@@ -1,16 +1,21 @@
 """Files that are truncated, foreign, newer or malicious, and a disk without room."""
 
+import errno
 import json
 import os
 import pickle
 import shutil
 import subprocess
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 import torch
-from forked import FileLimit
+from forked import FileLimit, GoneAt, PlainReport
+from test_interrupt import MOMENTS
 
 from nsf.runs import Run
 
@@ -178,7 +183,9 @@ def half_written(root, stage, smallest=0):
     return [*root.rglob(".partial-*"), *results]
 
 
-@pytest.mark.parametrize(("stage", "limit"), [("simulate", 500_000), ("deploy", 4_500), ("evaluate", 5_000)])
+@pytest.mark.parametrize(
+    ("stage", "limit"), [("simulate", 500_000), ("train", 20_000), ("deploy", 4_500), ("evaluate", 5_000)]
+)
 def test_no_room_for_a_file(refused, copied, pipeline_at, stage, limit):
     """A file may not grow past a limit: a clear line, nothing half-written, and on it goes afterwards."""
     root = copied(*STAGES[: STAGES.index(stage)])
@@ -194,13 +201,21 @@ def test_no_room_for_a_file(refused, copied, pipeline_at, stage, limit):
 
 
 @pytest.fixture
-def disk_with(tmp_path, chain):
-    """(stages, free) → a file system that holds these stages of the tiny chain and `free` bytes of room."""
+def disk(tmp_path):
+    """A small file system."""
     folder = tmp_path / "disk"
     folder.mkdir()
     command = ["mount", "-t", "tmpfs", "-o", "size=12m", "none", str(folder)]
     if shutil.which("mount") is None or subprocess.run(command, capture_output=True).returncode:
         pytest.skip("mounting a small disk is not permitted here")
+    yield folder
+    subprocess.run(["umount", "-l", str(folder)], check=True)
+
+
+@pytest.fixture
+def disk_with(disk, chain):
+    """(stages, free) → a file system that holds these stages of the tiny chain and `free` bytes of room."""
+    folder = disk
 
     def fill(stages, free):
         for stage in stages:
@@ -209,8 +224,7 @@ def disk_with(tmp_path, chain):
         (folder / "filler").write_bytes(bytes(room))
         return folder
 
-    yield fill
-    subprocess.run(["umount", "-l", str(folder)], check=True)
+    return fill
 
 
 @pytest.mark.parametrize(
@@ -235,3 +249,76 @@ def test_a_folder_of_runs_that_is_a_file(refused, tmp_path):
     line = refused("simulate", tmp_path / "occupied")
     assert "cannot write" in line
     assert str(tmp_path / "occupied") in line
+
+
+@dataclass(frozen=True)
+class TemporaryFilesIn:
+    """A folder in place of /tmp."""
+
+    folder: Path
+
+    def __call__(self):
+        tempfile.tempdir = str(self.folder)
+
+
+def test_no_room_for_temporary_files(nsf, copied, disk, pipeline_at):
+    """A training needs the disk of its run alone."""
+    (disk / "filler").write_bytes(bytes(shutil.disk_usage(disk).free))
+    root = copied("simulate")
+    outcome = nsf("train", root, faults=[TemporaryFilesIn(disk)])
+    assert outcome.code == 0, outcome.err
+    assert pipeline_at(root).training.complete
+
+
+@dataclass(frozen=True)
+class NoRoomForLog:
+    """The disk is full when a log is added to for the n-th time."""
+
+    call: int
+
+    def __call__(self):
+        from pytorch_lightning.loggers import CSVLogger
+
+        save, calls = CSVLogger.save, []
+
+        def full(logger):
+            calls.append(None)
+            if len(calls) == self.call:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            save(logger)
+
+        CSVLogger.save = full
+
+
+def test_no_room_for_a_log(refused, copied, pipeline_at):
+    root = copied("simulate")
+    line = refused("train", root, faults=[NoRoomForLog(3)])
+    assert "cannot write" in line
+    assert "free some space" in line
+    assert str(pipeline_at(root).training.path) in line
+
+
+@pytest.mark.parametrize(
+    ("stage", "moved"),
+    [("simulate", True), ("train", False), ("train", True), ("deploy", False), ("evaluate", False)],
+)
+def test_a_folder_of_runs_that_goes_while_it_is_written(refused, copied, tmp_path, stage, moved):
+    root, to = copied(*STAGES[: STAGES.index(stage)]), tmp_path / "elsewhere"
+    moment = GoneAt(MOMENTS[stage].where, MOMENTS[stage].call, root, to if moved else None)
+    line = refused(stage, root, faults=[moment])
+    assert str(root / stage) in line
+    assert "was deleted or moved" in line
+    assert "run the same command again" in line
+    # Another trajectory may have been begun in a folder of its own, and is whole.
+    assert not any(run.complete for run in Run.find(stage, root=root) if str(run.path) in line)
+    assert not list(root.rglob(".partial-*"))
+    assert to.is_dir() == moved
+
+
+def test_a_folder_of_reports_that_goes_while_it_is_written(refused, copied, tmp_path):
+    root = copied(*STAGES)
+    reports = tmp_path / "work" / "reports"
+    faults = [PlainReport(), GoneAt("nsf.reporting.swap:_take_place", 1, reports)]
+    line = refused("report", root, faults=faults)
+    assert str(reports) in line
+    assert "was not written" in line

@@ -2,13 +2,14 @@
 
 import errno
 import os
+import shutil
 import subprocess
 import sys
 
 import pytest
 
 from nsf.errors import StorageError
-from nsf.storage import require_folder, require_space, write_json, writing
+from nsf.storage import refusals, require_folder, require_space, write_json, writing
 
 
 @pytest.fixture
@@ -37,6 +38,23 @@ def test_writing_replaces_the_file_and_keeps_its_suffix(tmp_path):
         assert target.read_text() == text
         assert target.stat().st_ino == inode  # renamed, not copied: no reader sees a part
     assert os.listdir(target.parent) == ["frames.npz"]
+
+
+def test_a_folder_that_goes_as_it_is_written(tmp_path):
+    target = tmp_path / "new" / "a.txt"
+    gone = pytest.raises(StorageError, match=r"cannot write .*a\.txt: its folder was deleted or moved")
+    with gone, writing(target) as partial:
+        partial.write_text("half")
+        shutil.rmtree(target.parent)
+    assert not target.parent.exists()
+
+
+@pytest.mark.parametrize("error", [OSError(errno.ENOSPC, "No space"), OSError(errno.EIO, "broken")])
+def test_whose_fault_a_refusal_is(tmp_path, error):
+    kind = StorageError if error.errno == errno.ENOSPC else OSError
+    with pytest.raises(kind) as found, refusals(tmp_path):
+        raise error
+    assert (str(tmp_path) in str(found.value)) == (kind is StorageError)
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, ValueError, SystemExit])

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytorch_lightning as pl
 import torch
+from pytorch_lightning.plugins import TorchCheckpointIO
 from pytorch_lightning.plugins.environments import LightningEnvironment
 from pytorch_lightning.strategies import DDPStrategy
 from torch import Tensor
@@ -187,10 +187,7 @@ class FieldTraining(pl.LightningModule):
 
     @override
     def on_train_epoch_end(self) -> None:
-        # All ranks come here, and the first one writes.
-        target = writing(self.checkpoint) if self.descent.rank.first else nullcontext(self.checkpoint)
-        with target as partial:
-            self.trainer.save_checkpoint(partial)
+        self.trainer.save_checkpoint(self.checkpoint)
 
     @override
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
@@ -200,6 +197,15 @@ class FieldTraining(pl.LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         kept = checkpoint["nsf"]
         self.step, self.loss, self.seconds = kept["step"], kept["loss"], kept["seconds"]
+
+
+class _BesideTheLast(TorchCheckpointIO):
+    """Writes a checkpoint in the folder that it belongs to; Lightning's own begins in the system's."""
+
+    @override
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        with writing(path) as partial, partial.open("wb") as file:
+            torch.save(checkpoint, file)
 
 
 def descend(descent: Descent, steps: int, folder: Path, tracking: str | None) -> tuple[float, float]:
@@ -219,6 +225,7 @@ def descend(descent: Descent, steps: int, folder: Path, tracking: str | None) ->
         module = FieldTraining(descent, steps, checkpoint, progress)
         trainer = pl.Trainer(
             **_placement(descent),
+            plugins=_BesideTheLast(),
             max_epochs=-1,
             enable_checkpointing=False,  # ModelCheckpoint counts the steps of Lightning's wrapped optimizer
             logger=loggers(folder, tracking) if descent.rank.first else False,

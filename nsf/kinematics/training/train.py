@@ -19,7 +19,7 @@ from nsf.kinematics.training.phases import Fit, at_least, seeded
 from nsf.kinematics.training.ranks import ALONE, Rank
 from nsf.kinematics.training.schedules import Trainer
 from nsf.kinematics.training.tracking import check_tracking
-from nsf.storage import writing
+from nsf.storage import refusals, writing
 
 WEIGHTS_STREAM = 1 << 30  # apart from the phases' streams
 PROBE_STEPS, PROBE_SECONDS = 5, 1.0  # taken at a time, and the least time over which a rate is measured
@@ -85,6 +85,7 @@ def train(
         ConfigError: a value is out of range.
         MissingExtraError: what tracks is not installed.
         InstabilityError: a loss is not finite.
+        StorageError: the disk refused a file.
         KeyboardInterrupt: on an interrupt, after which a second call goes on.
 
     Source: Zong et al. 2023, section 4.5.
@@ -96,7 +97,7 @@ def train(
             f"trainer.devices={trainer.devices}, but processes that train: {rank.count}; call train_together"
         )
     device, folder = torch.device(device), Path(folder)
-    with _determinism(deterministic):
+    with refusals(folder), _determinism(deterministic):
         whole, schedule, own_seed = snapshots.whole, trainer.share(), rank.seed(seed)
         prepared, total = _timed(folder / "prepared.pt", lambda: field.prepare(whole, latent_dim), rank)
         manifold = field.build(whole, prepared, latent_dim, seeded("cpu", seed, WEIGHTS_STREAM)).to(device)
@@ -172,8 +173,8 @@ def _once(path: Path, compute: Callable[[], Any], rank: Rank, together: bool = F
     if (rank.first or together) and not path.is_file():
         value = compute()
         if rank.first:
-            with writing(path) as temporary:
-                torch.save(value, temporary)
+            with writing(path) as temporary, temporary.open("wb") as file:
+                torch.save(value, file)
     rank.wait()
     return torch.load(path, map_location="cpu", weights_only=True)
 

@@ -1,20 +1,20 @@
 """Training in two processes: what they exchange, resumption, and what is refused."""
 
 import os
+import signal
 from functools import partial
 
 import pytest
 import torch
 
 from nsf.data import Snapshots
-from nsf.errors import ConfigError, StorageError
+from nsf.errors import ConfigError, LaunchError, StorageError
 from nsf.kinematics.training import descent
 from nsf.kinematics.training import train as training
 from nsf.kinematics.training.phases import PHASES, seeded
-from nsf.kinematics.training.ranks import SEED_STREAM, Rank, run_rank, train_together
+from nsf.kinematics.training.ranks import SEED_STREAM, Rank, train_together
 from nsf.kinematics.training.schedules import FastTrainer, PaperTrainer
 from nsf.kinematics.training.train import WEIGHTS_STREAM, train
-from nsf.workers import ended, working
 
 LATENT, SEED = 2, 3
 TOGETHER = FastTrainer(steps=[20, 12, 12], frames_per_batch=6, particles_per_batch=16, devices=2)
@@ -38,31 +38,24 @@ def training_in(fields):
 
 
 def in_short_blocks(until, **arguments):
-    """Train in blocks of five steps, and keep each rank's weights; the first stops before a (phase, step)."""
+    """Train in blocks of five steps, and keep each rank's outcome; the first stops before a (phase, step)."""
     descent.SHORTEST_BLOCK = 5
     take, phase = descent.Steps._take, training._phase
 
     def kept(descent, folder, tracking):
         outcome = phase(descent, folder, tracking)
-        torch.save(outcome["state"], folder / f"{descent.fit.name}_of_{descent.rank.number}.pt")
+        torch.save(outcome, folder / f"{descent.fit.name}_of_{descent.rank.number}.pt")
         return outcome
 
     def stopping(self, step):
         if (self.descent.fit.name, step) == until and self.descent.rank.first:
+            if until[0] == "affine":
+                os.kill(os.getpid(), signal.SIGKILL)
             raise StorageError("the disk is full")
         return take(self, step)
 
     descent.Steps._take, training._phase = stopping, kept
     return train(**arguments)
-
-
-def of_all_ranks(files, one, schedule, device, folder):
-    """What `train_together` has of each rank."""
-    ranks = [Rank(number, schedule.devices) for number in range(schedule.devices)]
-    calls = [partial(run_rank, rank, folder, files, one, schedule, device, "auto") for rank in ranks]
-    with working(calls, [{"LOCAL_RANK": str(rank.number)} for rank in ranks]) as workers:
-        found = dict(ended(workers))
-    return [found[worker] for worker in workers]
 
 
 @pytest.fixture(scope="module")
@@ -71,9 +64,19 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def both(files, training_in, folder):
-    """(manifold, metrics) of either rank, in a folder."""
-    return of_all_ranks(files, training_in(folder / "run"), TOGETHER, "cpu", str(folder))
+def together(files, training_in, folder):
+    """(manifold, metrics) of two ranks, in a folder."""
+    return train_together(files, training_in(folder), TOGETHER, "cpu")
+
+
+def alike(folder):
+    """Whether both ranks ended every phase with the same weights and the same loss."""
+    for phase in PHASES:
+        one, other = (torch.load(folder / f"{phase}_of_{number}.pt") for number in range(2))
+        same = all(torch.equal(one["state"][name], other["state"][name]) for name in one["state"])
+        if not same or one["loss"] != other["loss"]:
+            return False
+    return True
 
 
 def equal(one, other):
@@ -82,17 +85,12 @@ def equal(one, other):
     )
 
 
-def test_the_weights_of_all_ranks_agree(both, folder):
-    (first, metrics), (second, others) = both
-    assert equal(first, second)
-    for phase in PHASES:
-        one, other = (torch.load(folder / f"run/{phase}_of_{number}.pt") for number in range(2))
-        assert all(torch.equal(one[name], other[name]) for name in one)
-    assert [metrics[f"{phase}_steps"] for phase in PHASES] == [20, 12, 12]
-    assert all(metrics[f"{phase}_loss"] == others[f"{phase}_loss"] for phase in PHASES)
+def test_the_weights_of_all_ranks_agree(together, folder):
+    assert alike(folder)
+    assert [together[1][f"{phase}_steps"] for phase in PHASES] == [20, 12, 12]
 
 
-def test_a_step_is_that_of_the_mean_gradient(both, files, fields):
+def test_a_step_is_that_of_the_mean_gradient(together, files, fields):
     """The same training in one process, which adds the gradients of both shards."""
     field, whole, share = fields["mlp"], Snapshots(files), TOGETHER.share()
     assert share.frames_per_batch == 3
@@ -112,7 +110,7 @@ def test_a_step_is_that_of_the_mean_gradient(both, files, fields):
             for group in optimizer.param_groups:
                 group["lr"] = torch.tensor(share.rate_at(step, steps))
             optimizer.step()
-    found = both[0][0]
+    found = together[0]
     for name, value in manifold.state_dict().items():
         torch.testing.assert_close(found.state_dict()[name], value, rtol=1e-4, atol=1e-6, msg=name)
 
@@ -131,15 +129,21 @@ def test_a_shard_has_the_losses_of_its_rows(files, fields):
 
 
 @pytest.mark.slow
-def test_resumed_training_has_the_same_bits(both, files, training_in, tmp_path):
+def test_resumed_training_has_the_same_bits(together, files, training_in, tmp_path):
     with pytest.raises(StorageError, match="the disk is full"):
         train_together(files, training_in(tmp_path, ("stress", 7)), TOGETHER, "cpu")
     assert (tmp_path / "deformation.pt").is_file()
     assert (tmp_path / "stress" / descent.CHECKPOINT).is_file()
     resumed, metrics = train_together(files, training_in(tmp_path), TOGETHER, "cpu")
-    assert equal(resumed, both[0][0])
-    assert all(metrics[f"{phase}_loss"] == both[0][1][f"{phase}_loss"] for phase in PHASES)
+    assert equal(resumed, together[0])
+    assert all(metrics[f"{phase}_loss"] == together[1][f"{phase}_loss"] for phase in PHASES)
     assert len(list(tmp_path.glob("stress/csv/*/metrics.csv"))) == 2  # the first rank alone keeps logs
+
+
+@pytest.mark.slow
+def test_a_rank_that_dies(files, training_in, tmp_path):
+    with pytest.raises(LaunchError, match=r"training: process 0 .* SIGKILL; .*trainer\.devices=2$"):
+        train_together(files, training_in(tmp_path, ("affine", 7)), TOGETHER, "cpu")
 
 
 def test_seeds_of_ranks():
@@ -170,12 +174,9 @@ def test_what_is_refused(snapshots, fields, tmp_path):
 @pytest.mark.gpu
 @pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
 def test_on_two_gpus(files, training_in, tmp_path):
-    one, other = of_all_ranks(files, training_in(tmp_path / "run"), TOGETHER, "cuda:0", str(tmp_path))
-    for phase in PHASES:
-        states = [torch.load(tmp_path / f"run/{phase}_of_{number}.pt") for number in range(2)]
-        assert all(torch.equal(states[0][name], states[1][name]) for name in states[0])
-    assert equal(one[0], other[0])
+    one, _ = train_together(files, training_in(tmp_path / "run"), TOGETHER, "cuda:0")
+    assert alike(tmp_path / "run")
     resumed = tmp_path / "resumed"
     with pytest.raises(StorageError):
         train_together(files, training_in(resumed, ("stress", 7)), TOGETHER, "cuda:0")
-    assert equal(train_together(files, training_in(resumed), TOGETHER, "cuda:0")[0], one[0])
+    assert equal(train_together(files, training_in(resumed), TOGETHER, "cuda:0")[0], one)

@@ -16,7 +16,6 @@ from nsf.reporting.sources import Source, file_hash, open_sources
 from nsf.reporting.study import Study
 from nsf.reporting.tables import merge
 from nsf.reporting.trust import spearman, trust_note
-from nsf.workers import working
 
 ERRORS = ("error-over-time.png", "error-over-time.svg")
 TINY = Made(particles=30, frames=4, parameters=TEST[:2], splits=("test",) * 2)
@@ -79,7 +78,8 @@ def test_pictures_of_many_variants_are_the_same_from_several_processes(sweep, re
     monkeypatch.setattr(pictures, "_FEW", 1)
     monkeypatch.setattr(pictures.os, "cpu_count", lambda: 2)
     asked = []
-    monkeypatch.setattr(pictures, "working", lambda calls, e: asked.append(len(calls)) or working(calls, e))
+    pool = pictures.ProcessPoolExecutor
+    monkeypatch.setattr(pictures, "ProcessPoolExecutor", lambda n, **how: asked.append(n) or pool(n, **how))
     again = build_report(sweep, tmp_path / "sand", "Sand & friends").parent
     assert asked == [2]
     assert files(again) == files(report)
