@@ -103,8 +103,8 @@ def make_combination(
 
 
 @cache
-def make_field_arrays(precision: Precision, coefficients, stored):
-    """Warp struct of a matrix field at N, mean + Σ_k modes_k a_k; arguments as of `make_contraction`."""
+def _make_field_arrays(precision: Precision, coefficients, stored):
+    """Warp struct of a matrix field, mean + Σ_k modes_k a_k: its factors, and `found`, where it goes."""
     real = precision.real
 
     @wp.struct
@@ -123,7 +123,7 @@ def _make_field(precision: Precision, vectors: int, coefficients, tile: int, sev
     """Warp function of `make_contraction` for one of its fields; t is a thread's number in the field."""
     vec3 = precision.vec3
     combined = make_combination(precision, vectors, 1, tile, several, coefficients, stored)
-    Field = make_field_arrays(precision, coefficients, stored)
+    Field = _make_field_arrays(precision, coefficients, stored)
 
     @wp.func
     def field(needed: wp.array2d(dtype=wp.int32), its: Field, start: int, t: int):
@@ -189,7 +189,7 @@ def make_contraction(
     type of a, `stored` that of modes.
     """
     tile_of, within = make_tiles(several)
-    Field = make_field_arrays(precision, coefficients, stored)
+    Field = _make_field_arrays(precision, coefficients, stored)
     first, second = (_make_field(precision, Q, coefficients, tile, several, stored) for Q in vectors)
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
@@ -212,7 +212,7 @@ def make_contraction(
 
 
 @cache
-def make_gathered(precision: Precision):
+def _make_gathered(precision: Precision):
     """Warp struct of what `make_gathering` reads, and of b.
 
     `displacement` holds the modes of S alone; v has `rows` of each simulation, S first; w_p are `weights`.
@@ -238,7 +238,7 @@ def make_gathering(precision: Precision, several: bool = False):
     block of a simulation gives Σ_p w_p |Δt v_p|².
     """
     _, copy_of = make_copies(several)
-    Gathered = make_gathered(precision)
+    Gathered = _make_gathered(precision)
 
     @wp.func_native(native_code(__package__, "gathering"))
     def share(given: Gathered, copy: int, k: int, lane: int, lanes: int) -> wp.float64: ...

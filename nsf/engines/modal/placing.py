@@ -154,11 +154,11 @@ def make_others(
         if not live:
             return
         p = of_sample + t
-        taken, beginning = places(), places()
+        mean, taken, beginning = at.mean[p], places(), places()
         # Before anything is written, so that all loads are under way together.
         for s in range(wp.static(tile)):
             copy = wp.min(start + s, at.first.shape[0] - 1)
-            x = at.mean[p] + vec3(moved[6 * s], moved[6 * s + 1], moved[6 * s + 2])
+            x = mean + vec3(moved[6 * s], moved[6 * s + 1], moved[6 * s + 2])
             c = _cell(base_node(x, at.inv_dx), at.lower, at.extent)
             stamp = at.stamps[copy, wp.max(c, 0)]
             taken[s] = wp.where(c >= 0 and stamp == at.step[copy], 1, 0)
@@ -171,7 +171,7 @@ def make_others(
                 x = vec3(real(-1.0), real(-1.0), real(-1.0))  # the grid starts at the origin
                 if taken[s] != 0:
                     bits += wp.static(1 << s)
-                    x = at.mean[p] + vec3(moved[6 * s], moved[6 * s + 1], moved[6 * s + 2])
+                    x = mean + vec3(moved[6 * s], moved[6 * s + 1], moved[6 * s + 2])
                     if beginning[s] != 0:
                         at.v[row] = at.initial_velocity[row]
                     else:

@@ -98,11 +98,15 @@ def make_projection(
     not exceed the tolerance, it is the last (see `GaussNewton`), and a moves by A u, which misses by that
     order. `EVALUATE` gives a and ȧ at x̂_n, for a run that begins.
 
+    One block evaluates the members of a committee one after another. Blocks that shared them would have to
+    wait for each other, and an ordinary launch does not promise that all of them are resident: the wait could
+    hang. The cost is members − 1 further closures in each evaluation, and nothing for a single network.
+    `PREPARE` hides it beside the rest of the step; `SOLVE` has it where one update is not enough.
+
     Args:
         precision: of the closure; sums over modes and the solution are fp64.
         widths: of the closure's layers (r, hidden..., K − r); empty without one.
-        members: networks of these widths whose shares in the closure are added up, one after another: blocks
-            that share them would have to wait for each other, and nothing makes all of them run at once.
+        members: networks of these widths whose shares in the closure are added up.
         latents: r.
         modes: K.
         several: whether there are several simulations.

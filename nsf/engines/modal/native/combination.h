@@ -1,6 +1,7 @@
-// Sums Σ_k modes[p, c + i, k] a_k, i < 3, for each simulation of a tile from `start` on, each followed by those
-// of b if SUMS is 2. The K modes lie in vectors of four, on a GPU those of neighbouring particles side by side
-// (`Arena.modes`): what is under way then covers the time that memory takes, even for few particles.
+// The sums Σ_k modes[p, c + i, k] a_k, i < 3, for each simulation of a tile, the first of which is `start`; where
+// SUMS is 2, those with b follow those with a. The K modes lie in vectors of four. On a GPU the vectors of
+// neighbouring particles lie side by side (`Arena.modes`): enough loads are then under way to cover the time that
+// memory takes, even for few particles.
 const int K = a.shape[1], simulations = a.shape[0];
 const decltype(a.data) coefficients[] = {a.data, b.data};
 wp::vec_t<3 * SUMS * TILE, real> sum;
@@ -56,7 +57,8 @@ if (live) {
         for (int j = 0; j < AHEAD; ++j) {
             const int q = begin + j;
             if (q >= Q) break;
-            const float4 x = widened(under_way[j][0]), y = widened(under_way[j][1]), z = widened(under_way[j][2]);
+            const float4 x = widened(under_way[j][0]), y = widened(under_way[j][1]);
+            const float4 z = widened(under_way[j][2]);
             const float w[4][3] = {{x.x, y.x, z.x}, {x.y, y.y, z.y}, {x.z, y.z, z.z}, {x.w, y.w, z.w}};
             #pragma unroll
             for (int s = 0; s < TILE; ++s)

@@ -1,4 +1,5 @@
-// One output of a layer of one of two networks, for each simulation of a tile, by the lanes of a warp.
+// One output of a layer for each simulation of a tile, by the lanes of a warp; the outputs of the second network
+// follow those of the first.
 const bool first = output < one.b.shape[1];
 const int o = first ? output : output - one.b.shape[1], outputs = first ? one.b.shape[1] : two.b.shape[1];
 const int n = first ? one.W.shape[1] : two.W.shape[1];

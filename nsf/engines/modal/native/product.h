@@ -1,4 +1,5 @@
-// A block of a layer of one of two networks: EDGE outputs of a member in each of EDGE simulations, on a GPU.
+// EDGE outputs of a member's layer in each of EDGE simulations, by a block of a GPU; `first` blocks of a tile of
+// simulations are of the first network.
 const int T = threadIdx.x, lane = T % 32, warp = T / 32;
 __shared__ real w[DEEP][EDGE + 1], h[DEEP][EDGE + 1];
 const int simulations = one.x.shape[0], each = blocks / ((simulations + EDGE - 1) / EDGE);

@@ -1,4 +1,4 @@
-// The inversion of one simulation by a block of threads, or by a CPU's one; `make_projection` says how.
+// The inversion of one simulation by a block of a GPU or a thread of a CPU; `make_projection` says how.
 typedef float slope_t;  // as Warp takes float(x) for its own
 struct alignas(8) pair_t { slope_t one, two; };
 #if defined(__CUDA_ARCH__)
@@ -24,7 +24,8 @@ double *const latent = own(given.latent), *const a = own(given.a);
 const double* b = own(given.b);
 double *const x_0 = own(given.prepared), *const a_0 = x_0 + R, *const q_0 = a_0 + K;
 double *const A_0 = q_0 + K, *const M_0 = A_0 + K * R, *const inverse = M_0 + K * R;
-real *const xhat = own(given.xhat), *const xhat_previous = own(given.xhat_previous), *const xhats = own(given.xhats);
+real *const xhat = own(given.xhat), *const xhat_previous = own(given.xhat_previous);
+real *const xhats = own(given.xhats);
 real *const residuals = own(given.residuals), *const updates = own(given.updates);
 const int iterations = given.iterations;
 const bool linear = given.linear;
