@@ -2,9 +2,11 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import torch
+import warp as wp
 
 from nsf.dynamics.batch import Batch
 from nsf.dynamics.integration import ParticleSets
@@ -14,6 +16,17 @@ from nsf.mpm import Grid, GridStep
 
 #: The stages of one step in the order of the paper's section 5: name → what it does.
 Stages = dict[str, Callable[[], None]]
+
+
+class Particles(NamedTuple):
+    """Rows of a span as Warp sees them, in the order of `GridStep.p2g`."""
+
+    x: wp.array
+    v: wp.array
+    C: wp.array
+    tau: wp.array
+    mass: wp.array
+    volume0: wp.array
 
 
 class Span(ABC):
@@ -34,7 +47,7 @@ class Span(ABC):
         C, tau: [B n, 3, 3] affine momentum [1/s] and Kirchhoff stress [Pa].
         mass, volume0, mu, lam: [B n] of the particles [kg, m³, Pa, Pa].
         s: |S|; size: n.
-        grid_step: P2G, and G2P of S.
+        particles: the rows that P2G reads, as Warp sees them; grid_step: P2G, and G2P of S.
         capturable: whether a step is the same launches each time; graph: of a step, where it is captured.
     """
 
@@ -73,7 +86,7 @@ class Span(ABC):
         vectors = [as_vectors(a[:n], precision) for a in (self.x, self.v)]
         matrices = [as_matrices(a[:n], precision) for a in (self.C, self.tau)]
         scalars = [as_scalars(a[:n]) for a in (self.mass, self.volume0)]
-        self.particles = (*vectors, *matrices, *scalars)
+        self.particles = Particles(*vectors, *matrices, *scalars)
         self.size = n // len(self.batch)
 
     @property
@@ -84,19 +97,6 @@ class Span(ABC):
     @abstractmethod
     def enter(self, first: bool) -> None:
         """Begin with the latents of the record; `first`: v is the initial velocity, not a difference."""
-
-    def p2g(self) -> None:
-        """N → grid (paper section 5.2)."""
-        self.grid_step.p2g(*self.particles)
-
-    def g2p(self) -> None:
-        """Grid → x and v of S; nodes are updated as S needs them (paper section 5.2)."""
-        self.grid_step.follow()
-        self.move_sample()
-
-    def move_sample(self) -> None:
-        """`g2p` once the boundaries are where they will be."""
-        self.grid_step.update_g2p(*self.particles[:2], self.s)
 
     @property
     def mean_sizes(self) -> list[float]:

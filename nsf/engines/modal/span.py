@@ -78,7 +78,7 @@ class ModalSpan(Span):
         return {
             "inference": self.infer,
             "p2g": self.p2g,
-            "g2p": self.g2p,
+            "g2p": self.update_g2p,
             "inversion": self.project,
         }
 
@@ -101,7 +101,7 @@ class ModalSpan(Span):
         """
         if self._clears_ahead:
             with self._arena.beside(_CLEARING):
-                self.grid_step.clear(self.particles[0])
+                self.grid_step.clear(self.particles.x)
         with self._arena.beside(_PREPARING):  # what nothing needs before S is moved
             self.grid_step.follow()
             self._projection.prepare.launch()
@@ -116,17 +116,17 @@ class ModalSpan(Span):
         for launch in self._fields:
             launch.launch()
 
-    @override
     def p2g(self) -> None:
+        """N → grid (paper section 5.2)."""
         if self._clears_ahead:
             self.grid_step.scatter(*self.particles)
         else:
-            super().p2g()
+            self.grid_step.p2g(*self.particles)
 
-    @override
-    def g2p(self) -> None:
+    def update_g2p(self) -> None:
+        """Grid → x and v of S, once the boundaries are where they will be (paper section 5.2)."""
         self._arena.meet(_PREPARING)
-        self.move_sample()
+        self.grid_step.update_g2p(self.particles.x, self.particles.v, self.s)
 
     def project(self) -> None:
         """x̂_{n+1} from the displacement of S (paper section 5.3)."""
@@ -273,8 +273,8 @@ class Projection:
             "tolerance": projector.tolerance, "linear": isinstance(projector, Taylor),
         }  # fmt: skip
         self.evaluate, self.prepare, self.solve = (
-            arena.pack(kernel, count * threads, block, given=given, mode=mode, threads=threads)
-            for mode in (EVALUATE, PREPARE, SOLVE)
+            arena.pack(kernel, count * threads, block, given=given, task=task, threads=threads)
+            for task in (EVALUATE, PREPARE, SOLVE)
         )
 
 

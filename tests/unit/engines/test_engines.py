@@ -1,6 +1,8 @@
 """Every engine takes the steps of the reference, wherever it says that it can; else it says why not."""
 
+import gc
 import re
+import weakref
 from typing import ClassVar
 
 import numpy as np
@@ -223,6 +225,20 @@ def test_the_reference_steps_one_run_at_a_time(chain, tiny_manifold):
         engines.reduced_batch(
             chain.scene, tiny_manifold, [ANGLE, ANGLE], 20, engine="reference", device="cpu"
         )
+
+
+def test_the_arrays_go_when_the_solver_goes(reduced):
+    """On a device they must not wait for a collection of garbage."""
+    for engine in ("modal", "reference"):
+        solver = reduced(engine=engine)
+        solver.step(2)
+        left = weakref.ref(solver.together), weakref.ref(solver.span)
+        gc.disable()
+        try:
+            del solver
+            assert [of() for of in left] == [None, None]
+        finally:
+            gc.enable()
 
 
 # -- one protocol ---------------------------------------------------------------------------------------
