@@ -48,7 +48,7 @@ lint: install  ## ruff and the layers of imports
 	$(BIN)/lint-imports
 
 readme: install  ## the figures in README.md, from a report, and the list of reports
-	$(BIN)/python -m nsf.reporting.readme README.md
+	$(BIN)/python -m nsf.reporting.committed README.md
 	$(BIN)/nsf reports folder=reports
 
 check-reports: install  ## whether reports/ is as it was generated

@@ -13,7 +13,7 @@ from nsf import config
 from nsf.errors import ConfigError
 from nsf.pipeline import Pipeline
 from nsf.reporting import COLUMNS
-from nsf.reporting.readme import BEGIN, END, REPORT, figures, updated
+from nsf.reporting.committed import BEGIN, END, REPORT, figures, updated
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
