@@ -94,6 +94,9 @@ def test_wheel_carries_configurations_and_experiments(wheel):
     for folder in ("conf", "experiments"):
         for file in (ROOT / folder).rglob("*.yaml"):
             assert f"nsf/{file.relative_to(ROOT).as_posix()}" in held
+    templates = [*(ROOT / "nsf").rglob("templates/*")]
+    assert templates
+    assert {file.relative_to(ROOT).as_posix() for file in templates} <= held
     assert not [name for name in held if name.startswith("tests")]
 
 

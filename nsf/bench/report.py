@@ -5,16 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from nsf.bench.rows import OTHER_SAMPLER, size_name
-from nsf.reporting.charts import plain_ticks
 from nsf.reporting.columns import number
-from nsf.reporting.cost_charts import rings
-from nsf.reporting.style import INK, figure, line_style, save, stage_colors, styled
-from nsf.reporting.tables import markdown_rows
+from nsf.reporting.drawing.charts import plain_ticks, rings
+from nsf.reporting.drawing.style import INK, figure, line_style, save, stage_colors, styled
+from nsf.reporting.formats import Rows, markdown_document, terminal_table
 from nsf.storage import writing
 
 _HEADINGS = {
@@ -85,60 +84,68 @@ _OF_SAMPLE = r"_s\d+$"
 
 def write_report(folder: Path) -> Path:
     """Charts and index.md from results.csv, kernels.csv and stages.csv of a folder."""
-    results, kernels, stages = (
-        pd.read_csv(folder / name) for name in ("results.csv", "kernels.csv", "stages.csv")
-    )
-    parts = ["# Speed", _LEAD]
-    for device in results["device"].unique():
-        rows, passes = (frame[frame["device"] == device] for frame in (results, kernels))
-        of_reduced = passes["bench"] == "reduced"
-        passes, floors = passes[~of_reduced], passes[of_reduced]
-        stem = re.sub("[^a-z0-9]+", "-", device.lower())
-        parts.append(f"## On {device}")
-        of_size = rows[rows["bench"].isin(["full_order", "scaling"])]
-        by_sample = of_size["case"].str.contains(_OF_SAMPLE)
-        of_sample = of_size[by_sample]
-        of_scene, of_batch = (rows[rows["bench"] == name] for name in ("reduced", "batch"))
-        if len(of_scene):
-            caption = "Time of a step of both solvers by scene; a point names δ of its run."
-            with styled():
-                save(steps_by_scene(of_scene), folder, f"reduced-{stem}")
-            parts += [f"![{caption}](reduced-{stem}.png)", caption, _markdown(of_scene)]
-        of_stages = stages[(stages["device"] == device) & stages["case"].isin(_PAPER)]
-        if len(of_stages):
-            with styled():
-                save(step_beside_paper(of_stages), folder, f"stages-{stem}")
-            parts += [f"![{_STAGES}](stages-{stem}.png)", _STAGES]
-        if len(floors):
-            parts += [_FLOORS, _markdown(floors)]
-        of_training = rows[rows["bench"] == "training"]
-        if len(of_training):
-            parts += [_TRAINING, _markdown(of_training)]
-        if len(of_batch):
-            with styled():
-                save(step_over_batch(of_batch), folder, f"batch-{stem}")
-            parts += [f"![{_BATCH}](batch-{stem}.png)", _BATCH, _markdown(of_batch)]
-        if len(of_size):
-            with styled():
-                save(step_over_particles(of_size[~by_sample], passes), folder, f"step-{stem}")
-                save(passes_beside_floor(passes), folder, f"kernels-{stem}")
-            parts += [f"![{_SIZES}](step-{stem}.png)", _SIZES, _markdown(of_size[~by_sample])]
-        if len(of_sample):
-            same = (of_size["bench"] == "scaling") & of_size["particles"].isin(of_sample["particles"])
-            full_order = of_size[same & ~by_sample]
-            with styled():
-                save(step_over_sample(of_sample, full_order), folder, f"sample-{stem}")
-            parts += [f"![{_SAMPLES}](sample-{stem}.png)", _SAMPLES, _markdown(of_sample)]
-        if len(of_size):
-            caption = "Time of each pass of a full-order step; the mark is its floor."
-            parts += [f"![{caption}](kernels-{stem}.png)", caption, _KERNELS, _markdown(passes)]
-        of_several = rows[rows["bench"] == "multi_gpu"]
-        if len(of_several):
-            parts += [_SEVERAL, _markdown(with_speed_up(of_several))]
+    frames = [pd.read_csv(folder / name) for name in ("results.csv", "kernels.csv", "stages.csv")]
+    devices = {
+        device: _parts(folder, *(frame[frame["device"] == device] for frame in frames))
+        for device in frames[0]["device"].unique()
+    }
     page = folder / "index.md"
     with writing(page) as partial:
-        partial.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+        partial.write_text(markdown_document("speed.md", lead=_LEAD, devices=devices), encoding="utf-8")
     return page
+
+
+def _parts(folder: Path, results: pd.DataFrame, kernels: pd.DataFrame, stages: pd.DataFrame) -> list[dict]:
+    """What the page says of one device: charts, what they show, and tables, each where it has rows."""
+    of_reduced = kernels["bench"] == "reduced"
+    passes, floors = kernels[~of_reduced], kernels[of_reduced]
+    of_size = results[results["bench"].isin(["full_order", "scaling"])]
+    by_sample = of_size["case"].str.contains(_OF_SAMPLE)
+    of_sample, sizes = of_size[by_sample], of_size[~by_sample]
+    same = (sizes["bench"] == "scaling") & sizes["particles"].isin(of_sample["particles"])
+    of_stages = stages[stages["case"].isin(_PAPER)]
+    of_scene, of_training, of_batch, of_several = (
+        results[results["bench"] == name] for name in ("reduced", "training", "batch", "multi_gpu")
+    )
+    parts: list[dict] = []
+
+    def add(rows: pd.DataFrame, *texts: str, chart: str = "", figure=None, table=None) -> None:
+        if not len(rows):
+            return
+        stem = f"{chart}-{re.sub('[^a-z0-9]+', '-', rows['device'].iloc[0].lower())}" if chart else ""
+        if chart:
+            save(figure(), folder, stem)
+        parts.append({"chart": stem, "texts": texts, "table": None if table is None else _rows(table)})
+
+    add(
+        of_scene,
+        "Time of a step of both solvers by scene; a point names δ of its run.",
+        chart="reduced",
+        figure=lambda: steps_by_scene(of_scene),
+        table=of_scene,
+    )
+    add(of_stages, _STAGES, chart="stages", figure=lambda: step_beside_paper(of_stages))
+    add(floors, _FLOORS, table=floors)
+    add(of_training, _TRAINING, table=of_training)
+    add(of_batch, _BATCH, chart="batch", figure=lambda: step_over_batch(of_batch), table=of_batch)
+    add(of_size, _SIZES, chart="step", figure=lambda: step_over_particles(sizes, passes), table=sizes)
+    add(
+        of_sample,
+        _SAMPLES,
+        chart="sample",
+        figure=lambda: step_over_sample(of_sample, sizes[same]),
+        table=of_sample,
+    )
+    add(
+        of_size,
+        "Time of each pass of a full-order step; the mark is its floor.",
+        _KERNELS,
+        chart="kernels",
+        figure=lambda: passes_beside_floor(passes),
+        table=passes,
+    )
+    add(of_several, _SEVERAL, table=with_speed_up(of_several) if len(of_several) else None)
+    return parts  # fmt: skip
 
 
 def with_speed_up(results: pd.DataFrame) -> pd.DataFrame:
@@ -159,26 +166,19 @@ def step_over_particles(results: pd.DataFrame, kernels: pd.DataFrame) -> Figure:
     of_block = results["bench"].eq("full_order").map({True: " of a block", False: ""})
     series = results.assign(solver=[_solver(case) for case in results["case"]] + of_block)
     with styled():
-        fig = figure(4.4)
-        panel = fig.subplots()
+        fig, panel = _over("particles P [–]")
         colors = {}
-        lines = series.groupby(["solver", "precision"], sort=False)
-        for i, ((solver, precision), part) in enumerate(lines):
-            part = part.sort_values("particles")
-            style = line_style(i)
-            P, median = part["particles"], part["ms_median"]
-            panel.fill_between(P, part["ms_p10"], part["ms_p90"], color=style["color"], alpha=0.18, lw=0)
-            panel.plot(P, median, marker="o", ms=4.5, label=f"{solver}, {precision}", **style)
+        for (solver, precision), part in series.groupby(["solver", "precision"], sort=False):
+            color = _line(panel, part, "particles", f"{solver}, {precision}")
             if solver.startswith("full-order"):
-                colors[precision] = style["color"]
+                colors[precision] = color
         for precision, part in kernels.groupby("precision", sort=True):
             floor = part.groupby(["bench", "particles"])["floor_ms"].sum().groupby("particles").mean()
             panel.plot(
                 floor.index, floor, ls=(0, (5, 2)), lw=1.2, label=f"full-order floor, {precision}",
                 color=colors[precision],
             )  # fmt: skip
-        panel.set(xscale="log", yscale="log", xlabel="particles P [–]", ylabel="time of a step [ms]")
-        panel.grid(which="major")
+        plain_ticks(panel.xaxis, lambda count: size_name(round(count)))
         fig.legend(loc="outside upper left", ncols=3, handlelength=2.6)
     return fig
 
@@ -211,27 +211,19 @@ def step_over_sample(results: pd.DataFrame, full_order: pd.DataFrame) -> Figure:
         full_order: rows of as many particles.
     """
     with styled():
-        fig = figure(4.4)
-        panel = fig.subplots()
+        fig, panel = _over("sample particles |S| [–]", results["sample"].astype(int))
         for i, (precision, part) in enumerate(results.groupby("precision")):
-            part, style = part.sort_values("sample"), line_style(i)
-            S, median = part["sample"], part["ms_median"]
-            panel.fill_between(S, part["ms_p10"], part["ms_p90"], color=style["color"], alpha=0.18, lw=0)
-            panel.plot(S, median, marker="o", ms=4.5, label=f"reduced, {precision}", **style)
-            for at, ms, delta in zip(S, median, part["delta"].astype(float), strict=True):
+            part = part.sort_values("sample")
+            color = _line(panel, part, "sample", f"reduced, {precision}")
+            for at, ms, delta in zip(
+                part["sample"], part["ms_median"], part["delta"].astype(float), strict=True
+            ):
                 panel.annotate(
                     f"{number(100 * delta)} %", (at, ms), (0, 6 - 18 * (i == 0)), ha="center",
-                    textcoords="offset points", fontsize=8.5, color=style["color"],
+                    textcoords="offset points", fontsize=8.5, color=color,
                 )  # fmt: skip
             for ms in full_order.loc[full_order["precision"] == precision, "ms_median"]:
-                panel.axhline(ms, ls=":", lw=1.4, color=style["color"], label=f"full-order, {precision}")
-        panel.set(xscale="log", yscale="log")
-        panel.set(xlabel="sample particles |S| [–]", ylabel="time of a step [ms]")
-        sizes = sorted(results["sample"].astype(int).unique())
-        panel.set_xticks(sizes, [str(size) for size in sizes])
-        panel.minorticks_off()
-        plain_ticks(panel.yaxis)
-        panel.grid(which="major")
+                panel.axhline(ms, ls=":", lw=1.4, color=color, label=f"full-order, {precision}")
         fig.legend(loc="outside upper left", ncols=2, handlelength=2.6)
     return fig
 
@@ -243,28 +235,39 @@ def step_over_batch(results: pd.DataFrame) -> Figure:
         results: rows of `batch` of one device; a line for each number of particles, end of the case and
             precision.
     """
+    ends = results["case"].str.extract(r"\d+(.*)$")[0].rename("end")
     with styled():
-        fig = figure(4.4)
-        panel = fig.subplots()
-        ends = results["case"].str.extract(r"\d+(.*)$")[0].rename("end")
-        for i, ((particles, end, precision), part) in enumerate(
-            results.groupby(["particles", ends, "precision"])
-        ):
-            part, style = part.sort_values("batch"), line_style(i)
-            B, median = part["batch"], part["ms_median"]
-            panel.fill_between(B, part["ms_p10"], part["ms_p90"], color=style["color"], alpha=0.18, lw=0)
+        fig, panel = _over("simulations B [–]", results["batch"], "time of a simulation-step [ms]")
+        for (particles, end, precision), part in results.groupby(["particles", ends, "precision"]):
             name = f"{size_name(particles)} particles{end.replace('_', ', ')}, {precision}"
-            panel.plot(B, median, marker="o", ms=4.5, label=name, **style)
-            shared = median.iloc[0] * B.iloc[0] / B
-            panel.plot(B, shared, ls=":", lw=1.2, color=style["color"])
-        panel.set(xscale="log", yscale="log")
-        panel.set(xlabel="simulations B [–]", ylabel="time of a simulation-step [ms]")
-        sizes = sorted(results["batch"].unique())
-        panel.set_xticks(sizes, [str(size) for size in sizes])
-        panel.minorticks_off()
-        panel.grid(which="major")
+            part = part.sort_values("batch")
+            color = _line(panel, part, "batch", name)
+            shared = part["ms_median"].iloc[0] * part["batch"].iloc[0] / part["batch"]
+            panel.plot(part["batch"], shared, ls=":", lw=1.2, color=color)
         fig.legend(loc="outside upper left", ncols=2, handlelength=2.6)
     return fig
+
+
+def _over(x: str, at: pd.Series | None = None, y: str = "time of a step [ms]") -> tuple[Figure, Axes]:
+    """An empty chart with logarithmic axes; x has ticks at the values `at`."""
+    fig = figure(4.4)
+    panel = fig.subplots()
+    panel.set(xscale="log", yscale="log", xlabel=x, ylabel=y)
+    if at is not None:
+        sizes = sorted(at.unique())
+        panel.set_xticks(sizes, [str(size) for size in sizes])
+        panel.minorticks_off()
+    panel.grid(which="major")
+    return fig, panel
+
+
+def _line(panel: Axes, rows: pd.DataFrame, x: str, label: str) -> str:
+    """The median over a column, and a band from 10 % to 90 % of the trials; gives the colour."""
+    rows, style = rows.sort_values(x), line_style(len(panel.collections))
+    panel.fill_between(rows[x], rows["ms_p10"], rows["ms_p90"], color=style["color"], alpha=0.18, lw=0)
+    panel.plot(rows[x], rows["ms_median"], marker="o", ms=4.5, label=label, **style)
+    plain_ticks(panel.yaxis)
+    return style["color"]
 
 
 def steps_by_scene(results: pd.DataFrame) -> Figure:
@@ -329,13 +332,7 @@ def passes_beside_floor(kernels: pd.DataFrame) -> Figure:
 
 def table(path: Path) -> Table:
     """Rows of results.csv for a terminal."""
-    frame = pd.read_csv(path).drop(columns="commit").dropna(axis=1, how="all")
-    drawn = Table(box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for name in frame:
-        drawn.add_column(_HEADINGS.get(name, name), justify="left" if name in _TEXT else "right")
-    for row in _cells(frame):
-        drawn.add_row(*row)
-    return drawn
+    return terminal_table(_rows(pd.read_csv(path).drop(columns="commit")))
 
 
 def _solver(case: str) -> str:
@@ -343,12 +340,7 @@ def _solver(case: str) -> str:
     return case.rpartition("_")[0].replace("_", "-")
 
 
-def _markdown(frame: pd.DataFrame) -> str:
+def _rows(frame: pd.DataFrame) -> Rows:
     frame = frame.dropna(axis=1, how="all")
-    return markdown_rows(
-        [_HEADINGS.get(name, name) for name in frame], _cells(frame), [name not in _TEXT for name in frame]
-    )
-
-
-def _cells(frame: pd.DataFrame) -> list[list[str]]:
-    return [[number(value) for value in row] for row in frame.itertuples(index=False, name=None)]
+    body = [[number(value) for value in row] for row in frame.itertuples(index=False, name=None)]
+    return Rows([_HEADINGS.get(name, name) for name in frame], body, [name not in _TEXT for name in frame])

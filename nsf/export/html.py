@@ -1,17 +1,17 @@
 """`--html`: one page that plays in a browser, opened from disk, without a network."""
 
 import base64
-import html
-import json
 import zlib
 from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
+from markupsafe import Markup
 
 from nsf.errors import ConfigError
 from nsf.export.playback import QUANTITIES, Playback
-from nsf.reporting.colors import STRESS_COLORS, ColorScale
+from nsf.reporting.drawing.style import STRESS_COLORS, ColorScale
+from nsf.reporting.formats import HTML
 from nsf.storage import writing
 
 NEEDS = ()
@@ -64,16 +64,10 @@ def write(playback: Playback, folder: Path) -> Path:
     }
     planes = _differences(_quantised(x, lower, upper, np.uint16)), _differences(stress)
     data = base64.b64encode(zlib.compress(b"".join(plane.tobytes() for plane in planes), 6)).decode()
-    page = files("nsf.export").joinpath("player.html").read_text(encoding="utf-8")
+    page = HTML.from_string(files("nsf.export").joinpath("player.html").read_text(encoding="utf-8"))
     path = folder / f"{playback.name}.html"
-    with writing(path) as partial, partial.open("w", encoding="utf-8") as file:
-        for name, text in (
-            ("__TITLE__", html.escape(playback.title)),
-            ("__TOLD__", json.dumps(told).replace("<", "\\u003c")),
-        ):
-            page = page.replace(name, text)
-        before, after = page.split("__DATA__")
-        file.writelines((before, data, after))
+    with writing(path) as partial:
+        page.stream(title=playback.title, told=told, data=Markup(data)).dump(str(partial), encoding="utf-8")
     return path
 
 

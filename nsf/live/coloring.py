@@ -9,16 +9,16 @@ import torch
 from nsf.evaluation.metrics import pressure, von_mises
 from nsf.live.model import LiveModel, Truth
 from nsf.live.player import Moment
-from nsf.reporting.colors import (
+from nsf.reporting.drawing.style import (
     CLIP,
     DIFFERENCE_COLORS,
     METRES,
+    PALETTE,
     PASCALS,
     SIGNED_COLORS,
     STRESS_COLORS,
     ColorScale,
 )
-from nsf.reporting.style import PALETTE
 
 #: End of the scale of the distance to the truth, over the end of the scale of the displacement.
 _DISTANCE = 0.05

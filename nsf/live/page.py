@@ -14,7 +14,7 @@ from matplotlib.colors import to_hex
 from nsf.live.coloring import ROLES, SAMPLE, Coloring, Picture
 from nsf.live.model import Parameter
 from nsf.live.player import Moment, Player, every
-from nsf.reporting.colors import ColorScale
+from nsf.reporting.drawing.style import ColorScale
 
 log = logging.getLogger(__name__)
 

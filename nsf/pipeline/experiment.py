@@ -130,7 +130,7 @@ class Experiment:
             MissingRunError: no job was evaluated.
         """
         from nsf.reporting.build import build_report
-        from nsf.reporting.study import Study
+        from nsf.reporting.sources import Study
 
         runs: dict[str, Run] = {}
         fine: dict[str, Run] = {}

@@ -175,10 +175,8 @@ def write(
 
 def write_superresolution(record: Record, scene: Scene, fine: Sequence[SuperResolution]) -> pd.DataFrame:
     """Write `superresolution.csv` and `superresolution.png` into a run's folder; gives the table."""
-    from nsf.reporting.colors import STRESS_COLORS
-    from nsf.reporting.png import write_png
-    from nsf.reporting.render import fine_shapes
-    from nsf.reporting.style import PIXELS
+    from nsf.reporting.drawing.shapes import fine_shapes
+    from nsf.reporting.drawing.style import PIXELS, STRESS_COLORS, write_png
 
     table = pd.DataFrame([f.row for f in fine])
     with writing(record.path / "superresolution.csv") as partial:

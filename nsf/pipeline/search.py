@@ -15,7 +15,7 @@ from nsf.errors import ConfigError, MissingRunError, NSFError
 from nsf.extras import optional
 from nsf.pipeline.chain import STAGES, Pipeline
 from nsf.pipeline.plan import Plan
-from nsf.reporting.search import OBJECTIVES, write_search
+from nsf.reporting.drawing.search import OBJECTIVES, write_search
 from nsf.storage import locked
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"

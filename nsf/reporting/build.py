@@ -1,22 +1,17 @@
 """Builds a report: a folder with a page, tables, charts, pictures, and where each number comes from."""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
-from nsf.reporting.columns import axis, parameter_text
-from nsf.reporting.latex import latex_table
+from nsf.reporting.columns import ABSENT, axis, parameter_text
+from nsf.reporting.formats import Rows, latex_table, spreadsheet
 from nsf.reporting.page import Page, Table, html_page, markdown_page
 from nsf.reporting.pictures import draw
-from nsf.reporting.provenance import provenance_rows, sources_json
-from nsf.reporting.sources import Source, open_sources
-from nsf.reporting.study import Study
-from nsf.reporting.superresolution import FineSource, fine_section, fine_table
+from nsf.reporting.sources import Source, Study, file_hash, open_sources
+from nsf.reporting.study import FineSource, fine_section, fine_table, swept, trust_table
 from nsf.reporting.swap import MARK, replaced
-from nsf.reporting.sweeps import swept
-from nsf.reporting.tables import Merged, console_table, means, merge, variants, without_constants
-from nsf.reporting.trust import RENAMED, trust_note, trust_rows
-
-__all__ = ["build_report", "console_table"]
+from nsf.reporting.tables import VARIANT, Merged, means, merge, rows_of, variants, without_constants
 
 _LEAD = (
     "A reduced-order model of elastoplastic material (Neural Stress Fields) runs beside the full-order "
@@ -29,6 +24,9 @@ _PROVENANCE = (
     "hash of each file read or written; results.csv holds the rows in full precision, results.tex the first "
     "table."
 )
+
+_HEADINGS = ["run", "commit", "device", "precision", "seed", "made", "versions"]
+_KEPT = ("commit", "dirty", "device", "precision", "seed", "created", "versions", "parents")
 
 
 def build_report(evaluate_runs, folder, title: str, first=None, study: Study | None = None) -> Path:
@@ -55,7 +53,7 @@ def build_report(evaluate_runs, folder, title: str, first=None, study: Study | N
     """
     merged = merge(open_sources(evaluate_runs, first), study.settings if study else None)
     with replaced(Path(folder)) as fresh:
-        merged.csv.to_csv(fresh / "results.csv", index=False)
+        merged.csv.map(spreadsheet).to_csv(fresh / "results.csv", index=False)
         fine = _fine(merged, study)
         own = [fine_section(fine, fresh)] if fine else []
         sweep = swept(merged, study, fresh) if study else []
@@ -64,14 +62,16 @@ def build_report(evaluate_runs, folder, title: str, first=None, study: Study | N
         page = _page(title, merged, sections, study, more, fine, bool(sweep))
         (fresh / "index.html").write_text(html_page(page), encoding="utf-8")
         (fresh / "index.md").write_text(markdown_page(page), encoding="utf-8")
+        first_table = page.tables[0]
         (fresh / "results.tex").write_text(
-            latex_table(page.tables[0].content, title, page.tables[0].note), encoding="utf-8"
+            latex_table(first_table.content, title, first_table.note), encoding="utf-8"
         )
         told = sources_json(page, merged, fresh, fine, study)
         # What the list of reports shows of this one; the last section compares all variants.
         shown = [picture for section in (*sweep, *own, *sections[-1:]) for picture in section.pictures][:1]
         told["chart"] = {"file": shown[0].files[-1], "caption": shown[0].caption} if shown else None
-        (fresh / MARK).write_text(json.dumps(told, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+        text = json.dumps(told, indent=2, ensure_ascii=False) + "\n"
+        (fresh / MARK).write_text(text, encoding="utf-8", errors="backslashreplace")
     return Path(folder) / "index.html"
 
 
@@ -90,17 +90,18 @@ def _page(title: str, merged: Merged, sections, study: Study | None, more, fine,
         if len(variants(merged)) > len(alike)
         else ""
     )
-    parameter, trust = _parameter_heading(merged), trust_rows(merged)
+    parameter = _parameter_heading(merged)
     note = f"Means over the parameter values of a split. {chosen}{_smaller(merged)}{_said(same)}"
     return Page(
         title=title,
         lead=study.question if study else _LEAD,
         facts=[*_asked(study), *_facts(merged)],
+        warnings=_warnings(merged),
         tables=[
-            Table("Results beside the paper's", headline, note),
+            Table("Results beside the paper's", rows_of(headline), note),
             *more,
-            Table("Each parameter value", per_value, _said(same_there), parameter),
-            *([Table("Trust", trust, trust_note(trust), parameter | RENAMED)] if len(trust) else []),
+            Table("Each parameter value", rows_of(per_value, parameter), _said(same_there)),
+            *trust_table(merged, parameter),
         ],
         sections=sections,
         provenance=Table("Where the numbers come from", provenance_rows(merged, fine), _PROVENANCE),
@@ -111,6 +112,17 @@ def _asked(study: Study | None) -> list[tuple[str, str]]:
     if study is None:
         return []
     return [("The paper", study.paper), *(("Missing", told) for told in study.missing)]
+
+
+def _warnings(merged: Merged) -> list[str]:
+    """What the simulations behind the rows warned of, each once."""
+    told: dict[str, None] = {}
+    waiting = [source.run for source in merged.source]
+    for run in waiting:
+        waiting += [parent for parent in run.parent_runs if parent not in waiting]
+        if run.stage == "simulate":
+            told |= dict.fromkeys(map(str, run.manifest.get("warnings", [])))
+    return list(told)
 
 
 def _parameter_heading(merged: Merged) -> dict[str, str]:
@@ -185,3 +197,79 @@ def _duration(seconds: float) -> str:
 
 def _said(same: str) -> str:
     return f"The same in every row: {same}." if same else ""
+
+
+def used_sources(merged: Merged, also: Sequence = ()) -> list[Source]:
+    """The runs that rows come from and those beside them, newest first."""
+    unique = {source.id: source for source in (*merged.source, *also)}
+    return sorted(unique.values(), key=lambda source: (source.created, source.id), reverse=True)
+
+
+def provenance_rows(merged: Merged, also: Sequence = ()) -> Rows:
+    """Run, commit, device and versions of everything shown, and of runs that no row of `merged` is of."""
+    body = []
+    for source in used_sources(merged, also):
+        manifest = source.manifest
+        versions = ", ".join(
+            f"{name} {version}" for name, version in manifest.get("versions", {}).items() if version
+        )
+        kept = [manifest.get(key) for key in ("device", "precision", "seed", "created")]
+        told = [ABSENT if value is None else value for value in kept]
+        body.append([source.id, commit_text(manifest), *map(str, told), versions or ABSENT])
+    return Rows(_HEADINGS, body, [False] * len(_HEADINGS))
+
+
+def commit_text(manifest: dict) -> str:
+    """The commit a run was made at; says so where the tree had uncommitted changes."""
+    commit = str(manifest.get("commit") or "no commit")[:12]
+    if manifest.get("dirty") is None:
+        return f"{commit} (state of the tree unknown)"
+    return f"{commit} + uncommitted changes" if manifest["dirty"] else commit
+
+
+def sources_json(
+    page: Page, merged: Merged, folder: Path, also: Sequence = (), study: Study | None = None
+) -> dict:
+    """What a report is, the run, commit and file hashes behind every row and picture, and its files' hashes.
+
+    Args:
+        page: all of it.
+        merged: its rows.
+        folder: holds every other file of the report.
+        also: runs that no row of `merged` is of.
+        study: what the report is about, if it is of an experiment.
+    """
+    frame = merged.frame
+    runs = {
+        source.id: {
+            **{key: source.manifest.get(key) for key in _KEPT},
+            "files": source.hashes,
+            "paper": source.summary.get("paper"),
+            "scale": source.summary.get("scale"),
+            "keys": dict(study.keys.get(source.id, {})) if study else {},
+        }
+        for source in used_sources(merged, also)
+    }
+    rows = [
+        {"row": i, "run": source.id}
+        | {name: _plain(frame[name].iloc[i]) for name in (*VARIANT, "parameter", "split")}
+        for i, source in enumerate(merged.source)
+    ]
+    return {
+        "title": page.title,
+        "question": page.lead,
+        "paper": study.paper if study else None,
+        "printed": list(study.printed) if study and study.printed is not None else None,
+        "missing": list(study.missing) if study else [],
+        "files": {path.name: file_hash(path) for path in sorted(folder.iterdir())},
+        "runs": runs,
+        "rows": rows,
+        "pictures": {
+            file: picture.runs for s in page.sections for picture in s.pictures for file in picture.files
+        },
+        "superseded": [{"run": source.id, "parameter": _plain(value)} for source, value in merged.superseded],
+    }
+
+
+def _plain(value):
+    return value.item() if hasattr(value, "item") else value

@@ -1,19 +1,28 @@
-"""The reports of a folder: what they found, in the order of a paper, and whether they are as generated."""
+"""The reports of a folder: what they found, in the order of a paper, and whether they are as generated.
+
+`make readme` calls it as a program: the pictures and the table of one report are written between two
+markers of README.md, so that no result there is typed by hand.
+"""
 
 import json
 import re
+import sys
+from functools import cache
 from pathlib import Path
 
 import pandas as pd
+from omegaconf import DictConfig
 
-from nsf.errors import SchemaError
+from nsf.errors import ConfigError, SchemaError
 from nsf.provenance import not_ignored
+from nsf.reporting.build import commit_text
+from nsf.reporting.formats import HTML, file_name, markdown, markdown_document, markdown_table, unescaped
 from nsf.reporting.headline import Report, headline
 from nsf.reporting.page import DEFINITIONS
-from nsf.reporting.provenance import commit_text
 from nsf.reporting.sources import file_hash
-from nsf.reporting.superresolution import fine_means
+from nsf.reporting.study import fine_means
 from nsf.reporting.swap import MARK
+from nsf.reporting.tables import VARIANT, rows_of, without_constants
 from nsf.storage import writing
 
 LIST = "index.md"
@@ -27,14 +36,20 @@ CHAPTERS = {
     "One scene in detail, and speed": ("sand", "speed"),
 }  # fmt: skip
 _OTHERS = "Further reports"
-_LEAD = (
-    "Every number here is computed from the files of the reports, and every report from the runs that its "
-    "sources.json names; `nsf reports` writes this page. Each report has all values, charts and pictures. "
-    "Reports were made at different commits and seeds, so that the same setting differs from one to another "
-    "as it does from seed to seed. The state of the tree is unknown where the code ran outside of git."
-)
 _CHART = {"file": "delta.png", "caption": "Mean δ, each value, and the paper's."}  # of reports that name none
 _REBUILD = "build it again with `nsf report`"
+
+BEGIN, END = "<!-- figures:begin -->", "<!-- figures:end -->"
+REPORT, EXPERIMENT = Path("reports/table1"), "table1"
+_PICTURE = "{}-nsf-strip.png"  # of a scene
+_ACROSS = 2  # pictures in a row
+_ERRORS = ("delta", "displacement_error", "stress_error")
+_COSTS = ("speedup_step", "memory_full_mib", "memory_reduced_mib")
+_PAPER = "paper_delta"
+_PENDING = (
+    f"`{REPORT}` holds no report yet: `nsf run +experiment={EXPERIMENT}` writes one, "
+    "`make readme` shows it here."
+)
 
 
 def write_list(folder: Path) -> Path:
@@ -81,22 +96,11 @@ def _changed(report: Path) -> list[str]:
 def _list(folder: Path) -> str:
     sections = {report.name: _section(report, _sources(report)) for report in _reports(folder)}
     sections |= {report.name: _bench_section(report) for report in _benches(folder)}
-    chapters: dict[str, list[str]] = {heading: [] for heading in (*CHAPTERS, _OTHERS)}
+    chapters: dict[str, list[dict]] = {heading: [] for heading in (*CHAPTERS, _OTHERS)}
     for name in sorted(sections, key=_place):
-        chapters[_place(name)[1]].append(name)
-    contents = [
-        f"- {heading}: " + ", ".join(f"[{sections[name][0]}](#{name})" for name in names)
-        for heading, names in chapters.items()
-        if names
-    ]
-    terms = "\n".join(f"- **{term}**: {text}" for term, text in DEFINITIONS)
-    parts = ["# Results", _LEAD, "\n".join(contents), "What is measured:", terms]
-    for heading, names in chapters.items():
-        parts += [f"## {heading}"] if names else []
-        for name in names:
-            title, body = sections[name]
-            parts += [f'<a id="{name}"></a>', f"### {title}", *body]
-    return "\n\n".join(parts) + "\n"
+        chapters[_place(name)[1]].append(sections[name] | {"name": name})
+    filled = {heading: reports for heading, reports in chapters.items() if reports}
+    return markdown_document("list.md", chapters=filled, definitions=DEFINITIONS)
 
 
 def _place(name: str) -> tuple[int, str, int, str]:
@@ -107,19 +111,21 @@ def _place(name: str) -> tuple[int, str, int, str]:
     return len(CHAPTERS), _OTHERS, 0, name
 
 
-def _section(folder: Path, told: dict) -> tuple[str, list[str]]:
-    """Title and paragraphs of a report."""
+def _section(folder: Path, told: dict) -> dict:
+    """What the list says of a report."""
     report = Report(folder, told)
-    body = [told["question"]]
-    if told.get("paper"):
-        body.append(f"**The paper:** {told['paper']}")
-    body.append(headline(report))
-    if (folder / "superresolution.csv").is_file():
-        body.append(fine_means(folder))
+    table, said = headline(report)
     chart = told.get("chart") or _CHART
-    if chart["file"] in told["files"]:
-        body.append(f"![{told['title']}]({folder.name}/{chart['file']})\n\n{chart['caption']}")
-    return told["title"], [*body, f"{_made(report)} [The whole report]({folder.name}/index.md)."]
+    return {
+        "title": told["title"],
+        "lead": told["question"],
+        "paper": told.get("paper"),
+        "table": table,
+        "said": said,
+        "finer": fine_means(folder) if (folder / "superresolution.csv").is_file() else None,
+        "chart": {"alt": told["title"]} | chart if chart["file"] in told["files"] else None,
+        "made": _made(report),
+    }
 
 
 def _made(report: Report) -> str:
@@ -139,16 +145,20 @@ def _made(report: Report) -> str:
     return f"{made} Missing jobs: {missing}, with the reasons in the report." if missing else made
 
 
-def _bench_section(folder: Path) -> tuple[str, list[str]]:
-    """Title, first lines and first chart of a page of benchmarks."""
+def _bench_section(folder: Path) -> dict:
+    """The same of a page of benchmarks: its title, first lines and first chart."""
     page = (folder / LIST).read_text(encoding="utf-8")
-    title, lead = page.split("\n\n")[:2]
+    title, lead = map(unescaped, page.split("\n\n")[:2])
+    charts = re.findall(r"^!\[(.*)\]\(([\w-]+\.png)\)$", page, re.MULTILINE)
+    chart = [{"alt": unescaped(alt), "file": file, "caption": unescaped(alt)} for alt, file in charts[:1]]
     rows = pd.read_csv(folder / "results.csv")
-    charts = re.findall(r"!\[([^\]]*)\]\(([^)]+)\)", page)
     devices, commits = (", ".join(sorted(rows[name].astype(str).unique())) for name in ("device", "commit"))
-    body = [lead, *(f"![{caption}]({folder.name}/{file})\n\n{caption}" for caption, file in charts[:1])]
-    made = f"{len(rows)} rows on {devices}, {commits}."
-    return title.removeprefix("# "), [*body, f"{made} [The whole report]({folder.name}/index.md)."]
+    return {
+        "title": title.removeprefix("# "),
+        "lead": lead,
+        "chart": chart[0] if chart else None,
+        "made": f"{len(rows)} rows on {devices}, {commits}.",
+    } | dict.fromkeys(("paper", "table", "said", "finer"))
 
 
 def _reports(folder: Path) -> list[Path]:
@@ -169,3 +179,73 @@ def _sources(report: Path) -> dict:
     if absent:
         raise SchemaError(f"{report / MARK} lacks {', '.join(absent)}; {_REBUILD}")
     return told
+
+
+def figures(report: Path) -> str:
+    """Pictures and the mean held-out results of a report beside the paper's δ, as markdown.
+
+    Args:
+        report: folder of the report, relative to README.md.
+    """
+    if not (report / "results.csv").is_file():
+        return _PENDING
+    folder = report.as_posix()
+    frame = pd.read_csv(report / "results.csv")
+    frame = frame[frame["split"] == "test"]
+    variants = frame.groupby([name for name in VARIANT if name in frame], sort=False, as_index=False)
+    # A value that diverged leaves the mean infinite, one that was not measured leaves it empty.
+    means = variants[[*_ERRORS, *_COSTS]].agg(lambda values: values.mean(skipna=False))
+    means[_PAPER] = [_printed(row["scene"], row["method"]) for row in means.to_dict("records")]
+    described = [name for name in means if name not in (*_ERRORS, *_COSTS, _PAPER)]
+    table, same = without_constants(means[[*described, _PAPER, *_ERRORS, *_COSTS]], keep=("scene", "method"))
+    gallery = _gallery(report, list(dict.fromkeys(frame["scene"])))
+    return (
+        f"{gallery}Means over held-out parameter values at the paper's size ({markdown(same)}).\n\n"
+        + markdown_table(rows_of(table, {_PAPER: "paper's δ [%]"}))
+        + f"\n\nFrom [`{folder}/results.csv`]({folder}/results.csv); the whole report is "
+        f"[`index.md`]({folder}/index.md)."
+    )
+
+
+def _gallery(report: Path, scenes: list[str]) -> str:
+    """The strips of the scenes that have one, in a table; each leads to its full size."""
+    paths = {scene: report / _PICTURE.format(file_name(scene)) for scene in scenes}
+    shown = [
+        {"title": _title(scene), "path": path.as_posix()} for scene, path in paths.items() if path.is_file()
+    ]
+    return HTML.get_template("gallery.html").render(pictures=shown, across=_ACROSS) if shown else ""
+
+
+def _title(scene: str) -> str:
+    return _described(scene).title
+
+
+def _printed(scene: str, method: str) -> float:
+    """δ [%] that the paper prints of a scene and method, NaN where it prints none."""
+    return 100 * _described(scene).paper.get(method, {}).get("delta", float("nan"))
+
+
+@cache
+def _described(scene: str) -> DictConfig:
+    """A scene's configuration at the paper's size."""
+    from nsf import config  # 0.3 s that `nsf reports` need not pay
+
+    return config.load([f"scene={scene}", "scale=paper"]).scene
+
+
+def updated(text: str, report: Path) -> str:
+    """README.md's text with the figures of a report between the markers.
+
+    Raises:
+        ConfigError: the markers are not there once each, in order.
+    """
+    if text.count(BEGIN) != 1 or text.count(END) != 1 or text.index(BEGIN) > text.index(END):
+        raise ConfigError(f"README must hold {BEGIN} and, after it, {END}, once each")
+    head, rest = text.split(BEGIN)
+    tail = rest.split(END)[1]
+    return f"{head}{BEGIN}\n{figures(report)}\n{END}{tail}"
+
+
+if __name__ == "__main__":
+    readme = Path(sys.argv[1])
+    readme.write_text(updated(readme.read_text(encoding="utf-8"), REPORT), encoding="utf-8")

@@ -10,9 +10,9 @@ import pandas as pd
 
 from nsf.errors import SchemaError
 from nsf.reporting.columns import ABSENT, COLUMN, TEXT, axis, number, parameter_text
-from nsf.reporting.study import printed_delta
-from nsf.reporting.sweeps import AXES, SEEDS
-from nsf.reporting.tables import markdown_rows
+from nsf.reporting.formats import Rows
+from nsf.reporting.sources import printed_delta
+from nsf.reporting.study import AXES, SEEDS
 
 FEW = 15  # rows of a table in which a number is varied; of more, settings and scenes go down and across
 MANY = 24  # rows where none is, as in the paper's Table 1
@@ -122,21 +122,21 @@ class Report:
         return printed_delta(entries, known)
 
 
-def headline(report: Report) -> str:
-    """The table and what is to be said of it, as markdown."""
+def headline(report: Report) -> tuple[Rows, str]:
+    """The table, and what is to be said of it."""
     varied = [key for key in report.settings if key in _NUMBERS]
     if not report.settings and report.seeds:
         table, said = _over_seeds(report), "Shown: of each seed the mean over held-out values."
-        return f"{table}\n\n{said}{_diverged(report)}"  # the paper's figure stands in each row
+        return table, f"{said}{_diverged(report)}"  # the paper's figure stands in each row
     if len(report.groups) <= (FEW if varied else MANY):
         table, said = _flat(report), f"Shown: {_averaged(report)}."
     else:
         table = _pivot(report, varied)
         said = f"Shown: δ [%], in brackets the stress error [%]; {_averaged(report)}.{_best(report)}"
-    return f"{table}\n\n{said}{_beside_paper(report)}{_diverged(report)}"
+    return table, f"{said}{_beside_paper(report)}{_diverged(report)}"
 
 
-def _flat(report: Report) -> str:
+def _flat(report: Report) -> Rows:
     """A row a scene and setting, with every measure."""
     groups = report.groups
     order = dict.fromkeys(("scene", "method", "field", *report.settings, "r", "sample"))
@@ -153,10 +153,10 @@ def _flat(report: Report) -> str:
     ]
     headings = [*map(_title, shown), *seeds, *paper, *(COLUMN[name].heading for name in measured)]
     numeric = [*map(_is_number, shown), *(True for _ in (*seeds, *paper, *measured))]
-    return markdown_rows(headings, body, numeric)
+    return Rows(headings, body, numeric)
 
 
-def _pivot(report: Report, varied: Sequence[str]) -> str:
+def _pivot(report: Report, varied: Sequence[str]) -> Rows:
     """Mean δ and stress error, settings down and scenes across, or as it takes fewer rows."""
     groups, settings = report.groups, report.settings
     kinds = _kinds(groups, settings)
@@ -186,7 +186,7 @@ def _pivot(report: Report, varied: Sequence[str]) -> str:
             if at in printed:
                 body[-1].append(number(row[_PAPER], 100) if row else "")
     numeric = [*map(_is_number, down), *(True for _ in headings[len(down) :])]
-    return markdown_rows(headings, body, numeric)
+    return Rows(headings, body, numeric)
 
 
 def _both_errors(row: Mapping) -> str:
@@ -196,7 +196,7 @@ def _both_errors(row: Mapping) -> str:
     return f"{number(row['delta'], 100)} ({number(row['stress_error'], 100)})"
 
 
-def _over_seeds(report: Report) -> str:
+def _over_seeds(report: Report) -> Rows:
     """δ of the seeds of each scene, a row for training and one for the sample."""
     body = []
     for seed in report.seeds:
@@ -206,7 +206,7 @@ def _over_seeds(report: Report) -> str:
             paper = part[_PAPER].mean(skipna=False)
             body.append([scene, seed, f"{len(delta)}", *(number(value, 100) for value in (*told, paper))])
     headings = ["scene", "varied", "seeds", "mean δ [%]", "smallest [%]", "largest [%]", "paper's δ [%]"]
-    return markdown_rows(headings, body, [i > 1 for i in range(len(headings))])
+    return Rows(headings, body, [i > 1 for i in range(len(headings))])
 
 
 def _averaged(report: Report) -> str:

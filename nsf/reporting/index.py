@@ -1,13 +1,22 @@
 """A page of all runs that sorts and filters in the browser, and needs nothing but itself."""
 
-import html
 import os
-from collections.abc import Iterable
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from PIL import Image
+
+from nsf.data import Trajectory
+from nsf.data.schema import TRAJECTORY
+from nsf.deployment import Rollout
+from nsf.errors import NSFError
+from nsf.reporting.drawing.style import FULL, PALETTE, REDUCED, figure, styled
+from nsf.reporting.formats import HTML
 from nsf.reporting.listing import FIELDS, Entry, entries, text
-from nsf.reporting.page import CSS
-from nsf.reporting.thumbnails import thumbnail
+from nsf.runs import Run
 from nsf.storage import writing
 
 #: What tells variants apart, beside the fields: keys of the configuration, by the heading they get.
@@ -20,53 +29,8 @@ _SETTINGS = {
 _HEADINGS = {"seconds": "time [s]"}
 _CHOSEN = ("stage", "scene", "status")
 
-_STYLE = """
-main { max-width: none; }
-form { display: flex; flex-wrap: wrap; gap: .6rem; margin: 1rem 0; align-items: center; }
-input, select { font: inherit; padding: .25rem .5rem; color: inherit; background: var(--page);
-  border: 1px solid var(--line); border-radius: 6px; }
-input { flex: 1 1 18rem; max-width: 32rem; }
-th button { all: unset; cursor: pointer; } th button:focus-visible { outline: 2px solid currentColor; }
-th[aria-sort=ascending] button::after { content: " ▲"; }
-th[aria-sort=descending] button::after { content: " ▼"; }
-td { vertical-align: middle; } td img { display: block; width: 120px; background: #fff; }
-.failed, .killed, .interrupted { color: #b04a00; font-weight: 600; }
-"""
-_SCRIPT = """
-const body = document.querySelector("tbody"), rows = [...body.rows], count = document.querySelector("output");
-const words = document.querySelector("input"), choices = [...document.querySelectorAll("select")];
-const heads = [...document.querySelectorAll("th")];
-function filter() {
-  const wanted = words.value.toLowerCase().split(/\\s+/).filter(Boolean);
-  let shown = 0;
-  for (const row of rows) {
-    const text = row.textContent.toLowerCase();
-    const kept = wanted.every(word => text.includes(word)) &&
-      choices.every(c => !c.value || row.cells[c.dataset.column].textContent === c.value);
-    row.hidden = !kept;
-    shown += kept;
-  }
-  count.textContent = `${shown} of ${rows.length} runs`;
-}
-function sort(head) {
-  const down = head.getAttribute("aria-sort") === "ascending", at = head.cellIndex;
-  heads.forEach(h => h.removeAttribute("aria-sort"));
-  head.setAttribute("aria-sort", down ? "descending" : "ascending");
-  const key = row => row.cells[at].dataset.value ?? "";
-  rows.sort((a, b) => {
-    const [x, y] = [key(a), key(b)];
-    if (!x || !y) return !x - !y;
-    const numbers = !isNaN(x) && !isNaN(y);
-    return (down ? -1 : 1) * (numbers ? x - y : x.localeCompare(y));
-  });
-  body.append(...rows);
-}
-document.querySelector("form").addEventListener("submit", event => event.preventDefault());
-words.addEventListener("input", filter);
-choices.forEach(choice => choice.addEventListener("change", filter));
-heads.forEach(head => head.querySelector("button")?.addEventListener("click", () => sort(head)));
-filter();
-"""
+_SIZE = (1.6, 1.0)  # [inch] at 100 dpi
+_POINTS = 1500
 
 
 def write_index(folder: Path, root: Path | None = None) -> Path:
@@ -83,55 +47,118 @@ def write_index(folder: Path, root: Path | None = None) -> Path:
         StorageError: the disk refused a file.
     """
     found = entries(root=root)
-    body = "\n".join(_row(entry, folder) for entry in found)
-    heads = "".join(
-        f'<th scope="col"><button type="button">{_esc(name)}</button></th>'
-        for name in (*(_HEADINGS.get(field, field) for field in FIELDS), *_SETTINGS)
-    )
-    page = (
-        '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>Runs</title>\n<style>{CSS}{_STYLE}</style>\n</head>\n<body>\n<main>\n<h1>Runs</h1>\n"
-        '<form><input type="search" placeholder="words that a run must have" aria-label="filter by words">'
-        f"{''.join(_choice(found, field) for field in _CHOSEN)}<output></output></form>\n"
-        f'<div class="table"><table><thead><tr><th scope="col"></th>{heads}</tr></thead>\n'
-        f"<tbody>\n{body}\n</tbody></table></div>\n</main>\n<script>{_SCRIPT}</script>\n</body>\n</html>\n"
+    choices = [
+        {
+            "name": field,
+            "column": 1 + FIELDS.index(field),  # the first is the thumbnail
+            "choices": sorted({str(entry.values[field]) for entry in found}),
+        }
+        for field in _CHOSEN
+    ]
+    page = HTML.get_template("runs.html").render(
+        title="Runs",
+        choices=choices,
+        headings=[*(_HEADINGS.get(field, field) for field in FIELDS), *_SETTINGS],
+        rows=[_row(entry, folder) for entry in found],
     )
     with writing(folder / "index.html") as partial:
         partial.write_text(page, encoding="utf-8")
     return folder / "index.html"
 
 
-def _row(entry: Entry, folder: Path) -> str:
-    picture = f"thumbnails/{entry.run.id.replace('/', '-')}.png"
-    image = f'<img src="{picture}" alt="" loading="lazy">' if thumbnail(entry.run, folder / picture) else ""
-    link = Path(os.path.relpath(entry.run.path / "manifest.json", folder)).as_posix()
-    cells = [f"<td>{image}</td>"]
-    for field, told in zip(FIELDS, entry.texts(), strict=True):
-        shown = f'<a href="{_esc(link)}">{_esc(told)}</a>' if field == "id" else _esc(told)
-        kind = f' class="{_esc(told)}"' if field == "status" else ""
-        title = (
-            f' title="{_esc(str(entry.manifest["error"]))}"' if kind and entry.manifest.get("error") else ""
-        )
-        cells.append(f"<td{kind}{title} data-value={_quoted(entry.values[field])}>{shown}</td>")
-    for key in _SETTINGS.values():
-        value = entry.settings.get(key)
-        cells.append(f"<td data-value={_quoted(value)}>{_esc(text(value))}</td>")
-    return f"<tr>{''.join(cells)}</tr>"
+def _row(entry: Entry, folder: Path) -> dict:
+    """A row of the page: its cells as shown, and the values by which they sort."""
+    shown = list(zip(FIELDS, entry.texts(), (entry.values[field] for field in FIELDS), strict=True))
+    settings = [(key, entry.settings.get(key)) for key in _SETTINGS.values()]
+    shown += [(key, text(value), value) for key, value in settings]
+    picture = f"thumbnails/{entry.run.id}.png"
+    return {
+        "picture": picture if thumbnail(entry.run, folder / picture) else None,
+        "link": Path(os.path.relpath(entry.run.path / "manifest.json", folder)).as_posix(),
+        "error": entry.manifest.get("error") or "",
+        "cells": [
+            {"name": name, "text": told, "value": "" if value is None else value}
+            for name, told, value in shown
+        ],
+    }
 
 
-def _choice(found: Iterable[Entry], field: str) -> str:
-    """A list of a field's values to choose one from; the first column is the thumbnail."""
-    values = sorted({str(entry.values[field]) for entry in found})
-    options = "".join(f"<option>{_esc(value)}</option>" for value in values)
-    return (
-        f'<select data-column="{1 + FIELDS.index(field)}" aria-label="{field}">'
-        f'<option value="">every {field}</option>{options}</select>'
-    )
+def thumbnail(run: Run, path: Path) -> bool:
+    """Draw a run into a png, unless it is there already; False where there is nothing to be seen.
+
+    Raises:
+        StorageError: the disk refused the file.
+    """
+    if path.is_file():
+        return True
+    draw = _DRAWN.get(run.stage)
+    if draw is None or not run.complete:
+        return False
+    with styled():
+        fig = figure(_SIZE[1], _SIZE[0])
+        fig.set_layout_engine("none")
+        ax = fig.add_axes((0, 0, 1, 1))
+        ax.axis("off")
+        try:
+            draw(ax, run.path)
+        except (NSFError, OSError, ValueError, KeyError):
+            return False  # a page of all runs must not fail for one that cannot be read
+        with writing(path) as partial:
+            fig.savefig(partial, metadata={"Software": None})
+    return True
 
 
-def _quoted(value) -> str:
-    return f'"{"" if value is None else _esc(str(value))}"'
+def _simulated(ax: Axes, folder: Path) -> None:
+    """The particles at the end."""
+    with Trajectory.open(folder / TRAJECTORY) as trajectory:
+        step = max(1, trajectory.particles // _POINTS)
+        x = trajectory.read("x", trajectory.frames - 1, slice(None, None, step)).reshape(-1, 3)
+    _scatter(ax, x, FULL)
 
 
-_esc = html.escape
+def _trained(ax: Axes, folder: Path) -> None:
+    """The losses of the three phases."""
+    phases: dict[str, list[Path]] = {}
+    for log in sorted(folder.glob("*/csv/*/metrics.csv")):
+        phases.setdefault(log.parents[2].name, []).append(log)
+    if not phases:
+        raise ValueError("no log")
+    for color, logs in zip(PALETTE, phases.values(), strict=False):
+        loss = pd.concat(map(pd.read_csv, logs)).sort_values("step")
+        ax.semilogy(loss["step"], loss["loss"], color=color, linewidth=1)
+
+
+def _deployed(ax: Axes, folder: Path) -> None:
+    """The first two latent coordinates of every reduced run."""
+    for path in sorted(folder.glob("rollout_*.h5")):
+        xhat = Rollout.open(path).xhat
+        ax.plot(xhat[:, 0], xhat[:, min(1, xhat.shape[1] - 1)], color=REDUCED, linewidth=1)
+
+
+def _evaluated(ax: Axes, folder: Path) -> None:
+    """The particles at the end, full-order and reduced, of the first value."""
+    with np.load(folder / "frames.npz", allow_pickle=False) as frames:
+        for name, color in (("x_full", FULL), ("x_reduced", REDUCED)):
+            x = frames[name][0, -1]
+            _scatter(ax, x[:: max(1, len(x) // _POINTS)], color)
+
+
+def _superresolved(ax: Axes, folder: Path) -> None:
+    """The picture that the run holds."""
+    with Image.open(folder / "superresolution.png") as picture:
+        picture.thumbnail((320, 200))
+        ax.imshow(np.asarray(picture))
+
+
+def _scatter(ax: Axes, x: np.ndarray, color: str) -> None:
+    ax.scatter(x[:, 0], x[:, 2], s=2.0, color=color, linewidths=0, alpha=0.7)
+    ax.set_aspect("equal", adjustable="datalim")
+
+
+_DRAWN: dict[str, Callable[[Axes, Path], None]] = {
+    "simulate": _simulated,
+    "train": _trained,
+    "deploy": _deployed,
+    "evaluate": _evaluated,
+    "superresolve": _superresolved,
+}

@@ -3,7 +3,7 @@
 import operator
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -11,12 +11,12 @@ import numpy as np
 import pandas as pd
 from joblib.externals.loky import ProcessPoolExecutor
 
-from nsf.reporting import charts, cost_charts, render
-from nsf.reporting.colors import DIFFERENCE_COLORS, STRESS_COLORS
 from nsf.reporting.columns import COSTS, MEASURED, parameter_text
-from nsf.reporting.sources import Motion, same_parameter
-from nsf.reporting.study import Study
-from nsf.reporting.style import save
+from nsf.reporting.drawing import charts, shapes
+from nsf.reporting.drawing.style import DIFFERENCE_COLORS, STRESS_COLORS, save
+from nsf.reporting.formats import file_name
+from nsf.reporting.page import Picture, Section
+from nsf.reporting.sources import Motion, Study, same_parameter
 from nsf.reporting.tables import Merged, mean_rows, printed_of, variant_labels, variants
 
 ROWS = 6  # parameter values in one picture of final shapes
@@ -27,23 +27,6 @@ CROWDED_BYTES, CROWDED_ANIMATED, CROWDED_FRAMES = 2**19, 1, 16
 MANY = 16  # scenes and methods beyond which each has only what shows that it fails: strip and error
 _FEW = 3  # variants that processes are not worth starting for
 _IDLE = 60  # [s] after which one of them ends that nobody asks any more
-
-
-@dataclass(frozen=True)
-class Picture:
-    """One picture: its files (html shows the first, markdown the last), caption, and the runs it shows."""
-
-    files: list[str]
-    caption: str
-    runs: list[str]
-
-
-@dataclass(frozen=True)
-class Section:
-    """Pictures under one heading."""
-
-    heading: str
-    pictures: list[Picture] = field(default_factory=list)
 
 
 @dataclass
@@ -144,7 +127,7 @@ def _best(known: list[_Variant], alike: Sequence[str]) -> list[_Variant]:
 
 def _of_variants(shown: list[_Variant], folder: Path, animated: bool) -> list[list[Picture]]:
     """The pictures of each variant; where they are many, drawn in several processes."""
-    gif_bytes = min(render.GIF_BYTES, ANIMATIONS_BYTES // len(shown)) if animated else 0
+    gif_bytes = min(shapes.GIF_BYTES, ANIMATIONS_BYTES // len(shown)) if animated else 0
     calls = [
         partial(_of_variant, v, folder, prefix, gif_bytes, brief=len(shown) > MANY)
         for v, prefix in zip(shown, _prefixes(shown), strict=True)
@@ -168,14 +151,14 @@ def _animation(v: _Variant, folder: Path, prefix: str, gif_bytes: int) -> list[P
     motions = v.motions(CROWDED_ANIMATED if crowded else ANIMATED)
     if not motions:
         return []
-    render.animation(
+    shapes.animation(
         motions, folder / f"{prefix}animation.gif", name, unit, v.floor,
         frames=CROWDED_FRAMES if crowded else FRAMES, max_bytes=gif_bytes,
     )  # fmt: skip
     told = f"{name} " + " and ".join(parameter_text(m.parameter, "", unit) for m in motions)
     caption = (
         f"The full-order model (left) and the reduced one (right) at {told}, held out from training"
-        f"{'; the front half is cut away' if render.is_cut_open(motions) else ''}.{v.continued()}"
+        f"{'; the front half is cut away' if shapes.is_cut_open(motions) else ''}.{v.continued()}"
     )
     return [Picture([f"{prefix}animation.gif"], _held_out(caption, v), v.runs)]
 
@@ -186,7 +169,7 @@ def _stills(v: _Variant, folder: Path, prefix: str, brief: bool) -> list[Picture
     if not motions:
         return []
     strip = save(
-        render.strip(motions[0], name, unit, v.floor), folder, f"{prefix}strip", ("png",), [STRESS_COLORS]
+        shapes.strip(motions[0], name, unit, v.floor), folder, f"{prefix}strip", ("png",), [STRESS_COLORS]
     )
     told = (
         f"Whole bodies over time at {name} {parameter_text(motions[0].parameter, '', unit)}: full-order "
@@ -195,17 +178,17 @@ def _stills(v: _Variant, folder: Path, prefix: str, brief: bool) -> list[Picture
     pictures = [Picture(strip, told, v.runs)]
     if brief:
         return pictures
-    shapes = save(
-        render.final_shapes(motions, name, unit, v.floor),
+    final = save(
+        shapes.final_shapes(motions, name, unit, v.floor),
         folder, f"{prefix}final-shapes", ("png",), [STRESS_COLORS, DIFFERENCE_COLORS],
     )  # fmt: skip
-    cut = render.is_cut_open(motions)
+    cut = shapes.is_cut_open(motions)
     told = (
         f"The last frame of each parameter value{', the front half cut away' if cut else ''}; "
         "the right column shows how far each particle of the reduced model lies from where the "
         f"full-order one puts it.{continued}"
     )
-    return [*pictures, Picture(shapes, told, v.runs)]
+    return [*pictures, Picture(final, told, v.runs)]
 
 
 def _charts(v: _Variant, folder: Path, prefix: str, brief: bool) -> list[Picture]:
@@ -245,7 +228,7 @@ def _charts(v: _Variant, folder: Path, prefix: str, brief: bool) -> list[Picture
         )  # fmt: skip
     if any(v.breakdown.values()):
         add(
-            "runtime", cost_charts.runtime_breakdown(v.breakdown),
+            "runtime", charts.runtime_breakdown(v.breakdown),
             "Where a step's time goes, stage by stage; measuring takes a little time too, so that the sum "
             "may exceed the step in the table.",
         )  # fmt: skip
@@ -268,7 +251,7 @@ def _comparison(known: list[_Variant], folder: Path, study: Study | None) -> lis
     drawings: tuple[tuple[str, Callable, str], ...] = (
         ("delta", charts.delta_per_variant,
          f"Mean δ over the {splits} values, each of them (dots), and the paper's figure where it gives one."),
-        ("speedup-memory", cost_charts.speedup_and_memory,
+        ("speedup-memory", charts.speedup_and_memory,
          "Speedup of the reduced over the full-order model (line: 1×), and the peak memory of both."),
     )  # fmt: skip
     if all(pd.isna(entry[name]) for entry in entries for name in COSTS):
@@ -285,7 +268,8 @@ def _prefixes(shown: list[_Variant]) -> list[str]:
     if len(shown) == 1:
         return [""]
     scenes = len({v.scene for v in shown}) > 1
-    return [f"{v.scene}-{v.method}-" if scenes else f"{v.method}-" for v in shown]
+    heads = [file_name(f"{v.scene}-{v.method}-" if scenes else f"{v.method}-") for v in shown]
+    return heads if len(set(heads)) == len(heads) else [f"{i}-{head}" for i, head in enumerate(heads)]
 
 
 def _held_out(caption: str, v: _Variant) -> str:

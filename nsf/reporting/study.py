@@ -1,41 +1,300 @@
-"""What a report of an experiment is about."""
+"""What the report of a study tells beyond its variants: what is varied, finer points, and trust."""
 
-import dataclasses
 import math
+import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from pathlib import Path
+
+import pandas as pd
+
+from nsf.reporting.columns import COLUMN, Column, axis, parameter_text
+from nsf.reporting.drawing import charts
+from nsf.reporting.drawing.style import save
+from nsf.reporting.formats import Rows, file_name, spreadsheet
+from nsf.reporting.page import Picture, Section, Table
+from nsf.reporting.sources import Source, Study, checked_hash
+from nsf.reporting.tables import Merged, paper_row, printed_of, rows_of, variant_labels, variants
+
+_SCENE, _RUN, _PAPER = "scene", "run", "the paper's δ"
+SEEDS = ("seed", "sampler.seed")
+AXES = {
+    "sampler.size": ("sample particles |S|", "–", "sample"),
+    "latent_dim": ("latent coordinates r", "–", "r"),
+    "field.beta": ("hidden width β over d", "–", None),
+    "deploy.dt_multiplier": ("deployment step", "full-order Δt", None),
+}
+"""Keys that are an axis: its title and unit, and the column of results.csv that tells what became of it."""
+
+_TABLE, _PICTURE = "superresolution.csv", "superresolution.png"
+_HEADING = "At many more points"
+_PERCENT = ("%", 100.0)
+_COLUMNS = (
+    Column("factor", "points for each particle"),
+    Column("points", "points"),
+    Column("delta", "δ at the points", *_PERCENT),
+    Column("particles_delta", "δ at the particles", *_PERCENT),
+    Column("displacement_error", "displacement error at the points", *_PERCENT),
+    Column("particles_displacement_error", "displacement error at the particles", *_PERCENT),
+    Column("full_order_difference", "few beside many full-order particles", *_PERCENT),
+    Column("interpolation_error", "interpolation", *_PERCENT),
+    Column("smeared", "smeared", *_PERCENT),
+    Column("seconds", "query", "s"),
+    Column("full_order_seconds", "fine full-order run", "s"),
+)
+_NOTE = (
+    "The reduced run's fields, beside a full-order run of as many particles on the same grid, at the frames "
+    "that super_resolution.frames spreads over the run. The training particles are among the points. "
+    "Displacement errors too: of a full-order run of the training particles beside the fine one, at those "
+    "they share, which is what no field can know (few beside many); and of the fine run's own positions at "
+    "the training particles, interpolated to the points left out (interpolation). Smeared is the share of "
+    "these that interpolation puts more than half a grid cell away in the last frame. The query is of all "
+    "these frames together; values are queried together too, and share its time equally."
+)
+_MEANS = ("points", "delta", "particles_delta", "full_order_difference", "interpolation_error", "seconds")
+_TOLD = ("scene", "method", "field", "r", "sample")  # of a variant, in results.csv
+
+_RENAMED = {
+    "method": "variant",
+    "trust": "distrust ratio",
+    "distrusted_at": "first distrusted [s]",
+    "handed_over_at": "full order from [s]",
+}
+_FEWEST = 3  # rows of which a rank correlation says anything
 
 
-def printed_delta(entries: Sequence[Mapping], known: Mapping[str, str]) -> float:
-    """δ of the first entry of `Study.printed` that is of this, a fraction; NaN where none is.
+def swept(merged: Merged, study: Study, folder: Path) -> list[Section]:
+    """Draw δ over each number that the jobs vary; over the seeds where they vary nothing else.
 
     Args:
-        entries: as of `Study`.
-        known: what it is of, as text, by the entries' keys; an entry may say `null` of what is not there.
+        merged: results.
+        study: whose jobs they are.
+        folder: of the report.
     """
-    fits = (e["delta"] for e in entries if all(known.get(k, "null") == e[k] for k in e if k != "delta"))
-    return next(fits, math.nan)
+    frame = _held_out(merged, study)
+    varied = [key for key in frame.columns if key in (*AXES, *SEEDS) and frame[key].nunique() > 1]
+    pictures = [_over(key, frame, merged, study, folder) for key in varied if key in AXES]
+    if not pictures and varied:
+        pictures = [_scatter(frame, merged, folder)]
+    return [Section("What is varied", pictures)] if pictures else []
 
 
-@dataclass(frozen=True)
-class Study:
-    """What a report is about, where it is of more than one scene's variants.
+def _held_out(merged: Merged, study: Study) -> pd.DataFrame:
+    """One row a job and held-out value: the job's keys, its run, δ, the paper's, and the row of `merged`."""
+    printed = {i: printed_of(merged, members, study) for members in variants(merged) for i in members}
+    rows = [
+        {_SCENE: row["scene"]}
+        | study.keys.get(source.id, {})
+        | {_RUN: source.id, "delta": row["delta"], _PAPER: printed[i], "row": i}
+        for i, (row, source) in enumerate(zip(merged.frame.to_dict("records"), merged.source, strict=True))
+        if row["split"] != "train"
+    ]
+    return pd.DataFrame(rows)
 
-    Attributes:
-        question: what it was made to find out.
-        paper: what the paper reports on it.
-        settings: by run id, what tells a run apart that no column of results.csv tells.
-        keys: by run id, the keys of its job.
-        missing: what was asked for and is not there, with the reason.
-        printed: δ that the paper prints of single jobs: each {"delta": fraction} and, as text, what it is
-            of: scene, method, parameter or keys of the job. None: what the scenes say of it holds.
-        fine: by evaluate run id, the superresolve run of the same deployment, where there is one.
+
+def _over(key: str, frame: pd.DataFrame, merged: Merged, study: Study, folder: Path) -> Picture:
+    """δ over one key, a panel a scene, a line for each setting of the other keys."""
+    title, unit, column = AXES[key]
+    shown = frame[frame[key].notna()]
+    source = merged.frame[column].loc[shown["row"]].array if column else shown[key]
+    shown = shown.assign(x=pd.to_numeric(pd.Series(source, index=shown.index), errors="coerce"))
+    panels, papers = {}, {}
+    by_scene = list(shown.dropna(subset="x").groupby(_SCENE, sort=False))
+    told = list(dict.fromkeys(name for _, part in by_scene for name in _told(part, (key, *SEEDS))))
+    for scene, part in by_scene:
+        panels[scene] = {
+            name: group.groupby("x")["delta"].apply(list).to_dict()
+            for name, group in _settings(part, told, alone="mean")
+        }
+        if study.printed is not None:
+            papers[scene] = part[["x", _PAPER]].dropna().drop_duplicates().to_numpy().tolist()
+        else:
+            printed = paper_row(merged, [part["row"].iloc[0]]) or {}
+            paper = [pd.to_numeric(printed.get(name), errors="coerce") for name in (column, "delta")]
+            papers[scene] = [] if any(map(pd.isna, paper)) else [paper]
+    seeds = any(shown[seed].nunique() > 1 for seed in SEEDS if seed in shown)
+    figure = charts.delta_over(panels, axis(title, unit), papers)
+    caption = (
+        f"Mean δ (line) against {title}, and from the smallest to the largest over the held-out values"
+        f"{' and seeds' if seeds else ''} (band). Where a run diverged, the line has a gap."
+        + (" The cross is what the paper prints." if any(papers.values()) else "")
+    )
+    stem = f"delta-over-{key.replace('.', '-').replace('_', '-')}"
+    return Picture(save(figure, folder, stem), caption, sorted(set(shown[_RUN])))
+
+
+def _scatter(frame: pd.DataFrame, merged: Merged, folder: Path) -> Picture:
+    """Mean δ of each seed, a row for each setting of the other keys."""
+    entries = []
+    for seed in SEEDS:
+        part = frame[frame[seed].notna()] if seed in frame else frame.iloc[:0]
+        for name, group in _settings(part, _told(part, SEEDS), alone=merged.frame["scene"].iloc[0]):
+            values = group.groupby(seed)["delta"].apply(lambda deltas: deltas.mean(skipna=False))
+            printed = group[_PAPER].iloc[0]
+            told = {"mean": values.mean(skipna=False), "values": list(values)}
+            paper = None if pd.isna(printed) else printed
+            entries.append({"label": f"{name} · {len(values)} × {seed}", "paper": paper} | told)
+    caption = (
+        "δ, averaged over the held-out values, for each seed (dots): seed is of the networks' first weights "
+        "and batches, sampler.seed of the sample particles; their mean, and what the paper prints."
+    )
+    figure = charts.delta_per_variant(entries, dots="one seed")
+    return Picture(save(figure, folder, "delta-over-seeds"), caption, sorted(set(frame[_RUN])))
+
+
+def _told(frame: pd.DataFrame, without: Sequence[str]) -> list[str]:
+    """Keys of the jobs that tell the settings in rows of `_held_out` apart; `without` are no setting."""
+    told: list[str] = []
+    groups = 1
+    for key in frame.columns.drop([_RUN, "delta", _PAPER, "row", "x", *without], errors="ignore"):
+        found = frame.groupby([*told, key], dropna=False).ngroups
+        if found > groups:
+            told, groups = [*told, key], found
+    return told
+
+
+def _settings(frame: pd.DataFrame, told: Sequence[str], alone: str) -> list[tuple[str, pd.DataFrame]]:
+    """The rows of each setting, by a name of the keys that tell settings apart.
+
+    Args:
+        frame: rows of `_held_out`.
+        told: these keys.
+        alone: the name of all rows where there are none.
+    """
+    if not told:
+        return [(alone, frame)] if len(frame) else []
+    return [
+        (" · ".join(str(value) for value in values if not pd.isna(value)), group)
+        for values, group in frame.groupby(told, dropna=False, sort=False)
+    ]
+
+
+class FineSource:
+    """A superresolve run whose files are whole, and the evaluate run of the same deployment.
+
+    Raises:
+        SchemaError: a file is missing or differs from its manifest.
     """
 
-    question: str
-    paper: str
-    settings: Mapping[str, str]
-    keys: Mapping[str, Mapping[str, str]]
-    missing: Sequence[str]
-    printed: Sequence[Mapping] | None = None
-    fine: Mapping[str, object] = dataclasses.field(default_factory=dict)
+    def __init__(self, run, source: Source):
+        self.run, self.id, self.manifest, self.of = run, run.id, run.manifest, source
+        self.hashes = {name: checked_hash(run, name) for name in (_TABLE, _PICTURE)}
+        self.table = pd.read_csv(Path(run.path) / _TABLE)
+        self.summary: dict = {}
+
+    @property
+    def created(self) -> str:
+        """When the run was made (ISO), by its manifest."""
+        return str(self.manifest.get("created", ""))
+
+
+def fine_table(fine: Sequence[FineSource], settings, folder: Path) -> Table:
+    """A row a run and parameter value; the numbers in full go to `superresolution.csv` in the folder.
+
+    Args:
+        fine: runs.
+        settings: by evaluate run id, what tells jobs of a scene apart; empty where nothing does.
+        folder: of the report.
+    """
+    variants = [_variant(f, settings) for f in fine]
+    varied = [name for name in variants[0] if len({variant[name] for variant in variants}) > 1]
+    known = ["scene", *(name for name in varied if name != "scene")]
+    frames = [f.table.assign(**variant) for f, variant in zip(fine, variants, strict=True)]
+    frame = pd.concat(frames, ignore_index=True)[[*known, *fine[0].table]]
+    frame.map(spreadsheet).to_csv(folder / _TABLE, index=False)
+    units = {f.of.results["scene"].iloc[0]: f.of.parameter[1] for f in fine}
+    body = [
+        [
+            *(str(row[name]) for name in known),
+            parameter_text(row["parameter"], "", units[row["scene"]]),
+            *(column.text(row[column.name]) for column in _COLUMNS),
+        ]
+        for row in frame.to_dict("records")
+    ]
+    headings = [*known, "parameter", *(c.heading for c in _COLUMNS)]
+    return Table(_HEADING, Rows(headings, body, [False] * len(headings)), _NOTE)
+
+
+def fine_means(folder: Path) -> Rows:
+    """Means over parameter values of a report's `superresolution.csv`, a row a variant."""
+    frame = pd.read_csv(folder / _TABLE)
+    known = list(frame.columns[: frame.columns.get_loc("parameter")])
+    columns = [column for column in _COLUMNS if column.name in _MEANS]
+    means = frame.groupby(known, sort=False, as_index=False)[[column.name for column in columns]].mean()
+    body = [
+        [*(str(row[name]) for name in known), *(column.text(row[column.name]) for column in columns)]
+        for row in means.to_dict("records")
+    ]
+    headings = [*known, *(column.heading for column in columns)]
+    return Rows(headings, body, [i >= len(known) for i in range(len(headings))])
+
+
+def _variant(f: FineSource, settings) -> dict:
+    """What tells a job from others."""
+    return f.of.results.iloc[0][list(_TOLD)].to_dict() | {"setting": settings.get(f.of.id, "")}
+
+
+def fine_section(fine: Sequence[FineSource], folder: Path) -> Section:
+    """The picture of each run."""
+    pictures = []
+    for index, f in enumerate(fine):
+        variant = _variant(f, {})
+        name = file_name(f"{variant['scene']}-{variant['field']}-superresolution{index or ''}") + ".png"
+        shutil.copyfile(Path(f.run.path) / _PICTURE, folder / name)
+        caption = (
+            f"The last frame of {variant['scene']} ({variant['field']} field): the reduced run at its "
+            "particles, the same at many more points, and a full-order run of as many particles; whole "
+            "bodies, coloured by how far they moved."
+        )
+        pictures.append(Picture([name], caption, [f.id]))
+    return Section(_HEADING, pictures)
+
+
+def trust_table(merged: Merged, renamed: Mapping[str, str]) -> list[Table]:
+    """How far each reduced run went from its training data, beside its true error; none where no run tells.
+
+    Args:
+        merged: results; the parameter, ratio, times [s] and true δ of each row whose run tells them.
+        renamed: headings of columns that this page calls otherwise.
+    """
+    rows = []
+    for i, label in enumerate(variant_labels(merged.frame.to_dict("records"))):
+        row, told = merged.frame.iloc[i], merged.source[i].trust(merged.frame["parameter"].iloc[i])
+        if told is None:
+            continue
+        ratio = math.inf if told["trust"] is None else told["trust"]
+        times = {name: _or_nan(told[name]) for name in ("distrusted_at", "handed_over_at")}
+        known = {name: row[name] for name in ("parameter", "split")}
+        rows.append({"method": label, **known, "trust": ratio, **times, "delta": row["delta"]})
+    if not rows:
+        return []
+    frame = pd.DataFrame(rows)
+    same = frame["method"].nunique() == 1
+    shown = frame.drop(columns="method") if same else frame
+    return [Table("Trust", rows_of(shown, {**renamed, **_RENAMED}), trust_note(frame))]
+
+
+def trust_note(rows: pd.DataFrame) -> str:
+    """The meaning of the ratio, and how its ranks agree with those of δ."""
+    said = (
+        "The distrust ratio is the largest of a run's steps: how far it went from the training data, by the "
+        "residual of its projections or by its latent vector, where 1 is as far as training data are from "
+        "themselves. It needs no full-order run; a ratio above 1 says not to believe what follows."
+    )
+    # The rest of a run that was handed over is the full-order solver's, and so is its error.
+    reduced = rows[rows["handed_over_at"].isna()]
+    if len(reduced) < _FEWEST:
+        return said
+    agreement = spearman(reduced["trust"], reduced["delta"])
+    return (
+        f"{said} Over the {len(reduced)} reduced runs of this table its Spearman rank correlation with the "
+        f"true {COLUMN['delta'].title} is {agreement:.2f}."
+    )
+
+
+def spearman(a: pd.Series, b: pd.Series) -> float:
+    """Spearman's rank correlation: the correlation of ranks, in which ∞ is a value like any other."""
+    return float(a.rank().corr(b.rank()))
+
+
+def _or_nan(value: float | None) -> float:
+    return math.nan if value is None else value

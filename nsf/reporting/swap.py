@@ -1,16 +1,20 @@
 """A folder that is replaced whole or not at all."""
 
+import re
 import shutil
+import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from nsf.errors import ConfigError, StorageError
-from nsf.storage import locked
+from nsf.storage import in_use, locked
 
 MARK = "sources.json"
 """The file by which a folder is known as a report and may be replaced."""
+
+_LEFT = re.compile(r"\.(?P<name>.+)\.(?P<kind>new|old)-\w+")  # beside a folder while it is replaced
 
 
 def check_place(folder: Path) -> None:
@@ -44,7 +48,8 @@ def replaced(folder: Path) -> Iterator[Path]:
     """An empty sibling folder to write into; it takes `folder`'s place once the block ends without an error.
 
     Until then, and after any error or interrupt, whatever stood at `folder` stands there unchanged. Two
-    processes that replace it do so in turn, by the lock `.<name>.lock` beside it, which stays.
+    processes that replace it do so in turn, by the lock `.<name>.lock` beside it, which stays; what a killed
+    process left beside it is removed.
 
     Raises:
         ConfigError: `folder` holds something that is not a report.
@@ -52,21 +57,43 @@ def replaced(folder: Path) -> Iterator[Path]:
     """
     folder = Path(folder).absolute()
     check_place(folder)
-    try:
-        fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.new-", dir=folder.parent))
-    except OSError as error:
-        raise _no_place(folder, error) from error
-    try:
-        yield fresh
-        fresh.chmod(0o755)
-        with locked(folder.with_name(f".{folder.name}.lock"), waiting=lambda: None):
+    _clear(folder.parent)
+    waiting = f"waiting for another process, which writes {folder}"
+    with locked(_lock(folder), waiting=lambda: print(waiting, file=sys.stderr)):
+        try:
+            fresh = Path(tempfile.mkdtemp(prefix=f".{folder.name}.new-", dir=folder.parent))
+        except OSError as error:
+            raise _no_place(folder, error) from error
+        try:
+            yield fresh
+            fresh.chmod(0o755)
             _take_place(fresh, folder)
-    except OSError as error:
-        raise StorageError(
-            f"the report for {folder} was not written: {error}; the old one, if any, stands"
-        ) from error
-    finally:
-        shutil.rmtree(fresh, ignore_errors=True)
+        except OSError as error:
+            raise StorageError(
+                f"the report for {folder} was not written: {error}; the old one, if any, stands"
+            ) from error
+        finally:
+            shutil.rmtree(fresh, ignore_errors=True)
+
+
+def _lock(folder: Path) -> Path:
+    """Its holder, and nobody else, has folders beside `folder` that are to replace it."""
+    return folder.with_name(f".{folder.name}.lock")
+
+
+def _clear(reports: Path) -> None:
+    """Remove what killed processes left in a folder of reports; a report that was put aside comes back."""
+    for left in sorted(reports.iterdir()):
+        found = _LEFT.fullmatch(left.name)
+        if not found:
+            continue
+        folder = reports / found["name"]
+        with suppress(OSError, StorageError):  # of someone else
+            if in_use(_lock(folder)):
+                continue
+            if found["kind"] == "old" and not folder.exists():
+                left.rename(folder)
+            shutil.rmtree(left, ignore_errors=True)
 
 
 def _take_place(fresh: Path, folder: Path) -> None:

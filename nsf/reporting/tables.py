@@ -1,15 +1,12 @@
-"""Tables: the results of many evaluate runs merged, averaged, and written as text."""
+"""Tables: the results of many evaluate runs merged and averaged, with units in their headings."""
 
-import html
 import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import pandas as pd
-from rich.box import SIMPLE_HEAD
-from rich.markup import escape
-from rich.table import Table
+import rich.table
 
 from nsf.reporting.columns import (
     ABSENT,
@@ -26,8 +23,8 @@ from nsf.reporting.columns import (
     number,
     split_rank,
 )
-from nsf.reporting.sources import Source, open_sources
-from nsf.reporting.study import Study, printed_delta
+from nsf.reporting.formats import Rows, terminal_table
+from nsf.reporting.sources import Source, Study, open_sources, printed_delta
 
 VARIANT = ("scene", "method", "field", "r", "sample", SETTING, "precision", "device")
 """The visible key of a variant; `device` counts by its type."""
@@ -191,12 +188,11 @@ def variant_labels(rows: list[dict]) -> list[str]:
     ]
 
 
-def cells(frame: pd.DataFrame, renamed: dict[str, str] | None = None) -> tuple[list[str], list[list[str]]]:
-    """Headings with units (`renamed` ones as given), and every cell as text."""
-    known = {name: column.heading for name, column in COLUMN.items()} | (renamed or {})
-    headings = [known[name] for name in frame]
+def rows_of(frame: pd.DataFrame, renamed: Mapping[str, str] | None = None) -> Rows:
+    """A frame as text, with units in its headings; `renamed` ones as given."""
+    known = {name: column.heading for name, column in COLUMN.items()} | dict(renamed or {})
     body = [[_cell(name, row[name]) for name in frame] for row in frame.to_dict("records")]
-    return headings, body
+    return Rows([known[name] for name in frame], body, [name not in TEXT for name in frame])
 
 
 def without_constants(
@@ -226,54 +222,10 @@ def without_constants(
     return frame.drop(columns=[*constant, *empty]), ", ".join(told)
 
 
-def markdown_table(frame: pd.DataFrame, renamed: dict[str, str] | None = None) -> str:
-    """A GitHub table with units in its headings."""
-    return markdown_rows(*cells(frame, renamed), numeric=is_numeric(frame))
-
-
-def html_table(frame: pd.DataFrame, renamed: dict[str, str] | None = None) -> str:
-    """A table with units in its headings; numbers align to the right."""
-    return html_rows(*cells(frame, renamed), numeric=is_numeric(frame))
-
-
-def markdown_rows(headings: list[str], body: list[list[str]], numeric: list[bool]) -> str:
-    """Texts as a GitHub table."""
-    rule = ["---:" if right else "---" for right in numeric]
-    lines = [headings, rule, *body]
-    return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in line) + " |" for line in lines)
-
-
-def html_rows(headings: list[str], body: list[list[str]], numeric: list[bool]) -> str:
-    """Texts as an HTML table that scrolls sideways where a page is narrow."""
-    kinds = ["number" if right else "text" for right in numeric]
-
-    def line(tag: str, texts: list[str]) -> str:
-        inner = (
-            f'<{tag} class="{kind}">{html.escape(text)}</{tag}>'
-            for kind, text in zip(kinds, texts, strict=True)
-        )
-        return f"<tr>{''.join(inner)}</tr>"
-
-    rows = "\n".join(line("td", texts) for texts in body)
-    head = line("th", headings)
-    return f'<div class="table"><table>\n<thead>{head}</thead>\n<tbody>{rows}</tbody>\n</table></div>'
-
-
-def console_table(frame: pd.DataFrame) -> Table:
+def console_table(frame: pd.DataFrame) -> rich.table.Table:
     """The results for a terminal; columns that never change are told in the caption, commits in the csv."""
     shown, said = without_constants(frame.drop(columns="commit", errors="ignore"), also=COSTS)
-    headings, body = cells(shown)
-    table = Table(caption=escape(said), caption_justify="left", box=SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    for heading, right in zip(headings, is_numeric(shown), strict=True):
-        table.add_column(escape(heading), justify="right" if right else "left", overflow="fold")
-    for row in body:
-        table.add_row(*map(escape, row))
-    return table
-
-
-def is_numeric(frame: pd.DataFrame) -> list[bool]:
-    """Which columns hold numbers, which align to the right."""
-    return [name not in TEXT for name in frame]
+    return terminal_table(rows_of(shown), said)
 
 
 def _cell(name: str, value) -> str:

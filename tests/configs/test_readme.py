@@ -9,7 +9,7 @@ from pages import ROOT, blocks_of, try_command
 
 from nsf.errors import ConfigError
 from nsf.reporting import COLUMNS
-from nsf.reporting.readme import BEGIN, END, REPORT, figures, updated
+from nsf.reporting.committed import BEGIN, END, REPORT, figures, updated
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 

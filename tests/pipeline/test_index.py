@@ -20,7 +20,7 @@ def page_of(chain, tmp_path_factory):
 
 
 def test_thumbnails_are_drawn_once(page_of, chain):
-    pictures = sorted(page_of.parent.glob("thumbnails/*.png"))
+    pictures = sorted(page_of.parent.glob("thumbnails/**/*.png"))
     # Of four trajectories, the manifold, the reduced run and the evaluation; a failed run has none.
     assert len(pictures) == 7
     before = [picture.stat().st_mtime_ns for picture in pictures]

@@ -8,15 +8,14 @@ from nsf.errors import SchemaError
 from nsf.reporting import headline as module
 from nsf.reporting.committed import _sources
 from nsf.reporting.headline import Report, headline
-from nsf.reporting.study import printed_delta
+from nsf.reporting.sources import printed_delta
 
 
 def told(folder) -> tuple[list[list[str]], str]:
     """Cells of the table, and the sentences under it."""
-    table, _, said = headline(Report(folder, _sources(folder))).partition("\n\n")
-    plain = table.replace("\\|S\\|", "S")
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in plain.splitlines()]
-    return [rows[0], *rows[2:]], said
+    table, said = headline(Report(folder, _sources(folder)))
+    headings = [heading.replace("|S|", "S") for heading in table.headings]
+    return [headings, *table.body], said
 
 
 def test_means_over_values_and_seeds_a_row_a_scene_and_setting(tmp_path):
@@ -155,7 +154,7 @@ def test_small_runs_are_not_held_to_the_paper(tmp_path):
     folder = write_report(tmp_path / "a", [job()])
     sources = _sources(folder)
     sources["runs"]["run0"]["scale"] = "small"
-    said = headline(Report(folder, sources))
+    _, said = headline(Report(folder, sources))
     assert "these runs are of small scale" in said
     assert "below the paper's" not in said
 
@@ -167,8 +166,8 @@ def test_a_setting_of_an_older_report_tells_rows_apart(tmp_path):
     sources = _sources(folder)
     for run in sources["runs"].values():
         del run["keys"]
-    table = headline(Report(folder, sources))
-    assert "| sand | seed=1 | 0.400 | 0.100 |" in table
+    table, _ = headline(Report(folder, sources))
+    assert table.body[0][:4] == ["sand", "seed=1", "0.400", "0.100"]
 
 
 def test_rows_that_are_not_those_of_the_sources_are_refused(tmp_path):

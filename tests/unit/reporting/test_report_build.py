@@ -6,16 +6,16 @@ import re
 import pandas as pd
 import pytest
 from PIL import Image
-from synthetic import TEST, Made, seal, write_run
+from synthetic import TEST, Made, rewrite_manifest, seal, write_run
 
 from nsf.errors import ConfigError, StorageError
 from nsf.reporting import build, build_report, pictures
 from nsf.reporting.columns import number
 from nsf.reporting.pictures import _Variant
-from nsf.reporting.sources import Source, file_hash, open_sources
-from nsf.reporting.study import Study
+from nsf.reporting.sources import Source, Study, file_hash, open_sources
+from nsf.reporting.study import spearman, trust_note
 from nsf.reporting.tables import merge
-from nsf.reporting.trust import spearman, trust_note
+from nsf.runs import Run
 
 ERRORS = ("error-over-time.png", "error-over-time.svg")
 TINY = Made(particles=30, frames=4, parameters=TEST[:2], splits=("test",) * 2)
@@ -206,7 +206,7 @@ def test_animations_of_a_crowded_page_are_of_one_value_and_fewer_frames(tmp_path
     monkeypatch.setattr(pictures, "CROWDED_FRAMES", 3)
     drawn = []
     monkeypatch.setattr(
-        pictures.render, "animation", lambda motions, *_, **keys: drawn.append((motions, keys))
+        pictures.shapes, "animation", lambda motions, *_, **keys: drawn.append((motions, keys))
     )
     run = write_run(tmp_path / "runs", TINY)
     build_report([run], tmp_path / "report", "t")
@@ -229,7 +229,7 @@ def test_a_sweep_shows_the_best_variant_of_a_scene_and_does_not_animate_it(tmp_p
     assert not list(folder.glob("*.gif"))
     page = (folder / "index.md").read_text()
     assert "Of each scene, the pictures show" in page
-    assert "## sand · nsf · |S| 50" in page
+    assert r"## sand · nsf · \|S\| 50" in page
 
 
 @pytest.mark.slow
@@ -276,6 +276,30 @@ def test_trust_beside_the_true_error(tmp_path, no_pictures):
 def test_runs_that_know_no_trust_show_none(tmp_path, no_pictures):
     page = build_report([write_run(tmp_path / "runs", TINY)], tmp_path / "report", "Sand")
     assert "<h2>Trust" not in page.read_text()
+
+
+def test_warnings_of_the_simulations_behind_the_rows(tmp_path, no_pictures):
+    """Once each, whether the evaluate run or one that it goes back to names the simulation."""
+    thin, coarse = "<b>thin</b>: 0.7 cells across; dx=0.01 would do", "coarse"
+    told = {"a": [thin, coarse], "b": [coarse], "c": []}
+    simulations = [Run.open("simulate", "sand", {"of": of}, root=tmp_path / "runs") for of in told]
+    trained = Run.open("train", "sand", {}, simulations[1:], root=tmp_path / "runs")
+    for run in (*simulations, trained):
+        with run.record():
+            pass
+    for run, warnings in zip(simulations, told.values(), strict=True):
+        rewrite_manifest(run, warnings=warnings)
+    run = write_run(tmp_path / "runs", TINY)
+    run = Run.load(run.id, tmp_path / "runs")
+    rewrite_manifest(run, parents=[simulations[0].id, trained.id])
+    folder = build_report([run], tmp_path / "report", "Sand").parent
+    page, text = (folder / "index.html").read_text(), (folder / "index.md").read_text()
+    assert page.count("<li>") == 2
+    assert "<li>&lt;b&gt;thin&lt;/b&gt;: 0.7 cells across; dx=0.01 would do</li>" in page
+    assert page.index("<h2>Warnings</h2>") < page.index("<table>")
+    assert "- &lt;b&gt;thin&lt;/b&gt;: 0.7 cells across; dx=0.01 would do\n- coarse\n\n## Results" in text
+    rewrite_manifest(run, parents=[simulations[2].id])
+    assert "Warnings" not in build_report([run], tmp_path / "report", "Sand").read_text()
 
 
 @pytest.mark.parametrize(

@@ -8,12 +8,12 @@ import pytest
 from synthetic import TEST, Made, collapse
 
 from nsf import config
-from nsf.reporting import charts, cost_charts
-from nsf.reporting.camera import Camera, View
-from nsf.reporting.point import point_chart, point_response
-from nsf.reporting.render import animation, final_shapes, is_cut_open, strip
+from nsf.reporting.drawing import charts
+from nsf.reporting.drawing.camera import Camera, View
+from nsf.reporting.drawing.point import point_chart, point_response
+from nsf.reporting.drawing.shapes import animation, final_shapes, is_cut_open, strip
+from nsf.reporting.drawing.style import save
 from nsf.reporting.sources import Motion
-from nsf.reporting.style import save
 
 RED, BLUE = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
 
@@ -98,7 +98,7 @@ def test_reconstruction_and_rollout_are_rms_over_frames(series):
 
 
 def test_runtime_rings_say_the_sum():
-    figure = cost_charts.runtime_breakdown({"reduced": {"p2g": 1.5, "transfer": 0.5}, "full_order": {}})
+    figure = charts.runtime_breakdown({"reduced": {"p2g": 1.5, "transfer": 0.5}, "full_order": {}})
     told = [text.get_text() for panel in figure.axes for text in panel.texts]
     assert "2 ms,\nall stages" in told
     assert "not measured" in told
@@ -107,7 +107,7 @@ def test_runtime_rings_say_the_sum():
 def test_bars_say_what_was_not_measured():
     entry = {"label": "nsf", "speedup_step": 4.0, "speedup_total": float("nan")}
     entry |= {"memory_full_mib": 900.0, "memory_reduced_mib": 400.0}
-    told = [text.get_text() for panel in cost_charts.speedup_and_memory([entry]).axes for text in panel.texts]
+    told = [text.get_text() for panel in charts.speedup_and_memory([entry]).axes for text in panel.texts]
     assert "not measured" in told
     assert "900" in told
 

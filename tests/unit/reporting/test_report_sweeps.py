@@ -9,11 +9,12 @@ import pandas as pd
 import pytest
 from synthetic import Made, write_run
 
-from nsf.reporting import build_report, charts, sweeps
-from nsf.reporting.latex import escaped, latex_table
-from nsf.reporting.sources import open_sources
-from nsf.reporting.study import Study
-from nsf.reporting.tables import means, merge
+from nsf.reporting import build_report
+from nsf.reporting.drawing import charts
+from nsf.reporting.formats import latex, latex_table
+from nsf.reporting.sources import Study, open_sources
+from nsf.reporting.study import _settings, _told, swept
+from nsf.reporting.tables import means, merge, rows_of
 
 VALUES = (22.5, 27.5)
 
@@ -58,7 +59,7 @@ def drawn(monkeypatch):
 def test_delta_over_what_varies_with_every_value_and_seed(tmp_path, drawn):
     found, keys, settings = runs(tmp_path, sizes={20: 0.02, 50: 0.008, 150: 0.004}, seeds=("0", "1", "2"))
     merged = merge(open_sources(found), settings)
-    (section,) = sweeps.swept(merged, of(keys), tmp_path)
+    (section,) = swept(merged, of(keys), tmp_path)
     ((name, (panels, x, papers)),) = drawn
     assert (name, x) == ("delta_over", "sample particles |S| [–]")
     assert (list(panels), list(panels["sand"]), papers["sand"][0][0]) == (["sand"], ["mean"], 150)
@@ -78,7 +79,7 @@ def test_what_the_paper_prints_of_single_jobs_stands_beside_them(tmp_path, drawn
         {"scene": "sand", "sampler.size": size, "delta": at} for size, at in (("20", 0.03), ("50", 0.01))
     ]
     study = of(keys, entries)
-    sweeps.swept(merged, study, tmp_path)
+    swept(merged, study, tmp_path)
     ((_, (_, _, papers)),) = drawn
     assert sorted(papers["sand"]) == [[20.0, 0.03], [50.0, 0.01]]
     table = means(merged, study)
@@ -90,7 +91,7 @@ def test_what_the_paper_prints_of_single_jobs_stands_beside_them(tmp_path, drawn
 def test_seeds_alone_are_dots(tmp_path, drawn):
     found, keys, settings = runs(tmp_path, seeds=("0", "1", "2"))
     merged = merge(open_sources(found), settings)
-    (section,) = sweeps.swept(merged, of(keys), tmp_path)
+    (section,) = swept(merged, of(keys), tmp_path)
     ((name, (entries,)),) = drawn
     assert name == "delta_per_variant"
     (entry,) = entries
@@ -101,7 +102,7 @@ def test_seeds_alone_are_dots(tmp_path, drawn):
 
 def test_nothing_varied_draws_nothing(tmp_path):
     found, keys, _ = runs(tmp_path)
-    assert sweeps.swept(merge(open_sources(found)), of(keys), tmp_path) == []
+    assert swept(merge(open_sources(found)), of(keys), tmp_path) == []
 
 
 def test_lines_are_named_by_what_tells_them_apart():
@@ -109,9 +110,9 @@ def test_lines_are_named_by_what_tells_them_apart():
     frame = pd.DataFrame(
         {"scene": "sand", "field": ["basis", "mlp"], "trainer.steps": [None, "null"], "x": 1.0, "run": "a"}
     )
-    told = sweeps._told(frame, ())
+    told = _told(frame, ())
     assert told == ["field"]
-    assert [name for name, _ in sweeps._settings(frame, told, "mean")] == ["basis", "mlp"]
+    assert [name for name, _ in _settings(frame, told, "mean")] == ["basis", "mlp"]
 
 
 def test_a_setting_has_one_name_in_every_scene(tmp_path, drawn):
@@ -126,7 +127,7 @@ def test_a_setting_has_one_name_in_every_scene(tmp_path, drawn):
                 keys[run.id] = {"scene": scene, "field": field, "field.beta": beta}
                 settings[run.id] = f"field.beta={beta}"
     merged = merge(open_sources(found), settings)
-    sweeps.swept(merged, of(keys), tmp_path)
+    swept(merged, of(keys), tmp_path)
     ((name, (panels, *_)),) = drawn
     assert name == "delta_over"
     assert {scene: list(lines) for scene, lines in panels.items()} == {
@@ -186,10 +187,10 @@ def test_sources_without_a_study(report):
 
 
 def test_latex_escapes():
-    assert escaped("a_b & 5 % ≤ |S| – 1×") == r"a\_b \& 5 \% ≤ \textbar{}S\textbar{} -- 1$\times$"
-    assert escaped("\\{") == r"\textbackslash{}\{"
+    assert latex("a_b & 5 % ≤ |S| – 1×") == r"a\_b \& 5 \% ≤ \textbar{}S\textbar{} -- 1$\times$"
+    assert latex("\\{") == r"\textbackslash{}\{"
 
 
 def test_latex_knows_every_sign_of_a_table(sweep):
-    text = latex_table(means(merge(open_sources(sweep))), "Sand", "")
+    text = latex_table(rows_of(means(merge(open_sources(sweep)))), "Sand", "")
     assert text.isascii()

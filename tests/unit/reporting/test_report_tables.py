@@ -12,13 +12,13 @@ from synthetic import TEST, Made, seal, write_run
 from nsf.errors import MissingRunError, SchemaError
 from nsf.reporting import COLUMNS, console_table, merge_results
 from nsf.reporting.columns import COSTS, number, parameter_text
+from nsf.reporting.formats import HTML, markdown_table
 from nsf.reporting.sources import open_sources
 from nsf.reporting.tables import (
     PAPER,
-    html_table,
-    markdown_table,
     means,
     merge,
+    rows_of,
     variant_labels,
     without_constants,
 )
@@ -111,17 +111,18 @@ def test_a_diverged_value_is_not_averaged_around(tmp_path):
     table = means(merge(open_sources([run])))
     assert table["delta"].iloc[0] == float("inf")
     assert pd.isna(table["stress_error"].iloc[0])
-    assert "∞" in markdown_table(table)
+    assert "∞" in markdown_table(rows_of(table))
 
 
 def test_tables_show_units_and_escape(sweep):
     frame = merge_results(sweep)
     frame.loc[0, "field"] = "<mlp|x>"
-    markdown, page = markdown_table(frame), html_table(frame)
+    rows = rows_of(frame)
+    markdown, page = markdown_table(rows), HTML.get_template("tables.html").module.table(rows)
     for heading in ("δ [%]", "full-order step [ms]", "speedup, total [×]", "reduced memory [MiB]"):
         assert heading in markdown
         assert heading in page
-    assert "<mlp\\|x>" in markdown
+    assert "&lt;mlp\\|x&gt;" in markdown
     assert "&lt;mlp|x&gt;" in page
     assert number(frame["delta"].iloc[0], 100) in page
 

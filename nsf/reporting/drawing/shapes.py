@@ -11,11 +11,22 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from PIL import Image
 
-from nsf.reporting.camera import Camera, View
-from nsf.reporting.colors import CLIP, DIFFERENCE_COLORS, METRES, PASCALS, STRESS_COLORS, ColorScale
 from nsf.reporting.columns import parameter_text
+from nsf.reporting.drawing.camera import Camera, View
+from nsf.reporting.drawing.style import (
+    CLIP,
+    DIFFERENCE_COLORS,
+    INK,
+    METRES,
+    MUTED,
+    PASCALS,
+    STRESS_COLORS,
+    WARNING,
+    WIDTH,
+    ColorScale,
+    styled,
+)
 from nsf.reporting.sources import Motion
-from nsf.reporting.style import INK, MUTED, WARNING, WIDTH, styled
 
 if TYPE_CHECKING:
     from nsf.evaluation import SuperResolution

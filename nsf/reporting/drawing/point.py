@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 from nsf import config as configuration
 from nsf.errors import ConfigError
 from nsf.mpm.materials import deformation_path, drive
-from nsf.reporting.style import PALETTE, styled
+from nsf.reporting.drawing.style import PALETTE, styled
 from nsf.storage import writing
 
 _COMPONENTS = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
-from rich.markup import escape
 from rich.table import Table
 
 from nsf.reporting.columns import COLUMN, Column
-from nsf.reporting.style import MUTED, PALETTE, figure, save, styled
+from nsf.reporting.drawing.style import MUTED, PALETTE, figure, save, styled
+from nsf.reporting.formats import Rows, spreadsheet, terminal_table
 from nsf.storage import writing
 
 #: What a search can make small, by the name that a user gives it.
@@ -27,7 +27,7 @@ def write_search(table: pd.DataFrame, keys: Sequence[str], objectives: Sequence[
         StorageError: the disk refused a file.
     """
     with writing(folder / "trials.csv") as partial:
-        table.to_csv(partial, index=False)
+        table.map(spreadsheet).to_csv(partial, index=False)
     with styled():
         fig = figure(4.2)
         ax = fig.add_subplot()
@@ -42,13 +42,12 @@ def best_table(path: Path) -> Table:
     """The best trials of a `trials.csv`, for the terminal: the Pareto front."""
     trials = pd.read_csv(path)
     best = trials[trials["pareto"]].drop(columns=["pareto", "error"])
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    columns = {name: OBJECTIVES.get(name, Column(name, name)) for name in best}
-    for column in columns.values():
-        table.add_column(escape(column.heading), overflow="fold")
-    for _, row in best.iterrows():
-        table.add_row(*(column.text(row[name]) for name, column in columns.items()))
-    return table
+    columns = [OBJECTIVES.get(name, Column(name, name)) for name in best]
+    body = [
+        [column.text(row[name]) for name, column in zip(best, columns, strict=True)]
+        for row in best.to_dict("records")
+    ]
+    return terminal_table(Rows([column.heading for column in columns], body, [False] * len(columns)))
 
 
 def _front(ax, done: pd.DataFrame, objectives: Sequence[str]) -> None:

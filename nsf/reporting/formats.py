@@ -1,0 +1,154 @@
+"""How text is written in each format: HTML, Markdown, LaTeX, spreadsheets, terminals, addresses, file names.
+
+Titles, names, units, paths and errors come from files that anyone may have written. Templates escape every
+value for their own format; no other module writes a format by hand.
+"""
+
+import html
+import re
+from dataclasses import dataclass
+from urllib.parse import quote
+
+import rich.box
+import rich.markup
+import rich.table
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup, escape
+
+_INVISIBLE = re.compile(
+    "[\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff\ufffe\uffff]+"
+)
+"""Control characters, line ends, changes of direction, and what no file holds as UTF-8."""
+
+_MARKDOWN = re.compile(
+    r"(?P<code>`[^`]+`)"
+    r"|(?P<unit>(?!\A)\[(?:[^\W_]|[ %×°/–.-])+\](?![(\[:]))"  # followed by these it would be a link
+    r"|(?P<entity>[<>]|&(?=#?\w+;))"
+    r"|(?P<sign>[\\`*~$|\[\]]|(?<![^\W_])_|_(?![^\W_])|\A(?:#|=|[-+](?=[\s-]|\Z)))"
+    r"|(?P<number>\A\d+(?=[.)](?:\s|\Z)))"
+)
+_TEX = {
+    "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}",
+    "|": r"\textbar{}", "<": r"\textless{}", ">": r"\textgreater{}", "–": "--", "°": r"$^\circ$",
+    "×": r"$\times$", "·": r"$\cdot$", "∞": r"$\infty$", "‖": r"$\|$", "²": "$^2$", "³": "$^3$",
+    "α": r"$\alpha$", "β": r"$\beta$", "γ": r"$\gamma$", "δ": r"$\delta$", "η": r"$\eta$", "θ": r"$\theta$",
+    "μ": r"$\mu$", "ν": r"$\nu$", "ξ": r"$\xi$", "τ": r"$\tau$", "φ": r"$\phi$", "Δ": r"$\Delta$",
+} | {sign: f"\\{sign}" for sign in "#$%&_"}  # fmt: skip
+_SPECIAL = re.compile(r"\A\s*[\[*]|" + "|".join(map(re.escape, _TEX)))
+_FORMULA = re.compile(r"[=+\-@\t\r]")
+
+
+@dataclass(frozen=True)
+class Rows:
+    """A table as text: a heading a column, and whether the column is of numbers, which align to the right."""
+
+    headings: list[str]
+    body: list[list[str]]
+    numeric: list[bool]
+
+
+def plain(text) -> str:
+    """Text on one line, without what a reader cannot see."""
+    return _INVISIBLE.sub(" ", str(text))
+
+
+def markdown(text) -> str:
+    """Text as Markdown shows it; what stands between backticks is shown as code."""
+
+    def written(found: re.Match) -> str:
+        match found.lastgroup:
+            case "code":
+                return found[0].replace("|", r"\|")
+            case "entity":
+                return str(escape(found[0]))
+            case "sign":
+                return f"\\{found[0]}"
+            case "number":
+                return f"{found[0]}\\"
+        return found[0]
+
+    return _MARKDOWN.sub(written, plain(text))
+
+
+def unescaped(text: str) -> str:
+    """The text that `markdown` wrote."""
+    return html.unescape(re.sub(r"\\([\\`*~$|\[\]_#=+.)-])", r"\1", text))
+
+
+def latex(text) -> str:
+    """Text as LaTeX prints it, in a cell or a comment."""
+    # A row that begins with one of these would be read as the argument of the line end before it.
+    return _SPECIAL.sub(lambda found: _TEX.get(found[0], f"{{{found[0]}}}"), plain(text))
+
+
+def terminal(text) -> str:
+    """Text as rich prints it."""
+    return rich.markup.escape(plain(text))
+
+
+def spreadsheet(value):
+    """A cell of a csv; text that a spreadsheet would compute begins with an apostrophe."""
+    if not isinstance(value, str) or not _FORMULA.match(value):
+        return value
+    try:
+        float(value)
+    except ValueError:
+        return f"'{value}"
+    return value
+
+
+def file_name(text) -> str:
+    """Text as a part of a file's name: letters, digits, `_` and `-`."""
+    return re.sub(r"[^\w-]+", "-", plain(text), flags=re.ASCII)
+
+
+def address(path) -> Markup:
+    """A relative path as an address of HTML and Markdown."""
+    return Markup(quote(str(path), errors="replace"))
+
+
+def _environment(write, **signs) -> Environment:
+    """Templates of a format, whose values `write` escapes."""
+    environment = Environment(
+        loader=PackageLoader("nsf.reporting"), undefined=StrictUndefined, autoescape=True,
+        finalize=lambda value: value if hasattr(value, "__html__") else Markup(write(value)),
+        trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, **signs,
+    )  # fmt: skip
+    environment.filters["url"] = address
+    return environment
+
+
+HTML = _environment(lambda text: escape(plain(text)))
+MARKDOWN = _environment(markdown)
+LATEX = _environment(
+    latex, variable_start_string="<<", variable_end_string=">>",
+    block_start_string="<%", block_end_string="%>", comment_start_string="<#", comment_end_string="#>",
+)  # fmt: skip
+
+
+def markdown_document(template: str, **values) -> str:
+    """A whole file from a template."""
+    return MARKDOWN.get_template(template).render(values).rstrip("\n") + "\n"
+
+
+def markdown_table(rows: Rows) -> str:
+    """A GitHub table."""
+    return str(MARKDOWN.get_template("tables.md").module.table(rows)).rstrip("\n")  # type: ignore[attr-defined]
+
+
+def latex_table(rows: Rows, title: str, note: str) -> str:
+    """A `tabular` with units in its headings; title and note stand above it as comments."""
+    return LATEX.get_template("table.tex").render(rows=rows, title=title, note=note)
+
+
+def terminal_table(rows: Rows, caption: str | None = None) -> rich.table.Table:
+    """A table for rich to print."""
+    table = rich.table.Table(
+        caption=terminal(caption) if caption else None, caption_justify="left", box=rich.box.SIMPLE_HEAD,
+        padding=(0, 1, 0, 0),
+    )  # fmt: skip
+    for heading, right in zip(rows.headings, rows.numeric, strict=True):
+        table.add_column(terminal(heading), justify="right" if right else "left", overflow="fold")
+    for texts in rows.body:
+        table.add_row(*map(terminal, texts))
+    return table

@@ -1,0 +1,78 @@
+"""A report killed while it is written: the old one stays, and the next is as an undisturbed one."""
+
+import signal
+
+import pytest
+from forked import PlainReport, SignalAt, run_nsf
+
+from nsf.storage import locked
+
+#: In the middle of the pictures, before the page, and between the two renames of the exchange.
+MOMENTS = {
+    "drawing": ("nsf.reporting.pictures:save", 3),
+    "writing": ("nsf.reporting.build:markdown_page", 1),
+    "exchanging": ("nsf.reporting.swap:Path.rename", 2),
+}
+
+
+def files(folder):
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+@pytest.fixture(scope="module")
+def undisturbed(chain, tiny, tmp_path_factory):
+    """The files of a report that nothing interrupted."""
+    work = tmp_path_factory.mktemp("undisturbed")
+    assert run_nsf(["report", *tiny], chain.root, work).code == 0
+    (folder,) = (path for path in (work / "reports").iterdir() if path.is_dir())
+    return folder.name, files(folder)
+
+
+@pytest.mark.parametrize("kind", [signal.SIGKILL, signal.SIGTERM], ids=lambda kind: kind.name)
+@pytest.mark.parametrize("moment", MOMENTS)
+def test_a_report_that_was_killed(chain, nsf, tmp_path, undisturbed, moment, kind):
+    name, expected = undisturbed
+    reports = tmp_path / "work/reports"
+    assert nsf("report", chain.root, faults=[PlainReport()]).code == 0
+    old = files(reports / name)
+    assert old != expected
+
+    where, call = MOMENTS[moment]
+    outcome = nsf("report", chain.root, faults=[SignalAt(where, call, kind)])
+    assert outcome.code == (130 if kind == signal.SIGTERM else -signal.SIGKILL), outcome.err
+    left = [path for path in reports.iterdir() if ".new-" in path.name or ".old-" in path.name]
+    assert bool(left) == (kind == signal.SIGKILL)
+    aside = [path for path in left if ".old-" in path.name]
+    assert bool(aside) == (kind == signal.SIGKILL and moment == "exchanging")
+    assert files(aside[0] if aside else reports / name) == old
+
+    assert nsf("report", chain.root).code == 0
+    assert files(reports / name) == expected
+    assert {path.name for path in reports.iterdir()} == {name, f".{name}.lock"}
+
+
+def test_a_report_that_a_killed_process_had_put_aside_comes_back(chain, nsf, tmp_path, undisturbed):
+    """Even where the next report is of something else."""
+    name, _ = undisturbed
+    reports = tmp_path / "work/reports"
+    assert nsf("report", chain.root, faults=[PlainReport()]).code == 0
+    old = files(reports / name)
+    assert nsf("report", chain.root, faults=[SignalAt(*MOMENTS["exchanging"], signal.SIGKILL)]).code < 0
+    assert not (reports / name).exists()
+    assert nsf("report", chain.root, "report.name=other", faults=[PlainReport()]).code == 0
+    assert files(reports / name) == old
+    assert {path.name for path in reports.iterdir()} == {name, f".{name}.lock", "other", ".other.lock"}
+
+
+def test_what_a_living_process_writes_is_left_alone(chain, nsf, tmp_path):
+    reports = tmp_path / "work/reports"
+    for name in (".mine.new-abc", ".dead.new-abc", ".dead.old-abc"):
+        (reports / name).mkdir(parents=True)
+        (reports / name / "page").touch()
+    with locked(reports / ".mine.lock"):
+        assert nsf("report", chain.root, faults=[PlainReport()]).code == 0
+        assert (reports / ".mine.new-abc/page").exists()
+    assert not (reports / ".dead.new-abc").exists()
+    assert (reports / "dead/page").exists()
+    assert nsf("report", chain.root, faults=[PlainReport()]).code == 0
+    assert not (reports / ".mine.new-abc").exists()
