@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 from nsf.errors import ConfigError, SchemaError
 from nsf.provenance import not_ignored
 from nsf.reporting.build import commit_text
-from nsf.reporting.formats import HTML, file_name, markdown, markdown_document, markdown_table, unescaped
+from nsf.reporting.formats import markdown, markdown_document, markdown_table, unescaped
 from nsf.reporting.headline import Report, headline
 from nsf.reporting.page import DEFINITIONS
 from nsf.reporting.sources import file_hash
@@ -41,8 +41,7 @@ _REBUILD = "build it again with `nsf report`"
 
 BEGIN, END = "<!-- figures:begin -->", "<!-- figures:end -->"
 REPORT, EXPERIMENT = Path("reports/table1"), "table1"
-_PICTURE = "{}-nsf-strip.png"  # of a scene
-_ACROSS = 2  # pictures in a row
+_SHOWN = {"method": "nsf", "field": "basis"}  # one row a scene
 _ERRORS = ("delta", "displacement_error", "stress_error")
 _COSTS = ("speedup_step", "memory_full_mib", "memory_reduced_mib")
 _PAPER = "paper_delta"
@@ -182,7 +181,7 @@ def _sources(report: Path) -> dict:
 
 
 def figures(report: Path) -> str:
-    """Pictures and the mean held-out results of a report beside the paper's δ, as markdown.
+    """The mean held-out results of this project's method beside the paper's δ, as markdown.
 
     Args:
         report: folder of the report, relative to README.md.
@@ -191,33 +190,20 @@ def figures(report: Path) -> str:
         return _PENDING
     folder = report.as_posix()
     frame = pd.read_csv(report / "results.csv")
-    frame = frame[frame["split"] == "test"]
+    for column, value in {"split": "test", **_SHOWN}.items():
+        frame = frame[frame[column] == value]
     variants = frame.groupby([name for name in VARIANT if name in frame], sort=False, as_index=False)
     # A value that diverged leaves the mean infinite, one that was not measured leaves it empty.
     means = variants[[*_ERRORS, *_COSTS]].agg(lambda values: values.mean(skipna=False))
     means[_PAPER] = [_printed(row["scene"], row["method"]) for row in means.to_dict("records")]
     described = [name for name in means if name not in (*_ERRORS, *_COSTS, _PAPER)]
-    table, same = without_constants(means[[*described, _PAPER, *_ERRORS, *_COSTS]], keep=("scene", "method"))
-    gallery = _gallery(report, list(dict.fromkeys(frame["scene"])))
+    table, same = without_constants(means[[*described, _PAPER, *_ERRORS, *_COSTS]], keep=("scene",))
     return (
-        f"{gallery}Means over held-out parameter values at the paper's size ({markdown(same)}).\n\n"
+        f"Means over held-out parameter values ({markdown(same)}).\n\n"
         + markdown_table(rows_of(table, {_PAPER: "paper's δ [%]"}))
         + f"\n\nFrom [`{folder}/results.csv`]({folder}/results.csv); the whole report is "
         f"[`index.md`]({folder}/index.md)."
     )
-
-
-def _gallery(report: Path, scenes: list[str]) -> str:
-    """The strips of the scenes that have one, in a table; each leads to its full size."""
-    paths = {scene: report / _PICTURE.format(file_name(scene)) for scene in scenes}
-    shown = [
-        {"title": _title(scene), "path": path.as_posix()} for scene, path in paths.items() if path.is_file()
-    ]
-    return HTML.get_template("gallery.html").render(pictures=shown, across=_ACROSS) if shown else ""
-
-
-def _title(scene: str) -> str:
-    return _described(scene).title
 
 
 def _printed(scene: str, method: str) -> float:
