@@ -1,12 +1,44 @@
-"""Vectors of a configuration: checked, and turned about an axis."""
+"""Numbers and vectors of a configuration: checked, and turned about an axis."""
 
 import math
+import sys
 from collections.abc import Sequence
 from numbers import Real
 
 import numpy as np
 
 from nsf.errors import ConfigError
+
+
+def is_finite(value: Real) -> bool:
+    """Whether floating point can hold a number: not NaN, not infinite, no larger integer."""
+    return abs(value) <= sys.float_info.max
+
+
+def number(key: str, value, least: float = -math.inf, whole: bool = False) -> float | int:
+    """A finite number of at least `least`.
+
+    Raises:
+        ConfigError: quotes the key and the value.
+    """
+    fits = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
+    if not (fits and is_finite(value) and value >= least):
+        wanted = "a whole number" if whole else "a finite number"
+        raise ConfigError(
+            f"{key}={value} must be {wanted}" + (f" of at least {least:g}" if least > -math.inf else "")
+        )
+    return value
+
+
+def length(key: str, value) -> float:
+    """A positive length [m].
+
+    Raises:
+        ConfigError: quotes the key and the value.
+    """
+    if not number(key, value) > 0:
+        raise ConfigError(f"{key}={value} m must be positive")
+    return float(value)
 
 
 def is_list(values) -> bool:
@@ -21,7 +53,7 @@ def numbers(key: str, values, unit: str = "", count: int | None = None) -> np.nd
         ConfigError: quotes the key and the values.
     """
     finite = is_list(values) and all(
-        isinstance(x, Real) and not isinstance(x, bool) and math.isfinite(x) for x in values
+        isinstance(x, Real) and not isinstance(x, bool) and is_finite(x) for x in values
     )
     if not finite or count not in (None, len(values)):
         wanted = "a list of finite numbers" if count is None else f"{count} finite numbers"

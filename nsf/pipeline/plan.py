@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import ConfigKeyError
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError
 
 from nsf import config as configuration
 from nsf.data import Split
@@ -58,7 +58,7 @@ class Plan:
     def __post_init__(self):
         try:
             self._build()
-        except ConfigKeyError as error:
+        except (ConfigAttributeError, ConfigKeyError) as error:
             raise ConfigError(
                 f"{error.full_key} is missing from the configuration; give it a value"
             ) from error
