@@ -6,6 +6,7 @@ simulation at a parameter value is the same configuration with that key replaced
 
 import difflib
 import itertools
+import math
 import re
 import typing
 import warnings
@@ -17,6 +18,7 @@ from hydra import compose, initialize_config_dir
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override, RangeSweep
 from hydra.errors import HydraException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
@@ -32,6 +34,7 @@ from nsf.targets import build as build
 from nsf.targets import build_all as build_all
 from nsf.vectors import length as length
 from nsf.vectors import number as number
+from nsf.vectors import text as text
 
 # conf/hydra/launcher/joblib.yaml takes the place of the launcher's own configuration on purpose.
 warnings.filterwarnings(
@@ -48,6 +51,8 @@ _SWEEP = (
     "hydra.sweep.subdir=.",
 )
 
+#: Of a sweep; the largest experiment has some hundred.
+_MOST_JOBS = 10_000
 #: Raised by Hydra and the yaml parser on files that are no configuration, beside their own errors.
 _OF_BROKEN_FILES = (
     YAMLError,
@@ -210,9 +215,11 @@ def jobs(sweeps: Sequence[Sequence[str]], config_name: str = "config") -> list[t
     Jobs of one scene follow each other, so that its trajectories can go when the next one's come.
 
     Raises:
-        ConfigError: a syntax error, or an interval of values.
+        ConfigError: a syntax error, an interval of values, or more jobs than anyone can mean.
     """
     options = [_options(overrides, config_name) for overrides in sweeps]
+    if (count := sum(math.prod(map(len, values)) for values in options)) > _MOST_JOBS:
+        raise ConfigError(f"{count} jobs are more than the {_MOST_JOBS} of a sweep; give fewer values")
     found = list(dict.fromkeys(job for values in options for job in itertools.product(*values)))
     scenes = [scene_of(job) for job in found]
     return [job for _, job in sorted(zip(scenes, found, strict=True), key=lambda one: scenes.index(one[0]))]
@@ -230,7 +237,7 @@ def _options(overrides: Sequence[str], config_name: str) -> list[list[str]]:
         parser = OverridesParser.create(GlobalHydra.instance().config_loader())  # which glob(*) looks through
     try:
         parsed = parser.parse_overrides(list(overrides))
-    except HydraException as error:
+    except (HydraException, RecursionError) as error:
         raise ConfigError(_explain(error, config_name, overrides)) from error
     options: dict[str, list[str]] = {}
     for override in parsed:
@@ -239,8 +246,22 @@ def _options(overrides: Sequence[str], config_name: str) -> list[list[str]]:
         if override.is_sweep_override():
             if not override.is_discrete_sweep():
                 raise ConfigError(f"{override.input_line} has no end of values; list them, or use nsf search")
-            options[key] = [f"{key}={value}" for value in override.sweep_string_iterator()]
+            options[key] = [f"{key}={value}" for value in _values(override)]
     return list(options.values())
+
+
+def _values(override: Override) -> list[str]:
+    """The values of an override that has several."""
+    try:
+        if isinstance(several := override.value(), RangeSweep):
+            found = list(itertools.islice(several.range(), _MOST_JOBS + 1))  # a shuffled one would be listed
+        if not isinstance(several, RangeSweep) or len(found) <= _MOST_JOBS:
+            found = list(override.sweep_string_iterator())
+    except (HydraException, ValueError, ArithmeticError) as error:
+        raise ConfigError(f"{override.input_line}: {error}; give start, stop and step") from error
+    if len(found) > _MOST_JOBS:
+        raise ConfigError(f"{override.input_line} has more than {_MOST_JOBS} values; give fewer")
+    return found
 
 
 def check_sweep(

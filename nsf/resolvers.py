@@ -84,7 +84,7 @@ def resolved(config: DictConfig) -> Any:
     except OmegaConfBaseException as error:
         # OmegaConf wraps what a resolver raises; its own words come first in the text.
         detail = re.sub(r"^\w*Error raised while resolving interpolation: ", "", str(error).splitlines()[0])
-        raise ConfigError(detail) from error
+        raise ConfigError(f"{error.full_key}: {detail}" if error.full_key else detail) from error
     for path, value in leaves(plain):
         if (
             isinstance(value, str) and "${" in value

@@ -41,6 +41,17 @@ def length(key: str, value) -> float:
     return float(value)
 
 
+def text(key: str, value) -> str:
+    """A text that is not empty.
+
+    Raises:
+        ConfigError: quotes the key and the value.
+    """
+    if not isinstance(value, str) or not value.strip():
+        raise ConfigError(f"{key}={value!r} must be text, and not empty")
+    return value
+
+
 def is_list(values) -> bool:
     """Whether values are several, of a yaml or of Python."""
     return isinstance(values, Sequence | np.ndarray) and not isinstance(values, str)

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from nsf import config as configuration
 from nsf.errors import ConfigError
@@ -76,7 +77,10 @@ def check_key(key: str, values: Sequence[float], template: DictConfig) -> None:
     """
     remedy = "name a key of the material, the motion or the boundaries"
     config = configuration.resolve(template)
-    own = OmegaConf.select(config, key) if key else None
+    try:
+        own = OmegaConf.select(config, key) if key else None
+    except OmegaConfBaseException:  # it is no key, as ../name
+        own = None
     if not isinstance(own, int | float) or isinstance(own, bool):
         raise ConfigError(f"scene.parameters.key={key!r} names no key that holds a number; {remedy}")
     other = template.copy()

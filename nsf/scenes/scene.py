@@ -161,16 +161,14 @@ class Scene:
     @classmethod
     def _build(cls, config: DictConfig, template: DictConfig) -> "Scene":
         s = configuration.section(config, "scene")
-        for key in ("name", "title"):
-            if not isinstance(s[key], str):
-                raise ConfigError(f"scene.{key}={s[key]} must be text")
+        configuration.text("scene.title", s.title)
         colliders = tuple(configuration.build_all(s.colliders, "scene.colliders").values())
         bodies = configuration.build_all(s.bodies, "scene.bodies").values()
         if not bodies:
             raise ConfigError("scene.bodies={} leaves nothing to simulate; give a body")
         dx = float(configuration.length("scene.dx", s.dx))
         return cls(
-            name=s.name,
+            name=configuration.text("scene.name", s.name),
             scale=config.scale,
             dx=dx,
             dt=float(configuration.number("scene.dt", s.dt)),
