@@ -4,52 +4,37 @@ A problem parameter is the value of one configuration key (`scene.parameters.key
 simulation at a parameter value is the same configuration with that key replaced.
 """
 
-import dataclasses
 import difflib
-import inspect
 import itertools
 import math
-import pkgutil
 import re
-import types
 import typing
 import warnings
 from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from pathlib import Path
 
 from hydra import compose, initialize_config_dir
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override, RangeSweep
 from hydra.errors import HydraException, OverrideParseException
 from hydra.types import RunMode
-from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from yaml import MarkedYAMLError
+from yaml import MarkedYAMLError, YAMLError
 
-from nsf.errors import ConfigError, NSFError
+from nsf import targets
+from nsf.documents import check_sizes, text_of
+from nsf.errors import ConfigError
 from nsf.paths import CONF, groups
-from nsf.vectors import direction, rotation, vector
-
-
-def _scaled(table: DictConfig, *, _root_: DictConfig):
-    """`${scaled:{small: a, paper: b}}`: the entry of the scale in force."""
-    scale = _root_.scale
-    if scale not in table:
-        raise ConfigError(f"scale={scale} is unknown here; choose one of {', '.join(map(str, table))}")
-    return table[scale]
-
-
-def _per(count) -> float:
-    """`${per:150}` = 1/150."""
-    return 1.0 / float(count)
-
-
-def _turned(values, axis, angle) -> list[float]:
-    """`${turned:[1,0,0],[0,1,0],30}`: the vector turned by 30° about the axis, right-handed."""
-    matrix = rotation(direction("axis of ${turned:…}", axis), number("angle of ${turned:…}", angle))
-    return (matrix @ vector("vector of ${turned:…}", values)).tolist()
-
+from nsf.resolvers import resolved
+from nsf.targets import build as build
+from nsf.targets import build_all as build_all
+from nsf.vectors import length as length
+from nsf.vectors import number as number
+from nsf.vectors import text as text
 
 # conf/hydra/launcher/joblib.yaml takes the place of the launcher's own configuration on purpose.
 warnings.filterwarnings(
@@ -66,9 +51,18 @@ _SWEEP = (
     "hydra.sweep.subdir=.",
 )
 
-OmegaConf.register_new_resolver("scaled", _scaled, replace=True)
-OmegaConf.register_new_resolver("per", _per, replace=True)
-OmegaConf.register_new_resolver("turned", _turned, replace=True)
+#: Of a sweep; the largest experiment has some hundred.
+_MOST_JOBS = 10_000
+#: Raised by Hydra and the yaml parser on files that are no configuration, beside their own errors.
+_OF_BROKEN_FILES = (
+    YAMLError,
+    ValueError,
+    RecursionError,
+    AttributeError,
+    TypeError,
+    LookupError,
+    AssertionError,
+)
 
 
 def load(overrides: Sequence[str] = (), config_name: str = "config") -> DictConfig:
@@ -83,21 +77,73 @@ def load(overrides: Sequence[str] = (), config_name: str = "config") -> DictConf
 
     Raises:
         ConfigError: unknown key or option (with the nearest known one), a missing value,
-            a syntax error, or an `_target_` outside `nsf`.
+            a syntax error, a `_target_` that its key does not expect, or an interpolation that is refused.
     """
     try:
         return checked(_compose(config_name, overrides))
-    except (HydraException, OmegaConfBaseException, ValueError) as error:
+    except (HydraException, OmegaConfBaseException) as error:
         raise ConfigError(_explain(error, config_name, overrides)) from error
     except MarkedYAMLError as error:
         mark = error.problem_mark
         raise ConfigError(f"{mark.name}, line {mark.line + 1}: {error.problem}; correct the yaml") from error
+    except _OF_BROKEN_FILES as error:
+        for path in sorted(CONF.rglob("*.yaml")):
+            text_of(path)  # tells of the one that cannot be read
+        told = _explain(error, config_name, overrides)
+        raise ConfigError(f"the configuration cannot be composed: {told}") from error
+
+
+def read(path: Path) -> DictConfig:
+    """The configuration of a file that is whole by itself, as a run's; its interpolations stay.
+
+    Raises:
+        ConfigError: the file cannot be read, or holds no configuration; see also `load`.
+    """
+    try:
+        config = OmegaConf.create(text_of(path))
+    except (OmegaConfBaseException, YAMLError, ValueError) as error:
+        raise ConfigError(f"{path}: {str(error).splitlines()[0]}; correct the yaml") from error
+    if not isinstance(config, DictConfig):
+        raise ConfigError(f"{path} holds no keys with values; correct the yaml")
+    try:
+        return checked(config)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
 
 
 def _compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
+    check_sizes(CONF)
+    config = _with_hydra(config_name, overrides)
+    own = _of_hydra(config)
+    if own != _default_hydra():
+        changed = [f"hydra.{key}" for key, value in own.items() if value != _default_hydra()[key]]
+        raise ConfigError(
+            f"the configuration sets {', '.join(changed)}, by which Hydra could be made to run code; "
+            "leave it out: only the command line says how jobs are launched"
+        )
+    del config["hydra"]
+    return config
+
+
+def _with_hydra(config_name: str | None, overrides: Sequence[str]) -> DictConfig:
     GlobalHydra.instance().clear()
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        return compose(config_name, overrides=list(overrides))
+        config = compose(config_name, overrides=list(overrides), return_hydra_config=True)
+    OmegaConf.set_readonly(config, False)
+    OmegaConf.set_struct(config, False)
+    return config
+
+
+def _of_hydra(config: DictConfig) -> dict[str, typing.Any]:
+    """Hydra's own part of a configuration, without what it tells of the overrides."""
+    own = OmegaConf.to_container(config.hydra)
+    own["job"] = {k: v for k, v in own["job"].items() if k not in ("override_dirname", "config_name")}
+    return {k: v for k, v in own.items() if k not in ("overrides", "runtime")}
+
+
+@cache
+def _default_hydra() -> dict[str, typing.Any]:
+    return _of_hydra(_with_hydra(None, ()))
 
 
 def checked(config: DictConfig) -> DictConfig:
@@ -117,130 +163,23 @@ def resolve(config: DictConfig) -> DictConfig:
         ConfigError: see `load`.
     """
     try:
-        config = OmegaConf.create(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
-    except OmegaConfBaseException as error:
-        # OmegaConf wraps what a resolver raises; its own words come first in the text.
-        detail = re.sub(r"^\w*Error raised while resolving interpolation: ", "", str(error).splitlines()[0])
-        raise ConfigError(detail) from error
-    check_targets(config)
-    return config
+        plain = resolved(config)
+        targets.check(plain)
+        return OmegaConf.create(plain)
+    except RecursionError as error:
+        raise ConfigError("the configuration is nested too deeply; flatten it") from error
 
 
-_REFUSED = "_target_: {} is refused; only nsf.* classes are built from a configuration"
-
-
-def check_targets(config: DictConfig) -> list[str]:
-    """Refuse an `_target_` whose name is not of this package: configuration is not code.
-
-    Returns:
-        Every target.
+def section(config: DictConfig, key: str) -> DictConfig:
+    """The keys below a key.
 
     Raises:
-        ConfigError: names the target.
+        ConfigError: it is missing, or holds something else.
     """
-    stack, found = [OmegaConf.to_container(config, resolve=False)], []
-    while stack:
-        node = stack.pop()
-        if isinstance(node, dict):
-            if (target := node.get("_target_")) is not None:
-                if not re.fullmatch(r"nsf(\.\w+)+", str(target)):
-                    raise ConfigError(_REFUSED.format(target))
-                found.append(target)
-            stack.extend(node.values())
-        elif isinstance(node, list):
-            stack.extend(node)
+    found = OmegaConf.select(config, key)
+    if not isinstance(found, DictConfig):
+        raise ConfigError(f"{key}={'null' if found is None else found} must map keys to values")
     return found
-
-
-def _load_targets(config: DictConfig, where: str) -> None:
-    """Load every `_target_`; what a module of this package only imports is not part of it.
-
-    Raises:
-        ConfigError: one does not exist, or is refused.
-    """
-    for target in check_targets(config):
-        try:
-            found = pkgutil.resolve_name(target)
-        except (ImportError, AttributeError, ValueError) as error:
-            raise ConfigError(f"{where}: _target_: {target} does not exist ({error})") from error
-        if not str(getattr(found, "__module__", "")).startswith("nsf."):
-            raise ConfigError(_REFUSED.format(target))
-
-
-def build(config: DictConfig, where: str):
-    """Instantiate the `_target_` of a configuration node.
-
-    Raises:
-        ConfigError: no `_target_`, a misspelt key, or a value that the class refuses; names the node.
-    """
-    _load_targets(config, where)
-    if "_target_" not in config:
-        raise ConfigError(f"{where} names no class; give it a _target_: nsf.…")
-    _check_types(config, where)
-    try:
-        return instantiate(config, _convert_="all")
-    except HydraException as error:
-        cause = error.__cause__
-        if isinstance(cause, NSFError):
-            raise type(cause)(f"{where}: {cause}") from error
-        detail = str(cause or error).splitlines()[0]
-        if isinstance(cause, TypeError) and "unexpected keyword" in detail:
-            raise ConfigError(
-                f"{where}: {detail.split('got an ')[-1]}; known keys: {', '.join(_known(config))}"
-            ) from error
-        raise ConfigError(f"{where}: {detail}") from error
-
-
-def _known(config: DictConfig) -> list[str]:
-    """Keys that the target of a configuration node takes."""
-    return list(inspect.signature(pkgutil.resolve_name(config._target_)).parameters)
-
-
-_KINDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
-
-
-def _check_types(config: DictConfig, where: str) -> None:
-    """Refuse a value that is not of the type its class declares, as `material.E=soft`.
-
-    Raises:
-        ConfigError: names the key and the value.
-    """
-    target = pkgutil.resolve_name(config._target_)
-    hints = typing.get_type_hints(target) if dataclasses.is_dataclass(target) else {}
-    for name, hint in hints.items():
-        kinds = typing.get_args(hint) if isinstance(hint, types.UnionType) else (hint,)
-        if name not in config or not set(kinds) <= {*_KINDS, types.NoneType}:
-            continue
-        kind, given = type(config[name]), set(kinds)
-        if kind not in given and not (kind is int and float in given):
-            wanted = " or ".join(_KINDS[k] for k in kinds if k in _KINDS)
-            raise ConfigError(f"{where}.{name}={config[name]} must be {wanted}")
-
-
-def number(key: str, value, least: float = -math.inf, whole: bool = False) -> float | int:
-    """A finite number of at least `least`.
-
-    Raises:
-        ConfigError: quotes the key and the value.
-    """
-    fits = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
-    if not (fits and math.isfinite(value) and value >= least):
-        wanted = "a whole number" if whole else "a finite number"
-        raise ConfigError(
-            f"{key}={value} must be {wanted}" + (f" of at least {least:g}" if least > -math.inf else "")
-        )
-    return value
-
-
-def length(key: str, value) -> float:
-    """A positive length [m].
-
-    Raises:
-        ConfigError: quotes the key and the value.
-    """
-    if not number(key, value) > 0:
-        raise ConfigError(f"{key}={value} m must be positive")
-    return float(value)
 
 
 def of_launcher(override: str) -> bool:
@@ -276,9 +215,11 @@ def jobs(sweeps: Sequence[Sequence[str]], config_name: str = "config") -> list[t
     Jobs of one scene follow each other, so that its trajectories can go when the next one's come.
 
     Raises:
-        ConfigError: a syntax error, or an interval of values.
+        ConfigError: a syntax error, an interval of values, or more jobs than anyone can mean.
     """
     options = [_options(overrides, config_name) for overrides in sweeps]
+    if (count := sum(math.prod(map(len, values)) for values in options)) > _MOST_JOBS:
+        raise ConfigError(f"{count} jobs are more than the {_MOST_JOBS} of a sweep; give fewer values")
     found = list(dict.fromkeys(job for values in options for job in itertools.product(*values)))
     scenes = [scene_of(job) for job in found]
     return [job for _, job in sorted(zip(scenes, found, strict=True), key=lambda one: scenes.index(one[0]))]
@@ -296,7 +237,7 @@ def _options(overrides: Sequence[str], config_name: str) -> list[list[str]]:
         parser = OverridesParser.create(GlobalHydra.instance().config_loader())  # which glob(*) looks through
     try:
         parsed = parser.parse_overrides(list(overrides))
-    except HydraException as error:
+    except (HydraException, RecursionError) as error:
         raise ConfigError(_explain(error, config_name, overrides)) from error
     options: dict[str, list[str]] = {}
     for override in parsed:
@@ -305,8 +246,22 @@ def _options(overrides: Sequence[str], config_name: str) -> list[list[str]]:
         if override.is_sweep_override():
             if not override.is_discrete_sweep():
                 raise ConfigError(f"{override.input_line} has no end of values; list them, or use nsf search")
-            options[key] = [f"{key}={value}" for value in override.sweep_string_iterator()]
+            options[key] = [f"{key}={value}" for value in _values(override)]
     return list(options.values())
+
+
+def _values(override: Override) -> list[str]:
+    """The values of an override that has several."""
+    try:
+        if isinstance(several := override.value(), RangeSweep):
+            found = list(itertools.islice(several.range(), _MOST_JOBS + 1))  # a shuffled one would be listed
+        if not isinstance(several, RangeSweep) or len(found) <= _MOST_JOBS:
+            found = list(override.sweep_string_iterator())
+    except (HydraException, ValueError, ArithmeticError) as error:
+        raise ConfigError(f"{override.input_line}: {error}; give start, stop and step") from error
+    if len(found) > _MOST_JOBS:
+        raise ConfigError(f"{override.input_line} has more than {_MOST_JOBS} values; give fewer")
+    return found
 
 
 def check_sweep(
@@ -356,7 +311,8 @@ def leaves(node, prefix: str = "") -> list[str]:
     """Dotted keys of a plain tree that hold values, and those that a `_target_` has a default for."""
     if not isinstance(node, dict):
         return [prefix]
-    unset = _known(OmegaConf.create(node)) if "_target_" in node else []
+    path = tuple(prefix.split("."))
+    unset = targets.keys_of(node["_target_"], path) if "_target_" in node else []
     return [
         key
         for name, child in (dict.fromkeys(unset) | node).items()

@@ -10,7 +10,13 @@ class NSFError(Exception):
 
 
 class ConfigError(NSFError):
-    """A key is unknown, missing, or has a value outside its valid range."""
+    """A key is unknown, missing, or has a value outside its valid range.
+
+    Its text is one line, also where it quotes a value that has several, or that would steer a terminal.
+    """
+
+    def __init__(self, text: str = ""):
+        super().__init__("".join(c if c.isprintable() else repr(c)[1:-1] for c in str(text)))
 
 
 class ShapeError(NSFError):

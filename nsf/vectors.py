@@ -1,4 +1,4 @@
-"""Vectors of a configuration: checked, and turned about an axis."""
+"""Numbers and vectors of a configuration: checked, and turned about an axis."""
 
 import math
 from collections.abc import Sequence
@@ -9,17 +9,54 @@ import numpy as np
 from nsf.errors import ConfigError
 
 
-def is_list(values) -> bool:
-    """Whether values are several, of a yaml or of Python."""
-    return isinstance(values, Sequence | np.ndarray) and not isinstance(values, str)
-
-
 def is_finite(value) -> bool:
     """Whether a value is a number that a float can hold."""
     try:
         return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
     except OverflowError:  # a whole number of more than 308 digits
         return False
+
+
+def number(key: str, value, least: float = -math.inf, whole: bool = False) -> float | int:
+    """A finite number of at least `least`.
+
+    Raises:
+        ConfigError: quotes the key and the value.
+    """
+    fits = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
+    if not (fits and is_finite(value) and value >= least):
+        wanted = "a whole number" if whole else "a finite number"
+        raise ConfigError(
+            f"{key}={value} must be {wanted}" + (f" of at least {least:g}" if least > -math.inf else "")
+        )
+    return value
+
+
+def length(key: str, value) -> float:
+    """A positive length [m].
+
+    Raises:
+        ConfigError: quotes the key and the value.
+    """
+    if not number(key, value) > 0:
+        raise ConfigError(f"{key}={value} m must be positive")
+    return float(value)
+
+
+def text(key: str, value) -> str:
+    """A text that is not empty.
+
+    Raises:
+        ConfigError: quotes the key and the value.
+    """
+    if not isinstance(value, str) or not value.strip():
+        raise ConfigError(f"{key}={value!r} must be text, and not empty")
+    return value
+
+
+def is_list(values) -> bool:
+    """Whether values are several, of a yaml or of Python."""
+    return isinstance(values, Sequence | np.ndarray) and not isinstance(values, str)
 
 
 def numbers(key: str, values, unit: str = "", count: int | None = None) -> np.ndarray:

@@ -1,5 +1,6 @@
 """Network inversion: the latent vector of given sample positions (paper section 5.3)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
@@ -42,13 +43,26 @@ class Latents(Protocol):
         """[r] x̂_{n+1} on the parabola through the last three."""
 
 
+class Projector(Protocol):
+    """What a reduced run asks of a projector, which may be one's own.
+
+    Attributes:
+        start, solve, iterations, tolerance: as of `GaussNewton`.
+    """
+
+    start: Callable[[Latents], torch.Tensor]
+    solve: Callable[..., ProjectionResult]
+    iterations: int
+    tolerance: float
+
+
 def check_projector(projector) -> None:
     """Whether a projector, which may be one's own, has all that a reduced run asks of it.
 
     Raises:
         ConfigError: it lacks one of `start`, `solve`, `iterations` and `tolerance` of `GaussNewton`.
     """
-    missing = [n for n in ("start", "solve", "iterations", "tolerance") if not hasattr(projector, n)]
+    missing = [n for n in Projector.__annotations__ if not hasattr(projector, n)]
     if missing:
         raise ConfigError(
             f"{type(projector).__name__} is no projector: it lacks {', '.join(missing)}; "

@@ -140,7 +140,7 @@ class Playback:
         self.device = torch_device(self._warp_device)
         self._precision = precision_of(self._settings["precision"])
         self._dtype = torch_dtype(self._precision)
-        self._method = configuration.build(OmegaConf.create(self._settings["method"]), "method")
+        self._method = configuration.build(self._settings["method"], "method")
         self.manifold = Manifold.load(self._training.path / "manifold.pt").to(self.device)
         self._rollout = Rollout.open(run.path / rollout_file(index))
         self._continuation = run.path / continuation_file(index)
@@ -212,8 +212,8 @@ class Playback:
     @property
     def floor(self) -> float | None:
         """Height of a horizontal floor at rest [m]."""
-        colliders = OmegaConf.create(self._settings["scene"]["colliders"])
-        return floor_height([configuration.build(c, f"scene.colliders.{n}") for n, c in colliders.items()])
+        colliders = configuration.build_all(self._settings["scene"]["colliders"], "scene.colliders")
+        return floor_height(list(colliders.values()))
 
     @property
     def radius(self) -> float:

@@ -82,11 +82,13 @@ def _serve(run: Run, options: argparse.Namespace) -> None:
     import asyncio
     import secrets
 
+    from nsf.live.guard import check_token
     from nsf.live.server import Stream
 
     token = options.token
     if token is None and options.host not in LOOPBACK:
         token = secrets.token_urlsafe(16)
+    check_token(options.host, token)  # before the model is built
     player = _player(run, options)
     if options.bench:
         _bench(player, options)
@@ -142,7 +144,10 @@ def _parser(command: str, text: str) -> argparse.ArgumentParser:
     if command == "view":
         add("--bench", action="store_true", help="measure how fast the slider is followed, and end")
     else:
-        add("--token", help="that whoever joins must give; drawn at random unless only this machine can")
+        add(
+            "--token",
+            help="that whoever joins must give, 16 letters at least; drawn unless only this machine can join",
+        )
         add("--rate", type=_positive, default=30.0, help="frames a second")
         add(
             "--patience",

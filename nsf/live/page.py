@@ -3,15 +3,18 @@
 import logging
 import math
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 
 import matplotlib
 import numpy as np
 import viser
+import websockets.asyncio.server as websockets
 from matplotlib.colors import to_hex
 
 from nsf.live.coloring import ROLES, SAMPLE, Coloring, Picture
+from nsf.live.guard import Connection, refused
 from nsf.live.model import Parameter
 from nsf.live.player import Moment, Player, every
 from nsf.reporting.drawing.style import ColorScale
@@ -23,6 +26,31 @@ FRAMES_PER_SECOND = 30
 _GAP = 0.25
 _GREY = (187, 187, 187)
 _GREEN, _AMBER, _RED = "#2B8A3E", "#E69F00", "#C92A2A"
+
+
+class _Server(viser.ViserServer):
+    """viser's server, without the tunnel to the internet that any of its clients could ask for."""
+
+    def request_share_url(self, verbose: bool = True) -> None:
+        """No address."""
+
+
+@contextmanager
+def _own_pages_only(host: str) -> Iterator[None]:
+    """A server that viser starts in the block refuses pages of other sites, which viser itself lets in."""
+    serve = websockets.serve
+
+    def guarded(handler, at, port, *, process_request, **options):
+        def answer(connection, request):
+            return refused(connection, request, host, None) or process_request(connection, request)
+
+        return serve(handler, at, port, process_request=answer, create_connection=Connection, **options)
+
+    websockets.serve = guarded
+    try:
+        yield
+    finally:
+        websockets.serve = serve
 
 
 class Page:
@@ -44,8 +72,10 @@ class Page:
         self._truth_value, self._truth = math.nan, None
         self._last: tuple | None = None
         self.drawn = 0
-        # viser's own banner would name viser's address only.
-        self._server = viser.ViserServer(host=host, port=port, verbose=False, label="nsf view")
+        with _own_pages_only(host):
+            # viser's own banner would name viser's address only.
+            self._server = _Server(host=host, port=port, verbose=False, label="nsf view")
+        self._server.gui.configure_theme(show_share_button=False)
         self._place()
         self._build_controls()
 

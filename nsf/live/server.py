@@ -1,11 +1,9 @@
 """The server of `nsf serve`: one reduced run, whose latent vectors many browsers decode."""
 
 import asyncio
-import hmac
 import http
 import logging
 from importlib.resources import files
-from urllib.parse import parse_qs, urlsplit
 
 from websockets.asyncio.server import Server, ServerConnection, broadcast, serve
 from websockets.datastructures import Headers
@@ -13,7 +11,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from nsf.errors import ConfigError
-from nsf.live import LOOPBACK
+from nsf.live.guard import Connection, check_token, name_of, refused
 from nsf.live.player import Moment, Player
 from nsf.live.wire import asked_value, field_message, frame_message, state_message
 
@@ -44,14 +42,18 @@ class Stream:
     Args:
         player: what is shown; all clients see the same.
         host: where it is served.
-        token: who does not give it as `?token=…` is refused; None asks for none.
+        token: who does not give it as `?token=…` is refused; None asks for none, which only loopback may.
         rate: frames a second.
         patience: seconds that a client may lag.
+
+    Raises:
+        ConfigError: the token is short or missing, or the field is none that a browser can decode.
     """
 
     def __init__(
         self, player: Player, host: str, token: str | None = None, rate: float = 30.0, patience: float = 5.0
     ):
+        check_token(host, token)
         self._player, self._host, self._token = player, host, token
         self._rate, self._patience = rate, patience
         self._field = field_message(player.model)
@@ -77,6 +79,7 @@ class Stream:
                 self._host,
                 port,
                 process_request=self._answer,
+                create_connection=Connection,
                 max_size=_LONGEST,
                 compression=None,  # 32 bytes of floating-point numbers do not get smaller
                 ping_interval=self._patience / 2,
@@ -109,36 +112,20 @@ class Stream:
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """Refuse, serve a file, or let a WebSocket be opened."""
-        asked = urlsplit(request.path)
-        why = self._refusal(request, parse_qs(asked.query).get("token", [""])[-1])
-        if why:
-            log.warning("%s refused: %s", _name(connection), why)
-            return connection.respond(http.HTTPStatus.FORBIDDEN, f"{why}\n")
-        if asked.path == "/stream":
+        if answer := refused(connection, request, self._host, self._token):
+            return answer
+        path = request.path.partition("?")[0]
+        if path == "/stream":
             return None
-        if asked.path == "/":
+        if path == "/":
             return _file(self._page, "text/html; charset=utf-8")
-        if asked.path == "/field":
+        if path == "/field":
             return _file(self._field, "application/octet-stream")
         return connection.respond(http.HTTPStatus.NOT_FOUND, "there are /, /field and /stream\n")
 
-    def _refusal(self, request: Request, token: str) -> str | None:
-        """Why a request is not answered, if it is not."""
-        named, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
-        host = named[0] if len(named) == 1 else ""
-        if self._host in LOOPBACK and urlsplit(f"//{host}").hostname not in LOOPBACK:
-            # Another name for this machine is how a foreign page would get past the check of its origin.
-            return f"host {host!r} is not this machine's own name"
-        # Only browsers send an origin, and they always do so for a WebSocket.
-        if any(origin not in (f"http://{host}", f"https://{host}") for origin in origins):
-            return f"origin {origins} is another site"
-        if self._token is not None and not hmac.compare_digest(token.encode(), self._token.encode()):
-            return "token is missing or wrong"
-        return None
-
     async def _attend(self, connection: ServerConnection) -> None:
         """Follow one client until it goes."""
-        name = _name(connection)
+        name = name_of(connection)
         broadcast([connection], self._state)
         broadcast([connection], self._frame)
         self._clients.add(connection)
@@ -161,11 +148,6 @@ class Stream:
 def _file(body: bytes, kind: str) -> Response:
     headers = Headers({"Content-Type": kind, "Content-Length": str(len(body)), **_HEADERS})
     return Response(http.HTTPStatus.OK, "OK", headers, body)
-
-
-def _name(connection: ServerConnection) -> str:
-    address = connection.remote_address
-    return f"{address[0]}:{address[1]}" if address else "a client that is gone"
 
 
 def _reason(error: ConnectionClosed) -> str:

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
+from nsf import config as configuration
 from nsf.data import Snapshots, Trajectory
 from nsf.data.schema import TRAJECTORY
 from nsf.deployment import Rollout, calibrate, continuation_file, deploy, go_on, rollout_file
@@ -68,7 +69,7 @@ class Pipeline(Plan):
                 f"{run.path} has no {CONFIGURATION}: it was made by an earlier nsf; "
                 f"delete the folder and run `nsf deploy scene={run.scene}` with the same keys"
             )
-        config = OmegaConf.load(path)
+        config = configuration.read(path)
         config.device = device
         return cls(config, say, run.root)
 

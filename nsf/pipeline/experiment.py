@@ -9,10 +9,12 @@ import yaml
 from omegaconf import DictConfig
 
 from nsf import config as configuration
+from nsf.documents import text_of
 from nsf.errors import ConfigError, MissingRunError
 from nsf.paths import EXPERIMENTS
 from nsf.pipeline.plan import Plan
 from nsf.runs import Run
+from nsf.vectors import is_finite
 
 _KEYS = {"title", "question", "paper", "jobs"}
 _OPTIONAL = {"stages", "each", "printed"}
@@ -74,30 +76,24 @@ class Experiment:
         Raises:
             ConfigError: there is no such file (the nearest is named), or a key of it is missing or unknown.
         """
-        path = folder / f"{name}.yaml"
-        if not path.is_file():
-            known = sorted(p.stem for p in folder.glob("*.yaml"))
+        path, known = folder / f"{name}.yaml", sorted(p.stem for p in folder.glob("*.yaml"))
+        if name not in known:
             near = difflib.get_close_matches(name, known, n=1)
             hint = f" (did you mean {near[0]}?)" if near else ""
             raise ConfigError(f"unknown experiment={name}; choose one of {', '.join(known)}{hint}")
-        try:
-            content = yaml.safe_load(path.read_text(encoding="utf-8"))
-        except yaml.YAMLError as error:
-            raise ConfigError(f"{path}: {error}; correct the yaml") from error
-        found = set(content) if isinstance(content, dict) else set()
-        if found - _OPTIONAL != _KEYS or not isinstance(content["jobs"], list):
-            raise ConfigError(f"{path} must have the keys {', '.join(sorted(_KEYS))}; jobs is a list")
+        content = _read(path)
         stages = content.get("stages", [])
-        if not isinstance(stages, list) or not set(stages) <= set(_MORE_STAGES):
+        if not isinstance(stages, list) or any(stage not in _MORE_STAGES for stage in stages):
             raise ConfigError(f"{path}: stages={stages} must be a list of {', '.join(_MORE_STAGES)}")
-        if not isinstance(content.get("each", {}), dict):
-            raise ConfigError(f"{path}: each={content['each']} must be keys with their values")
+        each = _grid(content.get("each", {}), f"{path}: each")
         own = {override.split("=", 1)[0]: override for override in overrides}
         grids = tuple(
-            {str(key): f"{key}={_values(value)}" for key, value in grid.items()} | own
-            for grid in (content.get("each", {}) | grid for grid in content["jobs"])
+            each | _grid(grid, f"{path}: jobs[{at}]") | own for at, grid in enumerate(content["jobs"])
         )
-        texts = {key: " ".join(str(content[key]).split()) for key in ("title", "question", "paper")}
+        texts = {
+            key: " ".join(configuration.text(f"{path}: {key}", content[key]).split())
+            for key in ("title", "question", "paper")
+        }
         printed = _printed(content.get("printed"), path)
         return cls(name=name, grids=grids, stages=tuple(stages), printed=printed, **texts)
 
@@ -178,6 +174,28 @@ class Experiment:
         return Path(config.report.folder) / (f"{self.name}_small" if scales == {"small"} else self.name)
 
 
+def _read(path: Path) -> dict:
+    """The content of an experiment's file, with the keys that it needs."""
+    try:
+        content = yaml.safe_load(text_of(path))
+    except (yaml.YAMLError, ValueError) as error:
+        raise ConfigError(f"{path}: {str(error).splitlines()[0]}; correct the yaml") from error
+    found = set(content) if isinstance(content, dict) else set()
+    jobs = content["jobs"] if "jobs" in found else None
+    if found - _OPTIONAL != _KEYS or not isinstance(jobs, list) or not jobs:
+        raise ConfigError(f"{path} must have the keys {', '.join(sorted(_KEYS))}; jobs is a list")
+    return content
+
+
+def _grid(values, where: str) -> dict[str, str]:
+    """The override with all its values, by key."""
+    if not isinstance(values, dict) or not all(isinstance(key, str) for key in values):
+        raise ConfigError(f"{where}={values} must be keys with their values, as {{scene: sand}}")
+    if empty := [key for key, value in values.items() if value == []]:
+        raise ConfigError(f"{where}: {empty[0]}=[] has no value; give one, or [[]] for an empty list")
+    return {key: f"{key}={_values(value)}" for key, value in values.items()}
+
+
 def _why(plan: Plan) -> str:
     """What became of a job that has no result: the first stage that did not end well."""
     needed = (
@@ -204,7 +222,8 @@ def _printed(entries, path: Path) -> tuple[dict, ...] | None:
     if entries is None:
         return None
     if not isinstance(entries, list) or not all(
-        isinstance(entry, dict) and isinstance(entry.get("delta"), float) for entry in entries
+        isinstance(entry, dict) and isinstance(entry.get("delta"), float) and is_finite(entry["delta"])
+        for entry in entries
     ):
         raise ConfigError(f"{path}: printed must be a list of mappings, each with a number delta")
     return tuple(

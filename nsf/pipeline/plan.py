@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import ConfigKeyError
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError
 
 from nsf import config as configuration
 from nsf.data import Split
@@ -31,6 +31,10 @@ from nsf.storage import require_folder, require_space
 
 #: Keys of the configuration that a simulation's content depends on.
 _SCENE_KEYS = ("scale", "material", "transfer")
+#: Keys that hold others, none of which is left out.
+_SECTIONS = ("data", "deploy", "evaluation", "super_resolution", "report")
+#: Least deployment step in units of the scene's: a thousand reduced steps for one are no reduction.
+_LEAST_STEP = 1e-3
 #: Precision of stored frames by the name of their type.
 _STORED = {"float32": FP32, "float64": FP64}
 #: Keys that no scene is built from, without their values.
@@ -64,7 +68,7 @@ class Plan:
     def __post_init__(self):
         try:
             self._build()
-        except ConfigKeyError as error:
+        except (ConfigAttributeError, ConfigKeyError) as error:
             raise ConfigError(
                 f"{error.full_key} is missing from the configuration; give it a value"
             ) from error
@@ -73,6 +77,8 @@ class Plan:
         """Build and check everything, so that a bad value is refused before any work."""
         self.scene = Scene.from_config(self.config)
         c = self.config = self.scene.config
+        for key in _SECTIONS:
+            configuration.section(c, key)
         p = self.scene.parameters
         self.split = Split(train=tuple(p.train), validation=tuple(p.validation), test=tuple(p.test))
         for name in ("field", "trainer", "method", "sampler", "projector", "integration"):
@@ -99,9 +105,7 @@ class Plan:
             configuration.number(f"evaluation.{key}", c.evaluation[key], least=least, whole=True)
         for key, least in (("factor", 2), ("substeps", 1), ("frames", 1)):
             configuration.number(f"super_resolution.{key}", c.super_resolution[key], least=least, whole=True)
-        multiplier = c.deploy.dt_multiplier
-        if not configuration.number("deploy.dt_multiplier", multiplier) > 0:
-            raise ConfigError(f"deploy.dt_multiplier={multiplier} must be positive")
+        configuration.number("deploy.dt_multiplier", c.deploy.dt_multiplier, least=_LEAST_STEP)
 
     def _check_batch(self) -> None:
         """What cannot be deployed at several values together, as far as it shows before any work."""
@@ -128,9 +132,11 @@ class Plan:
         _one_of("data.resident", c.data.resident, (True, False, "auto"))
         _one_of("data.keep", c.data.keep, ("all", "held_out"))
         _one_of("data.dtype", c.data.dtype, tuple(_STORED))
+        configuration.text("report.folder", c.report.folder)
         if str(c.report.name) in ("", "..") or Path(str(c.report.name)).name != str(c.report.name):
             raise ConfigError(f"report.name={c.report.name} must be one folder's name; set report.folder")
         precision_of(c.precision)
+        _check_paper(c.scene.get("paper"))
         if self.trainer.devices > 1 and not self.field.shardable:
             raise ConfigError(
                 f"trainer.devices={self.trainer.devices} is for field=mlp; this field takes all snapshots in "
@@ -337,6 +343,22 @@ class Plan:
     def _content(self, keys: Sequence[str]) -> dict:
         plain = OmegaConf.to_container(self.config)
         return {key: plain[key] for key in keys}
+
+
+def _check_paper(stated) -> None:
+    """What a scene's paper reports: its place, and figures by method."""
+    if stated is None:
+        return
+    stated = OmegaConf.to_container(stated) if isinstance(stated, DictConfig) else {"": stated}
+    place = stated.pop("place", "")
+    figures = all(isinstance(of, dict) for of in stated.values())
+    if not figures or not isinstance(place, str):
+        raise ConfigError(
+            "scene.paper must have place, a text, and figures by method, as {nsf: {delta: 0.01}}"
+        )
+    for method, of in stated.items():
+        for name, value in of.items():
+            configuration.number(f"scene.paper.{method}.{name}", value)
 
 
 def _one_of(key: str, value, options: Sequence) -> None:

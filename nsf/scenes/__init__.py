@@ -6,8 +6,9 @@ from nsf import config as _config
 from nsf.scenes.body import Body
 from nsf.scenes.geometry import Ball, Box, Cylinder, Frame, Shape
 from nsf.scenes.mesh import Mesh, mesh_or_ball
+from nsf.scenes.parameters import ParameterRange
 from nsf.scenes.ribbon import Ribbon
-from nsf.scenes.scene import ParameterRange, Scene
+from nsf.scenes.scene import Scene
 from nsf.scenes.tentacle_ball import TentacleBall
 from nsf.scenes.weakness import Weakness
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from nsf.config import length, vector
 from nsf.errors import ConfigError
 from nsf.scenes.geometry import AXES, Ball, Box, Shape
 from nsf.scenes.winding import WindingNumber
+from nsf.vectors import length, vector
 
 EXTENSIONS = (".obj", ".ply", ".stl")
 # A triangle takes some 50 bytes of a file and 500 of memory while a mesh is read.

@@ -15,51 +15,12 @@ from nsf.mpm import Collider, DomainWalls, FullOrderMPM, GridGeometry, ParticleC
 from nsf.mpm.materials import Material
 from nsf.scenes.body import Body
 from nsf.scenes.checks import check_memory, check_particles, check_physics
+from nsf.scenes.parameters import ParameterRange, check_key
+from nsf.targets import filled
 from nsf.vectors import vector
 
 #: Keys of a scene that its simulation does not depend on.
 NOT_PHYSICS = ("parameters", "reduced", "paper", "title")
-
-
-@dataclass(frozen=True)
-class ParameterRange:
-    """The problem parameter μ of a scene and the values it takes (paper section 4.1).
-
-    Attributes:
-        key: configuration key that the parameter replaces, for example `material.friction_angle`.
-        unit: unit for tables and charts.
-        train, validation, test: values; no value is in two of them.
-
-    Raises:
-        ConfigError: a list is empty where it must not be, or lists overlap.
-    """
-
-    key: str
-    unit: str
-    train: Sequence[float]
-    test: Sequence[float]
-    validation: Sequence[float] = ()
-
-    def __post_init__(self):
-        for split in ("train", "validation", "test"):
-            values = getattr(self, split)
-            if not isinstance(values, list | tuple):
-                raise ConfigError(f"scene.parameters.{split}={values} must be a list, as [{values}]")
-            for value in values:
-                configuration.number(f"scene.parameters.{split}", value)
-            if not values and split == "train":
-                raise ConfigError("scene.parameters.train=[] must name at least one value")
-        for one, other in (("train", "test"), ("train", "validation"), ("test", "validation")):
-            shared = sorted(set(getattr(self, one)) & set(getattr(self, other)))
-            if shared:
-                raise ConfigError(
-                    f"scene.parameters: {shared} is in {one} and {other}; a value belongs to one split"
-                )
-
-    @property
-    def name(self) -> str:
-        """Last part of the key."""
-        return self.key.rsplit(".", 1)[-1]
 
 
 @dataclass(frozen=True)
@@ -102,33 +63,43 @@ class Scene:
             ConfigError: a key is unknown or a value outside its range.
         """
         try:
-            return cls._build(configuration.resolve(config), config)
+            found = cls._build(configuration.resolve(config), config)
         except ConfigAttributeError as error:
             raise ConfigError(
                 f"{error.full_key} is missing from the configuration; give it a value"
             ) from error
+        check_key(found.parameters.key, found.parameters.values, config)
+        return found
 
     @classmethod
     def _build(cls, config: DictConfig, template: DictConfig) -> "Scene":
-        s = config.scene
-        colliders = tuple(configuration.build(c, f"scene.colliders.{n}") for n, c in s.colliders.items())
+        s = configuration.section(config, "scene")
+        configuration.text("scene.title", s.title)
+        colliders = tuple(configuration.build_all(s.colliders, "scene.colliders").values())
+        bodies = configuration.build_all(s.bodies, "scene.bodies")
+        if not bodies:
+            raise ConfigError("scene.bodies={} leaves nothing to simulate; give a body")
         dx = float(configuration.length("scene.dx", s.dx))
         size = tuple(configuration.length("scene.size", a) for a in vector("scene.size", s.size, "m"))
         GridGeometry.of_domain(size, dx)
         return cls(
-            name=s.name,
+            name=configuration.text("scene.name", s.name),
             scale=config.scale,
             dx=dx,
             dt=float(configuration.number("scene.dt", s.dt)),
             steps=configuration.number("scene.steps", s.steps, least=1, whole=True),
             size=size,
             gravity=vector("scene.gravity", s.gravity, "m/s²"),
-            bodies=tuple(_body(b, f"scene.bodies.{n}", size, dx) for n, b in s.bodies.items()),
+            bodies=tuple(_body(b, f"scene.bodies.{n}", size, dx) for n, b in bodies.items()),
             colliders=colliders,
             walls=configuration.build(s.walls, "scene.walls"),
             material=configuration.build(config.material, "material"),
             transfer=configuration.build(config.transfer, "transfer"),
-            parameters=ParameterRange(**OmegaConf.to_container(s.parameters)),
+            parameters=filled(
+                ParameterRange,
+                OmegaConf.to_container(configuration.section(config, "scene.parameters")),
+                "scene.parameters",
+            ),
             config=config,
             template=template,
         )
@@ -149,12 +120,8 @@ class Scene:
                 )
             if not (isinstance(value, int | float | np.number) and math.isfinite(value)):
                 raise ConfigError(f"{name}={value!r} must be a finite number")
-            if OmegaConf.select(config, self.parameters.key) is None:
-                raise ConfigError(
-                    f"scene.parameters.key={self.parameters.key} names no key of the configuration"
-                )
             OmegaConf.update(config, self.parameters.key, float(value))
-        self._at[asked] = Scene.from_config(config)
+        self._at[asked] = Scene._build(configuration.resolve(config), config)
         return self._at[asked]
 
     def with_changes(self, changes: Mapping[str, Any]) -> "Scene":
@@ -331,9 +298,8 @@ class Scene:
         return engines.reduced_batch(self, manifold, parameters, sample, **options)
 
 
-def _body(config: DictConfig, where: str, size: Sequence[float], dx: float) -> Body:
+def _body(body: Body, where: str, size: Sequence[float], dx: float) -> Body:
     """A body that the grid can hold, with its number of particles."""
-    body = configuration.build(config, where)
     try:
         body.check_extent(size, dx)
         return body.counted(dx)

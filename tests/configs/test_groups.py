@@ -10,13 +10,19 @@ from nsf.pipeline import Pipeline
 
 GROUPS = groups()
 #: A scene sets its material's constants, so a law alone is composed with the material point.
-CHAIN = [(g, option) for g in GROUPS if g not in ("scene", "material") for option in GROUPS[g]]
+APART = ("scene", "material", "hydra/launcher")
+CHAIN = [(g, option) for g in GROUPS if g not in APART for option in GROUPS[g]]
 
 
 @pytest.mark.parametrize(("group", "option"), CHAIN)
 @pytest.mark.parametrize("scale", ["small", "paper"])
 def test_option_builds(group, option, scale):
     Pipeline(config.load([f"{group}={option}", f"scale={scale}", "device=cpu"]))
+
+
+@pytest.mark.parametrize("name", GROUPS["hydra/launcher"])
+def test_launcher_composes(name):
+    assert config.launching([f"hydra/launcher={name}"])[0].hydra.launcher
 
 
 @pytest.mark.parametrize("name", GROUPS["scene"])

@@ -60,6 +60,9 @@ REFUSED = [
     (("serve", "--bench", "0"), "must be at least 1"),
     (("serve", "--bench", "1,x"), "'x' must be a whole number"),
     (("serve", "--host", "no.such.host.invalid"), "cannot serve at no.such.host.invalid:8765"),
+    (("serve", "--token", ""), "the token is empty; give at least 16 random ones"),
+    (("serve", "--host", "0.0.0.0", "--token", ""), "the token is empty; give at least 16 random ones"),
+    (("serve", "--host", "0.0.0.0", "--token", "secret"), "the token has 6 letters"),
     (("veiw",), "did you mean view?"),
 ]
 

@@ -1,7 +1,9 @@
 """`nsf view` in a real browser, without a network."""
 
 import re
+import socket
 import threading
+import urllib.request
 
 import numpy as np
 import pytest
@@ -144,3 +146,44 @@ def test_two_browsers_share_what_is_shown(browser, served):
     player.playing = True
     wait_until(lambda: page.drawn > drawn + 5)
     assert other.get_by_role("slider").count() == 2
+
+
+def test_a_page_of_another_site_neither_sees_nor_steers(player):
+    """viser lets every origin in; the server here does not, nor another name for this machine."""
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    page = Page(player, port=0)
+    try:
+        port = int(page.url.rsplit(":", 1)[1])
+
+        def status(origin=None, host=f"127.0.0.1:{port}"):
+            try:
+                with connect(
+                    f"ws://{host}", origin=origin, sock=socket.create_connection(("127.0.0.1", port))
+                ):
+                    return 101
+            except InvalidStatus as error:
+                return error.response.status_code
+
+        assert status() == status(f"http://127.0.0.1:{port}") == 101
+        assert status("http://evil.example") == status("null") == status("http://127.0.0.1:1") == 403
+        assert status(f"http://evil.example:{port}", f"evil.example:{port}") == 403
+        with urllib.request.urlopen(page.url, timeout=20) as response:
+            assert response.status == 200
+    finally:
+        page.close()
+
+
+def test_no_client_opens_a_tunnel_to_the_internet(player, monkeypatch):
+    """viser would, on a message that any client may send."""
+    import viser
+
+    asked = []
+    monkeypatch.setattr(viser._viser, "ViserTunnel", lambda *a, **k: asked.append(a))
+    page = Page(player, port=0)
+    try:
+        assert page._server.request_share_url() is None
+        assert not asked
+    finally:
+        page.close()

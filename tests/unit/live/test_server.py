@@ -248,13 +248,13 @@ def test_another_name_for_this_machine_is_refused(model, caplog):
 
 
 def test_a_token_is_asked_of_every_request(model):
-    token = {"token": "s e/c?ret"}
+    token = {"token": "s e/c?ret & more than that"}
     for path, status in (
         ("/stream", 403),
         ("/stream?token=", 403),
         ("/stream?token=s%20e", 403),
         ("/stream?token=%E2%98%83", 403),
-        ("/stream?token=s%20e%2Fc%3Fret", 101),
+        ("/stream?token=s%20e%2Fc%3Fret%20%26%20more%20than%20that", 101),
     ):
         assert refused(model, path, host="0.0.0.0", **token) == status
 
@@ -262,9 +262,115 @@ def test_a_token_is_asked_of_every_request(model):
         async with streaming(model, **token) as (_, _, port):
             for path in ("/", "/field", "/other", "/?token=wrong"):
                 assert (await asyncio.to_thread(answer, port, path))[0] == 403
-            assert (await asyncio.to_thread(answer, port, "/?token=s%20e%2Fc%3Fret"))[0] == 200
+            assert (
+                await asyncio.to_thread(answer, port, "/?token=s%20e%2Fc%3Fret%20%26%20more%20than%20that")
+            )[0] == 200
 
     asyncio.run(run())
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "127.0.0.1", "localhost", ""])
+@pytest.mark.parametrize("token", ["", " ", "secret", "15 letters long"])
+def test_a_token_that_can_be_guessed_is_refused(player, host, token):
+    with pytest.raises(ConfigError, match=r"the token (is empty|has \d+ letters); give at least 16"):
+        Stream(player, host, token)
+
+
+def test_beyond_this_machine_no_token_is_refused(player):
+    for host in ("0.0.0.0", "192.0.2.1", "", "::"):
+        with pytest.raises(ConfigError, match="the token is empty"):
+            Stream(player, host, None)
+    assert Stream(player, "::1", None)
+
+
+H = b"Host: 127.0.0.1\r\n"
+#: Requests as they come, and the status that answers them.
+MALFORMED = {
+    "nothing of HTTP": (b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\r\n\r\n", 400),
+    "one word": (b"GET\r\n\r\n", 400),
+    "no version": (b"GET /\r\n\r\n", 400),
+    "HTTP/1.0": (b"GET / HTTP/1.0\r\n" + H + b"\r\n", 400),
+    "HTTP/2": (b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n", 400),
+    "another method": (b"POST / HTTP/1.1\r\n" + H + b"\r\n", 400),
+    "connect": (b"CONNECT evil.example:443 HTTP/1.1\r\n" + H + b"\r\n", 400),
+    "a body": (b"GET / HTTP/1.1\r\n" + H + b"Content-Length: 3\r\n\r\nabc", 400),
+    "a body in pieces": (b"GET / HTTP/1.1\r\n" + H + b"Transfer-Encoding: chunked\r\n\r\n0\r\n\r\n", 400),
+    "an odd length": (b"GET / HTTP/1.1\r\n" + H + b"Content-Length: x\r\n\r\n", 400),
+    "absolute form": (b"GET http://127.0.0.1/ HTTP/1.1\r\n" + H + b"\r\n", 400),
+    "absolute form of another": (b"GET http://evil.example/stream HTTP/1.1\r\n" + H + b"\r\n", 400),
+    "authority form": (b"GET 127.0.0.1:80 HTTP/1.1\r\n" + H + b"\r\n", 400),
+    "asterisk form": (b"GET * HTTP/1.1\r\n" + H + b"\r\n", 400),
+    "two slashes": (b"GET //evil.example/ HTTP/1.1\r\n" + H + b"\r\n", 400),
+    "a path with a bracket": (b"GET //[::1 HTTP/1.1\r\n" + H + b"\r\n", 400),
+    "bad percent-encoding": (b"GET /?token=%zz HTTP/1.1\r\n" + H + b"\r\n", 400),
+    "cut percent-encoding": (b"GET /?token=%4 HTTP/1.1\r\n" + H + b"\r\n", 400),
+    "a path that is not ASCII": ("GET /ä HTTP/1.1\r\n".encode() + H + b"\r\n", 400),
+    "a token that is not ASCII": (b"GET /?token=\xff\xfe HTTP/1.1\r\n" + H + b"\r\n", 400),
+    "NUL in the path": (b"GET /\x00 HTTP/1.1\r\n" + H + b"\r\n", 400),
+    "an escape in the path": (b"GET /\x1b[31m HTTP/1.1\r\n" + H + b"\r\n", 400),
+    "a space in the path": (b"GET /a b HTTP/1.1\r\n" + H + b"\r\n", 400),
+    "a long path": (b"GET /" + b"a" * 9000 + b" HTTP/1.1\r\n" + H + b"\r\n", 400),
+    "a long header": (b"GET / HTTP/1.1\r\n" + H + b"X: " + b"a" * 100_000 + b"\r\n\r\n", 400),
+    "many headers": (b"GET / HTTP/1.1\r\n" + H + b"X: a\r\n" * 500 + b"\r\n", 400),
+    "a header without a colon": (b"GET / HTTP/1.1\r\n" + H + b"nonsense\r\n\r\n", 400),
+    "a header with NUL": (b"GET / HTTP/1.1\r\n" + H + b"X: a\x00b\r\n\r\n", 400),
+    "a header that goes on": (b"GET / HTTP/1.1\r\n" + H + b"X: a\r\n b\r\n\r\n", 400),
+    "no host": (b"GET / HTTP/1.1\r\n\r\n", 400),
+    "two hosts": (b"GET / HTTP/1.1\r\n" + H + H + b"\r\n", 400),
+    "an empty host": (b"GET / HTTP/1.1\r\nHost:\r\n\r\n", 400),
+    "half a host": (b"GET / HTTP/1.1\r\nHost: [::1\r\n\r\n", 400),
+    "a host with more": (b"GET / HTTP/1.1\r\nHost: 127.0.0.1:80:80\r\n\r\n", 400),
+    "a host with a user": (b"GET / HTTP/1.1\r\nHost: a@127.0.0.1\r\n\r\n", 400),
+    "a host with a path": (b"GET / HTTP/1.1\r\nHost: 127.0.0.1/a\r\n\r\n", 400),
+    "two hosts in one": (b"GET / HTTP/1.1\r\nHost: 127.0.0.1, evil.example\r\n\r\n", 400),
+    "a host that is not ASCII": (b"GET / HTTP/1.1\r\nHost: \xff\r\n\r\n", 400),
+    "a host of digits": ("GET / HTTP/1.1\r\nHost: 127.0.0.\u0661\r\n\r\n".encode(), 400),
+    "another host": (b"GET / HTTP/1.1\r\nHost: evil.example\r\n\r\n", 403),
+    "another address": (b"GET / HTTP/1.1\r\nHost: [::2]:80\r\n\r\n", 403),
+    "an origin that is none": (b"GET / HTTP/1.1\r\n" + H + b"Origin: \xff[\r\n\r\n", 403),
+    "two origins": (b"GET / HTTP/1.1\r\n" + H + b"Origin: http://127.0.0.1\r\nOrigin: http://a\r\n\r\n", 403),
+    "another path": (b"GET /%00%ff HTTP/1.1\r\n" + H + b"\r\n", 404),
+    "a climbing path": (b"GET /../../etc/passwd HTTP/1.1\r\n" + H + b"\r\n", 404),
+    "no WebSocket": (b"GET /stream HTTP/1.1\r\n" + H + b"\r\n", 426),
+    "a WebSocket without a key": (
+        b"GET /stream HTTP/1.1\r\n" + H + b"Upgrade: websocket\r\nConnection: Upgrade\r\n\r\n", 400
+    ),
+    "a WebSocket of yesterday": (
+        b"GET /stream HTTP/1.1\r\n" + H + b"Upgrade: websocket\r\nConnection: Upgrade\r\n"
+        b"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Version: 1\r\n\r\n", 400
+    ),
+    "half a request": (b"GET / HTTP/1.1\r\nHost: 127", 400),
+}  # fmt: skip
+
+
+def test_malformed_requests_are_answered_and_logged_in_a_line(model, caplog):
+    """Each gets its status, none a traceback, and nobody else is disturbed."""
+    found, lines = {}, {}
+
+    async def run():
+        async with streaming(model) as (_, _, port), connected(port) as good:
+            for name, (request, _) in MALFORMED.items():
+                before = len(caplog.records)
+                reader, writer = await asyncio.open_connection("127.0.0.1", port)
+                writer.write(request)
+                if name == "half a request":
+                    writer.write_eof()
+                answer = await asyncio.wait_for(reader.read(), 20)
+                writer.close()
+                found[name] = int(answer.split()[1]) if answer.startswith(b"HTTP/1.1 ") else answer
+                lines[name] = caplog.records[before:]
+            await frames(good, 5)
+
+    with caplog.at_level(logging.INFO):
+        asyncio.run(run())
+    assert found == {name: status for name, (_, status) in MALFORMED.items()}
+    for name, records in lines.items():
+        for record in records:
+            assert record.exc_info is None, name
+            assert record.getMessage().isprintable(), name
+            assert len(record.getMessage()) < 300, name
+        told = [record for record in records if "refused" in record.getMessage()]
+        assert len(told) == (name not in ("another path", "a climbing path", "half a request")), name
 
 
 def test_what_is_served(model):

@@ -87,11 +87,68 @@ def test_equal_jobs_are_one(written):
         (TEXT + "printed: [0.2]\n", "printed must be a list of mappings"),
         (TEXT + "printed: [{scene: sand}]\n", "each with a number delta"),
         ("", "must have the keys"),
+        ("- 1", "must have the keys"),
+        ("title: !!python/name:os.system", "could not determine a constructor"),
+        (TEXT[: TEXT.index("jobs")] + "jobs: []", "jobs is a list"),
+        (TEXT[: TEXT.index("jobs")] + "jobs: null", "jobs is a list"),
+        (TEXT[: TEXT.index("jobs")] + "jobs: [5]", r"jobs\[0\]=5 must be keys with their values"),
+        (TEXT[: TEXT.index("jobs")] + "jobs: [[a]]", r"jobs\[0\]=\['a'\] must be keys"),
+        (TEXT[: TEXT.index("jobs")] + "jobs: [null]", r"jobs\[0\]=None must be keys"),
+        (TEXT[: TEXT.index("jobs")] + "jobs: [{5: 5}]", r"jobs\[0\]=\{5: 5\} must be keys"),
+        (TEXT[: TEXT.index("jobs")] + "jobs: [{scene: []}]", r"jobs\[0\]: scene=\[\] has no value"),
+        (TEXT + "each: 3\n", "each=3 must be keys"),
+        (TEXT + "each: null\n", "each=None must be keys"),
+        (TEXT + "each: {1: 2}\n", "must be keys"),
+        (TEXT + "stages: [[a]]\n", "must be a list of superresolve"),
+        (TEXT + "stages: superresolve\n", "must be a list of superresolve"),
+        (TEXT + "printed: 5\n", "printed must be a list of mappings"),
+        (TEXT + "printed: [{delta: .nan}]\n", "each with a number delta"),
+        (TEXT + "printed: [{delta: .inf}]\n", "each with a number delta"),
+        (TEXT.replace("A title", "[1, 2]"), r"title=\[1, 2\] must be text"),
+        (TEXT.replace("Which?", "null"), "question=None must be text"),
+        (TEXT.replace("Nothing.", "' '"), "paper=' ' must be text"),
+        (TEXT.replace("Which?", '"a\\0b"').replace("A title", "5"), "title=5 must be text"),
+        ("title: a\0b", "control character"),
+        ("a: &a [*a]", "holds itself"),
+        ("a: 2024-99-99", "month must be in"),
     ],
 )
 def test_a_file_that_is_no_experiment(written, text, told):
     with pytest.raises(ConfigError, match=told):
         written(text)
+
+
+@pytest.mark.parametrize("encoding", ["latin-1", "utf-16"])
+def test_a_file_in_another_encoding(tmp_path, encoding):
+    (tmp_path / "one.yaml").write_bytes(TEXT.replace("A title", "Ein Säulentitel").encode(encoding))
+    with pytest.raises(ConfigError, match=r"one\.yaml.*save it as UTF-8"):
+        Experiment.load("one", folder=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("job", "told"),
+    [
+        ("{seed: 'range(0,1000000000)'}", "has more than 10000 values"),
+        ("{seed: 'shuffle(range(0,1000000000))'}", "has more than 10000 values"),
+        ("{seed: 'range(0,1,0.0)'}", "give start, stop and step"),
+        ("{seed: 'range(0,5,0)'}", "give start, stop and step"),
+        ("{seed: 'range(0,900)', latent_dim: 'range(0,900)'}", "810000 jobs are more than the 10000"),
+        ("{seed: 'interval(0,1)'}", "has no end of values"),
+        ("{seed: '[1'}", "is not Hydra's key=value"),
+        ("{'a b=c': 1}", "is not Hydra's key=value"),
+        ("{seed: {a: {b: '[['}}}", "is not Hydra's key=value"),
+    ],
+)
+def test_jobs_that_no_one_can_mean(written, job, told):
+    with pytest.raises(ConfigError, match=told):
+        _ = written(TEXT[: TEXT.index("jobs")] + f"jobs: [{job}]").jobs
+
+
+def test_a_name_leads_nowhere_else(tmp_path):
+    (tmp_path / "one.yaml").write_text(TEXT)
+    (tmp_path / "inner").mkdir()
+    with pytest.raises(ConfigError, match=r"unknown experiment=\.\./one"):
+        Experiment.load("../one", folder=tmp_path / "inner")
 
 
 def test_the_nearest_name_is_told():

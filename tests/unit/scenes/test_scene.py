@@ -98,9 +98,53 @@ def test_parameters_are_refused(sand, parameters, quoted):
 
 
 def test_parameter_key_must_exist():
-    scene = load("sand", [FEW, "scene.parameters.key=material.cohesion"])
-    with pytest.raises(ConfigError, match=r"scene\.parameters\.key=material\.cohesion"):
-        scene.with_parameters({"cohesion": 1.0})
+    with pytest.raises(ConfigError, match=r"scene\.parameters\.key='material\.cohesion' names no key"):
+        load("sand", [FEW, "scene.parameters.key=material.cohesion"])
+
+
+@pytest.mark.parametrize(
+    ("key", "told"),
+    [
+        ("''", "names no key that holds a number"),
+        ("material", "names no key that holds a number"),
+        ("material._target_", "names no key that holds a number"),
+        ("scene.title", "names no key that holds a number"),
+        ("scene..dx", "names no key that holds a number"),
+        ("scene.gravity.7", "names no key that holds a number"),
+        ("scene.reduced.sample", "changes no physics"),
+        ("sampler.size", "changes no physics"),
+        ("latent_dim", "changes no physics"),
+        ("seed", "changes no physics"),
+        ("scene.paper.nsf.r", "changes no physics"),
+        ("scene.parameters.train.0", "changes no physics"),
+        ("scene.dx", "changes scene.dx"),
+        ("scene.dt", "changes scene.dt"),
+        ("scene.steps", "changes scene.steps"),
+        ("scene.size.0", "changes scene.size.0"),
+        ("scene.bodies.column.particles", "changes scene.bodies.column.particles"),
+        ("scene.bodies.column.shape.radius", "changes scene.bodies.column.shape.radius"),
+    ],
+)
+def test_a_parameter_is_of_the_physics_alone(key, told):
+    with pytest.raises(ConfigError, match=re.escape(told)):
+        load("sand", [f"scene.parameters.key={key}"])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "told"),
+    [
+        (["+scene.n=64", "scene.dx='${per:${scene.n}}'", "scene.parameters.key=scene.n"], "scene.dx"),
+        (["+scene.unused=3", "scene.parameters.key=scene.unused"], "changes no physics"),
+    ],
+)
+def test_a_parameter_is_told_by_what_refers_to_it(overrides, told):
+    with pytest.raises(ConfigError, match=told):
+        load("sand", overrides)
+
+
+@pytest.mark.parametrize("key", ["gravity.2", "bodies.column.density", "colliders.floor.friction"])
+def test_a_parameter_may_be_of_any_physics(key):
+    assert load("sand", [FEW, "scene.colliders.floor.kind=separate", f"scene.parameters.key=scene.{key}"])
 
 
 def test_full_order_runs_at_a_parameter(sand):
@@ -131,9 +175,8 @@ def test_keys_that_refer_to_the_parameter_follow_it():
 
 
 def test_a_parameter_that_is_no_key_is_refused():
-    scene = load("sand", [FEW, "scene.parameters.key=scene.tilt"])
     with pytest.raises(ConfigError, match=r"scene\.tilt"):
-        scene.with_parameters({"tilt": 30.0})
+        load("sand", [FEW, "scene.parameters.key=scene.tilt"])
 
 
 @pytest.mark.parametrize(
@@ -242,7 +285,7 @@ def test_moving_colliders():
     [
         ("until=soon", "scene.colliders.grip.until=soon must be a number"),
         ("motion.times=[0.2,0.0]", "motion.times=[0.2, 0.0] s"),
-        ("motion.times=soon", "motion.times=soon s must be a list"),
+        ("motion.times=soon", "motion.times=soon must be a list of numbers"),
         ("motion.translations=[[0,0,0]]", "motion.translations=[[0, 0, 0]] must be a list of 2"),
         ("+motion.axes=[0,0,1]", "axes"),
         ("motion._target_=os.system", "os.system is refused"),

@@ -1,0 +1,134 @@
+"""Interpolations of a configuration: which there are, and their values.
+
+A configuration may come from someone else. It refers to its own keys and calls the resolvers named here;
+what it could learn of this machine through OmegaConf's and Hydra's other ones stays unread.
+"""
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from nsf.errors import ConfigError
+from nsf.vectors import direction, number, rotation, vector
+
+#: Resolvers that any key may call.
+ALLOWED = ("scaled", "per", "turned", "oc.select")
+#: Keys that may name a folder by the environment, and how.
+_FOLDERS = {"report.folder", "point.folder"}
+_FROM_ENVIRONMENT = re.compile(r"\$\{oc\.env:NSF_REPORTS,\w+\}[\w/-]*")
+#: Every interpolation begins like this; in group 1 the resolver or the key, in 2 what ends it.
+_BEGINNING = re.compile(r"\$\{\s*([^:{}$]*?)\s*([:{}$]|\Z)")
+#: `oc.select` of a key that is written out.
+_SELECTION = re.compile(r"\$\{\s*oc\.select\s*:\s*[\w.\[\]-]+\s*[,}]")
+#: A reference to another key, by itself or through `oc.select`; leading dots count from where it stands.
+_REFERENCE = re.compile(r"\$\{\s*(?:oc\.select\s*:\s*)?(\.*)([\w-]+(?:\.[\w-]+|\[\w+\])*)")
+_MOST = (
+    20_000  # values of a whole configuration with those that it refers to; those of conf/ have some hundred
+)
+
+
+def _scaled(table: DictConfig, *, _root_: DictConfig):
+    """`${scaled:{small: a, paper: b}}`: the entry of the scale in force."""
+    scale = _root_.scale
+    if scale not in table:
+        raise ConfigError(f"scale={scale} is unknown here; choose one of {', '.join(map(str, table))}")
+    return table[scale]
+
+
+def _per(count) -> float:
+    """`${per:150}` = 1/150."""
+    if not number("argument of ${per:…}", count):
+        raise ConfigError(f"${{per:{count}}} divides by zero; give another number")
+    return 1.0 / float(count)
+
+
+def _turned(values, axis, angle) -> list[float]:
+    """`${turned:[1,0,0],[0,1,0],30}`: the vector turned by 30° about the axis, right-handed."""
+    matrix = rotation(direction("axis of ${turned:…}", axis), number("angle of ${turned:…}", angle))
+    return (matrix @ vector("vector of ${turned:…}", values)).tolist()
+
+
+OmegaConf.register_new_resolver("scaled", _scaled, replace=True)
+OmegaConf.register_new_resolver("per", _per, replace=True)
+OmegaConf.register_new_resolver("turned", _turned, replace=True)
+
+
+def leaves(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Path and value of everything in a plain tree that is neither a mapping nor a list."""
+    children = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else None
+    if children is None:
+        yield path, node
+        return
+    for key, child in children:
+        yield from leaves(child, (*path, str(key)))
+
+
+def resolved(config: DictConfig) -> Any:
+    """The plain tree of a configuration, each interpolation replaced by its value.
+
+    Raises:
+        ConfigError: a value is missing, refers to nothing, or calls a resolver that is not allowed.
+    """
+    try:
+        raw = OmegaConf.to_container(config)
+        for path, value in leaves(raw):
+            _check(".".join(path), value)
+        if _size(raw) > _MOST:
+            raise ConfigError(
+                f"the configuration has more than {_MOST} values, as keys refer to others; have fewer"
+            )
+        plain = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+    except OmegaConfBaseException as error:
+        # OmegaConf wraps what a resolver raises; its own words come first in the text.
+        detail = re.sub(r"^\w*Error raised while resolving interpolation: ", "", str(error).splitlines()[0])
+        raise ConfigError(f"{error.full_key}: {detail}" if error.full_key else detail) from error
+    for path, value in leaves(plain):
+        if (
+            isinstance(value, str) and "${" in value
+        ):  # put together from pieces, it would be resolved next time
+            raise ConfigError(f"{'.'.join(path)}={value} becomes an interpolation itself; write it out")
+    return plain
+
+
+def _check(key: str, value: Any) -> None:
+    if not isinstance(value, str) or (key in _FOLDERS and _FROM_ENVIRONMENT.fullmatch(value)):
+        return
+    for found in _BEGINNING.finditer(value):
+        name, end = found.groups()
+        written_out = name != "oc.select" or _SELECTION.match(value, found.start())
+        if end != "}" and not (end == ":" and name in ALLOWED and written_out):
+            raise ConfigError(
+                f"{key}: ${{{name}{end}…}} is refused; a value may refer to a key, as ${{scene.dx}}, "
+                f"or call one of {', '.join(ALLOWED)}"
+            )
+
+
+def _size(raw: Any) -> int:
+    """How many values a tree has once every reference in it is replaced by what it refers to."""
+    known: dict[tuple[str, ...], int] = {}
+
+    def of(node: Any, path: tuple[str, ...]) -> int:
+        if path not in known:
+            known[path] = 1  # of one that refers to itself, which OmegaConf refuses
+            if isinstance(node, dict | list):
+                children = node.items() if isinstance(node, dict) else enumerate(node)
+                known[path] += sum(of(child, (*path, str(key))) for key, child in children)
+            elif isinstance(node, str):
+                known[path] += sum(referred(*found, path) for found in _REFERENCE.findall(node))
+        return known[path]
+
+    def referred(dots: str, name: str, path: tuple[str, ...]) -> int:
+        target = path[: len(path) - len(dots)] if dots else ()
+        target += tuple(re.findall(r"[\w-]+", name))
+        node = raw
+        for part in target:
+            try:
+                node = node[int(part) if isinstance(node, list) else part]
+            except (KeyError, IndexError, TypeError, ValueError):
+                return 1
+        return of(node, target)
+
+    return of(raw, ())
