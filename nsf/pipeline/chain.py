@@ -30,7 +30,6 @@ from nsf.pipeline.simulation import Job, Shared, simulate
 from nsf.runs import Record, Run
 from nsf.sampling import SamplePhase
 from nsf.scenes import Scene
-from nsf.scenes.resolution import resolution_warnings
 from nsf.storage import writing
 
 STAGES = ("simulate", "train", "deploy", "evaluate", "report")
@@ -123,6 +122,8 @@ class Pipeline(Plan):
 
     def _resolution(self, value: float, scene: Scene) -> list[str]:
         """What a trajectory is too coarse for."""
+        from nsf.scenes.resolution import resolution_warnings  # SciPy takes 0.2 s to load
+
         return resolution_warnings(scene.with_parameters({self.scene.parameters.name: value}))
 
     def _simulate(self, runs: dict[Run, tuple[float, Scene]], warnings: dict[Run, list[str]]) -> int:
