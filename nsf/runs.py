@@ -260,7 +260,11 @@ class Run:
 
     @contextmanager
     def record(
-        self, device: str = "cpu", seed: int | None = None, precision: str | None = None
+        self,
+        device: str = "cpu",
+        seed: int | None = None,
+        precision: str | None = None,
+        warnings: Sequence[str] = (),
     ) -> Iterator["Record"]:
         """Keep the manifest while the block works.
 
@@ -273,6 +277,7 @@ class Run:
             device: such as "cpu" or "cuda:0".
             seed: of every generator in the block.
             precision: such as "fp64".
+            warnings: lines for whoever uses the run's results; a manifest without any has no such key.
 
         Raises:
             StorageError: the folder cannot be written, or was deleted or moved meanwhile.
@@ -288,6 +293,7 @@ class Run:
             "seed": seed,
             "precision": precision,
             "created": datetime.now(UTC).isoformat(timespec="microseconds"),
+            **({"warnings": list(warnings)} if warnings else {}),
         }
         record = Record(self, manifest["created"])
         start = time.perf_counter()

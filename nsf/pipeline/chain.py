@@ -91,6 +91,7 @@ class Pipeline(Plan):
         # A changed scene that changes nothing, or trains on what it deploys, names one run twice.
         runs = {self.simulation(value, scene): (value, scene) for value, scene in self.needed()}
         missing = {run: needed for run, needed in runs.items() if not run.complete}
+        told = {line: None for run in runs if run.complete for line in run.manifest.get("warnings", ())}
         there, spare = len(runs) - len(missing), self._spare(later) if later else set()
         needless = [run for run in missing if run.id in spare]
         if there:
@@ -100,9 +101,12 @@ class Pipeline(Plan):
                 f"simulate: {len(needless)} of {len(runs)} trajectories are gone, and nothing needs them"
             )
             missing = {run: needed for run, needed in missing.items() if run not in needless}
+        warnings = {run: self._resolution(*needed) for run, needed in missing.items()}
+        for line in told | {line: None for lines in warnings.values() for line in lines}:
+            self.say(f"simulate: warning: {line}")
         if missing:
             started = time.perf_counter()
-            made = self._simulate(missing)
+            made = self._simulate(missing, warnings)
             elsewhere = f", {len(missing) - made} by another process" if made < len(missing) else ""
             self.say(f"simulate: {made} trajectories in {time.perf_counter() - started:.1f} s{elsewhere}")
         return list(runs)
@@ -116,13 +120,19 @@ class Pipeline(Plan):
         needed = (set() if over else truths) | (set() if self.training.complete else trained)
         return (truths | trained) - needed
 
-    def _simulate(self, runs: dict[Run, tuple[float, Scene]]) -> int:
+    def _resolution(self, value: float, scene: Scene) -> list[str]:
+        """What a trajectory is too coarse for."""
+        from nsf.scenes.resolution import resolution_warnings  # SciPy takes 0.2 s to load
+
+        return resolution_warnings(scene.with_parameters({self.scene.parameters.name: value}))
+
+    def _simulate(self, runs: dict[Run, tuple[float, Scene]], warnings: dict[Run, list[str]]) -> int:
         c, name, unit = self.config, self.scene.parameters.name, self.scene.parameters.unit
 
         def job(run: Run, value: float, scene: Scene) -> Job:
             parameters = {name: value}
             build = partial(scene.full_order, parameters, c.precision, self.device)
-            return Job(run, f"{name} {value:g}{unit}", parameters, build)
+            return Job(run, f"{name} {value:g}{unit}", parameters, build, warnings[run])
 
         self.check_room(runs)
         jobs = [job(run, *needed) for run, needed in runs.items()]

@@ -32,12 +32,14 @@ class Job:
         label: what the progress bar says.
         parameters: problem parameters.
         build: gives the solver at t = 0.
+        warnings: for the run's manifest.
     """
 
     run: Run
     label: str
     parameters: dict[str, float]
     build: Callable[[], FullOrderMPM]
+    warnings: Sequence[str] = ()
 
 
 @dataclass(frozen=True)
@@ -144,7 +146,8 @@ def _store(
     job: Job, frames: queue.Queue, claim: contextlib.ExitStack, solver: FullOrderMPM, shared: Shared
 ) -> None:
     constants = solver.constants
-    with claim, job.run.record(device=shared.device, precision=shared.precision) as record:
+    about = {"device": shared.device, "precision": shared.precision, "warnings": job.warnings}
+    with claim, job.run.record(**about) as record:
         writer = TrajectoryWriter(
             job.run.path / TRAJECTORY,
             X=constants.X,

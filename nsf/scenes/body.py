@@ -106,11 +106,16 @@ class Body:
 
     def points(self) -> np.ndarray:
         """[P, 3] particles at rest [m]; kept, as placing is slow and parameter values share their bodies."""
-        return _points(_Placing(self.shape, self.particles, tuple(self.shape.files.values())))
+        return points_of(self.placing)
+
+    @property
+    def placing(self) -> "Placing":
+        """What its points depend on, to look up by."""
+        return Placing(self.shape, self.particles, tuple(self.shape.files.values()))
 
 
 @dataclass(frozen=True)
-class _Placing:
+class Placing:
     """What the points of a body depend on; hashed by its text, as shapes hold lists."""
 
     shape: Shape
@@ -122,5 +127,6 @@ class _Placing:
 
 
 @functools.lru_cache(maxsize=8)
-def _points(placing: _Placing) -> np.ndarray:
+def points_of(placing: Placing) -> np.ndarray:
+    """[P, 3] the points [m]."""
     return placing.shape.sample(placing.particles)

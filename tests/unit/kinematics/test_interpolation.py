@@ -58,13 +58,12 @@ def test_coincident_particles():
     torch.testing.assert_close(local.value(particles), particles[[0, 30, 33]], rtol=0, atol=1e-6)
 
 
-def test_nearest_in_chunks(monkeypatch):
+def test_nearest_first():
     X, particles = cloud(50, seed=2), cloud(80)
-    whole = nearest(X, particles, 5)
-    monkeypatch.setattr("nsf.kinematics.interpolation.CHUNK_ENTRIES", 800)
-    assert torch.equal(nearest(X, particles, 5), whole)
-    reference = (X[:, None] - particles).norm(dim=-1).argsort(-1)[:, :5]
-    assert torch.equal(whole, reference)
+    reference = (X[:, None] - particles).norm(dim=-1).argsort(-1)
+    for k in (1, 5, 80):
+        assert torch.equal(nearest(X, particles, k), reference[:, :k])
+    assert nearest(X[:0], particles, 5).shape == (0, 5)
 
 
 @pytest.mark.parametrize(
@@ -77,8 +76,7 @@ def test_nearest_in_chunks(monkeypatch):
     ids=["cube", "slice", "clusters"],
 )
 @pytest.mark.parametrize("inside", [True, False])
-def test_nearest_in_groups(particles, inside):
-    """Groups look only about themselves; no particle that is nearer may be missed."""
+def test_nearest(particles, inside):
     particles = particles.double()
     X = particles[:1700] + (0.01 if inside else 0.7) * cloud(1700, seed=3)
     reference = (X[:, None] - particles).square().sum(-1).topk(20, largest=False)

@@ -19,3 +19,16 @@ def test_memory_must_hold_a_block_of_frames(pipeline_at, tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match=r"500 particles on a grid .* would take 0\.\d GiB of memory"):
         pipeline.simulate()
     assert not Run.find("simulate", root=tmp_path)
+
+
+def test_warnings_are_said_and_kept(pipeline_at, tmp_path):
+    """By the run that makes a trajectory, in its manifest, and by every later one that uses it."""
+    said = []
+    keys = ("scene.bodies.column.particles=100", "scene.steps=2")
+    runs = pipeline_at(tmp_path, *keys, say=said.append).simulate()
+    (line,) = [line for line in said if "warning" in line]
+    assert line.startswith("simulate: warning: scene.bodies.column: 100 particles are 0.45 a cell")
+    assert all(run.manifest["warnings"] == [line.removeprefix("simulate: warning: ")] for run in runs)
+    said.clear()
+    pipeline_at(tmp_path, *keys, say=said.append).simulate()
+    assert said == ["simulate: 4 of 4 trajectories are there, reused", line] or said[0] == line
