@@ -107,45 +107,29 @@ def _parts(folder: Path, results: pd.DataFrame, kernels: pd.DataFrame, stages: p
     of_scene, of_training, of_batch, of_several = (
         results[results["bench"] == name] for name in ("reduced", "training", "batch", "multi_gpu")
     )
-    parts: list[dict] = []
-
-    def add(rows: pd.DataFrame, *texts: str, chart: str = "", figure=None, table=None) -> None:
+    of_pass = "Time of each pass of a full-order step; the mark is its floor."
+    of_case = "Time of a step of both solvers by scene; a point names δ of its run."
+    listed = (  # rows, texts, chart and what draws it from which rows; the rows are the table
+        (of_scene, [of_case], "reduced", steps_by_scene, [of_scene]),
+        (of_stages, [_STAGES], "stages", step_beside_paper, [of_stages]),
+        (floors, [_FLOORS], None, None, []),
+        (of_training, [_TRAINING], None, None, []),
+        (of_batch, [_BATCH], "batch", step_over_batch, [of_batch]),
+        (sizes, [_SIZES], "step", step_over_particles, [sizes, passes]),
+        (of_sample, [_SAMPLES], "sample", step_over_sample, [of_sample, sizes[same]]),
+        (passes, [of_pass, _KERNELS], "kernels", passes_beside_floor, [passes]),
+        (with_speed_up(of_several) if len(of_several) else of_several, [_SEVERAL], None, None, []),
+    )
+    parts = []
+    for rows, texts, chart, draw, drawn in listed:
         if not len(rows):
-            return
-        stem = f"{chart}-{re.sub('[^a-z0-9]+', '-', rows['device'].iloc[0].lower())}" if chart else ""
+            continue
+        device = re.sub("[^a-z0-9]+", "-", str(rows["device"].iloc[0]).lower())
         if chart:
-            save(figure(), folder, stem)
-        parts.append({"chart": stem, "texts": texts, "table": None if table is None else _rows(table)})
-
-    add(
-        of_scene,
-        "Time of a step of both solvers by scene; a point names δ of its run.",
-        chart="reduced",
-        figure=lambda: steps_by_scene(of_scene),
-        table=of_scene,
-    )
-    add(of_stages, _STAGES, chart="stages", figure=lambda: step_beside_paper(of_stages))
-    add(floors, _FLOORS, table=floors)
-    add(of_training, _TRAINING, table=of_training)
-    add(of_batch, _BATCH, chart="batch", figure=lambda: step_over_batch(of_batch), table=of_batch)
-    add(of_size, _SIZES, chart="step", figure=lambda: step_over_particles(sizes, passes), table=sizes)
-    add(
-        of_sample,
-        _SAMPLES,
-        chart="sample",
-        figure=lambda: step_over_sample(of_sample, sizes[same]),
-        table=of_sample,
-    )
-    add(
-        of_size,
-        "Time of each pass of a full-order step; the mark is its floor.",
-        _KERNELS,
-        chart="kernels",
-        figure=lambda: passes_beside_floor(passes),
-        table=passes,
-    )
-    add(of_several, _SEVERAL, table=with_speed_up(of_several) if len(of_several) else None)
-    return parts  # fmt: skip
+            save(draw(*drawn), folder, f"{chart}-{device}")
+        table = None if rows is of_stages else _rows(rows)
+        parts.append({"chart": chart and f"{chart}-{device}", "texts": texts, "table": table})
+    return parts
 
 
 def with_speed_up(results: pd.DataFrame) -> pd.DataFrame:

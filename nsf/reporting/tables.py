@@ -37,6 +37,10 @@ _SHOWN = (
     "speedup_step", "speedup_total", "memory_full_mib", "memory_reduced_mib",
 )  # fmt: skip
 
+_NOTHING = dict.fromkeys((*VARIANT, PLACE), ABSENT) | dict.fromkeys(
+    (*_SHOWN, *MEASURED, VALUES, TRAINING), math.nan
+)  # of a row that the paper prints
+
 
 @dataclass(frozen=True)
 class Merged:
@@ -139,11 +143,7 @@ def paper_row(merged: Merged, members: list[int]) -> dict | None:
     paper: dict = next((p for p in stated if row["method"] in p), {})
     if not paper:
         return None
-    known = {"scene": row["scene"], "method": row["method"], "field": PAPER, "split": "test"}
-    absent = dict.fromkeys((*VARIANT, PLACE), ABSENT) | dict.fromkeys(
-        (*_SHOWN, *MEASURED, VALUES, TRAINING), math.nan
-    )
-    return absent | paper[row["method"]] | known | {PLACE: paper.get("place", ABSENT)}
+    return _NOTHING | paper[row["method"]] | _papers(row) | {PLACE: paper.get("place", ABSENT)}
 
 
 def paper_rows(merged: Merged, same: list[list[int]], study: Study | None) -> list[dict]:
@@ -154,16 +154,16 @@ def paper_rows(merged: Merged, same: list[list[int]], study: Study | None) -> li
     for members in same:
         row, delta = merged.frame.iloc[members[0]], printed_of(merged, members, study)
         if not math.isnan(delta):
-            found.setdefault((row["scene"], row["method"], row["sample"], delta), set()).add(row[SETTING])
-    absent = dict.fromkeys((*VARIANT, PLACE), ABSENT) | dict.fromkeys(
-        (*_SHOWN, *MEASURED, VALUES, TRAINING), math.nan
-    )
+            found.setdefault((row["sample"], delta), set()).add(row[SETTING])
+    head = _NOTHING | _papers(merged.frame.iloc[same[0][0]])
     return [
-        absent
-        | {"scene": scene, "method": method, "field": PAPER, "split": "test", "sample": sample}
-        | {"delta": delta, SETTING: min(settings) if len(settings) == 1 else ABSENT}
-        for (scene, method, sample, delta), settings in found.items()
+        head | {"sample": sample, "delta": delta, SETTING: min(told) if len(told) == 1 else ABSENT}
+        for (sample, delta), told in found.items()
     ]
+
+
+def _papers(row: Mapping) -> dict:
+    return {"scene": row["scene"], "method": row["method"], "field": PAPER, "split": "test"}
 
 
 def printed_of(merged: Merged, members: list[int], study: Study | None) -> float:

@@ -5,6 +5,7 @@ import io
 import json
 import re
 import zlib
+from html import unescape
 from pathlib import Path
 
 import numpy as np
@@ -70,11 +71,14 @@ def test_a_page_is_small_unless_points_are_asked_for(played, tmp_path, monkeypat
         html.write(played(300), tmp_path)
 
 
-def test_text_of_a_run_cannot_end_the_script(played, tmp_path, monkeypatch):
-    monkeypatch.setattr(Playback, "title", "</script><b>")
-    text = html.write(played(10), tmp_path).read_text()
-    assert "</script><b>" not in text
-    assert "<title>&lt;/script&gt;&lt;b&gt;</title>" in text
+@pytest.mark.parametrize("title", ["</script><b>", "__DATA__", "__TOLD__", "{{ data }}", "a' \"&amp; <!--"])
+def test_a_title_is_text_wherever_the_page_holds_it(played, tmp_path, monkeypatch, title):
+    monkeypatch.setattr(Playback, "title", title)
+    page = html.write(played(10), tmp_path)
+    told, data = held(page)
+    assert told["title"] == title
+    assert unescape(re.search(r"<title>([^<]*)</title>", page.read_text())[1]) == title
+    zlib.decompress(base64.b64decode(data))
 
 
 @pytest.fixture
