@@ -30,7 +30,7 @@ th button { all: unset; cursor: pointer; } th button:focus-visible { outline: 2p
 th[aria-sort=ascending] button::after { content: " ▲"; }
 th[aria-sort=descending] button::after { content: " ▼"; }
 td { vertical-align: middle; } td img { display: block; width: 120px; background: #fff; }
-.failed, .killed, .interrupted { color: #b04a00; font-weight: 600; }
+.broken, .failed, .killed, .interrupted { color: #b04a00; font-weight: 600; }
 """
 _SCRIPT = """
 const body = document.querySelector("tbody"), rows = [...body.rows], count = document.querySelector("output");
@@ -110,9 +110,8 @@ def _row(entry: Entry, folder: Path) -> str:
     for field, told in zip(FIELDS, entry.texts(), strict=True):
         shown = f'<a href="{_esc(link)}">{_esc(told)}</a>' if field == "id" else _esc(told)
         kind = f' class="{_esc(told)}"' if field == "status" else ""
-        title = (
-            f' title="{_esc(str(entry.manifest["error"]))}"' if kind and entry.manifest.get("error") else ""
-        )
+        why = entry.fault or entry.manifest.get("error")
+        title = f' title="{_esc(text(why))}"' if kind and why else ""
         cells.append(f"<td{kind}{title} data-value={_quoted(entry.values[field])}>{shown}</td>")
     for key in _SETTINGS.values():
         value = entry.settings.get(key)
