@@ -27,8 +27,9 @@ TOOLS = {
         "key=low..high[:log] … [key=value …] [search.objectives=[delta,step_ms]] [search.trials=20]",
     ),
     "runs": (
-        "every run there is, filtered by fields, metrics and keys; or what differs between two",
-        "[key=value[,value…] …] [sort=[-]key]\n       nsf runs diff ID ID",
+        "every run there is, filtered by fields, metrics and keys; what differs between two; which changed",
+        "[key=value[,value…] …] [sort=[-]key]\n       nsf runs diff ID ID\n"
+        "       nsf runs verify [key=value[,value…] …]; every file against its recorded sha256",
     ),
     "index": (
         "a page of every run, with a thumbnail each, that sorts and filters in the browser",
@@ -238,8 +239,8 @@ def _search(words: list[str]) -> int:
 
 
 def _runs(words: list[str]) -> int:
-    """The table of runs, or of what differs between two."""
-    from nsf.reporting.listing import difference_table, entries, runs_table
+    """The table of runs, or of what differs between two; or the files that were changed, 2 if any was."""
+    from nsf.reporting.listing import difference_table, entries, runs_table, text
     from nsf.runs import Run
 
     if words[:1] == ["diff"]:
@@ -247,12 +248,20 @@ def _runs(words: list[str]) -> int:
             raise ConfigError(f"nsf runs diff takes two runs, not {len(words) - 1}; `nsf runs` lists them")
         _console().print(difference_table(*map(Run.named, words[1:])))
         return 0
+    verify = words[:1] == ["verify"]
+    words = words[verify:]
     _check_words("runs", words)
     filters = dict(word.split("=", 1) for word in words)
     found = entries(filters, filters.pop("sort", "-created"))
-    _console().print(runs_table(found))
-    print(f"{len(found)} runs", file=sys.stderr)
-    return 0
+    if verify:
+        faults = [fault for entry in found for fault in entry.run.verify()]
+    else:
+        _console().print(runs_table(found))
+        faults = [f"broken: {entry.run.path}: {entry.fault}" for entry in found if entry.fault]
+    for fault in faults:
+        print(text(fault), file=sys.stderr)
+    print(f"{len(found)} runs" + f", {len(faults)} faults" * verify, file=sys.stderr)
+    return 2 if verify and faults else 0
 
 
 def _primary(stage: str) -> str:

@@ -1,9 +1,6 @@
 """Run folders: one folder a configuration, named by a hash of everything that determines its content."""
 
-import hashlib
-import json
 import os
-import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -13,12 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from nsf.canonical import content_hash, plain
-from nsf.errors import ConfigError, MissingRunError, StorageError
+from nsf.errors import ConfigError, MissingRunError, SchemaError, StorageError
+from nsf.manifest import CONFIG, MANIFEST, NAME, Record, altered, read_config, read_manifest
 from nsf.provenance import provenance
-from nsf.storage import AGAIN, clear_partial, in_use, locked, write_json, writing
+from nsf.storage import clear_partial, in_use, locked, write_json, writing
 
 FORMAT = 1  # of the folder's layout; a new value gives every run a new hash
-_NAME = re.compile(r"[A-Za-z0-9][\w.+-]*", re.ASCII)
 _LOCK = ".lock"
 _LISTED = 8  # runs that an error names
 
@@ -62,19 +59,11 @@ class Run:
                 non-finite or non-JSON value.
         """
         for key, name in (("stage", stage), ("scene", scene)):
-            if not _NAME.fullmatch(name):
+            if not NAME.fullmatch(name):
                 raise ConfigError(f"{key}={name!r} is no folder name; use letters, digits and _ . + -")
         settings = plain(config)
-        content = {
-            "format": FORMAT,
-            "stage": stage,
-            "scene": scene,
-            "config": settings,
-            "parents": [parent.hash for parent in parents],
-        }
-        return cls(
-            stage, scene, content_hash(content), _root(root), settings, tuple(parent.id for parent in parents)
-        )
+        ids = tuple(parent.id for parent in parents)
+        return cls(stage, scene, _hash_of(stage, scene, settings, ids), _root(root), settings, ids)
 
     @classmethod
     def load(cls, run_id: str, root: str | Path | None = None) -> "Run":
@@ -83,21 +72,24 @@ class Run:
         Raises:
             MissingRunError: no such run was ever started.
         """
-        path = _root(root) / run_id
-        if run_id.count("/") != 2 or not (path / "manifest.json").is_file():
+        names = run_id.split("/")
+        if not _is_run(names) or not (_root(root) / run_id / MANIFEST).is_file():
             raise MissingRunError(
                 f"no run {run_id!r} under {_root(root)}; run its stage first, or set NSF_RUNS"
             )
-        stage, scene, digest = run_id.split("/")
-        return cls(stage, scene, digest, _root(root))
+        return cls(*names, _root(root))
 
     @classmethod
     def find(
         cls, stage: str | None = None, scene: str | None = None, root: str | Path | None = None
     ) -> list["Run"]:
-        """Every run, of a stage or a scene where one is named, that was ever started, newest first."""
-        manifests = _root(root).glob(f"{stage or '*'}/{scene or '*'}/*/manifest.json")
-        runs = [cls(*path.parts[-4:-1], _root(root)) for path in manifests]
+        """Every run, of a stage or a scene where one is named, that was ever started, newest first.
+
+        Broken ones are among them, last; folders with names that no run could have are not.
+        """
+        manifests = _root(root).glob(f"{stage or '*'}/{scene or '*'}/*/{MANIFEST}")
+        names = (path.parts[-4:-1] for path in manifests)
+        runs = [cls(*own, _root(root)) for own in names if _is_run(own)]
         return sorted(runs, key=lambda run: (run.manifest.get("created", ""), run.hash), reverse=True)
 
     @classmethod
@@ -126,8 +118,8 @@ class Run:
         Raises:
             MissingRunError: no run or several fit, which it lists; or the folder is of another stage.
         """
-        if (Path(name) / "manifest.json").is_file():
-            path = Path(name).resolve()
+        path = Path(name).resolve()
+        if (path / MANIFEST).is_file() and _is_run(path.parts[-3:]):
             if stage not in (None, path.parts[-3]):
                 raise MissingRunError(f"{path} is a {path.parts[-3]} run; name a {stage} run")
             return cls(*path.parts[-3:], path.parents[2])
@@ -155,12 +147,17 @@ class Run:
 
     @property
     def config(self) -> dict[str, Any]:
-        """The resolved configuration, from memory or from config.yaml."""
+        """The resolved configuration, from memory or from config.yaml.
+
+        Raises:
+            SchemaError: the file is missing or broken.
+        """
         if self._config is not None:
             return self._config
-        from omegaconf import OmegaConf  # 0.2 s that `nsf --help` need not pay
-
-        return OmegaConf.to_container(OmegaConf.load(self.path / "config.yaml"))  # type: ignore[return-value]
+        try:
+            return read_config(self.path)
+        except SchemaError as error:
+            raise SchemaError(f"{self.path} is broken: {error}; run `nsf {self.stage}` again") from error
 
     @property
     def parents(self) -> tuple[str, ...]:
@@ -174,23 +171,46 @@ class Run:
 
     @property
     def manifest(self) -> dict[str, Any]:
-        """The manifest on disk; empty when there is none or it cannot be read."""
+        """The manifest on disk; empty when there is none or it is broken."""
+        with suppress(SchemaError):
+            return read_manifest(self.path)
+        return {}
+
+    @property
+    def fault(self) -> str | None:
+        """Why what lies in the folder cannot be the run that the folder is named after; None if it can."""
         try:
-            manifest = json.loads((self.path / "manifest.json").read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            return {}
-        return manifest if isinstance(manifest, dict) else {}
+            manifest = read_manifest(self.path)
+            if not manifest:
+                return None
+            if manifest["format"] != FORMAT:
+                return f"{MANIFEST} has format={manifest['format']}, and this nsf reads {FORMAT}"
+            if (manifest["stage"], manifest["scene"], manifest["hash"]) != (
+                self.stage,
+                self.scene,
+                self.hash,
+            ):
+                return f"{MANIFEST} is of another run"
+            if _hash_of(self.stage, self.scene, read_config(self.path), manifest["parents"]) != self.hash:
+                return f"{CONFIG} was changed after the run"
+        except SchemaError as error:
+            return str(error)
+        except KeyError as error:
+            return f"{MANIFEST} lacks {error}"
+        return None
 
     @property
     def status(self) -> str:
-        """The manifest's status.
+        """The manifest's status; "missing" without a manifest.
 
-        Instead "killed" where it says "running" and no process holds the run's lock, and "incomplete" where
-        it says "complete" and files of the run are gone or cut short: data.keep=held_out deletes some.
+        Instead "broken" where there is a `fault`, "killed" where it says "running" and no process holds the
+        run's lock, and "incomplete" where it says "complete" and files of the run are gone or cut short:
+        data.keep=held_out deletes some.
         """
-        manifest = self.manifest
-        status = manifest.get("status", "missing")
-        if status == "complete" and self._lost(manifest):
+        if self.fault:
+            return "broken"
+        status = self.manifest.get("status", "missing")
+        if status == "complete" and self._lost():
             return "incomplete"
         if status != "running":
             return status
@@ -201,24 +221,12 @@ class Run:
     @property
     def complete(self) -> bool:
         """Whether the run succeeded and its outputs are there in their recorded size."""
-        manifest = self.manifest
-        if manifest.get("status") != "complete" or manifest.get("hash") != self.hash:
-            return False
-        return not self._lost(manifest)
+        return self.status == "complete"
 
-    def _lost(self, manifest: dict[str, Any]) -> list[str]:
+    def _lost(self) -> list[str]:
         """Outputs of the manifest that are missing or of another size."""
-
-        def whole(output) -> bool:
-            try:
-                return (self.path / output["path"]).stat().st_size == output["bytes"]
-            except (OSError, KeyError, TypeError):
-                return False
-
-        outputs = manifest.get("outputs")
-        if not isinstance(outputs, list):
-            return ["manifest.json"]
-        return [str(o["path"]) if isinstance(o, dict) else "manifest.json" for o in outputs if not whole(o)]
+        outputs = self.manifest.get("outputs", ())
+        return [output["path"] for output in outputs if altered(self.path, output, sums=False)]
 
     def require(self) -> "Run":
         """This run, if it is complete.
@@ -226,18 +234,56 @@ class Run:
         Raises:
             MissingRunError: it is not; says how far it came.
         """
-        if self.complete:
-            return self
-        manifest = self.manifest
-        status = self.status if manifest else "not there"
-        lost = ", ".join(self._lost(manifest))
-        state = f"not whole ({lost} missing or cut short)" if status == "incomplete" else status
+        status = self.status
         if status == "complete":
-            state = "not whole (its manifest is of another run)"
-        why = f" ({manifest['error']})" if manifest.get("error") else ""
+            return self
+        state = {
+            "missing": "not there",
+            "broken": f"broken ({self.fault})",
+            "incomplete": f"not whole ({', '.join(self._lost())} missing or cut short)",
+        }.get(status, status)
+        why = f" ({error})" if (error := self.manifest.get("error")) else ""
         raise MissingRunError(
             f"{self.path} is {state}{why}; run `nsf {self.stage} scene={self.scene}` with the same keys"
         )
+
+    def file(self, name: str) -> Path:
+        """A file of this run for reading: what the run left, by its recorded size and sha256.
+
+        The sha256 is found once a process for as long as the file stays the same.
+
+        Raises:
+            SchemaError: the file is not recorded, is gone, or was changed since.
+        """
+        output = next((o for o in self.manifest.get("outputs", ()) if o["path"] == name), None)
+        if told := "is not recorded in its manifest" if output is None else altered(self.path, output):
+            raise SchemaError(
+                f"{self.path / name} {told}; delete the run's folder and run `nsf {self.stage}` again"
+            )
+        return self.path / name
+
+    def metric(self, *keys: str) -> float:
+        """A number of the manifest's metrics.
+
+        Raises:
+            SchemaError: there is no such number.
+        """
+        value: Any = self.manifest.get("metrics")
+        for key in keys:
+            value = value.get(key) if isinstance(value, dict) else None
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise SchemaError(
+                f"{self.path / MANIFEST} has no number {'.'.join(keys)} among its metrics; "
+                f"delete the run's folder and run `nsf {self.stage}` again"
+            )
+        return float(value)
+
+    def verify(self) -> list[str]:
+        """What is wrong with the folder, a line a fault; every recorded file is held to its sha256."""
+        if fault := self.fault:
+            return [f"{self.path}: {fault}"]
+        found = ((o["path"], altered(self.path, o)) for o in self.manifest.get("outputs", ()))
+        return [f"{self.path / name} {told}" for name, told in found if told]
 
     @contextmanager
     def claimed(self, say: Callable[[str], object] | None = None) -> Iterator[bool]:
@@ -295,7 +341,7 @@ class Run:
             "created": datetime.now(UTC).isoformat(timespec="microseconds"),
             **({"warnings": list(warnings)} if warnings else {}),
         }
-        record = Record(self, manifest["created"])
+        record = Record(self.path, manifest["created"])
         start = time.perf_counter()
 
         def close(status: str, metrics: dict[str, Any], **more: Any) -> None:
@@ -306,12 +352,12 @@ class Run:
                 "metrics": metrics,
                 "outputs": list(record.outputs.values()),
             }
-            write_json(self.path / "manifest.json", manifest | ending)
+            write_json(self.path / MANIFEST, manifest | ending)
 
         with self.claimed(lambda told: None):
             clear_partial(self.path)
             self._write_config()
-            write_json(self.path / "manifest.json", {**manifest, "status": "running"})
+            write_json(self.path / MANIFEST, {**manifest, "status": "running"})
             try:
                 yield record
                 record.require_folder()
@@ -334,57 +380,8 @@ class Run:
 
         # OmegaConf quotes strings that look like numbers; yaml.safe_dump leaves "1e-5" bare.
         text = OmegaConf.to_yaml(OmegaConf.create(self.config))
-        with writing(self.path / "config.yaml") as partial:
+        with writing(self.path / CONFIG) as partial:
             partial.write_text(text, encoding="utf-8")
-
-
-class Record:
-    """What a running stage says about itself: `metrics`, and the files it made."""
-
-    def __init__(self, run: Run, created: str) -> None:
-        self.path = run.path
-        self._run, self._created = run, created
-        self.metrics: dict[str, Any] = {}
-        self.outputs: dict[str, dict[str, Any]] = {}
-
-    def require_folder(self) -> None:
-        """Refuse to go on where the folder is no longer the one that the run began with.
-
-        Raises:
-            StorageError: it was deleted or moved.
-        """
-        if self._run.manifest.get("created") != self._created:
-            raise StorageError(f"{self.path} was deleted or moved while its files were being made; {AGAIN}")
-
-    def output(self, path: str | Path) -> Path:
-        """Enter a finished file, or every file of a folder, into the manifest.
-
-        Args:
-            path: within the run's folder, absolute or relative to it.
-
-        Raises:
-            ConfigError: the path leaves the run's folder or does not exist.
-            StorageError: the folder was deleted or moved.
-        """
-        self.require_folder()
-        path = self.path / path
-        files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
-        if not files or not path.resolve().is_relative_to(self.path.resolve()):
-            raise ConfigError(f"output {path} is no file inside {self.path}; write it there first")
-        for file in files:
-            name = file.resolve().relative_to(self.path.resolve()).as_posix()
-            with file.open("rb") as stream:
-                digest = hashlib.file_digest(stream, "sha256").hexdigest()
-            self.outputs[name] = {"path": name, "bytes": file.stat().st_size, "sha256": digest}
-        return path
-
-    def plain_metrics(self) -> dict[str, Any]:
-        """The metrics as JSON holds them; a value that is not finite becomes null.
-
-        Raises:
-            ConfigError: a metric is of a kind that JSON cannot hold.
-        """
-        return plain(self.metrics, finite=False, key="metrics")
 
 
 def _listed(runs: Sequence[Run], stage: str | None) -> str:
@@ -395,6 +392,18 @@ def _listed(runs: Sequence[Run], stage: str | None) -> str:
     if len(runs) > _LISTED:
         lines.append(f"and {len(runs) - _LISTED} more, which `nsf runs` lists")
     return "choose one of" + "".join(f"\n  {line}" for line in lines)
+
+
+def _hash_of(stage: str, scene: str, config: dict[str, Any], parents: Sequence[str]) -> str:
+    """The name of a run: a hash of all that determines its content; parents by their ids."""
+    hashes = [parent.split("/")[-1] for parent in parents]
+    content = {"format": FORMAT, "stage": stage, "scene": scene, "config": config, "parents": hashes}
+    return content_hash(content)
+
+
+def _is_run(names: Sequence[str]) -> bool:
+    """Whether a stage, a scene and a hash could name a folder of a run."""
+    return len(names) == 3 and all(map(NAME.fullmatch, names))
 
 
 def _root(root: str | Path | None) -> Path:

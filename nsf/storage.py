@@ -26,6 +26,7 @@ _REMEDIES = {
     errno.EACCES: _ACCESS,
     errno.EPERM: _ACCESS,
     errno.EROFS: _ACCESS,
+    errno.EISDIR: "a folder stands where the file is needed; remove it",
 }
 # torch.save reports a full disk as a RuntimeError without a cause; a file system this empty gives it away.
 _FULL_BYTES = 64 * 1024

@@ -12,11 +12,14 @@ from typing import Any
 import h5py
 import numpy as np
 
+from nsf.data import hdf5
 from nsf.data.schema import COMPONENTS, SCHEMA_VERSION, TAU_ORDER, UNITS, hash_of_positions, packed
 from nsf.data.sink import Sink
-from nsf.errors import InstabilityError, MissingRunError, SchemaError, ShapeError
+from nsf.errors import InstabilityError, SchemaError, ShapeError
 from nsf.storage import require_space, writing
 
+_EXACT, _STORED = ("<f8",), ("<f4", "<f8")  # types of constants and of frames
+_MOST_SCALARS = 1000
 _READ_BYTES = 2**30  # at once; the system reads no more than 2 GiB
 
 
@@ -168,26 +171,31 @@ class Trajectory:
     def __init__(self, path: Path, file: h5py.File) -> None:
         self.path = path
         self._file = file
-        attributes = file.attrs
-        _check_version(attributes)
-        if not attributes.get("complete"):
-            raise SchemaError("was not finished by its simulation; simulate again")
-        if attributes["tau_order"] != ",".join(TAU_ORDER):
-            raise SchemaError(
-                f"has tau_order={attributes['tau_order']}, not {','.join(TAU_ORDER)}; simulate again"
-            )
-        self.x_sha256 = str(attributes["x_sha256"])
-        self.dt, self.dx = float(attributes["dt"]), float(attributes["dx"])
-        self.X, self.mass, self.volume0 = (file["particles"][name][()] for name in ("X", "mass", "volume0"))
-        self.t = file["frames/t"][()]
-        self.particles, self.frames = len(self.X), len(self.t)
-        self.parameters = _read_scalars(file["parameters"])
-        self.cost = _read_scalars(file["cost"])
-        self._check_shapes()
+        _check_version(file)
+        if not hdf5.attribute(file, "complete", bool):
+            raise SchemaError("was not finished by its simulation")
+        if (order := hdf5.attribute(file, "tau_order", str)) != ",".join(TAU_ORDER):
+            raise SchemaError(f"has tau_order={order}, not {','.join(TAU_ORDER)}")
+        if hdf5.attribute(file, "units", str) != json.dumps(UNITS):
+            raise SchemaError("has units that are not those of this schema")
+        self.x_sha256 = hdf5.attribute(file, "x_sha256", str)
+        self.dt, self.dx = (hdf5.attribute(file, name, float) for name in ("dt", "dx"))
+        hdf5.check("dt and dx", np.array([self.dt, self.dx]), positive=True)
+        self.X = hdf5.values(file, "particles/X", _EXACT, (None, 3))
+        self.particles = P = len(self.X)
+        self.mass, self.volume0 = (
+            hdf5.values(file, f"particles/{name}", _EXACT, (P,), positive=True)
+            for name in ("mass", "volume0")
+        )
+        self.t = hdf5.values(file, "frames/t", _EXACT, (None,), increasing=True)
+        self.frames = len(self.t)
+        self._frames = {
+            name: hdf5.array(file, f"frames/{name}", _STORED, (self.frames, P, c))
+            for name, c in COMPONENTS.items()
+        }
+        self.parameters, self.cost = (_read_scalars(file, name) for name in ("parameters", "cost"))
         if (x_sha256 := hash_of_positions(self.X)) != self.x_sha256:
-            raise SchemaError(
-                f"says x_sha256={self.x_sha256[:12]}, but its X has {x_sha256[:12]}; simulate again"
-            )
+            raise SchemaError(f"says x_sha256={self.x_sha256[:12]}, but its X has {x_sha256[:12]}")
 
     @classmethod
     def open(cls, path: str | Path) -> "Trajectory":
@@ -195,29 +203,16 @@ class Trajectory:
 
         Raises:
             MissingRunError: there is no such file.
-            SchemaError: the file is truncated, foreign, unfinished, of a newer
-                schema, incomplete or damaged; names the file.
+            SchemaError: the file was changed after its run, is truncated, foreign,
+                unfinished, of a newer schema, incomplete or damaged, has links or
+                storage outside it, or values that no simulation leaves; names the file.
         """
-        path = Path(path)
-        if not path.exists():
-            raise MissingRunError(f"no trajectory at {path}; run `nsf simulate` first")
-        try:
-            file = h5py.File(path, "r")
-        except PermissionError:
-            raise
-        except OSError as error:
-            raise SchemaError(f"{path} is truncated or not HDF5; simulate again ({error})") from error
-        try:
-            return cls(path, file)
-        except BaseException as error:
-            file.close()
-            if isinstance(error, KeyError):
-                raise SchemaError(f"{path} lacks a part of a trajectory; simulate again ({error})") from error
-            if isinstance(error, SchemaError | ShapeError):
-                raise SchemaError(f"{path} {error}") from error
-            if isinstance(error, OSError | RuntimeError | TypeError | ValueError | AttributeError):
-                raise SchemaError(f"{path} is damaged; simulate again ({error})") from error
-            raise
+        with ExitStack() as stack:
+            file = stack.enter_context(hdf5.opened(path, "trajectory", "simulate"))
+            with hdf5.reading(path, "trajectory", "simulate"):
+                trajectory = cls(Path(path), file)
+            stack.pop_all()
+        return trajectory
 
     def read(
         self,
@@ -238,12 +233,12 @@ class Trajectory:
             [F,n,c] with c = 3, 3, 9, 6.
 
         Raises:
-            SchemaError: the data are damaged.
+            SchemaError: the data are damaged, or not finite.
             ShapeError: no such field, frame or particle, or `out` is of another shape.
         """
         if field not in COMPONENTS:
             raise ShapeError(f"field={field!r}; choose one of {', '.join(COMPONENTS)}")
-        dataset = self._file["frames"][field]
+        dataset = self._frames[field]
         rows = _selection(frames, self.frames, "frame")
         columns = _selection(slice(None) if particles is None else particles, self.particles, "particle")
         shape = (len(rows), len(columns), COMPONENTS[field])
@@ -263,6 +258,7 @@ class Trajectory:
                     out[i] = _read_frame(dataset, int(row), columns)
         except (OSError, OverflowError, RuntimeError) as error:
             raise SchemaError(f"{self.path} is damaged in {field}; simulate again ({error})") from error
+        self._check_finite(field, rows, out)
         return out
 
     def close(self) -> None:
@@ -278,16 +274,16 @@ class Trajectory:
     def __reduce__(self) -> tuple[Any, tuple[Path]]:
         return Trajectory.open, (self.path,)  # another process opens the file for itself
 
-    def _check_shapes(self) -> None:
-        expected: dict[str, tuple[int, ...]] = {
-            "particles/mass": (self.particles,),
-            "particles/volume0": (self.particles,),
-        }
-        for name, c in COMPONENTS.items():
-            expected[f"frames/{name}"] = (self.frames, self.particles, c)
-        for name, shape in expected.items():
-            if (found := self._file[name].shape) != shape:
-                raise SchemaError(f"has {name} of shape {list(found)}, not {list(shape)}; simulate again")
+    def _check_finite(self, field: str, rows: range | np.ndarray, found: np.ndarray) -> None:
+        with np.errstate(over="ignore", invalid="ignore"):
+            total = found.sum()  # at the speed of memory, and not finite if one of the values is not
+        if np.isfinite(total):
+            return
+        bad = np.flatnonzero(~np.isfinite(found).all((1, 2)))
+        if bad.size:
+            raise SchemaError(
+                f"{self.path} has non-finite values of {field}, as in frame {rows[bad[0]]}; simulate again"
+            )
 
 
 @dataclass(frozen=True)
@@ -333,16 +329,17 @@ def _read_frames(file: int, dataset: h5py.Dataset, rows: range, out: np.ndarray)
             rest, offset = rest[read:], offset + read
 
 
-def _check_version(attributes: h5py.AttributeManager) -> None:
-    version = attributes.get("schema_version")
-    if not isinstance(version, int | np.integer):
-        raise SchemaError("is HDF5, but not written by nsf; give a file of `nsf simulate`")
+def _check_version(file: h5py.File) -> None:
+    try:
+        version = hdf5.attribute(file, "schema_version", int)
+    except (KeyError, SchemaError) as error:
+        raise SchemaError("is HDF5, but not written by nsf; give a file of `nsf simulate`") from error
     if version > SCHEMA_VERSION:
         raise SchemaError(
             f"has schema_version={version}, newer than {SCHEMA_VERSION}; upgrade nsf to read it"
         )
     if version < SCHEMA_VERSION:
-        raise SchemaError(f"has schema_version={version}, older than {SCHEMA_VERSION}; simulate again")
+        raise SchemaError(f"has schema_version={version}, older than {SCHEMA_VERSION}")
 
 
 def _selection(wanted: Any, size: int, kind: str) -> range | np.ndarray:
@@ -375,5 +372,8 @@ def _write_scalars(group: h5py.Group, values: Mapping[str, float]) -> None:
         group[name] = np.float64(value)
 
 
-def _read_scalars(group: h5py.Group) -> dict[str, float]:
-    return {name: float(group[name][()]) for name in sorted(group)}
+def _read_scalars(file: h5py.File, name: str) -> dict[str, float]:
+    group = hdf5.group(file, name)
+    if len(group) > _MOST_SCALARS:
+        raise SchemaError(f"has {len(group):,} {name}")
+    return {own: float(hdf5.values(group, own, _EXACT, ())) for own in sorted(group)}

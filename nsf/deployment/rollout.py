@@ -3,6 +3,7 @@
 import io
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,18 +13,21 @@ import pytorch_lightning as pl
 import torch
 from torch.utils.data import DataLoader
 
+from nsf.data import hdf5
 from nsf.deployment.trust import LatentDistance, Trust, first_distrusted, training_values
-from nsf.dynamics import ReducedBatch, ReducedMPM
+from nsf.dynamics import STOP_REASONS, ReducedBatch, ReducedMPM
 from nsf.errors import SchemaError
 from nsf.progress import Progress, quiet_lightning
 from nsf.storage import writing
 from nsf.timing import synchronizer
 
 _VERSION = 2
-_SCALARS = (
-    "parameter", "sample", "integration_mean", "needed_outside", "seconds", "diverged", "handed_over",
-)  # fmt: skip
+_SCALARS = {
+    "parameter": float, "sample": int, "integration_mean": float, "needed_outside": int, "seconds": float,
+    "diverged": int, "handed_over": int,
+}  # fmt: skip
 _ARRAYS = ("t", "xhat", "residuals", "trust")
+_REAL = ("<f4", "<f8")  # types of the arrays: that of the run
 #: Steps between looks at the trust of a run that is to be handed over: a look reads back, and what was
 #: done since the last one is lost.
 _LOOK = 20
@@ -80,27 +84,56 @@ class Rollout:
             partial.write_bytes(memory.getbuffer())
 
     @classmethod
-    def open(cls, path: Path) -> "Rollout":
+    def open(cls, path: Path, latent_dim: int | None = None) -> "Rollout":
         """Read a rollout.
 
+        Args:
+            path: of the file.
+            latent_dim: r of the manifold it is of; None for any.
+
         Raises:
-            SchemaError: the file is missing, truncated, foreign or newer.
+            MissingRunError: there is no such file.
+            SchemaError: the file was changed after its run, is truncated, foreign or newer, or says what no
+                run does.
         """
-        try:
-            with h5py.File(path, "r") as file:
-                version = file.attrs.get("nsf_rollout")
-                if version != _VERSION:
-                    raise SchemaError(
-                        f"{path} is not a rollout of version {_VERSION} (found {version}); deploy again"
-                    )
-                scalars = {name: file.attrs[name].item() for name in _SCALARS}
-                arrays = {name: file[name][()] for name in _ARRAYS}
-                stops = [s.decode() for s in file["stops"][()]]
-        except (OSError, KeyError, RuntimeError) as error:
-            raise SchemaError(
-                f"{path} is truncated or not a rollout ({error}); delete it and deploy again"
-            ) from error
-        return cls(**scalars, **arrays, stops=stops)
+        with hdf5.opened(path, "rollout", "deploy") as file, hdf5.reading(path, "rollout", "deploy"):
+            version = None
+            with suppress(KeyError, SchemaError):
+                version = hdf5.attribute(file, "nsf_rollout", int)
+            if version != _VERSION:
+                raise SchemaError(f"is not a rollout of version {_VERSION} (found {version})")
+            scalars = {name: hdf5.attribute(file, name, kind) for name, kind in _SCALARS.items()}
+            t = hdf5.values(file, "t", _REAL, (None,), increasing=True)
+            shapes = {"xhat": (len(t), latent_dim), "residuals": (len(t) - 1, None), "trust": (len(t),)}
+            arrays = {name: hdf5.array(file, name, _REAL, shape)[()] for name, shape in shapes.items()}
+            stops = hdf5.texts(file, "stops", (len(t) - 1,))
+            found = cls(**scalars, t=t, **arrays, stops=stops)
+            found._check()
+        return found
+
+    def _check(self) -> None:
+        """Raises SchemaError where the values are none that a run leaves."""
+        steps = len(self.t) - 1
+        for name, least, most in (
+            ("sample", 1, np.inf),
+            ("needed_outside", 0, np.inf),
+            ("diverged", -1, steps),
+            ("handed_over", -1, steps),
+            ("seconds", 0, np.inf),
+            ("integration_mean", 0, np.inf),
+        ):
+            if not least <= getattr(self, name) <= most:
+                raise SchemaError(f"has {name}={getattr(self, name)}, in {steps} steps")
+        # A run that diverged, or was handed over before it did, may end in what is not finite.
+        last = (
+            self.handed_over if self.handed_over >= 0 else self.diverged - 1 if self.diverged >= 0 else steps
+        )
+        hdf5.check("xhat", self.xhat[: max(0, last) + 1])
+        hdf5.check("residuals", self.residuals[: max(0, last)])
+        if not (self.trust >= 0).all():
+            raise SchemaError("has values of trust that are negative or no numbers")
+        if unknown := set(self.stops) - set(STOP_REASONS):
+            raise SchemaError(f"has stops={sorted(unknown)[0]!r}, which is no reason to stop")
 
 
 def rollout_file(index: int) -> str:

@@ -81,6 +81,7 @@ def compare(
 
     Raises:
         SchemaError: the trajectory is of other particles, or a continuation is missing or too short.
+        InstabilityError: an error is not finite, though the run did not diverge.
     """
     scene, manifold, setup = solver.scene, solver.manifold, solver.setup
     device, parameters = setup.torch_device, setup.parameters
@@ -161,13 +162,21 @@ def compare(
     def total(error: str, norm: str) -> float:  # over frames 1..N
         return metrics.relative(column[error][1:], column[norm][1:])
 
+    errors = {
+        "reconstruction_delta": total("rec_error", "x_norm"),
+        "reconstruction_stress_error": total("rec_tau_error", "tau_norm"),
+    }
+    reduced = {
+        "delta": ("x_error", "x_norm"),
+        "displacement_error": ("x_error", "u_norm"),
+        "stress_error": ("tau_error", "tau_norm"),
+    }
+    if not diverged:
+        errors |= {name: total(*columns) for name, columns in reduced.items()}
+    metrics.require_finite(errors, f"{scene.parameters.name}={rollout.parameter:g}")
     xhat[own:] = torch.nan  # full-order frames are no latent vectors
     return Comparison(
-        delta=np.inf if diverged else total("x_error", "x_norm"),
-        displacement_error=np.inf if diverged else total("x_error", "u_norm"),
-        stress_error=np.inf if diverged else total("tau_error", "tau_norm"),
-        reconstruction_delta=total("rec_error", "x_norm"),
-        reconstruction_stress_error=total("rec_tau_error", "tau_norm"),
+        **dict.fromkeys(reduced, np.inf) | errors,
         series=_series(column, rollout, trajectory.t, split, xhat.cpu(), good),
         pictures={name: np.concatenate(blocks) for name, blocks in kept.items()}
         | {"t": trajectory.t[shown_frames]},

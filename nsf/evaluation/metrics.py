@@ -1,10 +1,13 @@
 """Errors of a reduced run against its full-order truth: pure functions."""
 
+import math
+from collections.abc import Mapping
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from nsf.errors import ShapeError
+from nsf.errors import InstabilityError, ShapeError
 
 
 def _same_shape(a: Tensor, b: Tensor) -> None:
@@ -20,6 +23,24 @@ def frame_squares(values: Float[Tensor, "frame particle component"]) -> Float[Te
 def relative(error: Float[Tensor, "frame"], reference: Float[Tensor, "frame"]) -> float:
     """√(Σ error / Σ reference) of sums of squares by frame."""
     return float((error.sum() / reference.sum()).sqrt())
+
+
+def require_finite(errors: Mapping[str, float], where: str) -> None:
+    """Refuse errors that are none: a run that diverged is named so, and its errors are not asked for.
+
+    Args:
+        errors: by name.
+        where: they were found, such as "friction_angle=26".
+
+    Raises:
+        InstabilityError: one is not finite; names it.
+    """
+    for name, value in errors.items():
+        if not math.isfinite(value):
+            raise InstabilityError(
+                f"{name}={value} at {where} is no error: the fields give values that are not finite, or the "
+                "full-order run neither moves nor bears stress; train again, or evaluate on another scene"
+            )
 
 
 def deformation_error(

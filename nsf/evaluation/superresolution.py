@@ -113,7 +113,7 @@ def superresolve(
     Raises:
         ConfigError: a rollout was handed over to the full-order solver, so its fields end before the scene.
         InstabilityError: a fine run is unstable where the coarse one is not, as more particles meet
-            more extreme strains; names the remedy.
+            more extreme strains; names the remedy. Or an error is not finite.
     """
     name = scene.parameters.name
     for rollout in rollouts:
@@ -207,8 +207,9 @@ def _errors(
         "particles_delta": metrics.deformation_error(*few),
         "particles_displacement_error": metrics.displacement_error(*few, X[shared]),
     }
-    difference = metrics.displacement_error(coarse, few[1], X[shared])
-    return (dict.fromkeys(errors, np.inf) if lost else errors) | {"full_order_difference": difference}
+    difference = {"full_order_difference": metrics.displacement_error(coarse, few[1], X[shared])}
+    metrics.require_finite(difference if lost else errors | difference, f"t = {last:.4g} s")
+    return (dict.fromkeys(errors, np.inf) if lost else errors) | difference
 
 
 def _interpolation_errors(

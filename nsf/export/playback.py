@@ -135,15 +135,15 @@ class Playback:
             raise ConfigError(f"fps={fps} must be positive and finite")
         self.run, self.color, self.every, self.fps, self._settings = run, color, every, fps, run.config
         index, self.parameter = _chosen(self._settings["values"], parameter)
-        self._training = Run.load(run.parents[0], run.root).require()
+        self._training = _parent(run).require()
         self._warp_device = warp_device(device)
         self.device = torch_device(self._warp_device)
         self._precision = precision_of(self._settings["precision"])
         self._dtype = torch_dtype(self._precision)
         self._method = configuration.build(self._settings["method"], "method")
-        self.manifold = Manifold.load(self._training.path / "manifold.pt").to(self.device)
-        self._rollout = Rollout.open(run.path / rollout_file(index))
-        self._continuation = run.path / continuation_file(index)
+        self.manifold = Manifold.load(self._training.file("manifold.pt")).to(self.device)
+        self._rollout = Rollout.open(run.file(rollout_file(index)), self.manifold.latent_dim)
+        self._rest = continuation_file(index)
         self.points_given = points is not None
         self._choose_frames()
         self._choose_points(points)
@@ -155,7 +155,7 @@ class Playback:
         own = len(t)  # frames of the reduced run; the full-order solver made the later ones
         if handed_over >= 0:
             own = handed_over + 1
-            with Trajectory.open(self._continuation) as rest:
+            with Trajectory.open(self.run.file(self._rest)) as rest:
                 t = np.concatenate([t[:own], rest.t[1:]])
         chosen = np.union1d(np.arange(0, len(t), self.every), len(t) - 1)
         self.stopped = float(rollout.t[diverged]) if diverged >= 0 else None
@@ -293,7 +293,7 @@ class Playback:
 
     def _read(self, rows: slice) -> tuple[torch.Tensor, torch.Tensor]:
         """x and τ of some of the points, in the frames of the full-order solver."""
-        with Trajectory.open(self._continuation) as rest:
+        with Trajectory.open(self.run.file(self._rest)) as rest:
             found = (rest.read(name, frames=self._later, particles=self._rows[rows]) for name in ("x", "tau"))
             return tuple(torch.as_tensor(values) for values in found)
 
@@ -306,7 +306,7 @@ class Playback:
         """
         content = {key: self._settings[key] for key in ("scale", "material", "transfer", "scene")}
         try:
-            key = Run.load(self._training.parents[0], self.run.root).config["parameter"]["key"]
+            key = _parent(self._training).config["parameter"]["key"]
         except MissingRunError as error:
             raise MissingRunError(
                 f"points beside the particles, and stress from the deformation, need the scene: {error}"
@@ -315,6 +315,15 @@ class Playback:
         content["scene"] = content["scene"] | {"parameters": varied}
         scene = Scene.from_config(OmegaConf.create(content))
         return scene.with_parameters({scene.parameters.name: self.parameter})
+
+
+def _parent(run: Run) -> Run:
+    """The first of the runs that a run was made from.
+
+    Raises:
+        MissingRunError: it is not there, or the run names none.
+    """
+    return Run.load(run.parents[0] if run.parents else "", run.root)
 
 
 def _chosen(values: Sequence[float], parameter: float | None) -> tuple[int, float]:

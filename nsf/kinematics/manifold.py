@@ -3,37 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import itertools
-import pickle
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from nsf.data import Standardizer
-from nsf.errors import MissingRunError, SchemaError, ShapeError
+from nsf.errors import NSFError, SchemaError, ShapeError
+from nsf.kinematics import checkpoint
 from nsf.storage import writing
-
-FORMAT = "nsf-manifold"
-FORMAT_VERSION = 1
-FIELDS = (
-    "basis",
-    "joint",
-    "mlp",
-)  # each is a module of this package that defines a Manifold with that `field`
-_KEYS = {
-    "latent_dim",
-    "x_sha256",
-    "parameter_names",
-    "hyperparameters",
-    "datasets",
-    "split",
-    "state",
-}
 
 
 class Restriction(ABC):
@@ -121,8 +103,6 @@ class Manifold(nn.Module, ABC):
         datasets, split: provenance of the snapshots, plain containers.
     """
 
-    field: ClassVar[str]
-
     def __init__(
         self, latent_dim: int, x_sha256: str, parameter_names: list[str], hyperparameters: dict[str, Any]
     ):
@@ -159,6 +139,11 @@ class Manifold(nn.Module, ABC):
         """
         begins = torch.diff(self.training_times, prepend=self.training_times[:1]) <= 0
         return begins.long().cumsum(0) - 1
+
+    @property
+    def field(self) -> str:
+        """Short name of its family, that of the module which defines it: "basis", "joint", "mlp"."""
+        return type(self).__module__.rpartition(".")[2]
 
     @abstractmethod
     def encode(self, x: Tensor, tau: Tensor | None = None) -> Tensor:
@@ -225,11 +210,17 @@ class Manifold(nn.Module, ABC):
         return rows, self.X[rows]
 
     def save(self, path: Path | str) -> None:
-        """Write the checkpoint to `path`: whole or not at all."""
+        """Write the checkpoint to `path`: whole or not at all.
+
+        Raises:
+            SchemaError: its class is in no module of `nsf.kinematics.fields`, where `load` would look for it.
+        """
+        name = f"{type(self).__module__}.{type(self).__qualname__}"
+        checkpoint.class_of(name, Manifold)
         content = {
-            "format": FORMAT,
-            "format_version": FORMAT_VERSION,
-            "field": self.field,
+            "format": checkpoint.FORMAT,
+            "format_version": checkpoint.FORMAT_VERSION,
+            "manifold": name,
             "latent_dim": self.latent_dim,
             "x_sha256": self.x_sha256,
             "parameter_names": list(self.parameter_names),
@@ -245,26 +236,37 @@ class Manifold(nn.Module, ABC):
     def load(path: Path | str) -> Manifold:
         """Read a checkpoint of any field onto the host.
 
-        The file is mapped, not read: a restriction to few particles touches few of its pages.
+        The file is mapped: a restriction to few particles holds few of its pages.
 
         Raises:
             MissingRunError: there is no such file.
-            SchemaError: the file is truncated, foreign, of a newer format, or holds more than plain data.
+            SchemaError: the file was changed after its run, is truncated, foreign, of a newer format, holds
+                more than plain data, or values that no training leaves.
         """
-        content = _read(Path(path))
+        path = Path(path)
+        content = checkpoint.read(path)
+        about = ("latent_dim", "x_sha256", "parameter_names", "hyperparameters")
         try:
-            with torch.device("meta"):
-                manifold = _manifold_class(content["field"])(
-                    content["latent_dim"],
-                    content["x_sha256"],
-                    content["parameter_names"],
-                    content["hyperparameters"],
-                )
-            manifold.load_state_dict(content["state"], assign=True)
-        except (RuntimeError, KeyError, TypeError, AttributeError, ValueError) as error:
+            kind = checkpoint.class_of(content.get("manifold"), Manifold)
+            # A tensor may be registered more than once, but no field has many that are not in its file.
+            with torch.device("meta"), checkpoint.registering(8 * len(content["state"]) + 64):
+                manifold = kind(*(content[key] for key in about))
+            checkpoint.fill(manifold, content["state"])
+        except SchemaError as error:
+            remedy = "" if ";" in str(error) else "; train again with `nsf train`"
+            raise SchemaError(f"{path} {error}{remedy}") from error
+        except (
+            RuntimeError,
+            LookupError,
+            TypeError,
+            AttributeError,
+            ValueError,
+            ArithmeticError,
+            NSFError,
+        ) as error:
             raise SchemaError(
-                f"{path} names field={content['field']!r} but its contents do not fit it"
-                f" ({_first_line(error)}); train again with `nsf train`"
+                f"{path} names {content['manifold']} but its contents do not fit it"
+                f" ({checkpoint.first_line(error)}); train again with `nsf train`"
             ) from error
         manifold.datasets, manifold.split = content["datasets"], content["split"]
         return manifold.requires_grad_(False).eval()
@@ -274,47 +276,3 @@ def identity(components: int) -> Standardizer:
     """A standardisation that does nothing yet; its buffers come from a checkpoint or from data."""
     # On the host even while a checkpoint is rebuilt on the meta device: Standardizer looks at the values.
     return Standardizer(torch.zeros(components, device="cpu"), torch.ones(components, device="cpu"))
-
-
-def _manifold_class(field: str) -> type[Manifold]:
-    module = importlib.import_module(f"nsf.kinematics.fields.{field}")
-    return next(
-        kind
-        for kind in vars(module).values()
-        if isinstance(kind, type) and getattr(kind, "field", None) == field
-    )
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]
-
-
-def _read(path: Path) -> dict[str, Any]:
-    if not path.is_file():
-        raise MissingRunError(f"{path} does not exist; run `nsf train` first")
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except (RuntimeError, EOFError, OSError, ValueError, KeyError, pickle.UnpicklingError) as error:
-        raise SchemaError(
-            f"{path} is truncated or not a checkpoint ({_first_line(error)}); delete it and run `nsf train`"
-            " again"
-        ) from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise SchemaError(
-            f"{path} is a torch file but no manifold of nsf; pass the checkpoint of a train run"
-        )
-    version = content.get("format_version")
-    if version != FORMAT_VERSION:
-        raise SchemaError(
-            f"{path} has format_version {version!r}, this nsf reads {FORMAT_VERSION}; install the nsf that"
-            " wrote it or train again with `nsf train`"
-        )
-    if content.get("field") not in FIELDS:
-        raise SchemaError(
-            f"{path} has field {content.get('field')!r}, this nsf knows {', '.join(FIELDS)};"
-            " install the nsf that wrote it"
-        )
-    missing = _KEYS - content.keys()
-    if missing:
-        raise SchemaError(f"{path} lacks {', '.join(sorted(missing))}; delete it and run `nsf train` again")
-    return content

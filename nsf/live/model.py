@@ -224,7 +224,7 @@ class LiveModel:
     def truth(self, value: float) -> Truth | None:
         """The full-order run at a known value; None at other values."""
         run = self._truths.get(value)
-        return Truth(Trajectory.open(run.path / TRAJECTORY), self.shown) if run else None
+        return Truth(Trajectory.open(run.file(TRAJECTORY)), self.shown) if run else None
 
     def roles(self, step: int) -> np.ndarray:
         """[n] set of each shown particle in the step that starts at `step`: 2 S, 1 N only, 0 neither."""
@@ -278,8 +278,8 @@ def _possible(pipeline: Pipeline, value: float) -> bool:
 
 def _trust(run: Run, manifold, sample: np.ndarray, device: str) -> Trust:
     """The trust estimate, with the scales that the deployment calibrated."""
-    scales = run.manifest["metrics"]["trust"]
-    return Trust(scales["residual_m"], scales["distance_m"], LatentDistance(manifold, sample, device))
+    residual, distance = (run.metric("trust", scale) for scale in ("residual_m", "distance_m"))
+    return Trust(residual, distance, LatentDistance(manifold, sample, device))
 
 
 def _shown(particles: int, sample: np.ndarray, points: int) -> np.ndarray:

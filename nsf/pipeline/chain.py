@@ -64,12 +64,12 @@ class Pipeline(Plan):
             MissingRunError: the run was made before its whole configuration was kept.
         """
         path = run.path / CONFIGURATION
-        if not path.is_file():
+        if not path.exists():
             raise MissingRunError(
                 f"{run.path} has no {CONFIGURATION}: it was made by an earlier nsf; "
                 f"delete the folder and run `nsf deploy scene={run.scene}` with the same keys"
             )
-        config = configuration.read(path)
+        config = configuration.read(run.file(CONFIGURATION))
         config.device = device
         return cls(config, say, run.root)
 
@@ -146,7 +146,7 @@ class Pipeline(Plan):
     def _train(self, run: Run) -> None:
         self.check_devices()
         c = self.config
-        paths = [run.path / TRAJECTORY for run in self.training_data]
+        paths = [run.file(TRAJECTORY) for run in self.training_data]
         own = {"field": self.field, "latent_dim": c.latent_dim, "seed": c.seed, "tracking": c.tracking}
         one = partial(train, folder=run.path, **own)
         with run.record(device=self.device, seed=c.seed) as record:
@@ -169,7 +169,7 @@ class Pipeline(Plan):
         Raises:
             MissingRunError: it is not trained.
         """
-        manifold = Manifold.load(self.training.require().path / "manifold.pt")
+        manifold = Manifold.load(self.training.require().file("manifold.pt"))
         if isinstance(self.field, MlpField):
             manifold.arithmetic = self.field.arithmetic
         return manifold
@@ -296,12 +296,11 @@ class Pipeline(Plan):
         return self._made(self.evaluation, self._evaluate)
 
     def _evaluate(self, run: Run) -> None:
-        deployment, truths = self.deployment, self._truths()
-        manifold = self.manifold().to(self.device)  # as in deployment
+        truths, manifold = self._truths(), self.manifold().to(self.device)  # as in deployment
         with run.record(device=self.device, precision=self.config.precision) as record:
-            rollouts = [Rollout.open(deployment.path / rollout_file(index)) for index in range(len(truths))]
+            rollouts = self._rollouts(len(truths), manifold)
             comparisons = [
-                self._compare(manifold, rollout, truth, deployment.path / continuation_file(index))
+                self._compare(manifold, rollout, truth, index)
                 for index, (rollout, truth) in enumerate(zip(rollouts, truths, strict=True))
             ]
             cost = self._cost(manifold)
@@ -309,21 +308,27 @@ class Pipeline(Plan):
             table = results.rows(
                 self.config, manifold, rollouts, comparisons, cost, self.device, run.manifest, engine
             )
-            seconds = self.training.manifest["metrics"]["training_seconds"]
+            seconds = self.training.metric("training_seconds")
             summary = results.summarise(self.deployed, manifold, table, comparisons, rollouts, seconds)
             results.write(record, table, comparisons, cost, summary)
         self.say(f"evaluate: mean δ {100 * table['delta'].mean():.3g} % over {len(table)} values → {run.id}")
 
     def _truths(self) -> list[Path]:
         """Files of the full-order trajectories that the deployed ones are held to."""
-        return [self.truth(value).path / TRAJECTORY for value in self.held_out]
+        return [self.truth(value).file(TRAJECTORY) for value in self.held_out]
 
-    def _compare(self, manifold: Manifold, rollout: Rollout, truth: Path, continuation: Path) -> Comparison:
+    def _rollouts(self, count: int, manifold: Manifold) -> list[Rollout]:
+        """The reduced runs at the held-out values."""
+        files = (self.deployment.file(rollout_file(index)) for index in range(count))
+        return [Rollout.open(file, manifold.latent_dim) for file in files]
+
+    def _compare(self, manifold: Manifold, rollout: Rollout, truth: Path, index: int) -> Comparison:
         shown = (self.config.evaluation.picture_particles, self.config.evaluation.picture_frames)
         with contextlib.ExitStack() as files:
             trajectory = files.enter_context(Trajectory.open(truth))
-            handed_over = rollout.handed_over >= 0
-            rest = files.enter_context(Trajectory.open(continuation)) if handed_over else None
+            rest = None
+            if rollout.handed_over >= 0:
+                rest = files.enter_context(Trajectory.open(self.deployment.file(continuation_file(index))))
             solver = self.solver_at(manifold, rollout.parameter)
             return compare(solver, trajectory, rollout, self.config.deploy.split, shown, rest)
 
@@ -385,12 +390,12 @@ class Pipeline(Plan):
 
     def _superresolve(self, run: Run) -> None:
         c, asked = self.config, self.config.super_resolution
-        deployment, truths, manifold = self.deployment, self._truths(), self.manifold()
+        truths, manifold = self._truths(), self.manifold()
         # Evenly spread, without frame 0, at which nothing has moved.
         steps = self.scene.steps
         frames = np.unique(np.linspace(0, steps, min(asked.frames, steps) + 1).round().astype(int))[1:]
         with run.record(device=self.device, precision=c.precision) as record:
-            rollouts = [Rollout.open(deployment.path / rollout_file(index)) for index in range(len(truths))]
+            rollouts = self._rollouts(len(truths), manifold)
             with contextlib.ExitStack() as files:
                 fine = superresolve(
                     manifold,

@@ -171,6 +171,7 @@ def write(
     for name in (*tables, "frames.npz", "cost.json", "summary.json"):
         record.output(name)
     record.metrics.update({name: summary[name] for name in ("delta", "reconstruction_delta")})
+    record.metrics["diverged"] = results.loc[np.isinf(results["delta"]), "parameter"].tolist()
 
 
 def write_superresolution(record: Record, scene: Scene, fine: Sequence[SuperResolution]) -> pd.DataFrame:

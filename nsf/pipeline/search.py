@@ -187,7 +187,7 @@ def _tried(overrides: list[str], objectives: Sequence[str], root: Path | None) -
     pipeline = Pipeline(config, lambda line: None, root)
     for stage in STAGES[:-1]:
         run = pipeline.run(stage)
-    results = pd.read_csv(run.path / "results.csv")
+    results = pd.read_csv(run.file("results.csv"))
     if set(results["split"]) != {"validation"}:
         raise ConfigError(f"{run.id} is not of the validation values alone; leave deploy.split out")
     values = [float(results[OBJECTIVES[name].name].mean()) for name in objectives]

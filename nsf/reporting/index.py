@@ -12,7 +12,6 @@ from PIL import Image
 from nsf.data import Trajectory
 from nsf.data.schema import TRAJECTORY
 from nsf.deployment import Rollout
-from nsf.errors import NSFError
 from nsf.reporting.drawing.style import FULL, PALETTE, REDUCED, figure, styled
 from nsf.reporting.formats import HTML
 from nsf.reporting.listing import FIELDS, Entry, entries, text
@@ -75,7 +74,7 @@ def _row(entry: Entry, folder: Path) -> dict:
     return {
         "picture": picture if thumbnail(entry.run, folder / picture) else None,
         "link": Path(os.path.relpath(entry.run.path / "manifest.json", folder)).as_posix(),
-        "error": entry.manifest.get("error") or "",
+        "error": text(entry.fault or entry.manifest.get("error") or ""),
         "cells": [
             {"name": name, "text": told, "value": "" if value is None else value}
             for name, told, value in shown
@@ -100,26 +99,26 @@ def thumbnail(run: Run, path: Path) -> bool:
         ax = fig.add_axes((0, 0, 1, 1))
         ax.axis("off")
         try:
-            draw(ax, run.path)
-        except (NSFError, OSError, ValueError, KeyError):
-            return False  # a page of all runs must not fail for one that cannot be read
+            draw(ax, run)
+        except Exception:
+            return False  # a page of all runs must not fail for one whose files are not what they should be
         with writing(path) as partial:
             fig.savefig(partial, metadata={"Software": None})
     return True
 
 
-def _simulated(ax: Axes, folder: Path) -> None:
+def _simulated(ax: Axes, run: Run) -> None:
     """The particles at the end."""
-    with Trajectory.open(folder / TRAJECTORY) as trajectory:
+    with Trajectory.open(run.file(TRAJECTORY)) as trajectory:
         step = max(1, trajectory.particles // _POINTS)
         x = trajectory.read("x", trajectory.frames - 1, slice(None, None, step)).reshape(-1, 3)
     _scatter(ax, x, FULL)
 
 
-def _trained(ax: Axes, folder: Path) -> None:
+def _trained(ax: Axes, run: Run) -> None:
     """The losses of the three phases."""
     phases: dict[str, list[Path]] = {}
-    for log in sorted(folder.glob("*/csv/*/metrics.csv")):
+    for log in sorted(run.path.glob("*/csv/*/metrics.csv")):
         phases.setdefault(log.parents[2].name, []).append(log)
     if not phases:
         raise ValueError("no log")
@@ -128,24 +127,24 @@ def _trained(ax: Axes, folder: Path) -> None:
         ax.semilogy(loss["step"], loss["loss"], color=color, linewidth=1)
 
 
-def _deployed(ax: Axes, folder: Path) -> None:
+def _deployed(ax: Axes, run: Run) -> None:
     """The first two latent coordinates of every reduced run."""
-    for path in sorted(folder.glob("rollout_*.h5")):
-        xhat = Rollout.open(path).xhat
+    for path in sorted(run.path.glob("rollout_*.h5")):
+        xhat = Rollout.open(run.file(path.name)).xhat
         ax.plot(xhat[:, 0], xhat[:, min(1, xhat.shape[1] - 1)], color=REDUCED, linewidth=1)
 
 
-def _evaluated(ax: Axes, folder: Path) -> None:
+def _evaluated(ax: Axes, run: Run) -> None:
     """The particles at the end, full-order and reduced, of the first value."""
-    with np.load(folder / "frames.npz", allow_pickle=False) as frames:
+    with np.load(run.file("frames.npz"), allow_pickle=False) as frames:
         for name, color in (("x_full", FULL), ("x_reduced", REDUCED)):
             x = frames[name][0, -1]
             _scatter(ax, x[:: max(1, len(x) // _POINTS)], color)
 
 
-def _superresolved(ax: Axes, folder: Path) -> None:
+def _superresolved(ax: Axes, run: Run) -> None:
     """The picture that the run holds."""
-    with Image.open(folder / "superresolution.png") as picture:
+    with Image.open(run.file("superresolution.png")) as picture:
         picture.thumbnail((320, 200))
         ax.imshow(np.asarray(picture))
 
@@ -155,7 +154,7 @@ def _scatter(ax: Axes, x: np.ndarray, color: str) -> None:
     ax.set_aspect("equal", adjustable="datalim")
 
 
-_DRAWN: dict[str, Callable[[Axes, Path], None]] = {
+_DRAWN: dict[str, Callable[[Axes, Run], None]] = {
     "simulate": _simulated,
     "train": _trained,
     "deploy": _deployed,

@@ -3,6 +3,7 @@
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from dataclasses import field as attribute
 from datetime import datetime
 from fnmatch import fnmatchcase
 from functools import cached_property
@@ -12,7 +13,7 @@ from typing import Any
 from rich.markup import escape
 from rich.table import Table
 
-from nsf.errors import ConfigError
+from nsf.errors import ConfigError, SchemaError
 from nsf.reporting.columns import ABSENT, number
 from nsf.runs import Run
 
@@ -24,14 +25,26 @@ _MAIN = {
     "superresolve": ("delta", "δ"),
     "train": ("deformation_loss", "loss of g"),
 }
+_GENERATIONS = 32  # of runs, each made from the one before; a chain has five
 _ORIGIN = ("commit", "dirty", "device", "seed", "precision", "versions")
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A run as it is listed."""
+    """A run as it is listed.
+
+    Attributes:
+        run: whole, half-made or broken.
+        known: settings of runs by run, which entries that are listed together share.
+    """
 
     run: Run
+    known: dict[Run, dict[str, Any]] = attribute(default_factory=dict, repr=False, compare=False)
+
+    @cached_property
+    def fault(self) -> str | None:
+        """Why the run is broken, None where it is not."""
+        return self.run.fault
 
     @cached_property
     def manifest(self) -> dict[str, Any]:
@@ -62,29 +75,26 @@ class Entry:
     def settings(self) -> dict[str, Any]:
         """The configuration by dotted key: of the runs that this one goes back to, and on top its own.
 
-        Where those runs differ, as simulations do in their parameter, the values are a tuple.
+        Where those runs differ, as simulations do in their parameter, the values are a tuple. A broken run
+        has none.
         """
-        found: dict[str, list[Any]] = {}
-        for parent in self.run.parent_runs:
-            for key, value in (Entry(parent).settings if parent.manifest else {}).items():
-                known = found.setdefault(key, [])
-                known += [v for v in (value if isinstance(value, tuple) else (value,)) if v not in known]
-        inherited = {key: known[0] if len(known) == 1 else tuple(known) for key, known in found.items()}
-        return inherited | _flat(self.run.config)
+        return _settings(self.run, self.known, _GENERATIONS)
 
     def texts(self) -> list[str]:
         """The fields as shown."""
-        shown = {key: ABSENT if value is None else str(value) for key, value in self.values.items()}
+        shown = {key: text(value) for key, value in self.values.items()}
         if self.values["created"]:
             when = datetime.fromisoformat(self.values["created"]).astimezone()
             shown["created"] = f"{when:%Y-%m-%d %H:%M:%S}"
         shown["seconds"] = number(self.values["seconds"])
-        if self.values["metric"] is not None:
+        if isinstance(self.values["metric"], int | float):
             _, title = _MAIN[self.run.stage]
             percent = title == "δ"
             shown["metric"] = (
                 f"{title} {number(self.values['metric'], 100 if percent else 1)}" + " %" * percent
             )
+        elif self.metrics.get("diverged"):
+            shown["metric"] = "diverged"
         return [shown[field] for field in FIELDS]
 
 
@@ -103,7 +113,8 @@ def entries(filters: Mapping[str, str] | None = None, sort: str = "-created", ro
     Raises:
         ConfigError: there are runs, and none has such a key; names the nearest.
     """
-    found = [Entry(run) for run in Run.find(root=root)]
+    known: dict[Run, dict[str, Any]] = {}
+    found = [Entry(run, known) for run in Run.find(root=root)]
     key = sort.removeprefix("-")
     for name in (*(filters or ()), key):
         _check_key(name, found)
@@ -126,7 +137,14 @@ def runs_table(found: Sequence[Entry]) -> Table:
 
 
 def difference_table(first: Run, second: Run) -> Table:
-    """What differs between two runs: configuration, origin, and result with its relative change."""
+    """What differs between two runs: configuration, origin, and result with its relative change.
+
+    Raises:
+        SchemaError: one of them is broken.
+    """
+    for run in (first, second):
+        if run.fault:
+            raise SchemaError(f"{run.path} is broken ({run.fault}); run `nsf {run.stage}` again")
     one, two = Entry(first), Entry(second)
     table = Table(box=None, header_style="bold", pad_edge=False)
     for heading in ("", "key", first.id, second.id, "change"):
@@ -146,6 +164,25 @@ def difference_table(first: Run, second: Run) -> Table:
         if not keys:
             table.add_row(part, "the same", "", "", "")
     return table
+
+
+def _settings(run: Run, known: dict[Run, dict[str, Any]], generations: int) -> dict[str, Any]:
+    """As `Entry.settings`; `known` ends the search where a run goes back to itself."""
+    if run in known:
+        return known[run]
+    if not generations:
+        return {}
+    known[run] = {}
+    if not run.manifest or run.fault:
+        return {}
+    found: dict[str, list[Any]] = {}
+    for parent in run.parent_runs:
+        for key, value in _settings(parent, known, generations - 1).items():
+            values = found.setdefault(key, [])
+            values += [v for v in (value if isinstance(value, tuple) else (value,)) if v not in values]
+    inherited = {key: values[0] if len(values) == 1 else tuple(values) for key, values in found.items()}
+    known[run] = inherited | _flat(run.config)
+    return known[run]
 
 
 def _check_key(key: str, found: Sequence[Entry]) -> None:
@@ -185,14 +222,16 @@ def _flat(value, prefix: str = "") -> dict[str, Any]:
 
 
 def text(value) -> str:
-    """A value of a configuration or a manifest as shown; several values in a row."""
+    """A value of a configuration or a manifest as shown, without control characters; several in a row."""
     if isinstance(value, tuple):
         return ", ".join(map(text, value))
     if value is None:
         return ABSENT
     if isinstance(value, bool):
         return str(value).lower()
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in str(value))
 
 
 def _change(a, b) -> str:

@@ -11,7 +11,6 @@ import yaml
 from pages import ROOT, blocks, try_command
 
 from nsf import config
-from nsf.kinematics import manifold
 from nsf.pipeline import Pipeline
 from nsf.pipeline.experiment import Experiment
 
@@ -41,7 +40,7 @@ def project(tmp_path, monkeypatch):
             del sys.modules[name]
 
 
-def add(file: str, content: str, project: Path, monkeypatch) -> None:
+def add(file: str, content: str, project: Path) -> None:
     """Write a file of a page where it belongs, and build what it defines."""
     path = project / file
     path.write_text(content, encoding="utf-8")
@@ -49,8 +48,6 @@ def add(file: str, content: str, project: Path, monkeypatch) -> None:
     if path.suffix == ".py":
         importlib.invalidate_caches()
         importlib.import_module(file.removesuffix(".py").replace("/", "."))
-        if group == "nsf/kinematics/fields":  # as the page says
-            monkeypatch.setattr(manifold, "FIELDS", (*manifold.FIELDS, name))
     elif group == "experiments":
         for job in Experiment.load(name, folder=project / "experiments").jobs:
             Pipeline(config.load([*job.overrides, "device=cpu"]))
@@ -85,7 +82,7 @@ def test_page(page, project, monkeypatch, capsys):
     for language, title, content in found:
         try:
             if title:
-                add(title, content, project, monkeypatch)
+                add(title, content, project)
             elif language == "python":
                 exec(compile(content, page, "exec"), names)
             else:

@@ -21,6 +21,7 @@ from nsf.errors import ConfigError, InstabilityError, MissingRunError, NSFError
 from nsf.evaluation import superresolution
 from nsf.kinematics.manifold import Manifold
 from nsf.mpm import FullOrderMPM
+from nsf.reporting.listing import entries
 from nsf.runs import Run
 
 #: Issue 2, "Done when".
@@ -457,6 +458,9 @@ def test_a_diverged_rollout_is_infinite_and_never_nan(copied, pipeline_at):
     pipeline.run("evaluate")
     assert any("friction_angle=26 diverged at step" in line and "∞" in line for line in said)
     assert pipeline.deployment.manifest["metrics"]["diverged"] == [26.0]
+    assert pipeline.evaluation.manifest["metrics"]["diverged"] == [26.0]
+    (listed,) = entries({"stage": "evaluate"}, root=root)
+    assert listed.texts()[-1] == "diverged"
     results = pd.read_csv(pipeline.evaluation.path / "results.csv")
     assert (results[["delta", "displacement_error", "stress_error"]] == np.inf).all().all()
     costs = ["step_ms_reduced", "speedup_step", "speedup_total", "memory_reduced_mib"]

@@ -1,7 +1,6 @@
 """Files that are truncated, foreign, newer or malicious, and a disk without room."""
 
 import errno
-import json
 import os
 import pickle
 import shutil
@@ -22,15 +21,15 @@ from nsf.runs import Run
 STAGES = ("simulate", "train", "deploy", "evaluate")
 
 
-def replace(run: Run, name: str, spoil) -> None:
-    """Change a file of a complete run; its manifest then says that size, as if it had always been so."""
-    path = run.path / name
-    spoil(path)
-    manifest = json.loads((run.path / "manifest.json").read_text())
-    for output in manifest["outputs"]:
-        if output["path"] == name:
-            output["bytes"] = path.stat().st_size
-    (run.path / "manifest.json").write_text(json.dumps(manifest))
+@pytest.fixture
+def replace(seal):
+    """(run, name, spoil) → a file of a complete run is another, which its manifest says it always was."""
+
+    def change(run: Run, name: str, spoil) -> None:
+        spoil(run.path / name)
+        seal(run)
+
+    return change
 
 
 def truncate(path):
@@ -89,7 +88,7 @@ def refused(nsf, tmp_path):
     [(truncate, "truncated"), (foreign_hdf5, "not written by nsf"), (text, "HDF5"), (newer_hdf5, "99")],
     ids=lambda value: getattr(value, "__name__", ""),
 )
-def test_a_bad_trajectory(refused, copied, pipeline_at, spoil, quoted):
+def test_a_bad_trajectory(refused, copied, pipeline_at, spoil, quoted, replace):
     root = copied("simulate")
     run = pipeline_at(root).simulation(30.0)
     replace(run, "trajectory.h5", spoil)
@@ -124,7 +123,7 @@ def test_a_trajectory_cut_short_is_simulated_again(copied, pipeline_at, refused,
     ],
     ids=lambda value: getattr(value, "__name__", ""),
 )
-def test_a_bad_checkpoint(refused, copied, pipeline_at, spoil, quoted):
+def test_a_bad_checkpoint(refused, copied, pipeline_at, spoil, quoted, replace):
     root = copied("simulate", "train")
     run = pipeline_at(root).training
     replace(run, "manifold.pt", spoil)
@@ -146,7 +145,7 @@ def test_a_checkpoint_cut_short_is_trained_again(copied, pipeline_at, chain):
     assert all(torch.equal(one["state"][k], other["state"][k]) for k in one["state"])
 
 
-def test_a_checkpoint_is_data_and_never_code(refused, copied, pipeline_at, tmp_path):
+def test_a_checkpoint_is_data_and_never_code(refused, copied, pipeline_at, tmp_path, replace):
     root, marker = copied("simulate", "train"), tmp_path / "executed"
     for save in (torch.save, lambda value, path: path.write_bytes(pickle.dumps(value))):
         replace(pipeline_at(root).training, "manifold.pt", lambda path: save({"format": Bomb(marker)}, path))  # noqa: B023
@@ -154,7 +153,7 @@ def test_a_checkpoint_is_data_and_never_code(refused, copied, pipeline_at, tmp_p
         assert not marker.exists()
 
 
-def test_a_bad_rollout(refused, copied, pipeline_at):
+def test_a_bad_rollout(refused, copied, pipeline_at, replace):
     root = copied("simulate", "train", "deploy")
     run = pipeline_at(root).deployment
     replace(run, "rollout_0.h5", truncate)
@@ -170,6 +169,94 @@ def test_a_spoiled_manifest_is_an_incomplete_run(copied, pipeline_at):
     assert not pipeline.training.complete
     pipeline.run("train")
     assert pipeline.training.complete
+
+
+def bit(path):
+    """Change one bit in the middle, and not the size."""
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 4
+    path.write_bytes(content)
+
+
+def nan_weights(path):
+    content = torch.load(path, weights_only=True)
+    content["state"]["fields.stress.network.layers.0.weight"][0, 0] = float("nan")
+    torch.save(content, path)
+
+
+def nan_in(name, place):
+    def change(path):
+        with h5py.File(path, "a") as file:
+            file[name][place] = np.nan
+
+    return change
+
+
+def another_file(path):
+    with h5py.File(path, "a") as file:
+        del file["frames/x"]
+        file["frames/x"] = h5py.ExternalLink("/etc/passwd", "/")
+
+
+def pipe(path):
+    path.unlink()
+    os.mkfifo(path)
+
+
+def linked(path):
+    path.rename(path.parent.parent / "elsewhere")
+    path.symlink_to(path.parent.parent / "elsewhere")
+
+
+#: The stage that reads a file, whose it is, and what it is called.
+READ = [
+    ("train", lambda p: p.simulation(30.0), "trajectory.h5"),
+    ("deploy", lambda p: p.training, "manifold.pt"),
+    ("evaluate", lambda p: p.deployment, "rollout_0.h5"),
+    ("evaluate", lambda p: p.truth(26.0), "trajectory.h5"),
+    ("evaluate", lambda p: p.training, "manifold.pt"),
+]
+
+
+@pytest.mark.parametrize("of", READ, ids=lambda of: f"{of[0]}-{of[2]}")
+@pytest.mark.parametrize("change", [bit, pipe, linked], ids=lambda change: change.__name__)
+def test_a_file_that_was_changed_after_its_run(refused, copied, pipeline_at, of, change):
+    stage, run_of, name = of
+    root = copied(*STAGES[: STAGES.index(stage)])
+    run = run_of(pipeline_at(root))
+    change(run.path / name)
+    line = refused(stage, root)
+    if change is bit:
+        assert f"{run.path / name} has sha256" in line
+    else:
+        assert f"{run.path} is not whole ({name} missing or cut short)" in line
+    assert f"run `nsf {run.stage}" in line
+    assert not [r for r in Run.find(stage, root=root) if r.complete]
+
+
+@pytest.mark.parametrize(
+    ("of", "change", "told"),
+    [
+        (READ[0], nan_in("frames/tau", (3, 7, 2)), "non-finite values of tau, as in frame 3"),
+        (READ[0], nan_in("particles/mass", 3), "non-finite values of particles/mass"),
+        (READ[0], nan_in("frames/t", 3), "non-finite values of frames/t"),
+        (READ[0], another_file, "has a link in the place of frames/x"),
+        (READ[1], nan_weights, "non-finite values of fields.stress.network.layers.0.weight"),
+        (READ[2], nan_in("xhat", (7, 1)), "non-finite values of xhat"),
+        (READ[3], nan_in("frames/x", (9, 1, 1)), "non-finite values of x, as in frame 9"),
+        (READ[4], nan_weights, "non-finite values of fields.stress.network.layers.0.weight"),
+    ],
+)
+def test_values_that_no_run_leaves(refused, copied, pipeline_at, of, change, told, replace):
+    """As if the run itself had left them."""
+    stage, run_of, name = of
+    root = copied(*STAGES[: STAGES.index(stage)])
+    run = run_of(pipeline_at(root))
+    replace(run, name, change)
+    line = refused(stage, root)
+    assert f"{run.path / name} has" in line
+    assert told in line
+    assert not [r for r in Run.find(stage, root=root) if r.complete]
 
 
 def half_written(root, stage, smallest=0):

@@ -62,6 +62,11 @@ class BasisField:
         at_least("members", self.members, 1)
         at_least("noise", self.noise, 0)
 
+    @property
+    def manifold(self) -> type[BasisManifold]:
+        """The class of the manifolds that `build` makes; a field that builds on this one has its own."""
+        return BasisManifold
+
     def prepare(self, snapshots: Snapshots, latent_dim: int) -> dict[str, Any]:
         """POD coefficients [M, K] of x, tau and C and the energy the modes leave out.
 
@@ -101,7 +106,7 @@ class BasisField:
             "head_parameters": self.head_parameters,
             "unresolved": [prepared[name]["unresolved"] for name, _ in TARGETS.values()],
         }
-        manifold = BasisManifold(
+        manifold = self.manifold(
             latent_dim, snapshots.x_sha256, list(snapshots.parameter_names), hyperparameters
         )
         manifold.describe(snapshots)
@@ -164,8 +169,6 @@ def coefficients(values: Tensor, mean: Tensor, modes: Tensor) -> Tensor:
 
 class BasisManifold(Manifold):
     """Modal fields of x, tau and C."""
-
-    field = "basis"
 
     def __init__(self, latent_dim, x_sha256, parameter_names, hyperparameters):
         super().__init__(latent_dim, x_sha256, parameter_names, hyperparameters)

@@ -55,6 +55,11 @@ class JointField(BasisField):
                 f"field.stress_weight={self.stress_weight} must be positive; or use field=basis"
             )
 
+    @property
+    @override
+    def manifold(self) -> type[JointManifold]:
+        return JointManifold
+
     @override
     def prepare(self, snapshots: Snapshots, latent_dim: int) -> dict[str, Any]:
         """As of `basis`, but for the coefficients of x: first those of the joint snapshots.
@@ -85,10 +90,7 @@ class JointField(BasisField):
         self, snapshots: Snapshots, prepared: dict[str, Any], latent_dim: int, generator: torch.Generator
     ) -> JointManifold:
         """The manifold with its modes and its encoder, and untrained networks."""
-        like = super().build(snapshots, prepared, latent_dim, generator)
-        manifold = JointManifold(latent_dim, like.x_sha256, list(like.parameter_names), like.hyperparameters)
-        manifold.describe(snapshots)
-        manifold.load_state_dict(like.state_dict(), strict=False)  # all but the encoder
+        manifold = super().build(snapshots, prepared, latent_dim, generator)
         latent = prepared["x"]["coefficients"][:, :latent_dim].to(snapshots.X.device)
         scale = manifold.fields["deformation"].leading
         for encoder, (name, components) in zip(
@@ -105,8 +107,6 @@ class JointManifold(BasisManifold):
     Attributes:
         of_x: [P, 3, r] 1/m, of_tau: [P, 6, r] 1/Pa: x̂ is the sum of their products with the deviations.
     """
-
-    field = "joint"
 
     def __init__(self, latent_dim, x_sha256, parameter_names, hyperparameters):
         super().__init__(latent_dim, x_sha256, parameter_names, hyperparameters)

@@ -123,7 +123,6 @@ class MlpManifold(Manifold):
             `networks.ARITHMETIC`, or None for that of g, which is the type asked for.
     """
 
-    field = "mlp"
     arithmetic: str | None = None
 
     def __init__(self, latent_dim, x_sha256, parameter_names, hyperparameters):

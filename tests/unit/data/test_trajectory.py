@@ -98,16 +98,6 @@ def test_reads_outside(write, field, frames, particles, message):
         trajectory.read(field, frames, particles)
 
 
-def test_frames_in_chunks_are_read_alike(write):
-    path, values = write()
-    with h5py.File(path, "r+") as file:
-        stored = file["frames/C"][()]
-        del file["frames/C"]
-        file.create_dataset("frames/C", data=stored, chunks=(1, 11, 9))
-    with Trajectory.open(path) as trajectory:
-        assert np.array_equal(trajectory.read("C"), stacked(values, "C").astype("f4"))
-
-
 def test_frames_come_in_as_many_pieces_as_the_system_gives(write, monkeypatch):
     path, values = write()
     plain = os.preadv
@@ -165,7 +155,7 @@ def test_what_is_not_hdf5(tmp_path, content):
     path.write_bytes(content)
     with pytest.raises(SchemaError, match=r"a\.h5"):
         Trajectory.open(path)
-    with pytest.raises(SchemaError, match=r"truncated or not HDF5"):
+    with pytest.raises(SchemaError, match="is no regular file"):
         Trajectory.open(tmp_path)
 
 
@@ -198,6 +188,44 @@ def attribute(name, value):
     return lambda file: file.attrs.__setitem__(name, value)
 
 
+def laid_out(name, **how):
+    """The same values in another layout."""
+
+    def change(file):
+        values = file[name][()]
+        del file[name]
+        file.create_dataset(name, data=values, **how)
+
+    return change
+
+
+def claims(name, shape, **how):
+    """An array of which not a byte is there."""
+
+    def change(file):
+        del file[name]
+        file.create_dataset(name, shape, "f4", **how)
+
+    return change
+
+
+def outside(file):
+    """HDF5's external storage: the values are those of another file."""
+    del file["frames/x"]
+    file.create_dataset("frames/x", (4, 11, 3), "f4", external=[(__file__, 0, h5py.h5f.UNLIMITED)])
+
+
+def virtual(file):
+    del file["frames/x"]
+    layout = h5py.VirtualLayout((4, 11, 3), "f4")
+    layout[:] = h5py.VirtualSource("other.h5", "secret", (4, 11, 3))
+    file.create_virtual_dataset("frames/x", layout)
+
+
+def at(name, index, value):
+    return lambda file: file[name].__setitem__(index, value)
+
+
 def swap_particles(file):
     file["particles/X"][:2] = file["particles/X"][:2][::-1]
 
@@ -211,7 +239,46 @@ def swap_particles(file):
         (attribute("complete", False), "not finished"),
         (attribute("tau_order", "xx,yy,zz,xy,xz,yz"), "tau_order=xx,yy"),
         (lambda file: file.attrs.__delitem__("dt"), "lacks"),
-        (attribute("dt", "soon"), "damaged"),
+        *[
+            (attribute(name, value), f"attribute {name}, which is no single")
+            for name, value in {"dt": "soon", "dx": [1.0, 2.0], "complete": "yes", "tau_order": 5}.items()
+        ],
+        (attribute("x_sha256", b"0"), "x_sha256=0"),
+        (attribute("units", '{"x": "mm"}'), "has units that are not those of this schema"),
+        (attribute("schema_version", [1]), "not written by nsf"),
+        (attribute("dt", np.nan), "non-finite values of dt"),
+        (attribute("dt", 0.0), "values of dt and dx that are not positive"),
+        (attribute("dx", -0.1), "values of dt and dx that are not positive"),
+        *[
+            (at(f"particles/{name}", 3, value), rf"{told} particles/{name}")
+            for name in ("mass", "volume0")
+            for value, told in (
+                (np.nan, "non-finite values of"),
+                (np.inf, "non-finite values of"),
+                (0.0, "values of"),
+            )
+        ],
+        (at("particles/X", (1, 1), np.nan), "non-finite values of particles/X"),
+        (at("frames/t", 2, np.nan), "non-finite values of frames/t"),
+        (at("frames/t", 2, 0.1), "frames/t that does not increase"),
+        (at("frames/t", 1, 0.0), "frames/t that does not increase"),
+        (at("parameters/friction_angle", (), np.inf), "non-finite values of friction_angle"),
+        (at("cost/seconds", (), np.nan), "non-finite values of seconds"),
+        (replace("frames/x", np.zeros((4, 11, 3), "i4")), "frames/x of <i4, not <f4 or <f8"),
+        (replace("frames/x", np.zeros((4, 11, 3), ">f4")), "frames/x of >f4"),
+        (replace("particles/mass", np.ones(11, "f4")), "particles/mass of <f4, not <f8"),
+        (replace("parameters/friction_angle", "steep"), "friction_angle of .*, not <f8"),
+        (replace("frames", 1.0), "lacks"),
+        (replace("particles/X", h5py.Empty("f8")), r"particles/X of shape \[\], not \[any, 3\]"),
+        (laid_out("frames/C", chunks=(1, 11, 9)), "frames/C in chunks"),
+        (laid_out("frames/C", compression="gzip"), "frames/C in chunks"),
+        (claims("frames/x", (4, 11, 3)), "ends before frames/x does"),
+        (claims("frames/t", (3 * 10**12,)), "frames/t of <f4"),
+        (outside, "frames/x in chunks or outside the file"),
+        (virtual, "frames/x in chunks or outside the file"),
+        (replace("frames/x", h5py.ExternalLink("other.h5", "/secret")), "a link in the place of frames/x"),
+        (replace("frames", h5py.ExternalLink("other.h5", "/")), "a link in the place of frames"),
+        (replace("parameters", h5py.SoftLink("/cost")), "a link in the place of parameters"),
         (swap_particles, "x_sha256"),
         (attribute("x_sha256", "0" * 64), "x_sha256=000000000000"),
         *[
@@ -230,9 +297,9 @@ def swap_particles(file):
         (replace("frames/tau", np.zeros((4, 11, 9))), "frames/tau"),
         (replace("frames/t", np.zeros(5)), "frames/"),
         (replace("particles/mass", np.zeros(10)), "particles/mass"),
-        (replace("particles/X", np.zeros((11, 2))), "X has shape"),
-        (replace("particles/X", 1.0), "damaged"),
-        (replace("frames/x", h5py.SoftLink("/nowhere")), "lacks"),
+        (replace("particles/X", np.zeros((11, 2))), r"particles/X of shape \[11, 2\], not \[any, 3\]"),
+        (replace("particles/X", 1.0), r"particles/X of shape \[\], not \[any, 3\]"),
+        (replace("frames/x", h5py.SoftLink("/nowhere")), "a link in the place of frames/x"),
     ],
 )
 def test_a_file_of_other_content(write, change, message):
@@ -243,6 +310,73 @@ def test_a_file_of_other_content(write, change, message):
     with pytest.raises(SchemaError, match=rf"a\.h5.*{message}"):
         Trajectory.open(path)
     path.unlink()
+
+
+def test_a_file_that_claims_terabytes_is_refused_before_any_is_asked_for(tmp_path, constants):
+    """24 TB of frames, all of whose constants are in order."""
+    path, frames = tmp_path / "a.h5", 10**8
+    with started(path, constants, 1) as writer:
+        writer.append(**one_frame())
+    with h5py.File(path, "r+") as file:
+        for name, c in COMPONENTS.items():
+            claims(f"frames/{name}", (frames, 11, c))(file)
+        replace("frames/t", np.arange(10.0))(file)
+    assert path.stat().st_size < 100_000
+    with pytest.raises(SchemaError, match="frames/x of shape"):
+        Trajectory.open(path)
+    with h5py.File(path, "r+") as file:
+        del file["frames/t"]
+        file["frames"].create_dataset("t", (frames,), "<f8")
+    with pytest.raises(SchemaError, match="ends before frames/t does, which is of 800,000,000 bytes"):
+        Trajectory.open(path)
+
+
+def test_a_pipe_is_no_trajectory(tmp_path):
+    os.mkfifo(tmp_path / "a.h5")
+    with pytest.raises(SchemaError, match=r"a\.h5 is no regular file"):
+        Trajectory.open(tmp_path / "a.h5")
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("field", COMPONENTS)
+def test_frames_are_finite_where_they_are_read(write, field, bad):
+    path, _ = write()
+    with h5py.File(path, "r+") as file:
+        file[f"frames/{field}"][2, 5, 1] = bad
+    with Trajectory.open(path) as trajectory:
+        assert trajectory.read(field, slice(0, 2)).shape[0] == 2
+        for part in ((slice(None),), ([3, 2],), (slice(None), slice(4, 6)), (2, [7, 5])):
+            with pytest.raises(SchemaError, match=rf"a\.h5 has non-finite values of {field}, as in frame 2"):
+                trajectory.read(field, *part)
+        assert np.isfinite(trajectory.read(field, slice(None), [0, 1])).all()
+
+
+def test_frames_whose_sum_is_not_finite_are_read(write):
+    path, _ = write()
+    with h5py.File(path, "r+") as file:
+        file["frames/x"][...] = 3e38
+    with Trajectory.open(path) as trajectory:
+        assert (trajectory.read("x") == np.float32(3e38)).all()
+
+
+def test_a_run_s_trajectory_is_what_the_run_left(write, tmp_path):
+    from nsf.runs import Run
+
+    path, _ = write()
+    run = Run.open("simulate", "sand", {}, root=tmp_path / "runs")
+    with run.record() as record:
+        shutil.copy(path, run.path / "trajectory.h5")
+        record.output("trajectory.h5")
+    own = run.path / "trajectory.h5"
+    Trajectory.open(own).close()
+    whole = own.read_bytes()
+    rng = np.random.default_rng(0)
+    for place in rng.integers(len(whole), size=50):
+        own.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << rng.integers(8)]) + whole[place + 1 :])
+        with pytest.raises(SchemaError, match=r"trajectory\.h5 has sha256 .* it was changed after the run"):
+            Trajectory.open(own)
+    own.write_bytes(whole)
+    Trajectory.open(own).close()
 
 
 # ---- Writing that goes wrong ----------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import pytest
 
 from nsf.deployment import Rollout, deploy, rollout, rollouts
 from nsf.dynamics import Taylor
-from nsf.errors import SchemaError
+from nsf.errors import MissingRunError, SchemaError
 
 
 @pytest.fixture(scope="module")
@@ -130,7 +130,7 @@ def test_truncated(made, tmp_path, keep):
 
 
 def test_missing(tmp_path):
-    with pytest.raises(SchemaError, match=r"rollout\.h5"):
+    with pytest.raises(MissingRunError, match=r"no rollout at .*rollout\.h5; run `nsf deploy` first"):
         Rollout.open(tmp_path / "rollout.h5")
 
 
@@ -143,7 +143,7 @@ def test_foreign(tmp_path, chain):
     with pytest.raises(SchemaError, match="is not a rollout of version 2"):
         Rollout.open(other)
     (tmp_path / "text.h5").write_text("not HDF5")
-    with pytest.raises(SchemaError, match="not a rollout"):
+    with pytest.raises(SchemaError, match="not HDF5"):
         Rollout.open(tmp_path / "text.h5")
 
 
@@ -164,3 +164,97 @@ def test_a_part_is_missing(made, tmp_path, lost):
         del file[lost]
     with pytest.raises(SchemaError, match="deploy again"):
         Rollout.open(path)
+
+
+def spoiled(made, path, change):
+    made.save(path)
+    with h5py.File(path, "a") as file:
+        change(file)
+
+
+def attribute(name, value):
+    return lambda file: file.attrs.__setitem__(name, value)
+
+
+def replaced(name, value, **how):
+    def change(file):
+        del file[name]
+        file.create_dataset(name, data=value, **how)
+
+    return change
+
+
+def at(name, index, value):
+    return lambda file: file[name].__setitem__(index, value)
+
+
+def external(file):
+    del file["xhat"]
+    file.create_dataset("xhat", (25, 4), "f8", external=[(__file__, 0, h5py.h5f.UNLIMITED)])
+
+
+ODD = [
+    (at("xhat", (7, 1), np.nan), "non-finite values of xhat"),
+    (at("xhat", (24, 0), np.inf), "non-finite values of xhat"),
+    (at("residuals", (3, 0), np.nan), "non-finite values of residuals"),
+    (at("trust", 3, np.nan), "trust that are negative or no numbers"),
+    (at("trust", 3, -1.0), "trust that are negative or no numbers"),
+    (at("t", 3, np.nan), "non-finite values of t"),
+    (at("t", 3, 0.0), "t that does not increase"),
+    (at("stops", 3, "bored"), "stops='bored', which is no reason to stop"),
+    (at("stops", 3, "x" * 100_000), "stops with a text of 100000 bytes"),
+    (attribute("seconds", "long"), "attribute seconds, which is no single float"),
+    (attribute("seconds", [1.0, 2.0]), "attribute seconds, which is no single float"),
+    (attribute("seconds", np.nan), "non-finite values of seconds"),
+    (attribute("parameter", np.inf), "non-finite values of parameter"),
+    (attribute("parameter", h5py.Empty("f8")), "attribute parameter, which is no single float"),
+    (attribute("sample", 20.5), "attribute sample, which is no single int"),
+    (attribute("sample", 0), "sample=0"),
+    (attribute("needed_outside", -1), "needed_outside=-1"),
+    (attribute("diverged", 25), "diverged=25, in 24 steps"),
+    (attribute("handed_over", -2), "handed_over=-2"),
+    (attribute("nsf_rollout", "2"), "not a rollout of version 2"),
+    (attribute("nsf_rollout", [2, 2]), "not a rollout of version 2"),
+    (lambda file: file.attrs.__delitem__("sample"), "lacks a part of a rollout"),
+    (replaced("xhat", np.zeros((24, 4))), r"xhat of shape \[24, 4\], not \[25, 4\]"),
+    (replaced("xhat", np.zeros((25, 5))), r"xhat of shape \[25, 5\], not \[25, 4\]"),
+    (replaced("xhat", np.zeros((25, 4), "i8")), "xhat of <i8, not <f4 or <f8"),
+    (replaced("xhat", np.zeros((25, 4)), chunks=(1, 4)), "xhat in chunks"),
+    (replaced("xhat", None, shape=(25, 4), dtype="f8"), "ends before xhat does"),
+    (replaced("t", None, shape=(3 * 10**12,), dtype="f8"), "ends before t does, which is of 24,000,"),
+    (replaced("stops", np.zeros(24)), "stops of <f8, not text"),
+    (replaced("stops", b"converged"), r"stops of shape \[\]"),
+    (external, "xhat in chunks or outside the file"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("change", "told"), ODD)
+def test_what_no_run_leaves(made, tmp_path, change, told):
+    spoiled(made, tmp_path / "rollout.h5", change)
+    with pytest.raises(SchemaError, match=rf"rollout\.h5 .*{told}.*; deploy again"):
+        Rollout.open(tmp_path / "rollout.h5", latent_dim=4)
+
+
+@pytest.mark.parametrize(
+    "link", [h5py.ExternalLink("other.h5", "/x"), h5py.SoftLink("/t")], ids=["other", "own"]
+)
+def test_links_are_not_followed(made, tmp_path, link):
+    def change(file):
+        del file["trust"]
+        file["trust"] = link
+
+    spoiled(made, tmp_path / "rollout.h5", change)
+    with pytest.raises(SchemaError, match="a link in the place of trust"):
+        Rollout.open(tmp_path / "rollout.h5")
+
+
+def test_a_run_that_diverged_may_end_in_anything(made, tmp_path):
+    xhat, residuals, trust = made.xhat.copy(), made.residuals.copy(), made.trust.copy()
+    xhat[9:], residuals[8:], trust[9:] = np.nan, np.nan, np.inf
+    lost = replace(made, xhat=xhat, residuals=residuals, trust=trust, diverged=9)
+    for run in (lost, replace(lost, diverged=-1, handed_over=8)):
+        run.save(tmp_path / "rollout.h5")
+        assert np.isnan(Rollout.open(tmp_path / "rollout.h5").xhat[9:]).all()
+    replace(lost, diverged=10).save(tmp_path / "rollout.h5")
+    with pytest.raises(SchemaError, match="non-finite values of xhat"):
+        Rollout.open(tmp_path / "rollout.h5")

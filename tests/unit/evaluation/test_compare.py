@@ -11,7 +11,7 @@ import nsf.scenes
 from nsf.data import Trajectory
 from nsf.deployment import Rollout, go_on
 from nsf.dynamics import Method
-from nsf.errors import SchemaError
+from nsf.errors import InstabilityError, SchemaError
 from nsf.evaluation import at_frames, compare, metrics
 from nsf.evaluation.compare import trust_at_frames
 
@@ -186,6 +186,26 @@ def test_a_run_lost_at_infinity(comparison_of, made):
     lost = comparison_of(replace(made, xhat=xhat, diverged=7))
     assert lost.delta == np.inf
     assert not lost.series[1:].isna().any().any()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_run_that_is_not_finite_and_does_not_say_so_has_no_errors(made, comparison_of, bad):
+    xhat = made.xhat.copy()
+    xhat[7, 0] = bad
+    with pytest.raises(InstabilityError, match=r"delta=nan at friction_angle=26 is no error"):
+        comparison_of(replace(made, xhat=xhat))
+
+
+def test_a_truth_that_never_moves_has_no_displacement_error(made, comparison_of, truth, monkeypatch):
+    plain = Trajectory.read
+
+    def still(self, field, *args, **options):
+        found = plain(self, field, *args, **options)
+        return np.broadcast_to(self.X, found.shape).copy() if field == "x" else found
+
+    monkeypatch.setattr(Trajectory, "read", still)
+    with pytest.raises(InstabilityError, match=r"displacement_error=inf at friction_angle=26 is no error"):
+        comparison_of(made)
 
 
 def test_a_method_is_held_to_the_stress_and_affine_momentum_it_used(

@@ -1,6 +1,5 @@
 """What exporters are given: frames and points of a reduced run, decoded block by block."""
 
-import json
 import shutil
 from dataclasses import replace
 
@@ -79,7 +78,7 @@ def test_magnitudes(played):
     torch.testing.assert_close(block.pressure, -(xx + yy + zz) / 3)
 
 
-def spoiled(run, tmp_path, **changes):
+def spoiled(run, tmp_path, seal, **changes):
     """A copy of the tiny chain's runs whose rollout is another."""
     root = tmp_path / "runs"
     shutil.copytree(run.root, root)
@@ -87,23 +86,21 @@ def spoiled(run, tmp_path, **changes):
     path = copy.path / "rollout_0.h5"
     rollout = replace(Rollout.open(path), **changes)
     rollout.save(path)
-    manifest = copy.manifest
-    for output in manifest["outputs"]:
-        output["bytes"] = (copy.path / output["path"]).stat().st_size
-    (copy.path / "manifest.json").write_text(json.dumps(manifest))
+    seal(copy)
     return copy, rollout
 
 
-def test_a_diverged_run_ends_before_it_is_lost(deployed, tmp_path):
-    run, _ = spoiled(deployed, tmp_path, diverged=18)
+def test_a_diverged_run_ends_before_it_is_lost(deployed, tmp_path, seal):
+    run, _ = spoiled(deployed, tmp_path, seal, diverged=18)
     shown = Playback(run, every=5, device="cpu")
     np.testing.assert_allclose(shown.t, np.array([0, 5, 10, 15, 17]) * 0.005)
     assert shown.stopped == pytest.approx(0.09)
 
 
-def test_a_run_handed_over_goes_on_at_full_order(deployed, tmp_path, solver):
-    run, rollout = spoiled(deployed, tmp_path, handed_over=8)
+def test_a_run_handed_over_goes_on_at_full_order(deployed, tmp_path, solver, seal):
+    run, rollout = spoiled(deployed, tmp_path, seal, handed_over=8)
     go_on(solver, rollout, run.path / "continuation_0.h5")
+    seal(run, "continuation_0.h5")
     shown = Playback(run, every=5, device="cpu")
     np.testing.assert_allclose(shown.t, np.array([0, 5, 10, 15, 20, 24]) * 0.005)
     x, tau = whole(shown)

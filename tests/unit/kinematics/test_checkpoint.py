@@ -1,12 +1,20 @@
 """A checkpoint comes back to the bit or is refused by name."""
 
+import copy
+import importlib
+import os
 import pickle
+import random
+import re
+import shutil
+import zipfile
 
 import pytest
 import torch
 
 from nsf.errors import MissingRunError, SchemaError
 from nsf.kinematics.manifold import Manifold
+from nsf.runs import Run
 
 
 @pytest.fixture
@@ -52,18 +60,212 @@ def test_truncated(path, share):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"format_version": 2}, "format_version 2"),
+        ({"format_version": 3}, "format_version 3"),
+        ({"format_version": 1}, "format_version 1"),
+        (
+            {"format_version": 1, "field": "os"},
+            r"names the manifold 'nsf\.kinematics\.fields\.os\.OsManifold'",
+        ),
         ({"format": "other"}, "no manifold"),
-        ({"field": "os"}, "field 'os'"),
-        ({"state": {}}, "do not fit"),
+        ({"state": {}}, "other tensors than its field"),
         ({"hyperparameters": {}}, "do not fit"),
-        ({"latent_dim": 3}, "do not fit"),
+        ({"latent_dim": 3}, r"has training_latents of float64\[26, 2\], not float64\[26, 3\]"),
+        ({"latent_dim": "2"}, "latent_dim='2', which is no int"),
+        ({"latent_dim": True}, "latent_dim=True, which is no int"),
+        ({"latent_dim": 0}, "latent_dim below 1"),
+        ({"x_sha256": 5}, "x_sha256=5, which is no str"),
+        ({"x_sha256": "0" * 64}, "has an X of other particles"),
+        ({"parameter_names": [1]}, "parameter_names that are no texts"),
+        ({"parameter_names": "speed"}, "parameter_names='speed', which is no list"),
+        ({"datasets": None}, "datasets=None, which is no list"),
+        ({"split": {"train": [float("nan")]}}, "holds nan beside its tensors"),
+        ({"split": {"train": [torch.zeros(1)]}}, r"holds tensor\(\[0\.\]\) beside its tensors"),
     ],
 )
 def test_foreign(path, change, message):
     torch.save({**torch.load(path, weights_only=True), **change}, path)
-    with pytest.raises(SchemaError, match=message):
+    with pytest.raises(SchemaError, match=rf"manifold\.pt .*{message}"):
         Manifold.load(path)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "os.system",
+        "os",
+        "nsf.workers.Worker",
+        "nsf.kinematics.manifold.Manifold",
+        "nsf.kinematics.fields.basis.BasisField",
+        "nsf.kinematics.fields.basis.Manifold",  # imported there, and not its own
+        "nsf.kinematics.fields.basis.BasisRestriction",
+        "nsf.kinematics.fields.basis.coefficients",
+        "nsf.kinematics.fields.basis.BasisManifold.load",
+        "nsf.kinematics.fields.joint.BasisManifold",
+        "nsf.kinematics.fields.nothing.Here",
+        "nsf.kinematics.fields..basis.BasisManifold",
+        "nsf.kinematics.fields._hidden.Manifold",
+        "nsf.kinematics.fields.basis.__builtins__",
+        "nsf.kinematics.fields.basis/../../../os.system",
+        "",
+        None,
+        5,
+        ["nsf.kinematics.fields.basis.BasisManifold"],
+        "x" * 10_000,
+    ],
+)
+def test_a_class_that_no_file_may_name(path, name, monkeypatch):
+    imported = []
+    plain = importlib.import_module
+    monkeypatch.setattr(importlib, "import_module", lambda name: imported.append(name) or plain(name))
+    torch.save(torch.load(path, weights_only=True) | {"manifold": name}, path)
+    with pytest.raises(
+        SchemaError, match=r"manifold\.pt names the manifold .*, which is no Manifold of a module of"
+    ):
+        Manifold.load(path)
+    assert not [module for module in imported if not module.startswith("nsf.kinematics.fields.")]
+
+
+def test_a_class_of_elsewhere_cannot_be_saved(manifold, tmp_path):
+    class Elsewhere(type(manifold)):
+        pass
+
+    manifold = copy.copy(manifold)
+    manifold.__class__ = Elsewhere
+    with pytest.raises(SchemaError, match=r"names the manifold '.*Elsewhere'"):
+        manifold.save(tmp_path / "manifold.pt")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_file_from_before_classes_were_named(manifold, path):
+    content = torch.load(path, weights_only=True)
+    del content["manifold"]
+    torch.save(content | {"format_version": 1, "field": manifold.field}, path)
+    assert type(Manifold.load(path)) is type(manifold)
+
+
+def state_of(path, change):
+    """Write the checkpoint with other tensors."""
+    content = torch.load(path, weights_only=True)
+    change(content["state"])
+    torch.save(content, path)
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+def test_every_tensor_must_be_finite(path, bad):
+    whole = path.read_bytes()
+    state = torch.load(path, weights_only=True)["state"]
+    for name in [name for name, tensor in state.items() if tensor.numel()]:
+        state_of(path, lambda state: state[name].view(-1)[-1:].fill_(bad))  # noqa: B023
+        with pytest.raises(
+            SchemaError, match=rf"manifold\.pt has non-finite values of {re.escape(name)}; train"
+        ):
+            Manifold.load(path)
+        path.write_bytes(whole)
+    Manifold.load(path)
+
+
+def test_a_sum_that_overflows_is_of_finite_values(path):
+    state_of(path, lambda state: state["training_times"].fill_(1.7e308))
+    assert Manifold.load(path).training_times[0] == 1.7e308
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s: s.update(X=s["X"].float()), r"X of float32\[150, 3\], not float64"),
+        (lambda s: s.update(X=s["X"].T), r"X of float64\[3, 150\]"),
+        (lambda s: s.update(X=s["X"].flip(0)), "has an X of other particles"),
+        (lambda s: s.update(X=s["X"].to_sparse()), "'X' among its tensors"),
+        (lambda s: s.update(X=[1, 2]), "'X' among its tensors"),
+        (lambda s: s.update(X=torch.zeros(1, 1).expand(10**9, 3)), "is larger than the file"),
+        (lambda s: s.pop("training_latents"), r"other tensors than its field \(training_latents\)"),
+        (lambda s: s.update(more=torch.zeros(1)), r"other tensors than its field \(more\)"),
+        (lambda s: s.update({5: torch.zeros(1)}), "has 5 among its tensors"),
+        (
+            lambda s: s["standard_parameters.std"].fill_(0.0),
+            r"standard_parameters\.std that are not positive",
+        ),
+        (
+            lambda s: s["standard_parameters.std"].fill_(-1.0),
+            r"standard_parameters\.std that are not positive",
+        ),
+    ],
+)
+def test_odd_tensors(path, change, message):
+    state_of(path, change)
+    with pytest.raises(SchemaError, match=rf"manifold\.pt .*{message}.*; train again"):
+        Manifold.load(path)
+
+
+@pytest.mark.parametrize("huge", [10**6, 10**9, 10**12, 2**63, 10**30, -(10**12)])
+@pytest.mark.parametrize("key", ["particles", "frames", "depth", "members"])
+def test_sizes_that_no_file_could_fill(path, key, huge):
+    content = torch.load(path, weights_only=True)
+    torch.save(content | {"hyperparameters": content["hyperparameters"] | {key: huge}}, path)
+    if key in content["hyperparameters"]:
+        with pytest.raises(SchemaError, match=r"asks for .* entries, with"):
+            Manifold.load(path)
+
+
+def test_more_layers_than_the_file_has_tensors(path, manifold):
+    if "depth" not in manifold.hyperparameters:
+        pytest.skip("its depth is fixed")
+    content = torch.load(path, weights_only=True)
+    torch.save(content | {"hyperparameters": content["hyperparameters"] | {"depth": 50_000}}, path)
+    with pytest.raises(SchemaError, match="asks for more tensors than it has"):
+        Manifold.load(path)
+
+
+def test_a_list_that_is_endless_to_go_through(path):
+    bomb = [0.0]
+    for _ in range(30):
+        bomb = [bomb] * 10
+    torch.save(torch.load(path, weights_only=True) | {"split": {"train": bomb}}, path)
+    assert path.stat().st_size < 10**6
+    with pytest.raises(SchemaError, match="more than plain data"):
+        Manifold.load(path)
+
+
+def test_a_file_that_unpacks_to_more_than_it_is(path, tmp_path):
+    packed = tmp_path / "packed.pt"
+    with zipfile.ZipFile(path) as whole, zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        for member in whole.namelist():
+            archive.writestr(member, whole.read(member))
+    with pytest.raises(SchemaError, match=r"packed\.pt has a part that is compressed"):
+        Manifold.load(packed)
+
+
+def test_a_run_s_manifold_is_what_the_run_left(path, tmp_path):
+    run = Run.open("train", "sand", {}, root=tmp_path / "runs")
+    with run.record() as record:
+        shutil.copy(path, run.path / "manifold.pt")
+        record.output("manifold.pt")
+    own = run.path / "manifold.pt"
+    Manifold.load(own)
+    whole, rng = own.read_bytes(), random.Random(0)
+    for _ in range(50):
+        place = rng.randrange(len(whole))
+        own.write_bytes(whole[:place] + bytes([whole[place] ^ 1 << rng.randrange(8)]) + whole[place + 1 :])
+        with pytest.raises(SchemaError, match=r"manifold\.pt has sha256 .* it was changed after the run"):
+            Manifold.load(own)
+
+
+def test_damaged_bytes_never_give_another_error(path):
+    whole, rng, refused = path.read_bytes(), random.Random(0), 0
+    for _ in range(60):
+        place = rng.randrange(len(whole))
+        path.write_bytes(whole[:place] + rng.randbytes(rng.randint(1, 64)) + whole[place + 64 :])
+        try:
+            Manifold.load(path)
+        except SchemaError:
+            refused += 1
+    assert refused > 10
+
+
+def test_a_pipe_is_no_checkpoint(tmp_path):
+    os.mkfifo(tmp_path / "manifold.pt")
+    with pytest.raises(SchemaError, match=r"manifold\.pt is no regular file"):
+        Manifold.load(tmp_path / "manifold.pt")
 
 
 def test_missing_key(path):

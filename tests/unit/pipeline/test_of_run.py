@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from nsf.errors import MissingRunError
+from nsf.errors import MissingRunError, SchemaError
 from nsf.pipeline import Pipeline
 from nsf.pipeline.chain import CONFIGURATION
 
@@ -18,11 +18,14 @@ def test_the_same_chain_comes_out(chain):
     assert CONFIGURATION in {output["path"] for output in run.manifest["outputs"]}
 
 
-def test_a_run_on_another_device_has_the_same_training(chain, tmp_path):
+def test_a_run_on_another_device_has_the_same_training(chain, tmp_path, seal):
     shutil.copytree(chain.root, tmp_path / "runs")
     run = replace(chain.pipeline.deployment, root=tmp_path / "runs")
     path = run.path / CONFIGURATION
     path.write_text(path.read_text().replace("device: cpu", "device: cuda:0"))
+    with pytest.raises(SchemaError, match=r"configuration\.yaml has .* bytes, where its manifest records"):
+        Pipeline.of_run(run, device="cpu")
+    seal(run)
     assert Pipeline.of_run(run, device="cpu").training.complete
 
 

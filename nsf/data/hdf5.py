@@ -1,0 +1,178 @@
+"""HDF5 as it is read here: arrays that lie whole in the file itself, of the kind they should be.
+
+A file may be made to read others (links and storage outside it), to claim more than it holds, or to run
+filters. The writers of this package do none of that, so all of it is refused before anything is read.
+"""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from nsf.errors import MissingRunError, SchemaError, ShapeError
+from nsf.manifest import verified
+
+_LONGEST = 64  # [byte] of a text in an array of texts
+#: On disk each text of an array is its length, and where it lies: 4 and 12 bytes (HDF5's "Global Heap ID").
+_TEXT_BYTES = 16
+#: What HDF5 makes of a file whose bytes are not what they should be.
+_FAULTS = (OSError, RuntimeError, TypeError, ValueError, AttributeError, LookupError, ArithmeticError)
+
+
+def opened(path: str | Path, what: str, stage: str) -> h5py.File:
+    """A file opened for reading, once it is sure that nobody changed it after its run.
+
+    Args:
+        path: of the file.
+        what: it should be, such as "trajectory".
+        stage: that makes it.
+
+    Raises:
+        MissingRunError: there is no such file.
+        SchemaError: it was changed after its run, is truncated, or is not HDF5.
+    """
+    try:
+        return h5py.File(verified(path), "r")
+    except FileNotFoundError as error:
+        raise MissingRunError(f"no {what} at {path}; run `nsf {stage}` first") from error
+    except OSError as error:
+        raise SchemaError(f"{path} is truncated or not HDF5; {stage} again ({error})") from error
+
+
+@contextmanager
+def reading(path: str | Path, what: str, stage: str) -> Iterator[None]:
+    """Whatever goes wrong in the block is a `SchemaError` that names the file and what makes it anew."""
+    try:
+        yield
+    except KeyError as error:
+        raise SchemaError(f"{path} lacks a part of a {what}; {stage} again ({error})") from error
+    except (SchemaError, ShapeError) as error:
+        remedy = "" if ";" in str(error) else f"; {stage} again"
+        raise SchemaError(f"{path} {error}{remedy}") from error
+    except _FAULTS as error:
+        raise SchemaError(f"{path} is damaged; {stage} again ({error})") from error
+
+
+def group(file: h5py.Group, name: str) -> h5py.Group:
+    """A group or an array of a file that is reached by no link.
+
+    Raises:
+        KeyError: there is none.
+        SchemaError: a link to somewhere else stands in its place.
+    """
+    found = file
+    for part in name.split("/"):
+        link = found.get(part, getlink=True) if isinstance(found, h5py.Group) else None
+        if link is None:
+            raise KeyError(name)
+        if not isinstance(link, h5py.HardLink):
+            raise SchemaError(f"has a link in the place of {name}")
+        found = found[part]
+    return found
+
+
+def array(file: h5py.Group, name: str, types: Sequence[str], shape: Sequence[int | None]) -> h5py.Dataset:
+    """An array that lies in one piece in the file.
+
+    Args:
+        file: or a group of it.
+        name: within the group.
+        types: which the values may be of, as "<f8"; "text" for text.
+        shape: None for a size of any number but zero.
+
+    Raises:
+        KeyError: there is none.
+        SchemaError: it is of another type or shape, lies elsewhere, or the file ends before it does.
+    """
+    found = group(file, name)
+    if not isinstance(found, h5py.Dataset):
+        raise SchemaError(f"has {name}, which is no array")
+    has = () if found.shape is None else found.shape
+    if len(has) != len(shape) or any(not h or w not in (None, h) for h, w in zip(has, shape, strict=True)):
+        wanted = ", ".join("any" if size is None else str(size) for size in shape)
+        raise SchemaError(f"has {name} of shape {list(has)}, not [{wanted}]")
+    text = h5py.check_string_dtype(found.dtype) is not None
+    if ("text" if text else found.dtype) not in [t if t == "text" else np.dtype(t) for t in types]:
+        raise SchemaError(f"has {name} of {found.dtype.str}, not {' or '.join(types)}")
+    how = found.id.get_create_plist()
+    if how.get_layout() != h5py.h5d.CONTIGUOUS or how.get_external_count():
+        raise SchemaError(f"has {name} in chunks or outside the file, and not in one piece")
+    held, needed = found.id.get_storage_size(), found.size * (_TEXT_BYTES if text else found.dtype.itemsize)
+    if held != needed or (needed and found.id.get_offset() + held > file.file.id.get_filesize()):
+        raise SchemaError(f"ends before {name} does, which is of {needed:,} bytes")
+    return found
+
+
+def values(
+    file: h5py.Group, name: str, types: Sequence[str], shape: Sequence[int | None], **limits: bool
+) -> np.ndarray:
+    """The values of an `array`, which are finite.
+
+    Args:
+        file, name, types, shape: as of `array`.
+        limits: of `check`.
+
+    Raises:
+        KeyError, SchemaError: as of `array`, or the values are outside their limits.
+    """
+    found = array(file, name, types, shape)[()]
+    check(name, found, **limits)
+    return found
+
+
+def check(name: str, found: np.ndarray | float, positive: bool = False, increasing: bool = False) -> None:
+    """Refuse values that are not finite, or not positive or increasing where they have to be.
+
+    Raises:
+        SchemaError: names the array.
+    """
+    if not np.isfinite(found).all():
+        raise SchemaError(f"has non-finite values of {name}")
+    if positive and not np.all(np.asarray(found) > 0):
+        raise SchemaError(f"has values of {name} that are not positive")
+    if increasing and not np.all(np.diff(found) > 0):
+        raise SchemaError(f"has {name} that does not increase")
+
+
+def texts(file: h5py.Group, name: str, shape: Sequence[int | None]) -> list[str]:
+    """The texts of an array, each of at most 64 bytes.
+
+    Raises:
+        KeyError, SchemaError: as of `array`, or a text is longer.
+    """
+    found = array(file, name, ["text"], shape)
+    if not found.size:
+        return []
+    # HDF5 would give each as long as it claims to be, and a few bytes of a file can claim one text often.
+    with open(file.file.filename, "rb") as raw:
+        raw.seek(found.id.get_offset())
+        lengths = np.frombuffer(raw.read(_TEXT_BYTES * found.size), "<u4")[:: _TEXT_BYTES // 4]
+    if lengths.max() > _LONGEST:
+        raise SchemaError(f"has {name} with a text of {lengths.max()} bytes")
+    return [text.decode() for text in found[()]]
+
+
+def attribute(file: h5py.File, name: str, kind: type) -> Any:
+    """A single value beside the arrays.
+
+    Args:
+        file: whose attribute it is.
+        name: of the attribute.
+        kind: bool, int, float (which an int may stand for) or str.
+
+    Raises:
+        KeyError: there is none.
+        SchemaError: it is of another kind, or not finite.
+    """
+    about = file.attrs.get_id(name)
+    text = h5py.check_string_dtype(about.dtype) is not None
+    letter = "O" if text else about.dtype.kind
+    if about.shape != () or letter not in {bool: "b", int: "iu", float: "fiu", str: "O" * text}[kind]:
+        raise SchemaError(f"has attribute {name}, which is no single {kind.__name__}")
+    found = file.attrs[name]
+    if kind is float:
+        check(name, found)
+    return found if kind is str else kind(found)

@@ -1,0 +1,224 @@
+"""The file of a manifold: plain data that names a class of this package, and the tensors that it asks for."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import inspect
+import itertools
+import math
+import pickle
+import re
+import reprlib
+import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.modules import module as registration
+
+from nsf.data import Standardizer, hash_of_positions
+from nsf.errors import MissingRunError, SchemaError
+from nsf.manifest import verified
+
+FORMAT = "nsf-manifold"
+FORMAT_VERSION = 2
+FIELDS = "nsf.kinematics.fields"  # the package that holds every class a file may name
+
+_CLASS = re.compile(rf"({re.escape(FIELDS)}\.[A-Za-z]\w*)\.([A-Za-z]\w*)", re.ASCII)
+_KINDS = {
+    "latent_dim": int,
+    "x_sha256": str,
+    "parameter_names": list,
+    "hyperparameters": dict,
+    "datasets": list,
+    "split": dict,
+    "state": dict,
+}
+_MOST_LEAVES = 100_000  # of what a file holds beside its tensors
+_REPR = reprlib.Repr()
+_REPR.maxstring = 100
+_PLAIN = (str, int, float, bool, type(None))
+
+
+def class_of(name: Any, base: type) -> type:
+    """The class that a file names: a public one, defined in a module of `nsf.kinematics.fields`.
+
+    No other module is imported: a new module in that package is all that a new field needs.
+
+    Args:
+        name: dotted, such as "nsf.kinematics.fields.basis.BasisManifold".
+        base: of which it must be.
+
+    Raises:
+        SchemaError: it is no such class.
+    """
+    found = _CLASS.fullmatch(name) if isinstance(name, str) else None
+    if found and importlib.util.find_spec(found[1]):
+        kind = vars(importlib.import_module(found[1])).get(found[2])
+        own = isinstance(kind, type) and issubclass(kind, base) and kind.__module__ == found[1]
+        if own and not inspect.isabstract(kind):
+            return kind
+    raise SchemaError(
+        f"names the manifold {_REPR.repr(name)}, which is no {base.__name__} of a module of {FIELDS}; "
+        "install the nsf that wrote it"
+    )
+
+
+def read(path: Path) -> dict[str, Any]:
+    """What a checkpoint holds, each value of its kind, tensors mapped and not read.
+
+    Raises:
+        MissingRunError: there is no such file.
+        SchemaError: it was changed after its run, is truncated, foreign, of another format, or holds more
+            than plain data.
+    """
+    try:
+        verified(path)
+        _check_members(path)
+        content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+    except FileNotFoundError as error:
+        raise MissingRunError(f"{path} does not exist; run `nsf train` first") from error
+    except SchemaError:
+        raise
+    except (
+        RuntimeError, EOFError, OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError,
+        AssertionError, pickle.UnpicklingError, zipfile.BadZipFile, NotImplementedError,
+    ) as error:  # fmt: skip
+        raise SchemaError(
+            f"{path} is truncated or not a checkpoint ({first_line(error)}); delete it and run `nsf train`"
+            " again"
+        ) from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise SchemaError(
+            f"{path} is a torch file but no manifold of nsf; pass the checkpoint of a train run"
+        )
+    if content.get("format_version") == 1 and isinstance(field := content.get("field"), str):
+        content |= {"manifold": f"{FIELDS}.{field}.{field.capitalize()}Manifold", "format_version": 2}
+    if (version := content.get("format_version")) != FORMAT_VERSION:
+        raise SchemaError(
+            f"{path} has format_version {_REPR.repr(version)}, this nsf reads {FORMAT_VERSION}; install the"
+            " nsf that wrote it or train again with `nsf train`"
+        )
+    if missing := _KINDS.keys() - content.keys():
+        raise SchemaError(f"{path} lacks {', '.join(sorted(missing))}; delete it and run `nsf train` again")
+    try:
+        _check_plain(content, path.stat().st_size)
+    except SchemaError as error:
+        raise SchemaError(f"{path} {error}; train again with `nsf train`") from error
+    return content
+
+
+def fill(manifold: nn.Module, state: dict[str, Tensor]) -> None:
+    """Give a manifold that was built without memory its tensors.
+
+    Every value is looked at once: a file of a GB takes some tenths of a second.
+
+    Raises:
+        SchemaError: a tensor is missing or unknown, of another type or shape, or not finite; or the
+            particles are not those of the manifold's `x_sha256`.
+    """
+    wanted = manifold.state_dict()
+    if odd := sorted(wanted.keys() ^ state.keys()):
+        raise SchemaError(f"has other tensors than its field ({', '.join(odd[:3])})")
+    for name, like in wanted.items():
+        tensor = state[name]
+        if (tensor.dtype, tensor.shape) != (like.dtype, like.shape):
+            raise SchemaError(
+                f"has {name} of {_type(tensor)}{list(tensor.shape)}, not {_type(like)}{list(like.shape)}"
+            )
+        if not is_finite(tensor):
+            raise SchemaError(f"has non-finite values of {name}")
+    manifold.load_state_dict(state, assign=True)
+    for name, part in manifold.named_modules():
+        if isinstance(part, Standardizer) and not (part.std > 0).all():
+            raise SchemaError(f"has values of {name}.std that are not positive")
+    if hash_of_positions(manifold.X.numpy()) != manifold.x_sha256:
+        raise SchemaError("has an X of other particles than its x_sha256")
+
+
+def is_finite(tensor: Tensor) -> bool:
+    """Whether every value of a tensor is finite."""
+    # A sum goes at the speed of memory, and is not finite if one of the values is not.
+    return bool(tensor.sum().isfinite()) or bool(tensor.isfinite().all())
+
+
+@contextmanager
+def registering(most: int) -> Iterator[None]:
+    """Refuse to build a module of more tensors than a file can fill.
+
+    Raises:
+        SchemaError: more parameters and buffers than `most` are made in the block.
+    """
+    made = itertools.count(1)
+
+    def count(module: nn.Module, name: str, value: Any) -> None:
+        if next(made) > most:
+            raise SchemaError("asks for more tensors than it has")
+
+    with (
+        registration.register_module_parameter_registration_hook(count),
+        registration.register_module_buffer_registration_hook(count),
+    ):
+        yield
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of what an error says."""
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def _check_members(path: Path) -> None:
+    """Raises SchemaError where a part of the file would be larger in memory than it is on disk."""
+    size = path.stat().st_size
+    with zipfile.ZipFile(path) as archive:
+        for member in archive.infolist():
+            if member.compress_type != zipfile.ZIP_STORED or member.file_size > size:
+                raise SchemaError(f"{path} has a part that is compressed; train again with `nsf train`")
+
+
+def _check_plain(content: dict[str, Any], size: int) -> None:
+    """Raises SchemaError without the path where a value is of another kind than a checkpoint's."""
+    for key, kind in _KINDS.items():
+        if type(content[key]) is not kind and not (kind is dict and isinstance(content[key], dict)):
+            raise SchemaError(f"has {key}={_REPR.repr(content[key])}, which is no {kind.__name__}")
+    if content["latent_dim"] < 1 or not all(isinstance(name, str) for name in content["parameter_names"]):
+        raise SchemaError("has a latent_dim below 1, or parameter_names that are no texts")
+    for leaf in _leaves({key: value for key, value in content.items() if key != "state"}):
+        if not isinstance(leaf, _PLAIN) or (isinstance(leaf, float) and not math.isfinite(leaf)):
+            raise SchemaError(f"holds {_REPR.repr(leaf)} beside its tensors, which is no plain value")
+    # These size what is built, of which each entry takes a byte or more of the file.
+    for leaf in _leaves([content["latent_dim"], content["hyperparameters"]]):
+        if isinstance(leaf, int) and abs(leaf) > size:
+            raise SchemaError(f"asks for {_REPR.repr(leaf)} entries, with {size:,} bytes")
+    for name, tensor in content["state"].items():
+        plain = isinstance(name, str) and type(tensor) in (Tensor, nn.Parameter)
+        if not plain or tensor.layout != torch.strided or tensor.device.type != "cpu":
+            raise SchemaError(f"has {_REPR.repr(name)} among its tensors, which is none")
+        if tensor.numel() * tensor.itemsize > size:
+            raise SchemaError(f"has {name} of {list(tensor.shape)}, which is larger than the file")
+
+
+def _leaves(node: Any) -> Iterator[Any]:
+    """Keys and values of a tree of containers.
+
+    Raises:
+        SchemaError: they are many, as where a list holds another one often, which takes no room in a file.
+    """
+    rest = [node]
+    for _ in range(_MOST_LEAVES):
+        if not rest:
+            return
+        node = rest.pop()
+        if isinstance(node, dict | list | tuple):
+            rest += [*node, *node.values()] if isinstance(node, dict) else node
+        else:
+            yield node
+    raise SchemaError("holds more than plain data beside its tensors")
+
+
+def _type(tensor: Tensor) -> str:
+    return str(tensor.dtype).removeprefix("torch.")
