@@ -304,7 +304,7 @@ class Pipeline(Plan):
                 for index, (rollout, truth) in enumerate(zip(rollouts, truths, strict=True))
             ]
             cost = self._cost(manifold)
-            engine = deployment.manifest["metrics"].get("engine", "")
+            engine = str(self.deployment.manifest["metrics"].get("engine", ""))
             table = results.rows(
                 self.config, manifold, rollouts, comparisons, cost, self.device, run.manifest, engine
             )
