@@ -1,0 +1,22 @@
+"""A reduced run as a recurrence of the latent vector, learned from the projected step (docs/method.md)."""
+
+from nsf.engines.operators.model import Operators, Sizes, Terms, first_change
+from nsf.engines.operators.states import collider_states, principal
+from nsf.engines.operators.taught import Taught
+from nsf.engines.operators.teach import Course, Teaching, Yardstick, random_values
+from nsf.engines.operators.teacher import Teacher
+
+__all__ = [
+    "Course",
+    "Operators",
+    "Sizes",
+    "Taught",
+    "Teacher",
+    "Teaching",
+    "Terms",
+    "Yardstick",
+    "collider_states",
+    "first_change",
+    "principal",
+    "random_values",
+]
