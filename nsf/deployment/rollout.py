@@ -234,6 +234,9 @@ def _ratios(solver: ReducedMPM, trust: Trust, diverged: int) -> np.ndarray:
     """Trust of the steps taken [n + 1]; ∞ from the step at which the run diverged."""
     latent = solver.trajectory()
     ratios = trust.ratios(latent.xhat, latent.residuals[:, -1])
+    off, _ = solver.doubt
+    if off > 1.0:
+        ratios = np.maximum(ratios, off)
     if diverged >= 0:
         ratios[diverged:] = np.inf
     return ratios

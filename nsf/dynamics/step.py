@@ -13,11 +13,11 @@ from typing_extensions import override
 from nsf.dynamics.batch import Batch
 from nsf.dynamics.inference import Inference
 from nsf.dynamics.integration import ParticleSets
-from nsf.dynamics.span import Span, Stages
+from nsf.dynamics.span import GridSpan, Stages
 from nsf.sampling.sampler import SampleSpan
 
 
-class Step(Span):
+class Step(GridSpan):
     """Infers the particles of N from x̂, takes one MPM step of them, and finds x̂ from where S went.
 
     Args:
@@ -61,7 +61,7 @@ class Step(Span):
             if values is not None:
                 array.copy_(values)
 
-    # p2g, g2p: one MPM step of N, of which S is moved (section 5.2); they are every engine's, in `Span`.
+    # p2g, g2p: one MPM step of N, of which S is moved (section 5.2); they are every engine's, in `GridSpan`.
 
     def project(self) -> None:
         """x̂_{n+1}, whose g(X_S, x̂) is nearest to where S went (section 5.3)."""

@@ -24,7 +24,7 @@ from nsf.mpm.stability import check_colliders, check_time_step
 from nsf.runs import Run
 from nsf.sampling.sampler import check_well_posed
 from nsf.scenes import Scene
-from nsf.scenes.scene import NOT_PHYSICS
+from nsf.scenes.identity import NOT_PHYSICS
 
 #: Keys of the configuration that a simulation's content depends on.
 _SCENE_KEYS = ("scale", "material", "transfer")

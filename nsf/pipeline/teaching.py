@@ -51,7 +51,9 @@ def course_of(
         truth = latents.unflatten(0, (len(known), -1)).transpose(0, 1)[:, order]
     course = Course([own, other], truth, yardstick, teaching, seed, folder, pipeline.say)
     first = batches_at(known[:1])[0].batch.shared
-    return course, Taught.of(first, own.gravity.mean(0).tolist(), course.reach)
+    middle = own.gravity.mean(0)
+    reach = float((own.gravity - middle).norm(dim=1).max()) + course.reach
+    return course, Taught.of(first, middle.tolist(), reach)
 
 
 def _yardstick(pipeline, manifold, batches_at: BatchesAt, ranges, taken, told) -> Yardstick:

@@ -15,11 +15,9 @@ from nsf.errors import ConfigError
 from nsf.mpm import Collider, DomainWalls, FullOrderMPM, GridGeometry, ParticleConstants, Transfer
 from nsf.mpm.materials import Material
 from nsf.scenes.geometry import Shape
+from nsf.scenes.identity import NOT_PHYSICS
 from nsf.scenes.weakness import Weakness
 from nsf.vectors import vector
-
-#: Keys of a scene that its simulation does not depend on.
-NOT_PHYSICS = ("parameters", "reduced", "paper", "title")
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,7 @@ class Terms:
     G: Tensor | None
 
 
-class Operators(nn.Module):
+class StepOperators(nn.Module):
     """A network of two hidden SiLU layers that gives B, f and G.
 
     Its last layer is zero at the start: no acceleration. Whatever it is given is standardised, and what it
@@ -172,7 +172,7 @@ class Operators(nn.Module):
             torch.save(content, temporary)
 
     @classmethod
-    def load(cls, path: Path | str) -> tuple["Operators", Taught]:
+    def load(cls, path: Path | str) -> tuple["StepOperators", Taught]:
         """Read operators, and what they were taught on, onto the host.
 
         Raises:

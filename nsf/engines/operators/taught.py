@@ -6,12 +6,11 @@ from dataclasses import asdict, dataclass, fields
 
 import numpy as np
 import torch
-from omegaconf import OmegaConf
 
-from nsf.canonical import content_hash, plain
+from nsf.canonical import plain
 from nsf.dynamics.setup import Setup
 from nsf.errors import SchemaError
-from nsf.scenes.scene import NOT_PHYSICS
+from nsf.scenes.identity import physics_hash
 
 _DIGITS = 12
 _SAME = 1e-9  # of a range: what round-off may move
@@ -29,7 +28,7 @@ class Taught:
         method, projector: as text.
         parameters: names of the problem parameters.
         ranges: [n, 2] smallest and largest training value of each.
-        gravity: [3] about which gravity was varied [m/s²]; reach: how far [m/s²].
+        gravity: [3] about which gravity was varied [m/s²]; reach: how far, at most [m/s²].
     """
 
     manifold: str
@@ -49,7 +48,7 @@ class Taught:
         known = setup.manifold.training_parameters
         return cls(
             manifold=manifold_hash(setup.manifold),
-            scene=scene_hash(setup.scene),
+            scene=physics_hash(setup.scene),
             sample=_sample_hash(setup),
             dt=setup.dt,
             method=str(setup.method),
@@ -94,19 +93,34 @@ class Taught:
             return f"other ranges: {self.ranges}, not {other.ranges}"
         return ""
 
-    def outside(self, parameters: Mapping[str, float], gravity: Sequence[float]) -> str:
-        """What of a run's input lies outside of what was taught; empty where nothing does."""
+    def outside(self, parameters: Mapping[str, float], gravity: Sequence[float]) -> tuple[float, str]:
+        """How far a run's input lies outside of what was taught.
+
+        Args:
+            parameters: of the run, by name.
+            gravity: [3] of the run [m/s²].
+
+        Returns:
+            Largest distance from the middle of a range in units of its half, at most 1 inside; and which
+            input is outside, empty where none is.
+        """
+        found = [(0.0, "")]
         for name, (low, high) in zip(self.parameters, self.ranges, strict=True):
-            slack = _SAME * max(abs(low), abs(high))
-            if not low - slack <= parameters[name] <= high + slack:
-                return f"{name}={parameters[name]:g} is outside the taught range {low:g} … {high:g}"
-        off = float(np.linalg.norm(np.subtract(gravity, self.gravity)))
-        if off > self.reach * (1 + _SAME):
-            return (
-                f"gravity={[round(float(value), 6) for value in gravity]} m/s² is {off:.3g} m/s² from that "
-                f"about which the operators were taught, {self.reach:.3g} m/s² at most"
-            )
-        return ""
+            off = _ratio(abs(parameters[name] - 0.5 * (low + high)), 0.5 * (high - low), abs(high) + abs(low))
+            found.append((off, f"{name}={parameters[name]:g} is outside of {low:g} … {high:g}"))
+        away = float(np.linalg.norm(np.subtract(gravity, self.gravity)))
+        around = float(np.linalg.norm(self.gravity))
+        text = f"gravity is {away:.3g} m/s² from that which was taught, {self.reach:.3g} m/s² at most"
+        found.append((_ratio(away, self.reach, around), text))
+        off, text = max(found)
+        return off, text if off > 1.0 else ""
+
+
+def _ratio(off: float, reach: float, size: float) -> float:
+    """How far off, in units of the reach; round-off of values of that size counts for nothing."""
+    if off <= reach + _SAME * size:
+        return min(off / reach, 1.0) if reach else 0.0
+    return off / reach if reach else np.inf
 
 
 def manifold_hash(manifold) -> str:
@@ -116,21 +130,6 @@ def manifold_hash(manifold) -> str:
         found.update(name.encode())
         found.update(tensor.detach().cpu().contiguous().reshape(-1).view(torch.uint8).numpy())
     return found.hexdigest()[:_DIGITS]
-
-
-def scene_hash(scene) -> str:
-    """Hash of a scene's physics but for gravity, initial velocities and the value of its parameter."""
-    template = scene.template.copy()
-    OmegaConf.update(template, scene.parameters.key, None)
-    template = OmegaConf.to_container(template, resolve=False)
-    content = {key: template[key] for key in ("scale", "material", "transfer")}
-    content["scene"] = {k: v for k, v in template["scene"].items() if k not in (*NOT_PHYSICS, "gravity")}
-    bodies = content["scene"]["bodies"]
-    content["scene"]["bodies"] = {
-        name: {key: value for key, value in body.items() if key != "velocity"}
-        for name, body in bodies.items()
-    }
-    return content_hash(content)
 
 
 def _sample_hash(setup: Setup) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nsf.engines.operators.model import Operators, Sizes
+from nsf.engines.operators.model import Sizes, StepOperators
 from nsf.engines.operators.states import principal
 from nsf.engines.operators.teacher import Teacher
 from nsf.errors import ConfigError, InstabilityError
@@ -24,7 +24,6 @@ _BATCH = 1024  # labels of one step of the descent
 _WINDOWS = 48  # unrolled windows of one
 _UNROLLED_WEIGHT = 0.1  # of their loss beside that of single steps
 _FAR = 4.0  # deviations from the mean of training latents, beyond which a run of one's own is cut off
-_HELD_BACK = 3  # values between the training ones, whose runs decide which round is kept
 #: Of their own deviation, by which the last change of a state of the tube differs from that of its run.
 _OTHER_CHANGE = 0.1
 
@@ -126,7 +125,7 @@ def random_values(ranges: Sequence[tuple[float, float]], count: int, seed: int, 
         taken: held-out values.
     """
     rng = np.random.default_rng(seed)
-    (low, high), = ranges
+    ((low, high),) = ranges
     values = low + (high - low) * (np.arange(count) + rng.random(count)) / count
     return [float(value) for value in values if not np.isclose(value, taken, rtol=1e-6).any()]
 
@@ -165,7 +164,7 @@ class Course:
         """Steps of the teacher so far."""
         return sum(teacher.steps for teacher in (*self.teachers, self.yardstick.teacher))
 
-    def follow(self) -> Operators:
+    def follow(self) -> StepOperators:
         """All rounds; gives the operators of the best.
 
         Raises:
@@ -247,7 +246,9 @@ class Course:
     def _moments(self, offset: int, count: int) -> Tensor:
         """Steps n ≥ 1 that a sweep asks for, ascending and evenly spread; another offset gives others."""
         N = self.teachers[0].total_steps
-        return 1 + ((torch.arange(count) * (N - 1) + (offset * (N - 1)) // (self.teaching.rounds + 1)) // count)
+        return 1 + (
+            (torch.arange(count) * (N - 1) + (offset * (N - 1)) // (self.teaching.rounds + 1)) // count
+        )
 
     def _of_runs(self, teacher: Teacher, runs: Tensor) -> Labels:
         """Labels that runs of the teacher itself are; runs [N + 1, R, r]."""
@@ -287,7 +288,7 @@ class Course:
         largest = max(float(teacher.gravity.norm(dim=1).max()) for teacher in self.teachers)
         return self.teaching.gravity * largest
 
-    def _model(self, truth: Tensor, changes: Tensor) -> Operators:
+    def _model(self, truth: Tensor, changes: Tensor) -> StepOperators:
         first = self.teachers[0]
         c_mean, c_matrix = principal(list(first.features.transpose(0, 1).numpy()))
         weightless = self.reach == 0.0 and not any(bool(t.gravity.any()) for t in self.teachers)
@@ -297,7 +298,7 @@ class Course:
         )  # fmt: skip
         state = torch.random.get_rng_state()
         torch.manual_seed(self.seed)
-        model = Operators(sizes, first.dt).double()
+        model = StepOperators(sizes, first.dt).double()
         torch.random.set_rng_state(state)
 
         def deviation(values: Tensor) -> Tensor:
@@ -317,7 +318,7 @@ class Course:
         return model
 
     def own_runs(self, teacher: Teacher) -> Tensor:
-        """[N + 1, R, r] runs of the operators at the teacher's values; what strays far is held where it is."""
+        """[N + 1, R, r] runs of the operators at the teacher's values; what strays far is held."""
         model, limit = self.model, _FAR
         c = model.collider_state(teacher.features)
         x, d = teacher.start, teacher.first_change()
@@ -336,11 +337,13 @@ class Course:
         teaching, model = self.teaching, self.model.float()
         rows = [getattr(self.labels, name).float() for name in Labels.__dataclass_fields__]
         xhat, change, acceleration, mu, g, features = rows
-        a_scale, d_scale = model.a_scale, model.d_scale
+        a_scale = model.a_scale
         # Far from training runs accelerations are ten to a hundred times as large, and would be all there is.
         weight = 1.0 / (1.0 + (acceleration / a_scale).square().mean(1) / 4.0)
         c = model.collider_state(features)
-        windows = [self._windows(teacher, runs) for teacher, runs in zip(self.teachers, self._runs, strict=True)]
+        windows = [
+            self._windows(teacher, runs) for teacher, runs in zip(self.teachers, self._runs, strict=True)
+        ]
         optimiser = torch.optim.Adam(model.parameters(), lr=teaching.rate / (1 if number == 0 else 2))
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, teaching.descent)
         for turn in range(teaching.descent):
@@ -401,7 +404,7 @@ class Course:
 
     def _take_up(self, kept: dict) -> None:
         """Go on from the end of a round."""
-        self.model = Operators(Sizes(**kept["sizes"]), self.teachers[0].dt).double()
+        self.model = StepOperators(Sizes(**kept["sizes"]), self.teachers[0].dt).double()
         self.model.load_state_dict(kept["model"])
         self.labels, self._runs = Labels(**kept["labels"]), kept["runs"]
         self.errors.append(kept["error"])

@@ -6,9 +6,11 @@ import numpy as np
 import torch
 
 from nsf.dynamics.interop import as_tensor
+from nsf.dynamics.setup import Setup
 from nsf.dynamics.solver import ReducedBatch
 from nsf.engines.operators.model import first_change
 from nsf.engines.operators.states import collider_states
+from nsf.kinematics.manifold import Restriction
 
 
 class Teacher:
@@ -40,7 +42,8 @@ class Teacher:
 
     def first_change(self) -> torch.Tensor:
         """[R, r] what stands for d at t = 0."""
-        return torch.cat([first_changes(batch) for batch in self._batches])
+        spans = [(batch.span_at(0), batch.batch.setups) for batch in self._batches]
+        return torch.cat([first_changes(span.at_sample, span.sets.sample, own) for span, own in spans])
 
     def run(self) -> torch.Tensor:
         """[N + 1, R, r] latent vectors of the runs as they go by themselves."""
@@ -84,15 +87,19 @@ class Teacher:
         self._told(steps)
 
 
-def first_changes(batch: ReducedBatch) -> torch.Tensor:
-    """[B, r] what stands for d at t = 0 in the runs of a batch, in fp64 on the host."""
-    span, found = batch.span_at(0), []
-    sample = torch.as_tensor(span.sets.sample).long()
+def first_changes(at_sample: Restriction, sample: np.ndarray, setups: Sequence[Setup]) -> torch.Tensor:
+    """[B, r] what stands for d at t = 0 in some runs, in fp64 on the host.
+
+    Args:
+        at_sample: the manifold restricted to S.
+        sample: [s] indices of S.
+        setups: of the runs.
+    """
+    rows, found = torch.as_tensor(sample).long(), []
     with torch.no_grad():
-        for setup in batch.batch.setups:
-            _, jacobian = span.at_sample.position_and_jacobian(setup.start)
-            velocity = setup.initial_velocity[sample]
-            found.append(first_change(_host(jacobian), _host(velocity), setup.dt))
+        for setup in setups:
+            _, jacobian = at_sample.position_and_jacobian(setup.start)
+            found.append(first_change(_host(jacobian), _host(setup.initial_velocity[rows]), setup.dt))
     return torch.stack(found)
 
 
