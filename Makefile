@@ -14,7 +14,7 @@ INSTALLED := $(VENV)/.installed
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 WORKERS ?= 2
 
-.PHONY: help install quickstart test test-slow test-slurm test-all lint readme check-reports docs clean
+.PHONY: help install quickstart test test-slow test-slurm test-all lint mirrors readme check-reports docs clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-13s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -46,6 +46,9 @@ lint: install  ## ruff and the layers of imports
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
+
+mirrors: install  ## the text of the reference that the modal engine mirrors; once its kernels follow an edit
+	$(BIN)/python -c 'from nsf.engines.modal import mirrors; mirrors.write()'
 
 readme: install  ## the figures in README.md, from a report, and the list of reports
 	$(BIN)/python -m nsf.reporting.readme README.md

@@ -1,4 +1,4 @@
-"""What a user sees of long work: a bar with a rate and an end time; no chatter of libraries."""
+"""Progress of long work for the user: a bar with a rate and an end time, without chatter of libraries."""
 
 import contextlib
 import logging
@@ -12,7 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, Task, T
 from rich.progress import Progress as RichProgress
 from rich.text import Text
 
-_TOLD_SECONDS = 0.1  # between two words from another process
+_TOLD_SECONDS = 0.1  # between two messages to another process
 
 
 class _Rate(ProgressColumn):
@@ -28,10 +28,10 @@ class Progress:
     """A progress bar on standard error.
 
     Args:
-        stage: what is being done.
+        stage: name of the work.
         total: units of work.
-        unit: what is counted.
-        shown: whether this process shows it.
+        unit: name of the units.
+        shown: whether this process shows the bar.
     """
 
     def __init__(self, stage: str, total: int, unit: str, shown: bool = True):
@@ -57,7 +57,7 @@ class Progress:
         self._bar.stop()
 
     def describe(self, what: str) -> None:
-        """Say what is being worked on."""
+        """Name the present piece of work on the bar."""
         self._bar.update(self._task, description=f"{self._stage}: {what}")
 
     def advance(self, amount: int = 1) -> None:
@@ -66,10 +66,10 @@ class Progress:
 
 
 class Told:
-    """Progress that another process shows: it is told the work done, some times a second.
+    """Progress that another process shows: it tells that process the work done, some times a second.
 
     Args:
-        tell: hands an amount of work over.
+        tell: called with an amount of work.
     """
 
     def __init__(self, tell: Callable[[int], object]):
@@ -82,7 +82,7 @@ class Told:
         self._tell(self._amount)
 
     def describe(self, what: str) -> None:
-        """Nothing: the other process works on several things."""
+        """Do nothing: the bar is for several pieces of work at once."""
 
     def advance(self, amount: int = 1) -> None:
         """Count work done."""
@@ -92,7 +92,7 @@ class Told:
             self._amount, self._since = 0, time.monotonic()
 
 
-# What Lightning says about choices made on purpose here.
+# Lightning's remarks on choices that are made on purpose here.
 _EXPECTED_WARNINGS = (
     r".*GPU available but not used",
     r".*`isinstance\(treespec, LeafSpec\)` is deprecated",
@@ -103,7 +103,7 @@ _EXPECTED_WARNINGS = (
 
 @contextlib.contextmanager
 def quiet_lightning() -> Iterator[None]:
-    """Without Lightning's banner and its advice against what is done on purpose."""
+    """Silence Lightning's banner, and its warnings about choices that are made on purpose."""
     chatter = [logging.getLogger(name) for name in ("pytorch_lightning", "lightning_fabric")]
     levels = [logger.level for logger in chatter]
     for logger in chatter:

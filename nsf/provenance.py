@@ -1,4 +1,4 @@
-"""Which code and which versions produced a result."""
+"""The code and the versions that produce a result."""
 
 import importlib.metadata
 import os
@@ -21,13 +21,13 @@ _DISTRIBUTIONS = {
 
 @cache
 def provenance() -> dict[str, Any]:
-    """The code's commit, whether the package differs from it, and the versions in use.
+    """The code's commit, whether the package differs from it (`dirty`), and the versions in use.
 
-    Where the package is not in a git checkout, as in a container, the
-    environment variable NSF_COMMIT may name the commit; `dirty` is then None.
+    Where the package is not in a git checkout, as in a container, the environment
+    variable NSF_COMMIT may name the commit. `dirty` is then None.
     """
     here = Path(__file__).parent
-    # A package installed below some other project's checkout is not tracked by it.
+    # Another project's checkout may hold an installed package; its git does not track the package.
     tracked = _git(here, "ls-files", "--error-unmatch", Path(__file__).name)
     commit = _git(here, "rev-parse", "HEAD") if tracked else os.environ.get("NSF_COMMIT")
     changes = _git(here, "status", "--porcelain", "--", ".") if tracked else None
@@ -40,7 +40,7 @@ def provenance() -> dict[str, Any]:
 
 
 def not_ignored(paths: Sequence[Path]) -> list[Path]:
-    """Those of some paths in one folder that git does not ignore; all of them where there is no git."""
+    """The paths, all in one folder, that git does not ignore; all paths where there is no git."""
     names = [str(path.absolute()) for path in paths]
     ignored = _git(paths[0].parents[1], "check-ignore", *names) if paths else None
     return [path for path, name in zip(paths, names, strict=True) if name not in (ignored or "").split("\n")]

@@ -19,10 +19,10 @@ _MIB = 2**20
 
 
 def synchronizer(device: Any = "cpu") -> Synchronize:
-    """The call that waits until everything asked of `device` is done.
+    """A call that waits until `device` has done everything asked of it.
 
-    On CUDA it waits for the whole device, whichever library's stream the work
-    is on. On the CPU there is nothing to wait for.
+    On CUDA the call waits for the whole device, whichever library's stream the
+    work is on. On the CPU it returns at once.
 
     Raises:
         DeviceError: `device` is a GPU and neither torch nor Warp is loaded.
@@ -40,24 +40,23 @@ def synchronizer(device: Any = "cpu") -> Synchronize:
 
 
 def untimed(stage: str) -> AbstractContextManager[None]:
-    """Stand in for a `StageTimer` where nothing is to be timed."""
+    """A stand-in for a `StageTimer` that times nothing."""
     return nullcontext()
 
 
 class StageTimer:
-    """Wall time a named stage.
+    """Wall time of named stages.
 
         timer = StageTimer(device)
         with timer("p2g"):
             ...
         timer.per_step(200)   # {"p2g": milliseconds}
 
-    A call takes the host's clock around a synchronised device. Synchronising
-    keeps stages from overlapping, so their sum exceeds an untimed step, and
-    on a GPU the wait for launches counts: publish the time of the whole step
-    beside such a breakdown. Within a CUDA graph there are no launches to wait
-    for: there `captured` takes the place of a call, and the graph's own events
-    tell where the time of a launch went.
+    A call reads the host's clock before and after its block, each time with the
+    device synchronised. Synchronised stages cannot overlap, so their sum exceeds
+    an untimed step, and on a GPU it includes the wait for launches. Publish the
+    time of the whole step beside such a breakdown. In a CUDA graph, use
+    `captured` in place of a call: events in the graph then time its stages.
 
         with capture() as graph:
             with timer.captured("p2g"):
@@ -67,7 +66,7 @@ class StageTimer:
 
     Args:
         device: "cpu", "cuda:0" or a library's device object.
-        synchronize: what to wait with, in place of `synchronizer(device)`.
+        synchronize: waits for the device; `synchronizer(device)` by default.
     """
 
     def __init__(self, device: Any = "cpu", synchronize: Synchronize | None = None) -> None:
@@ -90,8 +89,8 @@ class StageTimer:
     def captured(self, stage: str) -> Iterator[None]:
         """Mark the end of `stage` in the graph that is being captured on Warp's stream of the device.
 
-        A stage begins where the one before it ended. What the block puts on other streams counts where
-        the device's stream waits for it.
+        A stage begins where the one before it ended. Work of the block on other streams counts only as
+        far as the device's stream waits for it.
 
         Raises:
             DeviceError: torch or Warp is not loaded.
@@ -117,7 +116,7 @@ class StageTimer:
         return {stage: total / steps for stage, total in self.milliseconds.items()}
 
     def reset(self) -> None:
-        """Forget what was measured, such as a warm-up."""
+        """Forget all measurements, such as those of a warm-up."""
         self.milliseconds.clear()
         self.calls.clear()
 
@@ -139,26 +138,27 @@ class StageTimer:
 
 
 class MemoryProbe:
-    """Peak device memory over a region, every allocator counted.
+    """Peak device memory over a region, over all allocators.
 
         with MemoryProbe(device, nbytes=lambda: solver.nbytes) as probe:
             ...
         probe.peak_mib, probe.grown_mib, probe.allocators
 
-    On CUDA the peaks of torch's allocator and Warp's memory pool are added (an
-    upper bound: they may not coincide). Warp cannot reset its mark, so a region
-    that stays below an earlier one counts what Warp holds at its ends. On the
-    CPU no allocator can be asked; the caller's `nbytes` is read at the end.
+    On CUDA the peak is the sum of the peaks of torch's allocator and Warp's memory
+    pool. This is an upper bound, because the two may not coincide. Warp cannot
+    reset its high-water mark: a region that stays below an earlier one counts the
+    memory that Warp holds at its start or end. On the CPU no allocator can be
+    asked; the probe reads the caller's `nbytes` at the end.
 
     Args:
         device: "cpu", "cuda:0" or a library's device object.
         nbytes: [byte] held by the solvers, or a function of it; only used on the CPU.
 
     Attributes:
-        peak_mib: [MiB] the most that was held.
-        grown_mib: [MiB] the same, less what was held on entry.
-        allocators: [MiB] by allocator; "driver" is all that is in use on the
-            device at the end, other processes and loaded kernels included.
+        peak_mib: [MiB] most memory held at a time.
+        grown_mib: [MiB] `peak_mib` less the memory held on entry.
+        allocators: [MiB] by allocator; "driver" is all memory in use on the
+            device at the end, with other processes and loaded kernels.
     """
 
     def __init__(self, device: Any = "cpu", nbytes: int | Callable[[], int] = 0) -> None:

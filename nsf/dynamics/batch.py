@@ -44,7 +44,7 @@ class Batch:
         first = setups[0]
         for other in setups[1:]:
             _check_alike(first, other)
-        starts = torch.stack([setup.start for setup in setups])
+        starts = torch.stack([setup.xhat for setup in setups])
         record = LatentRecord(starts, first.total_steps, first.projector.iterations)
         colliders = tuple(chain.from_iterable(setup.scene.colliders for setup in setups))
         boundaries = BoundaryArrays(colliders, first.scene.walls, first.precision, first.device)

@@ -32,14 +32,14 @@ class Latents(Protocol):
 
     Attributes:
         now, before: [r] x̂_n and x̂_{n−1}.
-        predicted: [r] x̂_{n+1} on the parabola through the last three.
     """
 
     now: torch.Tensor
     before: torch.Tensor
 
     @property
-    def predicted(self) -> torch.Tensor: ...  # noqa: D102
+    def predicted(self) -> torch.Tensor:
+        """[r] x̂_{n+1} on the parabola through the last three."""
 
 
 def check_projector(projector) -> None:

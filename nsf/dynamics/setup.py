@@ -45,7 +45,7 @@ class Setup:
         dt, total_steps: step [s] and number of steps to the end of the scene.
         starts: step with which each span begins.
         constants: every particle of the scene; initial_velocity: [P, 3] theirs [m/s], on the host.
-        start: [r] x̂_0; parameters: [n_parameters] μ; both on the device.
+        xhat: [r] x̂_0; parameters: [n_parameters] μ; both on the device.
 
     Raises:
         ProjectionError: |S| < r/3.
@@ -103,7 +103,7 @@ class Setup:
         if xhat is None:  # a scene begins undeformed and free of stress
             X = torch.as_tensor(self.constants.X, device=manifold.X.device)[None]
             xhat = manifold.encode(X, X.new_zeros(*X.shape[:2], 6))[0].cpu()
-        self.start = tensor(_shaped("xhat", xhat, (manifold.latent_dim,)))
+        self.xhat = tensor(_shaped("xhat", xhat, (manifold.latent_dim,)))
         self.sets = self._found_sets() if sets is None else list(sets)
 
     def _found_sets(self) -> list[ParticleSets]:

@@ -2,9 +2,11 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import torch
+import warp as wp
 from typing_extensions import override
 
 from nsf.dynamics.batch import Batch
@@ -15,6 +17,17 @@ from nsf.mpm import Grid, GridStep
 
 #: The stages of one step in the order of the paper's section 5: name → what it does.
 Stages = dict[str, Callable[[], None]]
+
+
+class Particles(NamedTuple):
+    """Rows of a span as Warp sees them, in the order of `GridStep.p2g`."""
+
+    x: wp.array
+    v: wp.array
+    C: wp.array
+    tau: wp.array
+    mass: wp.array
+    volume0: wp.array
 
 
 class Span(ABC):
@@ -87,7 +100,7 @@ class GridSpan(Span):
         C, tau: [B n, 3, 3] affine momentum [1/s] and Kirchhoff stress [Pa].
         mass, volume0, mu, lam: [B n] of the particles [kg, m³, Pa, Pa].
         size: n.
-        grid_step: P2G, and G2P of S.
+        particles: the rows that P2G reads, as Warp sees them; grid_step: P2G, and G2P of S.
     """
 
     def __init__(self, batch: Batch, sets: ParticleSets, order: np.ndarray, at_sample: Restriction):
@@ -122,21 +135,8 @@ class GridSpan(Span):
         vectors = [as_vectors(a[:n], precision) for a in (self.x, self.v)]
         matrices = [as_matrices(a[:n], precision) for a in (self.C, self.tau)]
         scalars = [as_scalars(a[:n]) for a in (self.mass, self.volume0)]
-        self.particles = (*vectors, *matrices, *scalars)
+        self.particles = Particles(*vectors, *matrices, *scalars)
         self.size = n // len(self.batch)
-
-    def p2g(self) -> None:
-        """N → grid (paper section 5.2)."""
-        self.grid_step.p2g(*self.particles)
-
-    def g2p(self) -> None:
-        """Grid → x and v of S; nodes are updated as S needs them (paper section 5.2)."""
-        self.grid_step.follow()
-        self.move_sample()
-
-    def move_sample(self) -> None:
-        """`g2p` once the boundaries are where they will be."""
-        self.grid_step.update_g2p(*self.particles[:2], self.s)
 
     @property
     @override

@@ -47,7 +47,7 @@ class Step(GridSpan):
             "inference": self.infer,
             "transfer": self.load,
             "p2g": self.p2g,
-            "g2p": self.g2p,
+            "g2p": self.update_g2p,
             "inversion": self.project,
         }
 
@@ -61,7 +61,14 @@ class Step(GridSpan):
             if values is not None:
                 array.copy_(values)
 
-    # p2g, g2p: one MPM step of N, of which S is moved (section 5.2); they are every engine's, in `GridSpan`.
+    def p2g(self) -> None:
+        """N → grid: mass, momentum and the impulse of the stress (section 5.2)."""
+        self.grid_step.p2g(*self.particles)
+
+    def update_g2p(self) -> None:
+        """Momentum → velocity at the nodes of S, boundaries included; then x and v of S (section 5.2)."""
+        self.grid_step.follow()
+        self.grid_step.update_g2p(self.particles.x, self.particles.v, self.s)
 
     def project(self) -> None:
         """x̂_{n+1}, whose g(X_S, x̂) is nearest to where S went (section 5.3)."""

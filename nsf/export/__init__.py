@@ -1,7 +1,7 @@
-"""Reduced runs for other programs: one file here a format, and its line in `FORMATS`.
+"""Reduced runs for other programs: each format has one module here and one line in `FORMATS`.
 
-A format's module has `write(playback, folder)`, which gives the path to open, and `NEEDS`, the modules of the
-extra `export` that it takes.
+The module has `write(playback, folder)`, which gives the path to open, and `NEEDS`, the modules of the extra
+`export` that it uses.
 """
 
 FORMATS = {

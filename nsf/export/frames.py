@@ -21,13 +21,13 @@ GREY, INK = "#ededf0", "#222222"
 def write(playback: Playback, folder: Path) -> Path:
     """Write `frame_0000.png` and on, and the film beside their folder, as MP4 (H.264) at the playback's fps.
 
-    Points are spheres in the colours of the playback's quantity. Blocks of points come with all their
-    frames, a picture needs all points of one frame: in between the positions lie in a file, so that no more
-    than a frame is in memory.
+    Points are spheres in the colours of the playback's quantity. A block holds some points in all frames, and
+    a picture needs all points in one frame. So the positions go to a temporary file first, and only one frame
+    at a time is in memory.
 
     Raises:
         MissingExtraError: pyvista or imageio-ffmpeg is not installed.
-        StorageError: the disk cannot hold the positions in between.
+        StorageError: the disk cannot hold the temporary file.
     """
     pyvista, imageio, _ = (optional(name, "export") for name in NEEDS)
     pictures, film = folder / f"{playback.name}_frames", folder / f"{playback.name}.mp4"
@@ -40,7 +40,7 @@ def write(playback: Playback, folder: Path) -> Path:
             frames[:, block.rows, :3] = block.x.numpy()
             frames[:, block.rows, 3] = block.magnitude(playback.color).numpy()
         with (
-            pyvista.vtk_verbosity("off"),  # it looks for a display first, and says that there is none
+            pyvista.vtk_verbosity("off"),  # VTK looks for a display first, and says that there is none
             contextlib.closing(pyvista.Plotter(off_screen=True, window_size=SIZE)) as plotter,
             imageio.get_writer(partial, fps=playback.fps, macro_block_size=1, quality=8) as movie,
             Progress("export: draw", len(frames), "frames") as progress,
@@ -61,7 +61,7 @@ def write(playback: Playback, folder: Path) -> Path:
 
 
 def _furnish(plotter, pyvista, playback: Playback, first: np.ndarray):
-    """Camera, floor, legend, and the points of the first frame [N, 4], which are given."""
+    """Set camera, floor and legend, add the points of the first frame [N, 4], and return them."""
     quantity, top = QUANTITIES[playback.color], playback.tops[playback.color]
     lower, upper = playback.bounds
     centre, size = 0.5 * (lower + upper), float(np.linalg.norm(upper - lower))

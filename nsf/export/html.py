@@ -15,18 +15,19 @@ from nsf.reporting.colors import STRESS_COLORS, ColorScale
 from nsf.storage import writing
 
 NEEDS = ()
-POINTS = 20_000  # unless asked for: a page of some MiB that a telephone plays
+POINTS = 20_000  # by default: a page of some MiB that a telephone plays
 LARGEST = 1 << 29  # bytes of positions and colours that a browser unpacks
 
 
 def write(playback: Playback, folder: Path) -> Path:
-    """Write the page: positions in 16 bits of their bounding box, von Mises stress in 8 of its colour scale.
+    """Write the page.
 
-    Each plane of values is stored as its difference from the plane before, and the whole deflated. The
-    address may name where to begin, paused: `page.html#frame=50`, and `&color=displacement`.
+    Positions take 16 bits over their bounding box, von Mises stress 8 bits over its colour scale. The page
+    stores each plane of values as its difference from the plane before, deflated. Its address may name a
+    frame, at which it begins paused, and a quantity: `page.html#frame=50&color=displacement`.
 
     Raises:
-        ConfigError: so many points in so many frames are too much for a browser.
+        ConfigError: a browser cannot hold so many points in so many frames.
     """
     if not playback.points_given:
         playback = playback.thinned(POINTS)
@@ -77,13 +78,16 @@ def write(playback: Playback, folder: Path) -> Path:
 
 
 def _quantised(values: np.ndarray, lower, upper, kind: type) -> np.ndarray:
-    """Values from `lower` to `upper`, and beyond, as whole numbers from 0 to the largest of `kind`."""
+    """Values, clipped to [`lower`, `upper`], as whole numbers from 0 to the largest of `kind`."""
     largest = np.iinfo(kind).max
     span = np.maximum(np.subtract(upper, lower), np.finfo(np.float32).tiny)
     return np.rint(np.clip((values - lower) / span, 0.0, 1.0) * largest).astype(kind)
 
 
 def _differences(planes: np.ndarray) -> np.ndarray:
-    """Each plane less the one before, modulo the type, byte by byte: nearly all high bytes are alike."""
+    """Each plane less the one before it, modulo the type.
+
+    The bytes are sorted by their significance, because nearly all high bytes are alike.
+    """
     differences = np.diff(planes, axis=0, prepend=np.zeros_like(planes[:1]))
     return np.moveaxis(np.ascontiguousarray(differences).view(np.uint8).reshape(-1, planes.itemsize), 1, 0)

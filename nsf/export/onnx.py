@@ -28,14 +28,13 @@ def write(playback: Playback, folder: Path) -> Path:
     """Write `deformation.onnx`, `stress.onnx`, `affine.onnx` and `inputs.npz` into a folder of their own.
 
     Inputs: `xhat` [frames, r]; `parameters` [n], problem parameters in the order of the metadata's
-    `parameter_names`; and of a field that is a function of X (`field=mlp`) `X` [points, 3] m at rest, while
-    another field (`field=basis`) is that at the points of the playback. A graph keeps an input that its field
-    does not depend on. Outputs: `x` [frames, points, 3] m; `tau` [frames, points, 6] Pa in the order of the
+    `parameter_names`; and `X` [points, 3] m at rest, if the field is a function of X (`field=mlp`). Other
+    fields (`field=basis`) are fixed to the points of the playback. A graph keeps an input on which its field
+    does not depend. Outputs: `x` [frames, points, 3] m; `tau` [frames, points, 6] Pa in the order of the
     metadata's `tau_order`; `C` [frames, points, 3, 3] 1/s.
 
-    `inputs.npz` holds the run's own `xhat`, `parameters`, `X`, and the time `t` [s] of its frames.
-
-    The fields are those trained, also where the run's method did without one.
+    `inputs.npz` holds the run's own `xhat`, `parameters`, `X`, and the time `t` [s] of its frames. All three
+    trained fields are written, even if the run's method does not use each of them.
 
     Raises:
         MissingExtraError: onnx or onnxscript is not installed.
@@ -74,7 +73,7 @@ def _check_size(module: nn.Module, points: int) -> None:
 
 @contextmanager
 def _quiet(logger: logging.Logger) -> Iterator[None]:
-    """Errors alone: it also warns of packages that are absent and not needed."""
+    """Let errors through alone: the logger also warns of absent packages that are not needed."""
     level = logger.level
     logger.setLevel(logging.ERROR)
     try:
@@ -84,10 +83,10 @@ def _quiet(logger: logging.Logger) -> Iterator[None]:
 
 
 def _graph(module: nn.Module, output: str, inputs: dict[str, np.ndarray]):
-    """The module's graph with named axes and without the exporter's notes, which tell of paths."""
+    """The module's graph, with named axes without the exporter's notes, which hold paths of this machine."""
     names = list(inspect.signature(module.forward).parameters)
     axes = {"X": {0: "points"}, "xhat": {0: "frames"}, "parameters": {}}
-    # To trace with: the graph does not depend on how many frames and points these are.
+    # Example inputs for the trace. The graph does not depend on their numbers of frames and points.
     example = {name: torch.zeros(4 if axes[name] else len(a), *a.shape[1:]) for name, a in inputs.items()}
     with warnings.catch_warnings(), _quiet(logging.getLogger("torch.onnx")):
         warnings.simplefilter("ignore")
@@ -120,7 +119,7 @@ def _graph(module: nn.Module, output: str, inputs: dict[str, np.ndarray]):
 
 
 def _properties(playback: Playback, phase: str) -> dict[str, str]:
-    """What a reader of the file alone wants to know."""
+    """Metadata for a reader who has the file alone."""
     manifold, (name, _) = playback.manifold, TARGETS[phase]
     told = {
         "field": manifold.field,

@@ -1,4 +1,4 @@
-"""A reduced run from its files, decoded at as many points as asked for, block by block."""
+"""A reduced run, read from its files and decoded block by block at any number of points."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -27,17 +27,17 @@ from nsf.reporting.colors import CLIP
 from nsf.runs import Run
 from nsf.scenes import Scene
 
-BLOCK = 1 << 21  # positions decoded at once, of all frames: with τ some hundred MiB
+BLOCK = 1 << 21  # positions of all frames that are decoded at once: with τ some hundred MiB
 SHOWN = 2000  # particles that set the colour scale and the camera
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """What points can be coloured by.
+    """A quantity by which points can be coloured.
 
     Attributes:
         title, unit: for a legend.
-        clip: [%] percentile at which the colour scale ends: peaks of stress would darken all else.
+        clip: [%] percentile at which the colour scale ends, because peaks of stress would darken all else.
     """
 
     title: str
@@ -56,7 +56,7 @@ class Block:
     """Some of the points in every frame, on the host.
 
     Attributes:
-        rows: of these points among all.
+        rows: indices of these points among all points.
         X: [n, 3] at rest [m]; x: [F, n, 3] [m].
         tau: [F, n, 6] Kirchhoff stress [Pa], order xx xy xz yy yz zz.
     """
@@ -89,16 +89,17 @@ class Block:
 class Playback:
     """One reduced run of a deploy run: its frames, and its points at rest.
 
-    Only the files of the deploy run and of its train run are read; the scene is built, with the key of the
-    parameter from a simulate run's configuration, where points in between or the elastic law ask for it.
+    A playback reads the files of the deploy run and of its train run. It builds the scene only where it needs
+    points between the particles or the elastic law. It then takes the key of the parameter from the
+    configuration of a simulate run.
 
     Args:
         run: complete deploy run.
         parameter: held-out value; the first by default.
-        points: how many. More than the training particles are points of the same shapes in between
-            (super-resolution), fewer are particles drawn once and for all; the particles by default.
-        color: what points are coloured by, of `QUANTITIES`.
-        every: takes each `every`-th step, and the last.
+        points: number of points; the particles by default. More than the training particles are points of the
+            same shapes between them (super-resolution). Fewer are a fixed random choice of the particles.
+        color: one of `QUANTITIES`, by which points are coloured.
+        every: take one step in `every`, and the last step.
         fps: frames shown a second.
         device: where the fields are decoded: `cpu`, `cuda`, `cuda:N` or `auto`.
 
@@ -106,11 +107,11 @@ class Playback:
         points_given: whether a number of points was asked for.
         t: [F] time of the frames [s].
         X: [N, 3] points at rest [m], in the order of the blocks.
-        stopped: time [s] at which the run diverged, None when it did not; frames end before it.
+        stopped: time [s] at which the run diverged, after the last frame; None if it did not diverge.
 
     Raises:
-        ConfigError: no such value; a number that is not positive; points in between of a run that the
-            full-order solver went on with, as that part has no fields.
+        ConfigError: the value was not deployed; a number is not positive; or points between the particles are
+            asked of a run that the full-order solver went on with, a part that has no fields.
         MissingRunError: the train run is not whole.
         DeviceError: there is no such device.
     """
@@ -151,7 +152,7 @@ class Playback:
         rollout = self._rollout
         diverged, handed_over = rollout.diverged, rollout.handed_over
         t = rollout.t if diverged < 0 else rollout.t[:diverged]
-        own = len(t)  # frames of the reduced run; later ones are the full-order solver's
+        own = len(t)  # frames of the reduced run; the full-order solver made the later ones
         if handed_over >= 0:
             own = handed_over + 1
             with Trajectory.open(self._continuation) as rest:
@@ -162,7 +163,7 @@ class Playback:
         self._xhat = torch.as_tensor(
             rollout.xhat[chosen[chosen < own]], dtype=self._dtype, device=self.device
         )
-        self._later = chosen[chosen >= own] - (own - 1)  # of the continuation, whose first is a reduced one
+        self._later = chosen[chosen >= own] - (own - 1)  # of the continuation, whose first frame is reduced
 
     def _choose_points(self, points: int | None) -> None:
         X = self.manifold.X.cpu().numpy()
@@ -179,7 +180,7 @@ class Playback:
             X = constants.X
             rows = torch.cat(lying_together(torch.as_tensor(X), POINTS)).numpy()
         elif points is not None:
-            # As drawn for reports: strides of a quasi-random sequence would show a pattern.
+            # At random, as for reports: strides of a quasi-random sequence would show a pattern.
             rows = np.sort(np.random.default_rng(0).permutation(len(X))[:points])
         self.X, self._rows = X[rows], rows
         self._moduli = None
@@ -200,7 +201,7 @@ class Playback:
 
     @property
     def xhat(self) -> np.ndarray:
-        """[F, r] latent vectors, without the frames that the full-order solver went on with."""
+        """[F, r] latent vectors of the reduced run, without the frames of the full-order solver."""
         return self._xhat.cpu().numpy()
 
     @property
@@ -216,18 +217,18 @@ class Playback:
 
     @property
     def radius(self) -> float:
-        """Of a sphere [m] at which the points look closed: from the volume that they fill at rest."""
+        """Radius [m] of spheres at which the points look closed, from the volume that they fill at rest."""
         extent = np.maximum(np.ptp(self.X, axis=0), 1e-6)
         return float(0.62 * (np.prod(extent) / len(self.X)) ** (1 / 3))
 
     def thinned(self, points: int) -> "Playback":
-        """The same frames at `points` of the particles, or at all if these are fewer."""
+        """The same frames at `points` of the particles, or at all particles if there are fewer."""
         points = min(points, len(self.manifold.X))
         return Playback(self.run, self.parameter, points, self.color, self.every, self.fps, str(self.device))
 
     @cached_property
     def tops(self) -> dict[str, float]:
-        """Where the colour scale of each of `QUANTITIES` ends, the same for any number of points."""
+        """The end of the colour scale of each of `QUANTITIES`, the same for any number of points."""
         found: dict[str, float] = {}
         for name, quantity in QUANTITIES.items():
             values = torch.cat([block.magnitude(name).flatten() for block in self._some])
@@ -254,10 +255,10 @@ class Playback:
     def blocks(self, what: str = "decode") -> Iterator[Block]:
         """Every point in every frame, a block of points at a time, with a progress bar.
 
-        No more than a block is held: memory does not grow with points × frames.
+        Only one block is held at a time, so memory does not grow with points × frames.
 
         Args:
-            what: is being made, for the bar.
+            what: name of the work, for the bar.
         """
         with Progress(f"export: {what}", len(self.X), "points") as progress:
             for block in self._decoded():
@@ -277,7 +278,7 @@ class Playback:
             yield Block(rows, torch.as_tensor(self.X[rows]).to(x), x, tau)
 
     def _decoder(self, rows: slice) -> Decoder:
-        """The fields at some of the points, as the run's method takes them."""
+        """The fields at some of the points, combined as in the run's method."""
         at = self.restricted(rows)
 
         def tensor(values: Sequence[float]) -> torch.Tensor:
@@ -291,14 +292,14 @@ class Playback:
         return Decoder(at, stress, self._method.affine_of(at, parameters))
 
     def _read(self, rows: slice) -> tuple[torch.Tensor, torch.Tensor]:
-        """x and τ of some of the points in the frames that the full-order solver went on with."""
+        """x and τ of some of the points, in the frames of the full-order solver."""
         with Trajectory.open(self._continuation) as rest:
             found = (rest.read(name, frames=self._later, particles=self._rows[rows]) for name in ("x", "tau"))
             return tuple(torch.as_tensor(values) for values in found)
 
     @cached_property
     def _scene(self) -> Scene:
-        """The scene deployed on, for its shapes and law; keys that follow the parameter are as configured.
+        """The scene deployed on, for its shapes and law. Keys that follow the parameter are as configured.
 
         Raises:
             MissingRunError: the configuration of the simulation that was trained on is not there.
@@ -320,7 +321,7 @@ def _chosen(values: Sequence[float], parameter: float | None) -> tuple[int, floa
     """Index and value of a held-out parameter value.
 
     Raises:
-        ConfigError: it is none of them; names them.
+        ConfigError: the value is none of the deployed ones, which the message names.
     """
     if parameter is None:
         return 0, float(values[0])

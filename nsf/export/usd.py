@@ -15,11 +15,11 @@ NEEDS = ("pxr.Usd", "pxr.UsdGeom", "pxr.Sdf", "pxr.Vt")
 def write(playback: Playback, folder: Path) -> Path:
     """Write a stage with a `Points` prim for each block of points, in metres, z up.
 
-    Time code k is frame k of `fps`; the attribute `nsf:time` of the root prim says its time in seconds.
-    Primvars, a value a point: displayColor by the quantity of the playback; displacement [m]; vonMises and
-    pressure [Pa]; kirchhoffStress [Pa], six values a point in the order xx xy xz yy yz zz.
+    Time code k is frame k at `fps` frames a second. The attribute `nsf:time` of the root prim holds the time
+    of each frame in seconds. Primvars with one value a point: displayColor by the quantity of the playback;
+    displacement [m]; vonMises and pressure [Pa]; kirchhoffStress [Pa], six values as xx xy xz yy yz zz.
 
-    The file is saved after each block, and what is saved leaves the memory.
+    The file is saved after each block, which frees the block's memory.
 
     Raises:
         MissingExtraError: usd-core is not installed.

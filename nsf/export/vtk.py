@@ -1,6 +1,6 @@
 """`--vtk`: one VTKHDF file with every time step, for ParaView 5.12 or newer and VTK's readers.
 
-VTK's own writer wants a whole step in memory; h5py fills the same layout block by block.
+VTK's own writer needs a whole step in memory. h5py fills the same layout block by block.
 """
 
 from pathlib import Path
@@ -25,7 +25,7 @@ def write(playback: Playback, folder: Path) -> Path:
     """Write positions and the arrays of `ARRAYS` of every point and frame, in single precision.
 
     Arrays: displacement [m], von_mises and pressure [Pa], kirchhoff_stress [Pa] as XX YY ZZ XY YZ XZ. The
-    time of a step is in seconds. Points do not change places from step to step.
+    time of a step is in seconds. The order of the points is the same in every step.
 
     Raises:
         StorageError: the disk cannot hold the file.
@@ -64,7 +64,7 @@ def _dataset(group: h5py.Group, name: str, rows: int, components: int) -> h5py.D
 
 
 def _cells(root: h5py.Group, points: int) -> None:
-    """A vertex at each point, the same in every step: filters of ParaView work on cells."""
+    """Write a vertex cell at each point, the same in every step, because ParaView's filters work on cells."""
     root["NumberOfPoints"] = root["NumberOfCells"] = root["NumberOfConnectivityIds"] = np.array([points])
     root["Connectivity"] = np.arange(points)
     root["Offsets"] = np.arange(points + 1)
@@ -72,7 +72,7 @@ def _cells(root: h5py.Group, points: int) -> None:
 
 
 def _steps(root: h5py.Group, t: np.ndarray, points: int) -> None:
-    """Where each step's points begin; cells are read from the first row in all."""
+    """Write the row at which the points of each step begin. All steps read the same cells, from row 0."""
     steps = root.create_group("Steps")
     steps.attrs["NSteps"] = len(t)
     steps["Values"] = t

@@ -1,7 +1,8 @@
-"""A deployed reduced model under one's hands: run at any parameter value, looked at, and streamed.
+"""A deployed reduced model, live: it runs at any parameter value, is shown in a browser, and is streamed.
 
-`model` runs and decodes, `player` decides what is shown; `page` shows it in viser, `server` streams it.
+`model` runs and decodes, `player` chooses the run and the frame to show, `page` shows it in viser, and
+`server` streams it.
 """
 
-#: Hosts that only this machine reaches.
+#: Hosts that this machine alone reaches.
 LOOPBACK = ("127.0.0.1", "localhost", "::1")

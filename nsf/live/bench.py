@@ -1,4 +1,4 @@
-"""What `--bench` measures: how fast a slider is followed, and what a stream costs."""
+"""The measurements of `--bench`: how fast the picture follows a slider, and how much a stream costs."""
 
 import asyncio
 import itertools
@@ -17,19 +17,19 @@ from nsf.live.player import Player
 from nsf.live.server import Stream
 from nsf.live.wire import field_message, frame_message
 
-#: A rate that no server reaches: it sends as fast as it can.
+#: A rate that no server reaches, so that it sends as fast as it can.
 _UNLIMITED = 1e6
 _TRIALS = 9
 _SECONDS, _WARM_UP, _STEER = 5.0, 1.0, 0.5
 
 
 def follow(player: Player) -> pd.DataFrame:
-    """How fast `nsf view` can be, without what viser and the browser take.
+    """How fast `nsf view` can follow its slider, without the time of viser and of the browser.
 
     Returns:
-        One row a step at which what is shown stands still while the parameter is moved: median and longest
-        time [s] from there until the run at the new value is shown. `build` of it is the solver's; frames/s
-        are those of a step and its picture, beside the full-order run's, one after the other.
+        One row a shown step. While that step is shown, the parameter moves: median and longest time [s] until
+        the run at the new value is shown. "of it build [s]" is the share of building the solver. "frames/s"
+        counts a step and its picture (with the full-order run's), one after the other.
     """
     model, coloring = player.model, Coloring(player.model)
     known = model.truth(model.initial)
@@ -66,21 +66,20 @@ def follow(player: Player) -> pd.DataFrame:
 
 
 def _values(low: float, high: float) -> Iterator[float]:
-    """Values between two, none twice: the run at one that was asked for would be there already."""
+    """Values between `low` and `high`, none twice: the player keeps the runs of values it had before."""
     return (low + (high - low) * (n * 0.618034 % 1.0) for n in itertools.count(1))
 
 
 def bench(player: Player, counts: Sequence[int], rate: float) -> pd.DataFrame:
-    """Frames a second at each number of clients, at the rate asked for and as fast as can be.
+    """Frames a second at each number of clients, at the rate asked for and as fast as possible.
 
-    The clients are another process of this machine. One of them moves the parameter twice a second, so
-    that the server makes reduced runs all the while. Nothing is sent, and so nothing counted, while a run
-    stands still at its end.
+    The clients are another process of this machine. One of them moves the parameter twice a second, so that
+    the server makes reduced runs throughout. The server sends nothing while a run stands still at its end.
 
     Returns:
-        Columns clients, rate asked for, mean and least frames/s of a client.
+        Columns: clients, rate asked for, mean and least frames/s of a client.
     """
-    logging.getLogger("nsf").setLevel(logging.WARNING)  # who comes and goes is no news here
+    logging.getLogger("nsf").setLevel(logging.WARNING)  # without a line for each client that comes or goes
     rows = []
     for count in counts:
         for wanted in (rate, _UNLIMITED):
@@ -97,7 +96,7 @@ def bench(player: Player, counts: Sequence[int], rate: float) -> pd.DataFrame:
 
 
 def sizes(player: Player) -> dict[str, int]:
-    """Bytes: a frame on the wire, the same as positions and as positions and stress, and the field, once."""
+    """Bytes of a frame on the wire, of its positions, of these and their stress, and of the field."""
     frame, model = len(frame_message(player.tick())), player.model
     return {
         # A server's WebSocket frame of up to 125 bytes has a header of two.

@@ -1,4 +1,4 @@
-"""What particles can be coloured by, and the scales that stay while a parameter is moved."""
+"""Colours of particles by several quantities, on scales that do not change with the parameter."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,9 +20,9 @@ from nsf.reporting.colors import (
 )
 from nsf.reporting.style import PALETTE
 
-#: Where the scale of the distance to the truth ends, over that of the displacement.
+#: End of the scale of the distance to the truth, over the end of the scale of the displacement.
 _DISTANCE = 0.05
-#: Of a particle in neither set, in N only, and in S.
+#: Colours of a particle in neither set, in N only, and in S.
 ROLES = ("#BBBBBB", PALETTE[0], PALETTE[1])
 _ROLES = np.array([[int(color[i : i + 2], 16) for i in (1, 3, 5)] for color in ROLES], np.uint8)
 SAMPLE = tuple(_ROLES[2].tolist())
@@ -30,11 +30,11 @@ SAMPLE = tuple(_ROLES[2].tolist())
 
 @dataclass(frozen=True)
 class Picture:
-    """What is drawn of a moment.
+    """The drawing of a moment.
 
     Attributes:
         x_reduced: [n, 3] m; colors_reduced: [n, 3] of 8 bits.
-        x_full, colors_full: the same of the full-order run; None where there is none.
+        x_full, colors_full: the same of the full-order run; None without such a run.
     """
 
     x_reduced: np.ndarray
@@ -47,10 +47,10 @@ class Coloring:
     """Colours of a model's particles.
 
     Args:
-        model: its training snapshots set the scales.
+        model: the training snapshots of this model set the scales.
 
     Attributes:
-        scales: by name of what is shown; None for the particle sets, which have three colours.
+        scales: colour scale by name of the quantity; None for the particle sets, which have three colours.
     """
 
     def __init__(self, model: LiveModel):
@@ -70,8 +70,8 @@ class Coloring:
         """Positions and colours of a moment.
 
         Args:
-            moment: what is shown.
-            truth: the full-order run beside it, if there is one.
+            moment: the run and the step that are shown.
+            truth: the full-order run at the same value, if there is one.
             by: a key of `scales`.
         """
         run, step, t = moment.run, moment.step, moment.t
@@ -82,7 +82,7 @@ class Coloring:
             colors = _ROLES[self._model.roles(step)]
             return Picture(x, colors, x_full, colors if truth else None)
         if by == "distance to the truth":
-            # Without a truth nothing is known, and so nothing is said.
+            # Without a truth the distance is unknown, and the colour says nothing.
             distance = np.zeros(len(x)) if x_full is None else np.linalg.norm(x - x_full, axis=1)
             reduced, full = distance, np.zeros(len(x))
         elif by == "displacement":

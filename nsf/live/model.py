@@ -1,4 +1,4 @@
-"""A deployed reduced model that runs at any value of its problem parameter, and the truth beside it."""
+"""A deployed reduced model that runs at any value of its problem parameter, and its full-order runs."""
 
 import math
 import time
@@ -18,19 +18,19 @@ from nsf.mpm.stability import check_time_step
 from nsf.pipeline import Pipeline
 from nsf.runs import Run
 
-#: Of live runs, whatever that of the deployment: a CPU reads half as much a step. On the sand column it
+#: Precision of live runs, whatever the deployment's: a CPU reads half as much a step. On the sand column this
 #: moves no particle by more than a thousandth of the displacement.
 PRECISION = "fp32"
-#: How far a parameter reaches beyond its training values on each side, over their span.
+#: Reach of the parameter beyond its training values on each side, over their span.
 _BEYOND = 0.5
-#: Steps of a parameter's range.
+#: Number of steps in the range of the parameter.
 _STEPS = 200
 _SNAPSHOTS = 64  # training snapshots that bounds and colour scales are taken from
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """The problem parameter and where it may go.
+    """The problem parameter and its range.
 
     Attributes:
         name, unit: of the scene's parameter.
@@ -48,7 +48,7 @@ class Parameter:
 
     @property
     def step(self) -> float:
-        """Difference that is worth another run."""
+        """Least difference of two values that is worth another run."""
         return (self.upper - self.lower) / _STEPS or 1.0
 
     def inside(self, value: float) -> bool:
@@ -59,7 +59,7 @@ class Parameter:
         """The value, or the known one that lies within half a step of it.
 
         Raises:
-            ConfigError: it is not finite, or out of reach.
+            ConfigError: the value is not finite, or out of reach.
         """
         if not (math.isfinite(value) and self.lower <= value <= self.upper):
             raise ConfigError(f"{self.name}={value:g} must lie in [{self.lower:g}, {self.upper:g}]")
@@ -71,8 +71,8 @@ class Truth:
     """The full-order run at a parameter value, at the particles that are shown.
 
     Args:
-        trajectory: opened; frames are read when they are asked for.
-        particles: [n] indices.
+        trajectory: opened; each frame is read when it is asked for.
+        particles: [n] indices of the particles that are shown.
     """
 
     def __init__(self, trajectory: Trajectory, particles: np.ndarray):
@@ -89,7 +89,7 @@ class Truth:
     def _at(self, field: str, t: float) -> np.ndarray:
         last = self._trajectory.frames - 1
         at = min(max(t / self._trajectory.dt, 0.0), float(last))
-        # Times of a step are whole numbers of Δt but for round-off: then one frame is read, not two.
+        # A step's time is a whole number of Δt but for round-off. One frame is then read in place of two.
         first = round(at) if abs(at - round(at)) < 1e-6 else int(at)
         here = self._read(field, first)
         part = at - first
@@ -100,19 +100,19 @@ class Truth:
 
 
 class LiveRun:
-    """A reduced run, as far as it has come; one thread advances it while others read what is there.
+    """A reduced run in the making: one thread advances it while others read its steps up to `reached`.
 
     Args:
         value: of the problem parameter.
-        solver: at t = 0.
-        decoder: its fields at the particles that are shown.
-        trust: the estimate of whether to believe it.
+        solver: reduced solver at t = 0.
+        decoder: the solver's fields at the particles that are shown.
+        trust: estimates whether to believe the run.
 
     Attributes:
-        steps, dt: of the whole run; dt in s.
+        steps, dt: number of steps of the whole run, and their length [s].
         reached: last step that can be read.
-        finished: whether it has come to its end: that of the scene, or where it diverged.
-        diverged: whether it ended early, with x̂ not finite or a sample particle off the grid.
+        finished: whether the run has reached the scene's end or has diverged.
+        diverged: whether the run ended early, with x̂ not finite or a sample particle off the grid.
         seconds: wall time of the steps [s].
     """
 
@@ -128,11 +128,11 @@ class LiveRun:
 
     @property
     def finished(self) -> bool:
-        """Whether nothing is left to do."""
+        """Whether the run has reached the scene's end or has diverged."""
         return self._solver is None
 
     def advance(self, steps: int) -> None:
-        """Take steps, or those that are left; the last one frees the solver."""
+        """Take `steps` steps, or as many as are left. The last step frees the solver."""
         solver, first = self._solver, self.reached + 1
         if solver is None:
             return
@@ -147,7 +147,7 @@ class LiveRun:
         self._ratios[found] = self._trust.ratios(latent.xhat[first - 1 : last + 1], residuals)[1:]
         self.seconds += time.perf_counter() - started
         self.diverged = lost >= 0
-        self.reached = last  # only now: what is read up to here is there
+        self.reached = last  # only now, since other threads read all steps up to here
         if self.diverged or last == self.steps:
             self._solver = None
 
@@ -166,7 +166,7 @@ class LiveRun:
         return self._decoder.position(torch.as_tensor(self._xhat[step])).cpu().numpy()
 
     def stress(self, step: int) -> np.ndarray:
-        """[n, 6] Kirchhoff stress [Pa] as the method takes it, float32."""
+        """[n, 6] Kirchhoff stress [Pa] that the run's method uses, float32."""
         now = torch.as_tensor(self._xhat[step], device=self._decoder.at.device)
         return packed("tau", self._decoder.stress(now[None])[0].cpu().numpy())
 
@@ -175,8 +175,8 @@ class LiveModel:
     """The reduced model of a deploy run.
 
     Args:
-        run: complete.
-        points: most particles that are shown; sample particles are always among them.
+        run: complete deploy run.
+        points: most particles that are shown; the sample particles are always among them.
         device: `cpu`, `cuda`, `cuda:N` or `auto`.
 
     Attributes:
@@ -184,13 +184,13 @@ class LiveModel:
         title: of the scene.
         particles: P.
         shown: [n] indices of the particles that are shown.
-        at: the fields there.
-        X: [n, 3] their positions at rest [m].
-        spacing: edge of the cube that each has to fill [m].
+        at: the fields at these particles.
+        X: [n, 3] positions of these particles at rest [m].
+        spacing: edge of the cube that each of these particles fills [m].
 
     Raises:
-        MissingRunError: the deployment, or the training that it rests on, is not whole.
-        DeviceError: the device is not there.
+        MissingRunError: the deployment, or its training, is not whole.
+        DeviceError: the device does not exist.
     """
 
     def __init__(self, run: Run, points: int = 6000, device: str = "auto"):
@@ -200,7 +200,7 @@ class LiveModel:
         self.manifold = self._pipeline.manifold()
         self._truths = _truths(self._pipeline)
         self.parameter = _parameter(self._pipeline, tuple(sorted(self._truths)))
-        # Samples and sets in the deployment's own precision; live runs share them.
+        # Live runs share the samples and sets, which are found in the deployment's own precision.
         solver = self._pipeline.solver_at(self.manifold, self.initial)
         sample = np.unique(np.concatenate([sets.sample for sets in solver.sets]))
         self._sets_at = solver.sets_at
@@ -213,7 +213,7 @@ class LiveModel:
 
     @property
     def initial(self) -> float:
-        """The value to begin with: the first that was deployed."""
+        """The first value to show: the first that was deployed."""
         return self._pipeline.held_out[0]
 
     def start(self, value: float) -> LiveRun:
@@ -222,19 +222,19 @@ class LiveModel:
         return LiveRun(value, solver, solver.decoder(self.shown, self.at), self.trust)
 
     def truth(self, value: float) -> Truth | None:
-        """The full-order run at a known value; None elsewhere."""
+        """The full-order run at a known value; None at other values."""
         run = self._truths.get(value)
         return Truth(Trajectory.open(run.path / TRAJECTORY), self.shown) if run else None
 
     def roles(self, step: int) -> np.ndarray:
-        """[n] of each shown particle in the step that begins there: 2 in S, 1 in N only, 0 in neither."""
+        """[n] set of each shown particle in the step that starts at `step`: 2 S, 1 N only, 0 neither."""
         sets = self._sets_at(step)
         role = np.zeros(self.particles, np.int8)
         role[sets.integration], role[sets.sample] = 1, 2
         return role[self.shown]
 
     def training_frames(self) -> tuple[np.ndarray, np.ndarray]:
-        """x [F, n, 3] m and τ [F, n, 6] Pa of some of the training snapshots, as the fields have them."""
+        """x [F, n, 3] m and τ [F, n, 6] Pa of some training snapshots, evaluated by the fields."""
         known = self.manifold.training_latents
         rows = torch.linspace(0, len(known) - 1, min(len(known), _SNAPSHOTS)).long()
         xhat = known[rows].to(self.at.device)
@@ -250,7 +250,7 @@ def _truths(pipeline: Pipeline) -> Mapping[float, Run]:
 
 
 def _parameter(pipeline: Pipeline, known: tuple[float, ...]) -> Parameter:
-    """The parameter with its reach: as far beyond the training as the scene can be built and is stable."""
+    """The parameter and its range, which ends where the scene cannot be built or is not stable."""
     p, values = pipeline.scene.parameters, pipeline.split.train
     low, high = min(values), max(values)
     span = (high - low) or abs(low) or 1.0
@@ -277,13 +277,13 @@ def _possible(pipeline: Pipeline, value: float) -> bool:
 
 
 def _trust(run: Run, manifold, sample: np.ndarray, device: str) -> Trust:
-    """The estimate as the deployment calibrated it."""
+    """The trust estimate, with the scales that the deployment calibrated."""
     scales = run.manifest["metrics"]["trust"]
     return Trust(scales["residual_m"], scales["distance_m"], LatentDistance(manifold, sample, device))
 
 
 def _shown(particles: int, sample: np.ndarray, points: int) -> np.ndarray:
-    """The sample particles, and others at random, ascending."""
+    """Indices of the sample particles and of others at random, ascending."""
     order = np.random.default_rng(0).permutation(particles)
     others = order[~np.isin(order, sample)][: max(0, points - len(sample))]
     return np.sort(np.concatenate([sample, others]))

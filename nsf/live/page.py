@@ -1,4 +1,4 @@
-"""The page of `nsf view`: the reduced run beside the full-order one, and a slider that runs it anew."""
+"""The page of `nsf view`: the reduced run beside the full-order one, and a slider for the parameter."""
 
 import logging
 import math
@@ -19,7 +19,7 @@ from nsf.reporting.colors import ColorScale
 log = logging.getLogger(__name__)
 
 FRAMES_PER_SECOND = 30
-#: Between the two bodies, over the width of what moves.
+#: Gap between the two bodies, over the width of the box that the motion fills.
 _GAP = 0.25
 _GREY = (187, 187, 187)
 _GREEN, _AMBER, _RED = "#2B8A3E", "#E69F00", "#C92A2A"
@@ -31,8 +31,8 @@ class Page:
     Every browser sees the same moment and may steer it.
 
     Args:
-        player: what is shown.
-        host, port: where the page is served; another port is taken if this one is.
+        player: chooses the run and the step to show.
+        host, port: address of the page; if the port is taken, the page uses another.
 
     Attributes:
         drawn: pictures drawn since the start.
@@ -44,14 +44,14 @@ class Page:
         self._truth_value, self._truth = math.nan, None
         self._last: tuple | None = None
         self.drawn = 0
-        # Its own banner would speak of viser's address only.
+        # viser's own banner would name viser's address only.
         self._server = viser.ViserServer(host=host, port=port, verbose=False, label="nsf view")
         self._place()
         self._build_controls()
 
     @property
     def url(self) -> str:
-        """Where a browser finds it."""
+        """Address of the page."""
         return f"http://{self._server.get_host()}:{self._server.get_port()}"
 
     def close(self) -> None:
@@ -65,7 +65,7 @@ class Page:
     # -- scene ----------------------------------------------------------------------------------------------
 
     def _place(self) -> None:
-        """Where both bodies stand, and the camera: from what moves in the training data."""
+        """Place both bodies and the camera by the motion in the training data."""
         x, _ = self._model.training_frames()
         low, high = x.min((0, 1)), x.max((0, 1))
         self._centre = 0.5 * (low + high)
@@ -73,7 +73,7 @@ class Page:
         self._beside = np.array([(1.0 + _GAP) * extent[0], 0.0, 0.0])
         X = self._model.X
         size = 1.1 * self._model.spacing
-        # What the camera has in front of the middle hides the inside, where the stress is.
+        # Particles between the camera and the middle hide the inside, where the stress is.
         self._behind = X[:, 1] >= X[:, 1].mean()
         self._thick = bool(extent[:2].min() > 0.5 * extent[:2].max())
         scene = self._server.scene
@@ -108,7 +108,7 @@ class Page:
         )
         across = (2.0 + _GAP) * extent[0]
         camera = self._server.initial_camera
-        # Right of the middle, since the controls are there.
+        # The camera looks to the right of the middle, because the controls stand there.
         middle = 0.65 * self._beside
         camera.position = middle + across * np.array([0.1, -0.7, 0.3])
         camera.look_at = middle
@@ -148,7 +148,7 @@ class Page:
 
     @staticmethod
     def _by_hand(act: Callable[[], None]) -> Callable[[viser.GuiEvent], None]:
-        """What to do where a user moves a control, and not where the page itself does."""
+        """Call `act` when a user moves a control, and not when the page itself does."""
 
         def on_update(event: viser.GuiEvent) -> None:
             if event.client is not None:
@@ -174,7 +174,7 @@ class Page:
     # -- drawing --------------------------------------------------------------------------------------------
 
     def draw(self) -> None:
-        """Go on by a frame and show it, if anything is new."""
+        """Go on by a frame, and show it if it differs from the last one."""
         moment = self._player.tick()
         controls = (self._by.value, self._cut.value, self._show_sample.value)
         told = (moment.run, moment.step, moment.run.finished, *controls)
@@ -216,7 +216,7 @@ class Page:
 
 
 def light(moment: Moment, parameter: Parameter) -> str:
-    """Whether to believe what is shown, as HTML: green, amber beyond the training values, red if not."""
+    """A light as HTML: green to believe the run, amber beyond the training values, red not to believe it."""
     low, high = parameter.trained
     if moment.run.diverged and moment.step >= moment.run.reached:
         color, text = _RED, f"diverged at t = {moment.t:.3g} s"

@@ -1,4 +1,4 @@
-"""What is shown: one parameter value and one moment, for all who look at the same time."""
+"""The player: it chooses one parameter value and one step, which all browsers show."""
 
 import logging
 import threading
@@ -14,23 +14,23 @@ from nsf.live.model import LiveModel, LiveRun
 
 log = logging.getLogger(__name__)
 
-#: Steps between looks at what is wanted: short beside the time of a picture.
+#: Steps between checks for a newly wanted value: short beside the time of a picture.
 _CHUNK = 4
-#: Runs that are kept once they are finished.
+#: Number of finished runs that are kept.
 _KEPT = 64
-#: Frames in which a run is played, and those for which its end stands still.
+#: Frames in which a run is played, and frames for which its end stands still.
 _FRAMES, _HOLD = 150, 30
-#: Frames that a run is ahead of what is shown when it is first shown: they play while the next is made.
+#: Frames that a run is ahead of the shown step when it is first shown. They play while the next run is made.
 _LEAD = 20
 
 
 @dataclass(frozen=True)
 class Moment:
-    """What is to be shown.
+    """A run and one of its steps, to be shown.
 
     Attributes:
-        run: at the parameter value that is shown.
-        step: of it.
+        run: the run at the shown parameter value.
+        step: of the run.
     """
 
     run: LiveRun
@@ -48,20 +48,19 @@ class Moment:
 
     @property
     def trust(self) -> float:
-        """Largest distrust ratio up to now."""
+        """Largest distrust ratio up to the step."""
         return self.run.trust(self.step)
 
 
 class Player:
-    """Runs a live model ahead of what is shown, and starts it anew where the parameter is moved to.
+    """Runs a live model ahead of the shown step, and starts a new run when the parameter moves.
 
-    A run at another value is shown once it has come as far as the one that is shown, or a little further
-    where that goes on, and only then gives way to a newer value: while a slider is dragged, what is shown
-    follows it as fast as runs can be made. Any thread may call; `work` belongs to one, which `with player:`
-    provides.
+    A new run is shown once it has reached the shown step (during playback a little more). Until then no newer
+    value takes its place. So the picture follows a dragged slider as fast as runs can be made. Any thread may
+    call the methods, except `work`, which belongs to the thread that `with player:` starts.
 
     Args:
-        model: what is run.
+        model: the live model.
 
     Attributes:
         playing: whether each tick goes on by a frame.
@@ -92,31 +91,31 @@ class Player:
 
     @property
     def steps(self) -> int:
-        """Of a whole run."""
+        """Number of steps of a whole run."""
         return self._shown.steps
 
     @property
     def value(self) -> float:
-        """The parameter value that is asked for; that which is shown follows."""
+        """The parameter value that was asked for last; the shown value follows it."""
         return self._wanted
 
     def steer(self, value: float) -> None:
         """Ask for another parameter value.
 
         Raises:
-            ConfigError: it is not finite, or out of reach.
+            ConfigError: the value is not finite, or out of reach.
         """
         with self._wake:
             self._wanted = self.model.parameter.checked(value)
             self._wake.notify()
 
     def seek(self, step: int) -> None:
-        """Show a step; or, until the run has come so far, the last one there is."""
+        """Show a step, or the run's last one until the run has come so far."""
         with self._wake:
             self._step, self._held = min(max(int(step), 0), self.steps), 0
 
     def tick(self) -> Moment:
-        """Go on by a frame, if playing, and say what is to be shown."""
+        """Go on by a frame, if playing, and return the run and the step to show."""
         with self._wake:
             run = self._shown
             if self.playing:
@@ -133,7 +132,7 @@ class Player:
             self._step = self._held = 0
 
     def work(self) -> bool:
-        """Bring a run on by some steps; False if there is nothing to do."""
+        """Advance a run by some steps; False if there is nothing to do."""
         if self._coming is None and self._wanted != self._shown.value:
             self._coming = self._run_at(self._wanted)
         run = self._coming or self._shown
@@ -161,7 +160,7 @@ class Player:
             try:
                 busy = self.work()
             except NSFError as error:
-                # A value that the scene refuses is no reason to stop: the last one goes on.
+                # The scene refuses this value, so the shown run goes on.
                 log.warning("%s=%g: %s", self.model.parameter.name, self._wanted, error)
                 self._wanted, busy = self._shown.value, True
             if not busy:
@@ -170,7 +169,7 @@ class Player:
 
 
 def every(seconds: float, closing: threading.Event, act: Callable[[], None]) -> None:
-    """Call `act` each so many seconds until `closing` is set; what takes longer is not caught up with."""
+    """Call `act` every `seconds` [s] until `closing` is set; a late call does not hasten the next ones."""
     due = time.perf_counter()
     while not closing.wait(max(0.0, due - time.perf_counter())):
         act()

@@ -1,4 +1,4 @@
-"""What goes over the wire: the deformation field once, then a latent vector a frame."""
+"""Messages of `nsf serve`: the deformation field once, then a latent vector a frame."""
 
 import json
 import struct
@@ -11,22 +11,22 @@ from nsf.live.model import LiveModel
 from nsf.live.player import Moment
 
 _LEVELS = 32767  # of a signed 16-bit number
-FIELDS = ("basis", "joint")  # of linear modes
+FIELDS = ("basis", "joint")  # the fields of linear modes
 
 
 def field_message(model: LiveModel) -> bytes:
-    """The deformation field g at the particles that are shown, and what a page must know beside it.
+    """The deformation field g at the shown particles, and the header that a page needs.
 
-    g(X, x̂) = mean + Σ_k scale_k modes_k a_k with a = [x̂ ; closure(x̂)], as `BasisManifold` has it. The
-    closure's weights go too: it runs in the browser, so that a frame is x̂ alone.
+    g(X, x̂) = mean + Σ_k scale_k modes_k a_k with a = [x̂ ; closure(x̂)], as in `BasisManifold`. The message
+    also has the closure's weights. The browser evaluates the closure, so that a frame is x̂ alone.
 
     Returns:
-        Length of the header as uint32, the header (JSON, padded with spaces to whole words), then arrays, all
-        little-endian: rest and mean [n, 3] float32 [m], scale [K] float32, modes [n, 3, K] int16, and of each
-        layer of the closure weight [out, in] and bias [out] float32. SiLU stands between the layers.
+        Length of the header as uint32, the header (JSON, padded with spaces to whole words), then the arrays,
+        all little-endian: rest and mean [n, 3] float32 [m], scale [K] float32, modes [n, 3, K] int16, and for
+        each layer of the closure weight [out, in] and bias [out] float32. SiLU stands between the layers.
 
     Raises:
-        ConfigError: the fields are no linear modes.
+        ConfigError: the field does not consist of linear modes.
     """
     _check_field(model)
     field = model.at.fields["deformation"]
@@ -65,7 +65,7 @@ def field_message(model: LiveModel) -> bytes:
     }
     text = json.dumps(header).encode()
     text += b" " * (-len(text) % 4)
-    # Each array begins at a whole word: a browser can view it where it lies.
+    # Each array begins at a whole word, so that a browser can view it in place.
     body = b"".join(a.tobytes() + b"\0" * (-a.nbytes % 4) for a in arrays.values())
     return struct.pack("<I", len(text)) + text + body
 
@@ -76,15 +76,15 @@ def frame_message(moment: Moment) -> bytes:
 
 
 def state_message(moment: Moment) -> str:
-    """Which parameter value is shown, as JSON."""
+    """The shown parameter value, and whether its run diverged, as JSON."""
     return json.dumps({"value": moment.run.value, "diverged": moment.run.diverged})
 
 
 def asked_value(message: str | bytes) -> float:
-    """The parameter value that a client asks for: `{"value": 31.5}`, and nothing else.
+    """The parameter value that a client asks for by `{"value": 31.5}`.
 
     Raises:
-        ConfigError: it says anything else.
+        ConfigError: the message is anything else.
     """
     try:
         asked = json.loads(message) if isinstance(message, str) else None

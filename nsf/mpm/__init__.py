@@ -9,7 +9,7 @@ from nsf.mpm.colliders import Collider, Cuboid, HalfSpace, Sphere, floor_height 
 from nsf.mpm.grid import Grid, GridGeometry  # noqa: E402
 from nsf.mpm.motion import Motion  # noqa: E402
 from nsf.mpm.precision import FP32, FP64, Precision, precision_of  # noqa: E402
-from nsf.mpm.solver import FullOrderMPM, diagnosed  # noqa: E402
+from nsf.mpm.solver import FullOrderMPM, Solver, diagnosed  # noqa: E402
 from nsf.mpm.state import ParticleConstants, ParticleState  # noqa: E402
 from nsf.mpm.step import GridStep  # noqa: E402
 from nsf.mpm.transfer import Transfer  # noqa: E402
@@ -30,6 +30,7 @@ __all__ = [
     "ParticleConstants",
     "ParticleState",
     "Precision",
+    "Solver",
     "Sphere",
     "Transfer",
     "diagnosed",

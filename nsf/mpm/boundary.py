@@ -1,4 +1,4 @@
-"""Boundaries of the grid: the walls of the domain, and solids and walls on the device."""
+"""Boundaries of the grid: the walls of the domain, and all solids and walls on the device."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -59,8 +59,8 @@ def make_solids(precision: Precision):
 class BoundaryArrays:
     """Colliders and walls on the device.
 
-    Time lives in `steps`, on the device, so that a step captured in a graph moves the colliders too. Solvers
-    that take turns at one simulation (the phases of a reduced run) share one object.
+    `steps`, on the device, counts the time, so that a step captured in a graph moves the colliders, too.
+    Solvers that take turns at one simulation (the phases of a reduced run) share one object.
 
     Args:
         colliders: applied in order.
@@ -71,14 +71,14 @@ class BoundaryArrays:
     Attributes:
         colliders, walls: as given.
         shape: [c] code of the shape.
-        active: [c] whether it acts in this step.
+        active: [c] whether the collider acts in this step.
         position: [c, 3] [m]; orientation: [c, 3, 3]; both at the start t^n of the step.
         extents: [c, 3] see `Collider.extents`.
-        velocity: [c, 3] of the point at `position`, mean over the step [m/s].
-        gradient: [c, 3, 3] of that velocity in space [1/s].
+        velocity: [c, 3] mean velocity of the point at `position` over the step [m/s].
+        gradient: [c, 3, 3] gradient of this velocity in space [1/s].
         kind: [c] code of the contact; friction: [c].
         steps: [c] steps taken.
-        solids: all of these but the last, and the walls, as the kernels take them.
+        solids: the struct of these arrays and of the walls that the kernels take.
     """
 
     def __init__(self, colliders: Sequence[Collider], walls: DomainWalls, precision: Precision, device):
@@ -86,7 +86,7 @@ class BoundaryArrays:
         count = len(self.colliders)
 
         def array(values, dtype, *entry: int):
-            # The entry's shape, since NumPy cannot tell it when there is no collider.
+            # Without a collider, NumPy cannot tell the shape of an entry.
             return wp.array(np.array(values, float).reshape(-1, *entry), dtype=dtype, device=device)
 
         positions, turns = ([getattr(c, k) for c in self.colliders] for k in ("position", "orientation"))
@@ -131,7 +131,7 @@ class BoundaryArrays:
         self.steps.fill_(steps)
 
     def advance(self, dt: float) -> None:
-        """Pose and velocity of every collider for the next step of dt [s]; nothing where none changes."""
+        """Set pose and velocity of every collider for the next step of dt [s], if any of them changes."""
         if not self._changes:
             return
         found = [self.active, self.position, self.orientation, self.velocity, self.gradient]

@@ -35,7 +35,7 @@ class Collider(ABC):
         kind: `sticky`, `slip` (no normal motion) or `separate` (may lift off).
         friction: Coulomb coefficient of `slip` and `separate`, dimensionless.
         motion: keyframes relative to the shape's pose, which is the pose at rest; None for none.
-        since, until: [s] it acts in steps that start in [since, until); it moves at any time.
+        since, until: [s] the collider acts in steps that start in [since, until); it moves at any time.
 
     Raises:
         ConfigError: unknown kind, negative friction, friction on `sticky`, since not in [0, until), a
@@ -79,7 +79,7 @@ class Collider(ABC):
     @property
     @abstractmethod
     def extents(self) -> np.ndarray:
-        """[3] what the contact function takes for this shape."""
+        """[3] dimensions of this shape for the contact function."""
 
     @property
     @abstractmethod
@@ -98,11 +98,11 @@ class Collider(ABC):
 
     @property
     def changes(self) -> bool:
-        """Whether its pose or its presence depends on time."""
+        """Whether the pose or the presence depends on time."""
         return self.motion is not None or self.since > 0.0 or self.until < math.inf
 
     def top_speed(self, upper: np.ndarray) -> float:
-        """Bound on the speed [m/s] of its points in the domain from 0 to `upper` [3] [m]."""
+        """Bound on the speed [m/s] of the solid's points in the domain from 0 to `upper` [3] [m]."""
         if self.motion is None:
             return 0.0
         pivot, translations = self.motion.hinge()[1], self.motion.keyframes()[1]
@@ -114,7 +114,7 @@ class Collider(ABC):
 
 @dataclass(frozen=True)
 class HalfSpace(Collider):
-    """The solid half-space {x : (x − point)·normal ≤ 0}; material is on the other side.
+    """The solid half-space {x : (x − point)·normal ≤ 0}; the material is on the other side.
 
     Attributes:
         point: a point of the surface [m].
@@ -199,16 +199,17 @@ class Sphere(Collider):
 class Cuboid(Collider):
     """A solid box at any angle: a grip, a plate or, when thin, a blade.
 
-    A box thinner than 1.5 Δx holds the nodes within 0.75 Δx of its middle plane: at any angle no two
-    neighbouring nodes lie on opposite sides of it, and along the grid's planes quadratic B-splines of
+    A box thinner than 1.5 Δx holds the nodes within 0.75 Δx of its middle plane. At any angle no two
+    neighbouring nodes lie on opposite sides of it. Along the grid's planes, quadratic B-splines of
     particles on its two sides meet in its own nodes only. Such a blade parts its two sides wholly if
-    `sticky`; `slip` stops what crosses it, while what slides along both sides shares its nodes;
-    `separate` must tell which side a node serves, which takes a thickness of 3 Δx.
+    it is `sticky`. `slip` stops material that crosses the blade, while material that slides along
+    both sides shares its nodes. `separate` must tell which side a node serves, which takes a
+    thickness of 3 Δx.
 
     Attributes:
         centre: [m].
         size: edge lengths along its own axes [m].
-        axis, angle: it is turned by `angle` [°] about `axis` through its centre, right-handed.
+        axis, angle: the box is turned by `angle` [°] about `axis` through its centre, right-handed.
         kind, friction, motion, since, until: see `Collider`.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Contact of a grid node with a solid: is it inside, and what velocity does the surface leave it."""
+"""Contact of a grid node with a solid: whether the node is inside, and the velocity it keeps."""
 
 from functools import cache
 
@@ -71,7 +71,7 @@ def make_contact(precision: Precision):
 
     @wp.func
     def against(v: vec3, normal: vec3, kind: int, friction: real):
-        """What a surface at rest leaves of a velocity."""
+        """The part of a velocity that a surface at rest leaves."""
         if kind == wp.static(STICKY):
             return vec3()
         normal_speed = wp.dot(v, normal)

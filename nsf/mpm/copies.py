@@ -7,11 +7,11 @@ import warp as wp
 
 @cache
 def make_copies(several: bool):
-    """Warp functions (share, copy_of) of arrays that hold as many rows of each simulation, one by one.
+    """Warp functions (share, copy_of) for arrays that hold equally many rows of each simulation, in turn.
 
     share: (rows of all, simulations) → rows of one.
     copy_of: (row, rows of one) → its simulation.
-    Unless there are several, these are all rows and 0, and a compiler leaves nothing of them.
+    For one simulation they give all rows and 0, and the compiler removes them.
     """
     if several:
 

@@ -1,4 +1,4 @@
-"""Devices by name, and the GPUs of a host shared out among processes."""
+"""Devices by name, and the sharing of a host's GPUs among processes."""
 
 import itertools
 import os
@@ -15,10 +15,10 @@ _held = ExitStack()  # the lock of this process's GPU, which the operating syste
 
 
 def warp_device(name: str):
-    """The Warp device `cpu`, `cuda` or `cuda:N`; `auto` is the GPU where there is one.
+    """The Warp device `cpu`, `cuda` or `cuda:N`; `auto` is the first GPU, or the CPU where there is none.
 
     Raises:
-        DeviceError: a GPU was asked for where there is none.
+        DeviceError: the device does not exist.
     """
     name = str(name)
     if name == "auto":
@@ -34,7 +34,7 @@ def warp_device(name: str):
 
 
 def visible_gpus() -> tuple[str, ...]:
-    """The GPUs that this process may use, each as CUDA_VISIBLE_DEVICES names it for a process of its own.
+    """The GPUs that this process may use, by the names that CUDA_VISIBLE_DEVICES has for each.
 
     The first one is this process's `cuda:0`.
     """
@@ -46,13 +46,14 @@ def visible_gpus() -> tuple[str, ...]:
 
 @cache
 def take_gpu(gpus: tuple[str, ...], folder: Path) -> None:
-    """See one GPU alone from now on, as `cuda:0`; call it before CUDA is used.
+    """Make this process see one GPU alone, as `cuda:0`. Call it before CUDA is used.
 
-    Processes that call it take the GPUs in turn; what one had is free again once it has ended.
+    Processes that call it take the GPUs in turn. The GPU of a process is free again once the process has
+    ended.
 
     Args:
-        gpus: as `visible_gpus` names them.
-        folder: of the locks that the processes share.
+        gpus: names from `visible_gpus`.
+        folder: holds the locks that the processes share.
 
     Raises:
         StorageError: the folder cannot be written.

@@ -1,4 +1,4 @@
-"""The background grid: where nodes are stored, and which of them a step works on (paper section 3.3)."""
+"""The background grid: the storage of its nodes, and the nodes that a step works on (paper section 3.3)."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -63,26 +63,27 @@ class GridGeometry:
 class Grid:
     """Momentum (then velocity) and mass of the grid's nodes, on one device.
 
-    Stored for every node of the box, or only for the nodes listed (a reduced model
-    touches few). The kernels find a node's storage through `slots`.
+    A grid stores every node of the box, or only a list of nodes, since a reduced model touches
+    few. The kernels find a node's storage through `slots`.
 
-    Of a box, a step clears and updates only the blocks of 4³ nodes that particles reach. They are
-    found on the device, so a captured step finds them anew; all other nodes stay zero.
+    If every node is stored, a step clears and updates only the blocks of 4³ nodes that particles
+    reach. The device finds these blocks, so that a captured step finds them anew. All other nodes
+    stay zero.
 
     Args:
         geometry: spacing and node counts.
         precision, device: of the values.
         nodes: flat indices of the nodes to store; all by default.
-        copies: simulations that have values of their own at these nodes.
+        copies: number of simulations, each with values of its own at these nodes.
 
     Attributes:
         geometry, copies: as given.
         values: [copies n, 4] m_i v_i [kg m/s] after P2G, v_i [m/s] after the update; last m_i [kg].
         nodes: [n] flat node index of each stored node; empty when every node is stored.
         slots: [all nodes] storage index or −1; empty when every node is stored.
-        marks: [all blocks] 1 for a block that is listed; empty where nodes are listed, as the next two.
-        blocks: [all blocks] flat indices of the listed blocks, in any order.
-        listed: [1] their number.
+        marks: [all blocks] 1 for a block that particles reach; empty for a list of nodes, as the next two.
+        blocks: [all blocks] flat indices of the reached blocks, in any order.
+        listed: [1] number of reached blocks.
 
     Raises:
         ConfigError: several copies of a grid that stores every node.
@@ -129,12 +130,12 @@ class Grid:
 
     @property
     def mass(self) -> wp.array:
-        """[n] m_i [kg]; a view, for as long as the grid lives."""
+        """[n] m_i [kg]; a view, valid as long as the grid lives."""
         return self._view(self._precision.real, 3)
 
     @property
     def momentum(self) -> wp.array:
-        """[n, 3] m_i v_i [kg m/s] after P2G, v_i [m/s] after the update; a view, as `mass`."""
+        """[n, 3] m_i v_i [kg m/s] after P2G, v_i [m/s] after the update; a view like `mass`."""
         return self._view(self._precision.vec3, 0)
 
     def _view(self, dtype, column: int) -> wp.array:
@@ -152,7 +153,7 @@ class Grid:
 
     @property
     def stored(self) -> list:
-        """What the kernels find the nodes of a step by, in their order."""
+        """Arguments by which the kernels find the nodes of a step, in order."""
         return [self.nodes, self.slots, self.blocks, self.listed, self.shape, self.block_shape, self.threads]
 
     def clear(self) -> None:
@@ -181,7 +182,7 @@ def node_of(flat: int, shape: wp.vec3i):
 def inside(base: wp.vec3i, width: int, shape: wp.vec3i):
     """Whether a stencil of `width` nodes an axis that starts at `base` lies on the grid.
 
-    `base` may be any integer: a GPU gives a position far away the largest one, to which nothing can be added.
+    `base` may be any integer: on a GPU a position far away gives the largest one, and adding to it overflows.
     """
     return (
         base[0] >= 0
@@ -195,7 +196,7 @@ def inside(base: wp.vec3i, width: int, shape: wp.vec3i):
 
 @wp.func
 def storage(flat: int, slots: wp.array(dtype=wp.int32)):
-    """Storage index of a node, −1 when it is not stored."""
+    """Storage index of a node; −1 if the node is not stored."""
     slot = flat
     if slots.shape[0] > 0:
         slot = slots[flat]
@@ -204,7 +205,7 @@ def storage(flat: int, slots: wp.array(dtype=wp.int32)):
 
 @wp.func
 def nodes_of_step(nodes: wp.array(dtype=wp.int32), listed: wp.array(dtype=wp.int32)):
-    """Number of nodes that a step works on: of a list those stored, of a box those in the listed blocks."""
+    """Number of nodes that a step works on: the listed ones, or those in the reached blocks of a box."""
     if listed.shape[0] > 0:
         return listed[0] * wp.static(_BLOCK_NODES)
     return nodes.shape[0]
@@ -218,7 +219,7 @@ def node_of_step(
     shape: wp.vec3i,
     block_shape: wp.vec3i,
 ):
-    """Flat index of the `index`-th of these nodes, −1 where a block reaches over the edge of the box."""
+    """Flat index of the `index`-th node of a step; −1 where a block reaches over the edge of the box."""
     if nodes.shape[0] > 0:
         return nodes[index]
     block = node_of(blocks[index / wp.static(_BLOCK_NODES)], block_shape)
@@ -284,7 +285,7 @@ def make_reach(precision: Precision, shape_name: str):
             for j in range(base[1] / BLOCK, (base[1] + width - 1) / BLOCK + 1):
                 for k in range(base[2] / BLOCK, (base[2] + width - 1) / BLOCK + 1):
                     block = flat_index(i, j, k, block_shape)
-                    # Read first: nearly every particle finds its blocks marked, and an atomic costs more.
+                    # Read before the atomic, which costs more: nearly every particle finds its blocks marked.
                     if marks[block] == 0 and wp.atomic_cas(marks, block, 0, 1) == 0:
                         blocks[wp.atomic_add(listed, 0, 1)] = block
 

@@ -23,10 +23,10 @@ class Motion:
     linear between keyframes, constant before the first and after the last.
 
     Attributes:
-        times: [k] of the keyframes [s], ascending.
+        times: [k] times of the keyframes [s], ascending.
         translations: [k, 3] d [m]; none if left out.
         angles: [k] θ about `axis`, right-handed [°]; none if left out.
-        axis: [3] of the rotation, any length.
+        axis: [3] axis of the rotation, any length.
         pivot: [3] a point of the axis, at rest [m]; the translation carries it along.
 
     Raises:
@@ -78,7 +78,7 @@ class Motion:
         return np.array(self.times, float), translations, angles
 
     def hinge(self) -> tuple[np.ndarray, np.ndarray]:
-        """Unit axis [3] and pivot [3] [m]; the origin where nothing turns."""
+        """Unit axis [3] and pivot [3] [m]; the origin if the motion has no rotation."""
         if not len(self.angles):
             return np.array([0.0, 0.0, 1.0]), np.zeros(3)
         return direction("motion.axis", self.axis), np.array(self.pivot, float)
@@ -94,17 +94,17 @@ class Motion:
 
 @cache
 def make_follow(precision: Precision):
-    """Kernel that puts each solid at its pose at t^n and gives its velocity over the step from there.
+    """Kernel that puts each solid at its pose at t^n and gives the solid's velocity over the step from there.
 
-    The pose is that of the particles which P2G takes to the grid, t^n. The velocity of the solid's
-    point at x is the mean over [t^n, t^{n+1}], that is (x^{n+1} − x)/Δt of that point, so that what
-    sticks to the solid is displaced as the solid is: whatever the keyframes and Δt, translations add
-    up exactly and rotations stay rigid (f_p = R). ω × r at t^n would spiral outward, by
-    ½(ω Δt)² r a step. It is linear in x, so a velocity and its gradient hold it:
+    t^n is the time of the particles that P2G takes to the grid. The velocity of the solid's point at x
+    is the mean over [t^n, t^{n+1}], which is (x^{n+1} − x)/Δt. Material that sticks to the solid is then
+    displaced as the solid is: whatever the keyframes and Δt, translations add up exactly and rotations
+    stay rigid (f_p = R). ω × r at t^n would spiral outward, by ½(ω Δt)² r a step. The mean velocity is
+    linear in x, so a velocity and its gradient hold it:
     v(x) = velocity + gradient (x − position), gradient = (R − I)/Δt = ω × + O(Δt).
 
-    Each solid counts its own steps, hence time stays on the device and a captured graph replays. In
-    fp64 whatever the precision: velocities are differences of near positions.
+    Each solid counts its own steps, so that time stays on the device and a captured graph replays. The
+    kernel is fp64 in either precision, because velocities are differences of near positions.
     """
     vec3, mat33 = precision.vec3, precision.mat33
     f64, vec3d, mat33d = wp.float64, wp.vec3d, wp.mat33d

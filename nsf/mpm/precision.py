@@ -20,7 +20,7 @@ class Precision:
         vec4: Warp 4-vector.
         mat33: Warp 3×3 matrix, row major.
         numpy: NumPy scalar type.
-        native: scalar in code of C++ and CUDA.
+        native: name of the scalar in C++ and CUDA.
     """
 
     name: str

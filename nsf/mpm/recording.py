@@ -20,17 +20,17 @@ _Memory = dict[str, wp.array]
 
 
 class HostMemory:
-    """Memory of the host that blocks of frames are copied to, and that is used again once they are done.
+    """Host memory for blocks of frames. A block gives its memory back when it is done.
 
-    Blocks of several recorders may share it, and be done in other threads: to fill fresh pages is slower than
-    to write what is in them. For a GPU it is pinned.
+    Memory is used again, because filling fresh pages is slower than writing a block to disk. Blocks of
+    several recorders may share the memory, and other threads may finish them. For a GPU the memory is pinned.
     """
 
     def __init__(self):
         self._free: queue.SimpleQueue[_Memory] = queue.SimpleQueue()
 
     def take(self, like: _Memory) -> _Memory:
-        """Arrays of the shapes and types of these."""
+        """Arrays of the same shapes and types as the given ones."""
         with contextlib.suppress(queue.Empty):
             memory = self._free.get_nowait()
             if _kinds(memory) == _kinds(like):
@@ -39,7 +39,7 @@ class HostMemory:
         return {name: wp.empty(a.shape, a.dtype, device="cpu", pinned=pinned) for name, a in like.items()}
 
     def give_back(self, memory: _Memory) -> None:
-        """Let another block have it."""
+        """Let another block have the arrays."""
         self._free.put(memory)
 
 
@@ -53,7 +53,7 @@ class Block:
 
     Attributes:
         fields: x, v [n, P, 3], C [n, P, 9] and τ [n, P, 6].
-        done: to be called once the frames are not needed any more; they are lost then.
+        done: call it once the frames are no longer needed; they are lost then.
     """
 
     fields: dict[str, np.ndarray]
@@ -103,10 +103,10 @@ class FrameRecorder:
     """Collects frames of a state on its device.
 
     Args:
-        state: what is recorded.
+        state: the state to record.
         precision: of the state.
         stored: precision of the recorded values.
-        memory: of the blocks.
+        memory: host memory of the blocks.
     """
 
     def __init__(
@@ -121,7 +121,7 @@ class FrameRecorder:
         self._device = state.order.device
         frame_bytes = len(state) * sum(COMPONENTS.values()) * np.dtype(stored.numpy).itemsize
         self.capacity = max(1, _BLOCK_BYTES // frame_bytes)
-        # A field lies in one piece, as on disk, so that a frame of it is written without another copy.
+        # A field lies in one piece, as on disk, so that its frames are written without another copy.
         self._block = {
             name: wp.empty((self.capacity, len(state), c), dtype=stored.real, device=self._device)
             for name, c in COMPONENTS.items()
@@ -131,7 +131,7 @@ class FrameRecorder:
 
     @property
     def full(self) -> bool:
-        """Whether the block must be taken before the next frame."""
+        """Whether `take` must be called before the next frame."""
         return self.count == self.capacity
 
     def record(self) -> None:
@@ -156,17 +156,18 @@ class FrameRecorder:
 def blocks(
     solver, steps: int, stored: Precision, after=lambda: None, memory: HostMemory | None = None
 ) -> Iterator[Block]:
-    """The state as it stands and after each of `steps` steps, in blocks of frames.
+    """The present state and the state after each of `steps` steps, in blocks of frames.
 
     Args:
         solver: a `FullOrderMPM`.
-        steps: to be taken.
+        steps: number of steps to take.
         stored: precision of the frames.
         after: called after each frame.
-        memory: of the blocks; shared with other runs, or their own.
+        memory: host memory of the blocks, which other runs may share; their own by default.
 
     Raises:
-        InstabilityError: the solver loses stability; after the last block, if its last check finds it.
+        InstabilityError: the solver loses stability. The error comes after the last block if the last check
+            finds it.
     """
     recorder = FrameRecorder(solver.state, solver.precision, stored, memory)
     for n in range(steps + 1):

@@ -22,7 +22,7 @@ class ShapeFunctions:
         local: (x [m], 1/dx, base) → position relative to the base node [dx].
         weights: local position → [3, b + 1] weights w, one row an axis.
         gradients: local position → [3, b + 1] derivatives dw/d(x/dx).
-        entry: (weights or gradients, axis, i) → entry i of an axis, where i is known only when it runs.
+        entry: (weights or gradients, axis, i) → entry i of an axis, for an i that is known only at run time.
     """
 
     degree: int
@@ -39,7 +39,7 @@ class ShapeFunctions:
 
 
 def stencil_offset(name: str) -> float:
-    """From a particle down to its stencil, at least [dx]: 1/2 for `quadratic`, 1 for `cubic`."""
+    """Least distance from a particle down to its stencil [dx]: 1/2 for `quadratic`, 1 for `cubic`."""
     return 0.5 * (DEGREES[name] - 1)
 
 

@@ -1,7 +1,8 @@
 """The full-order material point method (paper section 3.3)."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import warp as wp
@@ -28,8 +29,61 @@ from nsf.timing import StageTimer
 _NEVER = 2**31 - 1
 
 
+class State(Protocol):
+    """The state of a simulation, on its device."""
+
+    def __len__(self) -> int:
+        """Number of particles P."""
+
+    def numpy(self) -> dict[str, np.ndarray]:
+        """Host copies by name: x, v [P, 3] m and m/s, C, tau [P, 3, 3] 1/s and Pa, and what else there is."""
+
+
+@runtime_checkable
+class Solver(Protocol):
+    """What a user holds of a simulation, at full order or reduced, whatever computes its steps.
+
+    A step takes no argument: the forcing of its moment, gravity and where colliders are, is on the device.
+
+    Attributes:
+        dt: step [s]; device: Warp device.
+    """
+
+    dt: float
+    device: object
+
+    @property
+    def state(self) -> State:
+        """Where the particles are."""
+
+    @property
+    def steps_taken(self) -> int:
+        """Number of steps since t = 0."""
+
+    @property
+    def time(self) -> float:
+        """Simulated time [s]."""
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that the arrays take on the device."""
+
+    @property
+    def stages(self) -> Mapping[str, Callable[[], None]]:
+        """One step, stage by stage, in order."""
+
+    def step(self, n: int = 1) -> None:
+        """Advance by n steps of Δt."""
+
+    def timed_step(self, timer: StageTimer) -> None:
+        """One step, stage by stage under a timer."""
+
+    def restart(self) -> None:
+        """Go back to t = 0."""
+
+
 class FullOrderMPM:
-    """Explicit symplectic MPM over every particle.
+    """Explicit symplectic MPM over all particles.
 
     Args:
         constants: particles.
@@ -49,7 +103,7 @@ class FullOrderMPM:
         beyond_law: particles whose stress `resume` had to scale down.
 
     Raises:
-        InstabilityError: Δt is unstable or a collider too fast; the message names the largest stable one.
+        InstabilityError: Δt is unstable, or a collider too fast; the message names the largest stable Δt.
         ConfigError: the grid does not resolve a collider.
         ShapeError: x or v is not [P, 3].
         DeviceError: the device does not exist.
@@ -96,6 +150,7 @@ class FullOrderMPM:
         self.mass, self.volume0 = on_device(constants.mass), on_device(constants.volume0)
         self.mu, self.lam = on_device(constants.mu), on_device(constants.lam)
         history = material.initial_history(len(constants))
+        self._start = {"x": x, "v": v, "history": history}
         self.state = ParticleState(x, v, history, order, self.precision, self.device)
         self.grid = Grid(grid, self.precision, self.device)
         boundaries = BoundaryArrays(colliders, walls, self.precision, self.device)
@@ -120,12 +175,21 @@ class FullOrderMPM:
         own = (self.mass, self.volume0, self.mu, self.lam, self._first_bad)
         return self.state.nbytes + self.grid.nbytes + sum(a.capacity for a in own)
 
-    def resume(self, steps: int, x: np.ndarray, v: np.ndarray, C: np.ndarray, tau: np.ndarray) -> None:
-        """Go on from a state that is known by its positions, velocities and stresses alone.
+    def restart(self) -> None:
+        """Go back to t = 0; captured graphs stay good."""
+        for name, values in self._start.items():
+            getattr(self.state, name).assign(values)
+        self.state.unload()
+        self.grid_step.boundaries.start_from(0)
+        self.steps_taken = self.beyond_law = 0
 
-        F_e is the stretch that carries τ (`Material.stretch_of`), the history variables are those that the
-        law assumes for τ (`Material.history_of`), and the colliders are where they are at that time. A
-        stress beyond the law is scaled down to what it carries; `beyond_law` counts them.
+    def resume(self, steps: int, x: np.ndarray, v: np.ndarray, C: np.ndarray, tau: np.ndarray) -> None:
+        """Continue from a state that is known by its positions, velocities and stresses alone.
+
+        F_e becomes the stretch that carries τ (`Material.stretch_of`), and the history variables those that
+        the law assumes for τ (`Material.history_of`). The colliders go to their pose at that time. A stress
+        beyond the law is scaled down to the largest one that the law carries; `beyond_law` counts such
+        particles.
 
         Args:
             steps: time of the state in steps of Δt.
@@ -182,7 +246,7 @@ class FullOrderMPM:
         self.g2p_stress()
 
     def timed_step(self, timer: StageTimer) -> None:
-        """One step, stage by stage under a timer; captured anew where steps are captured."""
+        """Take one step, stage by stage under a timer; on a GPU, as a graph that is captured anew."""
         if self._graph is None:
             self._run_stages(timer)
         else:
@@ -200,7 +264,7 @@ class FullOrderMPM:
 
     @property
     def stages(self) -> dict[str, Callable[[], None]]:
-        """One step, stage by stage, in order; `step` makes one pass of the last two."""
+        """The stages of one step, in order. `step` does the last two in one pass."""
         return {"p2g": self.p2g, "grid": self.grid_step.update, "g2p": self.g2p, "stress": self.update_stress}
 
     def p2g(self) -> None:
@@ -217,7 +281,7 @@ class FullOrderMPM:
 
     @cached_property
     def increment(self) -> wp.array:
-        """[P, 3, 3] f = I + Δt ∇v of the last step that was taken stage by stage; `step` needs none."""
+        """[P, 3, 3] f = I + Δt ∇v of the last step taken stage by stage; `step` does not store it."""
         return wp.empty_like(self.state.F_e.rows)
 
     def g2p(self) -> None:
@@ -254,7 +318,7 @@ class FullOrderMPM:
         return speed * self.dt / self.grid.geometry.dx
 
     def check(self) -> None:
-        """Stop if a particle is non-finite or off the grid.
+        """Raise if a particle is non-finite or off the grid.
 
         Raises:
             InstabilityError: names the particle, the step and the time.
@@ -293,13 +357,13 @@ def diagnosed(
 ) -> InstabilityError:
     """The error of a run that failed a check, with the elastic CFL number at the check before it.
 
-    The check of Δt before a run knows the material at rest only; a law that stiffens in tension outgrows it.
-    The run is made again up to there, which costs nothing where nothing fails.
+    The check of Δt before a run knows the material at rest only, and a law that stiffens in tension outgrows
+    it. The number is found by making the failed run again, so that runs without a failure pay nothing.
 
     Args:
-        error: of the check that failed.
+        error: error of the check that failed.
         build: gives the solver at t = 0.
-        steps_taken: up to the check that failed.
+        steps_taken: number of steps up to the check that failed.
     """
     solver = build()
     rest = solver.elastic_cfl()

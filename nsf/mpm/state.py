@@ -1,4 +1,4 @@
-"""Particles: what stays constant and what a step changes."""
+"""Particles: their constants, and the state that a step changes."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from nsf.mpm.precision import Precision
 
 @dataclass(frozen=True)
 class ParticleConstants:
-    """What identifies the particles; host arrays in float64.
+    """Constants of the particles, as host arrays in float64.
 
     Attributes:
         X: [P, 3] reference position [m].
@@ -44,10 +44,10 @@ class ParticleConstants:
 
 
 class ParticleArray:
-    """A device array whose rows lie in an order of their own; read and written in the particles' order.
+    """A device array with rows in an order of their own, read and written in the particles' order.
 
     Args:
-        rows: [P] what kernels work on.
+        rows: [P] array that kernels work on.
         order: [P] particle of each row.
     """
 
@@ -104,12 +104,18 @@ class ParticleState:
             return ParticleArray(wp.full(len(x), value, dtype=mat33, device=device), order)
 
         self.x, self.v, self.history = taken(x, vec3), taken(v, vec3), taken(history, vecH)
-        # Made on the device: of millions of particles these are gigabytes, of one value.
+        # Made on the device: for millions of particles these are gigabytes of one value.
         self.C, self.tau, self.F_e = filled(mat33()), filled(mat33()), filled(mat33(np.eye(3)))
         self.order = wp.array(order, dtype=wp.int32, device=device)
 
     def __len__(self) -> int:
         return self.order.shape[0]
+
+    def unload(self) -> None:
+        """Let no particle be deformed, stressed or turning: F_e = 1, τ = 0, C = 0."""
+        for array in (self.C, self.tau):
+            array.rows.zero_()
+        self.F_e.rows.fill_(self.F_e.rows.dtype(np.eye(3)))
 
     @property
     def nbytes(self) -> int:
@@ -123,14 +129,15 @@ class ParticleState:
 
 
 def cell_order(x: np.ndarray, dx: float, offset: float) -> np.ndarray:
-    """[P] particles such that those of a block of 4³ cells, and in it those of a cell, follow each other.
+    """[P] particles by block of 4³ cells, and within a block by cell.
 
-    Neighbours in memory then reach the same nodes. Particles that flow leave the order; it only costs time.
+    Neighbours in memory then reach the same nodes. Particles that flow leave this order, which only costs
+    time.
 
     Args:
         x: [P, 3] positions [m], which may be off the grid or not finite.
         dx: grid spacing [m].
-        offset: from a particle down to the lowest node of its stencil [dx].
+        offset: distance from a particle down to the lowest node of its stencil [dx].
     """
     with np.errstate(invalid="ignore"):
         cells = np.clip(np.nan_to_num(x / dx - offset), 0, 2**20 - 1).astype(np.int64)

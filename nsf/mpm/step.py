@@ -1,4 +1,4 @@
-"""P2G, grid update and G2P, of which the full-order and the reduced solver share what `GridStep` says."""
+"""P2G, grid update and G2P: the part of a step that the full-order and the reduced solver share."""
 
 import numpy as np
 import warp as wp
@@ -16,16 +16,16 @@ from nsf.mpm.update import make_grid_update, make_update_g2p
 class GridStep:
     """P2G, grid update and G2P over given particle arrays.
 
-    What the full-order and the reduced solver share: one P2G, and one rule by which a node's momentum becomes
-    its velocity. Every particle is moved by `update` and `g2p`, few of them by `update_g2p`, which gives the
-    same, so a reduced step is the full-order step on fewer particles. On a grid of several copies P2G and
-    `update_g2p` are those of as many simulations; arrays of particles then hold as many rows of each.
+    Both solvers have one P2G, and one rule by which a node's momentum becomes its velocity. `update` and
+    `g2p` move every particle. `update_g2p` moves few particles to the same places. A reduced step is
+    therefore the full-order step on fewer particles. On a grid with several copies, `p2g` and `update_g2p` do
+    the work of as many simulations, and arrays of particles hold equally many rows of each.
 
     Args:
         grid: the nodes.
-        boundaries: colliders and walls; of several simulations those of each, one by one, as many of each.
+        boundaries: colliders and walls; for several simulations equally many colliders of each, in turn.
         transfer: transfer scheme and B-spline.
-        gravity: [3] [m/s²]; of several simulations [copies, 3].
+        gravity: [3] [m/s²]; for several simulations [copies, 3].
         dt: step [s].
         precision: floating-point types.
         device: Warp device.
@@ -76,7 +76,7 @@ class GridStep:
             wp.launch(self._reach, dim=x.shape[0], inputs=inputs, device=self.device)
 
     def scatter(self, x, v, C, tau, mass, volume0) -> None:
-        """Add what particles carry to their nodes, which are clear; arguments as of `p2g`."""
+        """Add mass, momentum and impulse of the particles to cleared nodes; arguments as for `p2g`."""
         grid, each = self.grid, particles_of_warp(x.shape[0]) if self._by_warp else WARP
         inputs = [
             x,
@@ -98,14 +98,14 @@ class GridStep:
         )
 
     def follow(self) -> None:
-        """Move the boundaries on by a step; `update` does it, `update_g2p` does not."""
+        """Move the boundaries by a step. `update` calls this; `update_g2p` does not."""
         self.boundaries.advance(self._seconds)
 
     def update(self) -> None:
-        """Momentum → velocity at the next time level, boundaries included, which move on by a step.
+        """Momentum → velocity at the next time level with all boundaries, which then move by a step.
 
         Raises:
-            ConfigError: the grid is of several simulations, of which `update_g2p` moves few particles each.
+            ConfigError: the grid holds several simulations; use `update_g2p` for these.
         """
         if self.grid.copies > 1:
             raise ConfigError(
@@ -121,13 +121,13 @@ class GridStep:
         wp.launch(self._g2p, dim=C.shape[0], inputs=inputs, device=self.device)
 
     def update_g2p(self, x, v, moved: int) -> None:
-        """Velocity and position of the first particles of each simulation, in place of `update` and `g2p`.
+        """Find v and x of the first particles of each simulation, in place of `update` and `g2p`.
 
-        For few particles: nothing is updated but what they need, and the nodes keep their momentum.
+        Only the nodes of these particles are updated, on the way. The grid keeps its momenta.
 
         Args:
-            x, v: [n] position [m] and velocity [m/s] as they were for P2G.
-            moved: how many of each simulation.
+            x, v: [n] position [m] and velocity [m/s] that P2G took.
+            moved: number of particles to move in each simulation.
         """
         lanes, grid = WARP if self.device.is_cuda else 1, self.grid
         inputs = [grid.shape, grid.slots, moved, lanes, grid.copies, x, v, *self._updating]
@@ -135,12 +135,12 @@ class GridStep:
 
     @property
     def _updating(self) -> list:
-        """What the velocity of nodes is found from, in the kernels' order."""
+        """Arguments of the nodes' velocity, in the kernels' order."""
         grid = self.grid
         return [grid.values, self.dx, self.dt, self.gravity, self.boundaries.solids]
 
     @property
     def gathering(self) -> list:
-        """What G2P gathers from and with, in the kernels' order."""
+        """Arguments of G2P, in the kernels' order."""
         grid = self.grid
         return [grid.values, grid.shape, grid.slots, self.dx, self.dt, *self.affine_shares]

@@ -1,7 +1,8 @@
 """Transfers between particles and grid: P2G and G2P (paper section 3.3, steps 1 and 3).
 
-One P2G serves the full-order and the reduced solver, which launches it over its integration particles. G2P
-of its few sample particles needs neither C nor the deformation increment: see `update.py`.
+The full-order and the reduced solver share one P2G. The reduced solver launches it over its integration
+particles. Its G2P for few sample particles is in `update.py` and needs neither C nor the deformation
+increment.
 """
 
 from dataclasses import dataclass
@@ -26,12 +27,12 @@ class Transfer:
     """How velocities travel between particles and grid.
 
     Attributes:
-        scheme: `pic` carries no affine momentum; `apic` all of it; `rpic` its
-            rotation, and of its symmetric part the share `1 − damping`.
+        scheme: `pic` carries no affine momentum; `apic` carries all of it; `rpic` carries its
+            rotation, and the share `1 − damping` of its symmetric part.
         shape: B-spline, `quadratic` or `cubic`.
         damping: RPIC damping in [0, 1], dimensionless; 1 keeps rotation only.
         deterministic: on a GPU, sum P2G's contributions in a fixed order, so that the same run gives
-            the same bits (slower); on a CPU that is so in any case.
+            the same bits (slower). A CPU always does.
 
     Raises:
         ConfigError: unknown scheme or shape; damping outside [0, 1] or not with RPIC.
@@ -72,14 +73,14 @@ def make_p2g(
     several: bool = False,
     by_warp: bool = False,
 ):
-    """Kernel of P2G, launched over whole warps, whose first `each` threads have a particle.
+    """Kernel of P2G, launched over whole warps. The first `each` threads of a warp have a particle.
 
     m_i = Σ_p w_ip m_p and, with the explicit force's impulse added in the same sweep,
     m_i v_i = Σ_p w_ip m_p (v_p + C_p (x_i − x_p)) − Δt Σ_p τ_p ∇w_ip V_p⁰.
     Particles off the grid are passed over; the solver's check reports them. With `several`, rows of particles
     and nodes are those of `copies` simulations. `by_warp` is for a GPU: the threads of a warp share the nodes
-    of its particles (`make_scatter`), and add up what those of one cell give before it reaches memory, in no
-    fixed order; not with `deterministic`.
+    of the warp's particles (`make_scatter`). They add up the contributions of one cell before these reach
+    memory, in no fixed order. `by_warp` excludes `deterministic`.
 
     Source: paper section 3.3, steps 1 and 2.
     """
@@ -110,7 +111,7 @@ def make_p2g(
         each: int,
     ):
         lane = wp.tid() % WARP
-        # A thread without a particle reads its neighbour's.
+        # A thread without a particle reads its neighbour's particle.
         t = wp.tid() / WARP * each + wp.min(lane, each - 1)
         p = wp.min(t, x.shape[0] - 1)
         copy = copy_of(p, share(x.shape[0], copies))
@@ -155,7 +156,7 @@ def make_p2g(
 
 @cache
 def make_gather(precision: Precision, shape_name: str):
-    """Warp function of G2P: what a particle's nodes give it, v_p, C_p and the deformation increment f_p.
+    """Warp function of G2P: v_p, C_p and the deformation increment f_p from a particle's nodes.
 
     v_p = Σ_i w_ip v_i, x_p ← x_p + Δt v_p, C_p = 12/(Δx²(b+1)) Σ_i w_ip v_i (x_i − x_p)ᵀ,
     f_p = I + Δt Σ_i v_i ∇w_ipᵀ, so that F_trial = f_p F_e.
@@ -254,7 +255,7 @@ def make_g2p(precision: Precision, shape_name: str):
 def make_g2p_stress(precision: Precision, shape_name: str, law: LawFunctions, history_size: int):
     """Kernel of G2P and the constitutive update in one pass, so that f_p never reaches memory.
 
-    The same as `make_g2p` and then `make_stress_update`.
+    It equals `make_g2p` followed by `make_stress_update`.
 
     Source: paper section 3.3, step 3.
     """

@@ -15,14 +15,14 @@ from nsf.mpm.shape import shape_functions
 
 @cache
 def make_node_velocity(precision: Precision):
-    """Warp function (values of a node, node, ...) → its velocity; of no use without mass. `fall` is Δt g.
+    """Warp function (values of a node, node, ...) → its velocity. The node must have mass. `fall` is Δt g.
 
     v_i = (m_i v_i − Δt Σ_p τ_p ∇w_ip V_p⁰)/m_i + Δt g, then the boundary conditions
     in order: each collider that acts, then the walls of the domain. P2G has already added
-    the force impulse to the momentum. A node belongs to a solid by the solid's pose at t^n, the
-    time of the particles that P2G took here, and v_i^{n+1} meets the condition relative to the
-    solid's mean velocity over the step (`make_follow`). Frames that move by whole cells a step
-    thus see the same contact. Of all solids those from `first` up to `end` are the node's simulation's.
+    the force impulse to the momentum. The solid's pose at t^n decides whether a node belongs to the
+    solid, because t^n is the time of the particles of P2G. v_i^{n+1} meets the condition relative to
+    the solid's mean velocity over the step (`make_follow`). Frames that move by whole cells a step
+    thus see the same contact. The solids from `first` up to `end` are those of the node's simulation.
 
     Source: paper section 3.3, step 2.
     """
@@ -113,12 +113,12 @@ def make_grid_update(precision: Precision):
 
 @cache
 def make_update_g2p(precision: Precision, shape_name: str, several: bool = False):
-    """Kernel of v and x after a step for few particles, from nodes that hold momenta still.
+    """Kernel of v and x after a step for few particles, from nodes that still hold momenta.
 
-    What `make_grid_update` and then `make_g2p` give them but C and the increment, in one pass: `lanes`
-    threads, a warp or one, share the nodes of a particle's stencil and update each of them on the way.
-    Nothing is written to the grid. With `several`, arrays are those of `copies` simulations, and of each the
-    first `moved` particles are moved.
+    It gives v and x of `make_grid_update` and `make_g2p` in one pass, without C and the increment. `lanes`
+    threads (a warp, or one) share the nodes of a particle's stencil and update each node on the way. The grid
+    is not written. With `several`, arrays are those of `copies` simulations, and the first `moved` particles
+    of each are moved.
 
     Source: paper section 3.3, steps 2 and 3.
     """

@@ -295,8 +295,9 @@ class Pipeline(Plan):
                 for index, (rollout, truth) in enumerate(zip(rollouts, truths, strict=True))
             ]
             cost = self._cost(manifold)
+            engine = deployment.manifest["metrics"].get("engine", "")
             table = results.rows(
-                self.config, manifold, rollouts, comparisons, cost, self.device, run.manifest
+                self.config, manifold, rollouts, comparisons, cost, self.device, run.manifest, engine
             )
             seconds = self.training.manifest["metrics"]["training_seconds"]
             summary = results.summarise(self.deployed, manifold, table, comparisons, rollouts, seconds)

@@ -41,14 +41,19 @@ def rows(
     cost: dict,
     device: str,
     manifest: dict,
+    engine: str = "",
 ) -> pd.DataFrame:
-    """Content of `results.csv`, one row a parameter value; errors are fractions, ∞ where a run diverged."""
+    """Content of `results.csv`, one row a parameter value; errors are fractions, ∞ where a run diverged.
+
+    `engine` took the steps of the rollouts; empty where their run does not say.
+    """
     commit = str(manifest.get("commit") or "unknown")[:12] + ("-dirty" if manifest.get("dirty") else "")
     variant = {
         "scene": config.scene.name,
         "method": config.method.name,
         "field": manifold.field,
         "r": manifold.latent_dim,
+        "engine": engine,
     }
     measured = {
         "gamma": reduction_ratio(len(manifold.X), manifold.latent_dim),

@@ -35,6 +35,7 @@ _SPEC = (
     Column("method", "method"),
     Column("field", "field"),
     Column("r", "r"),
+    Column("engine", "engine"),
     Column("sample", "|S|"),
     Column("integration_mean", "mean |N|"),
     Column("parameter", "parameter"),
@@ -56,6 +57,8 @@ _SPEC = (
 
 COLUMNS = tuple(column.name for column in _SPEC)
 """Columns of `results.csv`, in order. Errors and δ are fractions there."""
+LATER = ("engine",)
+"""Columns that runs from before there were engines lack."""
 
 SETTING, VALUES, TRAINING, PLACE = "setting", "values", "training_seconds", "place"
 _MORE = (
@@ -67,7 +70,19 @@ _MORE = (
 COLUMN = {column.name: column for column in (*_SPEC, *_MORE)}
 """Columns of tables: those of `results.csv`; a variant's setting beyond them; and what means are beside."""
 
-TEXT = ("scene", "method", "field", "sample", "split", "precision", "device", "commit", SETTING, PLACE)
+TEXT = (
+    "scene",
+    "method",
+    "field",
+    "engine",
+    "sample",
+    "split",
+    "precision",
+    "device",
+    "commit",
+    SETTING,
+    PLACE,
+)
 COSTS = (
     "step_ms_full", "step_ms_reduced", "speedup_step", "speedup_total",
     "memory_full_mib", "memory_reduced_mib",

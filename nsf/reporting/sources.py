@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 
 from nsf.errors import MissingRunError, SchemaError
-from nsf.reporting.columns import COLUMNS, TEXT
+from nsf.reporting.columns import COLUMNS, LATER, TEXT
 
 FILES = ("results.csv", "series.csv", "frames.npz", "cost.json", "summary.json")
 _FRAMES = ("parameters", "splits", "t", "x_full", "x_reduced", "stress_full", "stress_reduced")
@@ -125,6 +125,7 @@ class Source:
 
     def _csv(self, name: str, columns, text) -> pd.DataFrame:
         frame = pd.read_csv(self._path(name), dtype=dict.fromkeys(text, str))
+        frame = frame.assign(**{name: "" for name in LATER if name in columns and name not in frame})
         absent = [column for column in columns if column not in frame]
         if absent:
             raise SchemaError(f"{self._path(name)} lacks the columns {absent}; run `nsf evaluate` again")

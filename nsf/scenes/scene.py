@@ -298,6 +298,21 @@ class Scene:
         ends = np.cumsum([0] + [body.particles for body in self.bodies])
         return Scene.from_config(self._recounted(np.diff(np.rint(particles * (ends / ends[-1])))))
 
+    def coarsened(self, factor: int, multiple: int = 1) -> "Scene":
+        """The same scene on a grid of factor times the spacing, with as many particles a cell.
+
+        Args:
+            factor: of Δx; a body's particles become fewer by its third power.
+            multiple: of Δt; it divides the steps.
+
+        Raises:
+            ConfigError: a body, a collider or the walls do not fit the coarse grid.
+        """
+        config = self._recounted([max(1, round(body.particles / factor**3)) for body in self.bodies])
+        config.scene.dx, config.scene.dt = factor * self.dx, multiple * self.dt
+        config.scene.steps = self.steps // multiple
+        return Scene.from_config(config)
+
     def _recounted(self, counts: Sequence[int]) -> DictConfig:
         """The configuration with other numbers of particles of the bodies."""
         config = self.template.copy()

@@ -65,19 +65,29 @@ def add(file: str, content: str, project: Path, monkeypatch) -> None:
         Pipeline(config.load([option, "scale=small", "device=cpu"]))
 
 
+def train_sand() -> None:
+    """A manifold of the small sand column, with its particles but few steps, values and iterations."""
+    short = ["scene.steps=8", "scene.parameters.train=[21.0,30.0,38.5]", "trainer.steps=20"]
+    pipeline = Pipeline(config.load(["scene=sand", "scale=small", "device=cpu", *short]))
+    pipeline.simulate()
+    pipeline.train()
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_page(page, project, monkeypatch, capsys):
     text = (DOCS / page).read_text(encoding="utf-8")
+    if "Run.find(" in text:
+        train_sand()
     if "trimesh" in text:
         pytest.importorskip("trimesh")
-    found = blocks(text)
+    found, names = blocks(text), {"__name__": "page"}
     assert len(found) == text.count("\n```") / 2, "a block that is not read: indented, or without a language"
     for language, title, content in found:
         try:
             if title:
                 add(title, content, project, monkeypatch)
             elif language == "python":
-                exec(compile(content, page, "exec"), {"__name__": "page"})
+                exec(compile(content, page, "exec"), names)
             else:
                 assert language == "sh", f"a {language} block without a title"
                 for command in content.splitlines():

@@ -6,6 +6,7 @@ import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -15,7 +16,7 @@ import torch
 
 from nsf.data import Trajectory
 from nsf.deployment import Rollout
-from nsf.dynamics import NeighbourSearch, ParticleSets, ProjectionResult, Taylor
+from nsf.dynamics import GaussNewton, NeighbourSearch, ParticleSets, ProjectionResult, Taylor
 from nsf.errors import ConfigError, InstabilityError, MissingRunError, NSFError
 from nsf.evaluation import superresolution
 from nsf.kinematics.manifold import Manifold
@@ -24,8 +25,8 @@ from nsf.runs import Run
 
 #: Issue 2, "Done when".
 COLUMNS = [
-    "scene", "method", "field", "r", "sample", "integration_mean", "parameter", "split", "delta",
-    "displacement_error", "stress_error", "gamma", "step_ms_full", "step_ms_reduced", "speedup_step",
+    "scene", "method", "field", "r", "engine", "sample", "integration_mean", "parameter", "split",
+    "delta", "displacement_error", "stress_error", "gamma", "step_ms_full", "step_ms_reduced", "speedup_step",
     "speedup_total", "memory_full_mib", "memory_reduced_mib", "precision", "device", "commit",
 ]  # fmt: skip
 STAGES = ("simulate", "train", "deploy", "evaluate")
@@ -48,11 +49,12 @@ def said_by(pipeline_at, root, *overrides, stages=STAGES):
 
 def test_what_is_said(chain):
     said = [line for line in chain.said if "warning" not in line]
-    assert [line.split(":")[0] for line in said] == ["simulate", "train", "deploy", "evaluate"]
+    assert [line.split(":")[0] for line in said] == ["simulate", "train", "deploy", "deploy", "evaluate"]
     assert "4 trajectories in" in said[0]
     assert "field=basis, r=4" in said[1]
-    assert "method=nsf, |S|=20, 1 values" in said[2]
-    assert "mean δ" in said[3]
+    assert said[2] == "deploy: engine modal"
+    assert "method=nsf, |S|=20, 1 values" in said[3]
+    assert "mean δ" in said[4]
 
 
 def test_trajectories(chain):
@@ -88,6 +90,7 @@ def test_results_have_the_columns_of_a_report(chain):
     row = results.iloc[0]
     assert (row["scene"], row["method"], row["field"], row["split"]) == ("sand", "nsf", "basis", "test")
     assert (row["r"], row["sample"], row["parameter"], row["precision"]) == (4, 20, 26.0, "fp64")
+    assert row["engine"] == "modal"
     assert row["gamma"] == 3 * 500 / 4
     assert row["device"] == "cpu"
     assert 0 < row["delta"] < 0.02
@@ -123,7 +126,8 @@ def test_manifests(chain):
     assert p.training.manifest["parents"] == [p.simulation(v).id for v in (22, 30, 38)]
     assert p.deployment.manifest["parents"] == [p.training.id]
     assert p.evaluation.manifest["parents"] == [p.deployment.id, p.simulation(26).id]
-    assert p.deployment.manifest["metrics"]["needed_outside"] == 0
+    metrics = p.deployment.manifest["metrics"]
+    assert (metrics["needed_outside"], metrics["engine"], metrics["engine_why"]) == (0, "modal", "")
 
 
 def test_the_manifold_knows_its_data(chain, tiny_manifold):
@@ -191,6 +195,37 @@ def test_values_deployed_together_are_as_one_by_one(copied, pipeline_at):
     assert pipeline.evaluate().complete
 
 
+def test_an_engine_that_is_asked_for(copied, pipeline_at):
+    root = copied("simulate", "train")
+    pipeline, said = said_by(pipeline_at, root, "engine=reference", "evaluation.trials=1")
+    assert said[-3] == "deploy: engine reference, since it was asked for"
+    assert pd.read_csv(pipeline.evaluation.path / "results.csv")["engine"].tolist() == ["reference"]
+    assert pipeline_at(root, "engine=auto").deployment == pipeline_at(root).deployment
+    with pytest.raises(ConfigError, match=r"engine\.name=fast is unknown"):
+        pipeline_at(root, "engine.name=fast")
+    with pytest.raises(ConfigError, match=r"deploy\.batch=2 needs engine=modal, or auto"):
+        pipeline_at(root, "engine=reference", "deploy.batch=2")
+
+
+def test_an_edited_step_is_deployed_anew_and_runs(copied, pipeline_at, monkeypatch):
+    """What a reader changes in the reference takes effect in a run that was made before."""
+    root = copied(*STAGES)
+    solve = GaussNewton.solve
+
+    def damped(self, at, target, xhat, weights=None):
+        result = solve(self, at, target, xhat, weights)
+        return replace(result, xhat=xhat + 0.9 * (result.xhat - xhat))
+
+    before = pipeline_at(root).deployment
+    monkeypatch.setattr(GaussNewton, "solve", damped)
+    pipeline, said = said_by(pipeline_at, root, stages=("deploy",))
+    assert pipeline.deployment != before
+    assert "deploy: engine reference, since modal mirrors another text" in said[-2]
+    assert "nsf.dynamics.projection.GaussNewton.solve" in said[-2]
+    one, other = (Rollout.open(run.path / "rollout_0.h5").xhat for run in (before, pipeline.deployment))
+    assert np.abs(one - other).max() > 1e-3
+
+
 def test_deploying_on_another_scene_than_the_one_trained_on(copied, pipeline_at):
     """Appendix "Generalization": the deployed scene and its truths differ, the training does not."""
     root = copied(*STAGES)
@@ -245,6 +280,7 @@ HASHES = {
     "method=deformation_only": {"deployment", "evaluation"},
     "sampler.size=30": {"deployment", "evaluation"},
     "projector=taylor": {"deployment", "evaluation"},
+    "engine=reference": {"deployment", "evaluation"},
     "integration=search": {"deployment", "evaluation"},
     "deploy.dt_multiplier=1.5": {"deployment", "evaluation"},
     "deploy.changes={material.E:1900}": {"deployment", "evaluation"},

@@ -78,7 +78,7 @@ class ModalSpan(GridSpan):
         return {
             "inference": self.infer,
             "p2g": self.p2g,
-            "g2p": self.g2p,
+            "g2p": self.update_g2p,
             "inversion": self.project,
         }
 
@@ -101,7 +101,7 @@ class ModalSpan(GridSpan):
         """
         if self._clears_ahead:
             with self._arena.beside(_CLEARING):
-                self.grid_step.clear(self.particles[0])
+                self.grid_step.clear(self.particles.x)
         with self._arena.beside(_PREPARING):  # what nothing needs before S is moved
             self.grid_step.follow()
             self._projection.prepare.launch()
@@ -116,17 +116,17 @@ class ModalSpan(GridSpan):
         for launch in self._fields:
             launch.launch()
 
-    @override
     def p2g(self) -> None:
+        """N → grid (paper section 5.2)."""
         if self._clears_ahead:
             self.grid_step.scatter(*self.particles)
         else:
-            super().p2g()
+            self.grid_step.p2g(*self.particles)
 
-    @override
-    def g2p(self) -> None:
+    def update_g2p(self) -> None:
+        """Grid → x and v of S, once the boundaries are where they will be (paper section 5.2)."""
         self._arena.meet(_PREPARING)
-        self.move_sample()
+        self.grid_step.update_g2p(self.particles.x, self.particles.v, self.s)
 
     def project(self) -> None:
         """x̂_{n+1} from the displacement of S (paper section 5.3)."""

@@ -1,4 +1,4 @@
-"""What a constitutive law is: parameters, a stress function and a return map."""
+"""The parts of a constitutive law: parameters, a stress function and a return map."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -22,8 +22,8 @@ class LawFunctions:
         tau_of: (F_e, history, mu, lam) → Kirchhoff stress [Pa].
         return_map: (F_trial, history, mu, lam, params, dt) → (F_e, history); None where `update` is given.
         Params: Warp struct of the law's constants.
-        update: (F_trial, history, mu, lam, params, dt) → (F_e, history, tau), of a law whose return map and
-            stress share work; by default the one after the other.
+        update: (F_trial, history, mu, lam, params, dt) → (F_e, history, tau), for a law whose return map and
+            stress share work; by default `return_map` and then `tau_of`.
     """
 
     tau_of: Any
@@ -88,8 +88,8 @@ class Material(ABC):
     def stretch_of(self, tau: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
         """The symmetric F_e = V with τ(V) = τ: the inverse of the elastic law.
 
-        τ does not tell the rotation R of F_e = V R, and an isotropic law needs none: neither τ(F_e) nor
-        what a return map makes of f F_e depends on it.
+        τ does not tell the rotation R of F_e = V R. An isotropic law needs no R: neither τ(F_e) nor the
+        return map of f F_e depends on it.
 
         Args:
             tau: [P, 3, 3] symmetric Kirchhoff stress [Pa].
@@ -116,7 +116,7 @@ class Material(ABC):
     def carried_share(self, tau: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
         """Largest share [P] of each stress, at most 1, that a deformation carries, by bisection.
 
-        A stress that comes from elsewhere than the law, as a field's, may lie beyond what the law can give.
+        A stress that the law did not give, such as that of a field, may lie beyond the law.
 
         Args:
             tau: [P, 3, 3] symmetric Kirchhoff stress [Pa].
@@ -135,14 +135,14 @@ class Material(ABC):
         return share
 
     def _stretches(self, principal: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
-        """`stretches_of`, whose NaN are an answer."""
+        """`stretches_of` without NumPy's warnings, because its NaN are answers."""
         with np.errstate(invalid="ignore", divide="ignore"):
             return self.stretches_of(principal, mu, lam)
 
     def history_of(self, tau: np.ndarray) -> np.ndarray:
-        """[P, H] history variables assumed where only τ [P, 3, 3] [Pa] is known: those at rest.
+        """[P, H] history variables to assume where τ [P, 3, 3] [Pa] alone is known: by default those at rest.
 
-        A law says where it can know better.
+        A law that can tell more from τ overrides this.
         """
         return self.initial_history(len(tau))
 

@@ -21,8 +21,8 @@ def drive(
     """Kirchhoff stress of one material point along a deformation path.
 
     The point starts undeformed. At each row the elastic predictor is
-    F_trial = F_k F_{k−1}⁻¹ F_e (F_{−1} = I), followed by the law's return map and
-    history update: what a particle of the full-order solver does.
+    F_trial = F_k F_{k−1}⁻¹ F_e (F_{−1} = I). The law's return map and history update
+    follow, as for a particle of the full-order solver.
 
     Args:
         material: the law.

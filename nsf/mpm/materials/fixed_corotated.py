@@ -41,8 +41,8 @@ def fixed_corotated_tau(precision: Precision):
 def fixed_corotated_stretches(principal: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
     """Principal stretches of `fixed_corotated_tau` on the branch through the identity: σ ≥ 1/2, 1/2 ≤ J ≤ 8.
 
-    With q = λ (J − 1) J each stretch is the larger root of 2μ̂ σ(σ − 1) = τ − q, so that one unknown is
-    left, J = Π σ(q(J)): Newton's method from J = 1, which halves its bracket where a step would leave it.
+    With q = λ (J − 1) J each stretch is the larger root of 2μ̂ σ(σ − 1) = τ − q. One unknown is left,
+    J = Π σ(q(J)). Newton's method finds it from J = 1, and halves its bracket where a step would leave it.
 
     Args:
         principal: [P, 3] principal Kirchhoff stresses [Pa]; mu, lam: [P] Lamé parameters [Pa].

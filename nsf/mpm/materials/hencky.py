@@ -73,13 +73,13 @@ def hencky_tau(precision: Precision):
 
 
 def hencky_update(precision: Precision, flow, Params):
-    """Warp function of the constitutive update of a law over Hencky elasticity: F_trial is decomposed once.
+    """Warp function of the constitutive update of a law over Hencky elasticity: it decomposes F_trial once.
 
-    The flow is along the principal directions of F_trial = U exp(ε) Vᵀ, which F_e therefore shares.
+    Flow keeps the principal directions of F_trial = U exp(ε) Vᵀ, so that F_e has the same directions.
 
     Args:
         precision: floating-point types.
-        flow: Warp function (ε, history, mu, lam, params) → (ε, history); ε as it was where nothing flows.
+        flow: Warp function (ε, history, mu, lam, params) → (ε, history); ε is unchanged where nothing flows.
         Params: Warp struct of the law's constants.
     """
     real, mat33 = precision.real, precision.mat33

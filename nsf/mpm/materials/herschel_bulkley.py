@@ -42,9 +42,9 @@ def volumetric_deviatoric_tau(precision: Precision):
 def isochoric_mean(precision: Precision):
     """Warp function (deviator d [3], start) → m with Π (dᵢ + m) = 1, all dᵢ + m > 0.
 
-    As Σ dᵢ = 0, m is the largest root of m³ − (‖d‖²/2) m + d₁d₂d₃ = 1. The left side grows and is
-    convex to the right of it, so Newton's steps from a start above the root only go down: they end
-    where rounding lets them fall no further.
+    Because Σ dᵢ = 0, m is the largest root of m³ − (‖d‖²/2) m + d₁d₂d₃ = 1. The left side grows and is
+    convex to the right of the root. Newton's steps from a start above the root therefore only go down, and
+    end where rounding stops them.
     """
     real, vec3 = precision.real, precision.vec3
 

@@ -119,9 +119,9 @@ class VonMisesHardening(VonMises):
             raise ConfigError(f"material.hardening={self.hardening} must be finite and not negative")
 
     def history_of(self, tau: np.ndarray) -> np.ndarray:
-        """[P, 1] a lower bound of τ_Y [Pa]: at least that at rest, and at least the ‖dev τ‖ which is carried.
+        """[P, 1] lower bound of τ_Y [Pa]: the larger of τ_Y at rest and the ‖dev τ‖ that is carried.
 
-        What a particle that has unloaded had hardened beyond that is lost.
+        The bound misses the hardening of a particle that has unloaded since.
         """
         mean = np.trace(tau, axis1=1, axis2=2)[:, None, None] / 3.0
         carried = np.linalg.norm(tau - mean * np.eye(3), axis=(1, 2))
@@ -139,10 +139,11 @@ class VonMisesSoftening(VonMises):
     """Yield stress that falls with plastic flow, τ_Y ← τ_Y − θ ‖ε − proj ε‖, down to damage.
 
     A particle whose τ_Y reaches zero is damaged for good: τ = 0, as the paper's zero Lamé parameters
-    give. Its τ_Y ≤ 0 is the mark, so the particle's moduli stay constants. From the next step on its
+    give. τ_Y ≤ 0 marks the damage, so the particle's moduli stay constants. From the next step on its
     F_e is held at I: a product of increments that nothing resists would overflow in a long run, and
-    the elastic strain of a material without stiffness has no meaning. τ alone does not tell damage, as a
-    damaged particle looks like an unloaded one: `history_of` gives τ_Y at rest, an upper bound.
+    the elastic strain of a material without stiffness has no meaning. τ alone does not tell damage,
+    because a damaged particle looks like an unloaded one. `history_of` therefore gives τ_Y at rest, an
+    upper bound.
 
     Attributes:
         softening: θ [Pa] lost by τ_Y for a unit of plastic logarithmic strain, not negative.

@@ -1,0 +1,82 @@
+"""Rivals of a reduced run: the nearest training run, their interpolation, and a coarser full-order run."""
+
+import numpy as np
+import pytest
+
+from nsf.evaluation.rivals import TrainingRuns, coarse_run
+
+
+@pytest.fixture
+def runs(tiny_manifold):
+    return TrainingRuns.of(tiny_manifold)
+
+
+def test_training_runs_are_those_of_the_manifold(runs, tiny_manifold):
+    assert runs.latents.shape == (3, 25, 4)
+    np.testing.assert_array_equal(runs.latents.reshape(-1, 4), tiny_manifold.training_latents)
+    np.testing.assert_allclose(runs.parameters[:, 0], [-np.sqrt(1.5), 0.0, np.sqrt(1.5)])
+
+
+@pytest.mark.parametrize(("value", "run"), [(25.9, 0), (26.1, 1), (33.0, 1), (50.0, 2)])
+def test_nearest_is_the_run_of_the_nearest_value(runs, value, run):
+    np.testing.assert_array_equal(runs.nearest([value]), runs.latents[run])
+
+
+def test_interpolation_is_linear_between_training_values_and_exact_at_them(runs):
+    np.testing.assert_allclose(runs.interpolated([30.0]), runs.latents[1], atol=1e-10)
+    mixed = 0.25 * runs.latents[0] + 0.75 * runs.latents[1]
+    np.testing.assert_allclose(runs.interpolated([28.0]), mixed, atol=1e-10)
+    np.testing.assert_allclose(runs.interpolated([60.0]), runs.latents[2], atol=1e-10)
+
+
+def test_interpolation_over_two_parameters_keeps_training_runs():
+    parameters = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0], [1.0, 1.0]])
+    latents = np.random.default_rng(0).normal(size=(4, 5, 2))
+    runs = TrainingRuns(parameters, latents, np.zeros(2), np.ones(2))
+    for values, own in zip(parameters, latents, strict=True):
+        np.testing.assert_allclose(runs.interpolated(values), own, atol=1e-10)
+    middle = runs.interpolated([0.5, 0.5])
+    np.testing.assert_allclose(middle, latents.mean(0), atol=1e-10)  # by symmetry
+
+
+def test_a_coarse_run_has_the_frames_and_particles_of_the_fine_one(chain):
+    scene = chain.scene
+    fine = scene.with_parameters({"friction_angle": 26.0})
+    X = fine.particles().X
+    coarse = coarse_run(scene, {"friction_angle": 26.0}, X, 2, "fp64", "cpu")
+    assert coarse.x.shape == (scene.steps + 1, 500, 3)
+    np.testing.assert_allclose(coarse.x[0], X, atol=1e-12)
+    assert coarse.dx == pytest.approx(2 * scene.dx)
+    assert coarse.particles == round(500 / 8)
+    assert scene.steps % coarse.steps == 0
+    solver = scene.full_order({"friction_angle": 26.0}, device="cpu")
+    solver.step(scene.steps)
+    x = solver.state.numpy()["x"]
+    error = np.linalg.norm(coarse.x[-1] - x) / np.linalg.norm(x - X)
+    assert 0.01 < error < 0.6  # near, and not the same
+
+
+def test_a_rigid_fall_is_the_same_on_a_coarse_grid(chain):
+    scene = chain.scene.with_changes({"scene.gravity": [0.0, 0.0, 0.0]})
+    config = scene.template.copy()
+    config.scene.bodies.column.velocity = [0.1, 0.0, 0.2]
+    config.scene.bodies.column.shape.base = [0.5, 0.5, 0.5]  # clear of the sticky floor
+    scene = type(scene).from_config(config)
+    X = scene.particles().X
+    coarse = coarse_run(scene, {"friction_angle": 26.0}, X, 2, "fp64", "cpu")
+    t = scene.dt * np.arange(scene.steps + 1)[:, None, None]
+    np.testing.assert_allclose(coarse.x, X + t * np.array([0.1, 0.0, 0.2]), atol=1e-10)
+
+
+def test_a_scene_that_no_coarse_grid_resolves_says_why(chain):
+    config = chain.scene.template.copy()
+    config.scene.colliders.blade = {
+        "_target_": "nsf.mpm.Cuboid",
+        "centre": [0.8, 0.8, 0.8],
+        "size": [0.07, 0.07, 0.07],
+        "kind": "separate",
+        "friction": 0.0,
+    }
+    scene = type(chain.scene).from_config(config)
+    reason = coarse_run(scene, {"friction_angle": 26.0}, scene.particles().X, 2, "fp64", "cpu")
+    assert "needs dx of at most" in reason
