@@ -1,6 +1,6 @@
 """The stages in order; each reads the files of the one before it and nothing else.
 
-scene → simulate → dataset → train → deploy → evaluate → report
+scene → simulate → dataset → train (→ teach) → deploy → evaluate → report
 """
 
 import contextlib
@@ -17,6 +17,7 @@ from nsf.data.schema import TRAJECTORY
 from nsf.deployment import Rollout, calibrate, continuation_file, deploy, go_on, rollout_file
 from nsf.dynamics import ParticleSets, ReducedBatch, ReducedMPM
 from nsf.dynamics.setup import reduced_steps
+from nsf.engines import Engine, Operators
 from nsf.errors import MissingRunError
 from nsf.evaluation import Comparison, Subject, compare, measure, superresolve
 from nsf.kinematics.fields.mlp import MlpField
@@ -27,12 +28,13 @@ from nsf.mpm.device import visible_gpus
 from nsf.pipeline import results
 from nsf.pipeline.plan import Plan
 from nsf.pipeline.simulation import Job, Shared, simulate
+from nsf.pipeline.teaching import OPERATORS, teach
 from nsf.runs import Record, Run
 from nsf.sampling import SampleSpan
 from nsf.scenes import Scene
 from nsf.storage import writing
 
-STAGES = ("simulate", "train", "deploy", "evaluate", "report")
+STAGES = ("simulate", "train", "teach", "deploy", "evaluate", "report")
 #: File of a deploy run with the configuration of its whole chain, interpolations kept.
 CONFIGURATION = "configuration.yaml"
 
@@ -50,6 +52,7 @@ class Pipeline(Plan):
         self.say = say
         self._samples: Sequence[SampleSpan] | None = None
         self._sets: Sequence[ParticleSets] | None = None
+        self._taught: Operators | None = None
 
     @classmethod
     def of_run(cls, run: Run, device: str = "auto", say: Callable[[str], None] = print) -> "Pipeline":
@@ -72,6 +75,11 @@ class Pipeline(Plan):
         config = OmegaConf.load(path)
         config.device = device
         return cls(config, say, run.root)
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The stages of the chain, `teach` only where the engine that is asked for is taught."""
+        return tuple(name for name in STAGES if name != "teach" or self.teaching is not None)
 
     def run(self, stage: str) -> Run | Path:
         """One stage by name; what it reads must be there, except that `simulate` needs nothing.
@@ -165,10 +173,15 @@ class Pipeline(Plan):
         return manifold
 
     def solver_at(
-        self, manifold: Manifold, value: float, device: str | None = None, precision: str | None = None
+        self,
+        manifold: Manifold,
+        value: float,
+        device: str | None = None,
+        precision: str | None = None,
+        engine: str | Engine | None = None,
     ) -> ReducedMPM:
-        """The reduced solver at a parameter value, at t = 0; device and precision as configured."""
-        return self.batch_at(manifold, [value], device, precision).runs[0]
+        """The reduced solver at a parameter value, at t = 0; device, precision and engine as configured."""
+        return self.batch_at(manifold, [value], device, precision, engine).runs[0]
 
     def batch_at(
         self,
@@ -176,13 +189,20 @@ class Pipeline(Plan):
         values: Sequence[float],
         device: str | None = None,
         precision: str | None = None,
+        engine: str | Engine | None = None,
+        scene: Scene | None = None,
     ) -> ReducedBatch:
-        """Reduced runs at several parameter values that take their steps together, likewise."""
-        batch = self.deployed.reduced_batch(
+        """Reduced runs at several parameter values that take their steps together, likewise.
+
+        By the engine that is asked for, of the scene that is deployed, unless others are given.
+        """
+        if engine is None:
+            engine = self._operators(manifold) if self.engine == Operators.name else self.engine
+        batch = (scene or self.deployed).reduced_batch(
             manifold,
             [{self.scene.parameters.name: value} for value in values],
             self._samples or self.sampler,
-            engine=self.engine,
+            engine=engine,
             method=self.method,
             projector=self.projector,
             integration=self.integration,
@@ -195,15 +215,43 @@ class Pipeline(Plan):
         self._samples, self._sets = batch.batch.shared.samples, batch.batch.shared.sets
         return batch
 
+    def teach(self) -> Run:
+        """The operators of the deployed step, where the engine that is asked for steps by them.
+
+        Raises:
+            ConfigError: it does not.
+        """
+        return self._made(self.taught, self._teach)
+
+    def _teach(self, run: Run) -> None:
+        manifold = self.manifold().to(self.device)
+        with run.record(device=self.device, seed=self.config.seed, precision=self.config.precision) as record:
+            teach(self, manifold, record)
+        found = record.metrics
+        self.say(
+            f"teach: {found['teacher_steps']} steps of the teacher in {found['teach_seconds']:.1f} s, "
+            f"{100 * min(found['errors']):.2g} % off at values held back → {run.id}"
+        )
+
+    def _operators(self, manifold: Manifold) -> Operators:
+        """The operators that were taught; with them the sample, which is that of the scene of training."""
+        if self._taught is None:
+            self._taught = Operators.load(self.taught.require().path / OPERATORS)
+            self.batch_at(manifold, self.split.train[:1], engine=self.projecting, scene=self.scene)
+        return self._taught
+
     def deploy(self) -> Run:
         """Reduced trajectories of the held-out values, through Lightning's `Trainer.predict`."""
+        if self.teaching is not None:
+            self.teach()
         return self._made(self.deployment, self._deploy)
 
     def _deploy(self, run: Run) -> None:
         manifold = self.manifold().to(self.device)  # many solvers take their rows from it
         with run.record(device=self.device, precision=self.config.precision) as record:
             started = time.perf_counter()
-            trust = calibrate(partial(self.solver_at, manifold), manifold, self.device)
+            solver_at = partial(self.solver_at, manifold, engine=self.projecting)
+            trust = calibrate(solver_at, manifold, self.device)
             record.metrics["trust"] = {
                 "residual_m": trust.residual,
                 "distance_m": trust.distance,

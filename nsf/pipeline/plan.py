@@ -3,7 +3,7 @@
 import os
 from collections.abc import Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
@@ -13,7 +13,9 @@ from nsf import config as configuration
 from nsf.data import Split
 from nsf.dynamics.interop import torch_device
 from nsf.engines import NAMES as ENGINES
+from nsf.engines import Operators
 from nsf.engines.modal.mirrors import edits
+from nsf.engines.operators import random_values
 from nsf.errors import ConfigError, DeviceError
 from nsf.kinematics.fields.basis import BasisField
 from nsf.kinematics.fields.mlp import MlpField
@@ -32,6 +34,10 @@ _SCENE_KEYS = ("scale", "material", "transfer")
 _STORED = {"float32": FP32, "float64": FP64}
 #: Keys that no scene is built from, without their values.
 _REST = dict.fromkeys(("field", "trainer", "method", "sampler", "evaluation", "report", "latent_dim"))
+#: Values between the training ones whose runs decide which round of teaching is kept.
+HELD_BACK = 3
+#: Engines that operators can be taught by.
+TEACHERS = tuple(name for name in ENGINES if name != Operators.name)
 #: What this process has checked; the jobs of a sweep ask the same thing again and again, for seconds.
 _PASSED: set[str] = set()
 
@@ -76,6 +82,10 @@ class Plan:
             setattr(self, name, configuration.build(c[name], name))
         # A configuration from before there were engines has no such key.
         self.engine = OmegaConf.select(c, "engine.name", default="auto")
+        self.teaching = None
+        if self.engine == Operators.name:
+            self.teaching = configuration.build(c.engine.teaching, "engine.teaching")
+            _one_of("engine.teacher", c.engine.teacher, TEACHERS)
         self._check_numbers()
         self._check_words()
         self._check_batch()
@@ -159,6 +169,11 @@ class Plan:
             for multiplier in (1.0, self.config.deploy.dt_multiplier):
                 check_colliders(scene.colliders, grid, multiplier * scene.dt)
         _PASSED.add(asked)
+
+    @property
+    def projecting(self) -> str:
+        """The engine of steps that are projected: that which is asked for, or which operators learn from."""
+        return self.engine if self.teaching is None else self.config.engine.teacher
 
     @property
     def held_out(self) -> tuple[float, ...]:
@@ -265,7 +280,46 @@ class Plan:
             content["engine"] = self.engine
         if changed := edits():  # an edited step is another run, whose result is not there yet
             content["edited"] = changed
-        return Run.open("deploy", self.scene.name, content, [self.training], root=self.root)
+        parents = [self.training] if self.teaching is None else [self.training, self.taught]
+        return Run.open("deploy", self.scene.name, content, parents, root=self.root)
+
+    @property
+    def taught(self) -> Run:
+        """The run of the operators.
+
+        Raises:
+            ConfigError: the engine that is asked for learns nothing.
+        """
+        if self.teaching is None:
+            raise ConfigError(f"engine={self.engine} is not taught; set engine=operators")
+        content = (
+            self._content(("method", "sampler", "projector", "integration", "precision", "seed"))
+            | self._physics(self.scene)
+            | {
+                "teaching": asdict(self.teaching),
+                "teacher": self.config.engine.teacher,
+                "values": self.lessons,
+                "validation": list(self.split.validation),
+                "dt_multiplier": self.config.deploy.dt_multiplier,
+                "device": self.device,
+            }
+        )
+        if changed := edits():
+            content["edited"] = changed
+        return Run.open("teach", self.scene.name, content, [self.training], root=self.root)
+
+    @property
+    def lessons(self) -> list[list[float]]:
+        """Values of three kinds that the teacher is asked at: of training, between them, and held back.
+
+        Runs at those held back decide which round of teaching is kept, where there are no validation values.
+        None is a validation or test value.
+        """
+        known, seed = sorted(self.split.train), int(self.config.seed)
+        taken = [*known, *self.split.validation, *self.split.test]
+        between = random_values((known[0], known[-1]), len(known), seed, taken)
+        back = random_values((known[0], known[-1]), HELD_BACK, seed + 1, [*taken, *between])
+        return [known, between, back]
 
     @property
     def evaluation(self) -> Run:

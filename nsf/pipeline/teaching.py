@@ -1,84 +1,90 @@
 """The stage `teach`: operators of the deployed step, taught by another engine."""
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
+import time
 
 import torch
 
 from nsf.data import Trajectory
 from nsf.data.schema import TRAJECTORY
 from nsf.dynamics import ReducedBatch
-from nsf.engines.operators import Course, Taught, Teacher, Yardstick, random_values
+from nsf.engines.operators import Course, Taught, Teacher, Yardstick
 from nsf.kinematics.manifold import Manifold
+from nsf.progress import Progress
+from nsf.runs import Record
 
 #: File of a teach run with the operators.
 OPERATORS = "operators.pt"
-_HELD_BACK = 3  # values between the training ones whose runs decide which round is kept
-#: Gives the runs at some values, of the scene of training, by the teacher's engine.
-BatchesAt = Callable[[Sequence[float]], list[ReducedBatch]]
 
 
-def course_of(
-    pipeline,
-    manifold: Manifold,
-    batches_at: BatchesAt,
-    folder: Path | None,
-    told: Callable[[int], object],
-) -> tuple[Course, Taught]:
-    """A course of teaching for the configuration of a pipeline.
+def teach(pipeline, manifold: Manifold, record: Record) -> None:
+    """Teach the operators of a pipeline's configuration; finished rounds in the run's folder are taken up.
 
     Args:
         pipeline: a `nsf.pipeline.Pipeline`.
         manifold: its trained fields.
-        batches_at: as above.
-        folder: for rounds that are finished.
-        told: called with each number of teacher's steps.
-
-    Returns:
-        The course, and what is taught on.
+        record: of the run.
     """
-    split, seed, teaching = pipeline.split, int(pipeline.config.seed), pipeline.teaching
-    held_out = [*split.validation, *split.test]
-    known = sorted(split.train)
-    ranges = [(known[0], known[-1])]
-    between = random_values(ranges, len(known), seed, [*held_out, *known])
-    own, other = (Teacher(batches_at(values), told) for values in (known, between))
-    yardstick = _yardstick(pipeline, manifold, batches_at, ranges, [*known, *between], told)
-    truth = None
-    if pipeline.config.deploy.dt_multiplier == 1.0:
-        order = torch.as_tensor(sorted(range(len(known)), key=lambda i: split.train[i]))
-        latents = manifold.training_latents.detach().cpu().double()
-        truth = latents.unflatten(0, (len(known), -1)).transpose(0, 1)[:, order]
-    course = Course([own, other], truth, yardstick, teaching, seed, folder, pipeline.say)
-    first = batches_at(known[:1])[0].batch.shared
-    middle = own.gravity.mean(0)
-    reach = float((own.gravity - middle).norm(dim=1).max()) + course.reach
-    return course, Taught.of(first, middle.tolist(), reach)
+    started = time.perf_counter()
+    with Progress("teach", pipeline.teaching.steps, "teacher's steps") as progress:
+        known, between, _ = pipeline.lessons
+        lessons = [Teacher(_batches(pipeline, manifold, v), progress.advance) for v in (known, between) if v]
+        yardstick = _yardstick(pipeline, manifold, progress)
+        seed = int(pipeline.config.seed)
+        truth = _truth(pipeline, manifold)
+        course = Course(lessons, truth, yardstick, pipeline.teaching, seed, record.path, progress.describe)
+        before = time.perf_counter() - started
+        operators = course.follow()
+    taught = Taught.of(lessons[0].setup, *course.gravity)
+    operators.save(record.path / OPERATORS, taught)
+    record.output(OPERATORS)
+    for left in record.path.glob("round_*.pt"):
+        left.unlink()
+    record.metrics |= {
+        "teach_seconds": before + course.seconds,
+        "teacher_steps": course.steps,
+        "errors": course.errors,
+        "round": course.best,
+    }
 
 
-def _yardstick(pipeline, manifold, batches_at: BatchesAt, ranges, taken, told) -> Yardstick:
-    """Validation runs where there are any, else the teacher's own between the training values."""
-    split = pipeline.split
-    validation = list(split.validation) if pipeline.config.deploy.dt_multiplier == 1.0 else []
-    if validation:
-        values = validation
-    else:
-        taken = [*taken, *split.validation, *split.test]
-        values = random_values(ranges, _HELD_BACK, int(pipeline.config.seed) + 1, taken)
-    teacher = Teacher(batches_at(values), told)
-    span = batches_at(values[:1])[0].span_at(0)
-    at = manifold.restrict(torch.as_tensor(span.sets.sample), device="cpu")
+def _truth(pipeline, manifold: Manifold) -> torch.Tensor | None:
+    """[N + 1, K, r] training latents, by ascending value; None where a step is not one of theirs."""
+    if pipeline.config.deploy.dt_multiplier != 1.0:
+        return None
+    values = pipeline.split.train
+    order = sorted(range(len(values)), key=values.__getitem__)
+    latents = manifold.training_latents.detach().to("cpu", torch.float64)
+    return latents.unflatten(0, (len(values), -1)).transpose(0, 1)[:, order]
+
+
+def _yardstick(pipeline, manifold: Manifold, progress: Progress) -> Yardstick:
+    """Validation runs where there are any, else the teacher's own at values that are held back."""
+    frames = pipeline.config.deploy.dt_multiplier == 1.0
+    validation = list(pipeline.split.validation) if frames else []
+    teacher = Teacher(_batches(pipeline, manifold, validation or pipeline.lessons[2]), progress.advance)
+    sample = teacher.setup.samples[0].particles
+    at = manifold.restrict(torch.as_tensor(sample), device=manifold.X.device)
 
     def positions(run: torch.Tensor) -> torch.Tensor:
         with torch.no_grad():
-            return at.position(run)
+            return at.position(run.to(at.device)).cpu()
 
     if not validation:
-        runs = teacher.run()
-        return Yardstick(teacher, positions, torch.stack([positions(run) for run in runs.unbind(1)], 1))
+        return Yardstick(
+            teacher, positions, torch.stack([positions(run) for run in teacher.run().unbind(1)], 1)
+        )
     truths = []
     for value in validation:
         with Trajectory.open(pipeline.simulation(value).require().path / TRAJECTORY) as trajectory:
-            x = trajectory.read("x", particles=span.sets.sample)
+            x = trajectory.read("x", particles=sample)
             truths.append(torch.as_tensor(x, dtype=torch.float64))
     return Yardstick(teacher, positions, torch.stack(truths, 1))
+
+
+def _batches(pipeline, manifold: Manifold, values: list[float]) -> list[ReducedBatch]:
+    """Runs of the scene of training by the teacher's engine; one by one where it steps them so."""
+    asked = {"engine": pipeline.projecting, "scene": pipeline.scene}
+    first = pipeline.batch_at(manifold, values[:1], **asked)
+    if first.engine == "reference" or pipeline.integration.strategy == "search":
+        return [first, *(pipeline.batch_at(manifold, [value], **asked) for value in values[1:])]
+    return [pipeline.batch_at(manifold, values, **asked)]

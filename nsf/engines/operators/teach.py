@@ -115,19 +115,19 @@ class Labels:
         return cls(*(values[good] for values in rows))
 
 
-def random_values(ranges: Sequence[tuple[float, float]], count: int, seed: int, taken: Sequence[float]):
-    """Values between the training ones, spread evenly and shaken, and none of those that are held out.
+def random_values(ends: tuple[float, float], count: int, seed: int, taken: Sequence[float]) -> list[float]:
+    """Values in a range, spread evenly and shaken.
 
     Args:
-        ranges: of the problem parameter, which is one.
-        count: how many.
+        ends: of the range.
+        count: how many; one fewer for each that would be a value that is taken.
         seed: of the generator.
-        taken: held-out values.
+        taken: values that are left out.
     """
-    rng = np.random.default_rng(seed)
-    ((low, high),) = ranges
-    values = low + (high - low) * (np.arange(count) + rng.random(count)) / count
-    return [float(value) for value in values if not np.isclose(value, taken, rtol=1e-6).any()]
+    low, high = ends
+    shaken = (np.arange(count) + np.random.default_rng(seed).random(count)) / count
+    values = low + (high - low) * shaken
+    return [float(value) for value in values if not np.isclose(value, taken, rtol=1e-6, atol=0.0).any()]
 
 
 class Course:
@@ -142,6 +142,10 @@ class Course:
         seed: of network, states and batches.
         folder: where finished rounds are kept, for a teaching that is broken off; None for nowhere.
         say: told of each round.
+
+    Attributes:
+        errors: of each round by the yardstick; best: the round that is kept.
+        seconds: of all rounds [s].
     """
 
     def __init__(
@@ -156,7 +160,7 @@ class Course:
     ):
         self.teachers, self.yardstick, self.teaching, self.seed = teachers, yardstick, teaching, seed
         self._truth, self._folder, self._say = truth, folder, say
-        self.seconds = 0.0
+        self.seconds, self.best = 0.0, 0
         self.errors: list[float] = []
 
     @property
@@ -180,8 +184,8 @@ class Course:
             else:
                 self._take_up(kept)
             if kept["error"] < least:
-                best, least = kept["model"], kept["error"]
-            self._say(f"round {number}: {100 * kept['error']:.3g} % from the held-back runs")
+                best, least, self.best = kept["model"], kept["error"], number
+            self._say(f"round {number}: {100 * kept['error']:.3g} % off")
         if best is None:
             raise InstabilityError(
                 "no round of teaching gave operators whose runs stay finite; raise engine.teaching.steps or "
@@ -287,6 +291,13 @@ class Course:
         """How far gravity is varied [m/s²]; 0 where there is none."""
         largest = max(float(teacher.gravity.norm(dim=1).max()) for teacher in self.teachers)
         return self.teaching.gravity * largest
+
+    @property
+    def gravity(self) -> tuple[list[float], float]:
+        """The middle [3] of all gravity that was taught, and how far from it any was [m/s²]."""
+        known = self.teachers[0].gravity
+        middle = known.mean(0)
+        return middle.tolist(), float((known - middle).norm(dim=1).max()) + self.reach
 
     def _model(self, truth: Tensor, changes: Tensor) -> StepOperators:
         first = self.teachers[0]

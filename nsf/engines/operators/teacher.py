@@ -24,16 +24,17 @@ class Teacher:
     Attributes:
         parameters: μ [R, n]; gravity: [R, 3] [m/s²]; start: x̂_0 [R, r]; all in fp64 on the host.
         features: [N, R, f] state of the colliders at each step.
-        total_steps: N; dt: step [s]; steps: how many were taken here.
+        setup: of the first run. total_steps: N; dt: step [s]; steps: how many were taken here.
     """
 
     def __init__(self, batches: Sequence[ReducedBatch], told: Callable[[int], object] = lambda steps: None):
         self._batches, self._told, self.steps = batches, told, 0
         setups = [setup for batch in batches for setup in batch.batch.setups]
+        self.setup = setups[0]
         self.total_steps, self.dt = batches[0].total_steps, batches[0].dt
         self.parameters = _host(torch.stack([setup.parameters for setup in setups]))
         self.gravity = torch.tensor(np.array([setup.gravity for setup in setups]), dtype=torch.float64)
-        self.start = _host(torch.stack([setup.start for setup in setups]))
+        self.start = _host(torch.stack([setup.xhat for setup in setups]))
         states = [collider_states(setup.scene.colliders, self.dt, self.total_steps) for setup in setups]
         self.features = torch.as_tensor(np.stack(states, 1))
 
@@ -98,7 +99,7 @@ def first_changes(at_sample: Restriction, sample: np.ndarray, setups: Sequence[S
     rows, found = torch.as_tensor(sample).long(), []
     with torch.no_grad():
         for setup in setups:
-            _, jacobian = at_sample.position_and_jacobian(setup.start)
+            _, jacobian = at_sample.position_and_jacobian(setup.xhat)
             found.append(first_change(_host(jacobian), _host(setup.initial_velocity[rows]), setup.dt))
     return torch.stack(found)
 
