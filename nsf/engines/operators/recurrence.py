@@ -143,7 +143,7 @@ class Recurrence:
             held = folded(model, parameters)
             held["states"] = model.collider_state(features).flatten(1)
             held["gravity"] = (gravity - model.g_mean) / model.g_scale
-        held = {name: values.to(where, dtype).contiguous() for name, values in held.items()}
+        held = {name: values.detach().to(where, dtype).contiguous() for name, values in held.items()}
         none = torch.zeros(0, 0, dtype=torch.float64, device=where)
         held["push"] = none if push is None else push.flatten(1)
         self.latent, self.change = (none.new_zeros(count * r) for _ in range(2))

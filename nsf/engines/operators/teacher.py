@@ -73,6 +73,8 @@ class Teacher:
             record.now.copy_(xhat[rows])
             record.before.copy_(xhat[rows] - change[rows])
             record.row.fill_(step)
+            if step > 1:  # the inversion begins on the parabola through three, here a line
+                record.xhat[:, step - 2] = xhat[rows] - 2.0 * change[rows]
             forcing = as_tensor(batch.span_at(step).grid_step.gravity)
             forcing.copy_((self.gravity if gravity is None else gravity)[rows])
             batch.resume(step)
