@@ -3,7 +3,7 @@
 import io
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import h5py
@@ -12,6 +12,7 @@ import pytorch_lightning as pl
 import torch
 from torch.utils.data import DataLoader
 
+from nsf.deployment.levels import Levels
 from nsf.deployment.trust import LatentDistance, Trust, first_distrusted, training_values
 from nsf.dynamics import ReducedBatch, ReducedMPM
 from nsf.errors import SchemaError
@@ -47,6 +48,8 @@ class Rollout:
         diverged: step at which x̂ ceased to be finite or a sample particle left the grid, −1 when neither did.
         handed_over: step from whose state the full-order solver goes on, −1 when it does not. The steps then
             end with the first distrusted one.
+        by_operators: how many steps operators took, the first ones; the projected step took the others.
+        estimate: [N + 1] how far steps by operators are from projected ones, as far as is known [m].
     """
 
     parameter: float
@@ -61,6 +64,15 @@ class Rollout:
     seconds: float
     diverged: int
     handed_over: int = -1
+    by_operators: int = 0
+    estimate: np.ndarray | None = None
+
+    @property
+    def levels(self) -> list[str]:
+        """[N] who took each step, `operators` or `projected`, up to where the full-order solver went on."""
+        believed = len(self.stops) if self.handed_over < 0 else self.handed_over
+        own = min(self.by_operators, believed)
+        return ["operators"] * own + ["projected"] * (believed - own)
 
     @property
     def distrusted(self) -> int:
@@ -75,6 +87,8 @@ class Rollout:
             file.attrs.update({"nsf_rollout": _VERSION} | {name: getattr(self, name) for name in _SCALARS})
             for name in _ARRAYS:
                 file[name] = getattr(self, name)
+            if self.estimate is not None:
+                file.attrs["by_operators"], file["estimate"] = self.by_operators, self.estimate
             file["stops"] = np.array(self.stops, dtype=h5py.string_dtype())
         with writing(path) as partial:
             partial.write_bytes(memory.getbuffer())
@@ -96,6 +110,9 @@ class Rollout:
                 scalars = {name: file.attrs[name].item() for name in _SCALARS}
                 arrays = {name: file[name][()] for name in _ARRAYS}
                 stops = [s.decode() for s in file["stops"][()]]
+                if "estimate" in file:  # of a run by operators
+                    scalars["by_operators"] = file.attrs["by_operators"].item()
+                    arrays["estimate"] = file["estimate"][()]
         except (OSError, KeyError, RuntimeError) as error:
             raise SchemaError(
                 f"{path} is truncated or not a rollout ({error}); delete it and deploy again"
@@ -119,7 +136,7 @@ class Deployment(pl.LightningModule):
     Args:
         batch_at: as for `deploy`.
         trust: the estimate of whether to believe a run.
-        until_distrusted: as for `rollout`.
+        until_distrusted, levels: as for `rollouts`.
         progress: told of each run done.
     """
 
@@ -129,10 +146,11 @@ class Deployment(pl.LightningModule):
         trust: Trust,
         until_distrusted: bool,
         progress: Progress,
+        levels: Levels | None = None,
     ):
         super().__init__()
         self._batch_at, self._progress = batch_at, progress
-        self._how = trust, until_distrusted
+        self._how = trust, until_distrusted, levels
 
     def predict_step(self, batch: torch.Tensor, batch_idx: int) -> list[Rollout]:
         """Run each parameter value of a batch [B] from t = 0 to T; they take their steps together."""
@@ -157,7 +175,11 @@ def rollout(solver: ReducedMPM, parameter: float, trust: Trust, until_distrusted
 
 
 def rollouts(
-    batch: ReducedBatch, parameters: Sequence[float], trust: Trust, until_distrusted: bool = False
+    batch: ReducedBatch,
+    parameters: Sequence[float],
+    trust: Trust,
+    until_distrusted: bool = False,
+    levels: Levels | None = None,
 ) -> list[Rollout]:
     """Run a batch to the end of its scene.
 
@@ -165,11 +187,21 @@ def rollouts(
         batch: at t = 0.
         parameters: value of the problem parameter of each run, for the record.
         trust, until_distrusted: as for `rollout`; steps are taken for as long as any run is to be believed.
+        levels: who goes on with runs by operators, and how these are watched; their time counts too. None
+            where no operators step, or nobody looks.
     """
-    seconds = _timed_run(batch, trust if until_distrusted else None) / len(batch)
+    if levels is None:
+        seconds = _timed_run(batch, trust if until_distrusted else None) / len(batch)
+        watched = [(run, None, 0) for run in batch.runs]
+    else:
+        seconds, started = _timed_run(batch, None), time.perf_counter()
+        watched = levels.watched(batch, parameters, trust)
+        seconds = (seconds + time.perf_counter() - started) / len(batch)
     return [
-        _rollout_of(run, value, trust, until_distrusted, seconds)
-        for run, value in zip(batch.runs, parameters, strict=True)
+        replace(
+            _rollout_of(run, value, trust, until_distrusted, seconds), by_operators=own, estimate=estimate
+        )
+        for (run, estimate, own), value in zip(watched, parameters, strict=True)
     ]
 
 
@@ -282,6 +314,7 @@ def deploy(
     trust: Trust,
     until_distrusted: bool = False,
     batch: int = 1,
+    levels: Levels | None = None,
 ) -> list[Rollout]:
     """Reduced runs at every parameter value, with a progress bar.
 
@@ -289,7 +322,7 @@ def deploy(
         batch_at: some parameter values and device name → their runs at t = 0.
         values: parameter values.
         device: `cpu`, `cuda` or `cuda:N`.
-        trust, until_distrusted: as for `rollout`.
+        trust, until_distrusted, levels: as for `rollouts`.
         batch: most values that take their steps together.
 
     Raises:
@@ -308,7 +341,7 @@ def deploy(
             inference_mode=False,  # torch's inference tensors could not be updated in place between steps
         )
         try:
-            deployment = Deployment(batch_at, trust, until_distrusted, progress)
+            deployment = Deployment(batch_at, trust, until_distrusted, progress, levels)
             batches = trainer.predict(deployment, loader)
         except SystemExit as stop:
             raise KeyboardInterrupt from stop

@@ -14,7 +14,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nsf.data import Snapshots, Trajectory
 from nsf.data.schema import TRAJECTORY
-from nsf.deployment import Rollout, calibrate, continuation_file, deploy, go_on, rollout_file
+from nsf.deployment import Levels, Rollout, calibrate, continuation_file, deploy, go_on, rollout_file
 from nsf.dynamics import ParticleSets, ReducedBatch, ReducedMPM
 from nsf.dynamics.setup import reduced_steps
 from nsf.engines import Engine, Operators
@@ -265,7 +265,8 @@ class Pipeline(Plan):
                 record.metrics |= {"engine": batch.engine, "engine_why": batch.why}
                 return batch
 
-            rollouts = deploy(batch_at, self.held_out, self.device, trust, hand_over, together)
+            levels = self._levels(manifold)
+            rollouts = deploy(batch_at, self.held_out, self.device, trust, hand_over, together, levels)
             engine, why = record.metrics["engine"], record.metrics["engine_why"]
             self.say(f"deploy: engine {engine}" + (f", since {why}" if why else ""))
             for index, rollout in enumerate(rollouts):
@@ -279,6 +280,7 @@ class Pipeline(Plan):
             # Runs that took their steps together share the time of these equally.
             record.metrics["batch"] = together
             record.metrics["seconds"] = [r.seconds for r in rollouts]
+            record.metrics["by_operators"] = [r.by_operators for r in rollouts]
             record.metrics["needed_outside"] = max(r.needed_outside for r in rollouts)
             record.metrics["diverged"] = [r.parameter for r in rollouts if r.diverged >= 0]
             record.metrics["distrusted"] = [r.parameter for r in rollouts if r.distrusted >= 0]
@@ -286,6 +288,18 @@ class Pipeline(Plan):
         self.say(
             f"deploy: method={self.config.method.name}, |S|={rollouts[0].sample}, "
             f"{len(rollouts)} values{at_once} → {run.id}"
+        )
+
+    def _levels(self, manifold: Manifold) -> Levels | None:
+        """How runs by operators are watched, and who goes on with them."""
+        if self.teaching is None:
+            return None
+        asked = self.config.deploy
+        return Levels(
+            partial(self.batch_at, manifold, engine=self.projecting),
+            self.config.engine.check,
+            asked.tolerance,
+            asked.on_distrust != "report",
         )
 
     def _write_configuration(self, record: Record) -> None:
@@ -308,6 +322,8 @@ class Pipeline(Plan):
 
     def _warn(self, rollout: Rollout) -> None:
         value = self._named(rollout)
+        if (own := rollout.by_operators) < len(rollout.stops) and rollout.estimate is not None:
+            self.say(f"deploy: {value}: the projected step goes on from t = {rollout.t[own]:.4g} s")
         if rollout.diverged >= 0:
             self.say(
                 f"deploy: warning: {value} diverged at step {rollout.diverged} (off the grid or not finite); "
@@ -344,10 +360,12 @@ class Pipeline(Plan):
             ]
             cost = self._cost(manifold)
             engine = deployment.manifest["metrics"].get("engine", "")
-            table = results.rows(
-                self.config, manifold, rollouts, comparisons, cost, self.device, run.manifest, engine
-            )
             seconds = self.training.manifest["metrics"]["training_seconds"]
+            teaching = 0.0 if self.teaching is None else self.taught.manifest["metrics"]["teach_seconds"]
+            offline = seconds, teaching
+            table = results.rows(
+                self.config, manifold, rollouts, comparisons, cost, self.device, run.manifest, engine, offline
+            )
             summary = results.summarise(self.deployed, manifold, table, comparisons, rollouts, seconds)
             results.write(record, table, comparisons, cost, summary)
         self.say(f"evaluate: mean δ {100 * table['delta'].mean():.3g} % over {len(table)} values → {run.id}")

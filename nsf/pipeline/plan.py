@@ -130,7 +130,8 @@ class Plan:
         c = self.config
         _one_of("engine.name", self.engine, ENGINES)
         _one_of("deploy.split", c.deploy.split, ("test", "validation", "train"))
-        _one_of("deploy.on_distrust", c.deploy.on_distrust, ("report", "full_order"))
+        _one_of("deploy.on_distrust", c.deploy.on_distrust, ("report", "projected", "full_order"))
+        self._check_levels()
         check_tracking(c.tracking)
         _one_of("data.resident", c.data.resident, (True, False, "auto"))
         _one_of("data.keep", c.data.keep, ("all", "held_out"))
@@ -143,6 +144,21 @@ class Plan:
                 f"trainer.devices={self.trainer.devices} is for field=mlp; this field takes all snapshots in "
                 "every step, in seconds: set trainer.devices=1"
             )
+
+    def _check_levels(self) -> None:
+        """Who goes on with a run by operators; no other engine has an estimate, or a level below."""
+        asked = self.config.deploy
+        tolerance = OmegaConf.select(asked, "tolerance", default=None)
+        if self.teaching is None:
+            if asked.on_distrust == "projected" or tolerance is not None:
+                key = "tolerance" if tolerance is not None else "on_distrust"
+                raise ConfigError(
+                    f"deploy.{key}={asked[key]} needs engine=operators; set it, or leave it out"
+                )
+            return
+        configuration.number("engine.check", self.config.engine.check, least=1, whole=True)
+        if tolerance is not None and not configuration.number("deploy.tolerance", tolerance) > 0:
+            raise ConfigError(f"deploy.tolerance={tolerance} m must be positive, or null for none")
 
     def _changed(self, changes: DictConfig | None) -> Scene:
         """The scene of the held-out simulations and of deployment."""
@@ -278,6 +294,8 @@ class Plan:
             content["arithmetic"] = self.field.arithmetic
         if self.engine != "auto":
             content["engine"] = self.engine
+        if self.teaching is not None:
+            content |= {"check": self.config.engine.check, "tolerance": self.config.deploy.tolerance}
         if changed := edits():  # an edited step is another run, whose result is not there yet
             content["edited"] = changed
         parents = [self.training] if self.teaching is None else [self.training, self.taught]

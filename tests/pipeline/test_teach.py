@@ -8,7 +8,8 @@ import pandas as pd
 import pytest
 import torch
 
-from nsf.deployment import Rollout, rollout
+from nsf.deployment import Levels, Rollout, rollout, rollouts
+from nsf.deployment.levels import estimated_errors
 from nsf.dynamics import Method, Taylor
 from nsf.engines import Operators
 from nsf.engines.operators import Course
@@ -245,3 +246,101 @@ def test_what_operators_were_not_taught_on_is_refused(reduced, lesson, tiny_mani
 def test_a_name_is_not_enough(chain, tiny_manifold):
     with pytest.raises(ConfigError, match=re.escape("give engine=nsf.engines.Operators.load(FILE)")):
         chain.scene.reduced(tiny_manifold, ANGLE, 20, engine="operators", device="cpu")
+
+
+# -- levels ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def levels_of(lesson):
+    pipeline, _ = lesson
+    manifold = pipeline.manifold()
+
+    def build(*how, every=4):
+        return Levels(lambda values: pipeline.batch_at(manifold, values, engine="auto"), every, *how)
+
+    return build
+
+
+def test_the_estimate_is_how_far_projected_runs_are(reduced, lesson, levels_of):
+    pipeline, _ = lesson
+    values = [23.0, 26.0]
+    batch = pipeline.batch_at(pipeline.manifold(), values)
+    batch.step(24)
+    projected = levels_of().projected(values)
+    found = estimated_errors(batch, projected, 1)
+    projected.restart()
+    projected.step(24)
+    at = batch.span.at_sample
+    for run, other, estimate in zip(batch.runs, projected.runs, found, strict=True):
+        off = at.position(run.record.xhat) - at.position(other.record.xhat)
+        error = off.square().sum(-1).mean(-1).sqrt().numpy()
+        assert error[-1] > 1e-4
+        # Of operators that were hardly taught, which carry a defect on as badly as they step.
+        assert 0.3 * error.max() < estimate.max() < 5.0 * error.max()
+    assert (batch.batch.record.residuals[:, 1:, -1] > 0).all()
+
+
+def test_beyond_a_tolerance_the_projected_step_goes_on(reduced, levels_of, tiny_trust):
+    own = rollouts(reduced().together, [26.0], tiny_trust, levels=levels_of())[0]
+    assert (own.by_operators, own.levels) == (24, ["operators"] * 24)
+    assert own.estimate[0] == 0.0 < own.estimate[-1]
+    tolerance = 0.5 * float(own.estimate.max())
+    found = rollouts(reduced().together, [26.0], tiny_trust, levels=levels_of(tolerance))[0]
+    n = found.by_operators
+    assert 0 < n < 24
+    assert found.levels == ["operators"] * n + ["projected"] * (24 - n)
+    assert found.estimate[n] <= tolerance
+    np.testing.assert_array_equal(found.xhat[: n + 1], own.xhat[: n + 1])
+    projected = reduced(engine="auto")
+    for name, values in (("now", own.xhat[n]), ("before", own.xhat[n - 1])):
+        getattr(projected.record, name).copy_(torch.as_tensor(values))
+    projected.record.xhat[: n + 1] = torch.as_tensor(own.xhat[: n + 1])
+    projected.record.row.fill_(n)
+    projected.together.resume(n)
+    projected.step(24 - n)
+    np.testing.assert_allclose(found.xhat[-1], projected.state.xhat, rtol=0, atol=1e-12)
+
+
+def test_what_is_doubted_is_projected_and_what_is_off_goes_to_full_order(reduced, levels_of, tiny_trust):
+    outside = {"friction_angle": 60.0}
+    solver = reduced(parameters=outside)
+    found = rollouts(solver.together, [60.0], tiny_trust, levels=levels_of(None, True))[0]
+    assert (found.by_operators, found.levels) == (0, ["projected"] * 24)
+    assert reduced().doubt[0] <= 1.0
+    plain = rollouts(reduced(parameters=outside).together, [60.0], tiny_trust, levels=levels_of())[0]
+    assert plain.by_operators == 24
+    assert (plain.trust > 1.0).all()  # never without saying so
+    handed = rollouts(reduced(parameters=outside).together, [60.0], tiny_trust, True, levels_of(None, True))[
+        0
+    ]
+    assert handed.handed_over == -1 or handed.levels == ["projected"] * handed.handed_over
+
+
+def test_a_rollout_keeps_who_took_its_steps(lesson, tmp_path):
+    pipeline, _ = lesson
+    kept = Rollout.open(pipeline.deployment.path / "rollout_0.h5")
+    assert kept.by_operators == 24
+    assert kept.estimate.shape == (25,)
+    assert pipeline.deployment.manifest["metrics"]["by_operators"] == [24]
+    row = pd.read_csv(pipeline.evaluation.path / "results.csv").iloc[0]
+    assert row["handed_over"] == 0.0
+    assert row["teach_seconds"] == pytest.approx(pipeline.taught.manifest["metrics"]["teach_seconds"])
+    offline = row["teach_seconds"] + pipeline.training.manifest["metrics"]["training_seconds"]
+    assert row["break_even_runs"] > offline / (1e-3 * 40 * row["step_ms_full"])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (("deploy.tolerance=0.001",), "deploy.tolerance=0.001 needs engine=operators"),
+        (("deploy.on_distrust=projected",), "deploy.on_distrust=projected needs engine=operators"),
+        ((*TAUGHT, "deploy.tolerance=-1.0"), "deploy.tolerance=-1.0 m must be positive, or null"),
+        ((*TAUGHT, "engine.check=0"), "engine.check=0 must be a whole number of at least 1"),
+        ((*TAUGHT, "engine.teacher=operators"), "engine.teacher=operators is unknown"),
+        ((*TAUGHT, "engine.teaching.width=0"), "engine.teaching: width=0 must be at least 1"),
+    ],
+)
+def test_what_cannot_be_asked_for(pipeline_at, tmp_path, overrides, message):
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        pipeline_at(tmp_path, *overrides)

@@ -1,6 +1,7 @@
 """The engine that steps by operators, and what it refuses."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -9,6 +10,7 @@ import torch
 from typing_extensions import override
 
 from nsf.dynamics.batch import Batch
+from nsf.dynamics.latent import LatentRecord
 from nsf.dynamics.setup import Setup
 from nsf.dynamics.span import Span, Stages
 from nsf.engines.base import Engine
@@ -83,21 +85,23 @@ class OperatorRun:
             states = states[:1]
         parameters = torch.stack([setup.parameters for setup in setups])
         gravity = torch.tensor(np.array([setup.gravity for setup in setups]), dtype=torch.float64)
-        self.recurrence = Recurrence(
-            model,
-            parameters.to("cpu", torch.float64),
-            gravity,
-            torch.as_tensor(np.stack(states)),
-            batch.record,
-            one.precision,
-            one.device,
-        )
+        given = parameters.to("cpu", torch.float64), gravity, torch.as_tensor(np.stack(states))
+        self._of = partial(Recurrence, model, *given, precision=one.precision, device=one.device)
+        self.recurrence = self._of(record=batch.record)
 
     def enter(self, first: bool) -> None:
         """Begin with the latents of the record."""
         now, before = (latest.double() for latest in (self._record.now, self._record.before))
-        self.recurrence.latent.view_as(now).copy_(now)
-        self.recurrence.change.view_as(now).copy_(self._first if first else now - before)
+        self.recurrence.begin(now, self._first if first else now - before)
+
+    def pushed(self, push: torch.Tensor) -> torch.Tensor:
+        """[B, N + 1, r] latents of the same runs from t = 0, with [B, N, r] added to their changes."""
+        start, steps = self._record.xhat[:, 0], push.shape[1]
+        record = LatentRecord(start, steps, 1)
+        again = self._of(record=record, push=push.to(start.device))
+        again.begin(start, self._first)
+        again.advance(steps)
+        return record.xhat
 
 
 class OperatorSpan(Span):
@@ -126,6 +130,10 @@ class OperatorSpan(Span):
     @override
     def take(self, steps: int) -> None:
         self._run.recurrence.advance(steps)
+
+    def pushed(self, push: torch.Tensor) -> torch.Tensor:
+        """As `OperatorRun.pushed`."""
+        return self._run.pushed(push)
 
     @property
     @override

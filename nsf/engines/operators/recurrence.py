@@ -123,7 +123,7 @@ class Recurrence:
         push: [B, N, r] added to each change; None for nothing.
 
     Attributes:
-        latent, change: [B, r] x̂_n and d, in fp64.
+        latent, change: [B r] x̂_n and d, in fp64.
     """
 
     def __init__(
@@ -157,6 +157,11 @@ class Recurrence:
         self._kernel = make_recurrence(precision, model.sizes, push is not None)
         self._lanes = block_of(model.sizes.width) if device.is_cuda else 1
         self._count, self._device = count, device
+
+    def begin(self, xhat: torch.Tensor, change: torch.Tensor) -> None:
+        """Go on from x̂_n and d [B, r]."""
+        self.latent.view(self._count, -1).copy_(xhat)
+        self.change.view(self._count, -1).copy_(change)
 
     def advance(self, steps: int) -> None:
         """Take steps of every run, in one launch."""
