@@ -11,6 +11,7 @@ STAGES = {
     "run": "the whole chain: simulate, train, deploy, evaluate, report; unchanged stages are reused",
     "simulate": "full-order trajectories of every parameter value",
     "train": "the manifold: encoder and deformation, stress and affine fields",
+    "teach": "the operators of the reduced step, for engine=operators, which deploy asks for by itself",
     "deploy": "reduced runs at the held-out parameter values",
     "evaluate": "errors and costs of the reduced runs beside the full-order ones",
     "report": "tables, charts and pictures of every evaluated variant of the scene",

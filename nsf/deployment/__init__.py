@@ -1,6 +1,7 @@
 """Reduced runs at held-out values: their rollouts, whether to believe them, who goes on where not."""
 
 from nsf.deployment.handover import go_on, hand_over
+from nsf.deployment.levels import Levels
 from nsf.deployment.rollout import (
     Rollout,
     calibrate,
@@ -13,6 +14,7 @@ from nsf.deployment.rollout import (
 from nsf.deployment.trust import Trust
 
 __all__ = [
+    "Levels",
     "Rollout",
     "Trust",
     "calibrate",

@@ -4,7 +4,7 @@ import io
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import h5py
@@ -14,6 +14,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from nsf.data import hdf5
+from nsf.deployment.levels import Levels
 from nsf.deployment.trust import LatentDistance, Trust, first_distrusted, training_values
 from nsf.dynamics import STOP_REASONS, ReducedBatch, ReducedMPM
 from nsf.errors import SchemaError
@@ -51,6 +52,8 @@ class Rollout:
         diverged: step at which x̂ ceased to be finite or a sample particle left the grid, −1 when neither did.
         handed_over: step from whose state the full-order solver goes on, −1 when it does not. The steps then
             end with the first distrusted one.
+        by_operators: how many steps operators took, the first ones; the projected step took the others.
+        estimate: [N + 1] how far steps by operators are from projected ones, as far as is known [m].
     """
 
     parameter: float
@@ -65,6 +68,15 @@ class Rollout:
     seconds: float
     diverged: int
     handed_over: int = -1
+    by_operators: int = 0
+    estimate: np.ndarray | None = None
+
+    @property
+    def levels(self) -> list[str]:
+        """[N] who took each step, `operators` or `projected`, up to where the full-order solver went on."""
+        believed = len(self.stops) if self.handed_over < 0 else self.handed_over
+        own = min(self.by_operators, believed)
+        return ["operators"] * own + ["projected"] * (believed - own)
 
     @property
     def distrusted(self) -> int:
@@ -79,6 +91,8 @@ class Rollout:
             file.attrs.update({"nsf_rollout": _VERSION} | {name: getattr(self, name) for name in _SCALARS})
             for name in _ARRAYS:
                 file[name] = getattr(self, name)
+            if self.estimate is not None:
+                file.attrs["by_operators"], file["estimate"] = self.by_operators, self.estimate
             file["stops"] = np.array(self.stops, dtype=h5py.string_dtype())
         with writing(path) as partial:
             partial.write_bytes(memory.getbuffer())
@@ -107,6 +121,9 @@ class Rollout:
             shapes = {"xhat": (len(t), latent_dim), "residuals": (len(t) - 1, None), "trust": (len(t),)}
             arrays = {name: hdf5.array(file, name, _REAL, shape)[()] for name, shape in shapes.items()}
             stops = hdf5.texts(file, "stops", (len(t) - 1,))
+            if "estimate" in file:  # of a run by operators
+                scalars["by_operators"] = hdf5.attribute(file, "by_operators", int)
+                arrays["estimate"] = hdf5.array(file, "estimate", _REAL, (len(t),))[()]
             found = cls(**scalars, t=t, **arrays, stops=stops)
             found._check()
         return found
@@ -119,6 +136,7 @@ class Rollout:
             ("needed_outside", 0, np.inf),
             ("diverged", -1, steps),
             ("handed_over", -1, steps),
+            ("by_operators", 0, steps),
             ("seconds", 0, np.inf),
             ("integration_mean", 0, np.inf),
         ):
@@ -130,8 +148,10 @@ class Rollout:
         )
         hdf5.check("xhat", self.xhat[: max(0, last) + 1])
         hdf5.check("residuals", self.residuals[: max(0, last)])
-        if not (self.trust >= 0).all():
-            raise SchemaError("has values of trust that are negative or no numbers")
+        for name in ("trust", "estimate"):
+            values = getattr(self, name)
+            if values is not None and not (values >= 0).all():
+                raise SchemaError(f"has values of {name} that are negative or no numbers")
         if unknown := set(self.stops) - set(STOP_REASONS):
             raise SchemaError(f"has stops={sorted(unknown)[0]!r}, which is no reason to stop")
 
@@ -152,7 +172,7 @@ class Deployment(pl.LightningModule):
     Args:
         batch_at: as for `deploy`.
         trust: the estimate of whether to believe a run.
-        until_distrusted: as for `rollout`.
+        until_distrusted, levels: as for `rollouts`.
         progress: told of each run done.
     """
 
@@ -162,10 +182,11 @@ class Deployment(pl.LightningModule):
         trust: Trust,
         until_distrusted: bool,
         progress: Progress,
+        levels: Levels | None = None,
     ):
         super().__init__()
         self._batch_at, self._progress = batch_at, progress
-        self._how = trust, until_distrusted
+        self._how = trust, until_distrusted, levels
 
     def predict_step(self, batch: torch.Tensor, batch_idx: int) -> list[Rollout]:
         """Run each parameter value of a batch [B] from t = 0 to T; they take their steps together."""
@@ -190,7 +211,11 @@ def rollout(solver: ReducedMPM, parameter: float, trust: Trust, until_distrusted
 
 
 def rollouts(
-    batch: ReducedBatch, parameters: Sequence[float], trust: Trust, until_distrusted: bool = False
+    batch: ReducedBatch,
+    parameters: Sequence[float],
+    trust: Trust,
+    until_distrusted: bool = False,
+    levels: Levels | None = None,
 ) -> list[Rollout]:
     """Run a batch to the end of its scene.
 
@@ -198,11 +223,21 @@ def rollouts(
         batch: at t = 0.
         parameters: value of the problem parameter of each run, for the record.
         trust, until_distrusted: as for `rollout`; steps are taken for as long as any run is to be believed.
+        levels: who goes on with runs by operators, and how these are watched; their time counts too. None
+            where no operators step, or nobody looks.
     """
-    seconds = _timed_run(batch, trust if until_distrusted else None) / len(batch)
+    if levels is None:
+        seconds = _timed_run(batch, trust if until_distrusted else None) / len(batch)
+        watched = [(run, None, 0) for run in batch.runs]
+    else:
+        seconds, started = _timed_run(batch, None), time.perf_counter()
+        watched = levels.watched(batch, parameters, trust)
+        seconds = (seconds + time.perf_counter() - started) / len(batch)
     return [
-        _rollout_of(run, value, trust, until_distrusted, seconds)
-        for run, value in zip(batch.runs, parameters, strict=True)
+        replace(
+            _rollout_of(run, value, trust, until_distrusted, seconds), by_operators=own, estimate=estimate
+        )
+        for (run, estimate, own), value in zip(watched, parameters, strict=True)
     ]
 
 
@@ -267,6 +302,9 @@ def _ratios(solver: ReducedMPM, trust: Trust, diverged: int) -> np.ndarray:
     """Trust of the steps taken [n + 1]; ∞ from the step at which the run diverged."""
     latent = solver.trajectory()
     ratios = trust.ratios(latent.xhat, latent.residuals[:, -1])
+    off, _ = solver.doubt
+    if off > 1.0:
+        ratios = np.maximum(ratios, off)
     if diverged >= 0:
         ratios[diverged:] = np.inf
     return ratios
@@ -312,6 +350,7 @@ def deploy(
     trust: Trust,
     until_distrusted: bool = False,
     batch: int = 1,
+    levels: Levels | None = None,
 ) -> list[Rollout]:
     """Reduced runs at every parameter value, with a progress bar.
 
@@ -319,7 +358,7 @@ def deploy(
         batch_at: some parameter values and device name → their runs at t = 0.
         values: parameter values.
         device: `cpu`, `cuda` or `cuda:N`.
-        trust, until_distrusted: as for `rollout`.
+        trust, until_distrusted, levels: as for `rollouts`.
         batch: most values that take their steps together.
 
     Raises:
@@ -338,7 +377,7 @@ def deploy(
             inference_mode=False,  # torch's inference tensors could not be updated in place between steps
         )
         try:
-            deployment = Deployment(batch_at, trust, until_distrusted, progress)
+            deployment = Deployment(batch_at, trust, until_distrusted, progress, levels)
             batches = trainer.predict(deployment, loader)
         except SystemExit as stop:
             raise KeyboardInterrupt from stop

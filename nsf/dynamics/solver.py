@@ -1,7 +1,7 @@
 """The reduced-order solver: what a user holds (paper section 5)."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -19,6 +19,8 @@ from nsf.kinematics.manifold import Restriction
 from nsf.mpm.shape import DEGREES
 from nsf.timing import StageTimer, untimed
 
+_CHUNK = 2**22  # positions of sample particles decoded at once [values]
+
 
 class ReducedBatch:
     """Steps the latent vectors of B runs together; one run is a batch of one.
@@ -31,10 +33,11 @@ class ReducedBatch:
         spans_of: gives what takes the steps of each span of time, as `Engine.spans`; those of the reference
             by default.
         engine, why: name of the engine that gives them, and the reason for its choice; for the record.
+        doubts: of each run, as `Engine.doubt` gives it; none by default.
 
     Attributes:
         batch: setups, record of the latent vectors, colliders and walls.
-        engine, why: as given.
+        engine, why, doubts: as given.
         steps_taken, total_steps: taken, and those to the end of the scene.
         dt: step [s]; device: Warp device.
 
@@ -50,9 +53,11 @@ class ReducedBatch:
         spans_of: Callable[[Batch], Sequence[Span]] = steps_of,
         engine: str = "reference",
         why: str = "",
+        doubts: Sequence[tuple[float, str]] = (),
     ):
         self.batch = Batch.of(setups)
         self.engine, self.why = engine, why
+        self.doubts = tuple(doubts) or ((0.0, ""),) * len(setups)
         shared = self.batch.shared
         self.dt, self.total_steps, self.device = shared.dt, shared.total_steps, shared.device
         self.steps_taken = 0
@@ -91,11 +96,12 @@ class ReducedBatch:
         """What takes the step that starts `step` steps after t = 0."""
         return self._spans[max(i for i, start in enumerate(self._starts) if start <= step)]
 
-    def steps_by_span(self) -> list[tuple[int, Span]]:
-        """How many of the steps taken each span of time has had."""
+    def steps_by_span(self, since: int = 0) -> list[tuple[int, Span]]:
+        """How many of the steps taken, those before `since` left out, each span of time has had."""
         ends = [*self._starts[1:], self.total_steps]
         counts = (
-            max(0, min(self.steps_taken, end) - start) for start, end in zip(self._starts, ends, strict=True)
+            max(0, min(self.steps_taken, end) - max(start, since))
+            for start, end in zip(self._starts, ends, strict=True)
         )
         return list(zip(counts, self._spans, strict=True))
 
@@ -121,26 +127,41 @@ class ReducedBatch:
             raise ConfigError(
                 f"{self.steps_taken} + {n} steps pass the end of the scene, {self.total_steps} steps"
             )
+        last = self.steps_taken + n
         with torch.no_grad():
-            for _ in range(n):
-                self._step(self._advance)
+            while self.steps_taken < last:
+                self._begin_step()
+                if self._span.latent_only:
+                    taken = min(last, self._end_of_span()) - self.steps_taken
+                    self._span.take(taken)
+                else:
+                    taken = 1
+                    self._advance()
+                self.steps_taken += taken
 
     def timed_step(self, timer: StageTimer) -> None:
         """One step, stage by stage under a timer; captured anew where steps are captured."""
         with torch.no_grad():
-            self._step(partial(self._advance_timed, timer))
+            self._begin_step()
+            self._advance_timed(timer)
+            self.steps_taken += 1
 
     @property
     def stages(self) -> Stages:
         """One step, stage by stage, in order."""
         return self._span.stages
 
-    def _step(self, advance: Callable[[], None]) -> None:
+    def _begin_step(self) -> None:
+        """Be in the span of time that the next step is of."""
         span = self.span_at(self.steps_taken)
-        if span is not self._span:
+        if span.latent_only:
+            self._span = span
+        elif span is not self._span:
             self._enter(span)
-        advance()
-        self.steps_taken += 1
+
+    def _end_of_span(self) -> int:
+        """Step with which the next span of time begins, or the scene's end."""
+        return min([start for start in self._starts if start > self.steps_taken], default=self.total_steps)
 
     def _enter(self, span: Span) -> None:
         """Give the span the state one step back, which the backward difference needs."""
@@ -232,6 +253,11 @@ class ReducedMPM:
         return self.together.engine
 
     @property
+    def doubt(self) -> tuple[float, str]:
+        """How far the run's input lies outside of what its engine learned from; see `Engine.doubt`."""
+        return self.together.doubts[self.index]
+
+    @property
     def nbytes(self) -> int:
         """Bytes that the solver's arrays and fields take on the device, of the whole batch."""
         return self.together.nbytes
@@ -248,7 +274,10 @@ class ReducedMPM:
 
     def trajectory(self) -> LatentTrajectory:
         """Everything recorded up to now, on the host."""
-        return self.record.trajectory(self.steps_taken, self.dt, self.setup.projector.tolerance)
+        found = self.record.trajectory(self.steps_taken, self.dt, self.setup.projector.tolerance)
+        if self.span.latent_only:  # nothing was projected, so nothing stopped
+            found = replace(found, stops=[self.engine] * self.steps_taken)
+        return found
 
     @property
     def sample_size(self) -> int:
@@ -283,18 +312,22 @@ class ReducedMPM:
         Such a particle no longer takes part in a step, so what follows is no reduced model of anything;
         the full-order solver stops there. For after a run.
         """
-        for n in range(since, self.steps_taken + 1):
-            x = self.together.span_at(n - 1).at_sample.position(self.record.xhat[n])
-            if not bool(self._on_grid(x).all()):
-                return n
+        first = since
+        for count, span in self.together.steps_by_span(since - 1):
+            rows = max(1, _CHUNK // (3 * span.s))
+            for xhat in self.record.xhat[first : first + count].split(rows):
+                lost = ~self._on_grid(span.at_sample.position(xhat)).all(1)
+                if bool(lost.any()):
+                    return first + int(lost.int().argmax())
+                first += len(xhat)
         return -1
 
     def _on_grid(self, x: torch.Tensor) -> torch.Tensor:
-        """[n] whether the stencils of particles at x [n, 3] lie on the grid; False where x is not finite."""
+        """[...] whether stencils of particles at x [..., 3] lie on the grid; False where x is not finite."""
         geometry = self.setup.geometry
         reach = 0.5 * (DEGREES[self.setup.transfer.shape] - 1) * geometry.dx  # of a stencil, downwards
         upper = torch.tensor(geometry.upper, dtype=x.dtype, device=x.device) - reach
-        return ((x >= reach) & (x < upper)).all(1)
+        return ((x >= reach) & (x < upper)).all(-1)
 
     def needed_outside(self, steps: int | None = None) -> int:
         """Most particles and nodes that a step needed and the superset lacks, or that were off the grid.
@@ -305,7 +338,7 @@ class ReducedMPM:
 
         Source: paper section 5.4, b.
         """
-        if self.setup.integration.strategy == "search":
+        if self.setup.integration.strategy == "search" or self.span.latent_only:
             return 0
         everything, search, worst = self.decoder(), self.setup.search, 0
         for n in range(self.steps_taken if steps is None else steps):

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 import warp as wp
+from typing_extensions import override
 
 from nsf.dynamics.batch import Batch
 from nsf.dynamics.integration import ParticleSets
@@ -32,31 +33,79 @@ class Particles(NamedTuple):
 class Span(ABC):
     """Takes the steps of a batch in a span of time; each engine has its own.
 
+    Args:
+        batch: the runs.
+        sets: S, N and I.
+        at_sample: the manifold restricted to S.
+
+    Attributes:
+        batch, sets, at_sample: as given; record: the batch's.
+        s: |S|; size: particles of each run that a step may need.
+        latent_only: whether a step goes from x̂ to x̂ without particles. Then `take` takes many at once,
+            nothing is projected, and what is entered stays good from one span to the next.
+        capturable: whether a step is the same launches each time; graph: of a step, where it is captured.
+    """
+
+    latent_only = False
+    capturable = True
+    graph = None
+    size = 0
+
+    def __init__(self, batch: Batch, sets: ParticleSets, at_sample: Restriction):
+        self.batch, self.record, self.sets = batch, batch.record, sets
+        self.at_sample, self.s = at_sample, len(sets.sample)
+
+    @property
+    @abstractmethod
+    def stages(self) -> Stages:
+        """One step, stage by stage, in order."""
+
+    @abstractmethod
+    def enter(self, first: bool) -> None:
+        """Begin with the latents of the record; `first`: v is the initial velocity, not a difference."""
+
+    def take(self, steps: int) -> None:
+        """Take steps at once, where they are `latent_only`."""
+        raise NotImplementedError(f"{type(self).__name__} takes its steps one by one")
+
+    @property
+    def mean_sizes(self) -> list[float]:
+        """Mean |N| of each run over the steps taken in this span."""
+        return [float(self.size)] * len(self.batch)
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of arrays and fields on the device."""
+        return self.at_sample.nbytes
+
+    @property
+    def mode_bytes(self) -> float:
+        """Bytes of the modes of one particle that a step reads; 0 where it reads none."""
+        return 0.0
+
+
+class GridSpan(Span):
+    """A span whose steps move particles over a grid.
+
     Holds what P2G reads and G2P moves: n rows of each run, one run after the other, S first. Where their
     values come from, and how x̂ follows from S, is left to the engine.
 
     Args:
-        batch: the runs.
-        sets: S, N and I.
+        batch, sets, at_sample: as for `Span`.
         order: [n] the particles of N in the order of the rows, S first.
-        at_sample: the manifold restricted to S.
 
     Attributes:
-        batch, sets, order, at_sample: as given; record: the batch's.
+        order: as given.
         x, v: [B n, 3] position [m] and velocity [m/s]; G2P moves the first |S| rows of each run.
         C, tau: [B n, 3, 3] affine momentum [1/s] and Kirchhoff stress [Pa].
         mass, volume0, mu, lam: [B n] of the particles [kg, m³, Pa, Pa].
-        s: |S|; size: n.
+        size: n.
         particles: the rows that P2G reads, as Warp sees them; grid_step: P2G, and G2P of S.
-        capturable: whether a step is the same launches each time; graph: of a step, where it is captured.
     """
 
-    capturable = True
-    graph = None
-
     def __init__(self, batch: Batch, sets: ParticleSets, order: np.ndarray, at_sample: Restriction):
-        self.batch, self.record, self.sets, self.order = batch, batch.record, sets, order
-        self.at_sample, self.s = at_sample, len(sets.sample)
+        super().__init__(batch, sets, at_sample)
+        self.order = order
         one = batch.shared
         grid = Grid(one.geometry, one.precision, one.device, sets.nodes, copies=len(batch))
         # The forcing of the moment is on the device: gravity here, the colliders' time in the boundaries.
@@ -90,27 +139,8 @@ class Span(ABC):
         self.size = n // len(self.batch)
 
     @property
-    @abstractmethod
-    def stages(self) -> Stages:
-        """One step, stage by stage, in order."""
-
-    @abstractmethod
-    def enter(self, first: bool) -> None:
-        """Begin with the latents of the record; `first`: v is the initial velocity, not a difference."""
-
-    @property
-    def mean_sizes(self) -> list[float]:
-        """Mean |N| of each run over the steps taken in this span."""
-        return [float(self.size)] * len(self.batch)
-
-    @property
+    @override
     def nbytes(self) -> int:
-        """Bytes of arrays and fields on the device."""
         own = (self.mass, self.volume0, self.mu, self.lam, self.initial_velocity, self.x, self.v)
         own += (self.C, self.tau)
-        return self.at_sample.nbytes + self.grid_step.grid.nbytes + sum(a.nbytes for a in own)
-
-    @property
-    def mode_bytes(self) -> float:
-        """Bytes of the modes of one particle that a step reads; 0 where it reads none."""
-        return 0.0
+        return super().nbytes + self.grid_step.grid.nbytes + sum(a.nbytes for a in own)

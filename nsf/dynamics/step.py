@@ -13,11 +13,11 @@ from typing_extensions import override
 from nsf.dynamics.batch import Batch
 from nsf.dynamics.inference import Inference
 from nsf.dynamics.integration import ParticleSets
-from nsf.dynamics.span import Span, Stages
+from nsf.dynamics.span import GridSpan, Stages
 from nsf.sampling.sampler import SampleSpan
 
 
-class Step(Span):
+class Step(GridSpan):
     """Infers the particles of N from x̂, takes one MPM step of them, and finds x̂ from where S went.
 
     Args:

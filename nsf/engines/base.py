@@ -10,7 +10,7 @@ from nsf.dynamics.span import Span
 
 
 class Engine(ABC):
-    """Computes the steps of reduced runs; equal to the reference but for round-off.
+    """Computes the steps of reduced runs; equal to the reference but for round-off, unless it is learned.
 
     Attributes:
         name: as `engine=` takes it.
@@ -25,3 +25,11 @@ class Engine(ABC):
     @abstractmethod
     def spans(self, batch: Batch) -> Sequence[Span]:
         """What takes the steps of each span of time, of runs that are not refused."""
+
+    def doubt(self, setup: Setup) -> tuple[float, str]:
+        """How far a run's input lies outside of what the engine learned from, in units of its range.
+
+        Returns:
+            At most 1 where it is inside, as it always is where nothing is learned; and what lies outside.
+        """
+        return 0.0, ""

@@ -5,13 +5,14 @@ from collections.abc import Sequence
 from nsf.dynamics.setup import Setup
 from nsf.engines.base import Engine
 from nsf.engines.modal import Modal
+from nsf.engines.operators import Operators
 from nsf.engines.reference import Reference
 from nsf.errors import ConfigError
 
 #: From the fastest to the one that steps whatever can be stepped.
 ENGINES: tuple[Engine, ...] = (Modal(), Reference())
-#: What `engine=` may be.
-NAMES = ("auto", *(engine.name for engine in ENGINES))
+#: What `engine=` may be; operators are no name's own, but of a file that `nsf teach` writes.
+NAMES = ("auto", *(engine.name for engine in ENGINES), Operators.name)
 
 
 def choose(wanted: str | Engine, setups: Sequence[Setup]) -> tuple[Engine, str]:
@@ -34,6 +35,11 @@ def choose(wanted: str | Engine, setups: Sequence[Setup]) -> tuple[Engine, str]:
         candidates = list(ENGINES)
     elif wanted in known:
         candidates = [known[wanted]]
+    elif wanted == Operators.name:
+        raise ConfigError(
+            "engine=operators needs operators that were taught; give engine=nsf.engines.Operators.load(FILE) "
+            "of a teach run"
+        )
     else:
         raise ConfigError(f"engine={wanted} is unknown; choose one of {', '.join(NAMES)}")
     refusals = []

@@ -8,6 +8,7 @@ from nsf.dynamics import ParticleSets, ReducedBatch, ReducedMPM, Setup
 from nsf.dynamics.interop import torch_device
 from nsf.engines.base import Engine
 from nsf.engines.choice import choose
+from nsf.engines.operators import Operators
 from nsf.errors import ConfigError, ShapeError
 from nsf.mpm.device import warp_device
 from nsf.sampling.sampler import RandomSampler, Sampler, SampleSpan, check_well_posed
@@ -32,8 +33,8 @@ def reduced(
         parameters: `{name: value}`; the configured value by default.
         sample: particle indices, a number (drawn at random), a `Sampler`, the `samples` of an earlier
             solver, or None for the scene's number.
-        engine: how steps are computed: `auto`, the fastest engine that can; `reference`, `modal`, or an
-            engine of one's own.
+        engine: how steps are computed: `auto`, the fastest engine that can; `reference`, `modal`, taught
+            operators (`Operators.load`), or an engine of one's own.
         **options: further arguments of `nsf.dynamics.Setup`.
 
     Raises:
@@ -79,7 +80,7 @@ def reduced_batch(
 
 def _together(setups: Sequence[Setup], wanted: str | Engine) -> ReducedBatch:
     engine, why = choose(wanted, setups)
-    return ReducedBatch(setups, engine.spans, engine.name, why)
+    return ReducedBatch(setups, engine.spans, engine.name, why, [engine.doubt(setup) for setup in setups])
 
 
 def _setup(scene, manifold, parameters, sample: Sample, engine: str | Engine, options: dict) -> Setup:
@@ -103,6 +104,8 @@ def _setup(scene, manifold, parameters, sample: Sample, engine: str | Engine, op
 
 def _sampled(scene, manifold, sampler: Sampler, engine: str | Engine, options: dict) -> list[SampleSpan]:
     """What a sampler chooses; one that learns from steps is given a solver whose sample is every particle."""
+    if isinstance(engine, Operators):  # which know one sample, and move no particle
+        engine = "auto"
     everyone = np.arange(len(manifold.X))
     whole = {"sample": everyone, "sets": [ParticleSets(everyone, everyone, None)], "engine": engine}
     whole |= {k: options[k] for k in ("method", "precision", "device") if k in options}

@@ -1,6 +1,6 @@
 """The stages in order; each reads the files of the one before it and nothing else.
 
-scene → simulate → dataset → train → deploy → evaluate → report
+scene → simulate → dataset → train (→ teach) → deploy → evaluate → report
 """
 
 import contextlib
@@ -15,9 +15,10 @@ from omegaconf import DictConfig, OmegaConf
 from nsf import config as configuration
 from nsf.data import Snapshots, Trajectory
 from nsf.data.schema import TRAJECTORY
-from nsf.deployment import Rollout, calibrate, continuation_file, deploy, go_on, rollout_file
+from nsf.deployment import Levels, Rollout, calibrate, continuation_file, deploy, go_on, rollout_file
 from nsf.dynamics import ParticleSets, ReducedBatch, ReducedMPM
 from nsf.dynamics.setup import reduced_steps
+from nsf.engines import Engine, Operators
 from nsf.errors import MissingRunError
 from nsf.evaluation import Comparison, Subject, compare, measure, superresolve
 from nsf.kinematics.fields.mlp import MlpField
@@ -27,12 +28,13 @@ from nsf.kinematics.training.train import train
 from nsf.pipeline import results
 from nsf.pipeline.plan import Plan
 from nsf.pipeline.simulation import Job, Shared, simulate
+from nsf.pipeline.teaching import OPERATORS, teach
 from nsf.runs import Record, Run
 from nsf.sampling import SampleSpan
 from nsf.scenes import Scene
 from nsf.storage import writing
 
-STAGES = ("simulate", "train", "deploy", "evaluate", "report")
+STAGES = ("simulate", "train", "teach", "deploy", "evaluate", "report")
 #: File of a deploy run with the configuration of its whole chain, interpolations kept.
 CONFIGURATION = "configuration.yaml"
 
@@ -50,6 +52,7 @@ class Pipeline(Plan):
         self.say = say
         self._samples: Sequence[SampleSpan] | None = None
         self._sets: Sequence[ParticleSets] | None = None
+        self._taught: Operators | None = None
 
     @classmethod
     def of_run(cls, run: Run, device: str = "auto", say: Callable[[str], None] = print) -> "Pipeline":
@@ -72,6 +75,11 @@ class Pipeline(Plan):
         config = configuration.read(run.file(CONFIGURATION))
         config.device = device
         return cls(config, say, run.root)
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The stages of the chain, `teach` only where the engine that is asked for is taught."""
+        return tuple(name for name in STAGES if name != "teach" or self.teaching is not None)
 
     def run(self, stage: str) -> Run | Path:
         """One stage by name; what it reads must be there, except that `simulate` needs nothing.
@@ -175,10 +183,15 @@ class Pipeline(Plan):
         return manifold
 
     def solver_at(
-        self, manifold: Manifold, value: float, device: str | None = None, precision: str | None = None
+        self,
+        manifold: Manifold,
+        value: float,
+        device: str | None = None,
+        precision: str | None = None,
+        engine: str | Engine | None = None,
     ) -> ReducedMPM:
-        """The reduced solver at a parameter value, at t = 0; device and precision as configured."""
-        return self.batch_at(manifold, [value], device, precision).runs[0]
+        """The reduced solver at a parameter value, at t = 0; device, precision and engine as configured."""
+        return self.batch_at(manifold, [value], device, precision, engine).runs[0]
 
     def batch_at(
         self,
@@ -186,13 +199,20 @@ class Pipeline(Plan):
         values: Sequence[float],
         device: str | None = None,
         precision: str | None = None,
+        engine: str | Engine | None = None,
+        scene: Scene | None = None,
     ) -> ReducedBatch:
-        """Reduced runs at several parameter values that take their steps together, likewise."""
-        batch = self.deployed.reduced_batch(
+        """Reduced runs at several parameter values that take their steps together, likewise.
+
+        By the engine that is asked for, of the scene that is deployed, unless others are given.
+        """
+        if engine is None:
+            engine = self._operators(manifold) if self.engine == Operators.name else self.engine
+        batch = (scene or self.deployed).reduced_batch(
             manifold,
             [{self.scene.parameters.name: value} for value in values],
             self._samples or self.sampler,
-            engine=self.engine,
+            engine=engine,
             method=self.method,
             projector=self.projector,
             integration=self.integration,
@@ -205,15 +225,43 @@ class Pipeline(Plan):
         self._samples, self._sets = batch.batch.shared.samples, batch.batch.shared.sets
         return batch
 
+    def teach(self) -> Run:
+        """The operators of the deployed step, where the engine that is asked for steps by them.
+
+        Raises:
+            ConfigError: it does not.
+        """
+        return self._made(self.taught, self._teach)
+
+    def _teach(self, run: Run) -> None:
+        manifold = self.manifold().to(self.device)
+        with run.record(device=self.device, seed=self.config.seed, precision=self.config.precision) as record:
+            teach(self, manifold, record)
+        found = record.metrics
+        self.say(
+            f"teach: {found['teacher_steps']} steps of the teacher in {found['teach_seconds']:.1f} s, "
+            f"{100 * min(found['errors']):.2g} % off at values held back → {run.id}"
+        )
+
+    def _operators(self, manifold: Manifold) -> Operators:
+        """The operators that were taught; with them the sample, which is that of the scene of training."""
+        if self._taught is None:
+            self._taught = Operators.load(self.taught.require().file(OPERATORS))
+            self.batch_at(manifold, self.split.train[:1], engine=self.projecting, scene=self.scene)
+        return self._taught
+
     def deploy(self) -> Run:
         """Reduced trajectories of the held-out values, through Lightning's `Trainer.predict`."""
+        if self.teaching is not None:
+            self.teach()
         return self._made(self.deployment, self._deploy)
 
     def _deploy(self, run: Run) -> None:
         manifold = self.manifold().to(self.device)  # many solvers take their rows from it
         with run.record(device=self.device, precision=self.config.precision) as record:
             started = time.perf_counter()
-            trust = calibrate(partial(self.solver_at, manifold), manifold, self.device)
+            solver_at = partial(self.solver_at, manifold, engine=self.projecting)
+            trust = calibrate(solver_at, manifold, self.device)
             record.metrics["trust"] = {
                 "residual_m": trust.residual,
                 "distance_m": trust.distance,
@@ -227,7 +275,8 @@ class Pipeline(Plan):
                 record.metrics |= {"engine": batch.engine, "engine_why": batch.why}
                 return batch
 
-            rollouts = deploy(batch_at, self.held_out, self.device, trust, hand_over, together)
+            levels = self._levels(manifold)
+            rollouts = deploy(batch_at, self.held_out, self.device, trust, hand_over, together, levels)
             engine, why = record.metrics["engine"], record.metrics["engine_why"]
             self.say(f"deploy: engine {engine}" + (f", since {why}" if why else ""))
             for index, rollout in enumerate(rollouts):
@@ -241,6 +290,7 @@ class Pipeline(Plan):
             # Runs that took their steps together share the time of these equally.
             record.metrics["batch"] = together
             record.metrics["seconds"] = [r.seconds for r in rollouts]
+            record.metrics["by_operators"] = [r.by_operators for r in rollouts]
             record.metrics["needed_outside"] = max(r.needed_outside for r in rollouts)
             record.metrics["diverged"] = [r.parameter for r in rollouts if r.diverged >= 0]
             record.metrics["distrusted"] = [r.parameter for r in rollouts if r.distrusted >= 0]
@@ -248,6 +298,18 @@ class Pipeline(Plan):
         self.say(
             f"deploy: method={self.config.method.name}, |S|={rollouts[0].sample}, "
             f"{len(rollouts)} values{at_once} → {run.id}"
+        )
+
+    def _levels(self, manifold: Manifold) -> Levels | None:
+        """How runs by operators are watched, and who goes on with them."""
+        if self.teaching is None:
+            return None
+        asked = self.config.deploy
+        return Levels(
+            partial(self.batch_at, manifold, engine=self.projecting),
+            self.config.engine.check,
+            asked.tolerance,
+            asked.on_distrust != "report",
         )
 
     def _write_configuration(self, record: Record) -> None:
@@ -270,6 +332,8 @@ class Pipeline(Plan):
 
     def _warn(self, rollout: Rollout) -> None:
         value = self._named(rollout)
+        if (own := rollout.by_operators) < len(rollout.stops) and rollout.estimate is not None:
+            self.say(f"deploy: {value}: the projected step goes on from t = {rollout.t[own]:.4g} s")
         if rollout.diverged >= 0:
             self.say(
                 f"deploy: warning: {value} diverged at step {rollout.diverged} (off the grid or not finite); "
@@ -305,10 +369,11 @@ class Pipeline(Plan):
             ]
             cost = self._cost(manifold)
             engine = str(self.deployment.manifest["metrics"].get("engine", ""))
-            table = results.rows(
-                self.config, manifold, rollouts, comparisons, cost, self.device, run.manifest, engine
-            )
             seconds = self.training.metric("training_seconds")
+            offline = seconds, 0.0 if self.teaching is None else self.taught.metric("teach_seconds")
+            table = results.rows(
+                self.config, manifold, rollouts, comparisons, cost, self.device, run.manifest, engine, offline
+            )
             summary = results.summarise(self.deployed, manifold, table, comparisons, rollouts, seconds)
             results.write(record, table, comparisons, cost, summary)
         self.say(f"evaluate: mean δ {100 * table['delta'].mean():.3g} % over {len(table)} values → {run.id}")

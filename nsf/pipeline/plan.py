@@ -3,7 +3,7 @@
 import os
 from collections.abc import Mapping, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
@@ -13,7 +13,9 @@ from nsf import config as configuration
 from nsf.data import Split
 from nsf.dynamics.interop import torch_device
 from nsf.engines import NAMES as ENGINES
+from nsf.engines import Operators
 from nsf.engines.modal.mirrors import edits
+from nsf.engines.operators import random_values
 from nsf.errors import ConfigError, DeviceError
 from nsf.kinematics.fields.basis import BasisField
 from nsf.kinematics.fields.mlp import MlpField
@@ -26,7 +28,7 @@ from nsf.runs import Run
 from nsf.sampling.sampler import check_well_posed
 from nsf.scenes import Scene
 from nsf.scenes.checks import check_memory, check_physics
-from nsf.scenes.scene import NOT_PHYSICS
+from nsf.scenes.identity import NOT_PHYSICS
 from nsf.storage import require_folder, require_space
 
 #: Keys of the configuration that a simulation's content depends on.
@@ -39,6 +41,10 @@ _LEAST_STEP = 1e-3
 _STORED = {"float32": FP32, "float64": FP64}
 #: Keys that no scene is built from, without their values.
 _REST = dict.fromkeys(("field", "trainer", "method", "sampler", "evaluation", "report", "latent_dim"))
+#: Values between the training ones whose runs decide which round of teaching is kept.
+HELD_BACK = 3
+#: Engines that operators can be taught by.
+TEACHERS = tuple(name for name in ENGINES if name != Operators.name)
 #: What this process has checked; the jobs of a sweep ask the same thing again and again, for seconds.
 _PASSED: set[str] = set()
 
@@ -85,6 +91,10 @@ class Plan:
             setattr(self, name, configuration.build(c[name], name))
         # A configuration from before there were engines has no such key.
         self.engine = OmegaConf.select(c, "engine.name", default="auto")
+        self.teaching = None
+        if self.engine == Operators.name:
+            self.teaching = configuration.build(c.engine.teaching, "engine.teaching")
+            _one_of("engine.teacher", c.engine.teacher, TEACHERS)
         self._check_numbers()
         self._check_words()
         self._check_batch()
@@ -127,7 +137,8 @@ class Plan:
         c = self.config
         _one_of("engine.name", self.engine, ENGINES)
         _one_of("deploy.split", c.deploy.split, ("test", "validation", "train"))
-        _one_of("deploy.on_distrust", c.deploy.on_distrust, ("report", "full_order"))
+        _one_of("deploy.on_distrust", c.deploy.on_distrust, ("report", "projected", "full_order"))
+        self._check_levels()
         check_tracking(c.tracking)
         _one_of("data.resident", c.data.resident, (True, False, "auto"))
         _one_of("data.keep", c.data.keep, ("all", "held_out"))
@@ -142,6 +153,21 @@ class Plan:
                 f"trainer.devices={self.trainer.devices} is for field=mlp; this field takes all snapshots in "
                 "every step, in seconds: set trainer.devices=1"
             )
+
+    def _check_levels(self) -> None:
+        """Who goes on with a run by operators; no other engine has an estimate, or a level below."""
+        asked = self.config.deploy
+        tolerance = OmegaConf.select(asked, "tolerance", default=None)
+        if self.teaching is None:
+            if asked.on_distrust == "projected" or tolerance is not None:
+                key = "tolerance" if tolerance is not None else "on_distrust"
+                raise ConfigError(
+                    f"deploy.{key}={asked[key]} needs engine=operators; set it, or leave it out"
+                )
+            return
+        configuration.number("engine.check", self.config.engine.check, least=1, whole=True)
+        if tolerance is not None and not configuration.number("deploy.tolerance", tolerance) > 0:
+            raise ConfigError(f"deploy.tolerance={tolerance} m must be positive, or null for none")
 
     def _changed(self, changes: DictConfig | None) -> Scene:
         """The scene of the held-out simulations and of deployment."""
@@ -169,6 +195,11 @@ class Plan:
             for multiplier in (1.0, self.config.deploy.dt_multiplier):
                 check_colliders(scene.colliders, grid, multiplier * scene.dt)
         _PASSED.add(asked)
+
+    @property
+    def projecting(self) -> str:
+        """The engine of steps that are projected: that which is asked for, or which operators learn from."""
+        return self.engine if self.teaching is None else self.config.engine.teacher
 
     @property
     def held_out(self) -> tuple[float, ...]:
@@ -290,9 +321,50 @@ class Plan:
             content["arithmetic"] = self.field.arithmetic
         if self.engine != "auto":
             content["engine"] = self.engine
+        if self.teaching is not None:
+            content |= {"check": self.config.engine.check, "tolerance": self.config.deploy.tolerance}
         if changed := edits():  # an edited step is another run, whose result is not there yet
             content["edited"] = changed
-        return Run.open("deploy", self.scene.name, content, [self.training], root=self.root)
+        parents = [self.training] if self.teaching is None else [self.training, self.taught]
+        return Run.open("deploy", self.scene.name, content, parents, root=self.root)
+
+    @property
+    def taught(self) -> Run:
+        """The run of the operators.
+
+        Raises:
+            ConfigError: the engine that is asked for learns nothing.
+        """
+        if self.teaching is None:
+            raise ConfigError(f"engine={self.engine} is not taught; set engine=operators")
+        content = (
+            self._content(("method", "sampler", "projector", "integration", "precision", "seed"))
+            | self._physics(self.scene)
+            | {
+                "teaching": asdict(self.teaching),
+                "teacher": self.config.engine.teacher,
+                "values": self.lessons,
+                "validation": list(self.split.validation),
+                "dt_multiplier": self.config.deploy.dt_multiplier,
+                "device": self.device,
+            }
+        )
+        if changed := edits():
+            content["edited"] = changed
+        return Run.open("teach", self.scene.name, content, [self.training], root=self.root)
+
+    @property
+    def lessons(self) -> list[list[float]]:
+        """Values of three kinds that the teacher is asked at: of training, between them, and held back.
+
+        Runs at those held back decide which round of teaching is kept, where there are no validation values.
+        None is a validation or test value.
+        """
+        known, seed = sorted(self.split.train), int(self.config.seed)
+        taken = [*known, *self.split.validation, *self.split.test]
+        between = random_values((known[0], known[-1]), len(known), seed, taken)
+        back = random_values((known[0], known[-1]), HELD_BACK, seed + 1, [*taken, *between])
+        return [known, between, back]
 
     @property
     def evaluation(self) -> Run:

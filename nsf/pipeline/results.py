@@ -9,6 +9,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from nsf.deployment import Rollout
+from nsf.dynamics.setup import reduced_steps
 from nsf.evaluation import Comparison, SolverCost, SuperResolution, reduction_ratio
 from nsf.mpm import floor_height
 from nsf.runs import Record
@@ -42,10 +43,12 @@ def rows(
     device: str,
     manifest: dict,
     engine: str = "",
+    offline: tuple[float, float] = (math.nan, 0.0),
 ) -> pd.DataFrame:
     """Content of `results.csv`, one row a parameter value; errors are fractions, ∞ where a run diverged.
 
-    `engine` took the steps of the rollouts; empty where their run does not say.
+    `engine` took the steps of the rollouts; empty where their run does not say. `offline` are the times of
+    training and of teaching [s].
     """
     commit = str(manifest.get("commit") or "unknown")[:12] + ("-dirty" if manifest.get("dirty") else "")
     variant = {
@@ -58,12 +61,15 @@ def rows(
     measured = {
         "gamma": reduction_ratio(len(manifold.X), manifold.latent_dim),
         **_costs_in_a_row(cost),
+        "teach_seconds": offline[1],
+        "break_even_runs": _break_even(cost, sum(offline)),
+        "handed_over": 0.0,
         "precision": config.precision,
         "device": torch.cuda.get_device_name(device) if device.startswith("cuda") else "cpu",
         "commit": commit,
     }
     # What a step costs whose particles have left the grid is no one's speedup, nor is half a reduced run's.
-    costly = ("step_ms_reduced", "speedup_step", "speedup_total", "memory_reduced_mib")
+    costly = ("step_ms_reduced", "speedup_step", "speedup_total", "memory_reduced_mib", "break_even_runs")
     lost = measured | dict.fromkeys(costly, math.nan)
     found = []
     for rollout, comparison in zip(rollouts, comparisons, strict=True):
@@ -77,7 +83,8 @@ def rows(
             "stress_error": comparison.stress_error,
         }
         reduced = rollout.diverged < 0 and rollout.handed_over < 0
-        found.append(variant | own | (measured if reduced else lost))
+        share = {"handed_over": _handed_over(rollout, config)}
+        found.append(variant | own | (measured if reduced else lost) | share)
     return pd.DataFrame(found)
 
 
@@ -96,6 +103,22 @@ def _costs_in_a_row(cost: dict) -> dict[str, float]:
         "memory_full_mib": memory[0],
         "memory_reduced_mib": memory[1],
     }
+
+
+def _break_even(cost: dict, seconds: float) -> float:
+    """Runs after which what was spent beforehand [s] has paid; ∞ where a reduced run saves no time."""
+    full, reduced = (cost.get(solver, {}).get("total_ms", math.nan) for solver in ("full_order", "reduced"))
+    saved = 1e-3 * (full - reduced)
+    return math.inf if saved <= 0.0 else seconds / saved
+
+
+def _handed_over(rollout: Rollout, config: DictConfig) -> float:
+    """Share of the steps that were not taken by the first level: operators, or else the projected step."""
+    steps = reduced_steps(config.scene.steps, config.deploy.dt_multiplier)
+    own = steps if rollout.handed_over < 0 else rollout.handed_over
+    if rollout.estimate is not None:
+        own = min(own, rollout.by_operators)
+    return 1.0 - own / steps
 
 
 def trust_of(rollout: Rollout) -> dict:

@@ -13,7 +13,7 @@ from nsf import config as configuration
 from nsf.canonical import content_hash
 from nsf.errors import ConfigError, MissingRunError, NSFError
 from nsf.extras import optional
-from nsf.pipeline.chain import STAGES, Pipeline
+from nsf.pipeline.chain import Pipeline
 from nsf.pipeline.plan import Plan
 from nsf.reporting.drawing.search import OBJECTIVES, write_search
 from nsf.storage import locked
@@ -185,7 +185,7 @@ def _tried(overrides: list[str], objectives: Sequence[str], root: Path | None) -
     """The evaluate run of one trial, and its objectives: means over the validation values."""
     config = configuration.load([*overrides, "deploy.split=validation", "scene.parameters.test=[]"])
     pipeline = Pipeline(config, lambda line: None, root)
-    for stage in STAGES[:-1]:
+    for stage in pipeline.stages[:-1]:
         run = pipeline.run(stage)
     results = pd.read_csv(run.file("results.csv"))
     if set(results["split"]) != {"validation"}:

@@ -52,6 +52,7 @@ def work(config: DictConfig, stages: Sequence[str], say: Callable[[str], object]
         return plot_point(config)
     pipeline = Pipeline(config, say)
     if len(stages) > 1:
+        stages = [name for name in stages if name != "teach" or name in pipeline.stages]
         pipeline.check_held_out()  # before hours of simulation and training, not after
     if "report" in stages:
         pipeline.check_report_folder()

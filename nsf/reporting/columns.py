@@ -50,6 +50,9 @@ _SPEC = (
     Column("speedup_total", "speedup, total", "×"),
     Column("memory_full_mib", "full-order memory", "MiB"),
     Column("memory_reduced_mib", "reduced memory", "MiB"),
+    Column("teach_seconds", "teaching", "s"),
+    Column("break_even_runs", "runs until it pays"),
+    Column("handed_over", "handed on", "%", 100.0),
     Column("precision", "precision"),
     Column("device", "device"),
     Column("commit", "commit"),
@@ -57,8 +60,8 @@ _SPEC = (
 
 COLUMNS = tuple(column.name for column in _SPEC)
 """Columns of `results.csv`, in order. Errors and δ are fractions there."""
-LATER = ("engine",)
-"""Columns that runs from before there were engines lack."""
+LATER = ("engine", "teach_seconds", "break_even_runs", "handed_over")
+"""Columns that runs from before there were engines, and operators, lack."""
 
 SETTING, VALUES, TRAINING, PLACE = "setting", "values", "training_seconds", "place"
 _MORE = (
@@ -85,10 +88,10 @@ TEXT = (
 )
 COSTS = (
     "step_ms_full", "step_ms_reduced", "speedup_step", "speedup_total",
-    "memory_full_mib", "memory_reduced_mib",
+    "memory_full_mib", "memory_reduced_mib", "teach_seconds", "break_even_runs",
 )  # fmt: skip
 """Columns measured once a variant."""
-MEASURED = ("delta", "displacement_error", "stress_error", *COSTS)
+MEASURED = ("delta", "displacement_error", "stress_error", "handed_over", *COSTS)
 """Columns that are averaged over parameter values."""
 
 ABSENT = "–"

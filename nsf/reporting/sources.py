@@ -127,7 +127,13 @@ class Source:
 
     def _csv(self, name: str, columns, text) -> pd.DataFrame:
         frame = pd.read_csv(self._path(name), dtype=dict.fromkeys(text, str))
-        frame = frame.assign(**{name: "" for name in LATER if name in columns and name not in frame})
+        frame = frame.assign(
+            **{
+                name: "" if name in TEXT else math.nan
+                for name in LATER
+                if name in columns and name not in frame
+            }
+        )
         absent = [column for column in columns if column not in frame]
         if absent:
             raise SchemaError(f"{self._path(name)} lacks the columns {absent}; run `nsf evaluate` again")

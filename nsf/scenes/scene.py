@@ -15,12 +15,10 @@ from nsf.mpm import Collider, DomainWalls, FullOrderMPM, GridGeometry, ParticleC
 from nsf.mpm.materials import Material
 from nsf.scenes.body import Body
 from nsf.scenes.checks import check_memory, check_particles, check_physics
+from nsf.scenes.identity import NOT_PHYSICS
 from nsf.scenes.parameters import ParameterRange, check_key
 from nsf.targets import filled
 from nsf.vectors import vector
-
-#: Keys of a scene that its simulation does not depend on.
-NOT_PHYSICS = ("parameters", "reduced", "paper", "title")
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,8 @@ from nsf.runs import Run
 COLUMNS = [
     "scene", "method", "field", "r", "engine", "sample", "integration_mean", "parameter", "split",
     "delta", "displacement_error", "stress_error", "gamma", "step_ms_full", "step_ms_reduced", "speedup_step",
-    "speedup_total", "memory_full_mib", "memory_reduced_mib", "precision", "device", "commit",
+    "speedup_total", "memory_full_mib", "memory_reduced_mib", "teach_seconds", "break_even_runs",
+    "handed_over", "precision", "device", "commit",
 ]  # fmt: skip
 STAGES = ("simulate", "train", "deploy", "evaluate")
 
@@ -92,6 +93,8 @@ def test_results_have_the_columns_of_a_report(chain):
     assert (row["scene"], row["method"], row["field"], row["split"]) == ("sand", "nsf", "basis", "test")
     assert (row["r"], row["sample"], row["parameter"], row["precision"]) == (4, 20, 26.0, "fp64")
     assert row["engine"] == "modal"
+    assert (row["teach_seconds"], row["handed_over"]) == (0.0, 0.0)
+    assert row["break_even_runs"] > 0  # ∞ where a reduced run saves nothing
     assert row["gamma"] == 3 * 500 / 4
     assert row["device"] == "cpu"
     assert 0 < row["delta"] < 0.02

@@ -9,7 +9,7 @@ import warp as wp
 from nsf.data import TAU_MATRIX
 from nsf.dynamics.interop import as_matrices
 from nsf.dynamics.latent import LatentRecord
-from nsf.dynamics.span import Span
+from nsf.dynamics.span import GridSpan
 from nsf.engines.modal.arena import Arena
 from nsf.engines.modal.gathering import THREADS, make_contraction, tiling
 from nsf.engines.modal.networks import make_layer, make_product, product_blocks
@@ -18,7 +18,7 @@ from nsf.mpm.materials import Material, make_elastic_stress
 
 
 def field_launches(
-    arena: Arena, span: Span, a: torch.Tensor, needed: torch.Tensor, tiles: tuple[int, int]
+    arena: Arena, span: GridSpan, a: torch.Tensor, needed: torch.Tensor, tiles: tuple[int, int]
 ) -> tuple[list, list]:
     """The launches of the networks, and those that then give τ and C at N, as the method takes them.
 
@@ -143,7 +143,7 @@ def _contraction(arena: Arena, fields: Sequence[tuple], needed: torch.Tensor, ti
     )  # fmt: skip
 
 
-def _elastic(arena: Arena, span: Span, materials: Sequence[Material], F: torch.Tensor):
+def _elastic(arena: Arena, span: GridSpan, materials: Sequence[Material], F: torch.Tensor):
     """The launch of τ = τ(F) at N; without flow the history keeps its values at rest."""
     precision, n, material = arena.precision, len(F), materials[0]
     history = np.concatenate([one.initial_history(span.size) for one in materials])

@@ -9,7 +9,7 @@ from nsf.dynamics.batch import Batch
 from nsf.dynamics.integration import ParticleSets
 from nsf.dynamics.interop import as_vectors, on_torch_stream
 from nsf.dynamics.projection import Taylor
-from nsf.dynamics.span import Span, Stages
+from nsf.dynamics.span import GridSpan, Stages
 from nsf.engines.modal.arena import Arena
 from nsf.engines.modal.closure import packed_weights, projection_block
 from nsf.engines.modal.fields import field_launches
@@ -31,7 +31,7 @@ from nsf.sampling.sampler import SampleSpan
 _HEADS, _PREPARING, _CLEARING = range(3)  # what of a step runs beside the rest
 
 
-class ModalSpan(Span):
+class ModalSpan(GridSpan):
     """Fields of `field=basis` and `joint`, of one run or of several.
 
     The networks run once a step, on x̂ alone; modes and coefficients are contracted at those particles of N
@@ -189,7 +189,7 @@ class Placing:
         state: Coefficients,
         deformation: ModalFactors,
         of_sample: torch.Tensor,
-        span: Span,
+        span: GridSpan,
         tiles: tuple[int, int],
     ):
         shape, grid = span.batch.shared.transfer.shape, span.grid_step.grid
@@ -238,7 +238,7 @@ class Projection:
         gather, solve: the others, in this order.
     """
 
-    def __init__(self, arena, state, deformation, displacement, span: Span, weights: np.ndarray | None):
+    def __init__(self, arena, state, deformation, displacement, span: GridSpan, weights: np.ndarray | None):
         one, s, (count, K) = span.batch.shared, span.s, state.a.shape
         projector, record, r = one.projector, span.record, state.latent.shape[1]
         of_sample = deformation.table[deformation.rows[:s]].to(one.torch_device)

@@ -1,0 +1,234 @@
+"""The operators: one reduced step as a map of the latent vector, affine in its last change and in gravity.
+
+    d' = d + B(x̂, μ, c) d + Δt² [f(x̂, μ, c) + G(x̂, μ, c) g],    d = x̂_n − x̂_{n−1},    x̂_{n+1} = x̂_n + d'
+
+μ are the problem parameters and c is the state of what moves. docs/method.md derives it. Not in the paper.
+"""
+
+import pickle
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+
+from nsf.engines.operators.taught import Taught
+from nsf.errors import MissingRunError, SchemaError
+from nsf.manifest import verified
+from nsf.storage import writing
+
+FORMAT = "nsf-operators"
+FORMAT_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """Sizes of a network of operators.
+
+    Attributes:
+        latents: r; parameters: n; features: of collider states; states: C, what varies among these.
+        gravity: whether there is any.
+        width: of both hidden layers.
+    """
+
+    latents: int
+    parameters: int
+    features: int
+    states: int
+    gravity: bool
+    width: int
+
+    @property
+    def inputs(self) -> int:
+        """Inputs of the network."""
+        return self.latents + self.parameters + self.states
+
+    @property
+    def outputs(self) -> int:
+        """Entries of B [r, r], f [r] and, where there is gravity, G [r, 3]."""
+        return self.latents * (self.latents + 1 + 3 * self.gravity)
+
+
+@dataclass(frozen=True)
+class Terms:
+    """B [..., r, r], f [..., r] [1/s²] and G [..., r, 3] [1/m], None without gravity."""
+
+    B: Tensor
+    f: Tensor
+    G: Tensor | None
+
+
+class StepOperators(nn.Module):
+    """A network of two hidden SiLU layers that gives B, f and G.
+
+    Its last layer is zero at the start: no acceleration. Whatever it is given is standardised, and what it
+    gives is in units of what training runs show; all scales are buffers.
+
+    Args:
+        sizes: of the network.
+        dt: step [s].
+
+    Attributes:
+        x_mean, x_scale: [r] of x̂; mu_mean, mu_scale: [n] of μ.
+        c_mean: [features], c_matrix: [features, C]: of collider states (`states.principal`).
+        d_scale, a_scale: [r] deviation of d and of d' − d in training runs.
+        g_mean: [3], g_scale: [] [m/s²]; f + G g is found as (f + G ḡ) + G (g − ḡ).
+    """
+
+    def __init__(self, sizes: Sizes, dt: float):
+        super().__init__()
+        self.sizes, self.dt = sizes, dt
+        width, r, n = sizes.width, sizes.latents, sizes.parameters
+        self.net = nn.Sequential(
+            nn.Linear(sizes.inputs, width), nn.SiLU(),
+            nn.Linear(width, width), nn.SiLU(),
+            nn.Linear(width, sizes.outputs),
+        )  # fmt: skip
+        nn.init.zeros_(self.net[4].weight)
+        nn.init.zeros_(self.net[4].bias)
+        buffers = {
+            "x_mean": torch.zeros(r), "x_scale": torch.ones(r),
+            "mu_mean": torch.zeros(n), "mu_scale": torch.ones(n),
+            "c_mean": torch.zeros(sizes.features), "c_matrix": torch.zeros(sizes.features, sizes.states),
+            "d_scale": torch.ones(r), "a_scale": torch.ones(r),
+            "g_mean": torch.zeros(3), "g_scale": torch.ones(()),
+        }  # fmt: skip
+        for name, value in buffers.items():
+            self.register_buffer(name, value)
+
+    def collider_state(self, features: Tensor) -> Tensor:
+        """c [..., C] of collider states [..., features] (`states.collider_states`)."""
+        return (features - self.c_mean) @ self.c_matrix
+
+    def _outputs(self, xhat: Tensor, parameters: Tensor, c: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+        """B, f and G in units of the scales, f at the mean gravity."""
+        r, lead = self.sizes.latents, xhat.shape[:-1]
+        given = [(xhat - self.x_mean) / self.x_scale, (parameters - self.mu_mean) / self.mu_scale, c]
+        out = self.net(torch.cat([values.expand(*lead, values.shape[-1]) for values in given], -1))
+        B, f = out[..., : r * r].unflatten(-1, (r, r)), out[..., r * r : r * r + r]
+        return B, f, out[..., r * r + r :].unflatten(-1, (r, 3)) if self.sizes.gravity else None
+
+    def terms(self, xhat: Tensor, parameters: Tensor, c: Tensor) -> Terms:
+        """B, f and G at latent vectors.
+
+        Args:
+            xhat: [..., r]; parameters: μ [..., n] or [n]; c: [..., C] or [C].
+        """
+        B, f, G = self._outputs(xhat, parameters, c)
+        B = self.a_scale[:, None] * B / self.d_scale
+        if G is not None:
+            f = f - G @ (self.g_mean / self.g_scale)
+            G = self.a_scale[:, None] * G / (self.g_scale * self.dt**2)
+        return Terms(B, self.a_scale * f / self.dt**2, G)
+
+    def acceleration(
+        self, xhat: Tensor, change: Tensor, parameters: Tensor, gravity: Tensor, c: Tensor
+    ) -> Tensor:
+        """d' − d [..., r]; arguments as for `step`."""
+        B, f, G = self._outputs(xhat, parameters, c)
+        found = (B @ (change / self.d_scale)[..., None])[..., 0] + f
+        if G is not None:
+            found = found + (G @ ((gravity - self.g_mean) / self.g_scale)[..., None])[..., 0]
+        return self.a_scale * found
+
+    def step(
+        self, xhat: Tensor, change: Tensor, parameters: Tensor, gravity: Tensor, c: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """x̂_{n+1} and d' [..., r].
+
+        Args:
+            xhat, change: [..., r] x̂_n and d = x̂_n − x̂_{n−1}.
+            parameters: μ [..., n]; gravity: [..., 3] [m/s²]; c: [..., C]; each may lack leading axes.
+        """
+        change = change + self.acceleration(xhat, change, parameters, gravity, c)
+        return xhat + change, change
+
+    def run(self, xhat: Tensor, change: Tensor, parameters: Tensor, gravity: Tensor, c: Tensor) -> Tensor:
+        """A run, differentiable in all that it is given and in the weights.
+
+        Args:
+            xhat, change: [..., r] x̂_0 and what stands for d at t = 0 (`first_change`).
+            parameters: μ [..., n].
+            gravity: [N, ..., 3] [m/s²] of each step, or [3] of all.
+            c: [N, ..., C] of each step, or [N, C].
+
+        Returns:
+            [N + 1, ..., r] latent vectors.
+        """
+        found = [xhat]
+        for n, state in enumerate(c):
+            xhat, change = self.step(
+                xhat, change, parameters, gravity if gravity.ndim == 1 else gravity[n], state
+            )
+            found.append(xhat)
+        return torch.stack(found)
+
+    def save(self, path: Path | str, taught: Taught) -> None:
+        """Write weights, scales and what they were taught on; whole or not at all."""
+        content = {
+            "format": FORMAT, "format_version": FORMAT_VERSION, "sizes": vars(self.sizes), "dt": self.dt,
+            "taught": taught.plain(), "state": dict(self.state_dict()),
+        }  # fmt: skip
+        with writing(Path(path)) as temporary:
+            torch.save(content, temporary)
+
+    @classmethod
+    def load(cls, path: Path | str) -> tuple["StepOperators", Taught]:
+        """Read operators, and what they were taught on, onto the host.
+
+        Raises:
+            MissingRunError: there is no such file.
+            SchemaError: the file is truncated, foreign, of a newer format, or does not fit together.
+        """
+        path = Path(path)
+        content = _read(path)
+        try:
+            taught, sizes = Taught.read(content["taught"]), Sizes(**content["sizes"])
+            with torch.device("meta"):  # whatever sizes the file claims, nothing of theirs is made
+                model = cls(sizes, taught.dt)
+            model.load_state_dict(content["state"], assign=True)
+            if not all(bool(torch.isfinite(values).all()) for values in model.state_dict().values()):
+                raise ValueError("a value is not finite")
+        except (RuntimeError, KeyError, TypeError, AttributeError, ValueError) as error:
+            first = (str(error).splitlines() or [type(error).__name__])[0]
+            raise SchemaError(
+                f"{path}: its contents do not fit each other ({first}); teach again with `nsf teach`"
+            ) from error
+        return model.double().requires_grad_(False).eval(), taught
+
+
+def first_change(jacobian: Tensor, velocity: Tensor, dt: float) -> Tensor:
+    """What stands for d at t = 0: the least squares of (∂g/∂x̂) d = v₀ Δt over S.
+
+    Args:
+        jacobian: ∂g/∂x̂ [..., s, 3, r] [m] at x̂_0.
+        velocity: v₀ [..., s, 3] [m/s].
+        dt: step [s].
+
+    Returns:
+        [..., r]; zero for a body at rest.
+    """
+    rows, target = jacobian.flatten(-3, -2), (dt * velocity).flatten(-2)
+    return torch.linalg.lstsq(rows, target[..., None], driver="gels").solution[..., 0]
+
+
+def _read(path: Path) -> dict:
+    try:
+        verified(path)
+    except FileNotFoundError as error:
+        raise MissingRunError(f"{path} does not exist; run `nsf teach` first") from error
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except (RuntimeError, EOFError, OSError, ValueError, KeyError, pickle.UnpicklingError) as error:
+        first = (str(error).splitlines() or [type(error).__name__])[0]
+        raise SchemaError(
+            f"{path} is truncated or holds no operators ({first}); delete it and run `nsf teach` again"
+        ) from error
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise SchemaError(f"{path} is a torch file but holds no operators; pass the file of a teach run")
+    if content.get("format_version") != FORMAT_VERSION:
+        raise SchemaError(
+            f"{path} has format_version {content.get('format_version')!r}, this nsf reads {FORMAT_VERSION}; "
+            "install the nsf that wrote it or teach again with `nsf teach`"
+        )
+    return content

@@ -1,0 +1,59 @@
+"""What colliders do at each step, as a few numbers: the moment's state, never the time itself."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from nsf.mpm import Collider
+
+#: Shift [m], angle [rad], both over the coming step too, and whether it acts.
+FEATURES = 9
+_SAME_TIME = 1e-6  # of a step, as `nsf.mpm.motion` has it
+#: A combination of features that moves less than this share of the first one counts for nothing.
+_HARDLY = 0.03
+
+
+def collider_states(colliders: Sequence[Collider], dt: float, steps: int) -> np.ndarray:
+    """State of every collider at the start of each step.
+
+    Args:
+        colliders: c of them.
+        dt: step [s].
+        steps: N.
+
+    Returns:
+        [N, 9 c]: of each collider its shift from rest d [m] and angle θ [rad], how both change in the coming
+        step, and 1 where it acts, else 0.
+    """
+    t = dt * np.arange(steps + 1)
+    found = [np.zeros((steps, 0))]
+    for collider in colliders:
+        pose = np.zeros((steps + 1, 4))
+        if collider.motion is not None:
+            times, shifts, angles = collider.motion.keyframes()
+            pose = np.stack([np.interp(t, times, way) for way in (*shifts.T, angles)], 1)
+        later = t[:-1] + _SAME_TIME * dt
+        active = (later >= collider.since) & (later < collider.until)
+        found += [pose[:-1], np.diff(pose, axis=0), active[:, None].astype(float)]
+    return np.concatenate(found, 1)
+
+
+def principal(states: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """The combinations of collider states that vary in a run.
+
+    Plates that mirror each other vary as one; what stays as it is in each run is no state.
+
+    Args:
+        states: [N, f] of each training run, as `collider_states` gives them.
+
+    Returns:
+        Mean [f] and matrix [f, C]: c = (state − mean) matrix, whose first entry has unit variance.
+    """
+    rows = np.concatenate(states)
+    varies = np.max([np.ptp(run, axis=0) for run in states], axis=0) > 0.0
+    mean = rows.mean(0)
+    deviation = np.where(varies, rows.std(0), np.inf)
+    _, sizes, axes = np.linalg.svd((rows - mean) / deviation, full_matrices=False)
+    kept = sizes > _HARDLY * max(sizes.max(initial=0.0), np.finfo(float).tiny)
+    scale = sizes[0] / np.sqrt(len(rows)) if kept.any() else 1.0
+    return mean, (axes[kept] / scale / deviation).T

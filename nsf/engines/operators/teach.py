@@ -1,0 +1,334 @@
+"""Teaching: the projected step is asked from many states, and the operators learn what it answers.
+
+Labels are single steps of the teacher; the operators' own runs say from where, round by round, as in DAgger
+(Ross et al. 2011). Held-out values have no part in it.
+"""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from nsf.engines.operators.lessons import Labels, Teaching, Yardstick
+from nsf.engines.operators.model import Sizes, StepOperators
+from nsf.engines.operators.states import principal
+from nsf.engines.operators.teacher import Teacher
+from nsf.errors import InstabilityError
+from nsf.storage import writing
+
+_BATCH = 1024  # labels of one step of the descent
+_WINDOWS = 48  # unrolled windows of one
+_UNROLLED_WEIGHT = 0.1  # of their loss beside that of single steps
+_FAR = 4.0  # deviations from the mean of training latents, beyond which a run of one's own is cut off
+#: Of their own deviation, by which the last change of a state of the tube differs from that of its run.
+_OTHER_CHANGE = 0.1
+
+
+class Course:
+    """One teaching: what is asked of the teacher, and what is learned, round by round.
+
+    Args:
+        teachers: at the training values, and at values between them.
+        truth: [N + 1, R, r] training latents, of the first teacher's values; None where the teacher's step is
+            not theirs.
+        yardstick: decides which round is kept.
+        teaching: how.
+        seed: of network, states and batches.
+        folder: where finished rounds are kept, for a teaching that is broken off; None for nowhere.
+        say: told of each round.
+
+    Attributes:
+        errors: of each round by the yardstick; best: the round that is kept.
+        seconds: of all rounds [s].
+    """
+
+    def __init__(
+        self,
+        teachers: Sequence[Teacher],
+        truth: Tensor | None,
+        yardstick: Yardstick,
+        teaching: Teaching,
+        seed: int,
+        folder: Path | None = None,
+        say: Callable[[str], object] = lambda line: None,
+    ):
+        self.teachers, self.yardstick, self.teaching, self.seed = teachers, yardstick, teaching, seed
+        self._truth, self._folder, self._say = truth, folder, say
+        self.seconds, self.best = 0.0, 0
+        self.errors: list[float] = []
+
+    @property
+    def steps(self) -> int:
+        """Steps of the teacher so far."""
+        return sum(teacher.steps for teacher in (*self.teachers, self.yardstick.teacher))
+
+    def follow(self) -> StepOperators:
+        """All rounds; gives the operators of the best.
+
+        Raises:
+            InstabilityError: no round gave a run that stays finite.
+        """
+        best, least = None, math.inf
+        for number in range(self.teaching.rounds + 1):
+            started = time.perf_counter()
+            kept = self._kept(number)
+            if kept is None:
+                self._learn(number)
+                kept = self._keep(number, time.perf_counter() - started)
+            else:
+                self._take_up(kept)
+            if kept["error"] < least:
+                best, least, self.best = kept["model"], kept["error"], number
+            self._say(f"round {number}: {100 * kept['error']:.3g} % off")
+        if best is None:
+            raise InstabilityError(
+                "no round of teaching gave operators whose runs stay finite; raise engine.teaching.steps or "
+                "engine.teaching.descent, or deploy with engine=auto"
+            )
+        self.model.load_state_dict(best)
+        return self.model.double().requires_grad_(False).eval()
+
+    # -- rounds -----------------------------------------------------------------------------------------
+
+    def _learn(self, number: int) -> None:
+        generator = torch.Generator().manual_seed(1000 * self.seed + number)
+        if number == 0:
+            self._begin(generator)
+        else:
+            self.labels = Labels.joined([self.labels, *self._along_own_runs(number)])
+        self._descend(number, generator)
+        runs = self.own_runs(self.yardstick.teacher)
+        self.errors.append(self.yardstick.error(runs))
+
+    def _begin(self, generator: torch.Generator) -> None:
+        """Runs of the teacher, states of the truth and of the tube, and the scales of the operators."""
+        self._runs = [teacher.run() for teacher in self.teachers]
+        first, runs = self.teachers[0], self._runs[0]
+        changes = torch.diff(runs, dim=0)
+        truth = runs if self._truth is None else self._truth
+        self.model = self._model(truth, changes)
+        parts = [self._of_runs(teacher, own) for teacher, own in zip(self.teachers, self._runs, strict=True)]
+        if self._truth is not None:
+            asked = self._moments(0, self._share)
+            parts.append(self._asked(first, asked, self._truth[asked], self._truth[asked - 1]))
+        for teacher, own in zip(self.teachers, self._runs, strict=True):
+            asked = self._moments(1, self._share)
+            xhat, change = own[asked], own[asked] - own[asked - 1]
+
+            def noise(like: Tensor) -> Tensor:
+                return torch.randn(like.shape, generator=generator, dtype=torch.float64)
+
+            change = change * (1.0 + _OTHER_CHANGE * noise(change[..., :1]))
+            change = change + _OTHER_CHANGE * self.model.d_scale * noise(change)
+            xhat = xhat + self.teaching.tube * self.model.x_scale * noise(xhat)
+            gravity = teacher.gravity + self.reach * _ball(xhat.shape[:-1], generator)
+            parts.append(self._asked(teacher, asked, xhat, xhat - change, gravity))
+        self.labels = Labels.joined(parts)
+
+    def _along_own_runs(self, number: int) -> list[Labels]:
+        parts = []
+        for teacher in self.teachers:
+            own = self.own_runs(teacher)
+            asked = self._moments(number, self._share)
+            parts.append(self._asked(teacher, asked, own[asked], own[asked - 1]))
+        return parts
+
+    @property
+    def _share(self) -> int:
+        """Moments of each sweep, so that all steps of the teacher come to about as many as are asked for."""
+        N, runs = self.teachers[0].total_steps, sum(map(len, self.teachers))
+        sweeps = runs * (1 + self.teaching.rounds) + (0 if self._truth is None else len(self.teachers[0]))
+        left = self.teaching.steps - N * (runs + len(self.yardstick.teacher))
+        return min(N - 1, max(1, left // sweeps))
+
+    def _moments(self, offset: int, count: int) -> Tensor:
+        """Steps n ≥ 1 that a sweep asks for, ascending and evenly spread; another offset gives others."""
+        N = self.teachers[0].total_steps
+        return 1 + (
+            (torch.arange(count) * (N - 1) + (offset * (N - 1)) // (self.teaching.rounds + 1)) // count
+        )
+
+    def _of_runs(self, teacher: Teacher, runs: Tensor) -> Labels:
+        """Labels that runs of the teacher itself are; runs [N + 1, R, r]."""
+        first = teacher.first_change()[None]
+        changes = torch.cat([first, torch.diff(runs, dim=0)])
+        return self._labelled(
+            teacher, torch.arange(len(runs) - 1), runs[:-1], changes[:-1], torch.diff(changes, dim=0)
+        )
+
+    def _asked(
+        self, teacher: Teacher, moments: Tensor, xhat: Tensor, before: Tensor, gravity: Tensor | None = None
+    ) -> Labels:
+        """What the teacher answers at moments [m] from states [m, R, r]."""
+        change = xhat - before
+        answers = torch.stack(
+            [
+                teacher.step_from(int(n), xhat[i], change[i], None if gravity is None else gravity[i])
+                for i, n in enumerate(moments)
+            ]
+        )
+        return self._labelled(teacher, moments, xhat, change, answers - xhat - change, gravity)
+
+    @staticmethod
+    def _labelled(
+        teacher: Teacher, moments, xhat: Tensor, change: Tensor, acceleration: Tensor, gravity=None
+    ) -> Labels:
+        like = xhat.shape[:-1]
+        given = teacher.parameters, teacher.gravity if gravity is None else gravity, teacher.features[moments]
+        rows = [xhat, change, acceleration, *(values.expand(*like, -1) for values in given)]
+        return Labels(*(values.flatten(0, 1).clone() for values in rows))
+
+    # -- the network ------------------------------------------------------------------------------------
+
+    @property
+    def reach(self) -> float:
+        """How far gravity is varied [m/s²]; 0 where there is none."""
+        largest = max(float(teacher.gravity.norm(dim=1).max()) for teacher in self.teachers)
+        return self.teaching.gravity * largest
+
+    @property
+    def gravity(self) -> tuple[list[float], float]:
+        """The middle [3] of all gravity that was taught, and how far from it any was [m/s²]."""
+        known = self.teachers[0].gravity
+        middle = known.mean(0)
+        return middle.tolist(), float((known - middle).norm(dim=1).max()) + self.reach
+
+    def _model(self, truth: Tensor, changes: Tensor) -> StepOperators:
+        first = self.teachers[0]
+        c_mean, c_matrix = principal(list(first.features.transpose(0, 1).numpy()))
+        weightless = self.reach == 0.0 and not any(bool(t.gravity.any()) for t in self.teachers)
+        sizes = Sizes(
+            latents=truth.shape[-1], parameters=first.parameters.shape[1], features=len(c_mean),
+            states=c_matrix.shape[1], gravity=not weightless, width=self.teaching.width,
+        )  # fmt: skip
+        state = torch.random.get_rng_state()
+        torch.manual_seed(self.seed)
+        model = StepOperators(sizes, first.dt).double()
+        torch.random.set_rng_state(state)
+
+        def deviation(values: Tensor) -> Tensor:
+            found = values.flatten(0, -2).std(0)
+            return found.clamp_min(1e-9 * float(found.max().clamp_min(1e-30)))
+
+        scales = {
+            "x_mean": truth.flatten(0, -2).mean(0), "x_scale": deviation(truth),
+            "mu_mean": first.parameters.mean(0), "mu_scale": _spread(first.parameters),
+            "c_mean": torch.as_tensor(c_mean), "c_matrix": torch.as_tensor(c_matrix),
+            "d_scale": deviation(changes), "a_scale": deviation(torch.diff(changes, dim=0)),
+            "g_mean": first.gravity.mean(0),
+            "g_scale": first.gravity.norm(dim=1).max().clamp_min(1e-30),
+        }  # fmt: skip
+        for name, value in scales.items():
+            getattr(model, name).copy_(value)
+        return model
+
+    def own_runs(self, teacher: Teacher) -> Tensor:
+        """[N + 1, R, r] runs of the operators at the teacher's values; what strays far is held."""
+        model, limit = self.model, _FAR
+        c = model.collider_state(teacher.features)
+        x, d = teacher.start, teacher.first_change()
+        found = [x]
+        with torch.no_grad():
+            for state in c:
+                there, change = model.step(x, d, teacher.parameters, teacher.gravity, state)
+                near = (((there - model.x_mean) / model.x_scale).abs() < limit).all(-1, keepdim=True)
+                d = torch.where(near, change, 0.0)
+                x = torch.where(near, there, x)
+                found.append(x)
+        return torch.stack(found)
+
+    def _descend(self, number: int, generator: torch.Generator) -> None:
+        """Adam on single steps and unrolled windows, with cosine decay."""
+        teaching, model = self.teaching, self.model.float()
+        rows = [getattr(self.labels, name).float() for name in Labels.__dataclass_fields__]
+        xhat, change, acceleration, mu, g, features = rows
+        a_scale = model.a_scale
+        # Far from training runs accelerations are ten to a hundred times as large, and would be all there is.
+        weight = 1.0 / (1.0 + (acceleration / a_scale).square().mean(1) / 4.0)
+        c = model.collider_state(features)
+        windows = [
+            self._windows(teacher, runs) for teacher, runs in zip(self.teachers, self._runs, strict=True)
+        ]
+        optimiser = torch.optim.Adam(model.parameters(), lr=teaching.rate / (1 if number == 0 else 2))
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, teaching.descent)
+        for turn in range(teaching.descent):
+            at = torch.randint(len(xhat), (min(_BATCH, len(xhat)),), generator=generator)
+            found = model.acceleration(xhat[at], change[at], mu[at], g[at], c[at])
+            loss = (weight[at] * ((found - acceleration[at]) / a_scale).square().mean(1)).mean()
+            if teaching.unroll > 1:
+                loss = loss + _UNROLLED_WEIGHT * self._unrolled(windows[turn % len(windows)], generator)
+            optimiser.zero_grad()
+            loss.backward()
+            torch.nn.utils.clip_grad_norm_(model.parameters(), 10.0)
+            optimiser.step()
+            schedule.step()
+        self.model = model.double()
+
+    def _windows(self, teacher: Teacher, runs: Tensor) -> tuple[Tensor, ...]:
+        first = teacher.first_change()
+        changes = torch.cat([first[None], torch.diff(runs, dim=0)])
+        c = self.model.collider_state(teacher.features.float())
+        return runs.float(), changes.float(), teacher.parameters.float(), teacher.gravity.float(), c
+
+    def _unrolled(self, window: tuple[Tensor, ...], generator: torch.Generator) -> Tensor:
+        runs, changes, mu, g, c = window
+        model, unroll = self.model, min(self.teaching.unroll, len(runs) - 1)
+        k = torch.randint(runs.shape[1], (_WINDOWS,), generator=generator)
+        n = torch.randint(len(runs) - unroll, (_WINDOWS,), generator=generator)
+        x, d, loss = runs[n, k], changes[n, k], 0.0
+        x = x + self.teaching.noise * model.x_scale * torch.randn(x.shape, generator=generator)
+        for j in range(unroll):
+            x, d = model.step(x, d, mu[k], g[k], c[n + j, k])
+            loss = loss + ((x - runs[n + j + 1, k]) / model.d_scale).square().mean()
+        return loss / unroll
+
+    # -- rounds on disk ---------------------------------------------------------------------------------
+
+    def _keep(self, number: int, seconds: float) -> dict:
+        """Write what a round leaves; all that the next one needs."""
+        self.seconds += seconds
+        kept = {
+            "model": {name: value.clone() for name, value in self.model.state_dict().items()},
+            "sizes": vars(self.model.sizes), "labels": vars(self.labels), "runs": self._runs,
+            "error": self.errors[-1], "seconds": self.seconds,
+            "steps": [teacher.steps for teacher in (*self.teachers, self.yardstick.teacher)],
+        }  # fmt: skip
+        if self._folder is not None:
+            with writing(self._file(number)) as partial:
+                torch.save(kept, partial)
+        return kept
+
+    def _file(self, number: int) -> Path:
+        return self._folder / f"round_{number}.pt"
+
+    def _kept(self, number: int) -> dict | None:
+        """What a round left that was finished before."""
+        if self._folder is None or not self._file(number).is_file():
+            return None
+        return torch.load(self._file(number), weights_only=True)
+
+    def _take_up(self, kept: dict) -> None:
+        """Go on from the end of a round."""
+        self.model = StepOperators(Sizes(**kept["sizes"]), self.teachers[0].dt).double()
+        self.model.load_state_dict(kept["model"])
+        self.labels, self._runs = Labels(**kept["labels"]), kept["runs"]
+        self.errors.append(kept["error"])
+        self.seconds = kept["seconds"]
+        for teacher, steps in zip((*self.teachers, self.yardstick.teacher), kept["steps"], strict=True):
+            teacher.steps = steps
+
+
+def _ball(shape: torch.Size, generator: torch.Generator) -> Tensor:
+    """[*shape, 3] points drawn evenly from the unit ball."""
+    way = torch.randn((*shape, 3), generator=generator, dtype=torch.float64)
+    radius = torch.rand((*shape, 1), generator=generator, dtype=torch.float64) ** (1 / 3)
+    return radius * way / way.norm(dim=-1, keepdim=True)
+
+
+def _spread(values: Tensor) -> Tensor:
+    """Deviation [n] of rows, 1 where there is none."""
+    found = values.std(0, correction=0)
+    return torch.where(found > 0, found, 1.0)

@@ -1,0 +1,110 @@
+"""The teacher: another engine, stepped in batches from states of one's choice."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import torch
+
+from nsf.dynamics.interop import as_tensor
+from nsf.dynamics.setup import Setup
+from nsf.dynamics.solver import ReducedBatch
+from nsf.engines.operators.model import first_change
+from nsf.engines.operators.states import collider_states
+from nsf.kinematics.manifold import Restriction
+
+
+class Teacher:
+    """Runs of another engine at some parameter values, whose every step may begin where one likes.
+
+    Args:
+        batches: the runs at t = 0, in the order of the values; an engine that steps one at a time has a batch
+            for each.
+        told: called with each number of steps taken.
+
+    Attributes:
+        parameters: μ [R, n]; gravity: [R, 3] [m/s²]; start: x̂_0 [R, r]; all in fp64 on the host.
+        features: [N, R, f] state of the colliders at each step.
+        setup: of the first run. total_steps: N; dt: step [s]; steps: how many were taken here.
+    """
+
+    def __init__(self, batches: Sequence[ReducedBatch], told: Callable[[int], object] = lambda steps: None):
+        self._batches, self._told, self.steps = batches, told, 0
+        setups = [setup for batch in batches for setup in batch.batch.setups]
+        self.setup = setups[0]
+        self.total_steps, self.dt = batches[0].total_steps, batches[0].dt
+        self.parameters = _host(torch.stack([setup.parameters for setup in setups]))
+        self.gravity = torch.tensor(np.array([setup.gravity for setup in setups]), dtype=torch.float64)
+        self.start = _host(torch.stack([setup.xhat for setup in setups]))
+        states = [collider_states(setup.scene.colliders, self.dt, self.total_steps) for setup in setups]
+        self.features = torch.as_tensor(np.stack(states, 1))
+
+    def __len__(self) -> int:
+        return len(self.parameters)
+
+    def first_change(self) -> torch.Tensor:
+        """[R, r] what stands for d at t = 0."""
+        spans = [(batch.span_at(0), batch.batch.setups) for batch in self._batches]
+        return torch.cat([first_changes(span.at_sample, span.sets.sample, own) for span, own in spans])
+
+    def run(self) -> torch.Tensor:
+        """[N + 1, R, r] latent vectors of the runs as they go by themselves."""
+        found = []
+        for batch in self._batches:
+            batch.restart()
+            batch.step(batch.total_steps)
+            found.append(_host(batch.batch.record.xhat))
+            self._count(batch.total_steps * len(batch))
+        return torch.cat(found).transpose(0, 1)
+
+    def step_from(
+        self, step: int, xhat: torch.Tensor, change: torch.Tensor, gravity: torch.Tensor | None = None
+    ) -> torch.Tensor:
+        """x̂_{n+1} [R, r] from states of one's choice.
+
+        Args:
+            step: n, at least 1; it says where colliders are and which sample holds.
+            xhat, change: [R, r] x̂_n and d = x̂_n − x̂_{n−1}.
+            gravity: [R, 3] [m/s²] of this step; the scenes' own by default.
+        """
+        found, first = [], 0
+        for batch in self._batches:
+            rows = slice(first, first := first + len(batch))
+            record = batch.batch.record
+            record.now.copy_(xhat[rows])
+            record.before.copy_(xhat[rows] - change[rows])
+            record.row.fill_(step)
+            if step > 1:  # the inversion begins on the parabola through three, here a line
+                record.xhat[:, step - 2] = xhat[rows] - 2.0 * change[rows]
+            forcing = as_tensor(batch.span_at(step).grid_step.gravity)
+            forcing.copy_((self.gravity if gravity is None else gravity)[rows])
+            batch.resume(step)
+            batch.step(1)
+            found.append(_host(record.now))
+            if gravity is not None:
+                forcing.copy_(self.gravity[rows])
+            self._count(len(batch))
+        return torch.cat(found)
+
+    def _count(self, steps: int) -> None:
+        self.steps += steps
+        self._told(steps)
+
+
+def first_changes(at_sample: Restriction, sample: np.ndarray, setups: Sequence[Setup]) -> torch.Tensor:
+    """[B, r] what stands for d at t = 0 in some runs, in fp64 on the host.
+
+    Args:
+        at_sample: the manifold restricted to S.
+        sample: [s] indices of S.
+        setups: of the runs.
+    """
+    rows, found = torch.as_tensor(sample).long(), []
+    with torch.no_grad():
+        for setup in setups:
+            _, jacobian = at_sample.position_and_jacobian(setup.xhat)
+            found.append(first_change(_host(jacobian), _host(setup.initial_velocity[rows]), setup.dt))
+    return torch.stack(found)
+
+
+def _host(values: torch.Tensor) -> torch.Tensor:
+    return values.detach().to("cpu", torch.float64, copy=True)

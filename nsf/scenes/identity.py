@@ -1,0 +1,23 @@
+"""What makes two scenes the same physics."""
+
+from omegaconf import OmegaConf
+
+from nsf.canonical import content_hash
+
+#: Keys of a scene that its simulation does not depend on.
+NOT_PHYSICS = ("parameters", "reduced", "paper", "title")
+
+
+def physics_hash(scene) -> str:
+    """Hash of a scene's physics but for gravity, initial velocities and the value of its parameter."""
+    template = scene.template.copy()
+    OmegaConf.update(template, scene.parameters.key, None)
+    template = OmegaConf.to_container(template, resolve=False)
+    content = {key: template[key] for key in ("scale", "material", "transfer")}
+    content["scene"] = {k: v for k, v in template["scene"].items() if k not in (*NOT_PHYSICS, "gravity")}
+    bodies = content["scene"]["bodies"]
+    content["scene"]["bodies"] = {
+        name: {key: value for key, value in body.items() if key != "velocity"}
+        for name, body in bodies.items()
+    }
+    return content_hash(content)

@@ -1,0 +1,346 @@
+"""Operators from their teaching to their errors, on the tiny chain; and what they are refused for."""
+
+import re
+import shutil
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from nsf.deployment import Levels, Rollout, rollout, rollouts
+from nsf.deployment.levels import estimated_errors
+from nsf.dynamics import Method, Taylor
+from nsf.engines import Operators
+from nsf.engines.operators import Course
+from nsf.errors import ConfigError, MissingRunError
+from nsf.sampling import SampleSpan
+
+ANGLE = {"friction_angle": 26.0}
+TAUGHT = (
+    "engine=operators",
+    "engine.teaching.steps=400",
+    "engine.teaching.descent=300",
+    "engine.teaching.rounds=1",
+    "engine.teaching.width=32",
+)
+
+
+@pytest.fixture(scope="module")
+def lesson(chain, pipeline_at, tmp_path_factory):
+    """The tiny chain by operators, and what it said."""
+    root, said = tmp_path_factory.mktemp("taught") / "runs", []
+    for stage in ("simulate", "train"):
+        shutil.copytree(chain.root / stage, root / stage)
+    pipeline = pipeline_at(root, *TAUGHT, say=said.append)
+    for stage in ("deploy", "evaluate"):
+        pipeline.run(stage)
+    return pipeline, said
+
+
+@pytest.fixture(scope="module")
+def taught(lesson):
+    pipeline, _ = lesson
+    return Operators.load(pipeline.taught.path / "operators.pt")
+
+
+@pytest.fixture
+def reduced(lesson, taught, tiny_manifold):
+    """(scene, **options) → a solver by operators; with the sample that they know."""
+    pipeline, _ = lesson
+    manifold = pipeline.manifold()
+    known = pipeline.batch_at(manifold, [26.0]).batch.shared
+
+    def build(scene=pipeline.scene, parameters=ANGLE, sample=known.samples, manifold=manifold, **options):
+        options = {"engine": taught, "device": "cpu"} | options
+        return scene.reduced(manifold, parameters, sample, **options)
+
+    return build
+
+
+# -- the stage ------------------------------------------------------------------------------------------
+
+
+def test_the_chain(lesson, chain):
+    pipeline, said = lesson
+    assert [line.split(":")[0] for line in said if "warning" not in line] == [
+        "teach",
+        "deploy",
+        "deploy",
+        "evaluate",
+    ]
+    run = pipeline.taught
+    assert run.manifest["parents"] == [pipeline.training.id]
+    assert pipeline.deployment.manifest["parents"] == [pipeline.training.id, run.id]
+    found = run.manifest["metrics"]
+    assert 300 < found["teacher_steps"] <= 400
+    assert len(found["errors"]) == 2
+    assert found["round"] == int(np.argmin(found["errors"]))
+    assert found["teach_seconds"] > 0
+    assert [path.name for path in run.path.glob("*.pt")] == ["operators.pt"]
+    row = pd.read_csv(pipeline.evaluation.path / "results.csv").iloc[0]
+    assert (row["engine"], row["integration_mean"]) == ("operators", 0)
+    projected = pd.read_csv(chain.pipeline.evaluation.path / "results.csv").iloc[0]
+    # Of 0.4 thousand steps of the teacher; a run that does not move is off by 1.
+    assert projected["displacement_error"] < 0.03
+    assert row["displacement_error"] < 0.06
+
+
+def test_a_second_call_reuses_what_was_taught(lesson, pipeline_at):
+    pipeline, _ = lesson
+    said = []
+    pipeline_at(pipeline.root, *TAUGHT, say=said.append).deploy()
+    assert said == [
+        f"{run.stage}: inputs unchanged, reused → {run.id}" for run in (pipeline.taught, pipeline.deployment)
+    ]
+
+
+def test_no_held_out_value_is_a_lesson(pipeline_at, tmp_path):
+    for seed in range(20):
+        pipeline = pipeline_at(tmp_path, *TAUGHT, f"seed={seed}")
+        known, between, back = pipeline.lessons
+        assert known == [22.0, 30.0, 38.0]
+        assert (len(between), len(back)) == (3, 3)
+        assert not {*between, *back} & {26.0, *known}
+    taken = pipeline_at(tmp_path, *TAUGHT, f"scene.parameters.test=[{between[1]}]")
+    assert taken.taught.hash != pipeline.taught.hash
+
+
+def test_a_teaching_that_was_broken_off_goes_on(lesson, copied, pipeline_at, monkeypatch):
+    pipeline, _ = lesson
+    root = copied("simulate", "train")
+    descend = Course._descend
+
+    def broken(course, number, generator):
+        if number == 1:
+            raise KeyboardInterrupt
+        descend(course, number, generator)
+
+    monkeypatch.setattr(Course, "_descend", broken)
+    with pytest.raises(KeyboardInterrupt):
+        pipeline_at(root, *TAUGHT).teach()
+    monkeypatch.setattr(Course, "_descend", descend)
+    began = []
+    begin = Course._begin
+    monkeypatch.setattr(Course, "_begin", lambda *given: (began.append(1), begin(*given)))
+    again = pipeline_at(root, *TAUGHT).teach()
+    assert not began  # the first round was there
+    one, other = (
+        torch.load(run.path / "operators.pt", weights_only=True) for run in (pipeline.taught, again)
+    )
+    assert one["taught"] == other["taught"]
+    assert all(torch.equal(one["state"][name], other["state"][name]) for name in one["state"])
+    metrics = [run.manifest["metrics"] for run in (pipeline.taught, again)]
+    assert metrics[0]["errors"] == metrics[1]["errors"]
+    assert metrics[0]["teacher_steps"] == metrics[1]["teacher_steps"]
+
+
+def test_an_engine_that_learns_nothing_is_not_taught(pipeline_at, tmp_path):
+    with pytest.raises(ConfigError, match="engine=auto is not taught; set engine=operators"):
+        pipeline_at(tmp_path).teach()
+    with pytest.raises(MissingRunError, match="run `nsf train"):
+        pipeline_at(tmp_path, *TAUGHT).teach()
+
+
+# -- the engine -----------------------------------------------------------------------------------------
+
+
+def test_a_run_is_a_solver_as_others(reduced, lesson):
+    pipeline, _ = lesson
+    solver, other = reduced(), reduced()
+    solver.step(24)
+    for n in (1, 10, 13):
+        other.step(n)
+    assert torch.equal(solver.record.xhat, other.record.xhat)
+    assert solver.engine == "operators"
+    assert solver.trajectory().stops == ["operators"] * 24
+    assert (solver.left_grid(), solver.needed_outside(), solver.integration_mean) == (-1, 0, 0.0)
+    projected = reduced(engine="auto")
+    projected.step(24)
+    one, two = (np.asarray(run.state.numpy()["x"]) for run in (solver, projected))
+    moved = np.linalg.norm(two - pipeline.scene.particles().X)
+    assert np.linalg.norm(one - two) < 0.06 * moved
+    first = solver.record.xhat.clone()
+    solver.restart()
+    solver.step(24)
+    assert torch.equal(solver.record.xhat, first)
+    kept = Rollout.open(pipeline.deployment.path / "rollout_0.h5")
+    np.testing.assert_array_equal(kept.xhat, first.numpy())
+
+
+def test_a_batch_is_its_runs(reduced, lesson, taught):
+    pipeline, _ = lesson
+    sample = reduced().setup.samples
+    parameters = [{"friction_angle": value} for value in (23.0, 26.0, 37.0)]
+    manifold = pipeline.manifold()
+    batch = pipeline.scene.reduced_batch(manifold, parameters, sample, engine=taught, device="cpu")
+    batch.step(24)
+    for run, own in zip(batch.runs, parameters, strict=True):
+        alone = reduced(parameters=own)
+        alone.step(24)
+        assert torch.equal(alone.record.xhat, run.record.xhat)
+
+
+def test_a_run_goes_on_from_where_another_engine_is(reduced):
+    projected, solver = reduced(engine="auto"), reduced()
+    projected.step(10)
+    for name in ("now", "before"):
+        getattr(solver.record, name).copy_(getattr(projected.record, name))
+    solver.record.row.fill_(10)
+    solver.together.resume(10)
+    for run in (solver, projected):
+        run.step(1)
+    change = np.abs(projected.state.xhat - projected.record.before.numpy()).max()
+    assert np.abs(solver.state.xhat - projected.state.xhat).max() < 0.2 * change
+
+
+@pytest.mark.parametrize(
+    ("changes", "inside"),
+    [
+        ({"scene.gravity": [0.0, 0.2, -3.7]}, True),
+        ({"scene.bodies.column.velocity": [0.0, 0.0, -0.1]}, True),
+        ({"scene.gravity": [0.0, 1.0, -4.0]}, False),
+    ],
+)
+def test_gravity_and_the_initial_velocity_may_be_others(reduced, lesson, changes, inside, tiny_trust):
+    pipeline, _ = lesson
+    changed = pipeline.scene.with_changes(changes)
+    plain, own, projected = reduced(), reduced(scene=changed), reduced(scene=changed, engine="auto")
+    for run in (plain, own, projected):
+        run.step(12)
+    difference = np.abs(projected.state.xhat - plain.state.xhat).max()
+    assert np.abs(own.state.xhat - plain.state.xhat).max() > 0.3 * difference
+    assert (own.doubt[0] <= 1.0) == inside
+    if not inside:
+        own.restart()
+        assert rollout(own, 26.0, tiny_trust).distrusted == 0
+
+
+def test_a_parameter_outside_of_what_was_taught_is_doubted(reduced):
+    assert reduced(parameters={"friction_angle": 38.0}).doubt == (1.0, "")
+    off, text = reduced(parameters={"friction_angle": 42.0}).doubt
+    assert off == pytest.approx(1.5)
+    assert text == "friction_angle=42 is outside of 22 … 38"
+
+
+def test_what_operators_were_not_taught_on_is_refused(reduced, lesson, tiny_manifold):
+    pipeline, _ = lesson
+    other = pipeline.manifold()
+    other.training_latents[0] += 1e-6
+    refused = [
+        ({"manifold": other}, "another manifold"),
+        ({"sample": 21}, "another sample"),
+        ({"dt_multiplier": 1.5}, "another Δt"),
+        ({"method": Method("deformation_only", False, False)}, "another method"),
+        ({"projector": Taylor()}, "another projector"),
+        ({"scene": pipeline.scene.with_changes({"material.nu": 0.25})}, "another scene"),
+    ]
+    for options, message in refused:
+        with pytest.raises(ConfigError, match=re.escape(f"they were taught on {message}")):
+            reduced(**options)
+    spans = [SampleSpan(0.0, reduced().samples[0].particles), SampleSpan(0.5, np.arange(20))]
+    with pytest.raises(ConfigError, match="another sample"):
+        reduced(sample=spans)
+
+
+def test_a_name_is_not_enough(chain, tiny_manifold):
+    with pytest.raises(ConfigError, match=re.escape("give engine=nsf.engines.Operators.load(FILE)")):
+        chain.scene.reduced(tiny_manifold, ANGLE, 20, engine="operators", device="cpu")
+
+
+# -- levels ---------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def levels_of(lesson):
+    pipeline, _ = lesson
+    manifold = pipeline.manifold()
+
+    def build(*how, every=4):
+        return Levels(lambda values: pipeline.batch_at(manifold, values, engine="auto"), every, *how)
+
+    return build
+
+
+def test_the_estimate_is_how_far_projected_runs_are(reduced, lesson, levels_of):
+    pipeline, _ = lesson
+    values = [23.0, 26.0]
+    batch = pipeline.batch_at(pipeline.manifold(), values)
+    batch.step(24)
+    projected = levels_of().projected(values)
+    found = estimated_errors(batch, projected, 1)
+    projected.restart()
+    projected.step(24)
+    at = batch.span.at_sample
+    for run, other, estimate in zip(batch.runs, projected.runs, found, strict=True):
+        off = at.position(run.record.xhat) - at.position(other.record.xhat)
+        error = off.square().sum(-1).mean(-1).sqrt().numpy()
+        assert error[-1] > 1e-4
+        # Of operators that were hardly taught, which carry a defect on as badly as they step.
+        assert 0.3 * error.max() < estimate.max() < 5.0 * error.max()
+    assert (batch.batch.record.residuals[:, 1:, -1] > 0).all()
+
+
+def test_beyond_a_tolerance_the_projected_step_goes_on(reduced, levels_of, tiny_trust):
+    own = rollouts(reduced().together, [26.0], tiny_trust, levels=levels_of())[0]
+    assert (own.by_operators, own.levels) == (24, ["operators"] * 24)
+    assert own.estimate[0] == 0.0 < own.estimate[-1]
+    tolerance = 0.5 * float(own.estimate.max())
+    found = rollouts(reduced().together, [26.0], tiny_trust, levels=levels_of(tolerance))[0]
+    n = found.by_operators
+    assert 0 < n < 24
+    assert found.levels == ["operators"] * n + ["projected"] * (24 - n)
+    assert found.estimate[n] <= tolerance
+    np.testing.assert_array_equal(found.xhat[: n + 1], own.xhat[: n + 1])
+    projected = reduced(engine="auto")
+    for name, values in (("now", own.xhat[n]), ("before", own.xhat[n - 1])):
+        getattr(projected.record, name).copy_(torch.as_tensor(values))
+    projected.record.xhat[: n + 1] = torch.as_tensor(own.xhat[: n + 1])
+    projected.record.row.fill_(n)
+    projected.together.resume(n)
+    projected.step(24 - n)
+    np.testing.assert_allclose(found.xhat[-1], projected.state.xhat, rtol=0, atol=1e-12)
+
+
+def test_what_is_doubted_is_projected_and_what_is_off_goes_to_full_order(reduced, levels_of, tiny_trust):
+    outside = {"friction_angle": 60.0}
+    solver = reduced(parameters=outside)
+    found = rollouts(solver.together, [60.0], tiny_trust, levels=levels_of(None, True))[0]
+    assert (found.by_operators, found.levels) == (0, ["projected"] * 24)
+    assert reduced().doubt[0] <= 1.0
+    plain = rollouts(reduced(parameters=outside).together, [60.0], tiny_trust, levels=levels_of())[0]
+    assert plain.by_operators == 24
+    assert (plain.trust > 1.0).all()  # never without saying so
+    handed = rollouts(reduced(parameters=outside).together, [60.0], tiny_trust, True, levels_of(None, True))[
+        0
+    ]
+    assert handed.handed_over == -1 or handed.levels == ["projected"] * handed.handed_over
+
+
+def test_a_rollout_keeps_who_took_its_steps(lesson, tmp_path):
+    pipeline, _ = lesson
+    kept = Rollout.open(pipeline.deployment.path / "rollout_0.h5")
+    assert kept.by_operators == 24
+    assert kept.estimate.shape == (25,)
+    assert pipeline.deployment.manifest["metrics"]["by_operators"] == [24]
+    row = pd.read_csv(pipeline.evaluation.path / "results.csv").iloc[0]
+    assert row["handed_over"] == 0.0
+    assert row["teach_seconds"] == pytest.approx(pipeline.taught.manifest["metrics"]["teach_seconds"])
+    offline = row["teach_seconds"] + pipeline.training.manifest["metrics"]["training_seconds"]
+    assert row["break_even_runs"] > offline / (1e-3 * 40 * row["step_ms_full"])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (("deploy.tolerance=0.001",), "deploy.tolerance=0.001 needs engine=operators"),
+        (("deploy.on_distrust=projected",), "deploy.on_distrust=projected needs engine=operators"),
+        ((*TAUGHT, "deploy.tolerance=-1.0"), "deploy.tolerance=-1.0 m must be positive, or null"),
+        ((*TAUGHT, "engine.check=0"), "engine.check=0 must be a whole number of at least 1"),
+        ((*TAUGHT, "engine.teacher=operators"), "engine.teacher=operators is unknown"),
+        ((*TAUGHT, "engine.teaching.width=0"), "engine.teaching: width=0 must be at least 1"),
+    ],
+)
+def test_what_cannot_be_asked_for(pipeline_at, tmp_path, overrides, message):
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        pipeline_at(tmp_path, *overrides)

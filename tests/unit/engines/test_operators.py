@@ -1,0 +1,331 @@
+"""Operators: what a step is by construction, how a file is read, and what the compiled loop computes."""
+
+import re
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from nsf.dynamics.latent import LatentRecord
+from nsf.engines.operators import (
+    Operators,
+    Sizes,
+    StepOperators,
+    Taught,
+    Teaching,
+    collider_states,
+    first_change,
+    principal,
+    random_values,
+)
+from nsf.engines.operators.recurrence import Recurrence, make_recurrence
+from nsf.errors import ConfigError, MissingRunError, SchemaError
+from nsf.mpm import Cuboid, HalfSpace, Motion, precision_of
+from nsf.mpm.device import warp_device
+
+TAUGHT = Taught(
+    manifold="aa", scene="bb", sample="cc", dt=0.01, method="nsf", projector="gn", parameters=("angle",),
+    ranges=((20.0, 40.0),), gravity=(0.0, 0.0, -10.0), reach=1.0,
+)  # fmt: skip
+RUNS, STEPS = 3, 12
+
+
+def operators(states=2, gravity=True, width=16, seed=0):
+    """Operators of random weights and scales."""
+    torch.manual_seed(seed)
+    model = StepOperators(Sizes(4, 1, 9 * bool(states), states, gravity, width), 0.01).double()
+    with torch.no_grad():
+        model.net[4].weight.normal_(std=0.1)
+        model.net[4].bias.normal_(std=0.1)
+    for name, values in model.named_buffers():
+        scaled = 0.5 + torch.rand(values.shape).double()
+        values.copy_(0.01 * scaled if name in ("d_scale", "a_scale") else scaled)
+    return model
+
+
+def given(model, *lead):
+    """x̂, d, μ, g and c."""
+    torch.manual_seed(1)
+    sizes = model.sizes
+    shapes = [sizes.latents, sizes.latents, sizes.parameters, 3, sizes.states]
+    x, d, mu, g, c = (torch.randn(*lead, size).double() for size in shapes)
+    return x, 0.01 * d, mu, g, c
+
+
+# -- a step ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("gravity", [True, False])
+def test_a_step_is_what_its_terms_say(gravity):
+    model = operators(gravity=gravity)
+    x, d, mu, g, c = given(model, 5)
+    terms = model.terms(x, mu, c)
+    change = d + (terms.B @ d[..., None])[..., 0] + model.dt**2 * terms.f
+    if gravity:
+        change = change + model.dt**2 * (terms.G @ g[..., None])[..., 0]
+    assert (terms.G is not None) == gravity
+    there, found = model.step(x, d, mu, g, c)
+    torch.testing.assert_close(found, change, rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(there, x + change, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("what", [1, 3], ids=["change", "gravity"])
+def test_a_step_is_affine(what):
+    model = operators()
+    one, other = (list(given(model, 5)) for _ in range(2))
+    other[what] = other[what] + 3.0 * torch.randn_like(other[what])
+    between = list(one)
+    between[what] = 0.3 * one[what] + 0.7 * other[what]
+    ends = [model.step(*values)[1] for values in (one, other, between)]
+    assert (ends[0] - ends[1]).abs().max() > 1e-3
+    torch.testing.assert_close(0.3 * ends[0] + 0.7 * ends[1], ends[2], rtol=1e-12, atol=1e-14)
+
+
+def test_untaught_operators_keep_the_change():
+    model = StepOperators(Sizes(4, 1, 0, 0, True, 8), 0.01).double()
+    x, d, mu, g, c = given(model, 5)
+    assert torch.equal(model.step(x, d, mu, g, c)[1], d)
+
+
+def test_a_run_is_differentiable_in_all_it_is_given():
+    model = operators()
+    x, d, mu, g, _ = given(model)
+    c = torch.randn(3, 2).double()
+    inputs = [values.requires_grad_() for values in (x, d, mu, g)]
+    assert torch.autograd.gradcheck(lambda *values: model.run(*values, c), inputs)
+    forcing = g.detach().expand(3, 3).clone().requires_grad_()  # of each step
+    assert torch.autograd.gradcheck(lambda values: model.run(x, d, mu, values, c), [forcing])
+    model.run(x, d, mu, g, c)[-1].sum().backward()
+    weight, size = model.net[0].weight, 1e-6
+    ends = []
+    for sign in (1, -1):
+        with torch.no_grad():
+            weight[2, 3] += sign * size
+            ends.append(model.run(x, d, mu, g, c)[-1].sum())
+            weight[2, 3] -= sign * size
+    torch.testing.assert_close(weight.grad[2, 3], (ends[0] - ends[1]) / (2 * size), rtol=1e-5, atol=1e-9)
+
+
+def test_a_body_at_rest_begins_at_rest_and_a_moving_one_moves():
+    torch.manual_seed(0)
+    J, d = torch.randn(20, 3, 4).double(), torch.randn(4).double()
+    assert torch.equal(first_change(J, torch.zeros(20, 3).double(), 0.1), torch.zeros(4).double())
+    torch.testing.assert_close(first_change(J, (J @ d) / 0.1, 0.1), d)
+
+
+# -- colliders ------------------------------------------------------------------------------------------
+
+
+def plates():
+    """Two that mirror each other, come to a halt and go, and a floor."""
+
+    def motion(way):
+        return Motion((0.0, 0.04), ((0.0, 0.0, 0.0), (0.0, 0.0, way)))
+
+    return [
+        Cuboid((0.5, 0.5, 0.2), (0.1, 0.1, 0.1), motion=motion(0.1), until=0.06),
+        Cuboid((0.5, 0.5, 0.8), (0.1, 0.1, 0.1), motion=motion(-0.1), until=0.06),
+        HalfSpace((0.0, 0.0, 0.1), (0.0, 0.0, 1.0)),
+    ]
+
+
+def test_the_state_of_colliders():
+    states = collider_states(plates(), 0.01, 8)
+    assert states.shape == (8, 27)
+    np.testing.assert_allclose(states[:, 2], [0.0, 0.025, 0.05, 0.075, 0.1, 0.1, 0.1, 0.1])
+    np.testing.assert_allclose(states[:, 11], -states[:, 2])
+    np.testing.assert_allclose(states[:, 6], [0.025] * 4 + [0.0] * 4, atol=1e-15)
+    np.testing.assert_array_equal(states[:, 8], [1] * 6 + [0] * 2)
+    np.testing.assert_array_equal(states[:, 18:26], 0.0)
+
+
+def test_what_moves_together_is_one_state_and_what_rests_is_none():
+    mean, matrix = principal([collider_states(plates(), 0.01, 8)] * 2)
+    c = (collider_states(plates(), 0.01, 8) - mean) @ matrix
+    assert c.shape == (8, 3)  # way, speed and presence
+    np.testing.assert_allclose(c[:, 0].std(), 1.0)
+    assert len(np.unique(c.round(9), axis=0)) == 6  # the time itself is not told: what rests is alike
+    _, none = principal([collider_states(plates()[2:], 0.01, 8)])
+    assert none.shape == (9, 0)
+
+
+# -- the file -------------------------------------------------------------------------------------------
+
+
+def test_a_file_gives_what_was_saved(tmp_path):
+    model = operators()
+    model.save(tmp_path / "operators.pt", TAUGHT)
+    found, taught = StepOperators.load(tmp_path / "operators.pt")
+    assert taught == TAUGHT
+    assert (found.sizes, found.dt) == (model.sizes, model.dt)
+    values = given(model, 5)
+    assert torch.equal(found.step(*values)[0], model.step(*values)[0])
+    assert not any(weight.requires_grad for weight in found.parameters())
+
+
+class Evil:
+    def __reduce__(self):
+        return (print, ("code ran",))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda content: content | {"format": "other"}, "holds no operators"),
+        (lambda content: content | {"format_version": 9}, "has format_version 9, this nsf reads 1"),
+        (lambda content: content | {"taught": {}}, "do not say what they were taught on"),
+        (lambda content: content | {"sizes": content["sizes"] | {"width": 10**9}}, "do not fit each other"),
+        (lambda content: content | {"sizes": content["sizes"] | {"latents": "4"}}, "do not fit each other"),
+        (
+            lambda content: content | {"state": content["state"] | {"x_mean": torch.full((4,), torch.nan)}},
+            "a value is not finite",
+        ),
+        (lambda content: content | {"more": Evil()}, "truncated or holds no operators"),
+    ],
+)  # fmt: skip
+def test_a_bad_file_is_refused(tmp_path, capsys, spoil, message):
+    path = tmp_path / "operators.pt"
+    operators().save(path, TAUGHT)
+    torch.save(spoil(torch.load(path, weights_only=True)), path)
+    with pytest.raises(SchemaError, match=re.escape(message)):
+        Operators.load(path)
+    assert "code ran" not in capsys.readouterr().out
+
+
+def test_a_file_that_is_cut_short_or_missing(tmp_path):
+    path = tmp_path / "operators.pt"
+    with pytest.raises(MissingRunError, match="run `nsf teach` first"):
+        Operators.load(path)
+    operators().save(path, TAUGHT)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(SchemaError, match="truncated"):
+        Operators.load(path)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"manifold": "dd"}, "another manifold: aa, not dd"),
+        ({"scene": "dd"}, "another scene: bb, not dd"),
+        ({"sample": "dd"}, "another sample: cc, not dd"),
+        ({"dt": 0.02}, "another Δt [s]: 0.01, not 0.02"),
+        ({"method": "pic"}, "another method: nsf, not pic"),
+        ({"projector": "taylor"}, "another projector: gn, not taylor"),
+        ({"ranges": ((20.0, 50.0),)}, "other ranges: ((20.0, 40.0),), not ((20.0, 50.0),)"),
+        ({}, ""),
+    ],
+)
+def test_what_operators_were_taught_on_is_compared(changed, message):
+    other = Taught(**(vars(TAUGHT) | changed))
+    assert TAUGHT.differing(other) == message
+
+
+@pytest.mark.parametrize(
+    ("angle", "gravity", "off", "text"),
+    [
+        (30.0, [0.0, 0.0, -10.0], 0.0, ""),
+        (40.0, [0.0, 0.0, -10.0], 1.0, ""),
+        (45.0, [0.0, 0.0, -10.0], 1.5, "angle=45 is outside of 20 … 40"),
+        (30.0, [0.0, 0.5, -10.0], 0.5, ""),
+        (30.0, [2.0, 0.0, -10.0], 2.0, "gravity is 2 m/s² from that which was taught, 1 m/s² at most"),
+    ],
+)
+def test_how_far_an_input_lies_outside(angle, gravity, off, text):
+    assert TAUGHT.outside({"angle": angle}, gravity) == (pytest.approx(off), text)
+
+
+# -- the compiled loop ----------------------------------------------------------------------------------
+
+
+def recurrence(model, name="fp64", runs=RUNS, push=None, rows=slice(None)):
+    """Runs of the loop at their start, and the same by torch; `rows` are those of as many runs."""
+    precision, (x, d, mu, g, _) = precision_of(name), given(model, runs)
+    features = torch.randn(runs, STEPS, model.sizes.features, generator=torch.Generator().manual_seed(2))
+    features = features.double()
+    c = model.collider_state(features).transpose(0, 1)
+    with torch.no_grad():
+        expected = model.run(x, d, mu, g.expand(STEPS, *g.shape), c)[:, rows]
+    x, d, mu, g, features = (values[rows] for values in (x, d, mu, g, features))
+    record = LatentRecord(x.to({"fp32": torch.float32, "fp64": torch.float64}[name]), STEPS, 1)
+    found = Recurrence(model, mu, g, features, record, precision, warp_device("cpu"), push)
+    found.latent.view_as(x).copy_(x)
+    found.change.view_as(d).copy_(d)
+    return found, record, expected
+
+
+@pytest.mark.parametrize("gravity", [True, False])
+@pytest.mark.parametrize("states", [0, 2])
+@pytest.mark.parametrize(("name", "tolerance"), [("fp64", 1e-12), ("fp32", 1e-5)])
+def test_the_loop_is_torch(name, tolerance, states, gravity):
+    found, record, expected = recurrence(operators(states, gravity), name)
+    found.advance(STEPS)
+    assert (expected[-1] - expected[0]).abs().max() > 0.05
+    torch.testing.assert_close(record.xhat.transpose(0, 1).double(), expected, rtol=0, atol=tolerance)
+    torch.testing.assert_close(record.now.double(), expected[-1], rtol=0, atol=tolerance)
+    torch.testing.assert_close(record.before.double(), expected[-2], rtol=0, atol=tolerance)
+    assert record.row.tolist() == [STEPS] * RUNS
+
+
+@pytest.mark.parametrize("name", ["fp64", "fp32"])
+def test_steps_taken_at_once_and_one_by_one_are_the_same_bits(name):
+    once, record, _ = recurrence(operators(), name)
+    once.advance(STEPS)
+    single, other, _ = recurrence(operators(), name)
+    for n in (1, 4, STEPS - 5):
+        single.advance(n)
+    assert torch.equal(record.xhat, other.xhat)
+    assert torch.equal(record.before, other.before)
+
+
+def test_a_batch_is_its_runs():
+    batch, record, _ = recurrence(operators())
+    batch.advance(STEPS)
+    for run in range(RUNS):
+        alone, own, _ = recurrence(operators(), rows=slice(run, run + 1))
+        alone.advance(STEPS)
+        assert torch.equal(own.xhat[0], record.xhat[run])
+
+
+def test_what_is_added_to_each_change():
+    model = operators()
+    push = 1e-3 * torch.randn(RUNS, STEPS, 4, generator=torch.Generator().manual_seed(3)).double()
+    found, record, _ = recurrence(model, push=push)
+    found.advance(STEPS)
+    x, d, mu, g, _ = given(model, RUNS)
+    features = torch.randn(RUNS, STEPS, 9, generator=torch.Generator().manual_seed(2)).double()
+    with torch.no_grad():
+        for n, c in enumerate(model.collider_state(features).unbind(1)):
+            d = model.step(x, d, mu, g, c)[1] + push[:, n]
+            x = x + d
+            torch.testing.assert_close(record.xhat[:, n + 1], x, rtol=0, atol=1e-12)
+
+
+@pytest.mark.skipif(90 not in wp.get_cuda_supported_archs(), reason="Warp was built without CUDA")
+@pytest.mark.parametrize("width", [96, 128])
+@pytest.mark.parametrize("name", ["fp32", "fp64"])
+def test_the_loop_compiles_for_a_gpu(name, width, tmp_path):
+    for gravity, pushed in ((True, False), (False, True)):
+        kernel = make_recurrence(precision_of(name), Sizes(6, 1, 9, 2, gravity, width), pushed)
+        wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path, use_ptx=True)
+    assert len(list(tmp_path.glob("*.ptx"))) == 2
+
+
+# -- teaching -------------------------------------------------------------------------------------------
+
+
+def test_values_between_are_none_that_is_taken():
+    values = random_values((20.0, 40.0), 5, 0, [])
+    assert values == sorted(values) == random_values((20.0, 40.0), 5, 0, [])
+    assert all(20.0 <= value <= 40.0 for value in values)
+    assert random_values((20.0, 40.0), 5, 0, [values[2]]) == values[:2] + values[3:]
+    assert random_values((20.0, 40.0), 5, 1, []) != values
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"width": 0}, "width=0 must be at least 1"), ({"noise": -1.0}, "noise=-1.0 must be finite")],
+)
+def test_bad_teaching(options, message):
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        Teaching(**options)
