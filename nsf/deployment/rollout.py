@@ -152,7 +152,8 @@ class Rollout:
             values = getattr(self, name)
             if values is not None and not (values >= 0).all():
                 raise SchemaError(f"has values of {name} that are negative or no numbers")
-        if unknown := set(self.stops) - set(STOP_REASONS):
+        # A step by operators ends in no inversion.
+        if unknown := set(self.stops) - {*STOP_REASONS, "operators"}:
             raise SchemaError(f"has stops={sorted(unknown)[0]!r}, which is no reason to stop")
 
 
