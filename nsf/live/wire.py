@@ -88,7 +88,7 @@ def asked_value(message: str | bytes) -> float:
     """
     try:
         asked = json.loads(message) if isinstance(message, str) else None
-    except ValueError:
+    except (ValueError, RecursionError):
         asked = None
     if not isinstance(asked, dict) or asked.keys() != {"value"} or type(asked["value"]) not in (int, float):
         raise ConfigError('a client may only send {"value": number}')

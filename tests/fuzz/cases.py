@@ -281,7 +281,7 @@ def damaged(shop: Workshop, draw: random.Random) -> Case:
 
     def hand_over() -> None:
         shop.rewrite(path, data)
-        run.verify()
+        run.require().file(path.name)
 
     return Case(f"{run.id}/{path.name} altered", hand_over, altered=True)
 
