@@ -181,7 +181,7 @@ def _is_at(path: tuple[str, ...], key: str) -> bool:
 def _kind(path: tuple[str, ...], target: Any) -> Kind:
     """What a key expects, if it is where a target could lie."""
     kind = next((kind for key, kind in KINDS.items() if _is_at(path, key)), None)
-    refused = f"{'.'.join(path)}: _target_: {target} is refused; "
+    refused = f"{'.'.join(path) or 'the configuration'}: _target_: {target} is refused; "
     if kind is None:
         raise ConfigError(refused + "nothing is built from this key")
     if not (_NAME.fullmatch(str(target)) and str(target).startswith(f"{kind.package}.")):
@@ -253,4 +253,4 @@ def _told(hint: Any, several: bool = False) -> str:
 def _all_finite(value: Any) -> bool:
     if isinstance(value, list):
         return all(map(_all_finite, value))
-    return not isinstance(value, int | float) or is_finite(value)
+    return not isinstance(value, int | float) or isinstance(value, bool) or is_finite(value)

@@ -1,7 +1,6 @@
 """Numbers and vectors of a configuration: checked, and turned about an axis."""
 
 import math
-import sys
 from collections.abc import Sequence
 from numbers import Real
 
@@ -10,9 +9,12 @@ import numpy as np
 from nsf.errors import ConfigError
 
 
-def is_finite(value: Real) -> bool:
-    """Whether floating point can hold a number: not NaN, not infinite, no larger integer."""
-    return abs(value) <= sys.float_info.max
+def is_finite(value) -> bool:
+    """Whether a value is a number that a float can hold."""
+    try:
+        return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:  # a whole number of more than 308 digits
+        return False
 
 
 def number(key: str, value, least: float = -math.inf, whole: bool = False) -> float | int:
@@ -21,8 +23,7 @@ def number(key: str, value, least: float = -math.inf, whole: bool = False) -> fl
     Raises:
         ConfigError: quotes the key and the value.
     """
-    fits = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
-    if not (fits and is_finite(value) and value >= least):
+    if not (isinstance(value, int if whole else int | float) and is_finite(value) and value >= least):
         wanted = "a whole number" if whole else "a finite number"
         raise ConfigError(
             f"{key}={value} must be {wanted}" + (f" of at least {least:g}" if least > -math.inf else "")
@@ -63,9 +64,7 @@ def numbers(key: str, values, unit: str = "", count: int | None = None) -> np.nd
     Raises:
         ConfigError: quotes the key and the values.
     """
-    finite = is_list(values) and all(
-        isinstance(x, Real) and not isinstance(x, bool) and is_finite(x) for x in values
-    )
+    finite = is_list(values) and all(map(is_finite, values))
     if not finite or count not in (None, len(values)):
         wanted = "a list of finite numbers" if count is None else f"{count} finite numbers"
         raise ConfigError(f"{key}={values}{' ' * bool(unit)}{unit} must be {wanted}")
