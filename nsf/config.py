@@ -10,7 +10,8 @@ import math
 import re
 import typing
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from hydra.core.override_parser.types import Override, RangeSweep
 from hydra.errors import HydraException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 from yaml import MarkedYAMLError, YAMLError
 
 from nsf import targets
@@ -101,10 +102,11 @@ def read(path: Path) -> DictConfig:
     """
     try:
         config = OmegaConf.create(text_of(path))
-    except (OmegaConfBaseException, YAMLError, ValueError) as error:
-        raise ConfigError(f"{path}: {str(error).splitlines()[0]}; correct the yaml") from error
+    except (OmegaConfBaseException, *_OF_BROKEN_FILES) as error:
+        told = (str(error) or type(error).__name__).splitlines()[0]
+        raise ConfigError(f"{path} is no configuration: {told}; correct the yaml") from error
     if not isinstance(config, DictConfig):
-        raise ConfigError(f"{path} holds no keys with values; correct the yaml")
+        raise ConfigError(f"{path} is no configuration: it has no keys; correct the yaml")
     try:
         return checked(config)
     except ConfigError as error:
@@ -116,7 +118,7 @@ def _compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
     config = _with_hydra(config_name, overrides)
     own = _of_hydra(config)
     if own != _default_hydra():
-        changed = [f"hydra.{key}" for key, value in own.items() if value != _default_hydra()[key]]
+        changed = [f"hydra.{key}" for key, value in own.items() if value != _default_hydra().get(key)]
         raise ConfigError(
             f"the configuration sets {', '.join(changed)}, by which Hydra could be made to run code; "
             "leave it out: only the command line says how jobs are launched"
@@ -168,6 +170,19 @@ def resolve(config: DictConfig) -> DictConfig:
         return OmegaConf.create(plain)
     except RecursionError as error:
         raise ConfigError("the configuration is nested too deeply; flatten it") from error
+
+
+@contextmanager
+def naming_the_missing() -> Iterator[None]:
+    """Say which key is missing that the block reads from a configuration.
+
+    Raises:
+        ConfigError: one is missing.
+    """
+    try:
+        yield
+    except (ConfigAttributeError, ConfigKeyError) as error:
+        raise ConfigError(f"{error.full_key} is missing from the configuration; give it a value") from error
 
 
 def section(config: DictConfig, key: str) -> DictConfig:
@@ -352,10 +367,17 @@ def _explain(error: Exception, config_name: str, overrides: Sequence[str]) -> st
     nameless = [o for o in overrides if o.startswith("=")]
     if nameless:
         return f"{nameless[0]!r} has no key; give key=value"
-    option = re.search(r"Could not find '(.+)/([^']+)'", text)
-    if option:
-        group, name = option.groups()
-        known = groups().get(group, [])
+    if "Config group override must be" in first:
+        pairs = (o.lstrip("+").split("=", 1) for o in overrides if "=" in o)
+        told = [f"{group}={name}" for group, name in pairs if name not in groups().get(group, [name])]
+        if told:
+            return f"{told[0]} names no option of its group; `nsf --help` lists them"
+    if first.startswith("Error merging override") and error.__cause__ is not None:
+        return f"{first.removeprefix('Error merging override ')}: {str(error.__cause__).splitlines()[0]}"
+    option = re.search(r"Could not find '([^']+)'", text)
+    group = max((g for g in groups() if option and option[1].startswith(f"{g}/")), key=len, default=None)
+    if option and group:
+        name, known = option[1].removeprefix(f"{group}/"), groups()[group]
         near = difflib.get_close_matches(name, known, n=1)
         return f"unknown {group}={name}; choose one of {', '.join(known)}" + (
             f" (did you mean {near[0]}?)" if near else ""

@@ -4,19 +4,24 @@ Library code raises one of these; only the command line exits (with code 2).
 Each message quotes the offending value and says what to do about it.
 """
 
+from typing import ClassVar
+
 
 class NSFError(Exception):
-    """Base class: a fault the user can mend; its text names the remedy."""
+    """Base class: a fault the user can mend; its text names the remedy.
+
+    It is one line, also where it quotes a value that has several, or that would steer a terminal.
+    """
+
+    _kept: ClassVar[str] = ""  # characters beside visible ones
+
+    def __init__(self, text: str = ""):
+        visible = (c if c.isprintable() or c in self._kept else repr(c)[1:-1] for c in str(text))
+        super().__init__("".join(visible))
 
 
 class ConfigError(NSFError):
-    """A key is unknown, missing, or has a value outside its valid range.
-
-    Its text is one line, also where it quotes a value that has several, or that would steer a terminal.
-    """
-
-    def __init__(self, text: str = ""):
-        super().__init__("".join(c if c.isprintable() else repr(c)[1:-1] for c in str(text)))
+    """A key is unknown, missing, or has a value outside its valid range."""
 
 
 class ShapeError(NSFError):
@@ -48,7 +53,9 @@ class MissingExtraError(NSFError):
 
 
 class MissingRunError(NSFError):
-    """A stage needs the result of an earlier stage that does not exist."""
+    """A stage needs the result of an earlier stage that does not exist; lists those there are."""
+
+    _kept = "\n"
 
 
 class LaunchError(NSFError):

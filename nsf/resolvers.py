@@ -30,30 +30,32 @@ _MOST = (
 )
 
 
-def _scaled(table: DictConfig, *, _root_: DictConfig):
+def scaled(table: DictConfig, *, _root_: DictConfig):
     """`${scaled:{small: a, paper: b}}`: the entry of the scale in force."""
     scale = _root_.scale
+    if not isinstance(table, dict | DictConfig):
+        raise ConfigError(f"${{scaled:{table}}} has no values by scale; give {{small: …, paper: …}}")
     if scale not in table:
         raise ConfigError(f"scale={scale} is unknown here; choose one of {', '.join(map(str, table))}")
     return table[scale]
 
 
-def _per(count) -> float:
+def per(count) -> float:
     """`${per:150}` = 1/150."""
     if not number("argument of ${per:…}", count):
         raise ConfigError(f"${{per:{count}}} divides by zero; give another number")
     return 1.0 / float(count)
 
 
-def _turned(values, axis, angle) -> list[float]:
+def turned(values, axis, angle) -> list[float]:
     """`${turned:[1,0,0],[0,1,0],30}`: the vector turned by 30° about the axis, right-handed."""
     matrix = rotation(direction("axis of ${turned:…}", axis), number("angle of ${turned:…}", angle))
     return (matrix @ vector("vector of ${turned:…}", values)).tolist()
 
 
-OmegaConf.register_new_resolver("scaled", _scaled, replace=True)
-OmegaConf.register_new_resolver("per", _per, replace=True)
-OmegaConf.register_new_resolver("turned", _turned, replace=True)
+OmegaConf.register_new_resolver("scaled", scaled, replace=True)
+OmegaConf.register_new_resolver("per", per, replace=True)
+OmegaConf.register_new_resolver("turned", turned, replace=True)
 
 
 def leaves(node: Any, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:

@@ -182,7 +182,7 @@ def _is_at(path: tuple[str, ...], key: str) -> bool:
 def _kind(path: tuple[str, ...], target: Any) -> Kind:
     """What a key expects, if it is where a target could lie."""
     kind = next((kind for key, kind in KINDS.items() if _is_at(path, key)), None)
-    refused = f"{'.'.join(path)}: _target_: {target} is refused; "
+    refused = f"{'.'.join(path) or 'the configuration'}: _target_: {target} is refused; "
     if kind is None:
         raise ConfigError(refused + "nothing is built from this key")
     if not (_NAME.fullmatch(str(target)) and str(target).startswith(f"{kind.package}.")):

@@ -23,8 +23,7 @@ def number(key: str, value, least: float = -math.inf, whole: bool = False) -> fl
     Raises:
         ConfigError: quotes the key and the value.
     """
-    fits = isinstance(value, int if whole else int | float) and not isinstance(value, bool)
-    if not (fits and is_finite(value) and value >= least):
+    if not (isinstance(value, int if whole else int | float) and is_finite(value) and value >= least):
         wanted = "a whole number" if whole else "a finite number"
         raise ConfigError(
             f"{key}={value} must be {wanted}" + (f" of at least {least:g}" if least > -math.inf else "")

@@ -17,6 +17,7 @@ from nsf.storage import require_folder, writing
 BENCHES = ("full_order", "scaling", "reduced", "batch", "training", "multi_gpu")
 """Modules of this package that have `run(settings, say) -> Result`."""
 
+_MOST = 10**9  # particles: some hundred GB of them
 _UNITS = {"": 1, "k": 1_000, "m": 1_000_000}
 
 
@@ -78,10 +79,12 @@ def _scenes(text: str) -> tuple[str, ...]:
 def _count(text: str) -> int:
     """`71363`, `200k` or `1.5m` particles."""
     found = re.fullmatch(r"(\d+(?:\.\d+)?)([km]?)", text.strip().lower())
-    count = round(float(found[1]) * _UNITS[found[2]]) if found else 0
-    if count < 1:
-        raise ConfigError(f"particles={text} is no number of particles; give for example 71363, 200k or 1m")
-    return count
+    count = float(found[1]) * _UNITS[found[2]] if found else 0.0
+    if not 1.0 <= count <= _MOST:
+        raise ConfigError(
+            f"particles={text} is no number of particles up to a billion; give for example 71363, 200k or 1m"
+        )
+    return round(count)
 
 
 def _merge(path: Path, kind: type, rows: list) -> None:

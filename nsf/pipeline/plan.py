@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import ConfigAttributeError, ConfigKeyError
 
 from nsf import config as configuration
 from nsf.data import Split
@@ -72,12 +71,8 @@ class Plan:
     root: Path | None = None
 
     def __post_init__(self):
-        try:
+        with configuration.naming_the_missing():
             self._build()
-        except (ConfigAttributeError, ConfigKeyError) as error:
-            raise ConfigError(
-                f"{error.full_key} is missing from the configuration; give it a value"
-            ) from error
 
     def _build(self) -> None:
         """Build and check everything, so that a bad value is refused before any work."""
@@ -144,7 +139,8 @@ class Plan:
         _one_of("data.keep", c.data.keep, ("all", "held_out"))
         _one_of("data.dtype", c.data.dtype, tuple(_STORED))
         configuration.text("report.folder", c.report.folder)
-        if str(c.report.name) in ("", "..") or Path(str(c.report.name)).name != str(c.report.name):
+        name = c.report.name if isinstance(c.report.name, str | int) else ""
+        if str(name) in ("", "..") or Path(str(name)).name != str(name):
             raise ConfigError(f"report.name={c.report.name} must be one folder's name; set report.folder")
         precision_of(c.precision)
         _check_paper(c.scene.get("paper"))
@@ -175,6 +171,8 @@ class Plan:
             return self.scene
         if not isinstance(changes, DictConfig):
             raise ConfigError(f"deploy.changes={changes} must map keys to values, as {{material.nu:0.25}}")
+        if wrong := [key for key in changes if not isinstance(key, str)]:
+            raise ConfigError(f"deploy.changes has the key {wrong[0]}; give dotted keys, as material.nu")
         try:
             return self.scene.with_changes(OmegaConf.to_container(changes))
         except ConfigError as error:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pandas as pd
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig
 
 from nsf import config as configuration
 from nsf.canonical import content_hash
@@ -84,7 +84,8 @@ def search(words: Sequence[str], say: Callable[[str], object] = print, root: Pat
     optional("optuna", "search")
     ranges, fixed = _parted(words)
     config = configuration.load(fixed)
-    objectives, trials = _asked(config)
+    with configuration.naming_the_missing():
+        objectives, trials = _asked(config)
     _check(ranges, fixed, root)
     study = _study(config, ranges, fixed, objectives, Path(Plan(config, root).training.root))
 
@@ -121,16 +122,20 @@ def _parted(words: Sequence[str]) -> tuple[list[Range], list[str]]:
 
 
 def _asked(config: DictConfig) -> tuple[list[str], int]:
-    asked = OmegaConf.to_container(config.search)
-    objectives = asked["objectives"]
-    known = isinstance(objectives, list) and objectives and set(objectives) <= set(OBJECTIVES)
+    asked = configuration.section(config, "search")
+    objectives = asked.objectives
+    known = (
+        isinstance(objectives, ListConfig)
+        and objectives
+        and all(name in list(OBJECTIVES) for name in objectives)
+    )
     if not known or len(set(objectives)) < len(objectives):
         raise ConfigError(f"search.objectives={objectives} must list one or more of {', '.join(OBJECTIVES)}")
-    if "step_ms" in objectives and not config.evaluation.trials:
+    if "step_ms" in objectives and not configuration.section(config, "evaluation").trials:
         raise ConfigError(
             "search.objectives has step_ms, but evaluation.trials=0 measures none; give 1 or more"
         )
-    return objectives, configuration.number("search.trials", asked["trials"], least=1, whole=True)
+    return list(objectives), configuration.number("search.trials", asked.trials, least=1, whole=True)
 
 
 def _check(ranges: Sequence[Range], fixed: Sequence[str], root: Path | None) -> None:

@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import ConfigAttributeError
 
 from nsf import config as configuration
 from nsf.errors import ConfigError
@@ -60,12 +59,8 @@ class Scene:
         Raises:
             ConfigError: a key is unknown or a value outside its range.
         """
-        try:
+        with configuration.naming_the_missing():
             found = cls._build(configuration.resolve(config), config)
-        except ConfigAttributeError as error:
-            raise ConfigError(
-                f"{error.full_key} is missing from the configuration; give it a value"
-            ) from error
         check_key(found.parameters.key, found.parameters.values, config)
         return found
 

@@ -118,6 +118,116 @@ def test_bad_input_is_one_clear_line(nsf, tmp_path, stage, override, quoted):
     assert not files(tmp_path)
 
 
+MALFORMED = [
+    ("scene.bodies=null", "scene.bodies=null must map names to nodes"),
+    ("scene.colliders=5", "scene.colliders=5 must map names to nodes"),
+    ("scene.colliders=null", "scene.colliders=null must map names to nodes"),
+    ("scene.walls=null", "scene.walls names no class; give it a _target_: nsf.mpm."),
+    ("scene.colliders.floor=null", "scene.colliders.floor names no class"),
+    ("+scene.bodies.x=5", "scene.bodies.x names no class"),
+    ("scene.bodies.column.density=inf", "scene.bodies.column.density=inf must be finite"),
+    ("scene.bodies.column.density=nan", "scene.bodies.column.density=nan must be finite"),
+    ("scene.bodies.column.shape.base=[a,b,c]", "shape.base=['a', 'b', 'c'] must be a list of numbers"),
+    ("scene.bodies.column.shape.base=[nan,0.5,0.13]", "shape.base=[nan, 0.5, 0.13] must be finite"),
+    ("scene.bodies.column.shape=5", "shape=5 must be built; give it a _target_"),
+    ("scene.bodies.column.velocity=5", "scene.bodies.column.velocity=5 must be a list of numbers"),
+    ("scene.bodies.column.particles=true", "particles=True must be a whole number or null"),
+    ("~scene.bodies.column.density", "scene.bodies.column.density is missing"),
+    ("+scene.bodies.column.weight=1", "unexpected key 'weight'; known keys: shape, density"),
+    ("scene.parameters.key=''", "scene.parameters.key='' names no key"),
+    ("scene.parameters.key=[a]", "scene.parameters.key=['a'] must be text"),
+    ("~scene.parameters.key", "scene.parameters.key is missing"),
+    ("~scene.parameters.unit", "scene.parameters.unit is missing"),
+    ("~scene.parameters.train", "scene.parameters.train is missing"),
+    ("scene.parameters=null", "scene.parameters=null must map keys to values"),
+    ("scene.parameters.unit=5", "scene.parameters.unit=5 must be text"),
+    ("scene.parameters.test=null", "scene.parameters.test=None must be a list of numbers"),
+    ("scene.parameters.validation=[[1]]", "scene.parameters.validation=[[1]] must be a list of numbers"),
+    ("scene.name=[1]", "scene.name=[1] must be text"),
+    ("scene.name=''", "scene.name='' must be text, and not empty"),
+    ("scene.title=null", "scene.title=None must be text"),
+    ("scene.paper=5", "scene.paper must have place, a text, and figures by method"),
+    ("scene.paper={nsf:{delta:a}}", "scene.paper.nsf.delta=a must be a finite number"),
+    ("scene=null", "scene=null names no option of its group"),
+    ("material=5", "material=5 names no option of its group"),
+    ("scene=../../etc/passwd", "unknown scene=../../etc/passwd; choose one of bread"),
+    ("scene.colliders.floor=[]", "scene.colliders.floor=[]: Cannot merge DictConfig with ListConfig"),
+    ("data=null", "data=null must map keys to values"),
+    ("deploy=5", "deploy=5"),
+    ("evaluation=null", "evaluation=null must map keys to values"),
+    ("super_resolution=null", "super_resolution=null must map keys to values"),
+    ("report=null", "report=null must map keys to values"),
+    ("~deploy", "deploy=null must map keys to values"),
+    ("~deploy.split", "deploy.split is missing from the configuration"),
+    ("~precision", "precision is missing from the configuration"),
+    ("report.folder=5", "report.folder=5 must be text"),
+    ("report.name=null", "report.name=None must be one folder's name"),
+    ("seed=1e400", "seed=inf must be a whole number"),
+    ("deploy.dt_multiplier=1e-300", "deploy.dt_multiplier=1e-300 must be a finite number of at least 0.001"),
+    ("deploy.changes={5:5}", "deploy.changes has the key 5; give dotted keys"),
+    (
+        "deploy.changes={material:{_target_:os.system}}",
+        "deploy.changes.material: _target_: os.system is refused",
+    ),
+    ("+scene.x='${scene.x}'", "scene.x: Recursive interpolation detected"),
+    ("+scene.x='${scene.y}'", "scene.x: Interpolation key 'scene.y' not found"),
+    ("+scene.x='${scaled:5}'", "scene.x: ${scaled:5} has no values by scale"),
+    ("+scene.x='${per:0}'", "scene.x: ${per:0} divides by zero"),
+    ("+scene.x='${per:1,2}'", "scene.x: per() takes 1 positional argument"),
+    ("scale=[]", "scale=[] is unknown here"),
+]
+
+
+@pytest.mark.parametrize(("override", "told"), MALFORMED, ids=[o for o, _ in MALFORMED])
+def test_a_malformed_value_is_one_line_that_names_it(nsf, tmp_path, override, told):
+    code, _, err = nsf("simulate", override)
+    assert code == 2
+    assert err.startswith("error: ")
+    assert told in err
+    assert len(err.strip().splitlines()) == 1
+    assert not files(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("override", "told"),
+    [
+        ("point=null", "point=null must map keys to values"),
+        ("~path", "path is missing from the configuration"),
+        ("~point.folder", "point.folder is missing from the configuration"),
+        ("point.folder=5", "point.folder=5 must be text"),
+        ("point.points=99999999999", "point.points=99999999999 is more than"),
+        ("material._target_=nsf.workers.Worker", "nsf.workers.Worker is refused"),
+    ],
+)
+def test_a_malformed_material_point_is_one_line(nsf, override, told):
+    code, _, err = nsf("point", override, tiny_scene=False)
+    assert (code, len(err.strip().splitlines())) == (2, 1)
+    assert told in err
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["search=null"], "search=null must map keys to values"),
+        (["search.objectives=[[a]]"], "search.objectives=[['a']] must list one or more of"),
+        (["search.objectives=[step_ms]", "evaluation=null"], "evaluation=null must map keys to values"),
+    ],
+)
+def test_a_malformed_search_is_one_line(nsf, words, told):
+    pytest.importorskip("optuna", reason="optuna is not installed")
+    code, _, err = nsf("search", "seed=0..3", *words)
+    assert (code, len(err.strip().splitlines())) == (2, 1)
+    assert told in err
+
+
+def test_an_error_steers_no_terminal(nsf, monkeypatch):
+    """A value that quotes control characters is shown with their names."""
+    from nsf.errors import ConfigError, DeviceError
+
+    for kind in (ConfigError, DeviceError):
+        assert str(kind("a\x1b[31mb\nc\u202ed")) == "a\\x1b[31mb\\nc\\u202ed"
+
+
 # What later stages need is known from the start: minutes of simulating and training must not be spent first.
 BEFORE_ANY_WORK = [
     ("sampler.size=0", ["sampler.size"]),

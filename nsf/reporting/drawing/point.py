@@ -13,6 +13,7 @@ from nsf.mpm.materials import deformation_path, drive
 from nsf.reporting.drawing.style import PALETTE, styled
 from nsf.storage import writing
 
+_MOST_POINTS = 1_000_000
 _COMPONENTS = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
 
 
@@ -29,9 +30,10 @@ def point_response(config: DictConfig) -> pd.DataFrame:
         ConfigError: unknown law or path, or a value out of range.
     """
     material = configuration.build(config.material, "material")
-    p = config.point
+    p = configuration.section(config, "point")
     configuration.number("point.amplitude", p.amplitude)
-    configuration.number("point.points", p.points, least=2, whole=True)
+    if configuration.number("point.points", p.points, least=2, whole=True) > _MOST_POINTS:
+        raise ConfigError(f"point.points={p.points} is more than the {_MOST_POINTS} of a chart; give fewer")
     if not configuration.number("point.rate", p.rate) > 0:
         raise ConfigError(f"point.rate={p.rate} 1/s must be positive")
     amplitude, F = deformation_path(config.path, p.amplitude, p.points)
@@ -68,9 +70,11 @@ def plot_point(config: DictConfig) -> Path:
         ConfigError: as `point_response`.
         StorageError: the disk refused a file.
     """
-    response = point_response(config)
+    with configuration.naming_the_missing():
+        response = point_response(config)
+        folder = configuration.text("point.folder", config.point.folder)
     name = config.material["_target_"].rsplit(".", 1)[-1]
-    stem = Path(config.point.folder) / f"{name}_{config.path}"
+    stem = Path(folder) / f"{name}_{config.path}"
     with writing(stem.with_suffix(".csv")) as partial:
         response.to_csv(partial, index=False)
     with writing(stem.with_suffix(".png")) as partial:

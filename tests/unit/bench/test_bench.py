@@ -159,6 +159,7 @@ def test_sizes_by_name(count, name):
             "benches=sorting is unknown; choose from full_order, scaling",
         ),
         ({"particles": "10q"}, ConfigError, "particles=10q is no number of particles"),
+        ({"particles": "9" * 400}, ConfigError, "is no number of particles up to a billion"),
         ({"particles": "0"}, ConfigError, "particles=0 is no number"),
         ({"trials": "0"}, ConfigError, "trials=0 must be"),
         ({"scenes": "cake,tea"}, ConfigError, "scenes=tea is not measured; choose from cake, metal"),

@@ -4,8 +4,9 @@ import shutil
 from dataclasses import replace
 
 import pytest
+from omegaconf import OmegaConf
 
-from nsf.errors import MissingRunError, SchemaError
+from nsf.errors import ConfigError, MissingRunError, SchemaError
 from nsf.pipeline import Pipeline
 from nsf.pipeline.chain import CONFIGURATION
 
@@ -37,6 +38,41 @@ def test_keys_still_follow_the_parameter(pipeline_at, tmp_path):
         pipeline._write_configuration(record)
     scenes = [Pipeline.of_run(run, "cpu").scene.with_parameters({"friction_angle": v}) for v in (20.0, 30.0)]
     assert [scene.material.E for scene in scenes] == [20.0, 30.0]
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "told"),
+    [
+        ("method._target_", "nsf.workers.Worker", r"method: _target_: nsf\.workers\.Worker is refused"),
+        ("scene.colliders.floor._target_", "nsf.storage.write_json", "write_json is refused"),
+        ("sampler._target_", "os.system", r"sampler: _target_: os\.system is refused"),
+        ("scene.title", "${oc.env:HOME}", "scene.title: .*oc.env.* is refused"),
+        ("deploy", None, "deploy=null must map keys to values"),
+    ],
+)
+def test_a_configuration_that_was_handed_over_runs_nothing(chain, tmp_path, monkeypatch, key, value, told):
+    """As `nsf serve` opens one: whole by its manifest, which whoever wrote it wrote as well."""
+    shutil.copytree(chain.root, tmp_path / "runs")
+    run = replace(chain.pipeline.deployment, root=tmp_path / "runs")
+    config = OmegaConf.load(run.path / CONFIGURATION)
+    OmegaConf.update(config, key, value)
+    with run.record() as record:
+        (run.path / CONFIGURATION).write_text(OmegaConf.to_yaml(config))
+        record.output(CONFIGURATION)
+    with pytest.raises(ConfigError, match=told):
+        Pipeline.of_run(run, device="cpu")
+
+
+@pytest.mark.parametrize("content", [b"", b"- 1\n", b"5", b"a: [", b"\xff\xfe", b"a: \0", b"a: b\n"])
+def test_a_configuration_that_is_none_is_told_by_name(chain, tmp_path, content):
+    shutil.copytree(chain.root / "deploy", tmp_path / "deploy")
+    run = replace(chain.pipeline.deployment, root=tmp_path)
+    with run.record() as record:
+        (run.path / CONFIGURATION).write_bytes(content)
+        record.output(CONFIGURATION)
+    with pytest.raises(ConfigError) as refusal:
+        Pipeline.of_run(run, device="cpu")
+    assert len(str(refusal.value).splitlines()) == 1
 
 
 def test_a_run_without_its_configuration_says_what_to_do(chain, tmp_path):
