@@ -91,7 +91,7 @@ REFUSED = [
     ("run", "device=gpu", ["device=gpu"]),
     ("run", "data.dtype=float16", ["data.dtype=float16", "float32 or float64"]),
     ("run", "deploy.split=foo", ["deploy.split=foo", "test, validation or train"]),
-    ("run", "deploy.on_distrust=stop", ["deploy.on_distrust=stop", "report or full_order"]),
+    ("run", "deploy.on_distrust=stop", ["deploy.on_distrust=stop", "projected or full_order"]),
     ("run", "field._target_=os.system", ["os.system is refused"]),
     ("run", "~latent_dim", ["latent_dim"]),
     ("run", "~scene.dx", ["scene.dx"]),
