@@ -12,6 +12,9 @@ from nsf.scenes.geometry import Shape
 from nsf.scenes.weakness import Weakness
 from nsf.vectors import is_finite, vector
 
+# Particles are numbered with 32 bits.
+_MOST = 2**31 - 1
+
 
 @dataclass(frozen=True)
 class Body:
@@ -86,18 +89,22 @@ class Body:
         """The same body with `particles`, on a grid of spacing dx [m].
 
         Raises:
-            ConfigError: the body is so small that it gets no particle.
+            ConfigError: the body is so small that it gets no particle, or gets more than can be numbered.
         """
         if self.particles is not None:
             return self
         cells = self.shape.volume / dx**3
-        count = round(self.particles_per_cell * cells)
-        if count < 1:
+        if not (count := self.particles_per_cell * cells) < _MOST:
+            raise ConfigError(
+                f"particles_per_cell={self.particles_per_cell} gives {count:.3g} particles; "
+                f"give no more than makes {_MOST}"
+            )
+        if round(count) < 1:
             raise ConfigError(
                 f"particles_per_cell={self.particles_per_cell} gives no particle: the body fills {cells:.2g} "
                 f"of a cell of dx={dx:g} m; enlarge the body or refine dx"
             )
-        return replace(self, particles=count, particles_per_cell=None)
+        return replace(self, particles=round(count), particles_per_cell=None)
 
     @property
     def files(self) -> dict[str, str]:

@@ -10,6 +10,8 @@ from nsf.errors import ConfigError
 from nsf.scenes.geometry import Shape
 from nsf.vectors import vector
 
+# Radii along a path: its check for coming back looks at four points a radius, each with each.
+_LONGEST = 5000
 # A path that just fits passes, whatever its last digits.
 _LENIENT = 1.0 - 1e-9
 
@@ -23,8 +25,9 @@ class Ribbon(Shape):
         radius: [m].
 
     Raises:
-        ConfigError: too few points, two equal ones in a row, a bend too sharp for the radius, or a
-            path that comes back to within 2 radius of itself. The volume would not be the one given.
+        ConfigError: too few points, two equal ones in a row, a radius too thin for the path's length, a
+            bend too sharp for the radius, or a path that comes back to within 2 radius of itself. The
+            volume would not be the one given.
     """
 
     path: Sequence[Sequence[float]]
@@ -37,6 +40,11 @@ class Ribbon(Shape):
         for point in self.path:
             vector("ribbon path point", point, "m")
         self._check_pieces()
+        if not (long := float(self._pieces()[0].sum())) <= _LONGEST * self.radius:
+            raise ConfigError(
+                f"ribbon radius={self.radius} m is less than a {_LONGEST}th of its path of {long:.3g} m, "
+                "which no grid resolves; take a larger radius or a shorter path"
+            )
         self._check_bends()
         self._check_distance()
 

@@ -10,6 +10,9 @@ from nsf.errors import ConfigError
 from nsf.scenes.geometry import Ball, Shape
 from nsf.vectors import vector
 
+# Each is held to each other, and each point to each.
+_MOST = 2000
+
 
 @dataclass(frozen=True)
 class TentacleBall(Shape):
@@ -40,6 +43,8 @@ class TentacleBall(Shape):
     def __post_init__(self):
         vector("tentacle ball centre", self.centre, "m")
         configuration.number("tentacles", self.tentacles, least=1, whole=True)
+        if self.tentacles > _MOST:
+            raise ConfigError(f"tentacles={self.tentacles} are more than {_MOST}; take fewer")
         for name in ("radius", "length", "tentacle_radius"):
             configuration.length(f"tentacle ball {name}", getattr(self, name))
         if self.length < self.tentacle_radius:

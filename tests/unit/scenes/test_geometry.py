@@ -145,6 +145,8 @@ def test_thin_shapes_are_cut_from_the_cube_not_squeezed():
         (lambda: Ribbon([(0.0, 0.0, 0.0), (1.0, 0.0)], 0.1), r"ribbon path point=\(1.0, 0.0\)"),
         (lambda: Ribbon([(0.0, 0.0, 0.0), (0.0, 0.0, 0.0)], 0.1), "twice in a row"),
         (lambda: Ribbon(ZIGZAG, 0.0), "ribbon radius=0.0"),
+        (lambda: Ribbon(ZIGZAG, 1e-6), r"radius=1e-06 m is less than a 5000th of its path of 1\.01 m"),
+        (lambda: TentacleBall((0.5, 0.5, 0.5), 0.1, 10**6, 0.1, 1e-6), "tentacles=1000000 are more"),
         (lambda: Ribbon(ZIGZAG, 0.2), r"radius=0.2 m is too large for the bends"),
         (lambda: Ribbon([(0, 0, 0), (1, 0, 0), (0, 0, 0)], 0.1), "too large for the bends"),
         (lambda: Ribbon([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0.5, 1, 0), (0.5, -1, 0)], 0.1), "of itself at"),

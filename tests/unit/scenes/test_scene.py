@@ -394,6 +394,10 @@ class TestParticlesPerCell:
         with pytest.raises(ConfigError, match=f"particles_per_cell={value}"):
             Body(CUBE, density=1.0, particles_per_cell=value)
 
+    def test_more_than_can_be_numbered(self):
+        with pytest.raises(ConfigError, match=r"particles_per_cell=1e\+308 gives inf particles"):
+            Body(CUBE, density=1.0, particles_per_cell=1e308).counted(0.01)
+
     def test_a_body_too_small_for_the_grid(self):
         with pytest.raises(ConfigError, match="gives no particle"):
             Body(CUBE, density=1.0, particles_per_cell=8).counted(100.0)
