@@ -13,8 +13,11 @@ INSTALLED := $(VENV)/.installed
 # One thread a test worker: two workers share two cores.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 WORKERS ?= 2
+# Of make fuzz.
+CASES ?= 2400
+SEED ?= 0
 
-.PHONY: help install quickstart test test-slow test-slurm test-all lint mirrors readme check-reports docs clean
+.PHONY: help install quickstart test fuzz test-slow test-slurm test-all lint mirrors readme check-reports docs clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-13s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -36,6 +39,9 @@ test: install  ## the tests, without those marked slow or slurm
 
 test-slow: install  ## the tests marked slow
 	$(PYTEST) -m slow
+
+fuzz: install  ## malformed inputs by the thousand, drawn from SEED: none runs code, hangs or is believed
+	OMP_NUM_THREADS=1 $(BIN)/python tests/fuzz/fuzz.py --cases $(CASES) --seed $(SEED)
 
 test-slurm: install  ## sweeps through a Slurm of one node; on Debian after apt install slurm-wlm munge
 	$(PYTEST) -m slurm

@@ -14,15 +14,21 @@ def is_list(values) -> bool:
     return isinstance(values, Sequence | np.ndarray) and not isinstance(values, str)
 
 
+def is_finite(value) -> bool:
+    """Whether a value is a number that a float can hold."""
+    try:
+        return isinstance(value, Real) and not isinstance(value, bool) and math.isfinite(value)
+    except OverflowError:  # a whole number of more than 308 digits
+        return False
+
+
 def numbers(key: str, values, unit: str = "", count: int | None = None) -> np.ndarray:
     """An array of `count` finite numbers, or of any number of them.
 
     Raises:
         ConfigError: quotes the key and the values.
     """
-    finite = is_list(values) and all(
-        isinstance(x, Real) and not isinstance(x, bool) and math.isfinite(x) for x in values
-    )
+    finite = is_list(values) and all(map(is_finite, values))
     if not finite or count not in (None, len(values)):
         wanted = "a list of finite numbers" if count is None else f"{count} finite numbers"
         raise ConfigError(f"{key}={values}{' ' * bool(unit)}{unit} must be {wanted}")
@@ -42,12 +48,14 @@ def direction(key: str, values) -> np.ndarray:
     """The unit vector [3] along three numbers.
 
     Raises:
-        ConfigError: they are not finite, or all zero; quotes the key and the values.
+        ConfigError: they are not finite, or their length is zero or overflows; quotes the key and the values.
     """
     along = numbers(key, values, count=3)
-    if not along.any():
-        raise ConfigError(f"{key}={values} has no direction; give a vector that is not zero")
-    return along / np.linalg.norm(along)
+    with np.errstate(over="ignore", under="ignore"):
+        length = np.linalg.norm(along)
+    if not 0.0 < length < math.inf:
+        raise ConfigError(f"{key}={values} has no direction; give a vector of a length near 1")
+    return along / length
 
 
 def rotation(axis: np.ndarray, angle: float) -> np.ndarray:

@@ -10,6 +10,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from hatchling.builders.wheel import WheelBuilder
 
 from nsf import paths
 
@@ -78,6 +79,13 @@ def wheel(tmp_path_factory) -> Path:
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
     return next(folder.glob("*.whl"))
+
+
+def test_wheel_lists_native_code():
+    listed = {file.distribution_path for file in WheelBuilder(str(ROOT)).recurse_included_files()}
+    native = {file.relative_to(ROOT).as_posix() for file in (ROOT / "nsf").rglob("*.h")}
+    assert len(native) > 8
+    assert native <= listed
 
 
 @pytest.mark.slow

@@ -17,6 +17,7 @@ from torch import Tensor
 from nsf.data.schema import COMPONENTS
 from nsf.data.trajectory import Trajectory
 from nsf.errors import ConfigError, DeviceError, SchemaError, ShapeError
+from nsf.memory import host_memory
 
 # Fields that training reads again and again; v is rarely read, and streams.
 RESIDENT_FIELDS = ("x", "tau", "C")
@@ -248,8 +249,4 @@ def _free(device: torch.device) -> int:
     """[byte] that could still be allocated on the device."""
     if device.type == "cuda":
         return torch.cuda.mem_get_info(device)[0]
-    try:  # free pages and the file cache that the kernel would give up
-        with open("/proc/meminfo", encoding="ascii") as file:
-            return next(1024 * int(line.split()[1]) for line in file if line.startswith("MemAvailable"))
-    except (OSError, StopIteration):
-        return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return host_memory()

@@ -23,6 +23,9 @@ class DomainWalls:
     Attributes:
         kind: as for `Collider`, without friction.
         padding: nodes from the edge on which the condition holds.
+
+    Raises:
+        ConfigError: unknown kind, or a padding that is not a whole number of at least 1.
     """
 
     kind: str = "separate"
@@ -30,8 +33,8 @@ class DomainWalls:
 
     def __post_init__(self):
         check_kind(self.kind, "walls")
-        if self.padding < 1:
-            raise ConfigError(f"walls.padding={self.padding} must be at least 1 node")
+        if not (isinstance(self.padding, int) and self.padding >= 1):
+            raise ConfigError(f"walls.padding={self.padding} must be a whole number of nodes, at least 1")
 
 
 @cache

@@ -86,6 +86,15 @@ class Collider(ABC):
     def bound(self) -> float:
         """Radius of the ball about `position` that holds the solid [m]."""
 
+    @abstractmethod
+    def _distance(self, arm: np.ndarray) -> np.ndarray:
+        """[n] distance [m] from the surface; `arm` [n, 3] [m] from `position`, in the solid's axes."""
+
+    def distance(self, x: np.ndarray, t: float = 0.0) -> np.ndarray:
+        """[n] distance [m] of points x [n, 3] [m] from the surface at time t [s], negative inside."""
+        at_rest = x if self.motion is None else self.motion.undone(x, t)
+        return self._distance((at_rest - self.position) @ self.orientation)
+
     @property
     def orientation(self) -> np.ndarray:
         """[3, 3] rotation from the solid's axes to the domain's, at rest."""
@@ -147,6 +156,9 @@ class HalfSpace(Collider):
         """[3] unit normal."""
         return direction("half-space.normal", self.normal)
 
+    def _distance(self, arm: np.ndarray) -> np.ndarray:
+        return arm @ self.extents
+
 
 @dataclass(frozen=True)
 class Sphere(Collider):
@@ -188,6 +200,9 @@ class Sphere(Collider):
     def extents(self) -> np.ndarray:
         """[3] radius, 0, 0."""
         return np.array([self.radius, 0.0, 0.0])
+
+    def _distance(self, arm: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(arm, axis=1) - self.radius
 
     @property
     def coarsest_dx(self) -> float:
@@ -249,6 +264,10 @@ class Cuboid(Collider):
     def extents(self) -> np.ndarray:
         """[3] half edges."""
         return 0.5 * np.array(self.size, float)
+
+    def _distance(self, arm: np.ndarray) -> np.ndarray:
+        beyond = np.abs(arm) - self.extents
+        return np.linalg.norm(np.maximum(beyond, 0.0), axis=1) + np.minimum(beyond.max(1), 0.0)
 
     @property
     def bound(self) -> float:

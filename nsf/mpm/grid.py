@@ -13,6 +13,8 @@ from nsf.mpm.shape import shape_functions
 #: Nodes along the edge of a block, the part of the grid that is cleared and updated as one.
 BLOCK = 4
 _BLOCK_NODES = BLOCK**3
+# A kernel's index of a node is a signed one of 32 bits, also that of the last block's end.
+_MOST_NODES = 2**31 - 2**20
 # Threads that share the nodes of the listed blocks: enough to fill a GPU, too few to be noticed.
 _THREADS = {"cuda": 2**17, "cpu": _BLOCK_NODES}
 
@@ -38,11 +40,21 @@ class GridGeometry:
             dx: spacing [m].
 
         Raises:
-            ConfigError: the spacing is not positive or leaves fewer than 8 cells an axis.
+            ConfigError: the spacing is not positive, leaves fewer than 8 cells an axis or makes more nodes
+                than the solver numbers.
         """
         if not dx > 0:
             raise ConfigError(f"dx={dx} m must be positive")
-        cells = tuple(int(np.ceil(edge / dx - 1e-9)) for edge in size)
+        with np.errstate(over="ignore"):
+            edges = np.ceil(np.divide(size, dx) - 1e-9)
+            count = np.prod(edges + 1.0)
+        if not count <= _MOST_NODES:
+            coarse = float(np.prod(np.cbrt(size))) * _MOST_NODES ** (-1 / 3)
+            raise ConfigError(
+                f"dx={dx} m makes {count:.3g} grid nodes of 32 bytes ({32 * count / 2**30:,.0f} GiB), "
+                f"more than the {_MOST_NODES} that the solver numbers; choose dx above {coarse:.2g} m"
+            )
+        cells = tuple(map(int, edges))
         if min(cells) < 8:
             raise ConfigError(
                 f"dx={dx} m leaves {min(cells)} cells across the domain {tuple(size)} m; choose a smaller dx"
@@ -53,6 +65,16 @@ class GridGeometry:
     def count(self) -> int:
         """Number of nodes."""
         return int(np.prod(self.nodes))
+
+    @property
+    def blocks(self) -> tuple[int, int, int]:
+        """Number of blocks of 4³ nodes an axis; the last may reach over the edge."""
+        return tuple(-(-n // BLOCK) for n in self.nodes)
+
+    def nbytes(self, precision: Precision) -> int:
+        """[byte] of a `Grid` of all its nodes."""
+        node = 4 * np.dtype(precision.numpy).itemsize
+        return self.count * node + 2 * 4 * int(np.prod(self.blocks)) + 4
 
     @property
     def upper(self) -> tuple[float, float, float]:
@@ -112,9 +134,8 @@ class Grid:
         self.slots = wp.array(slots, dtype=wp.int32, device=device)
         self.shape = wp.vec3i(*geometry.nodes)
         self.values = wp.zeros(copies * count, dtype=precision.vec4, device=device)
-        edges = tuple(-(-n // BLOCK) for n in geometry.nodes)
-        blocks = 0 if self.sparse else int(np.prod(edges))
-        self.block_shape = wp.vec3i(*edges)
+        blocks = 0 if self.sparse else int(np.prod(geometry.blocks))
+        self.block_shape = wp.vec3i(*geometry.blocks)
         self.marks, self.blocks = (wp.zeros(blocks, dtype=wp.int32, device=device) for _ in range(2))
         self.listed = wp.zeros(min(blocks, 1), dtype=wp.int32, device=device)
         most = _THREADS["cuda" if self.values.device.is_cuda else "cpu"]

@@ -9,7 +9,7 @@ import warp as wp
 
 from nsf.errors import ConfigError
 from nsf.mpm.precision import Precision
-from nsf.vectors import direction, is_list, numbers, vector
+from nsf.vectors import direction, is_list, numbers, rotation, vector
 
 # A time this near to `since` or `until` (in steps) is that time, in spite of round-off.
 _SAME_TIME = 1e-6
@@ -82,6 +82,13 @@ class Motion:
         if not len(self.angles):
             return np.array([0.0, 0.0, 1.0]), np.zeros(3)
         return direction("motion.axis", self.axis), np.array(self.pivot, float)
+
+    def undone(self, x: np.ndarray, t: float) -> np.ndarray:
+        """Where points x [n, 3] [m] of the solid at time t [s] lie at rest [m]."""
+        times, translations, angles = self.keyframes()
+        axis, pivot = self.hinge()
+        moved = pivot + [np.interp(t, times, d) for d in translations.T]
+        return (x - moved) @ rotation(axis, np.degrees(np.interp(t, times, angles))) + pivot
 
     def top_speed(self, reach: float) -> float:
         """Bound on the speed [m/s] of the solid's points within `reach` [m] of the pivot."""

@@ -99,6 +99,17 @@ def _make_pack(precision: Precision, stored: Precision):
     return pack
 
 
+def block_bytes(particles: int, stored: Precision) -> int:
+    """[byte] of a block: as many frames as 64 MiB hold, at least one."""
+    frame = frame_bytes(particles, stored)
+    return frame * max(1, _BLOCK_BYTES // frame)
+
+
+def frame_bytes(particles: int, stored: Precision) -> int:
+    """[byte] of a frame, on disk as in memory."""
+    return particles * sum(COMPONENTS.values()) * np.dtype(stored.numpy).itemsize
+
+
 class FrameRecorder:
     """Collects frames of a state on its device.
 
@@ -119,8 +130,7 @@ class FrameRecorder:
         self._memory = memory or HostMemory()
         self._state = state
         self._device = state.order.device
-        frame_bytes = len(state) * sum(COMPONENTS.values()) * np.dtype(stored.numpy).itemsize
-        self.capacity = max(1, _BLOCK_BYTES // frame_bytes)
+        self.capacity = max(1, _BLOCK_BYTES // frame_bytes(len(state), stored))
         # A field lies in one piece, as on disk, so that its frames are written without another copy.
         self._block = {
             name: wp.empty((self.capacity, len(state), c), dtype=stored.real, device=self._device)

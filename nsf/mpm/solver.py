@@ -82,6 +82,14 @@ class Solver(Protocol):
         """Go back to t = 0."""
 
 
+def bytes_on_device(particles: int, grid: GridGeometry, material: Material, precision: Precision) -> int:
+    """[byte] that the arrays of a `FullOrderMPM` will take, its `nbytes`, before anything is made."""
+    # mass, V⁰, μ̂, λ; x and v; C, F_e and τ; the history; and the order.
+    values = 4 + 2 * 3 + 3 * 9 + material.history_size
+    real = np.dtype(precision.numpy).itemsize
+    return particles * (values * real + 4) + grid.nbytes(precision)
+
+
 class FullOrderMPM:
     """Explicit symplectic MPM over all particles.
 

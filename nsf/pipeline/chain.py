@@ -132,6 +132,7 @@ class Pipeline(Plan):
             build = partial(scene.full_order, parameters, c.precision, self.device)
             return Job(run, f"{name} {value:g}{unit}", parameters, build)
 
+        self.check_room(runs)
         jobs = [job(run, *needed) for run, needed in runs.items()]
         shared = Shared(self.scene.steps, self.scene.dx, self.stored, self.device, c.precision)
         further = visible_gpus()[1:] if c.device == "auto" else ()

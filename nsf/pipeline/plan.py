@@ -1,7 +1,7 @@
 """What a configuration asks for: everything that its stages need, checked, and the run of each stage."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,11 +22,14 @@ from nsf.kinematics.fields.mlp import MlpField
 from nsf.kinematics.training.tracking import check_tracking
 from nsf.mpm import FP32, FP64, Precision, precision_of
 from nsf.mpm.device import visible_gpus, warp_device
+from nsf.mpm.recording import frame_bytes
 from nsf.mpm.stability import check_colliders, check_time_step
 from nsf.runs import Run
 from nsf.sampling.sampler import check_well_posed
 from nsf.scenes import Scene
+from nsf.scenes.checks import check_memory, check_physics
 from nsf.scenes.identity import NOT_PHYSICS
+from nsf.storage import require_folder, require_space
 
 #: Keys of the configuration that a simulation's content depends on.
 _SCENE_KEYS = ("scale", "material", "transfer")
@@ -181,6 +184,7 @@ class Plan:
         for value, scene in self.needed():
             scene = scene.with_parameters({self.scene.parameters.name: value})
             grid = scene.grid
+            check_physics(scene)
             check_time_step(scene.particles(), scene.initial_velocity(), grid.dx, scene.dt)
             for multiplier in (1.0, self.config.deploy.dt_multiplier):
                 check_colliders(scene.colliders, grid, multiplier * scene.dt)
@@ -229,6 +233,23 @@ class Plan:
                 f"{'GPU' if on_gpu else 'processor core'}{'' if there == 1 else 's'}; "
                 f"set trainer.devices={most}"
             )
+
+    def check_room(self, runs: Mapping[Run, tuple[float, Scene]]) -> None:
+        """Refuse trajectories that fit neither into memory nor, all together, on the disk.
+
+        Args:
+            runs: that are to be made, at least one, each with its parameter value and scene.
+
+        Raises:
+            ConfigError: names the bytes of memory that are needed and available.
+            StorageError: names the bytes of the disk.
+        """
+        for _, scene in runs.values():
+            check_memory(scene, self.config.precision, self.device, self.stored)
+        folder = next(iter(runs)).path.parent
+        require_folder(folder)
+        frames = sum((s.steps + 1) * frame_bytes(s.particle_count, self.stored) for _, s in runs.values())
+        require_space(folder / f"{len(runs)} trajectories", frames)
 
     @property
     def stored(self) -> Precision:

@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 
 from nsf import config as _config
+from nsf.scenes.body import Body
 from nsf.scenes.geometry import Ball, Box, Cylinder, Frame, Shape
 from nsf.scenes.mesh import Mesh, mesh_or_ball
 from nsf.scenes.ribbon import Ribbon
-from nsf.scenes.scene import Body, ParameterRange, Scene
+from nsf.scenes.scene import ParameterRange, Scene
 from nsf.scenes.tentacle_ball import TentacleBall
 from nsf.scenes.weakness import Weakness
 

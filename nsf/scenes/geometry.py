@@ -48,7 +48,8 @@ class Shape(ABC):
             [count, 3] [m].
 
         Raises:
-            ConfigError: count is not positive.
+            ConfigError: count is not positive, or the shape fills so little of its cube that finding the
+                points would take minutes.
 
         Source: an additive recurrence (Roberts 2018, "The unreasonable effectiveness of
         quasirandom sequences") over the cube of the longest edge, kept where inside. Stretched
@@ -59,17 +60,34 @@ class Shape(ABC):
             raise ConfigError(f"particles={count} must be at least 1")
         lower, upper = self.bounds
         edge = float((upper - lower).max())
+        share = self.volume / edge / edge / edge
+        # Twice as many as the volume asks for, should `contains` hold less than that.
+        most = 2 * (start + count) / share + _DRAWN if share * _MOST_DRAWN > start + count else 0
         found, drawn, kept = [], 0, 0
         while kept < start + count:
-            indices = np.arange(drawn + 1, drawn + 1 + 65536, dtype=np.float64)
-            points = lower + edge * np.modf(0.5 + indices[:, None] * _ADDENDS)[0]
-            points = points[((points >= lower) & (points <= upper)).all(1)]
-            points = points[self.contains(points)]
-            found.append(points)
-            drawn, kept = drawn + 65536, kept + len(points)
+            if drawn >= most:
+                raise ConfigError(
+                    f"particles={start + count} cannot be placed in a shape that fills {share:.2g} of the "
+                    f"cube about it (bounds {lower} to {upper} m); make it thicker or take fewer particles"
+                )
+            points = self._drawn(drawn, edge)
+            found.append(points[self.contains(points)])
+            drawn, kept = drawn + _DRAWN, kept + len(found[-1])
         return np.concatenate(found)[start : start + count]
 
+    def _drawn(self, start: int, edge: float) -> np.ndarray:
+        """The points [n, 3] of the next stretch of the cube's sequence that lie within the bounds."""
+        indices = np.arange(start + 1, start + 1 + _DRAWN, dtype=np.float64)
+        lower, upper = self.bounds
+        # By the thinnest axis first: of a thin shape few points are left for the others.
+        for axis in np.argsort(upper - lower):
+            x = lower[axis] + edge * np.modf(0.5 + indices * _ADDENDS[axis])[0]
+            indices = indices[(x >= lower[axis]) & (x <= upper[axis])]
+        return lower + edge * np.modf(0.5 + indices[:, None] * _ADDENDS)[0]
 
+
+# Points of the cube's sequence that are looked at together, and in all: some ten seconds.
+_DRAWN, _MOST_DRAWN = 2**16, 2**29
 # With 1 a basis of a quartic field, hence badly approximable by fractions together.
 _ADDENDS = 2.0 ** (np.arange(1.0, 4.0) / 4.0)
 
@@ -84,14 +102,15 @@ class Box(Shape):
         lower, upper: opposite corners [m].
 
     Raises:
-        ConfigError: a corner is not below the other.
+        ConfigError: a corner is not 3 finite numbers, or not below the other.
     """
 
     lower: Sequence[float]
     upper: Sequence[float]
 
     def __post_init__(self):
-        if len(self.lower) != 3 or len(self.upper) != 3 or not np.all(np.less(self.lower, self.upper)):
+        lower, upper = vector("box lower", self.lower, "m"), vector("box upper", self.upper, "m")
+        if not np.all(np.less(lower, upper)):
             raise ConfigError(f"box lower={self.lower} must lie below upper={self.upper} in each of 3 axes")
 
     @property
@@ -119,7 +138,7 @@ class Cylinder(Shape):
         radius, height: [m].
 
     Raises:
-        ConfigError: radius or height is not positive.
+        ConfigError: the base is not 3 finite numbers, or radius or height not positive and finite.
     """
 
     base: Sequence[float]
@@ -127,10 +146,9 @@ class Cylinder(Shape):
     height: float
 
     def __post_init__(self):
-        if len(self.base) != 3 or not (self.radius > 0 and self.height > 0):
-            raise ConfigError(
-                f"cylinder base={self.base} radius={self.radius} height={self.height}: give positive lengths"
-            )
+        vector("cylinder base", self.base, "m")
+        length("cylinder radius", self.radius)
+        length("cylinder height", self.height)
 
     @property
     def volume(self) -> float:

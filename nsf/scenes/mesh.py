@@ -220,7 +220,8 @@ def _oriented(path: str, triangles: np.ndarray) -> WindingNumber:
             f"mesh={path} overlaps itself: {wrong.sum()} of its {len(triangles)} faces lie inside another "
             "part or are doubled; unite its parts into one surface"
         )
-    number = surface.of(Box(lower, upper).sample(_PROBES))
+    # Stretched to the box, as a needle's would hardly be hit otherwise.
+    number = surface.of(lower + (upper - lower) * Box((0, 0, 0), (1, 1, 1)).sample(_PROBES))
     if ((number < 0) | (number > 1)).any():
         share = ((number < 0) | (number > 1)).mean()
         raise ConfigError(

@@ -1,9 +1,8 @@
 """Scenes: what is simulated (paper section 6)."""
 
-import functools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -14,96 +13,10 @@ from nsf import config as configuration
 from nsf.errors import ConfigError
 from nsf.mpm import Collider, DomainWalls, FullOrderMPM, GridGeometry, ParticleConstants, Transfer
 from nsf.mpm.materials import Material
-from nsf.scenes.geometry import Shape
+from nsf.scenes.body import Body
+from nsf.scenes.checks import check_memory, check_particles, check_physics
 from nsf.scenes.identity import NOT_PHYSICS
-from nsf.scenes.weakness import Weakness
 from nsf.vectors import vector
-
-
-@dataclass(frozen=True)
-class Body:
-    """Particles of one shape.
-
-    Attributes:
-        shape: where the particles are at rest.
-        density: reference density [kg/m³].
-        particles: how many; or
-        particles_per_cell: how many in a grid cell's volume. Exactly one of the two; a body of a
-            `Scene` has `particles`.
-        velocity: initial velocity [m/s].
-        weakness: particles that are softer than the material; none by default.
-
-    Raises:
-        ConfigError: not one of the two numbers, or one that is not positive; a density that is not
-            positive; a velocity that is not 3 numbers.
-    """
-
-    shape: Shape
-    _: KW_ONLY
-    density: float
-    particles: int | None = None
-    particles_per_cell: float | None = None
-    velocity: Sequence[float] = (0.0, 0.0, 0.0)
-    weakness: Weakness | None = None
-
-    def __post_init__(self):
-        if (self.particles is None) == (self.particles_per_cell is None):
-            raise ConfigError(
-                f"particles={self.particles} and particles_per_cell={self.particles_per_cell}: "
-                "give exactly one, the other null"
-            )
-        if self.particles is not None and (self.particles < 1 or self.particles != int(self.particles)):
-            raise ConfigError(f"particles={self.particles} must be a whole number, at least 1")
-        if self.particles_per_cell is not None and not 0 < self.particles_per_cell < math.inf:
-            raise ConfigError(f"particles_per_cell={self.particles_per_cell} must be positive and finite")
-        for key, kind in (("shape", Shape), ("weakness", Weakness | None)):
-            if not isinstance(getattr(self, key), kind):
-                raise ConfigError(
-                    f"{key}={getattr(self, key)} must be built; give it a _target_: nsf.scenes.…"
-                )
-        if not self.density > 0:
-            raise ConfigError(f"density={self.density} kg/m³ must be positive")
-        vector("velocity", self.velocity, "m/s")
-
-    def counted(self, dx: float) -> "Body":
-        """The same body with `particles`, on a grid of spacing dx [m].
-
-        Raises:
-            ConfigError: the body is so small that it gets no particle.
-        """
-        if self.particles is not None:
-            return self
-        cells = self.shape.volume / dx**3
-        count = round(self.particles_per_cell * cells)
-        if count < 1:
-            raise ConfigError(
-                f"particles_per_cell={self.particles_per_cell} gives no particle: the body fills {cells:.2g} "
-                f"of a cell of dx={dx:g} m; enlarge the body or refine dx"
-            )
-        return replace(self, particles=count, particles_per_cell=None)
-
-    @property
-    def files(self) -> dict[str, str]:
-        """Path and sha256 of every file that the body is made from."""
-        return self.shape.files | (self.weakness.region.files if self.weakness else {})
-
-
-@dataclass(frozen=True)
-class _Placing:
-    """What the points of a body depend on; hashed by its text, as shapes hold lists."""
-
-    shape: Shape
-    particles: int
-    files: tuple[str, ...]
-
-    def __hash__(self):
-        return hash((repr(self.shape), self.particles, self.files))
-
-
-@functools.lru_cache(maxsize=8)
-def _points(placing: _Placing) -> np.ndarray:
-    """[P, 3] points at rest [m]; placing is slow, and a scene's parameter values share their bodies."""
-    return placing.shape.sample(placing.particles)
 
 
 @dataclass(frozen=True)
@@ -198,17 +111,17 @@ class Scene:
         s = config.scene
         colliders = tuple(configuration.build(c, f"scene.colliders.{n}") for n, c in s.colliders.items())
         dx = float(configuration.length("scene.dx", s.dx))
+        size = tuple(configuration.length("scene.size", a) for a in vector("scene.size", s.size, "m"))
+        GridGeometry.of_domain(size, dx)
         return cls(
             name=s.name,
             scale=config.scale,
             dx=dx,
             dt=float(configuration.number("scene.dt", s.dt)),
             steps=configuration.number("scene.steps", s.steps, least=1, whole=True),
-            size=tuple(configuration.length("scene.size", a) for a in vector("scene.size", s.size, "m")),
+            size=size,
             gravity=vector("scene.gravity", s.gravity, "m/s²"),
-            bodies=tuple(
-                configuration.build(b, f"scene.bodies.{n}").counted(dx) for n, b in s.bodies.items()
-            ),
+            bodies=tuple(_body(b, f"scene.bodies.{n}", size, dx) for n, b in s.bodies.items()),
             colliders=colliders,
             walls=configuration.build(s.walls, "scene.walls"),
             material=configuration.build(config.material, "material"),
@@ -327,6 +240,11 @@ class Scene:
         return GridGeometry.of_domain(self.size, self.dx)
 
     @property
+    def particle_count(self) -> int:
+        """Particles of all bodies together."""
+        return sum(body.particles for body in self.bodies)
+
+    @property
     def files(self) -> dict[str, str]:
         """Path and sha256 of every file that the scene is made from beyond its configuration."""
         return {path: digest for body in self.bodies for path, digest in body.files.items()}
@@ -335,18 +253,13 @@ class Scene:
         """Particles of every body, in order; μ̂ and λ are the material's, times a body's weakness.
 
         Raises:
-            ConfigError: a body reaches outside the domain, or a weak region holds no particles.
+            ConfigError: a weak region holds no particles, or the particles do not fit into memory.
         """
+        check_particles(self.particle_count)
         X, mass, volume0, stiffness = [], [], [], []
         for body in self.bodies:
-            lower, upper = body.shape.bounds
-            if (lower < 0).any() or (upper > np.asarray(self.size)).any():
-                raise ConfigError(
-                    f"body from {lower} to {upper} m reaches outside the domain [0, {self.size}] m; "
-                    "move it or make it smaller"
-                )
             volume = body.shape.volume / body.particles
-            X.append(_points(_Placing(body.shape, body.particles, tuple(body.shape.files.values()))))
+            X.append(body.points())
             volume0.append(np.full(body.particles, volume))
             mass.append(np.full(body.particles, body.density * volume))
             stiffness.append(body.weakness.of(X[-1]) if body.weakness else np.ones(body.particles))
@@ -369,9 +282,13 @@ class Scene:
             device: `cpu`, `cuda`, `cuda:N` or `auto`.
 
         Raises:
-            ConfigError, InstabilityError, DeviceError: see `FullOrderMPM`.
+            ConfigError: the simulation does not fit into memory, or the scene cannot be meant
+                (`nsf.scenes.checks`); and see `FullOrderMPM`.
+            InstabilityError, DeviceError: see `FullOrderMPM`.
         """
         scene = self.with_parameters(parameters or {})
+        check_memory(scene, precision, device)
+        check_physics(scene)
         return FullOrderMPM(
             scene.particles(),
             scene.material,
@@ -410,3 +327,13 @@ class Scene:
         from nsf import engines
 
         return engines.reduced_batch(self, manifold, parameters, sample, **options)
+
+
+def _body(config: DictConfig, where: str, size: Sequence[float], dx: float) -> Body:
+    """A body that the grid can hold, with its number of particles."""
+    body = configuration.build(config, where)
+    try:
+        body.check_extent(size, dx)
+        return body.counted(dx)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from error

@@ -25,6 +25,7 @@ _KNOWN = {
     "method": (Method,),
     "integration": (Integration,),
 }
+_NAMED = 3  # edited functions that a refusal names
 
 
 class Modal(Engine):
@@ -49,7 +50,8 @@ class Modal(Engine):
         if one.device.is_cuda and not _closure_fits(one):
             return "a block of the GPU does not hold the networks of the field"
         if changed := [name.replace(":", ".") for name in edits()]:
-            return f"modal mirrors another text of {', '.join(changed)}"
+            more = f" and {len(changed) - _NAMED} more" if len(changed) > _NAMED else ""
+            return f"modal mirrors another text of {', '.join(changed[:_NAMED])}{more}"
         return ""
 
     @override

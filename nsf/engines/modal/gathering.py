@@ -2,8 +2,8 @@
 
 Nothing here is read back to the host, and no launch depends on a value, so a step is one CUDA graph.
 A few sums go over the threads of a block or of a warp by native code; on a CPU a block is one thread.
-What each of several simulations has of its own lies simulation by simulation in the arrays; modes and weights
-are common to all, and a thread reads them once for a tile of simulations.
+What each of several runs has of its own lies run by run in the arrays; modes and weights
+are common to all, and a thread reads them once for a tile of runs.
 """
 
 from functools import cache
@@ -16,20 +16,20 @@ from nsf.mpm.copies import make_copies
 from nsf.mpm.native import native_code
 
 THREADS = 128  # of a block that shares coefficients, or a sum over S
-_TILE = 8  # most simulations of one thread: their sums fill its registers
+_TILE = 8  # most runs of one thread: their sums fill its registers
 _NATIVE = {wp.float16: "wp::half", wp.float32: "float"}
 
 
-def tiling(simulations: int, shared: int = 0) -> tuple[int, int]:
-    """Tiles, and simulations of a tile, so that none is much emptier than the others.
+def tiling(runs: int, shared: int = 0) -> tuple[int, int]:
+    """Tiles, and runs of a tile, so that none is much emptier than the others.
 
     Args:
-        simulations: in all.
-        shared: memory [byte] that a block shares for each simulation of its tile.
+        runs: in all.
+        shared: memory [byte] that a block shares for each run of its tile.
     """
     most = max(1, min(_TILE, (SHARED - TAKEN) // max(shared, 1)))
-    tiles = -(-simulations // most)
-    return tiles, -(-simulations // tiles)
+    tiles = -(-runs // most)
+    return tiles, -(-runs // tiles)
 
 
 @cache
@@ -66,7 +66,7 @@ def make_tiles(several: bool):
 def make_combination(
     precision: Precision, vectors: int, sums: int, tile: int, several: bool, coefficients, stored
 ):
-    """Warp function of the sums Σ_k modes[p, c..c+2, k] a_k, for each simulation of a tile, and as many of b.
+    """Warp function of the sums Σ_k modes[p, c..c+2, k] a_k, for each run of a tile, and as many of b.
 
     On a GPU all threads of a block call it, also those beyond the last particle; one that is not `live` only
     helps to share the coefficients. A CPU may change the order of additions.
@@ -75,7 +75,7 @@ def make_combination(
         precision: of the sums.
         vectors: those of four modes.
         sums: one, of a alone, or two.
-        tile, several: simulations of a tile, from `start` on, and whether there are more tiles.
+        tile, several: runs of a tile, from `start` on, and whether there are more tiles.
         coefficients: type of a and b.
         stored: type of modes; fp16 on a GPU alone, each over its length (`Arena.halved`).
     """
@@ -103,8 +103,8 @@ def make_combination(
 
 
 @cache
-def make_field_arrays(precision: Precision, coefficients, stored):
-    """Warp struct of a matrix field at N, mean + Σ_k modes_k a_k; arguments as of `make_contraction`."""
+def _make_field_arrays(precision: Precision, coefficients, stored):
+    """Warp struct of a matrix field, mean + Σ_k modes_k a_k: its factors, and `found`, where it goes."""
     real = precision.real
 
     @wp.struct
@@ -123,7 +123,7 @@ def _make_field(precision: Precision, vectors: int, coefficients, tile: int, sev
     """Warp function of `make_contraction` for one of its fields; t is a thread's number in the field."""
     vec3 = precision.vec3
     combined = make_combination(precision, vectors, 1, tile, several, coefficients, stored)
-    Field = make_field_arrays(precision, coefficients, stored)
+    Field = _make_field_arrays(precision, coefficients, stored)
 
     @wp.func
     def field(needed: wp.array2d(dtype=wp.int32), its: Field, start: int, t: int):
@@ -182,14 +182,14 @@ def make_contraction(
 ):
     """Kernel of two matrix fields at N at once, each mean + Σ_k modes_k a_k, over whole blocks.
 
-    A thread has three components of a particle, in the simulations of a tile; `several` tiles have blocks in
+    A thread has three components of a particle, in the runs of a tile; `several` tiles have blocks in
     turn. The first `threads` are those of the first field. The six components of a symmetric field are xx xy
-    xz yy yz zz, the nine of another go row by row. Nothing is found where the bit of a simulation in `needed`
+    xz yy yz zz, the nine of another go row by row. Nothing is found where the bit of a run in `needed`
     is not set, see `make_others`. `vectors` are those of four modes of either field, `coefficients` is the
     type of a, `stored` that of modes.
     """
     tile_of, within = make_tiles(several)
-    Field = make_field_arrays(precision, coefficients, stored)
+    Field = _make_field_arrays(precision, coefficients, stored)
     first, second = (_make_field(precision, Q, coefficients, tile, several, stored) for Q in vectors)
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
@@ -212,10 +212,10 @@ def make_contraction(
 
 
 @cache
-def make_gathered(precision: Precision):
+def _make_gathered(precision: Precision):
     """Warp struct of what `make_gathering` reads, and of b.
 
-    `displacement` holds the modes of S alone; v has `rows` of each simulation, S first; w_p are `weights`.
+    `displacement` holds the modes of S alone; v has `rows` of each run, S first; w_p are `weights`.
     """
 
     @wp.struct
@@ -232,13 +232,13 @@ def make_gathered(precision: Precision):
 
 @cache
 def make_gathering(precision: Precision, several: bool = False):
-    """Kernel of what the projection needs of S, one block a simulation and mode: b_k = Σ_p w_p B_p,kᵀ Δt v_p.
+    """Kernel of what the projection needs of S, one block a run and mode: b_k = Σ_p w_p B_p,kᵀ Δt v_p.
 
     The displacement of S in the step is Δt v_p, as its positions before it lie on the manifold. The last
-    block of a simulation gives Σ_p w_p |Δt v_p|².
+    block of a run gives Σ_p w_p |Δt v_p|².
     """
     _, copy_of = make_copies(several)
-    Gathered = make_gathered(precision)
+    Gathered = _make_gathered(precision)
 
     @wp.func_native(native_code(__package__, "gathering"))
     def share(given: Gathered, copy: int, k: int, lane: int, lanes: int) -> wp.float64: ...

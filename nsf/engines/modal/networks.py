@@ -9,12 +9,12 @@ from nsf.mpm import Precision
 from nsf.mpm.copies import make_copies
 from nsf.mpm.native import native_code
 
-_EDGE, _DEEP = 16, 128  # outputs, as many simulations, and inputs that a block of a product holds at once
+_EDGE, _DEEP = 16, 128  # outputs, as many runs, and inputs that a block of a product holds at once
 
 
 @cache
 def _make_side(precision: Precision):
-    """Warp struct of a layer of one network, y = act(W x + b): W [out, in], x, b and y of each simulation.
+    """Warp struct of a layer of one network, y = act(W x + b): W [out, in], x, b and y of each run.
 
     W_0 and b_0 are of the layer before it, if it is found anew.
     """
@@ -34,9 +34,9 @@ def _make_side(precision: Precision):
 
 @cache
 def make_layer(precision: Precision, tile: int = 1, several: bool = False, latents: int = 0):
-    """Kernel of one layer of two networks at once: act(W x + b), W [out, in], x and b of each simulation.
+    """Kernel of one layer of two networks at once: act(W x + b), W [out, in], x and b of each run.
 
-    One warp has an output in the simulations of a tile. SiLU where `active`, else the identity; the second
+    One warp has an output in the runs of a tile. SiLU where `active`, else the identity; the second
     network's outputs follow the first's, `outputs` in all. Where W has fewer columns than there are entries,
     both are of several members, whose rows and entries follow each other. With `latents`, x is what the layer
     before takes, of so many entries: silu(W_0 x + b_0), which every warp finds anew, as a launch costs more.
@@ -76,23 +76,23 @@ def make_layer(precision: Precision, tile: int = 1, several: bool = False, laten
     return layer
 
 
-def product_blocks(sides: Sequence[tuple[int, int]], simulations: int) -> tuple[int, int]:
-    """Blocks of `make_product` of the first network for a tile of simulations, and of all for all of them.
+def product_blocks(sides: Sequence[tuple[int, int]], runs: int) -> tuple[int, int]:
+    """Blocks of `make_product` of the first network for a tile of runs, and of all for all of them.
 
     Args:
         sides: (outputs, members) of each network.
-        simulations: of the batch.
+        runs: of the batch.
     """
     each = [members * -(-outputs // members // _EDGE) for outputs, members in sides]
-    return each[0], sum(each) * -(-simulations // _EDGE)
+    return each[0], sum(each) * -(-runs // _EDGE)
 
 
 @cache
 def make_product(precision: Precision):
-    """Kernel of a layer as `make_layer`'s for many simulations on a GPU, over `blocks` of 128 threads.
+    """Kernel of a layer as `make_layer`'s for many runs on a GPU, over `blocks` of 128 threads.
 
-    A block has 16 outputs of a member in each of 16 simulations; its four warps share the inputs, and add up.
-    The blocks of a tile of simulations follow each other, the `first` of them are of the first network.
+    A block has 16 outputs of a member in each of 16 runs; its four warps share the inputs, and add up.
+    The blocks of a tile of runs follow each other, the `first` of them are of the first network.
     """
     Side = _make_side(precision)
 

@@ -25,10 +25,10 @@ def _cell(base: wp.vec3i, lower: wp.vec3i, extent: wp.vec3i):
 def _make_motion(precision: Precision):
     """Warp struct of what tells where particles are, and of what is found.
 
-    The coefficients a and their rate are of each simulation, as are whether its step is the `first`, the
+    The coefficients a and their rate are of each run, as are whether its step is the `first`, the
     number of the `step`, the `stamps` of cells, and `count`: particles needed in all steps, and the steps.
     `mean` and the box of cells, which begins at `lower`, are common to all. x, v and the initial velocity
-    have a row for each particle of each simulation, the `of_sample` of S first.
+    have a row for each particle of each run, the `of_sample` of S first.
     """
     real, vec3 = precision.real, precision.vec3
 
@@ -58,7 +58,7 @@ def make_sample(precision: Precision, shape_name: str, several: bool = False):
 
     x = mean + Σ_k b_k a_k and v = Σ_k b_k ȧ_k, where ȧ is the backward difference of a (paper section 5.1:
     there is no v field); in the first step v is the initial velocity. It writes the number of the step to
-    every cell from which a stencil meets one of S's; each simulation has cells of its own. A particle off
+    every cell from which a stencil meets one of S's; each run has cells of its own. A particle off
     the grid, which no transfer will move, gets no velocity.
 
     Source: paper section 5.4, a.
@@ -119,11 +119,11 @@ def make_others(
     several: bool = False,
     stored=wp.float32,
 ):
-    """Kernel of x and v at N without S, as `make_sample`, one thread a particle and tile of simulations.
+    """Kernel of x and v at N without S, as `make_sample`, one thread a particle and tile of runs.
 
     It is launched over whole blocks; `several` tiles have blocks in turn. Only particles in the cells that
     `make_sample` has stamped are needed; it moves the rest off the grid, where the transfers pass over it.
-    Which simulations of a tile need a particle are the bits of `needed`. `stored` is the type of the modes.
+    Which runs of a tile need a particle are the bits of `needed`. `stored` is the type of the modes.
 
     Source: paper section 5.4, b.
     """
@@ -154,11 +154,11 @@ def make_others(
         if not live:
             return
         p = of_sample + t
-        taken, beginning = places(), places()
+        mean, taken, beginning = at.mean[p], places(), places()
         # Before anything is written, so that all loads are under way together.
         for s in range(wp.static(tile)):
             copy = wp.min(start + s, at.first.shape[0] - 1)
-            x = at.mean[p] + vec3(moved[6 * s], moved[6 * s + 1], moved[6 * s + 2])
+            x = mean + vec3(moved[6 * s], moved[6 * s + 1], moved[6 * s + 2])
             c = _cell(base_node(x, at.inv_dx), at.lower, at.extent)
             stamp = at.stamps[copy, wp.max(c, 0)]
             taken[s] = wp.where(c >= 0 and stamp == at.step[copy], 1, 0)
@@ -171,7 +171,7 @@ def make_others(
                 x = vec3(real(-1.0), real(-1.0), real(-1.0))  # the grid starts at the origin
                 if taken[s] != 0:
                     bits += wp.static(1 << s)
-                    x = at.mean[p] + vec3(moved[6 * s], moved[6 * s + 1], moved[6 * s + 2])
+                    x = mean + vec3(moved[6 * s], moved[6 * s + 1], moved[6 * s + 2])
                     if beginning[s] != 0:
                         at.v[row] = at.initial_velocity[row]
                     else:

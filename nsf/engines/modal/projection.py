@@ -1,6 +1,6 @@
 """The kernel that inverts the deformation field in the coefficients of its modes.
 
-A GPU takes a block for each simulation, a CPU one thread.
+A GPU takes a block for each run, a CPU one thread.
 """
 
 from functools import cache
@@ -25,7 +25,7 @@ def shared_bytes(precision: Precision, widths: tuple[int, ...], latents: int, mo
 
 
 def prepared_size(latents: int, modes: int) -> int:
-    """Numbers that `PREPARE` leaves of a simulation: x̂*, a, q, A, G A and (AᵀG A)⁻¹."""
+    """Numbers that `PREPARE` leaves of a run: x̂*, a, q, A, G A and (AᵀG A)⁻¹."""
     return latents + 2 * modes + 2 * modes * latents + latents**2
 
 
@@ -36,7 +36,7 @@ def projection_fits(precision: Precision, widths: tuple[int, ...], latents: int,
 
 @cache
 def _make_inversion(precision: Precision):
-    """Warp struct of what the projection reads and writes, a row a simulation where it is of two dimensions.
+    """Warp struct of what the projection reads and writes, a row a run where it is of two dimensions.
 
     `weights` (`packed_weights`), `scale`, `sigma` [r] and G [K²] are of the fields, b comes from
     `make_gathering`, `sample` is |S|, `iterations` and `tolerance` are of the projector, which is `linear` if
@@ -98,14 +98,18 @@ def make_projection(
     not exceed the tolerance, it is the last (see `GaussNewton`), and a moves by A u, which misses by that
     order. `EVALUATE` gives a and ȧ at x̂_n, for a run that begins.
 
+    One block evaluates the members of a committee one after another. Blocks that shared them would have to
+    wait for each other, and an ordinary launch does not promise that all of them are resident: the wait could
+    hang. The cost is members − 1 further closures in each evaluation, and nothing for a single network.
+    `PREPARE` hides it beside the rest of the step; `SOLVE` has it where one update is not enough.
+
     Args:
         precision: of the closure; sums over modes and the solution are fp64.
         widths: of the closure's layers (r, hidden..., K − r); empty without one.
-        members: networks of these widths whose shares in the closure are added up, one after another: blocks
-            that share them would have to wait for each other, and nothing makes all of them run at once.
+        members: networks of these widths whose shares in the closure are added up.
         latents: r.
         modes: K.
-        several: whether there are several simulations.
+        several: whether there are several runs.
 
     Source: paper section 5.3.
     """
@@ -119,12 +123,12 @@ def make_projection(
     }  # fmt: skip
 
     @wp.func_native(native_code(__package__, "projection", real=precision.native, **constants))
-    def invert(given: Inversion, mode: int, simulation: int): ...
+    def invert(given: Inversion, task: int, run: int): ...
 
     @wp.kernel(
         enable_backward=False, module="unique", grid_stride=False, launch_bounds=projection_block(widths)
     )
-    def projection(given: Inversion, mode: int, threads: int):
-        invert(given, mode, copy_of(wp.tid(), threads))
+    def projection(given: Inversion, task: int, threads: int):
+        invert(given, task, copy_of(wp.tid(), threads))
 
     return projection

@@ -273,8 +273,8 @@ class Projection:
             "tolerance": projector.tolerance, "linear": isinstance(projector, Taylor),
         }  # fmt: skip
         self.evaluate, self.prepare, self.solve = (
-            arena.pack(kernel, count * threads, block, given=given, mode=mode, threads=threads)
-            for mode in (EVALUATE, PREPARE, SOLVE)
+            arena.pack(kernel, count * threads, block, given=given, task=task, threads=threads)
+            for task in (EVALUATE, PREPARE, SOLVE)
         )
 
 

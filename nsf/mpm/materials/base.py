@@ -1,5 +1,6 @@
 """The parts of a constitutive law: parameters, a stress function and a return map."""
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cache
@@ -50,8 +51,8 @@ class Material(ABC):
     history_size: ClassVar[int] = 1  # Warp has no vector of length 0, so laws without history carry one zero
 
     def __post_init__(self):
-        if not self.E > 0:
-            raise ConfigError(f"material.E={self.E} Pa must be positive")
+        if not 0.0 < self.E < math.inf:
+            raise ConfigError(f"material.E={self.E} Pa must be positive and finite")
         if not -1.0 < self.nu < 0.5:
             raise ConfigError(f"material.nu={self.nu} must lie in (-1, 0.5)")
 

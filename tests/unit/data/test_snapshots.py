@@ -86,16 +86,6 @@ def test_auto_goes_by_free_memory(paths, monkeypatch):
     assert not Snapshots(paths).resident
 
 
-def test_free_memory_is_read(monkeypatch):
-    assert snapshots._free(torch.device("cpu")) > 2**20
-
-    def absent(*arguments, **keys):
-        raise FileNotFoundError
-
-    monkeypatch.setattr("builtins.open", absent)
-    assert snapshots._free(torch.device("cpu")) > 2**20
-
-
 def test_resident_data_outlive_their_files(paths):
     snaps = Snapshots(paths, resident=True)
     expected = snaps.slab("tau", slice(None)).clone()

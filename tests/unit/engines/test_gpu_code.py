@@ -1,5 +1,7 @@
 """What is native in the kernels compiles for a GPU, also where there is none: Warp brings the compiler."""
 
+import re
+
 import pytest
 import warp as wp
 
@@ -41,6 +43,16 @@ def test_a_kernel_compiles_for_a_gpu(name, precision, several, tmp_path):
     for kernel in made if isinstance(made, tuple) else (made,):
         wp.compile_aot_module(kernel.module, arch=ARCH, module_dir=tmp_path, use_ptx=True)
     assert list(tmp_path.glob("*.ptx"))
+
+
+@pytest.mark.skipif(ARCH not in wp.get_cuda_supported_archs(), reason="Warp was built without CUDA")
+@pytest.mark.parametrize("members", [1, 4])
+def test_blocks_of_the_projection_do_not_wait_for_each_other(members, tmp_path):
+    """Nothing makes them run at once, so a wait could hang; without an atomic or a fence there is none."""
+    kernel = make_projection(precision_of("fp32"), (5, 48, 48, 31), members, 5, 36)
+    wp.compile_aot_module(kernel.module, arch=ARCH, module_dir=tmp_path, use_ptx=True)
+    (ptx,) = tmp_path.glob("*.ptx")
+    assert not re.findall(r"\b(?:atom|red|membar|fence|ld\.volatile)\.\S+", ptx.read_text())
 
 
 @pytest.mark.skipif(80 not in wp.get_cuda_supported_archs(), reason="Warp was built without CUDA")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from nsf.errors import ConfigError
-from nsf.scenes import Ball, Box, Cylinder, Frame, Ribbon, TentacleBall
+from nsf.scenes import Ball, Box, Cylinder, Frame, Ribbon, TentacleBall, geometry, load
 
 WAVE = [(0.2 + 0.6 * t, 0.5 + 0.06 * np.sin(9.0 * t), 0.4 + 0.1 * t * t) for t in np.linspace(0.0, 1.0, 40)]
 ZIGZAG = [(0.2, 0.5, 0.5), (0.5, 0.5, 0.5), (0.5, 0.8, 0.5), (0.5, 0.7, 0.9)]
@@ -84,6 +84,34 @@ class TestSampling:
             shape.sample(count)
 
 
+class Hollow(Box):
+    """Says more of itself than it holds."""
+
+    def contains(self, x):
+        return np.zeros(len(x), bool)
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [
+        Cylinder((0.5, 0.5, 0.13), 1e-6, 0.131465),
+        Box((0.0, 0.0, 0.0), (1e-5, 1e-5, 1.0)),
+        Box((0.0, 0.0, 0.0), (1e-300, 1e-300, 1.0)),
+        Hollow((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
+    ],
+)
+def test_points_that_would_take_minutes_to_find_are_refused(shape):
+    with pytest.raises(ConfigError, match=r"particles=300 cannot be placed .* make it thicker"):
+        shape.sample(300)
+
+
+def test_a_hundred_times_the_particles_of_the_thinnest_scene_are_not():
+    """The tries for super-resolution stay within the limit, by far."""
+    ribbon = load("toothpaste", ["scale=paper"]).bodies[0]
+    edge = (ribbon.shape.bounds[1] - ribbon.shape.bounds[0]).max()
+    assert 100 * ribbon.particles * edge**3 / ribbon.shape.volume < 0.5 * geometry._MOST_DRAWN
+
+
 def test_thin_shapes_are_cut_from_the_cube_not_squeezed():
     """Squeezed, the sequence would leave cells of a thin shape empty."""
     cube, slab = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)), Box((0.0, 0.0, 0.0), (1.0, 0.1, 1.0))
@@ -99,6 +127,11 @@ def test_thin_shapes_are_cut_from_the_cube_not_squeezed():
         (lambda: Box((0.0, 0.0, 0.0), (1.0, 0.0, 1.0)), r"upper=\(1.0, 0.0, 1.0\)"),
         (lambda: Box((0.0, 0.0), (1.0, 1.0)), r"lower=\(0.0, 0.0\)"),
         (lambda: Box((0.0, 0.0, float("nan")), (1.0, 1.0, 1.0)), "nan"),
+        (lambda: Box((0.0, 0.0, -float("inf")), (1.0, 1.0, 1.0)), r"lower=\(0.0, 0.0, -inf\)"),
+        (lambda: Box((0.0, 0.0, 0.0), (1.0, 1.0, 10**400)), "upper="),
+        (lambda: Cylinder((float("nan"), 0.5, 0.13), 0.1, 0.1), r"base=\(nan, 0.5, 0.13\)"),
+        (lambda: Cylinder(("a", "b", "c"), 0.1, 0.1), r"base=\('a', 'b', 'c'\)"),
+        (lambda: Cylinder((0.5, 0.5, 0.1), float("inf"), 0.1), "radius=inf"),
         (lambda: Cylinder((0.5, 0.5, 0.1), 0.0, 1.0), "radius=0.0"),
         (lambda: Cylinder((0.5, 0.5, 0.1), 0.1, -1.0), "height=-1.0"),
         (lambda: Cylinder((0.5, 0.5), 0.1, 1.0), r"base=\(0.5, 0.5\)"),

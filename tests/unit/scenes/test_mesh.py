@@ -181,6 +181,13 @@ class TestPlacement:
         np.testing.assert_array_equal(body.contains(x[:, order]), upright.contains(x))
         assert body.volume == pytest.approx(upright.volume)
 
+    def test_needle(self, tmp_path):
+        """Read at once, whatever its share of the cube about it; its points would take days to find."""
+        body = Mesh(write(tmp_path, cube((0.5, 0.5, 0.0), (0.50001, 0.50001, 1.0))))
+        assert body.volume == pytest.approx(1e-10)
+        with pytest.raises(ConfigError, match="cannot be placed in a shape that fills 1e-10 of the cube"):
+            body.sample(100)
+
     def test_relative_path(self, tmp_path, monkeypatch):
         write(tmp_path, cube())
         monkeypatch.chdir(tmp_path)
@@ -404,9 +411,8 @@ class TestDrop:
 
     def test_outside_the_domain(self, tmp_path):
         path = write(tmp_path, cube())
-        scene = load("drop", [f"scene.geometry.mesh={path}", "scene.geometry.height=0.9"])
         with pytest.raises(ConfigError, match=r"reaches outside the domain .*; move it or make it smaller"):
-            scene.particles()
+            load("drop", [f"scene.geometry.mesh={path}", "scene.geometry.height=0.9"])
 
     def test_missing_mesh(self):
         with pytest.raises(ConfigError, match=r"mesh=bunny\.obj is no file"):

@@ -1,17 +1,21 @@
 """Scenes: loading, overrides, the problem parameter, what is refused."""
 
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from nsf import config as configuration
 from nsf.errors import ConfigError, NSFError
-from nsf.mpm import HalfSpace, Motion
+from nsf.mpm import FP32, HalfSpace, Motion, precision_of
 from nsf.mpm.materials import DruckerPrager
-from nsf.scenes import Body, Box, ParameterRange, load
+from nsf.mpm.solver import bytes_on_device
+from nsf.scenes import Body, Box, Cylinder, ParameterRange, Scene, load
+from nsf.scenes.checks import check_memory
 
 FEW = "scene.bodies.column.particles=300"
+MANY = "scene.bodies.column.particles=1000000000"
 
 
 @pytest.fixture(scope="module")
@@ -155,6 +159,9 @@ def test_a_parameter_that_is_no_key_is_refused():
         (["scene.bodies.column.particles=0"], "particles=0"),
         (["scene.bodies.column.particles=2.5"], "particles=2.5"),
         (["scene.bodies.column.density=-1"], "density=-1"),
+        (["scene.bodies.column.density=inf"], "density=inf"),
+        (["scene.bodies.column.shape.base=[nan,0.5,0.13]"], "base=[nan, 0.5, 0.13]"),
+        (["material.E=inf"], "material.E=inf"),
         (["scene.walls.kind=open"], "walls.kind='open'"),
         (["scene.walls.padding=0"], "walls.padding=0"),
         (["scene.colliders.floor.kind=glue"], "half-space.kind='glue'"),
@@ -248,9 +255,63 @@ def test_refused_motions(change, quoted):
 
 
 def test_body_outside_the_domain(sand):
-    scene = load("sand", [FEW, "scene.bodies.column.shape.base=[0.98, 0.5, 0.13]"])
-    with pytest.raises(ConfigError, match=r"reaches outside the domain"):
-        scene.particles()
+    with pytest.raises(ConfigError, match=r"scene\.bodies\.column: .* reaches outside the domain"):
+        load("sand", [FEW, "scene.bodies.column.shape.base=[0.98, 0.5, 0.13]"])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "quoted"),
+    [
+        (
+            ["scene.bodies.column.shape.radius=0.004", "scene.bodies.column.shape.height=0.008"],
+            "smaller than a cell of scene.dx=0.015625 m in every direction",
+        ),
+        (["scene.bodies.column.shape.radius=1e200"], "reaches outside the domain"),
+        (["scene.dx=0.0005"], "dx=0.0005 m makes 8.01e+09 grid nodes of 32 bytes (239 GiB)"),
+        (["scene.dx=1e-300"], "dx=1e-300 m makes inf grid nodes"),
+        (["scene.size=[1e300,1e300,1e300]"], "makes inf grid nodes"),
+    ],
+)
+def test_what_the_grid_cannot_hold(overrides, quoted):
+    with pytest.raises(ConfigError, match=re.escape(quoted)):
+        load("sand", [FEW, *overrides])
+
+
+@pytest.mark.parametrize(
+    ("make", "override", "quoted"),
+    [
+        (Scene.particles, MANY, "1000000000 particles would take 223.5"),
+        (Scene.full_order, MANY, "65 × 65 × 65 nodes would take 510.4"),
+        (Scene.full_order, "scene.dx=0.0025", "a grid of 401 × 401 × 401 nodes would take 1.9"),
+    ],
+)
+def test_what_memory_cannot_hold_is_refused_before_any_work(make, override, quoted, monkeypatch):
+    scene = load("sand", [FEW, "scene.dt=1e-4", override])
+    monkeypatch.setattr("nsf.scenes.checks.host_memory", lambda: 2**30)
+    monkeypatch.setattr(Cylinder, "sample", None)
+    monkeypatch.setattr("nsf.scenes.checks.warp_device", lambda name: SimpleNamespace(is_cuda=False))
+    expected = f"{quoted} GiB of memory and 1.0 GiB are available; take fewer"
+    with pytest.raises(ConfigError, match=re.escape(expected)):
+        make(scene)
+
+
+def test_memory_of_a_gpu(sand, monkeypatch):
+    """Solver and a block of frames on the GPU, the rest on the host."""
+    gpu = SimpleNamespace(is_cuda=True, alias="cuda:0", free_memory=10 * 2**20)
+    monkeypatch.setattr("nsf.scenes.checks.warp_device", lambda name: gpu)
+    with pytest.raises(ConfigError, match=r"nodes, on cuda:0, would take 0\.1 GiB of memory"):
+        check_memory(sand, "fp64", "cuda", FP32)
+    gpu.free_memory = 2**30
+    check_memory(sand, "fp64", "cuda", FP32)
+    monkeypatch.setattr("nsf.scenes.checks.host_memory", lambda: 600 * 2**20)
+    with pytest.raises(ConfigError, match=r"nodes would take 0\.6 GiB of memory and 0\.6 GiB"):
+        check_memory(sand, "fp64", "cuda", FP32)
+
+
+@pytest.mark.parametrize("precision", ["fp64", "fp32"])
+def test_bytes_are_those_that_the_solver_takes(sand, precision):
+    expected = bytes_on_device(300, sand.grid, sand.material, precision_of(precision))
+    assert sand.full_order(precision=precision, device="cpu").nbytes == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize(("particles", "density"), [(0, 1.0), (10, 0.0), (10, float("nan"))])

@@ -1,7 +1,7 @@
-// The closure of a deformation and its tangents, added to `at` and A, each member's share in turn; all layers in
-// one piece, as code that a step meets for the first time must be short. Values are summed in the precision of
-// the step, tangents in fp32: they steer Gauss-Newton, and miss its fixed point by no more than their round-off
-// times the residual.
+// The closure of a deformation goes to `at`, and its tangents to A: the sum over the members of a committee. The
+// layers share one piece of code, since a step often meets it for the first time. Values are summed in the
+// precision of the step, tangents in fp32: they steer Gauss-Newton, and miss its fixed point by no more than
+// their round-off times the residual.
 #pragma unroll 1
 for (int member = 0; member < MEMBERS; ++member) {
     const slope_t* W = given.weights.data + size_t(member) * (given.weights.shape[0] / MEMBERS);

@@ -1,7 +1,8 @@
-// Sums Σ_k modes[p, c + i, k] a_k, i < 3, for each simulation of a tile from `start` on, each followed by those
-// of b if SUMS is 2. The K modes lie in vectors of four, on a GPU those of neighbouring particles side by side
-// (`Arena.modes`): what is under way then covers the time that memory takes, even for few particles.
-const int K = a.shape[1], simulations = a.shape[0];
+// The sums Σ_k modes[p, c + i, k] a_k, i < 3, for each run of a tile, the first of which is `start`; where
+// SUMS is 2, those with b follow those with a. The K modes lie in vectors of four. On a GPU the vectors of
+// neighbouring particles lie side by side (`Arena.modes`): enough loads are then under way to cover the time that
+// memory takes, even for few particles.
+const int K = a.shape[1], runs = a.shape[0];
 const decltype(a.data) coefficients[] = {a.data, b.data};
 wp::vec_t<3 * SUMS * TILE, real> sum;
 #if defined(__CUDA_ARCH__)
@@ -10,7 +11,7 @@ constexpr bool HALF = sizeof(stored) == 2;  // each mode over its length
 __shared__ real shared[SUMS][TILE][4 * Q];
 for (int e = threadIdx.x; e < TILE * 4 * Q; e += blockDim.x) {
     const int s = e / (4 * Q), k = e % (4 * Q);
-    const bool known = k < K && start + s < simulations;
+    const bool known = k < K && start + s < runs;
     for (int m = 0; m < SUMS; ++m) {
         const auto* of = coefficients[m] + (start + s) * K + k;
         if constexpr (HALF) shared[m][s][k] = known ? real(*of * lengths.data[k]) : real(0);
@@ -56,7 +57,8 @@ if (live) {
         for (int j = 0; j < AHEAD; ++j) {
             const int q = begin + j;
             if (q >= Q) break;
-            const float4 x = widened(under_way[j][0]), y = widened(under_way[j][1]), z = widened(under_way[j][2]);
+            const float4 x = widened(under_way[j][0]), y = widened(under_way[j][1]);
+            const float4 z = widened(under_way[j][2]);
             const float w[4][3] = {{x.x, y.x, z.x}, {x.y, y.y, z.y}, {x.z, y.z, z.z}, {x.w, y.w, z.w}};
             #pragma unroll
             for (int s = 0; s < TILE; ++s)
@@ -74,7 +76,7 @@ if (live) {
 if (live) {
     #pragma clang fp reassociate(on)  // a CPU works on several modes at once
     const wp::float32* first = modes.data + (size_t(p) * components + c) * 4 * Q;
-    for (int s = 0; s < TILE && start + s < simulations; ++s) {
+    for (int s = 0; s < TILE && start + s < runs; ++s) {
         real found[3 * SUMS] = {};
         for (int k = 0; k < K; ++k)
             for (int m = 0; m < SUMS; ++m)

@@ -1,4 +1,4 @@
-// Adds `taken`, 0 or 1, to count[copy, 0]; threads of a warp that are of one simulation add together.
+// Adds `taken`, 0 or 1, to count[copy, 0]; threads of a warp that are of one run add together.
 #if defined(__CUDA_ARCH__)
 unsigned long long* at = (unsigned long long*)count.data + size_t(copy) * count.shape[1];
 #if __CUDA_ARCH__ >= 700

@@ -1,4 +1,4 @@
-// Of S in a simulation: Σ_p w_p B_p,kᵀ Δt v_p of mode k, and beyond the last mode Σ_p w_p |Δt v_p|².
+// Σ_p w_p B_p,kᵀ Δt v_p over S of a run, for mode k; beyond the last mode Σ_p w_p |Δt v_p|².
 const double dt = given.dt;
 const int particles = given.weights.shape[0], modes = given.b.shape[1] - 1, vectors = (modes + 3) / 4;
 const auto* v = given.v.data + size_t(copy) * given.rows;

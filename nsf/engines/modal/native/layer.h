@@ -1,4 +1,5 @@
-// One output of a layer of one of two networks, for each simulation of a tile, by the lanes of a warp.
+// One output of a layer for each run of a tile, by the lanes of a warp; the outputs of the second network
+// follow those of the first.
 const bool first = output < one.b.shape[1];
 const int o = first ? output : output - one.b.shape[1], outputs = first ? one.b.shape[1] : two.b.shape[1];
 const int n = first ? one.W.shape[1] : two.W.shape[1];
@@ -8,7 +9,7 @@ const int entries_2 = LATENTS > 0 ? two.W_0.shape[0] : two.x.shape[1];
 const int entries = first ? entries_1 : entries_2;
 const int at = o / (outputs / (entries / n)) * n;  // where the entries of the output's member begin
 const real* row = (first ? one.W.data : two.W.data) + size_t(o) * n;
-// One beyond the last simulation is done again.
+// One beyond the last run is done again.
 auto of = [&](int s) { return wp::min(start + s, one.x.shape[0] - 1); };
 auto entry = [&](int s, int i) {
     if constexpr (LATENTS > 0) {  // found anew from the layer before

@@ -1,4 +1,4 @@
-// The inversion of one simulation by a block of threads, or by a CPU's one; `make_projection` says how.
+// The inversion of one run by a block of a GPU or a thread of a CPU; `make_projection` says how.
 typedef float slope_t;  // as Warp takes float(x) for its own
 struct alignas(8) pair_t { slope_t one, two; };
 #if defined(__CUDA_ARCH__)
@@ -18,13 +18,14 @@ NSF_SHARED alignas(16) slope_t slope[2][ROWS * ROW];
 NSF_SHARED double x[R], at[K], a_n[K], d[K + 1], A[K * R], q[K], M[K * R], g[R], u[R], E[2][2 * R * R];
 NSF_SHARED double error, copied[KEPT ? K * K : 1];
 const double* gram = KEPT ? copied : given.G.data;
-// A simulation has a row of each array of two dimensions.
-auto own = [&](const auto& values) { return values.data + size_t(simulation) * values.shape[1]; };
+// A run has a row of each array of two dimensions.
+auto own = [&](const auto& values) { return values.data + size_t(run) * values.shape[1]; };
 double *const latent = own(given.latent), *const a = own(given.a);
 const double* b = own(given.b);
 double *const x_0 = own(given.prepared), *const a_0 = x_0 + R, *const q_0 = a_0 + K;
 double *const A_0 = q_0 + K, *const M_0 = A_0 + K * R, *const inverse = M_0 + K * R;
-real *const xhat = own(given.xhat), *const xhat_previous = own(given.xhat_previous), *const xhats = own(given.xhats);
+real *const xhat = own(given.xhat), *const xhat_previous = own(given.xhat_previous);
+real *const xhats = own(given.xhats);
 real *const residuals = own(given.residuals), *const updates = own(given.updates);
 const int iterations = given.iterations;
 const bool linear = given.linear;
@@ -107,11 +108,11 @@ auto left = [&]() {
 const long long n = own(given.row)[0];
 #pragma unroll 1
 for (int k = lane; k < K; k += lanes) a_n[k] = a[k];
-if (mode != SOLVE) {
+if (task != SOLVE) {
     #pragma unroll 1
     for (int i = lane; i < R; i += lanes) {
         x[i] = latent[i];
-        if (mode == PREPARE && !linear) {
+        if (task == PREPARE && !linear) {
             const double before = xhat_previous[i], change = latent[i] - before;
             x[i] += change;
             if (n > 1) x[i] += change - before + xhats[(n - 2) * R + i];
@@ -121,7 +122,7 @@ if (mode != SOLVE) {
     for (int k = lane; k <= K; k += lanes) d[k] = 0.0;
     begin();
     evaluate();
-    if (mode == PREPARE) {
+    if (task == PREPARE) {
         residual(R);
         assemble(true);
         const double* found = eliminate(R);
