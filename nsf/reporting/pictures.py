@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from joblib.externals.loky import ProcessPoolExecutor
 
-from nsf.reporting.columns import COSTS, MEASURED, parameter_text
+from nsf.reporting.columns import MEASURED, parameter_text
 from nsf.reporting.drawing import charts, shapes
 from nsf.reporting.drawing.style import DIFFERENCE_COLORS, STRESS_COLORS, save
 from nsf.reporting.formats import file_name
@@ -254,7 +254,7 @@ def _comparison(known: list[_Variant], folder: Path, study: Study | None) -> lis
         ("speedup-memory", charts.speedup_and_memory,
          "Speedup of the reduced over the full-order model (line: 1×), and the peak memory of both."),
     )  # fmt: skip
-    if all(pd.isna(entry[name]) for entry in entries for name in COSTS):
+    if all(pd.isna(entry["step_ms_full"]) for entry in entries):
         drawings = drawings[:1]  # evaluation.trials=0
     return [Picture(save(drawn(entries), folder, stem), caption, runs) for stem, drawn, caption in drawings]
 

@@ -15,12 +15,10 @@ SEED = 2023  # not that of `make fuzz`
 
 
 @pytest.fixture(scope="module")
-def shop(chain, tmp_path_factory):
+def shop(chain, tiny, tmp_path_factory):
     before = {name: os.environ.get(name) for name in ("NSF_RUNS", "NSF_REPORTS")}
     folder = tmp_path_factory.mktemp("fuzz")
-    from conftest import TINY
-
-    yield cases.Workshop(folder, chain.root, TINY)
+    yield cases.Workshop(folder, chain.root, tiny)
     for name, value in before.items():
         os.environ.pop(name) if value is None else os.environ.update({name: value})
 
