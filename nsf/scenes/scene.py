@@ -67,7 +67,8 @@ class Scene:
     @classmethod
     def _build(cls, config: DictConfig, template: DictConfig) -> "Scene":
         s = configuration.section(config, "scene")
-        configuration.text("scene.title", s.title)
+        if "title" in s:  # the configuration of a simulation has none
+            configuration.text("scene.title", s.title)
         colliders = tuple(configuration.build_all(s.colliders, "scene.colliders").values())
         bodies = configuration.build_all(s.bodies, "scene.bodies")
         if not bodies:
