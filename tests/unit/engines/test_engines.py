@@ -196,9 +196,7 @@ def test_an_engine_is_asked_for(reduced):
     solver = reduced(engine="reference")
     assert (solver.engine, solver.together.why) == ("reference", "it was asked for")
     assert reduced(engine="modal").together.why == ""
-    with pytest.raises(
-        ConfigError, match=r"engine=fast is unknown; choose one of auto, modal, reference, operators"
-    ):
+    with pytest.raises(ConfigError, match=r"engine=fast is unknown; choose one of auto, .*operators"):
         reduced(engine="fast")
     assert NAMES == ("auto", "modal", "reference", "operators")
 
