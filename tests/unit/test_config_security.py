@@ -320,3 +320,12 @@ def test_a_scene_that_runs_code_is_refused(conf, tmp_path, monkeypatch):
         ConfigError, match=r"scene\.colliders\.floor: _target_: nsf\.workers\.Worker is refused"
     ):
         load("evil")
+
+
+@pytest.mark.parametrize(
+    "override", ["projector=$", "evaluation.picture_frames=$", "sampler=${oc.decode:'1'}"]
+)
+def test_an_override_that_no_grammar_reads_is_one_line(override):
+    with pytest.raises(ConfigError) as refused:
+        config.load([override])
+    assert "\n" not in str(refused.value)
