@@ -322,9 +322,7 @@ def test_a_scene_that_runs_code_is_refused(conf, tmp_path, monkeypatch):
         load("evil")
 
 
-@pytest.mark.parametrize(
-    "override", ["projector=$", "evaluation.picture_frames=$", "sampler=${oc.decode:'1'}"]
-)
+@pytest.mark.parametrize("override", ["projector=$", "sampler=${oc.decode:'1'}"])
 def test_an_override_that_no_grammar_reads_is_one_line(override):
     with pytest.raises(ConfigError) as refused:
         config.load([override])
