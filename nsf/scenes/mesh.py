@@ -145,6 +145,10 @@ def _surface(path: str, digest: str, up: str) -> WindingNumber:
     vertices, faces = _parse(path)
     if not len(faces):
         raise ConfigError(f"mesh={path} has no faces; export triangles, not points or lines")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise ConfigError(
+            f"mesh={path}: a face names vertex {faces.max()} of {len(vertices)}; export it again"
+        )
     used = vertices[faces]
     if not np.isfinite(used).all():
         count = len(np.unique(faces[~np.isfinite(used).all(2)]))
@@ -154,6 +158,8 @@ def _surface(path: str, digest: str, up: str) -> WindingNumber:
     vertices, faces = np.unique(used.reshape(-1, 3), axis=0, return_inverse=True)
     faces = faces.reshape(-1, 3)
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(1)]
+    if not len(faces):
+        raise ConfigError(f"mesh={path} has no face with an area; export a solid")
     _check_closed(path, faces)
     return _oriented(path, vertices[faces])
 

@@ -417,3 +417,26 @@ class TestDrop:
     def test_missing_mesh(self):
         with pytest.raises(ConfigError, match=r"mesh=bunny\.obj is no file"):
             load("drop", ["scene.geometry.mesh=bunny.obj"])
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 99\n", "mesh="),
+        ("v 0 0 0\nv 0 0 0\nv 0 0 0\nf 1 2 3\n", "no face with an area"),
+    ],
+)
+def test_faces_that_cannot_be_are_refused(text, told, tmp_path):
+    path = tmp_path / "odd.obj"
+    path.write_text(text)
+    with pytest.raises(ConfigError, match=told):
+        Mesh(str(path))
+
+
+def test_a_face_beyond_the_vertices_is_refused(tmp_path):
+    path = tmp_path / "odd.ply"
+    head = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    head += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    path.write_text(f"{head}0 0 0\n1 0 0\n0 1 0\n3 0 1 66\n")
+    with pytest.raises(ConfigError, match="a face names vertex 66 of 3"):
+        Mesh(str(path))
