@@ -347,7 +347,7 @@ def _keys(node, prefix: str = "") -> list[str]:
 def _explain(error: Exception, config_name: str, overrides: Sequence[str]) -> str:
     """Hydra's message in one line, with the nearest known key."""
     text = str(error)
-    first = (text.splitlines() or ["an override cannot be read; quote brackets, commas, $ and spaces"])[0]
+    first = (text.splitlines() or ["a value cannot be read; check quotes, brackets and ${…}"])[0]
     missing = re.search(r"Could not override '([^']+)'", text)
     if missing:
         key = missing.group(1)
