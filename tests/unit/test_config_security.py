@@ -66,9 +66,9 @@ def test_a_target_that_is_no_text(target):
         config.build({"_target_": target}, "field")
 
 
-def test_nothing_outside_the_package_of_a_key_is_imported():
+def test_nothing_outside_the_package_of_a_key_is_imported(monkeypatch):
     for module in ("nsf.doctor", "antigravity"):
-        sys.modules.pop(module, None)
+        monkeypatch.delitem(sys.modules, module, raising=False)  # and put back afterwards
         with pytest.raises(ConfigError, match="is refused"):
             config.build({"_target_": f"{module}.report"}, "field")
         assert module not in sys.modules
