@@ -14,6 +14,8 @@ from nsf.mpm import GridGeometry, Precision
 from nsf.mpm.grid import flat_index, inside
 from nsf.mpm.shape import shape_functions
 
+#: Nodes by which the integration particles are widened at most; every grid of the scenes is smaller.
+_WIDEST = 512
 STRATEGIES = ("superset", "search")
 
 
@@ -29,7 +31,7 @@ class Integration:
             the training values stay inside.
 
     Raises:
-        ConfigError: unknown strategy or negative margin.
+        ConfigError: unknown strategy, or a margin outside 0 to `_WIDEST` nodes.
     """
 
     strategy: str = "superset"
@@ -40,8 +42,8 @@ class Integration:
             raise ConfigError(
                 f"integration.strategy={self.strategy!r} is unknown; choose one of {', '.join(STRATEGIES)}"
             )
-        if self.margin < 0:
-            raise ConfigError(f"integration.margin={self.margin} must be at least 0 nodes")
+        if not 0 <= self.margin <= _WIDEST:
+            raise ConfigError(f"integration.margin={self.margin} must be from 0 to {_WIDEST} nodes")
 
 
 @dataclass(frozen=True)
