@@ -95,3 +95,34 @@ class LatentRecord:
         stops = stop_reasons(residuals, updates, tolerance)
         t, xhat = np.arange(steps + 1) * dt, self.xhat[: steps + 1].cpu().numpy()
         return LatentTrajectory(t, xhat, residuals.numpy(), updates.numpy(), stops)
+
+
+class LatentState:
+    """The state of a reduced run; particle fields are decoded when they are asked for.
+
+    Args:
+        run: a `ReducedMPM`.
+    """
+
+    def __init__(self, run):
+        self._run = run
+
+    @property
+    def xhat(self) -> np.ndarray:
+        """[r] latent vector."""
+        return self._run.xhat.cpu().numpy()
+
+    def __len__(self) -> int:
+        return len(self._run.setup.constants)
+
+    def numpy(self) -> dict[str, np.ndarray]:
+        """Every particle's x, v [P, 3], C, tau [P, 3, 3], as of the full-order state, and xhat [r]."""
+        run = self._run
+        decoder, now = run.decoder(), run.xhat[None]
+        x = decoder.position(run.xhat)
+        if run.steps_taken == 0:
+            v = run.setup.initial_velocity
+        else:
+            v = (x - decoder.position(run.record.before)) / run.dt
+        fields = {"x": x, "v": v, "C": decoder.affine(now)[0], "tau": decoder.stress(now)[0]}
+        return {name: value.cpu().numpy() for name, value in fields.items()} | {"xhat": self.xhat}
