@@ -12,7 +12,7 @@ from nsf.dynamics.interop import as_vectors, on_torch_stream
 from nsf.errors import ConfigError
 from nsf.mpm import GridGeometry, Precision
 from nsf.mpm.grid import flat_index, inside
-from nsf.mpm.shape import shape_functions, stencil_offset
+from nsf.mpm.grid.shape import shape_functions, stencil_offset
 
 STRATEGIES = ("superset", "search")
 

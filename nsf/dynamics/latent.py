@@ -51,7 +51,7 @@ class LatentRecord:
         self.row = torch.zeros(runs.numel(), dtype=torch.int64, device=xhat.device)
 
     def of(self, run: int) -> "LatentRecord":
-        """That of one of several runs, sharing memory."""
+        """That of one run of a batch, sharing memory."""
         own = copy(self)
         own.row = self.row[run : run + 1]
         for name in ("now", "before", "xhat", "residuals", "updates"):
@@ -68,7 +68,7 @@ class LatentRecord:
     def predicted(self) -> torch.Tensor:
         """[r] x̂_{n+1} on the parabola through the last three, or the line through two, or x̂_0.
 
-        Of one run: in several each has its own number of steps.
+        Of one run: in a batch each has its own number of steps.
         """
         change = self.now - self.before
         older = self.xhat.index_select(0, (self.row - 2).clamp_min(0))[0]
