@@ -14,8 +14,8 @@ from rich.console import Console
 import nsf.runs.manifest
 from nsf.cli import main
 from nsf.errors import ConfigError, MissingRunError, NSFError, SchemaError, StorageError
-from nsf.reporting.index import write_index
-from nsf.reporting.listing import difference_table, entries, runs_table
+from nsf.reporting.overview.index import write_index
+from nsf.reporting.overview.listing import difference_table, entries, runs_table
 from nsf.runs import Run
 
 MUTATIONS = 40  # of each kind; a few thousand were tried

@@ -28,7 +28,7 @@ CALLABLES = [
     "nsf.mpm.FullOrderMPM",
     "nsf.scenes.Scene",
     "nsf.scenes.load",
-    "nsf.scenes.mesh._read",
+    "nsf.scenes.shapes.mesh._read",
     "nsf.dynamics.ReducedMPM",
     "nsf.sampling.sampler.np.save",
     "nsf.reporting.build.build_report",
