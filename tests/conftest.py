@@ -129,7 +129,7 @@ def seal():
     from nsf.runs import Record
 
     def rewrite(run, *more):
-        record = Record(run.path, run.manifest["created"])
+        record = Record(run.path, run.manifest)
         for name in [*(output["path"] for output in run.manifest["outputs"]), *more]:
             record.output(name)
         manifest = run.manifest | {"outputs": list(record.outputs.values())}
