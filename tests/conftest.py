@@ -38,6 +38,18 @@ TINY = (
 )
 
 
+def pytest_runtest_setup(item):
+    """A test marked `gpu` says what it lacks here."""
+    import warp as wp
+
+    for marker in item.iter_markers("gpu"):
+        needed = marker.args[0] if marker.args else 1
+        found = {"torch": torch.cuda.device_count(), "Warp": wp.get_cuda_device_count()}
+        if min(found.values()) < needed:
+            told = " and ".join(f"{library} sees {count}" for library, count in found.items())
+            pytest.skip(f"GPUs needed: {needed}; {told}")
+
+
 @pytest.fixture(scope="session", autouse=True)
 def one_thread_for_torch():
     before = torch.get_num_threads()
@@ -80,6 +92,12 @@ def tiny_pipeline(root, *overrides, say=None):
     return Pipeline(config.load([*TINY, *overrides]), say=say or (lambda line: None), root=root)
 
 
+@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def device(request) -> str:
+    """The name of a device: of the CPU, and in tests marked `gpu` of a GPU."""
+    return request.param
+
+
 @pytest.fixture(scope="session")
 def tiny():
     """The overrides of the tiny chain."""
@@ -119,6 +137,22 @@ def tiny_manifold(chain):
     import nsf
 
     return nsf.Manifold.load(chain.checkpoint)
+
+
+@pytest.fixture(scope="session")
+def tiny_scene():
+    """The scene of the tiny chain, for tests that read nothing that its stages left."""
+    import nsf.scenes
+
+    return nsf.scenes.load("sand", TINY[1:])
+
+
+@pytest.fixture(scope="session")
+def reference_manifold():
+    """The tiny chain's manifold as it is committed: a GPU machine need not simulate and train for it."""
+    from gpu_references import manifold
+
+    return manifold()
 
 
 @pytest.fixture(scope="session")
