@@ -25,6 +25,7 @@ TINY = (
     "scene.steps=24",
     "scene.bodies.column.particles=500",
     "scene.parameters.train=[22,30,38]",
+    "scene.parameters.validation=[]",
     "scene.parameters.test=[26]",
     "field.modes=[8,8,8]",
     "field.beta=4",
