@@ -3,7 +3,6 @@
 scene → simulate → dataset → train (→ teach) → deploy → evaluate → report
 """
 
-import contextlib
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -12,20 +11,17 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from nsf import config as configuration
-from nsf.data import Snapshots
-from nsf.data.schema import TRAJECTORY
 from nsf.dynamics import ParticleSets, ReducedBatch, ReducedMPM
 from nsf.engines import Engine, Operators
 from nsf.errors import MissingRunError
 from nsf.kinematics.fields.mlp import MlpField
 from nsf.kinematics.manifold import Manifold
-from nsf.kinematics.training.ranks import train_together
-from nsf.kinematics.training.train import train
-from nsf.pipeline.deployment import CONFIGURATION, deploy_held_out
-from nsf.pipeline.evaluation import evaluate, superresolve_held_out
 from nsf.pipeline.plan import Plan
-from nsf.pipeline.simulation import Job, Shared, simulate
-from nsf.pipeline.teaching import OPERATORS, teach
+from nsf.pipeline.stages.deployment import CONFIGURATION, deploy_held_out
+from nsf.pipeline.stages.evaluation import evaluate, superresolve_held_out
+from nsf.pipeline.stages.simulation import Job, Shared, simulate
+from nsf.pipeline.stages.teaching import OPERATORS, teach
+from nsf.pipeline.stages.training import train
 from nsf.runs import Run
 from nsf.sampling import SampleSpan
 from nsf.scenes import Scene
@@ -143,27 +139,7 @@ class Pipeline(Plan):
 
     def train(self) -> Run:
         """The manifold of the training trajectories."""
-        return self._made(self.training, self._train)
-
-    def _train(self, run: Run) -> None:
-        self.check_devices()
-        c = self.config
-        paths = [run.file(TRAJECTORY) for run in self.training_data]
-        own = {"field": self.field, "latent_dim": c.latent_dim, "seed": c.seed, "tracking": c.tracking}
-        one = partial(train, folder=run.path, **own)
-        with run.record(device=self.device, seed=c.seed) as record:
-            if self.trainer.devices > 1:
-                manifold, metrics = train_together(paths, one, self.trainer, self.device, c.data.resident)
-            else:
-                with contextlib.closing(Snapshots(paths, self.device, c.data.resident)) as snapshots:
-                    manifold, metrics = one(snapshots, trainer=self.trainer, device=self.device)
-            manifold.datasets = [run.id for run in self.training_data]
-            manifold.split = {"train": list(self.split.train), "test": list(self.split.test)}
-            manifold.save(run.path / "manifold.pt")
-            record.output("manifold.pt")
-            record.metrics.update(metrics)
-        seconds = metrics["training_seconds"]
-        self.say(f"train: field={manifold.field}, r={c.latent_dim} in {seconds:.1f} s → {run.id}")
+        return self._made(self.training, partial(train, self))
 
     def manifold(self) -> Manifold:
         """The trained manifold.

@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 
 from nsf.errors import ConfigError, MissingRunError, SchemaError
 from nsf.pipeline import Pipeline
-from nsf.pipeline.deployment import CONFIGURATION, write_configuration
+from nsf.pipeline.stages.deployment import CONFIGURATION, write_configuration
 
 
 def test_the_same_chain_comes_out(chain):

@@ -11,7 +11,7 @@ from nsf.deployment import Rollout, continuation_file, rollout_file
 from nsf.dynamics.setup import reduced_steps
 from nsf.evaluation import Comparison, Subject, compare, measure, superresolve
 from nsf.kinematics.manifold import Manifold
-from nsf.pipeline import results
+from nsf.pipeline.stages import results
 from nsf.runs import Run
 
 
