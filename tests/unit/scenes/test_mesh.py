@@ -11,7 +11,8 @@ import pytest
 from meshes import FORMATS, cube, joined, sphere, torus, turned, write
 
 from nsf.errors import ConfigError
-from nsf.scenes import Ball, Box, Mesh, load, mesh, mesh_or_ball
+from nsf.scenes import Ball, Box, Mesh, load, mesh_or_ball
+from nsf.scenes.shapes import mesh
 from nsf.scenes.shapes.winding import WindingNumber
 
 
