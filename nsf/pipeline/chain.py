@@ -15,7 +15,16 @@ from omegaconf import DictConfig, OmegaConf
 from nsf import config as configuration
 from nsf.data import Snapshots, Trajectory
 from nsf.data.schema import TRAJECTORY
-from nsf.deployment import Levels, Rollout, calibrate, continuation_file, deploy, go_on, rollout_file
+from nsf.deployment import (
+    PROJECTED,
+    Levels,
+    Rollout,
+    calibrate,
+    continuation_file,
+    deploy,
+    go_on,
+    rollout_file,
+)
 from nsf.dynamics import ParticleSets, ReducedBatch, ReducedMPM
 from nsf.dynamics.setup import reduced_steps
 from nsf.engines import Engine, Operators
@@ -332,8 +341,12 @@ class Pipeline(Plan):
 
     def _warn(self, rollout: Rollout) -> None:
         value = self._named(rollout)
-        if (own := rollout.by_operators) < len(rollout.stops) and rollout.estimate is not None:
-            self.say(f"deploy: {value}: the projected step goes on from t = {rollout.t[own]:.4g} s")
+        projected = np.flatnonzero(rollout.levels == PROJECTED)
+        if rollout.by is not None and len(projected):
+            self.say(
+                f"deploy: {value}: the projected step takes {len(projected)} of {len(rollout.stops)} steps, "
+                f"the first at t = {rollout.t[projected[0]]:.4g} s"
+            )
         if rollout.diverged >= 0:
             self.say(
                 f"deploy: warning: {value} diverged at step {rollout.diverged} (off the grid or not finite); "
