@@ -21,7 +21,7 @@ from nsf.engines.operators.states import collider_states
 from nsf.engines.operators.teacher import first_changes
 from nsf.evaluation import metrics
 from nsf.pipeline import Pipeline
-from nsf.pipeline.teaching import OPERATORS
+from nsf.pipeline.stages.teaching import OPERATORS
 from nsf.scenes import Scene
 from nsf.timing import synchronizer
 

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, fields
 
-from nsf.provenance import provenance
+from nsf.runs.provenance import provenance
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import yaml
 from omegaconf import DictConfig
 
 from nsf import config as configuration
-from nsf.documents import text_of
+from nsf.config.documents import text_of
 from nsf.errors import ConfigError, MissingRunError
 from nsf.paths import EXPERIMENTS
 from nsf.pipeline.plan import Plan

@@ -214,7 +214,7 @@ def test_broken_yaml_names_file_and_line(tmp_path, monkeypatch):
 
     shutil.copytree(CONF, tmp_path / "conf")
     (tmp_path / "conf/method/broken.yaml").write_text("_target_: nsf.dynamics.Method\nname: [\n")
-    monkeypatch.setattr(config, "CONF", tmp_path / "conf")
+    monkeypatch.setattr(config.composing, "CONF", tmp_path / "conf")
     with pytest.raises(ConfigError, match=r"broken\.yaml.*line [23].*correct the yaml"):
         config.load(["method=broken"])
 

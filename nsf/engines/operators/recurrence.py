@@ -9,8 +9,8 @@ import warp as wp
 from nsf.dynamics.interop import torch_device, torch_dtype
 from nsf.engines.operators.model import Sizes, StepOperators
 from nsf.mpm import Precision
-from nsf.mpm.access import SHARED, TAKEN, WARP
 from nsf.mpm.native import native_code
+from nsf.mpm.native.access import SHARED, TAKEN, WARP
 
 _REGISTERS = 512  # [byte] of weights that a thread of a GPU holds
 

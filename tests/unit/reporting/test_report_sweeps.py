@@ -11,10 +11,10 @@ from synthetic import Made, write_run
 
 from nsf.reporting import build_report
 from nsf.reporting.drawing import charts
-from nsf.reporting.formats import latex, latex_table
 from nsf.reporting.sources import Study, open_sources
 from nsf.reporting.study import _settings, _told, swept
 from nsf.reporting.tables import means, merge, rows_of
+from nsf.reporting.text.formats import latex, latex_table
 
 VALUES = (22.5, 27.5)
 

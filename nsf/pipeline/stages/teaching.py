@@ -10,20 +10,30 @@ from nsf.dynamics import ReducedBatch
 from nsf.engines.operators import Course, Taught, Teacher, Yardstick
 from nsf.kinematics.manifold import Manifold
 from nsf.progress import Progress
-from nsf.runs import Record
+from nsf.runs import Record, Run
 
 #: File of a teach run with the operators.
 OPERATORS = "operators.pt"
 
 
-def teach(pipeline, manifold: Manifold, record: Record) -> None:
+def teach(pipeline, run: Run) -> None:
     """Teach the operators of a pipeline's configuration; finished rounds in the run's folder are taken up.
 
     Args:
         pipeline: a `nsf.pipeline.Pipeline`.
-        manifold: its trained fields.
-        record: of the run.
+        run: its teach run.
     """
+    manifold, c = pipeline.manifold().to(pipeline.device), pipeline.config
+    with run.record(device=pipeline.device, seed=c.seed, precision=c.precision) as record:
+        _follow(pipeline, manifold, record)
+    found = record.metrics
+    pipeline.say(
+        f"teach: {found['teacher_steps']} steps of the teacher in {found['teach_seconds']:.1f} s, "
+        f"{100 * min(found['errors']):.2g} % off at values held back → {run.id}"
+    )
+
+
+def _follow(pipeline, manifold: Manifold, record: Record) -> None:
     started = time.perf_counter()
     with Progress("teach", pipeline.teaching.steps, "teacher's steps") as progress:
         known, between, _ = pipeline.lessons

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple
 
 from omegaconf import DictConfig
 
+from nsf.config.resolvers import resolved
 from nsf.errors import ConfigError, NSFError
-from nsf.resolvers import resolved
 from nsf.vectors import is_finite
 
 

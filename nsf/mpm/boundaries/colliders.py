@@ -9,8 +9,8 @@ from typing import ClassVar
 import numpy as np
 
 from nsf.errors import ConfigError
-from nsf.mpm.contact import CUBOID, HALF_SPACE, KINDS, SPHERE
-from nsf.mpm.motion import Motion
+from nsf.mpm.boundaries.contact import CUBOID, HALF_SPACE, KINDS, SPHERE
+from nsf.mpm.boundaries.motion import Motion
 from nsf.vectors import direction, rotation, vector
 
 # Reach of a quadratic B-spline, in Δx.

@@ -8,9 +8,9 @@ import numpy as np
 import warp as wp
 
 from nsf.errors import ConfigError
-from nsf.mpm.colliders import Collider, check_kind
-from nsf.mpm.contact import KINDS
-from nsf.mpm.motion import Motion, make_follow
+from nsf.mpm.boundaries.colliders import Collider, check_kind
+from nsf.mpm.boundaries.contact import KINDS
+from nsf.mpm.boundaries.motion import Motion, make_follow
 from nsf.mpm.precision import Precision
 
 _AT_REST = Motion((0.0, 1.0), ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))

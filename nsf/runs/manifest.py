@@ -14,14 +14,12 @@ import reprlib
 import stat
 import time
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from nsf.canonical import plain
-from nsf.errors import ConfigError, NSFError, SchemaError, StorageError
-from nsf.storage import AGAIN
+from nsf.errors import NSFError, SchemaError
+from nsf.runs.canonical import plain
 
 MANIFEST = "manifest.json"
 CONFIG = "config.yaml"
@@ -136,59 +134,6 @@ def verified(path: str | Path) -> Path:
             f"`nsf {manifest.get('stage', 'run')}` again"
         )
     return path
-
-
-class Record:
-    """What a running stage says about itself: `metrics`, and the files it made.
-
-    Args:
-        path: folder of the run.
-        created: of its manifest, by which the folder is known.
-    """
-
-    def __init__(self, path: Path, created: str) -> None:
-        self.path, self._created = path, created
-        self.metrics: dict[str, Any] = {}
-        self.outputs: dict[str, dict[str, Any]] = {}
-
-    def require_folder(self) -> None:
-        """Refuse to go on where the folder is no longer the one that the run began with.
-
-        Raises:
-            StorageError: it was deleted or moved.
-        """
-        with suppress(SchemaError):
-            if read_manifest(self.path).get("created") == self._created:
-                return
-        raise StorageError(f"{self.path} was deleted or moved while its files were being made; {AGAIN}")
-
-    def output(self, path: str | Path) -> Path:
-        """Enter a finished file, or every file of a folder, into the manifest.
-
-        Args:
-            path: within the run's folder, absolute or relative to it.
-
-        Raises:
-            ConfigError: the path leaves the run's folder or does not exist.
-            StorageError: the folder was deleted or moved.
-        """
-        self.require_folder()
-        path = self.path / path
-        files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
-        if not files or not path.resolve().is_relative_to(self.path.resolve()):
-            raise ConfigError(f"output {path} is no file inside {self.path}; write it there first")
-        for file in files:
-            name = file.resolve().relative_to(self.path.resolve()).as_posix()
-            self.outputs[name] = {"path": name, "bytes": file.stat().st_size, "sha256": digest(file)}
-        return path
-
-    def plain_metrics(self) -> dict[str, Any]:
-        """The metrics as JSON holds them; a value that is not finite becomes null.
-
-        Raises:
-            ConfigError: a metric is of a kind that JSON cannot hold.
-        """
-        return plain(self.metrics, finite=False, key="metrics")
 
 
 def _read(read: Callable[[Path], dict[str, Any]], path: Path) -> dict[str, Any] | None:

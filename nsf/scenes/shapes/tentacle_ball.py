@@ -7,7 +7,7 @@ import numpy as np
 
 from nsf import config as configuration
 from nsf.errors import ConfigError
-from nsf.scenes.geometry import Ball, Shape
+from nsf.scenes.shapes.geometry import Ball, Shape
 from nsf.vectors import vector
 
 # Each is held to each other, and each point to each.

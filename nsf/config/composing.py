@@ -1,41 +1,32 @@
-"""Configuration: Hydra groups in `conf/`, composed and checked.
+"""Configurations composed from the groups of `conf/`, or read from a file, and checked.
 
 A problem parameter is the value of one configuration key (`scene.parameters.key`), so a
 simulation at a parameter value is the same configuration with that key replaced.
 """
 
 import difflib
-import itertools
-import math
 import re
 import typing
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from functools import cache
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override, RangeSweep
 from hydra.errors import HydraException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+from omegaconf.errors import OmegaConfBaseException
 from yaml import MarkedYAMLError, YAMLError
 
-from nsf import targets
-from nsf.documents import check_sizes, text_of
+from nsf.config import targets
+from nsf.config.documents import check_sizes, text_of
+from nsf.config.resolvers import resolved
 from nsf.errors import ConfigError
 from nsf.paths import CONF, groups
-from nsf.resolvers import resolved
-from nsf.targets import build as build
-from nsf.targets import build_all as build_all
-from nsf.vectors import length as length
-from nsf.vectors import number as number
-from nsf.vectors import text as text
 
 # conf/hydra/launcher/joblib.yaml takes the place of the launcher's own configuration on purpose.
 warnings.filterwarnings(
@@ -52,8 +43,6 @@ _SWEEP = (
     "hydra.sweep.subdir=.",
 )
 
-#: Of a sweep; the largest experiment has some hundred.
-_MOST_JOBS = 10_000
 #: Raised by Hydra and the yaml parser on files that are no configuration, beside their own errors.
 _OF_BROKEN_FILES = (
     YAMLError,
@@ -83,14 +72,14 @@ def load(overrides: Sequence[str] = (), config_name: str = "config") -> DictConf
     try:
         return checked(_compose(config_name, overrides))
     except (HydraException, OmegaConfBaseException) as error:
-        raise ConfigError(_explain(error, config_name, overrides)) from error
+        raise ConfigError(explained(error, config_name, overrides)) from error
     except MarkedYAMLError as error:
         mark = error.problem_mark
         raise ConfigError(f"{mark.name}, line {mark.line + 1}: {error.problem}; correct the yaml") from error
     except _OF_BROKEN_FILES as error:
         for path in sorted(CONF.rglob("*.yaml")):
             text_of(path)  # tells of the one that cannot be read
-        told = _explain(error, config_name, overrides)
+        told = explained(error, config_name, overrides)
         raise ConfigError(f"the configuration cannot be composed: {told}") from error
 
 
@@ -127,9 +116,14 @@ def _compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
     return config
 
 
-def _with_hydra(config_name: str | None, overrides: Sequence[str]) -> DictConfig:
+def initialized(**named: str) -> AbstractContextManager:
+    """Hydra over `conf/` while a block works, anew."""
     GlobalHydra.instance().clear()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
+    return initialize_config_dir(str(CONF), version_base="1.3", **named)
+
+
+def _with_hydra(config_name: str | None, overrides: Sequence[str]) -> DictConfig:
+    with initialized():
         config = compose(config_name, overrides=list(overrides), return_hydra_config=True)
     OmegaConf.set_readonly(config, False)
     OmegaConf.set_struct(config, False)
@@ -172,31 +166,6 @@ def resolve(config: DictConfig) -> DictConfig:
         raise ConfigError("the configuration is nested too deeply; flatten it") from error
 
 
-@contextmanager
-def naming_the_missing() -> Iterator[None]:
-    """Say which key is missing that the block reads from a configuration.
-
-    Raises:
-        ConfigError: one is missing.
-    """
-    try:
-        yield
-    except (ConfigAttributeError, ConfigKeyError) as error:
-        raise ConfigError(f"{error.full_key} is missing from the configuration; give it a value") from error
-
-
-def section(config: DictConfig, key: str) -> DictConfig:
-    """The keys below a key.
-
-    Raises:
-        ConfigError: it is missing, or holds something else.
-    """
-    found = OmegaConf.select(config, key)
-    if not isinstance(found, DictConfig):
-        raise ConfigError(f"{key}={'null' if found is None else found} must map keys to values")
-    return found
-
-
 def of_launcher(override: str) -> bool:
     """Whether an override is about how jobs are launched, as `hydra/launcher=slurm`, and not about a job."""
     return override.lstrip("+~").startswith(("hydra/", "hydra."))
@@ -212,128 +181,15 @@ def launching(overrides: Sequence[str], config_name: str = "config") -> tuple[Di
     Raises:
         ConfigError: an unknown key or launcher, with the nearest known one.
     """
-    GlobalHydra.instance().clear()
-    with initialize_config_dir(str(CONF), version_base="1.3", job_name="nsf"):
+    with initialized(job_name="nsf"):
         hydra = GlobalHydra.instance().hydra
         try:
             config = hydra.compose_config(
                 config_name, [*_SWEEP, *overrides], RunMode.MULTIRUN, with_log_configuration=False
             )
         except HydraException as error:
-            raise ConfigError(_explain(error, config_name, overrides)) from error
+            raise ConfigError(explained(error, config_name, overrides)) from error
         return config, hydra.config_loader
-
-
-def jobs(sweeps: Sequence[Sequence[str]], config_name: str = "config") -> list[tuple[str, ...]]:
-    """The overrides of every job of sweeps, each job once: every combination of a sweep's values.
-
-    Jobs of one scene follow each other, so that its trajectories can go when the next one's come.
-
-    Raises:
-        ConfigError: a syntax error, an interval of values, or more jobs than anyone can mean.
-    """
-    options = [_options(overrides, config_name) for overrides in sweeps]
-    if (count := sum(math.prod(map(len, values)) for values in options)) > _MOST_JOBS:
-        raise ConfigError(f"{count} jobs are more than the {_MOST_JOBS} of a sweep; give fewer values")
-    found = list(dict.fromkeys(job for values in options for job in itertools.product(*values)))
-    scenes = [scene_of(job) for job in found]
-    return [job for _, job in sorted(zip(scenes, found, strict=True), key=lambda one: scenes.index(one[0]))]
-
-
-def scene_of(job: Sequence[str]) -> str:
-    """The override of a job that names its scene; empty where none does."""
-    return next((override for override in job if override.startswith("scene=")), "")
-
-
-def _options(overrides: Sequence[str], config_name: str) -> list[list[str]]:
-    """The overrides of a multirun, each as the list of single ones that it stands for; of a key, the last."""
-    GlobalHydra.instance().clear()
-    with initialize_config_dir(str(CONF), version_base="1.3"):
-        parser = OverridesParser.create(GlobalHydra.instance().config_loader())  # which glob(*) looks through
-    try:
-        parsed = parser.parse_overrides(list(overrides))
-    except (HydraException, RecursionError) as error:
-        raise ConfigError(_explain(error, config_name, overrides)) from error
-    options: dict[str, list[str]] = {}
-    for override in parsed:
-        key = override.get_key_element()
-        options[key] = [override.input_line]
-        if override.is_sweep_override():
-            if not override.is_discrete_sweep():
-                raise ConfigError(f"{override.input_line} has no end of values; list them, or use nsf search")
-            options[key] = [f"{key}={value}" for value in _values(override)]
-    return list(options.values())
-
-
-def _values(override: Override) -> list[str]:
-    """The values of an override that has several."""
-    try:
-        if isinstance(several := override.value(), RangeSweep):
-            found = list(itertools.islice(several.range(), _MOST_JOBS + 1))  # a shuffled one would be listed
-        if not isinstance(several, RangeSweep) or len(found) <= _MOST_JOBS:
-            found = list(override.sweep_string_iterator())
-    except (HydraException, ValueError, ArithmeticError) as error:
-        raise ConfigError(f"{override.input_line}: {error}; give start, stop and step") from error
-    if len(found) > _MOST_JOBS:
-        raise ConfigError(f"{override.input_line} has more than {_MOST_JOBS} values; give fewer")
-    return found
-
-
-def check_sweep(
-    overrides: Sequence[str], config_name: str = "config", check: Callable[[DictConfig], object] | None = None
-) -> None:
-    """Compose with each value of a multirun once, so that a mistake shows before the first job.
-
-    Args:
-        overrides, config_name: as for `load`; overrides may have several values.
-        check: called with each configuration; raises where it refuses one.
-
-    Raises:
-        ConfigError: see `load`; and whatever `check` raises.
-    """
-    options = _options(overrides, config_name)
-    first = [values[0] for values in options]
-    for at, values in enumerate(options):
-        for value in values:
-            config = load([*first[:at], value, *first[at + 1 :]], config_name)
-            if check is not None:
-                check(config)
-
-
-def replaced(config: DictConfig, values: Mapping[str, typing.Any], known: Sequence[str]) -> DictConfig:
-    """A copy with other values of some keys; a key that refers to a replaced one follows.
-
-    Args:
-        config: composed, its interpolations kept.
-        values: by dotted key.
-        known: keys that may be replaced, as of `leaves`.
-
-    Raises:
-        ConfigError: an unknown key, with the nearest known one, or one that holds others.
-    """
-    config = config.copy()
-    for key, value in values.items():
-        if key not in known:
-            inner = [k for k in known if k.startswith(f"{key}.")]
-            near = inner or difflib.get_close_matches(key, known, n=3, cutoff=0.5)
-            hint = f"did you mean {' or '.join(near[:3])}?" if near else "give a dotted key, as scene.gravity"
-            raise ConfigError(f"{'several keys in' if inner else 'unknown key'} {key!r}; {hint}")
-        OmegaConf.update(config, key, value)
-    return config
-
-
-def leaves(node, prefix: str = "") -> list[str]:
-    """Dotted keys of a plain tree that hold values, and those that a `_target_` has a default for."""
-    if not isinstance(node, dict):
-        return [prefix]
-    path = tuple(prefix.split("."))
-    unset = targets.keys_of(node["_target_"], path) if "_target_" in node else []
-    return [
-        key
-        for name, child in (dict.fromkeys(unset) | node).items()
-        if not name.startswith("_")
-        for key in leaves(child, f"{prefix}.{name}" if prefix else name)
-    ]
 
 
 def _keys(node, prefix: str = "") -> list[str]:
@@ -344,7 +200,7 @@ def _keys(node, prefix: str = "") -> list[str]:
     ]
 
 
-def _explain(error: Exception, config_name: str, overrides: Sequence[str]) -> str:
+def explained(error: Exception, config_name: str, overrides: Sequence[str]) -> str:
     """Hydra's message in one line, with the nearest known key."""
     text = str(error)
     first = (text.splitlines() or ["a value cannot be read; check quotes, brackets and ${…}"])[0]

@@ -7,8 +7,8 @@ import numpy as np
 import warp as wp
 
 from nsf.errors import ConfigError
+from nsf.mpm.grid.shape import shape_functions
 from nsf.mpm.precision import Precision
-from nsf.mpm.shape import shape_functions
 
 #: Nodes along the edge of a block, the part of the grid that is cleared and updated as one.
 BLOCK = 4
@@ -96,11 +96,11 @@ class Grid:
         geometry: spacing and node counts.
         precision, device: of the values.
         nodes: flat indices of the nodes to store; all by default.
-        copies: number of simulations, each with values of its own at these nodes.
+        runs: number of runs of a batch, each with values of its own at these nodes.
 
     Attributes:
-        geometry, copies: as given.
-        values: [copies n, 4] m_i v_i [kg m/s] after P2G, v_i [m/s] after the update; last m_i [kg].
+        geometry, runs: as given.
+        values: [runs n, 4] m_i v_i [kg m/s] after P2G, v_i [m/s] after the update; last m_i [kg].
         nodes: [n] flat node index of each stored node; empty when every node is stored.
         slots: [all nodes] storage index or −1; empty when every node is stored.
         marks: [all blocks] 1 for a block that particles reach; empty for a list of nodes, as the next two.
@@ -108,7 +108,7 @@ class Grid:
         listed: [1] number of reached blocks.
 
     Raises:
-        ConfigError: several copies of a grid that stores every node.
+        ConfigError: a batch on a grid that stores every node.
     """
 
     def __init__(
@@ -117,14 +117,12 @@ class Grid:
         precision: Precision,
         device,
         nodes: np.ndarray | None = None,
-        copies: int = 1,
+        runs: int = 1,
     ):
-        self.geometry, self.copies = geometry, copies
+        self.geometry, self.runs = geometry, runs
         self.sparse = nodes is not None
-        if copies > 1 and not self.sparse:
-            raise ConfigError(
-                f"{copies} simulations on one grid need a list of nodes; use integration=superset"
-            )
+        if runs > 1 and not self.sparse:
+            raise ConfigError(f"{runs} runs on one grid need a list of nodes; use integration=superset")
         count = len(nodes) if self.sparse else geometry.count
         slots = np.zeros(0, np.int32)
         if self.sparse:
@@ -133,7 +131,7 @@ class Grid:
         self.nodes = wp.array(nodes if self.sparse else np.zeros(0), dtype=wp.int32, device=device)
         self.slots = wp.array(slots, dtype=wp.int32, device=device)
         self.shape = wp.vec3i(*geometry.nodes)
-        self.values = wp.zeros(copies * count, dtype=precision.vec4, device=device)
+        self.values = wp.zeros(runs * count, dtype=precision.vec4, device=device)
         blocks = 0 if self.sparse else int(np.prod(geometry.blocks))
         self.block_shape = wp.vec3i(*geometry.blocks)
         self.marks, self.blocks = (wp.zeros(blocks, dtype=wp.int32, device=device) for _ in range(2))
@@ -146,8 +144,8 @@ class Grid:
 
     @property
     def count(self) -> int:
-        """Number of stored nodes of a simulation."""
-        return self.values.shape[0] // self.copies
+        """Number of stored nodes of a run."""
+        return self.values.shape[0] // self.runs
 
     @property
     def mass(self) -> wp.array:

@@ -18,7 +18,7 @@ def make_warp_sum(precision: Precision):
     """Warp function (value [3], lanes) → the sum over the lanes of a warp, in each; of one lane its value."""
     vec3 = precision.vec3
 
-    @wp.func_native(native_code(__package__, "warp_sum", real=precision.native))
+    @wp.func_native(native_code("nsf.mpm", "warp_sum", real=precision.native))
     def total(value: vec3, lanes: int) -> vec3: ...
 
     return total
@@ -29,7 +29,7 @@ def make_load(precision: Precision):
     """Warp function (values, slot) → values[slot]; values start where an allocation does, and are aligned."""
     vec4 = precision.vec4
 
-    @wp.func_native(native_code(__package__, "load", real=precision.native))
+    @wp.func_native(native_code("nsf.mpm", "load", real=precision.native))
     def load(values: wp.array(dtype=vec4), slot: int) -> vec4: ...
 
     return load

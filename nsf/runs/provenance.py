@@ -26,9 +26,10 @@ def provenance() -> dict[str, Any]:
     Where the package is not in a git checkout, as in a container, the environment
     variable NSF_COMMIT may name the commit. `dirty` is then None.
     """
-    here = Path(__file__).parent
+    file = Path(__file__)
+    here = file.parents[1]
     # Another project's checkout may hold an installed package; its git does not track the package.
-    tracked = _git(here, "ls-files", "--error-unmatch", Path(__file__).name)
+    tracked = _git(file.parent, "ls-files", "--error-unmatch", file.name)
     commit = _git(here, "rev-parse", "HEAD") if tracked else os.environ.get("NSF_COMMIT")
     changes = _git(here, "status", "--porcelain", "--", ".") if tracked else None
     return {

@@ -4,8 +4,8 @@ from functools import cache
 
 import warp as wp
 
-from nsf.mpm.access import WARP
 from nsf.mpm.native import native_code
+from nsf.mpm.native.access import WARP
 from nsf.mpm.precision import Precision
 
 #: Threads of a block, whose shared memory holds what each of its particles carries.
@@ -47,7 +47,7 @@ def make_scatter(precision: Precision, width: int):
     stencil = wp.types.matrix(shape=(3, width), dtype=real)
 
     @wp.func_native(
-        native_code(__package__, "scatter", real=precision.native, WIDTH=width, WARPS=THREADS // WARP)
+        native_code("nsf.mpm", "scatter", real=precision.native, WIDTH=width, WARPS=THREADS // WARP)
     )
     def scatter(
         cell: int,

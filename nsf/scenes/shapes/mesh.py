@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from nsf.errors import ConfigError
-from nsf.scenes.geometry import AXES, Ball, Box, Shape
-from nsf.scenes.winding import WindingNumber
+from nsf.scenes.shapes.geometry import AXES, Ball, Box, Shape
+from nsf.scenes.shapes.winding import WindingNumber
 from nsf.vectors import length, vector
 
 EXTENSIONS = (".obj", ".ply", ".stl")

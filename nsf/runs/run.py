@@ -1,7 +1,6 @@
 """Run folders: one folder a configuration, named by a hash of everything that determines its content."""
 
 import os
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -9,11 +8,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from nsf.canonical import content_hash, plain
 from nsf.errors import ConfigError, MissingRunError, SchemaError, StorageError
-from nsf.manifest import CONFIG, MANIFEST, NAME, Record, altered, read_config, read_manifest
-from nsf.provenance import provenance
-from nsf.storage import clear_partial, in_use, locked, write_json, writing
+from nsf.runs.canonical import content_hash, plain
+from nsf.runs.manifest import CONFIG, MANIFEST, NAME, altered, read_config, read_manifest
+from nsf.runs.provenance import provenance
+from nsf.runs.record import Record
+from nsf.storage import clear_partial, in_use, locked, writing
 
 FORMAT = 1  # of the folder's layout; a new value gives every run a new hash
 _LOCK = ".lock"
@@ -311,7 +311,7 @@ class Run:
         seed: int | None = None,
         precision: str | None = None,
         warnings: Sequence[str] = (),
-    ) -> Iterator["Record"]:
+    ) -> Iterator[Record]:
         """Keep the manifest while the block works.
 
         The status is "running" from the start; "complete" after the block,
@@ -341,39 +341,12 @@ class Run:
             "created": datetime.now(UTC).isoformat(timespec="microseconds"),
             **({"warnings": list(warnings)} if warnings else {}),
         }
-        record = Record(self.path, manifest["created"])
-        start = time.perf_counter()
-
-        def close(status: str, metrics: dict[str, Any], **more: Any) -> None:
-            ending = {
-                "status": status,
-                **more,
-                "seconds": time.perf_counter() - start,
-                "metrics": metrics,
-                "outputs": list(record.outputs.values()),
-            }
-            write_json(self.path / MANIFEST, manifest | ending)
-
+        record = Record(self.path, manifest)
         with self.claimed(lambda told: None):
             clear_partial(self.path)
             self._write_config()
-            write_json(self.path / MANIFEST, {**manifest, "status": "running"})
-            try:
+            with record.kept():
                 yield record
-                record.require_folder()
-                close("complete", record.plain_metrics())
-            except BaseException as error:
-                if isinstance(error, Exception):
-                    record.require_folder()
-                status = "failed" if isinstance(error, Exception) else "interrupted"
-                metrics: dict[str, Any] = {}
-                # A full disk, or a metric that no manifest can hold, must not hide the first error.
-                with suppress(ConfigError):
-                    metrics = record.plain_metrics()
-                with suppress(StorageError):
-                    record.require_folder()
-                    close(status, metrics, error=f"{type(error).__name__}: {error}")
-                raise
 
     def _write_config(self) -> None:
         from omegaconf import OmegaConf

@@ -13,8 +13,8 @@ from nsf.data import Trajectory
 from nsf.data.schema import TRAJECTORY
 from nsf.deployment import Rollout
 from nsf.reporting.drawing.style import FULL, PALETTE, REDUCED, figure, styled
-from nsf.reporting.formats import HTML
-from nsf.reporting.listing import FIELDS, Entry, entries, text
+from nsf.reporting.overview.listing import FIELDS, Entry, entries, text
+from nsf.reporting.text.formats import HTML
 from nsf.runs import Run
 from nsf.storage import writing
 

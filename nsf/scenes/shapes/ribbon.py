@@ -7,7 +7,7 @@ import numpy as np
 
 from nsf.config import length
 from nsf.errors import ConfigError
-from nsf.scenes.geometry import Shape
+from nsf.scenes.shapes.geometry import Shape
 from nsf.vectors import vector
 
 # Radii along a path: its check for coming back looks at four points a radius, each with each.

@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from nsf.errors import ConfigError, SchemaError
-from nsf.reporting.columns import ABSENT, number
+from nsf.reporting.text.columns import ABSENT, number
 from nsf.runs import Run
 
 #: What a user sees of each run first.
