@@ -20,7 +20,7 @@ from nsf.dynamics import ParticleSets, ReducedBatch, ReducedMPM
 from nsf.dynamics.setup import reduced_steps
 from nsf.engines import Engine, Operators
 from nsf.errors import MissingRunError
-from nsf.evaluation import Comparison, Subject, compare, measure, superresolve
+from nsf.evaluation import Comparison, Subject, compare, decoding_ms, measure, superresolve
 from nsf.kinematics.fields.mlp import MlpField
 from nsf.kinematics.manifold import Manifold
 from nsf.kinematics.training.ranks import train_together
@@ -367,7 +367,7 @@ class Pipeline(Plan):
                 self._compare(manifold, rollout, truth, index)
                 for index, (rollout, truth) in enumerate(zip(rollouts, truths, strict=True))
             ]
-            cost = self._cost(manifold)
+            cost = self._cost(manifold, rollouts[0])
             engine = str(self.deployment.manifest["metrics"].get("engine", ""))
             seconds = self.training.metric("training_seconds")
             offline = seconds, 0.0 if self.teaching is None else self.taught.metric("teach_seconds")
@@ -397,7 +397,7 @@ class Pipeline(Plan):
             solver = self.solver_at(manifold, rollout.parameter)
             return compare(solver, trajectory, rollout, self.config.deploy.split, shown, rest)
 
-    def _cost(self, manifold: Manifold) -> dict:
+    def _cost(self, manifold: Manifold, rollout: Rollout) -> dict:
         trials, value = self.config.evaluation.trials, self.held_out[0]
         name = self.scene.parameters.name
         scene, multiplier = self.deployed, self.config.deploy.dt_multiplier
@@ -415,7 +415,8 @@ class Pipeline(Plan):
             trials,
             self.device,
         )
-        return results.costs(cost)
+        decoding = decoding_ms(self.solver_at(manifold, value), rollout, trials)
+        return results.costs(cost, decoding)
 
     @property
     def _report_folder(self) -> Path:
