@@ -55,7 +55,7 @@ class ReducedBatch:
         doubts: Sequence[tuple[float, str]] = (),
     ):
         self.batch = Batch.of(setups)
-        self.engine, self.why = engine, why
+        self.engine, self.why, self._spans_of = engine, why, spans_of
         self.doubts = tuple(doubts) or ((0.0, ""),) * len(setups)
         shared = self.batch.shared
         self.dt, self.total_steps, self.device = shared.dt, shared.total_steps, shared.device
@@ -70,6 +70,11 @@ class ReducedBatch:
     def runs(self) -> tuple["ReducedMPM", ...]:
         """Each run, to be asked for its own state and trajectory."""
         return tuple(ReducedMPM(self, index) for index in range(len(self)))
+
+    def alone(self, index: int) -> "ReducedBatch":
+        """One of the runs, at t = 0 and in a batch of its own."""
+        own = self.batch.setups[index], self.doubts[index]
+        return ReducedBatch([own[0]], self._spans_of, self.engine, self.why, [own[1]])
 
     @property
     def xhat(self) -> torch.Tensor:

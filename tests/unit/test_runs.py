@@ -343,8 +343,8 @@ def test_plain_of_tensors_and_paths(tmp_path):
 
 def test_provenance_in_and_outside_a_checkout(tmp_path, monkeypatch):
     git = ["git", "-C", str(tmp_path), "-c", "user.name=n", "-c", "user.email=e@x"]
-    package = tmp_path / "pkg"
-    package.mkdir()
+    package = tmp_path / "pkg" / "runs"
+    package.mkdir(parents=True)
     (package / "provenance.py").write_text("")
     monkeypatch.setattr(nsf.runs.provenance, "__file__", str(package / "provenance.py"))
     fresh = nsf.runs.provenance.provenance.__wrapped__

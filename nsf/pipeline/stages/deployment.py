@@ -4,9 +4,19 @@ import time
 from collections.abc import Sequence
 from functools import partial
 
+import numpy as np
 from omegaconf import OmegaConf
 
-from nsf.deployment import Levels, Rollout, calibrate, continuation_file, deploy, go_on, rollout_file
+from nsf.deployment import (
+    PROJECTED,
+    Levels,
+    Rollout,
+    calibrate,
+    continuation_file,
+    deploy,
+    go_on,
+    rollout_file,
+)
 from nsf.dynamics import ReducedBatch
 from nsf.kinematics.manifold import Manifold
 from nsf.runs import Record, Run
@@ -103,8 +113,12 @@ def _levels(pipeline, manifold: Manifold) -> Levels | None:
 def _told(rollout: Rollout, named: str) -> list[str]:
     """Lines for the user: who went on with a run, and why it is not to be believed."""
     lines, t = [], rollout.t
-    if (own := rollout.by_operators) < len(rollout.stops) and rollout.estimate is not None:
-        lines.append(f"{named}: the projected step goes on from t = {t[own]:.4g} s")
+    projected = np.flatnonzero(rollout.levels == PROJECTED)
+    if rollout.by is not None and len(projected):
+        lines.append(
+            f"{named}: the projected step takes {len(projected)} of {len(rollout.stops)} steps, "
+            f"the first at t = {t[projected[0]]:.4g} s"
+        )
     if rollout.diverged >= 0:
         lines.append(
             f"warning: {named} diverged at step {rollout.diverged} (off the grid or not finite); "
