@@ -20,7 +20,17 @@ from nsf.dynamics import ParticleSets, ReducedBatch, ReducedMPM
 from nsf.dynamics.setup import reduced_steps
 from nsf.engines import Engine, Operators
 from nsf.errors import MissingRunError
-from nsf.evaluation import Comparison, Subject, compare, decoding_ms, measure, superresolve
+from nsf.evaluation import (
+    Comparison,
+    Rivals,
+    Subject,
+    coarse_subjects,
+    compare,
+    decoding_ms,
+    measure,
+    rivals,
+    superresolve,
+)
 from nsf.kinematics.fields.mlp import MlpField
 from nsf.kinematics.manifold import Manifold
 from nsf.kinematics.training.ranks import train_together
@@ -363,18 +373,30 @@ class Pipeline(Plan):
         truths, manifold = self._truths(), self.manifold().to(self.device)  # as in deployment
         with run.record(device=self.device, precision=self.config.precision) as record:
             rollouts = self._rollouts(len(truths), manifold)
-            comparisons = [
+            found = [
                 self._compare(manifold, rollout, truth, index)
                 for index, (rollout, truth) in enumerate(zip(rollouts, truths, strict=True))
             ]
-            cost = self._cost(manifold, rollouts[0])
+            comparisons, beside = zip(*found, strict=True)
+            cost = self._cost(manifold, rollouts[0], beside[0].factors)
             engine = str(self.deployment.manifest["metrics"].get("engine", ""))
             seconds = self.training.metric("training_seconds")
             offline = seconds, 0.0 if self.teaching is None else self.taught.metric("teach_seconds")
             table = results.rows(
-                self.config, manifold, rollouts, comparisons, cost, self.device, run.manifest, engine, offline
+                self.config,
+                manifold,
+                rollouts,
+                comparisons,
+                beside,
+                cost,
+                self.device,
+                run.manifest,
+                engine,
+                offline,
             )
-            summary = results.summarise(self.deployed, manifold, table, comparisons, rollouts, seconds)
+            summary = results.summarise(
+                self.deployed, manifold, table, comparisons, beside, rollouts, seconds
+            )
             results.write(record, table, comparisons, cost, summary)
         self.say(f"evaluate: mean δ {100 * table['delta'].mean():.3g} % over {len(table)} values → {run.id}")
 
@@ -387,7 +409,9 @@ class Pipeline(Plan):
         files = (self.deployment.file(rollout_file(index)) for index in range(count))
         return [Rollout.open(file, manifold.latent_dim) for file in files]
 
-    def _compare(self, manifold: Manifold, rollout: Rollout, truth: Path, index: int) -> Comparison:
+    def _compare(
+        self, manifold: Manifold, rollout: Rollout, truth: Path, index: int
+    ) -> tuple[Comparison, Rivals]:
         shown = (self.config.evaluation.picture_particles, self.config.evaluation.picture_frames)
         with contextlib.ExitStack() as files:
             trajectory = files.enter_context(Trajectory.open(truth))
@@ -395,14 +419,16 @@ class Pipeline(Plan):
             if rollout.handed_over >= 0:
                 rest = files.enter_context(Trajectory.open(self.deployment.file(continuation_file(index))))
             solver = self.solver_at(manifold, rollout.parameter)
-            return compare(solver, trajectory, rollout, self.config.deploy.split, shown, rest)
+            found = compare(solver, trajectory, rollout, self.config.deploy.split, shown, rest)
+            return found, rivals(solver, trajectory, self.coarse)
 
-    def _cost(self, manifold: Manifold, rollout: Rollout) -> dict:
+    def _cost(self, manifold: Manifold, rollout: Rollout, factors: Sequence[int]) -> dict:
         trials, value = self.config.evaluation.trials, self.held_out[0]
         name = self.scene.parameters.name
         scene, multiplier = self.deployed, self.config.deploy.dt_multiplier
         if not trials:
             return results.costs({})
+        coarse = coarse_subjects(scene, {name: value}, factors, self.config.precision, self.device)
         cost = measure(
             {
                 "full_order": Subject(
@@ -411,6 +437,7 @@ class Pipeline(Plan):
                 "reduced": Subject(
                     lambda: self.solver_at(manifold, value), reduced_steps(scene.steps, multiplier)
                 ),
+                **coarse,
             },
             trials,
             self.device,

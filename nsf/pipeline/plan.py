@@ -6,7 +6,7 @@ from copy import copy
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from nsf import config as configuration
 from nsf.data import Split
@@ -59,6 +59,7 @@ class Plan:
     Attributes:
         scene: that is trained on; deployed: that of the held-out simulations and of deployment.
         engine: name of the engine that is asked for.
+        coarse: factors of Δx of the full-order runs that a reduced one is held to.
         split: parameter values by their use.
         device: found once, so that a missing GPU is reported before any work.
 
@@ -108,6 +109,7 @@ class Plan:
             configuration.number(key, c[key], least=least, whole=True)
         for key, least in (("trials", 0), ("picture_particles", 1), ("picture_frames", 1)):
             configuration.number(f"evaluation.{key}", c.evaluation[key], least=least, whole=True)
+        self.coarse = _factors(OmegaConf.select(c, "evaluation.coarse", default=[]))
         for key, least in (("factor", 2), ("substeps", 1), ("frames", 1)):
             configuration.number(f"super_resolution.{key}", c.super_resolution[key], least=least, whole=True)
         configuration.number("deploy.dt_multiplier", c.deploy.dt_multiplier, least=_LEAST_STEP)
@@ -429,6 +431,17 @@ def _check_paper(stated) -> None:
     for method, of in stated.items():
         for name, value in of.items():
             configuration.number(f"scene.paper.{method}.{name}", value)
+
+
+def _factors(asked) -> list[int]:
+    """Factors of Δx of coarse full-order runs."""
+    key = "evaluation.coarse"
+    if not isinstance(asked, list | ListConfig):
+        raise ConfigError(f"{key}={asked} must be a list of factors, as [2] or []")
+    found = [configuration.number(key, factor, least=2, whole=True) for factor in asked]
+    if len(set(found)) < len(found):
+        raise ConfigError(f"{key}={asked} names a factor twice; give each once")
+    return [int(factor) for factor in found]
 
 
 def _one_of(key: str, value, options: Sequence) -> None:
