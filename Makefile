@@ -17,10 +17,10 @@ WORKERS ?= 2
 CASES ?= 2400
 SEED ?= 0
 
-.PHONY: help install quickstart test fuzz test-slow test-slurm test-all lint mirrors readme check-reports docs clean
+.PHONY: help install quickstart test fuzz test-slow test-gpu gpu-references test-slurm test-all lint mirrors readme check-reports docs clean
 
 help:  ## this list
-	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-13s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 install: $(INSTALLED)  ## .venv with the package and what it needs
 
@@ -39,6 +39,12 @@ test: install  ## the tests, without those marked slow or slurm
 
 test-slow: install  ## the tests marked slow
 	$(PYTEST) -m slow
+
+test-gpu: install  ## the tests marked gpu, on a machine with a GPU
+	$(PYTEST) -m gpu -rs
+
+gpu-references: install  ## what tests on a GPU compare with, from a CPU, in tests/references/
+	OMP_NUM_THREADS=1 $(BIN)/python tests/gpu_references.py
 
 fuzz: install  ## malformed inputs by the thousand, drawn from SEED: none runs code, hangs or is believed
 	OMP_NUM_THREADS=1 $(BIN)/python tests/fuzz/fuzz.py --cases $(CASES) --seed $(SEED)

@@ -200,7 +200,7 @@ def _index(words: list[str]) -> int:
     folder = asked.get("folder", os.path.join(os.environ.get("NSF_REPORTS", "reports"), "runs"))
     from pathlib import Path
 
-    from nsf.reporting.index import write_index
+    from nsf.reporting.overview.index import write_index
 
     print(f"open {write_index(Path(folder)).resolve()}")
     return 0
@@ -241,7 +241,7 @@ def _search(words: list[str]) -> int:
 
 def _runs(words: list[str]) -> int:
     """The table of runs, or of what differs between two; or the files that were changed, 2 if any was."""
-    from nsf.reporting.listing import difference_table, entries, runs_table, text
+    from nsf.reporting.overview.listing import difference_table, entries, runs_table, text
     from nsf.runs import Run
 
     if words[:1] == ["diff"]:

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from nsf.provenance import provenance
+from nsf.runs.provenance import provenance
 
 _DEVELOPMENT = ("dev", "docs")  # extras that a user does not miss
 

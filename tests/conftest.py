@@ -25,6 +25,7 @@ TINY = (
     "scene.steps=24",
     "scene.bodies.column.particles=500",
     "scene.parameters.train=[22,30,38]",
+    "scene.parameters.validation=[]",
     "scene.parameters.test=[26]",
     "field.modes=[8,8,8]",
     "field.beta=4",
@@ -36,6 +37,18 @@ TINY = (
     "evaluation.picture_particles=100",
     "evaluation.picture_frames=3",
 )
+
+
+def pytest_runtest_setup(item):
+    """A test marked `gpu` says what it lacks here."""
+    import warp as wp
+
+    for marker in item.iter_markers("gpu"):
+        needed = marker.args[0] if marker.args else 1
+        found = {"torch": torch.cuda.device_count(), "Warp": wp.get_cuda_device_count()}
+        if min(found.values()) < needed:
+            told = " and ".join(f"{library} sees {count}" for library, count in found.items())
+            pytest.skip(f"GPUs needed: {needed}; {told}")
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -80,6 +93,12 @@ def tiny_pipeline(root, *overrides, say=None):
     return Pipeline(config.load([*TINY, *overrides]), say=say or (lambda line: None), root=root)
 
 
+@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
+def device(request) -> str:
+    """The name of a device: of the CPU, and in tests marked `gpu` of a GPU."""
+    return request.param
+
+
 @pytest.fixture(scope="session")
 def tiny():
     """The overrides of the tiny chain."""
@@ -122,6 +141,22 @@ def tiny_manifold(chain):
 
 
 @pytest.fixture(scope="session")
+def tiny_scene():
+    """The scene of the tiny chain, for tests that read nothing that its stages left."""
+    import nsf.scenes
+
+    return nsf.scenes.load("sand", TINY[1:])
+
+
+@pytest.fixture(scope="session")
+def reference_manifold():
+    """The tiny chain's manifold as it is committed: a GPU machine need not simulate and train for it."""
+    from gpu_references import manifold
+
+    return manifold()
+
+
+@pytest.fixture(scope="session")
 def seal():
     """(run, *more) → its manifest records its files, and `more`, as they now stand, as if they always had."""
     import json
@@ -129,7 +164,7 @@ def seal():
     from nsf.runs import Record
 
     def rewrite(run, *more):
-        record = Record(run.path, run.manifest["created"])
+        record = Record(run.path, run.manifest)
         for name in [*(output["path"] for output in run.manifest["outputs"]), *more]:
             record.output(name)
         manifest = run.manifest | {"outputs": list(record.outputs.values())}

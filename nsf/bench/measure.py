@@ -69,7 +69,7 @@ def step_times(solvers: Mapping[str, object], trials: int, device: str) -> dict[
 
 
 def window_times(
-    solvers: Mapping[str, object], total: int, trials: int, device: str
+    solvers: Mapping[str, object], total: int, trials: int, device: str, whole: Mapping[str, object] = {}
 ) -> dict[str, np.ndarray]:
     """[trials] mean time of a step [ms] in windows spread over a run, the same of every solver, in turns.
 
@@ -78,8 +78,11 @@ def window_times(
         total: steps of the run, more than the warm-up's.
         trials: windows; fewer where there are not so many steps.
         device: of all.
+        whole: others by name, each of which takes a whole run in every turn; as for `run_times`.
     """
-    wait, found = synchronizer(device), {name: [] for name in solvers}
+    wait, found = synchronizer(device), {name: [] for name in (*solvers, *whole)}
+    for solver in whole.values():
+        _whole_run(solver, wait)
     edges = np.unique(np.linspace(_WARM_UP, total, trials + 1).round().astype(int)).tolist()
     for start, end in itertools.pairwise(edges):
         steps = min(end - start, _MOST_STEPS)
@@ -90,6 +93,8 @@ def window_times(
             solver.step(steps)
             wait()
             found[name].append(1e3 * (time.perf_counter() - begun) / steps)
+        for name, solver in whole.items():
+            found[name].append(_whole_run(solver, wait))
     return {name: np.array(times) for name, times in found.items()}
 
 
@@ -102,14 +107,20 @@ def run_times(solvers: Mapping[str, object], trials: int, device: str) -> dict[s
     wait, found = synchronizer(device), {name: [] for name in solvers}
     for trial in range(trials + 1):
         for name, solver in solvers.items():
-            solver.restart()
-            wait()
-            begun = time.perf_counter()
-            solver.step(solver.total_steps)
-            wait()
+            ms = _whole_run(solver, wait)
             if trial:
-                found[name].append(1e3 * (time.perf_counter() - begun) / solver.total_steps)
+                found[name].append(ms)
     return {name: np.array(times) for name, times in found.items()}
+
+
+def _whole_run(solver, wait: Callable[[], object]) -> float:
+    """Mean time of a step [ms] of a run from t = 0 to its end."""
+    solver.restart()
+    wait()
+    begun = time.perf_counter()
+    solver.step(solver.total_steps)
+    wait()
+    return 1e3 * (time.perf_counter() - begun) / solver.total_steps
 
 
 def pass_time(call: Callable[[], None], device: str, trials: int = 5) -> float:

@@ -201,18 +201,30 @@ def _row(case, particles: int, precision: str, device: str, cost: SolverCost, so
     )  # fmt: skip
 
 
-@torch.no_grad()
 def deformation_error(solver, truth) -> float:
-    """δ of a reduced run that has ended, over the frames of a trajectory file after the first.
-
-    Between its steps a run of longer Δt counts by the latents between them. ∞ for one that diverged.
-    """
+    """δ of a reduced run that has ended; ∞ for one that diverged. Arguments as for `error_of_latents`."""
     if solver.left_grid() >= 0:
         return float("inf")
-    run, decoder = solver.trajectory(), solver.decoder()
+    run = solver.trajectory()
+    return error_of_latents(run.t, run.xhat, solver.decoder(), truth)
+
+
+@torch.no_grad()
+def error_of_latents(t: np.ndarray, xhat, decoder, truth) -> float:
+    """δ of latent vectors over the frames of a trajectory file after the first.
+
+    Between its steps a run of longer Δt counts by the latents between them.
+
+    Args:
+        t: [N + 1] their times [s].
+        xhat: [N + 1, r] of them.
+        decoder: the fields at every particle.
+        truth: the file.
+    """
+    columns = torch.as_tensor(xhat).cpu().numpy().T
     with Trajectory.open(truth) as trajectory:
-        t, frames = trajectory.t, trajectory.frames
-        between = np.stack([np.interp(t, run.t, column) for column in run.xhat.T], axis=1)
+        frames = trajectory.frames
+        between = np.stack([np.interp(trajectory.t, t, column) for column in columns], axis=1)
         xhat = torch.as_tensor(between, dtype=decoder.at.dtype, device=decoder.at.device)
         rows = max(1, _CHUNK // (3 * trajectory.particles))
         errors, norms = [], []

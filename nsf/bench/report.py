@@ -10,10 +10,10 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from nsf.bench.rows import OTHER_SAMPLER, size_name
-from nsf.reporting.columns import number
 from nsf.reporting.drawing.charts import plain_ticks, rings
 from nsf.reporting.drawing.style import INK, figure, line_style, save, stage_colors, styled
-from nsf.reporting.formats import Rows, markdown_document, terminal_table
+from nsf.reporting.text.columns import number
+from nsf.reporting.text.formats import Rows, markdown_document, terminal_table
 from nsf.storage import writing
 
 _HEADINGS = {
@@ -23,6 +23,10 @@ _HEADINGS = {
     "peak_mib": "peak memory [MiB]",
     "speed_up": "speed-up",
     "delta": "δ",
+    "run_mib": "of a run [MiB]",
+    "decode_ms": "a frame decoded [ms]",
+    "teach_seconds": "teaching [s]",
+    "teacher_steps": "teacher's steps",
     "sample": "|S|",
     "integration": "|N|",
     "ms": "time [ms]",
@@ -39,6 +43,13 @@ _LEAD = (
 _BATCH = (
     "Time of a simulation-step, which is the step of a batch over the simulations that take it together, by "
     "their number; the band is from 10 % to 90 % of the trials. Dotted: half the time for twice as many."
+)
+_OPERATORS = (
+    "Time of a step by operators: all steps of a run in one launch, over their number; of many runs at once, "
+    "over their number too. Speed-up: over the full-order step of the same call. A run holds no particles "
+    "but S; the time of decoding a frame stands apart. The operators of the sand column step as at the "
+    "scene's own size, while the full-order step of as many particles as are decoded is on a finer grid, and "
+    "shorter."
 )
 _SIZES = (
     "Time of a step over the number of particles; dashed: the floor that the bandwidth sets a full-order "
@@ -104,8 +115,9 @@ def _parts(folder: Path, results: pd.DataFrame, kernels: pd.DataFrame, stages: p
     of_sample, sizes = of_size[by_sample], of_size[~by_sample]
     same = (sizes["bench"] == "scaling") & sizes["particles"].isin(of_sample["particles"])
     of_stages = stages[stages["case"].isin(_PAPER)]
-    of_scene, of_training, of_batch, of_several = (
-        results[results["bench"] == name] for name in ("reduced", "training", "batch", "multi_gpu")
+    of_scene, of_training, of_batch, of_operators, of_several = (
+        results[results["bench"] == name]
+        for name in ("reduced", "training", "batch", "operators", "multi_gpu")
     )
     of_pass = "Time of each pass of a full-order step; the mark is its floor."
     of_case = "Time of a step of both solvers by scene; a point names δ of its run."
@@ -114,6 +126,7 @@ def _parts(folder: Path, results: pd.DataFrame, kernels: pd.DataFrame, stages: p
         (of_stages, [_STAGES], "stages", step_beside_paper, [of_stages]),
         (floors, [_FLOORS], None, None, []),
         (of_training, [_TRAINING], None, None, []),
+        (of_operators, [_OPERATORS], None, None, []),
         (of_batch, [_BATCH], "batch", step_over_batch, [of_batch]),
         (sizes, [_SIZES], "step", step_over_particles, [sizes, passes]),
         (of_sample, [_SAMPLES], "sample", step_over_sample, [of_sample, sizes[same]]),

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, fields
 
-from nsf.provenance import provenance
+from nsf.runs.provenance import provenance
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Settings:
 OTHER_SAMPLER = {"cake": "region", "metal": "cells"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Row:
     """One side of a benchmark: a row of results.csv.
 
@@ -44,22 +44,31 @@ class Row:
         delta: δ of the run that is timed, or begun for the time of its first steps, a fraction; None for a
             full-order run.
         commit: of the code.
+        speed_up: how many times as fast as the full-order step of the same call.
+        run_mib: of a run by operators, all that it holds but for the fields that decode a frame [MiB].
+        decode_ms: time of the positions of all particles of one frame [ms].
+        teach_seconds, teacher_steps: of its operators' teaching.
     """
 
     bench: str
     case: str
     particles: int
-    sample: int | None
-    integration: int | None
-    batch: int
+    sample: int | None = None
+    integration: int | None = None
+    batch: int = 1
     precision: str
     device: str
     ms_median: float
     ms_p10: float
     ms_p90: float
     peak_mib: float | None
-    delta: float | None
+    delta: float | None = None
     commit: str
+    speed_up: float | None = None
+    run_mib: float | None = None
+    decode_ms: float | None = None
+    teach_seconds: float | None = None
+    teacher_steps: int | None = None
 
 
 @dataclass(frozen=True)

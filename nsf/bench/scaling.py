@@ -127,8 +127,8 @@ def _compared(
     times = window_times(
         {of: solver for of, (solver, _) in built.items()}, scene.steps, settings.trials, device
     )
-    steps = np.unique(np.linspace(0, scene.steps, _FRAMES + 1).round().astype(int))[1:]
-    truth = _positions(scene.full_order(precision=max(settings.precisions), device=device), steps)
+    steps = frames_of(scene.steps)
+    truth = positions_after(scene.full_order(precision=max(settings.precisions), device=device), steps)
     for (case, precision), (solver, peak_mib) in built.items():
         reduced = isinstance(solver, ReducedMPM)
         delta = _error(solver, steps, truth) if reduced else None
@@ -170,7 +170,12 @@ def _built(
     return found
 
 
-def _positions(solver: FullOrderMPM, steps: Sequence[int]) -> list[torch.Tensor]:
+def frames_of(steps: int) -> np.ndarray:
+    """Steps after which δ is taken, of a run of so many."""
+    return np.unique(np.linspace(0, steps, _FRAMES + 1).round().astype(int))[1:]
+
+
+def positions_after(solver: FullOrderMPM, steps: Sequence[int]) -> list[torch.Tensor]:
     """[P, 3] positions [m] after some numbers of steps, on the host."""
     found = []
     for step in steps:

@@ -1,7 +1,7 @@
 """Reduced runs at held-out values: their rollouts, whether to believe them, who goes on where not."""
 
 from nsf.deployment.handover import go_on, hand_over
-from nsf.deployment.levels import Levels
+from nsf.deployment.levels import FULL_ORDER, OPERATORS, PROJECTED, Levels
 from nsf.deployment.rollout import (
     Rollout,
     calibrate,
@@ -14,6 +14,9 @@ from nsf.deployment.rollout import (
 from nsf.deployment.trust import Trust
 
 __all__ = [
+    "FULL_ORDER",
+    "OPERATORS",
+    "PROJECTED",
     "Levels",
     "Rollout",
     "Trust",

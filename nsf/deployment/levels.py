@@ -3,12 +3,14 @@
 Every so many steps a projected step is taken from the operators' own state. What the operators missed of it,
 the defect, is added to their changes, from one such step to the next, and they run once more: how far this
 run is from the first estimates how far the first is from the projected one. Where the estimate passes a
-tolerance, or the run leaves what it was taught or trained on, the projected step goes on; where that one is
-not to be believed either, the full-order solver (`nsf.deployment.handover`).
+tolerance, or the run leaves what it was taught or trained on, the projected step goes on, and after as many
+steps the operators try again. What they miss then adds to what they missed before. Where the projected step
+is not to be believed either, the full-order solver goes on, to the end (`nsf.deployment.handover`).
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 
 import numpy as np
 import torch
@@ -16,8 +18,13 @@ import torch
 from nsf.deployment.trust import Trust
 from nsf.dynamics import ReducedBatch, ReducedMPM
 
-#: Share of the tolerance up to which a run is by operators that passes it later: who goes on starts well.
+#: Who takes a step.
+OPERATORS, PROJECTED, FULL_ORDER = range(3)
+LEVELS = ("operators", "projected", "full_order")
+#: Share of the tolerance, and of the distrust ratio that is believed, up to which a run is left to operators
+#: that pass it later, and below which they try again: who goes on starts well.
 _WELL = 0.5
+_ROWS = 256  # steps decoded at once
 
 
 @dataclass(frozen=True)
@@ -38,7 +45,7 @@ class Levels:
 
     def watched(
         self, batch: ReducedBatch, parameters: Sequence[float], trust: Trust
-    ) -> list[tuple[ReducedMPM, np.ndarray, int]]:
+    ) -> list[tuple[ReducedMPM, np.ndarray, np.ndarray]]:
         """Look at runs that operators have taken to their end.
 
         Args:
@@ -47,38 +54,118 @@ class Levels:
             trust: the estimate of whether to believe a run.
 
         Returns:
-            Of each run: the solver that holds all of it, its estimated error [N + 1] [m], 0 where the
-            projected step has gone on, and the number of steps by operators.
+            Of each run: the solver that holds all of it, its estimated error [N + 1] [m], which stays as it
+            is while the projected step goes on, and who took each step [N], `OPERATORS` or `PROJECTED`.
         """
-        estimates = estimated_errors(batch, self.projected(parameters), self.every)
+        projected = self.projected(parameters)
+        estimates = estimated_errors(batch, projected, self.every)
         found = []
-        for run, value, estimate in zip(batch.runs, parameters, estimates, strict=True):
-            own = self._believed(run, estimate, trust)
-            if own < run.steps_taken:
-                solver = self.projected([value]).runs[0]
-                go_on_projected(run, solver, own)
-                run, estimate = solver, np.where(np.arange(len(estimate)) <= own, estimate, 0.0)
-            found.append((run, estimate, own))
+        for run, estimate in zip(batch.runs, estimates, strict=True):
+            own = self._believed(estimate, _ratios(run, 0, run.steps_taken, trust))
+            if self.on_distrust and run.doubt[0] > 1.0:
+                own = 0
+            by, solver = np.full(run.steps_taken, OPERATORS, np.int8), run
+            if own < len(by):
+                solver = projected.alone(run.index).runs[0]
+                by[own:] = PROJECTED
+                estimate = self._shared(run, solver, estimate, by, trust)
+            found.append((solver, estimate, by))
         return found
 
-    def _believed(self, run: ReducedMPM, estimate: np.ndarray, trust: Trust) -> int:
-        """How many steps of a run are left to the operators."""
-        steps = run.steps_taken
-        finite = np.isfinite(estimate)
-        beyond = ~finite if self.tolerance is None else ~(estimate <= self.tolerance)
+    def _believed(self, estimate: np.ndarray, ratios: np.ndarray) -> int:
+        """How many of some steps are left to the operators.
+
+        Args:
+            estimate: [n + 1] estimated error after each [m].
+            ratios: [n + 1] of distrust.
+        """
+        steps, beyond = len(estimate) - 1, ~self._within(estimate)
         if beyond.any():
             well = np.inf if self.tolerance is None else _WELL * self.tolerance
             until = int(np.flatnonzero(beyond)[0])
-            steps = int(np.flatnonzero(estimate[:until] <= well)[-1])
+            steps = int(max(np.flatnonzero(estimate[:until] <= well), default=0))
         if self.on_distrust:
-            latent = run.trajectory()
-            ratios = trust.ratios(latent.xhat, latent.residuals[:, -1])
-            if run.doubt[0] > 1.0:
-                return 0
             above = np.flatnonzero(ratios > 1.0)
             if len(above):
                 steps = min(steps, max(0, int(above[0]) - 1))
         return steps
+
+    def _within(self, estimate: np.ndarray) -> np.ndarray:
+        """Which estimated errors are finite and within the tolerance."""
+        return np.isfinite(estimate) if self.tolerance is None else estimate <= self.tolerance
+
+    def _shared(
+        self, run: ReducedMPM, solver: ReducedMPM, estimate: np.ndarray, by: np.ndarray, trust: Trust
+    ) -> np.ndarray:
+        """Take a run to its end by projected steps, and by operators wherever these are believed again.
+
+        Args:
+            run: by operators, to the end.
+            solver: of the same run, by projected steps, at t = 0 and alone in its batch. It gets all steps.
+            estimate: [N + 1] of the run [m].
+            by: [N] who takes each step: `OPERATORS` for the first ones, which are kept, then `PROJECTED`.
+                Where the operators go on it is changed.
+            trust: the estimate of whether to believe a run.
+
+        Returns:
+            Estimated error [N + 1] [m].
+        """
+        N, n = len(by), int((by == OPERATORS).sum())
+        estimate = np.where(np.arange(N + 1) <= n, estimate, estimate[n])
+        again = run.together.alone(run.index).runs[0]
+        _copy(run, solver, 0, n)
+        while n < N:
+            _stand(solver, n)
+            block = min(self.every, N - n)
+            solver.step(block)
+            n += block
+            if n == N or not self._well(again, solver, n, estimate[n], trust):
+                continue
+            _copy(solver, again, 0, n)
+            _stand(again, n)
+            again.step(N - n)
+            ahead, ratios = self._ahead(again, solver, n, estimate[n], trust)
+            own = self._believed(ahead, ratios)
+            if own >= min(self.every, N - n):
+                _copy(again, solver, n, n + own)
+                by[n : n + own] = OPERATORS
+                estimate[n : n + own], estimate[n + own :] = ahead[:own], ahead[own]
+                n += own
+        return estimate
+
+    def _well(self, again: ReducedMPM, solver: ReducedMPM, n: int, estimate: float, trust: Trust) -> bool:
+        """Whether operators may try again after n steps."""
+        if self.tolerance is not None and estimate > _WELL * self.tolerance:
+            return False
+        if not self.on_distrust:
+            return self.tolerance is not None  # else only a run that is not finite was handed on
+        return again.doubt[0] <= 1.0 and _ratios(solver, n - 1, n, trust)[-1] <= _WELL
+
+    def _ahead(
+        self, again: ReducedMPM, solver: ReducedMPM, since: int, estimate: float, trust: Trust
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Look at a run by operators from a step on, until it is no longer believed.
+
+        Args:
+            again: the run, which operators have taken from that step to its end.
+            solver: of the same run, by projected steps; left in the midst of one.
+            since: the step.
+            estimate: before it [m].
+            trust: the estimate of whether to believe a run.
+
+        Returns:
+            Estimated error [m + 1] [m] and distrust ratios [m + 1] after each step that was looked at.
+        """
+        N, checked, defects = again.steps_taken, [], []
+        found, ratios = np.array([estimate]), np.zeros(1)
+        while (last := since + len(found) - 1) < N:
+            checked.append(min(last + self.every, N) - 1)
+            defects.append(_defect(again.together, solver.together, checked[-1]))
+            found = estimate + _carried(again.together, checked, torch.stack(defects, 1), since)[0]
+            ratios = np.concatenate([ratios, _ratios(again, last, checked[-1] + 1, trust)[1:]])
+            if self._believed(found, ratios) < len(found) - 1:
+                break
+        return found, ratios
 
 
 def estimated_errors(batch: ReducedBatch, projected: ReducedBatch, every: int) -> np.ndarray:
@@ -94,54 +181,72 @@ def estimated_errors(batch: ReducedBatch, projected: ReducedBatch, every: int) -
     Returns:
         [B, N + 1] RMS over S [m]; not finite where a run is not.
     """
-    record, other, steps = batch.batch.record, projected.batch.record, batch.steps_taken
-    checked = np.arange(min(every, steps - 1), steps, every)
-    defects = torch.zeros(len(batch), len(checked), record.xhat.shape[-1], dtype=torch.float64)
-    for i, n in enumerate(checked.tolist()):
-        other.now.copy_(record.xhat[:, n])
-        other.before.copy_(record.xhat[:, n - 1])
-        other.row.fill_(n)
-        other.xhat[:, : n + 1] = record.xhat[:, : n + 1]
-        projected.resume(n)
-        projected.step(1)
-        defects[:, i] = (other.now - record.xhat[:, n + 1]).double().cpu()
-        record.residuals[:, n] = other.residuals[:, n]
+    steps = batch.steps_taken
+    checked = list(range(min(every, steps - 1), steps, every))
+    defects = torch.stack([_defect(batch, projected, n) for n in checked], 1)
+    return _carried(batch, checked, defects, 0, steps)
+
+
+def _defect(batch: ReducedBatch, projected: ReducedBatch, n: int) -> torch.Tensor:
+    """[B, r] what operators missed of a projected step from their own state after n steps."""
+    record, other = batch.batch.record, projected.batch.record
+    other.now.copy_(record.xhat[:, n])
+    other.before.copy_(record.xhat[:, n - 1])
+    other.row.fill_(n)
+    other.xhat[:, : n + 1] = record.xhat[:, : n + 1]
+    projected.resume(n)
+    projected.step(1)
+    record.residuals[:, n] = other.residuals[:, n]
+    return (other.now - record.xhat[:, n + 1]).double().cpu()
+
+
+def _carried(
+    batch: ReducedBatch, checked: Sequence[int], defects: torch.Tensor, since: int, until: int | None = None
+) -> np.ndarray:
+    """How far defects take runs by operators [B, m + 1], RMS over S [m]; not finite where a defect is not.
+
+    Args:
+        batch: the runs.
+        checked: [c] steps at which defects [B, c, r] were found.
+        since, until: first and last step; the last is that after the last check by default.
+    """
+    until = checked[-1] + 1 if until is None else until
     good = torch.nan_to_num(defects, nan=0.0, posinf=0.0, neginf=0.0).numpy()
-    between = np.stack(
-        [np.stack([np.interp(np.arange(steps), checked, column) for column in run.T], 1) for run in good]
-    )
+    at = np.arange(until)
+    between = np.stack([np.stack([np.interp(at, checked, column) for column in run.T], 1) for run in good])
+    own, found = batch.batch.record.xhat, torch.zeros(len(batch), until - since + 1, dtype=torch.float64)
     with torch.no_grad():
-        again = batch.span.pushed(torch.as_tensor(between))
-        found = torch.zeros(len(batch), steps + 1, dtype=torch.float64)
-        last = 0
-        for count, span in batch.steps_by_span():
-            for rows in torch.arange(last, last + count + 1).split(256):
+        again = batch.span_at(since).pushed(torch.as_tensor(between), since)
+        for span, rows in groupby(range(since, until + 1), batch.span_at):
+            for part in torch.tensor(list(rows)).split(_ROWS):
                 for run in range(len(batch)):
                     one, two = (
-                        span.at_sample.position(of[run, rows].to(span.at_sample.dtype))
-                        for of in (record.xhat, again)
+                        span.at_sample.position(latent[run, part].to(span.at_sample.dtype))
+                        for latent in (own, again)
                     )
-                    found[run, rows] = (one - two).square().sum(-1).mean(-1).sqrt().double().cpu()
-            last += count
+                    off = (one - two).square().sum(-1).mean(-1).sqrt()
+                    found[run, part - since] = off.double().cpu()
     found[~torch.isfinite(defects).all(-1).all(-1)] = torch.inf
     return found.numpy()
 
 
-def go_on_projected(run: ReducedMPM, solver: ReducedMPM, step: int) -> None:
-    """Take a run to its end by projected steps, from a step of it on; all of it is in the solver's record.
+def _ratios(run: ReducedMPM, first: int, last: int, trust: Trust) -> np.ndarray:
+    """[last − first + 1] distrust ratios of steps in a run's record."""
+    residuals = run.record.residuals[first:last, -1].cpu().numpy()
+    return trust.ratios(run.record.xhat[first : last + 1].cpu().numpy(), residuals)
 
-    Args:
-        run: by operators.
-        solver: of the same run, by projected steps; the only one of its batch.
-        step: how many steps of the run are kept.
-    """
-    own, other = solver.record, run.record
-    own.xhat[: step + 1] = other.xhat[: step + 1]
-    own.residuals[:step] = other.residuals[:step]
-    own.updates[:step] = 0.0
-    if step:
-        own.now.copy_(other.xhat[step])
-        own.before.copy_(other.xhat[step - 1])
-        own.row.fill_(step)
-    solver.together.resume(step)
-    solver.step(run.steps_taken - step)
+
+def _copy(source: ReducedMPM, target: ReducedMPM, first: int, last: int) -> None:
+    """Put steps of one run into the record of another."""
+    target.record.xhat[first : last + 1] = source.record.xhat[first : last + 1]
+    target.record.residuals[first:last] = source.record.residuals[first:last]
+    target.record.updates[first:last] = 0.0
+
+
+def _stand(run: ReducedMPM, step: int) -> None:
+    """Make a run, the only one of its batch, go on from a step of its record."""
+    record = run.record
+    record.now.copy_(record.xhat[step])
+    record.before.copy_(record.xhat[max(0, step - 1)])
+    record.row.fill_(step)
+    run.together.resume(step)

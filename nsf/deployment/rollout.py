@@ -4,7 +4,7 @@ import io
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
@@ -14,7 +14,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from nsf.data import hdf5
-from nsf.deployment.levels import Levels
+from nsf.deployment.levels import FULL_ORDER, LEVELS, OPERATORS, PROJECTED, Levels
 from nsf.deployment.trust import LatentDistance, Trust, first_distrusted, training_values
 from nsf.dynamics import STOP_REASONS, ReducedBatch, ReducedMPM
 from nsf.errors import SchemaError
@@ -52,8 +52,10 @@ class Rollout:
         diverged: step at which x̂ ceased to be finite or a sample particle left the grid, −1 when neither did.
         handed_over: step from whose state the full-order solver goes on, −1 when it does not. The steps then
             end with the first distrusted one.
-        by_operators: how many steps operators took, the first ones; the projected step took the others.
-        estimate: [N + 1] how far steps by operators are from projected ones, as far as is known [m].
+        estimate: [N + 1] how far a run by operators is from one by projected steps alone, as far as is known
+            [m]; None for a run without operators.
+        by: [N] who took each step: 0 operators, 1 the projected step, 2 the full-order solver, from
+            `handed_over` on; None for a run without operators, whose steps are projected.
     """
 
     parameter: float
@@ -68,15 +70,20 @@ class Rollout:
     seconds: float
     diverged: int
     handed_over: int = -1
-    by_operators: int = 0
     estimate: np.ndarray | None = None
+    by: np.ndarray | None = None
 
     @property
-    def levels(self) -> list[str]:
-        """[N] who took each step, `operators` or `projected`, up to where the full-order solver went on."""
-        believed = len(self.stops) if self.handed_over < 0 else self.handed_over
-        own = min(self.by_operators, believed)
-        return ["operators"] * own + ["projected"] * (believed - own)
+    def levels(self) -> np.ndarray:
+        """[N] `by` of any run."""
+        by = np.full(len(self.stops), PROJECTED) if self.by is None else self.by
+        handed = (self.handed_over >= 0) & (np.arange(len(by)) >= self.handed_over)
+        return np.where(handed, FULL_ORDER, by).astype(np.int8)
+
+    @property
+    def by_operators(self) -> int:
+        """How many steps operators took."""
+        return int((self.levels == OPERATORS).sum())
 
     @property
     def distrusted(self) -> int:
@@ -92,7 +99,7 @@ class Rollout:
             for name in _ARRAYS:
                 file[name] = getattr(self, name)
             if self.estimate is not None:
-                file.attrs["by_operators"], file["estimate"] = self.by_operators, self.estimate
+                file["by"], file["estimate"] = self.levels, self.estimate
             file["stops"] = np.array(self.stops, dtype=h5py.string_dtype())
         with writing(path) as partial:
             partial.write_bytes(memory.getbuffer())
@@ -122,7 +129,7 @@ class Rollout:
             arrays = {name: hdf5.array(file, name, _REAL, shape)[()] for name, shape in shapes.items()}
             stops = hdf5.texts(file, "stops", (len(t) - 1,))
             if "estimate" in file:  # of a run by operators
-                scalars["by_operators"] = hdf5.attribute(file, "by_operators", int)
+                arrays["by"] = hdf5.array(file, "by", ("|i1",), (len(t) - 1,))[()]
                 arrays["estimate"] = hdf5.array(file, "estimate", _REAL, (len(t),))[()]
             found = cls(**scalars, t=t, **arrays, stops=stops)
             found._check()
@@ -136,7 +143,6 @@ class Rollout:
             ("needed_outside", 0, np.inf),
             ("diverged", -1, steps),
             ("handed_over", -1, steps),
-            ("by_operators", 0, steps),
             ("seconds", 0, np.inf),
             ("integration_mean", 0, np.inf),
         ):
@@ -152,6 +158,8 @@ class Rollout:
             values = getattr(self, name)
             if values is not None and not (values >= 0).all():
                 raise SchemaError(f"has values of {name} that are negative or no numbers")
+        if self.by is not None and not np.isin(self.by, range(len(LEVELS))).all():
+            raise SchemaError("has steps by none of " + ", ".join(LEVELS))
         # A step by operators ends in no inversion.
         if unknown := set(self.stops) - {*STOP_REASONS, "operators"}:
             raise SchemaError(f"has stops={sorted(unknown)[0]!r}, which is no reason to stop")
@@ -229,17 +237,23 @@ def rollouts(
     """
     if levels is None:
         seconds = _timed_run(batch, trust if until_distrusted else None) / len(batch)
-        watched = [(run, None, 0) for run in batch.runs]
+        watched = [(run, None, None) for run in batch.runs]
     else:
         seconds, started = _timed_run(batch, None), time.perf_counter()
         watched = levels.watched(batch, parameters, trust)
         seconds = (seconds + time.perf_counter() - started) / len(batch)
-    return [
-        replace(
-            _rollout_of(run, value, trust, until_distrusted, seconds), by_operators=own, estimate=estimate
-        )
-        for (run, estimate, own), value in zip(watched, parameters, strict=True)
-    ]
+    found = []
+    for (run, estimate, by), value, (off, _) in zip(watched, parameters, batch.doubts, strict=True):
+        own = _rollout_of(run, value, trust, until_distrusted, seconds)
+        if by is not None:
+            steps = len(own.stops)
+            own.by, own.estimate = by[:steps], estimate[: steps + 1]
+            own.stops = ["operators" if b == OPERATORS else s for b, s in zip(own.by, own.stops, strict=True)]
+            if off > 1.0:
+                after = np.append(own.by[:1], own.by) == OPERATORS
+                own.trust = np.where(after, np.maximum(own.trust, off), own.trust)
+        found.append(own)
+    return found
 
 
 def _rollout_of(

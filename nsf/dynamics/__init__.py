@@ -3,11 +3,11 @@
 from nsf.dynamics.batch import Batch
 from nsf.dynamics.inference import Decoder
 from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
-from nsf.dynamics.latent import LatentTrajectory
+from nsf.dynamics.latent import LatentState, LatentTrajectory
 from nsf.dynamics.methods import Method
 from nsf.dynamics.projection import STOP_REASONS, GaussNewton, ProjectionResult, Taylor, stop_reasons
 from nsf.dynamics.setup import NSF, Setup
-from nsf.dynamics.solver import LatentState, ReducedBatch, ReducedMPM
+from nsf.dynamics.solver import ReducedBatch, ReducedMPM
 
 __all__ = [
     "NSF",

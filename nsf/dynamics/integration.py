@@ -12,8 +12,10 @@ from nsf.dynamics.interop import as_vectors, on_torch_stream
 from nsf.errors import ConfigError
 from nsf.mpm import GridGeometry, Precision
 from nsf.mpm.grid import flat_index, inside
-from nsf.mpm.shape import shape_functions
+from nsf.mpm.grid.shape import shape_functions, stencil_offset
 
+#: Nodes by which the integration particles are widened at most; every grid of the scenes is smaller.
+_WIDEST = 512
 STRATEGIES = ("superset", "search")
 
 
@@ -29,7 +31,7 @@ class Integration:
             the training values stay inside.
 
     Raises:
-        ConfigError: unknown strategy or negative margin.
+        ConfigError: unknown strategy, or a margin outside 0 to `_WIDEST` nodes.
     """
 
     strategy: str = "superset"
@@ -40,8 +42,8 @@ class Integration:
             raise ConfigError(
                 f"integration.strategy={self.strategy!r} is unknown; choose one of {', '.join(STRATEGIES)}"
             )
-        if self.margin < 0:
-            raise ConfigError(f"integration.margin={self.margin} must be at least 0 nodes")
+        if not 0 <= self.margin <= _WIDEST:
+            raise ConfigError(f"integration.margin={self.margin} must be from 0 to {_WIDEST} nodes")
 
 
 @dataclass(frozen=True)
@@ -115,6 +117,7 @@ class NeighbourSearch:
 
     def __init__(self, geometry: GridGeometry, shape: str, precision: Precision, device):
         self.geometry, self.precision, self.device = geometry, precision, device
+        self._reach = stencil_offset(shape) * geometry.dx  # of a stencil, downwards
         self._mark, self._flag = _kernels(precision, shape)
 
     def mark_nodes(self, x: torch.Tensor, marked: torch.Tensor, margin: int = 0) -> None:
@@ -149,6 +152,23 @@ class NeighbourSearch:
         needed = torch.zeros(len(x), dtype=torch.uint8, device=x.device)
         self.flag_particles(x.contiguous(), marked, needed)
         return needed.bool()
+
+    def on_grid(self, x: torch.Tensor) -> torch.Tensor:
+        """[...] whether stencils of particles at x [..., 3] lie on the grid; False where x is not finite."""
+        upper = torch.tensor(self.geometry.upper, dtype=x.dtype, device=x.device) - self._reach
+        return ((x >= self._reach) & (x < upper)).all(-1)
+
+    def missing(self, x: torch.Tensor, sets: ParticleSets) -> int:
+        """How many particles and nodes S needs and sets lack, or are off the grid, with all at x [P, 3]."""
+        sample, integration, nodes = (
+            torch.as_tensor(of, device=x.device).long() for of in (sets.sample, sets.integration, sets.nodes)
+        )
+        needed = self.needed(x, sample)
+        needed[integration] = False
+        marked = self.no_nodes(x.device)
+        self.mark_nodes(x[sample].contiguous(), marked)
+        marked[nodes] = 0
+        return int(needed.sum()) + int(marked.sum()) + int((~self.on_grid(x)).sum())
 
     def superset(self, frames: Iterable[torch.Tensor], sample: np.ndarray, margin: int) -> ParticleSets:
         """Union of I and of N over many configurations.

@@ -51,7 +51,7 @@ class LatentRecord:
         self.row = torch.zeros(runs.numel(), dtype=torch.int64, device=xhat.device)
 
     def of(self, run: int) -> "LatentRecord":
-        """That of one of several runs, sharing memory."""
+        """That of one run of a batch, sharing memory."""
         own = copy(self)
         own.row = self.row[run : run + 1]
         for name in ("now", "before", "xhat", "residuals", "updates"):
@@ -68,7 +68,7 @@ class LatentRecord:
     def predicted(self) -> torch.Tensor:
         """[r] x̂_{n+1} on the parabola through the last three, or the line through two, or x̂_0.
 
-        Of one run: in several each has its own number of steps.
+        Of one run: in a batch each has its own number of steps.
         """
         change = self.now - self.before
         older = self.xhat.index_select(0, (self.row - 2).clamp_min(0))[0]
@@ -95,3 +95,34 @@ class LatentRecord:
         stops = stop_reasons(residuals, updates, tolerance)
         t, xhat = np.arange(steps + 1) * dt, self.xhat[: steps + 1].cpu().numpy()
         return LatentTrajectory(t, xhat, residuals.numpy(), updates.numpy(), stops)
+
+
+class LatentState:
+    """The state of a reduced run; particle fields are decoded when they are asked for.
+
+    Args:
+        run: a `ReducedMPM`.
+    """
+
+    def __init__(self, run):
+        self._run = run
+
+    @property
+    def xhat(self) -> np.ndarray:
+        """[r] latent vector."""
+        return self._run.xhat.cpu().numpy()
+
+    def __len__(self) -> int:
+        return len(self._run.setup.constants)
+
+    def numpy(self) -> dict[str, np.ndarray]:
+        """Every particle's x, v [P, 3], C, tau [P, 3, 3], as of the full-order state, and xhat [r]."""
+        run = self._run
+        decoder, now = run.decoder(), run.xhat[None]
+        x = decoder.position(run.xhat)
+        if run.steps_taken == 0:
+            v = run.setup.initial_velocity
+        else:
+            v = (x - decoder.position(run.record.before)) / run.dt
+        fields = {"x": x, "v": v, "C": decoder.affine(now)[0], "tau": decoder.stress(now)[0]}
+        return {name: value.cpu().numpy() for name, value in fields.items()} | {"xhat": self.xhat}

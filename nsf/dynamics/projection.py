@@ -70,6 +70,10 @@ def check_projector(projector) -> None:
         )
 
 
+#: Gauss-Newton that has not ended by then never does.
+_MOST_ITERATIONS = 1000
+
+
 @dataclass(frozen=True)
 class GaussNewton:
     """Gauss-Newton on Σ w_p ‖g(X_p, x̂) − x_p‖² over S.
@@ -92,8 +96,8 @@ class GaussNewton:
     tolerance: float = 1e-4
 
     def __post_init__(self):
-        if self.iterations < 1:
-            raise ConfigError(f"projector.iterations={self.iterations} must be at least 1")
+        if not 1 <= self.iterations <= _MOST_ITERATIONS:
+            raise ConfigError(f"projector.iterations={self.iterations} must be from 1 to {_MOST_ITERATIONS}")
         if not self.tolerance > 0:
             raise ConfigError(f"projector.tolerance={self.tolerance} must be positive")
 

@@ -10,13 +10,12 @@ from nsf.dynamics.batch import Batch
 from nsf.dynamics.inference import Decoder
 from nsf.dynamics.integration import ParticleSets
 from nsf.dynamics.interop import captured, on_torch_stream
-from nsf.dynamics.latent import LatentTrajectory
+from nsf.dynamics.latent import LatentState, LatentTrajectory
 from nsf.dynamics.setup import Setup
 from nsf.dynamics.span import Span, Stages
 from nsf.dynamics.step import steps_of
 from nsf.errors import ConfigError
 from nsf.kinematics.manifold import Restriction
-from nsf.mpm.shape import DEGREES
 from nsf.timing import StageTimer, untimed
 
 _CHUNK = 2**22  # positions of sample particles decoded at once [values]
@@ -56,7 +55,7 @@ class ReducedBatch:
         doubts: Sequence[tuple[float, str]] = (),
     ):
         self.batch = Batch.of(setups)
-        self.engine, self.why = engine, why
+        self.engine, self.why, self._spans_of = engine, why, spans_of
         self.doubts = tuple(doubts) or ((0.0, ""),) * len(setups)
         shared = self.batch.shared
         self.dt, self.total_steps, self.device = shared.dt, shared.total_steps, shared.device
@@ -71,6 +70,11 @@ class ReducedBatch:
     def runs(self) -> tuple["ReducedMPM", ...]:
         """Each run, to be asked for its own state and trajectory."""
         return tuple(ReducedMPM(self, index) for index in range(len(self)))
+
+    def alone(self, index: int) -> "ReducedBatch":
+        """One of the runs, at t = 0 and in a batch of its own."""
+        own = self.batch.setups[index], self.doubts[index]
+        return ReducedBatch([own[0]], self._spans_of, self.engine, self.why, [own[1]])
 
     @property
     def xhat(self) -> torch.Tensor:
@@ -263,7 +267,7 @@ class ReducedMPM:
         return self.together.nbytes
 
     @property
-    def state(self) -> "LatentState":
+    def state(self) -> LatentState:
         """The latent state; `state.numpy()` decodes every particle."""
         return LatentState(self)
 
@@ -316,18 +320,11 @@ class ReducedMPM:
         for count, span in self.together.steps_by_span(since - 1):
             rows = max(1, _CHUNK // (3 * span.s))
             for xhat in self.record.xhat[first : first + count].split(rows):
-                lost = ~self._on_grid(span.at_sample.position(xhat)).all(1)
+                lost = ~self.setup.search.on_grid(span.at_sample.position(xhat)).all(1)
                 if bool(lost.any()):
                     return first + int(lost.int().argmax())
                 first += len(xhat)
         return -1
-
-    def _on_grid(self, x: torch.Tensor) -> torch.Tensor:
-        """[...] whether stencils of particles at x [..., 3] lie on the grid; False where x is not finite."""
-        geometry = self.setup.geometry
-        reach = 0.5 * (DEGREES[self.setup.transfer.shape] - 1) * geometry.dx  # of a stencil, downwards
-        upper = torch.tensor(geometry.upper, dtype=x.dtype, device=x.device) - reach
-        return ((x >= reach) & (x < upper)).all(-1)
 
     def needed_outside(self, steps: int | None = None) -> int:
         """Most particles and nodes that a step needed and the superset lacks, or that were off the grid.
@@ -342,19 +339,8 @@ class ReducedMPM:
             return 0
         everything, search, worst = self.decoder(), self.setup.search, 0
         for n in range(self.steps_taken if steps is None else steps):
-            sets = self.sets_at(n)
             x = everything.position(self.record.xhat[n])
-            sample, integration, nodes = (
-                torch.as_tensor(of, device=x.device).long()
-                for of in (sets.sample, sets.integration, sets.nodes)
-            )
-            needed = search.needed(x, sample)
-            needed[integration] = False
-            marked = search.no_nodes(x.device)
-            search.mark_nodes(x[sample].contiguous(), marked)
-            marked[nodes] = 0
-            lost = ~self._on_grid(x)
-            worst = max(worst, int(needed.sum()) + int(marked.sum()) + int(lost.sum()))
+            worst = max(worst, search.missing(x, self.sets_at(n)))
         return worst
 
     def equations_at(
@@ -381,30 +367,3 @@ class ReducedMPM:
                     stage()
             position, jacobian = span.at_sample.position_and_jacobian(self.record.now)
         return span.x[: span.s] - position, jacobian
-
-
-class LatentState:
-    """The state of a reduced run; particle fields are decoded when they are asked for."""
-
-    def __init__(self, run: ReducedMPM):
-        self._run = run
-
-    @property
-    def xhat(self) -> np.ndarray:
-        """[r] latent vector."""
-        return self._run.xhat.cpu().numpy()
-
-    def __len__(self) -> int:
-        return len(self._run.setup.constants)
-
-    def numpy(self) -> dict[str, np.ndarray]:
-        """Every particle's x, v [P, 3], C, tau [P, 3, 3], as of the full-order state, and xhat [r]."""
-        run = self._run
-        decoder, now = run.decoder(), run.xhat[None]
-        x = decoder.position(run.xhat)
-        if run.steps_taken == 0:
-            v = run.setup.initial_velocity
-        else:
-            v = (x - decoder.position(run.record.before)) / run.dt
-        fields = {"x": x, "v": v, "C": decoder.affine(now)[0], "tau": decoder.stress(now)[0]}
-        return {name: value.cpu().numpy() for name, value in fields.items()} | {"xhat": self.xhat}

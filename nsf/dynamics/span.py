@@ -107,7 +107,7 @@ class GridSpan(Span):
         super().__init__(batch, sets, at_sample)
         self.order = order
         one = batch.shared
-        grid = Grid(one.geometry, one.precision, one.device, sets.nodes, copies=len(batch))
+        grid = Grid(one.geometry, one.precision, one.device, sets.nodes, runs=len(batch))
         # The forcing of the moment is on the device: gravity here, the colliders' time in the boundaries.
         gravity = [setup.gravity for setup in batch.setups]
         self.grid_step = GridStep(

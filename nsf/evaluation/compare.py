@@ -12,7 +12,7 @@ from nsf.deployment import Rollout
 from nsf.dynamics import Decoder, ReducedMPM
 from nsf.errors import SchemaError
 from nsf.evaluation import metrics
-from nsf.mpm.shape import DEGREES
+from nsf.mpm.grid.shape import DEGREES
 
 _CHUNK = 2**24  # values of one field decoded at once
 _SAME_TIME = 1e-9  # [s]

@@ -11,7 +11,7 @@ from markupsafe import Markup
 from nsf.errors import ConfigError
 from nsf.export.playback import QUANTITIES, Playback
 from nsf.reporting.drawing.style import STRESS_COLORS, ColorScale
-from nsf.reporting.formats import HTML
+from nsf.reporting.text.formats import HTML
 from nsf.storage import writing
 
 NEEDS = ()

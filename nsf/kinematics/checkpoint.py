@@ -22,7 +22,7 @@ from torch.nn.modules import module as registration
 
 from nsf.data import Standardizer, hash_of_positions
 from nsf.errors import MissingRunError, SchemaError
-from nsf.manifest import verified
+from nsf.runs.manifest import verified
 
 FORMAT = "nsf-manifold"
 FORMAT_VERSION = 2

@@ -4,10 +4,17 @@ import warp as wp
 
 wp.config.log_level = wp.LOG_ERROR  # kernels are compiled without a word; errors still show
 
-from nsf.mpm.boundary import BoundaryArrays, DomainWalls  # noqa: E402
-from nsf.mpm.colliders import Collider, Cuboid, HalfSpace, Sphere, floor_height  # noqa: E402
+from nsf.mpm.boundaries import (  # noqa: E402
+    BoundaryArrays,
+    Collider,
+    Cuboid,
+    DomainWalls,
+    HalfSpace,
+    Motion,
+    Sphere,
+    floor_height,
+)
 from nsf.mpm.grid import Grid, GridGeometry  # noqa: E402
-from nsf.mpm.motion import Motion  # noqa: E402
 from nsf.mpm.precision import FP32, FP64, Precision, precision_of  # noqa: E402
 from nsf.mpm.solver import FullOrderMPM, Solver, diagnosed  # noqa: E402
 from nsf.mpm.state import ParticleConstants, ParticleState  # noqa: E402

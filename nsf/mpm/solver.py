@@ -8,13 +8,13 @@ import numpy as np
 import warp as wp
 
 from nsf.errors import ConfigError, InstabilityError, ShapeError
-from nsf.mpm.boundary import BoundaryArrays, DomainWalls
-from nsf.mpm.colliders import Collider
+from nsf.mpm.boundaries.arrays import BoundaryArrays, DomainWalls
+from nsf.mpm.boundaries.colliders import Collider
 from nsf.mpm.device import warp_device
 from nsf.mpm.grid import Grid, GridGeometry
+from nsf.mpm.grid.shape import stencil_offset
 from nsf.mpm.materials import Material, make_elastic_stress, make_stress_update
 from nsf.mpm.precision import Precision, precision_of
-from nsf.mpm.shape import stencil_offset
 from nsf.mpm.stability import (
     MAX_ELASTIC_CFL,
     check_time_step,

@@ -7,10 +7,10 @@ import numpy as np
 import warp as wp
 
 from nsf.errors import ConfigError, InstabilityError
-from nsf.mpm.colliders import Collider
+from nsf.mpm.boundaries.colliders import Collider
 from nsf.mpm.grid import GridGeometry, inside
+from nsf.mpm.grid.shape import shape_functions
 from nsf.mpm.precision import Precision
-from nsf.mpm.shape import shape_functions
 from nsf.mpm.state import ParticleConstants
 
 # c Δt/Δx = 1 is the limit of one quadrature point in the middle of each cell, the worst regular

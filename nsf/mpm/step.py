@@ -4,12 +4,12 @@ import numpy as np
 import warp as wp
 
 from nsf.errors import ConfigError
-from nsf.mpm.access import WARP
-from nsf.mpm.boundary import BoundaryArrays
+from nsf.mpm.boundaries.arrays import BoundaryArrays
 from nsf.mpm.grid import Grid, make_reach
-from nsf.mpm.scatter import THREADS, particles_of_warp
+from nsf.mpm.native.access import WARP
 from nsf.mpm.stability import check_colliders
 from nsf.mpm.transfer import Transfer, make_g2p, make_p2g
+from nsf.mpm.transfer.scatter import THREADS, particles_of_warp
 from nsf.mpm.update import make_grid_update, make_update_g2p
 
 
@@ -18,14 +18,14 @@ class GridStep:
 
     Both solvers have one P2G, and one rule by which a node's momentum becomes its velocity. `update` and
     `g2p` move every particle. `update_g2p` moves few particles to the same places. A reduced step is
-    therefore the full-order step on fewer particles. On a grid with several copies, `p2g` and `update_g2p` do
-    the work of as many simulations, and arrays of particles hold equally many rows of each.
+    therefore the full-order step on fewer particles. On a grid of a batch, `p2g` and `update_g2p` do the
+    work of all its runs, and arrays of particles hold equally many rows of each.
 
     Args:
         grid: the nodes.
-        boundaries: colliders and walls; for several simulations equally many colliders of each, in turn.
+        boundaries: colliders and walls; for a batch equally many colliders of each run, in turn.
         transfer: transfer scheme and B-spline.
-        gravity: [3] [m/s²]; for several simulations [copies, 3].
+        gravity: [3] [m/s²]; for a batch [runs, 3].
         dt: step [s].
         precision: floating-point types.
         device: Warp device.
@@ -43,17 +43,17 @@ class GridStep:
         self.grid, self.device = grid, device
         self.dx, self.dt = real(grid.geometry.dx), real(dt)
         self._seconds = float(dt)  # the colliders' time is fp64 in either precision
-        several = grid.copies > 1
-        gravity = np.broadcast_to(np.asarray(gravity, float).reshape(-1, 3), (grid.copies, 3))
+        batch = grid.runs > 1
+        gravity = np.broadcast_to(np.asarray(gravity, float).reshape(-1, 3), (grid.runs, 3))
         self.gravity = wp.array(gravity, dtype=precision.vec3, device=device)
         self.boundaries = boundaries
         self.affine_shares = tuple(real(s) for s in transfer.affine_shares)
         self._by_warp = device.is_cuda and not transfer.deterministic
-        self._p2g = make_p2g(precision, transfer.shape, transfer.deterministic, several, self._by_warp)
+        self._p2g = make_p2g(precision, transfer.shape, transfer.deterministic, batch, self._by_warp)
         self._g2p = make_g2p(precision, transfer.shape)
         self._reach = make_reach(precision, transfer.shape)
         self._update = make_grid_update(precision)
-        self._update_g2p = make_update_g2p(precision, transfer.shape, several)
+        self._update_g2p = make_update_g2p(precision, transfer.shape, batch)
 
     def p2g(self, x, v, C, tau, mass, volume0) -> None:
         """Particles → grid: mass, momentum and the impulse of the stress.
@@ -89,7 +89,7 @@ class GridStep:
             grid.slots,
             self.dx,
             self.dt,
-            grid.copies,
+            grid.runs,
             grid.values,
             each,
         ]
@@ -105,12 +105,10 @@ class GridStep:
         """Momentum → velocity at the next time level with all boundaries, which then move by a step.
 
         Raises:
-            ConfigError: the grid holds several simulations; use `update_g2p` for these.
+            ConfigError: the grid is of a batch; use `update_g2p` for it.
         """
-        if self.grid.copies > 1:
-            raise ConfigError(
-                f"a grid of {self.grid.copies} simulations is not updated as a whole; use update_g2p"
-            )
+        if self.grid.runs > 1:
+            raise ConfigError(f"a grid of {self.grid.runs} runs is not updated as a whole; use update_g2p")
         self.follow()
         inputs = [*self.grid.stored, *self._updating]
         wp.launch(self._update, dim=self.grid.threads, inputs=inputs, device=self.device)
@@ -121,17 +119,17 @@ class GridStep:
         wp.launch(self._g2p, dim=C.shape[0], inputs=inputs, device=self.device)
 
     def update_g2p(self, x, v, moved: int) -> None:
-        """Find v and x of the first particles of each simulation, in place of `update` and `g2p`.
+        """Find v and x of the first particles of each run, in place of `update` and `g2p`.
 
         Only the nodes of these particles are updated, on the way. The grid keeps its momenta.
 
         Args:
             x, v: [n] position [m] and velocity [m/s] that P2G took.
-            moved: number of particles to move in each simulation.
+            moved: number of particles to move in each run.
         """
         lanes, grid = WARP if self.device.is_cuda else 1, self.grid
-        inputs = [grid.shape, grid.slots, moved, lanes, grid.copies, x, v, *self._updating]
-        wp.launch(self._update_g2p, dim=grid.copies * moved * lanes, inputs=inputs, device=self.device)
+        inputs = [grid.shape, grid.slots, moved, lanes, grid.runs, x, v, *self._updating]
+        wp.launch(self._update_g2p, dim=grid.runs * moved * lanes, inputs=inputs, device=self.device)
 
     @property
     def _updating(self) -> list:

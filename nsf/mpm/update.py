@@ -4,13 +4,13 @@ from functools import cache
 
 import warp as wp
 
-from nsf.mpm.access import make_load, make_warp_sum
-from nsf.mpm.boundary import make_solids
-from nsf.mpm.contact import SLIP, STICKY, make_contact
-from nsf.mpm.copies import make_copies
+from nsf.mpm.batch import make_runs
+from nsf.mpm.boundaries.arrays import make_solids
+from nsf.mpm.boundaries.contact import SLIP, STICKY, make_contact
 from nsf.mpm.grid import flat_index, inside, node_of, node_of_step, nodes_of_step, storage
+from nsf.mpm.grid.shape import shape_functions
+from nsf.mpm.native.access import make_load, make_warp_sum
 from nsf.mpm.precision import Precision
-from nsf.mpm.shape import shape_functions
 
 
 @cache
@@ -112,13 +112,13 @@ def make_grid_update(precision: Precision):
 
 
 @cache
-def make_update_g2p(precision: Precision, shape_name: str, several: bool = False):
+def make_update_g2p(precision: Precision, shape_name: str, batch: bool = False):
     """Kernel of v and x after a step for few particles, from nodes that still hold momenta.
 
     It gives v and x of `make_grid_update` and `make_g2p` in one pass, without C and the increment. `lanes`
     threads (a warp, or one) share the nodes of a particle's stencil and update each node on the way. The grid
-    is not written. With `several`, arrays are those of `copies` simulations, and the first `moved` particles
-    of each are moved.
+    is not written. With `batch`, arrays are those of `runs` runs, and the first `moved` particles of each are
+    moved.
 
     Source: paper section 3.3, steps 2 and 3.
     """
@@ -128,7 +128,7 @@ def make_update_g2p(precision: Precision, shape_name: str, several: bool = False
     width = shape.degree + 1
     node_velocity, load = make_node_velocity(precision), make_load(precision)
     total = make_warp_sum(precision)
-    share, copy_of = make_copies(several)
+    share, run_of = make_runs(batch)
     Solids = make_solids(precision)
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
@@ -137,7 +137,7 @@ def make_update_g2p(precision: Precision, shape_name: str, several: bool = False
         slots: wp.array(dtype=wp.int32),
         moved: int,
         lanes: int,
-        copies: int,
+        runs: int,
         x: wp.array(dtype=vec3),
         v: wp.array(dtype=vec3),
         values: wp.array(dtype=vec4),
@@ -147,12 +147,12 @@ def make_update_g2p(precision: Precision, shape_name: str, several: bool = False
         solids: Solids,
     ):
         t = wp.tid() / lanes
-        copy = copy_of(t, moved)
-        p = t + copy * (share(x.shape[0], copies) - moved)
-        start = copy * share(values.shape[0], copies)
-        count_of_solids = share(solids.kind.shape[0], copies)
-        first = copy * count_of_solids
-        fall = dt * gravity[copy]
+        run = run_of(t, moved)
+        p = t + run * (share(x.shape[0], runs) - moved)
+        start = run * share(values.shape[0], runs)
+        count_of_solids = share(solids.kind.shape[0], runs)
+        first = run * count_of_solids
+        fall = dt * gravity[run]
         at = x[p]
         inv_dx = real(1.0) / dx
         base = base_node(at, inv_dx)

@@ -9,7 +9,7 @@ import yaml
 from omegaconf import DictConfig
 
 from nsf import config as configuration
-from nsf.documents import text_of
+from nsf.config.documents import text_of
 from nsf.errors import ConfigError, MissingRunError
 from nsf.paths import EXPERIMENTS
 from nsf.pipeline.plan import Plan
@@ -54,6 +54,7 @@ class Experiment:
         stages: what each job does after `evaluate`.
         printed: δ that the paper prints of single jobs, as `Study` has them; None where it prints one a scene
             and method, which the scene's file has.
+        small: whether the file itself asks for scale=small, so that its report's name need not say so.
     """
 
     name: str
@@ -63,6 +64,7 @@ class Experiment:
     grids: tuple[dict[str, str], ...]
     stages: tuple[str, ...] = ()
     printed: tuple[dict, ...] | None = None
+    small: bool = False
 
     @classmethod
     def load(cls, name: str, overrides: Sequence[str] = (), folder: Path = EXPERIMENTS) -> "Experiment":
@@ -87,15 +89,15 @@ class Experiment:
             raise ConfigError(f"{path}: stages={stages} must be a list of {', '.join(_MORE_STAGES)}")
         each = _grid(content.get("each", {}), f"{path}: each")
         own = {override.split("=", 1)[0]: override for override in overrides}
-        grids = tuple(
-            each | _grid(grid, f"{path}: jobs[{at}]") | own for at, grid in enumerate(content["jobs"])
-        )
+        stated = [each | _grid(grid, f"{path}: jobs[{at}]") for at, grid in enumerate(content["jobs"])]
+        grids = tuple(grid | own for grid in stated)
+        small = all(grid.get("scale") == "scale=small" for grid in stated)
         texts = {
             key: " ".join(configuration.text(f"{path}: {key}", content[key]).split())
             for key in ("title", "question", "paper")
         }
         printed = _printed(content.get("printed"), path)
-        return cls(name=name, grids=grids, stages=tuple(stages), printed=printed, **texts)
+        return cls(name=name, grids=grids, stages=tuple(stages), printed=printed, small=small, **texts)
 
     @property
     def sweeps(self) -> list[list[str]]:
@@ -171,7 +173,8 @@ class Experiment:
         check_place(self._folder(config, {config.scale}))
 
     def _folder(self, config: DictConfig, scales: set[str]) -> Path:
-        return Path(config.report.folder) / (f"{self.name}_small" if scales == {"small"} else self.name)
+        shrunk = scales == {"small"} and not self.small
+        return Path(config.report.folder) / (f"{self.name}_small" if shrunk else self.name)
 
 
 def _read(path: Path) -> dict:

@@ -6,23 +6,29 @@ from copy import copy
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 
 from nsf import config as configuration
 from nsf.data import Split
 from nsf.dynamics.interop import torch_device
-from nsf.engines import NAMES as ENGINES
 from nsf.engines import Operators
 from nsf.engines.modal.mirrors import edits
 from nsf.engines.operators import random_values
 from nsf.errors import ConfigError, DeviceError
-from nsf.kinematics.fields.basis import BasisField
 from nsf.kinematics.fields.mlp import MlpField
-from nsf.kinematics.training.tracking import check_tracking
-from nsf.mpm import FP32, FP64, Precision, precision_of
+from nsf.mpm import Precision
 from nsf.mpm.device import visible_gpus, warp_device
 from nsf.mpm.recording import frame_bytes
 from nsf.mpm.stability import check_colliders, check_time_step
+from nsf.pipeline.values import (
+    STORED,
+    TEACHERS,
+    check_batch,
+    check_numbers,
+    check_words,
+    factors,
+    one_of,
+)
 from nsf.runs import Run
 from nsf.sampling.sampler import check_well_posed
 from nsf.scenes import Scene
@@ -34,16 +40,10 @@ from nsf.storage import require_folder, require_space
 _SCENE_KEYS = ("scale", "material", "transfer")
 #: Keys that hold others, none of which is left out.
 _SECTIONS = ("data", "deploy", "evaluation", "super_resolution", "report")
-#: Least deployment step in units of the scene's: a thousand reduced steps for one are no reduction.
-_LEAST_STEP = 1e-3
-#: Precision of stored frames by the name of their type.
-_STORED = {"float32": FP32, "float64": FP64}
 #: Keys that no scene is built from, without their values.
 _REST = dict.fromkeys(("field", "trainer", "method", "sampler", "evaluation", "report", "latent_dim"))
 #: Values between the training ones whose runs decide which round of teaching is kept.
 HELD_BACK = 3
-#: Engines that operators can be taught by.
-TEACHERS = tuple(name for name in ENGINES if name != Operators.name)
 #: What this process has checked; the jobs of a sweep ask the same thing again and again, for seconds.
 _PASSED: set[str] = set()
 
@@ -90,10 +90,16 @@ class Plan:
         self.teaching = None
         if self.engine == Operators.name:
             self.teaching = configuration.build(c.engine.teaching, "engine.teaching")
-            _one_of("engine.teacher", c.engine.teacher, TEACHERS)
-        self._check_numbers()
-        self._check_words()
-        self._check_batch()
+            one_of("engine.teacher", c.engine.teacher, TEACHERS)
+        check_numbers(c)
+        self.coarse = factors("evaluation.coarse", OmegaConf.select(c, "evaluation.coarse", default=[]))
+        check_words(c, self.engine)
+        if self.trainer.devices > 1 and not self.field.shardable:
+            raise ConfigError(
+                f"trainer.devices={self.trainer.devices} is for field=mlp; this field takes all snapshots in "
+                "every step, in seconds: set trainer.devices=1"
+            )
+        check_batch(c, self.engine, self.field, self.integration.strategy)
         self.deployed = self._changed(c.deploy.changes)
         X = self.scene.particles().X
         for region in self.sampler.regions:
@@ -101,71 +107,6 @@ class Plan:
             region.candidates(X)
         self.device = str(torch_device(warp_device(c.device)))
         self._check_parameter_values()
-
-    def _check_numbers(self) -> None:
-        """Numbers that nothing is built from before the stage that needs them."""
-        c = self.config
-        for key, least in (("latent_dim", 1), ("seed", 0)):
-            configuration.number(key, c[key], least=least, whole=True)
-        for key, least in (("trials", 0), ("picture_particles", 1), ("picture_frames", 1)):
-            configuration.number(f"evaluation.{key}", c.evaluation[key], least=least, whole=True)
-        self.coarse = _factors(OmegaConf.select(c, "evaluation.coarse", default=[]))
-        for key, least in (("factor", 2), ("substeps", 1), ("frames", 1)):
-            configuration.number(f"super_resolution.{key}", c.super_resolution[key], least=least, whole=True)
-        configuration.number("deploy.dt_multiplier", c.deploy.dt_multiplier, least=_LEAST_STEP)
-
-    def _check_batch(self) -> None:
-        """What cannot be deployed at several values together, as far as it shows before any work."""
-        size = configuration.number("deploy.batch", self.config.deploy.batch, least=1, whole=True)
-        if size == 1:
-            return
-        if not isinstance(self.field, BasisField):
-            raise ConfigError(
-                f"deploy.batch={size} needs field=basis or joint, whose steps are taken in coefficients; "
-                "set deploy.batch=1"
-            )
-        if self.engine == "reference":
-            raise ConfigError(f"deploy.batch={size} needs engine=modal, or auto; set it, or deploy.batch=1")
-        if self.integration.strategy != "superset":
-            raise ConfigError(f"deploy.batch={size} needs integration=superset; set it, or deploy.batch=1")
-
-    def _check_words(self) -> None:
-        """Values that are one of a few, and the report's name."""
-        c = self.config
-        _one_of("engine.name", self.engine, ENGINES)
-        _one_of("deploy.split", c.deploy.split, ("test", "validation", "train"))
-        _one_of("deploy.on_distrust", c.deploy.on_distrust, ("report", "projected", "full_order"))
-        self._check_levels()
-        check_tracking(c.tracking)
-        _one_of("data.resident", c.data.resident, (True, False, "auto"))
-        _one_of("data.keep", c.data.keep, ("all", "held_out"))
-        _one_of("data.dtype", c.data.dtype, tuple(_STORED))
-        configuration.text("report.folder", c.report.folder)
-        name = c.report.name if isinstance(c.report.name, str | int) else ""
-        if str(name) in ("", "..") or Path(str(name)).name != str(name):
-            raise ConfigError(f"report.name={c.report.name} must be one folder's name; set report.folder")
-        precision_of(c.precision)
-        _check_paper(c.scene.get("paper"))
-        if self.trainer.devices > 1 and not self.field.shardable:
-            raise ConfigError(
-                f"trainer.devices={self.trainer.devices} is for field=mlp; this field takes all snapshots in "
-                "every step, in seconds: set trainer.devices=1"
-            )
-
-    def _check_levels(self) -> None:
-        """Who goes on with a run by operators; no other engine has an estimate, or a level below."""
-        asked = self.config.deploy
-        tolerance = OmegaConf.select(asked, "tolerance", default=None)
-        if self.teaching is None:
-            if asked.on_distrust == "projected" or tolerance is not None:
-                key = "tolerance" if tolerance is not None else "on_distrust"
-                raise ConfigError(
-                    f"deploy.{key}={asked[key]} needs engine=operators; set it, or leave it out"
-                )
-            return
-        configuration.number("engine.check", self.config.engine.check, least=1, whole=True)
-        if tolerance is not None and not configuration.number("deploy.tolerance", tolerance) > 0:
-            raise ConfigError(f"deploy.tolerance={tolerance} m must be positive, or null for none")
 
     def _changed(self, changes: DictConfig | None) -> Scene:
         """The scene of the held-out simulations and of deployment."""
@@ -260,7 +201,7 @@ class Plan:
     @property
     def stored(self) -> Precision:
         """Precision of the frames of trajectories."""
-        return _STORED[self.config.data.dtype]
+        return STORED[self.config.data.dtype]
 
     def needed(self) -> list[tuple[float, Scene]]:
         """Every value with the scene that is simulated there: the deployed one where values are held out."""
@@ -415,36 +356,3 @@ class Plan:
     def _content(self, keys: Sequence[str]) -> dict:
         plain = OmegaConf.to_container(self.config)
         return {key: plain[key] for key in keys}
-
-
-def _check_paper(stated) -> None:
-    """What a scene's paper reports: its place, and figures by method."""
-    if stated is None:
-        return
-    stated = OmegaConf.to_container(stated) if isinstance(stated, DictConfig) else {"": stated}
-    place = stated.pop("place", "")
-    figures = all(isinstance(of, dict) for of in stated.values())
-    if not figures or not isinstance(place, str):
-        raise ConfigError(
-            "scene.paper must have place, a text, and figures by method, as {nsf: {delta: 0.01}}"
-        )
-    for method, of in stated.items():
-        for name, value in of.items():
-            configuration.number(f"scene.paper.{method}.{name}", value)
-
-
-def _factors(asked) -> list[int]:
-    """Factors of Δx of coarse full-order runs."""
-    key = "evaluation.coarse"
-    if not isinstance(asked, list | ListConfig):
-        raise ConfigError(f"{key}={asked} must be a list of factors, as [2] or []")
-    found = [configuration.number(key, factor, least=2, whole=True) for factor in asked]
-    if len(set(found)) < len(found):
-        raise ConfigError(f"{key}={asked} names a factor twice; give each once")
-    return [int(factor) for factor in found]
-
-
-def _one_of(key: str, value, options: Sequence) -> None:
-    if not any(value == option and type(value) is type(option) for option in options):
-        shown = [str(o).lower() if isinstance(o, bool) else "null" if o is None else o for o in options]
-        raise ConfigError(f"{key}={value} is unknown; choose {', '.join(shown[:-1])} or {shown[-1]}")

@@ -9,12 +9,17 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from nsf.reporting.build import build_report
-    from nsf.reporting.columns import COLUMNS
     from nsf.reporting.tables import console_table, merge_results
+    from nsf.reporting.text.columns import COLUMNS
 
 __all__ = ["COLUMNS", "build_report", "console_table", "merge_results"]
 
-_HOMES = {"COLUMNS": "columns", "build_report": "build", "console_table": "tables", "merge_results": "tables"}
+_HOMES = {
+    "COLUMNS": "text.columns",
+    "build_report": "build",
+    "console_table": "tables",
+    "merge_results": "tables",
+}
 
 
 def __getattr__(name: str):

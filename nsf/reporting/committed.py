@@ -15,17 +15,17 @@ import pandas as pd
 from omegaconf import DictConfig
 
 from nsf.errors import ConfigError, SchemaError
-from nsf.provenance import not_ignored
 from nsf.reporting.build import commit_text
-from nsf.reporting.columns import RIVALS
-from nsf.reporting.formats import markdown, markdown_document, markdown_table, unescaped
 from nsf.reporting.headline import Report, headline
-from nsf.reporting.page import DEFINITIONS
 from nsf.reporting.rivals import where_rivals_win
 from nsf.reporting.sources import file_hash
 from nsf.reporting.study import fine_means
 from nsf.reporting.swap import MARK
 from nsf.reporting.tables import VARIANT, rows_of, without_constants
+from nsf.reporting.text.columns import RIVALS
+from nsf.reporting.text.formats import markdown, markdown_document, markdown_table, unescaped
+from nsf.reporting.text.page import DEFINITIONS
+from nsf.runs.provenance import not_ignored
 from nsf.storage import writing
 
 LIST = "index.md"

@@ -9,7 +9,10 @@ import numpy as np
 import pandas as pd
 
 from nsf.errors import SchemaError
-from nsf.reporting.columns import (
+from nsf.reporting.rivals import where_rivals_win
+from nsf.reporting.sources import printed_delta
+from nsf.reporting.study import AXES, SEEDS
+from nsf.reporting.text.columns import (
     ABSENT,
     COLUMN,
     LATER,
@@ -20,10 +23,7 @@ from nsf.reporting.columns import (
     parameter_text,
     plus_minus,
 )
-from nsf.reporting.formats import Rows
-from nsf.reporting.rivals import where_rivals_win
-from nsf.reporting.sources import printed_delta
-from nsf.reporting.study import AXES, SEEDS
+from nsf.reporting.text.formats import Rows
 
 FEW = 15  # rows of a table in which a number is varied; of more, settings and scenes go down and across
 MANY = 24  # rows where none is, as in the paper's Table 1

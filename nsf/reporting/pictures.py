@@ -11,15 +11,15 @@ import numpy as np
 import pandas as pd
 from joblib.externals.loky import ProcessPoolExecutor
 
-from nsf.reporting.columns import COLUMN, MEASURED, RIVALS, parameter_text
 from nsf.reporting.drawing import charts, shapes
 from nsf.reporting.drawing.cost import error_over_cost
 from nsf.reporting.drawing.style import DIFFERENCE_COLORS, STRESS_COLORS, save
-from nsf.reporting.formats import file_name
-from nsf.reporting.page import Picture, Section
 from nsf.reporting.rivals import solvers
 from nsf.reporting.sources import Motion, Study, same_parameter
 from nsf.reporting.tables import Merged, mean_rows, printed_of, variant_labels, variants
+from nsf.reporting.text.columns import COLUMN, MEASURED, RIVALS, parameter_text
+from nsf.reporting.text.formats import file_name
+from nsf.reporting.text.page import Picture, Section
 
 ROWS = 6  # parameter values in one picture of final shapes
 ANIMATED, FRAMES = 2, 31  # parameter values and frames of an animation

@@ -5,8 +5,6 @@ from collections.abc import Iterable
 
 import pandas as pd
 
-from nsf.reporting.columns import COLUMN, RIVALS, SOLVER, device_type
-from nsf.reporting.page import Table
 from nsf.reporting.tables import (
     VARIANT,
     Merged,
@@ -16,6 +14,8 @@ from nsf.reporting.tables import (
     variants,
     without_constants,
 )
+from nsf.reporting.text.columns import COLUMN, RIVALS, SOLVER, device_type
+from nsf.reporting.text.page import Table
 
 _FULL = "full order"
 _PLACE = ("scene", "precision", "device")

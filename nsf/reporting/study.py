@@ -7,13 +7,13 @@ from pathlib import Path
 
 import pandas as pd
 
-from nsf.reporting.columns import COLUMN, Column, axis, parameter_text, plus_minus
 from nsf.reporting.drawing import charts
 from nsf.reporting.drawing.style import save
-from nsf.reporting.formats import Rows, file_name, spreadsheet
-from nsf.reporting.page import Picture, Section, Table
 from nsf.reporting.sources import Source, Study, checked_hash
 from nsf.reporting.tables import Merged, paper_row, printed_of, rows_of, variant_labels, variants
+from nsf.reporting.text.columns import COLUMN, Column, axis, parameter_text, plus_minus
+from nsf.reporting.text.formats import Rows, file_name, spreadsheet
+from nsf.reporting.text.page import Picture, Section, Table
 
 _SCENE, _RUN, _PAPER = "scene", "run", "the paper's δ"
 SEEDS = ("seed", "sampler.seed")

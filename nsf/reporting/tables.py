@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import pandas as pd
 import rich.table
 
-from nsf.reporting.columns import (
+from nsf.reporting.sources import Source, Study, open_sources, printed_delta
+from nsf.reporting.text.columns import (
     ABSENT,
     COLUMN,
     COLUMNS,
@@ -24,8 +25,7 @@ from nsf.reporting.columns import (
     number,
     split_rank,
 )
-from nsf.reporting.formats import Rows, terminal_table
-from nsf.reporting.sources import Source, Study, open_sources, printed_delta
+from nsf.reporting.text.formats import Rows, terminal_table
 
 VARIANT = ("scene", "method", "field", "r", "engine", "sample", SETTING, "precision", "device")
 """The visible key of a variant; `device` counts by its type."""

@@ -4,12 +4,9 @@ from collections.abc import Sequence
 
 from nsf import config as _config
 from nsf.scenes.body import Body
-from nsf.scenes.geometry import Ball, Box, Cylinder, Frame, Shape
-from nsf.scenes.mesh import Mesh, mesh_or_ball
 from nsf.scenes.parameters import ParameterRange
-from nsf.scenes.ribbon import Ribbon
 from nsf.scenes.scene import Scene
-from nsf.scenes.tentacle_ball import TentacleBall
+from nsf.scenes.shapes import Ball, Box, Cylinder, Frame, Mesh, Ribbon, Shape, TentacleBall, mesh_or_ball
 from nsf.scenes.weakness import Weakness
 
 __all__ = [

@@ -8,7 +8,7 @@ from dataclasses import KW_ONLY, dataclass, replace
 import numpy as np
 
 from nsf.errors import ConfigError
-from nsf.scenes.geometry import Shape
+from nsf.scenes.shapes.geometry import Shape
 from nsf.scenes.weakness import Weakness
 from nsf.vectors import is_finite, vector
 

@@ -2,7 +2,7 @@
 
 from omegaconf import OmegaConf
 
-from nsf.canonical import content_hash
+from nsf.runs.canonical import content_hash
 
 #: Keys of a scene that its simulation does not depend on.
 NOT_PHYSICS = ("parameters", "reduced", "paper", "title")

@@ -8,8 +8,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from nsf import config as configuration
+from nsf.config.resolvers import leaves
 from nsf.errors import ConfigError
-from nsf.resolvers import leaves
 from nsf.vectors import number
 
 #: Keys that the physics is read from; a scene may have others, which these refer to.

@@ -7,8 +7,8 @@ from scipy.ndimage import distance_transform_edt, maximum_filter
 
 from nsf.scenes.body import Placing, points_of
 from nsf.scenes.checks import depth_in_walls
-from nsf.scenes.geometry import Shape
 from nsf.scenes.scene import Scene
+from nsf.scenes.shapes.geometry import Shape
 
 #: Cells across the thinnest part of a body, and particles in a cell, below which it is warned of.
 LEAST_CELLS, LEAST_PARTICLES = 2.0, 4.0

@@ -9,6 +9,7 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from nsf import config as configuration
+from nsf.config.targets import filled
 from nsf.errors import ConfigError
 from nsf.mpm import Collider, DomainWalls, FullOrderMPM, GridGeometry, ParticleConstants, Transfer
 from nsf.mpm.materials import Material
@@ -16,7 +17,6 @@ from nsf.scenes.body import Body
 from nsf.scenes.checks import check_memory, check_particles, check_physics
 from nsf.scenes.identity import NOT_PHYSICS
 from nsf.scenes.parameters import ParameterRange, check_key
-from nsf.targets import filled
 from nsf.vectors import vector
 
 

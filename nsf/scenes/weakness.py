@@ -6,7 +6,7 @@ import numpy as np
 
 from nsf.config import number
 from nsf.errors import ConfigError
-from nsf.scenes.geometry import Shape
+from nsf.scenes.shapes.geometry import Shape
 
 
 @dataclass(frozen=True)

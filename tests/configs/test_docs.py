@@ -24,7 +24,7 @@ def project(tmp_path, monkeypatch):
     """A checkout to which a page adds its files: `conf`, `experiments` and what extends the package."""
     for folder in ("conf", "experiments"):
         shutil.copytree(ROOT / folder, tmp_path / folder)
-    monkeypatch.setattr(config, "CONF", tmp_path / "conf")
+    monkeypatch.setattr(config.composing, "CONF", tmp_path / "conf")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("NSF_RUNS", str(tmp_path / "runs"))
     monkeypatch.setenv("NSF_REPORTS", str(tmp_path / "reports"))

@@ -21,7 +21,7 @@ from nsf.errors import ConfigError, InstabilityError, MissingRunError, NSFError
 from nsf.evaluation import superresolution
 from nsf.kinematics.manifold import Manifold
 from nsf.mpm import FullOrderMPM
-from nsf.reporting.listing import entries
+from nsf.reporting.overview.listing import entries
 from nsf.runs import Run
 
 #: Issue 2, "Done when".

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 import torch
 
-from nsf.deployment import Levels, Rollout, rollout, rollouts
+from nsf.deployment import FULL_ORDER, OPERATORS, PROJECTED, Levels, Rollout, rollout, rollouts
 from nsf.deployment.levels import estimated_errors
 from nsf.dynamics import Method, Taylor
 from nsf.engines import Operators
@@ -283,14 +283,15 @@ def test_the_estimate_is_how_far_projected_runs_are(reduced, lesson, levels_of):
 
 def test_beyond_a_tolerance_the_projected_step_goes_on(reduced, levels_of, tiny_trust):
     own = rollouts(reduced().together, [26.0], tiny_trust, levels=levels_of())[0]
-    assert (own.by_operators, own.levels) == (24, ["operators"] * 24)
+    assert (own.by_operators, own.levels.tolist()) == (24, [OPERATORS] * 24)
     assert own.estimate[0] == 0.0 < own.estimate[-1]
     tolerance = 0.5 * float(own.estimate.max())
     found = rollouts(reduced().together, [26.0], tiny_trust, levels=levels_of(tolerance))[0]
-    n = found.by_operators
+    n = int(np.argmax(found.levels == PROJECTED))
     assert 0 < n < 24
-    assert found.levels == ["operators"] * n + ["projected"] * (24 - n)
-    assert found.estimate[n] <= tolerance
+    assert (found.levels[n : n + 4] == PROJECTED).all()
+    assert [stop == "operators" for stop in found.stops] == (found.levels == OPERATORS).tolist()
+    assert (found.estimate <= tolerance).all()
     np.testing.assert_array_equal(found.xhat[: n + 1], own.xhat[: n + 1])
     projected = reduced(engine="auto")
     for name, values in (("now", own.xhat[n]), ("before", own.xhat[n - 1])):
@@ -298,23 +299,27 @@ def test_beyond_a_tolerance_the_projected_step_goes_on(reduced, levels_of, tiny_
     projected.record.xhat[: n + 1] = torch.as_tensor(own.xhat[: n + 1])
     projected.record.row.fill_(n)
     projected.together.resume(n)
-    projected.step(24 - n)
-    np.testing.assert_allclose(found.xhat[-1], projected.state.xhat, rtol=0, atol=1e-12)
+    projected.step(4)
+    np.testing.assert_allclose(found.xhat[n + 4], projected.state.xhat, rtol=0, atol=1e-12)
 
 
 def test_what_is_doubted_is_projected_and_what_is_off_goes_to_full_order(reduced, levels_of, tiny_trust):
     outside = {"friction_angle": 60.0}
     solver = reduced(parameters=outside)
     found = rollouts(solver.together, [60.0], tiny_trust, levels=levels_of(None, True))[0]
-    assert (found.by_operators, found.levels) == (0, ["projected"] * 24)
+    assert (found.by_operators, found.levels.tolist()) == (0, [PROJECTED] * 24)
     assert reduced().doubt[0] <= 1.0
     plain = rollouts(reduced(parameters=outside).together, [60.0], tiny_trust, levels=levels_of())[0]
     assert plain.by_operators == 24
     assert (plain.trust > 1.0).all()  # never without saying so
-    handed = rollouts(reduced(parameters=outside).together, [60.0], tiny_trust, True, levels_of(None, True))[
-        0
-    ]
-    assert handed.handed_over == -1 or handed.levels == ["projected"] * handed.handed_over
+    mixed = rollouts(reduced(parameters=outside).together, [60.0], tiny_trust, levels=levels_of(1e-9))[0]
+    assert mixed.levels[-1] == PROJECTED
+    after = np.append(mixed.levels[:1], mixed.levels) == OPERATORS
+    assert (mixed.trust[after] > 1.0).all()
+    options = tiny_trust, True, levels_of(None, True)
+    handed = rollouts(reduced(parameters=outside).together, [60.0], *options)[0]
+    own = len(handed.stops) if handed.handed_over < 0 else handed.handed_over
+    assert handed.levels.tolist() == [PROJECTED] * own + [FULL_ORDER] * (len(handed.stops) - own)
 
 
 def test_a_rollout_keeps_who_took_its_steps(lesson, tmp_path):

@@ -11,11 +11,11 @@ import zlib
 import pytest
 from rich.console import Console
 
-import nsf.manifest
+import nsf.runs.manifest
 from nsf.cli import main
 from nsf.errors import ConfigError, MissingRunError, NSFError, SchemaError, StorageError
-from nsf.reporting.index import write_index
-from nsf.reporting.listing import difference_table, entries, runs_table
+from nsf.reporting.overview.index import write_index
+from nsf.reporting.overview.listing import difference_table, entries, runs_table
 from nsf.runs import Run
 
 MUTATIONS = 40  # of each kind; a few thousand were tried
@@ -300,11 +300,13 @@ def test_verify_tells_of_a_broken_run(runs):
 
 
 def test_a_file_is_read_for_its_sum_once_a_process(runs, monkeypatch):
-    monkeypatch.setattr(nsf.manifest, "_SETTLED", -1.0)  # as if the file were older
-    monkeypatch.setattr(nsf.manifest, "_KNOWN", {})
+    monkeypatch.setattr(nsf.runs.manifest, "_SETTLED", -1.0)  # as if the file were older
+    monkeypatch.setattr(nsf.runs.manifest, "_KNOWN", {})
     read = []
     monkeypatch.setattr(
-        nsf.manifest, "_sha256", lambda path, plain=nsf.manifest._sha256: read.append(path) or plain(path)
+        nsf.runs.manifest,
+        "_sha256",
+        lambda path, plain=nsf.runs.manifest._sha256: read.append(path) or plain(path),
     )
     for _ in range(3):
         runs[1].file("data.bin")

@@ -155,9 +155,14 @@ def test_foreign_targets_behind_an_added_key(tmp_path):
         ("material.E=soft", "material.E=soft"),
         ("material.nu=half", "material.nu=half"),
         ("transfer.damping=abc", "transfer.damping=abc"),
+        ("field.depth=1000000", "depth=1000000"),
+        ("field.beta=1000000000", "beta=1000000000"),
+        ("field.members=1000000", "members=1000000"),
+        ("projector.iterations=1000000000", "projector.iterations=1000000000"),
+        ("integration.margin=1000000000", "integration.margin=1000000000"),
     ],
 )
-def test_values_of_the_wrong_type_name_key_and_value(override, quoted):
+def test_values_of_the_wrong_type_or_size_name_key_and_value(override, quoted):
     group = override.split(".")[0]
     with pytest.raises(ConfigError, match=re.escape(quoted)):
         config.build(config.load([override])[group], group)
@@ -209,7 +214,7 @@ def test_broken_yaml_names_file_and_line(tmp_path, monkeypatch):
 
     shutil.copytree(CONF, tmp_path / "conf")
     (tmp_path / "conf/method/broken.yaml").write_text("_target_: nsf.dynamics.Method\nname: [\n")
-    monkeypatch.setattr(config, "CONF", tmp_path / "conf")
+    monkeypatch.setattr(config.composing, "CONF", tmp_path / "conf")
     with pytest.raises(ConfigError, match=r"broken\.yaml.*line [23].*correct the yaml"):
         config.load(["method=broken"])
 

@@ -7,7 +7,8 @@ import sys
 import pytest
 from omegaconf import OmegaConf
 
-from nsf import config, targets
+from nsf import config
+from nsf.config import targets
 from nsf.errors import ConfigError, NSFError
 from nsf.paths import CONF, groups
 from nsf.pipeline.sweep import sweep
@@ -27,7 +28,7 @@ CALLABLES = [
     "nsf.mpm.FullOrderMPM",
     "nsf.scenes.Scene",
     "nsf.scenes.load",
-    "nsf.scenes.mesh._read",
+    "nsf.scenes.shapes.mesh._read",
     "nsf.dynamics.ReducedMPM",
     "nsf.sampling.sampler.np.save",
     "nsf.reporting.build.build_report",
@@ -215,7 +216,7 @@ def test_references_that_multiply_are_refused(kind):
 def conf(tmp_path, monkeypatch):
     """A copy of conf/ to which files may be added."""
     shutil.copytree(CONF, tmp_path / "conf")
-    monkeypatch.setattr(config, "CONF", tmp_path / "conf")
+    monkeypatch.setattr(config.composing, "CONF", tmp_path / "conf")
     return tmp_path / "conf"
 
 

@@ -12,11 +12,12 @@ import pytest
 import yaml
 from omegaconf import OmegaConf
 
-import nsf.provenance
-import nsf.runs
-from nsf.canonical import content_hash, plain
+import nsf.runs.provenance
+import nsf.runs.record
+import nsf.runs.run
 from nsf.errors import ConfigError, MissingRunError, StorageError
 from nsf.runs import Run
+from nsf.runs.canonical import content_hash, plain
 
 CONFIG = {"mu": 1e6, "name": "1e-5", "list": [1, 2.5, None, True], "nested": {"b": 1, "a": "x: y"}}
 
@@ -60,7 +61,7 @@ def test_everything_that_determines_the_content_changes_the_hash(tmp_path, monke
         Run.open("train", "sand", {"r": 5}, parents=[other]),
         Run.open("train", "sand", {"r": 5}, parents=[parent, other]),
     ]
-    monkeypatch.setattr(nsf.runs, "FORMAT", 2)
+    monkeypatch.setattr(nsf.runs.run, "FORMAT", 2)
     runs.append(Run.open("train", "sand", {"r": 5}))
     assert len({run.hash for run in runs}) == len(runs)
 
@@ -147,7 +148,7 @@ def test_a_full_disk_at_the_end_does_not_hide_the_error(run, monkeypatch):
 
     def work():
         with run.record():
-            monkeypatch.setattr(nsf.runs, "write_json", full)
+            monkeypatch.setattr(nsf.runs.record, "write_json", full)
             raise ValueError("first")
 
     with pytest.raises(ValueError, match="first"):
@@ -342,11 +343,11 @@ def test_plain_of_tensors_and_paths(tmp_path):
 
 def test_provenance_in_and_outside_a_checkout(tmp_path, monkeypatch):
     git = ["git", "-C", str(tmp_path), "-c", "user.name=n", "-c", "user.email=e@x"]
-    package = tmp_path / "pkg"
-    package.mkdir()
+    package = tmp_path / "pkg" / "runs"
+    package.mkdir(parents=True)
     (package / "provenance.py").write_text("")
-    monkeypatch.setattr(nsf.provenance, "__file__", str(package / "provenance.py"))
-    fresh = nsf.provenance.provenance.__wrapped__
+    monkeypatch.setattr(nsf.runs.provenance, "__file__", str(package / "provenance.py"))
+    fresh = nsf.runs.provenance.provenance.__wrapped__
     monkeypatch.setenv("GIT_CEILING_DIRECTORIES", str(tmp_path.parent))
     assert (fresh()["commit"], fresh()["dirty"]) == (None, None)
     subprocess.run([*git, "init", "-q"], check=True)

@@ -5,7 +5,7 @@ import pytest
 import warp as wp
 
 from nsf.mpm import precision_of
-from nsf.mpm.shape import shape_functions
+from nsf.mpm.grid.shape import shape_functions
 
 ROUND_OFF = {"fp64": 1e-13, "fp32": 2e-5}
 DX = 0.01

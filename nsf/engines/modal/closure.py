@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import torch
 
-from nsf.mpm.access import WARP
+from nsf.mpm.native.access import WARP
 
 #: Threads that share a sum over a layer's inputs; each has two outputs, to read its inputs once for both.
 PARTS = 8

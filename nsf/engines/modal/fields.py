@@ -13,8 +13,8 @@ from nsf.dynamics.span import GridSpan
 from nsf.engines.modal.arena import Arena
 from nsf.engines.modal.gathering import THREADS, make_contraction, tiling
 from nsf.engines.modal.networks import make_layer, make_product, product_blocks
-from nsf.mpm.access import WARP
 from nsf.mpm.materials import Material, make_elastic_stress
+from nsf.mpm.native.access import WARP
 
 
 def field_launches(

@@ -11,9 +11,9 @@ from functools import cache
 import warp as wp
 
 from nsf.mpm import Precision
-from nsf.mpm.access import SHARED, TAKEN
-from nsf.mpm.copies import make_copies
+from nsf.mpm.batch import make_runs
 from nsf.mpm.native import native_code
+from nsf.mpm.native.access import SHARED, TAKEN
 
 THREADS = 128  # of a block that shares coefficients, or a sum over S
 _TILE = 8  # most runs of one thread: their sums fill its registers
@@ -237,20 +237,20 @@ def make_gathering(precision: Precision, several: bool = False):
     The displacement of S in the step is Δt v_p, as its positions before it lie on the manifold. The last
     block of a run gives Σ_p w_p |Δt v_p|².
     """
-    _, copy_of = make_copies(several)
+    _, run_of = make_runs(several)
     Gathered = _make_gathered(precision)
 
     @wp.func_native(native_code(__package__, "gathering"))
-    def share(given: Gathered, copy: int, k: int, lane: int, lanes: int) -> wp.float64: ...
+    def share(given: Gathered, run: int, k: int, lane: int, lanes: int) -> wp.float64: ...
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def gathering(given: Gathered, lanes: int):
         t = wp.tid()
         sums = given.b.shape[1]
-        copy = copy_of(t / lanes, sums)
-        k, lane = t / lanes - copy * sums, t % lanes
-        total = share(given, copy, k, lane, lanes)
+        run = run_of(t / lanes, sums)
+        k, lane = t / lanes - run * sums, t % lanes
+        total = share(given, run, k, lane, lanes)
         if lane == 0:
-            given.b[copy, k] = total
+            given.b[run, k] = total
 
     return gathering

@@ -6,7 +6,7 @@ from functools import cache
 import warp as wp
 
 from nsf.mpm import Precision
-from nsf.mpm.copies import make_copies
+from nsf.mpm.batch import make_runs
 from nsf.mpm.native import native_code
 
 _EDGE, _DEEP = 16, 128  # outputs, as many runs, and inputs that a block of a product holds at once
@@ -43,7 +43,7 @@ def make_layer(precision: Precision, tile: int = 1, several: bool = False, laten
     """
     real = precision.real
     sums = wp.types.vector(length=tile, dtype=real)
-    _, copy_of = make_copies(several)
+    _, run_of = make_runs(several)
     Side = _make_side(precision)
 
     @wp.func_native(native_code(__package__, "layer", real=precision.native, TILE=tile, LATENTS=latents))
@@ -56,7 +56,7 @@ def make_layer(precision: Precision, tile: int = 1, several: bool = False, laten
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def layer(one: Side, two: Side, active: int, lanes: int, outputs: int):
         t = wp.tid()
-        at = copy_of(t / lanes, outputs)
+        at = run_of(t / lanes, outputs)
         o, lane = t / lanes - at * outputs, t % lanes
         start = at * wp.static(tile)
         first = one.b.shape[1]

@@ -6,10 +6,10 @@ import warp as wp
 
 from nsf.engines.modal.gathering import make_combination, make_tiles
 from nsf.mpm import Precision
-from nsf.mpm.copies import make_copies
+from nsf.mpm.batch import make_runs
 from nsf.mpm.grid import inside
+from nsf.mpm.grid.shape import shape_functions
 from nsf.mpm.native import native_code
-from nsf.mpm.shape import shape_functions
 
 
 @wp.func
@@ -68,11 +68,11 @@ def make_sample(precision: Precision, shape_name: str, several: bool = False):
     base_node, reach = shape.base_node, shape.degree
     across = 2 * reach + 1
     sums = wp.types.vector(length=6, dtype=real)
-    share, copy_of = make_copies(several)
+    share, run_of = make_runs(several)
     Motion = _make_motion(precision)
 
     @wp.func_native(native_code(__package__, "sample", real=precision.native))
-    def combined(given: Motion, modes: wp.array(dtype=wp.float32), p: int, copy: int, lane: int) -> sums: ...
+    def combined(given: Motion, modes: wp.array(dtype=wp.float32), p: int, run: int, lane: int) -> sums: ...
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def sample(
@@ -82,29 +82,29 @@ def make_sample(precision: Precision, shape_name: str, several: bool = False):
         lanes: int,
     ):
         t, lane = wp.tid() / lanes, wp.tid() % lanes
-        copy = copy_of(t, at.of_sample)
-        p = t - copy * at.of_sample
-        row = p + copy * share(at.x.shape[0], at.first.shape[0])
-        moved = combined(at, modes, p, copy, lane)
+        run = run_of(t, at.of_sample)
+        p = t - run * at.of_sample
+        row = p + run * share(at.x.shape[0], at.first.shape[0])
+        moved = combined(at, modes, p, run, lane)
         x = at.mean[p] + vec3(moved[0], moved[1], moved[2])
         base = base_node(x, at.inv_dx)
         if lane == 0:
             at.x[row] = x
             if not inside(base, wp.static(reach + 1), grid_shape):
                 at.v[row] = vec3()
-            elif at.first[copy] != 0:
+            elif at.first[run] != 0:
                 at.v[row] = at.initial_velocity[row]
             else:
                 at.v[row] = vec3(moved[3], moved[4], moved[5])
             if p == 0:
-                at.count[copy, 0] = at.count[copy, 0] + wp.int64(at.of_sample)
-                at.count[copy, 1] = at.count[copy, 1] + wp.int64(1)
+                at.count[run, 0] = at.count[run, 0] + wp.int64(at.of_sample)
+                at.count[run, 1] = at.count[run, 1] + wp.int64(1)
         offset = lane
         while offset < wp.static(across**3):
             place = wp.vec3i(offset / (across * across), (offset / across) % across, offset % across)
             c = _cell(base + place - wp.vec3i(reach, reach, reach), at.lower, at.extent)
             if c >= 0:
-                at.stamps[copy, c] = at.step[copy]
+                at.stamps[run, c] = at.step[run]
             offset += lanes
 
     return sample
@@ -135,7 +135,7 @@ def make_others(
     combined = make_combination(precision, vectors, 2, tile, several, wp.float64, stored)
 
     @wp.func_native(native_code(__package__, "count"))
-    def add_up(count: wp.array2d(dtype=wp.int64), copy: int, taken: int): ...
+    def add_up(count: wp.array2d(dtype=wp.int64), run: int, taken: int): ...
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def others(
@@ -157,17 +157,17 @@ def make_others(
         mean, taken, beginning = at.mean[p], places(), places()
         # Before anything is written, so that all loads are under way together.
         for s in range(wp.static(tile)):
-            copy = wp.min(start + s, at.first.shape[0] - 1)
+            run = wp.min(start + s, at.first.shape[0] - 1)
             x = mean + vec3(moved[6 * s], moved[6 * s + 1], moved[6 * s + 2])
             c = _cell(base_node(x, at.inv_dx), at.lower, at.extent)
-            stamp = at.stamps[copy, wp.max(c, 0)]
-            taken[s] = wp.where(c >= 0 and stamp == at.step[copy], 1, 0)
-            beginning[s] = at.first[copy]
+            stamp = at.stamps[run, wp.max(c, 0)]
+            taken[s] = wp.where(c >= 0 and stamp == at.step[run], 1, 0)
+            beginning[s] = at.first[run]
         bits = 0
         for s in range(wp.static(tile)):
-            copy = start + s
-            if copy < at.first.shape[0]:
-                row = copy * n + p
+            run = start + s
+            if run < at.first.shape[0]:
+                row = run * n + p
                 x = vec3(real(-1.0), real(-1.0), real(-1.0))  # the grid starts at the origin
                 if taken[s] != 0:
                     bits += wp.static(1 << s)
@@ -177,7 +177,7 @@ def make_others(
                     else:
                         at.v[row] = vec3(moved[6 * s + 3], moved[6 * s + 4], moved[6 * s + 5])
                 at.x[row] = x
-                add_up(at.count, copy, taken[s])
+                add_up(at.count, run, taken[s])
         needed[start / wp.static(tile), p] = bits
 
     return others

@@ -9,9 +9,9 @@ import warp as wp
 
 from nsf.engines.modal.closure import PARTS, inputs_of_widest, projection_block
 from nsf.mpm import Precision
-from nsf.mpm.access import SHARED, TAKEN, WARP
-from nsf.mpm.copies import make_copies
+from nsf.mpm.batch import make_runs
 from nsf.mpm.native import native_code
+from nsf.mpm.native.access import SHARED, TAKEN, WARP
 
 #: What a launch does: a and ȧ at x̂_n, the linearisation where the next inversion begins, or that inversion.
 EVALUATE, PREPARE, SOLVE = range(3)
@@ -113,7 +113,7 @@ def make_projection(
 
     Source: paper section 5.3.
     """
-    _, copy_of = make_copies(several)
+    _, run_of = make_runs(several)
     rows = inputs_of_widest(widths, latents)
     kept = shared_bytes(precision, widths, latents, modes) + 8 * modes**2 <= SHARED - TAKEN
     Inversion = _make_inversion(precision)
@@ -129,6 +129,6 @@ def make_projection(
         enable_backward=False, module="unique", grid_stride=False, launch_bounds=projection_block(widths)
     )
     def projection(given: Inversion, task: int, threads: int):
-        invert(given, task, copy_of(wp.tid(), threads))
+        invert(given, task, run_of(wp.tid(), threads))
 
     return projection

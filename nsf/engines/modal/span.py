@@ -23,8 +23,8 @@ from nsf.engines.modal.projection import (
     prepared_size,
 )
 from nsf.kinematics.fields.modal import ModalFactors
-from nsf.mpm.access import WARP
-from nsf.mpm.shape import DEGREES, stencil_offset
+from nsf.mpm.grid.shape import DEGREES, stencil_offset
+from nsf.mpm.native.access import WARP
 from nsf.mpm.state import cell_order
 from nsf.sampling.sampler import SampleSpan
 

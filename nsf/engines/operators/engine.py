@@ -94,13 +94,16 @@ class OperatorRun:
         now, before = (latest.double() for latest in (self._record.now, self._record.before))
         self.recurrence.begin(now, self._first if first else now - before)
 
-    def pushed(self, push: torch.Tensor) -> torch.Tensor:
-        """[B, N + 1, r] latents of the same runs from t = 0, with [B, N, r] added to their changes."""
-        start, steps = self._record.xhat[:, 0], push.shape[1]
-        record = LatentRecord(start, steps, 1)
-        again = self._of(record=record, push=push.to(start.device))
-        again.begin(start, self._first)
-        again.advance(steps)
+    def pushed(self, push: torch.Tensor, since: int = 0) -> torch.Tensor:
+        """[B, N + 1, r] latents of the same runs from a step on, with [B, N, r] added to their changes."""
+        own, steps = self._record.xhat, push.shape[1]
+        record = LatentRecord(own[:, 0], steps, 1)
+        record.row.fill_(since)
+        record.xhat[:, since] = own[:, since]
+        again = self._of(record=record, push=push.to(own.device))
+        now, before = own[:, since].double(), own[:, max(0, since - 1)].double()
+        again.begin(now, now - before if since else self._first)
+        again.advance(steps - since)
         return record.xhat
 
 
@@ -131,9 +134,9 @@ class OperatorSpan(Span):
     def take(self, steps: int) -> None:
         self._run.recurrence.advance(steps)
 
-    def pushed(self, push: torch.Tensor) -> torch.Tensor:
+    def pushed(self, push: torch.Tensor, since: int = 0) -> torch.Tensor:
         """As `OperatorRun.pushed`."""
-        return self._run.pushed(push)
+        return self._run.pushed(push, since)
 
     @property
     @override

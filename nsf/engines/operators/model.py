@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from nsf.engines.operators.taught import Taught
 from nsf.errors import MissingRunError, SchemaError
-from nsf.manifest import verified
+from nsf.runs.manifest import verified
 from nsf.storage import writing
 
 FORMAT = "nsf-operators"

@@ -9,8 +9,8 @@ import warp as wp
 from nsf.dynamics.interop import torch_device, torch_dtype
 from nsf.engines.operators.model import Sizes, StepOperators
 from nsf.mpm import Precision
-from nsf.mpm.access import SHARED, TAKEN, WARP
 from nsf.mpm.native import native_code
+from nsf.mpm.native.access import SHARED, TAKEN, WARP
 
 _REGISTERS = 512  # [byte] of weights that a thread of a GPU holds
 
@@ -51,6 +51,15 @@ def block_of(width: int) -> int:
     return WARP * -(-min(width, 1024) // WARP)
 
 
+def places(precision: Precision, sizes: Sizes) -> tuple[bool, bool]:
+    """Whether a GPU's block holds the outer layers' weights, and a thread its column of the middle one's."""
+    real = np.dtype(precision.numpy).itemsize
+    inputs = sizes.latents + sizes.states
+    weights = real * sizes.width * (inputs + sizes.outputs)
+    values = real * (inputs + 2 * sizes.width + sizes.outputs) + 16 * sizes.latents
+    return weights + values + 256 <= SHARED - TAKEN, real * sizes.width <= _REGISTERS
+
+
 @cache
 def make_recurrence(precision: Precision, sizes: Sizes, pushed: bool = False):
     """Kernel of many steps of runs: x̂ ← x̂ + d, d ← d + B d + Δt² (f + G g).
@@ -63,15 +72,10 @@ def make_recurrence(precision: Precision, sizes: Sizes, pushed: bool = False):
         sizes: of the network.
         pushed: whether something is added to each change.
     """
-    real = np.dtype(precision.numpy).itemsize
-    inputs = sizes.latents + sizes.states
-    weights = real * sizes.width * (inputs + sizes.outputs)
-    values = real * (inputs + 2 * sizes.width + sizes.outputs) + 16 * sizes.latents
+    kept, column = places(precision, sizes)
     constants = {
         "R": sizes.latents, "STATES": sizes.states, "WIDTH": sizes.width, "OUTPUTS": sizes.outputs,
-        "GRAVITY": sizes.gravity, "PUSHED": pushed,
-        "KEPT": weights + values + 256 <= SHARED - TAKEN,
-        "COLUMN": real * sizes.width <= _REGISTERS,
+        "GRAVITY": sizes.gravity, "PUSHED": pushed, "KEPT": kept, "COLUMN": column,
     }  # fmt: skip
     Given = _make_given(precision)
 

@@ -8,7 +8,7 @@ from nsf.mpm import Collider
 
 #: Shift [m], angle [rad], both over the coming step too, and whether it acts.
 FEATURES = 9
-_SAME_TIME = 1e-6  # of a step, as `nsf.mpm.motion` has it
+_SAME_TIME = 1e-6  # of a step, as `nsf.mpm.boundaries.motion` has it
 #: A combination of features that moves less than this share of the first one counts for nothing.
 _HARDLY = 0.03
 

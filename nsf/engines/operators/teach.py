@@ -147,9 +147,8 @@ class Course:
     def _moments(self, offset: int, count: int) -> Tensor:
         """Steps n ≥ 1 that a sweep asks for, ascending and evenly spread; another offset gives others."""
         N = self.teachers[0].total_steps
-        return 1 + (
-            (torch.arange(count) * (N - 1) + (offset * (N - 1)) // (self.teaching.rounds + 1)) // count
-        )
+        kinds = self.teaching.rounds + 1
+        return 1 + (torch.arange(count) * (N - 1) + (offset % kinds * (N - 1)) // kinds) // count
 
     def _of_runs(self, teacher: Teacher, runs: Tensor) -> Labels:
         """Labels that runs of the teacher itself are; runs [N + 1, R, r]."""

@@ -26,7 +26,16 @@ from nsf.kinematics.fields.modal import ModalFactors, ModalField, ModalModule, R
 from nsf.kinematics.fields.networks import Committee, FullyConnected
 from nsf.kinematics.interpolation import Interpolation, interpolation
 from nsf.kinematics.manifold import Manifold, Restriction
-from nsf.kinematics.training.phases import PHASES, TARGETS, Fit, at_least, joined, per_phase
+from nsf.kinematics.training.phases import (
+    MOST_DEEP,
+    MOST_MEMBERS,
+    PHASES,
+    TARGETS,
+    Fit,
+    at_least,
+    joined,
+    per_phase,
+)
 
 ENCODED_ENTRIES = 1 << 26  # values encoded at once
 
@@ -58,8 +67,8 @@ class BasisField:
     def __post_init__(self) -> None:
         per_phase("modes", self.modes)
         per_phase("beta", self.beta)
-        at_least("depth", self.depth, 1)
-        at_least("members", self.members, 1)
+        at_least("depth", self.depth, 1, MOST_DEEP)
+        at_least("members", self.members, 1, MOST_MEMBERS)
         at_least("noise", self.noise, 0)
 
     @property

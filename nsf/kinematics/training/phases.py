@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -43,28 +44,37 @@ class Fit:
     pointwise: bool
 
 
+#: Units of a layer, layers, networks: more of them fill memory, or take days before a slip is seen.
+MOST_WIDE, MOST_DEEP, MOST_MEMBERS = 16384, 256, 256
+
+
 def per_phase(key: str, value: int | Sequence[int]) -> tuple[int, int, int]:
     """A count for g, h and l, given as one for all, a pair (g, h and l) or a triple.
 
     Raises:
-        ConfigError: another number of entries, or an entry that is not a whole number of at least 1.
+        ConfigError: another number of entries, or an entry that is no whole number from 1 to `MOST_WIDE`.
     """
     entries = (value,) if isinstance(value, int) else tuple(value)
-    if len(entries) not in (1, 2, 3) or any(not isinstance(n, int) or n < 1 for n in entries):
+    if len(entries) not in (1, 2, 3) or any(
+        not isinstance(n, int) or not 1 <= n <= MOST_WIDE for n in entries
+    ):
         raise ConfigError(
-            f"{key}={value} is not one, two or three whole numbers >= 1; give n, [g, h=l] or [g, h, l]"
+            f"{key}={value} is not one, two or three whole numbers from 1 to {MOST_WIDE}; "
+            "give n, [g, h=l] or [g, h, l]"
         )
     return (*entries, *entries[-1:] * (3 - len(entries)))
 
 
-def at_least(key: str, value: float, least: float) -> None:
-    """Refuse a value below its least, naming both.
+def at_least(key: str, value: float, least: float, most: float = math.inf) -> None:
+    """Refuse a value below its least or above its most, naming both.
 
     Raises:
-        ConfigError: value < least, or not a number.
+        ConfigError: value < least, value > most, or not a number.
     """
     if not value >= least:
         raise ConfigError(f"{key}={value} is below its least value; choose {key} >= {least}")
+    if value > most:
+        raise ConfigError(f"{key}={value} is above its largest value; choose {key} <= {most}")
 
 
 def seed_of(*stream: int) -> int:

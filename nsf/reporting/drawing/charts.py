@@ -8,7 +8,6 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from nsf.reporting.columns import axis, number, parameter_text
 from nsf.reporting.drawing.style import (
     FULL,
     INK,
@@ -21,6 +20,7 @@ from nsf.reporting.drawing.style import (
     stage_colors,
     styled,
 )
+from nsf.reporting.text.columns import axis, number, parameter_text
 
 OVER_TIME = {
     "delta": "relative deformation error δ",

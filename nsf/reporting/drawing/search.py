@@ -6,9 +6,9 @@ from pathlib import Path
 import pandas as pd
 from rich.table import Table
 
-from nsf.reporting.columns import COLUMN, Column
 from nsf.reporting.drawing.style import MUTED, PALETTE, figure, save, styled
-from nsf.reporting.formats import Rows, spreadsheet, terminal_table
+from nsf.reporting.text.columns import COLUMN, Column
+from nsf.reporting.text.formats import Rows, spreadsheet, terminal_table
 from nsf.storage import writing
 
 #: What a search can make small, by the name that a user gives it.

@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from PIL import Image
 
-from nsf.reporting.columns import parameter_text
 from nsf.reporting.drawing.camera import Camera, View
 from nsf.reporting.drawing.style import (
     CLIP,
@@ -27,6 +26,7 @@ from nsf.reporting.drawing.style import (
     styled,
 )
 from nsf.reporting.sources import Motion
+from nsf.reporting.text.columns import parameter_text
 
 if TYPE_CHECKING:
     from nsf.evaluation import SuperResolution

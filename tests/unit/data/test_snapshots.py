@@ -126,7 +126,6 @@ def test_no_gpu(paths):
 
 
 @pytest.mark.gpu
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 @pytest.mark.parametrize("resident", [True, False, "auto"])
 def test_on_a_gpu(paths, whole, resident, monkeypatch):
     monkeypatch.setattr(snapshots, "_STAGING_BYTES", 4 * 11 * 6 * 3)  # several blocks a trajectory

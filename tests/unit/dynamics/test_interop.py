@@ -8,11 +8,9 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from gpu_references import METHODS
 
-from nsf.dynamics import Method
 from nsf.dynamics.interop import captured, on_torch_stream
-
-METHODS = [(a, b) for a in (True, False) for b in (True, False)]
 
 
 class FakeDevice:
@@ -48,16 +46,13 @@ def test_torchs_stream_is_entered_once(entered):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize(("neural_stress", "neural_affine"), METHODS)
-def test_captured_steps_are_the_steps_themselves(neural_stress, neural_affine, chain, tiny_manifold):
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
+def test_captured_steps_are_the_steps_themselves(method, tiny_scene, reference_manifold):
     """Every replay clears the grid and takes the stress anew."""
-    if not (torch.cuda.is_available() and wp.is_cuda_available()):
-        pytest.skip("needs a GPU")
-    method = Method("one", neural_stress, neural_affine)
     found = []
     for capturable in (True, False):
-        solver = chain.pipeline.scene.reduced(
-            tiny_manifold, {"friction_angle": 26.0}, 60, method=method, device="cuda"
+        solver = tiny_scene.reduced(
+            reference_manifold, {"friction_angle": 26.0}, 60, method=method, device="cuda"
         )
         solver.span.capturable = capturable
         solver.step(8)

@@ -223,7 +223,8 @@ def test_on_a_linear_manifold_one_iteration_is_exact(start, goal):
 @pytest.mark.parametrize(
     ("build", "quoted"),
     [
-        (lambda: GaussNewton(iterations=0), r"projector\.iterations=0 must be at least 1"),
+        (lambda: GaussNewton(iterations=0), r"projector\.iterations=0 must be from 1 to 1000"),
+        (lambda: GaussNewton(iterations=10**9), r"projector\.iterations=1000000000 must be from 1 to 1000"),
         (lambda: GaussNewton(tolerance=0.0), r"projector\.tolerance=0\.0 must be positive"),
         (lambda: GaussNewton(tolerance=float("nan")), r"projector\.tolerance=nan must be positive"),
     ],

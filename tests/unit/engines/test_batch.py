@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-import warp as wp
 
 import nsf.scenes
 from nsf.dynamics import NSF, GaussNewton, Integration, Method, ReducedBatch, Setup, Taylor
@@ -336,14 +335,12 @@ def test_bad_states(setup_of, chain, options, message):
 @pytest.mark.gpu
 @pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
 @pytest.mark.parametrize("count", [3, 19])
-def test_on_a_gpu(chain, tiny_manifold, method, count):
-    if not (torch.cuda.is_available() and wp.is_cuda_available()):
-        pytest.skip("needs a GPU")
+def test_on_a_gpu(tiny_scene, reference_manifold, method, count):
     parameters = [{ANGLE: angle} for angle in np.linspace(22.0, 38.0, count)]
     options = {"method": method, "device": "cuda"}
-    batch = chain.scene.reduced_batch(tiny_manifold, parameters, 60, **options)
+    batch = tiny_scene.reduced_batch(reference_manifold, parameters, 60, **options)
     batch.step(24)
     for index in {0, 1, count - 1}:
-        single = chain.scene.reduced(tiny_manifold, parameters[index], 60, **options)
+        single = tiny_scene.reduced(reference_manifold, parameters[index], 60, **options)
         single.step(24)
         same(batch.runs[index], single, 1e-7)  # of a GPU's sums the order is not fixed

@@ -3,18 +3,16 @@
 import numpy as np
 import pytest
 import torch
-import warp as wp
+from gpu_references import METHODS, TOLERANCES, steps, steps_of_a_cpu
 
 import nsf.scenes
-from nsf.dynamics import GaussNewton, Integration, Method, Taylor
+from nsf.dynamics import GaussNewton, Integration, Taylor
 from nsf.engines.modal.arena import Arena
 from nsf.engines.modal.projection import projection_fits
 from nsf.kinematics.fields.basis import BasisManifold
 from nsf.mpm import precision_of
 from nsf.sampling import RandomSampler, SampleSpan
 from nsf.timing import StageTimer
-
-METHODS = [Method(f"{a}{b}", a, b) for a in (True, False) for b in (True, False)]
 
 
 @pytest.fixture
@@ -215,14 +213,19 @@ def test_the_particles_taken_are_those_of_the_search(pair, chain):
     assert fixed.integration_mean == modal.integration_mean
 
 
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
+@pytest.mark.parametrize("tolerance", TOLERANCES)
+def test_references_are_what_a_cpu_computes(tiny_scene, reference_manifold, method, tolerance):
+    """Else what a GPU is compared with is of older code: `make gpu-references` writes it anew."""
+    found = steps(tiny_scene, reference_manifold, "cpu", method, tolerance)
+    same(found, steps_of_a_cpu(method, tolerance), tolerance=1e-9)
+
+
 @pytest.mark.gpu
 @pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
 @pytest.mark.parametrize("half", [False, True])
-@pytest.mark.parametrize("tolerance", [1e-6, 0.1])
-def test_the_gpu_takes_the_same_steps(chain, tiny_manifold, method, half, tolerance, monkeypatch):
-    """With the larger tolerance one update is enough in every step."""
-    if not (torch.cuda.is_available() and wp.is_cuda_available()):
-        pytest.skip("needs a GPU")
+@pytest.mark.parametrize("tolerance", TOLERANCES)
+def test_the_gpu_takes_the_same_steps(tiny_scene, reference_manifold, method, half, tolerance, monkeypatch):
     if not half:
         monkeypatch.setattr(
             Arena,
@@ -232,26 +235,21 @@ def test_the_gpu_takes_the_same_steps(chain, tiny_manifold, method, half, tolera
                 arena.hold(torch.ones(table.shape[2]), arena.real),
             ),
         )
-    found = []
-    for device in ("cuda", "cpu"):
-        options = {"method": method, "device": device, "projector": GaussNewton(tolerance=tolerance)}
-        solver = chain.scene.reduced(tiny_manifold, {"friction_angle": 26.0}, 60, **options)
-        found += runs((solver,))
+    found = steps(tiny_scene, reference_manifold, "cuda", method, tolerance)
+    expected = steps_of_a_cpu(method, tolerance)
     if half:
-        gpu, cpu = (trajectory.xhat for trajectory in found)
-        np.testing.assert_allclose(gpu, cpu, rtol=0, atol=1e-3 * np.ptp(cpu))
+        np.testing.assert_allclose(found.xhat, expected.xhat, rtol=0, atol=1e-3 * np.ptp(expected.xhat))
     else:
-        same(*found, tolerance=1e-6)
+        same(found, expected, tolerance=1e-6)
 
 
 @pytest.mark.gpu
 @pytest.mark.parametrize("phases", [(), [{"start": 0.5, "size": 20}]], ids=["one phase", "two"])
-def test_steps_timed_on_the_gpu_are_steps(chain, tiny_manifold, phases):
-    if not (torch.cuda.is_available() and wp.is_cuda_available()):
-        pytest.skip("needs a GPU")
+def test_steps_timed_on_the_gpu_are_steps(tiny_scene, reference_manifold, phases):
     sampler = RandomSampler(40, phases=phases)
     timed, plain = (
-        chain.scene.reduced(tiny_manifold, {"friction_angle": 26.0}, sampler, device="cuda") for _ in range(2)
+        tiny_scene.reduced(reference_manifold, {"friction_angle": 26.0}, sampler, device="cuda")
+        for _ in range(2)
     )
     plain.step(16)
     timer = StageTimer("cuda")

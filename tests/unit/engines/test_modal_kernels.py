@@ -19,11 +19,9 @@ from nsf.mpm.device import warp_device
 SIZES = [(129, 48, 1), (127, 47, 5), (300, 5, 19)]
 
 
-@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
-def arena(request):
-    if request.param == "cuda" and not (torch.cuda.is_available() and wp.is_cuda_available()):
-        pytest.skip("needs a GPU")
-    return Arena(precision_of("fp64"), warp_device(request.param))
+@pytest.fixture
+def arena(device):
+    return Arena(precision_of("fp64"), warp_device(device))
 
 
 @pytest.fixture

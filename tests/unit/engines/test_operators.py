@@ -19,7 +19,7 @@ from nsf.engines.operators import (
     principal,
     random_values,
 )
-from nsf.engines.operators.recurrence import Recurrence, make_recurrence
+from nsf.engines.operators.recurrence import Recurrence, make_recurrence, places
 from nsf.errors import ConfigError, MissingRunError, SchemaError
 from nsf.mpm import Cuboid, HalfSpace, Motion, precision_of
 from nsf.mpm.device import warp_device
@@ -29,14 +29,18 @@ TAUGHT = Taught(
     ranges=((20.0, 40.0),), gravity=(0.0, 0.0, -10.0), reach=1.0,
 )  # fmt: skip
 RUNS, STEPS = 3, 12
+#: r and width, so that on a GPU weights are in shared memory or not, and columns in registers or not; the
+#: last ones are wider than a block.
+WIDTHS = [(4, 16), (4, 160), (4, 400), (8, 128), (4, 1100)]
+PRECISIONS = [("fp64", 1e-12), ("fp32", 1e-5)]
 
 
-def operators(states=2, gravity=True, width=16, seed=0):
+def operators(states=2, gravity=True, width=16, latents=4):
     """Operators of random weights and scales."""
-    torch.manual_seed(seed)
-    model = StepOperators(Sizes(4, 1, 9 * bool(states), states, gravity, width), 0.01).double()
+    torch.manual_seed(0)
+    model = StepOperators(Sizes(latents, 1, 9 * bool(states), states, gravity, width), 0.01).double()
     with torch.no_grad():
-        model.net[4].weight.normal_(std=0.1)
+        model.net[4].weight.normal_(std=0.4 / width**0.5)
         model.net[4].bias.normal_(std=0.1)
     for name, values in model.named_buffers():
         scaled = 0.5 + torch.rand(values.shape).double()
@@ -238,59 +242,77 @@ def test_how_far_an_input_lies_outside(angle, gravity, off, text):
 # -- the compiled loop ----------------------------------------------------------------------------------
 
 
-def recurrence(model, name="fp64", runs=RUNS, push=None, rows=slice(None)):
+def recurrence(model, device, name="fp64", push=None, rows=slice(None)):
     """Runs of the loop at their start, and the same by torch; `rows` are those of as many runs."""
-    precision, (x, d, mu, g, _) = precision_of(name), given(model, runs)
-    features = torch.randn(runs, STEPS, model.sizes.features, generator=torch.Generator().manual_seed(2))
+    precision, (x, d, mu, g, _) = precision_of(name), given(model, RUNS)
+    features = torch.randn(RUNS, STEPS, model.sizes.features, generator=torch.Generator().manual_seed(2))
     features = features.double()
     c = model.collider_state(features).transpose(0, 1)
     with torch.no_grad():
         expected = model.run(x, d, mu, g.expand(STEPS, *g.shape), c)[:, rows]
     x, d, mu, g, features = (values[rows] for values in (x, d, mu, g, features))
-    record = LatentRecord(x.to({"fp32": torch.float32, "fp64": torch.float64}[name]), STEPS, 1)
-    found = Recurrence(model, mu, g, features, record, precision, warp_device("cpu"), push)
-    found.latent.view_as(x).copy_(x)
-    found.change.view_as(d).copy_(d)
+    record = LatentRecord(x.to(device, {"fp32": torch.float32, "fp64": torch.float64}[name]), STEPS, 1)
+    found = Recurrence(model, mu, g, features, record, precision, warp_device(device), push)
+    found.begin(x, d)
     return found, record, expected
+
+
+def assert_is_torch(model, device, name, tolerance):
+    found, record, expected = recurrence(model, device, name)
+    found.advance(STEPS)
+    assert (expected[-1] - expected[0]).abs().max() > 0.05
+    tolerance *= max(1.0, float(expected.abs().max()))
+    xhat, now, before = (values.cpu().double() for values in (record.xhat, record.now, record.before))
+    torch.testing.assert_close(xhat.transpose(0, 1), expected, rtol=0, atol=tolerance)
+    torch.testing.assert_close(now, expected[-1], rtol=0, atol=tolerance)
+    torch.testing.assert_close(before, expected[-2], rtol=0, atol=tolerance)
+    assert record.row.tolist() == [STEPS] * RUNS
 
 
 @pytest.mark.parametrize("gravity", [True, False])
 @pytest.mark.parametrize("states", [0, 2])
-@pytest.mark.parametrize(("name", "tolerance"), [("fp64", 1e-12), ("fp32", 1e-5)])
-def test_the_loop_is_torch(name, tolerance, states, gravity):
-    found, record, expected = recurrence(operators(states, gravity), name)
-    found.advance(STEPS)
-    assert (expected[-1] - expected[0]).abs().max() > 0.05
-    torch.testing.assert_close(record.xhat.transpose(0, 1).double(), expected, rtol=0, atol=tolerance)
-    torch.testing.assert_close(record.now.double(), expected[-1], rtol=0, atol=tolerance)
-    torch.testing.assert_close(record.before.double(), expected[-2], rtol=0, atol=tolerance)
-    assert record.row.tolist() == [STEPS] * RUNS
+@pytest.mark.parametrize(("name", "tolerance"), PRECISIONS)
+def test_the_loop_is_torch(device, name, tolerance, states, gravity):
+    assert_is_torch(operators(states, gravity), device, name, tolerance)
+
+
+@pytest.mark.parametrize(("latents", "width"), WIDTHS)
+@pytest.mark.parametrize(("name", "tolerance"), PRECISIONS)
+def test_the_loop_of_a_width_is_torch(device, name, tolerance, latents, width):
+    assert_is_torch(operators(width=width, latents=latents), device, name, tolerance)
+
+
+def test_weights_are_wherever_they_can_be():
+    """The widths tried have both in shared memory and registers, either alone, and neither."""
+    sizes = [Sizes(latents, 1, 9, 2, True, width) for latents, width in WIDTHS]
+    found = {places(precision_of(name), size) for name, _ in PRECISIONS for size in sizes}
+    assert found == {(kept, column) for kept in (True, False) for column in (True, False)}
 
 
 @pytest.mark.parametrize("name", ["fp64", "fp32"])
-def test_steps_taken_at_once_and_one_by_one_are_the_same_bits(name):
-    once, record, _ = recurrence(operators(), name)
+def test_steps_taken_at_once_and_one_by_one_are_the_same_bits(device, name):
+    once, record, _ = recurrence(operators(), device, name)
     once.advance(STEPS)
-    single, other, _ = recurrence(operators(), name)
+    single, other, _ = recurrence(operators(), device, name)
     for n in (1, 4, STEPS - 5):
         single.advance(n)
     assert torch.equal(record.xhat, other.xhat)
     assert torch.equal(record.before, other.before)
 
 
-def test_a_batch_is_its_runs():
-    batch, record, _ = recurrence(operators())
+def test_a_batch_is_its_runs(device):
+    batch, record, _ = recurrence(operators(), device)
     batch.advance(STEPS)
     for run in range(RUNS):
-        alone, own, _ = recurrence(operators(), rows=slice(run, run + 1))
+        alone, own, _ = recurrence(operators(), device, rows=slice(run, run + 1))
         alone.advance(STEPS)
         assert torch.equal(own.xhat[0], record.xhat[run])
 
 
-def test_what_is_added_to_each_change():
+def test_what_is_added_to_each_change(device):
     model = operators()
     push = 1e-3 * torch.randn(RUNS, STEPS, 4, generator=torch.Generator().manual_seed(3)).double()
-    found, record, _ = recurrence(model, push=push)
+    found, record, _ = recurrence(model, device, push=push)
     found.advance(STEPS)
     x, d, mu, g, _ = given(model, RUNS)
     features = torch.randn(RUNS, STEPS, 9, generator=torch.Generator().manual_seed(2)).double()
@@ -298,15 +320,15 @@ def test_what_is_added_to_each_change():
         for n, c in enumerate(model.collider_state(features).unbind(1)):
             d = model.step(x, d, mu, g, c)[1] + push[:, n]
             x = x + d
-            torch.testing.assert_close(record.xhat[:, n + 1], x, rtol=0, atol=1e-12)
+            torch.testing.assert_close(record.xhat[:, n + 1].cpu(), x, rtol=0, atol=1e-12)
 
 
 @pytest.mark.skipif(90 not in wp.get_cuda_supported_archs(), reason="Warp was built without CUDA")
-@pytest.mark.parametrize("width", [96, 128])
+@pytest.mark.parametrize(("latents", "width"), WIDTHS)
 @pytest.mark.parametrize("name", ["fp32", "fp64"])
-def test_the_loop_compiles_for_a_gpu(name, width, tmp_path):
+def test_the_loop_compiles_for_a_gpu(name, latents, width, tmp_path):
     for gravity, pushed in ((True, False), (False, True)):
-        kernel = make_recurrence(precision_of(name), Sizes(6, 1, 9, 2, gravity, width), pushed)
+        kernel = make_recurrence(precision_of(name), Sizes(latents, 1, 9, 2, gravity, width), pushed)
         wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path, use_ptx=True)
     assert len(list(tmp_path.glob("*.ptx"))) == 2
 

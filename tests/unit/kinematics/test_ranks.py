@@ -171,8 +171,7 @@ def test_what_is_refused(snapshots, fields, tmp_path):
         training.train(snapshots, fields["mlp"], TOGETHER, LATENT, 0, tmp_path, "cpu")
 
 
-@pytest.mark.gpu
-@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs two GPUs")
+@pytest.mark.gpu(2)
 def test_on_two_gpus(files, training_in, tmp_path):
     one, _ = train_together(files, training_in(tmp_path / "run"), TOGETHER, "cuda:0")
     assert alike(tmp_path / "run")

@@ -2,19 +2,11 @@
 
 import numpy as np
 import pytest
-import warp as wp
 
 from nsf.mpm import DomainWalls, FullOrderMPM, GridGeometry, ParticleConstants
 from nsf.mpm.materials import FixedCorotated
 
 DX = 1.0 / 16.0
-
-
-@pytest.fixture(params=["cpu", pytest.param("cuda", marks=pytest.mark.gpu)])
-def device(request):
-    if request.param == "cuda" and not wp.is_cuda_available():
-        pytest.skip("no GPU")
-    return request.param
 
 
 @pytest.fixture

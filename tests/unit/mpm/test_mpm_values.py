@@ -20,6 +20,7 @@ from nsf.mpm import (
     precision_of,
 )
 from nsf.mpm.device import warp_device
+from nsf.mpm.grid.shape import shape_functions
 from nsf.mpm.materials import (
     DruckerPrager,
     FixedCorotated,
@@ -29,7 +30,6 @@ from nsf.mpm.materials import (
     VonMisesHardening,
     VonMisesSoftening,
 )
-from nsf.mpm.shape import shape_functions
 
 NAN, INF = float("nan"), float("inf")
 ORIGIN, UP = (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)

@@ -7,9 +7,9 @@ import pytest
 import warp as wp
 
 from nsf.mpm import BoundaryArrays, DomainWalls, Grid, GridGeometry, GridStep, Transfer, precision_of
-from nsf.mpm.access import WARP
-from nsf.mpm.scatter import particles_of_warp
+from nsf.mpm.native.access import WARP
 from nsf.mpm.state import cell_order
+from nsf.mpm.transfer.scatter import particles_of_warp
 
 DX, DT = 0.25, 0.002
 GEOMETRY = GridGeometry(DX, (11, 9, 10))
@@ -54,13 +54,13 @@ def test_p2g_of_several_simulations(precision, tolerance, shape, degree, each, r
     if device == "cpu" and each != 32:
         pytest.skip("warps are of a GPU")
     monkeypatch.setattr("nsf.mpm.step.particles_of_warp", lambda particles: each)
-    types, n, copies = precision_of(precision), 203, 3
+    types, n, count = precision_of(precision), 203, 3
     listed = np.sort(rng.permutation(GEOMETRY.count)[: GEOMETRY.count * 2 // 3]).astype(np.int32)
-    grid = Grid(GEOMETRY, types, device, listed, copies)
+    grid = Grid(GEOMETRY, types, device, listed, count)
     boundaries = BoundaryArrays([], DomainWalls(), types, device)
     work = GridStep(grid, boundaries, Transfer(shape=shape), np.zeros(3), DT, types, wp.get_device(device))
     runs = []
-    for _ in range(copies):
+    for _ in range(count):
         x = np.array([0.6, 0.5, 0.5]) + [0.5, 0.5, 1.2] * rng.random((n, 3))
         x = x[cell_order(x, DX, (degree - 1) / 2)]
         x[rng.random(n) < 0.2] = -1.0
@@ -75,7 +75,7 @@ def test_p2g_of_several_simulations(precision, tolerance, shape, degree, each, r
     kinds = {"x": types.vec3, "v": types.vec3, "C": types.mat33, "tau": types.mat33}
     together = {name: np.concatenate([run[name] for run in runs]) for name in runs[0]}
     work.p2g(**{k: wp.array(of, dtype=kinds.get(k, types.real), device=device) for k, of in together.items()})
-    found = grid.values.numpy().reshape(copies, -1, 4)
+    found = grid.values.numpy().reshape(count, -1, 4)
     nodes = np.stack(np.unravel_index(listed, GEOMETRY.nodes), 1)
     for values, run in zip(found, runs, strict=True):
         on_grid = run["x"][:, 0] > 0

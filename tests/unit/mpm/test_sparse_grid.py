@@ -96,7 +96,7 @@ def test_a_step_over_the_neighbours_is_exact(shape, particles):
 
 
 def test_a_grid_of_several_simulations_is_not_updated_as_a_whole():
-    grid = Grid(GEOMETRY, FP64, DEVICE, np.arange(5), copies=2)
+    grid = Grid(GEOMETRY, FP64, DEVICE, np.arange(5), runs=2)
     boundaries = BoundaryArrays([], DomainWalls(), FP64, DEVICE)
     work = GridStep(grid, boundaries, Transfer(), np.zeros((2, 3)), DT, FP64, wp.get_device(DEVICE))
     with pytest.raises(ConfigError, match="use update_g2p"):

@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 
 from nsf.errors import ConfigError, MissingRunError, SchemaError
 from nsf.pipeline import Pipeline
-from nsf.pipeline.chain import CONFIGURATION
+from nsf.pipeline.stages.deployment import CONFIGURATION, write_configuration
 
 
 def test_the_same_chain_comes_out(chain):
@@ -35,7 +35,7 @@ def test_keys_still_follow_the_parameter(pipeline_at, tmp_path):
     pipeline = pipeline_at(tmp_path, "material.E=${material.friction_angle}")
     run = pipeline.deployment
     with run.record() as record:
-        pipeline._write_configuration(record)
+        write_configuration(pipeline, record)
     scenes = [Pipeline.of_run(run, "cpu").scene.with_parameters({"friction_angle": v}) for v in (20.0, 30.0)]
     assert [scene.material.E for scene in scenes] == [20.0, 30.0]
 

@@ -6,10 +6,10 @@ from finished import job, write_report
 
 from nsf.errors import SchemaError
 from nsf.reporting import headline as module
-from nsf.reporting.columns import LATER, RIVALS
 from nsf.reporting.committed import _sources
 from nsf.reporting.headline import Report, headline
 from nsf.reporting.sources import printed_delta
+from nsf.reporting.text.columns import LATER, RIVALS
 
 
 def told(folder) -> tuple[list[list[str]], str]:

@@ -14,7 +14,7 @@ from synthetic import TEST, Made, rewrite_manifest, seal, write_run
 
 from nsf.reporting import build, build_report
 from nsf.reporting.committed import write_list
-from nsf.reporting.index import write_index
+from nsf.reporting.overview.index import write_index
 from nsf.runs import Run
 
 SCRIPT = "</title></style></script><script>alert(1)</script>"

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from nsf.errors import ConfigError
-from nsf.reporting.listing import difference_table, entries, runs_table
+from nsf.reporting.overview.listing import difference_table, entries, runs_table
 from nsf.runs import Run
 
 

@@ -10,11 +10,11 @@ from synthetic import TEST, Made, rewrite_manifest, seal, write_run
 
 from nsf.errors import ConfigError, StorageError
 from nsf.reporting import build, build_report, pictures
-from nsf.reporting.columns import number
 from nsf.reporting.pictures import _Variant
 from nsf.reporting.sources import Source, Study, file_hash, open_sources
 from nsf.reporting.study import spearman, trust_note
 from nsf.reporting.tables import merge
+from nsf.reporting.text.columns import number
 from nsf.runs import Run
 
 ERRORS = ("error-over-time.png", "error-over-time.svg")

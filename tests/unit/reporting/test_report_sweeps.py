@@ -10,12 +10,12 @@ import pytest
 from synthetic import Made, write_run
 
 from nsf.reporting import build_report
-from nsf.reporting.columns import plus_minus
 from nsf.reporting.drawing import charts
-from nsf.reporting.formats import latex, latex_table
 from nsf.reporting.sources import Study, open_sources
 from nsf.reporting.study import _settings, _told, over_seeds, swept
 from nsf.reporting.tables import means, merge, rows_of
+from nsf.reporting.text.columns import plus_minus
+from nsf.reporting.text.formats import latex, latex_table
 
 VALUES = (22.5, 27.5)
 

@@ -11,8 +11,6 @@ from synthetic import TEST, Made, seal, write_run
 
 from nsf.errors import MissingRunError, SchemaError
 from nsf.reporting import COLUMNS, console_table, merge_results
-from nsf.reporting.columns import COLUMN, COSTS, RIVALS, number, parameter_text
-from nsf.reporting.formats import HTML, markdown_table
 from nsf.reporting.rivals import beside_rivals, side_by_side, solvers, where_rivals_win
 from nsf.reporting.sources import open_sources
 from nsf.reporting.tables import (
@@ -23,6 +21,8 @@ from nsf.reporting.tables import (
     variant_labels,
     without_constants,
 )
+from nsf.reporting.text.columns import COLUMN, COSTS, RIVALS, number, parameter_text
+from nsf.reporting.text.formats import HTML, markdown_table
 
 EARLIER, LATER = "2024-05-01T10:00:00+00:00", "2024-06-01T10:00:00+00:00"
 

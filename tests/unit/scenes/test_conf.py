@@ -8,6 +8,7 @@ from nsf import config as configuration
 from nsf.mpm import Transfer
 from nsf.mpm.materials import Material, deformation_path, drive
 from nsf.mpm.stability import check_time_step
+from nsf.paths import CONF
 from nsf.scenes import load
 
 #: What scenes set in a material; any other open value gets 0.05.
@@ -15,14 +16,14 @@ OPEN = {"E": 1000.0, "nu": 0.3, "friction_angle": 30.0}
 
 
 def names(group):
-    found = sorted(f.stem for f in (configuration.CONF / group).glob("*.yaml"))
+    found = sorted(f.stem for f in (CONF / group).glob("*.yaml"))
     assert found
     return found
 
 
 @pytest.mark.parametrize("name", names("material"))
 def test_material(name):
-    node = OmegaConf.load(configuration.CONF / "material" / f"{name}.yaml")
+    node = OmegaConf.load(CONF / "material" / f"{name}.yaml")
     for key in [k for k in node if OmegaConf.is_missing(node, k)]:
         node[key] = OPEN.get(key, 0.05)
     material = configuration.build(node, "material")
@@ -34,9 +35,7 @@ def test_material(name):
 
 @pytest.mark.parametrize("name", names("transfer"))
 def test_transfer(name):
-    transfer = configuration.build(
-        OmegaConf.load(configuration.CONF / "transfer" / f"{name}.yaml"), "transfer"
-    )
+    transfer = configuration.build(OmegaConf.load(CONF / "transfer" / f"{name}.yaml"), "transfer")
     assert isinstance(transfer, Transfer)
     assert transfer.scheme == name
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from nsf.errors import ConfigError
-from nsf.scenes import Ball, Box, Cylinder, Frame, Ribbon, TentacleBall, geometry, load
+from nsf.scenes import Ball, Box, Cylinder, Frame, Ribbon, TentacleBall, load
+from nsf.scenes.shapes import geometry
 
 WAVE = [(0.2 + 0.6 * t, 0.5 + 0.06 * np.sin(9.0 * t), 0.4 + 0.1 * t * t) for t in np.linspace(0.0, 1.0, 40)]
 ZIGZAG = [(0.2, 0.5, 0.5), (0.5, 0.5, 0.5), (0.5, 0.8, 0.5), (0.5, 0.7, 0.9)]

@@ -11,8 +11,9 @@ import pytest
 from meshes import FORMATS, cube, joined, sphere, torus, turned, write
 
 from nsf.errors import ConfigError
-from nsf.scenes import Ball, Box, Mesh, load, mesh, mesh_or_ball
-from nsf.scenes.winding import WindingNumber
+from nsf.scenes import Ball, Box, Mesh, load, mesh_or_ball
+from nsf.scenes.shapes import mesh
+from nsf.scenes.shapes.winding import WindingNumber
 
 
 def solid_angles(triangles, x):
@@ -153,7 +154,7 @@ def test_portions_make_no_difference(monkeypatch):
     surface = WindingNumber(vertices[faces])
     x = np.random.default_rng(0).uniform(-0.4, 0.4, (2000, 3))
     whole = surface.of(x)
-    monkeypatch.setattr("nsf.scenes.winding._PAIRS", 50)
+    monkeypatch.setattr("nsf.scenes.shapes.winding._PAIRS", 50)
     np.testing.assert_array_equal(surface.of(x), whole)
 
 

@@ -1,7 +1,7 @@
 // Σ_p w_p B_p,kᵀ Δt v_p over S of a run, for mode k; beyond the last mode Σ_p w_p |Δt v_p|².
 const double dt = given.dt;
 const int particles = given.weights.shape[0], modes = given.b.shape[1] - 1, vectors = (modes + 3) / 4;
-const auto* v = given.v.data + size_t(copy) * given.rows;
+const auto* v = given.v.data + size_t(run) * given.rows;
 double sum = 0.0;
 #pragma unroll 4
 for (int p = lane; p < particles; p += lanes) {

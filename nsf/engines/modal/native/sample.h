@@ -1,6 +1,6 @@
 // The displacement and its rate at one particle of S, by all lanes of a warp, or by a CPU's thread.
 const int K = given.a.shape[1], Q = (K + 3) / 4;
-const double *const of_a = given.a.data + copy * K, *const of_rate = given.rate.data + copy * K;
+const double *const of_a = given.a.data + run * K, *const of_rate = given.rate.data + run * K;
 wp::vec_t<6, real> sum;
 #if defined(__CUDA_ARCH__)
 const float4* first = (const float4*)modes.data + p;

@@ -29,11 +29,19 @@ if (COLUMN) {
 }
 const real* first = KEPT ? kept : given.first.data;
 const real* last = KEPT ? kept + IN * WIDTH : given.last.data;
-// Four sums, since an addition waits for the one before it.
+// Four sums, since an addition waits for the one before it. A column in registers asks for every turn unrolled;
+// of wide layers that would take minutes to compile.
 auto dot = [](auto weight, const real* values, auto count) {
+    constexpr int inputs = decltype(count)::inputs, turns = inputs / 4;
+    constexpr int unrolled = turns < 1 ? 1 : COLUMN || turns <= 32 ? turns : 8;
     real sum[4] = {};
+    #pragma unroll unrolled
+    for (int i = 0; i < turns; ++i) {
+        #pragma unroll
+        for (int j = 0; j < 4; ++j) sum[j] += weight(4 * i + j) * values[4 * i + j];
+    }
     #pragma unroll
-    for (int i = 0; i < decltype(count)::inputs; ++i) sum[i % 4] += weight(i) * values[i];
+    for (int i = 4 * turns; i < inputs; ++i) sum[i % 4] += weight(i) * values[i];
     return (sum[0] + sum[1]) + (sum[2] + sum[3]);
 };
 auto layer = [&](auto size, const real* W, const real* bias, const real* values, real* result, auto act) {

@@ -1,0 +1,28 @@
+"""Configuration: Hydra groups in `conf/`, composed, checked, and built into objects."""
+
+from nsf.config.composing import checked, launching, load, of_launcher, read, resolve
+from nsf.config.keys import leaves, naming_the_missing, replaced, section
+from nsf.config.sweeps import check_sweep, jobs, scene_of
+from nsf.config.targets import build, build_all
+from nsf.vectors import length, number, text
+
+__all__ = [
+    "build",
+    "build_all",
+    "check_sweep",
+    "checked",
+    "jobs",
+    "launching",
+    "leaves",
+    "length",
+    "load",
+    "naming_the_missing",
+    "number",
+    "of_launcher",
+    "read",
+    "replaced",
+    "resolve",
+    "scene_of",
+    "section",
+    "text",
+]

@@ -1,0 +1,249 @@
+"""Configurations composed from the groups of `conf/`, or read from a file, and checked.
+
+A problem parameter is the value of one configuration key (`scene.parameters.key`), so a
+simulation at a parameter value is the same configuration with that key replaced.
+"""
+
+import difflib
+import re
+import typing
+import warnings
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
+from functools import cache
+from pathlib import Path
+
+from hydra import compose, initialize_config_dir
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException, OverrideParseException
+from hydra.types import RunMode
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import MarkedYAMLError, YAMLError
+
+from nsf.config import targets
+from nsf.config.documents import check_sizes, text_of
+from nsf.config.resolvers import resolved
+from nsf.errors import ConfigError
+from nsf.paths import CONF, groups
+
+# conf/hydra/launcher/joblib.yaml takes the place of the launcher's own configuration on purpose.
+warnings.filterwarnings(
+    "ignore", message=r"\s*'hydra/launcher/joblib' is validated against ConfigStore schema"
+)
+
+#: How jobs of a sweep are launched, unless told otherwise: without files of Hydra's own.
+_SWEEP = (
+    "hydra/launcher=serial",
+    "hydra/job_logging=disabled",
+    "hydra/hydra_logging=disabled",
+    "hydra.output_subdir=null",
+    "hydra.sweep.dir=${oc.env:NSF_RUNS,runs}/multirun",
+    "hydra.sweep.subdir=.",
+)
+
+#: Raised by Hydra and the yaml parser on files that are no configuration, beside their own errors.
+_OF_BROKEN_FILES = (
+    YAMLError,
+    ValueError,
+    RecursionError,
+    AttributeError,
+    TypeError,
+    LookupError,
+    AssertionError,
+)
+
+
+def load(overrides: Sequence[str] = (), config_name: str = "config") -> DictConfig:
+    """Compose the configuration from Hydra overrides and check it.
+
+    Interpolations stay, so that a key that is replaced later (the problem parameter) is seen by
+    every key that refers to it.
+
+    Args:
+        overrides: `key=value` in Hydra's grammar, for example `scene=sand`, `scene.dt=0.001`.
+        config_name: the primary file in `conf/`.
+
+    Raises:
+        ConfigError: unknown key or option (with the nearest known one), a missing value,
+            a syntax error, a `_target_` that its key does not expect, or an interpolation that is refused.
+    """
+    try:
+        return checked(_compose(config_name, overrides))
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(explained(error, config_name, overrides)) from error
+    except MarkedYAMLError as error:
+        mark = error.problem_mark
+        raise ConfigError(f"{mark.name}, line {mark.line + 1}: {error.problem}; correct the yaml") from error
+    except _OF_BROKEN_FILES as error:
+        for path in sorted(CONF.rglob("*.yaml")):
+            text_of(path)  # tells of the one that cannot be read
+        told = explained(error, config_name, overrides)
+        raise ConfigError(f"the configuration cannot be composed: {told}") from error
+
+
+def read(path: Path) -> DictConfig:
+    """The configuration of a file that is whole by itself, as a run's; its interpolations stay.
+
+    Raises:
+        ConfigError: the file cannot be read, or holds no configuration; see also `load`.
+    """
+    try:
+        config = OmegaConf.create(text_of(path))
+    except (OmegaConfBaseException, *_OF_BROKEN_FILES) as error:
+        told = (str(error) or type(error).__name__).splitlines()[0]
+        raise ConfigError(f"{path} is no configuration: {told}; correct the yaml") from error
+    if not isinstance(config, DictConfig):
+        raise ConfigError(f"{path} is no configuration: it has no keys; correct the yaml")
+    try:
+        return checked(config)
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
+def _compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
+    check_sizes(CONF)
+    config = _with_hydra(config_name, overrides)
+    own = _of_hydra(config)
+    if own != _default_hydra():
+        changed = [f"hydra.{key}" for key, value in own.items() if value != _default_hydra().get(key)]
+        raise ConfigError(
+            f"the configuration sets {', '.join(changed)}, by which Hydra could be made to run code; "
+            "leave it out: only the command line says how jobs are launched"
+        )
+    del config["hydra"]
+    return config
+
+
+def initialized(**named: str) -> AbstractContextManager:
+    """Hydra over `conf/` while a block works, anew."""
+    GlobalHydra.instance().clear()
+    return initialize_config_dir(str(CONF), version_base="1.3", **named)
+
+
+def _with_hydra(config_name: str | None, overrides: Sequence[str]) -> DictConfig:
+    with initialized():
+        config = compose(config_name, overrides=list(overrides), return_hydra_config=True)
+    OmegaConf.set_readonly(config, False)
+    OmegaConf.set_struct(config, False)
+    return config
+
+
+def _of_hydra(config: DictConfig) -> dict[str, typing.Any]:
+    """Hydra's own part of a configuration, without what it tells of the overrides."""
+    own = OmegaConf.to_container(config.hydra)
+    own["job"] = {k: v for k, v in own["job"].items() if k not in ("override_dirname", "config_name")}
+    return {k: v for k, v in own.items() if k not in ("overrides", "runtime")}
+
+
+@cache
+def _default_hydra() -> dict[str, typing.Any]:
+    return _of_hydra(_with_hydra(None, ()))
+
+
+def checked(config: DictConfig) -> DictConfig:
+    """The configuration with its interpolations, once it is sure that all of them resolve.
+
+    Raises:
+        ConfigError: see `load`.
+    """
+    resolve(config)
+    return OmegaConf.create(OmegaConf.to_container(config))
+
+
+def resolve(config: DictConfig) -> DictConfig:
+    """Replace every interpolation by its value and check targets and missing values.
+
+    Raises:
+        ConfigError: see `load`.
+    """
+    try:
+        plain = resolved(config)
+        targets.check(plain)
+        return OmegaConf.create(plain)
+    except RecursionError as error:
+        raise ConfigError("the configuration is nested too deeply; flatten it") from error
+
+
+def of_launcher(override: str) -> bool:
+    """Whether an override is about how jobs are launched, as `hydra/launcher=slurm`, and not about a job."""
+    return override.lstrip("+~").startswith(("hydra/", "hydra."))
+
+
+def launching(overrides: Sequence[str], config_name: str = "config") -> tuple[DictConfig, ConfigLoader]:
+    """The configuration from which Hydra launches jobs, and what composes each of them.
+
+    Args:
+        overrides: Hydra's own, as `hydra/launcher=slurm`, `hydra.launcher.partition=gpu`.
+        config_name: as for `load`.
+
+    Raises:
+        ConfigError: an unknown key or launcher, with the nearest known one.
+    """
+    with initialized(job_name="nsf"):
+        hydra = GlobalHydra.instance().hydra
+        try:
+            config = hydra.compose_config(
+                config_name, [*_SWEEP, *overrides], RunMode.MULTIRUN, with_log_configuration=False
+            )
+        except HydraException as error:
+            raise ConfigError(explained(error, config_name, overrides)) from error
+        return config, hydra.config_loader
+
+
+def _keys(node, prefix: str = "") -> list[str]:
+    if not isinstance(node, dict):
+        return [prefix]
+    return [prefix] * bool(prefix) + [
+        k for n, v in node.items() for k in _keys(v, f"{prefix}.{n}" if prefix else n)
+    ]
+
+
+def explained(error: Exception, config_name: str, overrides: Sequence[str]) -> str:
+    """Hydra's message in one line, with the nearest known key."""
+    text = str(error)
+    first = (text.splitlines() or ["a value cannot be read; check quotes, brackets and ${…}"])[0]
+    missing = re.search(r"Could not override '([^']+)'", text)
+    if missing:
+        key = missing.group(1)
+        if key == "experiment":
+            return "an experiment is named with a plus: +experiment=NAME"
+        others = [o for o in overrides if not o.lstrip("+~").startswith(key)]
+        known = _known_keys(config_name, others, of_launcher(key))
+        if key in known:
+            return f"{key!r} takes no keys beyond its own; set them one by one, or write a scene's yaml"
+        near = difflib.get_close_matches(key, known, n=3, cutoff=0.5)
+        hint = f"; did you mean {' or '.join(near)}?" if near else "; see `nsf --help` for the groups"
+        return f"unknown key {key!r}{hint}"
+    if isinstance(error, OverrideParseException):
+        return f"{error.override!r} is not Hydra's key=value ({first}); quote brackets, commas and spaces"
+    if first.startswith("Ambiguous value"):
+        return f"{first}; several values of a key need -m"
+    nameless = [o for o in overrides if o.startswith("=")]
+    if nameless:
+        return f"{nameless[0]!r} has no key; give key=value"
+    if "Config group override must be" in first:
+        pairs = (o.lstrip("+").split("=", 1) for o in overrides if "=" in o)
+        told = [f"{group}={name}" for group, name in pairs if name not in groups().get(group, [name])]
+        if told:
+            return f"{told[0]} names no option of its group; `nsf --help` lists them"
+    if first.startswith("Error merging override") and error.__cause__ is not None:
+        return f"{first.removeprefix('Error merging override ')}: {str(error.__cause__).splitlines()[0]}"
+    option = re.search(r"Could not find '([^']+)'", text)
+    group = max((g for g in groups() if option and option[1].startswith(f"{g}/")), key=len, default=None)
+    if option and group:
+        name, known = option[1].removeprefix(f"{group}/"), groups()[group]
+        near = difflib.get_close_matches(name, known, n=1)
+        return f"unknown {group}={name}; choose one of {', '.join(known)}" + (
+            f" (did you mean {near[0]}?)" if near else ""
+        )
+    return first
+
+
+def _known_keys(config_name: str, overrides: Sequence[str], launcher: bool) -> list[str]:
+    try:
+        config = launching(overrides, config_name)[0] if launcher else _compose(config_name, overrides)
+    except HydraException:
+        return list(groups())
+    return _keys(OmegaConf.to_container(config, resolve=False))

@@ -1,0 +1,257 @@
+"""What the `_target_` of a configuration may name, and the objects that are built from it.
+
+A configuration is data, also where someone else wrote it: it chooses among the classes that a key expects and
+gives them their values. All else is refused before it is imported.
+"""
+
+import dataclasses
+import importlib
+import inspect
+import re
+import typing
+from collections.abc import Mapping, Sequence
+from types import NoneType, UnionType
+from typing import Any, NamedTuple
+
+from omegaconf import DictConfig
+
+from nsf.config.resolvers import resolved
+from nsf.errors import ConfigError, NSFError
+from nsf.vectors import is_finite
+
+
+class Kind(NamedTuple):
+    """What a key expects.
+
+    Attributes:
+        package: in which its classes lie; nothing else is imported.
+        base: what they are derived from, or the protocol whose members they have.
+        functions: of the package that may be named as well.
+    """
+
+    package: str
+    base: str
+    functions: tuple[str, ...] = ()
+
+
+_SHAPE = Kind("nsf.scenes", "nsf.scenes.Shape", ("nsf.scenes.mesh_or_ball",))
+
+#: What each key expects; `*` stands for any name. A new group of conf/ is a line here.
+KINDS = {
+    "engine.teaching": Kind("nsf.engines.operators", "nsf.engines.operators.Teaching"),
+    "field": Kind("nsf.kinematics.fields", "nsf.kinematics.training.train.Field"),
+    "integration": Kind("nsf.dynamics", "nsf.dynamics.Integration"),
+    "material": Kind("nsf.mpm.materials", "nsf.mpm.materials.Material"),
+    "method": Kind("nsf.dynamics", "nsf.dynamics.Method"),
+    "projector": Kind("nsf.dynamics", "nsf.dynamics.projection.Projector"),
+    "sampler": Kind("nsf.sampling", "nsf.sampling.Sampler"),
+    "trainer": Kind("nsf.kinematics.training", "nsf.kinematics.training.schedules.Trainer"),
+    "transfer": Kind("nsf.mpm", "nsf.mpm.Transfer"),
+    "scene.walls": Kind("nsf.mpm", "nsf.mpm.DomainWalls"),
+    "scene.colliders.*": Kind("nsf.mpm", "nsf.mpm.Collider"),
+    "scene.colliders.*.motion": Kind("nsf.mpm", "nsf.mpm.Motion"),
+    "scene.bodies.*": Kind("nsf.scenes", "nsf.scenes.Body"),
+    "scene.bodies.*.shape": _SHAPE,
+    "scene.bodies.*.weakness": Kind("nsf.scenes", "nsf.scenes.Weakness"),
+    "scene.bodies.*.weakness.region": _SHAPE,
+}
+_NAME = re.compile(r"nsf(\.[A-Za-z]\w*)+", re.ASCII)
+#: Types in words: one value, and several.
+_WORDS = {
+    int: ("a whole number", "whole numbers"),
+    float: ("a number", "numbers"),
+    bool: ("true or false", "true or false"),
+    str: ("text", "texts"),
+    dict: ("keys with values", "mappings of keys to values"),
+    NoneType: ("null", "null"),
+}
+
+
+def check(node: Any, path: tuple[str, ...] = ()) -> None:
+    """Refuse a plain tree with a `_target_` that its key does not expect; nothing is imported.
+
+    Args:
+        node: without interpolations.
+        path: of its key.
+
+    Raises:
+        ConfigError: names the key and the target.
+    """
+    if isinstance(node, dict):
+        for key in node:
+            if key == "_target_":
+                _kind(path, node[key])
+            elif re.fullmatch("_.*_", str(key)):
+                raise ConfigError(
+                    f"{'.'.join((*path, str(key)))} is refused; of such keys there is only _target_"
+                )
+    children = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
+    for key, child in children:
+        check(child, (*path, str(key)))
+
+
+def build(node: DictConfig | Mapping, where: str) -> Any:
+    """The object that a node of a configuration stands for.
+
+    Args:
+        node: with a `_target_`, and the values that its class takes; these may be such nodes themselves.
+        where: its key, which says what is expected.
+
+    Raises:
+        ConfigError: the target is missing or refused, a key is misspelt or missing, or the class refuses a
+            value; names the node.
+    """
+    path = tuple(where.split("."))
+    plain = resolved(node) if isinstance(node, DictConfig) else node
+    check(plain, path)
+    if not isinstance(plain, dict) or "_target_" not in plain:
+        kind = next((kind for key, kind in KINDS.items() if _is_at(path, key)), None)
+        raise ConfigError(f"{where} names no class; give it a _target_: {kind.package if kind else 'nsf'}.…")
+    return _built(plain, path)
+
+
+def build_all(nodes: Any, where: str) -> dict[str, Any]:
+    """The objects of a mapping from names to nodes.
+
+    Raises:
+        ConfigError: there is no such mapping; and as for `build`.
+    """
+    if not isinstance(nodes, Mapping):
+        raise ConfigError(
+            f"{where}={'null' if nodes is None else nodes} must map names to nodes; {{}} is none"
+        )
+    if dotted := [name for name in nodes if "." in str(name)]:
+        raise ConfigError(f"{where} has the name {dotted[0]!r}; leave the dot out, which parts keys")
+    return {str(name): build(node, f"{where}.{name}") for name, node in nodes.items()}
+
+
+def filled(made_of: Any, values: Mapping[str, Any], where: str) -> Any:
+    """An object of a class, made of plain values.
+
+    Args:
+        made_of: the class, or a function.
+        values: its arguments by name.
+        where: key that they come from.
+
+    Raises:
+        ConfigError: a key is unknown or missing, or a value refused; names it.
+    """
+    parameters = inspect.signature(made_of).parameters
+    if unknown := [key for key in values if key not in parameters]:
+        raise ConfigError(f"{where}: unexpected key {unknown[0]!r}; known keys: {', '.join(parameters)}")
+    for name, parameter in parameters.items():
+        if name not in values and parameter.default is parameter.empty:
+            raise ConfigError(f"{where}.{name} is missing; give it a value")
+    hints = _hints(made_of)
+    for name, value in values.items():
+        if not _fits(value, hints.get(name)):
+            raise ConfigError(f"{where}.{name}={value} must be {_told(hints[name])}")
+        if not _all_finite(value):
+            raise ConfigError(f"{where}.{name}={value} must be finite")
+    try:
+        return made_of(**values)
+    except NSFError as error:
+        raise type(error)(str(error) if str(error).startswith(where) else f"{where}: {error}") from error
+    except Exception as error:
+        raise ConfigError(f"{where}: {(str(error) or type(error).__name__).splitlines()[0]}") from error
+
+
+def keys_of(target: str, path: tuple[str, ...]) -> list[str]:
+    """Keys that a target takes.
+
+    Raises:
+        ConfigError: as for `build`.
+    """
+    return list(inspect.signature(_named(target, path)).parameters)
+
+
+def _built(node: Any, path: tuple[str, ...]) -> Any:
+    if isinstance(node, list):
+        return [_built(child, (*path, str(at))) for at, child in enumerate(node)]
+    if not isinstance(node, dict):
+        return node
+    values = {key: _built(child, (*path, str(key))) for key, child in node.items() if key != "_target_"}
+    return filled(_named(node["_target_"], path), values, ".".join(path)) if "_target_" in node else values
+
+
+def _is_at(path: tuple[str, ...], key: str) -> bool:
+    parts = key.split(".")
+    return len(parts) == len(path) and all(part in ("*", own) for part, own in zip(parts, path, strict=True))
+
+
+def _kind(path: tuple[str, ...], target: Any) -> Kind:
+    """What a key expects, if it is where a target could lie."""
+    kind = next((kind for key, kind in KINDS.items() if _is_at(path, key)), None)
+    refused = f"{'.'.join(path) or 'the configuration'}: _target_: {target} is refused; "
+    if kind is None:
+        raise ConfigError(refused + "nothing is built from this key")
+    if not (_NAME.fullmatch(str(target)) and str(target).startswith(f"{kind.package}.")):
+        raise ConfigError(refused + _wanted(kind))
+    return kind
+
+
+def _wanted(kind: Kind) -> str:
+    return f"name a {kind.base.rpartition('.')[2]} of {kind.package}"
+
+
+def _named(target: str, path: tuple[str, ...]) -> Any:
+    """The class, or the function, that a target names."""
+    kind, where = _kind(path, target), ".".join(path)
+    module, _, name = target.rpartition(".")
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(f"{where}: _target_: {target} does not exist ({error})") from error
+    if target in kind.functions:
+        return found
+    module, _, name = kind.base.rpartition(".")
+    if not (inspect.isclass(found) and _is_a(found, getattr(importlib.import_module(module), name))):
+        raise ConfigError(f"{where}: _target_: {target} is refused; {_wanted(kind)}")
+    if inspect.isabstract(found):
+        raise ConfigError(f"{where}: _target_: {target} is abstract; name a class derived from it")
+    return found
+
+
+def _is_a(found: type, base: type) -> bool:
+    if not getattr(base, "_is_protocol", False):
+        return issubclass(found, base)
+    own = {field.name for field in dataclasses.fields(found)} if dataclasses.is_dataclass(found) else set()
+    return found.__module__.startswith("nsf.") and members(base) <= own | set(dir(found))
+
+
+def members(protocol: type) -> set[str]:
+    """Names of the attributes and methods that a protocol asks for."""
+    return {name for name in {*vars(protocol), *protocol.__annotations__} if not name.startswith("_")}
+
+
+def _hints(made_of: Any) -> dict[str, Any]:
+    try:
+        return typing.get_type_hints(made_of)
+    except NameError:  # one that is imported for type checkers alone
+        return {}
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Whether a plain value is of an annotated type; of types not known here, the class itself says."""
+    origin, inner = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, UnionType):
+        return any(_fits(value, kind) for kind in inner)
+    if origin is Sequence:
+        return isinstance(value, list) and all(_fits(item, inner[0]) for item in value)
+    return hint not in _WORDS or type(value) is hint or (hint is float and type(value) is int)
+
+
+def _told(hint: Any, several: bool = False) -> str:
+    """A type in words."""
+    origin, inner = typing.get_origin(hint), typing.get_args(hint)
+    if origin in (typing.Union, UnionType):
+        return " or ".join(_told(kind, several) for kind in inner)
+    if origin is Sequence:
+        return ("lists of " if several else "a list of ") + _told(inner[0], several=True)
+    return _WORDS[hint][several] if hint in _WORDS else hint.__name__
+
+
+def _all_finite(value: Any) -> bool:
+    if isinstance(value, list):
+        return all(map(_all_finite, value))
+    return isinstance(value, bool) or not isinstance(value, int | float) or is_finite(value)

@@ -1,0 +1,142 @@
+"""Boundaries of the grid: the walls of the domain, and all solids and walls on the device."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+import warp as wp
+
+from nsf.errors import ConfigError
+from nsf.mpm.boundaries.colliders import Collider, check_kind
+from nsf.mpm.boundaries.contact import KINDS
+from nsf.mpm.boundaries.motion import Motion, make_follow
+from nsf.mpm.precision import Precision
+
+_AT_REST = Motion((0.0, 1.0), ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+
+
+@dataclass(frozen=True)
+class DomainWalls:
+    """The six faces of the domain, `padding` nodes deep.
+
+    Attributes:
+        kind: as for `Collider`, without friction.
+        padding: nodes from the edge on which the condition holds.
+
+    Raises:
+        ConfigError: unknown kind, or a padding that is not a whole number of at least 1.
+    """
+
+    kind: str = "separate"
+    padding: int = 3
+
+    def __post_init__(self):
+        check_kind(self.kind, "walls")
+        if not (isinstance(self.padding, int) and self.padding >= 1):
+            raise ConfigError(f"walls.padding={self.padding} must be a whole number of nodes, at least 1")
+
+
+@cache
+def make_solids(precision: Precision):
+    """Warp struct of colliders and walls for kernels; fields as in `BoundaryArrays`."""
+    real, vec3, mat33 = precision.real, precision.vec3, precision.mat33
+
+    @wp.struct
+    class Solids:
+        shape: wp.array(dtype=wp.int32)
+        active: wp.array(dtype=wp.int32)
+        position: wp.array(dtype=vec3)
+        orientation: wp.array(dtype=mat33)
+        extents: wp.array(dtype=vec3)
+        velocity: wp.array(dtype=vec3)
+        gradient: wp.array(dtype=mat33)
+        kind: wp.array(dtype=wp.int32)
+        friction: wp.array(dtype=real)
+        wall_kind: wp.int32
+        wall_padding: wp.int32
+
+    return Solids
+
+
+class BoundaryArrays:
+    """Colliders and walls on the device.
+
+    `steps`, on the device, counts the time, so that a step captured in a graph moves the colliders, too.
+    Solvers that take turns at one simulation (the phases of a reduced run) share one object.
+
+    Args:
+        colliders: applied in order.
+        walls: condition on the faces of the domain.
+        precision: of the kernel.
+        device: Warp device.
+
+    Attributes:
+        colliders, walls: as given.
+        shape: [c] code of the shape.
+        active: [c] whether the collider acts in this step.
+        position: [c, 3] [m]; orientation: [c, 3, 3]; both at the start t^n of the step.
+        extents: [c, 3] see `Collider.extents`.
+        velocity: [c, 3] mean velocity of the point at `position` over the step [m/s].
+        gradient: [c, 3, 3] gradient of this velocity in space [1/s].
+        kind: [c] code of the contact; friction: [c].
+        steps: [c] steps taken.
+        solids: the struct of these arrays and of the walls that the kernels take.
+    """
+
+    def __init__(self, colliders: Sequence[Collider], walls: DomainWalls, precision: Precision, device):
+        self.colliders, self.walls, self._device = tuple(colliders), walls, device
+        count = len(self.colliders)
+
+        def array(values, dtype, *entry: int):
+            # Without a collider, NumPy cannot tell the shape of an entry.
+            return wp.array(np.array(values, float).reshape(-1, *entry), dtype=dtype, device=device)
+
+        positions, turns = ([getattr(c, k) for c in self.colliders] for k in ("position", "orientation"))
+        self.shape = wp.array([c.shape for c in self.colliders], dtype=wp.int32, device=device)
+        self.active = wp.full(count, 1, dtype=wp.int32, device=device)
+        self.position = array(positions, precision.vec3, 3)
+        self.orientation = array(turns, precision.mat33, 3, 3)
+        self.extents = array([c.extents for c in self.colliders], precision.vec3, 3)
+        self.velocity = wp.zeros(count, dtype=precision.vec3, device=device)
+        self.gradient = wp.zeros(count, dtype=precision.mat33, device=device)
+        self.kind = wp.array([KINDS[c.kind] for c in self.colliders], dtype=wp.int32, device=device)
+        self.friction = array([c.friction for c in self.colliders], precision.real)
+        self.steps = wp.zeros(count, dtype=wp.int32, device=device)
+        self.solids = make_solids(precision)()
+        for name in ("shape", "active", "position", "orientation", "extents", "velocity", "gradient"):
+            setattr(self.solids, name, getattr(self, name))
+        self.solids.kind, self.solids.friction = self.kind, self.friction
+        self.solids.wall_kind, self.solids.wall_padding = KINDS[walls.kind], walls.padding
+        self._changes = any(c.changes for c in self.colliders)
+        if not self._changes:
+            return
+        self._follow = make_follow(precision)
+        motions = [c.motion or _AT_REST for c in self.colliders]
+        times, translations, angles = zip(*(m.keyframes() for m in motions), strict=True)
+        axes, pivots = zip(*(m.hinge() for m in motions), strict=True)
+        first = np.cumsum([0, *(len(t) for t in times)])
+        self._prescribed = [
+            array(np.concatenate(times), wp.float64),
+            array(np.concatenate(translations), wp.vec3d, 3),
+            array(np.concatenate(angles), wp.float64),
+            wp.array(first, dtype=wp.int32, device=device),
+            array(axes, wp.vec3d, 3),
+            array(pivots, wp.vec3d, 3),
+            array(positions, wp.vec3d, 3),
+            array(turns, wp.mat33d, 3, 3),
+            array([c.since for c in self.colliders], wp.float64),
+            array([c.until for c in self.colliders], wp.float64),
+        ]
+
+    def start_from(self, steps: int) -> None:
+        """Let the next step be the one that starts `steps` steps after t = 0."""
+        self.steps.fill_(steps)
+
+    def advance(self, dt: float) -> None:
+        """Set pose and velocity of every collider for the next step of dt [s], if any of them changes."""
+        if not self._changes:
+            return
+        found = [self.active, self.position, self.orientation, self.velocity, self.gradient]
+        inputs = [*self._prescribed, dt, self.steps, *found]
+        wp.launch(self._follow, dim=len(self.colliders), inputs=inputs, device=self._device)

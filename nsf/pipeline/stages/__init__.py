@@ -1,0 +1,1 @@
+"""The work of each stage: trajectories, manifold, operators, reduced runs, errors and costs."""

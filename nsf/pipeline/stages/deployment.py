@@ -1,0 +1,139 @@
+"""The stage `deploy`: reduced runs at the held-out values, and the lines that a user is told of them."""
+
+import time
+from collections.abc import Sequence
+from functools import partial
+
+import numpy as np
+from omegaconf import OmegaConf
+
+from nsf.deployment import (
+    PROJECTED,
+    Levels,
+    Rollout,
+    calibrate,
+    continuation_file,
+    deploy,
+    go_on,
+    rollout_file,
+)
+from nsf.dynamics import ReducedBatch
+from nsf.kinematics.manifold import Manifold
+from nsf.runs import Record, Run
+from nsf.storage import writing
+
+#: File of a deploy run with the configuration of its whole chain, interpolations kept.
+CONFIGURATION = "configuration.yaml"
+
+
+def deploy_held_out(pipeline, run: Run) -> None:
+    """Deploy a pipeline's held-out values; rollouts and the configuration of its chain go into the run.
+
+    Args:
+        pipeline: a `nsf.pipeline.Pipeline`.
+        run: its deploy run.
+    """
+    manifold = pipeline.manifold().to(pipeline.device)  # many solvers take their rows from it
+    with run.record(device=pipeline.device, precision=pipeline.config.precision) as record:
+        rollouts = _rollouts(pipeline, manifold, record)
+        for index, rollout in enumerate(rollouts):
+            rollout.save(record.path / rollout_file(index))
+            record.output(rollout_file(index))
+            named = f"{pipeline.scene.parameters.name}={rollout.parameter:g}"
+            for line in _told(rollout, named):
+                pipeline.say(f"deploy: {line}")
+            if rollout.handed_over >= 0:
+                solver = pipeline.solver_at(manifold, rollout.parameter)
+                if beyond := go_on(solver, rollout, record.path / continuation_file(index), pipeline.stored):
+                    pipeline.say(
+                        f"deploy: warning: {named}: at the hand-over the stress of {beyond} particles "
+                        "was beyond what the law carries, and was scaled down to that"
+                    )
+                record.output(continuation_file(index))
+        write_configuration(pipeline, record)
+        record.metrics["seconds"] = [r.seconds for r in rollouts]
+        record.metrics["by_operators"] = [r.by_operators for r in rollouts]
+        record.metrics["needed_outside"] = max(r.needed_outside for r in rollouts)
+        record.metrics["diverged"] = [r.parameter for r in rollouts if r.diverged >= 0]
+        record.metrics["distrusted"] = [r.parameter for r in rollouts if r.distrusted >= 0]
+    together = record.metrics["batch"]
+    at_once = f", {together} together" if together > 1 else ""
+    pipeline.say(
+        f"deploy: method={pipeline.config.method.name}, |S|={rollouts[0].sample}, "
+        f"{len(rollouts)} values{at_once} → {run.id}"
+    )
+
+
+def write_configuration(pipeline, record: Record) -> None:
+    """Write the configuration of a pipeline's whole chain into the folder of a run."""
+    # config.yaml is resolved, so in it no key follows another value of the problem parameter.
+    with writing(record.path / CONFIGURATION) as partial:
+        OmegaConf.save(pipeline.scene.template, partial)
+    record.output(CONFIGURATION)
+
+
+def _rollouts(pipeline, manifold: Manifold, record: Record) -> list[Rollout]:
+    """The reduced runs; how far they may be believed, and who takes their steps, go on record."""
+    started, asked = time.perf_counter(), pipeline.config.deploy
+    projected = partial(pipeline.solver_at, manifold, engine=pipeline.projecting)
+    trust = calibrate(projected, manifold, pipeline.device)
+    record.metrics["trust"] = {
+        "residual_m": trust.residual,
+        "distance_m": trust.distance,
+        "seconds": time.perf_counter() - started,
+    }
+    # Runs that take their steps together share the time of these equally.
+    together = record.metrics["batch"] = min(asked.batch, len(pipeline.held_out))
+
+    def batch_at(values: Sequence[float], device: str) -> ReducedBatch:
+        batch = pipeline.batch_at(manifold, values, device)
+        record.metrics |= {"engine": batch.engine, "engine_why": batch.why}
+        return batch
+
+    hand_over, levels = asked.on_distrust == "full_order", _levels(pipeline, manifold)
+    rollouts = deploy(batch_at, pipeline.held_out, pipeline.device, trust, hand_over, together, levels)
+    engine, why = record.metrics["engine"], record.metrics["engine_why"]
+    pipeline.say(f"deploy: engine {engine}" + (f", since {why}" if why else ""))
+    return rollouts
+
+
+def _levels(pipeline, manifold: Manifold) -> Levels | None:
+    """How runs by operators are watched, and who goes on with them."""
+    if pipeline.teaching is None:
+        return None
+    asked = pipeline.config.deploy
+    return Levels(
+        partial(pipeline.batch_at, manifold, engine=pipeline.projecting),
+        pipeline.config.engine.check,
+        asked.tolerance,
+        asked.on_distrust != "report",
+    )
+
+
+def _told(rollout: Rollout, named: str) -> list[str]:
+    """Lines for the user: who went on with a run, and why it is not to be believed."""
+    lines, t = [], rollout.t
+    projected = np.flatnonzero(rollout.levels == PROJECTED)
+    if rollout.by is not None and len(projected):
+        lines.append(
+            f"{named}: the projected step takes {len(projected)} of {len(rollout.stops)} steps, "
+            f"the first at t = {t[projected[0]]:.4g} s"
+        )
+    if rollout.diverged >= 0:
+        lines.append(
+            f"warning: {named} diverged at step {rollout.diverged} (off the grid or not finite); "
+            "its errors are reported as ∞"
+        )
+    if (step := rollout.distrusted) >= 0:
+        then = (
+            f"; the full-order solver goes on from t = {t[rollout.handed_over]:.4g} s"
+            if rollout.handed_over >= 0
+            else f": {rollout.trust.max():.3g} times as far as training data are from themselves"
+        )
+        lines.append(f"warning: {named} left what the model was trained on at t = {t[step]:.4g} s{then}")
+    if rollout.needed_outside:
+        lines.append(
+            f"warning: {named}: a step needed {rollout.needed_outside} particles or nodes "
+            "outside the superset or the grid; raise integration.margin or use integration=search"
+        )
+    return lines

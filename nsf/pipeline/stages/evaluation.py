@@ -1,0 +1,135 @@
+"""The stages `evaluate` and `superresolve`: reduced runs held to full-order ones, and their costs."""
+
+import contextlib
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from nsf.data import Trajectory
+from nsf.data.schema import TRAJECTORY
+from nsf.deployment import Rollout, continuation_file, rollout_file
+from nsf.dynamics.setup import reduced_steps
+from nsf.evaluation import (
+    Comparison,
+    Rivals,
+    Subject,
+    coarse_subjects,
+    compare,
+    decoding_ms,
+    measure,
+    rivals,
+    superresolve,
+)
+from nsf.kinematics.manifold import Manifold
+from nsf.pipeline.stages import results
+from nsf.runs import Run
+
+
+def evaluate(pipeline, run: Run) -> None:
+    """Write the errors and costs of a pipeline's reduced runs.
+
+    Args:
+        pipeline: a `nsf.pipeline.Pipeline`.
+        run: its evaluate run.
+    """
+    truths, manifold = _truths(pipeline), pipeline.manifold().to(pipeline.device)  # as in deployment
+    with run.record(device=pipeline.device, precision=pipeline.config.precision) as record:
+        rollouts = _rollouts(pipeline, manifold)
+        found = [
+            _compare(pipeline, manifold, rollout, truth, index)
+            for index, (rollout, truth) in enumerate(zip(rollouts, truths, strict=True))
+        ]
+        comparisons, beside = zip(*found, strict=True)
+        cost = _cost(pipeline, manifold, rollouts[0], beside[0].factors)
+        engine = str(pipeline.deployment.manifest["metrics"].get("engine", ""))
+        seconds = pipeline.training.metric("training_seconds")
+        offline = seconds, 0.0 if pipeline.teaching is None else pipeline.taught.metric("teach_seconds")
+        own = cost, pipeline.device, run.manifest, engine, offline
+        table = results.rows(pipeline.config, manifold, rollouts, comparisons, beside, *own)
+        held = comparisons, beside, rollouts
+        summary = results.summarise(pipeline.deployed, manifold, table, *held, seconds)
+        results.write(record, table, comparisons, cost, summary)
+    pipeline.say(f"evaluate: mean δ {100 * table['delta'].mean():.3g} % over {len(table)} values → {run.id}")
+
+
+def superresolve_held_out(pipeline, run: Run) -> None:
+    """Write a pipeline's reduced runs at many more points, beside full-order ones of as many particles.
+
+    Args:
+        pipeline: a `nsf.pipeline.Pipeline`.
+        run: its superresolve run.
+    """
+    c, asked, steps = pipeline.config, pipeline.config.super_resolution, pipeline.scene.steps
+    truths, manifold = _truths(pipeline), pipeline.manifold()
+    # Evenly spread, without frame 0, at which nothing has moved.
+    frames = np.unique(np.linspace(0, steps, min(asked.frames, steps) + 1).round().astype(int))[1:]
+    with run.record(device=pipeline.device, precision=c.precision) as record:
+        rollouts = _rollouts(pipeline, manifold)
+        with contextlib.ExitStack() as files:
+            fine = superresolve(
+                manifold,
+                pipeline.deployed,
+                [files.enter_context(Trajectory.open(truth)) for truth in truths],
+                rollouts,
+                asked.factor,
+                frames.tolist(),
+                asked.substeps,
+                c.precision,
+                pipeline.device,
+                pipeline.say,
+            )
+        table = results.write_superresolution(record, pipeline.deployed, fine)
+    pipeline.say(
+        f"superresolve: {table['points'][0]:,} points, mean δ {100 * table['delta'].mean():.3g} % "
+        f"({100 * table['particles_delta'].mean():.3g} % at the {len(manifold.X):,} particles), "
+        f"queried in {table['seconds'].sum():.1f} s → {run.id}"
+    )
+
+
+def _truths(pipeline) -> list[Path]:
+    """Files of the full-order trajectories that the deployed ones are held to."""
+    return [pipeline.truth(value).file(TRAJECTORY) for value in pipeline.held_out]
+
+
+def _rollouts(pipeline, manifold: Manifold) -> list[Rollout]:
+    """The reduced runs at the held-out values."""
+    files = (pipeline.deployment.file(rollout_file(index)) for index in range(len(pipeline.held_out)))
+    return [Rollout.open(file, manifold.latent_dim) for file in files]
+
+
+def _compare(
+    pipeline, manifold: Manifold, rollout: Rollout, truth: Path, index: int
+) -> tuple[Comparison, Rivals]:
+    asked = pipeline.config.evaluation
+    with contextlib.ExitStack() as files:
+        trajectory = files.enter_context(Trajectory.open(truth))
+        rest = None
+        if rollout.handed_over >= 0:
+            rest = files.enter_context(Trajectory.open(pipeline.deployment.file(continuation_file(index))))
+        solver = pipeline.solver_at(manifold, rollout.parameter)
+        shown = (asked.picture_particles, asked.picture_frames)
+        found = compare(solver, trajectory, rollout, pipeline.config.deploy.split, shown, rest)
+        return found, rivals(solver, trajectory, pipeline.coarse)
+
+
+def _cost(pipeline, manifold: Manifold, rollout: Rollout, factors: Sequence[int]) -> dict:
+    """Content of `cost.json`, measured at the first held-out value.
+
+    Args:
+        pipeline, manifold: that are timed.
+        rollout: the reduced run at that value, which is decoded.
+        factors: of Δx of the coarse full-order runs that there are.
+    """
+    c, scene, value = pipeline.config, pipeline.deployed, pipeline.held_out[0]
+    if not c.evaluation.trials:
+        return results.costs({})
+    parameters = {pipeline.scene.parameters.name: value}
+    full = Subject(lambda: scene.full_order(parameters, c.precision, pipeline.device), scene.steps)
+    steps = reduced_steps(scene.steps, c.deploy.dt_multiplier)
+    reduced = Subject(lambda: pipeline.solver_at(manifold, value), steps)
+    coarse = coarse_subjects(scene, parameters, factors, c.precision, pipeline.device)
+    subjects = {"full_order": full, "reduced": reduced, **coarse}
+    measured = measure(subjects, c.evaluation.trials, pipeline.device)
+    decoding = decoding_ms(pipeline.solver_at(manifold, value), rollout, c.evaluation.trials)
+    return results.costs(measured, decoding)

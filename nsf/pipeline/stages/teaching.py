@@ -1,0 +1,100 @@
+"""The stage `teach`: operators of the deployed step, taught by another engine."""
+
+import time
+
+import torch
+
+from nsf.data import Trajectory
+from nsf.data.schema import TRAJECTORY
+from nsf.dynamics import ReducedBatch
+from nsf.engines.operators import Course, Taught, Teacher, Yardstick
+from nsf.kinematics.manifold import Manifold
+from nsf.progress import Progress
+from nsf.runs import Record, Run
+
+#: File of a teach run with the operators.
+OPERATORS = "operators.pt"
+
+
+def teach(pipeline, run: Run) -> None:
+    """Teach the operators of a pipeline's configuration; finished rounds in the run's folder are taken up.
+
+    Args:
+        pipeline: a `nsf.pipeline.Pipeline`.
+        run: its teach run.
+    """
+    manifold, c = pipeline.manifold().to(pipeline.device), pipeline.config
+    with run.record(device=pipeline.device, seed=c.seed, precision=c.precision) as record:
+        _follow(pipeline, manifold, record)
+    found = record.metrics
+    pipeline.say(
+        f"teach: {found['teacher_steps']} steps of the teacher in {found['teach_seconds']:.1f} s, "
+        f"{100 * min(found['errors']):.2g} % off at values held back → {run.id}"
+    )
+
+
+def _follow(pipeline, manifold: Manifold, record: Record) -> None:
+    started = time.perf_counter()
+    with Progress("teach", pipeline.teaching.steps, "teacher's steps") as progress:
+        known, between, _ = pipeline.lessons
+        lessons = [Teacher(_batches(pipeline, manifold, v), progress.advance) for v in (known, between) if v]
+        yardstick = _yardstick(pipeline, manifold, progress)
+        seed = int(pipeline.config.seed)
+        truth = _truth(pipeline, manifold)
+        course = Course(lessons, truth, yardstick, pipeline.teaching, seed, record.path, progress.describe)
+        before = time.perf_counter() - started
+        operators = course.follow()
+    taught = Taught.of(lessons[0].setup, *course.gravity)
+    operators.save(record.path / OPERATORS, taught)
+    record.output(OPERATORS)
+    for left in record.path.glob("round_*.pt"):
+        left.unlink()
+    record.metrics |= {
+        "teach_seconds": before + course.seconds,
+        "teacher_steps": course.steps,
+        "errors": course.errors,
+        "round": course.best,
+    }
+
+
+def _truth(pipeline, manifold: Manifold) -> torch.Tensor | None:
+    """[N + 1, K, r] training latents, by ascending value; None where a step is not one of theirs."""
+    if pipeline.config.deploy.dt_multiplier != 1.0:
+        return None
+    values = pipeline.split.train
+    order = sorted(range(len(values)), key=values.__getitem__)
+    latents = manifold.training_latents.detach().to("cpu", torch.float64)
+    return latents.unflatten(0, (len(values), -1)).transpose(0, 1)[:, order]
+
+
+def _yardstick(pipeline, manifold: Manifold, progress: Progress) -> Yardstick:
+    """Validation runs where there are any, else the teacher's own at values that are held back."""
+    frames = pipeline.config.deploy.dt_multiplier == 1.0
+    validation = list(pipeline.split.validation) if frames else []
+    teacher = Teacher(_batches(pipeline, manifold, validation or pipeline.lessons[2]), progress.advance)
+    sample = teacher.setup.samples[0].particles
+    at = manifold.restrict(torch.as_tensor(sample), device=manifold.X.device)
+
+    def positions(run: torch.Tensor) -> torch.Tensor:
+        with torch.no_grad():
+            return at.position(run.to(at.device)).cpu()
+
+    if not validation:
+        return Yardstick(
+            teacher, positions, torch.stack([positions(run) for run in teacher.run().unbind(1)], 1)
+        )
+    truths = []
+    for value in validation:
+        with Trajectory.open(pipeline.simulation(value).require().path / TRAJECTORY) as trajectory:
+            x = trajectory.read("x", particles=sample)
+            truths.append(torch.as_tensor(x, dtype=torch.float64))
+    return Yardstick(teacher, positions, torch.stack(truths, 1))
+
+
+def _batches(pipeline, manifold: Manifold, values: list[float]) -> list[ReducedBatch]:
+    """Runs of the scene of training by the teacher's engine; one by one where it steps them so."""
+    asked = {"engine": pipeline.projecting, "scene": pipeline.scene}
+    first = pipeline.batch_at(manifold, values[:1], **asked)
+    if first.engine == "reference" or pipeline.integration.strategy == "search":
+        return [first, *(pipeline.batch_at(manifold, [value], **asked) for value in values[1:])]
+    return [pipeline.batch_at(manifold, values, **asked)]

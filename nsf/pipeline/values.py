@@ -1,0 +1,128 @@
+"""Values of a configuration that nothing is built from before the stage that needs them, checked first."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from omegaconf import DictConfig, ListConfig, OmegaConf
+
+from nsf import config as configuration
+from nsf.engines import NAMES as ENGINES
+from nsf.engines import Operators
+from nsf.errors import ConfigError
+from nsf.kinematics.fields.basis import BasisField
+from nsf.kinematics.training.tracking import check_tracking
+from nsf.mpm import FP32, FP64, precision_of
+
+#: Precision of stored frames by the name of their type.
+STORED = {"float32": FP32, "float64": FP64}
+#: Engines that operators can be taught by.
+TEACHERS = tuple(name for name in ENGINES if name != Operators.name)
+#: Least deployment step in units of the scene's: a thousand reduced steps for one are no reduction.
+_LEAST_STEP = 1e-3
+
+
+def check_numbers(c: DictConfig) -> None:
+    """Raises ConfigError where a number is none, too small or not whole."""
+    for key, least in (("latent_dim", 1), ("seed", 0)):
+        configuration.number(key, c[key], least=least, whole=True)
+    for key, least in (("trials", 0), ("picture_particles", 1), ("picture_frames", 1)):
+        configuration.number(f"evaluation.{key}", c.evaluation[key], least=least, whole=True)
+    for key, least in (("factor", 2), ("substeps", 1), ("frames", 1)):
+        configuration.number(f"super_resolution.{key}", c.super_resolution[key], least=least, whole=True)
+    configuration.number("deploy.dt_multiplier", c.deploy.dt_multiplier, least=_LEAST_STEP)
+
+
+def check_words(c: DictConfig, engine: str) -> None:
+    """Raises ConfigError where a value is not one of the few that it may be, or the report's name is none.
+
+    Args:
+        c: the configuration.
+        engine: name of the engine that is asked for.
+    """
+    one_of("engine.name", engine, ENGINES)
+    one_of("deploy.split", c.deploy.split, ("test", "validation", "train"))
+    one_of("deploy.on_distrust", c.deploy.on_distrust, ("report", "projected", "full_order"))
+    _check_levels(c, engine)
+    check_tracking(c.tracking)
+    one_of("data.resident", c.data.resident, (True, False, "auto"))
+    one_of("data.keep", c.data.keep, ("all", "held_out"))
+    one_of("data.dtype", c.data.dtype, tuple(STORED))
+    configuration.text("report.folder", c.report.folder)
+    name = c.report.name if isinstance(c.report.name, str | int) else ""
+    if str(name) in ("", "..") or Path(str(name)).name != str(name):
+        raise ConfigError(f"report.name={c.report.name} must be one folder's name; set report.folder")
+    precision_of(c.precision)
+    _check_paper(c.scene.get("paper"))
+
+
+def check_batch(c: DictConfig, engine: str, field, strategy: str) -> None:
+    """Raises ConfigError where a batch is asked for and cannot be deployed, as far as it shows before work.
+
+    Args:
+        c: the configuration.
+        engine: name of the engine that is asked for.
+        field: that is trained.
+        strategy: by which integration particles are found.
+    """
+    size = configuration.number("deploy.batch", c.deploy.batch, least=1, whole=True)
+    if size == 1:
+        return
+    if not isinstance(field, BasisField):
+        raise ConfigError(
+            f"deploy.batch={size} needs field=basis or joint, whose steps are taken in coefficients; "
+            "set deploy.batch=1"
+        )
+    if engine == "reference":
+        raise ConfigError(f"deploy.batch={size} needs engine=modal, or auto; set it, or deploy.batch=1")
+    if strategy != "superset":
+        raise ConfigError(f"deploy.batch={size} needs integration=superset; set it, or deploy.batch=1")
+
+
+def factors(key: str, asked) -> list[int]:
+    """Different whole numbers of at least 2.
+
+    Raises:
+        ConfigError: the key's value is no list of them.
+    """
+    if not isinstance(asked, list | ListConfig):
+        raise ConfigError(f"{key}={asked} must be a list of factors, as [2] or []")
+    found = [int(configuration.number(key, factor, least=2, whole=True)) for factor in asked]
+    if len(set(found)) < len(found):
+        raise ConfigError(f"{key}={asked} names a factor twice; give each once")
+    return found
+
+
+def one_of(key: str, value, options: Sequence) -> None:
+    """Raises ConfigError where the value of a key is no option; names them."""
+    if not any(value == option and type(value) is type(option) for option in options):
+        shown = [str(o).lower() if isinstance(o, bool) else "null" if o is None else o for o in options]
+        raise ConfigError(f"{key}={value} is unknown; choose {', '.join(shown[:-1])} or {shown[-1]}")
+
+
+def _check_levels(c: DictConfig, engine: str) -> None:
+    """Who goes on with a run by operators; no other engine has an estimate, or a level below."""
+    tolerance = OmegaConf.select(c.deploy, "tolerance", default=None)
+    if engine != Operators.name:
+        if c.deploy.on_distrust == "projected" or tolerance is not None:
+            key = "tolerance" if tolerance is not None else "on_distrust"
+            raise ConfigError(f"deploy.{key}={c.deploy[key]} needs engine=operators; set it, or leave it out")
+        return
+    configuration.number("engine.check", c.engine.check, least=1, whole=True)
+    if tolerance is not None and not configuration.number("deploy.tolerance", tolerance) > 0:
+        raise ConfigError(f"deploy.tolerance={tolerance} m must be positive, or null for none")
+
+
+def _check_paper(stated) -> None:
+    """What a scene's paper reports: its place, and figures by method."""
+    if stated is None:
+        return
+    stated = OmegaConf.to_container(stated) if isinstance(stated, DictConfig) else {"": stated}
+    place = stated.pop("place", "")
+    figures = all(isinstance(of, dict) for of in stated.values())
+    if not figures or not isinstance(place, str):
+        raise ConfigError(
+            "scene.paper must have place, a text, and figures by method, as {nsf: {delta: 0.01}}"
+        )
+    for method, of in stated.items():
+        for name, value in of.items():
+            configuration.number(f"scene.paper.{method}.{name}", value)

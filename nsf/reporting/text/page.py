@@ -1,0 +1,74 @@
+"""The report's page, once as HTML that opens from a disk and once as Markdown for GitHub."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from nsf.reporting.text.formats import HTML, Rows, markdown_document
+
+DEFINITIONS = (
+    (
+        "δ",
+        "‖x_rom − x_fom‖ / ‖x_fom‖ over frames and particles: the paper's error; it depends on the origin.",
+    ),
+    (
+        "displacement error",
+        "‖x_rom − x_fom‖ / ‖x_fom − X‖: the same distance beside how far the particles moved.",
+    ),
+    ("stress error", "‖τ_rom − τ_fom‖ / ‖τ_fom‖ of the Kirchhoff stress."),
+    ("r, |S|, |N|, γ", "latent dimension, sample and integration particles, and γ = 3·particles / r."),
+    (
+        "method",
+        "nsf takes stress and affine momentum from their fields, neural_stress_only the stress alone "
+        "(C = 0), neural_affine_only the affine momentum alone (τ from ∂g/∂X), deformation_only neither.",
+    ),
+    ("speedup", "full-order over reduced wall time, of one step and of the whole simulation."),
+)
+
+
+@dataclass(frozen=True)
+class Picture:
+    """One picture: its files (html shows the first, markdown the last), caption, and the runs it shows."""
+
+    files: list[str]
+    caption: str
+    runs: list[str]
+
+
+@dataclass(frozen=True)
+class Section:
+    """Pictures under one heading."""
+
+    heading: str
+    pictures: list[Picture] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table under a heading, and a note on it."""
+
+    heading: str
+    content: Rows
+    note: str
+
+
+@dataclass(frozen=True)
+class Page:
+    """Everything a report says, in the order it is said."""
+
+    title: str
+    lead: str
+    facts: Sequence[tuple[str, str]]
+    warnings: Sequence[str]
+    tables: Sequence[Table]
+    sections: Sequence[Section]
+    provenance: Table
+
+
+def html_page(page: Page) -> str:
+    """The page with its style inside and its pictures beside it."""
+    return HTML.get_template("report.html").render(vars(page), definitions=DEFINITIONS)
+
+
+def markdown_page(page: Page) -> str:
+    """The same page for GitHub."""
+    return markdown_document("report.md", **vars(page), definitions=DEFINITIONS)

@@ -1,0 +1,237 @@
+"""Bodies from a user's triangle mesh."""
+
+import hashlib
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from nsf.errors import ConfigError
+from nsf.scenes.shapes.geometry import AXES, Ball, Box, Shape
+from nsf.scenes.shapes.winding import WindingNumber
+from nsf.vectors import length, vector
+
+EXTENSIONS = (".obj", ".ply", ".stl")
+# A triangle takes some 50 bytes of a file and 500 of memory while a mesh is read.
+_MAX_BYTES = 256 * 2**20
+# Points at which a mesh is tested for overlaps of its own parts.
+_PROBES = 2**15
+# How far off a face's middle its two sides are probed, in units of the mesh's extent.
+_OFF = 1e-9
+
+
+@dataclass(frozen=True)
+class Mesh(Shape):
+    """The solid inside a closed triangle mesh, read from a file.
+
+    Vertices that are equal to the bit are one vertex, as STL repeats them. Faces that all point
+    inwards are turned. A closed surface inside another and turned inwards is a cavity. Only
+    geometry is read: no materials, no textures, no file that the mesh refers to.
+
+    Attributes:
+        path: an .obj, .ply or .stl file; where relative, of the current directory.
+        height: vertical extent to which the mesh is scaled [m]; by default 1 unit of the file is 1 m.
+        base: middle of the bottom of its bounding box [m]; where the file has it, by default.
+        up: axis of the file that points up, `x`, `y` or `z`.
+
+    Raises:
+        ConfigError: the file is missing, too large, of another kind or not whole, trimesh is not
+            installed, or the mesh is not the boundary of a solid: it has open edges, neighbouring
+            faces of opposite orientation, vertices that are not finite, no volume, or parts that
+            overlap. Overlap is found where a face's middle lies beyond another part, or at one of
+            32 768 points of the bounding box, hence above about 1e-4 of its volume; a smaller one
+            is counted twice in `volume`.
+    """
+
+    path: str
+    height: float | None = None
+    base: Sequence[float] | None = None
+    up: str = "z"
+
+    def __post_init__(self):
+        if self.height is not None:
+            length("mesh height", self.height)
+        if self.base is not None:
+            vector("mesh base", self.base, "m")
+        if self.up not in AXES:
+            raise ConfigError(f"mesh up={self.up!r} is unknown; choose x, y or z")
+        _ = self._placed
+
+    @cached_property
+    def files(self) -> dict[str, str]:
+        """Path and sha256 of the file, so that a run knows what it was made from."""
+        return {str(self.path): hashlib.sha256(_read(str(self.path))).hexdigest()}
+
+    @cached_property
+    def _placed(self) -> tuple[float, np.ndarray, WindingNumber]:
+        """Scale and shift from the file, and the surface in the file's units, turned upright."""
+        surface = _surface(str(self.path), self.files[str(self.path)], self.up)
+        lower, upper = surface.corners
+        scale = 1.0 if self.height is None else self.height / (upper[2] - lower[2])
+        foot = np.array([*(0.5 * (lower + upper))[:2], lower[2]])
+        shift = np.zeros(3) if self.base is None else np.asarray(self.base, float) - scale * foot
+        return scale, shift, surface
+
+    @property
+    def volume(self) -> float:
+        """Volume [m³]."""
+        scale, _, surface = self._placed
+        return scale**3 * signed_volume(surface.triangles)
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Corners [m]."""
+        scale, shift, surface = self._placed
+        lower, upper = surface.corners
+        return scale * lower + shift, scale * upper + shift
+
+    def contains(self, x: np.ndarray) -> np.ndarray:
+        """Whether each point lies inside; exact but within rounding of the surface."""
+        scale, shift, surface = self._placed
+        return surface.of((x - shift) / scale) > 0
+
+
+def mesh_or_ball(
+    mesh: str | None, height: float | None = None, base: Sequence[float] | None = None, up: str = "z"
+) -> Shape:
+    """The mesh of a file, or without one a ball that stands as high in the same place.
+
+    Args:
+        mesh: path of an .obj, .ply or .stl file, or None.
+        height, base, up: as for `Mesh`; the ball needs the first two.
+
+    Raises:
+        ConfigError: see `Mesh`.
+    """
+    if mesh is not None:
+        return Mesh(mesh, height, base, up)
+    radius = 0.5 * length("height", height)
+    x, y, z = vector("base", base, "m")
+    return Ball((x, y, z + radius), radius)
+
+
+def signed_volume(triangles: np.ndarray) -> float:
+    """Volume inside triangles [F, 3, 3], by the divergence theorem; negative where they point inwards."""
+    a, b, c = np.moveaxis(triangles - 0.5 * (triangles.min((0, 1)) + triangles.max((0, 1))), 1, 0)
+    return float((a * np.cross(b, c)).sum() / 6.0)
+
+
+def _read(path: str) -> bytes:
+    """The file's bytes, if it can be a mesh."""
+    file = Path(path)
+    if file.suffix.lower() not in EXTENSIONS:
+        raise ConfigError(
+            f"mesh={path}: extension {file.suffix!r} is not supported; export it as {', '.join(EXTENSIONS)}"
+        )
+    if not file.is_file():
+        raise ConfigError(f"mesh={path} is no file; relative paths start from {Path.cwd()}")
+    try:
+        size = file.stat().st_size
+        if size > _MAX_BYTES:
+            raise ConfigError(
+                f"mesh={path} has {size / 2**20:.0f} MiB, more than {_MAX_BYTES // 2**20} MiB; decimate it"
+            )
+        return file.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"mesh={path} cannot be read: {error.strerror}; check its permissions") from error
+
+
+@lru_cache(maxsize=4)
+def _surface(path: str, digest: str, up: str) -> WindingNumber:
+    """The checked surface of a file; kept, since a scene is built anew at each parameter value."""
+    vertices, faces = _parse(path)
+    if not len(faces):
+        raise ConfigError(f"mesh={path} has no faces; export triangles, not points or lines")
+    if faces.min() < 0 or faces.max() >= len(vertices):
+        raise ConfigError(
+            f"mesh={path}: a face names vertex {faces.max()} of {len(vertices)}; export it again"
+        )
+    used = vertices[faces]
+    if not np.isfinite(used).all():
+        count = len(np.unique(faces[~np.isfinite(used).all(2)]))
+        raise ConfigError(f"mesh={path}: {count} vertices are not finite; repair the mesh")
+    # A cyclic exchange of axes, so that a right-handed file stays right-handed. 0.0 turns −0.0 into 0.0.
+    used = np.roll(used, 2 - AXES[up], axis=2) + 0.0
+    vertices, faces = np.unique(used.reshape(-1, 3), axis=0, return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(1)]
+    if not len(faces):
+        raise ConfigError(f"mesh={path} has no face with an area; export a solid")
+    _check_closed(path, faces)
+    return _oriented(path, vertices[faces])
+
+
+def _parse(path: str) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [V, 3] and faces [F, 3] as the file has them."""
+    try:
+        import trimesh
+    except ImportError as error:
+        raise ConfigError(
+            f"mesh={path} needs trimesh, which is not installed; pip install trimesh"
+        ) from error
+    content = io.BytesIO(_read(path))
+    try:
+        # From memory and without materials, so that nothing a mesh names is opened; unprocessed,
+        # so that a fault of the file is reported and not mended in passing.
+        mesh = trimesh.load_mesh(
+            content, file_type=Path(path).suffix[1:].lower(), process=False, skip_materials=True
+        )
+        return np.asarray(mesh.vertices, float), np.asarray(mesh.faces, np.int64).reshape(-1, 3)
+    except Exception as error:  # whatever a parser makes of a broken file
+        raise ConfigError(
+            f"mesh={path} cannot be read as {Path(path).suffix}: {error}; export it again"
+        ) from error
+
+
+def _check_closed(path: str, faces: np.ndarray) -> None:
+    """Each edge must be passed as often one way as the other."""
+    edges = np.stack([faces, np.roll(faces, -1, axis=1)], 2).reshape(-1, 2)
+    rising = np.where(edges[:, 0] < edges[:, 1], 1, -1)
+    _, which, count = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
+    balance = np.bincount(which.ravel(), weights=rising, minlength=len(count))
+    boundary = int((count % 2).astype(bool).sum())
+    if boundary:
+        raise ConfigError(
+            f"mesh={path} is open: {boundary} of its {len(count)} edges are on a boundary; "
+            "close its holes and merge double vertices"
+        )
+    clashing = int(np.count_nonzero(balance))
+    if clashing:
+        raise ConfigError(
+            f"mesh={path}: faces on both sides of {clashing} of its {len(count)} edges have opposite "
+            "orientations; make its normals consistent"
+        )
+
+
+def _oriented(path: str, triangles: np.ndarray) -> WindingNumber:
+    """The surface with its faces pointing outwards, if it bounds a solid."""
+    volume = signed_volume(triangles)
+    lower, upper = triangles.min((0, 1)), triangles.max((0, 1))
+    # Rounding of a flat mesh's volume stays below this.
+    if not abs(volume) > 1e-12 * np.prod(np.maximum(upper - lower, 1e-6 * (upper - lower).max())):
+        raise ConfigError(f"mesh={path} encloses no volume; give a solid")
+    surface = WindingNumber(triangles if volume > 0.0 else triangles[:, ::-1])
+    a, b, c = np.moveaxis(surface.triangles, 1, 0)
+    normal, middle = np.cross(b - a, c - a), (a + b + c) / 3.0
+    area = np.linalg.norm(normal, axis=1)
+    # A sliver's middle is within rounding of its neighbours.
+    broad = area > 1e-9 * np.abs(surface.upper - surface.lower).max(1) ** 2
+    off = _OFF * (upper - lower).max() * normal[broad] / area[broad, None]
+    wrong = (surface.of(middle[broad] - off) != 1) | (surface.of(middle[broad] + off) != 0)
+    if wrong.any():
+        raise ConfigError(
+            f"mesh={path} overlaps itself: {wrong.sum()} of its {len(triangles)} faces lie inside another "
+            "part or are doubled; unite its parts into one surface"
+        )
+    # Stretched to the box, as a needle's would hardly be hit otherwise.
+    number = surface.of(lower + (upper - lower) * Box((0, 0, 0), (1, 1, 1)).sample(_PROBES))
+    if ((number < 0) | (number > 1)).any():
+        share = ((number < 0) | (number > 1)).mean()
+        raise ConfigError(
+            f"mesh={path} overlaps itself in {100 * share:.2g} % of its bounding box; "
+            "unite its parts into one surface"
+        )
+    return surface
