@@ -3,14 +3,17 @@
 from nsf.evaluation.compare import Comparison, at_frames, compare
 from nsf.evaluation.cost import SolverCost, Subject, decoding_ms, measure
 from nsf.evaluation.metrics import deformation_error, displacement_error, reduction_ratio, stress_error
+from nsf.evaluation.rivals import Rivals, coarse_subjects, rivals
 from nsf.evaluation.superresolution import SuperResolution, query, superresolve
 
 __all__ = [
     "Comparison",
+    "Rivals",
     "SolverCost",
     "Subject",
     "SuperResolution",
     "at_frames",
+    "coarse_subjects",
     "compare",
     "decoding_ms",
     "deformation_error",
@@ -18,6 +21,7 @@ __all__ = [
     "measure",
     "query",
     "reduction_ratio",
+    "rivals",
     "stress_error",
     "superresolve",
 ]

@@ -43,7 +43,7 @@ class SolverCost:
             captured step, where steps are captured, else synchronised, so that their sum may exceed a step.
         memory_mib: peak of every allocator during the first run, beyond what was held before it [MiB].
         allocators: the same by allocator [MiB].
-        trials: number of runs.
+        trials: number of runs; steps: of each.
     """
 
     step_ms: float
@@ -54,6 +54,7 @@ class SolverCost:
     memory_mib: float
     allocators: dict[str, float]
     trials: int
+    steps: int
 
     def as_dict(self) -> dict:
         """Plain containers."""
@@ -90,6 +91,7 @@ def measure(subjects: dict[str, Subject], trials: int, device: str) -> dict[str,
             memory_mib=memory[name][0],
             allocators=memory[name][1],
             trials=trials,
+            steps=subjects[name].steps,
         )
     return found
 

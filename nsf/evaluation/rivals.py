@@ -4,19 +4,23 @@ On a family with few parameters and a fixed forcing, interpolating the training 
 truth as a reduced run, and costs nothing. Whoever reads an error should see these beside it.
 """
 
-import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.interpolate import RBFInterpolator
 
-from nsf.errors import NSFError
+from nsf.data import Trajectory
+from nsf.dynamics import ReducedMPM
+from nsf.errors import InstabilityError, NSFError
+from nsf.evaluation import metrics
+from nsf.evaluation.cost import Subject
 from nsf.kinematics.interpolation import interpolation
 from nsf.kinematics.manifold import Manifold
 from nsf.mpm.stability import largest_stable_dt
 from nsf.scenes import Scene
-from nsf.timing import synchronizer
+
+_CHUNK = 2**24  # positions decoded at once
 
 
 @dataclass(frozen=True)
@@ -60,6 +64,8 @@ class TrainingRuns:
         The radial basis function |p − q| makes it piecewise linear in one parameter, constant beyond the
         training values.
         """
+        from scipy.interpolate import RBFInterpolator  # SciPy takes 0.2 s to load
+
         values = self.latents.reshape(len(self.latents), -1)
         fit = RBFInterpolator(self.parameters, values, kernel="linear", degree=0)
         return fit(self.standardised(parameters)[None]).reshape(self.latents.shape[1:])
@@ -72,24 +78,37 @@ class CoarseRun:
     Attributes:
         x: [F, P, 3] positions [m] of the fine particles at the fine frames; displacements are interpolated
             at rest.
-        step_ms, total_ms: mean time of a step, and time of all [ms]; kernels were compiled before.
         steps: taken; dx: its grid spacing [m]; particles: its own.
     """
 
     x: np.ndarray
-    step_ms: float
-    total_ms: float
     steps: int
     dx: float
     particles: int
 
 
-def coarse_run(
-    scene: Scene, parameters: dict[str, float], X: np.ndarray, factor: int, precision: str, device: str
-) -> CoarseRun | str:
-    """Run a scene on a coarser grid, and carry its displacements to the scene's own particles.
+def coarse_scene(scene: Scene, parameters: Mapping[str, float], factor: int) -> Scene:
+    """A scene at parameter values on a coarser grid.
 
     Δt is the largest whole multiple of the scene's that is stable and divides its steps.
+
+    Raises:
+        ConfigError: a solid, a collider or the walls do not fit the coarse grid.
+        InstabilityError: the scene's Δt is unstable on it.
+    """
+    fine = scene.with_parameters(parameters)
+    coarse = fine.coarsened(factor)
+    stable = largest_stable_dt(coarse.particles(), coarse.initial_velocity(), coarse.dx)
+    multiples = [m for m in range(1, factor + 1) if scene.steps % m == 0 and m * scene.dt <= stable]
+    if not multiples:
+        raise InstabilityError(f"dt={scene.dt:g} s is unstable at dx={coarse.dx:g} m")
+    return fine.coarsened(factor, multiples[-1])
+
+
+def coarse_run(
+    scene: Scene, parameters: Mapping[str, float], X: np.ndarray, factor: int, precision: str, device: str
+) -> CoarseRun | str:
+    """Run a scene on a coarser grid, and carry its displacements to the scene's own particles.
 
     Args:
         scene: the fine one.
@@ -103,37 +122,104 @@ def coarse_run(
         The run; or the reason why there is none, such as a solid that the coarse grid does not resolve.
     """
     try:
-        coarse = scene.with_parameters(parameters).coarsened(factor)
-        stable = largest_stable_dt(coarse.particles(), coarse.initial_velocity(), coarse.dx)
-        multiples = [m for m in range(1, factor + 1) if scene.steps % m == 0 and m * scene.dt <= stable]
-        if not multiples:
-            return f"dt={scene.dt:g} s is unstable at dx={coarse.dx:g} m"
-        multiple = multiples[-1]
-        coarse = scene.with_parameters(parameters).coarsened(factor, multiple)
-        coarse.full_order(precision=precision, device=device).step(1)  # compiles and loads
+        coarse = coarse_scene(scene, parameters, factor)
         solver = coarse.full_order(precision=precision, device=device)
-        frames, wait = [solver.state.numpy()["x"]], synchronizer(device)
-        wait()
-        seconds = 0.0
+        frames = [solver.state.numpy()["x"]]
         for _ in range(coarse.steps):
-            begun = time.perf_counter()
             solver.step(1)
-            wait()
-            seconds += time.perf_counter() - begun
             frames.append(solver.state.numpy()["x"])
     except NSFError as error:
         return str(error)
     own = torch.as_tensor(coarse.particles().X)
     carried = interpolation(torch.as_tensor(X), own)
     moved = torch.stack([carried.value(torch.as_tensor(x) - own) for x in frames]).numpy()
-    at = np.arange(scene.steps + 1) / multiple
+    at = np.arange(scene.steps + 1) * (coarse.steps / scene.steps)
     below = np.minimum(at.astype(int), coarse.steps - 1)
     share = (at - below)[:, None, None]
     return CoarseRun(
         x=X + (1.0 - share) * moved[below] + share * moved[below + 1],
-        step_ms=1e3 * seconds / coarse.steps,
-        total_ms=1e3 * seconds,
         steps=coarse.steps,
         dx=coarse.dx,
         particles=len(own),
     )
+
+
+@dataclass(frozen=True)
+class Rivals:
+    """How far the rivals of a reduced run are from its truth, as `displacement_error` over frames 1..N.
+
+    Attributes:
+        static: nothing moves, which is 1 by definition; nearest: the training run of the nearest parameters;
+            interpolated: the latent vectors of training runs, interpolated over the parameters.
+        coarse: of the full-order solver by factor of Δx: `displacement_error`, `dx` [m], `particles` and
+            `steps`; or `why` there is none.
+    """
+
+    static: float
+    nearest: float
+    interpolated: float
+    coarse: dict[int, dict]
+
+    @property
+    def factors(self) -> list[int]:
+        """Those at which there is a coarse run."""
+        return [factor for factor, told in self.coarse.items() if "why" not in told]
+
+
+def rivals(solver: ReducedMPM, trajectory: Trajectory, factors: Sequence[int] = ()) -> Rivals:
+    """Hold the rivals of a reduced run to its full-order trajectory, at all particles and frames.
+
+    Args:
+        solver: the reduced solver of the run, with the training runs' latent vectors in its manifold.
+        trajectory: the full-order run; its frames are those of the training runs.
+        factors: of Δx of coarse full-order runs.
+    """
+    scene, setup = solver.scene, solver.setup
+    decoder, runs = solver.decoder(), TrainingRuns.of(solver.manifold)
+    parameters = setup.parameters.cpu().double().numpy()
+
+    def tensor(values) -> torch.Tensor:
+        return torch.as_tensor(np.asarray(values)).to(setup.torch_device).to(setup.dtype)
+
+    latents = {"nearest": tensor(runs.nearest(parameters))}
+    latents["interpolated"] = tensor(runs.interpolated(parameters))
+    coarse = {
+        factor: coarse_run(scene, setup.given, trajectory.X, factor, setup.precision.name, setup.device)
+        for factor in factors
+    }
+    ran = {factor: run for factor, run in coarse.items() if not isinstance(run, str)}
+    X, squares = tensor(trajectory.X), {}
+    rows = max(1, _CHUNK // (3 * trajectory.particles))
+    for start in range(1, trajectory.frames, rows):
+        block = slice(start, min(start + rows, trajectory.frames))
+        x = tensor(trajectory.read("x", frames=block))
+        found = {"norm": x - X, "static": X - x}
+        found |= {name: decoder.position(xhat[block]) - x for name, xhat in latents.items()}
+        found |= {factor: tensor(run.x[block]) - x for factor, run in ran.items()}
+        for name, apart in found.items():
+            squares.setdefault(name, []).append(metrics.frame_squares(apart))
+    norm = torch.cat(squares.pop("norm"))
+    errors = {name: metrics.relative(torch.cat(of), norm) for name, of in squares.items()}
+    told = {
+        factor: {"why": run}
+        if isinstance(run, str)
+        else {
+            "displacement_error": errors.pop(factor),
+            "dx": run.dx,
+            "particles": run.particles,
+            "steps": run.steps,
+        }
+        for factor, run in coarse.items()
+    }
+    return Rivals(**errors, coarse=told)
+
+
+def coarse_subjects(
+    scene: Scene, parameters: Mapping[str, float], factors: Sequence[int], precision: str, device: str
+) -> dict[str, Subject]:
+    """Coarse full-order runs to be timed beside others, by `coarse_factor`; each factor must have a run."""
+
+    def subject(coarse: Scene) -> Subject:
+        return Subject(lambda: coarse.full_order(precision=precision, device=device), coarse.steps)
+
+    return {f"coarse_{factor}": subject(coarse_scene(scene, parameters, factor)) for factor in factors}

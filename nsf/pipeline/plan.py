@@ -20,7 +20,15 @@ from nsf.mpm import Precision
 from nsf.mpm.device import visible_gpus, warp_device
 from nsf.mpm.recording import frame_bytes
 from nsf.mpm.stability import check_colliders, check_time_step
-from nsf.pipeline.values import STORED, TEACHERS, check_batch, check_numbers, check_words, one_of
+from nsf.pipeline.values import (
+    STORED,
+    TEACHERS,
+    check_batch,
+    check_numbers,
+    check_words,
+    factors,
+    one_of,
+)
 from nsf.runs import Run
 from nsf.sampling.sampler import check_well_posed
 from nsf.scenes import Scene
@@ -51,6 +59,7 @@ class Plan:
     Attributes:
         scene: that is trained on; deployed: that of the held-out simulations and of deployment.
         engine: name of the engine that is asked for.
+        coarse: factors of Δx of the full-order runs that a reduced one is held to.
         split: parameter values by their use.
         device: found once, so that a missing GPU is reported before any work.
 
@@ -83,6 +92,7 @@ class Plan:
             self.teaching = configuration.build(c.engine.teaching, "engine.teaching")
             one_of("engine.teacher", c.engine.teacher, TEACHERS)
         check_numbers(c)
+        self.coarse = factors("evaluation.coarse", OmegaConf.select(c, "evaluation.coarse", default=[]))
         check_words(c, self.engine)
         if self.trainer.devices > 1 and not self.field.shardable:
             raise ConfigError(

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from nsf import config as configuration
 from nsf.engines import NAMES as ENGINES
@@ -76,6 +76,20 @@ def check_batch(c: DictConfig, engine: str, field, strategy: str) -> None:
         raise ConfigError(f"deploy.batch={size} needs engine=modal, or auto; set it, or deploy.batch=1")
     if strategy != "superset":
         raise ConfigError(f"deploy.batch={size} needs integration=superset; set it, or deploy.batch=1")
+
+
+def factors(key: str, asked) -> list[int]:
+    """Different whole numbers of at least 2.
+
+    Raises:
+        ConfigError: the key's value is no list of them.
+    """
+    if not isinstance(asked, list | ListConfig):
+        raise ConfigError(f"{key}={asked} must be a list of factors, as [2] or []")
+    found = [int(configuration.number(key, factor, least=2, whole=True)) for factor in asked]
+    if len(set(found)) < len(found):
+        raise ConfigError(f"{key}={asked} names a factor twice; give each once")
+    return found
 
 
 def one_of(key: str, value, options: Sequence) -> None:

@@ -8,6 +8,7 @@ import json
 import re
 import sys
 from functools import cache
+from math import nan
 from pathlib import Path
 
 import pandas as pd
@@ -16,10 +17,12 @@ from omegaconf import DictConfig
 from nsf.errors import ConfigError, SchemaError
 from nsf.reporting.build import commit_text
 from nsf.reporting.headline import Report, headline
+from nsf.reporting.rivals import where_rivals_win
 from nsf.reporting.sources import file_hash
 from nsf.reporting.study import fine_means
 from nsf.reporting.swap import MARK
 from nsf.reporting.tables import VARIANT, rows_of, without_constants
+from nsf.reporting.text.columns import RIVALS
 from nsf.reporting.text.formats import markdown, markdown_document, markdown_table, unescaped
 from nsf.reporting.text.page import DEFINITIONS
 from nsf.runs.provenance import not_ignored
@@ -193,16 +196,18 @@ def figures(report: Path) -> str:
     for column, value in {"split": "test", **_SHOWN}.items():
         frame = frame[frame[column] == value]
     alike = [name for name in VARIANT if name in frame]
+    frame = frame.assign(**{name: nan for name in RIVALS if name not in frame})
     frame = frame.fillna(dict.fromkeys(alike, ""))
     variants = frame.groupby(alike, sort=False, as_index=False)
     # A value that diverged leaves the mean infinite, one that was not measured leaves it empty.
-    means = variants[[*_ERRORS, *_COSTS]].agg(lambda values: values.mean(skipna=False))
+    means = variants[[*_ERRORS, *_COSTS, *RIVALS]].agg(lambda values: values.mean(skipna=False))
     means[_PAPER] = [_printed(row["scene"], row["method"]) for row in means.to_dict("records")]
-    described = [name for name in means if name not in (*_ERRORS, *_COSTS, _PAPER)]
+    described = [name for name in means if name not in (*_ERRORS, *_COSTS, *RIVALS, _PAPER)]
     table, same = without_constants(means[[*described, _PAPER, *_ERRORS, *_COSTS]], keep=("scene",))
     return (
         f"Means over held-out parameter values ({markdown(same)}).\n\n"
         + markdown_table(rows_of(table, {_PAPER: "paper's δ [%]"}))
+        + (f"\n\n{markdown(told)}" if (told := where_rivals_win(means)) else "")
         + f"\n\nFrom [`{folder}/results.csv`]({folder}/results.csv); the whole report is "
         f"[`index.md`]({folder}/index.md)."
     )

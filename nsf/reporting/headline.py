@@ -9,9 +9,26 @@ import numpy as np
 import pandas as pd
 
 from nsf.errors import SchemaError
+<<<<<<< HEAD
 from nsf.reporting.sources import printed_delta
 from nsf.reporting.study import AXES, SEEDS
 from nsf.reporting.text.columns import ABSENT, COLUMN, LATER, TEXT, axis, number, parameter_text, plus_minus
+=======
+from nsf.reporting.rivals import where_rivals_win
+from nsf.reporting.sources import printed_delta
+from nsf.reporting.study import AXES, SEEDS
+from nsf.reporting.text.columns import (
+    ABSENT,
+    COLUMN,
+    LATER,
+    RIVALS,
+    TEXT,
+    axis,
+    number,
+    parameter_text,
+    plus_minus,
+)
+>>>>>>> wt-rivals
 from nsf.reporting.text.formats import Rows
 
 FEW = 15  # rows of a table in which a number is varied; of more, settings and scenes go down and across
@@ -105,7 +122,7 @@ class Report:
         for values, part in self.rows.fillna(dict.fromkeys(alike, ABSENT)).groupby(alike, sort=False):
             row = dict(zip(alike, values, strict=True))
             row |= {name: part[name].iloc[0] if part[name].nunique() == 1 else ABSENT for name in others}
-            row |= {name: part[name].mean(skipna=False) for name in (*_MEASURED, _PAPER)}
+            row |= {name: part[name].mean(skipna=False) for name in (*_MEASURED, *RIVALS, _PAPER)}
             row |= {f"{name}{_DEVIATION}": value for name, value in self._deviations(part).items()}
             row |= {_RUNS: len(part), _DIVERGED: int(np.isinf(part["delta"]).sum())}
             rows.append(row | {_SEEDS: len(part[self.seeds].drop_duplicates()) if self.seeds else 1})
@@ -146,13 +163,15 @@ def headline(report: Report) -> tuple[Rows, str]:
     varied = [key for key in report.settings if key in _NUMBERS]
     if not report.settings and report.seeds:
         said = "Shown: of each seed the mean over held-out values; ± their standard deviation over seeds."
-        return _over_seeds(report), f"{said}{_diverged(report)}"  # the paper's figure stands in each row
+        return _over_seeds(
+            report
+        ), f"{said}{_rivals(report)}{_diverged(report)}"  # the paper's figure stands in each row
     if len(report.groups) <= (FEW if varied else MANY):
         table, said = _flat(report), f"Shown: {_averaged(report)}."
     else:
         table = _pivot(report, varied)
         said = f"Shown: δ [%], in brackets the stress error [%]; {_averaged(report)}.{_best(report)}"
-    return table, f"{said}{_beside_paper(report)}{_diverged(report)}"
+    return table, f"{said}{_beside_paper(report)}{_rivals(report)}{_diverged(report)}"
 
 
 def _flat(report: Report) -> Rows:
@@ -259,6 +278,11 @@ def _beside_paper(report: Report) -> str:
         below = int((part["delta"] < part[_PAPER]).sum())
         told.append(f"{below} of {len(part)} ({method}, {field})")
     return f" δ is below the paper's in {', '.join(told)}, of the cases in which the paper prints one."
+
+
+def _rivals(report: Report) -> str:
+    told = where_rivals_win(report.groups)
+    return f" {told}" if told else ""
 
 
 def _diverged(report: Report) -> str:

@@ -12,10 +12,12 @@ import pandas as pd
 from joblib.externals.loky import ProcessPoolExecutor
 
 from nsf.reporting.drawing import charts, shapes
+from nsf.reporting.drawing.cost import error_over_cost
 from nsf.reporting.drawing.style import DIFFERENCE_COLORS, STRESS_COLORS, save
+from nsf.reporting.rivals import solvers
 from nsf.reporting.sources import Motion, Study, same_parameter
 from nsf.reporting.tables import Merged, mean_rows, printed_of, variant_labels, variants
-from nsf.reporting.text.columns import MEASURED, parameter_text
+from nsf.reporting.text.columns import COLUMN, MEASURED, RIVALS, parameter_text
 from nsf.reporting.text.formats import file_name
 from nsf.reporting.text.page import Picture, Section
 
@@ -256,7 +258,32 @@ def _comparison(known: list[_Variant], folder: Path, study: Study | None) -> lis
     )  # fmt: skip
     if all(pd.isna(entry["step_ms_full"]) for entry in entries):
         drawings = drawings[:1]  # evaluation.trials=0
-    return [Picture(save(drawn(entries), folder, stem), caption, runs) for stem, drawn, caption in drawings]
+    pictures = [
+        Picture(save(drawn(entries), folder, stem), caption, runs) for stem, drawn, caption in drawings
+    ]
+    return [*pictures, *_over_cost(known[0].merged, folder, runs)]
+
+
+def _over_cost(merged: Merged, folder: Path, runs: list[str]) -> list[Picture]:
+    """Error over cost, a panel a scene; none where nothing was timed."""
+    frame = solvers(merged)
+    if frame["span_ms"].isna().all():
+        return []
+    placed = [name for name in ("precision", "device") if frame[name].nunique() > 1]
+    names = frame[["scene", *placed]].agg(" · ".join, axis=1)
+    panels = {name: part.to_dict("records") for name, part in frame.groupby(names, sort=False)}
+    least = merged.frame.groupby("scene")[list(RIVALS)].min()  # of nearest and interpolated, the best field's
+    costless = {name: COLUMN[name].title for name in RIVALS[:3]}
+    free = {
+        name: {title: least.loc[of[0]["scene"], column] for column, title in costless.items()}
+        for name, of in panels.items()
+    }
+    caption = (
+        "Displacement error over time, for each solver of a scene: the full-order one (vertical line), on "
+        "coarser grids (squares), and reduced ones (dots). Time is that for one Δt of the full-order solver: "
+        "a solver of longer steps takes fewer. Horizontal lines are of what takes no step."
+    )
+    return [Picture(save(error_over_cost(panels, free), folder, "error-over-cost"), caption, runs)]
 
 
 def _heading(v: _Variant) -> str:

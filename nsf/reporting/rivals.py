@@ -1,48 +1,117 @@
-"""Every solver of a scene beside the others: the full-order one and each engine, by error and by time."""
+"""Every solver of a scene beside the others by error and by time, and the rivals that cost nothing."""
+
+import math
+from collections.abc import Iterable
 
 import pandas as pd
 
+<<<<<<< HEAD
 from nsf.reporting.tables import Merged, mean_rows, rows_of, variant_labels, variants
 from nsf.reporting.text.columns import SOLVER, device_type
+=======
+from nsf.reporting.tables import (
+    VARIANT,
+    Merged,
+    mean_rows,
+    rows_of,
+    variant_labels,
+    variants,
+    without_constants,
+)
+from nsf.reporting.text.columns import COLUMN, RIVALS, SOLVER, device_type
+>>>>>>> wt-rivals
 from nsf.reporting.text.page import Table
 
 _FULL = "full order"
+_PLACE = ("scene", "precision", "device")
 _TIMES = ("step_ms", "total_ms", "shown_ms", "memory_mib")
+_ERRORS = ("delta", "displacement_error", "stress_error")
 _NOTE = (
     "Errors are means over held-out values, and the full-order run is what they are measured from. A run is "
     "all steps from t = 0. A reduced run ends with latent vectors: the last time is that of the run and of "
-    "decoding the positions of all particles at every frame, which stay on the device."
+    "decoding the positions of all particles at every frame, which stay on the device. A coarse solver may "
+    "take longer steps, so its run has fewer of them."
+)
+_BESIDE = (
+    "Displacement errors, means over held-out values. Nothing moves is 100 % by definition; the nearest "
+    "training run is that of the nearest parameters; the latent vectors of training runs are interpolated "
+    "over the parameters; the coarse full order is the full-order solver on a coarser grid, with as many "
+    "particles a cell. The first three take no step."
 )
 
 
 def solvers(merged: Merged) -> pd.DataFrame:
-    """A row a scene and solver, with errors (fractions), times [ms] and memory [MiB]; NaN where not measured.
+    """A row a scene and solver: errors (fractions), times [ms] and memory [MiB]; NaN where not measured.
 
-    A variant stands once, with the means of its held-out values; the full-order solver once for each
-    precision and type of device.
+    A variant stands once, with the means of its held-out values; the full-order solver, and each coarse one,
+    once for each precision and type of device. `span_ms` is the time for one Δt of the full-order solver:
+    a solver of longer steps takes fewer. `kind` is `full`, `coarse` or `reduced`.
     """
-    places: dict[tuple, list[dict]] = {}
+    places: dict[tuple, list[list[int]]] = {}
     for members in variants(merged):
-        row = mean_rows(merged, members)[0]  # held-out values come first
-        places.setdefault((row["scene"], row["precision"], device_type(row["device"])), []).append(row)
-    return pd.DataFrame([row for same in places.values() for row in _of_place(same)])
+        row = merged.frame.iloc[members[0]]
+        place = (row["scene"], row["precision"], device_type(row["device"]))
+        places.setdefault(place, []).append(members)
+    return pd.DataFrame([row for same in places.values() for row in _of_place(merged, same)])
 
 
-def _of_place(same: list[dict]) -> list[dict]:
-    """The full-order solver, then the variants of one scene, precision and type of device."""
-    head = {name: same[0][name] for name in ("scene", "precision", "device")}
-    cost = pd.DataFrame(same)[["step_ms_full", "total_ms_full", "memory_full_mib"]].astype(float).median()
-    full = head | {SOLVER: _FULL, "delta": 0.0, "displacement_error": 0.0, "stress_error": 0.0}
-    full |= {"step_ms": cost["step_ms_full"], "total_ms": cost["total_ms_full"]}
-    full |= {"shown_ms": cost["total_ms_full"], "memory_mib": cost["memory_full_mib"]}
-    rows = [full] if cost.notna().any() else []
-    for row, label in zip(same, variant_labels(same), strict=True):
-        errors = {name: row[name] for name in ("delta", "displacement_error", "stress_error")}
-        times = {"step_ms": row["step_ms_reduced"], "total_ms": row["total_ms_reduced"]}
-        times |= {"shown_ms": row["total_ms_reduced"] + row["decode_ms"]}
-        times |= {"memory_mib": row["memory_reduced_mib"]}
-        rows.append(head | {SOLVER: label} | errors | times)
+def _of_place(merged: Merged, same: list[list[int]]) -> list[dict]:
+    """The full-order solver, coarse ones, then the variants of one scene, precision and type of device."""
+    means = [mean_rows(merged, members)[0] for members in same]  # held-out values come first
+    head = {name: means[0][name] for name in _PLACE}
+    cost = pd.DataFrame(means)[["step_ms_full", "total_ms_full", "memory_full_mib"]].astype(float).median()
+    full = dict.fromkeys(_ERRORS, 0.0) | {SOLVER: _FULL, "kind": "full"}
+    full |= {"step_ms": cost["step_ms_full"], "span_ms": cost["step_ms_full"]}
+    full |= {"total_ms": cost["total_ms_full"], "shown_ms": cost["total_ms_full"]}
+    full |= {"memory_mib": cost["memory_full_mib"]}
+    rows = [head | full] if cost.notna().any() else []
+    rows += [head | row for row in _coarse(merged, same)]
+    for row, members, label in zip(means, same, variant_labels(means), strict=True):
+        own = {name: row[name] for name in _ERRORS} | {SOLVER: label, "kind": "reduced"}
+        own |= {"step_ms": row["step_ms_reduced"], "total_ms": row["total_ms_reduced"]}
+        own |= {"shown_ms": row["total_ms_reduced"] + row["decode_ms"]}
+        own |= {"memory_mib": row["memory_reduced_mib"]}
+        own |= {"span_ms": row["step_ms_reduced"] * _share(merged.source[members[0]].cost, "reduced")}
+        rows.append(head | own)
     return rows
+
+
+def _coarse(merged: Merged, same: list[list[int]]) -> list[dict]:
+    """Coarse full-order solvers of a scene, a row a factor: medians over what its variants' runs measured."""
+    errors: dict[str, list[list[float]]] = {}
+    times: dict[str, list[dict]] = {}
+    for members in same:
+        own: dict[str, list[float]] = {}
+        split = mean_rows(merged, members)[0]["split"]
+        for i in members:
+            row = merged.frame.iloc[i]
+            told = (merged.source[i].rivals(row["parameter"]) or {}) if row["split"] == split else {}
+            for factor, found in told.get("coarse", {}).items():
+                own.setdefault(factor, []).append(found.get("displacement_error", math.nan))
+        for factor, values in own.items():
+            errors.setdefault(factor, []).append(values)
+        cost = merged.source[members[0]].cost
+        for factor, found in cost.get("coarse", {}).items():
+            span = found["step_ms"] * _share(cost, "coarse", factor)
+            kept = {name: found[name] for name in ("step_ms", "total_ms", "memory_mib")}
+            times.setdefault(factor, []).append(kept | {"shown_ms": found["total_ms"], "span_ms": span})
+    rows = []
+    for factor in sorted(errors, key=int):
+        error = pd.Series([pd.Series(of).mean(skipna=False) for of in errors[factor]]).median()
+        if not math.isnan(error):
+            known = pd.DataFrame(times[factor]).median().to_dict() if factor in times else {}
+            name = f"{_FULL}, Δx × {factor}"
+            rows.append({SOLVER: name, "kind": "coarse", "displacement_error": error} | known)
+    return rows
+
+
+def _share(cost: dict, *solver: str) -> float:
+    """Steps of a solver over those of the full-order one; 1 where older costs do not say."""
+    own = cost
+    for name in solver:
+        own = own.get(name, {})
+    steps = cost.get("full_order", {}).get("steps")
+    return own["steps"] / steps if steps and "steps" in own else 1.0
 
 
 def side_by_side(merged: Merged) -> list[Table]:
@@ -50,6 +119,60 @@ def side_by_side(merged: Merged) -> list[Table]:
     frame = solvers(merged)
     if frame[list(_TIMES)].isna().all(axis=None):
         return []
-    alike = [name for name in ("scene", "precision", "device") if frame[name].nunique() == 1]
-    empty = [name for name in _TIMES if frame[name].isna().all()]
-    return [Table("Solvers side by side", rows_of(frame.drop(columns=[*alike, *empty])), _NOTE)]
+    alike = [name for name in _PLACE if frame[name].nunique() == 1]
+    shown = [name for name in _TIMES if frame[name].notna().any()]
+    columns = [*(name for name in _PLACE if name not in alike), SOLVER, *_ERRORS, *shown]
+    return [Table("Solvers side by side", rows_of(frame[columns]), _NOTE)]
+
+
+def beside_rivals(merged: Merged) -> list[Table]:
+    """Displacement errors of each variant and of its rivals; none of runs that were held to no rival."""
+    frame = pd.DataFrame([mean_rows(merged, members)[0] for members in variants(merged)])
+    frame = frame[[*VARIANT, "displacement_error", *RIVALS]].dropna(subset=list(RIVALS), how="all")
+    if not len(frame):
+        return []
+    shown, same = without_constants(frame.dropna(axis="columns", how="all"))
+    parts = [_BESIDE, where_rivals_win(frame), *_refused(merged)]
+    parts += [f"The same in every row: {same}."] if same else []
+    return [Table("Beside rivals", rows_of(shown), " ".join(parts))]
+
+
+def _refused(merged: Merged) -> list[str]:
+    """Why scenes have no coarse run, a sentence each."""
+    told: dict[str, None] = {}
+    for row, source in zip(merged.frame.to_dict("records"), merged.source, strict=True):
+        for factor, found in (source.rivals(row["parameter"]) or {}).get("coarse", {}).items():
+            if "why" in found:
+                told[f"{row['scene']} has no run at Δx × {factor}: {found['why']}."] = None
+    return list(told)
+
+
+def where_rivals_win(rows: pd.DataFrame) -> str:
+    """A sentence: on which scenes a rival is nearer to the truth than the best of the rows, and by how much.
+
+    Args:
+        rows: with `scene`, `displacement_error` and the columns of rivals (fractions).
+
+    Returns:
+        Nothing where no row was held to a rival.
+    """
+    known = rows.dropna(subset=list(RIVALS), how="all")
+    told = []
+    for scene, part in known.groupby("scene", sort=False):
+        own = part["displacement_error"].min()
+        best = {name: part[name].min() for name in RIVALS}
+        nearer = [f"{COLUMN[name].title} ({_percent(v)})" for name, v in best.items() if v < own]
+        told += [f"on {scene} {_listed(nearer)}, the reduced run {_percent(own)}"] if nearer else []
+    if told:
+        return f"A rival has a smaller displacement error than the best reduced run {'; '.join(told)}."
+    return "No rival has a smaller displacement error than the best reduced run." if len(known) else ""
+
+
+def _percent(value: float) -> str:
+    text = COLUMN["displacement_error"].text(value)
+    return f"{text} %" if math.isfinite(value) else text
+
+
+def _listed(texts: Iterable[str]) -> str:
+    *others, last = texts
+    return f"{', '.join(others)} and {last}" if others else last

@@ -5,7 +5,8 @@ Besides the keys every evaluate run has, `summary.json` may hold these, all opti
 `floor` (height [m], null where the scene has none) and `paper`: the `place` where the paper speaks of the
 scene, and by method the figures it prints, called as in results.csv, and `training_seconds`. `trust` is
 a list, one entry a parameter value: {"parameter", "trust", "distrusted", "distrusted_at", "handed_over_at"}
-(docs/design.md).
+(docs/design.md). `rivals` is likewise a list, with the displacement errors of each rival; `coarse` holds, by
+factor of Δx, that of a coarse full-order run, or `why` there is none.
 """
 
 import hashlib
@@ -95,6 +96,11 @@ class Source:
     def trust(self, parameter) -> dict | None:
         """What the run says of the trust of one parameter value, None for a run that does not know."""
         told = self.summary.get("trust", ())
+        return next((entry for entry in told if same_parameter(entry["parameter"], parameter)), None)
+
+    def rivals(self, parameter) -> dict | None:
+        """What the run says of the rivals at one parameter value, None for a run that knows none."""
+        told = self.summary.get("rivals", ())
         return next((entry for entry in told if same_parameter(entry["parameter"], parameter)), None)
 
     def motions(self, parameters) -> list[Motion]:

@@ -16,6 +16,7 @@ from nsf.reporting.text.columns import (
     COSTS,
     MEASURED,
     PLACE,
+    RIVALS,
     SETTING,
     TEXT,
     TRAINING,
@@ -219,7 +220,7 @@ def without_constants(
             said[name].add("")  # what was not measured of one row is not said of it by the others
     constant = [name for name in describing if name not in keep and len(said[name]) == 1]
     empty = [name for name in (*_BLANK, PLACE) if name in frame and set(frame[name]) <= {"", ABSENT}]
-    costs = (*COSTS, TRAINING)  # none with evaluation.trials=0
+    costs = (*RIVALS, *COSTS, TRAINING)  # none with evaluation.trials=0
     empty += [name for name in costs if name in frame and frame[name].isna().all()]
     first = {name: next(v for v in frame[name] if str(v) in said[name]) for name in constant}
     told = (f"{COLUMN[n].title} {_cell(n, first[n])} {COLUMN[n].unit}".strip() for n in constant)
@@ -227,8 +228,8 @@ def without_constants(
 
 
 def console_table(frame: pd.DataFrame) -> rich.table.Table:
-    """The results for a terminal; columns that never change are told in the caption, commits in the csv."""
-    shown, said = without_constants(frame.drop(columns="commit", errors="ignore"), also=COSTS)
+    """The results for a terminal; what never changes is in the caption, commits and rivals are in the csv."""
+    shown, said = without_constants(frame.drop(columns=["commit", *RIVALS], errors="ignore"), also=COSTS)
     return terminal_table(rows_of(shown), said)
 
 

@@ -27,10 +27,11 @@ from nsf.runs import Run
 #: Issue 2, "Done when".
 COLUMNS = [
     "scene", "method", "field", "r", "engine", "sample", "integration_mean", "parameter", "split",
-    "delta", "displacement_error", "stress_error", "gamma", "step_ms_full", "step_ms_reduced",
-    "total_ms_full", "total_ms_reduced", "decode_ms", "speedup_step", "speedup_total",
-    "memory_full_mib", "memory_reduced_mib", "teach_seconds", "break_even_runs", "handed_over", "precision",
-    "device", "commit",
+    "delta", "displacement_error", "stress_error", "displacement_static", "displacement_nearest",
+    "displacement_interpolated", "displacement_coarse", "gamma", "step_ms_full", "step_ms_reduced",
+    "step_ms_coarse", "total_ms_full", "total_ms_reduced", "total_ms_coarse", "decode_ms", "speedup_step",
+    "speedup_total", "memory_full_mib", "memory_reduced_mib", "teach_seconds", "break_even_runs",
+    "handed_over", "precision", "device", "commit",
 ]  # fmt: skip
 STAGES = ("simulate", "train", "deploy", "evaluate")
 
@@ -102,6 +103,15 @@ def test_results_have_the_columns_of_a_report(chain):
     assert row["delta"] < row["displacement_error"]
     assert row["speedup_total"] == pytest.approx(row["total_ms_full"] / row["total_ms_reduced"])
     assert row["decode_ms"] > 0
+    assert row["displacement_static"] == 1.0
+    assert 0 < row["displacement_interpolated"] < row["displacement_nearest"] < 1.0
+    assert 0.01 < row["displacement_coarse"] < 0.6
+    cost = json.loads((chain.pipeline.evaluation.path / "cost.json").read_text())
+    assert row["step_ms_coarse"] == cost["coarse"]["2"]["step_ms"] > 0
+    assert cost["full_order"]["steps"] % cost["coarse"]["2"]["steps"] == 0
+    (told,) = json.loads((chain.pipeline.evaluation.path / "summary.json").read_text())["rivals"]
+    assert told["parameter"] == 26.0
+    assert told["coarse"]["2"]["displacement_error"] == pytest.approx(row["displacement_coarse"])
     assert row["speedup_step"] == pytest.approx(row["step_ms_full"] / row["step_ms_reduced"])
     assert 20 < row["integration_mean"] <= 500
 

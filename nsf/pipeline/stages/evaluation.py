@@ -1,6 +1,7 @@
 """The stages `evaluate` and `superresolve`: reduced runs held to full-order ones, and their costs."""
 
 import contextlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,21 @@ from nsf.data import Trajectory
 from nsf.data.schema import TRAJECTORY
 from nsf.deployment import Rollout, continuation_file, rollout_file
 from nsf.dynamics.setup import reduced_steps
+<<<<<<< HEAD
 from nsf.evaluation import Comparison, Subject, compare, decoding_ms, measure, superresolve
+=======
+from nsf.evaluation import (
+    Comparison,
+    Rivals,
+    Subject,
+    coarse_subjects,
+    compare,
+    decoding_ms,
+    measure,
+    rivals,
+    superresolve,
+)
+>>>>>>> wt-rivals
 from nsf.kinematics.manifold import Manifold
 from nsf.pipeline.stages import results
 from nsf.runs import Run
@@ -25,17 +40,23 @@ def evaluate(pipeline, run: Run) -> None:
     truths, manifold = _truths(pipeline), pipeline.manifold().to(pipeline.device)  # as in deployment
     with run.record(device=pipeline.device, precision=pipeline.config.precision) as record:
         rollouts = _rollouts(pipeline, manifold)
-        comparisons = [
+        found = [
             _compare(pipeline, manifold, rollout, truth, index)
             for index, (rollout, truth) in enumerate(zip(rollouts, truths, strict=True))
         ]
+<<<<<<< HEAD
         cost = _cost(pipeline, manifold, rollouts[0])
+=======
+        comparisons, beside = zip(*found, strict=True)
+        cost = _cost(pipeline, manifold, rollouts[0], beside[0].factors)
+>>>>>>> wt-rivals
         engine = str(pipeline.deployment.manifest["metrics"].get("engine", ""))
         seconds = pipeline.training.metric("training_seconds")
         offline = seconds, 0.0 if pipeline.teaching is None else pipeline.taught.metric("teach_seconds")
         own = cost, pipeline.device, run.manifest, engine, offline
-        table = results.rows(pipeline.config, manifold, rollouts, comparisons, *own)
-        summary = results.summarise(pipeline.deployed, manifold, table, comparisons, rollouts, seconds)
+        table = results.rows(pipeline.config, manifold, rollouts, comparisons, beside, *own)
+        held = comparisons, beside, rollouts
+        summary = results.summarise(pipeline.deployed, manifold, table, *held, seconds)
         results.write(record, table, comparisons, cost, summary)
     pipeline.say(f"evaluate: mean δ {100 * table['delta'].mean():.3g} % over {len(table)} values → {run.id}")
 
@@ -85,7 +106,9 @@ def _rollouts(pipeline, manifold: Manifold) -> list[Rollout]:
     return [Rollout.open(file, manifold.latent_dim) for file in files]
 
 
-def _compare(pipeline, manifold: Manifold, rollout: Rollout, truth: Path, index: int) -> Comparison:
+def _compare(
+    pipeline, manifold: Manifold, rollout: Rollout, truth: Path, index: int
+) -> tuple[Comparison, Rivals]:
     asked = pipeline.config.evaluation
     with contextlib.ExitStack() as files:
         trajectory = files.enter_context(Trajectory.open(truth))
@@ -94,11 +117,23 @@ def _compare(pipeline, manifold: Manifold, rollout: Rollout, truth: Path, index:
             rest = files.enter_context(Trajectory.open(pipeline.deployment.file(continuation_file(index))))
         solver = pipeline.solver_at(manifold, rollout.parameter)
         shown = (asked.picture_particles, asked.picture_frames)
-        return compare(solver, trajectory, rollout, pipeline.config.deploy.split, shown, rest)
+        found = compare(solver, trajectory, rollout, pipeline.config.deploy.split, shown, rest)
+        return found, rivals(solver, trajectory, pipeline.coarse)
 
 
+<<<<<<< HEAD
 def _cost(pipeline, manifold: Manifold, rollout: Rollout) -> dict:
     """Content of `cost.json`, measured at the first held-out value."""
+=======
+def _cost(pipeline, manifold: Manifold, rollout: Rollout, factors: Sequence[int]) -> dict:
+    """Content of `cost.json`, measured at the first held-out value.
+
+    Args:
+        pipeline, manifold: that are timed.
+        rollout: the reduced run at that value, which is decoded.
+        factors: of Δx of the coarse full-order runs that there are.
+    """
+>>>>>>> wt-rivals
     c, scene, value = pipeline.config, pipeline.deployed, pipeline.held_out[0]
     if not c.evaluation.trials:
         return results.costs({})
@@ -106,7 +141,15 @@ def _cost(pipeline, manifold: Manifold, rollout: Rollout) -> dict:
     full = Subject(lambda: scene.full_order(parameters, c.precision, pipeline.device), scene.steps)
     steps = reduced_steps(scene.steps, c.deploy.dt_multiplier)
     reduced = Subject(lambda: pipeline.solver_at(manifold, value), steps)
+<<<<<<< HEAD
     subjects = {"full_order": full, "reduced": reduced}
     cost = measure(subjects, c.evaluation.trials, pipeline.device)
     decoding = decoding_ms(pipeline.solver_at(manifold, value), rollout, c.evaluation.trials)
     return results.costs(cost, decoding)
+=======
+    coarse = coarse_subjects(scene, parameters, factors, c.precision, pipeline.device)
+    subjects = {"full_order": full, "reduced": reduced, **coarse}
+    measured = measure(subjects, c.evaluation.trials, pipeline.device)
+    decoding = decoding_ms(pipeline.solver_at(manifold, value), rollout, c.evaluation.trials)
+    return results.costs(measured, decoding)
+>>>>>>> wt-rivals

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 
 import numpy as np
 import pandas as pd
@@ -10,11 +11,13 @@ from omegaconf import DictConfig, OmegaConf
 
 from nsf.deployment import Rollout
 from nsf.dynamics.setup import reduced_steps
-from nsf.evaluation import Comparison, SolverCost, SuperResolution, reduction_ratio
+from nsf.evaluation import Comparison, Rivals, SolverCost, SuperResolution, reduction_ratio
 from nsf.mpm import floor_height
 from nsf.runs import Record
 from nsf.scenes import Scene
 from nsf.storage import write_json, writing
+
+_COARSE = "coarse_"
 
 
 def costs(measured: Mapping[str, SolverCost], decode_ms: float = math.nan) -> dict:
@@ -28,6 +31,11 @@ def costs(measured: Mapping[str, SolverCost], decode_ms: float = math.nan) -> di
     return {
         "full_order": full.as_dict(),
         "reduced": reduced.as_dict(),
+        "coarse": {
+            name.removeprefix(_COARSE): found.as_dict()
+            for name, found in measured.items()
+            if name.startswith(_COARSE)
+        },
         "breakdown": {"reduced": reduced.stages, "full_order": full.stages},
         "trials": full.trials,
         "memory_full_mib": full.memory_mib,
@@ -43,6 +51,7 @@ def rows(
     manifold,
     rollouts: Sequence[Rollout],
     comparisons: Sequence[Comparison],
+    rivals: Sequence[Rivals],
     cost: dict,
     device: str,
     manifest: dict,
@@ -64,7 +73,7 @@ def rows(
     }
     measured = {
         "gamma": reduction_ratio(len(manifold.X), manifold.latent_dim),
-        **_costs_in_a_row(cost),
+        **_costs_in_a_row(cost, next(iter(rivals[0].coarse), None)),
         "teach_seconds": offline[1],
         "break_even_runs": _break_even(cost, sum(offline)),
         "handed_over": 0.0,
@@ -79,7 +88,7 @@ def rows(
     )  # fmt: skip
     lost = measured | dict.fromkeys(costly, math.nan)
     found = []
-    for rollout, comparison in zip(rollouts, comparisons, strict=True):
+    for rollout, comparison, beside in zip(rollouts, comparisons, rivals, strict=True):
         own = {
             "sample": rollout.sample,
             "integration_mean": rollout.integration_mean,
@@ -88,6 +97,7 @@ def rows(
             "delta": comparison.delta,
             "displacement_error": comparison.displacement_error,
             "stress_error": comparison.stress_error,
+            **_beside(beside),
         }
         reduced = rollout.diverged < 0 and rollout.handed_over < 0
         share = {"handed_over": _handed_over(rollout, config)}
@@ -95,18 +105,32 @@ def rows(
     return pd.DataFrame(found)
 
 
-def _costs_in_a_row(cost: dict) -> dict[str, float]:
-    """Columns of `results.csv`; NaN where nothing was measured."""
+def _beside(rivals: Rivals) -> dict[str, float]:
+    """Columns of `results.csv`; the coarse run is that of the first factor, NaN where there is none."""
+    first = next(iter(rivals.coarse.values()), {})
+    return {
+        "displacement_static": rivals.static,
+        "displacement_nearest": rivals.nearest,
+        "displacement_interpolated": rivals.interpolated,
+        "displacement_coarse": first.get("displacement_error", math.nan),
+    }
+
+
+def _costs_in_a_row(cost: dict, factor: int | None) -> dict[str, float]:
+    """Columns of `results.csv`, of the coarse run at a factor of Δx; NaN where nothing was measured."""
 
     def pair(key: str) -> tuple[float, float]:
         return tuple(cost.get(solver, {}).get(key, math.nan) for solver in ("full_order", "reduced"))
 
+    coarse = cost.get("coarse", {}).get(str(factor), {})
     step, total, memory = pair("step_ms"), pair("total_ms"), pair("memory_mib")
     return {
         "step_ms_full": step[0],
         "step_ms_reduced": step[1],
+        "step_ms_coarse": coarse.get("step_ms", math.nan),
         "total_ms_full": total[0],
         "total_ms_reduced": total[1],
+        "total_ms_coarse": coarse.get("total_ms", math.nan),
         "decode_ms": cost.get("decode_ms", math.nan),
         "speedup_step": step[0] / step[1],
         "speedup_total": total[0] / total[1],
@@ -152,6 +176,7 @@ def summarise(
     manifold,
     results: pd.DataFrame,
     comparisons: Sequence[Comparison],
+    rivals: Sequence[Rivals],
     rollouts: Sequence[Rollout],
     seconds: float,
 ) -> dict:
@@ -174,6 +199,10 @@ def summarise(
         "reconstruction_delta": mean("reconstruction_delta"),
         "reconstruction_stress_error": mean("reconstruction_stress_error"),
         "trust": [trust_of(rollout) for rollout in rollouts],
+        "rivals": [
+            {"parameter": rollout.parameter} | asdict(beside)
+            for rollout, beside in zip(rollouts, rivals, strict=True)
+        ],
         "variant": {name: results[name].tolist()[0] for name in ("method", "field", "r", "sample")},
     }
     if config.scene.get("paper"):

@@ -43,11 +43,17 @@ _SPEC = (
     Column("delta", "δ", "%", 100.0),
     Column("displacement_error", "displacement error", "%", 100.0),
     Column("stress_error", "stress error", "%", 100.0),
+    Column("displacement_static", "nothing moves", "%", 100.0),
+    Column("displacement_nearest", "nearest training run", "%", 100.0),
+    Column("displacement_interpolated", "interpolated latents", "%", 100.0),
+    Column("displacement_coarse", "coarse full order", "%", 100.0),
     Column("gamma", "γ"),
     Column("step_ms_full", "full-order step", "ms"),
     Column("step_ms_reduced", "reduced step", "ms"),
+    Column("step_ms_coarse", "coarse full-order step", "ms"),
     Column("total_ms_full", "full-order run", "ms"),
     Column("total_ms_reduced", "reduced run", "ms"),
+    Column("total_ms_coarse", "coarse full-order run", "ms"),
     Column("decode_ms", "decoding its frames", "ms"),
     Column("speedup_step", "speedup, step", "×"),
     Column("speedup_total", "speedup, total", "×"),
@@ -63,9 +69,13 @@ _SPEC = (
 
 COLUMNS = tuple(column.name for column in _SPEC)
 """Columns of `results.csv`, in order. Errors and δ are fractions there."""
+RIVALS = (
+    "displacement_static", "displacement_nearest", "displacement_interpolated", "displacement_coarse",
+)  # fmt: skip
+"""Displacement errors of what a reduced run is held to, beside its own."""
 LATER = (
-    "engine", "total_ms_full", "total_ms_reduced", "decode_ms", "teach_seconds", "break_even_runs",
-    "handed_over",
+    "engine", *RIVALS, "step_ms_coarse", "total_ms_full", "total_ms_reduced", "total_ms_coarse", "decode_ms",
+    "teach_seconds", "break_even_runs", "handed_over",
 )  # fmt: skip
 """Columns that older runs and reports lack: they are read as empty."""
 
@@ -100,11 +110,12 @@ TEXT = (
     SOLVER,
 )
 COSTS = (
-    "step_ms_full", "step_ms_reduced", "total_ms_full", "total_ms_reduced", "decode_ms", "speedup_step",
-    "speedup_total", "memory_full_mib", "memory_reduced_mib", "teach_seconds", "break_even_runs",
+    "step_ms_full", "step_ms_reduced", "step_ms_coarse", "total_ms_full", "total_ms_reduced",
+    "total_ms_coarse", "decode_ms", "speedup_step", "speedup_total", "memory_full_mib", "memory_reduced_mib",
+    "teach_seconds", "break_even_runs",
 )  # fmt: skip
 """Columns measured once a variant."""
-MEASURED = ("delta", "displacement_error", "stress_error", "handed_over", *COSTS)
+MEASURED = ("delta", "displacement_error", "stress_error", *RIVALS, "handed_over", *COSTS)
 """Columns that are averaged over parameter values."""
 
 ABSENT = "–"

@@ -2,9 +2,12 @@
 
 import json
 
+import numpy as np
 import pytest
+import torch
 
-from nsf.evaluation import Subject, measure
+from nsf.dynamics import Decoder
+from nsf.evaluation import Subject, at_frames, decoding_ms, measure
 
 REDUCED = ["inference", "p2g", "g2p", "inversion"]
 FULL = ["p2g", "grid", "g2p", "stress"]
@@ -26,6 +29,16 @@ def full(cost):
 @pytest.fixture(scope="module")
 def reduced(cost):
     return cost["reduced"]
+
+
+def test_a_run_is_decoded_at_every_frame(chain, tiny_manifold, made, monkeypatch):
+    solver = chain.scene.reduced(tiny_manifold, {"friction_angle": 26.0}, 20, device="cpu")
+    decoded = []
+    position = Decoder.position
+    monkeypatch.setattr(Decoder, "position", lambda self, xhat: decoded.append(xhat) or position(self, xhat))
+    assert decoding_ms(solver, made, 2) > 0
+    frames = torch.cat(decoded).reshape(3, 25, 4)  # once before, twice timed
+    np.testing.assert_allclose(frames[0], at_frames(made, 0.005 * np.arange(25)))
 
 
 def test_stages_are_those_of_a_step(full, reduced):
@@ -50,6 +63,7 @@ def test_what_a_cost_holds(full, reduced):
             "memory_mib",
             "allocators",
             "trials",
+            "steps",
         }
         assert set(json.loads(json.dumps(cost.as_dict()))) == keys
 

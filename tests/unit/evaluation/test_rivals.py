@@ -2,8 +2,11 @@
 
 import numpy as np
 import pytest
+import torch
 
-from nsf.evaluation.rivals import TrainingRuns, coarse_run
+from nsf.data import Trajectory
+from nsf.errors import ConfigError
+from nsf.evaluation.rivals import TrainingRuns, coarse_run, coarse_scene, coarse_subjects, rivals
 
 
 @pytest.fixture
@@ -37,6 +40,41 @@ def test_interpolation_over_two_parameters_keeps_training_runs():
         np.testing.assert_allclose(runs.interpolated(values), own, atol=1e-10)
     middle = runs.interpolated([0.5, 0.5])
     np.testing.assert_allclose(middle, latents.mean(0), atol=1e-10)  # by symmetry
+
+
+def test_rivals_are_held_to_every_particle_and_frame(chain, tiny_manifold, truth, runs):
+    solver = chain.pipeline.solver_at(tiny_manifold, 26.0)
+    found = rivals(solver, truth, [2])
+    x, X = truth.read("x")[1:], truth.X
+    norm = np.linalg.norm(x - X)
+    assert found.static == pytest.approx(1.0)
+    for error, xhat in (
+        (found.nearest, runs.nearest([26.0])),
+        (found.interpolated, runs.interpolated([26.0])),
+    ):
+        g = solver.decoder().position(torch.as_tensor(xhat))[1:].numpy()
+        assert error == pytest.approx(np.linalg.norm(g - x) / norm, rel=1e-5)
+    coarse = coarse_run(chain.scene, {"friction_angle": 26.0}, X, 2, "fp64", "cpu")
+    assert found.coarse[2]["displacement_error"] == pytest.approx(np.linalg.norm(coarse.x[1:] - x) / norm)
+    assert found.coarse[2]["particles"] == coarse.particles
+    assert found.factors == [2]
+
+
+def test_the_nearest_run_of_a_training_value_is_its_own(chain, tiny_manifold):
+    with Trajectory.open(chain.trajectory(30.0)) as known:
+        found = rivals(chain.pipeline.solver_at(tiny_manifold, 30.0), known)
+    assert found.nearest == pytest.approx(found.interpolated)
+    assert found.nearest < 0.02
+    assert found.coarse == {}
+
+
+def test_a_coarse_run_is_timed_over_its_own_steps(chain):
+    subjects = coarse_subjects(chain.scene, {"friction_angle": 26.0}, [2], "fp64", "cpu")
+    coarse = coarse_scene(chain.scene, {"friction_angle": 26.0}, 2)
+    assert subjects["coarse_2"].steps == coarse.steps
+    solver = subjects["coarse_2"].build()
+    solver.step(coarse.steps)
+    assert solver.time == pytest.approx(chain.scene.dt * chain.scene.steps)
 
 
 def test_a_coarse_run_has_the_frames_and_particles_of_the_fine_one(chain):
@@ -80,3 +118,12 @@ def test_a_scene_that_no_coarse_grid_resolves_says_why(chain):
     scene = type(chain.scene).from_config(config)
     reason = coarse_run(scene, {"friction_angle": 26.0}, scene.particles().X, 2, "fp64", "cpu")
     assert "needs dx of at most" in reason
+
+
+@pytest.mark.parametrize(
+    ("asked", "message"),
+    [("2", "must be a list of factors"), ("[1]", r"evaluation\.coarse=1"), ("[2,2]", "names a factor twice")],
+)
+def test_factors_that_are_refused(pipeline_at, tmp_path, asked, message):
+    with pytest.raises(ConfigError, match=message):
+        pipeline_at(tmp_path, f"evaluation.coarse={asked}")

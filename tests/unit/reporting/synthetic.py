@@ -41,6 +41,7 @@ class Made:
     training_seconds: float = 5400
     trust: tuple = ()  # ratio of each parameter value; None is not finite
     seed: int = 0
+    rivals: bool = False  # whether it was held to them
 
 
 def write_run(root: Path, made: Made) -> Run:
@@ -90,6 +91,9 @@ def write_payload(path: Path, made: Made) -> None:
     pd.DataFrame(results).to_csv(path / "results.csv", index=False)
     breakdown = {"reduced": STAGES, "full_order": FULL_STAGES}
     cost = {"full_order": {}, "reduced": {}, "breakdown": breakdown, "trials": 10}
+    if made.rivals:
+        cost["full_order"], cost["reduced"] = {"steps": 24}, {"steps": 24}
+        cost["coarse"] = {"2": {"step_ms": 1.0, "total_ms": 12.0, "memory_mib": 90.0, "steps": 12}}
     (path / "cost.json").write_text(json.dumps(cost))
     summary = {
         "parameter_name": "friction angle",
@@ -98,6 +102,9 @@ def write_payload(path: Path, made: Made) -> None:
         "training_seconds": made.training_seconds,
         "scale": made.scale,
     }
+    if made.rivals:
+        coarse = {"2": {"displacement_error": 0.2}, "3": {"why": "a wall is too thin"}}
+        summary["rivals"] = [{"parameter": value, "coarse": coarse} for value in made.parameters]
     if made.trust:
         summary["trust"] = [
             {"parameter": value, "trust": ratio, "distrusted": ratio is None or ratio > 1.0,
@@ -173,7 +180,8 @@ def _result(made: Made, value: float, split: str, m: dict, series: pd.DataFrame)
         if made.engine
         else {}  # as of runs from before there were engines
     )
-    return timed | {
+    beside = {"static": 1.0, "nearest": 0.09, "interpolated": 0.05, "coarse": 0.2} if made.rivals else {}
+    return timed | {f"displacement_{name}": error for name, error in beside.items()} | {
         "scene": made.scene, "method": made.method, "field": made.field, "r": made.r, "sample": made.sample,
         "integration_mean": 24.6 * made.sample, "parameter": value, "split": split,
         "delta": apart / _total(x),

@@ -9,7 +9,11 @@ from nsf.reporting import headline as module
 from nsf.reporting.committed import _sources
 from nsf.reporting.headline import Report, headline
 from nsf.reporting.sources import printed_delta
+<<<<<<< HEAD
 from nsf.reporting.text.columns import LATER
+=======
+from nsf.reporting.text.columns import LATER, RIVALS
+>>>>>>> wt-rivals
 
 
 def told(folder) -> tuple[list[list[str]], str]:
@@ -136,6 +140,15 @@ def test_engines_are_settings_and_reports_from_before_them_have_none(tmp_path):
     older = [{name: value for name, value in row.items() if name not in LATER} for row in jobs[:1]]
     rows, _ = told(write_report(tmp_path / "b", older))
     assert "engine" not in rows[0]
+
+
+def test_where_a_rival_wins_is_said(tmp_path):
+    rivals = {name: 0.5 for name in RIVALS} | {"displacement_coarse": 0.005}
+    _, said = told(write_report(tmp_path / "a", [job() | rivals]))
+    assert "than the best reduced run on sand coarse full order (0.500 %), the reduced run 1 %." in said
+    older = {name: value for name, value in job().items() if name not in LATER}
+    _, said = told(write_report(tmp_path / "b", [older]))
+    assert "rival" not in said
 
 
 def test_a_cell_says_how_many_of_its_runs_diverged(tmp_path):

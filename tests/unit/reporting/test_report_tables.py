@@ -11,7 +11,11 @@ from synthetic import TEST, Made, seal, write_run
 
 from nsf.errors import MissingRunError, SchemaError
 from nsf.reporting import COLUMNS, console_table, merge_results
+<<<<<<< HEAD
 from nsf.reporting.rivals import side_by_side, solvers
+=======
+from nsf.reporting.rivals import beside_rivals, side_by_side, solvers, where_rivals_win
+>>>>>>> wt-rivals
 from nsf.reporting.sources import open_sources
 from nsf.reporting.tables import (
     PAPER,
@@ -21,7 +25,7 @@ from nsf.reporting.tables import (
     variant_labels,
     without_constants,
 )
-from nsf.reporting.text.columns import COSTS, number, parameter_text
+from nsf.reporting.text.columns import COLUMN, COSTS, RIVALS, number, parameter_text
 from nsf.reporting.text.formats import HTML, markdown_table
 
 EARLIER, LATER = "2024-05-01T10:00:00+00:00", "2024-06-01T10:00:00+00:00"
@@ -30,8 +34,9 @@ EARLIER, LATER = "2024-05-01T10:00:00+00:00", "2024-06-01T10:00:00+00:00"
 def test_columns_are_exactly_those_of_the_design(sweep):
     expected = [
         "scene", "method", "field", "r", "engine", "sample", "integration_mean", "parameter", "split",
-        "delta", "displacement_error", "stress_error", "gamma", "step_ms_full", "step_ms_reduced",
-        "total_ms_full", "total_ms_reduced", "decode_ms", "speedup_step",
+        "delta", "displacement_error", "stress_error", "displacement_static", "displacement_nearest",
+        "displacement_interpolated", "displacement_coarse", "gamma", "step_ms_full", "step_ms_reduced",
+        "step_ms_coarse", "total_ms_full", "total_ms_reduced", "total_ms_coarse", "decode_ms", "speedup_step",
         "speedup_total", "memory_full_mib", "memory_reduced_mib", "teach_seconds",
         "break_even_runs", "handed_over", "precision", "device", "commit",
     ]  # fmt: skip
@@ -200,6 +205,42 @@ def test_solvers_stand_side_by_side(tmp_path):
     assert own["shown_ms"] == pytest.approx(rows["total_ms_reduced"][0] + 3.0)
     assert frame.loc["full order", "total_ms"] == pytest.approx(rows["total_ms_full"][0])
     assert frame.loc["full order", "delta"] == 0.0
+
+
+def test_coarse_runs_stand_with_the_solvers(tmp_path):
+    run = write_run(tmp_path, Made(engine="modal", rivals=True))
+    merged = merge(open_sources([run]))
+    frame = solvers(merged).set_index("solver")
+    assert list(frame.index) == ["full order", "full order, Δx × 2", "nsf"]
+    own = frame.loc["full order, Δx × 2"]
+    assert own["displacement_error"] == pytest.approx(0.2)
+    assert (own["step_ms"], own["total_ms"], own["span_ms"]) == (1.0, 12.0, 0.5)  # of half as many steps
+    assert frame.loc["nsf", "span_ms"] == frame.loc["nsf", "step_ms"]
+    (table,) = beside_rivals(merged)
+    assert table.content.headings[-4:] == [COLUMN[name].heading for name in RIVALS]
+    assert table.content.body[0][-4:] == ["100", "9", "5", "20"]
+    assert "sand has no run at Δx × 3: a wall is too thin." in table.note
+
+
+def test_runs_that_were_held_to_no_rival_have_no_such_table(sweep):
+    assert beside_rivals(merge(open_sources(sweep))) == []
+
+
+def test_a_rival_that_wins_is_told_with_its_error_and_the_reduced_runs():
+    rivals = dict(zip(RIVALS, (1.0, 0.04, 0.02, float("nan")), strict=True))
+    rows = [{"scene": "sand", "displacement_error": e} | rivals for e in (0.03, 0.5)]
+    assert where_rivals_win(pd.DataFrame(rows)) == (
+        "A rival has a smaller displacement error than the best reduced run on sand interpolated latents "
+        "(2 %), the reduced run 3 %."
+    )
+    rows[0]["displacement_error"] = 0.01
+    assert where_rivals_win(pd.DataFrame(rows)).startswith("No rival has a smaller")
+    rows.append({"scene": "bread", "displacement_error": float("inf")} | rivals)
+    assert (
+        "on bread nothing moves (100 %), nearest training run (4 %) and interpolated latents (2 %), the "
+        in (where_rivals_win(pd.DataFrame(rows)))
+    )
+    assert where_rivals_win(pd.DataFrame(rows).assign(**dict.fromkeys(RIVALS, float("nan")))) == ""
 
 
 def test_a_table_side_by_side_drops_what_older_runs_did_not_time(sweep, tmp_path):

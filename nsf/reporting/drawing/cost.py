@@ -1,0 +1,69 @@
+"""Error over cost: what each solver of a scene needs, and how near it is."""
+
+import math
+from collections.abc import Mapping, Sequence
+
+from matplotlib.figure import Figure
+
+from nsf.reporting.drawing.charts import plain_ticks
+from nsf.reporting.drawing.style import FULL, INK, MUTED, figure, line_style, styled
+
+_ACROSS = 3  # panels in a row
+_COARSE = {"ls": "", "marker": "s", "ms": 7, "mfc": "white", "mec": FULL, "mew": 1.6}
+_LINES = ((0, (6, 2)), (0, (2, 1.5)), (0, (1, 3)))
+
+
+def error_over_cost(
+    panels: Mapping[str, Sequence[Mapping]], free: Mapping[str, Mapping[str, float]]
+) -> Figure:
+    """Displacement error [%] over time [ms], both logarithmic: a panel a scene, a point a solver.
+
+    Args:
+        panels: by scene, solvers with `solver`, `kind` (`full`, `coarse` or `reduced`), `span_ms` and
+            `displacement_error` (a fraction). The full-order one has no error, and is a vertical line.
+        free: by scene, the errors (fractions) of what costs nothing, by name: horizontal lines.
+    """
+    reduced = dict.fromkeys(s["solver"] for of in panels.values() for s in of if s["kind"] == "reduced")
+    styles = {name: line_style(i) for i, name in enumerate(reduced)}
+    names = list(dict.fromkeys(name for of in free.values() for name in of))
+    rows = math.ceil(len(panels) / _ACROSS)
+    with styled():
+        fig = figure(0.9 + 3.1 * rows)
+        drawn = fig.subplots(rows, min(_ACROSS, len(panels)), squeeze=False).ravel()
+        for panel, (scene, solvers) in zip(drawn, panels.items(), strict=False):
+            for solver in solvers:
+                _point(panel, solver, styles)
+            for i, name in enumerate(names):
+                if _drawable(error := free.get(scene, {}).get(name)):
+                    panel.axhline(100 * error, color=MUTED, ls=_LINES[i % len(_LINES)], lw=1.2, label=name)
+            panel.set(xscale="log", yscale="log", title=scene)
+            panel.set(xlabel="time for one full-order Δt [ms]", ylabel="displacement error [%]")
+            panel.margins(0.12)
+            panel.grid()
+            for line in (panel.xaxis, panel.yaxis):
+                plain_ticks(line)
+        for panel in drawn[len(panels) :]:
+            panel.axis("off")
+        told = {line.get_label(): line for panel in drawn for line in panel.lines}
+        fig.legend(told.values(), told.keys(), loc="outside upper left", ncols=4, handlelength=2.2)
+    return fig
+
+
+def _point(panel, solver: Mapping, styles: Mapping[str, dict]) -> None:
+    """One solver, where its time and error are known."""
+    name, x, y = solver["solver"], solver["span_ms"], solver["displacement_error"]
+    if solver["kind"] == "full":
+        if _drawable(x):
+            panel.axvline(x, color=FULL, lw=1.6, label=name)
+    elif _drawable(x) and _drawable(y):
+        if solver["kind"] == "coarse":
+            panel.plot(x, 100 * y, label="full order on coarser grids", **_COARSE)
+            panel.annotate(
+                name.rpartition(" ")[2] + "Δx", (x, 100 * y), (5, 4), textcoords="offset points", color=INK
+            )
+        else:
+            panel.plot(x, 100 * y, "o", ms=7, color=styles[name]["color"], label=name)
+
+
+def _drawable(value) -> bool:
+    return value is not None and math.isfinite(value) and value > 0
