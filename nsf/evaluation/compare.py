@@ -27,6 +27,7 @@ class Comparison:
     Attributes:
         delta, displacement_error, stress_error: totals over frames 1..N, fractions; ∞ when the run diverged.
             Of a run that was handed over, the frames of its continuation count like the reduced ones.
+        true_error: largest distance of a frame from the full-order one, RMS over particles [m]; ∞ likewise.
         reconstruction_delta, reconstruction_stress_error: of the full-order frames encoded and decoded.
         series: one row a frame (design.md).
         pictures: arrays for `frames.npz`.
@@ -35,6 +36,7 @@ class Comparison:
     delta: float
     displacement_error: float
     stress_error: float
+    true_error: float
     reconstruction_delta: float
     reconstruction_stress_error: float
     series: pd.DataFrame
@@ -173,10 +175,11 @@ def compare(
     }
     if not diverged:
         errors |= {name: total(*columns) for name, columns in reduced.items()}
+        errors["true_error"] = float((column["x_error"].max() / len(X)).sqrt())
     metrics.require_finite(errors, f"{scene.parameters.name}={rollout.parameter:g}")
     xhat[own:] = torch.nan  # full-order frames are no latent vectors
     return Comparison(
-        **dict.fromkeys(reduced, np.inf) | errors,
+        **dict.fromkeys((*reduced, "true_error"), np.inf) | errors,
         series=_series(column, rollout, trajectory.t, split, xhat.cpu(), good),
         pictures={name: np.concatenate(blocks) for name, blocks in kept.items()}
         | {"t": trajectory.t[shown_frames]},

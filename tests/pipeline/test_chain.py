@@ -29,7 +29,7 @@ COLUMNS = [
     "scene", "method", "field", "r", "engine", "sample", "integration_mean", "parameter", "split",
     "delta", "displacement_error", "stress_error", "gamma", "step_ms_full", "step_ms_reduced", "speedup_step",
     "speedup_total", "memory_full_mib", "memory_reduced_mib", "teach_seconds", "break_even_runs",
-    "handed_over", "precision", "device", "commit",
+    "handed_over", "estimated_error", "true_error", "precision", "device", "commit",
 ]  # fmt: skip
 STAGES = ("simulate", "train", "deploy", "evaluate")
 

@@ -53,6 +53,8 @@ _SPEC = (
     Column("teach_seconds", "teaching", "s"),
     Column("break_even_runs", "runs until it pays"),
     Column("handed_over", "handed on", "%", 100.0),
+    Column("estimated_error", "estimated error", "m"),
+    Column("true_error", "true error", "m"),
     Column("precision", "precision"),
     Column("device", "device"),
     Column("commit", "commit"),
@@ -60,7 +62,7 @@ _SPEC = (
 
 COLUMNS = tuple(column.name for column in _SPEC)
 """Columns of `results.csv`, in order. Errors and δ are fractions there."""
-LATER = ("engine", "teach_seconds", "break_even_runs", "handed_over")
+LATER = ("engine", "teach_seconds", "break_even_runs", "handed_over", "estimated_error", "true_error")
 """Columns that runs from before there were engines, and operators, lack."""
 
 SETTING, VALUES, TRAINING, PLACE = "setting", "values", "training_seconds", "place"

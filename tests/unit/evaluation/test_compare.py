@@ -116,7 +116,10 @@ def test_pictures(comparison_of, made, truth):
     assert kept["x_full"].shape == kept["x_reduced"].shape == (4, 50, 3)
     assert kept["stress_full"].shape == kept["stress_reduced"].shape == (4, 50)
     np.testing.assert_allclose(kept["t"], truth.t[[0, 8, 16, 24]])
-    many = comparison_of(made, pictures=(10_000, 1000)).pictures
+    whole = comparison_of(made, pictures=(10_000, 1000))
+    many = whole.pictures
+    off = np.linalg.norm(many["x_reduced"].astype(float) - many["x_full"], axis=2)
+    assert whole.true_error == pytest.approx(np.sqrt((off**2).mean(1)).max(), rel=1e-4)
     assert many["x_full"].shape == (25, 500, 3)
     np.testing.assert_allclose(many["x_full"], truth.read("x"), rtol=1e-6)
     tau = torch.as_tensor(np.asarray(truth.read("tau"))).double()

@@ -31,7 +31,7 @@ def test_columns_are_exactly_those_of_the_design(sweep):
         "scene", "method", "field", "r", "engine", "sample", "integration_mean", "parameter", "split",
         "delta", "displacement_error", "stress_error", "gamma", "step_ms_full", "step_ms_reduced",
         "speedup_step", "speedup_total", "memory_full_mib", "memory_reduced_mib", "teach_seconds",
-        "break_even_runs", "handed_over", "precision", "device", "commit",
+        "break_even_runs", "handed_over", "estimated_error", "true_error", "precision", "device", "commit",
     ]  # fmt: skip
     frame = merge_results(sweep)
     assert list(frame.columns) == expected == list(COLUMNS)
