@@ -8,7 +8,7 @@ import pandas as pd
 import torch
 
 from nsf.data import Trajectory
-from nsf.deployment import Rollout
+from nsf.deployment import FULL_ORDER, Rollout
 from nsf.dynamics import Decoder, ReducedMPM
 from nsf.errors import SchemaError
 from nsf.evaluation import metrics
@@ -55,6 +55,13 @@ def trust_at_frames(rollout: Rollout, t: np.ndarray) -> np.ndarray:
     """
     reached = np.minimum(np.searchsorted(rollout.t, t - _SAME_TIME), len(rollout.t) - 1)
     return np.where(_of_continuation(rollout, t), np.nan, rollout.trust[reached])
+
+
+def levels_at_frames(rollout: Rollout, t: np.ndarray) -> np.ndarray:
+    """Who took the step [F] that reached each frame (`Rollout.by`); NaN at the first, which none did."""
+    reached = np.minimum(np.searchsorted(rollout.t, t - _SAME_TIME), len(rollout.t) - 1)
+    by = np.where(_of_continuation(rollout, t), FULL_ORDER, rollout.levels[np.maximum(reached - 1, 0)])
+    return np.where(reached > 0, by, np.nan)
 
 
 def _of_continuation(rollout: Rollout, t: np.ndarray) -> np.ndarray:
@@ -231,6 +238,7 @@ def _series(
             "angular_momentum_error": momentum("L"),
             "reconstruction_delta": (column["rec_error"] / column["x_norm"]).sqrt(),
             "trust": trust_at_frames(rollout, t),
+            "by": levels_at_frames(rollout, t),
             **{f"xhat_{k + 1}": xhat[:, k] for k in range(xhat.shape[1])},
             **{f"encoded_{k + 1}": column["encoded"][:, k] for k in range(xhat.shape[1])},
         }

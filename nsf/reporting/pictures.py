@@ -13,6 +13,7 @@ from joblib.externals.loky import ProcessPoolExecutor
 
 from nsf.reporting.drawing import charts, shapes
 from nsf.reporting.drawing.style import DIFFERENCE_COLORS, STRESS_COLORS, save
+from nsf.reporting.levels import levels_section
 from nsf.reporting.sources import Motion, Study, same_parameter
 from nsf.reporting.tables import Merged, mean_rows, printed_of, variant_labels, variants
 from nsf.reporting.text.columns import MEASURED, parameter_text
@@ -111,6 +112,7 @@ def draw(merged: Merged, folder: Path, sweep: bool = False, study: Study | None 
     ]
     return [
         *sections,
+        *levels_section(known, folder),
         Section("All variants" if len(known) > 1 else "Error and cost", _comparison(known, folder, study)),
     ]
 
