@@ -10,11 +10,7 @@ from nsf.reporting.sources import Source, Study, file_hash, open_sources
 from nsf.reporting.study import FineSource, fine_section, fine_table, over_seeds, swept, trust_table
 from nsf.reporting.swap import MARK, replaced
 from nsf.reporting.tables import VARIANT, Merged, means, merge, rows_of, variants, without_constants
-<<<<<<< HEAD
-from nsf.reporting.text.columns import ABSENT, COSTS, axis, parameter_text
-=======
 from nsf.reporting.text.columns import ABSENT, COSTS, RIVALS, axis, parameter_text
->>>>>>> wt-rivals
 from nsf.reporting.text.formats import Rows, latex_table, spreadsheet
 from nsf.reporting.text.page import Page, Table, html_page, markdown_page
 

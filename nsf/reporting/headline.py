@@ -9,11 +9,6 @@ import numpy as np
 import pandas as pd
 
 from nsf.errors import SchemaError
-<<<<<<< HEAD
-from nsf.reporting.sources import printed_delta
-from nsf.reporting.study import AXES, SEEDS
-from nsf.reporting.text.columns import ABSENT, COLUMN, LATER, TEXT, axis, number, parameter_text, plus_minus
-=======
 from nsf.reporting.rivals import where_rivals_win
 from nsf.reporting.sources import printed_delta
 from nsf.reporting.study import AXES, SEEDS
@@ -28,7 +23,6 @@ from nsf.reporting.text.columns import (
     parameter_text,
     plus_minus,
 )
->>>>>>> wt-rivals
 from nsf.reporting.text.formats import Rows
 
 FEW = 15  # rows of a table in which a number is varied; of more, settings and scenes go down and across

@@ -5,10 +5,6 @@ from collections.abc import Iterable
 
 import pandas as pd
 
-<<<<<<< HEAD
-from nsf.reporting.tables import Merged, mean_rows, rows_of, variant_labels, variants
-from nsf.reporting.text.columns import SOLVER, device_type
-=======
 from nsf.reporting.tables import (
     VARIANT,
     Merged,
@@ -19,7 +15,6 @@ from nsf.reporting.tables import (
     without_constants,
 )
 from nsf.reporting.text.columns import COLUMN, RIVALS, SOLVER, device_type
->>>>>>> wt-rivals
 from nsf.reporting.text.page import Table
 
 _FULL = "full order"

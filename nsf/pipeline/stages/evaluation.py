@@ -10,9 +10,6 @@ from nsf.data import Trajectory
 from nsf.data.schema import TRAJECTORY
 from nsf.deployment import Rollout, continuation_file, rollout_file
 from nsf.dynamics.setup import reduced_steps
-<<<<<<< HEAD
-from nsf.evaluation import Comparison, Subject, compare, decoding_ms, measure, superresolve
-=======
 from nsf.evaluation import (
     Comparison,
     Rivals,
@@ -24,7 +21,6 @@ from nsf.evaluation import (
     rivals,
     superresolve,
 )
->>>>>>> wt-rivals
 from nsf.kinematics.manifold import Manifold
 from nsf.pipeline.stages import results
 from nsf.runs import Run
@@ -44,12 +40,8 @@ def evaluate(pipeline, run: Run) -> None:
             _compare(pipeline, manifold, rollout, truth, index)
             for index, (rollout, truth) in enumerate(zip(rollouts, truths, strict=True))
         ]
-<<<<<<< HEAD
-        cost = _cost(pipeline, manifold, rollouts[0])
-=======
         comparisons, beside = zip(*found, strict=True)
         cost = _cost(pipeline, manifold, rollouts[0], beside[0].factors)
->>>>>>> wt-rivals
         engine = str(pipeline.deployment.manifest["metrics"].get("engine", ""))
         seconds = pipeline.training.metric("training_seconds")
         offline = seconds, 0.0 if pipeline.teaching is None else pipeline.taught.metric("teach_seconds")
@@ -121,10 +113,6 @@ def _compare(
         return found, rivals(solver, trajectory, pipeline.coarse)
 
 
-<<<<<<< HEAD
-def _cost(pipeline, manifold: Manifold, rollout: Rollout) -> dict:
-    """Content of `cost.json`, measured at the first held-out value."""
-=======
 def _cost(pipeline, manifold: Manifold, rollout: Rollout, factors: Sequence[int]) -> dict:
     """Content of `cost.json`, measured at the first held-out value.
 
@@ -133,7 +121,6 @@ def _cost(pipeline, manifold: Manifold, rollout: Rollout, factors: Sequence[int]
         rollout: the reduced run at that value, which is decoded.
         factors: of Δx of the coarse full-order runs that there are.
     """
->>>>>>> wt-rivals
     c, scene, value = pipeline.config, pipeline.deployed, pipeline.held_out[0]
     if not c.evaluation.trials:
         return results.costs({})
@@ -141,15 +128,8 @@ def _cost(pipeline, manifold: Manifold, rollout: Rollout, factors: Sequence[int]
     full = Subject(lambda: scene.full_order(parameters, c.precision, pipeline.device), scene.steps)
     steps = reduced_steps(scene.steps, c.deploy.dt_multiplier)
     reduced = Subject(lambda: pipeline.solver_at(manifold, value), steps)
-<<<<<<< HEAD
-    subjects = {"full_order": full, "reduced": reduced}
-    cost = measure(subjects, c.evaluation.trials, pipeline.device)
-    decoding = decoding_ms(pipeline.solver_at(manifold, value), rollout, c.evaluation.trials)
-    return results.costs(cost, decoding)
-=======
     coarse = coarse_subjects(scene, parameters, factors, c.precision, pipeline.device)
     subjects = {"full_order": full, "reduced": reduced, **coarse}
     measured = measure(subjects, c.evaluation.trials, pipeline.device)
     decoding = decoding_ms(pipeline.solver_at(manifold, value), rollout, c.evaluation.trials)
     return results.costs(measured, decoding)
->>>>>>> wt-rivals

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from nsf.mpm.access import SHARED, TAKEN
 
 from nsf.data import TAU_MATRIX
 from nsf.dynamics.interop import as_vectors
@@ -23,7 +24,6 @@ from nsf.engines.modal.projection import (
     shared_bytes,
 )
 from nsf.mpm import precision_of
-from nsf.mpm.access import SHARED, TAKEN
 from nsf.mpm.device import warp_device
 
 #: Fewer threads in the last block than coefficients, and modes that fill no whole vector of four; of one

@@ -9,11 +9,7 @@ from nsf.reporting import headline as module
 from nsf.reporting.committed import _sources
 from nsf.reporting.headline import Report, headline
 from nsf.reporting.sources import printed_delta
-<<<<<<< HEAD
-from nsf.reporting.text.columns import LATER
-=======
 from nsf.reporting.text.columns import LATER, RIVALS
->>>>>>> wt-rivals
 
 
 def told(folder) -> tuple[list[list[str]], str]:

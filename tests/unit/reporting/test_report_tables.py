@@ -11,11 +11,7 @@ from synthetic import TEST, Made, seal, write_run
 
 from nsf.errors import MissingRunError, SchemaError
 from nsf.reporting import COLUMNS, console_table, merge_results
-<<<<<<< HEAD
-from nsf.reporting.rivals import side_by_side, solvers
-=======
 from nsf.reporting.rivals import beside_rivals, side_by_side, solvers, where_rivals_win
->>>>>>> wt-rivals
 from nsf.reporting.sources import open_sources
 from nsf.reporting.tables import (
     PAPER,
@@ -38,7 +34,7 @@ def test_columns_are_exactly_those_of_the_design(sweep):
         "displacement_interpolated", "displacement_coarse", "gamma", "step_ms_full", "step_ms_reduced",
         "step_ms_coarse", "total_ms_full", "total_ms_reduced", "total_ms_coarse", "decode_ms", "speedup_step",
         "speedup_total", "memory_full_mib", "memory_reduced_mib", "teach_seconds",
-        "break_even_runs", "handed_over", "precision", "device", "commit",
+        "break_even_runs", "handed_over", "estimated_error", "true_error", "precision", "device", "commit",
     ]  # fmt: skip
     frame = merge_results(sweep)
     assert list(frame.columns) == expected == list(COLUMNS)
