@@ -335,12 +335,17 @@ def test_bad_states(setup_of, chain, options, message):
 @pytest.mark.gpu
 @pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
 @pytest.mark.parametrize("count", [3, 19])
-def test_on_a_gpu(tiny_scene, reference_manifold, method, count):
+@pytest.mark.parametrize("precision", ["fp64", "fp32"])
+def test_on_a_gpu(tiny_scene, reference_manifold, method, count, precision):
     parameters = [{ANGLE: angle} for angle in np.linspace(22.0, 38.0, count)]
-    options = {"method": method, "device": "cuda"}
+    options = {"method": method, "device": "cuda", "precision": precision}
     batch = tiny_scene.reduced_batch(reference_manifold, parameters, 60, **options)
     batch.step(24)
     for index in {0, 1, count - 1}:
         single = tiny_scene.reduced(reference_manifold, parameters[index], 60, **options)
         single.step(24)
-        same(batch.runs[index], single, 1e-7)  # of a GPU's sums the order is not fixed
+        if precision == "fp64":
+            same(batch.runs[index], single, 1e-7)  # of a GPU's sums the order is not fixed
+        else:
+            one, other = (run.trajectory().xhat for run in (batch.runs[index], single))
+            np.testing.assert_allclose(one, other, rtol=0, atol=2e-3)

@@ -244,6 +244,20 @@ def test_the_gpu_takes_the_same_steps(tiny_scene, reference_manifold, method, ha
 
 
 @pytest.mark.gpu
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
+@pytest.mark.parametrize(
+    ("options", "tolerance"),
+    [({"precision": "fp32"}, 1e-3), ({"engine": "reference"}, 1e-6)],
+    ids=["single precision", "the reference"],
+)
+def test_the_gpu_takes_nearly_the_same_steps(tiny_scene, reference_manifold, method, options, tolerance):
+    """In single precision as near as modes in half precision leave them."""
+    found = steps(tiny_scene, reference_manifold, "cuda", method, 1e-6, **options).xhat
+    expected = steps_of_a_cpu(method, 1e-6).xhat
+    np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance * np.ptp(expected))
+
+
+@pytest.mark.gpu
 @pytest.mark.parametrize("phases", [(), [{"start": 0.5, "size": 20}]], ids=["one phase", "two"])
 def test_steps_timed_on_the_gpu_are_steps(tiny_scene, reference_manifold, phases):
     sampler = RandomSampler(40, phases=phases)
