@@ -37,12 +37,13 @@ def run(settings: Settings, say: Callable[[str], object]) -> Result:
     """Each scene, 1 024 runs of `metal` at once, and the sand column with 4 million particles.
 
     At the paper's size on a GPU; on a CPU at small scale, and with 20 000 particles. Data, training and
-    teaching are made, or reused, as by `nsf teach engine=operators`. Where `scenes` are given, these are all.
+    teaching are made, or reused, as by `nsf teach engine=operators`. Where `scenes` or `particles` are given,
+    these are all.
     """
     found = Result()
-    for scene in settings.scenes or SCENES:
+    for scene in settings.scenes or (() if settings.particles else SCENES):
         measured(_chain(scene, settings, say), settings, found, say, MANY if scene == OF_MANY else 0)
-    if not settings.scenes:
+    if settings.particles or not settings.scenes:
         kind = "cuda" if settings.device.startswith("cuda") else "cpu"
         for particles in settings.particles or (PARTICLES[kind],):
             measured_decoded(_chain("sand", settings, say), particles, settings, found, say)

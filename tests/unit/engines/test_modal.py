@@ -238,7 +238,8 @@ def test_the_gpu_takes_the_same_steps(tiny_scene, reference_manifold, method, ha
     found = steps(tiny_scene, reference_manifold, "cuda", method, tolerance)
     expected = steps_of_a_cpu(method, tolerance)
     if half:
-        np.testing.assert_allclose(found.xhat, expected.xhat, rtol=0, atol=1e-3 * np.ptp(expected.xhat))
+        # Late in the run x̂ grows by a tenth a step, and with it what eleven bits of a mode leave out.
+        np.testing.assert_allclose(found.xhat, expected.xhat, rtol=3e-3, atol=1e-3 * np.ptp(expected.xhat))
     else:
         same(found, expected, tolerance=1e-6)
 
