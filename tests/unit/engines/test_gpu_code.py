@@ -15,7 +15,7 @@ from nsf.mpm.update import make_grid_update, make_update_g2p
 
 ARCH = 90  # compute capability 9.0, which has reductions of its own in P2G
 KERNELS = {
-    "p2g": lambda precision, several: make_p2g(precision, "quadratic", several=several),
+    "p2g": lambda precision, several: make_p2g(precision, "quadratic", batch=several),
     "p2g_by_warp": lambda precision, several: make_p2g(precision, "quadratic", False, several, by_warp=True),
     "p2g_cubic": lambda precision, several: make_p2g(precision, "cubic", False, several, by_warp=True),
     "grid_update": lambda precision, several: make_grid_update(precision),

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from nsf.mpm.access import SHARED, TAKEN
 
 from nsf.data import TAU_MATRIX
 from nsf.dynamics.interop import as_vectors
@@ -25,6 +24,7 @@ from nsf.engines.modal.projection import (
 )
 from nsf.mpm import precision_of
 from nsf.mpm.device import warp_device
+from nsf.mpm.native.access import SHARED, TAKEN
 
 #: Fewer threads in the last block than coefficients, and modes that fill no whole vector of four; of one
 #: simulation, of one tile, and of tiles that are not all full.
