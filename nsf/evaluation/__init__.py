@@ -1,7 +1,7 @@
 """Errors and costs of reduced runs (paper section 6 and appendix "Runtime analysis")."""
 
 from nsf.evaluation.compare import Comparison, at_frames, compare
-from nsf.evaluation.cost import SolverCost, Subject, measure
+from nsf.evaluation.cost import SolverCost, Subject, decoding_ms, measure
 from nsf.evaluation.metrics import deformation_error, displacement_error, reduction_ratio, stress_error
 from nsf.evaluation.superresolution import SuperResolution, query, superresolve
 
@@ -12,6 +12,7 @@ __all__ = [
     "SuperResolution",
     "at_frames",
     "compare",
+    "decoding_ms",
     "deformation_error",
     "displacement_error",
     "measure",

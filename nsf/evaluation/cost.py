@@ -6,9 +6,14 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
 import numpy as np
+import torch
 
+from nsf.deployment import Rollout
+from nsf.dynamics import ReducedMPM
+from nsf.evaluation.compare import at_frames
 from nsf.timing import MemoryProbe, StageTimer, synchronizer
 
+_CHUNK = 2**24  # numbers decoded at once
 _WARM_UP = 2  # steps of a fresh solver that compile, load and capture everything
 
 
@@ -87,6 +92,32 @@ def measure(subjects: dict[str, Subject], trials: int, device: str) -> dict[str,
             trials=trials,
         )
     return found
+
+
+def decoding_ms(solver: ReducedMPM, rollout: Rollout, trials: int) -> float:
+    """Median time to decode the positions of all particles at every frame of a reduced run [ms].
+
+    They stay on the device, as those of the full-order solver do.
+
+    Args:
+        solver: of the run.
+        rollout: the run; its latent vectors are taken at the full-order frames.
+        trials: decodings of all frames, after one that is not timed.
+    """
+    setup, scene = solver.setup, solver.scene
+    frames = at_frames(rollout, scene.dt * np.arange(scene.steps + 1))
+    xhat = torch.as_tensor(frames, dtype=setup.dtype, device=setup.torch_device)
+    decoder, wait = solver.decoder(), synchronizer(str(setup.torch_device))
+    blocks = xhat.split(max(1, _CHUNK // (3 * decoder.at.points)))
+    times = []
+    for _ in range(trials + 1):
+        wait()
+        begun = time.perf_counter()
+        for block in blocks:
+            decoder.position(block)
+        wait()
+        times.append(1e3 * (time.perf_counter() - begun))
+    return float(np.median(times[1:]))
 
 
 def _first_trial(subject: Subject, device: str) -> tuple[tuple[float, float], float, dict[str, float]]:

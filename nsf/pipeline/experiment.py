@@ -20,7 +20,7 @@ _KEYS = {"title", "question", "paper", "jobs"}
 _OPTIONAL = {"stages", "each", "printed"}
 _MORE_STAGES = ("superresolve",)  # that a job may do after those of `nsf run`
 #: Keys that a column of results.csv tells of.
-_COLUMNS = ("scene", "method", "field", "latent_dim", "sampler.size", "precision", "device")
+_COLUMNS = ("scene", "method", "field", "latent_dim", "engine", "sampler.size", "precision", "device")
 
 
 @dataclass(frozen=True)

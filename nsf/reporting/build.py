@@ -5,11 +5,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from nsf.reporting.pictures import draw
+from nsf.reporting.rivals import side_by_side
 from nsf.reporting.sources import Source, Study, file_hash, open_sources
-from nsf.reporting.study import FineSource, fine_section, fine_table, swept, trust_table
+from nsf.reporting.study import FineSource, fine_section, fine_table, over_seeds, swept, trust_table
 from nsf.reporting.swap import MARK, replaced
 from nsf.reporting.tables import VARIANT, Merged, means, merge, rows_of, variants, without_constants
-from nsf.reporting.text.columns import ABSENT, axis, parameter_text
+from nsf.reporting.text.columns import ABSENT, COSTS, axis, parameter_text
 from nsf.reporting.text.formats import Rows, latex_table, spreadsheet
 from nsf.reporting.text.page import Page, Table, html_page, markdown_page
 
@@ -83,7 +84,7 @@ def _fine(merged: Merged, study: Study | None) -> list[FineSource]:
 
 def _page(title: str, merged: Merged, sections, study: Study | None, more, fine, sweep: bool) -> Page:
     headline, same = without_constants(means(merged, study))
-    per_value, same_there = without_constants(merged.frame)
+    per_value, same_there = without_constants(merged.frame.drop(columns=list(COSTS)))
     alike = merged.frame[["scene"] if sweep else ["scene", "method"]].drop_duplicates()
     chosen = (
         f"Of each {alike.columns[-1]}, the pictures show the variant with the smallest mean held-out δ. "
@@ -99,6 +100,8 @@ def _page(title: str, merged: Merged, sections, study: Study | None, more, fine,
         warnings=_warnings(merged),
         tables=[
             Table("Results beside the paper's", rows_of(headline), note),
+            *side_by_side(merged),
+            *(over_seeds(merged, study) if study else ()),
             *more,
             Table("Each parameter value", rows_of(per_value, parameter), _said(same_there)),
             *trust_table(merged, parameter),

@@ -192,7 +192,9 @@ def figures(report: Path) -> str:
     frame = pd.read_csv(report / "results.csv")
     for column, value in {"split": "test", **_SHOWN}.items():
         frame = frame[frame[column] == value]
-    variants = frame.groupby([name for name in VARIANT if name in frame], sort=False, as_index=False)
+    alike = [name for name in VARIANT if name in frame]
+    frame = frame.fillna(dict.fromkeys(alike, ""))
+    variants = frame.groupby(alike, sort=False, as_index=False)
     # A value that diverged leaves the mean infinite, one that was not measured leaves it empty.
     means = variants[[*_ERRORS, *_COSTS]].agg(lambda values: values.mean(skipna=False))
     means[_PAPER] = [_printed(row["scene"], row["method"]) for row in means.to_dict("records")]

@@ -11,13 +11,14 @@ import pandas as pd
 from nsf.errors import SchemaError
 from nsf.reporting.sources import printed_delta
 from nsf.reporting.study import AXES, SEEDS
-from nsf.reporting.text.columns import ABSENT, COLUMN, TEXT, axis, number, parameter_text
+from nsf.reporting.text.columns import ABSENT, COLUMN, LATER, TEXT, axis, number, parameter_text, plus_minus
 from nsf.reporting.text.formats import Rows
 
 FEW = 15  # rows of a table in which a number is varied; of more, settings and scenes go down and across
 MANY = 24  # rows where none is, as in the paper's Table 1
 _VALUES = "scene.parameters.test"  # jobs with this key are about certain held-out values, so each counts
 _PAPER = "paper"
+_DEVIATION = ", deviation"
 _RUNS, _DIVERGED, _SEEDS = "runs", "diverged", "seeds"  # how many are in a row of `groups`
 _MEASURED = ("delta", "displacement_error", "stress_error", "speedup_step", "speedup_total")
 _COLUMN_OF = {
@@ -25,6 +26,7 @@ _COLUMN_OF = {
     "method": "method",
     "field": "field",
     "latent_dim": "r",
+    "engine": "engine",
     "sampler.size": "sample",
 }
 _NUMBERS = {column or key for key, (_, _, column) in AXES.items()}
@@ -52,6 +54,7 @@ class Report:
                 f"{path} has not the {len(self.told['rows'])} rows that sources.json tells of; "
                 "build the report again with `nsf report`"
             )
+        frame = frame.assign(**{name: np.nan for name in LATER if name not in frame})
         runs = [self.told["runs"][row["run"]] for row in self.told["rows"]]
         keys = pd.DataFrame([_own(run) for run in runs], index=frame.index).replace("null", np.nan)
         frame = frame.join(keys)
@@ -67,7 +70,15 @@ class Report:
         """Columns of `rows` that tell apart what is compared within a scene, as few as can."""
         keys = list(dict.fromkeys(key for run in self.told["runs"].values() for key in _own(run)))
         jobs = [key for key in keys if key not in SEEDS] if keys else ["setting"]
-        known = ["method", "field", *jobs, "r", "sample", *(["parameter"] if _VALUES in keys else [])]
+        known = [
+            "method",
+            "field",
+            "engine",
+            *jobs,
+            "r",
+            "sample",
+            *(["parameter"] if _VALUES in keys else []),
+        ]
         found: set[str] = set()
         for _, rows in self.rows.groupby("scene", sort=False):
             told: list[str] = []
@@ -95,11 +106,19 @@ class Report:
             row = dict(zip(alike, values, strict=True))
             row |= {name: part[name].iloc[0] if part[name].nunique() == 1 else ABSENT for name in others}
             row |= {name: part[name].mean(skipna=False) for name in (*_MEASURED, _PAPER)}
+            row |= {f"{name}{_DEVIATION}": value for name, value in self._deviations(part).items()}
             row |= {_RUNS: len(part), _DIVERGED: int(np.isinf(part["delta"]).sum())}
             rows.append(row | {_SEEDS: len(part[self.seeds].drop_duplicates()) if self.seeds else 1})
         frame = pd.DataFrame(rows)
         ranks = [frame[key].map(_ranks(frame[key])) for key in alike]
         return frame.iloc[np.lexsort(ranks[::-1])].reset_index(drop=True)
+
+    def _deviations(self, part: pd.DataFrame) -> dict[str, float]:
+        """Standard deviation over seeds of each measure's mean over held-out values; NaN of one seed."""
+        if not self.seeds:
+            return dict.fromkeys(_MEASURED, np.nan)
+        means = part.groupby(self.seeds, dropna=False)[list(_MEASURED)].agg(lambda v: v.mean(skipna=False))
+        return {name: means[name].std(skipna=False) for name in _MEASURED}
 
     @property
     def small(self) -> set[str]:
@@ -126,8 +145,8 @@ def headline(report: Report) -> tuple[Rows, str]:
     """The table, and what is to be said of it."""
     varied = [key for key in report.settings if key in _NUMBERS]
     if not report.settings and report.seeds:
-        table, said = _over_seeds(report), "Shown: of each seed the mean over held-out values."
-        return table, f"{said}{_diverged(report)}"  # the paper's figure stands in each row
+        said = "Shown: of each seed the mean over held-out values; ± their standard deviation over seeds."
+        return _over_seeds(report), f"{said}{_diverged(report)}"  # the paper's figure stands in each row
     if len(report.groups) <= (FEW if varied else MANY):
         table, said = _flat(report), f"Shown: {_averaged(report)}."
     else:
@@ -139,7 +158,7 @@ def headline(report: Report) -> tuple[Rows, str]:
 def _flat(report: Report) -> Rows:
     """A row a scene and setting, with every measure."""
     groups = report.groups
-    order = dict.fromkeys(("scene", "method", "field", *report.settings, "r", "sample"))
+    order = dict.fromkeys(("scene", "method", "field", "engine", *report.settings, "r", "sample"))
     shown = [key for key in order if key == "scene" or groups[key].nunique() > 1]
     measured = [name for name in _MEASURED if groups[name].notna().any()]
     seeds = [_SEEDS] if groups[_SEEDS].nunique() > 1 else []
@@ -148,7 +167,7 @@ def _flat(report: Report) -> Rows:
         [_text(key, row[key]) for key in shown]
         + [f"{row[name]}" for name in seeds]
         + [number(row[_PAPER], 100) for _ in paper]
-        + [COLUMN[name].text(row[name]) for name in measured]
+        + [plus_minus(row[name], row[f"{name}{_DEVIATION}"], COLUMN[name].scale) for name in measured]
         for row in groups.to_dict("records")
     ]
     headings = [*map(_title, shown), *seeds, *paper, *(COLUMN[name].heading for name in measured)]
@@ -193,7 +212,8 @@ def _both_errors(row: Mapping) -> str:
     """δ and the stress error of a row of `groups`, or how many of its runs diverged."""
     if row[_DIVERGED]:
         return f"{row[_DIVERGED]} of {row[_RUNS]} diverged"
-    return f"{number(row['delta'], 100)} ({number(row['stress_error'], 100)})"
+    delta = plus_minus(row["delta"], row[f"delta{_DEVIATION}"], 100)
+    return f"{delta} ({number(row['stress_error'], 100)})"
 
 
 def _over_seeds(report: Report) -> Rows:
@@ -202,9 +222,9 @@ def _over_seeds(report: Report) -> Rows:
     for seed in report.seeds:
         for scene, part in report.rows[report.rows[seed].notna()].groupby("scene", sort=False):
             delta = part.groupby(seed)["delta"].agg(lambda values: values.mean(skipna=False))
-            told = (delta.mean(skipna=False), delta.min(skipna=False), delta.max(skipna=False))
-            paper = part[_PAPER].mean(skipna=False)
-            body.append([scene, seed, f"{len(delta)}", *(number(value, 100) for value in (*told, paper))])
+            mean = plus_minus(delta.mean(skipna=False), delta.std(skipna=False), 100)
+            told = (delta.min(skipna=False), delta.max(skipna=False), part[_PAPER].mean(skipna=False))
+            body.append([scene, seed, f"{len(delta)}", mean, *(number(value, 100) for value in told)])
     headings = ["scene", "varied", "seeds", "mean δ [%]", "smallest [%]", "largest [%]", "paper's δ [%]"]
     return Rows(headings, body, [i > 1 for i in range(len(headings))])
 
@@ -212,7 +232,7 @@ def _over_seeds(report: Report) -> Rows:
 def _averaged(report: Report) -> str:
     """What the numbers are means over."""
     told = "each held-out value by itself" if "parameter" in report.settings else "means over held-out values"
-    return f"{told} and, where several were run, seeds" if report.seeds else told
+    return f"{told} and, where several were run, seeds (± their standard deviation)" if report.seeds else told
 
 
 def _best(report: Report) -> str:

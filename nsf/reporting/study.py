@@ -11,12 +11,13 @@ from nsf.reporting.drawing import charts
 from nsf.reporting.drawing.style import save
 from nsf.reporting.sources import Source, Study, checked_hash
 from nsf.reporting.tables import Merged, paper_row, printed_of, rows_of, variant_labels, variants
-from nsf.reporting.text.columns import COLUMN, Column, axis, parameter_text
+from nsf.reporting.text.columns import COLUMN, Column, axis, parameter_text, plus_minus
 from nsf.reporting.text.formats import Rows, file_name, spreadsheet
 from nsf.reporting.text.page import Picture, Section, Table
 
 _SCENE, _RUN, _PAPER = "scene", "run", "the paper's δ"
 SEEDS = ("seed", "sampler.seed")
+_ERRORS = ("delta", "displacement_error", "stress_error")
 AXES = {
     "sampler.size": ("sample particles |S|", "–", "sample"),
     "latent_dim": ("latent coordinates r", "–", "r"),
@@ -51,7 +52,7 @@ _NOTE = (
     "these frames together; values are queried together too, and share its time equally."
 )
 _MEANS = ("points", "delta", "particles_delta", "full_order_difference", "interpolation_error", "seconds")
-_TOLD = ("scene", "method", "field", "r", "sample")  # of a variant, in results.csv
+_TOLD = ("scene", "method", "field", "r", "engine", "sample")  # of a variant, in results.csv
 
 _RENAMED = {
     "method": "variant",
@@ -140,6 +141,28 @@ def _scatter(frame: pd.DataFrame, merged: Merged, folder: Path) -> Picture:
     )
     figure = charts.delta_per_variant(entries, dots="one seed")
     return Picture(save(figure, folder, "delta-over-seeds"), caption, sorted(set(frame[_RUN])))
+
+
+def over_seeds(merged: Merged, study: Study) -> list[Table]:
+    """Mean and standard deviation of each error over the seeds of jobs that differ in nothing else."""
+    frame, body = _held_out(merged, study), []
+    for seed in SEEDS:
+        part = frame[frame[seed].notna()] if seed in frame else frame.iloc[:0]
+        for name, group in _settings(part, _told(part, SEEDS), alone=merged.frame["scene"].iloc[0]):
+            if group[seed].nunique() < 2:
+                continue
+            rows = merged.frame.loc[group["row"], list(_ERRORS)].assign(seed=group[seed].array)
+            means = rows.groupby("seed").agg(lambda values: values.mean(skipna=False))
+            cells = (
+                plus_minus(means[e].mean(skipna=False), means[e].std(skipna=False), COLUMN[e].scale)
+                for e in _ERRORS
+            )
+            body.append([name, seed, f"{len(means)}", *cells])
+    if not body:
+        return []
+    headings = ["of", "varied", "seeds", *(COLUMN[e].heading for e in _ERRORS)]
+    note = "Of each seed the mean over held-out values: shown is their mean ± their standard deviation."
+    return [Table("Over seeds", Rows(headings, body, [i > 1 for i in range(len(headings))]), note)]
 
 
 def _told(frame: pd.DataFrame, without: Sequence[str]) -> list[str]:

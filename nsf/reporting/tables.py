@@ -26,7 +26,7 @@ from nsf.reporting.text.columns import (
 )
 from nsf.reporting.text.formats import Rows, terminal_table
 
-VARIANT = ("scene", "method", "field", "r", "sample", SETTING, "precision", "device")
+VARIANT = ("scene", "method", "field", "r", "engine", "sample", SETTING, "precision", "device")
 """The visible key of a variant; `device` counts by its type."""
 
 PAPER = "the paper"
@@ -36,6 +36,9 @@ _SHOWN = (
     "delta", "displacement_error", "stress_error", "gamma", "integration_mean",
     "speedup_step", "speedup_total", "memory_full_mib", "memory_reduced_mib",
 )  # fmt: skip
+
+_BLANK = ("engine", SETTING)
+"""Columns of the key that may say nothing: of runs before there were engines, and as the scene has it."""
 
 _NOTHING = dict.fromkeys((*VARIANT, PLACE), ABSENT) | dict.fromkeys(
     (*_SHOWN, *MEASURED, VALUES, TRAINING), math.nan
@@ -179,7 +182,7 @@ def printed_of(merged: Merged, members: list[int], study: Study | None) -> float
 def variant_labels(rows: list[dict]) -> list[str]:
     """Short names of variants: the method, and whatever else differs among them."""
     varying = {name for name in VARIANT if len({str(row[name]) for row in rows}) > 1} | {"method"}
-    form = {"field": "{} field", "r": "r {}", "sample": "|S| {}"}
+    form = {"field": "{} field", "r": "r {}", "engine": "{} engine", "sample": "|S| {}"}
     return [
         " · ".join(
             form.get(name, "{}").format(row[name]) for name in VARIANT if name in varying and row[name]
@@ -207,14 +210,15 @@ def without_constants(
     """
     describing = [name for name in (*VARIANT, "gamma", "integration_mean", "commit", *also) if name in frame]
     said = {name: {v for v in frame[name].map(str) if v not in ("", ABSENT, "nan")} for name in describing}
-    if said.get(SETTING) and (frame[SETTING].eq("") & frame["field"].ne(PAPER)).any():
-        said[SETTING].add("")  # as the scene has it, which is another setting than one that is named
     computed = frame[frame["field"].ne(PAPER)] if "field" in frame else frame
+    for name in _BLANK:
+        if said.get(name) and computed[name].eq("").any():
+            said[name].add("")  # which is another than one that is named
     for name in also:
         if said.get(name) and computed[name].isna().any():
             said[name].add("")  # what was not measured of one row is not said of it by the others
     constant = [name for name in describing if name not in keep and len(said[name]) == 1]
-    empty = [name for name in (SETTING, PLACE) if name in frame and set(frame[name]) <= {"", ABSENT}]
+    empty = [name for name in (*_BLANK, PLACE) if name in frame and set(frame[name]) <= {"", ABSENT}]
     costs = (*COSTS, TRAINING, "estimated_error")  # none with evaluation.trials=0, or without operators
     empty += [name for name in costs if name in frame and frame[name].isna().all()]
     first = {name: next(v for v in frame[name] if str(v) in said[name]) for name in constant}

@@ -27,9 +27,10 @@ from nsf.runs import Run
 #: Issue 2, "Done when".
 COLUMNS = [
     "scene", "method", "field", "r", "engine", "sample", "integration_mean", "parameter", "split",
-    "delta", "displacement_error", "stress_error", "gamma", "step_ms_full", "step_ms_reduced", "speedup_step",
-    "speedup_total", "memory_full_mib", "memory_reduced_mib", "teach_seconds", "break_even_runs",
-    "handed_over", "estimated_error", "true_error", "precision", "device", "commit",
+    "delta", "displacement_error", "stress_error", "gamma", "step_ms_full", "step_ms_reduced",
+    "total_ms_full", "total_ms_reduced", "decode_ms", "speedup_step", "speedup_total",
+    "memory_full_mib", "memory_reduced_mib", "teach_seconds", "break_even_runs", "handed_over",
+    "estimated_error", "true_error", "precision", "device", "commit",
 ]  # fmt: skip
 STAGES = ("simulate", "train", "deploy", "evaluate")
 
@@ -99,6 +100,8 @@ def test_results_have_the_columns_of_a_report(chain):
     assert row["device"] == "cpu"
     assert 0 < row["delta"] < 0.02
     assert row["delta"] < row["displacement_error"]
+    assert row["speedup_total"] == pytest.approx(row["total_ms_full"] / row["total_ms_reduced"])
+    assert row["decode_ms"] > 0
     assert row["speedup_step"] == pytest.approx(row["step_ms_full"] / row["step_ms_reduced"])
     assert 20 < row["integration_mean"] <= 500
 
@@ -466,7 +469,15 @@ def test_a_diverged_rollout_is_infinite_and_never_nan(copied, pipeline_at):
     assert listed.texts()[-1] == "diverged"
     results = pd.read_csv(pipeline.evaluation.path / "results.csv")
     assert (results[["delta", "displacement_error", "stress_error"]] == np.inf).all().all()
-    costs = ["step_ms_reduced", "speedup_step", "speedup_total", "memory_reduced_mib", "break_even_runs"]
+    costs = [
+        "step_ms_reduced",
+        "total_ms_reduced",
+        "decode_ms",
+        "speedup_step",
+        "speedup_total",
+        "memory_reduced_mib",
+        "break_even_runs",
+    ]
     assert results[costs].isna().all().all()  # of a run that has left the grid
     assert not results.drop(columns=costs).isna().any().any()
     frames = np.load(pipeline.evaluation.path / "frames.npz")

@@ -9,7 +9,7 @@ from nsf.data import Trajectory
 from nsf.data.schema import TRAJECTORY
 from nsf.deployment import Rollout, continuation_file, rollout_file
 from nsf.dynamics.setup import reduced_steps
-from nsf.evaluation import Comparison, Subject, compare, measure, superresolve
+from nsf.evaluation import Comparison, Subject, compare, decoding_ms, measure, superresolve
 from nsf.kinematics.manifold import Manifold
 from nsf.pipeline.stages import results
 from nsf.runs import Run
@@ -29,7 +29,7 @@ def evaluate(pipeline, run: Run) -> None:
             _compare(pipeline, manifold, rollout, truth, index)
             for index, (rollout, truth) in enumerate(zip(rollouts, truths, strict=True))
         ]
-        cost = _cost(pipeline, manifold)
+        cost = _cost(pipeline, manifold, rollouts[0])
         engine = str(pipeline.deployment.manifest["metrics"].get("engine", ""))
         seconds = pipeline.training.metric("training_seconds")
         offline = seconds, 0.0 if pipeline.teaching is None else pipeline.taught.metric("teach_seconds")
@@ -97,7 +97,7 @@ def _compare(pipeline, manifold: Manifold, rollout: Rollout, truth: Path, index:
         return compare(solver, trajectory, rollout, pipeline.config.deploy.split, shown, rest)
 
 
-def _cost(pipeline, manifold: Manifold) -> dict:
+def _cost(pipeline, manifold: Manifold, rollout: Rollout) -> dict:
     """Content of `cost.json`, measured at the first held-out value."""
     c, scene, value = pipeline.config, pipeline.deployed, pipeline.held_out[0]
     if not c.evaluation.trials:
@@ -107,4 +107,6 @@ def _cost(pipeline, manifold: Manifold) -> dict:
     steps = reduced_steps(scene.steps, c.deploy.dt_multiplier)
     reduced = Subject(lambda: pipeline.solver_at(manifold, value), steps)
     subjects = {"full_order": full, "reduced": reduced}
-    return results.costs(measure(subjects, c.evaluation.trials, pipeline.device))
+    cost = measure(subjects, c.evaluation.trials, pipeline.device)
+    decoding = decoding_ms(pipeline.solver_at(manifold, value), rollout, c.evaluation.trials)
+    return results.costs(cost, decoding)

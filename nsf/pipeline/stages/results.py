@@ -17,8 +17,11 @@ from nsf.scenes import Scene
 from nsf.storage import write_json, writing
 
 
-def costs(measured: Mapping[str, SolverCost]) -> dict:
-    """Content of `cost.json`, by solver; without a solver, that nothing was measured."""
+def costs(measured: Mapping[str, SolverCost], decode_ms: float = math.nan) -> dict:
+    """Content of `cost.json`, by solver; without a solver, that nothing was measured.
+
+    `decode_ms` is the time that decoding all frames of a reduced run takes [ms].
+    """
     if not measured:
         return {"trials": 0}
     full, reduced = measured["full_order"], measured["reduced"]
@@ -31,6 +34,7 @@ def costs(measured: Mapping[str, SolverCost]) -> dict:
         "memory_reduced_mib": reduced.memory_mib,
         "step_ms_full": full.step_ms,
         "step_ms_reduced": reduced.step_ms,
+        "decode_ms": decode_ms,
     }
 
 
@@ -71,7 +75,10 @@ def rows(
         "commit": commit,
     }
     # What a step costs whose particles have left the grid is no one's speedup, nor is half a reduced run's.
-    costly = ("step_ms_reduced", "speedup_step", "speedup_total", "memory_reduced_mib", "break_even_runs")
+    costly = (
+        "step_ms_reduced", "total_ms_reduced", "decode_ms", "speedup_step", "speedup_total",
+        "memory_reduced_mib", "break_even_runs",
+    )  # fmt: skip
     lost = measured | dict.fromkeys(costly, math.nan)
     found = []
     for rollout, comparison in zip(rollouts, comparisons, strict=True):
@@ -104,6 +111,9 @@ def _costs_in_a_row(cost: dict) -> dict[str, float]:
     return {
         "step_ms_full": step[0],
         "step_ms_reduced": step[1],
+        "total_ms_full": total[0],
+        "total_ms_reduced": total[1],
+        "decode_ms": cost.get("decode_ms", math.nan),
         "speedup_step": step[0] / step[1],
         "speedup_total": total[0] / total[1],
         "memory_full_mib": memory[0],

@@ -46,6 +46,9 @@ _SPEC = (
     Column("gamma", "γ"),
     Column("step_ms_full", "full-order step", "ms"),
     Column("step_ms_reduced", "reduced step", "ms"),
+    Column("total_ms_full", "full-order run", "ms"),
+    Column("total_ms_reduced", "reduced run", "ms"),
+    Column("decode_ms", "decoding its frames", "ms"),
     Column("speedup_step", "speedup, step", "×"),
     Column("speedup_total", "speedup, total", "×"),
     Column("memory_full_mib", "full-order memory", "MiB"),
@@ -62,15 +65,24 @@ _SPEC = (
 
 COLUMNS = tuple(column.name for column in _SPEC)
 """Columns of `results.csv`, in order. Errors and δ are fractions there."""
-LATER = ("engine", "teach_seconds", "break_even_runs", "handed_over", "estimated_error", "true_error")
-"""Columns that runs from before there were engines, and operators, lack."""
+LATER = (
+    "engine", "total_ms_full", "total_ms_reduced", "decode_ms", "teach_seconds", "break_even_runs",
+    "handed_over", "estimated_error", "true_error",
+)  # fmt: skip
+"""Columns that older runs and reports lack: they are read as empty."""
 
 SETTING, VALUES, TRAINING, PLACE = "setting", "values", "training_seconds", "place"
+SOLVER = "solver"
 _MORE = (
     Column(SETTING, "setting"),
     Column(VALUES, "values"),
     Column(TRAINING, "training", "s"),
     Column(PLACE, "in the paper"),
+    Column(SOLVER, "solver"),
+    Column("step_ms", "step", "ms"),
+    Column("total_ms", "run", "ms"),
+    Column("shown_ms", "run, frames decoded", "ms"),
+    Column("memory_mib", "memory", "MiB"),
 )
 COLUMN = {column.name: column for column in (*_SPEC, *_MORE)}
 """Columns of tables: those of `results.csv`; a variant's setting beyond them; and what means are beside."""
@@ -87,10 +99,11 @@ TEXT = (
     "commit",
     SETTING,
     PLACE,
+    SOLVER,
 )
 COSTS = (
-    "step_ms_full", "step_ms_reduced", "speedup_step", "speedup_total",
-    "memory_full_mib", "memory_reduced_mib", "teach_seconds", "break_even_runs",
+    "step_ms_full", "step_ms_reduced", "total_ms_full", "total_ms_reduced", "decode_ms", "speedup_step",
+    "speedup_total", "memory_full_mib", "memory_reduced_mib", "teach_seconds", "break_even_runs",
 )  # fmt: skip
 """Columns measured once a variant."""
 MEASURED = ("delta", "displacement_error", "stress_error", "handed_over", *COSTS)
@@ -116,6 +129,13 @@ def number(value, scale: float = 1.0) -> str:
         return f"{shown:.2e}"
     digits = max(0, 2 - math.floor(math.log10(abs(shown))))
     return f"{shown:.{digits}f}"
+
+
+def plus_minus(mean: float, deviation: float, scale: float = 1.0) -> str:
+    """A mean and the deviation of what it is of, as shown; the mean alone where the deviation is none."""
+    if not math.isfinite(deviation):
+        return number(mean, scale)
+    return f"{number(mean, scale)} ± {scale * deviation:.2g}"
 
 
 def parameter_text(value, name: str = "", unit: str = "") -> str:

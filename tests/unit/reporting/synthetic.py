@@ -36,6 +36,7 @@ class Made:
     status: str = "complete"
     paper: bool = True
     field: str = "mlp"
+    engine: str = ""
     scale: str = "paper"
     training_seconds: float = 5400
     trust: tuple = ()  # ratio of each parameter value; None is not finite
@@ -162,7 +163,17 @@ def _result(made: Made, value: float, split: str, m: dict, series: pd.DataFrame)
     x, X = m["x_full"][1:], m["x_full"][0]
     apart = _total(m["x_reduced"][1:] - x)
     full, reduced = sum(FULL_STAGES.values()), sum(STAGES.values()) * (0.8 + made.sample / 750)
-    return {
+    timed = (
+        {
+            "engine": made.engine,
+            "total_ms_full": 24 * full,
+            "total_ms_reduced": 24 * reduced,
+            "decode_ms": 3.0,
+        }
+        if made.engine
+        else {}  # as of runs from before there were engines
+    )
+    return timed | {
         "scene": made.scene, "method": made.method, "field": made.field, "r": made.r, "sample": made.sample,
         "integration_mean": 24.6 * made.sample, "parameter": value, "split": split,
         "delta": apart / _total(x),

@@ -9,6 +9,7 @@ from nsf.reporting import headline as module
 from nsf.reporting.committed import _sources
 from nsf.reporting.headline import Report, headline
 from nsf.reporting.sources import printed_delta
+from nsf.reporting.text.columns import LATER
 
 
 def told(folder) -> tuple[list[list[str]], str]:
@@ -28,13 +29,14 @@ def test_means_over_values_and_seeds_a_row_a_scene_and_setting(tmp_path):
     ]
     rows, said = told(write_report(tmp_path / "a", jobs))
     assert rows[0][:5] == ["scene", "method", "paper's δ [%]", "δ [%]", "displacement error [%]"]
-    assert rows[1][:5] == ["sand", "nsf", "0.400", "0.200", "2"]
+    assert rows[1][:5] == ["sand", "nsf", "0.400", "0.200 ± 0.071", "2 ± 0.71"]
     assert [row[:3] for row in rows[2:]] == [
         ["sand", "deformation_only", "5"], ["bread", "nsf", "–"], ["bread", "deformation_only", "–"],
     ]  # fmt: skip
     assert said == (
-        "Shown: means over held-out values and, where several were run, seeds. δ is below the paper's in "
-        "1 of 1 (nsf, basis), 1 of 1 (deformation_only, basis), of the cases in which the paper prints one."
+        "Shown: means over held-out values and, where several were run, seeds (± their standard deviation). "
+        "δ is below the paper's in 1 of 1 (nsf, basis), 1 of 1 (deformation_only, basis), of the "
+        "cases in which the paper prints one."
     )
 
 
@@ -114,8 +116,8 @@ def test_seeds_alone_show_their_scatter(tmp_path):
     jobs += [job(delta=0.004, **{"sampler.seed": k}) for k in ("1", "2")]
     rows, _ = told(write_report(tmp_path / "a", jobs))
     assert rows[1:] == [
-        ["sand", "seed", "3", "0.300", "0.100", "0.600", "0.400"],
-        ["sand", "sampler.seed", "2", "0.400", "0.400", "0.400", "0.400"],
+        ["sand", "seed", "3", "0.300 ± 0.26", "0.100", "0.600", "0.400"],
+        ["sand", "sampler.seed", "2", "0.400 ± 0", "0.400", "0.400", "0.400"],
     ]
 
 
@@ -124,6 +126,16 @@ def test_settings_of_unlike_numbers_of_seeds_say_how_many(tmp_path):
     rows, _ = told(write_report(tmp_path / "a", jobs))
     at = rows[0].index("seeds")
     assert [row[at] for row in rows[1:]] == ["2", "1"]
+
+
+def test_engines_are_settings_and_reports_from_before_them_have_none(tmp_path):
+    jobs = [job(delta=0.001 * k, engine=e) | {"engine": e} for k, e in ((1, "modal"), (2, "operators"))]
+    rows, _ = told(write_report(tmp_path / "a", jobs))
+    assert rows[0][:2] == ["scene", "engine"]
+    assert [row[1] for row in rows[1:]] == ["modal", "operators"]
+    older = [{name: value for name, value in row.items() if name not in LATER} for row in jobs[:1]]
+    rows, _ = told(write_report(tmp_path / "b", older))
+    assert "engine" not in rows[0]
 
 
 def test_a_cell_says_how_many_of_its_runs_diverged(tmp_path):

@@ -12,8 +12,9 @@ from synthetic import Made, write_run
 from nsf.reporting import build_report
 from nsf.reporting.drawing import charts
 from nsf.reporting.sources import Study, open_sources
-from nsf.reporting.study import _settings, _told, swept
+from nsf.reporting.study import _settings, _told, over_seeds, swept
 from nsf.reporting.tables import means, merge, rows_of
+from nsf.reporting.text.columns import plus_minus
 from nsf.reporting.text.formats import latex, latex_table
 
 VALUES = (22.5, 27.5)
@@ -70,6 +71,18 @@ def test_delta_over_what_varies_with_every_value_and_seed(tmp_path, drawn):
     assert picture.files == ["delta-over-sampler-size.svg", "delta-over-sampler-size.png"]
     assert "and seeds (band)" in picture.caption
     assert set(picture.runs) == {run.id for run in found}
+
+
+def test_seeds_are_summed_up_for_each_setting(tmp_path):
+    found, keys, settings = runs(tmp_path, sizes={20: 0.02, 50: 0.008}, seeds=("0", "1", "2"))
+    merged = merge(open_sources(found), settings)
+    (table,) = over_seeds(merged, of(keys))
+    assert [row[:3] for row in table.content.body] == [["20", "seed", "3"], ["50", "seed", "3"]]
+    own = merged.frame[merged.frame["sample"] == "20"].groupby("setting")["delta"].mean()
+    assert table.content.body[0][3] == plus_minus(own.mean(), own.std(), 100)
+    assert "±" in table.content.body[0][3]
+    alone = {id: {**known, "seed": "0"} for id, known in keys.items()}
+    assert over_seeds(merged, of(alone)) == []
 
 
 def test_what_the_paper_prints_of_single_jobs_stands_beside_them(tmp_path, drawn):

@@ -11,6 +11,7 @@ from synthetic import TEST, Made, seal, write_run
 
 from nsf.errors import MissingRunError, SchemaError
 from nsf.reporting import COLUMNS, console_table, merge_results
+from nsf.reporting.rivals import side_by_side, solvers
 from nsf.reporting.sources import open_sources
 from nsf.reporting.tables import (
     PAPER,
@@ -30,8 +31,10 @@ def test_columns_are_exactly_those_of_the_design(sweep):
     expected = [
         "scene", "method", "field", "r", "engine", "sample", "integration_mean", "parameter", "split",
         "delta", "displacement_error", "stress_error", "gamma", "step_ms_full", "step_ms_reduced",
-        "speedup_step", "speedup_total", "memory_full_mib", "memory_reduced_mib", "teach_seconds",
-        "break_even_runs", "handed_over", "estimated_error", "true_error", "precision", "device", "commit",
+        "total_ms_full", "total_ms_reduced", "decode_ms", "speedup_step",
+        "speedup_total", "memory_full_mib", "memory_reduced_mib", "teach_seconds",
+        "break_even_runs", "handed_over",
+        "estimated_error", "true_error", "precision", "device", "commit",
     ]  # fmt: skip
     frame = merge_results(sweep)
     assert list(frame.columns) == expected == list(COLUMNS)
@@ -56,7 +59,9 @@ def test_the_run_asked_for_stands_for_its_variant(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "difference", [{"method": "deformation_only"}, {"sample": 50}, {"r": 5}, {"device": "cpu"}], ids=str
+    "difference",
+    [{"method": "deformation_only"}, {"sample": 50}, {"r": 5}, {"device": "cpu"}, {"engine": "modal"}],
+    ids=str,
 )
 def test_runs_that_differ_in_the_variant_key_both_stay(tmp_path, difference):
     made = Made(created=EARLIER)
@@ -154,10 +159,60 @@ def test_without_constants_keeps_what_varies(sweep):
 
 
 def test_labels_name_what_differs():
-    rows = [dict.fromkeys(("scene", "field", "setting", "precision", "device"), "x") for _ in range(2)]
+    rows = [
+        dict.fromkeys(("scene", "field", "engine", "setting", "precision", "device"), "x") for _ in range(2)
+    ]
     rows[0] |= {"method": "nsf", "r": 6, "sample": "150"}
     rows[1] |= {"method": "nsf", "r": 6, "sample": "50"}
     assert variant_labels(rows) == ["nsf · |S| 150", "nsf · |S| 50"]
+    rows[0]["engine"] = "operators"
+    rows[1]["engine"] = ""  # of before there were engines
+    assert variant_labels(rows) == ["nsf · operators engine · |S| 150", "nsf · |S| 50"]
+
+
+def test_an_engine_is_said_of_no_row_that_does_not_name_it(tmp_path):
+    runs = [
+        write_run(tmp_path, Made(engine=engine, parameters=TEST[:1], splits=("test",)))
+        for engine in ("", "modal")
+    ]
+    frame = merge_results(runs)
+    shown, said = without_constants(frame)
+    assert sorted(shown["engine"]) == ["", "modal"]
+    assert "modal" not in said
+    shown, said = without_constants(frame[frame["engine"] == "modal"])
+    assert "engine" not in shown
+    assert "engine modal" in said
+    shown, said = without_constants(frame[frame["engine"] == ""])
+    assert "engine" not in shown
+    assert "engine" not in said
+
+
+def test_solvers_stand_side_by_side(tmp_path):
+    made = Made(splits=("test", "test", "validation", "test"), engine="modal")
+    runs = [
+        write_run(tmp_path, replace(made, engine=e, noise=n))
+        for e, n in (("modal", 0.01), ("operators", 0.02))
+    ]
+    frame = solvers(merge(open_sources(runs))).set_index("solver")
+    assert list(frame.index) == ["full order", "nsf · modal engine", "nsf · operators engine"]
+    rows = pd.read_csv(runs[1].path / "results.csv")
+    own = frame.loc["nsf · operators engine"]
+    assert own["displacement_error"] == pytest.approx(rows["displacement_error"][[0, 1, 3]].mean())
+    assert own["shown_ms"] == pytest.approx(rows["total_ms_reduced"][0] + 3.0)
+    assert frame.loc["full order", "total_ms"] == pytest.approx(rows["total_ms_full"][0])
+    assert frame.loc["full order", "delta"] == 0.0
+
+
+def test_a_table_side_by_side_drops_what_older_runs_did_not_time(sweep, tmp_path):
+    (table,) = side_by_side(merge(open_sources(sweep)))
+    assert "step [ms]" in table.content.headings
+    assert not any("decoded" in heading for heading in table.content.headings)
+    run = write_run(tmp_path, Made())
+    frame = pd.read_csv(run.path / "results.csv")
+    frame[[name for name in COSTS if name in frame]] = float("nan")
+    frame.to_csv(run.path / "results.csv", index=False)
+    seal(run)
+    assert side_by_side(merge(open_sources([run]))) == []
 
 
 @pytest.mark.parametrize(
