@@ -111,6 +111,7 @@ class Levels:
             Estimated error [N + 1] [m].
         """
         N, n = len(by), int((by == OPERATORS).sum())
+        estimate[0] = 0.0  # of a run that is not finite, all is ∞
         estimate = np.where(np.arange(N + 1) <= n, estimate, estimate[n])
         again = run.together.alone(run.index).runs[0]
         _copy(run, solver, 0, n)

@@ -150,3 +150,6 @@ def test_a_run_that_is_not_finite_is_handed_on_for_good(shared):
     (found,) = shared(Lost, Line, 4)
     assert (found.levels == PROJECTED).all()
     assert np.isfinite(found.xhat).all()
+    assert (found.estimate == 0.0).all()
+    (back,) = shared(Lost, Line, 4, 1e-4)
+    assert (back.levels[8:] == OPERATORS).all()
