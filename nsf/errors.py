@@ -60,3 +60,8 @@ class MissingRunError(NSFError):
 
 class LaunchError(NSFError):
     """The jobs of a sweep could not be started: a program or a queue is missing."""
+
+
+def first_line(error: BaseException) -> str:
+    """The first line of what an error says; its kind where it says nothing."""
+    return (str(error).splitlines() or [type(error).__name__])[0]

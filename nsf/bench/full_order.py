@@ -7,14 +7,8 @@ import numpy as np
 
 from nsf.bench.measure import bandwidth, build, name_of, pass_time, step_times
 from nsf.bench.rows import KernelRow, Result, Row, Settings, commit, size_name
-from nsf.mpm import (
-    DomainWalls,
-    FullOrderMPM,
-    GridGeometry,
-    HalfSpace,
-    ParticleConstants,
-)
-from nsf.mpm.grid import BLOCK
+from nsf.mpm import DomainWalls, FullOrderMPM, GridGeometry, HalfSpace, ParticleConstants
+from nsf.mpm.grid.nodes import BLOCK
 from nsf.mpm.materials import DruckerPrager
 from nsf.scenes import Box
 

@@ -25,7 +25,7 @@ from yaml import MarkedYAMLError, YAMLError
 from nsf.config import targets
 from nsf.config.documents import check_sizes, text_of
 from nsf.config.resolvers import resolved
-from nsf.errors import ConfigError
+from nsf.errors import ConfigError, first_line
 from nsf.paths import CONF, groups
 
 # conf/hydra/launcher/joblib.yaml takes the place of the launcher's own configuration on purpose.
@@ -92,8 +92,7 @@ def read(path: Path) -> DictConfig:
     try:
         config = OmegaConf.create(text_of(path))
     except (OmegaConfBaseException, *_OF_BROKEN_FILES) as error:
-        told = (str(error) or type(error).__name__).splitlines()[0]
-        raise ConfigError(f"{path} is no configuration: {told}; correct the yaml") from error
+        raise ConfigError(f"{path} is no configuration: {first_line(error)}; correct the yaml") from error
     if not isinstance(config, DictConfig):
         raise ConfigError(f"{path} is no configuration: it has no keys; correct the yaml")
     try:

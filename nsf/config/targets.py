@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from omegaconf import DictConfig
 
 from nsf.config.resolvers import resolved
-from nsf.errors import ConfigError, NSFError
+from nsf.errors import ConfigError, NSFError, first_line
 from nsf.vectors import is_finite
 
 
@@ -153,7 +153,7 @@ def filled(made_of: Any, values: Mapping[str, Any], where: str) -> Any:
     except NSFError as error:
         raise type(error)(str(error) if str(error).startswith(where) else f"{where}: {error}") from error
     except Exception as error:
-        raise ConfigError(f"{where}: {(str(error) or type(error).__name__).splitlines()[0]}") from error
+        raise ConfigError(f"{where}: {first_line(error)}") from error
 
 
 def keys_of(target: str, path: tuple[str, ...]) -> list[str]:

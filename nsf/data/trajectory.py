@@ -215,11 +215,7 @@ class Trajectory:
         return trajectory
 
     def read(
-        self,
-        field: str,
-        frames: Any = slice(None),
-        particles: Any = None,
-        out: np.ndarray | None = None,
+        self, field: str, frames: Any = slice(None), particles: Any = None, out: np.ndarray | None = None
     ) -> np.ndarray:
         """Read some frames of some particles; no more than one frame beyond them is held.
 

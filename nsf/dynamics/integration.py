@@ -11,7 +11,7 @@ import warp as wp
 from nsf.dynamics.interop import as_vectors, on_torch_stream
 from nsf.errors import ConfigError
 from nsf.mpm import GridGeometry, Precision
-from nsf.mpm.grid import flat_index, inside
+from nsf.mpm.grid.nodes import flat_index, inside
 from nsf.mpm.grid.shape import shape_functions, stencil_offset
 
 #: Nodes by which the integration particles are widened at most; every grid of the scenes is smaller.

@@ -8,7 +8,7 @@ import pandas as pd
 import torch
 
 from nsf.data import Trajectory
-from nsf.deployment import Rollout
+from nsf.deployment import FULL_ORDER, Rollout
 from nsf.dynamics import Decoder, ReducedMPM
 from nsf.errors import SchemaError
 from nsf.evaluation import metrics
@@ -27,6 +27,7 @@ class Comparison:
     Attributes:
         delta, displacement_error, stress_error: totals over frames 1..N, fractions; ∞ when the run diverged.
             Of a run that was handed over, the frames of its continuation count like the reduced ones.
+        true_error: largest distance of a frame from the full-order one, RMS over particles [m]; ∞ likewise.
         reconstruction_delta, reconstruction_stress_error: of the full-order frames encoded and decoded.
         series: one row a frame (design.md).
         pictures: arrays for `frames.npz`.
@@ -35,6 +36,7 @@ class Comparison:
     delta: float
     displacement_error: float
     stress_error: float
+    true_error: float
     reconstruction_delta: float
     reconstruction_stress_error: float
     series: pd.DataFrame
@@ -53,6 +55,13 @@ def trust_at_frames(rollout: Rollout, t: np.ndarray) -> np.ndarray:
     """
     reached = np.minimum(np.searchsorted(rollout.t, t - _SAME_TIME), len(rollout.t) - 1)
     return np.where(_of_continuation(rollout, t), np.nan, rollout.trust[reached])
+
+
+def levels_at_frames(rollout: Rollout, t: np.ndarray) -> np.ndarray:
+    """Who took the step [F] that reached each frame (`Rollout.by`); NaN at the first, which none did."""
+    reached = np.minimum(np.searchsorted(rollout.t, t - _SAME_TIME), len(rollout.t) - 1)
+    by = np.where(_of_continuation(rollout, t), FULL_ORDER, rollout.levels[np.maximum(reached - 1, 0)])
+    return np.where(reached > 0, by, np.nan)
 
 
 def _of_continuation(rollout: Rollout, t: np.ndarray) -> np.ndarray:
@@ -173,10 +182,11 @@ def compare(
     }
     if not diverged:
         errors |= {name: total(*columns) for name, columns in reduced.items()}
+        errors["true_error"] = float((column["x_error"].max() / len(X)).sqrt())
     metrics.require_finite(errors, f"{scene.parameters.name}={rollout.parameter:g}")
     xhat[own:] = torch.nan  # full-order frames are no latent vectors
     return Comparison(
-        **dict.fromkeys(reduced, np.inf) | errors,
+        **dict.fromkeys((*reduced, "true_error"), np.inf) | errors,
         series=_series(column, rollout, trajectory.t, split, xhat.cpu(), good),
         pictures={name: np.concatenate(blocks) for name, blocks in kept.items()}
         | {"t": trajectory.t[shown_frames]},
@@ -228,6 +238,7 @@ def _series(
             "angular_momentum_error": momentum("L"),
             "reconstruction_delta": (column["rec_error"] / column["x_norm"]).sqrt(),
             "trust": trust_at_frames(rollout, t),
+            "by": levels_at_frames(rollout, t),
             **{f"xhat_{k + 1}": xhat[:, k] for k in range(xhat.shape[1])},
             **{f"encoded_{k + 1}": column["encoded"][:, k] for k in range(xhat.shape[1])},
         }

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn.modules import module as registration
 
 from nsf.data import Standardizer, hash_of_positions
-from nsf.errors import MissingRunError, SchemaError
+from nsf.errors import MissingRunError, SchemaError, first_line
 from nsf.runs.manifest import verified
 
 FORMAT = "nsf-manifold"
@@ -164,11 +164,6 @@ def registering(most: int) -> Iterator[None]:
         registration.register_module_buffer_registration_hook(count),
     ):
         yield
-
-
-def first_line(error: BaseException) -> str:
-    """The first line of what an error says."""
-    return (str(error).splitlines() or [type(error).__name__])[0]
 
 
 def _check_members(path: Path) -> None:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from nsf.data import Standardizer
-from nsf.errors import NSFError, SchemaError, ShapeError
+from nsf.errors import NSFError, SchemaError, ShapeError, first_line
 from nsf.kinematics import checkpoint
 from nsf.storage import writing
 
@@ -266,7 +266,7 @@ class Manifold(nn.Module, ABC):
         ) as error:
             raise SchemaError(
                 f"{path} names {content['manifold']} but its contents do not fit it"
-                f" ({checkpoint.first_line(error)}); train again with `nsf train`"
+                f" ({first_line(error)}); train again with `nsf train`"
             ) from error
         manifold.datasets, manifold.split = content["datasets"], content["split"]
         return manifold.requires_grad_(False).eval()

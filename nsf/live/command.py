@@ -149,12 +149,7 @@ def _parser(command: str, text: str) -> argparse.ArgumentParser:
             help="that whoever joins must give, 16 letters at least; drawn unless only this machine can join",
         )
         add("--rate", type=_positive, default=30.0, help="frames a second")
-        add(
-            "--patience",
-            type=_positive,
-            default=5.0,
-            help="seconds that a client may lag",
-        )
+        add("--patience", type=_positive, default=5.0, help="seconds that a client may lag")
         add("--bench", type=_counts, metavar="N,…", help="measure with so many clients on loopback, and end")
     return parser
 

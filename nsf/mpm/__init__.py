@@ -4,17 +4,10 @@ import warp as wp
 
 wp.config.log_level = wp.LOG_ERROR  # kernels are compiled without a word; errors still show
 
-from nsf.mpm.boundaries import (  # noqa: E402
-    BoundaryArrays,
-    Collider,
-    Cuboid,
-    DomainWalls,
-    HalfSpace,
-    Motion,
-    Sphere,
-    floor_height,
-)
-from nsf.mpm.grid import Grid, GridGeometry  # noqa: E402
+from nsf.mpm.boundaries.arrays import BoundaryArrays, DomainWalls  # noqa: E402
+from nsf.mpm.boundaries.colliders import Collider, Cuboid, HalfSpace, Sphere, floor_height  # noqa: E402
+from nsf.mpm.boundaries.motion import Motion  # noqa: E402
+from nsf.mpm.grid.nodes import Grid, GridGeometry  # noqa: E402
 from nsf.mpm.precision import FP32, FP64, Precision, precision_of  # noqa: E402
 from nsf.mpm.solver import FullOrderMPM, Solver, diagnosed  # noqa: E402
 from nsf.mpm.state import ParticleConstants, ParticleState  # noqa: E402

@@ -15,12 +15,7 @@ from nsf.mpm.grid import Grid, GridGeometry
 from nsf.mpm.grid.shape import stencil_offset
 from nsf.mpm.materials import Material, make_elastic_stress, make_stress_update
 from nsf.mpm.precision import Precision, precision_of
-from nsf.mpm.stability import (
-    MAX_ELASTIC_CFL,
-    check_time_step,
-    make_particle_check,
-    wave_speed_at,
-)
+from nsf.mpm.stability import MAX_ELASTIC_CFL, check_time_step, make_particle_check, wave_speed_at
 from nsf.mpm.state import ParticleConstants, ParticleState, cell_order
 from nsf.mpm.step import GridStep
 from nsf.mpm.transfer import Transfer, make_g2p_stress

@@ -8,7 +8,7 @@ import warp as wp
 
 from nsf.errors import ConfigError, InstabilityError
 from nsf.mpm.boundaries.colliders import Collider
-from nsf.mpm.grid import GridGeometry, inside
+from nsf.mpm.grid.nodes import GridGeometry, inside
 from nsf.mpm.grid.shape import shape_functions
 from nsf.mpm.precision import Precision
 from nsf.mpm.state import ParticleConstants

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 
 from nsf.errors import ShapeError
-from nsf.mpm.grid import BLOCK
+from nsf.mpm.grid.nodes import BLOCK
 from nsf.mpm.precision import Precision
 
 

@@ -5,7 +5,7 @@ import warp as wp
 
 from nsf.errors import ConfigError
 from nsf.mpm.boundaries.arrays import BoundaryArrays
-from nsf.mpm.grid import Grid, make_reach
+from nsf.mpm.grid.nodes import Grid, make_reach
 from nsf.mpm.native.access import WARP
 from nsf.mpm.stability import check_colliders
 from nsf.mpm.transfer import Transfer, make_g2p, make_p2g

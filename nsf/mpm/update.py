@@ -7,7 +7,7 @@ import warp as wp
 from nsf.mpm.batch import make_runs
 from nsf.mpm.boundaries.arrays import make_solids
 from nsf.mpm.boundaries.contact import SLIP, STICKY, make_contact
-from nsf.mpm.grid import flat_index, inside, node_of, node_of_step, nodes_of_step, storage
+from nsf.mpm.grid.nodes import flat_index, inside, node_of, node_of_step, nodes_of_step, storage
 from nsf.mpm.grid.shape import shape_functions
 from nsf.mpm.native.access import make_load, make_warp_sum
 from nsf.mpm.precision import Precision

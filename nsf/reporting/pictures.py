@@ -14,6 +14,7 @@ from joblib.externals.loky import ProcessPoolExecutor
 from nsf.reporting.drawing import charts, shapes
 from nsf.reporting.drawing.cost import error_over_cost
 from nsf.reporting.drawing.style import DIFFERENCE_COLORS, STRESS_COLORS, save
+from nsf.reporting.levels import levels_section
 from nsf.reporting.rivals import solvers
 from nsf.reporting.sources import Motion, Study, same_parameter
 from nsf.reporting.tables import Merged, mean_rows, printed_of, variant_labels, variants
@@ -113,6 +114,7 @@ def draw(merged: Merged, folder: Path, sweep: bool = False, study: Study | None 
     ]
     return [
         *sections,
+        *levels_section(known, folder),
         Section("All variants" if len(known) > 1 else "Error and cost", _comparison(known, folder, study)),
     ]
 

@@ -61,6 +61,7 @@ _RENAMED = {
     "handed_over_at": "full order from [s]",
 }
 _FEWEST = 3  # rows of which a rank correlation says anything
+_ESTIMATED = 5  # of runs by operators, whose true error has that of projected runs in it
 
 
 def swept(merged: Merged, study: Study, folder: Path) -> list[Section]:
@@ -287,13 +288,45 @@ def trust_table(merged: Merged, renamed: Mapping[str, str]) -> list[Table]:
         ratio = math.inf if told["trust"] is None else told["trust"]
         times = {name: _or_nan(told[name]) for name in ("distrusted_at", "handed_over_at")}
         known = {name: row[name] for name in ("parameter", "split")}
-        rows.append({"method": label, **known, "trust": ratio, **times, "delta": row["delta"]})
+        errors = {name: row[name] for name in ("estimated_error", "true_error")}
+        told = {"tolerance": merged.source[i].summary.get("tolerance"), "handed_over": row["handed_over"]}
+        rows.append(
+            {"method": label, **known, "trust": ratio, **times, "delta": row["delta"], **errors, **told}
+        )
     if not rows:
         return []
     frame = pd.DataFrame(rows)
-    same = frame["method"].nunique() == 1
-    shown = frame.drop(columns="method") if same else frame
-    return [Table("Trust", rows_of(shown, {**renamed, **_RENAMED}), trust_note(frame))]
+    same, estimated = frame["method"].nunique() == 1, frame["estimated_error"].notna().any()
+    unseen = [] if estimated else ["estimated_error", "true_error"]
+    shown = frame.drop(columns=[*unseen, "tolerance", "handed_over", *(["method"] if same else [])])
+    note = " ".join(filter(None, (trust_note(frame), estimate_note(frame))))
+    return [Table("Trust", rows_of(shown, {**renamed, **_RENAMED}), note)]
+
+
+def estimate_note(rows: pd.DataFrame) -> str:
+    """How the estimate of runs by operators agrees with their true error; empty where there are too few.
+
+    Args:
+        rows: `estimated_error` and `true_error` [m], `tolerance` [m] or none, and `handed_over`, the share of
+            the steps that operators did not take.
+    """
+    known = rows[rows["estimated_error"].notna()]
+    if len(known) < _ESTIMATED:
+        return ""
+    agreement = spearman(known["estimated_error"], known["true_error"])
+    said = (
+        "The estimated error is how far a run by operators goes from one by projected steps, RMS over the "
+        "samples, as single projected steps tell. The true one is how far it goes from the full-order run, "
+        "RMS over all particles, with the error of the projected steps in it. Both are the largest of a run. "
+        f"Spearman's rank correlation of the two over {len(known)} runs is {agreement:.2f}."
+    )
+    off = known[known["true_error"] > pd.to_numeric(known["tolerance"])]
+    if known["tolerance"].notna().any():
+        unseen = int((off["handed_over"] == 0.0).sum())
+        said += (
+            f" {len(off)} of them went further than their tolerance; {unseen} of these were not handed on."
+        )
+    return said
 
 
 def trust_note(rows: pd.DataFrame) -> str:

@@ -18,7 +18,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from nsf.errors import NSFError, SchemaError
+from nsf.errors import NSFError, SchemaError, first_line
 from nsf.runs.canonical import plain
 
 MANIFEST = "manifest.json"
@@ -184,7 +184,7 @@ def _json(path: Path) -> dict[str, Any]:
     try:
         manifest = json.loads(_text(path), parse_constant=_not_json)
     except (ValueError, RecursionError) as error:
-        raise SchemaError(f"{path.name} is no JSON: {_first_line(error)}") from error
+        raise SchemaError(f"{path.name} is no JSON: {first_line(error)}") from error
     if not isinstance(manifest, dict):
         raise SchemaError(f"{path.name} holds {_shown(manifest)}, not keys with values")
     if (told := _odd_manifest(manifest)) is not None:
@@ -211,7 +211,7 @@ def _yaml(path: Path) -> dict[str, Any]:
     except (SchemaError, OSError):
         raise
     except Exception as error:  # whatever the parser makes of a text that is no configuration
-        told = str(error) if isinstance(error, NSFError) else _first_line(error)
+        told = str(error) if isinstance(error, NSFError) else first_line(error)
         raise SchemaError(f"{path.name} is no configuration: {told}") from error
     if _strange(config):
         raise SchemaError(f"{path.name} holds a value that no configuration has")
@@ -275,7 +275,3 @@ def _strange(value: Any, depth: int = 0) -> bool:
 
 def _shown(value: Any) -> str:
     return reprlib.repr(value)
-
-
-def _first_line(error: BaseException) -> str:
-    return (str(error).splitlines() or [type(error).__name__])[0]

@@ -6,7 +6,7 @@ import pytest
 
 from nsf import config
 from nsf.bench.reduced import MLP_TRAINING
-from nsf.paths import EXPERIMENTS, groups
+from nsf.paths import CONF, EXPERIMENTS, groups
 from nsf.pipeline import Pipeline
 from nsf.pipeline.experiment import Experiment
 from nsf.pipeline.plan import Plan
@@ -39,8 +39,8 @@ def test_there_are_experiments():
 
 def test_the_ablation_is_every_method_on_every_scene():
     jobs = [job.keys for job in Experiment.load("ablation").jobs]
-    methods = {path.stem for path in (config.CONF / "method").glob("*.yaml")}
-    scenes = {path.stem for path in (config.CONF / "scene").glob("*.yaml")} - {"drop"}  # not of the paper
+    methods = {path.stem for path in (CONF / "method").glob("*.yaml")}
+    scenes = {path.stem for path in (CONF / "scene").glob("*.yaml")} - {"drop"}  # not of the paper
     assert sorted((job["scene"], job["method"]) for job in jobs) == sorted(itertools.product(scenes, methods))
     assert {job["scale"] for job in jobs} == {"paper"}
 

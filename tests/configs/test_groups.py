@@ -5,7 +5,7 @@ import pytest
 
 from nsf import config, scenes
 from nsf.mpm.materials import PATHS, deformation_path, drive
-from nsf.paths import groups
+from nsf.paths import CONF, groups
 from nsf.pipeline import Pipeline
 
 GROUPS = groups()
@@ -16,7 +16,7 @@ CHAIN = [(g, option, "small") for g in GROUPS if g not in APART for option in GR
 OF_SCALE = [
     (g, option, "paper")
     for g, option, _ in CHAIN
-    if "scaled" in (config.CONF / g / f"{option}.yaml").read_text(encoding="utf-8")
+    if "scaled" in (CONF / g / f"{option}.yaml").read_text(encoding="utf-8")
 ]
 
 

@@ -330,6 +330,8 @@ def test_a_rollout_keeps_who_took_its_steps(lesson, tmp_path):
     assert pipeline.deployment.manifest["metrics"]["by_operators"] == [24]
     row = pd.read_csv(pipeline.evaluation.path / "results.csv").iloc[0]
     assert row["handed_over"] == 0.0
+    assert row["estimated_error"] == pytest.approx(kept.estimate.max())
+    assert 1e-4 < row["true_error"] < 1e-2
     assert row["teach_seconds"] == pytest.approx(pipeline.taught.manifest["metrics"]["teach_seconds"])
     offline = row["teach_seconds"] + pipeline.training.manifest["metrics"]["training_seconds"]
     assert row["break_even_runs"] > offline / (1e-3 * 40 * row["step_ms_full"])

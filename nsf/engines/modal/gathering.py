@@ -194,12 +194,7 @@ def make_contraction(
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def contraction(
-        needed: wp.array2d(dtype=wp.int32),
-        one: Field,
-        two: Field,
-        threads: int,
-        tiles: int,
-        lanes: int,
+        needed: wp.array2d(dtype=wp.int32), one: Field, two: Field, threads: int, tiles: int, lanes: int
     ):
         t = within(wp.tid(), tiles, lanes)
         start = tile_of(wp.tid(), tiles, lanes) * wp.static(tile)

@@ -7,7 +7,7 @@ import warp as wp
 from nsf.engines.modal.gathering import make_combination, make_tiles
 from nsf.mpm import Precision
 from nsf.mpm.batch import make_runs
-from nsf.mpm.grid import inside
+from nsf.mpm.grid.nodes import inside
 from nsf.mpm.grid.shape import shape_functions
 from nsf.mpm.native import native_code
 
@@ -75,12 +75,7 @@ def make_sample(precision: Precision, shape_name: str, several: bool = False):
     def combined(given: Motion, modes: wp.array(dtype=wp.float32), p: int, run: int, lane: int) -> sums: ...
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
-    def sample(
-        at: Motion,
-        modes: wp.array(dtype=wp.float32),
-        grid_shape: wp.vec3i,
-        lanes: int,
-    ):
+    def sample(at: Motion, modes: wp.array(dtype=wp.float32), grid_shape: wp.vec3i, lanes: int):
         t, lane = wp.tid() / lanes, wp.tid() % lanes
         run = run_of(t, at.of_sample)
         p = t - run * at.of_sample

@@ -15,13 +15,7 @@ from nsf.engines.modal.closure import packed_weights, projection_block
 from nsf.engines.modal.fields import field_launches
 from nsf.engines.modal.gathering import THREADS, make_gathering, tiling
 from nsf.engines.modal.placing import make_others, make_sample
-from nsf.engines.modal.projection import (
-    EVALUATE,
-    PREPARE,
-    SOLVE,
-    make_projection,
-    prepared_size,
-)
+from nsf.engines.modal.projection import EVALUATE, PREPARE, SOLVE, make_projection, prepared_size
 from nsf.kinematics.fields.modal import ModalFactors
 from nsf.mpm.grid.shape import DEGREES, stencil_offset
 from nsf.mpm.native.access import WARP
@@ -75,12 +69,7 @@ class ModalSpan(GridSpan):
     @property
     @override
     def stages(self) -> Stages:
-        return {
-            "inference": self.infer,
-            "p2g": self.p2g,
-            "g2p": self.update_g2p,
-            "inversion": self.project,
-        }
+        return {"inference": self.infer, "p2g": self.p2g, "g2p": self.update_g2p, "inversion": self.project}
 
     @override
     def enter(self, first: bool) -> None:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from nsf.engines.operators.taught import Taught
-from nsf.errors import MissingRunError, SchemaError
+from nsf.errors import MissingRunError, SchemaError, first_line
 from nsf.runs.manifest import verified
 from nsf.storage import writing
 
@@ -190,9 +190,9 @@ class StepOperators(nn.Module):
             if not all(bool(torch.isfinite(values).all()) for values in model.state_dict().values()):
                 raise ValueError("a value is not finite")
         except (RuntimeError, KeyError, TypeError, AttributeError, ValueError) as error:
-            first = (str(error).splitlines() or [type(error).__name__])[0]
             raise SchemaError(
-                f"{path}: its contents do not fit each other ({first}); teach again with `nsf teach`"
+                f"{path}: its contents do not fit each other ({first_line(error)}); teach again with "
+                "`nsf teach`"
             ) from error
         return model.double().requires_grad_(False).eval(), taught
 
@@ -220,9 +220,9 @@ def _read(path: Path) -> dict:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except (RuntimeError, EOFError, OSError, ValueError, KeyError, pickle.UnpicklingError) as error:
-        first = (str(error).splitlines() or [type(error).__name__])[0]
         raise SchemaError(
-            f"{path} is truncated or holds no operators ({first}); delete it and run `nsf teach` again"
+            f"{path} is truncated or holds no operators ({first_line(error)}); delete it and run "
+            "`nsf teach` again"
         ) from error
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise SchemaError(f"{path} is a torch file but holds no operators; pass the file of a teach run")

@@ -11,6 +11,8 @@ FEATURES = 9
 _SAME_TIME = 1e-6  # of a step, as `nsf.mpm.boundaries.motion` has it
 #: A combination of features that moves less than this share of the first one counts for nothing.
 _HARDLY = 0.03
+#: Share of its largest value by which a feature may differ from itself without being another.
+_ROUND_OFF = 1e-9
 
 
 def collider_states(colliders: Sequence[Collider], dt: float, steps: int) -> np.ndarray:
@@ -50,7 +52,8 @@ def principal(states: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         Mean [f] and matrix [f, C]: c = (state − mean) matrix, whose first entry has unit variance.
     """
     rows = np.concatenate(states)
-    varies = np.max([np.ptp(run, axis=0) for run in states], axis=0) > 0.0
+    # A solid at constant speed comes on by as much in each step, but for round-off.
+    varies = np.max([np.ptp(run, axis=0) for run in states], axis=0) > _ROUND_OFF * np.abs(rows).max(0)
     mean = rows.mean(0)
     deviation = np.where(varies, rows.std(0), np.inf)
     _, sizes, axes = np.linalg.svd((rows - mean) / deviation, full_matrices=False)

@@ -8,7 +8,7 @@ from functools import cache
 
 import warp as wp
 
-from nsf.mpm.grid import flat_index, inside, storage
+from nsf.mpm.grid.nodes import flat_index, inside, storage
 from nsf.mpm.grid.shape import shape_functions
 from nsf.mpm.materials import LawFunctions, make_law_update
 from nsf.mpm.native.access import make_load

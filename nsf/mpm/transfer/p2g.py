@@ -8,7 +8,7 @@ from functools import cache
 import warp as wp
 
 from nsf.mpm.batch import make_runs
-from nsf.mpm.grid import flat_index, inside, storage
+from nsf.mpm.grid.nodes import flat_index, inside, storage
 from nsf.mpm.grid.shape import shape_functions
 from nsf.mpm.native.access import WARP
 from nsf.mpm.precision import Precision

@@ -76,7 +76,9 @@ def rows(
         **_costs_in_a_row(cost, next(iter(rivals[0].coarse), None)),
         "teach_seconds": offline[1],
         "break_even_runs": _break_even(cost, sum(offline)),
-        "handed_over": 0.0,
+        **dict.fromkeys(
+            ("handed_over", "estimated_error", "true_error"), 0.0
+        ),  # their place; of each run below
         "precision": config.precision,
         "device": torch.cuda.get_device_name(device) if device.startswith("cuda") else "cpu",
         "commit": commit,
@@ -100,7 +102,11 @@ def rows(
             **_beside(beside),
         }
         reduced = rollout.diverged < 0 and rollout.handed_over < 0
-        share = {"handed_over": _handed_over(rollout, config)}
+        share = {
+            "handed_over": _handed_over(rollout, config),
+            "estimated_error": math.nan if rollout.estimate is None else rollout.estimate.max(),
+            "true_error": comparison.true_error,
+        }
         found.append(variant | own | (measured if reduced else lost) | share)
     return pd.DataFrame(found)
 
@@ -198,6 +204,7 @@ def summarise(
         "delta": mean("delta") if math.isfinite(mean("delta")) else None,
         "reconstruction_delta": mean("reconstruction_delta"),
         "reconstruction_stress_error": mean("reconstruction_stress_error"),
+        "tolerance": OmegaConf.select(config, "deploy.tolerance", default=None),
         "trust": [trust_of(rollout) for rollout in rollouts],
         "rivals": [
             {"parameter": rollout.parameter} | asdict(beside)

@@ -62,6 +62,8 @@ _SPEC = (
     Column("teach_seconds", "teaching", "s"),
     Column("break_even_runs", "runs until it pays"),
     Column("handed_over", "handed on", "%", 100.0),
+    Column("estimated_error", "estimated error", "m"),
+    Column("true_error", "true error", "m"),
     Column("precision", "precision"),
     Column("device", "device"),
     Column("commit", "commit"),
@@ -75,7 +77,7 @@ RIVALS = (
 """Displacement errors of what a reduced run is held to, beside its own."""
 LATER = (
     "engine", *RIVALS, "step_ms_coarse", "total_ms_full", "total_ms_reduced", "total_ms_coarse", "decode_ms",
-    "teach_seconds", "break_even_runs", "handed_over",
+    "teach_seconds", "break_even_runs", "handed_over", "estimated_error", "true_error",
 )  # fmt: skip
 """Columns that older runs and reports lack: they are read as empty."""
 

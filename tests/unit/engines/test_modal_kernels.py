@@ -1,16 +1,28 @@
 """Sums over modes are what NumPy makes of them, also at the last particles of the last block."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 import torch
 import warp as wp
+from nsf.mpm.access import SHARED, TAKEN
 
 from nsf.data import TAU_MATRIX
 from nsf.dynamics.interop import as_vectors
 from nsf.engines.modal.arena import Arena
+from nsf.engines.modal.closure import packed_weights, projection_block
 from nsf.engines.modal.gathering import THREADS, make_contraction, make_gathering, tiling
 from nsf.engines.modal.networks import make_layer, make_product, product_blocks
 from nsf.engines.modal.placing import make_others, make_sample
+from nsf.engines.modal.projection import (
+    EVALUATE,
+    PREPARE,
+    SOLVE,
+    make_projection,
+    prepared_size,
+    shared_bytes,
+)
 from nsf.mpm import precision_of
 from nsf.mpm.device import warp_device
 
@@ -245,3 +257,89 @@ def test_layers_of_two_networks(arena, rng, simulations, outs, way):
         of_members = entries[i].unflatten(1, (2, -1)), W[i].unflatten(0, (2, -1))
         expected = silu(torch.einsum("bme,moe->bmo", *of_members).flatten(1) + b[i])
         np.testing.assert_allclose(found[i].cpu(), expected.cpu(), rtol=1e-11, atol=1e-11)
+
+
+def closure_of(layers, scale, x):
+    """scale · Σ of the members at x [B, r]."""
+    total = 0.0
+    for *hidden, (W, b) in layers:
+        y = x
+        for W_h, b_h in hidden:
+            y = torch.nn.functional.silu(y @ W_h.T + b_h)
+        total = total + scale * (y @ W.T + b)
+    return total
+
+
+@pytest.mark.parametrize(("precision", "accuracy"), [("fp64", 1e-9), ("fp32", 2e-5)])
+@pytest.mark.parametrize(("K", "members", "kept"), [(20, 3, True), (72, 1, False)])
+@pytest.mark.parametrize("stops", [True, False], ids=["early", "late"])
+def test_the_inversion_finds_the_latents_that_moved_the_sample(
+    device, rng, precision, accuracy, K, members, kept, stops
+):
+    """Of three runs, with G in shared memory or not; no latents give all of the displacement."""
+    arena, runs, r, s, dt = Arena(precision_of(precision), warp_device(device)), 3, 5, 11, 0.25
+    widths, scale, iterations, left = (r, 40, 33, K - r), 0.3, 8, 0.7
+    assert (shared_bytes(arena.precision, widths, r, K) + 8 * K**2 <= SHARED - TAKEN) == kept
+    layers = [
+        [
+            (torch.tensor(rng.normal(size=(out, into)) / into**0.5), torch.tensor(rng.normal(size=out)))
+            for into, out in pairwise(widths)
+        ]
+        for _ in range(members)
+    ]
+    layers = [[(W.float().double(), b.float().double()) for W, b in member] for member in layers]
+    sigma, B = torch.tensor(1.0 + rng.random(r)), torch.tensor(rng.normal(size=(3 * s, K)) / 6.0)
+    B = torch.cat([B, torch.eye(K)])  # so that G is well conditioned
+    x, before, target = (torch.tensor(rng.normal(size=(runs, r))) for _ in range(3))
+    before, target = x + 0.02 * before, x + 0.05 * target
+
+    def coefficients(at):
+        return torch.cat([sigma * at, closure_of(layers, scale, at)], 1)
+
+    moved = coefficients(target) - coefficients(x)
+    b = moved @ (B.T @ B)
+    squares = (moved * b).sum(1, keepdim=True) + left
+    packed = torch.cat([packed_weights(member, arena.device.is_cuda) for member in layers])
+    held = {
+        name: arena.hold(values, torch.float64)
+        for name, values in {
+            "sigma": sigma, "G": (B.T @ B).flatten(), "b": torch.cat([b, squares], 1), "latent": x.clone(),
+        }.items()
+    }  # fmt: skip
+    held |= {
+        name: arena.zeros(runs, n) for name, n in {"a": K, "rate": K, "prepared": prepared_size(r, K)}.items()
+    }
+    held |= {"xhat": arena.hold(x.clone(), arena.real), "xhat_previous": arena.hold(before, arena.real)}
+    sizes = {"xhats": 2 * r, "residuals": iterations + 1, "updates": iterations}
+    held |= {name: arena.zeros(runs, n, dtype=arena.real) for name, n in sizes.items()}
+    held["row"] = arena.zeros(runs, 1, dtype=torch.int64)
+    held |= {name: arena.zeros(runs, 1, dtype=torch.int32) for name in ("first", "step")}
+    given = held | {
+        "weights": arena.hold(packed, torch.float32), "scale": scale, "sample": s, "iterations": iterations,
+        "tolerance": 1e-11 if stops else 0.0, "linear": False, "dt": dt,
+    }  # fmt: skip
+    kernel, block = make_projection(arena.precision, widths, members, r, K, True), projection_block(widths)
+    threads = arena.lanes(block)
+    tasks = []
+    for task in (EVALUATE, PREPARE, SOLVE):
+        arena.pack(kernel, runs * threads, block, given=given, task=task, threads=threads).launch()
+        wp.synchronize_device(arena.device)
+        tasks.append({name: held[name].cpu().double().clone() for name in ("a", "rate", "latent")})
+    evaluated, _, found = tasks
+    options = {"rtol": 0, "atol": accuracy}
+    torch.testing.assert_close(evaluated["a"], coefficients(x), **options)
+    torch.testing.assert_close(found["latent"], target, **options)
+    torch.testing.assert_close(found["a"], coefficients(target), **options)
+    torch.testing.assert_close(
+        found["rate"], (coefficients(target) - coefficients(x)) / dt, rtol=0, atol=accuracy / dt
+    )
+    torch.testing.assert_close(held["xhats"].cpu().double()[:, r:], found["latent"], rtol=1e-6, atol=0)
+    torch.testing.assert_close(
+        held["residuals"].cpu().double()[:, -1],
+        torch.full((runs,), (left / s) ** 0.5).double(),
+        rtol=1e-4,
+        atol=0,
+    )
+    taken = (held["updates"].cpu() > 0).sum(1)
+    assert held["row"].flatten().tolist() == [1] * runs
+    assert (taken < iterations).all() if stops else (taken == iterations).all()

@@ -154,6 +154,18 @@ def test_what_moves_together_is_one_state_and_what_rests_is_none():
     assert none.shape == (9, 0)
 
 
+def test_a_constant_speed_is_no_state():
+    """The way of each step differs by round-off, which must not be taken for a state of its own."""
+    motion = Motion([0.0, 0.6], [[0.0, 0.0, 0.0], [0.08, 0.0, 0.0]])
+    grip = Cuboid([0.2, 0.5, 0.5], [0.1, 0.2, 0.2], "sticky", motion=motion)
+    states = collider_states([grip], 0.004, 150)
+    assert 0.0 < np.ptp(states[:, 4]) < 1e-15
+    mean, matrix = principal([states])
+    c = (states - mean) @ matrix
+    assert c.shape == (150, 1)
+    np.testing.assert_allclose(np.diff(c[:, 0], axis=0), c[1, 0] - c[0, 0], rtol=1e-9)
+
+
 # -- the file -------------------------------------------------------------------------------------------
 
 

@@ -9,11 +9,11 @@ import torch
 
 import nsf.scenes
 from nsf.data import Trajectory
-from nsf.deployment import Rollout, go_on
+from nsf.deployment import FULL_ORDER, OPERATORS, PROJECTED, Rollout, go_on
 from nsf.dynamics import Method
 from nsf.errors import InstabilityError, SchemaError
 from nsf.evaluation import at_frames, compare, metrics
-from nsf.evaluation.compare import trust_at_frames
+from nsf.evaluation.compare import levels_at_frames, trust_at_frames
 
 ERRORS = ["delta", "displacement_error", "stress_error"]
 MOMENTA = ["linear_momentum_error", "angular_momentum_error"]
@@ -89,10 +89,11 @@ def test_series(comparison_of, made, truth):
     series = comparison_of(made).series
     latents = [f"{kind}_{k}" for kind in ("xhat", "encoded") for k in range(1, 5)]
     first = ["parameter", "split", "frame", "t"]
-    assert list(series) == [*first, *ERRORS, *MOMENTA, "reconstruction_delta", "trust", *latents]
+    assert list(series) == [*first, *ERRORS, *MOMENTA, "reconstruction_delta", "trust", "by", *latents]
     assert len(series) == truth.frames == 25
     assert set(series["split"]) == {"test"}
     np.testing.assert_array_equal(series["t"], truth.t)
+    np.testing.assert_array_equal(series["by"], [np.nan] + 24 * [PROJECTED])
     np.testing.assert_allclose(series[[f"xhat_{k}" for k in range(1, 5)]], made.xhat, rtol=1e-12)
     assert np.isnan(series["displacement_error"][0])  # nothing has moved yet
     assert np.isfinite(series[[*ERRORS, *MOMENTA]][1:]).all().all()
@@ -116,7 +117,10 @@ def test_pictures(comparison_of, made, truth):
     assert kept["x_full"].shape == kept["x_reduced"].shape == (4, 50, 3)
     assert kept["stress_full"].shape == kept["stress_reduced"].shape == (4, 50)
     np.testing.assert_allclose(kept["t"], truth.t[[0, 8, 16, 24]])
-    many = comparison_of(made, pictures=(10_000, 1000)).pictures
+    whole = comparison_of(made, pictures=(10_000, 1000))
+    many = whole.pictures
+    off = np.linalg.norm(many["x_reduced"].astype(float) - many["x_full"], axis=2)
+    assert whole.true_error == pytest.approx(np.sqrt((off**2).mean(1)).max(), rel=1e-4)
     assert many["x_full"].shape == (25, 500, 3)
     np.testing.assert_allclose(many["x_full"], truth.read("x"), rtol=1e-6)
     tau = torch.as_tensor(np.asarray(truth.read("tau"))).double()
@@ -132,6 +136,15 @@ def test_frames_between_deployment_steps():
 
 def test_frames_at_deployment_steps_are_exact(made):
     assert np.array_equal(at_frames(made, made.t), made.xhat)
+
+
+def test_who_took_the_step_to_each_frame(made):
+    by = np.repeat(np.array([OPERATORS, PROJECTED], np.int8), [10, 14])
+    run = replace(made, by=by, estimate=np.zeros(25))
+    t = np.append(0.0, made.t[1:])
+    np.testing.assert_array_equal(levels_at_frames(run, t), [np.nan, *by])
+    handed = replace(run, handed_over=12)
+    np.testing.assert_array_equal(levels_at_frames(handed, t), [np.nan, *by[:12], *[FULL_ORDER] * 12])
 
 
 def test_a_multiplied_step_is_compared_at_the_frames(chain, tiny_manifold, tiny_trust, comparison_of, made):

@@ -6,7 +6,7 @@ import warp as wp
 
 from nsf.errors import ConfigError
 from nsf.mpm import FP64, BoundaryArrays, DomainWalls, Grid, GridGeometry, GridStep, HalfSpace, Transfer
-from nsf.mpm.grid import inside
+from nsf.mpm.grid.nodes import inside
 
 DX, DT = 1.0 / 16.0, 0.002
 GEOMETRY = GridGeometry.of_domain((1.0, 1.0, 1.0), DX)

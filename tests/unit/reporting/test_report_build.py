@@ -12,7 +12,7 @@ from nsf.errors import ConfigError, StorageError
 from nsf.reporting import build, build_report, pictures
 from nsf.reporting.pictures import _Variant
 from nsf.reporting.sources import Source, Study, file_hash, open_sources
-from nsf.reporting.study import spearman, trust_note
+from nsf.reporting.study import estimate_note, spearman, trust_note
 from nsf.reporting.tables import merge
 from nsf.reporting.text.columns import number
 from nsf.runs import Run
@@ -315,6 +315,18 @@ def test_a_run_that_was_handed_over_does_not_count(tmp_path):
     assert "Over the 3 reduced runs" in trust_note(frame)
     assert "is 1.00." in trust_note(frame)
     assert "Spearman" not in trust_note(frame[1:])
+
+
+def test_an_estimate_stands_beside_the_true_error():
+    frame = pd.DataFrame({"estimated_error": [1.0, 2.0, 3.0, 4.0, 6.0, float("nan")]})
+    frame["true_error"] = [2.0, 3.0, 4.0, 6.0, 5.0, 9.0]
+    frame["tolerance"], frame["handed_over"] = None, [0.0, 0.0, 0.5, 0.0, 0.2, 0.0]
+    assert "over 5 runs is 0.90." in estimate_note(frame)
+    assert "tolerance" not in estimate_note(frame)
+    frame["tolerance"] = [3.5, 3.5, 3.5, 3.5, 5.5, 3.5]
+    said = "2 of them went further than their tolerance; 1 of these were not handed on."
+    assert estimate_note(frame).endswith(said)
+    assert estimate_note(frame[1:]) == ""
 
 
 def test_captions_say_where_the_full_order_solver_goes_on(tmp_path):

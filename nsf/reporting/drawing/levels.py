@@ -1,0 +1,51 @@
+"""Who took the steps of a run, and its error meanwhile."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from nsf.reporting.drawing.charts import plain_ticks
+from nsf.reporting.drawing.style import FULL, PALETTE, figure, line_style, styled
+
+#: Title and colour of each level, in the order of `by`.
+LEVELS = {"operators": PALETTE[0], "projected step": PALETTE[1], "full-order solver": FULL}
+
+
+def name_of(series: pd.DataFrame) -> str:
+    """What a run is called by those who took its steps."""
+    names = [title for i, title in enumerate(LEVELS) if (series["by"] == i).any()]
+    return f"{names[0]} alone" if len(names) == 1 else " and ".join(names)
+
+
+def levels_over_time(runs: Mapping[str, pd.DataFrame]) -> Figure:
+    """Displacement error [%] of runs of one parameter value over time [s], and a strip for each of who steps.
+
+    Args:
+        runs: by name, rows of `series.csv` of one run, `by` among them.
+    """
+    with styled():
+        fig = figure(3.6 + 0.3 * len(runs))
+        error, strips = fig.subplots(2, 1, sharex=True, height_ratios=[3.0, 0.36 * len(runs)])
+        for i, (name, series) in enumerate(runs.items()):
+            error.plot(series["t"], 100 * series["displacement_error"], label=name, **line_style(i))
+            taken = series["by"].notna().to_numpy()
+            ends, by = series["t"].to_numpy()[taken], series["by"].to_numpy()[taken].astype(int)
+            starts = np.append(series["t"].iloc[0], ends[:-1])
+            for level, color in enumerate(LEVELS.values()):
+                own = by == level
+                spans = list(zip(starts[own], (ends - starts)[own], strict=True))
+                strips.broken_barh(spans, (i - 0.36, 0.72), color=color, lw=0)
+        error.set(ylabel="displacement error [%]", yscale="log")
+        plain_ticks(error.yaxis)
+        error.grid(axis="y")
+        strips.set_yticks(range(len(runs)), list(runs))
+        strips.set(xlabel="time t [s]", ylim=(len(runs) - 0.5, -0.5))
+        strips.tick_params(axis="y", length=0)
+        error.legend(loc="lower right")
+        shown = sorted({int(level) for series in runs.values() for level in series["by"].dropna()})
+        known = [(title, color) for i, (title, color) in enumerate(LEVELS.items()) if i in shown]
+        patches = [strips.fill_between([], [], color=color, label=title) for title, color in known]
+        fig.legend(handles=patches, loc="outside upper left", ncols=3)
+    return fig

@@ -1,0 +1,47 @@
+"""Who took the steps of runs by operators: a picture beside the runs of one level alone."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from nsf.reporting.drawing.levels import levels_over_time, name_of
+from nsf.reporting.drawing.style import save
+from nsf.reporting.text.columns import parameter_text
+from nsf.reporting.text.page import Picture, Section
+
+
+def levels_section(known: Sequence, folder: Path) -> list[Section]:
+    """A picture a scene in which a run had more than one level, at the first such value; none without one.
+
+    Args:
+        known: variants, with `scene`, `values`, `parameter`, `runs` and `series` (`nsf.reporting.pictures`).
+        folder: of the report.
+    """
+    pictures = []
+    for scene in dict.fromkeys(variant.scene for variant in known):
+        own = [variant for variant in known if variant.scene == scene]
+        series = [variant.series(held_out_only=True) for variant in own]
+        mixed = [
+            part["parameter"].iloc[0]
+            for rows in series
+            if "by" in rows
+            for _, part in rows.groupby("parameter")
+            if part["by"].nunique() > 1
+        ]
+        if not mixed:
+            continue
+        shown, runs = {}, set()
+        for variant, rows in zip(own, series, strict=True):
+            part = rows[rows["parameter"] == mixed[0]]
+            if len(part) and "by" in part:
+                name = name_of(part)
+                shown[f"{name}, {variant.label}" if name in shown else name] = part
+                runs |= set(variant.runs)
+        name, unit = own[0].parameter
+        caption = (
+            f"The displacement error over time at {name} {parameter_text(mixed[0], '', unit)}, and who took "
+            "each step: the operators; the projected step, where the estimated error passed its tolerance or "
+            "the run was not to be believed; and the operators again, where they are well."
+        )
+        stem = "levels" if len({variant.scene for variant in known}) == 1 else f"{scene}-levels"
+        pictures.append(Picture(save(levels_over_time(shown), folder, stem), caption, sorted(runs)))
+    return [Section("Who took the steps", pictures)] if pictures else []

@@ -1,0 +1,72 @@
+"""The picture of who took the steps of a run."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+from matplotlib.colors import to_hex
+
+from nsf.deployment.levels import LEVELS as BY
+from nsf.reporting.drawing.levels import LEVELS, levels_over_time, name_of
+from nsf.reporting.levels import levels_section
+
+
+def series_of(*by: int, parameter: float = 0.6) -> pd.DataFrame:
+    n = len(by)
+    return pd.DataFrame(
+        {"parameter": parameter, "t": 0.1 * np.arange(n + 1), "displacement_error": 0.01 * np.arange(n + 1),
+         "by": [np.nan, *by]}
+    )  # fmt: skip
+
+
+def variant(label, *series, scene="jelly_cube"):
+    rows = pd.concat(series)
+    return SimpleNamespace(
+        scene=scene, label=label, parameter=("speed", "m/s"), runs=[f"evaluate/{label}"],
+        series=lambda held_out_only: rows,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("by", "name"),
+    [
+        ((0, 0), "operators alone"),
+        ((1, 1), "projected step alone"),
+        ((0, 1, 0), "operators and projected step"),
+        ((0, 1, 2), "operators and projected step and full-order solver"),
+    ],
+)
+def test_a_run_is_called_by_its_levels(by, name):
+    assert name_of(series_of(*by)) == name
+    assert len(BY) == len(LEVELS)
+
+
+def test_a_strip_has_a_span_for_each_step():
+    figure = levels_over_time({"both": series_of(0, 1, 1, 0), "one": series_of(1, 1, 1, 1)})
+    error, strips = figure.axes
+    assert [line.get_label() for line in error.lines] == ["both", "one"]
+    np.testing.assert_allclose(error.lines[0].get_ydata(), np.arange(5))
+    drawn = [
+        (to_hex(bars.get_facecolor()[0]), path.vertices[:, 0].min(), path.vertices[:, 1].mean().round())
+        for bars in strips.collections
+        for path in bars.get_paths()
+        if len(path.vertices) and bars.get_label().startswith("_")
+    ]
+    operators, projected, _ = (color.lower() for color in LEVELS.values())
+    expected = [(operators, 0.0), (operators, 0.3), (projected, 0.1), (projected, 0.2)]
+    assert [(color, pytest.approx(t)) for color, t, row in drawn if row == 0] == expected
+    assert {color for color, _, row in drawn if row == 1} == {projected}
+
+
+def test_a_picture_where_a_run_has_more_than_one_level(tmp_path):
+    alone = [variant("auto", series_of(1, 1, 1)), variant("operators", series_of(0, 0, 0))]
+    assert levels_section(alone, tmp_path) == []
+    assert levels_section([variant("old", series_of(0, 1, 0).drop(columns="by"))], tmp_path) == []
+    both = variant("levels", series_of(0, 0, 0, parameter=0.5), series_of(0, 1, 0))
+    (section,) = levels_section([*alone, both, variant("other", series_of(0, 1, 1), scene="sand")], tmp_path)
+    one, two = section.pictures
+    assert one.runs == ["evaluate/auto", "evaluate/levels", "evaluate/operators"]
+    assert "speed 0.6 m/s" in one.caption
+    assert two.runs == ["evaluate/other"]
+    assert {path.name for path in tmp_path.glob("*.png")} == {"jelly_cube-levels.png", "sand-levels.png"}
