@@ -1,7 +1,7 @@
 """Every solver of a scene beside the others by error and by time, and the rivals that cost nothing."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import pandas as pd
 
@@ -42,15 +42,18 @@ def solvers(merged: Merged) -> pd.DataFrame:
     once for each precision and type of device. `span_ms` is the time for one Δt of the full-order solver:
     a solver of longer steps takes fewer. `kind` is `full`, `coarse` or `reduced`.
     """
-    places: dict[tuple, list[list[int]]] = {}
-    for members in variants(merged):
-        row = merged.frame.iloc[members[0]]
+    groups = variants(merged)
+    rows = [merged.frame.iloc[members[0]].to_dict() for members in groups]
+    labels = variant_labels([row | dict.fromkeys(_PLACE, "") for row in rows])
+    places: dict[tuple, list[tuple[list[int], str]]] = {}
+    for row, members, label in zip(rows, groups, labels, strict=True):
         place = (row["scene"], row["precision"], device_type(row["device"]))
-        places.setdefault(place, []).append(members)
-    return pd.DataFrame([row for same in places.values() for row in _of_place(merged, same)])
+        places.setdefault(place, []).append((members, label))
+    rows = [row for own in places.values() for row in _of_place(merged, *zip(*own, strict=True))]
+    return pd.DataFrame(rows)
 
 
-def _of_place(merged: Merged, same: list[list[int]]) -> list[dict]:
+def _of_place(merged: Merged, same: Sequence[list[int]], labels: Sequence[str]) -> list[dict]:
     """The full-order solver, coarse ones, then the variants of one scene, precision and type of device."""
     means = [mean_rows(merged, members)[0] for members in same]  # held-out values come first
     head = {name: means[0][name] for name in _PLACE}
@@ -61,7 +64,7 @@ def _of_place(merged: Merged, same: list[list[int]]) -> list[dict]:
     full |= {"memory_mib": cost["memory_full_mib"]}
     rows = [head | full] if cost.notna().any() else []
     rows += [head | row for row in _coarse(merged, same)]
-    for row, members, label in zip(means, same, variant_labels(means), strict=True):
+    for row, members, label in zip(means, same, labels, strict=True):
         own = {name: row[name] for name in _ERRORS} | {SOLVER: label, "kind": "reduced"}
         own |= {"step_ms": row["step_ms_reduced"], "total_ms": row["total_ms_reduced"]}
         own |= {"shown_ms": row["total_ms_reduced"] + row["decode_ms"]}
@@ -71,7 +74,7 @@ def _of_place(merged: Merged, same: list[list[int]]) -> list[dict]:
     return rows
 
 
-def _coarse(merged: Merged, same: list[list[int]]) -> list[dict]:
+def _coarse(merged: Merged, same: Sequence[list[int]]) -> list[dict]:
     """Coarse full-order solvers of a scene, a row a factor: medians over what its variants' runs measured."""
     errors: dict[str, list[list[float]]] = {}
     times: dict[str, list[dict]] = {}
@@ -157,9 +160,9 @@ def where_rivals_win(rows: pd.DataFrame) -> str:
         own = part["displacement_error"].min()
         best = {name: part[name].min() for name in RIVALS}
         nearer = [f"{COLUMN[name].title} ({_percent(v)})" for name, v in best.items() if v < own]
-        told += [f"on {scene} {_listed(nearer)}, the reduced run {_percent(own)}"] if nearer else []
+        told += [f"on {scene} {_listed(nearer)} beside {_percent(own)}"] if nearer else []
     if told:
-        return f"A rival has a smaller displacement error than the best reduced run {'; '.join(told)}."
+        return f"A rival has a smaller displacement error than the best reduced run: {'; '.join(told)}."
     return "No rival has a smaller displacement error than the best reduced run." if len(known) else ""
 
 

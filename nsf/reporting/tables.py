@@ -220,9 +220,8 @@ def without_constants(
             said[name].add("")  # what was not measured of one row is not said of it by the others
     constant = [name for name in describing if name not in keep and len(said[name]) == 1]
     empty = [name for name in (*_BLANK, PLACE) if name in frame and set(frame[name]) <= {"", ABSENT}]
-    # None with evaluation.trials=0, or without operators.
-    costs = (*RIVALS, *COSTS, TRAINING, "estimated_error")
-    empty += [name for name in costs if name in frame and frame[name].isna().all()]
+    # Older runs, and those with evaluation.trials=0, have not measured everything.
+    empty += [name for name in frame if name not in TEXT and frame[name].isna().all()]
     first = {name: next(v for v in frame[name] if str(v) in said[name]) for name in constant}
     told = (f"{COLUMN[n].title} {_cell(n, first[n])} {COLUMN[n].unit}".strip() for n in constant)
     return frame.drop(columns=[*constant, *empty]), ", ".join(told)

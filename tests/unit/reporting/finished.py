@@ -1,6 +1,7 @@
 """Folders of finished reports, without the runs and the pictures."""
 
 import json
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import pandas as pd
 
 from nsf.reporting import COLUMNS
 from nsf.reporting.sources import file_hash
+from nsf.reporting.text.columns import RIVALS
 
 PAPER = {"sand": {"nsf": {"r": 6, "sample": 150, "delta": 0.004}, "deformation_only": {"delta": 0.05}}}
 
@@ -16,7 +18,7 @@ def job(
     scene: str = "sand", delta: float = 0.001, stress: float = 0.02, parameter: float = 26.0, **keys
 ) -> dict:
     """A held-out row: columns of results.csv, and in `keys` the keys of its job."""
-    row = dict.fromkeys(COLUMNS, 1.0) | {
+    row = dict.fromkeys(COLUMNS, 1.0) | dict.fromkeys(RIVALS, math.nan) | {
         "scene": scene, "method": keys.get("method", "nsf"), "field": keys.get("field", "basis"),
         "r": int(keys.get("latent_dim", 6)), "sample": keys.get("sampler.size", "150"),
         "parameter": parameter, "split": "test", "delta": delta, "displacement_error": 10 * delta,

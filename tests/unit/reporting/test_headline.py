@@ -141,7 +141,7 @@ def test_engines_are_settings_and_reports_from_before_them_have_none(tmp_path):
 def test_where_a_rival_wins_is_said(tmp_path):
     rivals = {name: 0.5 for name in RIVALS} | {"displacement_coarse": 0.005}
     _, said = told(write_report(tmp_path / "a", [job() | rivals]))
-    assert "than the best reduced run on sand coarse full order (0.500 %), the reduced run 1 %." in said
+    assert "than the best reduced run: on sand coarse full order (0.500 %) beside 1 %." in said
     older = {name: value for name, value in job().items() if name not in LATER}
     _, said = told(write_report(tmp_path / "b", [older]))
     assert "rival" not in said

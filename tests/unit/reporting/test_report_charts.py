@@ -10,6 +10,7 @@ from synthetic import TEST, Made, collapse
 from nsf import config
 from nsf.reporting.drawing import charts
 from nsf.reporting.drawing.camera import Camera, View
+from nsf.reporting.drawing.cost import error_over_cost
 from nsf.reporting.drawing.point import point_chart, point_response
 from nsf.reporting.drawing.shapes import animation, final_shapes, is_cut_open, strip
 from nsf.reporting.drawing.style import save
@@ -42,6 +43,35 @@ def test_error_over_time_spans_the_run_where_one_diverged_early(series):
     lost.loc[lost["t"] > 0.1, ["delta", "displacement_error"]] = np.inf
     for panel in charts.error_over_time(lost).axes:
         assert panel.get_xlim()[1] >= series["t"].max()
+
+
+def test_error_over_cost_has_a_point_for_each_solver_that_was_timed():
+    def solver(name, kind, ms, error):
+        return {"solver": name, "kind": kind, "span_ms": ms, "displacement_error": error}
+
+    panels = {
+        "sand": [
+            solver("full order", "full", 2.0, 0.0),
+            solver("full order, Δx × 2", "coarse", 0.5, 0.2),
+            solver("nsf", "reduced", 1.0, 0.01),
+            solver("lost", "reduced", np.nan, np.inf),
+        ],
+        "bread": [solver("nsf", "reduced", 0.1, 0.03)],
+    }
+    fig = error_over_cost(panels, {"sand": {"nothing moves": 1.0, "nearest training run": np.nan}})
+    sand, bread = fig.axes
+    assert [panel.get_title("left") for panel in (sand, bread)] == ["sand", "bread"]
+    drawn = {line.get_label(): line.get_xydata().tolist() for line in sand.lines}
+    assert drawn["nsf"] == [[1.0, 1.0]]
+    assert drawn["full order on coarser grids"] == [[0.5, 20.0]]
+    assert [x for x, _ in drawn["full order"]] == [2.0, 2.0]
+    assert [y for _, y in drawn["nothing moves"]] == [100.0, 100.0]
+    assert set(drawn).isdisjoint({"lost", "nearest training run"})
+    assert [text.get_text() for text in sand.texts] == ["2Δx"]
+    assert (sand.get_xscale(), sand.get_yscale()) == ("log", "log")
+    for text in labels(fig)[:2]:
+        assert text.endswith(("[ms]", "[%]"))
+    assert sand.lines[2].get_color() == bread.lines[0].get_color()  # one solver, one colour
 
 
 def test_a_strip_shows_both_models_from_the_first_frame_to_the_last():

@@ -226,15 +226,14 @@ def test_a_rival_that_wins_is_told_with_its_error_and_the_reduced_runs():
     rivals = dict(zip(RIVALS, (1.0, 0.04, 0.02, float("nan")), strict=True))
     rows = [{"scene": "sand", "displacement_error": e} | rivals for e in (0.03, 0.5)]
     assert where_rivals_win(pd.DataFrame(rows)) == (
-        "A rival has a smaller displacement error than the best reduced run on sand interpolated latents "
-        "(2 %), the reduced run 3 %."
+        "A rival has a smaller displacement error than the best reduced run: on sand interpolated latents "
+        "(2 %) beside 3 %."
     )
     rows[0]["displacement_error"] = 0.01
     assert where_rivals_win(pd.DataFrame(rows)).startswith("No rival has a smaller")
     rows.append({"scene": "bread", "displacement_error": float("inf")} | rivals)
-    assert (
-        "on bread nothing moves (100 %), nearest training run (4 %) and interpolated latents (2 %), the "
-        in (where_rivals_win(pd.DataFrame(rows)))
+    assert where_rivals_win(pd.DataFrame(rows)).endswith(
+        "on bread nothing moves (100 %), nearest training run (4 %) and interpolated latents (2 %) beside ∞."
     )
     assert where_rivals_win(pd.DataFrame(rows).assign(**dict.fromkeys(RIVALS, float("nan")))) == ""
 
