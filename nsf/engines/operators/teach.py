@@ -25,6 +25,7 @@ _UNROLLED_WEIGHT = 0.1  # of their loss beside that of single steps
 _FAR = 4.0  # deviations from the mean of training latents, beyond which a run of one's own is cut off
 #: Of their own deviation, by which the last change of a state of the tube differs from that of its run.
 _OTHER_CHANGE = 0.1
+_ASKED = 12  # moments at which it is found how far the teacher's step is from affine
 
 
 class Course:
@@ -64,6 +65,22 @@ class Course:
     def steps(self) -> int:
         """Steps of the teacher so far."""
         return sum(teacher.steps for teacher in (*self.teachers, self.yardstick.teacher))
+
+    def broken_affinity(self) -> float:
+        """How far the teacher's step is from affine in the last change d, along its runs at training values.
+
+        Half the second difference of d', for changes of d by a tenth of its deviation either way, in
+        deviations of d' − d; RMS. It is 0 where no contact opens or slips within such a change.
+        """
+        generator, teacher, own = torch.Generator().manual_seed(self.seed), self.teachers[0], self._runs[0]
+        asked = self._moments(0, min(_ASKED, teacher.total_steps - 1))
+        xhat, before = own[asked], own[asked - 1]
+        other = torch.randn(xhat.shape, generator=generator, dtype=torch.float64)
+        other = _OTHER_CHANGE * self.model.d_scale * other
+        less, same, more = (
+            self._asked(teacher, asked, xhat, before - way * other).acceleration for way in (-1.0, 0.0, 1.0)
+        )
+        return float(((less + more - 2.0 * same) / (2.0 * self.model.a_scale)).square().mean().sqrt())
 
     def follow(self) -> StepOperators:
         """All rounds; gives the operators of the best.

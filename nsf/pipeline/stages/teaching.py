@@ -2,6 +2,7 @@
 
 import time
 
+import numpy as np
 import torch
 
 from nsf.data import Trajectory
@@ -14,6 +15,8 @@ from nsf.runs import Record, Run
 
 #: File of a teach run with the operators.
 OPERATORS = "operators.pt"
+#: Particles that say how far a round's runs are off.
+_LOOKED_AT = 1000
 
 
 def teach(pipeline, run: Run) -> None:
@@ -43,7 +46,8 @@ def _follow(pipeline, manifold: Manifold, record: Record) -> None:
         truth = _truth(pipeline, manifold)
         course = Course(lessons, truth, yardstick, pipeline.teaching, seed, record.path, progress.describe)
         before = time.perf_counter() - started
-        operators = course.follow()
+        operators, steps = course.follow(), course.steps
+        broken = course.broken_affinity()
     taught = Taught.of(lessons[0].setup, *course.gravity)
     operators.save(record.path / OPERATORS, taught)
     record.output(OPERATORS)
@@ -51,8 +55,9 @@ def _follow(pipeline, manifold: Manifold, record: Record) -> None:
         left.unlink()
     record.metrics |= {
         "teach_seconds": before + course.seconds,
-        "teacher_steps": course.steps,
+        "teacher_steps": steps,
         "errors": course.errors,
+        "broken_affinity": broken,
         "round": course.best,
     }
 
@@ -72,8 +77,9 @@ def _yardstick(pipeline, manifold: Manifold, progress: Progress) -> Yardstick:
     frames = pipeline.config.deploy.dt_multiplier == 1.0
     validation = list(pipeline.split.validation) if frames else []
     teacher = Teacher(_batches(pipeline, manifold, validation or pipeline.lessons[2]), progress.advance)
-    sample = teacher.setup.samples[0].particles
-    at = manifold.restrict(torch.as_tensor(sample), device=manifold.X.device)
+    # S may lie where little is like the rest, as beside a tear: these are of the whole body.
+    looked_at = np.sort(np.random.default_rng(0).permutation(len(manifold.X))[:_LOOKED_AT])
+    at = manifold.restrict(torch.as_tensor(looked_at), device=manifold.X.device)
 
     def positions(run: torch.Tensor) -> torch.Tensor:
         with torch.no_grad():
@@ -86,7 +92,7 @@ def _yardstick(pipeline, manifold: Manifold, progress: Progress) -> Yardstick:
     truths = []
     for value in validation:
         with Trajectory.open(pipeline.simulation(value).require().path / TRAJECTORY) as trajectory:
-            x = trajectory.read("x", particles=sample)
+            x = trajectory.read("x", particles=looked_at)
             truths.append(torch.as_tensor(x, dtype=torch.float64))
     return Yardstick(teacher, positions, torch.stack(truths, 1))
 

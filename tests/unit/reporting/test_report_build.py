@@ -136,7 +136,7 @@ def diverged(tmp_path_factory):
 
 def test_a_diverged_run_still_gives_a_report_that_says_so(diverged):
     page = (diverged[1] / "index.html").read_text()
-    assert page.count('<td class="number">∞</td>') == 2  # its own row, and the mean
+    assert page.count('<td class="number">∞</td>') == 3  # its own row, the mean, and beside other solvers
 
 
 def test_a_motion_knows_when_its_run_stopped(diverged):
