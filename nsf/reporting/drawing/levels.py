@@ -7,7 +7,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from nsf.reporting.drawing.charts import plain_ticks
-from nsf.reporting.drawing.style import FULL, PALETTE, figure, line_style, styled
+from nsf.reporting.drawing.style import FULL, INK, PALETTE, figure, line_style, styled
 
 #: Title and colour of each level, in the order of `by`.
 LEVELS = {"operators": PALETTE[0], "projected step": PALETTE[1], "full-order solver": FULL}
@@ -29,7 +29,9 @@ def levels_over_time(runs: Mapping[str, pd.DataFrame]) -> Figure:
         fig = figure(3.6 + 0.3 * len(runs))
         error, strips = fig.subplots(2, 1, sharex=True, height_ratios=[3.0, 0.36 * len(runs)])
         for i, (name, series) in enumerate(runs.items()):
-            error.plot(series["t"], 100 * series["displacement_error"], label=name, **line_style(i))
+            alone = [color for k, color in enumerate(LEVELS.values()) if (series["by"].dropna() == k).all()]
+            style = {"color": alone[0]} if alone else line_style(i) | {"color": INK}
+            error.plot(series["t"], 100 * series["displacement_error"], label=name, **style)
             taken = series["by"].notna().to_numpy()
             ends, by = series["t"].to_numpy()[taken], series["by"].to_numpy()[taken].astype(int)
             starts = np.append(series["t"].iloc[0], ends[:-1])
@@ -43,7 +45,7 @@ def levels_over_time(runs: Mapping[str, pd.DataFrame]) -> Figure:
         strips.set_yticks(range(len(runs)), list(runs))
         strips.set(xlabel="time t [s]", ylim=(len(runs) - 0.5, -0.5))
         strips.tick_params(axis="y", length=0)
-        error.legend(loc="lower right")
+        error.legend(loc="upper left")
         shown = sorted({int(level) for series in runs.values() for level in series["by"].dropna()})
         known = [(title, color) for i, (title, color) in enumerate(LEVELS.items()) if i in shown]
         patches = [strips.fill_between([], [], color=color, label=title) for title, color in known]

@@ -47,6 +47,7 @@ def test_a_strip_has_a_span_for_each_step():
     error, strips = figure.axes
     assert [line.get_label() for line in error.lines] == ["both", "one"]
     np.testing.assert_allclose(error.lines[0].get_ydata(), np.arange(5))
+    assert error.lines[1].get_color() == LEVELS["projected step"] != error.lines[0].get_color()
     drawn = [
         (to_hex(bars.get_facecolor()[0]), path.vertices[:, 0].min(), path.vertices[:, 1].mean().round())
         for bars in strips.collections
