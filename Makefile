@@ -31,8 +31,8 @@ $(INSTALLED): pyproject.toml
 	$(BIN)/python -m pip install $(TORCH) -e '.[dev]'
 	@touch $@
 
-quickstart: install  ## the sand column at small scale, from simulation to report
-	$(BIN)/nsf run scene=sand scale=small
+quickstart: install  ## the sand column at small scale, from simulation to report, by two engines
+	$(BIN)/nsf run -m scene=sand scale=small engine=auto,operators
 
 test: install  ## the tests, without those marked slow or slurm
 	$(PYTEST) -m 'not slow and not slurm' -n $(WORKERS) --dist worksteal

@@ -34,7 +34,7 @@ class Teaching:
     width: int = 96
     rounds: int = 3
     steps: int = 8000
-    descent: int = 1500
+    descent: int = 3000
     rate: float = 3e-3
     unroll: int = 8
     noise: float = 0.01

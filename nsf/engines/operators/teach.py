@@ -21,7 +21,8 @@ from nsf.storage import writing
 
 _BATCH = 1024  # labels of one step of the descent
 _WINDOWS = 48  # unrolled windows of one
-_UNROLLED_WEIGHT = 0.1  # of their loss beside that of single steps
+#: They cost several times what single steps do: one step of the descent in so many has them, at this weight.
+_UNROLLED_EVERY, _UNROLLED_WEIGHT = 3, 0.3
 _FAR = 4.0  # deviations from the mean of training latents, beyond which a run of one's own is cut off
 #: Of their own deviation, by which the last change of a state of the tube differs from that of its run.
 _OTHER_CHANGE = 0.1
@@ -274,8 +275,9 @@ class Course:
             at = torch.randint(len(xhat), (min(_BATCH, len(xhat)),), generator=generator)
             found = model.acceleration(xhat[at], change[at], mu[at], g[at], c[at])
             loss = (weight[at] * ((found - acceleration[at]) / a_scale).square().mean(1)).mean()
-            if teaching.unroll > 1:
-                loss = loss + _UNROLLED_WEIGHT * self._unrolled(windows[turn % len(windows)], generator)
+            if teaching.unroll > 1 and turn % _UNROLLED_EVERY == 0:
+                window = windows[turn // _UNROLLED_EVERY % len(windows)]
+                loss = loss + _UNROLLED_WEIGHT * self._unrolled(window, generator)
             optimiser.zero_grad()
             loss.backward()
             torch.nn.utils.clip_grad_norm_(model.parameters(), 10.0)
