@@ -149,7 +149,7 @@ class Recurrence:
             held["gravity"] = (gravity - model.g_mean) / model.g_scale
         held = {name: values.detach().to(where, dtype).contiguous() for name, values in held.items()}
         none = torch.zeros(0, 0, dtype=torch.float64, device=where)
-        held["push"] = none if push is None else push.flatten(1)
+        held["push"] = none if push is None else push.to(where).flatten(1)
         self.latent, self.change = (none.new_zeros(count * r) for _ in range(2))
         held |= {"latent": self.latent, "change": self.change, "row": record.row}
         recorded = {"xhat": record.now, "before": record.before, "xhats": record.xhat}

