@@ -9,10 +9,10 @@ from nsf.errors import ConfigError, NSFError
 
 STAGES = {
     "run": "the whole chain: simulate, train, deploy, evaluate, report; unchanged stages are reused",
-    "simulate": "full-order trajectories of every parameter value",
+    "simulate": "full-order trajectories of every case",
     "train": "the manifold: encoder and deformation, stress and affine fields",
     "teach": "the operators of the reduced step, for engine=operators, which deploy asks for by itself",
-    "deploy": "reduced runs at the held-out parameter values",
+    "deploy": "reduced runs of the held-out cases",
     "evaluate": "errors and costs of the reduced runs beside the full-order ones",
     "report": "tables, charts and pictures of every evaluated variant of the scene",
     "superresolve": "deployed fields at many more points, beside a full-order run of as many particles",
@@ -52,7 +52,7 @@ _EXAMPLES = """\
 examples:
   nsf run scene=sand scale=small                       the paper's method in a minute or two, on a CPU
   nsf run scene=sand method=deformation_only           the baseline beside it, in the same report
-  nsf run scene=sand scene.parameters.test=[23,30.5]   other held-out values
+  nsf run scene=sand scene.design.test=[23,30.5]       other held-out cases
   nsf run -m scene=sand latent_dim=4,6 sampler.size=50,150   every combination
   nsf run +experiment=table1 scale=small               every job of experiments/table1.yaml, and its report
   nsf run -m +experiment=sand hydra/launcher=joblib    jobs side by side on this machine
@@ -60,7 +60,7 @@ examples:
   nsf export --html --frames                           the newest deployed run as a page and a film
   nsf point material=drucker_prager path=oedometer     plot a law before trusting it
   nsf view                                             the newest deployment in the browser
-  nsf search scene=sand scene.parameters.validation=[27,31] latent_dim=4..8   the r of the smallest δ there
+  nsf search scene=sand scene.design.validation=[27,31] latent_dim=4..8   the r of the smallest δ there
   nsf runs stage=evaluate scene=sand latent_dim=4 sort=delta   runs by what made them, the best first
   nsf runs diff 1a2b 3c4d                              what differs between two runs, in keys and in result
   nsf bench particles=10k,40k precision=fp32           what a step costs on this machine, and its floor

@@ -24,9 +24,9 @@ TINY = (
     "scene.dt=0.005",
     "scene.steps=24",
     "scene.bodies.column.particles=500",
-    "scene.parameters.train=[22,30,38]",
-    "scene.parameters.validation=[]",
-    "scene.parameters.test=[26]",
+    "scene.design.train=[22,30,38]",
+    "scene.design.validation=[]",
+    "scene.design.test=[26]",
     "field.modes=[8,8,8]",
     "field.beta=4",
     "field.depth=1",
@@ -82,7 +82,7 @@ class Chain:
         return self.pipeline.training.path / "manifold.pt"
 
     def trajectory(self, value: float) -> Path:
-        return self.pipeline.simulation(value).path / "trajectory.h5"
+        return self.pipeline.simulation(self.scene.case(value)).path / "trajectory.h5"
 
 
 def tiny_pipeline(root, *overrides, say=None):

@@ -1,4 +1,4 @@
-"""Reduced simulations at many parameter values that take their steps together, by their number."""
+"""Reduced simulations of many cases that take their steps together, by their number."""
 
 from collections.abc import Callable
 from functools import partial
@@ -10,12 +10,13 @@ from nsf import config
 from nsf.bench.measure import build, name_of, run_times
 from nsf.bench.reduced import SCENES, deformation_error, samplers
 from nsf.bench.rows import Result, Row, Settings, commit
+from nsf.data import Case
 from nsf.data.schema import TRAJECTORY
 from nsf.pipeline import Pipeline
+from nsf.scenes.designs import evenly
 
 #: Simulations of a batch.
 SIZES = {"cuda": (1, 4, 16, 64, 256), "cpu": (1, 4)}
-_GOLDEN = 0.618034  # multiples of it, less whole numbers, fill an interval evenly however many there are
 _SHARE = 0.8  # of the free device memory that a batch may be expected to take
 
 
@@ -23,7 +24,7 @@ def run(settings: Settings, say: Callable[[str], object]) -> Result:
     """Each scene: at the paper's size on a GPU, at small scale on a CPU.
 
     Data and training are made, or reused, as by `nsf train`. The first simulation of a batch is that of the
-    first held-out value, of which δ is told; the others' values fill the range of training. Sample particles
+    first held-out case, of which δ is told; the others fill the box of training. Sample particles
     are chosen in the scene's own way, or as the name of a case says.
     """
     kind = "cuda" if settings.device.startswith("cuda") else "cpu"
@@ -41,7 +42,7 @@ def measured(
     """Add the rows of one scene, whose cases end so; all of a precision turn by turn, in whole runs."""
     chain.simulate(("train",))
     chain.train()
-    manifold, scene, name = chain.manifold(), chain.scene, chain.scene.parameters.name
+    manifold, scene = chain.manifold(), chain.scene
     truth = chain.truth(chain.held_out[0]).path / TRAJECTORY
     first = chain.solver_at(manifold, chain.held_out[0])
     samples, sets, particles = first.samples, first.sets, len(first.state)
@@ -50,9 +51,7 @@ def measured(
 
     def make(size: int, precision: str):
         options = how | {"sets": sets, "precision": precision, "device": settings.device}
-        return scene.reduced_batch(
-            manifold, [{name: value} for value in values_of(chain, size)], samples, **options
-        )
+        return scene.reduced_batch(manifold, cases_of(chain, size), samples, **options)
 
     for precision in settings.precisions:
         built: dict[int, tuple] = {}
@@ -76,13 +75,13 @@ def measured(
             say(f"{row.case} {scene.name} {precision}: {median:.4g} ms a simulation-step, {error}")
 
 
-def values_of(chain: Pipeline, size: int) -> list[float]:
-    """Parameter values of a batch: the first held-out one, and others in the range of training.
+def cases_of(chain: Pipeline, size: int) -> list[Case]:
+    """Cases of a batch: the first held-out one, and others in the box of training.
 
     Those of a small batch are the first ones of a large one: building a scene takes a moment.
     """
-    low, high = min(chain.split.train), max(chain.split.train)
-    return [chain.held_out[0], *(low + (high - low) * (n * _GOLDEN % 1.0) for n in range(1, size))]
+    low, high = chain.split.box.T
+    return [chain.held_out[0], *map(chain.scene.case, low + (high - low) * evenly(size - 1, len(low)))]
 
 
 def _too_large(size: int, nbytes: dict[int, int], device: str) -> bool:

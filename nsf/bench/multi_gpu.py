@@ -33,7 +33,7 @@ def run(settings: Settings, say: Callable[[str], object]) -> Result:
     overrides = (
         "scene=sand", "scale=paper", "field=mlp", f"trainer.steps={_STEPS}",
         f"trainer.frames_per_batch={_FRAMES // gpus * gpus}",
-        f"scene.parameters.train={list(_TRAIN)}", "scene.parameters.test=[]",
+        f"scene.design.train={list(_TRAIN)}", "scene.design.test=[]",
     )  # fmt: skip
     measured(overrides, gpus, settings, found, say)
     return found

@@ -1,7 +1,7 @@
 """A step by operators beside the full-order one: single runs, many at once, and frames of many particles."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import numpy as np
@@ -12,6 +12,7 @@ from nsf.bench.measure import build, name_of, run_times, window_times
 from nsf.bench.reduced import SCENES, deformation_error, error_of_latents, scale_of
 from nsf.bench.rows import Result, Row, Settings, commit, size_name
 from nsf.bench.scaling import at_size, carried_over, frames_of, positions_after
+from nsf.data import Case
 from nsf.data.schema import TRAJECTORY
 from nsf.dynamics import ReducedMPM
 from nsf.dynamics.latent import LatentRecord
@@ -58,7 +59,7 @@ def _chain(scene: str, settings: Settings, say: Callable[[str], object]) -> Pipe
 def measured(
     chain: Pipeline, settings: Settings, found: Result, say: Callable[[str], object], many: int = 0
 ) -> None:
-    """Add the rows of one scene at its first held-out value.
+    """Add the rows of one scene in its first held-out case.
 
     Args:
         chain: of the scene, with `engine=operators`.
@@ -84,7 +85,7 @@ def measured(
 def measured_decoded(
     chain: Pipeline, particles: int, settings: Settings, found: Result, say: Callable[[str], object]
 ) -> None:
-    """Add the rows of one scene with another number of particles, at its first held-out value.
+    """Add the rows of one scene with another number of particles, in its first held-out case.
 
     A step by operators does not depend on the particles. So the run is that of the chain's own scene, and
     its frames are decoded at the particles asked for. The full-order run is theirs, on a finer grid and in
@@ -96,9 +97,9 @@ def measured_decoded(
         settings, found, say: as for `run`.
     """
     _taught(chain)
-    scene, manifold, value = at_size(chain.scene, particles), chain.manifold(), chain.held_out[0]
+    scene, manifold, case = at_size(chain.scene, particles), chain.manifold(), chain.held_out[0]
     fields, steps = carried_over(chain.manifold(), scene, settings.device), frames_of(scene.steps)
-    full = scene.full_order({scene.parameters.name: value}, max(settings.precisions), settings.device)
+    full = scene.full_order(case, max(settings.precisions), settings.device)
     truth = positions_after(full, steps)
     del full  # its arrays are on the device
 
@@ -150,10 +151,10 @@ def _compared(
         decode: run → positions of all particles.
         error: run and these → δ.
     """
-    device, value = settings.device, chain.held_out[0]
-    parameters, taught = {scene.parameters.name: value}, chain.taught
-    full, full_peak = build(partial(scene.full_order, parameters, precision, device), device)
-    run, peak = build(partial(chain.solver_at, manifold, value, precision=precision), device)
+    device, case = settings.device, chain.held_out[0]
+    taught = chain.taught
+    full, full_peak = build(partial(scene.full_order, case, precision, device), device)
+    run, peak = build(partial(chain.solver_at, manifold, case, precision=precision), device)
     times = window_times({"full": full}, scene.steps, settings.trials, device, whole={"own": run})
     ms, own = _times_of(times["full"]), _times_of(times["own"])
     position = decode(run)
@@ -194,10 +195,12 @@ def _together(
         truth: trajectory file of the first run.
     """
     full, alone = beside
-    known = np.array(chain.split.train)
-    drawn = np.random.default_rng(0).uniform(known.min(), known.max(), count - 1)
+    low, high = chain.split.box.T
+    drawn = np.random.default_rng(0).uniform(low, high, (count - 1, len(low)))
     model = Operators.load(chain.taught.file(OPERATORS)).model
-    many, peak = build(partial(Many, model, run, [chain.held_out[0], *drawn]), settings.device)
+    many, peak = build(
+        partial(Many, model, run, [chain.held_out[0], *map(chain.scene.case, drawn)]), settings.device
+    )
     (ms,) = run_times({count: many}, settings.trials, settings.device).values()
     delta = error_of_latents(run.trajectory().t, many.record.xhat[0], run.decoder(), truth)
     own = _times_of(ms / count)
@@ -213,24 +216,25 @@ def _together(
 
 
 class Many:
-    """Runs by operators at many parameter values, from one that is set up; all steps in one launch.
+    """Runs by operators of many cases, from one that is set up; all steps in one launch.
 
     A batch of solvers builds every scene and holds all of its particles, which takes minutes for a thousand.
-    The value may change no collider, no gravity and no start, as that of a material does not.
+    The cases may change no collider, no gravity and no start, as that of a material does not.
 
     Args:
         model: the operators.
         run: one of their runs.
-        values: B parameter values.
+        cases: B of them.
 
     Attributes:
         record: of the runs, on the device; total_steps: of each.
     """
 
-    def __init__(self, model, run: ReducedMPM, values):
+    def __init__(self, model, run: ReducedMPM, cases: Sequence[Case]):
         setup, span, self.total_steps = run.setup, run.together.span_at(0), run.total_steps
-        self.record = LatentRecord(setup.xhat.expand(len(values), -1), self.total_steps, 1)
-        mu = torch.tensor(np.array(values), dtype=torch.float64)[:, None]
+        self.record = LatentRecord(setup.xhat.expand(len(cases), -1), self.total_steps, 1)
+        names = setup.manifold.parameter_names
+        mu = torch.tensor([[case[name] for name in names] for case in cases], dtype=torch.float64)
         gravity = torch.tensor([setup.gravity], dtype=torch.float64).expand(len(mu), -1)
         states = collider_states(setup.scene.colliders, setup.dt, self.total_steps)[None]
         given = mu, gravity, torch.as_tensor(states), self.record, setup.precision, setup.device

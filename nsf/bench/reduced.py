@@ -67,7 +67,7 @@ def scale_of(device: str) -> str:
 def measured(
     chains: Mapping[str, Pipeline], settings: Settings, found: Result, say: Callable[[str], object]
 ) -> None:
-    """Add the rows of one scene at its first held-out value; every side of a precision turn by turn.
+    """Add the rows of one scene in its first held-out case; every side of a precision turn by turn.
 
     Args:
         chains: by the end of a case's name, configurations that differ in the sampler alone; longer steps are
@@ -77,18 +77,18 @@ def measured(
     chain = next(iter(chains.values()))
     chain.simulate(("train",))
     chain.train()
-    manifold, scene, value = chain.manifold(), chain.scene, chain.held_out[0]
-    parameters, name = {scene.parameters.name: value}, scene.name
-    built = {end: one.solver_at(manifold, value) for end, one in chains.items()}
+    manifold, scene, first = chain.manifold(), chain.scene, chain.held_out[0]
+    name = scene.name
+    built = {end: one.solver_at(manifold, first) for end, one in chains.items()}
     sets = {end: (solver.samples, solver.sets) for end, solver in built.items()}
     del built  # their arrays are on the device
-    truth = chain.truth(value).path / TRAJECTORY
+    truth = chain.truth(first).path / TRAJECTORY
     speed, launches = bandwidth(settings.device), launch_time(settings.device, _DEPENDENT)
 
     def reduced(precision: str, multiplier: float, end: str = ""):
         samples, own = sets[end]
         return scene.reduced(
-            manifold, parameters, samples, sets=own, method=chain.method, projector=chain.projector,
+            manifold, first, samples, sets=own, method=chain.method, projector=chain.projector,
             integration=chain.integration, precision=precision, device=settings.device,
             dt_multiplier=multiplier,
         )  # fmt: skip
@@ -96,7 +96,7 @@ def measured(
     for precision in settings.precisions:
         subjects = {
             f"full_order_{name}": Subject(
-                lambda p=precision: scene.full_order(parameters, p, settings.device), scene.steps
+                lambda p=precision: scene.full_order(first, p, settings.device), scene.steps
             )
         }
         for end in chains:
@@ -163,9 +163,9 @@ def measured_networks(
     """
     chain.simulate(("train",))
     chain.train()
-    manifold, value, name = chain.manifold(), chain.held_out[0], chain.scene.name
-    truth, particles = chain.truth(value).path / TRAJECTORY, len(manifold.X)
-    first = chain.solver_at(manifold, value)
+    manifold, case, name = chain.manifold(), chain.held_out[0], chain.scene.name
+    truth, particles = chain.truth(case).path / TRAJECTORY, len(manifold.X)
+    first = chain.solver_at(manifold, case)
     options = {"sample": first.samples, "sets": first.sets, "device": settings.device, "method": chain.method}
     options |= {"projector": chain.projector, "integration": chain.integration}
     del first  # its arrays are on the device
@@ -173,8 +173,7 @@ def measured_networks(
 
     def reduced(arithmetic: str | None, precision: str):
         manifold.arithmetic = arithmetic
-        parameters = {chain.scene.parameters.name: value}
-        return chain.scene.reduced(manifold, parameters, precision=precision, **options)
+        return chain.scene.reduced(manifold, case, precision=precision, **options)
 
     for precision in settings.precisions:
         subjects = {

@@ -47,7 +47,7 @@ def run(settings: Settings, say: Callable[[str], object]) -> Result:
 def measured(
     chain: Pipeline, sizes: Sequence[int], samples: Sequence[int], settings: Settings, found: Result, say
 ) -> None:
-    """Add the rows of one scene with `field=basis`, at its first held-out value.
+    """Add the rows of one scene with `field=basis`, in its first held-out case.
 
     Args:
         chain: of the scene.
@@ -121,8 +121,7 @@ def _compared(
     say: Callable[[str], object],
 ) -> None:
     """Add both solvers of a scene in every precision, all in turns; nothing of them stays on the device."""
-    device, name = settings.device, scene.parameters.name
-    scene = scene.with_parameters({name: chain.held_out[0]})
+    device, scene = settings.device, scene.with_parameters(chain.held_out[0])
     built = _built(chain, scene, fields(), samples, settings)
     times = window_times(
         {of: solver for of, (solver, _) in built.items()}, scene.steps, settings.trials, device
@@ -157,7 +156,7 @@ def _built(
     rest = torch.as_tensor(chain.scene.particles().X)[None]
     xhat = chain.manifold().encode(rest, rest.new_zeros(*rest.shape[:2], 6))[0].numpy()
     make = partial(
-        scene.reduced, fields, {scene.parameters.name: chain.held_out[0]}, method=chain.method, device=device,
+        scene.reduced, fields, chain.held_out[0], method=chain.method, device=device,
         projector=chain.projector, integration=chain.integration, xhat=xhat,
     )  # fmt: skip
     for number in samples:

@@ -35,7 +35,7 @@ def run(settings: Settings, say: Callable[[str], object]) -> Result:
 def measured(chain: Pipeline, settings: Settings, found: Result, say: Callable[[str], object]) -> None:
     """Add the row of one scene, whose time is that of a whole training [ms]."""
     chain.simulate()
-    paths = [chain.simulation(value).path / TRAJECTORY for value in chain.split.train]
+    paths = [chain.simulation(case).path / TRAJECTORY for case in chain.split.train]
     times, peaks, name = [], [], chain.scene.name
 
     def once(seed: int, folder: str) -> None:

@@ -1,7 +1,7 @@
 """Configurations composed from the groups of `conf/`, or read from a file, and checked.
 
-A problem parameter is the value of one configuration key (`scene.parameters.key`), so a
-simulation at a parameter value is the same configuration with that key replaced.
+A problem parameter is the value of one configuration key (`scene.parameters.NAME.key`), so a
+simulation of a case is the same configuration with these keys replaced.
 """
 
 import difflib

@@ -47,6 +47,7 @@ KINDS = {
     "sampler": Kind("nsf.sampling", "nsf.sampling.Sampler"),
     "trainer": Kind("nsf.kinematics.training", "nsf.kinematics.training.schedules.Trainer"),
     "transfer": Kind("nsf.mpm", "nsf.mpm.Transfer"),
+    "scene.design": Kind("nsf.scenes", "nsf.scenes.Design"),
     "scene.walls": Kind("nsf.mpm", "nsf.mpm.DomainWalls"),
     "scene.colliders.*": Kind("nsf.mpm", "nsf.mpm.Collider"),
     "scene.colliders.*.motion": Kind("nsf.mpm", "nsf.mpm.Motion"),

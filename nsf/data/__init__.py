@@ -7,6 +7,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from nsf.data.case import Case
     from nsf.data.normalize import Standardizer
     from nsf.data.schema import TAU_MATRIX, TAU_ORDER, hash_of_positions
     from nsf.data.snapshots import Snapshots
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 __all__ = [
     "TAU_MATRIX",
     "TAU_ORDER",
+    "Case",
     "Snapshots",
     "Split",
     "Standardizer",
@@ -25,6 +27,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "Case": "case",
     "Standardizer": "normalize",
     "Snapshots": "snapshots",
     "Split": "split",

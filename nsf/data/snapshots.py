@@ -31,7 +31,7 @@ Indices = slice | Sequence[int] | np.ndarray | Tensor
 
 
 class Snapshots:
-    """Rows of (frame, parameter value), by trajectory and then by frame.
+    """Rows of (frame, case), by trajectory and then by frame.
 
     The same calls give the same values whether the data lie on the device
     (`resident`) or stream from the files.

@@ -57,7 +57,7 @@ def go_on(solver: ReducedMPM, rollout: Rollout, path: Path, stored: Precision = 
     Raises:
         InstabilityError: the full-order solver loses stability; names the hand-over.
     """
-    scene, parameters = solver.scene, {solver.scene.parameters.name: rollout.parameter}
+    scene = solver.scene
     try:
         full = hand_over(solver, rollout)
         begin, constants = full.steps_taken, full.constants
@@ -66,7 +66,7 @@ def go_on(solver: ReducedMPM, rollout: Rollout, path: Path, stored: Precision = 
             X=constants.X,
             mass=constants.mass,
             volume0=constants.volume0,
-            parameters=parameters,
+            parameters=rollout.case,
             dt=full.dt,
             dx=scene.dx,
             frames=scene.steps - begin + 1,
@@ -83,7 +83,7 @@ def go_on(solver: ReducedMPM, rollout: Rollout, path: Path, stored: Precision = 
         return full.beyond_law
     except InstabilityError as error:
         raise InstabilityError(
-            f"the reduced run at {parameters} was handed over to the full-order solver at "
+            f"the reduced run at {rollout.case.named} was handed over to the full-order solver at "
             f"t = {rollout.t[rollout.handed_over]:.4g} s, which lost stability: {error}; "
-            "deploy with on_distrust=report, or simulate this value"
+            "deploy with on_distrust=report, or simulate this case"
         ) from error

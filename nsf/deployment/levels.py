@@ -15,6 +15,7 @@ from itertools import groupby
 import numpy as np
 import torch
 
+from nsf.data import Case
 from nsf.deployment.trust import Trust
 from nsf.dynamics import ReducedBatch, ReducedMPM
 
@@ -32,32 +33,32 @@ class Levels:
     """How runs by operators are watched, and when the projected step goes on.
 
     Attributes:
-        projected: parameter values → runs of the projected step at t = 0.
+        projected: cases → runs of the projected step at t = 0.
         every: steps from one projected step to the next.
         tolerance: [m] largest estimated error; None for any.
         on_distrust: whether the projected step goes on where a run is not to be believed.
     """
 
-    projected: Callable[[Sequence[float]], ReducedBatch]
+    projected: Callable[[Sequence[Case]], ReducedBatch]
     every: int
     tolerance: float | None = None
     on_distrust: bool = False
 
     def watched(
-        self, batch: ReducedBatch, parameters: Sequence[float], trust: Trust
+        self, batch: ReducedBatch, cases: Sequence[Case], trust: Trust
     ) -> list[tuple[ReducedMPM, np.ndarray, np.ndarray]]:
         """Look at runs that operators have taken to their end.
 
         Args:
             batch: the runs.
-            parameters: value of the problem parameter of each.
+            cases: problem parameters of each.
             trust: the estimate of whether to believe a run.
 
         Returns:
             Of each run: the solver that holds all of it, its estimated error [N + 1] [m], which stays as it
             is while the projected step goes on, and who took each step [N], `OPERATORS` or `PROJECTED`.
         """
-        projected = self.projected(parameters)
+        projected = self.projected(cases)
         estimates = estimated_errors(batch, projected, self.every)
         found = []
         for run, estimate in zip(batch.runs, estimates, strict=True):

@@ -1,4 +1,4 @@
-"""Deployment: reduced runs over parameter values, driven by Lightning's `Trainer.predict`."""
+"""Deployment: reduced runs of several cases, driven by Lightning's `Trainer.predict`."""
 
 import io
 import time
@@ -13,18 +13,18 @@ import pytorch_lightning as pl
 import torch
 from torch.utils.data import DataLoader
 
-from nsf.data import hdf5
+from nsf.data import Case, hdf5
 from nsf.deployment.levels import FULL_ORDER, LEVELS, OPERATORS, PROJECTED, Levels
-from nsf.deployment.trust import LatentDistance, Trust, first_distrusted, training_values
+from nsf.deployment.trust import Trust, first_distrusted
 from nsf.dynamics import STOP_REASONS, ReducedBatch, ReducedMPM
 from nsf.errors import SchemaError
 from nsf.progress import Progress, quiet_lightning
 from nsf.storage import writing
 from nsf.timing import synchronizer
 
-_VERSION = 2
+_VERSION = 3
 _SCALARS = {
-    "parameter": float, "sample": int, "integration_mean": float, "needed_outside": int, "seconds": float,
+    "away": float, "sample": int, "integration_mean": float, "needed_outside": int, "seconds": float,
     "diverged": int, "handed_over": int,
 }  # fmt: skip
 _ARRAYS = ("t", "xhat", "residuals", "trust")
@@ -36,16 +36,17 @@ _LOOK = 20
 _SAME_TIME = 1e-6
 
 
-@dataclass  # not frozen: Lightning moves the fields of what a prediction step returns
+@dataclass
 class Rollout:
     """One reduced run.
 
     Attributes:
-        parameter: value of the problem parameter.
+        case: its problem parameters.
         t: [N + 1] time [s]; xhat: [N + 1, r] latent vectors.
         residuals: [N, k + 1] projection residuals [m]; stops: [N] stop reasons.
         trust: [N + 1] how far each step is from the training data, in units of how far these are from
-            themselves (`Trust.ratios`).
+            themselves (`Trust.ratios`, and `away` where that is above 1).
+        away: how far the case is from the training cases, in units of their spacing (`CaseDistance`).
         sample: |S| of the first span of time; integration_mean: mean |N| over all steps taken.
         needed_outside: most particles or nodes a step needed outside the superset.
         seconds: wall time of the steps, without set-up; of a batch, an equal share of it.
@@ -58,12 +59,13 @@ class Rollout:
             `handed_over` on; None for a run without operators, whose steps are projected.
     """
 
-    parameter: float
+    case: Case
     t: np.ndarray
     xhat: np.ndarray
     residuals: np.ndarray
     stops: list[str]
     trust: np.ndarray
+    away: float
     sample: int
     integration_mean: float
     needed_outside: int
@@ -101,6 +103,10 @@ class Rollout:
             if self.estimate is not None:
                 file["by"], file["estimate"] = self.levels, self.estimate
             file["stops"] = np.array(self.stops, dtype=h5py.string_dtype())
+            file["case"] = self.case.numbers
+            for name in ("names", "units"):
+                of_all = getattr(self.case, name) or ("",) * len(self.case)
+                file[f"case_{name}"] = np.array(of_all, dtype=h5py.string_dtype())
         with writing(path) as partial:
             partial.write_bytes(memory.getbuffer())
 
@@ -128,10 +134,12 @@ class Rollout:
             shapes = {"xhat": (len(t), latent_dim), "residuals": (len(t) - 1, None), "trust": (len(t),)}
             arrays = {name: hdf5.array(file, name, _REAL, shape)[()] for name, shape in shapes.items()}
             stops = hdf5.texts(file, "stops", (len(t) - 1,))
+            numbers = hdf5.values(file, "case", ("<f8",), (None,))
+            names, units = (hdf5.texts(file, f"case_{name}", numbers.shape) for name in ("names", "units"))
             if "estimate" in file:  # of a run by operators
                 arrays["by"] = hdf5.array(file, "by", ("|i1",), (len(t) - 1,))[()]
                 arrays["estimate"] = hdf5.array(file, "estimate", _REAL, (len(t),))[()]
-            found = cls(**scalars, t=t, **arrays, stops=stops)
+            found = cls(Case(names, numbers, units), **scalars, t=t, **arrays, stops=stops)
             found._check()
         return found
 
@@ -144,6 +152,7 @@ class Rollout:
             ("diverged", -1, steps),
             ("handed_over", -1, steps),
             ("seconds", 0, np.inf),
+            ("away", 0, np.inf),
             ("integration_mean", 0, np.inf),
         ):
             if not least <= getattr(self, name) <= most:
@@ -166,7 +175,7 @@ class Rollout:
 
 
 def rollout_file(index: int) -> str:
-    """File of a deploy run with the reduced run at the held-out value of that index."""
+    """File of a deploy run with the reduced run of the held-out case of that index."""
     return f"rollout_{index}.h5"
 
 
@@ -176,52 +185,58 @@ def continuation_file(index: int) -> str:
 
 
 class Deployment(pl.LightningModule):
-    """Lightning module whose prediction step is a reduced run a parameter value.
+    """Lightning module whose prediction step is a reduced run a case.
 
     Args:
-        batch_at: as for `deploy`.
+        batch_at, cases: as for `deploy`.
         trust: the estimate of whether to believe a run.
         until_distrusted, levels: as for `rollouts`.
         progress: told of each run done.
+
+    Attributes:
+        runs: done so far; Lightning would take apart what a step returns.
     """
 
     def __init__(
         self,
-        batch_at: Callable[[Sequence[float], str], ReducedBatch],
+        batch_at: Callable[[Sequence[Case], str], ReducedBatch],
+        cases: Sequence[Case],
         trust: Trust,
         until_distrusted: bool,
         progress: Progress,
         levels: Levels | None = None,
     ):
         super().__init__()
-        self._batch_at, self._progress = batch_at, progress
+        self._batch_at, self._cases, self._progress = batch_at, cases, progress
         self._how = trust, until_distrusted, levels
+        self.runs: list[Rollout] = []
 
-    def predict_step(self, batch: torch.Tensor, batch_idx: int) -> list[Rollout]:
-        """Run each parameter value of a batch [B] from t = 0 to T; they take their steps together."""
-        values = batch.tolist()
-        runs = rollouts(self._batch_at(values, str(self.device)), values, *self._how)
+    def predict_step(self, batch: torch.Tensor, batch_idx: int) -> int:
+        """Run the cases of some indices [B] from t = 0 to T; they take their steps together. How many."""
+        cases = [self._cases[index] for index in batch.tolist()]
+        runs = rollouts(self._batch_at(cases, str(self.device)), cases, *self._how)
         for _ in runs:
             self._progress.advance()
-        return runs
+        self.runs += runs
+        return len(runs)
 
 
-def rollout(solver: ReducedMPM, parameter: float, trust: Trust, until_distrusted: bool = False) -> Rollout:
+def rollout(solver: ReducedMPM, case: Case, trust: Trust, until_distrusted: bool = False) -> Rollout:
     """Run a reduced solver to the end of its scene.
 
     Args:
         solver: at t = 0; the only one of its batch.
-        parameter: value of the problem parameter, for the record.
+        case: its problem parameters, for the record.
         trust: the estimate of whether to believe the run.
         until_distrusted: stop at the first step that is not to be believed, and name the one before it from
             whose state a full-order run can go on: the last whose time is a whole number of the scene's Δt.
     """
-    return rollouts(solver.together, [parameter], trust, until_distrusted)[0]
+    return rollouts(solver.together, [case], trust, until_distrusted)[0]
 
 
 def rollouts(
     batch: ReducedBatch,
-    parameters: Sequence[float],
+    cases: Sequence[Case],
     trust: Trust,
     until_distrusted: bool = False,
     levels: Levels | None = None,
@@ -230,7 +245,7 @@ def rollouts(
 
     Args:
         batch: at t = 0.
-        parameters: value of the problem parameter of each run, for the record.
+        cases: problem parameters of each run, for the record.
         trust, until_distrusted: as for `rollout`; steps are taken for as long as any run is to be believed.
         levels: who goes on with runs by operators, and how these are watched; their time counts too. None
             where no operators step, or nobody looks.
@@ -240,11 +255,11 @@ def rollouts(
         watched = [(run, None, None) for run in batch.runs]
     else:
         seconds, started = _timed_run(batch, None), time.perf_counter()
-        watched = levels.watched(batch, parameters, trust)
+        watched = levels.watched(batch, cases, trust)
         seconds = (seconds + time.perf_counter() - started) / len(batch)
     found = []
-    for (run, estimate, by), value, (off, _) in zip(watched, parameters, batch.doubts, strict=True):
-        own = _rollout_of(run, value, trust, until_distrusted, seconds)
+    for (run, estimate, by), case, (off, _) in zip(watched, cases, batch.doubts, strict=True):
+        own = _rollout_of(run, case, trust, until_distrusted, seconds)
         if by is not None:
             steps = len(own.stops)
             own.by, own.estimate = by[:steps], estimate[: steps + 1]
@@ -257,7 +272,7 @@ def rollouts(
 
 
 def _rollout_of(
-    solver: ReducedMPM, parameter: float, trust: Trust, until_distrusted: bool, seconds: float
+    solver: ReducedMPM, case: Case, trust: Trust, until_distrusted: bool, seconds: float
 ) -> Rollout:
     """What a run that has ended leaves."""
     taken = solver.steps_taken
@@ -271,12 +286,13 @@ def _rollout_of(
     believed = steps if handed_over < 0 else handed_over
     outside = solver.needed_outside(believed) if diverged < 0 else 0
     return Rollout(
-        parameter=float(parameter),
+        case=case,
         t=latent.t[: steps + 1],
         xhat=latent.xhat[: steps + 1],
         residuals=latent.residuals[:steps],
         stops=latent.stops[:steps],
         trust=ratios[: steps + 1],
+        away=trust.cases.of(case),
         sample=solver.sample_size,
         integration_mean=solver.integration_mean,
         needed_outside=outside,
@@ -317,9 +333,10 @@ def _ratios(solver: ReducedMPM, trust: Trust, diverged: int) -> np.ndarray:
     """Trust of the steps taken [n + 1]; ∞ from the step at which the run diverged."""
     latent = solver.trajectory()
     ratios = trust.ratios(latent.xhat, latent.residuals[:, -1])
-    off, _ = solver.doubt
-    if off > 1.0:
-        ratios = np.maximum(ratios, off)
+    # Not below 1: there the steps themselves tell more.
+    for off in (solver.doubt[0], trust.cases.of(solver.setup.given)):
+        if off > 1.0:
+            ratios = np.maximum(ratios, off)
     if diverged >= 0:
         ratios[diverged:] = np.inf
     return ratios
@@ -335,53 +352,30 @@ def _whole_step_before(t: np.ndarray, step: int, dt: float) -> int:
     return int(whole[-1]) if len(whole) else 0
 
 
-def calibrate(solver_at: Callable[[float, str], ReducedMPM], manifold, device: str) -> Trust:
-    """The estimate of trust, from reduced runs at the first, the middle and the last training value.
-
-    Runs and not the snapshots' own residuals: what a step leaves at S depends on S, the method and Δt.
-
-    Args:
-        solver_at: parameter value and device name → solver at t = 0.
-        manifold: trained fields.
-        device: `cpu`, `cuda` or `cuda:N`.
-    """
-    values, runs = training_values(manifold), []
-    with Progress("calibrate", len(values), "runs") as progress:
-        for value in values:
-            solver = solver_at(value, device)
-            solver.step(solver.total_steps)
-            latent, diverged = solver.trajectory(), solver.left_grid()
-            good = diverged if diverged >= 0 else len(latent.xhat)
-            runs.append((latent.xhat[:good], latent.residuals[: good - 1, -1]))
-            progress.advance()
-    particles = np.unique(np.concatenate([span.particles for span in solver.samples]))
-    return Trust.calibrated(LatentDistance(manifold, particles, device), runs)
-
-
 def deploy(
-    batch_at: Callable[[Sequence[float], str], ReducedBatch],
-    values: Sequence[float],
+    batch_at: Callable[[Sequence[Case], str], ReducedBatch],
+    cases: Sequence[Case],
     device: str,
     trust: Trust,
     until_distrusted: bool = False,
     batch: int = 1,
     levels: Levels | None = None,
 ) -> list[Rollout]:
-    """Reduced runs at every parameter value, with a progress bar.
+    """Reduced runs of every case, with a progress bar.
 
     Args:
-        batch_at: some parameter values and device name → their runs at t = 0.
-        values: parameter values.
+        batch_at: some cases and device name → their runs at t = 0.
+        cases: problem parameters of each run.
         device: `cpu`, `cuda` or `cuda:N`.
         trust, until_distrusted, levels: as for `rollouts`.
-        batch: most values that take their steps together.
+        batch: most cases that take their steps together.
 
     Raises:
         KeyboardInterrupt: passed on; Lightning would exit with code 1.
     """
-    loader = DataLoader(torch.tensor(list(values), dtype=torch.float64), batch_size=batch, num_workers=0)
+    loader = DataLoader(torch.arange(len(cases)), batch_size=batch, num_workers=0)
     cuda = torch.device(device).type == "cuda"
-    with quiet_lightning(), Progress("deploy", len(values), "runs") as progress:
+    with quiet_lightning(), Progress("deploy", len(cases), "runs") as progress:
         trainer = pl.Trainer(
             accelerator="gpu" if cuda else "cpu",
             devices=[torch.device(device).index or 0] if cuda else 1,
@@ -392,8 +386,8 @@ def deploy(
             inference_mode=False,  # torch's inference tensors could not be updated in place between steps
         )
         try:
-            deployment = Deployment(batch_at, trust, until_distrusted, progress, levels)
-            batches = trainer.predict(deployment, loader)
+            deployment = Deployment(batch_at, cases, trust, until_distrusted, progress, levels)
+            trainer.predict(deployment, loader, return_predictions=False)
         except SystemExit as stop:
             raise KeyboardInterrupt from stop
-    return [run for batch in batches for run in batch]
+    return deployment.runs

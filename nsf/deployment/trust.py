@@ -1,23 +1,31 @@
 """Whether to believe a reduced run: how far it is from what its fields were trained on.
 
-A reduced run has no truth beside it, but two things tell when it leaves its training data: the sample
-particles move where no latent vector can follow, which leaves a projection residual, and the latent vector
-goes where no training snapshot was. Both are measured in units of what training data themselves show, so
-that a ratio of 1 means "as far as training data are from themselves". Not in the paper.
+A reduced run has no truth beside it, but three things tell when it leaves its training data: the sample
+particles move where no latent vector can follow, which leaves a projection residual; the latent vector goes
+where no training snapshot was; and the problem parameters lie where no training case does. All are measured
+in units of what training data themselves show, so that a ratio of 1 means "as far as training data are from
+themselves". Not in the paper.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.sparse.csgraph import minimum_spanning_tree
+from scipy.spatial.distance import cdist
+
+from nsf.dynamics import ReducedMPM
+from nsf.progress import Progress
 
 #: Of the distances between training trajectories: the largest ones are of single frames.
 QUANTILE = 0.95
 #: A calibration run gone astray must not vouch for others: beyond this many medians it does not count.
 STRAY = 2.0
+#: Of a value: what float32 may have moved it by.
+_ROUND_OFF = 1e-6
 _ROWS = 256  # steps decoded, and held with their distances to all training snapshots, at once
 
 
@@ -61,6 +69,51 @@ class LatentDistance:
         return torch.cat(rows) / self._at.points**0.5
 
 
+class CaseDistance:
+    """How far a case is from the training cases, in units of their own spacing.
+
+    Parameters are standardised over the training cases. Their spacing is the longest edge of their minimum
+    spanning tree: the longest step that it takes to go from any case to any other by way of the rest.
+
+    Args:
+        manifold: trained fields.
+    """
+
+    def __init__(self, manifold):
+        self._names = manifold.parameter_names
+        # Snapshots keep parameters in float32, of which seven digits are the value's own.
+        rows = np.unique(manifold.training_parameters.cpu().numpy(), axis=0).tolist()
+        known = self._values = np.array([[float(f"{value:.7g}") for value in row] for row in rows])
+        deviation = known.std(0)
+        self._deviation = np.where(deviation > 0, deviation, 1.0)
+        between = cdist(known / self._deviation, known / self._deviation)
+        self._spacing = float(minimum_spanning_tree(between).max()) or 1.0
+
+    def of(self, case: Mapping[str, float]) -> float:
+        """The ratio: the distance to the nearest training case, or 1 and the way into their box from outside.
+
+        In one parameter it is at most 1/2 between the training values. 0 where nothing varies.
+        """
+        if not self._names:
+            return 0.0
+        at, low, high = [case[name] for name in self._names], self._values.min(0), self._values.max(0)
+        beyond = np.maximum(np.maximum(low - at, at - high), 0.0)
+        beyond = np.where(beyond > _ROUND_OFF * np.maximum(abs(low), abs(high)), beyond, 0.0)
+        nearest = cdist([at / self._deviation], self._values / self._deviation).min()
+        outside = float(np.linalg.norm(beyond / self._deviation))
+        return max(float(nearest) / self._spacing, 1.0 + outside / self._spacing if outside else 0.0)
+
+    def extremes(self) -> list[dict[str, float]]:
+        """First, middle and last training case along each parameter, without repetition."""
+        count = len(self._values)
+        rows = {
+            int(order[at])
+            for order in np.argsort(self._values, axis=0, kind="stable").T
+            for at in (0, count // 2, count - 1)
+        }
+        return [dict(zip(self._names, self._values[row].tolist(), strict=True)) for row in sorted(rows)]
+
+
 @dataclass(frozen=True)
 class Trust:
     """The estimate, calibrated on training data.
@@ -69,34 +122,40 @@ class Trust:
         residual: scale of projection residuals [m].
         distance: scale of the latent distance [m].
         latent_distance: the distance itself.
+        cases: distance from the training cases.
     """
 
     residual: float
     distance: float
     latent_distance: LatentDistance
+    cases: CaseDistance
 
     @classmethod
     def calibrated(
-        cls, latent_distance: LatentDistance, runs: Sequence[tuple[np.ndarray, np.ndarray]]
+        cls,
+        latent_distance: LatentDistance,
+        cases: CaseDistance,
+        runs: Sequence[tuple[np.ndarray, np.ndarray]],
     ) -> Trust:
-        """From reduced runs at training values.
+        """From reduced runs of training cases.
 
         The residual's scale is the largest that these runs leave; but at most `STRAY` times the median of
-        each run's largest, as a run at a training value may go astray too. The distance's is how far these
+        each run's largest, as a run of a training case may go astray too. The distance's is how far these
         runs go by the same rule, or the `QUANTILE` of what separates each training trajectory from the
         others where that is more.
 
         Args:
             latent_distance: distance from the training latents.
+            cases: distance from the training cases.
             runs: x̂ [N + 1, r] and residuals [N] [m] of each run, as for `ratios`, as far as it went well.
         """
         between = latent_distance.between_trajectories()
         apart = float(np.quantile(between, QUANTILE)) if len(between) else 0.0
         drift = _largest([latent_distance.of(xhat) for xhat, _ in runs])
-        return cls(_largest([residuals for _, residuals in runs]), max(apart, drift), latent_distance)
+        return cls(_largest([residuals for _, residuals in runs]), max(apart, drift), latent_distance, cases)
 
     def ratios(self, xhat: np.ndarray, residuals: np.ndarray) -> np.ndarray:
-        """The larger of both signals over its scale, at each step; ∞ where a value is not finite.
+        """The larger of residual and distance over its scale, at each step; ∞ where a value is not finite.
 
         Args:
             xhat: [N + 1, r] latent vectors.
@@ -111,17 +170,34 @@ class Trust:
         return np.nan_to_num(ratios, nan=np.inf, posinf=np.inf)
 
 
+def calibrate(solver_at: Callable[[Mapping[str, float], str], ReducedMPM], manifold, device: str) -> Trust:
+    """The estimate of trust, from reduced runs of the first, the middle and the last training cases.
+
+    Runs and not the snapshots' own residuals: what a step leaves at S depends on S, the method and Δt.
+
+    Args:
+        solver_at: case and device name → solver at t = 0.
+        manifold: trained fields.
+        device: `cpu`, `cuda` or `cuda:N`.
+    """
+    known, runs = CaseDistance(manifold), []
+    cases = known.extremes()
+    with Progress("calibrate", len(cases), "runs") as progress:
+        for case in cases:
+            solver = solver_at(case, device)
+            solver.step(solver.total_steps)
+            latent, diverged = solver.trajectory(), solver.left_grid()
+            good = diverged if diverged >= 0 else len(latent.xhat)
+            runs.append((latent.xhat[:good], latent.residuals[: good - 1, -1]))
+            progress.advance()
+    particles = np.unique(np.concatenate([span.particles for span in solver.samples]))
+    return Trust.calibrated(LatentDistance(manifold, particles, device), known, runs)
+
+
 def first_distrusted(ratios: np.ndarray) -> int:
     """First step whose ratio [N + 1] exceeds 1; −1 when none does."""
     above = np.flatnonzero(ratios > 1.0)
     return int(above[0]) if len(above) else -1
-
-
-def training_values(manifold) -> list[float]:
-    """First, middle and last of the training values of the problem parameter, without repetition."""
-    # Snapshots keep parameters in float32, of which seven digits are the value's own.
-    values = sorted({float(f"{v:.7g}") for v in manifold.training_parameters[:, 0].tolist()})
-    return sorted({values[0], values[len(values) // 2], values[-1]})
 
 
 def _nearest(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:

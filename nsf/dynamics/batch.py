@@ -82,10 +82,10 @@ def _check_alike(first: Setup, other: Setup) -> None:
     }
     differing = [name for name, alike in shared.items() if not alike]
     if differing:
-        (name, one), (_, value) = (_parameter(setup) for setup in (first, other))
+        one, two = (", ".join(f"{k}={v:g}" for k, v in setup.given.items()) for setup in (first, other))
         raise ConfigError(
-            f"runs of a batch share {differing[0]}, which differs between {name}={one:g} and "
-            f"{name}={value:g}; step them one by one, with deploy.batch=1"
+            f"runs of a batch share {differing[0]}, which differs between {one} and {two}; "
+            "step them one by one, with deploy.batch=1"
         )
 
 
@@ -99,9 +99,3 @@ def _same_sample(first: Setup, other: Setup) -> bool:
         return False
     pairs = zip(chain(*one), chain(*two), strict=True)
     return all(a is b or (a is not None and b is not None and np.array_equal(a, b)) for a, b in pairs)
-
-
-def _parameter(setup: Setup) -> tuple[str, float]:
-    """Name and value of a run's problem parameter."""
-    name = setup.scene.parameters.name
-    return name, float(setup.given[name])

@@ -30,7 +30,7 @@ def reduced(
     Args:
         scene: an `nsf.scenes.Scene`.
         manifold: trained fields.
-        parameters: `{name: value}`; the configured value by default.
+        parameters: `{name: value}`; those left out are as configured.
         sample: particle indices, a number (drawn at random), a `Sampler`, the `samples` of an earlier
             solver, or None for the scene's number.
         engine: how steps are computed: `auto`, the fastest engine that can; `reference`, `modal`, taught
@@ -85,8 +85,7 @@ def _together(setups: Sequence[Setup], wanted: str | Engine) -> ReducedBatch:
 
 def _setup(scene, manifold, parameters, sample: Sample, engine: str | Engine, options: dict) -> Setup:
     """The setup of one run of a scene."""
-    if not parameters:
-        parameters = {scene.parameters.name: _configured(scene)}
+    parameters = scene.case(parameters or {})
     scene = scene.with_parameters(parameters)
     if sample is None:
         sample = int(scene.config.scene.reduced.sample)
@@ -113,12 +112,6 @@ def _sampled(scene, manifold, sampler: Sampler, engine: str | Engine, options: d
     return sampler.spans_of(
         manifold, device, lambda parameters: reduced(scene, manifold, parameters, **whole)
     )
-
-
-def _configured(scene) -> float:
-    from omegaconf import OmegaConf
-
-    return float(OmegaConf.select(scene.config, scene.parameters.key))
 
 
 def _indices(sample, particles: int) -> np.ndarray:

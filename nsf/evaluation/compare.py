@@ -22,7 +22,7 @@ _UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])  # entries xx, xy, xz, yy, yz,
 
 @dataclass(frozen=True)
 class Comparison:
-    """What one parameter value gave.
+    """What one case gave.
 
     Attributes:
         delta, displacement_error, stress_error: totals over frames 1..N, fractions; ∞ when the run diverged.
@@ -78,7 +78,7 @@ def compare(
     pictures: tuple[int, int],
     continuation: Trajectory | None = None,
 ) -> Comparison:
-    """Errors of a rollout against the trajectory at the same parameter value.
+    """Errors of a rollout against the trajectory of the same case.
 
     Args:
         solver: the reduced solver of the rollout: it says what the method takes τ and C from.
@@ -108,7 +108,7 @@ def compare(
     own = int((~_of_continuation(rollout, trajectory.t)).sum())  # frames up to the hand-over
     if own < frames and (continuation is None or continuation.frames != frames - own + 1):
         raise SchemaError(
-            f"the run at {rollout.parameter:g} was handed over at frame {own - 1} of {frames - 1}, and its "
+            f"the run at {rollout.case.named} was handed over at frame {own - 1} of {frames - 1}, and its "
             "full-order continuation does not reach the end; deploy again"
         )
 
@@ -183,7 +183,7 @@ def compare(
     if not diverged:
         errors |= {name: total(*columns) for name, columns in reduced.items()}
         errors["true_error"] = float((column["x_error"].max() / len(X)).sqrt())
-    metrics.require_finite(errors, f"{scene.parameters.name}={rollout.parameter:g}")
+    metrics.require_finite(errors, rollout.case.named)
     xhat[own:] = torch.nan  # full-order frames are no latent vectors
     return Comparison(
         **dict.fromkeys((*reduced, "true_error"), np.inf) | errors,
@@ -227,7 +227,7 @@ def _series(
 
     return pd.DataFrame(
         {
-            "parameter": rollout.parameter,
+            "parameter": rollout.case.column,
             "split": split,
             "frame": np.arange(len(t)),
             "t": t,

@@ -24,7 +24,7 @@ POINTS = 1 << 15  # queried at once: their modes and weights take some hundred M
 
 @dataclass(frozen=True)
 class SuperResolution:
-    """What one parameter value gave; errors are fractions over the chosen frames, ∞ when the run diverged.
+    """What one case gave; errors are fractions over the chosen frames, ∞ when the run diverged.
 
     Attributes:
         row: of `superresolution.csv`:
@@ -40,13 +40,13 @@ class SuperResolution:
             smeared: share of those that end more than half a grid cell away in the last frame;
             query_difference [m]: largest distance between the fields at a training particle and at a
             point in its place;
-            seconds: of the query of all values together, shared equally; full_order_seconds: of the fine
+            seconds: of the query of all cases together, shared equally; full_order_seconds: of the fine
             full-order run, its set-up included.
         X: [n, 3] points at rest [m]; x_reduced, x_full: [n, 3] in the last frame [m].
         particles: [P] rows of the training particles among the points.
     """
 
-    row: dict[str, float]
+    row: dict[str, float | str]
     X: np.ndarray
     x_reduced: np.ndarray
     x_full: np.ndarray
@@ -102,7 +102,7 @@ def superresolve(
     Args:
         manifold: of the rollouts.
         scene: that was deployed on.
-        trajectories: its full-order run at each rollout's parameter.
+        trajectories: its full-order run of each rollout's case.
         rollouts: the reduced runs.
         factor: points for each particle.
         frames: of the trajectories, in ascending order, without frame 0.
@@ -115,9 +115,8 @@ def superresolve(
         InstabilityError: a fine run is unstable where the coarse one is not, as more particles meet
             more extreme strains; names the remedy. Or an error is not finite.
     """
-    name = scene.parameters.name
     for rollout in rollouts:
-        _check_own(rollout, name)
+        _check_own(rollout)
     fine = scene.refined(factor, substeps)
     where = torch_device(warp_device(device))
     wait = synchronizer(where)
@@ -127,11 +126,11 @@ def superresolve(
     x_full, full_order_seconds = [], []
     for rollout in rollouts:
         started = time.perf_counter()
-        build = partial(fine.full_order, {name: rollout.parameter}, precision, device)
+        build = partial(fine.full_order, rollout.case, precision, device)
         x_full.append(_full_order_frames(build, substeps * np.array(frames)))
         full_order_seconds.append(time.perf_counter() - started)
         took = f"{len(X):,} full-order particles in {full_order_seconds[-1]:.1f} s"
-        say(f"superresolve: {name}={rollout.parameter:g}: {took}")
+        say(f"superresolve: {rollout.case.named}: {took}")
     interpolation_errors = _interpolation_errors(X, x_full, shared, 0.5 * scene.dx)
 
     dtype = torch_dtype(precision_of(precision))
@@ -148,7 +147,7 @@ def superresolve(
     found = []
     of_each = zip(x.split(len(frames)), at_particles.split(len(frames)), x_full, strict=True)
     for k, (x_k, at_particles_k, x_full_k) in enumerate(of_each):
-        own = {"parameter": rollouts[k].parameter, "factor": factor, "points": len(X)}
+        own = {"parameter": rollouts[k].case.column, "factor": factor, "points": len(X)}
         errors = _errors(rollouts[k], trajectories[k], frames, x_k, x_full_k, X, shared)
         interpolation_error, smeared = interpolation_errors[k]
         rest = {
@@ -163,11 +162,11 @@ def superresolve(
     return found
 
 
-def _check_own(rollout: Rollout, name: str) -> None:
+def _check_own(rollout: Rollout) -> None:
     """Refuse a rollout whose last frames are the full-order solver's."""
     if rollout.handed_over >= 0:
         raise ConfigError(
-            f"the reduced run at {name}={rollout.parameter:g} was handed over to the full-order solver at "
+            f"the reduced run at {rollout.case.named} was handed over to the full-order solver at "
             f"t = {rollout.t[rollout.handed_over]:.4g} s and has no fields beyond; "
             "deploy with deploy.on_distrust=report"
         )
@@ -191,7 +190,7 @@ def _errors(
     """Columns of `SuperResolution.row` from delta to full_order_difference.
 
     Args:
-        rollout, trajectory: at one parameter value.
+        rollout, trajectory: of one case.
         frames: of the trajectory.
         x, x_full: [F, n, 3] of the fields and of the fine run [m].
         X: [n, 3] points at rest [m].

@@ -39,7 +39,7 @@ def _parser() -> argparse.ArgumentParser:
     for name, tells in FORMATS.items():
         parser.add_argument(f"--{name}", action="store_true", help=tells)
     options = (
-        ("parameter", float, None, "held-out value; the first by default"),
+        ("parameter", str, None, "held-out case, as 26 or E=1500,friction=0.3; the first by default"),
         ("points", int, None, "how many; more than the particles are points in between (super-resolution)"),
         ("color", str, "von_mises", "von_mises or displacement"),
         ("every", int, 1, "takes each EVERY-th step"),

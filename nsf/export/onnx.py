@@ -45,7 +45,7 @@ def write(playback: Playback, folder: Path) -> Path:
     inputs = {
         "X": playback.X.astype(np.float32),
         "xhat": playback.xhat.astype(np.float32),
-        "parameters": np.array([playback.parameter], np.float32),
+        "parameters": np.array(playback.parameters, np.float32),
     }
     folder = folder / f"{playback.name}_onnx"
     modules = {phase: at.module(phase).cpu().eval() for phase in PHASES}

@@ -1,7 +1,7 @@
 """A reduced run, read from its files and decoded block by block at any number of points."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -10,12 +10,12 @@ import torch
 from omegaconf import OmegaConf
 
 from nsf import config as configuration
-from nsf.data import Trajectory
+from nsf.data import Case, Trajectory
 from nsf.data.schema import TAU_COLUMNS, TAU_ROWS
 from nsf.deployment import Rollout, continuation_file, rollout_file
 from nsf.dynamics import Decoder
 from nsf.dynamics.interop import torch_device, torch_dtype
-from nsf.errors import ConfigError, MissingRunError
+from nsf.errors import ConfigError, MissingRunError, SchemaError
 from nsf.evaluation import metrics
 from nsf.evaluation.superresolution import POINTS
 from nsf.kinematics.interpolation import lying_together
@@ -90,12 +90,13 @@ class Playback:
     """One reduced run of a deploy run: its frames, and its points at rest.
 
     A playback reads the files of the deploy run and of its train run. It builds the scene only where it needs
-    points between the particles or the elastic law. It then takes the key of the parameter from the
+    points between the particles or the elastic law. It then takes the keys of the parameters from the
     configuration of a simulate run.
 
     Args:
         run: complete deploy run.
-        parameter: held-out value; the first by default.
+        parameter: held-out case, as the value of one parameter, a mapping from name to value, or text such as
+            `E=1500,friction=0.3`, to which the nearest is taken; the first by default.
         points: number of points; the particles by default. More than the training particles are points of the
             same shapes between them (super-resolution). Fewer are a fixed random choice of the particles.
         color: one of `QUANTITIES`, by which points are coloured.
@@ -104,22 +105,24 @@ class Playback:
         device: where the fields are decoded: `cpu`, `cuda`, `cuda:N` or `auto`.
 
     Attributes:
+        case: that is played.
         points_given: whether a number of points was asked for.
         t: [F] time of the frames [s].
         X: [N, 3] points at rest [m], in the order of the blocks.
         stopped: time [s] at which the run diverged, after the last frame; None if it did not diverge.
 
     Raises:
-        ConfigError: the value was not deployed; a number is not positive; or points between the particles are
+        ConfigError: the case was not deployed; a number is not positive; or points between the particles are
             asked of a run that the full-order solver went on with, a part that has no fields.
-        MissingRunError: the train run is not whole.
+        MissingRunError: the train run is not whole, or an earlier nsf made the run.
+        SchemaError: the reduced run has other parameters than its manifold.
         DeviceError: there is no such device.
     """
 
     def __init__(
         self,
         run: Run,
-        parameter: float | None = None,
+        parameter: Mapping[str, float] | float | str | None = None,
         points: int | None = None,
         color: str = "von_mises",
         every: int = 1,
@@ -134,7 +137,9 @@ class Playback:
         if not (fps > 0 and math.isfinite(fps)):
             raise ConfigError(f"fps={fps} must be positive and finite")
         self.run, self.color, self.every, self.fps, self._settings = run, color, every, fps, run.config
-        index, self.parameter = _chosen(self._settings["values"], parameter)
+        if "cases" not in self._settings:
+            raise run.of_earlier()
+        index = _chosen(self._settings["cases"], parameter)
         self._training = _parent(run).require()
         self._warp_device = warp_device(device)
         self.device = torch_device(self._warp_device)
@@ -143,7 +148,12 @@ class Playback:
         self._method = configuration.build(self._settings["method"], "method")
         self.manifold = Manifold.load(self._training.file("manifold.pt")).to(self.device)
         self._rollout = Rollout.open(run.file(rollout_file(index)), self.manifold.latent_dim)
-        self._rest = continuation_file(index)
+        self.case, self._rest = self._rollout.case, continuation_file(index)
+        if set(self.case) != set(self.manifold.parameter_names):
+            raise SchemaError(
+                f"{run.path} is of {', '.join(self.case)}, and its manifold of "
+                f"{', '.join(self.manifold.parameter_names)}; deploy again"
+            )
         self.points_given = points is not None
         self._choose_frames()
         self._choose_points(points)
@@ -190,14 +200,13 @@ class Playback:
 
     @property
     def name(self) -> str:
-        """For files: the parameter and its value, such as `friction_angle_26`."""
-        return f"{self.parameter_name}_{self.parameter:g}"
+        """For files: the parameters and their values, such as `friction_angle_26`."""
+        return self.case.label
 
     @property
     def title(self) -> str:
-        """For readers: the scene, the parameter and its value."""
-        scene = self.run.scene.replace("_", " ")
-        return f"{scene}, {self.parameter_name.replace('_', ' ')} {self.parameter:g}"
+        """For readers: the scene and the case."""
+        return f"{self.run.scene}, {self.case.named}".replace("_", " ")
 
     @property
     def xhat(self) -> np.ndarray:
@@ -205,9 +214,9 @@ class Playback:
         return self._xhat.cpu().numpy()
 
     @property
-    def parameter_name(self) -> str:
-        """Name of the problem parameter."""
-        return self.manifold.parameter_names[0]
+    def parameters(self) -> list[float]:
+        """[n] problem parameters in the order of the manifold's."""
+        return [self.case[name] for name in self.manifold.parameter_names]
 
     @property
     def floor(self) -> float | None:
@@ -224,7 +233,7 @@ class Playback:
     def thinned(self, points: int) -> "Playback":
         """The same frames at `points` of the particles, or at all particles if there are fewer."""
         points = min(points, len(self.manifold.X))
-        return Playback(self.run, self.parameter, points, self.color, self.every, self.fps, str(self.device))
+        return Playback(self.run, self.case, points, self.color, self.every, self.fps, str(self.device))
 
     @cached_property
     def tops(self) -> dict[str, float]:
@@ -284,7 +293,7 @@ class Playback:
         def tensor(values: Sequence[float]) -> torch.Tensor:
             return torch.as_tensor(values, dtype=self._dtype, device=self.device)
 
-        parameters = tensor([self.parameter])
+        parameters = tensor(self.parameters)
         law = None, None, None
         if self._moduli is not None:
             law = self._scene.material, *(tensor(values[rows]) for values in self._moduli)
@@ -299,22 +308,22 @@ class Playback:
 
     @cached_property
     def _scene(self) -> Scene:
-        """The scene deployed on, for its shapes and law. Keys that follow the parameter are as configured.
+        """The scene deployed on, for its shapes and law. Keys that follow a parameter are as configured.
 
         Raises:
             MissingRunError: the configuration of the simulation that was trained on is not there.
         """
         content = {key: self._settings[key] for key in ("scale", "material", "transfer", "scene")}
         try:
-            key = _parent(self._training).config["parameter"]["key"]
+            varied = _parent(self._training).config["parameters"]
         except MissingRunError as error:
             raise MissingRunError(
                 f"points beside the particles, and stress from the deformation, need the scene: {error}"
             ) from error
-        varied = {"key": key, "unit": "", "train": [self.parameter], "test": []}
-        content["scene"] = content["scene"] | {"parameters": varied}
-        scene = Scene.from_config(OmegaConf.create(content))
-        return scene.with_parameters({scene.parameters.name: self.parameter})
+        parameters = {name: {"key": own["key"], "unit": ""} for name, own in varied.items()}
+        design = {"_target_": "nsf.scenes.Values", "train": [dict(self.case)], "test": []}
+        content["scene"] = content["scene"] | {"parameters": parameters, "design": design}
+        return Scene.from_config(OmegaConf.create(content)).with_parameters(self.case)
 
 
 def _parent(run: Run) -> Run:
@@ -326,19 +335,39 @@ def _parent(run: Run) -> Run:
     return Run.load(run.parents[0] if run.parents else "", run.root)
 
 
-def _chosen(values: Sequence[float], parameter: float | None) -> tuple[int, float]:
-    """Index and value of a held-out parameter value.
+def _chosen(cases: Sequence[Mapping[str, float]], asked: Mapping[str, float] | float | str | None) -> int:
+    """Index of a held-out case: the first, the one of a value, or that nearest to values by name.
 
     Raises:
-        ConfigError: the value is none of the deployed ones, which the message names.
+        ConfigError: no such case was deployed, or the text is none; names those that are there.
     """
-    if parameter is None:
-        return 0, float(values[0])
-    for index, value in enumerate(values):
-        if math.isclose(value, parameter, rel_tol=1e-9):
-            return index, float(value)
-    held_out = ", ".join(f"{value:g}" for value in values)
+    if asked is None:
+        return 0
+    names = list(cases[0])
+    there = np.array([[case[name] for name in names] for case in cases])
+    wanted = _by_name(asked, names)
+    if wanted and wanted.keys() <= set(names):
+        known = there[:, [names.index(name) for name in wanted]]
+        off, spread = abs(known - list(wanted.values())), np.ptp(known, axis=0)
+        if len(names) > 1:
+            return int((off / np.where(spread > 0, spread, 1.0)).max(1).argmin())
+        if (same := off[:, 0] <= 1e-9 * abs(known[:, 0])).any():
+            return int(same.argmax())
+    listed = [Case.of(case) for case in cases]
+    held_out = "; ".join(map(str, listed)) if len(names) > 1 else ", ".join(map(str, listed))
+    shown = dict(asked) if isinstance(asked, Mapping) else asked
     raise ConfigError(
-        f"parameter={parameter:g} was not deployed; choose one of {held_out}, or deploy with "
-        f"scene.parameters.test=[{parameter:g}]"
+        f"parameter={shown} was not deployed; choose one of {held_out}, or deploy with scene.design.test"
     )
+
+
+def _by_name(asked: Mapping[str, float] | float | str, names: Sequence[str]) -> dict[str, float]:
+    """Values by name of what a user asks for; empty where it is no text of numbers."""
+    if isinstance(asked, Mapping):
+        return dict(asked)
+    try:
+        if isinstance(asked, str) and "=" in asked:
+            return {name.strip(): float(value) for name, value in (p.split("=") for p in asked.split(","))}
+        return {names[0]: float(asked)} if len(names) == 1 else {}
+    except ValueError:
+        return {}

@@ -1,4 +1,4 @@
-"""A deployed reduced model, live: it runs at any parameter value, is shown in a browser, and is streamed.
+"""A deployed reduced model, live: it runs in any case, is shown in a browser, and is streamed.
 
 `model` runs and decodes, `player` chooses the run and the frame to show, `page` shows it in viser, and
 `server` streams it.

@@ -1,7 +1,6 @@
 """The measurements of `--bench`: how fast the picture follows a slider, and how much a stream costs."""
 
 import asyncio
-import itertools
 import json
 import logging
 import sys
@@ -16,10 +15,12 @@ from nsf.live.coloring import Coloring
 from nsf.live.player import Player
 from nsf.live.server import Stream
 from nsf.live.wire import field_message, frame_message
+from nsf.scenes.designs import evenly
 
 #: A rate that no server reaches, so that it sends as fast as it can.
 _UNLIMITED = 1e6
 _TRIALS = 9
+_MOST = 10_000  # cases that are steered to
 _SECONDS, _WARM_UP, _STEER = 5.0, 1.0, 0.5
 
 
@@ -27,13 +28,13 @@ def follow(player: Player) -> pd.DataFrame:
     """How fast `nsf view` can follow its slider, without the time of viser and of the browser.
 
     Returns:
-        One row a shown step. While that step is shown, the parameter moves: median and longest time [s] until
-        the run at the new value is shown. "of it build [s]" is the share of building the solver. "frames/s"
+        One row a shown step. While that step is shown, the parameters move: median and longest time [s] until
+        the run of the new case is shown. "of it build [s]" is the share of building the solver. "frames/s"
         counts a step and its picture (with the full-order run's), one after the other.
     """
     model, coloring = player.model, Coloring(player.model)
     known = model.truth(model.initial)
-    rows, values = [], _values(*model.parameter.trained)
+    rows, values = [], _values([p.trained for p in model.parameters])
     with player:
         player.playing = False
         for step in sorted({player.steps // 4, player.steps // 2, player.steps}):
@@ -42,7 +43,7 @@ def follow(player: Player) -> pd.DataFrame:
             for _ in range(_TRIALS):
                 started = time.perf_counter()
                 player.steer(next(values))
-                while player.tick().run.value != player.value:
+                while player.tick().run.case != player.case:
                     time.sleep(0.001)
                 waits.append(time.perf_counter() - started)
                 moment = player.tick()
@@ -65,15 +66,16 @@ def follow(player: Player) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def _values(low: float, high: float) -> Iterator[float]:
-    """Values between `low` and `high`, none twice: the player keeps the runs of values it had before."""
-    return (low + (high - low) * (n * 0.618034 % 1.0) for n in itertools.count(1))
+def _values(box: Sequence[Sequence[float]]) -> Iterator[list[float]]:
+    """Values between the ends of a box [n, 2], none twice: the player keeps the runs it had before."""
+    low, high = np.transpose(box)
+    return ((low + (high - low) * u).tolist() for u in evenly(_MOST, len(box)))
 
 
 def bench(player: Player, counts: Sequence[int], rate: float) -> pd.DataFrame:
     """Frames a second at each number of clients, at the rate asked for and as fast as possible.
 
-    The clients are another process of this machine. One of them moves the parameter twice a second, so that
+    The clients are another process of this machine. One of them moves the parameters twice a second, so that
     the server makes reduced runs throughout. The server sends nothing while a run stands still at its end.
 
     Returns:
@@ -113,8 +115,8 @@ async def _measured(player: Player, count: int, rate: float) -> list[float]:
     async with await stream.listen(0) as server:
         playing = asyncio.create_task(stream.play())
         port = server.sockets[0].getsockname()[1]
-        p = player.model.parameter
-        arguments = [f"ws://127.0.0.1:{port}/stream", count, *p.trained]
+        box = [p.trained for p in player.model.parameters]
+        arguments = [f"ws://127.0.0.1:{port}/stream", count, json.dumps(box)]
         clients = await asyncio.create_subprocess_exec(
             sys.executable, "-m", __name__, *map(str, arguments), stdout=asyncio.subprocess.PIPE
         )
@@ -123,22 +125,22 @@ async def _measured(player: Player, count: int, rate: float) -> list[float]:
     return json.loads(said)
 
 
-async def _clients(url: str, count: int, low: float, high: float) -> list[float]:
+async def _clients(url: str, count: int, box: Sequence[Sequence[float]]) -> list[float]:
     async def client(steers: bool) -> float:
         async with connect(url, compression=None) as connection:
-            frames, steered, values = 0, 0.0, _values(low, high)
+            frames, steered, values = 0, 0.0, _values(box)
             started = time.monotonic() + _WARM_UP
             while (now := time.monotonic()) < started + _SECONDS:
                 message = await connection.recv()
                 frames += isinstance(message, bytes) and now > started
                 if steers and now > steered + _STEER:
                     steered = now
-                    await connection.send(json.dumps({"value": next(values)}))
+                    await connection.send(json.dumps({"values": next(values)}))
             return frames / _SECONDS
 
     return await asyncio.gather(*(client(index == 0) for index in range(count)))
 
 
 if __name__ == "__main__":
-    url, count, low, high = sys.argv[1:]
-    print(json.dumps(asyncio.run(_clients(url, int(count), float(low), float(high)))))
+    url, count, box = sys.argv[1:]
+    print(json.dumps(asyncio.run(_clients(url, int(count), json.loads(box)))))

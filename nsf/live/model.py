@@ -1,17 +1,17 @@
-"""A deployed reduced model that runs at any value of its problem parameter, and its full-order runs."""
+"""A deployed reduced model that runs at any values of its problem parameters, and its full-order runs."""
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
-from nsf.data import Trajectory
+from nsf.data import Case, Trajectory
 from nsf.data.schema import TRAJECTORY, packed
 from nsf.deployment import Trust
-from nsf.deployment.trust import LatentDistance
+from nsf.deployment.trust import CaseDistance, LatentDistance
 from nsf.dynamics import Decoder, ReducedMPM
 from nsf.errors import ConfigError, InstabilityError
 from nsf.mpm.stability import check_time_step
@@ -21,22 +21,21 @@ from nsf.runs import Run
 #: Precision of live runs, whatever the deployment's: a CPU reads half as much a step. On the sand column this
 #: moves no particle by more than a thousandth of the displacement.
 PRECISION = "fp32"
-#: Reach of the parameter beyond its training values on each side, over their span.
+#: Reach of a parameter beyond its training values on each side, over their span.
 _BEYOND = 0.5
-#: Number of steps in the range of the parameter.
+#: Number of steps in the range of a parameter.
 _STEPS = 200
 _SNAPSHOTS = 64  # training snapshots that bounds and colour scales are taken from
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """The problem parameter and its range.
+    """A problem parameter and its range.
 
     Attributes:
         name, unit: of the scene's parameter.
         trained: smallest and largest training value.
         lower, upper: smallest and largest value that can be asked for.
-        known: values with a full-order trajectory, ascending.
     """
 
     name: str
@@ -44,31 +43,15 @@ class Parameter:
     trained: tuple[float, float]
     lower: float
     upper: float
-    known: tuple[float, ...]
 
     @property
     def step(self) -> float:
         """Least difference of two values that is worth another run."""
         return (self.upper - self.lower) / _STEPS or 1.0
 
-    def inside(self, value: float) -> bool:
-        """Whether a value is between the training values."""
-        return self.trained[0] <= value <= self.trained[1]
-
-    def checked(self, value: float) -> float:
-        """The value, or the known one that lies within half a step of it.
-
-        Raises:
-            ConfigError: the value is not finite, or out of reach.
-        """
-        if not (math.isfinite(value) and self.lower <= value <= self.upper):
-            raise ConfigError(f"{self.name}={value:g} must lie in [{self.lower:g}, {self.upper:g}]")
-        nearest = min(self.known, key=lambda known: abs(known - value), default=value)
-        return nearest if abs(nearest - value) <= self.step / 2 else float(value)
-
 
 class Truth:
-    """The full-order run at a parameter value, at the particles that are shown.
+    """The full-order run of a case, at the particles that are shown.
 
     Args:
         trajectory: opened; each frame is read when it is asked for.
@@ -103,7 +86,7 @@ class LiveRun:
     """A reduced run in the making: one thread advances it while others read its steps up to `reached`.
 
     Args:
-        value: of the problem parameter.
+        case: its problem parameters.
         solver: reduced solver at t = 0.
         decoder: the solver's fields at the particles that are shown.
         trust: estimates whether to believe the run.
@@ -112,12 +95,14 @@ class LiveRun:
         steps, dt: number of steps of the whole run, and their length [s].
         reached: last step that can be read.
         finished: whether the run has reached the scene's end or has diverged.
+        away: how far the case is from the training cases, in units of their spacing.
         diverged: whether the run ended early, with x̂ not finite or a sample particle off the grid.
         seconds: wall time of the steps [s].
     """
 
-    def __init__(self, value: float, solver: ReducedMPM, decoder: Decoder, trust: Trust):
-        self.value, self.steps, self.dt = value, solver.total_steps, solver.dt
+    def __init__(self, case: Case, solver: ReducedMPM, decoder: Decoder, trust: Trust):
+        self.case, self.steps, self.dt = case, solver.total_steps, solver.dt
+        self.away = trust.cases.of(case)
         self._solver: ReducedMPM | None = solver
         self._decoder, self._trust = decoder, trust
         self._xhat = np.zeros((self.steps + 1, solver.manifold.latent_dim), np.float32)
@@ -180,7 +165,8 @@ class LiveModel:
         device: `cpu`, `cuda`, `cuda:N` or `auto`.
 
     Attributes:
-        run, manifold, parameter.
+        run, manifold.
+        parameters: what can be asked for; known: cases with a full-order trajectory, ascending.
         title: of the scene.
         particles: P.
         shown: [n] indices of the particles that are shown.
@@ -199,7 +185,8 @@ class LiveModel:
         self.title = self._pipeline.deployed.config.scene.title
         self.manifold = self._pipeline.manifold()
         self._truths = _truths(self._pipeline)
-        self.parameter = _parameter(self._pipeline, tuple(sorted(self._truths)))
+        self.known = tuple(sorted(self._truths))
+        self.parameters = _parameters(self._pipeline, self.known)
         # Live runs share the samples and sets, which are found in the deployment's own precision.
         solver = self._pipeline.solver_at(self.manifold, self.initial)
         sample = np.unique(np.concatenate([sets.sample for sets in solver.sets]))
@@ -212,18 +199,39 @@ class LiveModel:
         self.spacing = float((solver.setup.constants.volume0.sum() / len(self.shown)) ** (1 / 3))
 
     @property
-    def initial(self) -> float:
-        """The first value to show: the first that was deployed."""
+    def initial(self) -> Case:
+        """The first case to show: the first that was deployed."""
         return self._pipeline.held_out[0]
 
-    def start(self, value: float) -> LiveRun:
-        """A run at a parameter value, at t = 0."""
-        solver = self._pipeline.solver_at(self.manifold, value, precision=PRECISION)
-        return LiveRun(value, solver, solver.decoder(self.shown, self.at), self.trust)
+    def checked(self, numbers: Sequence[float]) -> Case:
+        """The case of some values, or the known one that lies within half a step of each of them.
 
-    def truth(self, value: float) -> Truth | None:
-        """The full-order run at a known value; None at other values."""
-        run = self._truths.get(value)
+        Raises:
+            ConfigError: there is not a value for each parameter, or one is not finite or out of reach.
+        """
+        if len(numbers) != len(self.parameters):
+            raise ConfigError(f"{len(numbers)} values must be {len(self.parameters)}, one for each parameter")
+        for p, value in zip(self.parameters, numbers, strict=True):
+            if not (math.isfinite(value) and p.lower <= value <= p.upper):
+                raise ConfigError(f"{p.name}={value:g} must lie in [{p.lower:g}, {p.upper:g}]")
+        steps = [p.step for p in self.parameters]
+
+        def off(case: Case) -> float:
+            return max(abs(np.subtract(case.numbers, numbers)) / steps)
+
+        nearest = min(self.known, key=off, default=None)
+        if nearest is not None and off(nearest) <= 0.5:
+            return nearest
+        return self._pipeline.scene.case(numbers)
+
+    def start(self, case: Case) -> LiveRun:
+        """A run of a case, at t = 0."""
+        solver = self._pipeline.solver_at(self.manifold, case, precision=PRECISION)
+        return LiveRun(case, solver, solver.decoder(self.shown, self.at), self.trust)
+
+    def truth(self, case: Case) -> Truth | None:
+        """The full-order run of a known case; None of other cases."""
+        run = self._truths.get(case)
         return Truth(Trajectory.open(run.file(TRAJECTORY)), self.shown) if run else None
 
     def roles(self, step: int) -> np.ndarray:
@@ -242,34 +250,37 @@ class LiveModel:
         return self.at.position(xhat).cpu().numpy(), self.at.stress(xhat, parameters).cpu().numpy()
 
 
-def _truths(pipeline: Pipeline) -> Mapping[float, Run]:
-    """Full-order runs of the scene that is deployed, by parameter value."""
-    pairs = ((value, scene) for value, scene in pipeline.needed() if scene is pipeline.deployed)
-    runs = {value: pipeline.simulation(value, scene) for value, scene in pairs}
-    return {value: run for value, run in runs.items() if run.complete}
+def _truths(pipeline: Pipeline) -> Mapping[Case, Run]:
+    """Full-order runs of the scene that is deployed, by case."""
+    pairs = ((case, scene) for case, scene in pipeline.needed() if scene is pipeline.deployed)
+    runs = {case: pipeline.simulation(case, scene) for case, scene in pairs}
+    return {case: run for case, run in runs.items() if run.complete}
 
 
-def _parameter(pipeline: Pipeline, known: tuple[float, ...]) -> Parameter:
-    """The parameter and its range, which ends where the scene cannot be built or is not stable."""
-    p, values = pipeline.scene.parameters, pipeline.split.train
-    low, high = min(values), max(values)
-    span = (high - low) or abs(low) or 1.0
+def _parameters(pipeline: Pipeline, known: Sequence[Case]) -> tuple[Parameter, ...]:
+    """The parameters and their ranges, which end where the scene cannot be built or is not stable."""
+    found, middle = [], pipeline.scene.case(pipeline.split.box.mean(1))
+    for (name, p), (low, high) in zip(
+        pipeline.scene.parameters.items(), pipeline.split.box.tolist(), strict=True
+    ):
+        span = (high - low) or abs(low) or 1.0
 
-    def reach(end: float, sign: float) -> float:
-        for share in (1.0, 0.75, 0.5, 0.25, 0.1):
-            value = end + sign * share * _BEYOND * span
-            if _possible(pipeline, value):
-                return value
-        return end
+        def reach(end: float, sign: float, name: str = name, span: float = span) -> float:
+            for share in (1.0, 0.75, 0.5, 0.25, 0.1):
+                value = end + sign * share * _BEYOND * span
+                if _possible(pipeline, dict(middle) | {name: value}):
+                    return value
+            return end
 
-    wanted = [*known, *pipeline.held_out]
-    lower, upper = min(reach(low, -1.0), *wanted), max(reach(high, 1.0), *wanted)
-    return Parameter(p.name, p.unit, (low, high), lower, upper, known)
+        wanted = [case[name] for case in (*known, *pipeline.held_out)]
+        lower, upper = min(reach(low, -1.0), *wanted), max(reach(high, 1.0), *wanted)
+        found.append(Parameter(name, p.unit, (low, high), lower, upper))
+    return tuple(found)
 
 
-def _possible(pipeline: Pipeline, value: float) -> bool:
+def _possible(pipeline: Pipeline, case: Mapping[str, float]) -> bool:
     try:
-        scene = pipeline.deployed.with_parameters({pipeline.scene.parameters.name: value})
+        scene = pipeline.deployed.with_parameters(case)
         check_time_step(scene.particles(), scene.initial_velocity(), scene.dx, scene.dt)
     except (ConfigError, InstabilityError):
         return False
@@ -279,7 +290,7 @@ def _possible(pipeline: Pipeline, value: float) -> bool:
 def _trust(run: Run, manifold, sample: np.ndarray, device: str) -> Trust:
     """The trust estimate, with the scales that the deployment calibrated."""
     residual, distance = (run.metric("trust", scale) for scale in ("residual_m", "distance_m"))
-    return Trust(residual, distance, LatentDistance(manifold, sample, device))
+    return Trust(residual, distance, LatentDistance(manifold, sample, device), CaseDistance(manifold))
 
 
 def _shown(particles: int, sample: np.ndarray, points: int) -> np.ndarray:

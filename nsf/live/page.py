@@ -1,7 +1,6 @@
-"""The page of `nsf view`: the reduced run beside the full-order one, and a slider for the parameter."""
+"""The page of `nsf view`: the reduced run beside the full-order one, and a slider for each parameter."""
 
 import logging
-import math
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,9 +14,9 @@ from matplotlib.colors import to_hex
 
 from nsf.live.coloring import ROLES, SAMPLE, Coloring, Picture
 from nsf.live.guard import Connection, refused
-from nsf.live.model import Parameter
 from nsf.live.player import Moment, Player, every
 from nsf.reporting.drawing.style import ColorScale
+from nsf.reporting.text.columns import axis
 
 log = logging.getLogger(__name__)
 
@@ -69,7 +68,7 @@ class Page:
     def __init__(self, player: Player, host: str = "127.0.0.1", port: int = 8080):
         self._player, self._model = player, player.model
         self._coloring = Coloring(player.model)
-        self._truth_value, self._truth = math.nan, None
+        self._truth_case, self._truth = None, None
         self._last: tuple | None = None
         self.drawn = 0
         with _own_pages_only(host):
@@ -147,22 +146,25 @@ class Page:
     # -- controls -------------------------------------------------------------------------------------------
 
     def _build_controls(self) -> None:
-        gui, parameter, player = self._server.gui, self._model.parameter, self._player
-        unit = f" [{parameter.unit}]" if parameter.unit else ""
+        gui, player = self._server.gui, self._player
         gui.add_markdown(f"**{self._model.title}**, `{self._model.run.id}`")
-        self._slider = gui.add_slider(
-            f"{parameter.name.replace('_', ' ')}{unit}",
-            min=parameter.lower,
-            max=parameter.upper,
-            step=parameter.step,
-            initial_value=player.value,
-            marks=tuple((value, f"{value:g}") for value in parameter.trained),
-            hint="marks: smallest and largest training value",
-        )
-        self._slider.on_update(self._by_hand(lambda: player.steer(self._slider.value)))
-        if parameter.known:
+        self._sliders = [
+            gui.add_slider(
+                axis(parameter.name.replace("_", " "), parameter.unit),
+                min=parameter.lower,
+                max=parameter.upper,
+                step=parameter.step,
+                initial_value=player.case[parameter.name],
+                marks=tuple((value, f"{value:g}") for value in parameter.trained),
+                hint="marks: smallest and largest training value",
+            )
+            for parameter in self._model.parameters
+        ]
+        for slider in self._sliders:
+            slider.on_update(self._by_hand(lambda: player.steer([s.value for s in self._sliders])))
+        if self._model.known:
             known = gui.add_dropdown(
-                "with full-order run", ["…", *(f"{value:g}" for value in parameter.known)], initial_value="…"
+                "with full-order run", ["…", *map(str, self._model.known)], initial_value="…"
             )
             known.on_update(self._by_hand(lambda: self._go_to(known.value)))
         self._light = gui.add_html("")
@@ -187,10 +189,11 @@ class Page:
         return on_update
 
     def _go_to(self, text: str) -> None:
-        chosen = [value for value in self._model.parameter.known if f"{value:g}" == text]
+        chosen = [case for case in self._model.known if str(case) == text]
         if chosen:
-            self._slider.value = chosen[0]
-            self._player.steer(chosen[0])
+            for slider, value in zip(self._sliders, chosen[0].numbers, strict=True):
+                slider.value = value
+            self._player.steer(chosen[0].numbers)
 
     def _toggle(self) -> None:
         self._player.playing = not self._player.playing
@@ -211,8 +214,8 @@ class Page:
         if told == self._last:
             return
         self._last = told
-        if moment.run.value != self._truth_value:
-            self._truth_value, self._truth = moment.run.value, self._model.truth(moment.run.value)
+        if moment.run.case != self._truth_case:
+            self._truth_case, self._truth = moment.run.case, self._model.truth(moment.run.case)
         picture = self._coloring.picture(moment, self._truth, self._by.value)
         with self._server.atomic():
             self._show(picture, moment)
@@ -231,29 +234,28 @@ class Page:
             self._sample.points = x[kept & (self._model.roles(moment.step) == 2)]
         if self._time.value != moment.step:
             self._time.value = moment.step
-        self._light.content = light(moment, self._model.parameter)
+        self._light.content = light(moment)
         self._legend.content = legend(self._coloring.scales[self._by.value], self._by.value)
         self._told.content = self._what_it_took(moment)
 
     def _what_it_took(self, moment: Moment) -> str:
-        run, p = moment.run, self._model.parameter
-        shown = f"{p.name.replace('_', ' ')} = {run.value:.4g}{p.unit}, t = {moment.t:.3g} s"
+        run = moment.run
+        shown = f"{run.case.named.replace('_', ' ')}, t = {moment.t:.3g} s"
         rate = f"; {run.reached / run.seconds:.0f} latent steps a second" if run.seconds else ""
-        known = "" if self._truth else "<br>no full-order run at this value"
+        known = "" if self._truth else "<br>no full-order run of this case"
         return _small(
             f"{shown}<br>{len(self._model.shown):,} of {self._model.particles:,} particles{rate}{known}"
         )
 
 
-def light(moment: Moment, parameter: Parameter) -> str:
-    """A light as HTML: green to believe the run, amber beyond the training values, red not to believe it."""
-    low, high = parameter.trained
+def light(moment: Moment) -> str:
+    """A light as HTML: green to believe the run, amber away from the training cases, red to distrust it."""
     if moment.run.diverged and moment.step >= moment.run.reached:
         color, text = _RED, f"diverged at t = {moment.t:.3g} s"
     elif moment.trust > 1.0:
         color, text = _RED, f"distrusted: ratio {moment.trust:.2g}, above 1"
-    elif not parameter.inside(moment.run.value):
-        color, text = _AMBER, f"beyond the training values, {low:g} to {high:g}{parameter.unit}"
+    elif moment.run.away > 1.0:
+        color, text = _AMBER, f"away from the training cases: ratio {moment.run.away:.3g}, above 1"
     else:
         color, text = _GREEN, f"distrust ratio {moment.trust:.2f}, below 1"
     dot = f"<span style='color:{color};font-size:1.6em;vertical-align:middle'>●</span>"

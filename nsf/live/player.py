@@ -1,20 +1,21 @@
-"""The player: it chooses one parameter value and one step, which all browsers show."""
+"""The player: it chooses one case and one step, which all browsers show."""
 
 import logging
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from nsf.data import Case
 from nsf.errors import NSFError
 from nsf.live.model import LiveModel, LiveRun
 
 log = logging.getLogger(__name__)
 
-#: Steps between checks for a newly wanted value: short beside the time of a picture.
+#: Steps between checks for a newly wanted case: short beside the time of a picture.
 _CHUNK = 4
 #: Number of finished runs that are kept.
 _KEPT = 64
@@ -29,7 +30,7 @@ class Moment:
     """A run and one of its steps, to be shown.
 
     Attributes:
-        run: the run at the shown parameter value.
+        run: the run of the shown case.
         step: of the run.
     """
 
@@ -53,10 +54,10 @@ class Moment:
 
 
 class Player:
-    """Runs a live model ahead of the shown step, and starts a new run when the parameter moves.
+    """Runs a live model ahead of the shown step, and starts a new run when a parameter moves.
 
     A new run is shown once it has reached the shown step (during playback a little more). Until then no newer
-    value takes its place. So the picture follows a dragged slider as fast as runs can be made. Any thread may
+    case takes its place. So the picture follows a dragged slider as fast as runs can be made. Any thread may
     call the methods, except `work`, which belongs to the thread that `with player:` starts.
 
     Args:
@@ -69,7 +70,7 @@ class Player:
 
     def __init__(self, model: LiveModel):
         self.model = model
-        self._runs: OrderedDict[float, LiveRun] = OrderedDict()
+        self._runs: OrderedDict[Case, LiveRun] = OrderedDict()
         self._wanted = model.initial
         self._shown = self._run_at(self._wanted)
         self._coming: LiveRun | None = None
@@ -95,18 +96,18 @@ class Player:
         return self._shown.steps
 
     @property
-    def value(self) -> float:
-        """The parameter value that was asked for last; the shown value follows it."""
+    def case(self) -> Case:
+        """The case that was asked for last; the shown one follows it."""
         return self._wanted
 
-    def steer(self, value: float) -> None:
-        """Ask for another parameter value.
+    def steer(self, numbers: Sequence[float]) -> None:
+        """Ask for other values of the parameters, in their order.
 
         Raises:
-            ConfigError: the value is not finite, or out of reach.
+            ConfigError: a value is missing, not finite, or out of reach.
         """
         with self._wake:
-            self._wanted = self.model.parameter.checked(value)
+            self._wanted = self.model.checked(numbers)
             self._wake.notify()
 
     def seek(self, step: int) -> None:
@@ -133,7 +134,7 @@ class Player:
 
     def work(self) -> bool:
         """Advance a run by some steps; False if there is nothing to do."""
-        if self._coming is None and self._wanted != self._shown.value:
+        if self._coming is None and self._wanted != self._shown.case:
             self._coming = self._run_at(self._wanted)
         run = self._coming or self._shown
         idle = run.finished and self._coming is None
@@ -146,12 +147,12 @@ class Player:
                 self._shown, self._coming = run, None
         return not idle
 
-    def _run_at(self, value: float) -> LiveRun:
-        return self._runs.get(value) or self.model.start(value)
+    def _run_at(self, case: Case) -> LiveRun:
+        return self._runs.get(case) or self.model.start(case)
 
     def _keep(self, run: LiveRun) -> None:
-        self._runs[run.value] = run
-        self._runs.move_to_end(run.value)
+        self._runs[run.case] = run
+        self._runs.move_to_end(run.case)
         if len(self._runs) > _KEPT:
             self._runs.popitem(last=False)
 
@@ -160,12 +161,12 @@ class Player:
             try:
                 busy = self.work()
             except NSFError as error:
-                # The scene refuses this value, so the shown run goes on.
-                log.warning("%s=%g: %s", self.model.parameter.name, self._wanted, error)
-                self._wanted, busy = self._shown.value, True
+                # The scene refuses this case, so the shown run goes on.
+                log.warning("%s: %s", self._wanted.named, error)
+                self._wanted, busy = self._shown.case, True
             if not busy:
                 with self._wake:
-                    self._wake.wait_for(lambda: self._closing or self._wanted != self._shown.value)
+                    self._wake.wait_for(lambda: self._closing or self._wanted != self._shown.case)
 
 
 def every(seconds: float, closing: threading.Event, act: Callable[[], None]) -> None:

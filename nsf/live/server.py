@@ -13,12 +13,12 @@ from websockets.http11 import Request, Response
 from nsf.errors import ConfigError
 from nsf.live.guard import Connection, check_token, name_of, refused
 from nsf.live.player import Moment, Player
-from nsf.live.wire import asked_value, field_message, frame_message, state_message
+from nsf.live.wire import asked_values, field_message, frame_message, state_message
 
 log = logging.getLogger(__name__)
 
-#: Longest message of a client [bytes]; a parameter value takes twenty.
-_LONGEST = 256
+#: Longest message of a client [bytes]; each parameter takes twenty.
+_LONGEST = 1024
 _LONGEST_REASON = 60  # letters of a close, which may take 123 bytes
 #: Pause after a client's message [s]: who sends more often waits, and nobody else does.
 _PACE = 0.01
@@ -36,8 +36,8 @@ class Stream:
     """Serves a page, the deformation field, and the latent vector of each frame.
 
     `/` is the page, `/field` what it decodes with (`wire.field_message`), `/stream` a WebSocket: a binary
-    message a frame, and a text message where another parameter value is shown. A client may send a value
-    (`wire.asked_value`). One that sends anything else, or that does not keep up for `patience`, is closed.
+    message a frame, and a text message where another case is shown. A client may send values
+    (`wire.asked_values`). One that sends anything else, or that does not keep up for `patience`, is closed.
 
     Args:
         player: what is shown; all clients see the same.
@@ -133,7 +133,7 @@ class Stream:
         why = "closed by itself"
         try:
             async for message in connection:
-                self._player.steer(asked_value(message))
+                self._player.steer(asked_values(message))
                 await asyncio.sleep(_PACE)
         except ConfigError as error:
             why = f"sent rubbish: {error}"

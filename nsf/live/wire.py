@@ -42,7 +42,7 @@ def field_message(model: LiveModel) -> bytes:
     for index, layer in enumerate(layers):
         arrays |= {f"weight{index}": _host(layer.weight), f"bias{index}": _host(layer.bias)}
     arrays = {k: a if a.dtype == np.dtype("<i2") else a.astype("<f4") for k, a in arrays.items()}
-    p, (x, _) = model.parameter, model.training_frames()
+    x, _ = model.training_frames()
     header = {
         "title": model.title,
         "run": model.run.id,
@@ -51,14 +51,17 @@ def field_message(model: LiveModel) -> bytes:
         "low": x.min((0, 1)).tolist(),
         "high": x.max((0, 1)).tolist(),
         "moved": float(np.percentile(np.linalg.norm(x - model.X, axis=2), 99.5)),
-        "parameter": {
-            "name": p.name.replace("_", " "),
-            "unit": p.unit,
-            "lower": p.lower,
-            "upper": p.upper,
-            "step": p.step,
-            "trained": p.trained,
-        },
+        "parameters": [
+            {
+                "name": p.name.replace("_", " "),
+                "unit": p.unit,
+                "lower": p.lower,
+                "upper": p.upper,
+                "step": p.step,
+                "trained": p.trained,
+            }
+            for p in model.parameters
+        ],
         "latent_dim": model.manifold.latent_dim,
         "layers": len(layers),
         "arrays": {name: {"shape": a.shape, "type": a.dtype.str[1:]} for name, a in arrays.items()},
@@ -76,12 +79,16 @@ def frame_message(moment: Moment) -> bytes:
 
 
 def state_message(moment: Moment) -> str:
-    """The shown parameter value, and whether its run diverged, as JSON."""
-    return json.dumps({"value": moment.run.value, "diverged": moment.run.diverged})
+    """The shown values of the parameters, how far they are from training, and whether the run diverged.
+
+    As JSON; the second is `LiveRun.away`.
+    """
+    run = moment.run
+    return json.dumps({"values": run.case.numbers, "away": run.away, "diverged": run.diverged})
 
 
-def asked_value(message: str | bytes) -> float:
-    """The parameter value that a client asks for by `{"value": 31.5}`.
+def asked_values(message: str | bytes) -> list[float]:
+    """The values that a client asks for by `{"values": [31.5]}`, in the parameters' order.
 
     Raises:
         ConfigError: the message is anything else.
@@ -90,10 +97,11 @@ def asked_value(message: str | bytes) -> float:
         asked = json.loads(message) if isinstance(message, str) else None
     except (ValueError, RecursionError):
         asked = None
-    if not isinstance(asked, dict) or asked.keys() != {"value"} or type(asked["value"]) not in (int, float):
-        raise ConfigError('a client may only send {"value": number}')
+    values = asked.get("values") if isinstance(asked, dict) and len(asked) == 1 else None
+    if not isinstance(values, list) or any(type(value) not in (int, float) for value in values):
+        raise ConfigError('a client may only send {"values": [number, …]}')
     try:
-        return float(asked["value"])
+        return list(map(float, values))
     except OverflowError as error:
         raise ConfigError("the value is too large") from error
 

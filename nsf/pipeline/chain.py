@@ -11,6 +11,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from nsf import config as configuration
+from nsf.data import Case
 from nsf.dynamics import ParticleSets, ReducedBatch, ReducedMPM
 from nsf.engines import Engine, Operators
 from nsf.errors import MissingRunError
@@ -54,15 +55,14 @@ class Pipeline(Plan):
             say: as for `Pipeline`.
 
         Raises:
-            MissingRunError: the run was made before its whole configuration was kept.
+            MissingRunError: the run was made by an earlier nsf, whose configuration says less.
         """
         path = run.path / CONFIGURATION
         if not path.exists():
-            raise MissingRunError(
-                f"{run.path} has no {CONFIGURATION}: it was made by an earlier nsf; "
-                f"delete the folder and run `nsf deploy scene={run.scene}` with the same keys"
-            )
+            raise run.of_earlier()
         config = configuration.read(run.file(CONFIGURATION))
+        if isinstance(scene := config.get("scene"), DictConfig) and "design" not in scene:
+            raise run.of_earlier()
         config.device = device
         return cls(config, say, run.root)
 
@@ -80,14 +80,14 @@ class Pipeline(Plan):
         return getattr(self, stage)()
 
     def simulate(self, later: Sequence[str] = ()) -> list[Run]:
-        """Full-order trajectories of every training, validation and held-out value.
+        """Full-order trajectories of every training, validation and held-out case.
 
         Args:
             later: the stages that they are for, if no others: trajectories that only read are in these
                 stages' results, where those are there, are not made again.
         """
         # A changed scene that changes nothing, or trains on what it deploys, names one run twice.
-        runs = {self.simulation(value, scene): (value, scene) for value, scene in self.needed()}
+        runs = {self.simulation(*needed): needed for needed in self.needed()}
         missing = {run: needed for run, needed in runs.items() if not run.complete}
         told = {line: None for run in runs if run.complete for line in run.manifest.get("warnings", ())}
         there, spare = len(runs) - len(missing), self._spare(later) if later else set()
@@ -111,26 +111,25 @@ class Pipeline(Plan):
 
     def _spare(self, later: Sequence[str]) -> set[str]:
         """Trajectories, by id, that the stages need not read, as their results are there."""
-        truths = {self.truth(value).id for value in self.held_out}
+        truths = {self.truth(case).id for case in self.held_out}
         read = {"evaluate": self.evaluation, "superresolve": self.superresolution}
         over = "evaluate" in later and all(run.complete for name, run in read.items() if name in later)
         trained = {run.id for run in self.training_data}
         needed = (set() if over else truths) | (set() if self.training.complete else trained)
         return (truths | trained) - needed
 
-    def _resolution(self, value: float, scene: Scene) -> list[str]:
+    def _resolution(self, case: Case, scene: Scene) -> list[str]:
         """What a trajectory is too coarse for."""
         from nsf.scenes.resolution import resolution_warnings  # SciPy takes 0.2 s to load
 
-        return resolution_warnings(scene.with_parameters({self.scene.parameters.name: value}))
+        return resolution_warnings(scene.with_parameters(case))
 
-    def _simulate(self, runs: dict[Run, tuple[float, Scene]], warnings: dict[Run, list[str]]) -> int:
-        c, name, unit = self.config, self.scene.parameters.name, self.scene.parameters.unit
+    def _simulate(self, runs: dict[Run, tuple[Case, Scene]], warnings: dict[Run, list[str]]) -> int:
+        c = self.config
 
-        def job(run: Run, value: float, scene: Scene) -> Job:
-            parameters = {name: value}
-            build = partial(scene.full_order, parameters, c.precision, self.device)
-            return Job(run, f"{name} {value:g}{unit}", parameters, build, warnings[run])
+        def job(run: Run, case: Case, scene: Scene) -> Job:
+            build = partial(scene.full_order, case, c.precision, self.device)
+            return Job(run, case, build, warnings[run])
 
         self.check_room(runs)
         jobs = [job(run, *needed) for run, needed in runs.items()]
@@ -155,24 +154,24 @@ class Pipeline(Plan):
     def solver_at(
         self,
         manifold: Manifold,
-        value: float,
+        case: Case,
         device: str | None = None,
         precision: str | None = None,
         engine: str | Engine | None = None,
     ) -> ReducedMPM:
-        """The reduced solver at a parameter value, at t = 0; device, precision and engine as configured."""
-        return self.batch_at(manifold, [value], device, precision, engine).runs[0]
+        """The reduced solver of a case, at t = 0; device, precision and engine as configured."""
+        return self.batch_at(manifold, [case], device, precision, engine).runs[0]
 
     def batch_at(
         self,
         manifold: Manifold,
-        values: Sequence[float],
+        cases: Sequence[Case],
         device: str | None = None,
         precision: str | None = None,
         engine: str | Engine | None = None,
         scene: Scene | None = None,
     ) -> ReducedBatch:
-        """Reduced runs at several parameter values that take their steps together, likewise.
+        """Reduced runs of several cases that take their steps together, likewise.
 
         By the engine that is asked for, of the scene that is deployed, unless others are given.
         """
@@ -180,7 +179,7 @@ class Pipeline(Plan):
             engine = self._operators(manifold) if self.engine == Operators.name else self.engine
         batch = (scene or self.deployed).reduced_batch(
             manifold,
-            [{self.scene.parameters.name: value} for value in values],
+            cases,
             self._samples or self.sampler,
             engine=engine,
             method=self.method,
@@ -189,7 +188,7 @@ class Pipeline(Plan):
             precision=precision or self.config.precision,
             device=device or self.device,
             dt_multiplier=self.config.deploy.dt_multiplier,
-            # As the sample, these depend on the manifold and the sampler alone: found once for all values.
+            # As the sample, these depend on the manifold and the sampler alone: found once for all cases.
             sets=self._sets,
         )
         self._samples, self._sets = batch.batch.shared.samples, batch.batch.shared.sets
@@ -211,7 +210,7 @@ class Pipeline(Plan):
         return self._taught
 
     def deploy(self) -> Run:
-        """Reduced trajectories of the held-out values, through Lightning's `Trainer.predict`."""
+        """Reduced trajectories of the held-out cases, through Lightning's `Trainer.predict`."""
         if self.teaching is not None:
             self.teach()
         return self._made(self.deployment, partial(deploy_held_out, self))
@@ -239,14 +238,14 @@ class Pipeline(Plan):
         """The report of every evaluated variant of this scene at these held-out trajectories."""
         from nsf.reporting.build import build_report
 
-        truths = {self.truth(v).id for v in self.held_out}
+        truths = {self.truth(case).id for case in self.held_out}
         found = Run.find("evaluate", self.scene.name, root=self.root)
         runs = [
             r for r in found if r.complete and truths == {p for p in r.parents if p.startswith("simulate/")}
         ]
         if not runs:
             raise MissingRunError(
-                "no evaluate run of these held-out values is there; run `nsf run` with the same keys"
+                "no evaluate run of these held-out cases is there; run `nsf run` with the same keys"
             )
         page = build_report(runs, self._report_folder, self.config.scene.title, first=self.evaluation)
         self.say(f"report: {len(runs)} evaluated variants → {page}")

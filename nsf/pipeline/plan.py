@@ -9,11 +9,11 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from nsf import config as configuration
-from nsf.data import Split
+from nsf.data import Case
 from nsf.dynamics.interop import torch_device
 from nsf.engines import Operators
 from nsf.engines.modal.mirrors import edits
-from nsf.engines.operators import random_values
+from nsf.engines.operators import random_cases
 from nsf.errors import ConfigError, DeviceError
 from nsf.kinematics.fields.mlp import MlpField
 from nsf.mpm import Precision
@@ -42,7 +42,7 @@ _SCENE_KEYS = ("scale", "material", "transfer")
 _SECTIONS = ("data", "deploy", "evaluation", "super_resolution", "report")
 #: Keys that no scene is built from, without their values.
 _REST = dict.fromkeys(("field", "trainer", "method", "sampler", "evaluation", "report", "latent_dim"))
-#: Values between the training ones whose runs decide which round of teaching is kept.
+#: Cases between the training ones whose runs decide which round of teaching is kept.
 HELD_BACK = 3
 #: What this process has checked; the jobs of a sweep ask the same thing again and again, for seconds.
 _PASSED: set[str] = set()
@@ -60,12 +60,12 @@ class Plan:
         scene: that is trained on; deployed: that of the held-out simulations and of deployment.
         engine: name of the engine that is asked for.
         coarse: factors of Δx of the full-order runs that a reduced one is held to.
-        split: parameter values by their use.
+        split: cases by their use.
         device: found once, so that a missing GPU is reported before any work.
 
     Raises:
         ConfigError: a value is missing or refused; names it.
-        InstabilityError: Δt is unstable at a parameter value.
+        InstabilityError: Δt is unstable in a case.
     """
 
     config: DictConfig
@@ -81,8 +81,12 @@ class Plan:
         c = self.config = self.scene.config
         for key in _SECTIONS:
             configuration.section(c, key)
-        p = self.scene.parameters
-        self.split = Split(train=tuple(p.train), validation=tuple(p.validation), test=tuple(p.test))
+        self.split = self.scene.split
+        if len(self.split.train) <= len(self.split.names):
+            raise ConfigError(
+                f"scene.design has {len(self.split.train)} training cases, and {', '.join(self.split.names)} "
+                f"need{'s' * (len(self.split.names) == 1)} at least {len(self.split.names) + 1}; add some"
+            )
         for name in ("field", "trainer", "method", "sampler", "projector", "integration"):
             setattr(self, name, configuration.build(c[name], name))
         # A configuration from before there were engines has no such key.
@@ -106,7 +110,7 @@ class Plan:
             check_well_posed(region.size, c.latent_dim)
             region.candidates(X)
         self.device = str(torch_device(warp_device(c.device)))
-        self._check_parameter_values()
+        self._check_cases()
 
     def _changed(self, changes: DictConfig | None) -> Scene:
         """The scene of the held-out simulations and of deployment."""
@@ -121,15 +125,15 @@ class Plan:
         except ConfigError as error:
             raise ConfigError(f"deploy.changes: {error}") from error
 
-    def _check_parameter_values(self) -> None:
-        """Build the scene at every parameter value: one out of range fails before any work."""
+    def _check_cases(self) -> None:
+        """Build the scene in every case: a value out of range fails before any work."""
         asked = repr(
             [OmegaConf.to_container(of, resolve=False) | _REST for of in (self.config, self.scene.template)]
         )
         if asked in _PASSED:
             return
-        for value, scene in self.needed():
-            scene = scene.with_parameters({self.scene.parameters.name: value})
+        for case, scene in self.needed():
+            scene = scene.with_parameters(case)
             grid = scene.grid
             check_physics(scene)
             check_time_step(scene.particles(), scene.initial_velocity(), grid.dx, scene.dt)
@@ -143,20 +147,20 @@ class Plan:
         return self.engine if self.teaching is None else self.config.engine.teacher
 
     @property
-    def held_out(self) -> tuple[float, ...]:
-        """Values that are deployed and evaluated."""
+    def held_out(self) -> tuple[Case, ...]:
+        """Cases that are deployed and evaluated."""
         self.check_held_out()
-        return tuple(getattr(self.split, self.config.deploy.split))
+        return getattr(self.split, self.config.deploy.split)
 
     def check_held_out(self) -> None:
-        """Refuse to deploy on no value.
+        """Refuse to deploy in no case.
 
         Raises:
             ConfigError: the split that is deployed is empty.
         """
         split = self.config.deploy.split
         if not getattr(self.split, split):
-            raise ConfigError(f"deploy.split={split} has no values; set scene.parameters.{split}")
+            raise ConfigError(f"deploy.split={split} has no cases; set scene.design.{split}")
 
     def check_devices(self) -> None:
         """Refuse to train on more devices than this machine has; what was trained elsewhere may be used.
@@ -181,11 +185,11 @@ class Plan:
                 f"set trainer.devices={most}"
             )
 
-    def check_room(self, runs: Mapping[Run, tuple[float, Scene]]) -> None:
+    def check_room(self, runs: Mapping[Run, tuple[Case, Scene]]) -> None:
         """Refuse trajectories that fit neither into memory nor, all together, on the disk.
 
         Args:
-            runs: that are to be made, at least one, each with its parameter value and scene.
+            runs: that are to be made, at least one, each with its case and scene.
 
         Raises:
             ConfigError: names the bytes of memory that are needed and available.
@@ -203,35 +207,35 @@ class Plan:
         """Precision of the frames of trajectories."""
         return STORED[self.config.data.dtype]
 
-    def needed(self) -> list[tuple[float, Scene]]:
-        """Every value with the scene that is simulated there: the deployed one where values are held out."""
+    def needed(self) -> list[tuple[Case, Scene]]:
+        """Every case with the scene that is simulated in it: the deployed one where cases are held out."""
         held_out = getattr(self.split, self.config.deploy.split)
-        plain = {*self.split.train, *self.split.validation, *self.split.test}.difference(
-            () if self.config.deploy.split == "train" else held_out
-        )
-        needed = [(value, self.scene) for value in plain] + [(value, self.deployed) for value in held_out]
+        plain = {*self.split.cases}.difference(() if self.config.deploy.split == "train" else held_out)
+        needed = [(case, self.scene) for case in plain] + [(case, self.deployed) for case in held_out]
         return sorted(needed, key=lambda pair: pair[0])
 
-    def simulation(self, value: float, scene: Scene | None = None) -> Run:
+    def simulation(self, case: Case, scene: Scene | None = None) -> Run:
         """The run of one full-order trajectory, of the scene of training by default."""
         c = self.config
         scene = scene or self.scene
         content = self._physics(scene)
         content |= {"precision": c.precision, "dtype": c.data.dtype}
-        content["parameter"] = {"key": self.scene.parameters.key, "value": float(value)}
+        content["parameters"] = {
+            name: {"key": self.scene.parameters[name].key, "value": value} for name, value in case.items()
+        }
         if scene.files:
             # A changed mesh under the same path is another simulation.
             content["files"] = scene.files
         return Run.open("simulate", self.scene.name, content, root=self.root)
 
-    def truth(self, value: float) -> Run:
+    def truth(self, case: Case) -> Run:
         """The run of the full-order trajectory that a deployed one is held to."""
-        return self.simulation(value, self.deployed)
+        return self.simulation(case, self.deployed)
 
     @property
     def training_data(self) -> list[Run]:
         """The runs of the trajectories that are trained on."""
-        return [self.simulation(value) for value in self.split.train]
+        return [self.simulation(case) for case in self.split.train]
 
     @property
     def training(self) -> Run:
@@ -251,7 +255,7 @@ class Plan:
             self._content(keys)
             | self._physics(self.deployed)
             | {
-                "values": list(self.held_out),
+                "cases": list(map(dict, self.held_out)),
                 "split": self.config.deploy.split,
                 "dt_multiplier": self.config.deploy.dt_multiplier,
                 "on_distrust": self.config.deploy.on_distrust,
@@ -284,8 +288,8 @@ class Plan:
             | {
                 "teaching": asdict(self.teaching),
                 "teacher": self.config.engine.teacher,
-                "values": self.lessons,
-                "validation": list(self.split.validation),
+                "cases": [list(map(dict, cases)) for cases in self.lessons],
+                "validation": list(map(dict, self.split.validation)),
                 "dt_multiplier": self.config.deploy.dt_multiplier,
                 "device": self.device,
             }
@@ -295,16 +299,16 @@ class Plan:
         return Run.open("teach", self.scene.name, content, [self.training], root=self.root)
 
     @property
-    def lessons(self) -> list[list[float]]:
-        """Values of three kinds that the teacher is asked at: of training, between them, and held back.
+    def lessons(self) -> list[list[Case]]:
+        """Cases of three kinds that the teacher is asked in: of training, between them, and held back.
 
-        Runs at those held back decide which round of teaching is kept, where there are no validation values.
-        None is a validation or test value.
+        Runs in those held back decide which round of teaching is kept, where there are no validation cases.
+        None is a validation or test case.
         """
         known, seed = sorted(self.split.train), int(self.config.seed)
         taken = [*known, *self.split.validation, *self.split.test]
-        between = random_values((known[0], known[-1]), len(known), seed, taken)
-        back = random_values((known[0], known[-1]), HELD_BACK, seed + 1, [*taken, *between])
+        between = random_cases(self.split.box, len(known), seed, taken)
+        back = random_cases(self.split.box, HELD_BACK, seed + 1, [*taken, *between])
         return [known, between, back]
 
     @property
@@ -312,7 +316,7 @@ class Plan:
         """The run of errors and costs."""
         content = self._content(("evaluation",))
         content["paper"] = self._content(("scene",))["scene"].get("paper")
-        parents = [self.deployment, *(self.truth(v) for v in self.held_out)]
+        parents = [self.deployment, *map(self.truth, self.held_out)]
         return Run.open("evaluate", self.scene.name, content, parents, root=self.root)
 
     def evaluated(self) -> Run:
@@ -343,7 +347,7 @@ class Plan:
     def superresolution(self) -> Run:
         """The run of the deployed fields at more points."""
         content = self._content(("super_resolution",))
-        parents = [self.deployment, *(self.truth(v) for v in self.held_out)]
+        parents = [self.deployment, *map(self.truth, self.held_out)]
         return Run.open("superresolve", self.scene.name, content, parents, root=self.root)
 
     @staticmethod

@@ -1,9 +1,9 @@
-"""Search for good values of numeric keys, by Optuna: at the validation values, never at the test values."""
+"""Search for good values of numeric keys, by Optuna: at the validation cases, never at the test cases."""
 
 import math
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pandas as pd
@@ -78,7 +78,7 @@ def search(words: Sequence[str], say: Callable[[str], object] = print, root: Pat
 
     Raises:
         MissingExtraError: Optuna is not installed.
-        ConfigError: no range; no validation values; a value that a key refuses at an end of its range.
+        ConfigError: no range; no validation cases; a value that a key refuses at an end of its range.
         MissingRunError: no trial has a result.
     """
     optional("optuna", "search")
@@ -139,14 +139,14 @@ def _asked(config: DictConfig) -> tuple[list[str], int]:
 
 
 def _check(ranges: Sequence[Range], fixed: Sequence[str], root: Path | None) -> None:
-    """Build both ends of each range, with the test values still there, so that no value is in two splits."""
+    """Build both ends of each range, with the test cases still there, so that no case is in two splits."""
     for end in ("low", "high"):
         overrides = [*fixed, *(f"{r.key}={getattr(r, end)}" for r in ranges), "deploy.split=validation"]
         plan = Plan(configuration.load(overrides), root)
         if not plan.split.validation:
             raise ConfigError(
-                f"scene={plan.scene.name} has no validation values, and a search never looks at test values; "
-                "give some, apart from those of training and test, as scene.parameters.validation=[27,31]"
+                f"scene={plan.scene.name} has no validation cases, and a search never looks at test cases; "
+                "give some, apart from those of training and test, as scene.design.validation=[27,31]"
             )
 
 
@@ -187,14 +187,15 @@ def _optimize(study, objective, trials: int, say: Callable[[str], object]) -> No
 
 
 def _tried(overrides: list[str], objectives: Sequence[str], root: Path | None) -> tuple[str, list[float]]:
-    """The evaluate run of one trial, and its objectives: means over the validation values."""
-    config = configuration.load([*overrides, "deploy.split=validation", "scene.parameters.test=[]"])
+    """The evaluate run of one trial, and its objectives: means over the validation cases."""
+    config = configuration.load([*overrides, "deploy.split=validation"])
     pipeline = Pipeline(config, lambda line: None, root)
+    pipeline.split = replace(pipeline.split, test=())  # which a search never looks at
     for stage in pipeline.stages[:-1]:
         run = pipeline.run(stage)
     results = pd.read_csv(run.file("results.csv"))
     if set(results["split"]) != {"validation"}:
-        raise ConfigError(f"{run.id} is not of the validation values alone; leave deploy.split out")
+        raise ConfigError(f"{run.id} is not of the validation cases alone; leave deploy.split out")
     values = [float(results[OBJECTIVES[name].name].mean()) for name in objectives]
     if not all(map(math.isfinite, values)):
         raise MissingRunError(f"{run.id}: the reduced run diverged")

@@ -218,7 +218,7 @@ def _drop_training(plans: Sequence[Plan], say: Callable[[str], object]) -> None:
 
     Their manifests stay; `nsf simulate` makes the trajectories again. What another process makes is left.
     """
-    truths = {plan.truth(value).id for plan in plans for value in plan.held_out}
+    truths = {plan.truth(case).id for plan in plans for case in plan.held_out}
     for run in {run for plan in plans for run in plan.training_data if run.id not in truths}:
         try:
             with run.claimed() as claimed:

@@ -27,7 +27,7 @@ from nsf.reporting.text.formats import Rows
 
 FEW = 15  # rows of a table in which a number is varied; of more, settings and scenes go down and across
 MANY = 24  # rows where none is, as in the paper's Table 1
-_VALUES = "scene.parameters.test"  # jobs with this key are about certain held-out values, so each counts
+_VALUES = "scene.design.test"  # jobs with this key are about certain held-out values, so each counts
 _PAPER = "paper"
 _DEVIATION = ", deviation"
 _RUNS, _DIVERGED, _SEEDS = "runs", "diverged", "seeds"  # how many are in a row of `groups`

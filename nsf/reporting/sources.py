@@ -4,7 +4,7 @@ Besides the keys every evaluate run has, `summary.json` may hold these, all opti
 `title` and `scale` (of the scene), `parameter_name`, `parameter_unit`, `particles`, `training_seconds`,
 `floor` (height [m], null where the scene has none) and `paper`: the `place` where the paper speaks of the
 scene, and by method the figures it prints, called as in results.csv, and `training_seconds`. `trust` is
-a list, one entry a parameter value: {"parameter", "trust", "distrusted", "distrusted_at", "handed_over_at"}
+a list, one entry a case: {"parameter", "away", "trust", "distrusted", "distrusted_at", "handed_over_at"}
 (docs/design.md). `rivals` is likewise a list, with the displacement errors of each rival; `coarse` holds, by
 factor of Δx, that of a coarse full-order run, or `why` there is none.
 """

@@ -333,8 +333,9 @@ def trust_note(rows: pd.DataFrame) -> str:
     """The meaning of the ratio, and how its ranks agree with those of δ."""
     said = (
         "The distrust ratio is the largest of a run's steps: how far it went from the training data, by the "
-        "residual of its projections or by its latent vector, where 1 is as far as training data are from "
-        "themselves. It needs no full-order run; a ratio above 1 says not to believe what follows."
+        "residual of its projections, by its latent vector or, beyond 1, by its parameters, where "
+        "1 is as far as training data are from themselves. It needs no full-order run; a ratio above 1 says "
+        "not to believe what follows."
     )
     # The rest of a run that was handed over is the full-order solver's, and so is its error.
     reduced = rows[rows["handed_over_at"].isna()]

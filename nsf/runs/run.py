@@ -304,6 +304,13 @@ class Run:
         with locked(self.path / _LOCK, None if say is None else lambda: say(told)) as claimed:
             yield claimed
 
+    def of_earlier(self) -> MissingRunError:
+        """The error of a run that an earlier nsf made, in a form that is no longer read."""
+        return MissingRunError(
+            f"{self.path} was made by an earlier nsf; "
+            f"delete the folder and run `nsf {self.stage} scene={self.scene}` with the same keys"
+        )
+
     @contextmanager
     def record(
         self,

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 from nsf import config as _config
 from nsf.scenes.body import Body
-from nsf.scenes.parameters import ParameterRange
+from nsf.scenes.designs import Design, Grid, LatinHypercube, Sobol, Values
+from nsf.scenes.parameters import Parameter
 from nsf.scenes.scene import Scene
 from nsf.scenes.shapes import Ball, Box, Cylinder, Frame, Mesh, Ribbon, Shape, TentacleBall, mesh_or_ball
 from nsf.scenes.weakness import Weakness
@@ -14,13 +15,18 @@ __all__ = [
     "Body",
     "Box",
     "Cylinder",
+    "Design",
     "Frame",
+    "Grid",
+    "LatinHypercube",
     "Mesh",
-    "ParameterRange",
+    "Parameter",
     "Ribbon",
     "Scene",
     "Shape",
+    "Sobol",
     "TentacleBall",
+    "Values",
     "Weakness",
     "load",
     "mesh_or_ball",

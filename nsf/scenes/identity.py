@@ -5,13 +5,14 @@ from omegaconf import OmegaConf
 from nsf.runs.canonical import content_hash
 
 #: Keys of a scene that its simulation does not depend on.
-NOT_PHYSICS = ("parameters", "reduced", "paper", "title")
+NOT_PHYSICS = ("parameters", "design", "reduced", "paper", "title")
 
 
 def physics_hash(scene) -> str:
-    """Hash of a scene's physics but for gravity, initial velocities and the value of its parameter."""
+    """Hash of a scene's physics but for gravity, initial velocities and the values of its parameters."""
     template = scene.template.copy()
-    OmegaConf.update(template, scene.parameters.key, None)
+    for parameter in scene.parameters.values():
+        OmegaConf.update(template, parameter.key, None)
     template = OmegaConf.to_container(template, resolve=False)
     content = {key: template[key] for key in ("scale", "material", "transfer")}
     content["scene"] = {k: v for k, v in template["scene"].items() if k not in (*NOT_PHYSICS, "gravity")}

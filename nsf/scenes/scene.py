@@ -3,26 +3,28 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from nsf import config as configuration
-from nsf.config.targets import filled
+from nsf.data import Case, Split
 from nsf.errors import ConfigError
 from nsf.mpm import Collider, DomainWalls, FullOrderMPM, GridGeometry, ParticleConstants, Transfer
 from nsf.mpm.materials import Material
 from nsf.scenes.body import Body
 from nsf.scenes.checks import check_memory, check_particles, check_physics
+from nsf.scenes.designs import Design, case_of
 from nsf.scenes.identity import NOT_PHYSICS
-from nsf.scenes.parameters import ParameterRange, check_key
+from nsf.scenes.parameters import Parameter, check_key, parameters_of
 from nsf.vectors import vector
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A full-order problem: bodies, law, boundaries, time span, problem parameter.
+    """A full-order problem: bodies, law, boundaries, time span, problem parameters.
 
     Attributes:
         name, scale: what it is called.
@@ -30,7 +32,7 @@ class Scene:
         size: domain edge lengths [m]; gravity: [3] [m/s²].
         bodies: what moves; colliders, walls: boundaries.
         material: constitutive law; transfer: PIC, APIC or RPIC.
-        parameters: the problem parameter and its values.
+        parameters: the problem parameters by name; design: draws the cases, the values that they take.
         config: the configuration that it was built from, resolved.
         template: the same before its interpolations were resolved.
     """
@@ -47,7 +49,8 @@ class Scene:
     walls: DomainWalls
     material: Material
     transfer: Transfer
-    parameters: ParameterRange
+    parameters: Mapping[str, Parameter]
+    design: Design
     config: DictConfig = field(repr=False, compare=False)
     template: DictConfig = field(repr=False, compare=False)
     _at: dict[tuple, "Scene"] = field(default_factory=dict, init=False, repr=False, compare=False)
@@ -61,7 +64,8 @@ class Scene:
         """
         with configuration.naming_the_missing():
             found = cls._build(configuration.resolve(config), config)
-        check_key(found.parameters.key, found.parameters.values, config)
+        for name, parameter in found.parameters.items():
+            check_key(name, parameter.key, [case[name] for case in found.split.cases], config)
         return found
 
     @classmethod
@@ -89,32 +93,58 @@ class Scene:
             walls=configuration.build(s.walls, "scene.walls"),
             material=configuration.build(config.material, "material"),
             transfer=configuration.build(config.transfer, "transfer"),
-            parameters=filled(
-                ParameterRange,
-                OmegaConf.to_container(configuration.section(config, "scene.parameters")),
-                "scene.parameters",
+            parameters=parameters_of(
+                OmegaConf.to_container(configuration.section(config, "scene.parameters"))
             ),
+            design=configuration.build(configuration.section(config, "scene.design"), "scene.design"),
             config=config,
             template=template,
         )
+
+    @cached_property
+    def split(self) -> Split:
+        """The cases that the design draws, by their use.
+
+        Raises:
+            ConfigError: see `Design.split`.
+        """
+        return self.design.split(self.parameters)
+
+    def case(self, values: Mapping[str, float] | Sequence[float] | float | None = None) -> Case:
+        """A case of the problem parameters.
+
+        Args:
+            values: by name, where those that are left out are as configured; or in the parameters' order; or
+                the value of the only one. As configured by default.
+
+        Raises:
+            ConfigError: a name is no parameter of the scene, or a value no finite number.
+        """
+        if values is None or isinstance(values, Mapping):
+            configured = {
+                name: OmegaConf.select(self.config, parameter.key)
+                for name, parameter in self.parameters.items()
+            }
+            values = configured | dict(values or {})
+        return case_of(self.parameters, values, self.name)
 
     def with_parameters(self, parameters: Mapping[str, float]) -> "Scene":
         """The same scene at given problem parameters, `{name: value}`; keys that refer to them follow.
 
         Raises:
-            ConfigError: a name is not the scene's parameter, or the value is refused.
+            ConfigError: a name is none of the scene's parameters, or a value is refused.
         """
         if (asked := tuple(parameters.items())) in self._at:
             return self._at[asked]
         config = self.template.copy()
         for name, value in parameters.items():
-            if name != self.parameters.name:
+            if name not in self.parameters:
                 raise ConfigError(
-                    f"{self.name} has no parameter {name!r}; its parameter is {self.parameters.name!r}"
+                    f"{self.name} has no parameter {name!r}; there are {', '.join(self.parameters)}"
                 )
             if not (isinstance(value, int | float | np.number) and math.isfinite(value)):
                 raise ConfigError(f"{name}={value!r} must be a finite number")
-            OmegaConf.update(config, self.parameters.key, float(value))
+            OmegaConf.update(config, self.parameters[name].key, float(value))
         self._at[asked] = Scene._build(configuration.resolve(config), config)
         return self._at[asked]
 
@@ -128,11 +158,11 @@ class Scene:
             changes: values by dotted key of the scene, its material or its transfer.
 
         Raises:
-            ConfigError: a key is unknown, the problem parameter's, or one that changes X, the grid or the
+            ConfigError: a key is unknown, a problem parameter's, or one that changes X, the grid or the
                 steps; a value is refused.
         """
-        if self.parameters.key in changes:
-            raise ConfigError(f"{self.parameters.key} is the problem parameter; set scene.parameters.test")
+        if own := [p.key for p in self.parameters.values() if p.key in changes]:
+            raise ConfigError(f"{own[0]} is a problem parameter; set scene.design.test")
         plain = OmegaConf.to_container(self.config)
         plain["scene"] = {k: v for k, v in plain["scene"].items() if k not in ("name", *NOT_PHYSICS)}
         known = configuration.leaves({part: plain[part] for part in ("scene", "material", "transfer")})
@@ -240,7 +270,7 @@ class Scene:
         """The full-order solver at t = 0 (paper section 3).
 
         Args:
-            parameters: problem parameters `{name: value}`; the configured value by default.
+            parameters: problem parameters `{name: value}`; those left out are as configured.
             precision: `fp64` or `fp32`.
             device: `cpu`, `cuda`, `cuda:N` or `auto`.
 

@@ -64,7 +64,7 @@ def add(file: str, content: str, project: Path) -> None:
 
 def train_sand() -> None:
     """A manifold of the small sand column, with its particles but few steps, values and iterations."""
-    short = ["scene.steps=8", "scene.parameters.train=[21.0,30.0,38.5]", "trainer.steps=20"]
+    short = ["scene.steps=8", "scene.design.train=[21.0,30.0,38.5]", "trainer.steps=20"]
     pipeline = Pipeline(config.load(["scene=sand", "scale=small", "device=cpu", *short]))
     pipeline.simulate()
     pipeline.train()

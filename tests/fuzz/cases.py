@@ -484,18 +484,20 @@ def requests(shop: Workshop, draw: random.Random) -> Case:
 
 def messages(shop: Workshop, draw: random.Random) -> Case:
     """What a client of the stream may send, malformed."""
-    text = json.dumps({"value": draw.choice((1, 1.5, "nan", None, [1], {"a": 1}, True, 2**2000, -1e308))})
+    text = json.dumps(
+        {"values": draw.choice((1, [1.5], ["nan"], None, [1, 2], {"a": 1}, [True], [2**2000], [-1e308]))}
+    )
     message = draw.choice(
-        (text, text[:-1], f"[{text}]", "[" * 100_000, "NaN", '{"value": NaN}', '{"value": 1e999}')
+        (text, text[:-1], f"[{text}]", "[" * 100_000, "NaN", '{"values": [NaN]}', '{"values": [1e999]}')
     )
     message = inputs.mutated(message.encode(), draw) if draw.random() < 0.5 else message
     if isinstance(message, bytes) and draw.random() < 0.7:
         message = message.decode("utf-8", "replace")
 
     def hand_over() -> None:
-        from nsf.live.wire import asked_value
+        from nsf.live.wire import asked_values
 
-        asked_value(message)
+        asked_values(message)
 
     return Case(repr(message[:200]), hand_over)
 

@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from angles import angle
 
 from nsf.data import Trajectory
 from nsf.deployment import Rollout
@@ -57,7 +58,7 @@ def test_what_is_said(chain):
     assert "4 trajectories in" in said[0]
     assert "field=basis, r=4" in said[1]
     assert said[2] == "deploy: engine modal"
-    assert "method=nsf, |S|=20, 1 values" in said[3]
+    assert "method=nsf, |S|=20, 1 cases" in said[3]
     assert "mean δ" in said[4]
 
 
@@ -137,19 +138,19 @@ def test_files_of_an_evaluation(chain):
 
 def test_manifests(chain):
     p = chain.pipeline
-    for run in (*(p.simulation(v) for v in (22, 26, 30, 38)), p.training, p.deployment, p.evaluation):
+    for run in (*(p.simulation(angle(v)) for v in (22, 26, 30, 38)), p.training, p.deployment, p.evaluation):
         assert run.manifest["status"] == "complete"
         assert run.complete
-    assert p.training.manifest["parents"] == [p.simulation(v).id for v in (22, 30, 38)]
+    assert p.training.manifest["parents"] == [p.simulation(angle(v)).id for v in (22, 30, 38)]
     assert p.deployment.manifest["parents"] == [p.training.id]
-    assert p.evaluation.manifest["parents"] == [p.deployment.id, p.simulation(26).id]
+    assert p.evaluation.manifest["parents"] == [p.deployment.id, p.simulation(angle(26)).id]
     metrics = p.deployment.manifest["metrics"]
     assert (metrics["needed_outside"], metrics["engine"], metrics["engine_why"]) == (0, "modal", "")
 
 
 def test_the_manifold_knows_its_data(chain, tiny_manifold):
-    assert tiny_manifold.split == {"train": [22.0, 30.0, 38.0], "test": [26.0]}
-    assert tiny_manifold.datasets == [chain.pipeline.simulation(v).id for v in (22, 30, 38)]
+    assert tiny_manifold.split == {"train": [[22.0], [30.0], [38.0]], "test": [[26.0]]}
+    assert tiny_manifold.datasets == [chain.pipeline.simulation(angle(v)).id for v in (22, 30, 38)]
     assert sorted(set(tiny_manifold.training_parameters.flatten().tolist())) == [22.0, 30.0, 38.0]
 
 
@@ -182,18 +183,18 @@ def test_another_method_deploys_and_evaluates_again(copied, pipeline_at):
 def test_another_test_value_simulates_only_that_one(copied, pipeline_at):
     root = copied(*STAGES)
     before = stamps(root)
-    pipeline, said = said_by(pipeline_at, root, "scene.parameters.test=[26,34]")
+    pipeline, said = said_by(pipeline_at, root, "scene.design.test=[26,34]")
     assert said[0] == "simulate: 4 of 5 trajectories are there, reused"
     assert "simulate: 1 trajectories in" in said[1]
     assert "train: inputs unchanged, reused" in said[2]
-    assert "2 values" in said[-2]
+    assert "2 cases" in said[-2]
     assert {p: t for p, t in stamps(root).items() if p in before} == before
     results = pd.read_csv(pipeline.evaluation.path / "results.csv")
     assert results["parameter"].tolist() == [26.0, 34.0]
 
 
 def test_values_deployed_together_are_as_one_by_one(copied, pipeline_at):
-    root, keys = copied("simulate", "train"), ("scene.parameters.test=[26,34,36]", "evaluation.trials=1")
+    root, keys = copied("simulate", "train"), ("scene.design.test=[26,34,36]", "evaluation.trials=1")
     said_by(pipeline_at, root, *keys, stages=("simulate",))
     found = {}
     for batch in (1, 2):
@@ -202,11 +203,11 @@ def test_values_deployed_together_are_as_one_by_one(copied, pipeline_at):
         run = pipeline.deployment
         found[batch] = run.hash, [Rollout.open(run.path / f"rollout_{i}.h5") for i in range(3)]
         assert run.manifest["metrics"]["batch"] == batch
-        assert ("3 values, 2 together → " in said[-1]) == (batch == 2)
+        assert ("3 cases, 2 together → " in said[-1]) == (batch == 2)
     (one_hash, ones), (other_hash, others) = found.values()
     assert one_hash == other_hash
     for one, other in zip(ones, others, strict=True):
-        assert (one.parameter, one.stops, one.diverged) == (other.parameter, other.stops, other.diverged)
+        assert (one.case, one.stops, one.diverged) == (other.case, other.stops, other.diverged)
         assert (one.sample, one.integration_mean) == (other.sample, other.integration_mean)
         np.testing.assert_allclose(one.xhat, other.xhat, rtol=0, atol=1e-10)
     assert pipeline.evaluate().complete
@@ -255,13 +256,17 @@ def test_deploying_on_another_scene_than_the_one_trained_on(copied, pipeline_at)
     assert said[0] == "simulate: 3 of 4 trajectories are there, reused"
     assert "train: inputs unchanged, reused" in said[2]
     assert {p: t for p, t in stamps(root).items() if p in before} == before
-    assert pipeline.truth(26.0).hash != pipeline.simulation(26.0).hash == plain.truth(26.0).hash
-    assert pipeline.evaluation.manifest["parents"] == [pipeline.deployment.id, pipeline.truth(26.0).id]
+    assert (
+        pipeline.truth(angle(26.0)).hash
+        != pipeline.simulation(angle(26.0)).hash
+        == plain.truth(angle(26.0)).hash
+    )
+    assert pipeline.evaluation.manifest["parents"] == [pipeline.deployment.id, pipeline.truth(angle(26.0)).id]
     assert json.loads((pipeline.evaluation.path / "summary.json").read_text())["changes"] == {
         change: [0, 0, -6]
     }
     fallen = []
-    for run in (plain.truth(26.0), pipeline.truth(26.0)):
+    for run in (plain.truth(angle(26.0)), pipeline.truth(angle(26.0))):
         with Trajectory.open(run.path / "trajectory.h5") as trajectory:
             fallen.append((trajectory.X - trajectory.read("x", 12)[0])[:, 2].mean())
     assert fallen[1] > 1.2 * fallen[0] > 0
@@ -271,29 +276,36 @@ def test_deploying_on_another_scene_than_the_one_trained_on(copied, pipeline_at)
     z = [manifold.restrict().position(torch.tensor(xhat[12]))[:, 2].mean().item() for xhat in latents]
     assert z[1] < z[0]
     # The changed truth is what a plain run of that scene makes.
-    assert pipeline_at(root, f"{change}=[0,0,-6]").simulation(26.0).complete
+    assert pipeline_at(root, f"{change}=[0,0,-6]").simulation(angle(26.0)).complete
 
 
 def test_extrapolation(copied, pipeline_at):
     """Appendix "Generalization": friction angles beyond those of training, which reach 38° here."""
     root = copied("simulate", "train")
-    pipeline, said = said_by(pipeline_at, root, "scene.parameters.test=[44,55]", "evaluation.trials=1")
+    pipeline, said = said_by(pipeline_at, root, "scene.design.test=[44,55]", "evaluation.trials=1")
     assert "train: inputs unchanged, reused" in said[2]
     results = pd.read_csv(pipeline.evaluation.path / "results.csv")
     assert results["parameter"].tolist() == [44.0, 55.0]
     assert 0 < results["delta"][0] < results["delta"][1]
+    assert any(
+        "friction_angle=44° is none of the cases that the model was trained for: 1.75 times as far" in line
+        for line in said
+    )
+    told = json.loads((pipeline.evaluation.path / "summary.json").read_text())["trust"]
+    assert [entry["away"] for entry in told] == pytest.approx([1.75, 3.125])
+    assert all(entry["distrusted_at"] == 0.0 for entry in told)
 
 
 def test_a_changed_training_value_is_another_simulation(chain, pipeline_at):
     pipeline = pipeline_at(chain.root, "deploy.split=train", "deploy.changes={material.E:1900}")
     assert pipeline.training.hash == chain.pipeline.training.hash
-    assert pipeline.truth(30.0).hash != pipeline.simulation(30.0).hash
+    assert pipeline.truth(angle(30.0)).hash != pipeline.simulation(angle(30.0)).hash
     assert len(pipeline.needed()) == 7  # three values twice, and the test value
 
 
 HASHES = {
     # override → stages that it makes anew
-    "scene.parameters.test=[26,34]": {"deployment", "evaluation"},
+    "scene.design.test=[26,34]": {"deployment", "evaluation"},
     "method=deformation_only": {"deployment", "evaluation"},
     "sampler.size=30": {"deployment", "evaluation"},
     "projector=taylor": {"deployment", "evaluation"},
@@ -307,7 +319,7 @@ HASHES = {
     "seed=1": {"training", "deployment", "evaluation"},
     "field.beta=5": {"training", "deployment", "evaluation"},
     "trainer.steps=100": {"training", "deployment", "evaluation"},
-    "scene.parameters.train=[22,30]": {"training", "deployment", "evaluation"},
+    "scene.design.train=[22,30]": {"training", "deployment", "evaluation"},
     "scene.dt=0.004": {"simulation", "training", "deployment", "evaluation"},
     "material.E=1900": {"simulation", "training", "deployment", "evaluation"},
     "transfer=pic": {"simulation", "training", "deployment", "evaluation"},
@@ -327,14 +339,14 @@ def test_what_a_change_makes_anew(chain, pipeline_at, override):
 
     def names(pipeline):
         stages = {k: getattr(pipeline, k).hash for k in ("training", "deployment", "evaluation")}
-        return stages | {"simulation": pipeline.simulation(30.0).hash}
+        return stages | {"simulation": pipeline.simulation(angle(30.0)).hash}
 
     before, after = names(chain.pipeline), names(changed)
     assert {k for k in before if before[k] != after[k]} == HASHES[override]
 
 
 def test_a_value_is_one_run_however_it_is_written(chain, pipeline_at):
-    written = pipeline_at(chain.root, "scene.parameters.train=[22.0,3e1,38]")
+    written = pipeline_at(chain.root, "scene.design.train=[22.0,3e1,38]")
     assert written.training.hash == chain.pipeline.training.hash
 
 
@@ -368,7 +380,7 @@ def test_a_stage_before_its_time_leaves_no_failed_run(pipeline_at, tmp_path):
 def test_a_lost_truth_leaves_no_failed_run(copied, pipeline_at, stage):
     root = copied("simulate", "train", "deploy")
     pipeline = pipeline_at(root)
-    shutil.rmtree(pipeline.truth(26.0).path)
+    shutil.rmtree(pipeline.truth(angle(26.0)).path)
     with pytest.raises(MissingRunError, match="run `nsf simulate"):
         pipeline.run(stage)
     assert not Run.find(stage, root=root)
@@ -386,9 +398,11 @@ def test_what_a_lost_training_needs_is_made_again(copied, pipeline_at):
     root = copied("simulate", "train", "deploy", "evaluate")
     stages = ("train", "deploy", "evaluate")
     pipeline = pipeline_at(root)
-    assert pipeline._spare(stages) == {run.id for run in (*pipeline.training_data, pipeline.truth(26.0))}
+    assert pipeline._spare(stages) == {
+        run.id for run in (*pipeline.training_data, pipeline.truth(angle(26.0)))
+    }
     shutil.rmtree(pipeline.training.path)
-    assert pipeline._spare(stages) == {pipeline.truth(26.0).id}
+    assert pipeline._spare(stages) == {pipeline.truth(angle(26.0)).id}
     same, _ = said_by(pipeline_at, root, "deploy.split=train", "evaluation.trials=0")
     shutil.rmtree(same.training.path)
     assert not same._spare(stages)
@@ -414,7 +428,7 @@ def test_a_run_without_timings_is_reported(copied, pipeline_at, tmp_path):
 
 
 def test_a_split_without_values(pipeline_at, tmp_path):
-    with pytest.raises(ConfigError, match=r"deploy\.split=validation has no values"):
+    with pytest.raises(ConfigError, match=r"deploy\.split=validation has no cases"):
         pipeline_at(tmp_path, "deploy.split=validation").deploy()
 
 
@@ -440,7 +454,7 @@ def test_needed_particles_outside_the_superset_are_told(copied, pipeline_at, mon
     missing = pipeline.deployment.manifest["metrics"]["needed_outside"]
     assert missing > 100
     (warning,) = [line for line in said if "a step needed" in line]
-    assert f"friction_angle=26: a step needed {missing} particles or nodes outside" in warning
+    assert f"friction_angle=26°: a step needed {missing} particles or nodes outside" in warning
     assert "integration=search" in warning  # the remedy
 
 
@@ -472,7 +486,7 @@ def test_a_diverged_rollout_is_infinite_and_never_nan(copied, pipeline_at):
     pipeline.projector = Breaks()
     pipeline.run("deploy")
     pipeline.run("evaluate")
-    assert any("friction_angle=26 diverged at step" in line and "∞" in line for line in said)
+    assert any("friction_angle=26° diverged at step" in line and "∞" in line for line in said)
     assert pipeline.deployment.manifest["metrics"]["diverged"] == [26.0]
     assert pipeline.evaluation.manifest["metrics"]["diverged"] == [26.0]
     (listed,) = entries({"stage": "evaluate"}, root=root)
@@ -502,10 +516,10 @@ def test_an_unstable_simulation_tells_its_cfl_number(pipeline_at, tmp_path, monk
             raise InstabilityError("particle 3 became non-finite")
 
     monkeypatch.setattr(FullOrderMPM, "check", check)
-    pipeline = pipeline_at(tmp_path, "scene.parameters.train=[30]")
+    pipeline = pipeline_at(tmp_path, "scene.design.train=[30,31]")
     with pytest.raises(InstabilityError, match=r"particle 3 became non-finite; elastic CFL .* at step 0"):
         pipeline.run("simulate")
-    error = pipeline.simulation(26.0).manifest["error"]
+    error = pipeline.simulation(angle(26.0)).manifest["error"]
     assert "elastic CFL c dt/dx" in error
     with pytest.raises(InstabilityError, match=r"fine full-order run: .*; raise super_resolution\.substeps"):
         superresolution._full_order_frames(pipeline.scene.full_order, [24])
@@ -518,9 +532,9 @@ def test_super_resolution_of_a_deployment(copied, pipeline_at):
     root, options = copied(*STAGES), ("super_resolution.factor=2", "super_resolution.frames=3")
     pipeline, said = said_by(pipeline_at, root, *options, stages=["superresolve"])
     run = pipeline.superresolution
-    assert run.manifest["parents"] == [pipeline.deployment.id, pipeline.truth(26.0).id]
+    assert run.manifest["parents"] == [pipeline.deployment.id, pipeline.truth(angle(26.0)).id]
     run_line, line = said
-    assert run_line.startswith("superresolve: friction_angle=26: 1,000 full-order particles in ")
+    assert run_line.startswith("superresolve: friction_angle=26°: 1,000 full-order particles in ")
     assert "1,000 points" in line
     assert "at the 500 particles" in line
     table = pd.read_csv(run.path / "superresolution.csv")
@@ -539,11 +553,11 @@ def test_super_resolution_of_a_deployment(copied, pipeline_at):
 
 @pytest.fixture(scope="module")
 def far(chain, pipeline_at, tmp_path_factory):
-    """A value far outside, evaluated with both answers to distrust: pipelines, and what was said."""
+    """A case far outside, evaluated with both answers to distrust: pipelines, and what was said."""
     root, said = tmp_path_factory.mktemp("far") / "runs", []
     for stage in ("simulate", "train"):
         shutil.copytree(chain.root / stage, root / stage)
-    keys = ("scene.parameters.test=[8]", "evaluation.trials=1")
+    keys = ("scene.design.test=[8]", "evaluation.trials=1")
     answers = ("report", "full_order")
     found = {a: pipeline_at(root, *keys, f"deploy.on_distrust={a}", say=said.append) for a in answers}
     for pipeline in found.values():
@@ -563,8 +577,10 @@ def test_a_run_far_from_training_says_so(far, chain):
     told, _, series = evaluated(pipeline)
     assert (told["parameter"], told["distrusted"], told["handed_over_at"]) == (8.0, True, None)
     assert told["trust"] > max(2.0, evaluated(chain.pipeline)[0]["trust"])
-    left = f"friction_angle=8 left what the model was trained on at t = {told['distrusted_at']:.4g} s"
-    assert any(left in line for line in said)
+    assert told["away"] == pytest.approx(2.75)  # 14° below the training angles, which are 8° apart
+    why = "friction_angle=8° is none of the cases that the model was trained for: 2.75 times as far"
+    assert any(why in line for line in said)
+    assert told["distrusted_at"] == 0.0
     assert series["trust"].max() == pytest.approx(told["trust"])
     assert series.loc[series["trust"] > 1.0, "t"].min() == pytest.approx(told["distrusted_at"])
     measured = pipeline.deployment.manifest["metrics"]
@@ -575,13 +591,13 @@ def test_a_run_far_from_training_says_so(far, chain):
 def test_the_full_order_solver_goes_on(far):
     (reported, handed), said = far[0].values(), far[1]
     assert handed.training.id == reported.training.id
-    assert any("friction_angle=8" in line and "full-order solver goes on from t =" in line for line in said)
+    assert any("friction_angle=8°" in line and "full-order solver goes on from t =" in line for line in said)
     _, before, reduced = evaluated(reported)
     told, after, series = evaluated(handed)
     assert after["delta"][0] < before["delta"][0]
     assert after[["step_ms_reduced", "speedup_step"]].isna().all().all()  # no reduced run's
     at = told["handed_over_at"]
-    assert 0.0 < at < told["distrusted_at"]
+    assert at == told["distrusted_at"] == 0.0  # no step of the reduced run is believed
     own = series["t"] <= at + 1e-9
     assert series.loc[own, ["trust", "xhat_1"]].notna().all().all()
     assert series.loc[~own, ["trust", "xhat_1"]].isna().all().all()

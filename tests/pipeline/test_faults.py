@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from angles import angle
 from forked import FileLimit, GoneAt, PlainReport
 from test_interrupt import MOMENTS
 
@@ -90,7 +91,7 @@ def refused(nsf, tmp_path):
 )
 def test_a_bad_trajectory(refused, copied, pipeline_at, spoil, quoted, replace):
     root = copied("simulate")
-    run = pipeline_at(root).simulation(30.0)
+    run = pipeline_at(root).simulation(angle(30.0))
     replace(run, "trajectory.h5", spoil)
     line = refused("train", root)
     assert str(run.path / "trajectory.h5") in line
@@ -101,7 +102,7 @@ def test_a_bad_trajectory(refused, copied, pipeline_at, spoil, quoted, replace):
 
 def test_a_trajectory_cut_short_is_simulated_again(copied, pipeline_at, refused, chain):
     root = copied("simulate")
-    run = pipeline_at(root).simulation(30.0)
+    run = pipeline_at(root).simulation(angle(30.0))
     whole = (run.path / "trajectory.h5").read_bytes()
     truncate(run.path / "trajectory.h5")
     assert str(run.path) in refused("train", root)
@@ -210,10 +211,10 @@ def linked(path):
 
 #: The stage that reads a file, whose it is, and what it is called.
 READ = [
-    ("train", lambda p: p.simulation(30.0), "trajectory.h5"),
+    ("train", lambda p: p.simulation(angle(30.0)), "trajectory.h5"),
     ("deploy", lambda p: p.training, "manifold.pt"),
     ("evaluate", lambda p: p.deployment, "rollout_0.h5"),
-    ("evaluate", lambda p: p.truth(26.0), "trajectory.h5"),
+    ("evaluate", lambda p: p.truth(angle(26.0)), "trajectory.h5"),
     ("evaluate", lambda p: p.training, "manifold.pt"),
 ]
 

@@ -8,6 +8,7 @@ import time
 
 import pytest
 import torch
+from angles import angle
 from forked import SignalAt
 
 from nsf.data import Trajectory
@@ -132,6 +133,6 @@ def test_a_killed_process_leaves_nothing_that_is_taken_for_whole(nsf, copied, pi
     pipeline.run("simulate")
     pipeline.run("train")
     for value in (22.0, 26.0, 30.0, 38.0):
-        with Trajectory.open(pipeline.simulation(value).path / "trajectory.h5") as trajectory:
+        with Trajectory.open(pipeline.simulation(angle(value)).path / "trajectory.h5") as trajectory:
             assert trajectory.frames == 25
     assert same_weights(pipeline.training.path / "manifold.pt", chain.checkpoint)

@@ -16,8 +16,8 @@ FEW = (
     "scene.dt=0.004",
     "scene.steps=24",
     "scene.bodies.body.particles_per_cell=4",
-    "scene.parameters.train=[2000,4000,6000]",
-    "scene.parameters.test=[3000]",
+    "scene.design.train=[2000,4000,6000]",
+    "scene.design.test=[3000]",
     "field.modes=[8,8,8]",
     "field.beta=4",
     "field.depth=1",
@@ -56,7 +56,7 @@ def test_chain(octahedron, tmp_path):
     for stage in ("simulate", "train", "deploy", "evaluate"):
         chain.run(stage)
     shape = Mesh(str(path), 0.3, (0.5, 0.5, 0.15))
-    with Trajectory.open(chain.simulation(3000.0).path / "trajectory.h5") as trajectory:
+    with Trajectory.open(chain.simulation(chain.scene.case(3000.0)).path / "trajectory.h5") as trajectory:
         x = trajectory.read("x").reshape(-1, trajectory.particles, 3)
         assert trajectory.particles == round(4 * shape.volume / 0.04**3)
     np.testing.assert_allclose(x[0], shape.sample(x.shape[1]), atol=1e-7)
@@ -68,6 +68,6 @@ def test_chain(octahedron, tmp_path):
     changed = pipeline()
     for stage in ("training", "deployment", "evaluation"):
         assert getattr(changed, stage).id != getattr(chain, stage).id
-    assert not changed.simulation(3000.0).complete
+    assert not changed.simulation(changed.scene.case(3000.0)).complete
     octahedron(1.0)
     assert pipeline().evaluation.complete

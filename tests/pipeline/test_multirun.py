@@ -148,7 +148,11 @@ def test_training_trajectories_go_once_their_jobs_are_done(nsf, copied):
 
     def kept():
         runs = Run.find("simulate", root=root)
-        return sorted(r.config["parameter"]["value"] for r in runs if (r.path / "trajectory.h5").exists())
+        return sorted(
+            r.config["parameters"]["friction_angle"]["value"]
+            for r in runs
+            if (r.path / "trajectory.h5").exists()
+        )
 
     failed = nsf("run", root, "latent_dim=9,3", *arguments[1:], faults=[PlainReport()], multirun=True)
     assert failed.code != 0

@@ -32,7 +32,7 @@ def tried(copied, tiny, tmp_path):
 
 @pytest.mark.slow
 def test_the_front_of_two_objectives(tried):
-    words = ("scene.parameters.validation=[25]", "latent_dim=3..5", "field.noise=0.001..0.1:log")
+    words = ("scene.design.validation=[25]", "latent_dim=3..5", "field.noise=0.001..0.1:log")
     table, said = tried(*words, "search.objectives=[delta,step_ms]", "search.trials=3")
     assert list(table["trial"]) == [0, 1, 2]
     assert set(table["latent_dim"]) <= {3, 4, 5}
@@ -44,7 +44,7 @@ def test_the_front_of_two_objectives(tried):
 
 
 def test_only_validation_values_are_deployed_and_the_search_goes_on(tried):
-    words = ("scene.parameters.validation=[25]", "latent_dim=3..5")
+    words = ("scene.design.validation=[25]", "latent_dim=3..5")
     assert len(tried(*words, "search.trials=1")[0]) == 1
     table, said = tried(*words, "search.trials=2")
     assert said[0].startswith("search: 1 trials of sand_")
@@ -57,7 +57,7 @@ def test_only_validation_values_are_deployed_and_the_search_goes_on(tried):
 
 @pytest.mark.slow
 def test_a_failed_trial_is_kept_and_the_others_go_on(tried, monkeypatch):
-    words = ("scene.parameters.validation=[25]", "latent_dim=7..9", "search.trials=3", "seed=1")
+    words = ("scene.design.validation=[25]", "latent_dim=7..9", "search.trials=3", "seed=1")
     table, said = tried(*words)
     failed = table[table["error"].notna()]
     assert set(failed["latent_dim"]) <= {9}
@@ -68,14 +68,14 @@ def test_a_failed_trial_is_kept_and_the_others_go_on(tried, monkeypatch):
 @pytest.mark.parametrize(
     ("words", "quoted"),
     [
-        (["latent_dim=4..6"], "no validation values.*scene.parameters.validation"),
-        (["latent_dim=4..6", "scene.parameters.validation=[26]"], "26"),  # a test value
+        (["latent_dim=4..6"], "no validation values.*scene.design.validation"),
+        (["latent_dim=4..6", "scene.design.validation=[26]"], "26"),  # a test value
         (["latent_dim=4"], "needs a range"),
         (["latent_dim=4..6", "+experiment=sand"], "has no experiment"),
         (["latent_dim=6..4"], "nothing between"),
         (["latent_dimm=4..6"], "did you mean latent_dim"),
         (["field.noise=0.0..0.1:log"], "reaches zero"),
-        (["latent_dim=0..4", "scene.parameters.validation=[25]"], "latent_dim=0"),
+        (["latent_dim=0..4", "scene.design.validation=[25]"], "latent_dim=0"),
         (["latent_dim=4..6", "search.objectives=[speed]"], "delta, step_ms"),
         (["latent_dim=4..6", "search.objectives=delta"], "delta, step_ms"),
         (["latent_dim=4..6", "search.trials=0"], "search.trials=0"),
@@ -103,4 +103,4 @@ def test_a_missing_extra_names_the_remedy(tried, monkeypatch):
 
 def test_no_result_at_all(tried):
     with pytest.raises(MissingRunError, match="no trial"):
-        tried("scene.parameters.validation=[25]", "latent_dim=7..8", "search.trials=1", "field.modes=[6,8,8]")
+        tried("scene.design.validation=[25]", "latent_dim=7..8", "search.trials=1", "field.modes=[6,8,8]")

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from angles import angle
 
 from nsf.deployment import FULL_ORDER, OPERATORS, PROJECTED, Levels, Rollout, rollout, rollouts
 from nsf.deployment.levels import estimated_errors
@@ -49,7 +50,7 @@ def reduced(lesson, taught, tiny_manifold):
     """(scene, **options) → a solver by operators; with the sample that they know."""
     pipeline, _ = lesson
     manifold = pipeline.manifold()
-    known = pipeline.batch_at(manifold, [26.0]).batch.shared
+    known = pipeline.batch_at(manifold, [angle(26.0)]).batch.shared
 
     def build(scene=pipeline.scene, parameters=ANGLE, sample=known.samples, manifold=manifold, **options):
         options = {"engine": taught, "device": "cpu"} | options
@@ -99,10 +100,10 @@ def test_no_held_out_value_is_a_lesson(pipeline_at, tmp_path):
     for seed in range(20):
         pipeline = pipeline_at(tmp_path, *TAUGHT, f"seed={seed}")
         known, between, back = pipeline.lessons
-        assert known == [22.0, 30.0, 38.0]
+        assert known == list(map(angle, (22.0, 30.0, 38.0)))
         assert (len(between), len(back)) == (3, 3)
-        assert not {*between, *back} & {26.0, *known}
-    taken = pipeline_at(tmp_path, *TAUGHT, f"scene.parameters.test=[{between[1]}]")
+        assert not {*between, *back} & {angle(26.0), *known}
+    taken = pipeline_at(tmp_path, *TAUGHT, f"scene.design.test={list(between[1].numbers)}")
     assert taken.taught.hash != pipeline.taught.hash
 
 
@@ -213,7 +214,7 @@ def test_gravity_and_the_initial_velocity_may_be_others(reduced, lesson, changes
     assert (own.doubt[0] <= 1.0) == inside
     if not inside:
         own.restart()
-        assert rollout(own, 26.0, tiny_trust).distrusted == 0
+        assert rollout(own, angle(26.0), tiny_trust).distrusted == 0
 
 
 def test_a_parameter_outside_of_what_was_taught_is_doubted(reduced):
@@ -257,17 +258,17 @@ def levels_of(lesson):
     manifold = pipeline.manifold()
 
     def build(*how, every=4):
-        return Levels(lambda values: pipeline.batch_at(manifold, values, engine="auto"), every, *how)
+        return Levels(lambda cases: pipeline.batch_at(manifold, cases, engine="auto"), every, *how)
 
     return build
 
 
 def test_the_estimate_is_how_far_projected_runs_are(reduced, lesson, levels_of):
     pipeline, _ = lesson
-    values = [23.0, 26.0]
-    batch = pipeline.batch_at(pipeline.manifold(), values)
+    cases = [angle(23.0), angle(26.0)]
+    batch = pipeline.batch_at(pipeline.manifold(), cases)
     batch.step(24)
-    projected = levels_of().projected(values)
+    projected = levels_of().projected(cases)
     found = estimated_errors(batch, projected, 1)
     projected.restart()
     projected.step(24)
@@ -282,11 +283,11 @@ def test_the_estimate_is_how_far_projected_runs_are(reduced, lesson, levels_of):
 
 
 def test_beyond_a_tolerance_the_projected_step_goes_on(reduced, levels_of, tiny_trust):
-    own = rollouts(reduced().together, [26.0], tiny_trust, levels=levels_of())[0]
+    own = rollouts(reduced().together, [angle(26.0)], tiny_trust, levels=levels_of())[0]
     assert (own.by_operators, own.levels.tolist()) == (24, [OPERATORS] * 24)
     assert own.estimate[0] == 0.0 < own.estimate[-1]
     tolerance = 0.5 * float(own.estimate.max())
-    found = rollouts(reduced().together, [26.0], tiny_trust, levels=levels_of(tolerance))[0]
+    found = rollouts(reduced().together, [angle(26.0)], tiny_trust, levels=levels_of(tolerance))[0]
     n = int(np.argmax(found.levels == PROJECTED))
     assert 0 < n < 24
     assert (found.levels[n : n + 4] == PROJECTED).all()
@@ -304,20 +305,20 @@ def test_beyond_a_tolerance_the_projected_step_goes_on(reduced, levels_of, tiny_
 
 
 def test_what_is_doubted_is_projected_and_what_is_off_goes_to_full_order(reduced, levels_of, tiny_trust):
-    outside = {"friction_angle": 60.0}
+    outside = angle(60.0)
     solver = reduced(parameters=outside)
-    found = rollouts(solver.together, [60.0], tiny_trust, levels=levels_of(None, True))[0]
+    found = rollouts(solver.together, [outside], tiny_trust, levels=levels_of(None, True))[0]
     assert (found.by_operators, found.levels.tolist()) == (0, [PROJECTED] * 24)
     assert reduced().doubt[0] <= 1.0
-    plain = rollouts(reduced(parameters=outside).together, [60.0], tiny_trust, levels=levels_of())[0]
+    plain = rollouts(reduced(parameters=outside).together, [outside], tiny_trust, levels=levels_of())[0]
     assert plain.by_operators == 24
     assert (plain.trust > 1.0).all()  # never without saying so
-    mixed = rollouts(reduced(parameters=outside).together, [60.0], tiny_trust, levels=levels_of(1e-9))[0]
+    mixed = rollouts(reduced(parameters=outside).together, [outside], tiny_trust, levels=levels_of(1e-9))[0]
     assert mixed.levels[-1] == PROJECTED
     after = np.append(mixed.levels[:1], mixed.levels) == OPERATORS
     assert (mixed.trust[after] > 1.0).all()
     options = tiny_trust, True, levels_of(None, True)
-    handed = rollouts(reduced(parameters=outside).together, [60.0], *options)[0]
+    handed = rollouts(reduced(parameters=outside).together, [outside], *options)[0]
     own = len(handed.stops) if handed.handed_over < 0 else handed.handed_over
     assert handed.levels.tolist() == [PROJECTED] * own + [FULL_ORDER] * (len(handed.stops) - own)
 

@@ -33,7 +33,7 @@ def made(root, stage, config, parents=()):
 @pytest.fixture
 def runs(tmp_path):
     """Three runs, each made from the one before."""
-    simulated = made(tmp_path, "simulate", {"parameter": {"key": "material.mu", "value": 26.0}})
+    simulated = made(tmp_path, "simulate", {"parameters": {"mu": {"key": "material.mu", "value": 26.0}}})
     trained = made(tmp_path, "train", {"latent_dim": 4, "field": {"modes": [8, 8, 8]}}, [simulated])
     return simulated, trained, made(tmp_path, "evaluate", {"evaluation": {"trials": 2}}, [trained])
 
@@ -158,7 +158,7 @@ def test_a_broken_run_is_listed_with_its_fault_and_breaks_no_other(
         broken.require()
     assert sorted(run.id for run in Run.find(root=tmp_path)) == sorted(run.id for run in runs)
     assert [run.status for run in runs if run != broken] == ["complete"] * 2
-    for filters, sort in (({"latent_dim": "4"}, "created"), ({"delta": "*"}, "parameter.value")):
+    for filters, sort in (({"latent_dim": "4"}, "created"), ({"delta": "*"}, "parameters.mu.value")):
         with contextlib.suppress(ConfigError):  # no other run may have such a key
             entries(filters, sort, tmp_path)
     code, out, err = said_by(runs, capsys, monkeypatch)

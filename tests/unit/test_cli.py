@@ -7,6 +7,7 @@ import signal
 import pandas as pd
 import pytest
 import torch
+from angles import angle
 
 from nsf.cli import STAGES, main
 from nsf.paths import groups
@@ -67,13 +68,14 @@ REFUSED = [
     ("run", "field=bassis", ["field=bassis", "did you mean basis?"]),
     ("run", "latent_dim", ["'latent_dim' is not key=value"]),
     ("run", "--fast", ["'--fast' is not key=value"]),
-    ("run", "scene.parameters.test=[1", ["scene.parameters.test=[1"]),
-    ("run", "scene.parameters.test=[22,26]", ["22", "train and test", "one split"]),
-    ("run", "scene.parameters.train=[22,22,30]", ["22", "twice in train"]),
-    ("run", "scene.parameters.test=[]", ["scene.parameters.test"]),
-    ("run", "scene.parameters.test=26", ["scene.parameters.test=26"]),
-    ("run", "scene.parameters.train=abc", ["scene.parameters.train"]),
-    ("run", "scene.parameters.test=[95]", ["friction_angle=95", "[0, 90)"]),
+    ("run", "scene.design.test=[1", ["scene.design.test=[1"]),
+    ("run", "scene.design.test=[22,26]", ["22", "train and test", "one split"]),
+    ("run", "scene.design.train=[30]", ["1 training cases", "friction_angle needs at least 2; add some"]),
+    ("run", "scene.design.train=[22,22,30]", ["22", "twice in train"]),
+    ("run", "scene.design.test=[]", ["scene.design.test"]),
+    ("run", "scene.design.test=26", ["scene.design.test=26"]),
+    ("run", "scene.design.train=abc", ["scene.design.train"]),
+    ("run", "scene.design.test=[95]", ["friction_angle=95", "[0, 90)"]),
     ("run", "scale=big", ["scale=big", "choose one of small, paper"]),
     ("run", "material.nu=0.6", ["material.nu=0.6", "(-1, 0.5)"]),
     ("run", "material.E=-1", ["material.E=-1", "positive"]),
@@ -134,15 +136,15 @@ MALFORMED = [
     ("scene.bodies.column.particles=true", "particles=True must be a whole number or null"),
     ("~scene.bodies.column.density", "scene.bodies.column.density is missing"),
     ("+scene.bodies.column.weight=1", "unexpected key 'weight'; known keys: shape, density"),
-    ("scene.parameters.key=''", "scene.parameters.key='' names no key"),
-    ("scene.parameters.key=[a]", "scene.parameters.key=['a'] must be text"),
-    ("~scene.parameters.key", "scene.parameters.key is missing"),
-    ("~scene.parameters.unit", "scene.parameters.unit is missing"),
-    ("~scene.parameters.train", "scene.parameters.train is missing"),
+    ("scene.parameters.friction_angle.key=''", "friction_angle.key='' names no key"),
+    ("scene.parameters.friction_angle.key=[a]", "friction_angle.key=['a'] must be text"),
+    ("~scene.parameters.friction_angle.key", "scene.parameters.friction_angle.key is missing"),
+    ("~scene.parameters.friction_angle.unit", "scene.parameters.friction_angle.unit is missing"),
+    ("~scene.design.train", "scene.design.train is missing"),
     ("scene.parameters=null", "scene.parameters=null must map keys to values"),
-    ("scene.parameters.unit=5", "scene.parameters.unit=5 must be text"),
-    ("scene.parameters.test=null", "scene.parameters.test=None must be a list of numbers"),
-    ("scene.parameters.validation=[[1]]", "scene.parameters.validation=[[1]] must be a list of numbers"),
+    ("scene.parameters.friction_angle.unit=5", "friction_angle.unit=5 must be text"),
+    ("scene.design.test=null", "scene.design.test=None must be a list, as [None]"),
+    ("scene.design.validation=[[1,2]]", "scene.design.validation: [1, 2] must be a finite number"),
     ("scene.name=[1]", "scene.name=[1] must be text"),
     ("scene.name=''", "scene.name='' must be text, and not empty"),
     ("scene.title=null", "scene.title=None must be text"),
@@ -316,14 +318,14 @@ def test_a_gpu_where_there_is_none(nsf, tmp_path, stage):
 
 
 def test_an_unstable_step_names_the_largest_stable_one(nsf, tmp_path):
-    code, _, err = nsf("simulate", "scene.dt=0.5", "scene.parameters.train=[30]")
+    code, _, err = nsf("simulate", "scene.dt=0.5", "scene.design.train=[30,31]")
     assert code == 2
     assert "dt=0.5 s is unstable" in err
     assert not files(tmp_path)
     largest = re.search(r"largest stable dt is (\S+) s", err).group(1)
-    assert nsf("simulate", f"scene.dt={largest}", "scene.parameters.train=[30]")[0] == 0
+    assert nsf("simulate", f"scene.dt={largest}", "scene.design.train=[30,31]")[0] == 0
     longer = 1.001 * float(largest)
-    assert nsf("simulate", f"scene.dt={longer}", "scene.parameters.train=[30]")[0] == 2
+    assert nsf("simulate", f"scene.dt={longer}", "scene.design.train=[30,31]")[0] == 2
 
 
 @pytest.mark.parametrize(
@@ -352,10 +354,10 @@ def test_runs_are_listed_and_compared(nsf, chain, monkeypatch):
     code, out, _ = nsf("runs", "stage=evaluate", "scene=sand", "latent_dim=4", tiny_scene=False)
     assert code == 0
     assert chain.pipeline.evaluation.hash in out
-    one, two = (chain.pipeline.simulation(value).hash for value in (22.0, 30.0))
+    one, two = (chain.pipeline.simulation(angle(value)).hash for value in (22.0, 30.0))
     code, out, _ = nsf("runs", "diff", one, two[:8], tiny_scene=False)
     assert code == 0
-    assert "parameter.value" in out
+    assert "parameters.friction_angle.value" in out
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,7 @@ def test_everything_resolves():
 def test_scale_chooses_every_size():
     small, paper = config.load(["scale=small"]), config.load(["scale=paper"])
     assert paper.scene.bodies.column.particles == 71363 > small.scene.bodies.column.particles
-    assert len(paper.scene.parameters.train) == 16
+    assert len(paper.scene.design.train) == 16
     assert paper.report.name == "sand"
     assert small.report.name == "sand_small"
 
@@ -103,7 +103,7 @@ def test_every_yaml_is_in_a_group_or_primary():
         ("method=nfs", "unknown method=nfs; choose one of deformation_only"),
         ("scene=snad", "(did you mean sand?)"),
         ("scale=big", "scale=big is unknown"),
-        ("scene.parameters.test=[1", "'scene.parameters.test=[1'"),
+        ("scene.design.test=[1", "'scene.design.test=[1'"),
         ("=3", "=3"),
         ("scene=sand,sand", "scene=sand,sand"),
         ("latent_dim=4,6", "latent_dim=4,6"),

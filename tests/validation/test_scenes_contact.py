@@ -11,7 +11,7 @@ SMALL = "scale=small"
 def run(name, value, *overrides, until=1.0, every=None):
     """The scene, x and v [f, P, 3] after each `every` steps or the last of `until` of them, mass [P, 1]."""
     scene = scenes.load(name, [SMALL, *overrides])
-    scene = scene.with_parameters({scene.parameters.name: value})
+    scene = scene.with_parameters(scene.case(value))
     solver = scene.full_order(device="cpu")
     steps = round(until * scene.steps)
     x, v = [], []

@@ -1,7 +1,7 @@
 """A reduced run as a recurrence of the latent vector, learned from the projected step (docs/method.md)."""
 
 from nsf.engines.operators.engine import Operators
-from nsf.engines.operators.lessons import Teaching, Yardstick, random_values
+from nsf.engines.operators.lessons import Teaching, Yardstick, random_cases
 from nsf.engines.operators.model import Sizes, StepOperators, Terms, first_change
 from nsf.engines.operators.states import collider_states, principal
 from nsf.engines.operators.taught import Taught
@@ -21,5 +21,5 @@ __all__ = [
     "collider_states",
     "first_change",
     "principal",
-    "random_values",
+    "random_cases",
 ]

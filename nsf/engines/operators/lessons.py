@@ -8,8 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nsf.data import Case
 from nsf.engines.operators.teacher import Teacher
 from nsf.errors import ConfigError
+from nsf.scenes.designs import evenly
 
 
 @dataclass(frozen=True)
@@ -99,16 +101,17 @@ class Labels:
         return cls(*(values[good] for values in rows))
 
 
-def random_values(ends: tuple[float, float], count: int, seed: int, taken: Sequence[float]) -> list[float]:
-    """Values in a range, spread evenly and shaken.
+def random_cases(box: np.ndarray, count: int, seed: int, taken: Sequence[Case]) -> list[Case]:
+    """Cases in a box, spread evenly and shaken: points of a Hammersley set, each moved by up to 1/count.
 
     Args:
-        ends: of the range.
-        count: how many; one fewer for each that would be a value that is taken.
+        box: [n, 2] smallest and largest value of each parameter.
+        count: how many; one fewer for each that would be a case that is taken.
         seed: of the generator.
-        taken: values that are left out.
+        taken: cases that are left out, at least one; they name the parameters.
     """
-    low, high = ends
-    shaken = (np.arange(count) + np.random.default_rng(seed).random(count)) / count
-    values = low + (high - low) * shaken
-    return [float(value) for value in values if not np.isclose(value, taken, rtol=1e-6, atol=0.0).any()]
+    even = np.column_stack([np.arange(count), count * evenly(count, len(box) - 1)])
+    shaken = (even + np.random.default_rng(seed).random(even.shape)) / count % 1.0
+    low, high = box.T
+    found = [Case(taken[0].names, point, taken[0].units) for point in low + (high - low) * shaken]
+    return [case for case in found if not any(map(case.near, taken))]

@@ -14,7 +14,7 @@ from nsf.kinematics.manifold import Restriction
 
 
 class Teacher:
-    """Runs of another engine at some parameter values, whose every step may begin where one likes.
+    """Runs of another engine in some cases, whose every step may begin where one likes.
 
     Args:
         batches: the runs at t = 0, in the order of the values; an engine that steps one at a time has a batch

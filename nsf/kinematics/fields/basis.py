@@ -96,7 +96,7 @@ class BasisField:
         if latent_dim > rank:
             raise ConfigError(
                 f"latent_dim={latent_dim} exceeds the rank {rank} of {snapshots.M} displacement snapshots;"
-                f" choose latent_dim <= {rank} or simulate more parameter values"
+                f" choose latent_dim <= {rank} or simulate more cases"
             )
         return prepared
 

@@ -110,7 +110,7 @@ def train_together(
     that are left add gradients in another order.
 
     Args:
-        trajectories: files of the training parameter values.
+        trajectories: files of the training cases.
         train: `nsf.kinematics.training.train.train` with all arguments but `snapshots`, `trainer`, `device`
             and `rank`; it is pickled.
         trainer: the schedule of all processes together.

@@ -65,7 +65,7 @@ def train(
     not repeated) and ends with the same bits as one that was never interrupted.
 
     Args:
-        snapshots: of the training parameter values, on `device`.
+        snapshots: of the training cases, on `device`.
         field, trainer: a field and a schedule of `conf/field/`, `conf/trainer/`.
         latent_dim: r.
         seed: of the initial weights, batches and noise.

@@ -1,4 +1,4 @@
-"""The stage `deploy`: reduced runs at the held-out values, and the lines that a user is told of them."""
+"""The stage `deploy`: reduced runs of the held-out cases, and the lines that a user is told of them."""
 
 import time
 from collections.abc import Sequence
@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 from omegaconf import OmegaConf
 
+from nsf.data import Case
 from nsf.deployment import (
     PROJECTED,
     Levels,
@@ -27,7 +28,7 @@ CONFIGURATION = "configuration.yaml"
 
 
 def deploy_held_out(pipeline, run: Run) -> None:
-    """Deploy a pipeline's held-out values; rollouts and the configuration of its chain go into the run.
+    """Deploy a pipeline's held-out cases; rollouts and the configuration of its chain go into the run.
 
     Args:
         pipeline: a `nsf.pipeline.Pipeline`.
@@ -39,34 +40,33 @@ def deploy_held_out(pipeline, run: Run) -> None:
         for index, rollout in enumerate(rollouts):
             rollout.save(record.path / rollout_file(index))
             record.output(rollout_file(index))
-            named = f"{pipeline.scene.parameters.name}={rollout.parameter:g}"
-            for line in _told(rollout, named):
+            for line in _told(rollout):
                 pipeline.say(f"deploy: {line}")
             if rollout.handed_over >= 0:
-                solver = pipeline.solver_at(manifold, rollout.parameter)
+                solver = pipeline.solver_at(manifold, rollout.case)
                 if beyond := go_on(solver, rollout, record.path / continuation_file(index), pipeline.stored):
                     pipeline.say(
-                        f"deploy: warning: {named}: at the hand-over the stress of {beyond} particles "
-                        "was beyond what the law carries, and was scaled down to that"
+                        f"deploy: warning: {rollout.case.named}: at the hand-over the stress of {beyond} "
+                        "particles was beyond what the law carries, and was scaled down to that"
                     )
                 record.output(continuation_file(index))
         write_configuration(pipeline, record)
         record.metrics["seconds"] = [r.seconds for r in rollouts]
         record.metrics["by_operators"] = [r.by_operators for r in rollouts]
         record.metrics["needed_outside"] = max(r.needed_outside for r in rollouts)
-        record.metrics["diverged"] = [r.parameter for r in rollouts if r.diverged >= 0]
-        record.metrics["distrusted"] = [r.parameter for r in rollouts if r.distrusted >= 0]
+        record.metrics["diverged"] = [r.case.column for r in rollouts if r.diverged >= 0]
+        record.metrics["distrusted"] = [r.case.column for r in rollouts if r.distrusted >= 0]
     together = record.metrics["batch"]
     at_once = f", {together} together" if together > 1 else ""
     pipeline.say(
         f"deploy: method={pipeline.config.method.name}, |S|={rollouts[0].sample}, "
-        f"{len(rollouts)} values{at_once} → {run.id}"
+        f"{len(rollouts)} cases{at_once} → {run.id}"
     )
 
 
 def write_configuration(pipeline, record: Record) -> None:
     """Write the configuration of a pipeline's whole chain into the folder of a run."""
-    # config.yaml is resolved, so in it no key follows another value of the problem parameter.
+    # config.yaml is resolved, so in it no key follows another value of a problem parameter.
     with writing(record.path / CONFIGURATION) as partial:
         OmegaConf.save(pipeline.scene.template, partial)
     record.output(CONFIGURATION)
@@ -85,8 +85,8 @@ def _rollouts(pipeline, manifold: Manifold, record: Record) -> list[Rollout]:
     # Runs that take their steps together share the time of these equally.
     together = record.metrics["batch"] = min(asked.batch, len(pipeline.held_out))
 
-    def batch_at(values: Sequence[float], device: str) -> ReducedBatch:
-        batch = pipeline.batch_at(manifold, values, device)
+    def batch_at(cases: Sequence[Case], device: str) -> ReducedBatch:
+        batch = pipeline.batch_at(manifold, cases, device)
         record.metrics |= {"engine": batch.engine, "engine_why": batch.why}
         return batch
 
@@ -110,9 +110,9 @@ def _levels(pipeline, manifold: Manifold) -> Levels | None:
     )
 
 
-def _told(rollout: Rollout, named: str) -> list[str]:
+def _told(rollout: Rollout) -> list[str]:
     """Lines for the user: who went on with a run, and why it is not to be believed."""
-    lines, t = [], rollout.t
+    lines, t, named = [], rollout.t, rollout.case.named
     projected = np.flatnonzero(rollout.levels == PROJECTED)
     if rollout.by is not None and len(projected):
         lines.append(
@@ -125,12 +125,15 @@ def _told(rollout: Rollout, named: str) -> list[str]:
             "its errors are reported as ∞"
         )
     if (step := rollout.distrusted) >= 0:
-        then = (
-            f"; the full-order solver goes on from t = {t[rollout.handed_over]:.4g} s"
-            if rollout.handed_over >= 0
-            else f": {rollout.trust.max():.3g} times as far as training data are from themselves"
-        )
-        lines.append(f"warning: {named} left what the model was trained on at t = {t[step]:.4g} s{then}")
+        why = f"left what the model was trained on at t = {t[step]:.4g} s"
+        far = f"{rollout.trust.max():.3g} times as far as training data are from themselves"
+        if rollout.away > 1.0:
+            why = "is none of the cases that the model was trained for"
+            far = f"{rollout.away:.3g} times as far from them as they are from each other"
+        then = f": {far}"
+        if rollout.handed_over >= 0:
+            then = f"; the full-order solver goes on from t = {t[rollout.handed_over]:.4g} s"
+        lines.append(f"warning: {named} {why}{then}")
     if rollout.needed_outside:
         lines.append(
             f"warning: {named}: a step needed {rollout.needed_outside} particles or nodes "

@@ -50,7 +50,7 @@ def evaluate(pipeline, run: Run) -> None:
         held = comparisons, beside, rollouts
         summary = results.summarise(pipeline.deployed, manifold, table, *held, seconds)
         results.write(record, table, comparisons, cost, summary)
-    pipeline.say(f"evaluate: mean δ {100 * table['delta'].mean():.3g} % over {len(table)} values → {run.id}")
+    pipeline.say(f"evaluate: mean δ {100 * table['delta'].mean():.3g} % over {len(table)} cases → {run.id}")
 
 
 def superresolve_held_out(pipeline, run: Run) -> None:
@@ -89,11 +89,11 @@ def superresolve_held_out(pipeline, run: Run) -> None:
 
 def _truths(pipeline) -> list[Path]:
     """Files of the full-order trajectories that the deployed ones are held to."""
-    return [pipeline.truth(value).file(TRAJECTORY) for value in pipeline.held_out]
+    return [pipeline.truth(case).file(TRAJECTORY) for case in pipeline.held_out]
 
 
 def _rollouts(pipeline, manifold: Manifold) -> list[Rollout]:
-    """The reduced runs at the held-out values."""
+    """The reduced runs of the held-out cases."""
     files = (pipeline.deployment.file(rollout_file(index)) for index in range(len(pipeline.held_out)))
     return [Rollout.open(file, manifold.latent_dim) for file in files]
 
@@ -107,29 +107,28 @@ def _compare(
         rest = None
         if rollout.handed_over >= 0:
             rest = files.enter_context(Trajectory.open(pipeline.deployment.file(continuation_file(index))))
-        solver = pipeline.solver_at(manifold, rollout.parameter)
+        solver = pipeline.solver_at(manifold, rollout.case)
         shown = (asked.picture_particles, asked.picture_frames)
         found = compare(solver, trajectory, rollout, pipeline.config.deploy.split, shown, rest)
         return found, rivals(solver, trajectory, pipeline.coarse)
 
 
 def _cost(pipeline, manifold: Manifold, rollout: Rollout, factors: Sequence[int]) -> dict:
-    """Content of `cost.json`, measured at the first held-out value.
+    """Content of `cost.json`, measured in the first held-out case.
 
     Args:
         pipeline, manifold: that are timed.
-        rollout: the reduced run at that value, which is decoded.
+        rollout: the reduced run of that case, which is decoded.
         factors: of Δx of the coarse full-order runs that there are.
     """
-    c, scene, value = pipeline.config, pipeline.deployed, pipeline.held_out[0]
+    c, scene, case = pipeline.config, pipeline.deployed, pipeline.held_out[0]
     if not c.evaluation.trials:
         return results.costs({})
-    parameters = {pipeline.scene.parameters.name: value}
-    full = Subject(lambda: scene.full_order(parameters, c.precision, pipeline.device), scene.steps)
+    full = Subject(lambda: scene.full_order(case, c.precision, pipeline.device), scene.steps)
     steps = reduced_steps(scene.steps, c.deploy.dt_multiplier)
-    reduced = Subject(lambda: pipeline.solver_at(manifold, value), steps)
-    coarse = coarse_subjects(scene, parameters, factors, c.precision, pipeline.device)
+    reduced = Subject(lambda: pipeline.solver_at(manifold, case), steps)
+    coarse = coarse_subjects(scene, case, factors, c.precision, pipeline.device)
     subjects = {"full_order": full, "reduced": reduced, **coarse}
     measured = measure(subjects, c.evaluation.trials, pipeline.device)
-    decoding = decoding_ms(pipeline.solver_at(manifold, value), rollout, c.evaluation.trials)
+    decoding = decoding_ms(pipeline.solver_at(manifold, case), rollout, c.evaluation.trials)
     return results.costs(measured, decoding)

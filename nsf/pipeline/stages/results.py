@@ -58,7 +58,7 @@ def rows(
     engine: str = "",
     offline: tuple[float, float] = (math.nan, 0.0),
 ) -> pd.DataFrame:
-    """Content of `results.csv`, one row a parameter value; errors are fractions, ∞ where a run diverged.
+    """Content of `results.csv`, one row a case; errors are fractions, ∞ where a run diverged.
 
     `engine` took the steps of the rollouts; empty where their run does not say. `offline` are the times of
     training and of teaching [s].
@@ -94,7 +94,7 @@ def rows(
         own = {
             "sample": rollout.sample,
             "integration_mean": rollout.integration_mean,
-            "parameter": rollout.parameter,
+            "parameter": rollout.case.column,
             "split": config.deploy.split,
             "delta": comparison.delta,
             "displacement_error": comparison.displacement_error,
@@ -169,7 +169,8 @@ def trust_of(rollout: Rollout) -> dict:
         return float(rollout.t[step]) if step >= 0 else None
 
     return {
-        "parameter": rollout.parameter,
+        "parameter": rollout.case.column,
+        "away": rollout.away if math.isfinite(rollout.away) else None,
         "trust": largest if math.isfinite(largest) else None,
         "distrusted": rollout.distrusted >= 0,
         "distrusted_at": when(rollout.distrusted),
@@ -195,8 +196,9 @@ def summarise(
     summary = {
         "title": config.scene.title,
         "scale": scene.scale,
-        "parameter_name": scene.parameters.name,
-        "parameter_unit": scene.parameters.unit,
+        "parameter_name": _parameter(scene)[0],
+        "parameter_unit": _parameter(scene)[1],
+        "cases": [dict(rollout.case) for rollout in rollouts],
         "particles": len(manifold.X),
         "floor": floor_height(scene.colliders),
         "training_seconds": seconds,
@@ -207,7 +209,7 @@ def summarise(
         "tolerance": OmegaConf.select(config, "deploy.tolerance", default=None),
         "trust": [trust_of(rollout) for rollout in rollouts],
         "rivals": [
-            {"parameter": rollout.parameter} | asdict(beside)
+            {"parameter": rollout.case.column} | asdict(beside)
             for rollout, beside in zip(rollouts, rivals, strict=True)
         ],
         "variant": {name: results[name].tolist()[0] for name in ("method", "field", "r", "sample")},
@@ -215,6 +217,12 @@ def summarise(
     if config.scene.get("paper"):
         summary["paper"] = OmegaConf.to_container(config.scene.paper)
     return summary
+
+
+def _parameter(scene: Scene) -> tuple[str, str]:
+    """Name and unit of what tells the cases of a scene apart, for headings."""
+    (name, one), *more = scene.parameters.items()
+    return ("case", "") if more else (name, one.unit)
 
 
 def write(
@@ -230,7 +238,7 @@ def write(
     with writing(path / "frames.npz") as partial:
         np.savez_compressed(
             partial,
-            parameters=results["parameter"].to_numpy(),
+            parameters=np.array(results["parameter"].tolist()),
             splits=results["split"].to_numpy(dtype=str),
             t=pictures[0]["t"],
             **{name: np.stack([p[name] for p in pictures]) for name in pictures[0] if name != "t"},
@@ -251,9 +259,8 @@ def write_superresolution(record: Record, scene: Scene, fine: Sequence[SuperReso
     table = pd.DataFrame([f.row for f in fine])
     with writing(record.path / "superresolution.csv") as partial:
         table.to_csv(partial, index=False)
-    picture = fine_shapes(
-        fine, scene.parameters.name.replace("_", " "), scene.parameters.unit, floor_height(scene.colliders)
-    )
+    name, unit = _parameter(scene)
+    picture = fine_shapes(fine, name.replace("_", " "), unit, floor_height(scene.colliders))
     with writing(record.path / "superresolution.png") as partial:
         write_png(picture, partial, PIXELS, [STRESS_COLORS])
     for name in ("superresolution.csv", "superresolution.png"):

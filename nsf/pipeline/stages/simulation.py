@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nsf.data import TrajectoryWriter
+from nsf.data import Case, TrajectoryWriter
 from nsf.data.schema import TRAJECTORY
 from nsf.errors import InstabilityError
 from nsf.mpm import FullOrderMPM, Precision, diagnosed
@@ -29,15 +29,13 @@ class Job:
 
     Attributes:
         run: where it is kept.
-        label: what the progress bar says.
-        parameters: problem parameters.
+        case: problem parameters.
         build: gives the solver at t = 0.
         warnings: for the run's manifest.
     """
 
     run: Run
-    label: str
-    parameters: dict[str, float]
+    case: Case
     build: Callable[[], FullOrderMPM]
     warnings: Sequence[str] = ()
 
@@ -89,7 +87,7 @@ def simulate(jobs: Sequence[Job], shared: Shared, say: Callable[[str], object]) 
                     if not claim.enter_context(job.run.claimed(wait)):
                         left.append(job)
                     elif not job.run.complete:
-                        progress.describe(job.label)
+                        progress.describe(job.case.named)
                         writing.append(_start(job, claim, pool, shared, progress, memory))
             jobs = left
         for future in writing:
@@ -153,7 +151,7 @@ def _store(
             X=constants.X,
             mass=constants.mass,
             volume0=constants.volume0,
-            parameters=job.parameters,
+            parameters=job.case,
             dt=solver.dt,
             dx=shared.dx,
             frames=shared.steps + 1,

@@ -5,7 +5,7 @@ import time
 import numpy as np
 import torch
 
-from nsf.data import Trajectory
+from nsf.data import Case, Trajectory
 from nsf.data.schema import TRAJECTORY
 from nsf.dynamics import ReducedBatch
 from nsf.engines.operators import Course, Taught, Teacher, Yardstick
@@ -32,7 +32,7 @@ def teach(pipeline, run: Run) -> None:
     found = record.metrics
     pipeline.say(
         f"teach: {found['teacher_steps']} steps of the teacher in {found['teach_seconds']:.1f} s, "
-        f"{100 * min(found['errors']):.2g} % off at values held back → {run.id}"
+        f"{100 * min(found['errors']):.2g} % off in cases held back → {run.id}"
     )
 
 
@@ -63,17 +63,17 @@ def _follow(pipeline, manifold: Manifold, record: Record) -> None:
 
 
 def _truth(pipeline, manifold: Manifold) -> torch.Tensor | None:
-    """[N + 1, K, r] training latents, by ascending value; None where a step is not one of theirs."""
+    """[N + 1, K, r] training latents, by ascending case; None where a step is not one of theirs."""
     if pipeline.config.deploy.dt_multiplier != 1.0:
         return None
-    values = pipeline.split.train
-    order = sorted(range(len(values)), key=values.__getitem__)
+    cases = pipeline.split.train
+    order = sorted(range(len(cases)), key=cases.__getitem__)
     latents = manifold.training_latents.detach().to("cpu", torch.float64)
-    return latents.unflatten(0, (len(values), -1)).transpose(0, 1)[:, order]
+    return latents.unflatten(0, (len(cases), -1)).transpose(0, 1)[:, order]
 
 
 def _yardstick(pipeline, manifold: Manifold, progress: Progress) -> Yardstick:
-    """Validation runs where there are any, else the teacher's own at values that are held back."""
+    """Validation runs where there are any, else the teacher's own in cases that are held back."""
     frames = pipeline.config.deploy.dt_multiplier == 1.0
     validation = list(pipeline.split.validation) if frames else []
     teacher = Teacher(_batches(pipeline, manifold, validation or pipeline.lessons[2]), progress.advance)
@@ -90,17 +90,17 @@ def _yardstick(pipeline, manifold: Manifold, progress: Progress) -> Yardstick:
             teacher, positions, torch.stack([positions(run) for run in teacher.run().unbind(1)], 1)
         )
     truths = []
-    for value in validation:
-        with Trajectory.open(pipeline.simulation(value).require().path / TRAJECTORY) as trajectory:
+    for case in validation:
+        with Trajectory.open(pipeline.simulation(case).require().path / TRAJECTORY) as trajectory:
             x = trajectory.read("x", particles=looked_at)
             truths.append(torch.as_tensor(x, dtype=torch.float64))
     return Yardstick(teacher, positions, torch.stack(truths, 1))
 
 
-def _batches(pipeline, manifold: Manifold, values: list[float]) -> list[ReducedBatch]:
+def _batches(pipeline, manifold: Manifold, cases: list[Case]) -> list[ReducedBatch]:
     """Runs of the scene of training by the teacher's engine; one by one where it steps them so."""
     asked = {"engine": pipeline.projecting, "scene": pipeline.scene}
-    first = pipeline.batch_at(manifold, values[:1], **asked)
+    first = pipeline.batch_at(manifold, cases[:1], **asked)
     if first.engine == "reference" or pipeline.integration.strategy == "search":
-        return [first, *(pipeline.batch_at(manifold, [value], **asked) for value in values[1:])]
-    return [pipeline.batch_at(manifold, values, **asked)]
+        return [first, *(pipeline.batch_at(manifold, [case], **asked) for case in cases[1:])]
+    return [pipeline.batch_at(manifold, cases, **asked)]

@@ -29,7 +29,9 @@ def train(pipeline, run: Run) -> None:
             with contextlib.closing(Snapshots(paths, device, c.data.resident)) as snapshots:
                 manifold, metrics = one(snapshots, trainer=trainer, device=device)
         manifold.datasets = [data.id for data in pipeline.training_data]
-        manifold.split = {"train": list(pipeline.split.train), "test": list(pipeline.split.test)}
+        manifold.split = {
+            part: [list(case.numbers) for case in getattr(pipeline.split, part)] for part in ("train", "test")
+        }
         manifold.save(run.path / "manifold.pt")
         record.output("manifold.pt")
         record.metrics.update(metrics)

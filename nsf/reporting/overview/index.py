@@ -1,6 +1,7 @@
 """A page of all runs that sorts and filters in the browser, and needs nothing but itself."""
 
 import os
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -23,8 +24,8 @@ _SETTINGS = {
     "method": "method.name",
     "r": "latent_dim",
     "|S|": "sampler.size",
-    "parameter": "parameter.value",
 }
+_CASE = re.compile(r"parameters\.(\w+)\.value")
 _HEADINGS = {"seconds": "time [s]"}
 _CHOSEN = ("stage", "scene", "status")
 
@@ -57,7 +58,7 @@ def write_index(folder: Path, root: Path | None = None) -> Path:
     page = HTML.get_template("runs.html").render(
         title="Runs",
         choices=choices,
-        headings=[*(_HEADINGS.get(field, field) for field in FIELDS), *_SETTINGS],
+        headings=[*(_HEADINGS.get(field, field) for field in FIELDS), *_SETTINGS, "case"],
         rows=[_row(entry, folder) for entry in found],
     )
     with writing(folder / "index.html") as partial:
@@ -69,6 +70,9 @@ def _row(entry: Entry, folder: Path) -> dict:
     """A row of the page: its cells as shown, and the values by which they sort."""
     shown = list(zip(FIELDS, entry.texts(), (entry.values[field] for field in FIELDS), strict=True))
     settings = [(key, entry.settings.get(key)) for key in _SETTINGS.values()]
+    case = {found[1]: value for key, value in entry.settings.items() if (found := _CASE.fullmatch(key))}
+    several = "; ".join(f"{name}={text(value)}" for name, value in case.items()) or None
+    settings.append(("case", next(iter(case.values())) if len(case) == 1 else several))
     shown += [(key, text(value), value) for key, value in settings]
     picture = f"thumbnails/{entry.run.id}.png"
     return {

@@ -3,6 +3,8 @@
 import math
 from dataclasses import dataclass
 
+from nsf.data.case import with_unit
+
 
 @dataclass(frozen=True)
 class Column:
@@ -152,13 +154,12 @@ def plus_minus(mean: float, deviation: float, scale: float = 1.0) -> str:
 def parameter_text(value, name: str = "", unit: str = "") -> str:
     """A parameter value as printed beside a picture: `friction angle 27.5°`."""
     shown = value if isinstance(value, str) else f"{value:g}"
-    gap = "" if unit in ("", "°") else " "
-    return f"{name} {shown}{gap}{unit}".strip()
+    return f"{name} {with_unit(shown, unit)}".strip()
 
 
 def axis(title: str, unit: str = "") -> str:
     """An axis label: the quantity and its unit in brackets."""
-    return f"{title} [{unit}]" if unit else title
+    return f"{title} [{unit}]" if unit not in ("", "-") else title
 
 
 def device_type(device: str) -> str:

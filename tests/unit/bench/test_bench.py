@@ -9,10 +9,11 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from angles import angle
 
 from nsf import config
 from nsf.bench import BENCHES, bench
-from nsf.bench.batch import _too_large, values_of
+from nsf.bench.batch import _too_large, cases_of
 from nsf.bench.batch import measured as measured_batches
 from nsf.bench.full_order import collapse, pass_times
 from nsf.bench.full_order import run as full_order
@@ -372,12 +373,12 @@ def test_batches_have_rows_by_their_size(batches, chain):
     assert batches["particles"].unique().tolist() == [500]
 
 
-def test_the_values_of_a_batch(chain):
-    assert values_of(chain.pipeline, 1) == [26.0]
-    many = values_of(chain.pipeline, 64)
-    assert many[:4] == values_of(chain.pipeline, 4)
+def test_the_cases_of_a_batch(chain):
+    assert cases_of(chain.pipeline, 1) == [angle(26.0)]
+    many = cases_of(chain.pipeline, 64)
+    assert many[:4] == cases_of(chain.pipeline, 4)
     assert len(set(many)) == 64
-    assert 22.0 <= min(many) < 22.5 < 37.5 < max(many) <= 38.0
+    assert angle(22.0) <= min(many) < angle(22.5) < angle(37.5) < max(many) <= angle(38.0)
 
 
 def test_a_batch_that_would_not_fit_is_left_out(monkeypatch):

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from angles import angle
 
 from nsf.bench.operators import Many, measured, measured_decoded
 from nsf.bench.report import write_report
@@ -65,7 +66,7 @@ def test_delta_is_that_of_the_evaluation(taught):
 
 def test_a_run_holds_little(taught):
     pipeline, rows, _ = taught
-    run = pipeline.solver_at(pipeline.manifold(), 26.0)
+    run = pipeline.solver_at(pipeline.manifold(), angle(26.0))
     own = rows[(rows["case"] == "operators_sand") & (rows["precision"] == "fp64")].iloc[0]
     assert own["run_mib"] == run.nbytes / 2**20
     assert run.nbytes < 0.2 * run.decoder().at.nbytes
@@ -75,11 +76,11 @@ def test_a_run_holds_little(taught):
 
 def test_many_runs_are_those_of_a_batch(taught):
     pipeline, _, _ = taught
-    values, manifold = [26.0, 23.5, 37.0], pipeline.manifold()
-    batch = pipeline.batch_at(manifold, values)
+    cases, manifold = list(map(angle, (26.0, 23.5, 37.0))), pipeline.manifold()
+    batch = pipeline.batch_at(manifold, cases)
     batch.step(24)
     model = Operators.load(pipeline.taught.path / "operators.pt").model
-    many = Many(model, batch.runs[0], values)
+    many = Many(model, batch.runs[0], cases)
     for _ in range(2):
         many.restart()
         many.step(10)

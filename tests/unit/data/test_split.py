@@ -1,55 +1,67 @@
-"""Splits by parameter value."""
+"""Cases, and splits by case."""
 
 import math
+import pickle
 
+import numpy as np
 import pytest
 
-from nsf.data import Split
+from nsf.data import Case, Split
 from nsf.errors import ConfigError
 
 
-def test_of():
-    split = Split(train=[20, 25.0, 30.0], validation=(22.5,), test=(27.5,))
-    assert split.train == (20.0, 25.0, 30.0)
-    assert [split.of(value) for value in (20, 25.0, 22.5, 27.5)] == ["train", "train", "validation", "test"]
-    assert split.of({"friction_angle": 27.5}) == "test"
-    assert split.of([27.5]) == "test"
-    assert hash(split) == hash(Split((20.0, 25.0, 30.0), (22.5,), (27.5,)))
+def one(value):
+    return Case(("friction_angle",), (value,), ("°",))
 
 
-def test_a_float32_round_trip_is_the_same_value():
-    assert Split(train=(0.1,), test=(0.3,)).of(0.30000001192092896) == "test"
+def two(E, friction):
+    return Case(("E", "friction"), (E, friction), ("Pa", "-"))
+
+
+def test_a_case_is_a_mapping_that_can_be_a_key():
+    case = two(1500, 0.3)
+    assert dict(case) == {"E": 1500.0, "friction": 0.3}
+    assert case["friction"] == 0.3
+    assert case == Case.of({"E": 1500.0, "friction": 0.3}) == pickle.loads(pickle.dumps(case))
+    assert {case: 1}[two(1500.0, 0.3)] == 1
+    assert sorted([two(2, 1), two(1, 2), two(1, 1)]) == [two(1, 1), two(1, 2), two(2, 1)]
+    with pytest.raises(KeyError):
+        case["mu"]
+
+
+def test_texts_of_a_case():
+    assert (str(one(26)), one(26).named, one(26).label) == ("26°", "friction_angle=26°", "friction_angle_26")
+    assert str(two(1500, 0.3)) == two(1500, 0.3).named == "E=1500 Pa, friction=0.3"
+    assert two(1500, 0.3).label == "E_1500_friction_0.3"
+    assert one(26).column == 26.0
+    assert two(1500, 0.3).column == "E=1500 Pa, friction=0.3"
+
+
+@pytest.mark.parametrize("numbers", [(math.nan,), ("warm",), (1.0, 2.0), ()])
+def test_a_case_has_a_finite_number_for_each_name(numbers):
     with pytest.raises(ConfigError):
-        Split(train=(0.1,), test=(0.3,)).of(0.3001)
+        Case(("E",), numbers)
 
 
-def test_several_parameters_in_the_order_of_their_names():
-    split = Split(train=((1.0, 20.0), (2.0, 20.0)), test=((1.0, 30.0),))
-    assert split.of((2.0, 20.0)) == "train"
-    assert split.of({"velocity": 30.0, "angle": 1.0}) == "test"
-    with pytest.raises(ConfigError, match=r"\(30\.0, 1\.0\) is in no part"):
-        split.of((30.0, 1.0))
+def test_a_split_knows_its_cases_and_the_box_of_training():
+    split = Split([two(1, 0.2), two(3, 0.1)], test=[two(2, 0.3)])
+    assert split.cases == (two(1, 0.2), two(3, 0.1), two(2, 0.3))
+    assert split.names == ("E", "friction")
+    assert np.array_equal(split.box, [[1.0, 3.0], [0.1, 0.2]])
+    assert hash(split) == hash(Split((two(1, 0.2), two(3, 0.1)), (), (two(2, 0.3),)))
 
 
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        ({"train": (20, 25), "test": (25.0000001,)}, r"25\.0 is in both train and test; keep"),
-        ({"train": (20,), "validation": (25,), "test": (25,)}, "25.0 is in both validation and test"),
-        ({"train": (20, 20.0)}, r"20\.0 is twice in train"),
-        ({"train": ()}, r"train=\(\) has no parameter value"),
-        ({"train": (20,), "test": (math.nan,)}, "test holds nan; give finite"),
-        ({"train": (math.inf,)}, "train holds inf"),
-        ({"train": (20, (1, 2))}, r"\(1\.0, 2\.0\) beside 20\.0"),
-        ({"train": ("warm",)}, "'warm' is no number"),
-        ({"train": ((),)}, "give finite"),
+        ({"train": [one(20), one(25)], "test": [one(25.0000001)]}, "25° is in both train and test; a case"),
+        ({"train": [one(20)], "validation": [one(25)], "test": [one(25)]}, "in both validation and test"),
+        ({"train": [one(20), one(20.0)]}, "20° is twice in train"),
+        ({"train": []}, r"train=\[\] must name at least one case"),
+        ({"train": [one(20), two(1, 2)]}, r"train holds E=1 Pa, friction=2 beside friction_angle=20°"),
+        ({"train": [two(1, 2), two(1, 2)]}, "E=1 Pa, friction=2 is twice in train"),
     ],
 )
 def test_bad_splits(parts, message):
     with pytest.raises(ConfigError, match=message):
         Split(**parts)
-
-
-def test_an_unknown_value_is_told_what_there_is():
-    with pytest.raises(ConfigError, match=r"21\.0 is in no part.*train=\(20\.0,\).*test=\(25\.0,\).*add it"):
-        Split(train=(20,), test=(25,)).of(21)

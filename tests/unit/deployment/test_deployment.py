@@ -5,6 +5,7 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
+from angles import AnyCase, angle
 
 from nsf.deployment import Rollout, deploy, rollout, rollouts
 from nsf.dynamics import Taylor
@@ -13,15 +14,15 @@ from nsf.errors import MissingRunError, SchemaError
 
 @pytest.fixture(scope="module")
 def solver_at(chain, tiny_manifold):
-    def build(value, device="cpu"):
-        return chain.scene.reduced(tiny_manifold, {"friction_angle": value}, 20, device=device)
+    def build(case, device="cpu"):
+        return chain.scene.reduced(tiny_manifold, case, 20, device=device)
 
     return build
 
 
 @pytest.fixture(scope="module")
 def made(solver_at, tiny_trust) -> Rollout:
-    return rollout(solver_at(26.0), 26.0, tiny_trust)
+    return rollout(solver_at(angle(26.0)), angle(26.0), tiny_trust)
 
 
 def same(one: Rollout, other: Rollout, timing: bool = True) -> bool:
@@ -32,10 +33,10 @@ def same(one: Rollout, other: Rollout, timing: bool = True) -> bool:
 
 
 def test_a_rollout_is_the_whole_run(made, solver_at):
-    solver = solver_at(26.0)
+    solver = solver_at(angle(26.0))
     solver.step(24)
     latent = solver.trajectory()
-    assert (made.parameter, made.sample, made.diverged, made.needed_outside) == (26.0, 20, -1, 0)
+    assert (made.case, made.sample, made.diverged, made.needed_outside) == (angle(26.0), 20, -1, 0)
     assert np.array_equal(made.xhat, latent.xhat)
     assert np.array_equal(made.t, latent.t)
     assert made.stops == latent.stops
@@ -57,42 +58,42 @@ class Thrown:
 
 
 def test_a_run_that_leaves_the_grid_has_diverged(chain, tiny_manifold, tiny_trust):
-    angle = {"friction_angle": 26.0}
-    solver = chain.scene.reduced(tiny_manifold, angle, 20, device="cpu", projector=Thrown())
-    made = rollout(solver, 26.0, tiny_trust)
+    solver = chain.scene.reduced(tiny_manifold, angle(26.0), 20, device="cpu", projector=Thrown())
+    made = rollout(solver, angle(26.0), tiny_trust)
     assert np.isfinite(made.xhat).all()
     assert made.diverged == 5
 
 
-def test_batches_are_parameter_values(made, batch_at, tiny_trust):
-    runs = deploy(batch_at, (26.0, 33.5), "cpu", tiny_trust)
-    assert [run.parameter for run in runs] == [26.0, 33.5]
+def test_batches_are_cases(made, batch_at, tiny_trust):
+    cases = (angle(26.0), angle(33.5))
+    runs = deploy(batch_at, cases, "cpu", tiny_trust)
+    assert tuple(run.case for run in runs) == cases
     assert same(runs[0], made, timing=False)
     assert not np.array_equal(runs[0].xhat, runs[1].xhat)
 
 
 @pytest.fixture(scope="module")
 def batch_at(chain, tiny_manifold):
-    def build(values, device="cpu"):
-        taken.append(len(values))
-        parameters = [{"friction_angle": value} for value in values]
-        return chain.scene.reduced_batch(tiny_manifold, parameters, 20, device=device)
+    def build(cases, device="cpu"):
+        taken.append(len(cases))
+        return chain.scene.reduced_batch(tiny_manifold, cases, 20, device=device)
 
     taken = build.taken = []
     return build
 
 
 @pytest.mark.parametrize("until_distrusted", [False, True])
-def test_values_that_take_their_steps_together(solver_at, batch_at, tiny_trust, until_distrusted):
+def test_cases_that_take_their_steps_together(solver_at, batch_at, tiny_trust, until_distrusted):
     """One of them is far from training, so that it hands over in mid-run; the last has no other beside it."""
-    values = (26.0, 8.0, 33.5, 30.0, 22.5)
+    cases = list(map(angle, (26.0, 8.0, 33.5, 30.0, 22.5)))
     batch_at.taken.clear()
-    found = deploy(batch_at, values, "cpu", tiny_trust, until_distrusted, 2)
+    of_steps = replace(tiny_trust, cases=AnyCase())
+    found = deploy(batch_at, cases, "cpu", of_steps, until_distrusted, 2)
     assert batch_at.taken == [2, 2, 1]
-    assert [run.parameter for run in found] == list(values)
+    assert [run.case for run in found] == cases
     assert found[0].seconds == found[1].seconds > 0
     for run in found:
-        alone = rollout(solver_at(run.parameter), run.parameter, tiny_trust, until_distrusted)
+        alone = rollout(solver_at(run.case), run.case, of_steps, until_distrusted)
         if run.handed_over >= 0:  # the other one of its batch went on, so that more steps were taken
             run = replace(run, integration_mean=alone.integration_mean)
         assert same(run, alone, timing=False)
@@ -103,8 +104,9 @@ def test_values_that_take_their_steps_together(solver_at, batch_at, tiny_trust, 
 
 def test_a_batch_ends_when_no_run_is_believed(batch_at, tiny_trust):
     for values, all_steps in (((8.0, 9.0), False), ((26.0, 8.0), True)):
-        batch = batch_at(values)
-        rollouts(batch, values, tiny_trust, until_distrusted=True)
+        cases = list(map(angle, values))
+        batch = batch_at(cases)
+        rollouts(batch, cases, tiny_trust, until_distrusted=True)
         assert (batch.steps_taken == batch.total_steps) == all_steps
 
 
@@ -116,7 +118,7 @@ def test_round_trip(made, tmp_path):
 
 def test_a_single_step_is_a_run(chain, tiny_manifold, tiny_trust):
     solver = chain.scene.reduced(tiny_manifold, {"friction_angle": 26.0}, 20, device="cpu", dt_multiplier=24)
-    assert rollout(solver, 26.0, tiny_trust).xhat.shape == (2, 4)
+    assert rollout(solver, angle(26.0), tiny_trust).xhat.shape == (2, 4)
 
 
 @pytest.mark.parametrize("keep", [0, 8, 100, 0.5, -64])
@@ -135,12 +137,12 @@ def test_missing(tmp_path):
 
 
 def test_foreign(tmp_path, chain):
-    with pytest.raises(SchemaError, match="is not a rollout of version 2"):
+    with pytest.raises(SchemaError, match="is not a rollout of version 3"):
         Rollout.open(chain.trajectory(26.0))
     other = tmp_path / "other.h5"
     with h5py.File(other, "w") as file:
         file["x"] = np.zeros(3)
-    with pytest.raises(SchemaError, match="is not a rollout of version 2"):
+    with pytest.raises(SchemaError, match="is not a rollout of version 3"):
         Rollout.open(other)
     (tmp_path / "text.h5").write_text("not HDF5")
     with pytest.raises(SchemaError, match="not HDF5"):
@@ -151,8 +153,8 @@ def test_newer(made, tmp_path):
     path = tmp_path / "rollout.h5"
     made.save(path)
     with h5py.File(path, "a") as file:
-        file.attrs["nsf_rollout"] = 3
-    with pytest.raises(SchemaError, match=r"found 3"):
+        file.attrs["nsf_rollout"] = 4
+    with pytest.raises(SchemaError, match=r"found 4"):
         Rollout.open(path)
 
 
@@ -206,15 +208,19 @@ ODD = [
     (attribute("seconds", "long"), "attribute seconds, which is no single float"),
     (attribute("seconds", [1.0, 2.0]), "attribute seconds, which is no single float"),
     (attribute("seconds", np.nan), "non-finite values of seconds"),
-    (attribute("parameter", np.inf), "non-finite values of parameter"),
-    (attribute("parameter", h5py.Empty("f8")), "attribute parameter, which is no single float"),
+    (attribute("away", np.inf), "non-finite values of away"),
+    (attribute("away", h5py.Empty("f8")), "attribute away, which is no single float"),
+    (attribute("away", -1.0), "away=-1.0"),
+    (replaced("case", [np.inf]), "non-finite values of case"),
+    (replaced("case", np.zeros(0)), r"case of shape \[0\], not \[any\]"),
+    (replaced("case", [1.0, 2.0]), r"case_names of shape \[1\], not \[2\]"),
     (attribute("sample", 20.5), "attribute sample, which is no single int"),
     (attribute("sample", 0), "sample=0"),
     (attribute("needed_outside", -1), "needed_outside=-1"),
     (attribute("diverged", 25), "diverged=25, in 24 steps"),
     (attribute("handed_over", -2), "handed_over=-2"),
-    (attribute("nsf_rollout", "2"), "not a rollout of version 2"),
-    (attribute("nsf_rollout", [2, 2]), "not a rollout of version 2"),
+    (attribute("nsf_rollout", "2"), "not a rollout of version 3"),
+    (attribute("nsf_rollout", [2, 2]), "not a rollout of version 3"),
     (lambda file: file.attrs.__delitem__("sample"), "lacks a part of a rollout"),
     (replaced("xhat", np.zeros((24, 4))), r"xhat of shape \[24, 4\], not \[25, 4\]"),
     (replaced("xhat", np.zeros((25, 5))), r"xhat of shape \[25, 5\], not \[25, 4\]"),

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from angles import angle
 
 from nsf.data import Trajectory
 from nsf.deployment import go_on, hand_over, rollout
@@ -13,12 +14,12 @@ from nsf.mpm import FP64, FullOrderMPM
 
 @pytest.fixture(scope="module")
 def solver(chain, tiny_manifold):
-    return chain.pipeline.solver_at(tiny_manifold, 26.0, "cpu")
+    return chain.pipeline.solver_at(tiny_manifold, angle(26.0), "cpu")
 
 
 @pytest.fixture(scope="module")
 def made(solver, tiny_trust):
-    return rollout(solver, 26.0, tiny_trust)
+    return rollout(solver, angle(26.0), tiny_trust)
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from angles import angle
 
 from nsf.deployment import OPERATORS, PROJECTED, Levels, Rollout, rollouts
 from nsf.dynamics import ReducedBatch
@@ -69,10 +70,10 @@ class Returning(Line):
 
 @pytest.fixture
 def batch_of(chain, tiny_manifold):
-    """(span, values) → runs whose steps that class of spans takes."""
+    """(span, cases) → runs whose steps that class of spans takes."""
 
-    def build(span, values=(26.0,), doubts=()):
-        runs = [chain.pipeline.solver_at(tiny_manifold, value, engine="modal").setup for value in values]
+    def build(span, cases=(angle(26.0),), doubts=()):
+        runs = [chain.pipeline.solver_at(tiny_manifold, case, engine="modal").setup for case in cases]
 
         def spans(batch):
             at = tiny_manifold.restrict(batch.shared.samples[0].particles, dtype=torch.float64)
@@ -88,8 +89,9 @@ def shared(batch_of, tiny_trust):
     """(operators, projected step, how) → the run at 26° that both take."""
 
     def run(operators, projected, *how, values=(26.0,), doubts=()):
-        levels = Levels(lambda values: batch_of(projected, values), *how)
-        return rollouts(batch_of(operators, values, doubts), values, tiny_trust, levels=levels)
+        cases = list(map(angle, values))
+        levels = Levels(lambda cases: batch_of(projected, cases), *how)
+        return rollouts(batch_of(operators, cases, doubts), cases, tiny_trust, levels=levels)
 
     return run
 

@@ -2,14 +2,16 @@
 
 from dataclasses import replace
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
+from angles import AnyCase, angle
 
 from nsf.deployment import Trust, calibrate, rollout
 from nsf.deployment.rollout import _whole_step_before
-from nsf.deployment.trust import QUANTILE, STRAY, LatentDistance, training_values
+from nsf.deployment.trust import QUANTILE, STRAY, CaseDistance, LatentDistance
 from nsf.dynamics import Taylor
 from nsf.kinematics.manifold import Manifold
 
@@ -58,16 +60,20 @@ def runs(largest, drift=0.1):
 
 def test_scales():
     between = np.quantile([0, 0.5, 0.5, 0, 0.5, 2.0], QUANTILE)
-    trust = Trust.calibrated(distance(TWO), runs([1.0, 1.5, 1.2]))
+    trust = Trust.calibrated(distance(TWO), AnyCase(), runs([1.0, 1.5, 1.2]))
     assert (trust.residual, trust.distance) == pytest.approx((1.5, between))
-    assert Trust.calibrated(distance(TWO), runs([1.0, 50.0, 1.2])).residual == pytest.approx(STRAY * 1.2)
+    assert Trust.calibrated(distance(TWO), AnyCase(), runs([1.0, 50.0, 1.2])).residual == pytest.approx(
+        STRAY * 1.2
+    )
     # Where trajectories are nearer to each other than runs stay to their own, or there is one alone.
-    assert Trust.calibrated(distance(ALONE), runs([1.0], drift=-7.0)).distance == pytest.approx(7.0)
-    assert Trust.calibrated(distance(TWO), runs([1.0], drift=-7.0)).distance == pytest.approx(7.0)
+    assert Trust.calibrated(distance(ALONE), AnyCase(), runs([1.0], drift=-7.0)).distance == pytest.approx(
+        7.0
+    )
+    assert Trust.calibrated(distance(TWO), AnyCase(), runs([1.0], drift=-7.0)).distance == pytest.approx(7.0)
 
 
 def test_ratios():
-    trust = Trust(residual=2.0, distance=0.5, latent_distance=distance(TWO))
+    trust = Trust(residual=2.0, distance=0.5, latent_distance=distance(TWO), cases=AnyCase())
     xhat = np.array([[0.0, 0.0], [1.0, 0.0], [4.5, 0.0], [np.nan, 0.0], [0.0, 0.0]])
     found = trust.ratios(xhat, np.array([1.0, 0.2, 0.0, np.inf]))
     np.testing.assert_allclose(found, [0.0, 0.5, 1.0, np.inf, np.inf], atol=1e-6)
@@ -75,7 +81,7 @@ def test_ratios():
 
 def test_runs_without_a_residual_calibrate_nothing():
     """As if all had diverged at once: then any residual is out of bounds."""
-    trust = Trust.calibrated(distance(TWO), [(np.zeros((1, 2)), np.zeros(0))])
+    trust = Trust.calibrated(distance(TWO), AnyCase(), [(np.zeros((1, 2)), np.zeros(0))])
     found = trust.ratios(np.zeros((3, 2)), np.array([0.0, 1e-12]))
     assert found[1] == 0.0
     assert found[2] > 1.0
@@ -85,17 +91,57 @@ def test_training_trajectories(tiny_manifold):
     np.testing.assert_array_equal(tiny_manifold.training_trajectories, np.repeat([0, 1, 2], 25))
 
 
-def test_calibration_values(tiny_manifold):
-    assert training_values(tiny_manifold) == [22.0, 30.0, 38.0]
-    alone = type("Alone", (), {"training_parameters": torch.full((5, 1), 0.2, dtype=torch.float32)})
-    assert training_values(alone) == [0.2]
+def cases_of(*rows, names=("a", "b")):
+    """Distance from training cases of two frames each, kept in float32 as snapshots keep them."""
+    parameters = torch.tensor(rows, dtype=torch.float32).repeat_interleave(2, 0)
+    return CaseDistance(
+        SimpleNamespace(parameter_names=names[: len(rows[0])], training_parameters=parameters)
+    )
+
+
+def test_calibration_cases(tiny_manifold):
+    angles = [{"friction_angle": value} for value in (22.0, 30.0, 38.0)]
+    assert CaseDistance(tiny_manifold).extremes() == angles
+    assert cases_of([0.2]).extremes() == [{"a": 0.2}]
+    rows = [[0.0, 5.0], [1.0, 9.0], [2.0, 6.0], [3.0, 7.0], [4.0, 8.0]]  # first, middle and last along each
+    assert [tuple(case.values()) for case in cases_of(*rows).extremes()] == [tuple(row) for row in rows]
+    assert len(cases_of(*rows, [2.5, 6.5]).extremes()) == 5
+
+
+def test_a_case_between_the_training_values_of_one_parameter_is_near():
+    """Also in the widest gap, and at the ends, where float32 has moved them."""
+    found = cases_of([0.1], [0.2], [0.3], [0.9])
+    assert [found.of({"a": value}) for value in (0.1, 0.9)] == [0.0, 0.0]
+    assert found.of({"a": 0.6}) == pytest.approx(0.5)
+    assert max(found.of({"a": value}) for value in np.linspace(0.1, 0.9, 81)) <= 0.5 + 1e-9
+
+
+def test_a_case_outside_of_the_box_of_training_is_far():
+    found = cases_of([0.0], [1.0], [3.0])  # the spacing is 2
+    assert found.of({"a": 3.001}) == pytest.approx(1.0005)
+    assert found.of({"a": -2.0}) == pytest.approx(2.0)
+    corners = cases_of([0, 0], [0, 10], [1, 0], [1, 10])  # standardised, both edges are 2
+    assert corners.of({"a": 0.5, "b": 5.0}) == pytest.approx(np.sqrt(2.0) / 2.0)
+    assert corners.of({"b": 5.0, "a": 1.5}) == pytest.approx(1.5)
+    assert corners.of({"a": 2.0, "b": 20.0}) == pytest.approx(1.0 + np.sqrt(2.0))
+
+
+def test_a_hole_among_the_training_cases_of_two_parameters_is_far():
+    rim = [[np.cos(a), np.sin(a)] for a in np.linspace(0, 2 * np.pi, 12, endpoint=False)]
+    assert cases_of(*rim).of({"a": 0.0, "b": 0.0}) > 1.9
+    assert cases_of(*rim, [0.0, 0.0]).of({"a": 0.0, "b": 0.0}) == 0.0
+
+
+def test_one_training_case_is_near_itself_alone():
+    assert cases_of([0.2, 7.0]).of({"a": 0.2, "b": 7.0}) == 0.0
+    assert 1.0 < cases_of([0.2, 7.0]).of({"a": 0.2, "b": 7.1}) < np.inf
 
 
 @pytest.fixture(scope="module")
 def build(pipeline_at, tmp_path_factory):
-    """value, device → solver; a longer and better trained tiny chain, on which angles make a difference."""
+    """case, device → solver; a longer and better trained tiny chain, on which angles make a difference."""
     longer = ("scene.steps=40", "trainer.steps=2000")
-    pipeline = pipeline_at(tmp_path_factory.mktemp("trust"), *longer, "scene.parameters.test=[]")
+    pipeline = pipeline_at(tmp_path_factory.mktemp("trust"), *longer, "scene.design.test=[]")
     pipeline.simulate()
     pipeline.train()
     manifold = Manifold.load(pipeline.training.path / "manifold.pt")
@@ -109,7 +155,18 @@ def trust(build):
 
 @pytest.fixture(scope="module")
 def run_at(build, trust):
-    return lambda value, **options: rollout(build(value, "cpu"), value, trust, **options)
+    """value → its run, of which the steps alone tell whether to believe it."""
+    of_steps = replace(trust, cases=AnyCase())
+    return lambda value, **options: rollout(build(angle(value), "cpu"), angle(value), of_steps, **options)
+
+
+def test_a_run_far_from_the_training_cases_is_distrusted_from_the_start(build, trust, run_at):
+    far = rollout(build(angle(40.0), "cpu"), angle(40.0), trust, until_distrusted=True)
+    assert far.away == pytest.approx(1.25)  # the training cases are 8° apart
+    assert (far.distrusted, far.handed_over) == (0, 0)
+    inside = rollout(build(angle(27.0), "cpu"), angle(27.0), trust)
+    assert inside.away == pytest.approx(3.0 / 8.0)
+    np.testing.assert_array_equal(inside.trust, run_at(27.0).trust)  # below 1 it says nothing
 
 
 def test_training_values_are_believed_and_far_ones_not(run_at):
@@ -138,9 +195,9 @@ def test_a_diverged_calibration_run_is_cut(chain, tiny_manifold, tiny_trust):
             far = 1e4 if self.calls[0] == 12 else 0.0
             return replace(result, xhat=result.xhat + far, residuals=result.residuals + far)
 
-    def solver_at(value, device):
+    def solver_at(case, device):
         options = {"projector": Thrown(), "sample": 20, "device": device}
-        return chain.scene.reduced(tiny_manifold, {"friction_angle": value}, **options)
+        return chain.scene.reduced(tiny_manifold, case, **options)
 
     trust = calibrate(solver_at, tiny_manifold, "cpu")
     assert 0.0 < trust.residual < 1.0

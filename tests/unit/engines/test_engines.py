@@ -47,14 +47,13 @@ OTHERS = [engine for engine in ENGINES if engine.name != "reference"]
 @pytest.fixture(scope="module", params=SCENES)
 def model(request, tmp_path_factory):
     """A scene of the paper and fields that were trained on the first steps of two simulations of it."""
-    overrides = [f"scene={request.param}", f"scene.parameters.train={SCENES[request.param]}"]
+    overrides = [f"scene={request.param}", f"scene.design.train={SCENES[request.param]}"]
     overrides += ["scene.steps=12", "field.modes=[6,6,6]", "field.beta=4", "field.depth=1"]
     overrides += ["trainer.steps=40", "latent_dim=3", "device=cpu", "sampler=random"]
     pipeline = Pipeline(config.load(overrides), lambda line: None, tmp_path_factory.mktemp("runs"))
     pipeline.simulate(("train",))
     pipeline.train()
-    value = float(np.mean(pipeline.split.train))
-    return pipeline.scene, pipeline.manifold(), {pipeline.scene.parameters.name: value}
+    return pipeline.scene, pipeline.manifold(), pipeline.scene.case(pipeline.split.box.mean(1))
 
 
 @pytest.mark.parametrize("engine", OTHERS, ids=lambda engine: engine.name)

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
+from angles import angle
 
+from nsf.data import Case
 from nsf.dynamics.latent import LatentRecord
 from nsf.engines.operators import (
     Operators,
@@ -17,7 +19,7 @@ from nsf.engines.operators import (
     collider_states,
     first_change,
     principal,
-    random_values,
+    random_cases,
 )
 from nsf.engines.operators.recurrence import Recurrence, make_recurrence, places
 from nsf.errors import ConfigError, MissingRunError, SchemaError
@@ -349,11 +351,22 @@ def test_the_loop_compiles_for_a_gpu(name, latents, width, tmp_path):
 
 
 def test_values_between_are_none_that_is_taken():
-    values = random_values((20.0, 40.0), 5, 0, [])
-    assert values == sorted(values) == random_values((20.0, 40.0), 5, 0, [])
-    assert all(20.0 <= value <= 40.0 for value in values)
-    assert random_values((20.0, 40.0), 5, 0, [values[2]]) == values[:2] + values[3:]
-    assert random_values((20.0, 40.0), 5, 1, []) != values
+    box, known = np.array([[20.0, 40.0]]), [angle(20.0)]
+    cases = random_cases(box, 5, 0, known)
+    assert cases == sorted(cases) == random_cases(box, 5, 0, known)
+    fifths = [int((case["friction_angle"] - 20.0) // 4.0) for case in cases]
+    assert fifths == list(range(5))  # shaken, each in its own
+    assert random_cases(box, 5, 0, [*known, cases[2]]) == cases[:2] + cases[3:]
+    assert random_cases(box, 5, 1, known) != cases
+
+
+def test_cases_between_fill_a_box_of_two_parameters():
+    known = Case(("E", "friction"), (0.0, 0.0))
+    cases = random_cases(np.array([[0.0, 1.0], [-2.0, 2.0]]), 16, 0, [known])
+    numbers = np.array([case.numbers for case in cases])
+    assert numbers.shape == (16, 2)
+    halves = (numbers[:, 0] >= 0.5) + 2 * (numbers[:, 1] >= 0.0)
+    assert np.bincount(halves, minlength=4).min() >= 3
 
 
 @pytest.mark.parametrize(

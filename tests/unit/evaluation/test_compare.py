@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from angles import angle
 
 import nsf.scenes
 from nsf.data import Trajectory
@@ -19,11 +20,10 @@ ERRORS = ["delta", "displacement_error", "stress_error"]
 MOMENTA = ["linear_momentum_error", "angular_momentum_error"]
 
 
-def rollout_of(t, xhat, diverged=-1, parameter=26.0):
+def rollout_of(t, xhat, diverged=-1):
     n = len(t) - 1
-    return Rollout(
-        parameter, t, xhat, np.zeros((n, 2)), ["converged"] * n, np.zeros(n + 1), 20, 50.0, 0, 1.0, diverged
-    )
+    stops, trust = ["converged"] * n, np.zeros(n + 1)
+    return Rollout(angle(26.0), t, xhat, np.zeros((n, 2)), stops, trust, 0.0, 20, 50.0, 0, 1.0, diverged)
 
 
 @pytest.fixture(scope="module")
@@ -152,7 +152,7 @@ def test_a_multiplied_step_is_compared_at_the_frames(chain, tiny_manifold, tiny_
 
     value = {"friction_angle": 26.0}
     solver = chain.scene.reduced(tiny_manifold, value, 20, device="cpu", dt_multiplier=1.5)
-    run = rollout(solver, 26.0, tiny_trust)
+    run = rollout(solver, angle(26.0), tiny_trust)
     found = comparison_of(run)
     assert len(found.series) == 25
     assert found.delta < 3.0 * comparison_of(made).delta + 0.005
@@ -205,7 +205,7 @@ def test_a_run_lost_at_infinity(comparison_of, made):
 def test_a_run_that_is_not_finite_and_does_not_say_so_has_no_errors(made, comparison_of, bad):
     xhat = made.xhat.copy()
     xhat[7, 0] = bad
-    with pytest.raises(InstabilityError, match=r"delta=nan at friction_angle=26 is no error"):
+    with pytest.raises(InstabilityError, match=r"delta=nan at friction_angle=26° is no error"):
         comparison_of(replace(made, xhat=xhat))
 
 
@@ -217,7 +217,7 @@ def test_a_truth_that_never_moves_has_no_displacement_error(made, comparison_of,
         return np.broadcast_to(self.X, found.shape).copy() if field == "x" else found
 
     monkeypatch.setattr(Trajectory, "read", still)
-    with pytest.raises(InstabilityError, match=r"displacement_error=inf at friction_angle=26 is no error"):
+    with pytest.raises(InstabilityError, match=r"displacement_error=inf at friction_angle=26° is no error"):
         comparison_of(made)
 
 
@@ -268,7 +268,7 @@ def test_other_particles_are_refused(chain, tiny, tiny_manifold, made, tmp_path)
 def continuation(chain, tiny_manifold, made, tmp_path_factory):
     """A rollout that was handed over at step 10, and its full-order rest."""
     handed = replace(made, handed_over=10, xhat=made.xhat[:13], t=made.t[:13], trust=0.1 * np.arange(13))
-    solver = chain.pipeline.solver_at(tiny_manifold, 26.0, "cpu")
+    solver = chain.pipeline.solver_at(tiny_manifold, angle(26.0), "cpu")
     path = tmp_path_factory.mktemp("rest") / "continuation.h5"
     go_on(solver, handed, path)
     with Trajectory.open(path) as rest:
@@ -281,7 +281,7 @@ def test_a_continued_run_is_compared_with_its_own_frames(
 ):
     if chunk:
         monkeypatch.setattr(sys.modules["nsf.evaluation.compare"], "_CHUNK", chunk)
-    solver, (handed, rest) = chain.pipeline.solver_at(tiny_manifold, 26.0, "cpu"), continuation
+    solver, (handed, rest) = chain.pipeline.solver_at(tiny_manifold, angle(26.0), "cpu"), continuation
     found = compare(solver, truth, handed, "test", (500, 25), rest)
     reduced = comparison_of(made).series
     np.testing.assert_allclose(found.series["delta"][:11], reduced["delta"][:11], rtol=1e-9)
@@ -297,7 +297,7 @@ def test_a_continued_run_is_compared_with_its_own_frames(
 
 
 def test_a_continuation_must_reach_the_end(continuation, chain, tiny_manifold, truth):
-    solver, (handed, rest) = chain.pipeline.solver_at(tiny_manifold, 26.0, "cpu"), continuation
+    solver, (handed, rest) = chain.pipeline.solver_at(tiny_manifold, angle(26.0), "cpu"), continuation
     for wrong, run in ((None, handed), (rest, replace(handed, handed_over=9))):
         with pytest.raises(SchemaError, match=r"handed over at frame \d+ of 24"):
             compare(solver, truth, run, "test", (10, 2), wrong)

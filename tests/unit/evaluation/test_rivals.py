@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from angles import angle
 
 from nsf.data import Trajectory
 from nsf.errors import ConfigError
@@ -43,7 +44,7 @@ def test_interpolation_over_two_parameters_keeps_training_runs():
 
 
 def test_rivals_are_held_to_every_particle_and_frame(chain, tiny_manifold, truth, runs):
-    solver = chain.pipeline.solver_at(tiny_manifold, 26.0)
+    solver = chain.pipeline.solver_at(tiny_manifold, angle(26.0))
     found = rivals(solver, truth, [2])
     x, X = truth.read("x")[1:], truth.X
     norm = np.linalg.norm(x - X)

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from angles import angle
 from test_compare import rollout_of
 
 from nsf.errors import ConfigError
@@ -74,7 +75,7 @@ def test_row_against_a_fine_run_of_its_own(fine, chain, tiny_manifold, made, tru
 
 
 def test_runs_together_are_those_alone(fine, chain, tiny_manifold, truth, made):
-    other = replace(made, parameter=34.0, xhat=0.9 * made.xhat)
+    other = replace(made, case=angle(34.0), xhat=0.9 * made.xhat)
     together, said = [other, made], []
     both = superresolve(
         tiny_manifold, chain.scene, [truth, truth], together, 3, FRAMES, device="cpu", say=said.append
@@ -88,7 +89,7 @@ def test_runs_together_are_those_alone(fine, chain, tiny_manifold, truth, made):
         np.testing.assert_allclose(found.x_reduced, expected.x_reduced, atol=1e-12)
     assert not np.allclose(alone.x_full, fine.x_full)
     assert [line.split(" in ")[0] for line in said] == [
-        f"superresolve: friction_angle={value}: 1,500 full-order particles" for value in (34, 26)
+        f"superresolve: friction_angle={value}°: 1,500 full-order particles" for value in (34, 26)
     ]
 
 

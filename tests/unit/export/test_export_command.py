@@ -48,7 +48,7 @@ def test_a_run_by_its_hash(export, chain, deployed, tmp_path):
     assert (code, err) == (0, "")
     folder = tmp_path / "reports/export" / f"sand-{deployed.hash}"
     assert {p.name for p in folder.iterdir()} == {"friction_angle_26.html", "friction_angle_26.vtkhdf"}
-    assert "sand, friction angle 26, 3 frames, 500 points" in out
+    assert "sand, friction angle=26°, 3 frames, 500 points" in out
     assert str(folder / "friction_angle_26.html") in out
 
 

@@ -127,7 +127,7 @@ def test_the_browser_unpacks_the_same(opened, page):
 
 def test_it_plays(opened):
     tab = opened()
-    assert tab.title() == "sand, friction angle 26"
+    assert tab.title() == "sand, friction angle=26°"
     assert tab.text_content("#play") == "Pause"
     begun = float(tab.evaluate("document.body.dataset.frame"))
     tab.wait_for_function(f"Number(document.body.dataset.frame) != {begun}")

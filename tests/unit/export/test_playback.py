@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from angles import angle
 from decoded import whole
 
 from nsf.deployment import Rollout, go_on
@@ -18,7 +19,7 @@ from nsf.runs import Run
 
 @pytest.fixture
 def solver(chain, tiny_manifold):
-    return chain.pipeline.solver_at(tiny_manifold, 26.0)
+    return chain.pipeline.solver_at(tiny_manifold, angle(26.0))
 
 
 def test_blocks_are_what_the_solver_decodes(played, solver, deployed, monkeypatch):
@@ -32,7 +33,7 @@ def test_blocks_are_what_the_solver_decodes(played, solver, deployed, monkeypatc
     torch.testing.assert_close(
         tau[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].unflatten(-1, (3, 3)), decoder.stress(xhat)
     )
-    assert (shown.title, shown.name) == ("sand, friction angle 26", "friction_angle_26")
+    assert (shown.title, shown.name) == ("sand, friction angle=26°", "friction_angle_26")
     assert shown.floor == 0.13
 
 
@@ -41,7 +42,7 @@ def test_stress_from_the_deformation(pipeline_at, own_root, tiny_manifold):
     pipeline = pipeline_at(own_root, "method=deformation_only")
     run = pipeline.deploy()
     xhat = torch.tensor(Rollout.open(run.path / "rollout_0.h5").xhat[[0, 20, 24]])
-    decoder = pipeline.solver_at(tiny_manifold, 26.0).decoder()
+    decoder = pipeline.solver_at(tiny_manifold, angle(26.0)).decoder()
     x, tau = whole(Playback(run, every=20, device="cpu"))
     torch.testing.assert_close(x, decoder.position(xhat))
     torch.testing.assert_close(tau, decoder.stress(xhat).flatten(2)[..., [0, 1, 2, 4, 5, 8]])
@@ -132,7 +133,11 @@ def test_only_points_in_between_need_the_simulation(deployed, tmp_path):
         ({"fps": 0.0}, "fps=0"),
         ({"fps": float("nan")}, "fps=nan"),
         ({"color": "red"}, "color=red is unknown; choose one of von_mises, displacement"),
-        ({"parameter": 27.0}, r"parameter=27 was not deployed; choose one of 26, or .*test=\[27\]"),
+        (
+            {"parameter": 27.0},
+            r"27.0 was not deployed; choose one of 26, or .*scene\.design\.test",
+        ),
+        ({"parameter": "E=1"}, r"parameter=E=1 was not deployed; choose one of 26, or"),
     ],
 )
 def test_refused(deployed, options, told):

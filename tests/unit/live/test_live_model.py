@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from angles import angle
 
 from nsf.data import Trajectory
 from nsf.deployment import Rollout
@@ -14,7 +15,7 @@ from nsf.live.model import LiveModel
 
 
 def whole(model, value):
-    run = model.start(value)
+    run = model.start(angle(value))
     while not run.finished:
         run.advance(7)
     return run
@@ -36,7 +37,7 @@ def test_it_is_the_deployed_run(chain, model, run):
 
 
 def test_it_decodes_the_particles_that_are_shown(chain, model, run):
-    solver = chain.pipeline.solver_at(model.manifold, 26.0)
+    solver = chain.pipeline.solver_at(model.manifold, angle(26.0))
     solver.step(solver.total_steps)
     state = solver.state.numpy()
     moved = np.abs(state["x"] - model.manifold.X.numpy()).max()
@@ -57,19 +58,20 @@ def test_what_is_shown_holds_the_sample(model, chain):
 
 
 def test_the_parameter_reaches_beyond_its_training_values(model):
-    p = model.parameter
-    assert p.trained == (22.0, 38.0)
+    (p,) = model.parameters
+    assert (p.name, p.unit, p.trained) == ("friction_angle", "°", (22.0, 38.0))
     assert (p.lower, p.upper) == (14.0, 46.0)
-    assert p.known == (22.0, 26.0, 30.0, 38.0)
-    assert [p.inside(v) for v in (21.9, 22.0, 38.0, 38.1)] == [False, True, True, False]
+    assert model.known == tuple(map(angle, (22.0, 26.0, 30.0, 38.0)))
+    away = [model.start(angle(value)).away for value in (21.9, 22.0, 38.0, 42.0)]
+    assert away == pytest.approx([1.0 + 0.1 / 8.0, 0.0, 0.0, 1.5])
 
 
 def test_the_parameter_stops_where_the_scene_does(chain, pipeline_at):
     """A friction angle must be below 90° and not below 0°."""
-    from nsf.live.model import _parameter
+    from nsf.live.model import _parameters
 
-    steep = pipeline_at(chain.root, "scene.parameters.train=[10,50,80]")
-    found = _parameter(steep, ())
+    steep = pipeline_at(chain.root, "scene.design.train=[10,50,80]")
+    (found,) = _parameters(steep, ())
     assert 0.0 <= found.lower < 10.0
     assert 80.0 < found.upper < 90.0
 
@@ -77,16 +79,18 @@ def test_the_parameter_stops_where_the_scene_does(chain, pipeline_at):
 @pytest.mark.parametrize("value", [math.nan, math.inf, 13.9, 46.1, -1e30])
 def test_values_out_of_reach_are_refused(model, value):
     with pytest.raises(ConfigError, match=r"friction_angle=.* must lie in \[14, 46\]"):
-        model.parameter.checked(value)
+        model.checked([value])
 
 
 def test_a_value_near_a_known_one_is_that(model):
-    assert model.parameter.checked(26.05) == 26.0
-    assert model.parameter.checked(26.5) == 26.5
+    assert model.checked([26.05]) == angle(26.0)
+    assert model.checked([26.5]) == angle(26.5)
+    with pytest.raises(ConfigError, match="2 values must be 1, one for each parameter"):
+        model.checked([26.0, 1.0])
 
 
 def test_the_truth_is_the_trajectory(chain, model):
-    truth = model.truth(26.0)
+    truth = model.truth(angle(26.0))
     with Trajectory.open(chain.trajectory(26.0)) as trajectory:
         x = trajectory.read("x", particles=model.shown)
         dt = trajectory.dt
@@ -94,11 +98,11 @@ def test_the_truth_is_the_trajectory(chain, model):
     np.testing.assert_allclose(truth.positions(5.25 * dt), 0.75 * x[5] + 0.25 * x[6], rtol=1e-6)
     np.testing.assert_array_equal(truth.positions(1e3), x[-1])
     assert truth.stress(0.0).shape == (200, 6)
-    assert model.truth(26.5) is None
+    assert model.truth(angle(26.5)) is None
 
 
 def test_a_run_that_diverges_ends_with_its_last_good_step(model):
-    run = model.start(26.0)
+    run = model.start(angle(26.0))
     run.advance(3)
     run._solver.xhat[0] = 1e4
     run.advance(20)
@@ -122,5 +126,5 @@ def test_without_full_order_runs_there_is_no_truth(chain, tmp_path):
     shutil.copytree(chain.root, tmp_path / "runs")
     shutil.rmtree(tmp_path / "runs/simulate")
     model = LiveModel(replace(chain.pipeline.deployment, root=tmp_path / "runs"), device="cpu")
-    assert model.parameter.known == ()
-    assert model.truth(26.0) is None
+    assert model.known == ()
+    assert model.truth(angle(26.0)) is None

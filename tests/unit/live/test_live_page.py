@@ -11,6 +11,8 @@ from test_player import wait_until
 
 pytest.importorskip("viser", reason="viser is not installed")
 
+from angles import angle
+
 from nsf.live.coloring import Coloring
 from nsf.live.page import Page, legend, light
 from nsf.live.player import Moment, Player
@@ -26,13 +28,13 @@ def coloring(model):
 
 @pytest.fixture(scope="module")
 def run(model):
-    run = model.start(26.0)
+    run = model.start(angle(26.0))
     run.advance(run.steps)
     return run
 
 
 def test_every_colouring_of_every_moment(model, coloring, run):
-    truth = model.truth(26.0)
+    truth = model.truth(angle(26.0))
     for by in coloring.scales:
         for step in (0, run.steps):
             for beside in (truth, None):
@@ -44,7 +46,7 @@ def test_every_colouring_of_every_moment(model, coloring, run):
 
 def test_colours_say_what_they_are_of(model, coloring, run):
     def colors(by, step=run.steps):
-        return coloring.picture(Moment(run, step), model.truth(26.0), by)
+        return coloring.picture(Moment(run, step), model.truth(angle(26.0)), by)
 
     lowest = coloring.scales["displacement"].pixels(np.zeros(1)).astype(int)
     # In double precision nothing has moved at t = 0; the page shows float32.
@@ -58,18 +60,17 @@ def test_colours_say_what_they_are_of(model, coloring, run):
 
 
 def test_the_light(model, run):
-    low, high = "22", "38°"
     inside = Moment(run, run.steps)
     assert inside.trust < 1.0
-    assert "below 1" in light(inside, model.parameter)
-    beyond = model.start(46.0)
-    assert f"beyond the training values, {low} to {high}" in light(Moment(beyond, 0), model.parameter)
+    assert "below 1" in light(inside)
+    beyond = model.start(angle(46.0))
+    assert "away from the training cases: ratio 2, above 1" in light(Moment(beyond, 0))
     beyond._ratios[0] = 2.5
-    assert "distrusted: ratio 2.5" in light(Moment(beyond, 0), model.parameter)
-    lost = model.start(26.0)
+    assert "distrusted: ratio 2.5" in light(Moment(beyond, 0))
+    lost = model.start(angle(26.0))
     lost._solver.xhat[0] = 1e4
     lost.advance(lost.steps)
-    assert "diverged at t = " in light(Moment(lost, lost.reached), model.parameter)
+    assert "diverged at t = " in light(Moment(lost, lost.reached))
 
 
 def test_the_legend_names_its_ends(coloring):
@@ -124,7 +125,7 @@ def test_in_a_browser(browser, served):
     number.press("Enter")
     wait_until(lambda: player.tick().run.value == 46.0)
     window.get_by_text("beyond the training values").wait_for()
-    window.get_by_text("no full-order run at this value").wait_for()
+    window.get_by_text("no full-order run of this case").wait_for()
     wait_until(lambda: window.screenshot(clip=SCENE) != before)
 
 

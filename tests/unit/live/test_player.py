@@ -5,6 +5,7 @@ import threading
 import time
 
 import pytest
+from angles import angle
 
 from nsf.errors import ConfigError, InstabilityError
 from nsf.live.player import _HOLD, Player, every
@@ -46,14 +47,14 @@ def test_another_value_is_shown_once_it_has_come_as_far(player):
     work(player)
     player.seek(10)
     before = player.tick()
-    player.steer(35.0)
+    player.steer([35.0])
     steps = []
     while player.tick().run is before.run:
         assert player.tick().step == 10
         player.work()
         steps.append(None)
     after = player.tick()
-    assert (after.run.value, after.step) == (35.0, 10)
+    assert (after.run.case, after.step) == (angle(35.0), 10)
     assert not after.run.finished
     assert abs(after.xhat - before.xhat).max() > 1e-3
     assert len(steps) > 1
@@ -65,13 +66,13 @@ def test_while_it_is_dragged_every_shown_run_is_of_a_value_that_was_asked_for(pl
     player.seek(8)
     seen, asked = [], [27.0 + 0.5 * k for k in range(12)]
     for value in asked:
-        player.steer(value)
+        player.steer([value])
         player.work()
-        seen.append(player.tick().run.value)
+        seen.append(player.tick().run.case["friction_angle"])
     assert len(set(seen) - {26.0}) > 2  # it follows, and does not wait for the hand to rest
     assert set(seen) <= {26.0, *asked}
     work(player)
-    assert player.tick().run.value == asked[-1]
+    assert player.tick().run.case == angle(asked[-1])
     assert player.tick().run.finished
 
 
@@ -81,53 +82,53 @@ def test_while_it_is_dragged_it_plays_on(player, monkeypatch):
     work(player)
     shown = []
     for n in range(100):
-        player.steer(25.0 + 0.1 * n)  # at every piece of work: no hand is faster
+        player.steer([25.0 + 0.1 * n])  # at every piece of work: no hand is faster
         player.work()
         if n % 3 == 0:
             shown.append(player.tick())
     steps = [moment.step for moment in shown]
-    assert len({moment.run.value for moment in shown}) > 5
+    assert len({moment.run.case for moment in shown}) > 5
     assert steps[:24] == list(range(1, 25))
 
 
 def test_a_run_that_was_made_is_not_made_again(player, monkeypatch):
     work(player)
     first = player.tick().run
-    player.steer(30.0)
+    player.steer([30.0])
     work(player)
     monkeypatch.setattr(player.model, "start", lambda value: pytest.fail("started again"))
-    player.steer(26.0)
+    player.steer([26.0])
     work(player)
     assert player.tick().run is first
 
 
 def test_values_out_of_reach_change_nothing(player):
     with pytest.raises(ConfigError):
-        player.steer(float("nan"))
-    assert player.value == 26.0
+        player.steer([float("nan")])
+    assert player.case == angle(26.0)
 
 
 def test_its_thread_survives_a_value_that_the_scene_refuses(model, monkeypatch, caplog):
     start = model.start
 
     def refuse(value):
-        if value == 40.0:
+        if value == angle(40.0):
             raise InstabilityError("dt=1 s is unstable")
         return start(value)
 
     monkeypatch.setattr(model, "start", refuse)
     with caplog.at_level(logging.WARNING), Player(model) as player:
-        player.steer(40.0)
-        wait_until(lambda: player.value == 26.0)
-        player.steer(30.0)
-        wait_until(lambda: player.tick().run.value == 30.0)
-    assert "friction_angle=40: dt=1 s is unstable" in caplog.text
+        player.steer([40.0])
+        wait_until(lambda: player.case == angle(26.0))
+        player.steer([30.0])
+        wait_until(lambda: player.tick().run.case == angle(30.0))
+    assert "friction_angle=40°: dt=1 s is unstable" in caplog.text
 
 
 def test_many_may_steer_at_once(model):
     with Player(model) as player:
         threads = [
-            threading.Thread(target=lambda k=k: [player.steer(20.0 + k + 0.1 * n) for n in range(40)])
+            threading.Thread(target=lambda k=k: [player.steer([20.0 + k + 0.1 * n]) for n in range(40)])
             for k in range(8)
         ]
         for thread in threads:
@@ -137,8 +138,8 @@ def test_many_may_steer_at_once(model):
             assert moment.step <= moment.run.reached
         for thread in threads:
             thread.join()
-        player.steer(30.0)
-        wait_until(lambda: player.tick().run.value == 30.0)
+        player.steer([30.0])
+        wait_until(lambda: player.tick().run.case == angle(30.0))
 
 
 def wait_until(true):

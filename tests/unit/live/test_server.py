@@ -14,6 +14,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from angles import angle
 from test_player import wait_until
 
 pytest.importorskip("websockets", reason="websockets is not installed")
@@ -24,7 +25,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from nsf.errors import ConfigError
 from nsf.live.player import Player
 from nsf.live.server import Stream
-from nsf.live.wire import asked_value, field_message, frame_message
+from nsf.live.wire import asked_values, field_message, frame_message
 
 
 @asynccontextmanager
@@ -62,7 +63,11 @@ async def until(true):
 def test_a_frame_is_time_trust_and_latent(model):
     async def run():
         async with streaming(model) as (_, player, port), connected(port) as client:
-            assert json.loads(await client.recv()) == {"value": 26.0, "diverged": False}
+            assert json.loads(await client.recv()) == {
+                "values": [26.0],
+                "away": 0.5,
+                "diverged": False,
+            }
             found = await frames(client, 60)
             made = player.tick().run
         assert found.shape == (60, 2 + 4)
@@ -79,13 +84,12 @@ def test_all_clients_see_what_one_asks_for(model):
         async with streaming(model) as (stream, _, port):
             async with connected(port) as one, connected(port) as other:
                 await until(lambda: stream.clients == 2)
-                await one.send('{"value": 34}')
+                await one.send('{"values": [34]}')
                 for client in (one, other):
                     async with asyncio.timeout(20):
-                        while (
-                            isinstance(message := await client.recv(), bytes)
-                            or json.loads(message)["value"] != 34
-                        ):
+                        while isinstance(message := await client.recv(), bytes) or json.loads(message)[
+                            "values"
+                        ] != [34]:
                             pass
             await until(lambda: stream.clients == 0)
 
@@ -93,26 +97,28 @@ def test_all_clients_see_what_one_asks_for(model):
 
 
 RUBBISH = [
-    "", "x", "{}", "[]", "34", '{"value": "34"}', '{"value": null}', '{"value": true}', '{"value": [34]}',
-    '{"value": NaN}', '{"value": Infinity}', '{"value": 1e999}', '{"value": 47}', '{"value": 34, "more": 1}',
-    '{"value": 1' + "0" * 320 + "}", "[" * 250, b"\0\1\2\3",
+    "", "x", "{}", "[]", "34", '{"values": ["34"]}', '{"values": [null]}', '{"values": [true]}',
+    '{"values": 34}', '{"values": [NaN]}', '{"values": [Infinity]}', '{"values": [1e999]}',
+    '{"values": [47]}',
+    '{"values": []}', '{"values": [34, 1]}', '{"values": [34], "more": 1}', '{"value": [34]}',
+    '{"values": [1' + "0" * 320 + "]}", "[" * 250, b"\0\1\2\3",
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize("message", RUBBISH, ids=[str(m)[:24] for m in RUBBISH])
 def test_rubbish_is_refused(message, player):
     with pytest.raises(ConfigError):
-        player.steer(asked_value(message))
-    assert player.value == 26.0
+        player.steer(asked_values(message))
+    assert player.case == angle(26.0)
 
 
 @pytest.mark.parametrize(
     ("message", "code", "why"),
     [
         ("rubbish", 1008, "sent rubbish: a client may only send"),
-        ('{"value": 1e9}', 1008, "sent rubbish: friction_angle=1e+09 must lie in [14, 46]"),
+        ('{"values": [1e9]}', 1008, "sent rubbish: friction_angle=1e+09 must lie in [14, 46]"),
         (b"\0", 1008, "sent rubbish"),
-        ("x" * 1000, 1009, "closed with 1009"),
+        ("x" * 2000, 1009, "closed with 1009"),
     ],
 )
 def test_a_client_that_sends_rubbish_is_closed_and_no_other(model, message, code, why, caplog):
@@ -442,11 +448,11 @@ def test_a_browser_decodes_what_the_server_does(browser, address, model):
     assert not faults
     before = other.screenshot()
 
-    one.locator("#value").fill("34")
-    wait_until(lambda: player.value == 34.0)
+    one.get_by_label("friction angle").fill("34")
+    wait_until(lambda: player.case == angle(34.0))
     for window in windows:
         window.get_by_text("friction angle = 34.00°").wait_for()
-    wait_until(lambda: other.evaluate("state.value === 34 && state.t > 0.1"))
+    wait_until(lambda: other.evaluate("state.values[0] === 34 && state.t > 0.1"))
     assert other.screenshot() != before
 
     shown = other.evaluate("({t: state.t, x: Array.from(state.x)})")

@@ -17,7 +17,7 @@ jobs:
     scale: small
     sampler: [random, greedy]
     deploy.dt_multiplier: 1.5
-    scene.parameters.test: [[44, 55]]
+    scene.design.test: [[44, 55]]
     field.modes: null
 """
 
@@ -34,7 +34,7 @@ def written(tmp_path):
 def test_every_combination_is_a_job(written):
     jobs = written(TEXT).jobs
     first = ("scene=sand", "scale=small")
-    rest = ("deploy.dt_multiplier=1.5", "scene.parameters.test=[44,55]", "field.modes=null")
+    rest = ("deploy.dt_multiplier=1.5", "scene.design.test=[44,55]", "field.modes=null")
     assert [job.overrides for job in jobs] == [
         *((*first, f"field={field}") for field in ("basis", "mlp")),
         *((*first, f"sampler={sampler}", *rest) for sampler in ("random", "greedy")),
@@ -50,7 +50,7 @@ def test_a_setting_tells_what_columns_do_not(written):
 def test_keys_of_a_job(written):
     *_, last = written(TEXT).jobs
     assert last.keys["sampler"] == "greedy"
-    assert last.keys["scene.parameters.test"] == "[44,55]"
+    assert last.keys["scene.design.test"] == "[44,55]"
 
 
 def test_what_the_paper_prints_is_text_as_in_the_keys_of_jobs(written):

@@ -159,7 +159,7 @@ def test_a_cell_says_how_many_of_its_runs_diverged(tmp_path):
 
 
 def test_values_that_the_jobs_name_count_one_by_one(tmp_path):
-    jobs = [job(parameter=v, **{"scene.parameters.test": "[41,44]"}) for v in (44.0, 41.0)]
+    jobs = [job(parameter=v, **{"scene.design.test": "[41,44]"}) for v in (44.0, 41.0)]
     rows, said = told(write_report(tmp_path / "a", jobs))
     assert [row[:2] for row in rows] == [["scene", "parameter"], ["sand", "41"], ["sand", "44"]]
     assert "each held-out value by itself" in said

@@ -17,7 +17,7 @@ def root(tmp_path_factory):
     """Two data sets, three manifolds of the first, one of which failed, and two evaluations."""
     root = tmp_path_factory.mktemp("runs")
     data = [
-        made(root, "simulate", {"parameter": {"key": "material.mu", "value": v}}, seconds=v)
+        made(root, "simulate", {"parameters": {"mu": {"key": "material.mu", "value": v}}}, seconds=v)
         for v in (1.0, 2.0)
     ]
     trained = [made(root, "train", {"latent_dim": r}, data, deformation_loss=0.1 / r) for r in (4, 6)]
@@ -25,7 +25,7 @@ def root(tmp_path_factory):
         raise ValueError("lost")
     for run, delta in zip(trained, (0.02, 0.001), strict=True):
         made(root, "evaluate", {"evaluation": {"trials": 2}}, [run, data[0]], delta=delta)
-    made(root, "simulate", {"parameter": {"key": "material.E", "value": 3.0}}, scene="jelly")
+    made(root, "simulate", {"parameters": {"E": {"key": "material.E", "value": 3.0}}}, scene="jelly")
     return root
 
 
@@ -61,8 +61,8 @@ def test_all_newest_first(root):
         ({"stage": "train", "latent_dim": "4,8"}, 2),
         ({"status": "failed"}, 1),
         ({"scene": "j*"}, 1),
-        ({"parameter.value": "3"}, 1),
-        ({"parameter.value": "2", "stage": "train"}, 3),  # of one of the data that it was made from
+        ({"parameters.E.value": "3"}, 1),
+        ({"parameters.mu.value": "2", "stage": "train"}, 3),  # of one of the data that it was made from
         ({"stage": "deploy"}, 0),
     ],
 )

@@ -11,9 +11,10 @@ from nsf.errors import ConfigError, NSFError
 from nsf.mpm import FP32, HalfSpace, Motion, precision_of
 from nsf.mpm.materials import DruckerPrager
 from nsf.mpm.solver import bytes_on_device
-from nsf.scenes import Body, Box, Cylinder, ParameterRange, Scene, load
+from nsf.scenes import Body, Box, Cylinder, Parameter, Scene, load
 from nsf.scenes.checks import check_memory
 
+KEY = "scene.parameters.friction_angle.key"
 FEW = "scene.bodies.column.particles=300"
 MANY = "scene.bodies.column.particles=1000000000"
 
@@ -40,8 +41,7 @@ def test_sand_is_what_its_file_says(sand):
     assert sand.dx == pytest.approx(1.0 / 64.0)
     assert sand.material == DruckerPrager(2000.0, 0.2, 30.0)
     assert sand.gravity == (0.0, 0.0, -4.0)
-    assert sand.parameters.name == "friction_angle"
-    assert sand.parameters.key == "material.friction_angle"
+    assert sand.parameters == {"friction_angle": Parameter("material.friction_angle", "°")}
 
 
 def test_paper_scale():
@@ -51,8 +51,8 @@ def test_paper_scale():
     assert len(particles) == 71363
     np.testing.assert_allclose(particles.volume0, 2.5e-8, rtol=1e-3)
     assert (paper.dx, paper.dt) == pytest.approx((1.0 / 150.0, 0.002))
-    assert (len(paper.parameters.train), len(paper.parameters.test)) == (16, 4)
-    assert (min(paper.parameters.train), max(paper.parameters.train)) == (21.0, 38.5)
+    assert (len(paper.split.train), len(paper.split.test)) == (16, 4)
+    assert paper.split.box.tolist() == [[21.0, 38.5]]
 
 
 def test_overrides():
@@ -86,7 +86,7 @@ def test_parameters_replace_the_key(sand):
 @pytest.mark.parametrize(
     ("parameters", "quoted"),
     [
-        ({"cohesion": 1.0}, "sand has no parameter 'cohesion'; its parameter is 'friction_angle'"),
+        ({"cohesion": 1.0}, "sand has no parameter 'cohesion'; there are friction_angle"),
         ({"friction_angle": float("nan")}, "friction_angle=nan must be a finite number"),
         ({"friction_angle": "30"}, "friction_angle='30' must be a finite number"),
         ({"friction_angle": 95.0}, "material.friction_angle=95.0"),
@@ -98,8 +98,10 @@ def test_parameters_are_refused(sand, parameters, quoted):
 
 
 def test_parameter_key_must_exist():
-    with pytest.raises(ConfigError, match=r"scene\.parameters\.key='material\.cohesion' names no key"):
-        load("sand", [FEW, "scene.parameters.key=material.cohesion"])
+    with pytest.raises(
+        ConfigError, match=r"scene\.parameters\.friction_angle\.key='material\.cohesion' names no key"
+    ):
+        load("sand", [FEW, f"{KEY}=material.cohesion"])
 
 
 @pytest.mark.parametrize(
@@ -116,7 +118,7 @@ def test_parameter_key_must_exist():
         ("latent_dim", "changes no physics"),
         ("seed", "changes no physics"),
         ("scene.paper.nsf.r", "changes no physics"),
-        ("scene.parameters.train.0", "changes no physics"),
+        ("scene.design.train.0", "changes no physics"),
         ("scene.dx", "changes scene.dx"),
         ("scene.dt", "changes scene.dt"),
         ("scene.steps", "changes scene.steps"),
@@ -127,14 +129,17 @@ def test_parameter_key_must_exist():
 )
 def test_a_parameter_is_of_the_physics_alone(key, told):
     with pytest.raises(ConfigError, match=re.escape(told)):
-        load("sand", [f"scene.parameters.key={key}"])
+        load("sand", [f"{KEY}={key}"])
 
 
 @pytest.mark.parametrize(
     ("overrides", "told"),
     [
-        (["+scene.n=64", "scene.dx='${per:${scene.n}}'", "scene.parameters.key=scene.n"], "scene.dx"),
-        (["+scene.unused=3", "scene.parameters.key=scene.unused"], "changes no physics"),
+        (
+            ["+scene.n=64", "scene.dx='${per:${scene.n}}'", f"{KEY}=scene.n"],
+            "scene.dx",
+        ),
+        (["+scene.unused=3", f"{KEY}=scene.unused"], "changes no physics"),
     ],
 )
 def test_a_parameter_is_told_by_what_refers_to_it(overrides, told):
@@ -144,7 +149,10 @@ def test_a_parameter_is_told_by_what_refers_to_it(overrides, told):
 
 @pytest.mark.parametrize("key", ["gravity.2", "bodies.column.density", "colliders.floor.friction"])
 def test_a_parameter_may_be_of_any_physics(key):
-    assert load("sand", [FEW, "scene.colliders.floor.kind=separate", f"scene.parameters.key=scene.{key}"])
+    assert load(
+        "sand",
+        [FEW, "scene.colliders.floor.kind=separate", f"{KEY}=scene.{key}"],
+    )
 
 
 def test_full_order_runs_at_a_parameter(sand):
@@ -159,9 +167,11 @@ def test_full_order_runs_at_a_parameter(sand):
 TILTED = [
     "+scene.tilt=10.0",
     "scene.gravity='${turned:[0,0,4],[0,1,0],${scene.tilt}}'",
-    "scene.parameters.key=scene.tilt",
-    "scene.parameters.train=[10.0, 20.0]",
-    "scene.parameters.test=[30.0]",
+    "~scene.parameters.friction_angle",
+    "+scene.parameters.tilt={key:scene.tilt,unit:'°'}",
+    "scene.design.train=[10.0, 20.0]",
+    "scene.design.validation=[]",
+    "scene.design.test=[30.0]",
 ]
 
 
@@ -176,7 +186,7 @@ def test_keys_that_refer_to_the_parameter_follow_it():
 
 def test_a_parameter_that_is_no_key_is_refused():
     with pytest.raises(ConfigError, match=r"scene\.tilt"):
-        load("sand", [FEW, "scene.parameters.key=scene.tilt"])
+        load("sand", [FEW, f"{KEY}=scene.tilt"])
 
 
 @pytest.mark.parametrize(
@@ -210,9 +220,9 @@ def test_a_parameter_that_is_no_key_is_refused():
         (["scene.colliders.floor.kind=glue"], "half-space.kind='glue'"),
         (["+scene.colliders.floor.frictin=1"], "frictin"),
         (["material.E=-1"], "material.E=-1"),
-        (["scene.parameters.train=[]"], "scene.parameters.train=[]"),
-        (["scene.parameters.test=[21.0]"], "21.0"),
-        (["scene.parameters.test=[26.0, nan]"], "nan"),
+        (["scene.design.train=[]"], "scene.design.train=[]"),
+        (["scene.design.test=[21.0]"], "21°"),
+        (["scene.design.test=[26.0, nan]"], "nan"),
         (["scene.dt=[1"], "[1"),
     ],
 )
@@ -428,18 +438,6 @@ def test_several_bodies():
     assert np.abs(moved[column, 1]).max() < 0.01 * moved[other, 1].min()
 
 
-def test_parameter_name_is_the_end_of_its_key():
-    assert ParameterRange("scene.bodies.blade.angle", "°", [1.0], [2.0]).name == "angle"
-
-
-@pytest.mark.parametrize("pair", [("train", "test"), ("train", "validation"), ("test", "validation")])
-def test_splits_share_no_value(pair):
-    values = {"train": [1.0, 2.0], "test": [3.0], "validation": [4.0]}
-    values[pair[1]] = [*values[pair[1]], values[pair[0]][0]]
-    with pytest.raises(ConfigError, match=f"{pair[0]} and {pair[1]}"):
-        ParameterRange("material.E", "Pa", **values)
-
-
 # -- changes: another scene for the same manifold ---------------------------------------------------------
 
 
@@ -468,8 +466,8 @@ def test_a_key_that_refers_to_a_changed_one_follows():
         ({"scene.bodies.column.velocty": 1}, "did you mean scene.bodies.column.velocity"),
         ({"scene.walls": 1}, "several keys in 'scene.walls'; did you mean scene.walls.kind"),
         ({"latent_dim": 3}, "unknown key 'latent_dim'"),
-        ({"scene.parameters.test": [3]}, "unknown key 'scene.parameters.test'"),
-        ({"material.friction_angle": 3}, "is the problem parameter; set scene.parameters.test"),
+        ({"scene.design.test": [3]}, "unknown key 'scene.design.test'"),
+        ({"material.friction_angle": 3}, "is a problem parameter; set scene.design.test"),
         ({"scene.bodies.column.particles": 200}, "scene.bodies.column.particles gives other particles"),
         ({"scene.bodies.column.shape.radius": 0.05}, "gives other particles than the manifold is trained on"),
         ({"scene.dx": 0.02}, "scene.dx gives other grid nodes"),

@@ -1,0 +1,141 @@
+"""A scene of two parameters through every stage, whose cases a design draws."""
+
+import json
+import shutil
+from functools import partial
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from nsf.data import Trajectory
+from nsf.deployment import Rollout
+from nsf.errors import ConfigError, MissingRunError
+from nsf.export.playback import Playback
+from nsf.pipeline import Pipeline
+from nsf.runs import Run
+
+TWO = (
+    "+scene.parameters.friction_angle.range=[22,38]",
+    "+scene.parameters.E={key:material.E,unit:Pa,range:[1500,2500],log:true}",
+    "scene.design={_target_:nsf.scenes.Sobol,train:4,validation:0,test:2}",
+    "evaluation.trials=0",
+)
+
+
+@pytest.fixture(scope="module")
+def made(pipeline_at, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("two")
+    said = []
+    pipeline = pipeline_at(folder / "runs", *TWO, f"report.folder={folder / 'reports'}", say=said.append)
+    for stage in ("simulate", "train", "deploy", "evaluate"):
+        pipeline.run(stage)
+    return pipeline, said
+
+
+def test_each_trajectory_is_of_its_case(made):
+    pipeline, said = made
+    assert any("simulate: 6 trajectories" in line for line in said)
+    for case in pipeline.split.cases:
+        with Trajectory.open(pipeline.simulation(case).file("trajectory.h5")) as trajectory:
+            assert trajectory.parameters == dict(case)
+
+
+def test_the_heads_see_both_parameters(made):
+    manifold = made[0].manifold()
+    assert manifold.parameter_names == ("E", "friction_angle")
+    assert len(np.unique(manifold.training_parameters.numpy(), axis=0)) == 4
+    at, xhat = manifold.restrict(), manifold.training_latents[20]
+    middle = manifold.training_parameters.double().mean(0).to(xhat)
+    for change in ([300.0, 0.0], [0.0, 5.0]):
+        other = middle + middle.new_tensor(change)
+        assert (at.stress(xhat, other) - at.stress(xhat, middle)).abs().max() > 0
+
+
+def test_a_solver_knows_both_parameters(made):
+    pipeline, _ = made
+    case = pipeline.held_out[0]
+    solver = pipeline.solver_at(pipeline.manifold(), case)
+    law = solver.scene.material
+    assert (law.friction_angle, law.E) == case.numbers
+    assert solver.setup.parameters.tolist() == [case["E"], case["friction_angle"]]
+
+
+def test_results_name_the_cases(made):
+    pipeline, _ = made
+    path = pipeline.evaluation.path
+    results, summary = pd.read_csv(path / "results.csv"), json.loads((path / "summary.json").read_text())
+    assert results["parameter"].tolist() == [str(case) for case in pipeline.held_out]
+    assert summary["cases"] == [dict(case) for case in pipeline.held_out]
+    assert set(pd.read_csv(path / "series.csv")["parameter"]) == set(results["parameter"])
+    assert (results["delta"] < 0.02).all()
+    rollouts = [Rollout.open(pipeline.deployment.path / f"rollout_{k}.h5") for k in range(2)]
+    assert [rollout.case for rollout in rollouts] == list(pipeline.held_out)
+    assert [rollout.case.units for rollout in rollouts] == [("°", "Pa")] * 2
+
+
+def test_a_report_names_the_cases(made):
+    pipeline, _ = made
+    page = pipeline.report()
+    text = page.read_text()
+    assert all(str(case) in text for case in pipeline.held_out)
+    assert len(list(page.parent.glob("*.png"))) >= 4
+
+
+def test_a_case_is_exported_that_is_the_nearest(made):
+    pipeline, _ = made
+    second = pipeline.held_out[1]
+    near = f"E={second['E'] + 1:.0f},friction_angle={second['friction_angle'] + 0.1:.1f}"
+    playback = Playback(pipeline.deployment, near, device="cpu")
+    assert playback.case == second
+    assert playback.name == second.label
+    assert playback.parameters == [second["E"], second["friction_angle"]]
+    assert Playback(pipeline.deployment, dict(second), points=600, device="cpu").case == second
+    with pytest.raises(ConfigError, match="parameter=26 was not deployed; choose one of friction_angle="):
+        Playback(pipeline.deployment, "26", device="cpu")
+
+
+def test_both_parameters_are_steered(made):
+    from nsf.live.model import LiveModel
+    from nsf.live.player import Player
+
+    pipeline, _ = made
+    model = LiveModel(pipeline.deployment, points=50, device="cpu")
+    assert [p.name for p in model.parameters] == ["friction_angle", "E"]
+    player = Player(model)
+    player.steer([30.0, 2000.0])
+    assert player.case == pipeline.scene.case([30.0, 2000.0])
+    with pytest.raises(ConfigError, match="1 values must be 2"):
+        player.steer([30.0])
+    assert model.start(pipeline.scene.case([60.0, 2000.0])).away > 1.0
+
+
+def test_lessons_fill_the_box_of_training(pipeline_at, tmp_path):
+    pipeline = pipeline_at(tmp_path, *TWO, "engine=operators")
+    known, between, back = pipeline.lessons
+    assert known == sorted(pipeline.split.train)
+    low, high = pipeline.split.box.T
+    for case in (*between, *back):
+        assert ((low <= case.numbers) & (case.numbers <= high)).all()
+
+
+def test_a_run_of_the_old_form_is_refused(made, seal, tmp_path):
+    """As an earlier nsf left it: one parameter with its values, and a deployment of numbers."""
+    pipeline, _ = made
+    shutil.copytree(pipeline.root, tmp_path / "runs")
+    run = Run.load(pipeline.deployment.id, tmp_path / "runs")
+    for name, keys in (("configuration.yaml", ("scene", "design")), ("config.yaml", ("cases",))):
+        content = yaml.safe_load((run.path / name).read_text())
+        del (content["scene"] if len(keys) > 1 else content)[keys[-1]]
+        (run.path / name).write_text(yaml.safe_dump(content))
+    seal(run)
+    for use in (Pipeline.of_run, partial(Playback, device="cpu")):
+        with pytest.raises(MissingRunError, match=r"was made by an earlier nsf; .*nsf deploy scene=sand"):
+            use(run)
+
+
+def test_too_few_training_cases_are_refused(pipeline_at, tmp_path):
+    few = (*TWO[:2], "scene.design={_target_:nsf.scenes.Sobol,train:2,validation:0,test:2}")
+    with pytest.raises(ConfigError, match="2 training cases, and friction_angle, E need at least 3; add"):
+        pipeline_at(tmp_path, *few)
