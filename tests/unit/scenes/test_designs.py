@@ -136,7 +136,10 @@ def test_a_scene_of_two_parameters():
 
 
 def test_null_leaves_out_a_parameter_of_the_scene_below():
-    (name,) = load("drop", ["scene.parameters.E=null", TWO[1]]).parameters
+    (name,) = load(
+        "drop",
+        ["scene.parameters.E=null", TWO[1], "scene.design.train=[0.2,0.3]", "scene.design.test=[0.25]"],
+    ).parameters
     assert name == "nu"
 
 
