@@ -91,7 +91,7 @@ def test_results_have_the_columns_of_a_report(chain):
     results = pd.read_csv(chain.pipeline.evaluation.path / "results.csv")
     assert list(results) == COLUMNS
     assert len(results) == 1
-    assert not results.isna().any().any()
+    assert set(results.columns[results.isna().any()]) == {"estimated_error"}  # which operators have
     row = results.iloc[0]
     assert (row["scene"], row["method"], row["field"], row["split"]) == ("sand", "nsf", "basis", "test")
     assert (row["r"], row["sample"], row["parameter"], row["precision"]) == (4, 20, 26.0, "fp64")
