@@ -52,7 +52,9 @@ def test_only_validation_values_are_deployed_and_the_search_goes_on(tried):
     assert len(tried(*words, "search.trials=2")[1]) == 1  # nothing more to try
     for run in Run.find("evaluate", root=tried.root):
         assert set(pd.read_csv(run.path / "results.csv")["split"]) == {"validation"}
-    assert all(run.config["values"] == [25] for run in Run.find("deploy", root=tried.root))
+    assert all(
+        run.config["cases"] == [{"friction_angle": 25.0}] for run in Run.find("deploy", root=tried.root)
+    )
 
 
 @pytest.mark.slow
@@ -68,7 +70,7 @@ def test_a_failed_trial_is_kept_and_the_others_go_on(tried, monkeypatch):
 @pytest.mark.parametrize(
     ("words", "quoted"),
     [
-        (["latent_dim=4..6"], "no validation values.*scene.design.validation"),
+        (["latent_dim=4..6"], "no validation cases.*scene.design.validation"),
         (["latent_dim=4..6", "scene.design.validation=[26]"], "26"),  # a test value
         (["latent_dim=4"], "needs a range"),
         (["latent_dim=4..6", "+experiment=sand"], "has no experiment"),
