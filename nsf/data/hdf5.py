@@ -91,7 +91,9 @@ def array(file: h5py.Group, name: str, types: Sequence[str], shape: Sequence[int
     if not isinstance(found, h5py.Dataset):
         raise SchemaError(f"has {name}, which is no array")
     has = () if found.shape is None else found.shape
-    if len(has) != len(shape) or any(not h or w not in (None, h) for h, w in zip(has, shape, strict=True)):
+    if len(has) != len(shape) or any(
+        size != asked if asked is not None else not size for size, asked in zip(has, shape, strict=True)
+    ):
         wanted = ", ".join("any" if size is None else str(size) for size in shape)
         raise SchemaError(f"has {name} of shape {list(has)}, not [{wanted}]")
     text = h5py.check_string_dtype(found.dtype) is not None

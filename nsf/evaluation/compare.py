@@ -60,7 +60,8 @@ def trust_at_frames(rollout: Rollout, t: np.ndarray) -> np.ndarray:
 def levels_at_frames(rollout: Rollout, t: np.ndarray) -> np.ndarray:
     """Who took the step [F] that reached each frame (`Rollout.by`); NaN at the first, which none did."""
     reached = np.minimum(np.searchsorted(rollout.t, t - _SAME_TIME), len(rollout.t) - 1)
-    by = np.where(_of_continuation(rollout, t), FULL_ORDER, rollout.levels[np.maximum(reached - 1, 0)])
+    levels = np.append(rollout.levels, FULL_ORDER)  # a run that was handed over at once has taken no step
+    by = np.where(_of_continuation(rollout, t), FULL_ORDER, levels[np.maximum(reached - 1, 0)])
     return np.where(reached > 0, by, np.nan)
 
 
