@@ -73,7 +73,8 @@ def test_jobs_are_told_apart(name):
     told = set()
     for job in experiment.jobs:
         c = config.load(job.overrides)
-        told.add((c.scene.name, c.method.name, c.field._target_, c.latent_dim, c.sampler.size, job.setting))
+        columns = (c.scene.name, c.method.name, c.field._target_, c.latent_dim, c.engine.name, c.sampler.size)
+        told.add((*columns, job.setting))
     assert len(told) == len(experiment.jobs)
 
 
