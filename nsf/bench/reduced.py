@@ -182,11 +182,11 @@ def measured_networks(
             )
             for arithmetic in ARITHMETICS[kind]
         }
-        for case, cost in measure(subjects, min(settings.trials, _MOST), settings.device).items():
-            solver = subjects[case].build()
+        for row, cost in measure(subjects, min(settings.trials, _MOST), settings.device).items():
+            solver = subjects[row].build()
             solver.step(solver.total_steps)
-            found.rows.append(_row(case, particles, precision, settings.device, cost, solver, truth))
-            say(f"{case} {precision}: {cost.step_ms:.4g} ms a step, δ {100 * found.rows[-1].delta:.3g} %")
+            found.rows.append(_row(row, particles, precision, settings.device, cost, solver, truth))
+            say(f"{row} {precision}: {cost.step_ms:.4g} ms a step, δ {100 * found.rows[-1].delta:.3g} %")
 
 
 def _row(case, particles: int, precision: str, device: str, cost: SolverCost, solver, truth) -> Row:
