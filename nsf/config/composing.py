@@ -212,7 +212,8 @@ def explained(error: Exception, config_name: str, overrides: Sequence[str]) -> s
         known = _known_keys(config_name, others, of_launcher(key))
         if key in known:
             return f"{key!r} takes no keys beyond its own; set them one by one, or write a scene's yaml"
-        near = difflib.get_close_matches(key, known, n=3, cutoff=0.5)
+        same_end = [other for other in known if other.split(".")[-1] == key.split(".")[-1]]
+        near = difflib.get_close_matches(key, same_end or known, n=3, cutoff=0.5)
         hint = f"; did you mean {' or '.join(near)}?" if near else "; see `nsf --help` for the groups"
         return f"unknown key {key!r}{hint}"
     if isinstance(error, OverrideParseException):
