@@ -44,8 +44,6 @@ _SECTIONS = ("data", "deploy", "evaluation", "super_resolution", "report")
 _REST = dict.fromkeys(("field", "trainer", "method", "sampler", "evaluation", "report", "latent_dim"))
 #: Cases between the training ones whose runs decide which round of teaching is kept.
 HELD_BACK = 3
-#: Cases that operators are taught in at least, where a scene has fewer than half as many of training.
-LESSONS = 9
 #: What this process has checked; the jobs of a sweep ask the same thing again and again, for seconds.
 _PASSED: set[str] = set()
 
@@ -309,7 +307,7 @@ class Plan:
         """
         known, seed = sorted(self.split.train), int(self.config.seed)
         taken = [*known, *self.split.validation, *self.split.test]
-        between = random_cases(self.split.box, max(len(known), LESSONS - len(known)), seed, taken)
+        between = random_cases(self.split.box, len(known), seed, taken)
         back = random_cases(self.split.box, HELD_BACK, seed + 1, [*taken, *between])
         return [known, between, back]
 

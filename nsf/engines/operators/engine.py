@@ -100,7 +100,7 @@ class OperatorRun:
         record = LatentRecord(own[:, 0], steps, 1)
         record.row.fill_(since)
         record.xhat[:, since] = own[:, since]
-        again = self._of(record=record, push=push.to(own.device))
+        again = self._of(record=record, push=push)
         now, before = own[:, since].double(), own[:, max(0, since - 1)].double()
         again.begin(now, now - before if since else self._first)
         again.advance(steps - since)

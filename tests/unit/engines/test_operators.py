@@ -11,11 +11,13 @@ from angles import angle
 from nsf.data import Case
 from nsf.dynamics.latent import LatentRecord
 from nsf.engines.operators import (
+    Course,
     Operators,
     Sizes,
     StepOperators,
     Taught,
     Teaching,
+    Yardstick,
     collider_states,
     first_change,
     principal,
@@ -166,6 +168,45 @@ def test_a_constant_speed_is_no_state():
     c = (states - mean) @ matrix
     assert c.shape == (150, 1)
     np.testing.assert_allclose(np.diff(c[:, 0], axis=0), c[1, 0] - c[0, 0], rtol=1e-9)
+
+
+class Stepper:
+    """A teacher of two runs with d' = 0.9 d + q d², whose own runs are what they are whatever q is."""
+
+    total_steps, dt, steps = 30, 0.01, 0
+    parameters, gravity = torch.tensor([[0.0], [1.0]]).double(), torch.zeros(2, 3).double()
+    start, features = torch.tensor([[0.0, 1.0], [0.5, 0.0]]).double(), torch.zeros(30, 2, 0).double()
+
+    def __init__(self, q):
+        self.q = q
+
+    def __len__(self):
+        return 2
+
+    def first_change(self):
+        return torch.tensor([[0.1, -0.2], [0.2, 0.1]]).double()
+
+    def run(self):
+        way = torch.cumsum(0.9 ** torch.arange(31).double(), 0) - 1.0
+        return self.start + way[:, None, None] * self.first_change()
+
+    def step_from(self, step, xhat, change, gravity=None):
+        return xhat + 0.9 * change + self.q * change**2
+
+
+def test_how_far_a_step_is_from_affine():
+    """An affine step has no second difference; that of q d² is in proportion to q."""
+
+    def broken(q):
+        teacher = Stepper(q)
+        yardstick = Yardstick(teacher, lambda run: run[:, None], teacher.run()[:, :, None])
+        course = Course([teacher], None, yardstick, Teaching(8, rounds=0, steps=90, descent=1, unroll=1), 0)
+        course.follow()
+        return course.broken_affinity()
+
+    assert broken(0.0) < 1e-12
+    assert broken(1.0) > 1e-4
+    np.testing.assert_allclose(broken(2.0), 2.0 * broken(1.0), rtol=1e-9)
 
 
 # -- the file -------------------------------------------------------------------------------------------
