@@ -235,7 +235,7 @@ class Many:
         self.record = LatentRecord(setup.xhat.expand(len(cases), -1), self.total_steps, 1)
         names = setup.manifold.parameter_names
         mu = torch.tensor([[case[name] for name in names] for case in cases], dtype=torch.float64)
-        gravity = torch.tensor([setup.gravity], dtype=torch.float64).expand(len(mu), -1)
+        gravity = torch.as_tensor(setup.gravity.at(setup.dt * np.arange(self.total_steps))[None])
         states = collider_states(setup.scene.colliders, setup.dt, self.total_steps)[None]
         given = mu, gravity, torch.as_tensor(states), self.record, setup.precision, setup.device
         self._recurrence = Recurrence(model, *given)

@@ -51,6 +51,8 @@ KINDS = {
     "scene.walls": Kind("nsf.mpm", "nsf.mpm.DomainWalls"),
     "scene.colliders.*": Kind("nsf.mpm", "nsf.mpm.Collider"),
     "scene.colliders.*.motion": Kind("nsf.mpm", "nsf.mpm.Motion"),
+    "scene.forcing.gravity.*": Kind("nsf.scenes", "nsf.scenes.GravityProgram"),
+    "scene.forcing.colliders.*": Kind("nsf.scenes", "nsf.scenes.MotionProgram"),
     "scene.bodies.*": Kind("nsf.scenes", "nsf.scenes.Body"),
     "scene.bodies.*.shape": _SHAPE,
     "scene.bodies.*.weakness": Kind("nsf.scenes", "nsf.scenes.Weakness"),

@@ -7,7 +7,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from nsf.data.case import Case
+    from nsf.data.case import PROGRAM, Case
     from nsf.data.normalize import Standardizer
     from nsf.data.schema import TAU_MATRIX, TAU_ORDER, hash_of_positions
     from nsf.data.snapshots import Snapshots
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from nsf.data.trajectory import Trajectory, TrajectoryWriter
 
 __all__ = [
+    "PROGRAM",
     "TAU_MATRIX",
     "TAU_ORDER",
     "Case",
@@ -27,6 +28,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "PROGRAM": "case",
     "Case": "case",
     "Standardizer": "normalize",
     "Snapshots": "snapshots",

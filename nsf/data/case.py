@@ -7,16 +7,18 @@ from dataclasses import dataclass, field
 
 from nsf.errors import ConfigError
 
+#: Name, beside those of the parameters, of the number of a run's forcing program.
+PROGRAM = "program"
 # Relative; values equal to this are one value. Wider than a float32 round trip (6e-8).
 TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True, order=True)
 class Case(Mapping[str, float]):
-    """The problem parameters of one run, a mapping from name to value.
+    """The problem parameters of one run, and which program its forcing follows; a mapping from name to value.
 
     Attributes:
-        names: of the parameters, in the scene's order.
+        names: of the parameters, in the scene's order; `program` is the last where the forcing has programs.
         numbers: their values.
         units: theirs, for people; they tell no cases apart.
 
@@ -59,6 +61,11 @@ class Case(Mapping[str, float]):
 
     def __str__(self) -> str:
         return self.text
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """The problem parameters alone."""
+        return {name: value for name, value in self.items() if name != PROGRAM}
 
     @property
     def text(self) -> str:

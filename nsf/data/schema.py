@@ -4,6 +4,7 @@ attributes   schema_version units tau_order x_sha256 dt dx complete
 /particles   X [P,3]  mass [P]  volume0 [P]                           float64
 /frames      t [F] float64;  x v [F,P,3]  C [F,P,9]  tau [F,P,6], each in one piece
 /parameters  one float64 scalar a problem parameter
+/forcing     gravity [F,3]  solids [F,c,4] shift and angle of c      float64; of simulations of a scene
 /cost        one float64 scalar a measured cost
 """
 
@@ -26,6 +27,9 @@ TAU_MATRIX = [[TAU_ORDER.index("".join(sorted(row + column))) for column in "xyz
 
 # Particle fields of a frame and their number of components; C is a 3x3 matrix by rows.
 COMPONENTS = {"x": 3, "v": 3, "C": 9, "tau": 6}
+
+# What forces a simulation at each frame, and its shape after the frames.
+FORCING = {"gravity": (3,), "solids": (None, 4)}
 
 UNITS = {
     "X": "m",

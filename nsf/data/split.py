@@ -50,8 +50,8 @@ class Split:
 
     @property
     def box(self) -> np.ndarray:
-        """[n, 2] smallest and largest training value of each parameter."""
-        numbers = np.array([case.numbers for case in self.train])
+        """[n, 2] smallest and largest training value of each parameter; programs have none."""
+        numbers = np.array([list(case.parameters.values()) for case in self.train])
         return np.stack([numbers.min(0), numbers.max(0)], axis=1)
 
 

@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 
 from nsf.data import hdf5
-from nsf.data.schema import COMPONENTS, SCHEMA_VERSION, TAU_ORDER, UNITS, hash_of_positions, packed
+from nsf.data.schema import COMPONENTS, FORCING, SCHEMA_VERSION, TAU_ORDER, UNITS, hash_of_positions, packed
 from nsf.data.sink import Sink
 from nsf.errors import InstabilityError, SchemaError, ShapeError
 from nsf.storage import require_space, writing
@@ -39,6 +39,7 @@ class TrajectoryWriter:
         dx: grid spacing [m].
         frames: number of frames to be appended, the initial one included.
         dtype: "float32" or "float64", of x, v, C and tau.
+        forcing: gravity [F,3] [m/s²] and solids [F,c,4], the shift [m] and angle [rad] of c solids.
 
     Raises:
         ShapeError: arrays disagree in the number of particles.
@@ -58,6 +59,7 @@ class TrajectoryWriter:
         dx: float,
         frames: int,
         dtype: str = "float32",
+        forcing: Mapping[str, np.ndarray] | None = None,
     ) -> None:
         self.path = Path(path)
         self.frames = frames
@@ -73,6 +75,10 @@ class TrajectoryWriter:
             if (shape := self._particles[name].shape) != (len(X),):
                 raise ShapeError(f"{name} has shape {list(shape)} for {len(X)} particles; give [{len(X)}]")
         self._parameters = {name: float(value) for name, value in parameters.items()}
+        self._forcing = {name: np.asarray(values, "<f8") for name, values in (forcing or {}).items()}
+        for name, values in self._forcing.items():
+            if len(values) != frames:
+                raise ShapeError(f"forcing {name} has {len(values)} frames; give frames={frames}")
         self._attributes = {
             "schema_version": SCHEMA_VERSION,
             "units": json.dumps(UNITS),
@@ -100,6 +106,8 @@ class TrajectoryWriter:
                 for name, c in COMPONENTS.items()
             }
             _write_scalars(self._file.create_group("parameters"), self._parameters)
+            for name, values in self._forcing.items():
+                self._file[f"forcing/{name}"] = values
             self._stack = stack.pop_all()
         return self
 
@@ -162,6 +170,7 @@ class Trajectory:
         dt: time step of the solver [s].
         dx: grid spacing [m].
         parameters: value of every problem parameter, by name in sorted order.
+        forcing: what forces the simulation at each frame, as the writer takes it; empty if not known.
         cost: measured costs of the simulation.
         x_sha256: identity of the particles (`hash_of_positions`).
         particles: P.
@@ -194,6 +203,12 @@ class Trajectory:
             for name, c in COMPONENTS.items()
         }
         self.parameters, self.cost = (_read_scalars(file, name) for name in ("parameters", "cost"))
+        self.forcing = {}
+        if "forcing" in file:
+            self.forcing = {
+                name: hdf5.values(file, f"forcing/{name}", _EXACT, (self.frames, *shape))
+                for name, shape in FORCING.items()
+            }
         if (x_sha256 := hash_of_positions(self.X)) != self.x_sha256:
             raise SchemaError(f"says x_sha256={self.x_sha256[:12]}, but its X has {x_sha256[:12]}")
 

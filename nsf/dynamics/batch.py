@@ -10,7 +10,7 @@ import torch
 from nsf.dynamics.latent import LatentRecord
 from nsf.dynamics.setup import Setup
 from nsf.errors import ConfigError
-from nsf.mpm import BoundaryArrays
+from nsf.mpm import BoundaryArrays, Forcing
 
 
 @dataclass(frozen=True)
@@ -24,12 +24,12 @@ class Batch:
     Attributes:
         setups: [B] what each run is given.
         record: latent vectors of all.
-        boundaries: colliders and walls; the colliders of each run, one run after the other.
+        forcing: gravity, colliders and walls; those of each run, one run after the other.
     """
 
     setups: tuple[Setup, ...]
     record: LatentRecord
-    boundaries: BoundaryArrays
+    forcing: Forcing
 
     @classmethod
     def of(cls, setups: Sequence[Setup]) -> "Batch":
@@ -48,7 +48,8 @@ class Batch:
         record = LatentRecord(starts, first.total_steps, first.projector.iterations)
         colliders = tuple(chain.from_iterable(setup.scene.colliders for setup in setups))
         boundaries = BoundaryArrays(colliders, first.scene.walls, first.precision, first.device)
-        return cls(tuple(setups), record, boundaries)
+        gravities = [setup.gravity for setup in setups]
+        return cls(tuple(setups), record, Forcing(gravities, boundaries, first.precision, first.device))
 
     def __len__(self) -> int:
         return len(self.setups)

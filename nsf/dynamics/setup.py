@@ -45,6 +45,7 @@ class Setup:
         dt, total_steps: step [s] and number of steps to the end of the scene.
         starts: step with which each span begins.
         constants: every particle of the scene; initial_velocity: [P, 3] theirs [m/s], on the host.
+        gravity: over the run, as the scene's programs have it.
         xhat: [r] x̂_0; parameters: [n_parameters] μ; both on the device.
 
     Raises:
@@ -82,7 +83,7 @@ class Setup:
         self.dt = scene.dt * dt_multiplier
         self.total_steps = reduced_steps(scene.steps, dt_multiplier)
         self.starts = [round(sample.start * self.total_steps) for sample in samples]
-        self.geometry, self.transfer, self.gravity = scene.grid, scene.transfer, scene.gravity
+        self.geometry, self.transfer, self.gravity = scene.grid, scene.transfer, scene.acting_gravity
         self.constants = scene.particles()
         P = len(self.constants)
         manifold.check_particles(hash_of_positions(self.constants.X))

@@ -16,6 +16,7 @@ from nsf.dynamics.span import Span, Stages
 from nsf.dynamics.step import steps_of
 from nsf.errors import ConfigError
 from nsf.kinematics.manifold import Restriction
+from nsf.mpm import Gravity, Hand
 from nsf.timing import StageTimer, untimed
 
 _CHUNK = 2**22  # positions of sample particles decoded at once [values]
@@ -32,11 +33,11 @@ class ReducedBatch:
         spans_of: gives what takes the steps of each span of time, as `Engine.spans`; those of the reference
             by default.
         engine, why: name of the engine that gives them, and the reason for its choice; for the record.
-        doubts: of each run, as `Engine.doubt` gives it; none by default.
+        doubt: how far a run's input lies outside of what was learned, as `Engine.doubt`; never by default.
 
     Attributes:
-        batch: setups, record of the latent vectors, colliders and walls.
-        engine, why, doubts: as given.
+        batch: setups, record of the latent vectors, forcing.
+        engine, why: as given.
         steps_taken, total_steps: taken, and those to the end of the scene.
         dt: step [s]; device: Warp device.
 
@@ -52,11 +53,11 @@ class ReducedBatch:
         spans_of: Callable[[Batch], Sequence[Span]] = steps_of,
         engine: str = "reference",
         why: str = "",
-        doubts: Sequence[tuple[float, str]] = (),
+        doubt: Callable[[Setup, Gravity], tuple[float, str]] = lambda setup, gravity: (0.0, ""),
     ):
         self.batch = Batch.of(setups)
         self.engine, self.why, self._spans_of = engine, why, spans_of
-        self.doubts = tuple(doubts) or ((0.0, ""),) * len(setups)
+        self._doubt = doubt
         shared = self.batch.shared
         self.dt, self.total_steps, self.device = shared.dt, shared.total_steps, shared.device
         self.steps_taken = 0
@@ -71,10 +72,21 @@ class ReducedBatch:
         """Each run, to be asked for its own state and trajectory."""
         return tuple(ReducedMPM(self, index) for index in range(len(self)))
 
+    def hand(self, index: int = 0) -> Hand:
+        """The forcing of one of the runs, which may be set between steps."""
+        names = self.batch.setups[index].scene.collider_names
+        return Hand(self.batch.forcing, lambda: self.time, index, names)
+
     def alone(self, index: int) -> "ReducedBatch":
         """One of the runs, at t = 0 and in a batch of its own."""
-        own = self.batch.setups[index], self.doubts[index]
-        return ReducedBatch([own[0]], self._spans_of, self.engine, self.why, [own[1]])
+        own = self.batch.setups[index]
+        return ReducedBatch([own], self._spans_of, self.engine, self.why, self._doubt)
+
+    @property
+    def doubts(self) -> tuple[tuple[float, str], ...]:
+        """How far the input of each run lies outside of what its engine learned from; see `Engine.doubt`."""
+        pairs = zip(self.batch.setups, self.batch.forcing.gravities, strict=True)
+        return tuple(self._doubt(*own) for own in pairs)
 
     @property
     def xhat(self) -> torch.Tensor:
@@ -110,8 +122,9 @@ class ReducedBatch:
         return list(zip(counts, self._spans, strict=True))
 
     def restart(self) -> None:
-        """Go back to t = 0; captured graphs stay good."""
+        """Go back to t = 0, and to the scene's own forcing; captured graphs stay good."""
         self.batch.record.restart()
+        self.batch.forcing.release()
         self.resume(0)
 
     def resume(self, step: int) -> None:
@@ -119,7 +132,7 @@ class ReducedBatch:
         self.steps_taken = step
         self._enter(self.span_at(step))
         with on_torch_stream(self.device):
-            self.batch.boundaries.start_from(step)
+            self.batch.forcing.start_from(step)
 
     def step(self, n: int = 1) -> None:
         """Advance by n steps of Δt.
@@ -250,6 +263,11 @@ class ReducedMPM:
     def time(self) -> float:
         """Simulated time [s]."""
         return self.together.time
+
+    @property
+    def forcing(self) -> Hand:
+        """Gravity and colliders, which may be set between steps."""
+        return self.together.hand(self.index)
 
     @property
     def engine(self) -> str:

@@ -108,11 +108,7 @@ class GridSpan(Span):
         self.order = order
         one = batch.shared
         grid = Grid(one.geometry, one.precision, one.device, sets.nodes, runs=len(batch))
-        # The forcing of the moment is on the device: gravity here, the colliders' time in the boundaries.
-        gravity = [setup.gravity for setup in batch.setups]
-        self.grid_step = GridStep(
-            grid, batch.boundaries, one.transfer, gravity, one.dt, one.precision, one.device
-        )
+        self.grid_step = GridStep(grid, batch.forcing, one.transfer, one.dt, one.precision, one.device)
 
         def rows(of) -> torch.Tensor:
             return torch.cat(

@@ -7,6 +7,7 @@ from typing import ClassVar
 from nsf.dynamics.batch import Batch
 from nsf.dynamics.setup import Setup
 from nsf.dynamics.span import Span
+from nsf.mpm import Gravity
 
 
 class Engine(ABC):
@@ -26,8 +27,12 @@ class Engine(ABC):
     def spans(self, batch: Batch) -> Sequence[Span]:
         """What takes the steps of each span of time, of runs that are not refused."""
 
-    def doubt(self, setup: Setup) -> tuple[float, str]:
+    def doubt(self, setup: Setup, gravity: Gravity) -> tuple[float, str]:
         """How far a run's input lies outside of what the engine learned from, in units of its range.
+
+        Args:
+            setup: what the run is given.
+            gravity: in its course, as far as is known.
 
         Returns:
             At most 1 where it is inside, as it always is where nothing is learned; and what lies outside.

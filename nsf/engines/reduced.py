@@ -80,7 +80,7 @@ def reduced_batch(
 
 def _together(setups: Sequence[Setup], wanted: str | Engine) -> ReducedBatch:
     engine, why = choose(wanted, setups)
-    return ReducedBatch(setups, engine.spans, engine.name, why, [engine.doubt(setup) for setup in setups])
+    return ReducedBatch(setups, engine.spans, engine.name, why, engine.doubt)
 
 
 def _setup(scene, manifold, parameters, sample: Sample, engine: str | Engine, options: dict) -> Setup:

@@ -28,7 +28,8 @@ class TrainingRuns:
     """The latent vectors of the training trajectories, run by run.
 
     Attributes:
-        parameters: [K, n] of each run, standardised over the runs; a parameter that never varies is 0.
+        parameters: [K, n] of each run, standardised over the runs; a parameter that never varies is 0. Where
+            programs force the runs, what these do in the course of a run stands beside.
         latents: [K, F, r] of each frame.
     """
 
@@ -38,8 +39,13 @@ class TrainingRuns:
     _deviation: np.ndarray
 
     @classmethod
-    def of(cls, manifold: Manifold) -> "TrainingRuns":
-        """Those that a manifold was trained on; all have the same frames."""
+    def of(cls, manifold: Manifold, forcing: Sequence[np.ndarray] = ()) -> "TrainingRuns":
+        """Those that a manifold was trained on; all have the same frames.
+
+        Args:
+            manifold: trained fields.
+            forcing: [D] of each run, as `forcing_of` gives it; none where no program forces the runs.
+        """
         run = manifold.training_trajectories.cpu().numpy()
         count = int(run[-1]) + 1
         latents = manifold.training_latents.cpu().double().numpy().reshape(count, -1, manifold.latent_dim)
@@ -47,6 +53,14 @@ class TrainingRuns:
         values = values.reshape(count, -1, values.shape[1])[:, 0]
         mean, deviation = values.mean(0), values.std(0)
         deviation = np.where(deviation > 0, deviation, 1.0)
+        if len(forcing):
+            # A whole program weighs as much as one parameter.
+            whole = np.stack(forcing)
+            spread = whole.std(0)
+            weight = np.linalg.norm(spread) or 1.0
+            values = np.hstack([values, whole])
+            mean = np.concatenate([mean, whole.mean(0)])
+            deviation = np.concatenate([deviation, np.full(whole.shape[1], weight)])
         return cls((values - mean) / deviation, latents, mean, deviation)
 
     def standardised(self, parameters: np.ndarray) -> np.ndarray:
@@ -69,6 +83,19 @@ class TrainingRuns:
         values = self.latents.reshape(len(self.latents), -1)
         fit = RBFInterpolator(self.parameters, values, kernel="linear", degree=0)
         return fit(self.standardised(parameters)[None]).reshape(self.latents.shape[1:])
+
+
+def forcing_of(scene: Scene) -> np.ndarray:
+    """[D] what forces a run in its course: gravity, and the solids' shifts, at each step.
+
+    Gravity in units of its reach and shifts in Δx, so that they can be held side by side.
+    """
+    acting, found = scene.forcing_at(scene.dt * np.arange(scene.steps)), []
+    if scene.forcing.gravity:
+        found.append(acting["gravity"].ravel() / (scene.forcing.reach(scene.gravity) or 1.0))
+    moved = [name in scene.forcing.colliders for name in scene.collider_names]
+    found.append(acting["solids"][:, moved, :3].ravel() / scene.dx)
+    return np.concatenate(found)
 
 
 @dataclass(frozen=True)
@@ -148,6 +175,8 @@ def coarse_run(
 class Rivals:
     """How far the rivals of a reduced run are from its truth, as `displacement_error` over frames 1..N.
 
+    Where programs force the runs, these count among the parameters.
+
     Attributes:
         static: nothing moves, which is 1 by definition; nearest: the training run of the nearest parameters;
             interpolated: the latent vectors of training runs, interpolated over the parameters.
@@ -166,17 +195,23 @@ class Rivals:
         return [factor for factor, told in self.coarse.items() if "why" not in told]
 
 
-def rivals(solver: ReducedMPM, trajectory: Trajectory, factors: Sequence[int] = ()) -> Rivals:
+def rivals(
+    solver: ReducedMPM, trajectory: Trajectory, factors: Sequence[int] = (), known: Sequence[Scene] = ()
+) -> Rivals:
     """Hold the rivals of a reduced run to its full-order trajectory, at all particles and frames.
 
     Args:
         solver: the reduced solver of the run, with the training runs' latent vectors in its manifold.
         trajectory: the full-order run; its frames are those of the training runs.
         factors: of Δx of coarse full-order runs.
+        known: the scene in each training case, in order; asked for where programs force the runs.
     """
     scene, setup = solver.scene, solver.setup
-    decoder, runs = solver.decoder(), TrainingRuns.of(solver.manifold)
+    forcing = [forcing_of(one) for one in known] if scene.forcing else []
+    decoder, runs = solver.decoder(), TrainingRuns.of(solver.manifold, forcing)
     parameters = setup.parameters.cpu().double().numpy()
+    if forcing:
+        parameters = np.concatenate([parameters, forcing_of(scene)])
 
     def tensor(values) -> torch.Tensor:
         return torch.as_tensor(np.asarray(values)).to(setup.torch_device).to(setup.dtype)

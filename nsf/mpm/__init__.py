@@ -7,6 +7,7 @@ wp.config.log_level = wp.LOG_ERROR  # kernels are compiled without a word; error
 from nsf.mpm.boundaries.arrays import BoundaryArrays, DomainWalls  # noqa: E402
 from nsf.mpm.boundaries.colliders import Collider, Cuboid, HalfSpace, Sphere, floor_height  # noqa: E402
 from nsf.mpm.boundaries.motion import Motion  # noqa: E402
+from nsf.mpm.forcing import Forcing, Gravity, Hand  # noqa: E402
 from nsf.mpm.grid.nodes import Grid, GridGeometry  # noqa: E402
 from nsf.mpm.precision import FP32, FP64, Precision, precision_of  # noqa: E402
 from nsf.mpm.solver import FullOrderMPM, Solver, diagnosed  # noqa: E402
@@ -21,11 +22,14 @@ __all__ = [
     "Collider",
     "Cuboid",
     "DomainWalls",
+    "Forcing",
     "FullOrderMPM",
+    "Gravity",
     "Grid",
     "GridGeometry",
     "GridStep",
     "HalfSpace",
+    "Hand",
     "Motion",
     "ParticleConstants",
     "ParticleState",

@@ -11,6 +11,7 @@ from nsf.errors import ConfigError, InstabilityError, ShapeError
 from nsf.mpm.boundaries.arrays import BoundaryArrays, DomainWalls
 from nsf.mpm.boundaries.colliders import Collider
 from nsf.mpm.device import warp_device
+from nsf.mpm.forcing import Forcing, Gravity, Hand
 from nsf.mpm.grid import Grid, GridGeometry
 from nsf.mpm.grid.shape import stencil_offset
 from nsf.mpm.materials import Material, make_elastic_stress, make_stress_update
@@ -46,6 +47,10 @@ class Solver(Protocol):
 
     dt: float
     device: object
+
+    @property
+    def forcing(self) -> Hand:
+        """Gravity and colliders, which may be set between steps."""
 
     @property
     def state(self) -> State:
@@ -93,7 +98,7 @@ class FullOrderMPM:
         material: constitutive law.
         grid: grid geometry.
         dt: step [s].
-        gravity: [3] [m/s²].
+        gravity: [3] [m/s²], or its keyframes.
         colliders: solids, at rest or moving, applied in order.
         walls: condition on the faces of the domain.
         transfer: PIC, APIC or RPIC, and the B-spline.
@@ -101,8 +106,10 @@ class FullOrderMPM:
         precision: `fp64` or `fp32`.
         device: `cpu`, `cuda`, `cuda:N` or `auto`.
         check_every: steps between checks of finiteness and bounds.
+        names: of the colliders, for `forcing`.
 
     Attributes:
+        forcing: gravity and colliders, which may be set between steps.
         beyond_law: particles whose stress `resume` had to scale down.
 
     Raises:
@@ -120,7 +127,7 @@ class FullOrderMPM:
         material: Material,
         grid: GridGeometry,
         dt: float,
-        gravity: Sequence[float] = (0.0, 0.0, 0.0),
+        gravity: Sequence[float] | Gravity = (0.0, 0.0, 0.0),
         colliders: Sequence[Collider] = (),
         walls: DomainWalls = DomainWalls(),
         transfer: Transfer = Transfer(),
@@ -129,6 +136,7 @@ class FullOrderMPM:
         precision: str | Precision = "fp64",
         device: str = "cpu",
         check_every: int = 50,
+        names: Sequence[str] = (),
     ):
         if check_every < 1:
             raise ConfigError(f"check_every={check_every} must be at least 1 step")
@@ -157,7 +165,9 @@ class FullOrderMPM:
         self.state = ParticleState(x, v, history, order, self.precision, self.device)
         self.grid = Grid(grid, self.precision, self.device)
         boundaries = BoundaryArrays(colliders, walls, self.precision, self.device)
-        self.grid_step = GridStep(self.grid, boundaries, transfer, gravity, dt, self.precision, self.device)
+        acting = Forcing([gravity], boundaries, self.precision, self.device)
+        self.grid_step = GridStep(self.grid, acting, transfer, dt, self.precision, self.device)
+        self.forcing = Hand(acting, lambda: self.time, names=names)
         law = material.functions(self.precision)
         self._stress_update = make_stress_update(law, self.precision, material.history_size)
         self._g2p_stress = make_g2p_stress(self.precision, transfer.shape, law, material.history_size)
@@ -183,7 +193,8 @@ class FullOrderMPM:
         for name, values in self._start.items():
             getattr(self.state, name).assign(values)
         self.state.unload()
-        self.grid_step.boundaries.start_from(0)
+        self.forcing.release()
+        self.grid_step.forcing.start_from(0)
         self.steps_taken = self.beyond_law = 0
 
     def resume(self, steps: int, x: np.ndarray, v: np.ndarray, C: np.ndarray, tau: np.ndarray) -> None:
@@ -214,7 +225,7 @@ class FullOrderMPM:
         state = {"x": x, "v": v, "C": C, "F_e": F_e, "tau": tau, "history": self.material.history_of(tau)}
         for name, values in state.items():
             getattr(self.state, name).assign(values)
-        self.grid_step.boundaries.start_from(steps)
+        self.grid_step.forcing.start_from(steps)
         self.steps_taken = steps
         self.check()
 

@@ -1,10 +1,9 @@
 """P2G, grid update and G2P: the part of a step that the full-order and the reduced solver share."""
 
-import numpy as np
 import warp as wp
 
 from nsf.errors import ConfigError
-from nsf.mpm.boundaries.arrays import BoundaryArrays
+from nsf.mpm.forcing import Forcing
 from nsf.mpm.grid.nodes import Grid, make_reach
 from nsf.mpm.native.access import WARP
 from nsf.mpm.stability import check_colliders
@@ -23,9 +22,8 @@ class GridStep:
 
     Args:
         grid: the nodes.
-        boundaries: colliders and walls; for a batch equally many colliders of each run, in turn.
+        forcing: gravity, colliders and walls, of all its runs.
         transfer: transfer scheme and B-spline.
-        gravity: [3] [m/s²]; for a batch [runs, 3].
         dt: step [s].
         precision: floating-point types.
         device: Warp device.
@@ -35,18 +33,14 @@ class GridStep:
         InstabilityError: a collider crosses more than a cell in a step.
     """
 
-    def __init__(
-        self, grid: Grid, boundaries: BoundaryArrays, transfer: Transfer, gravity, dt, precision, device
-    ):
+    def __init__(self, grid: Grid, forcing: Forcing, transfer: Transfer, dt, precision, device):
         real = precision.real
-        check_colliders(boundaries.colliders, grid.geometry, dt)
+        check_colliders(forcing.boundaries.colliders, grid.geometry, dt)
         self.grid, self.device = grid, device
         self.dx, self.dt = real(grid.geometry.dx), real(dt)
-        self._seconds = float(dt)  # the colliders' time is fp64 in either precision
+        self._seconds = float(dt)  # the forcing's time is fp64 in either precision
         batch = grid.runs > 1
-        gravity = np.broadcast_to(np.asarray(gravity, float).reshape(-1, 3), (grid.runs, 3))
-        self.gravity = wp.array(gravity, dtype=precision.vec3, device=device)
-        self.boundaries = boundaries
+        self.forcing = forcing
         self.affine_shares = tuple(real(s) for s in transfer.affine_shares)
         self._by_warp = device.is_cuda and not transfer.deterministic
         self._p2g = make_p2g(precision, transfer.shape, transfer.deterministic, batch, self._by_warp)
@@ -98,8 +92,8 @@ class GridStep:
         )
 
     def follow(self) -> None:
-        """Move the boundaries by a step. `update` calls this; `update_g2p` does not."""
-        self.boundaries.advance(self._seconds)
+        """Move the forcing on by a step. `update` calls this; `update_g2p` does not."""
+        self.forcing.advance(self._seconds)
 
     def update(self) -> None:
         """Momentum → velocity at the next time level with all boundaries, which then move by a step.
@@ -135,7 +129,7 @@ class GridStep:
     def _updating(self) -> list:
         """Arguments of the nodes' velocity, in the kernels' order."""
         grid = self.grid
-        return [grid.values, self.dx, self.dt, self.gravity, self.boundaries.solids]
+        return [grid.values, self.dx, self.dt, self.forcing.now, self.forcing.boundaries.solids]
 
     @property
     def gathering(self) -> list:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 from omegaconf import DictConfig
 
 from nsf import config as configuration
@@ -129,7 +130,8 @@ class Pipeline(Plan):
 
         def job(run: Run, case: Case, scene: Scene) -> Job:
             build = partial(scene.full_order, case, c.precision, self.device)
-            return Job(run, case, build, warnings[run])
+            forcing = scene.with_parameters(case).forcing_at(scene.dt * np.arange(scene.steps + 1))
+            return Job(run, case, build, forcing, warnings[run])
 
         self.check_room(runs)
         jobs = [job(run, *needed) for run, needed in runs.items()]

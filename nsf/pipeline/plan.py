@@ -221,7 +221,7 @@ class Plan:
         content = self._physics(scene)
         content |= {"precision": c.precision, "dtype": c.data.dtype}
         content["parameters"] = {
-            name: {"key": self.scene.parameters[name].key, "value": value} for name, value in case.items()
+            name: {"key": self.scene.varied[name].key, "value": value} for name, value in case.items()
         }
         if scene.files:
             # A changed mesh under the same path is another simulation.

@@ -6,6 +6,15 @@ from nsf import config as _config
 from nsf.scenes.body import Body
 from nsf.scenes.designs import Design, Grid, LatinHypercube, Sobol, Values
 from nsf.scenes.parameters import Parameter
+from nsf.scenes.programs import (
+    GravityProgram,
+    Keyframes,
+    MotionProgram,
+    RandomPress,
+    RandomPush,
+    RandomShake,
+    RandomTilt,
+)
 from nsf.scenes.scene import Scene
 from nsf.scenes.shapes import Ball, Box, Cylinder, Frame, Mesh, Ribbon, Shape, TentacleBall, mesh_or_ball
 from nsf.scenes.weakness import Weakness
@@ -17,10 +26,17 @@ __all__ = [
     "Cylinder",
     "Design",
     "Frame",
+    "GravityProgram",
     "Grid",
+    "Keyframes",
     "LatinHypercube",
     "Mesh",
+    "MotionProgram",
     "Parameter",
+    "RandomPress",
+    "RandomPush",
+    "RandomShake",
+    "RandomTilt",
     "Ribbon",
     "Scene",
     "Shape",

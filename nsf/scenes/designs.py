@@ -6,12 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nsf.data.case import Case
+from nsf.data.case import PROGRAM, Case
 from nsf.data.split import Split
 from nsf.errors import ConfigError
 from nsf.scenes.parameters import Parameter
 from nsf.vectors import is_finite, is_list, number
 
+#: Programs are numbered apart: those of another part, and of another seed, have other numbers.
+_PARTS, _SEEDS = 1000, 10_000
 #: Significant digits of a drawn value, which its text shows in full.
 _DIGITS = 6
 
@@ -24,7 +26,7 @@ class Design(ABC):
         """The cases, by their use.
 
         Args:
-            parameters: of the scene, by name.
+            parameters: of the scene, by name; `program` stands for the number of a run's forcing program.
 
         Raises:
             ConfigError: a case is refused, or a parameter lacks a range; names the remedy.
@@ -36,7 +38,8 @@ class Values(Design):
     """Cases that are listed: numbers for one parameter.
 
     For several parameters each case is a list of numbers in the order of the parameters, or a mapping from
-    name to number.
+    name to number. Where programs force the runs a case may name the number of its own, last or as `program`;
+    else it gets one.
 
     Attributes:
         train, validation, test: the cases.
@@ -56,9 +59,11 @@ class Values(Design):
     def split(self, parameters: Mapping[str, Parameter]) -> Split:
         """See `Design.split`; a value outside a declared range is refused as well."""
         parts = {}
-        for part in ("train", "validation", "test"):
-            where = f"scene.design.{part}"
-            parts[part] = [case_of(parameters, given, where) for given in getattr(self, part)]
+        for number_of_part, part in enumerate(("train", "validation", "test")):
+            where, cases = f"scene.design.{part}", getattr(self, part)
+            first = _first_program(0, number_of_part, len(cases))
+            numbered = (_programmed(parameters, given, first + i) for i, given in enumerate(cases))
+            parts[part] = [case_of(parameters, given, where) for given in numbered]
             for case in parts[part]:
                 _check_inside(case, parameters, where)
         return _split(**parts)
@@ -83,11 +88,12 @@ class _Drawn(Design):
     def split(self, parameters: Mapping[str, Parameter]) -> Split:
         """See `Design.split`."""
         counts = self.train, self.validation, self.test
-        drawn = [
-            self._points(count, len(parameters), np.random.default_rng([self.seed, part]))
-            for part, count in enumerate(counts)
-        ]
-        return _split(*(_cases(parameters, points, type(self).__name__) for points in drawn))
+        drawn, dimensions = [], len(parameters) - (PROGRAM in parameters)
+        for part, count in enumerate(counts):
+            points = self._points(count, dimensions, np.random.default_rng([self.seed, part]))
+            first = _first_program(self.seed, part, count)
+            drawn.append(_cases(parameters, points, type(self).__name__, first))
+        return _split(*drawn)
 
     @abstractmethod
     def _points(self, count: int, dimensions: int, generator: np.random.Generator) -> np.ndarray:
@@ -151,15 +157,17 @@ class Grid(Design):
 
     def split(self, parameters: Mapping[str, Parameter]) -> Split:
         """See `Design.split`."""
-        if len(self.train) != len(parameters):
+        own = [name for name in parameters if name != PROGRAM]
+        if len(self.train) != len(own):
             raise ConfigError(
-                f"scene.design.train={list(self.train)} must be {len(parameters)} numbers of values, "
-                f"one for each of {', '.join(parameters)}"
+                f"scene.design.train={list(self.train)} must be {len(own)} numbers of values, "
+                f"one for each of {', '.join(own)}"
             )
         held_out = Sobol(1, self.test, self.validation, self.seed).split(parameters)
         ends = [np.linspace(0.0, 1.0, n) if n > 1 else np.array([0.5]) for n in self.train]
         points = np.stack(np.meshgrid(*ends, indexing="ij"), -1).reshape(-1, len(ends))
-        return _split(_cases(parameters, points, "Grid"), held_out.validation, held_out.test)
+        train = _cases(parameters, points, "Grid", _first_program(self.seed, 0, len(points)))
+        return _split(train, held_out.validation, held_out.test)
 
 
 def case_of(parameters: Mapping[str, Parameter], given, where: str) -> Case:
@@ -185,6 +193,16 @@ def case_of(parameters: Mapping[str, Parameter], given, where: str) -> Case:
     return Case(tuple(parameters), tuple(values), tuple(p.unit for p in parameters.values()))
 
 
+def _programmed(parameters: Mapping[str, Parameter], given, program: int):
+    """A case as it is given, with the number of a program where it asks for one and names none."""
+    if PROGRAM not in parameters:
+        return given
+    if isinstance(given, Mapping):
+        return {PROGRAM: program} | dict(given)
+    values = list(given) if is_list(given) else [given]
+    return [*values, program] if len(values) == len(parameters) - 1 else values
+
+
 def evenly(count: int, dimensions: int) -> np.ndarray:
     """[count, dimensions] points that fill the unit cube evenly, however many of them are taken.
 
@@ -207,10 +225,18 @@ def _check_inside(case: Case, parameters: Mapping[str, Parameter], where: str) -
             )
 
 
-def _cases(parameters: Mapping[str, Parameter], points: np.ndarray, design: str) -> list[Case]:
-    """Cases of points [n, d] of the unit cube, in the parameters' ranges."""
+def _first_program(seed: int, part: int, count: int) -> int:
+    """Number of the first program of a part of a design."""
+    if count > _PARTS:
+        raise ConfigError(f"scene.design has {count} cases in a part; programs are numbered up to {_PARTS}")
+    return _SEEDS * seed + _PARTS * part
+
+
+def _cases(parameters: Mapping[str, Parameter], points: np.ndarray, design: str, first: int) -> list[Case]:
+    """Cases of points [n, d] of the unit cube, in the parameters' ranges; programs count from `first`."""
     columns = []
-    for (name, parameter), u in zip(parameters.items(), points.T, strict=True):
+    own = [(name, parameter) for name, parameter in parameters.items() if name != PROGRAM]
+    for (name, parameter), u in zip(own, points.T, strict=True):
         if parameter.range is None:
             raise ConfigError(
                 f"scene.parameters.{name} has no range, which {design} draws from; give it range: [low, high]"
@@ -220,6 +246,8 @@ def _cases(parameters: Mapping[str, Parameter], points: np.ndarray, design: str)
         values = np.exp(values) if parameter.log else values
         rounded = [float(f"{value:.{_DIGITS}g}") for value in values]
         columns.append(np.clip(rounded, *parameter.range).tolist())
+    if PROGRAM in parameters:
+        columns.append(list(range(first, first + len(points))))
     units = tuple(parameter.unit for parameter in parameters.values())
     return [Case(tuple(parameters), numbers, units) for numbers in zip(*columns, strict=True)]
 

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -10,15 +10,16 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from nsf import config as configuration
-from nsf.data import Case, Split
+from nsf.data import PROGRAM, Case, Split
 from nsf.errors import ConfigError
-from nsf.mpm import Collider, DomainWalls, FullOrderMPM, GridGeometry, ParticleConstants, Transfer
+from nsf.mpm import Collider, DomainWalls, FullOrderMPM, Gravity, GridGeometry, ParticleConstants, Transfer
 from nsf.mpm.materials import Material
 from nsf.scenes.body import Body
 from nsf.scenes.checks import check_memory, check_particles, check_physics
 from nsf.scenes.designs import Design, case_of
 from nsf.scenes.identity import NOT_PHYSICS
 from nsf.scenes.parameters import Parameter, check_key, parameters_of
+from nsf.scenes.programs import Programs
 from nsf.vectors import vector
 
 
@@ -32,6 +33,7 @@ class Scene:
         size: domain edge lengths [m]; gravity: [3] [m/s²].
         bodies: what moves; colliders, walls: boundaries.
         material: constitutive law; transfer: PIC, APIC or RPIC.
+        forcing: programs of gravity and colliders, as drawn for the run whose number `program` is.
         parameters: the problem parameters by name; design: draws the cases, the values that they take.
         config: the configuration that it was built from, resolved.
         template: the same before its interpolations were resolved.
@@ -49,6 +51,8 @@ class Scene:
     walls: DomainWalls
     material: Material
     transfer: Transfer
+    forcing: Programs
+    program: int
     parameters: Mapping[str, Parameter]
     design: Design
     config: DictConfig = field(repr=False, compare=False)
@@ -73,26 +77,35 @@ class Scene:
         s = configuration.section(config, "scene")
         if "title" in s:  # the configuration of a simulation has none
             configuration.text("scene.title", s.title)
-        colliders = tuple(configuration.build_all(s.colliders, "scene.colliders").values())
+        forcing, program = _programs(s)
+        dt = float(configuration.number("scene.dt", s.dt))
+        steps = configuration.number("scene.steps", s.steps, least=1, whole=True)
+        solids = configuration.build_all(s.colliders, "scene.colliders")
         bodies = configuration.build_all(s.bodies, "scene.bodies")
         if not bodies:
             raise ConfigError("scene.bodies={} leaves nothing to simulate; give a body")
         dx = float(configuration.length("scene.dx", s.dx))
         size = tuple(configuration.length("scene.size", a) for a in vector("scene.size", s.size, "m"))
         GridGeometry.of_domain(size, dx)
+        forcing.check(tuple(solids), dt * steps, dt, dx)
+        for name in forcing.colliders:
+            motion = forcing.motion_of(name, dt * steps, program)
+            solids[name] = replace(solids[name], motion=motion)
         return cls(
             name=configuration.text("scene.name", s.name),
             scale=config.scale,
             dx=dx,
-            dt=float(configuration.number("scene.dt", s.dt)),
-            steps=configuration.number("scene.steps", s.steps, least=1, whole=True),
+            dt=dt,
+            steps=steps,
             size=size,
             gravity=vector("scene.gravity", s.gravity, "m/s²"),
             bodies=tuple(_body(b, f"scene.bodies.{n}", size, dx) for n, b in bodies.items()),
-            colliders=colliders,
+            colliders=tuple(solids.values()),
             walls=configuration.build(s.walls, "scene.walls"),
             material=configuration.build(config.material, "material"),
             transfer=configuration.build(config.transfer, "transfer"),
+            forcing=forcing,
+            program=program,
             parameters=parameters_of(
                 OmegaConf.to_container(configuration.section(config, "scene.parameters"))
             ),
@@ -108,7 +121,36 @@ class Scene:
         Raises:
             ConfigError: see `Design.split`.
         """
-        return self.design.split(self.parameters)
+        return self.design.split(self.varied)
+
+    @cached_property
+    def varied(self) -> dict[str, Parameter]:
+        """What a case has a value of: the problem parameters, and the program's number if there is any."""
+        program = {PROGRAM: Parameter("scene.program", "")} if self.forcing else {}
+        return dict(self.parameters) | program
+
+    @cached_property
+    def acting_gravity(self) -> Gravity:
+        """Gravity in the course of the run, as the programs have it [m/s²]."""
+        return self.forcing.gravity_of(self.gravity, self.dt * self.steps, self.program)
+
+    def forcing_at(self, t: np.ndarray) -> dict[str, np.ndarray]:
+        """What forces a run at times t [n] [s].
+
+        Returns:
+            gravity: [n, 3] [m/s²]; solids: [n, c, 4] shift [m] and angle [rad] of each collider.
+        """
+        poses = np.zeros((len(t), len(self.colliders), 4))
+        for c, solid in enumerate(self.colliders):
+            if solid.motion is not None:
+                times, shifts, angles = solid.motion.keyframes()
+                poses[:, c] = np.stack([np.interp(t, times, way) for way in (*shifts.T, angles)], 1)
+        return {"gravity": self.acting_gravity.at(t), "solids": poses}
+
+    @property
+    def collider_names(self) -> tuple[str, ...]:
+        """Of the colliders, in order."""
+        return tuple(map(str, self.config.scene.colliders))
 
     def case(self, values: Mapping[str, float] | Sequence[float] | float | None = None) -> Case:
         """A case of the problem parameters.
@@ -122,11 +164,14 @@ class Scene:
         """
         if values is None or isinstance(values, Mapping):
             configured = {
-                name: OmegaConf.select(self.config, parameter.key)
-                for name, parameter in self.parameters.items()
+                name: OmegaConf.select(self.config, parameter.key) for name, parameter in self.varied.items()
             }
             values = configured | dict(values or {})
-        return case_of(self.parameters, values, self.name)
+        if not isinstance(values, Mapping):
+            values = np.atleast_1d(values).tolist()
+            if self.forcing and len(values) == len(self.parameters):
+                values.append(self.program)
+        return case_of(self.varied, values, self.name)
 
     def with_parameters(self, parameters: Mapping[str, float]) -> "Scene":
         """The same scene at given problem parameters, `{name: value}`; keys that refer to them follow.
@@ -138,13 +183,14 @@ class Scene:
             return self._at[asked]
         config = self.template.copy()
         for name, value in parameters.items():
-            if name not in self.parameters:
+            if name not in self.varied:
                 raise ConfigError(
-                    f"{self.name} has no parameter {name!r}; there are {', '.join(self.parameters)}"
+                    f"{self.name} has no parameter {name!r}; there are {', '.join(self.varied)}"
                 )
             if not (isinstance(value, int | float | np.number) and math.isfinite(value)):
                 raise ConfigError(f"{name}={value!r} must be a finite number")
-            OmegaConf.update(config, self.parameters[name].key, float(value))
+            value = int(value) if name == PROGRAM else float(value)
+            OmegaConf.update(config, self.varied[name].key, value)
         self._at[asked] = Scene._build(configuration.resolve(config), config)
         return self._at[asked]
 
@@ -287,13 +333,14 @@ class Scene:
             scene.material,
             scene.grid,
             scene.dt,
-            gravity=scene.gravity,
+            gravity=scene.acting_gravity,
             colliders=scene.colliders,
             walls=scene.walls,
             transfer=scene.transfer,
             v=scene.initial_velocity(),
             precision=precision,
             device=device,
+            names=scene.collider_names,
         )
 
     def reduced(self, manifold, parameters: Mapping[str, float] | None = None, sample=None, **options):
@@ -320,6 +367,20 @@ class Scene:
         from nsf import engines
 
         return engines.reduced_batch(self, manifold, parameters, sample, **options)
+
+
+def _programs(s: DictConfig) -> tuple[Programs, int]:
+    """The programs of a scene's configuration, and the number of the one that it follows."""
+    node = s.get("forcing") or {}
+    if not isinstance(node, Mapping) or not set(node) <= {"gravity", "colliders"}:
+        raise ConfigError(
+            f"scene.forcing={node} must have the keys gravity and colliders, each with programs by name"
+        )
+    found = Programs(
+        configuration.build_all(node.get("gravity", {}), "scene.forcing.gravity"),
+        configuration.build_all(node.get("colliders", {}), "scene.forcing.colliders"),
+    )
+    return found, int(configuration.number("scene.program", s.get("program", 0), least=0, whole=True))
 
 
 def _body(body: Body, where: str, size: Sequence[float], dx: float) -> Body:

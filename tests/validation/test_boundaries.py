@@ -7,6 +7,7 @@ import warp as wp
 from nsf.mpm import (
     BoundaryArrays,
     DomainWalls,
+    Forcing,
     Grid,
     GridGeometry,
     GridStep,
@@ -30,7 +31,8 @@ def update(
     # Every node is listed: of a box, only blocks that particles reach are updated.
     grid = Grid(geometry, types, "cpu", nodes=np.arange(geometry.count))
     boundaries = BoundaryArrays(colliders, walls, types, "cpu")
-    step = GridStep(grid, boundaries, Transfer(), gravity, 0.1, types, wp.get_device("cpu"))
+    forcing = Forcing([gravity], boundaries, types, "cpu")
+    step = GridStep(grid, forcing, Transfer(), 0.1, types, wp.get_device("cpu"))
     grid.mass.fill_(mass)
     grid.momentum.assign(np.tile(np.asarray(v, types.numpy) * types.numpy(mass), (grid.count, 1)))
     step.update()

@@ -11,6 +11,7 @@ from nsf.mpm import (
     BoundaryArrays,
     Cuboid,
     DomainWalls,
+    Forcing,
     Grid,
     GridGeometry,
     GridStep,
@@ -38,7 +39,8 @@ def updated(v, colliders, step=0, dt=0.01, precision="fp64"):
     # Every node is listed: of a box, only blocks that particles reach are updated.
     grid = Grid(geometry, types, "cpu", nodes=np.arange(geometry.count))
     boundaries = BoundaryArrays(colliders, DomainWalls("separate", 1), types, "cpu")
-    work = GridStep(grid, boundaries, Transfer(), (0.0, 0.0, 0.0), dt, types, wp.get_device("cpu"))
+    forcing = Forcing([(0.0, 0.0, 0.0)], boundaries, types, "cpu")
+    work = GridStep(grid, forcing, Transfer(), dt, types, wp.get_device("cpu"))
     boundaries.steps.fill_(step)
     grid.mass.fill_(1.0)
     grid.momentum.assign(np.tile(v, (grid.count, 1)).astype(types.numpy))

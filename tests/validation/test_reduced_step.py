@@ -12,7 +12,7 @@ from nsf.dynamics import GaussNewton, Integration, NeighbourSearch, Taylor
 from nsf.dynamics.integration import particle_sets
 from nsf.dynamics.interop import as_matrices, as_scalars, as_vectors
 from nsf.engines import ENGINES
-from nsf.mpm import FP64, BoundaryArrays, Grid, GridStep
+from nsf.mpm import FP64, BoundaryArrays, Forcing, Grid, GridStep
 from nsf.sampling import RandomSampler
 
 STEPS = 40
@@ -48,7 +48,8 @@ def moved_sample(scene, state, rows, sample, nodes, steps=STEPS, dt=None):
     device = wp.get_device("cpu")
     boundaries = BoundaryArrays(scene.colliders, scene.walls, FP64, device)
     grid = Grid(scene.grid, FP64, device, nodes=nodes)
-    step = GridStep(grid, boundaries, scene.transfer, scene.gravity, dt or scene.dt, FP64, device)
+    forcing = Forcing([scene.gravity], boundaries, FP64, device)
+    step = GridStep(grid, forcing, scene.transfer, dt or scene.dt, FP64, device)
     boundaries.steps.fill_(steps)
     vectors = [as_vectors(chosen[k], FP64) for k in ("x", "v")]
     matrices = [as_matrices(chosen[k], FP64) for k in ("C", "tau")]

@@ -19,6 +19,7 @@ from nsf.engines.operators.recurrence import Recurrence
 from nsf.engines.operators.states import collider_states
 from nsf.engines.operators.taught import Taught
 from nsf.engines.operators.teacher import first_changes
+from nsf.mpm import Gravity
 
 
 class Operators(Engine):
@@ -51,8 +52,9 @@ class Operators(Engine):
         for setup in seen.values():
             if other := self.taught.differing(Taught.of(setup)):
                 return f"they were taught on {other}; teach them again with `nsf teach`"
-            if np.any(setup.gravity) and not self.model.sizes.gravity:
-                return f"they were taught without gravity, and the scene has {list(setup.gravity)} m/s²"
+            if np.any(setup.gravity.values) and not self.model.sizes.gravity:
+                there = ", ".join(f"{value:g}" for value in setup.gravity.values[0])
+                return f"they were taught without gravity, and the scene has [{there}] m/s²"
         return ""
 
     @override
@@ -64,8 +66,8 @@ class Operators(Engine):
         return [OperatorSpan(batch, sets, sample, run) for sets, sample in zip(one.sets, at, strict=True)]
 
     @override
-    def doubt(self, setup: Setup) -> tuple[float, str]:
-        return self.taught.outside(setup.given, setup.gravity)
+    def doubt(self, setup: Setup, gravity: Gravity) -> tuple[float, str]:
+        return self.taught.outside(setup.given, np.asarray(gravity.values))
 
 
 class OperatorRun:
@@ -78,16 +80,34 @@ class OperatorRun:
     """
 
     def __init__(self, model: StepOperators, batch: Batch, first: torch.Tensor):
-        one, setups = batch.shared, batch.setups
+        one = batch.shared
+        self._batch, self._known = batch, batch.forcing.version
         self._first, self._record = first.to(one.torch_device), batch.record
-        states = [collider_states(setup.scene.colliders, one.dt, one.total_steps) for setup in setups]
-        if all(np.array_equal(states[0], other) for other in states):
-            states = states[:1]
-        parameters = torch.stack([setup.parameters for setup in setups])
-        gravity = torch.tensor(np.array([setup.gravity for setup in setups]), dtype=torch.float64)
-        given = parameters.to("cpu", torch.float64), gravity, torch.as_tensor(np.stack(states))
-        self._of = partial(Recurrence, model, *given, precision=one.precision, device=one.device)
-        self.recurrence = self._of(record=batch.record)
+        parameters = torch.stack([setup.parameters for setup in batch.setups]).to("cpu", torch.float64)
+        self._gravity, self._states = map(_shared, self._forcing())
+        self._of = partial(Recurrence, model, parameters, precision=one.precision, device=one.device)
+        self.recurrence = self._of(self._gravity, self._states, record=batch.record)
+
+    def _forcing(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Gravity [B, N, 3] and state of the colliders [B, N, f] at each step, as now known."""
+        one, forcing = self._batch.shared, self._batch.forcing
+        t, runs = one.dt * np.arange(one.total_steps), range(len(forcing))
+        states = [collider_states(forcing.colliders_of(run), one.dt, one.total_steps) for run in runs]
+        return torch.as_tensor(forcing.gravity_at(t)), torch.as_tensor(np.stack(states))
+
+    def take(self, steps: int) -> None:
+        """Take steps; what a hand has changed holds from here on."""
+        if self._batch.forcing.version != self._known:
+            self._known, since = self._batch.forcing.version, int(self._record.row.max())
+            self._gravity, self._states = (
+                _shared(torch.cat([held[:, :since].expand(len(now), -1, -1), now[:, since:]], 1))
+                for held, now in zip((self._gravity, self._states), self._forcing(), strict=True)
+            )
+            before = self.recurrence
+            self.recurrence = self._of(self._gravity, self._states, record=self._record)
+            self.recurrence.latent.copy_(before.latent)
+            self.recurrence.change.copy_(before.change)
+        self.recurrence.advance(steps)
 
     def enter(self, first: bool) -> None:
         """Begin with the latents of the record."""
@@ -100,11 +120,16 @@ class OperatorRun:
         record = LatentRecord(own[:, 0], steps, 1)
         record.row.fill_(since)
         record.xhat[:, since] = own[:, since]
-        again = self._of(record=record, push=push)
+        again = self._of(self._gravity, self._states, record=record, push=push)
         now, before = own[:, since].double(), own[:, max(0, since - 1)].double()
         again.begin(now, now - before if since else self._first)
         again.advance(steps - since)
         return record.xhat
+
+
+def _shared(values: torch.Tensor) -> torch.Tensor:
+    """Values [B, …] of each run; [1, …] where all are the same."""
+    return values[:1] if bool((values == values[:1]).all()) else values
 
 
 class OperatorSpan(Span):
@@ -132,7 +157,7 @@ class OperatorSpan(Span):
 
     @override
     def take(self, steps: int) -> None:
-        self._run.recurrence.advance(steps)
+        self._run.take(steps)
 
     def pushed(self, push: torch.Tensor, since: int = 0) -> torch.Tensor:
         """As `OperatorRun.pushed`."""

@@ -8,10 +8,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nsf.data import Case
+from nsf.data import PROGRAM, Case
 from nsf.engines.operators.teacher import Teacher
 from nsf.errors import ConfigError
 from nsf.scenes.designs import evenly
+
+#: Forcing programs that are drawn for teaching have numbers from here on, for each seed.
+_PROGRAMS = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -113,5 +116,8 @@ def random_cases(box: np.ndarray, count: int, seed: int, taken: Sequence[Case]) 
     even = np.column_stack([np.arange(count), count * evenly(count, len(box) - 1)])
     shaken = (even + np.random.default_rng(seed).random(even.shape)) / count % 1.0
     low, high = box.T
-    found = [Case(taken[0].names, point, taken[0].units) for point in low + (high - low) * shaken]
+    rows = low + (high - low) * shaken
+    if PROGRAM in taken[0].names:
+        rows = np.column_stack([rows, _PROGRAMS * (1 + seed) + np.arange(count)])
+    found = [Case(taken[0].names, point, taken[0].units) for point in rows]
     return [case for case in found if not any(map(case.near, taken))]

@@ -20,8 +20,9 @@ def _make_given(precision: Precision):
     """Warp struct of what the loop reads and writes.
 
     Weights are [inputs, outputs], flat, with all scales in them; `bias` [B, width] is the first layer's with
-    what μ adds; `states` is [B or 1, N C], `gravity` [B, 3] as the network takes it, `push` [B, N r] what is
-    added to each change. `latent` and `change` [B r] are x̂_n and d in fp64, the rest is the `LatentRecord`'s.
+    what μ adds; `states` is [B or 1, N C], `gravity` [B or 1, 3 N] as the network takes it, `push` [B, N r]
+    what is added to each change. `latent` and `change` [B r] are x̂_n and d in fp64, the rest is the
+    `LatentRecord`'s.
     """
     real = precision.real
 
@@ -121,7 +122,8 @@ class Recurrence:
 
     Args:
         model: the operators, in fp64.
-        parameters: μ [B, n]; gravity: [B, 3] [m/s²]; features: [B or 1, N, f] of the colliders at each step.
+        parameters: μ [B, n].
+        gravity: [B or 1, N, 3] [m/s²], and features: [B or 1, N, f] of the colliders, at each step.
         record: `LatentRecord` of the runs.
         precision, device: of the loop.
         push: [B, N, r] added to each change; None for nothing.
@@ -146,7 +148,7 @@ class Recurrence:
         with torch.no_grad():
             held = folded(model, parameters)
             held["states"] = model.collider_state(features).flatten(1)
-            held["gravity"] = (gravity - model.g_mean) / model.g_scale
+            held["gravity"] = ((gravity - model.g_mean) / model.g_scale).flatten(1)
         held = {name: values.detach().to(where, dtype).contiguous() for name, values in held.items()}
         none = torch.zeros(0, 0, dtype=torch.float64, device=where)
         held["push"] = none if push is None else push.to(where).flatten(1)

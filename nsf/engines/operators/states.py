@@ -40,20 +40,23 @@ def collider_states(colliders: Sequence[Collider], dt: float, steps: int) -> np.
     return np.concatenate(found, 1)
 
 
-def principal(states: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def principal(states: Sequence[np.ndarray], programs: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """The combinations of collider states that vary in a run.
 
-    Plates that mirror each other vary as one; what stays as it is in each run is no state.
+    Plates that mirror each other vary as one. What stays as it is in each run follows from the problem
+    parameters and is no state, unless programs differ from run to run.
 
     Args:
         states: [N, f] of each training run, as `collider_states` gives them.
+        programs: whether the runs follow programs.
 
     Returns:
         Mean [f] and matrix [f, C]: c = (state − mean) matrix, whose first entry has unit variance.
     """
     rows = np.concatenate(states)
     # A solid at constant speed comes on by as much in each step, but for round-off.
-    varies = np.max([np.ptp(run, axis=0) for run in states], axis=0) > _ROUND_OFF * np.abs(rows).max(0)
+    spread = [np.ptp(run, axis=0) for run in ([rows] if programs else states)]
+    varies = np.max(spread, axis=0) > _ROUND_OFF * np.abs(rows).max(0)
     mean = rows.mean(0)
     deviation = np.where(varies, rows.std(0), np.inf)
     _, sizes, axes = np.linalg.svd((rows - mean) / deviation, full_matrices=False)

@@ -93,12 +93,12 @@ class Taught:
             return f"other ranges: {self.ranges}, not {other.ranges}"
         return ""
 
-    def outside(self, parameters: Mapping[str, float], gravity: Sequence[float]) -> tuple[float, str]:
+    def outside(self, parameters: Mapping[str, float], gravity: np.ndarray) -> tuple[float, str]:
         """How far a run's input lies outside of what was taught.
 
         Args:
             parameters: of the run, by name.
-            gravity: [3] of the run [m/s²].
+            gravity: [3] or [n, 3] in the course of the run [m/s²].
 
         Returns:
             Largest distance from the middle of a range in units of its half, at most 1 inside; and which
@@ -108,7 +108,7 @@ class Taught:
         for name, (low, high) in zip(self.parameters, self.ranges, strict=True):
             off = _ratio(abs(parameters[name] - 0.5 * (low + high)), 0.5 * (high - low), abs(high) + abs(low))
             found.append((off, f"{name}={parameters[name]:g} is outside of {low:g} … {high:g}"))
-        away = float(np.linalg.norm(np.subtract(gravity, self.gravity)))
+        away = float(np.linalg.norm(np.subtract(gravity, self.gravity), axis=-1).max())
         around = float(np.linalg.norm(self.gravity))
         text = f"gravity is {away:.3g} m/s² from that which was taught, {self.reach:.3g} m/s² at most"
         found.append((_ratio(away, self.reach, around), text))

@@ -142,7 +142,7 @@ class Course:
             change = change * (1.0 + _OTHER_CHANGE * noise(change[..., :1]))
             change = change + _OTHER_CHANGE * self.model.d_scale * noise(change)
             xhat = xhat + self.teaching.tube * self.model.x_scale * noise(xhat)
-            gravity = teacher.gravity + self.reach * _ball(xhat.shape[:-1], generator)
+            gravity = teacher.gravity[asked] + self.reach * _ball(xhat.shape[:-1], generator)
             parts.append(self._asked(teacher, asked, xhat, xhat - change, gravity))
         self.labels = Labels.joined(parts)
 
@@ -194,7 +194,8 @@ class Course:
         teacher: Teacher, moments, xhat: Tensor, change: Tensor, acceleration: Tensor, gravity=None
     ) -> Labels:
         like = xhat.shape[:-1]
-        given = teacher.parameters, teacher.gravity if gravity is None else gravity, teacher.features[moments]
+        gravity = teacher.gravity[moments] if gravity is None else gravity
+        given = teacher.parameters, gravity, teacher.features[moments]
         rows = [xhat, change, acceleration, *(values.expand(*like, -1) for values in given)]
         return Labels(*(values.flatten(0, 1).clone() for values in rows))
 
@@ -203,19 +204,19 @@ class Course:
     @property
     def reach(self) -> float:
         """How far gravity is varied [m/s²]; 0 where there is none."""
-        largest = max(float(teacher.gravity.norm(dim=1).max()) for teacher in self.teachers)
+        largest = max(float(teacher.gravity.norm(dim=-1).max()) for teacher in self.teachers)
         return self.teaching.gravity * largest
 
     @property
     def gravity(self) -> tuple[list[float], float]:
         """The middle [3] of all gravity that was taught, and how far from it any was [m/s²]."""
-        known = self.teachers[0].gravity
-        middle = known.mean(0)
+        known = torch.cat([teacher.gravity.flatten(0, 1) for teacher in self.teachers])
+        middle = self.teachers[0].gravity.flatten(0, 1).mean(0)
         return middle.tolist(), float((known - middle).norm(dim=1).max()) + self.reach
 
     def _model(self, truth: Tensor, changes: Tensor) -> StepOperators:
         first = self.teachers[0]
-        c_mean, c_matrix = principal(list(first.features.transpose(0, 1).numpy()))
+        c_mean, c_matrix = principal(list(first.features.transpose(0, 1).numpy()), first.programs)
         weightless = self.reach == 0.0 and not any(bool(t.gravity.any()) for t in self.teachers)
         sizes = Sizes(
             latents=truth.shape[-1], parameters=first.parameters.shape[1], features=len(c_mean),
@@ -235,8 +236,8 @@ class Course:
             "mu_mean": first.parameters.mean(0), "mu_scale": _spread(first.parameters),
             "c_mean": torch.as_tensor(c_mean), "c_matrix": torch.as_tensor(c_matrix),
             "d_scale": deviation(changes), "a_scale": deviation(torch.diff(changes, dim=0)),
-            "g_mean": first.gravity.mean(0),
-            "g_scale": first.gravity.norm(dim=1).max().clamp_min(1e-30),
+            "g_mean": first.gravity.flatten(0, 1).mean(0),
+            "g_scale": first.gravity.norm(dim=-1).max().clamp_min(1e-30),
         }  # fmt: skip
         for name, value in scales.items():
             getattr(model, name).copy_(value)
@@ -249,8 +250,8 @@ class Course:
         x, d = teacher.start, teacher.first_change()
         found = [x]
         with torch.no_grad():
-            for state in c:
-                there, change = model.step(x, d, teacher.parameters, teacher.gravity, state)
+            for state, g in zip(c, teacher.gravity, strict=True):
+                there, change = model.step(x, d, teacher.parameters, g, state)
                 near = (((there - model.x_mean) / model.x_scale).abs() < limit).all(-1, keepdim=True)
                 d = torch.where(near, change, 0.0)
                 x = torch.where(near, there, x)
@@ -299,7 +300,7 @@ class Course:
         x, d, loss = runs[n, k], changes[n, k], 0.0
         x = x + self.teaching.noise * model.x_scale * torch.randn(x.shape, generator=generator)
         for j in range(unroll):
-            x, d = model.step(x, d, mu[k], g[k], c[n + j, k])
+            x, d = model.step(x, d, mu[k], g[n + j, k], c[n + j, k])
             loss = loss + ((x - runs[n + j + 1, k]) / model.d_scale).square().mean()
         return loss / unroll
 

@@ -5,7 +5,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
-from nsf.dynamics.interop import as_tensor
 from nsf.dynamics.setup import Setup
 from nsf.dynamics.solver import ReducedBatch
 from nsf.engines.operators.model import first_change
@@ -22,8 +21,9 @@ class Teacher:
         told: called with each number of steps taken.
 
     Attributes:
-        parameters: μ [R, n]; gravity: [R, 3] [m/s²]; start: x̂_0 [R, r]; all in fp64 on the host.
-        features: [N, R, f] state of the colliders at each step.
+        parameters: μ [R, n]; start: x̂_0 [R, r]; all in fp64 on the host.
+        gravity: [N, R, 3] [m/s²], and features: [N, R, f] state of the colliders, at each step.
+        programs: whether the runs follow forcing programs.
         setup: of the first run. total_steps: N; dt: step [s]; steps: how many were taken here.
     """
 
@@ -33,7 +33,9 @@ class Teacher:
         self.setup = setups[0]
         self.total_steps, self.dt = batches[0].total_steps, batches[0].dt
         self.parameters = _host(torch.stack([setup.parameters for setup in setups]))
-        self.gravity = torch.tensor(np.array([setup.gravity for setup in setups]), dtype=torch.float64)
+        self.programs = bool(self.setup.scene.forcing)
+        t = self.dt * np.arange(self.total_steps)
+        self.gravity = torch.as_tensor(np.stack([setup.gravity.at(t) for setup in setups], 1))
         self.start = _host(torch.stack([setup.xhat for setup in setups]))
         states = [collider_states(setup.scene.colliders, self.dt, self.total_steps) for setup in setups]
         self.features = torch.as_tensor(np.stack(states, 1))
@@ -75,13 +77,12 @@ class Teacher:
             record.row.fill_(step)
             if step > 1:  # the inversion begins on the parabola through three, here a line
                 record.xhat[:, step - 2] = xhat[rows] - 2.0 * change[rows]
-            forcing = as_tensor(batch.span_at(step).grid_step.gravity)
-            forcing.copy_((self.gravity if gravity is None else gravity)[rows])
+            if gravity is not None:
+                batch.batch.forcing.set_gravity(gravity[rows].numpy())
             batch.resume(step)
             batch.step(1)
             found.append(_host(record.now))
-            if gravity is not None:
-                forcing.copy_(self.gravity[rows])
+            batch.batch.forcing.release()
             self._count(len(batch))
         return torch.cat(found)
 

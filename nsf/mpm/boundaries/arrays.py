@@ -1,7 +1,7 @@
 """Boundaries of the grid: the walls of the domain, and all solids and walls on the device."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -13,6 +13,8 @@ from nsf.mpm.boundaries.contact import KINDS
 from nsf.mpm.boundaries.motion import Motion, make_follow
 from nsf.mpm.precision import Precision
 
+# Keyframes of a solid that a hand moves.
+_BY_HAND = 2
 _AT_REST = Motion((0.0, 1.0), ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
 
 
@@ -72,7 +74,7 @@ class BoundaryArrays:
         device: Warp device.
 
     Attributes:
-        colliders, walls: as given.
+        colliders: as they are now; a solid that a hand moves has its motion. walls: as given.
         shape: [c] code of the shape.
         active: [c] whether the collider acts in this step.
         position: [c, 3] [m]; orientation: [c, 3, 3]; both at the start t^n of the step.
@@ -86,6 +88,7 @@ class BoundaryArrays:
 
     def __init__(self, colliders: Sequence[Collider], walls: DomainWalls, precision: Precision, device):
         self.colliders, self.walls, self._device = tuple(colliders), walls, device
+        self._programs = self.colliders
         count = len(self.colliders)
 
         def array(values, dtype, *entry: int):
@@ -115,12 +118,18 @@ class BoundaryArrays:
         motions = [c.motion or _AT_REST for c in self.colliders]
         times, translations, angles = zip(*(m.keyframes() for m in motions), strict=True)
         axes, pivots = zip(*(m.hinge() for m in motions), strict=True)
-        first = np.cumsum([0, *(len(t) for t in times)])
+        # The first two keyframes of each solid are a hand's.
+        ends = np.cumsum([_BY_HAND + len(t) for t in times])
+        self._own = np.array([0, *ends[:-1]]) + _BY_HAND, ends - 1
+        self._keyframes = [
+            np.concatenate([part for own in lists for part in (np.zeros_like(own[:_BY_HAND]), own)])
+            for lists in (times, translations, angles)
+        ]
         self._prescribed = [
-            array(np.concatenate(times), wp.float64),
-            array(np.concatenate(translations), wp.vec3d, 3),
-            array(np.concatenate(angles), wp.float64),
-            wp.array(first, dtype=wp.int32, device=device),
+            array(self._keyframes[0], wp.float64),
+            array(self._keyframes[1], wp.vec3d, 3),
+            array(self._keyframes[2], wp.float64),
+            *(wp.array(which, dtype=wp.int32, device=device) for which in self._own),
             array(axes, wp.vec3d, 3),
             array(pivots, wp.vec3d, 3),
             array(positions, wp.vec3d, 3),
@@ -132,6 +141,33 @@ class BoundaryArrays:
     def start_from(self, steps: int) -> None:
         """Let the next step be the one that starts `steps` steps after t = 0."""
         self.steps.fill_(steps)
+
+    def move(self, collider: int, motion: Motion) -> None:
+        """Another motion of two keyframes for a solid that moves, in place of its own, with its axis."""
+        self.colliders = tuple(
+            replace(solid, motion=motion) if c == collider else solid
+            for c, solid in enumerate(self.colliders)
+        )
+        first = int(self._own[0][collider]) - _BY_HAND
+        for held, values, array in zip(self._keyframes, motion.keyframes(), self._prescribed, strict=False):
+            held[first : first + _BY_HAND] = values
+            array.assign(held)
+        self._point()
+
+    def release(self) -> None:
+        """Every solid follows its own motion again."""
+        if self.colliders is not self._programs:
+            self.colliders = self._programs
+            self._point()
+
+    def _point(self) -> None:
+        """Say to the kernel which keyframes each solid follows."""
+        steered = np.array([a is not b for a, b in zip(self.colliders, self._programs, strict=True)])
+        first, last = self._own
+        begin = np.where(steered, first - _BY_HAND, first)
+        end = np.where(steered, begin + _BY_HAND - 1, last)
+        for array, values in zip(self._prescribed[3:5], (begin, end), strict=True):
+            array.assign(values.astype(np.int32))
 
     def advance(self, dt: float) -> None:
         """Set pose and velocity of every collider for the next step of dt [s], if any of them changes."""

@@ -11,6 +11,8 @@ from nsf.errors import ConfigError
 from nsf.mpm.precision import Precision
 from nsf.vectors import direction, is_list, numbers, rotation, vector
 
+# For how long a solid goes on as a hand left it [s].
+_STEERED = 1e4
 # A time this near to `since` or `until` (in steps) is that time, in spite of round-off.
 _SAME_TIME = 1e-6
 
@@ -90,6 +92,20 @@ class Motion:
         moved = pivot + [np.interp(t, times, d) for d in translations.T]
         return (x - moved) @ rotation(axis, np.degrees(np.interp(t, times, angles))) + pivot
 
+    def steered(self, t: float, velocity: np.ndarray, spin: float) -> "Motion":
+        """The motion that goes on from time t [s] at a velocity [3] [m/s] and a spin about `axis` [°/s]."""
+        times, translations, angles = self.keyframes()
+        d = np.array([np.interp(t, times, way) for way in translations.T])
+        turned = {}
+        if len(self.angles):
+            angle = float(np.degrees(np.interp(t, times, angles)))
+            turned = {"angles": (angle, angle + _STEERED * spin), "axis": self.axis, "pivot": self.pivot}
+        elif spin:
+            raise ConfigError(
+                f"spin={spin:g} °/s: the solid's own motion has no axis; give its motion angles"
+            )
+        return Motion((t, t + _STEERED), (tuple(d), tuple(d + _STEERED * velocity)), **turned)
+
     def top_speed(self, reach: float) -> float:
         """Bound on the speed [m/s] of the solid's points within `reach` [m] of the pivot."""
         times, translations, angles = self.keyframes()
@@ -97,6 +113,17 @@ class Motion:
         if len(self.angles):
             speed = speed + reach * np.abs(np.diff(angles))
         return float((speed / np.diff(times)).max())
+
+
+@wp.func
+def keyframe_before(times: wp.array(dtype=wp.float64), first: int, last: int, t: wp.float64):
+    """Index of the keyframe at or before t, and the fraction of the way to the next."""
+    if t <= times[first] or first == last:
+        return first, wp.float64(0.0)
+    k = first
+    while k < last - 1 and times[k + 1] < t:
+        k += 1
+    return k, wp.min((t - times[k]) / (times[k + 1] - times[k]), wp.float64(1.0))
 
 
 @cache
@@ -122,22 +149,13 @@ def make_follow(precision: Precision):
         half = wp.sin(f64(0.5) * angle)
         return wp.sin(angle) * K + (f64(2.0) * half * half) * (K * K)
 
-    @wp.func
-    def keyframe_before(times: wp.array(dtype=f64), first: int, last: int, t: f64):
-        """Index of the keyframe at or before t, and the fraction of the way to the next."""
-        if t <= times[first]:
-            return first, f64(0.0)
-        k = first
-        while k < last - 1 and times[k + 1] < t:
-            k += 1
-        return k, wp.min((t - times[k]) / (times[k + 1] - times[k]), f64(1.0))
-
     @wp.kernel(enable_backward=False, module="unique")
     def follow(
         times: wp.array(dtype=f64),
         translations: wp.array(dtype=vec3d),
         angles: wp.array(dtype=f64),
         first: wp.array(dtype=wp.int32),
+        last: wp.array(dtype=wp.int32),
         axis: wp.array(dtype=vec3d),
         pivot: wp.array(dtype=vec3d),
         rest_position: wp.array(dtype=vec3d),
@@ -158,10 +176,10 @@ def make_follow(precision: Precision):
         t = f64(n) * dt
         later = t + f64(wp.static(_SAME_TIME)) * dt
         active[c] = int(later >= since[c] and later < until[c])
-        k, share = keyframe_before(times, first[c], first[c + 1] - 1, t)
+        k, share = keyframe_before(times, first[c], last[c], t)
         d = wp.lerp(translations[k], translations[k + 1], share)
         angle = wp.lerp(angles[k], angles[k + 1], share)
-        k, share = keyframe_before(times, first[c], first[c + 1] - 1, f64(n + 1) * dt)
+        k, share = keyframe_before(times, first[c], last[c], f64(n + 1) * dt)
         moved = wp.lerp(translations[k], translations[k + 1], share) - d
         turn = rotation_less_identity(axis[c], wp.lerp(angles[k], angles[k + 1], share) - angle)
         pose = wp.identity(n=3, dtype=f64) + rotation_less_identity(axis[c], angle)

@@ -1,7 +1,8 @@
 """The stage `deploy`: reduced runs of the held-out cases, and the lines that a user is told of them."""
 
+import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -18,7 +19,7 @@ from nsf.deployment import (
     go_on,
     rollout_file,
 )
-from nsf.dynamics import ReducedBatch
+from nsf.dynamics import ReducedBatch, ReducedMPM
 from nsf.kinematics.manifold import Manifold
 from nsf.runs import Record, Run
 from nsf.storage import writing
@@ -76,7 +77,12 @@ def _rollouts(pipeline, manifold: Manifold, record: Record) -> list[Rollout]:
     """The reduced runs; how far they may be believed, and who takes their steps, go on record."""
     started, asked = time.perf_counter(), pipeline.config.deploy
     projected = partial(pipeline.solver_at, manifold, engine=pipeline.projecting)
-    trust = calibrate(projected, manifold, pipeline.device)
+
+    def known_at(values: Mapping[str, float], device: str) -> ReducedMPM:
+        """A run in the training case of some parameters, with its own program."""
+        return projected(_case_of(pipeline.split.train, values), device)
+
+    trust = calibrate(known_at, manifold, pipeline.device)
     record.metrics["trust"] = {
         "residual_m": trust.residual,
         "distance_m": trust.distance,
@@ -95,6 +101,15 @@ def _rollouts(pipeline, manifold: Manifold, record: Record) -> list[Rollout]:
     engine, why = record.metrics["engine"], record.metrics["engine_why"]
     pipeline.say(f"deploy: engine {engine}" + (f", since {why}" if why else ""))
     return rollouts
+
+
+def _case_of(cases: Sequence[Case], values: Mapping[str, float]) -> Case:
+    """The first case with these parameters, which were kept in float32."""
+    return next(
+        case
+        for case in cases
+        if all(math.isclose(case[name], value, rel_tol=1e-6) for name, value in values.items())
+    )
 
 
 def _levels(pipeline, manifold: Manifold) -> Levels | None:

@@ -110,7 +110,9 @@ def _compare(
         solver = pipeline.solver_at(manifold, rollout.case)
         shown = (asked.picture_particles, asked.picture_frames)
         found = compare(solver, trajectory, rollout, pipeline.config.deploy.split, shown, rest)
-        return found, rivals(solver, trajectory, pipeline.coarse)
+        forced = pipeline.split.train if pipeline.scene.forcing else ()
+        known = list(map(pipeline.scene.with_parameters, forced))
+        return found, rivals(solver, trajectory, pipeline.coarse, known)
 
 
 def _cost(pipeline, manifold: Manifold, rollout: Rollout, factors: Sequence[int]) -> dict:

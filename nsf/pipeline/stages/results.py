@@ -221,7 +221,7 @@ def summarise(
 
 def _parameter(scene: Scene) -> tuple[str, str]:
     """Name and unit of what tells the cases of a scene apart, for headings."""
-    (name, one), *more = scene.parameters.items()
+    (name, one), *more = scene.varied.items()
     return ("case", "") if more else (name, one.unit)
 
 

@@ -4,7 +4,7 @@ import contextlib
 import os
 import queue
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -31,12 +31,14 @@ class Job:
         run: where it is kept.
         case: problem parameters.
         build: gives the solver at t = 0.
+        forcing: what forces it at each frame, for the file.
         warnings: for the run's manifest.
     """
 
     run: Run
     case: Case
     build: Callable[[], FullOrderMPM]
+    forcing: Mapping[str, np.ndarray]
     warnings: Sequence[str] = ()
 
 
@@ -151,11 +153,12 @@ def _store(
             X=constants.X,
             mass=constants.mass,
             volume0=constants.volume0,
-            parameters=job.case,
+            parameters=job.case.parameters,
             dt=solver.dt,
             dx=shared.dx,
             frames=shared.steps + 1,
             dtype=np.dtype(shared.stored.numpy).name,
+            forcing=job.forcing,
         )
         n = 0
         with writer:

@@ -72,14 +72,14 @@ class Returning(Line):
 def batch_of(chain, tiny_manifold):
     """(span, cases) → runs whose steps that class of spans takes."""
 
-    def build(span, cases=(angle(26.0),), doubts=()):
+    def build(span, cases=(angle(26.0),), doubt=None):
         runs = [chain.pipeline.solver_at(tiny_manifold, case, engine="modal").setup for case in cases]
 
         def spans(batch):
             at = tiny_manifold.restrict(batch.shared.samples[0].particles, dtype=torch.float64)
             return [span(batch, batch.shared.sets[0], at)]
 
-        return ReducedBatch(runs, spans, engine="operators", doubts=doubts)
+        return ReducedBatch(runs, spans, engine="operators", **({"doubt": doubt} if doubt else {}))
 
     return build
 
@@ -88,10 +88,10 @@ def batch_of(chain, tiny_manifold):
 def shared(batch_of, tiny_trust):
     """(operators, projected step, how) → the run at 26° that both take."""
 
-    def run(operators, projected, *how, values=(26.0,), doubts=()):
+    def run(operators, projected, *how, values=(26.0,), doubt=None):
         cases = list(map(angle, values))
         levels = Levels(lambda cases: batch_of(projected, cases), *how)
-        return rollouts(batch_of(operators, cases, doubts), cases, tiny_trust, levels=levels)
+        return rollouts(batch_of(operators, cases, doubt), cases, tiny_trust, levels=levels)
 
     return run
 
@@ -141,7 +141,7 @@ def test_who_left_the_training_data_comes_home_where_it_is_back(shared):
     assert believed.all()
     turns = np.flatnonzero(np.diff(found.levels.astype(int)) == OPERATORS - PROJECTED)
     assert len(turns) >= 2
-    (doubted,) = shared(Straying, Returning, 2, None, True, doubts=[(1.5, "outside")])
+    (doubted,) = shared(Straying, Returning, 2, None, True, doubt=lambda setup, gravity: (1.5, "outside"))
     assert (doubted.levels == PROJECTED).all()
 
 

@@ -161,13 +161,21 @@ CHANGES = {
         {"scene.colliders.plate.motion.translations": [[0, 0, 0], [0, 0, 0.05]]},
         {"scene.colliders.plate.until": 0.05},
     ],
+    "program": [{}, {"scene.program": 1}, {"scene.program": 2}],
 }
+#: Gravity that is tilted and shaken anew in each run.
+PROGRAMS = (
+    "+scene.program=0",
+    "+scene.forcing.gravity.tilt={_target_: nsf.scenes.RandomTilt, angle: 30}",
+    "+scene.forcing.gravity.shake={_target_: nsf.scenes.RandomShake, acceleration: 2}",
+)
 
 
 @pytest.mark.parametrize("what", CHANGES)
 @pytest.mark.parametrize("method", [NSF, Method("deformation", False, False)], ids=lambda m: m.name)
 def test_what_a_parameter_changes_is_each_ones_own(tiny, setup_of, what, method):
-    scene = nsf.scenes.load("sand", [*tiny[1:], *(PLATE if what == "plate" else [])])
+    added = {"plate": PLATE, "program": PROGRAMS}.get(what, ())
+    scene = nsf.scenes.load("sand", [*tiny[1:], *added])
     scenes = [scene.with_changes(changes) if changes else scene for changes in CHANGES[what]]
     setups = [setup_of(scene, method=method) for scene in scenes]
     batch, singles = together(*setups), [together(setup).runs[0] for setup in setups]
@@ -349,3 +357,38 @@ def test_on_a_gpu(tiny_scene, reference_manifold, method, count, precision):
         else:
             one, other = (run.trajectory().xhat for run in (batch.runs[index], single))
             np.testing.assert_allclose(one, other, rtol=0, atol=2e-3)
+
+
+@pytest.mark.parametrize("engine", ["reference", "modal"])
+def test_a_hand_is_a_program_known_only_afterwards(tiny, tiny_manifold, engine):
+    """Gravity set by hand between steps gives the run whose keyframes had it all along."""
+    scene = nsf.scenes.load("sand", [*tiny[1:], *PROGRAMS])
+    run = scene.reduced(tiny_manifold, sample=20, engine=engine, device="cpu")
+    run.step(24)
+    own = run.trajectory().xhat.copy()
+    run.restart()
+    for n in range(24):
+        run.forcing.gravity = scene.acting_gravity.at(n * run.dt)
+        run.step()
+    np.testing.assert_allclose(run.trajectory().xhat, own, rtol=0, atol=1e-10)
+    run.restart()
+    run.forcing.gravity = (0.0, 0.0, -4.0)
+    run.step(24)
+    plain = nsf.scenes.load("sand", tiny[1:]).reduced(tiny_manifold, sample=20, engine=engine, device="cpu")
+    plain.step(24)
+    np.testing.assert_allclose(run.trajectory().xhat, plain.trajectory().xhat, rtol=0, atol=1e-10)
+    assert np.abs(plain.trajectory().xhat - own).max() > 1e-3
+
+
+def test_the_hand_of_one_run_leaves_the_others(tiny, tiny_manifold):
+    scene = nsf.scenes.load("sand", [*tiny[1:], *PROGRAMS])
+    cases = [{"friction_angle": 26.0, "program": program} for program in (3, 4)]
+    batch = scene.reduced_batch(tiny_manifold, cases, 20, engine="modal", device="cpu")
+    alone = [scene.reduced(tiny_manifold, case, 20, engine="modal", device="cpu") for case in cases]
+    for run in (batch.runs[0], alone[0]):
+        run.together.step(8)
+        run.forcing.gravity = (1.0, 0.0, -2.0)
+        run.together.step(16)
+    alone[1].step(24)
+    for run, single in zip(batch.runs, alone, strict=True):
+        np.testing.assert_allclose(run.trajectory().xhat, single.trajectory().xhat, rtol=0, atol=1e-10)

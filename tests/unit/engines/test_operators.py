@@ -173,8 +173,8 @@ def test_a_constant_speed_is_no_state():
 class Stepper:
     """A teacher of two runs with d' = 0.9 d + q d², whose own runs are what they are whatever q is."""
 
-    total_steps, dt, steps = 30, 0.01, 0
-    parameters, gravity = torch.tensor([[0.0], [1.0]]).double(), torch.zeros(2, 3).double()
+    total_steps, dt, steps, programs = 30, 0.01, 0, False
+    parameters, gravity = torch.tensor([[0.0], [1.0]]).double(), torch.zeros(30, 2, 3).double()
     start, features = torch.tensor([[0.0, 1.0], [0.5, 0.0]]).double(), torch.zeros(30, 2, 0).double()
 
     def __init__(self, q):
@@ -297,14 +297,20 @@ def test_how_far_an_input_lies_outside(angle, gravity, off, text):
 # -- the compiled loop ----------------------------------------------------------------------------------
 
 
+def of_each_step(g):
+    """Gravity [R, 3] that varies in the course of the runs: [R, STEPS, 3]."""
+    return g[:, None] * (1.0 + 0.1 * torch.sin(torch.arange(STEPS).double()))[:, None]
+
+
 def recurrence(model, device, name="fp64", push=None, rows=slice(None)):
     """Runs of the loop at their start, and the same by torch; `rows` are those of as many runs."""
     precision, (x, d, mu, g, _) = precision_of(name), given(model, RUNS)
     features = torch.randn(RUNS, STEPS, model.sizes.features, generator=torch.Generator().manual_seed(2))
     features = features.double()
     c = model.collider_state(features).transpose(0, 1)
+    g = of_each_step(g)
     with torch.no_grad():
-        expected = model.run(x, d, mu, g.expand(STEPS, *g.shape), c)[:, rows]
+        expected = model.run(x, d, mu, g.transpose(0, 1), c)[:, rows]
     x, d, mu, g, features = (values[rows] for values in (x, d, mu, g, features))
     record = LatentRecord(x.to(device, {"fp32": torch.float32, "fp64": torch.float64}[name]), STEPS, 1)
     found = Recurrence(model, mu, g, features, record, precision, warp_device(device), push)
@@ -373,7 +379,7 @@ def test_what_is_added_to_each_change(device):
     features = torch.randn(RUNS, STEPS, 9, generator=torch.Generator().manual_seed(2)).double()
     with torch.no_grad():
         for n, c in enumerate(model.collider_state(features).unbind(1)):
-            d = model.step(x, d, mu, g, c)[1] + push[:, n]
+            d = model.step(x, d, mu, of_each_step(g)[:, n], c)[1] + push[:, n]
             x = x + d
             torch.testing.assert_close(record.xhat[:, n + 1].cpu(), x, rtol=0, atol=1e-12)
 

@@ -76,7 +76,7 @@ def test_time_goes_on_in_either_precision(precision, block, solver_of):
     lift = Motion((0.0, 10.0), (ORIGIN, (0.0, 0.0, 0.3)))
     solver = solver_of(block, colliders=[Cuboid(MIDDLE, (0.4, 0.4, 0.4), motion=lift)], precision=precision)
     solver.step(500)
-    boundaries = solver.grid_step.boundaries
+    boundaries = solver.grid_step.forcing.boundaries
     assert boundaries.steps.numpy().tolist() == [500]
     # The pose is that of the last step's start.
     height = 0.5 + 0.03 * 499 * solver.dt
@@ -90,7 +90,7 @@ def test_time_goes_on_in_either_precision(precision, block, solver_of):
 def test_no_step_is_counted_where_nothing_moves(block, solver_of):
     solver = solver_of(block, colliders=[HalfSpace((0.0, 0.0, 0.1), UP)])
     solver.step(3)
-    assert solver.grid_step.boundaries.steps.numpy().tolist() == [0]
+    assert solver.grid_step.forcing.boundaries.steps.numpy().tolist() == [0]
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from nsf.mpm import BoundaryArrays, DomainWalls, Grid, GridGeometry, GridStep, Transfer, precision_of
+from nsf.mpm import BoundaryArrays, DomainWalls, Forcing, Grid, GridGeometry, GridStep, Transfer, precision_of
 from nsf.mpm.native.access import WARP
 from nsf.mpm.state import cell_order
 from nsf.mpm.transfer.scatter import particles_of_warp
@@ -58,7 +58,8 @@ def test_p2g_of_several_simulations(precision, tolerance, shape, degree, each, r
     listed = np.sort(rng.permutation(GEOMETRY.count)[: GEOMETRY.count * 2 // 3]).astype(np.int32)
     grid = Grid(GEOMETRY, types, device, listed, count)
     boundaries = BoundaryArrays([], DomainWalls(), types, device)
-    work = GridStep(grid, boundaries, Transfer(shape=shape), np.zeros(3), DT, types, wp.get_device(device))
+    forcing = Forcing(np.zeros((count, 3)), boundaries, types, device)
+    work = GridStep(grid, forcing, Transfer(shape=shape), DT, types, wp.get_device(device))
     runs = []
     for _ in range(count):
         x = np.array([0.6, 0.5, 0.5]) + [0.5, 0.5, 1.2] * rng.random((n, 3))

@@ -5,7 +5,17 @@ import pytest
 import warp as wp
 
 from nsf.errors import ConfigError
-from nsf.mpm import FP64, BoundaryArrays, DomainWalls, Grid, GridGeometry, GridStep, HalfSpace, Transfer
+from nsf.mpm import (
+    FP64,
+    BoundaryArrays,
+    DomainWalls,
+    Forcing,
+    Grid,
+    GridGeometry,
+    GridStep,
+    HalfSpace,
+    Transfer,
+)
 from nsf.mpm.grid.nodes import inside
 
 DX, DT = 1.0 / 16.0, 0.002
@@ -42,9 +52,8 @@ def step(particles, shape, integration, sample, nodes=None):
     grid = Grid(GEOMETRY, FP64, DEVICE, nodes)
     floor = HalfSpace((0.0, 0.0, 0.45), (0.0, 0.0, 1.0), "separate", 0.3)
     boundaries = BoundaryArrays([floor], DomainWalls(), FP64, DEVICE)
-    work = GridStep(
-        grid, boundaries, Transfer(shape=shape), (0.0, 0.0, -9.0), DT, FP64, wp.get_device(DEVICE)
-    )
+    forcing = Forcing([(0.0, 0.0, -9.0)], boundaries, FP64, DEVICE)
+    work = GridStep(grid, forcing, Transfer(shape=shape), DT, FP64, wp.get_device(DEVICE))
     types = {
         "x": FP64.vec3,
         "v": FP64.vec3,
@@ -98,7 +107,8 @@ def test_a_step_over_the_neighbours_is_exact(shape, particles):
 def test_a_grid_of_several_simulations_is_not_updated_as_a_whole():
     grid = Grid(GEOMETRY, FP64, DEVICE, np.arange(5), runs=2)
     boundaries = BoundaryArrays([], DomainWalls(), FP64, DEVICE)
-    work = GridStep(grid, boundaries, Transfer(), np.zeros((2, 3)), DT, FP64, wp.get_device(DEVICE))
+    forcing = Forcing(np.zeros((2, 3)), boundaries, FP64, DEVICE)
+    work = GridStep(grid, forcing, Transfer(), DT, FP64, wp.get_device(DEVICE))
     with pytest.raises(ConfigError, match="use update_g2p"):
         work.update()
 

@@ -64,7 +64,8 @@ auto layer = [](auto size, const real* W, const real* bias, const real* values, 
 #endif
 auto same = [](real z) { return z; };
 const real* bias = given.bias.data + size_t(run) * WIDTH;
-const real* gravity = given.gravity.data + size_t(run) * 3;
+const real* gravity = given.gravity.data;
+if (given.gravity.shape[0] > 1) gravity += size_t(run) * given.gravity.shape[1];
 const real* states = given.states.data;
 if (given.states.shape[0] > 1) states += size_t(run) * given.states.shape[1];
 const double* push = given.push.data;
@@ -97,7 +98,7 @@ for (long long n = begin; n < begin + steps; ++n) {
         double sum = out[R * R + i];
         for (int j = 0; j < R; ++j) sum += double(out[i * R + j]) * d[j];
         if (GRAVITY)
-            for (int j = 0; j < 3; ++j) sum += double(out[R * R + R + 3 * i + j]) * double(gravity[j]);
+            for (int j = 0; j < 3; ++j) sum += double(out[R * R + R + 3 * i + j]) * double(gravity[3 * n + j]);
         if (PUSHED) sum += push[n * R + i];
         next[i] = d[i] + sum;
     }

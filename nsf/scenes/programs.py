@@ -1,0 +1,335 @@
+"""Programs of the forcing: how gravity and the solids of a scene move in a run, drawn anew for each.
+
+A program is drawn from its number, so that a run can be made again. It ends in keyframes; the dynamics see
+their value of the moment alone, so a program may be of any length, and a hand may take its place.
+"""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from zlib import crc32
+
+import numpy as np
+
+from nsf.errors import ConfigError
+from nsf.mpm import Gravity, Motion
+from nsf.vectors import direction, number, numbers
+
+#: Keyframes between two knots of a program.
+_KEYFRAMES = 8
+
+
+class GravityProgram(ABC):
+    """Changes gravity in the course of a run."""
+
+    @abstractmethod
+    def of(self, gravity: Gravity, duration: float, generator: np.random.Generator) -> Gravity:
+        """The gravity that a run has.
+
+        Args:
+            gravity: of the scene, or as an earlier program left it.
+            duration: of a run [s].
+            generator: draws the program.
+        """
+
+    @abstractmethod
+    def reach(self, gravity: float) -> float:
+        """How far from a gravity of that size [m/s²] it may take it at most [m/s²]."""
+
+
+class MotionProgram(ABC):
+    """Moves a solid in the course of a run."""
+
+    @abstractmethod
+    def motion(self, duration: float, generator: np.random.Generator) -> Motion:
+        """The motion that a run has.
+
+        Args:
+            duration: of a run [s].
+            generator: draws the program.
+        """
+
+    @abstractmethod
+    def top_speed(self, duration: float) -> float:
+        """Bound on the speed [m/s] of any motion that may be drawn."""
+
+
+@dataclass(frozen=True)
+class Keyframes(GravityProgram):
+    """Gravity that is listed: linear between keyframes, the same in each run.
+
+    Attributes:
+        times: [k] [s], ascending; values: [k, 3] [m/s²], which take the place of the scene's gravity.
+        angle: the largest angle [°] from the scene's gravity that the list may reach.
+
+    Raises:
+        ConfigError: see `nsf.mpm.Gravity`; at the first run, a value that is further off than `angle`.
+    """
+
+    times: Sequence[float]
+    values: Sequence[Sequence[float]]
+    angle: float = 180.0
+
+    def __post_init__(self):
+        Gravity(self.times, self.values)
+        _check_angle("angle", self.angle)
+
+    def of(self, gravity: Gravity, duration: float, generator: np.random.Generator) -> Gravity:
+        """See `GravityProgram.of`."""
+        down = _unit(gravity.at(0.0))
+        for t, value in zip(self.times, self.values, strict=True):
+            off = np.degrees(np.arccos(np.clip(down @ _unit(np.array(value)), -1.0, 1.0)))
+            if np.any(value) and np.any(down) and off > self.angle + 1e-9:
+                raise ConfigError(
+                    f"the program's gravity at t = {t:g} s is {off:.3g}° off, beyond angle={self.angle:g}°; "
+                    "change the values, or declare a larger angle"
+                )
+        return Gravity(self.times, self.values)
+
+    def reach(self, gravity: float) -> float:
+        """See `GravityProgram.reach`."""
+        return float(np.linalg.norm(self.values, axis=1).max()) + gravity
+
+
+@dataclass(frozen=True)
+class RandomTilt(GravityProgram):
+    """Gravity whose direction wanders, or the ground under it, from upright on.
+
+    Attributes:
+        angle: the largest tilt [°].
+        knots: directions it passes, evenly in time; drawn evenly from a disc about the scene's gravity.
+    """
+
+    angle: float
+    knots: int = 6
+
+    def __post_init__(self):
+        _check_angle("angle", self.angle)
+        number("knots", self.knots, least=1, whole=True)
+
+    def of(self, gravity: Gravity, duration: float, generator: np.random.Generator) -> Gravity:
+        """See `GravityProgram.of`."""
+        times, tilt = _wandering(duration, self.knots, generator)
+        tilt *= np.radians(self.angle)
+        found = gravity.at(times)
+        size = np.linalg.norm(found, axis=1, keepdims=True)
+        angle = np.linalg.norm(tilt, axis=1, keepdims=True)
+        down, aside = _unit(found), tilt @ _across(found[0])
+        turned = np.cos(angle) * down + np.sinc(angle / np.pi) * aside
+        return Gravity(times.tolist(), (size * turned).tolist())
+
+    def reach(self, gravity: float) -> float:
+        """See `GravityProgram.reach`."""
+        return 2.0 * gravity * float(np.sin(0.5 * np.radians(self.angle)))
+
+
+@dataclass(frozen=True)
+class RandomShake(GravityProgram):
+    """The ground is shaken sideways, in its own frame: an acceleration across the scene's gravity is added.
+
+    Attributes:
+        acceleration: the largest [m/s²].
+        knots: accelerations it passes, evenly in time; drawn evenly from a disc, the first one zero.
+    """
+
+    acceleration: float
+    knots: int = 12
+
+    def __post_init__(self):
+        number("acceleration", self.acceleration, least=0.0)
+        number("knots", self.knots, least=1, whole=True)
+
+    def of(self, gravity: Gravity, duration: float, generator: np.random.Generator) -> Gravity:
+        """See `GravityProgram.of`."""
+        own, pushed = _wandering(duration, self.knots, generator)
+        times = np.union1d(own, gravity.times)
+        added = np.stack([np.interp(times, own, way) for way in self.acceleration * pushed.T], 1)
+        found = gravity.at(times) + added @ _across(gravity.at(0.0))
+        return Gravity(times.tolist(), found.tolist())
+
+    def reach(self, gravity: float) -> float:
+        """See `GravityProgram.reach`."""
+        return self.acceleration
+
+
+@dataclass(frozen=True)
+class RandomPress(MotionProgram):
+    """A plate that presses once and lets go, from rest to rest, as deep, as fast and as far aside as drawn.
+
+    Attributes:
+        direction: [3] of the press.
+        depth: smallest and largest stroke [m].
+        stroke: shortest and longest time of a stroke [s].
+        hold: time between the strokes [s].
+        aside: the plate stands at most as far off its place [m] along `across`, all the time.
+        across: [3] direction of that.
+    """
+
+    direction: Sequence[float]
+    depth: Sequence[float]
+    stroke: Sequence[float]
+    hold: float = 0.0
+    aside: float = 0.0
+    across: Sequence[float] = (1.0, 0.0, 0.0)
+
+    def __post_init__(self):
+        direction("direction", self.direction)
+        direction("across", self.across)
+        for name, unit in (("depth", "m"), ("stroke", "s")):
+            low, high = numbers(name, getattr(self, name), unit, 2)
+            if not 0.0 < low <= high:
+                raise ConfigError(
+                    f"{name}=[{low:g}, {high:g}] {unit} must be positive, the smaller one first"
+                )
+        for name in ("hold", "aside"):
+            number(name, getattr(self, name), least=0.0)
+
+    def motion(self, duration: float, generator: np.random.Generator) -> Motion:
+        """See `MotionProgram.motion`."""
+        depth, stroke = generator.uniform(*self.depth), generator.uniform(*self.stroke)
+        aside = generator.uniform(-self.aside, self.aside) * direction("across", self.across)
+        share = np.linspace(0.0, 1.0, _KEYFRAMES + 1)
+        way = 0.5 * (1.0 - np.cos(np.pi * share))
+        times = [stroke * share, stroke * (1.0 + share) + self.hold]
+        gone = [way, way[::-1]]
+        if not self.hold:
+            times[1], gone[1] = times[1][1:], gone[1][1:]
+        d = depth * np.concatenate(gone)[:, None] * direction("direction", self.direction) + aside
+        return Motion(np.concatenate(times).tolist(), d.tolist())
+
+    def top_speed(self, duration: float) -> float:
+        """See `MotionProgram.top_speed`."""
+        return 0.5 * np.pi * self.depth[1] / self.stroke[0]
+
+
+@dataclass(frozen=True)
+class RandomPush(MotionProgram):
+    """A solid that is pushed to and fro along a line, from where it stands.
+
+    Attributes:
+        direction: [3] of the line.
+        reach: [m] how far back and how far forth, as [-0.01, 0.05].
+        knots: places it passes, evenly in time.
+    """
+
+    direction: Sequence[float]
+    reach: Sequence[float]
+    knots: int = 6
+
+    def __post_init__(self):
+        direction("direction", self.direction)
+        low, high = numbers("reach", self.reach, "m", 2)
+        if not low <= 0.0 <= high or low == high:
+            raise ConfigError(f"reach=[{low:g}, {high:g}] m must go back and forth from 0, as [-0.01, 0.05]")
+        number("knots", self.knots, least=1, whole=True)
+
+    def motion(self, duration: float, generator: np.random.Generator) -> Motion:
+        """See `MotionProgram.motion`."""
+        knots = np.concatenate([[0.0], generator.uniform(*self.reach, self.knots)])
+        times = np.linspace(0.0, duration, _KEYFRAMES * self.knots + 1)
+        d = _through(knots, times, duration)[:, None] * direction("direction", self.direction)
+        return Motion(times.tolist(), d.tolist())
+
+    def top_speed(self, duration: float) -> float:
+        """See `MotionProgram.top_speed`."""
+        return 3.0 * (self.reach[1] - self.reach[0]) * self.knots / duration  # of a monotone cubic
+
+
+@dataclass(frozen=True)
+class Programs:
+    """The programs of a scene.
+
+    Attributes:
+        gravity: by name, applied in order; colliders: by the collider's name.
+    """
+
+    gravity: Mapping[str, GravityProgram] = field(default_factory=dict)
+    colliders: Mapping[str, MotionProgram] = field(default_factory=dict)
+
+    def __bool__(self) -> bool:
+        return bool(self.gravity or self.colliders)
+
+    def gravity_of(self, gravity: Sequence[float], duration: float, program: int) -> Gravity:
+        """The gravity of one run.
+
+        Args:
+            gravity: [3] of the scene [m/s²].
+            duration: of the run [s].
+            program: its number.
+        """
+        found = Gravity.constant(gravity)
+        for name, own in self.gravity.items():
+            found = own.of(found, duration, _generator(program, f"gravity.{name}"))
+        return found
+
+    def motion_of(self, collider: str, duration: float, program: int) -> Motion | None:
+        """The motion that a collider has in one run; None where no program moves it."""
+        if collider not in self.colliders:
+            return None
+        return self.colliders[collider].motion(duration, _generator(program, f"colliders.{collider}"))
+
+    def reach(self, gravity: Sequence[float]) -> float:
+        """How far from the scene's gravity [3] any run's may be [m/s²]."""
+        size, far = float(np.linalg.norm(gravity)), 0.0
+        for own in self.gravity.values():
+            far += own.reach(size + far)
+        return far
+
+    def check(self, names: Sequence[str], duration: float, dt: float, dx: float) -> None:
+        """Refuse programs of colliders that are not there, or that cross more than a cell in a step.
+
+        Raises:
+            ConfigError: names the program.
+        """
+        for name, own in self.colliders.items():
+            where = f"scene.forcing.colliders.{name}"
+            if name not in names:
+                raise ConfigError(
+                    f"{where} moves a collider that does not exist; there are {', '.join(names) or 'none'}"
+                )
+            if (speed := own.top_speed(duration)) * dt > dx:
+                raise ConfigError(
+                    f"{where} may reach {speed:.3g} m/s, more than a cell, {dx:.3g} m, in a step of {dt:g} s; "
+                    "let it be slower, or choose a smaller scene.dt"
+                )
+
+
+def _check_angle(name: str, angle: float) -> None:
+    if not 0.0 < number(name, angle) <= 180.0:
+        raise ConfigError(f"{name}={angle:g}° must lie between 0° and 180°")
+
+
+def _generator(program: int, name: str) -> np.random.Generator:
+    """Of one program of a run: independent of the others', and of how many there are."""
+    return np.random.default_rng([program, crc32(name.encode())])
+
+
+def _through(knots: np.ndarray, t: np.ndarray, duration: float) -> np.ndarray:
+    """A smooth way [n, …] through knots [k, …] that are even in time, never beyond two neighbours."""
+    from scipy.interpolate import PchipInterpolator  # SciPy takes 0.2 s to load
+
+    return PchipInterpolator(np.linspace(0.0, duration, len(knots)), knots)(np.clip(t, 0.0, duration))
+
+
+def _wandering(duration: float, knots: int, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Times [n] of keyframes, and points [n, 2] of a way in the unit disc that starts in its middle."""
+    radius = np.sqrt(generator.random(knots))
+    angle = 2.0 * np.pi * generator.random(knots)
+    passed = np.vstack([np.zeros(2), np.stack([radius * np.cos(angle), radius * np.sin(angle)], 1)])
+    times = np.linspace(0.0, duration, _KEYFRAMES * knots + 1)
+    way = _through(passed, times, duration)
+    return times, way / np.maximum(1.0, np.linalg.norm(way, axis=1, keepdims=True))
+
+
+def _unit(values: np.ndarray) -> np.ndarray:
+    """Vectors [..., 3] of length 1; zero stays zero."""
+    size = np.linalg.norm(values, axis=-1, keepdims=True)
+    return values / np.where(size > 0.0, size, 1.0)
+
+
+def _across(gravity: np.ndarray) -> np.ndarray:
+    """[2, 3] unit vectors across gravity [3]: x and y where it points along z."""
+    down = _unit(gravity) if np.any(gravity) else np.array([0.0, 0.0, -1.0])
+    axis = np.eye(3)[0 if abs(down[0]) < 0.9 else 1]
+    one = _unit(axis - (axis @ down) * down)
+    return np.stack([one, np.cross(-down, one)])
