@@ -289,7 +289,7 @@ class Programs:
                 )
             if (speed := own.top_speed(duration)) * dt > dx:
                 raise ConfigError(
-                    f"{where} may reach {speed:.3g} m/s, more than a cell, {dx:.3g} m, in a step of {dt:g} s; "
+                    f"{where} may reach {speed:.3g} m/s, more than a cell, {dx:.3g} m, a step of {dt:g} s; "
                     "let it be slower, or choose a smaller scene.dt"
                 )
 
