@@ -16,10 +16,10 @@ from nsf.data import Case
 from nsf.data.schema import TRAJECTORY
 from nsf.dynamics import ReducedMPM
 from nsf.dynamics.latent import LatentRecord
+from nsf.dynamics.setup import first_changes
 from nsf.engines import Operators
 from nsf.engines.operators.recurrence import Recurrence
 from nsf.engines.operators.states import collider_states
-from nsf.engines.operators.teacher import first_changes
 from nsf.evaluation import metrics
 from nsf.pipeline import Pipeline
 from nsf.pipeline.stages.teaching import OPERATORS

@@ -36,7 +36,8 @@ def hand_over(solver: ReducedMPM, rollout: Rollout) -> FullOrderMPM:
     with torch.no_grad():
         x = decoder.position(now)
         v = (x - decoder.position(before)) / solver.dt
-        C, tau = decoder.affine(now[None])[0], decoder.stress(now[None])[0]
+        rate = (now - before) / solver.dt
+        C, tau = decoder.affine(now[None], rate[None])[0], decoder.stress(now[None])[0]
     state = (a.double().cpu().numpy() for a in (x, v, C, 0.5 * (tau + tau.mT)))
     full.resume(round(rollout.t[n] / full.dt), *state)
     return full

@@ -6,14 +6,16 @@ import torch
 
 from nsf.kinematics.manifold import Restriction
 
-#: A source of τ or C at n points: x̂ [r] → [n, 3, 3], or None for zero.
-Source = Callable[[torch.Tensor], torch.Tensor | None]
+#: Sources at n points: of τ, x̂ [r] → [n, 3, 3]; of C, x̂ and dx̂/dt [r] → [n, 3, 3], or None for zero.
+StressSource = Callable[[torch.Tensor], torch.Tensor]
+AffineSource = Callable[[torch.Tensor, torch.Tensor], torch.Tensor | None]
 
 
 class Inference:
     """x, v, τ and C at the integration particles N.
 
-    x = g(X, x̂_n), v = (g(X, x̂_n) − g(X, x̂_{n−1})) / Δt, and τ and C as the method takes them.
+    x = g(X, x̂_n), v = (g(X, x̂_n) − g(X, x̂_{n−1})) / Δt, and τ and C as the method takes them, C with
+    dx̂/dt = (x̂_n − x̂_{n−1}) / Δt.
 
     Args:
         at: the fields restricted to N.
@@ -23,19 +25,25 @@ class Inference:
     Source: paper section 5.1.
     """
 
-    def __init__(self, at: Restriction, stress: Source, affine: Source, dt: float):
+    def __init__(self, at: Restriction, stress: StressSource, affine: AffineSource, dt: float):
         self.at, self.stress, self.affine, self.dt = at, stress, affine, dt
         self.previous = torch.zeros(at.points, 3, dtype=at.dtype, device=at.device)
+        self.before = torch.zeros(at.latent_dim, dtype=at.dtype, device=at.device)
 
-    def begin(self, xhat: torch.Tensor, velocity: torch.Tensor | None = None) -> None:
-        """Take the positions one step back, from which the next velocity is found.
+    def begin(self, xhat: torch.Tensor) -> None:
+        """Take x̂_{n−1} [r] and the positions there, from which the next rates are found."""
+        self.previous.copy_(self.at.position(xhat))
+        self.before.copy_(xhat)
+
+    def begin_moving(self, xhat: torch.Tensor, velocity: torch.Tensor, rate: torch.Tensor) -> None:
+        """As `begin` at t = 0, where there is nothing to take a difference of.
 
         Args:
-            xhat: [r] x̂_{n−1}; x̂_0 where the velocity is given.
-            velocity: [n, 3] initial velocity [m/s]: at t = 0 there is nothing to take a difference of.
+            xhat: [r] x̂_0.
+            velocity: [n, 3] initial velocity [m/s]; rate: [r] the dx̂/dt of it [1/s].
         """
-        x = self.at.position(xhat)
-        self.previous.copy_(x if velocity is None else x - self.dt * velocity)
+        self.previous.copy_(self.at.position(xhat) - self.dt * velocity)
+        self.before.copy_(xhat - self.dt * rate)
 
     def __call__(
         self, xhat: torch.Tensor
@@ -45,7 +53,9 @@ class Inference:
         # Backward difference, not the grid velocity: the reduced model has no v field (section 5.1).
         v = (x - self.previous) / self.dt
         self.previous.copy_(x)
-        return x, v, self.stress(xhat), self.affine(xhat)
+        rate = (xhat - self.before) / self.dt
+        self.before.copy_(xhat)
+        return x, v, self.stress(xhat), self.affine(xhat, rate)
 
 
 class Decoder:
@@ -59,7 +69,7 @@ class Decoder:
         stress, affine: sources of τ and C, as for `Inference`.
     """
 
-    def __init__(self, at: Restriction, stress: Source, affine: Source):
+    def __init__(self, at: Restriction, stress: StressSource, affine: AffineSource):
         self.at, self._stress, self._affine = at, stress, affine
 
     def position(self, xhat: torch.Tensor) -> torch.Tensor:
@@ -70,8 +80,8 @@ class Decoder:
         """τ [F, n, 3, 3] of x̂ [F, r], in pascals."""
         return torch.stack([self._stress(row).clone() for row in xhat])
 
-    def affine(self, xhat: torch.Tensor) -> torch.Tensor:
-        """C [F, n, 3, 3] of x̂ [F, r], in 1/s."""
-        found = [self._affine(row) for row in xhat]
+    def affine(self, xhat: torch.Tensor, rate: torch.Tensor) -> torch.Tensor:
+        """C [F, n, 3, 3] of x̂ and dx̂/dt [F, r], in 1/s."""
+        found = [self._affine(*row) for row in zip(xhat, rate, strict=True)]
         empty = torch.zeros(self.at.points, 3, 3, dtype=self.at.dtype, device=self.at.device)
         return torch.stack([empty if C is None else C for C in found])

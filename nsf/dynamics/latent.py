@@ -124,5 +124,5 @@ class LatentState:
             v = run.setup.initial_velocity
         else:
             v = (x - decoder.position(run.record.before)) / run.dt
-        fields = {"x": x, "v": v, "C": decoder.affine(now)[0], "tau": decoder.stress(now)[0]}
+        fields = {"x": x, "v": v, "C": decoder.affine(now, run.rate[None])[0], "tau": decoder.stress(now)[0]}
         return {name: value.cpu().numpy() for name, value in fields.items()} | {"xhat": self.xhat}

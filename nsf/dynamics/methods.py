@@ -50,11 +50,13 @@ class Method:
             return StressNeural(at, parameters)
         return StressFromDeformation(at, material, mu, lam, precision, device)
 
-    def affine_of(self, at, parameters: torch.Tensor) -> Callable[[torch.Tensor], torch.Tensor | None]:
-        """The source of C at restricted fields: x̂ [r] → [n, 3, 3] [1/s], or None for C = 0."""
+    def affine_of(
+        self, at, parameters: torch.Tensor
+    ) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor | None]:
+        """The source of C at restricted fields: x̂ [r], dx̂/dt [r] → [n, 3, 3] [1/s], or None for C = 0."""
         if self.neural_affine:
-            return lambda xhat: at.affine(xhat, parameters)
-        return lambda xhat: None
+            return lambda xhat, rate: at.affine(xhat, parameters, rate)
+        return lambda xhat, rate: None
 
 
 class StressNeural:

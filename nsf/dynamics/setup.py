@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from nsf.data import hash_of_positions
-from nsf.dynamics.inference import Decoder, Source
+from nsf.dynamics.inference import AffineSource, Decoder, StressSource
 from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
 from nsf.dynamics.interop import torch_device, torch_dtype
 from nsf.dynamics.methods import Method
@@ -128,7 +128,7 @@ class Setup:
             found.append(self.search.superset(frames, sample.particles, self.integration.margin))
         return found
 
-    def sources(self, at: Restriction, particles: np.ndarray) -> tuple[Source, Source]:
+    def sources(self, at: Restriction, particles: np.ndarray) -> tuple[StressSource, AffineSource]:
         """The method's sources of τ and C at particles [n], to which the fields are restricted."""
         mu, lam = (
             torch.as_tensor(values[particles], dtype=self.dtype, device=self.torch_device)
@@ -149,6 +149,38 @@ class Setup:
         if at is None:
             at = self.manifold.restrict(particles, dtype=self.dtype, device=self.torch_device)
         return Decoder(at, *self.sources(at, particles))
+
+
+def first_change(jacobian: torch.Tensor, velocity: torch.Tensor, dt: float) -> torch.Tensor:
+    """What stands for d = x̂_n − x̂_{n−1} at t = 0: the least squares of (∂g/∂x̂) d = v₀ Δt over S.
+
+    Args:
+        jacobian: ∂g/∂x̂ [..., s, 3, r] [m] at x̂_0.
+        velocity: v₀ [..., s, 3] [m/s].
+        dt: step [s].
+
+    Returns:
+        [..., r]; zero for a body at rest.
+    """
+    rows, target = jacobian.flatten(-3, -2), (dt * velocity).flatten(-2)
+    return torch.linalg.lstsq(rows, target[..., None], driver="gels").solution[..., 0]
+
+
+def first_changes(at_sample: Restriction, sample: np.ndarray, setups: Sequence[Setup]) -> torch.Tensor:
+    """[B, r] what stands for d at t = 0 in some runs, in fp64 on the host.
+
+    Args:
+        at_sample: the manifold restricted to S.
+        sample: [s] indices of S.
+        setups: of the runs.
+    """
+    rows, found = torch.as_tensor(sample).long(), []
+    with torch.no_grad():
+        for setup in setups:
+            _, jacobian = at_sample.position_and_jacobian(setup.xhat)
+            velocity = setup.initial_velocity[rows].to("cpu", torch.float64)
+            found.append(first_change(jacobian.to(velocity), velocity, setup.dt))
+    return torch.stack(found)
 
 
 def reduced_steps(steps: int, dt_multiplier: float) -> int:

@@ -294,6 +294,16 @@ class ReducedMPM:
         """[r] latent vector, on the device."""
         return self.record.now
 
+    @property
+    def rate(self) -> torch.Tensor:
+        """[r] dx̂/dt [1/s] as the next step takes it, on the device."""
+        return (self.xhat - self.record.before) / self.dt if self.steps_taken else self.first_rate
+
+    @property
+    def first_rate(self) -> torch.Tensor:
+        """[r] dx̂/dt [1/s] at t = 0, see `Span.first_rate`."""
+        return self.together.span_at(0).first_rate()[self.index]
+
     def trajectory(self) -> LatentTrajectory:
         """Everything recorded up to now, on the host."""
         found = self.record.trajectory(self.steps_taken, self.dt, self.setup.projector.tolerance)

@@ -12,6 +12,7 @@ from typing_extensions import override
 from nsf.dynamics.batch import Batch
 from nsf.dynamics.integration import ParticleSets
 from nsf.dynamics.interop import as_matrices, as_scalars, as_vectors
+from nsf.dynamics.setup import first_changes
 from nsf.kinematics.manifold import Restriction
 from nsf.mpm import Grid, GridStep
 
@@ -63,6 +64,14 @@ class Span(ABC):
     @abstractmethod
     def enter(self, first: bool) -> None:
         """Begin with the latents of the record; `first`: v is the initial velocity, not a difference."""
+
+    def first_rate(self) -> torch.Tensor:
+        """[B, r] dx̂/dt at t = 0 [1/s], of the initial velocities; zero where no field asks for it."""
+        one, latents = self.batch.shared, self.at_sample.latent_dim
+        if not self.at_sample.takes_rate:
+            return torch.zeros(len(self.batch), latents, dtype=one.dtype, device=one.torch_device)
+        changes = first_changes(self.at_sample, self.sets.sample, self.batch.setups)
+        return (changes / one.dt).to(one.torch_device, one.dtype)
 
     def take(self, steps: int) -> None:
         """Take steps at once, where they are `latent_only`."""

@@ -78,7 +78,7 @@ class Step(GridSpan):
     @override
     def enter(self, first: bool) -> None:
         if first:
-            self.inference.begin(self.record.now, self.initial_velocity)
+            self.inference.begin_moving(self.record.now, self.initial_velocity, self.first_rate()[0])
         else:
             self.inference.begin(self.record.before)
 

@@ -118,6 +118,8 @@ def compare(
         return torch.as_tensor(np.asarray(values)).to(device).to(setup.dtype)
 
     xhat, X, mass = tensor(xhat), tensor(trajectory.X), tensor(trajectory.mass)
+    rate = torch.diff(xhat, dim=0, prepend=xhat[:1]) / trajectory.dt
+    rate[0] = solver.first_rate
     inertia = scene.dx**2 * (DEGREES[scene.transfer.shape] + 1) / 12.0
     shown_particles, shown_frames = _shown(trajectory.particles, frames, *pictures)
     kept = {name: [] for name in ("x_full", "x_reduced", "stress_full", "stress_reduced")}
@@ -133,7 +135,7 @@ def compare(
         block = slice(start, min(start + per_chunk, frames))
         x, tau, C, v = (tensor(trajectory.read(name, frames=block)) for name in ("x", "tau", "C", "v"))
         C = C.view(*C.shape[:2], 3, 3)
-        x_rom, C_rom, tau_rom = _reduced_fields(decoder, xhat[:own], continuation, block)
+        x_rom, C_rom, tau_rom = _reduced_fields(decoder, xhat[:own], rate[:own], continuation, block)
         v_rom = torch.diff(torch.cat([previous[None], x_rom]), dim=0) / trajectory.dt
         if start == 0:
             v_rom[0] = v[0]
@@ -247,21 +249,25 @@ def _series(
 
 
 def _reduced_fields(
-    decoder: Decoder, xhat: torch.Tensor, continuation: Trajectory | None, frames: slice
+    decoder: Decoder,
+    xhat: torch.Tensor,
+    rate: torch.Tensor,
+    continuation: Trajectory | None,
+    frames: slice,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """x [F, P, 3] [m], C [F, P, 3, 3] [1/s] and τ [F, P, 6] [Pa] of some frames of a reduced run.
 
     Args:
         decoder: the fields at every particle.
-        xhat: [own, r] latent vectors of the frames up to the hand-over; the later ones are read.
+        xhat, rate: [own, r] x̂ and dx̂/dt of the frames up to the hand-over; the later frames are read.
         continuation: full-order frames, of which the first is the last of `xhat`.
         frames: which, of the whole run.
     """
     own, parts = len(xhat), []
-    latent = xhat[frames.start : frames.stop]
+    latent, its_rate = (values[frames.start : frames.stop] for values in (xhat, rate))
     if len(latent):
         tau = decoder.stress(latent)[..., _UPPER[0], _UPPER[1]]
-        parts.append((decoder.position(latent), decoder.affine(latent), tau))
+        parts.append((decoder.position(latent), decoder.affine(latent, its_rate), tau))
     if frames.stop > own:
         since = slice(max(frames.start, own) - own + 1, frames.stop - own + 1)
         x, C, tau = (torch.as_tensor(continuation.read(k, frames=since)).to(xhat) for k in ("x", "C", "tau"))

@@ -30,6 +30,8 @@ class Restriction(ABC):
     latent_dim: int
     dtype: torch.dtype
     device: torch.device
+    #: Whether C depends on dx̂/dt.
+    takes_rate: bool = False
 
     @abstractmethod
     def position(self, xhat: Tensor) -> Tensor:
@@ -44,8 +46,11 @@ class Restriction(ABC):
         """Kirchhoff stress tau = h(X, xhat, μ), [n, 6] in pascals, order xx xy xz yy yz zz."""
 
     @abstractmethod
-    def affine(self, xhat: Tensor, parameters: Tensor) -> Tensor:
-        """Affine velocity matrix C = l(X, xhat), [n, 3, 3] in 1/s."""
+    def affine(self, xhat: Tensor, parameters: Tensor, rate: Tensor | None = None) -> Tensor:
+        """Affine velocity matrix C = l(X, xhat, μ), [n, 3, 3] in 1/s.
+
+        `rate` is dx̂/dt [r] in 1/s, or [F, r]; a field with `takes_rate` needs it, others pass over it.
+        """
 
     @abstractmethod
     def deformation_gradient(self, xhat: Tensor) -> Tensor:
@@ -172,9 +177,9 @@ class Manifold(nn.Module, ABC):
         """h(X, xhat, μ), [n, 6] Pa, anywhere in Ω₀."""
         return self.restrict(X=X, device=self.X.device).stress(xhat, parameters)
 
-    def affine(self, X: Tensor, xhat: Tensor, parameters: Tensor) -> Tensor:
-        """l(X, xhat, μ), [n, 3, 3] 1/s, anywhere in Ω₀."""
-        return self.restrict(X=X, device=self.X.device).affine(xhat, parameters)
+    def affine(self, X: Tensor, xhat: Tensor, parameters: Tensor, rate: Tensor | None = None) -> Tensor:
+        """l(X, xhat, μ), [n, 3, 3] 1/s, anywhere in Ω₀; `rate` as for `Restriction.affine`."""
+        return self.restrict(X=X, device=self.X.device).affine(xhat, parameters, rate)
 
     def check_particles(self, x_sha256: str) -> None:
         """Refuse particles other than those of training.

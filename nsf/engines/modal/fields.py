@@ -12,20 +12,25 @@ from nsf.dynamics.latent import LatentRecord
 from nsf.dynamics.span import GridSpan
 from nsf.engines.modal.arena import Arena
 from nsf.engines.modal.gathering import THREADS, make_contraction, tiling
-from nsf.engines.modal.networks import make_layer, make_product, product_blocks
+from nsf.engines.modal.networks import make_at_rate, make_layer, make_product, product_blocks
 from nsf.mpm.materials import Material, make_elastic_stress
 from nsf.mpm.native.access import WARP
 
 
 def field_launches(
-    arena: Arena, span: GridSpan, a: torch.Tensor, needed: torch.Tensor, tiles: tuple[int, int]
+    arena: Arena,
+    span: GridSpan,
+    a: torch.Tensor,
+    rate: torch.Tensor,
+    needed: torch.Tensor,
+    tiles: tuple[int, int],
 ) -> tuple[list, list]:
     """The launches of the networks, and those that then give τ and C at N, as the method takes them.
 
     Args:
         arena: holds what they need.
         span: whose rows of τ and C are found.
-        a: [B, K] coefficients of the displacement.
+        a, rate: [B, K] coefficients of the displacement and their rate [1/s].
         needed: [tiles, n] which particles a step needs, as bits; tiles: their number and the runs of one.
     """
     setups, one, n = span.batch.setups, span.batch.shared, span.size
@@ -43,7 +48,15 @@ def field_launches(
                 found.unflatten(0, (-1, n)).copy_(_as_matrices(factors.mean))
     stored = [arena.halved(factors.table, factors.rows) for factors, _ in heads]
     parameters = torch.stack([setup.parameters for setup in setups])
-    networks, coefficients = _networks(arena, [f.layers for f, _ in heads], span.record, parameters)
+    networks, outputs = _networks(arena, [f.layers for f, _ in heads], span.record, parameters)
+    coefficients = []
+    for (factors, _), found in zip(heads, outputs, strict=True):
+        coefficients.append(found)
+        if factors.rates:
+            coefficients[-1] = arena.zeros(len(found), factors.table.shape[2], dtype=arena.real)
+            sigma = arena.hold(one.manifold.fields["deformation"].leading, torch.float64)
+            own = {"outputs": found, "rate": rate, "sigma": sigma, "a": coefficients[-1]}
+            networks.append(arena.pack(make_at_rate(arena.precision), tuple(coefficients[-1].shape), **own))
     fields = [
         (factors, *modes, own, found)
         for (factors, found), modes, own in zip(heads, stored, coefficients, strict=True)

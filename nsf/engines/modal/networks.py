@@ -76,6 +76,31 @@ def make_layer(precision: Precision, tile: int = 1, several: bool = False, laten
     return layer
 
 
+@cache
+def make_at_rate(precision: Precision):
+    """Kernel of coefficients a = b + M dx̂/dt, a thread each; `outputs` are b and then the columns of M.
+
+    `rate` are those of the displacement's coefficients, of which the first are σ x̂.
+    """
+    real = precision.real
+
+    @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
+    def at_rate(
+        outputs: wp.array2d(dtype=real),
+        rate: wp.array2d(dtype=wp.float64),
+        sigma: wp.array(dtype=wp.float64),
+        a: wp.array2d(dtype=real),
+    ):
+        run, k = wp.tid()
+        K = a.shape[1]
+        sum = outputs[run, k]
+        for j in range(sigma.shape[0]):
+            sum += outputs[run, (j + 1) * K + k] * real(rate[run, j] / sigma[j])
+        a[run, k] = sum
+
+    return at_rate
+
+
 def product_blocks(sides: Sequence[tuple[int, int]], runs: int) -> tuple[int, int]:
     """Blocks of `make_product` of the first network for a tile of runs, and of all for all of them.
 

@@ -63,7 +63,7 @@ class ModalSpan(GridSpan):
         # What is handed on is the span of every engine, which is whole by now.
         self._placing = Placing(arena, state, deformation, of_sample, self, tiles)
         self.needed = self._placing.needed
-        self._networks, self._fields = field_launches(arena, self, state.a, self.needed, tiles)
+        self._networks, self._fields = field_launches(arena, self, state.a, state.rate, self.needed, tiles)
         self._projection = Projection(arena, state, deformation, of_sample, self, sample.weights)
 
     @property
@@ -80,6 +80,8 @@ class ModalSpan(GridSpan):
             for xhat in (record.before, record.now):
                 state.latent.copy_(xhat.view_as(state.latent))
                 self._projection.evaluate.launch()
+            if first:  # of the latents alone: the heads read it, while v is the initial velocity
+                state.rate[:, : state.latent.shape[1]] = self._projection.sigma * self.first_rate()
             state.first.fill_(int(first))
             state.step += 1  # what an earlier step stamped is of no account
 
@@ -222,6 +224,7 @@ class Projection:
     """The inversion of the deformation field (paper section 5.3).
 
     Attributes:
+        sigma: [r] σ of the latents.
         evaluate: gives a and ȧ at the latent vector of the state, for a run that begins.
         prepare: the part of a step's inversion that needs nothing of S, which may run beside the rest.
         gather, solve: the others, in this order.
@@ -247,6 +250,7 @@ class Projection:
                 "dt": one.dt, "b": b,
             },
         )  # fmt: skip
+        self.sigma = arena.hold(deformation.leading, torch.float64)
         kernel = make_projection(arena.precision, widths, members, r, K, count > 1)
         block = projection_block(widths)
         threads = arena.lanes(block)
@@ -258,7 +262,7 @@ class Projection:
         }  # fmt: skip
         given = {name: values.view(count, -1) for name, values in of_each.items()} | {
             "weights": weights, "scale": deformation.scale, "G": G, "sample": s, "dt": one.dt,
-            "sigma": arena.hold(deformation.leading, torch.float64), "iterations": projector.iterations,
+            "sigma": self.sigma, "iterations": projector.iterations,
             "tolerance": projector.tolerance, "linear": isinstance(projector, Taylor),
         }  # fmt: skip
         self.evaluate, self.prepare, self.solve = (

@@ -2,7 +2,7 @@
 
 from nsf.engines.operators.engine import Operators
 from nsf.engines.operators.lessons import Teaching, Yardstick, random_cases
-from nsf.engines.operators.model import Sizes, StepOperators, Terms, first_change
+from nsf.engines.operators.model import Sizes, StepOperators, Terms
 from nsf.engines.operators.states import collider_states, principal
 from nsf.engines.operators.taught import Taught
 from nsf.engines.operators.teach import Course
@@ -19,7 +19,6 @@ __all__ = [
     "Terms",
     "Yardstick",
     "collider_states",
-    "first_change",
     "principal",
     "random_cases",
 ]

@@ -11,14 +11,13 @@ from typing_extensions import override
 
 from nsf.dynamics.batch import Batch
 from nsf.dynamics.latent import LatentRecord
-from nsf.dynamics.setup import Setup
+from nsf.dynamics.setup import Setup, first_changes
 from nsf.dynamics.span import Span, Stages
 from nsf.engines.base import Engine
 from nsf.engines.operators.model import StepOperators
 from nsf.engines.operators.recurrence import Recurrence
 from nsf.engines.operators.states import collider_states
 from nsf.engines.operators.taught import Taught
-from nsf.engines.operators.teacher import first_changes
 from nsf.mpm import Gravity
 
 

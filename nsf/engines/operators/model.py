@@ -197,21 +197,6 @@ class StepOperators(nn.Module):
         return model.double().requires_grad_(False).eval(), taught
 
 
-def first_change(jacobian: Tensor, velocity: Tensor, dt: float) -> Tensor:
-    """What stands for d at t = 0: the least squares of (∂g/∂x̂) d = v₀ Δt over S.
-
-    Args:
-        jacobian: ∂g/∂x̂ [..., s, 3, r] [m] at x̂_0.
-        velocity: v₀ [..., s, 3] [m/s].
-        dt: step [s].
-
-    Returns:
-        [..., r]; zero for a body at rest.
-    """
-    rows, target = jacobian.flatten(-3, -2), (dt * velocity).flatten(-2)
-    return torch.linalg.lstsq(rows, target[..., None], driver="gels").solution[..., 0]
-
-
 def _read(path: Path) -> dict:
     try:
         verified(path)

@@ -5,11 +5,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
-from nsf.dynamics.setup import Setup
+from nsf.dynamics.setup import first_changes
 from nsf.dynamics.solver import ReducedBatch
-from nsf.engines.operators.model import first_change
 from nsf.engines.operators.states import collider_states
-from nsf.kinematics.manifold import Restriction
 
 
 class Teacher:
@@ -89,22 +87,6 @@ class Teacher:
     def _count(self, steps: int) -> None:
         self.steps += steps
         self._told(steps)
-
-
-def first_changes(at_sample: Restriction, sample: np.ndarray, setups: Sequence[Setup]) -> torch.Tensor:
-    """[B, r] what stands for d at t = 0 in some runs, in fp64 on the host.
-
-    Args:
-        at_sample: the manifold restricted to S.
-        sample: [s] indices of S.
-        setups: of the runs.
-    """
-    rows, found = torch.as_tensor(sample).long(), []
-    with torch.no_grad():
-        for setup in setups:
-            _, jacobian = at_sample.position_and_jacobian(setup.xhat)
-            found.append(first_change(_host(jacobian), _host(setup.initial_velocity[rows]), setup.dt))
-    return torch.stack(found)
 
 
 def _host(values: torch.Tensor) -> torch.Tensor:

@@ -3,6 +3,10 @@
     g(X, xhat)    = X + ū(X) + Σ_k b_k(X) a_k,   a = [σ · xhat ; closure(xhat)]
     h(X, xhat, μ) = τ̄(X) + Σ_k t_k(X) d_k(xhat, μ),   l likewise
 
+or with `affine=rate`, since C is a velocity gradient, and a state may be passed at different speeds,
+
+    l(X, xhat, dx̂/dt, μ) = C̄(X) + Σ_k c_k(X) [b_k(xhat, μ) + Σ_j M_kj(xhat, μ) dx̂_j/dt]
+
 b, t, c are POD modes of x, tau and C; xhat is the first r coefficients of x over their deviation σ, so
 encoding is a dot product. The small networks see xhat alone and run once a step, not once a particle. This is
 not in the paper, whose fields are `mlp`; it takes their place in every equation of sections 4 and 5.
@@ -22,7 +26,15 @@ from typing_extensions import override
 from nsf.data import Snapshots
 from nsf.errors import ConfigError
 from nsf.kinematics.fields import pod
-from nsf.kinematics.fields.modal import ModalFactors, ModalField, ModalModule, RestrictedField
+from nsf.kinematics.fields.modal import (
+    ModalFactors,
+    ModalField,
+    ModalModule,
+    PlacedFields,
+    RateModule,
+    RestrictedField,
+    at_rate,
+)
 from nsf.kinematics.fields.networks import Committee, FullyConnected
 from nsf.kinematics.interpolation import Interpolation, interpolation
 from nsf.kinematics.manifold import Manifold, Restriction
@@ -36,7 +48,9 @@ from nsf.kinematics.training.phases import (
     joined,
     per_phase,
 )
+from nsf.kinematics.training.rates import latent_rates
 
+AFFINE = ("latent", "rate")
 ENCODED_ENTRIES = 1 << 26  # values encoded at once
 
 
@@ -53,6 +67,9 @@ class BasisField:
         noise: deviation of the noise added to xhat in training, in units of xhat's deviation. It keeps the
             Jacobian and the heads regular beside the training trajectories.
         head_parameters: the heads see the (standardised) problem parameters beside xhat.
+        affine: `latent`: C follows from xhat, as in the paper; `rate`: from xhat and dx̂/dt.
+        rate_noise: deviation of the noise on dx̂/dt in training with `affine=rate`, in units of dx̂/dt's
+            deviation. Where xhat tells dx̂/dt to within the noise, as along one path, C is left to b(xhat, μ).
     """
 
     shardable: ClassVar[bool] = False
@@ -63,8 +80,13 @@ class BasisField:
     members: int = 1
     noise: float = 0.01
     head_parameters: bool = True
+    affine: str = "latent"
+    rate_noise: float = 0.1
 
     def __post_init__(self) -> None:
+        if self.affine not in AFFINE:
+            raise ConfigError(f"field.affine={self.affine} is unknown; choose {' or '.join(AFFINE)}")
+        at_least("rate_noise", self.rate_noise, 0)
         per_phase("modes", self.modes)
         per_phase("beta", self.beta)
         at_least("depth", self.depth, 1, MOST_DEEP)
@@ -113,6 +135,7 @@ class BasisField:
             "members": self.members,
             "noise": self.noise,
             "head_parameters": self.head_parameters,
+            "affine": self.affine,
             "unresolved": [prepared[name]["unresolved"] for name, _ in TARGETS.values()],
         }
         manifold = self.manifold(
@@ -139,6 +162,11 @@ class BasisField:
 
         As the modes are orthonormal, such a loss is the mean squared error of the field over its variance.
         """
+        if manifold.takes_rate:
+            rates = latent_rates(manifold, snapshots)
+            manifold.training_rates.copy_(rates)
+            deviation = rates.square().mean(0).sqrt()
+            manifold.fields["affine"].rate.copy_(torch.where(deviation > 0, deviation, 1.0))
         for phase, (name, _) in TARGETS.items():
             field = manifold.fields[phase]
             if field.network is not None:
@@ -148,9 +176,10 @@ class BasisField:
                 yield Fit(phase, field.network, self._loss(manifold, phase, targets.float()), pointwise=False)
 
     def _loss(self, manifold: BasisManifold, phase: str, targets: Tensor) -> Callable[..., Tensor]:
-        network = manifold.fields[phase].network
+        field, network = manifold.fields[phase], manifold.fields[phase].network
         latents = manifold.training_latents.float()
         parameters = manifold.standard_parameters(manifold.training_parameters.float())
+        rates = (manifold.training_rates / field.rate).float() if field.rates else None
 
         def loss(rows: Tensor | slice, particles: Tensor | slice, generator: torch.Generator) -> Tensor:
             xhat = latents[rows]
@@ -159,7 +188,13 @@ class BasisField:
             inputs = xhat + self.noise * torch.randn(shape, generator=generator, device=xhat.device)
             if manifold.takes_parameters(phase):
                 inputs = torch.cat([inputs, parameters[rows].expand(*shape[:-1], -1)], -1)
-            return (network(inputs) - targets[rows]).square().mean()
+            outputs = network(inputs)
+            if rates is None:
+                return (outputs - targets[rows]).square().mean()
+            # The mean over all noise on dx̂/dt, whose square M passes on: nothing is drawn.
+            passed_on = field.rates * outputs[..., targets.shape[1] :].square().mean()
+            found = at_rate(outputs, rates[rows])
+            return (found - targets[rows]).square().mean() + self.rate_noise**2 * passed_on
 
         return loss
 
@@ -181,6 +216,10 @@ class BasisManifold(Manifold):
 
     def __init__(self, latent_dim, x_sha256, parameter_names, hyperparameters):
         super().__init__(latent_dim, x_sha256, parameter_names, hyperparameters)
+        self.takes_rate = hyperparameters.get("affine") == "rate"  # files from before say nothing of it
+        if self.takes_rate:
+            shape = hyperparameters["frames"], latent_dim
+            self.register_buffer("training_rates", torch.zeros(shape, dtype=torch.float64))
         self.fields = nn.ModuleDict()
         self._kept_slopes: tuple[Tensor, Tensor] | None = None
         layout = zip(TARGETS.items(), hyperparameters["modes"], hyperparameters["beta"], strict=True)
@@ -196,6 +235,7 @@ class BasisManifold(Manifold):
                 beta * d,
                 hyperparameters["depth"],
                 hyperparameters.get("members", 1),  # files from before there were members
+                latent_dim if phase == "affine" and self.takes_rate else 0,
             )
 
     @property
@@ -237,7 +277,8 @@ class BasisManifold(Manifold):
                 lambda values: _slope(local(), values), base, networks["deformation"], like
             )
 
-        return BasisRestriction(fields, gradient, self.latent_dim, self.takes_parameters("stress"))
+        own = self.latent_dim, self.takes_parameters("stress"), self.takes_rate
+        return BasisRestriction(fields, gradient, *own)
 
     @torch.no_grad()
     def factors(self, name: str, particles, dtype: torch.dtype, device: torch.device | str) -> ModalFactors:
@@ -262,7 +303,7 @@ class BasisManifold(Manifold):
         network, scale = self._deployed(phase, like), float(field.scale)
         members = self.hyperparameters.get("members", 1)
         mean = (base + mean[rows]).to(like)
-        return ModalFactors(mean, table, rows, field.leading, scale, network, members)
+        return ModalFactors(mean, table, rows, field.leading, scale, network, members, field.rates)
 
     def _slopes(self, device: torch.device | str) -> tuple[Tensor, Tensor]:
         """∂/∂X of the deformation's mean [P, 9] and of its modes [P, 9, K], in fp32, at the particles.
@@ -286,21 +327,10 @@ class BasisManifold(Manifold):
         mean, std = [latent], [latent + 1]
         if self.takes_parameters(phase):
             mean, std = [latent, parameters.mean], [latent + 1, parameters.std]
-        scale = field.scale.expand(field.modes.shape[2] - len(field.leading))
+        scale = field.output_scale
         return field.network.in_raw_units(
             torch.cat(mean), torch.cat(std), torch.zeros_like(scale), scale, like.dtype, like.device
         )
-
-
-class PlacedFields(dict):
-    """Restricted fields by phase, each made when first asked for: most need that of the deformation alone."""
-
-    def __init__(self, make: Callable[[str], RestrictedField]):
-        self._make = make
-
-    def __missing__(self, phase: str) -> RestrictedField:
-        self[phase] = self._make(phase)
-        return self[phase]
 
 
 class BasisRestriction(Restriction):
@@ -310,6 +340,7 @@ class BasisRestriction(Restriction):
         fields: by phase.
         gradient: makes ∂g/∂X, a field of 9 components; called when first needed.
         takes_parameters: whether h and l see the problem parameters.
+        takes_rate: whether l sees dx̂/dt.
     """
 
     def __init__(
@@ -318,8 +349,9 @@ class BasisRestriction(Restriction):
         gradient: Callable[[], RestrictedField],
         latent_dim: int,
         takes_parameters: bool,
+        takes_rate: bool,
     ):
-        self.fields, self.latent_dim = fields, latent_dim
+        self.fields, self.latent_dim, self.takes_rate = fields, latent_dim, takes_rate
         mean = fields["deformation"].mean
         self.points, self.dtype, self.device = len(mean), mean.dtype, mean.device
         self._make_gradient = gradient
@@ -347,19 +379,19 @@ class BasisRestriction(Restriction):
         return self.fields["stress"].values(self._inputs(xhat, parameters))
 
     @override
-    def affine(self, xhat, parameters):
-        return self.fields["affine"].values(self._inputs(xhat, parameters)).unflatten(-1, (3, 3))
+    def affine(self, xhat, parameters, rate=None):
+        return self.fields["affine"].values(self._inputs(xhat, parameters), rate).unflatten(-1, (3, 3))
 
     @override
     def module(self, phase):
-        return ModalModule(self.fields[phase], phase, phase != "deformation" and self._takes_parameters)
+        kind = RateModule if phase == "affine" and self.takes_rate else ModalModule
+        return kind(self.fields[phase], phase, phase != "deformation" and self._takes_parameters)
 
     @override
     def subset(self, rows):
         fields = PlacedFields(lambda phase: self.fields[phase].subset(rows))
-        return BasisRestriction(
-            fields, lambda: self._gradient.subset(rows), self.latent_dim, self._takes_parameters
-        )
+        own = self.latent_dim, self._takes_parameters, self.takes_rate
+        return BasisRestriction(fields, lambda: self._gradient.subset(rows), *own)
 
     def _inputs(self, xhat: Tensor, parameters: Tensor) -> Tensor:
         xhat = xhat.to(self.dtype)

@@ -32,6 +32,7 @@ class MlpField:
             (section 4.5, last paragraph).
         arithmetic: of h and l where they are deployed on a GPU (`MlpManifold.arithmetic`); training does not
             depend on it.
+        affine: `latent` alone, the paper's l(X, x̂).
 
     Source: Zong et al. 2023, section 4.5, appendices "Training Details" and "Network architecture", table 1.
     """
@@ -41,9 +42,15 @@ class MlpField:
     beta: int | Sequence[int] = (48, 72, 72)
     stress_parameters: bool = False
     arithmetic: str | None = "tf32"
+    affine: str = "latent"
 
     def __post_init__(self) -> None:
         per_phase("beta", self.beta)
+        if self.affine != "latent":
+            raise ConfigError(
+                f"field.affine={self.affine}: C of field=mlp is a function of the latent vector alone; "
+                "choose field.affine=latent, or field=basis or joint"
+            )
         if self.arithmetic not in (None, *ARITHMETIC):
             known = ", ".join(ARITHMETIC)
             raise ConfigError(f"field.arithmetic={self.arithmetic} is unknown; choose {known} or null")
@@ -218,7 +225,7 @@ class MlpRestriction(Restriction):
         return self._decode("stress", xhat)
 
     @override
-    def affine(self, xhat, parameters):
+    def affine(self, xhat, parameters, rate=None):
         return self._decode("affine", xhat).unflatten(-1, (3, 3))
 
     @override

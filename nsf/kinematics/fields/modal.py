@@ -3,21 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 from typing_extensions import override
 
+from nsf.errors import ShapeError
 from nsf.kinematics.fields.networks import Committee, FullyConnected
 from nsf.kinematics.training.phases import joined, shaped
+
+
+def at_rate(outputs: Tensor, rate: Tensor) -> Tensor:
+    """Coefficients b + M dx̂/dt [..., K] from outputs [..., (1 + r) K], b and then the r columns of M.
+
+    Args:
+        outputs: of a network.
+        rate: dx̂/dt [..., r], in the unit that M is over.
+    """
+    rows = outputs.unflatten(-1, (1 + rate.shape[-1], -1))
+    return (rows[..., :1, :] + rate.unsqueeze(-2) @ rows[..., 1:, :]).squeeze(-2)
 
 
 class ModalField(nn.Module):
     """mean(X) + Σ_k modes_k(X) a_k with a = [leading · xhat ; scale · network(inputs)].
 
-    For the deformation this is the displacement x − X.
+    For the deformation this is the displacement x − X. With `rates` the network gives b and M of `at_rate`,
+    M over the deviations `rate` of dx̂/dt.
 
     Args:
         particles, components: P and c.
@@ -25,6 +38,7 @@ class ModalField(nn.Module):
         leading: how many coefficients are latents themselves (r for g, 0 for h and l).
         inputs, width, depth: of the network; there is none if no coefficient is left to it.
         members: networks whose mean it is.
+        rates: r if the coefficients depend on dx̂/dt, else 0.
     """
 
     def __init__(
@@ -37,14 +51,18 @@ class ModalField(nn.Module):
         width: int,
         depth: int,
         members: int,
+        rates: int = 0,
     ):
         super().__init__()
         self.register_buffer("mean", torch.zeros(particles, components, dtype=torch.float64))
         self.register_buffer("modes", torch.zeros(particles, components, modes))
         self.register_buffer("leading", torch.ones(leading, dtype=torch.float64))
         self.register_buffer("scale", torch.ones((), dtype=torch.float64))
+        self.rates = rates
+        if rates:
+            self.register_buffer("rate", torch.ones(rates, dtype=torch.float64))
         closed = modes - leading
-        widths = (inputs, *[width] * depth, closed)
+        widths = (inputs, *[width] * depth, closed * (1 + rates))
         self.network: FullyConnected | Committee | None = None
         if closed:
             several = members > 1
@@ -56,6 +74,14 @@ class ModalField(nn.Module):
         self.leading.copy_(leading.square().mean(0).sqrt())
         if closed.numel():
             self.scale.copy_(closed.square().mean().sqrt())
+
+    @property
+    def output_scale(self) -> Tensor:
+        """What each output of the network is multiplied with to be in the field's unit, [(1 + r) K]."""
+        closed = self.scale.expand(self.modes.shape[2] - len(self.leading))
+        if not self.rates:
+            return closed
+        return torch.cat([closed, (self.scale / self.rate).repeat_interleave(len(closed))])
 
     def at(
         self,
@@ -72,6 +98,7 @@ class ModalField(nn.Module):
             place(self.modes).to(like) * factors,
             len(self.leading),
             network,
+            self.rates,
         )
 
 
@@ -81,26 +108,41 @@ class RestrictedField:
 
     Attributes:
         mean: [n, c]; modes: [n, c, K], both in the unit of the field.
+        rates: r where the network gives b and M of `at_rate`, else 0.
     """
 
     mean: Tensor
     modes: Tensor
     leading: int
     network: FullyConnected | None
+    rates: int = 0
 
     def subset(self, rows: slice) -> RestrictedField:
         """The same field at some of the points, sharing memory."""
-        return RestrictedField(self.mean[rows], self.modes[rows], self.leading, self.network)
+        return replace(self, mean=self.mean[rows], modes=self.modes[rows])
 
-    def values(self, inputs: Tensor) -> Tensor:
-        """[..., inputs] → [..., n, c]."""
+    def values(self, inputs: Tensor, rate: Tensor | None = None) -> Tensor:
+        """[..., inputs] and, where there are `rates`, dx̂/dt [..., r] → [..., n, c].
+
+        Raises:
+            ShapeError: dx̂/dt is missing.
+        """
         a = [inputs[..., : self.leading]] if self.leading or self.network is None else []
         if self.network is not None:
-            a.append(self.network(inputs))
+            outputs = self.network(inputs)
+            a.append(at_rate(outputs, self._given(rate)) if self.rates else outputs)
         coefficients = torch.cat(a, -1) if len(a) > 1 else a[0]
         return F.linear(coefficients, self.modes.flatten(0, 1), self.mean.flatten()).unflatten(
             -1, self.mean.shape
         )
+
+    def _given(self, rate: Tensor | None) -> Tensor:
+        if rate is None:
+            raise ShapeError(
+                "C of this manifold depends on the rate of the latent vector (field.affine=rate); "
+                "pass rate=, dx̂/dt in 1/s of the shape of xhat"
+            )
+        return rate.to(self.modes)
 
     def values_and_jacobian(self, xhat: Tensor, identity: Tensor) -> tuple[Tensor, Tensor]:
         """[..., r] and the identity [r, r] → [..., n, c] and [..., n, c, r], in one product."""
@@ -111,6 +153,17 @@ class RestrictedField:
         rows = F.linear(torch.cat([a.unsqueeze(-2), along], -2), self.modes.flatten(0, 1))
         rows = rows.unflatten(-1, self.mean.shape)
         return rows[..., 0, :, :] + self.mean, rows[..., 1:, :, :].movedim(-3, -1)
+
+
+class PlacedFields(dict):
+    """Restricted fields by phase, each made when first asked for: most need that of the deformation alone."""
+
+    def __init__(self, make: Callable[[str], RestrictedField]):
+        self._make = make
+
+    def __missing__(self, phase: str) -> RestrictedField:
+        self[phase] = self._make(phase)
+        return self[phase]
 
 
 @dataclass(frozen=True)
@@ -125,6 +178,7 @@ class ModalFactors:
         scale: of the others, with which the network's last layer was multiplied.
         network: of the others, in raw units; None if there is none.
         members: how many networks it is the mean of.
+        rates: r where the network gives b and M of `at_rate`, else 0.
     """
 
     mean: Tensor
@@ -134,6 +188,7 @@ class ModalFactors:
     scale: float
     network: FullyConnected | None
     members: int
+    rates: int = 0
 
     @property
     def layers(self) -> list[tuple[Tensor, Tensor]]:
@@ -160,10 +215,22 @@ class ModalModule(nn.Module):
         super().__init__()
         self.register_buffer("mean", field.mean)
         self.register_buffer("modes", field.modes)
-        self.leading, self.network = field.leading, field.network
+        self.leading, self.network, self.rates = field.leading, field.network, field.rates
         self.phase, self.takes_parameters = phase, takes_parameters
 
     @override
     def forward(self, xhat: Tensor, parameters: Tensor) -> Tensor:
-        field = RestrictedField(self.mean, self.modes, self.leading, self.network)
-        return shaped(self.phase, field.values(joined(xhat, parameters) if self.takes_parameters else xhat))
+        return self._values(xhat, parameters)
+
+    def _values(self, xhat: Tensor, parameters: Tensor, rate: Tensor | None = None) -> Tensor:
+        field = RestrictedField(self.mean, self.modes, self.leading, self.network, self.rates)
+        inputs = joined(xhat, parameters) if self.takes_parameters else xhat
+        return shaped(self.phase, field.values(inputs, rate))
+
+
+class RateModule(ModalModule):
+    """A restricted field that depends on dx̂/dt."""
+
+    @override
+    def forward(self, xhat: Tensor, parameters: Tensor, rate: Tensor) -> Tensor:
+        return self._values(xhat, parameters, rate)
