@@ -32,6 +32,8 @@ _REAL = ("<f4", "<f8")  # types of the arrays: that of the run
 #: Steps between looks at the trust of a run that is to be handed over: a look reads back, and what was
 #: done since the last one is lost.
 _LOOK = 20
+#: Of the radius of gravity: what is further out is outside, whatever round-off does.
+_OUTSIDE = 1.0 + 1e-6
 #: Times less than this share of Δt apart are the same.
 _SAME_TIME = 1e-6
 
@@ -337,6 +339,9 @@ def _ratios(solver: ReducedMPM, trust: Trust, diverged: int) -> np.ndarray:
     for off in (solver.doubt[0], trust.cases.of(solver.setup.given)):
         if off > 1.0:
             ratios = np.maximum(ratios, off)
+    # A step takes the gravity of its start.
+    gravity = trust.of_gravity(solver.acting_gravity(latent.t[:-1]))
+    ratios[1:] = np.maximum(ratios[1:], np.where(gravity > _OUTSIDE, gravity, 0.0))
     if diverged >= 0:
         ratios[diverged:] = np.inf
     return ratios

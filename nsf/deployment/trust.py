@@ -123,12 +123,14 @@ class Trust:
         distance: scale of the latent distance [m].
         latent_distance: the distance itself.
         cases: distance from the training cases.
+        gravity: middle [3] and radius [m/s²] of what programs of training may give; None without any.
     """
 
     residual: float
     distance: float
     latent_distance: LatentDistance
     cases: CaseDistance
+    gravity: tuple[Sequence[float], float] | None = None
 
     @classmethod
     def calibrated(
@@ -168,6 +170,13 @@ class Trust:
         # Not np.fmax: a value that is not finite must not hide behind the other.
         ratios = np.maximum(residual, self.latent_distance.of(xhat) / self.distance)
         return np.nan_to_num(ratios, nan=np.inf, posinf=np.inf)
+
+    def of_gravity(self, gravity: np.ndarray) -> np.ndarray:
+        """[n] how far gravity [n, 3] [m/s²] is from the middle of what programs may give, over its radius."""
+        if self.gravity is None:
+            return np.zeros(len(gravity))
+        middle, radius = self.gravity
+        return np.linalg.norm(gravity - np.asarray(middle), axis=1) / radius
 
 
 def calibrate(solver_at: Callable[[Mapping[str, float], str], ReducedMPM], manifold, device: str) -> Trust:

@@ -269,6 +269,10 @@ class ReducedMPM:
         """Gravity and colliders, which may be set between steps."""
         return self.together.hand(self.index)
 
+    def acting_gravity(self, t: np.ndarray) -> np.ndarray:
+        """[n, 3] gravity [m/s²] at times t [n] [s], of the scene's programs or the hand in their place."""
+        return self.together.batch.forcing.gravities[self.index].at(t)
+
     @property
     def engine(self) -> str:
         """Name of the engine that takes the steps."""

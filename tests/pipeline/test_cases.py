@@ -10,7 +10,7 @@ import pytest
 import yaml
 
 from nsf.data import Trajectory
-from nsf.deployment import Rollout
+from nsf.deployment import Rollout, rollout_file
 from nsf.errors import ConfigError, MissingRunError
 from nsf.export.playback import Playback
 from nsf.pipeline import Pipeline
@@ -139,3 +139,38 @@ def test_too_few_training_cases_are_refused(pipeline_at, tmp_path):
     few = (*TWO[:2], "scene.design={_target_:nsf.scenes.Sobol,train:2,validation:0,test:2}")
     with pytest.raises(ConfigError, match="2 training cases, and friction_angle, E need at least 3; add"):
         pipeline_at(tmp_path, *few)
+
+
+FORCED = (
+    "+scene.program=0",
+    "+scene.forcing.gravity.tilt={_target_: nsf.scenes.RandomTilt, angle: 20}",
+    "scene.design.train=[22,26,30,34,38]",
+    "scene.design.test=[[27, 2000], [33, 2001]]",
+)
+
+
+def test_programs_through_the_whole_chain(pipeline_at, tmp_path):
+    """Simulated, trained on, taught from, deployed and evaluated; a program beyond the range is distrusted."""
+    taught = ("engine=operators", "engine.teaching.descent=60", "engine.teaching.rounds=0", "engine.check=4")
+    pipeline = pipeline_at(tmp_path, *FORCED, *taught)
+    for stage in ("simulate", "train", "teach", "deploy", "evaluate"):
+        pipeline.run(stage)
+    assert pipeline.manifold().parameter_names == ("friction_angle",)
+    case = pipeline.split.test[0]
+    with Trajectory.open(pipeline.simulation(case).path / "trajectory.h5") as trajectory:
+        acting = pipeline.scene.with_parameters(case).acting_gravity
+        np.testing.assert_allclose(trajectory.forcing["gravity"], acting.at(trajectory.t), atol=1e-12)
+        assert list(trajectory.parameters) == ["friction_angle"]
+    _, between, back = pipeline.lessons
+    programs = [case["program"] for case in (*pipeline.split.cases, *between, *back)]
+    assert len(set(programs)) == len(programs)
+    steep = pipeline_at(tmp_path, *FORCED, "deploy.changes={scene.forcing.gravity.tilt.angle:60}")
+    for stage in ("simulate", "deploy"):
+        steep.run(stage)
+    beyond = steep.scene.forcing.reach(steep.scene.gravity)
+    for index, held_out in enumerate(steep.held_out):
+        rollout = Rollout.open(steep.deployment.file(rollout_file(index)))
+        gravity = steep.deployed.with_parameters(held_out).acting_gravity.at(rollout.t[:-1])
+        outside = np.linalg.norm(gravity - steep.scene.gravity, axis=1) > beyond
+        assert outside.any()
+        assert (rollout.trust[1:][outside] > 1.0).all()

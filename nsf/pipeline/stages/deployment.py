@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -82,7 +83,10 @@ def _rollouts(pipeline, manifold: Manifold, record: Record) -> list[Rollout]:
         """A run in the training case of some parameters, with its own program."""
         return projected(_case_of(pipeline.split.train, values), device)
 
-    trust = calibrate(known_at, manifold, pipeline.device)
+    scene, range_of_gravity = pipeline.scene, None
+    if scene.forcing.gravity:
+        range_of_gravity = scene.gravity, scene.forcing.reach(scene.gravity)
+    trust = replace(calibrate(known_at, manifold, pipeline.device), gravity=range_of_gravity)
     record.metrics["trust"] = {
         "residual_m": trust.residual,
         "distance_m": trust.distance,
