@@ -17,8 +17,9 @@ from nsf.reporting.drawing.style import DIFFERENCE_COLORS, STRESS_COLORS, save
 from nsf.reporting.levels import levels_section
 from nsf.reporting.rivals import solvers
 from nsf.reporting.sources import Motion, Study, same_parameter
+from nsf.reporting.study import SEEDS
 from nsf.reporting.tables import Merged, mean_rows, printed_of, variant_labels, variants
-from nsf.reporting.text.columns import COLUMN, MEASURED, RIVALS, parameter_text
+from nsf.reporting.text.columns import COLUMN, MEASURED, RIVALS, SOLVER, parameter_text
 from nsf.reporting.text.formats import file_name
 from nsf.reporting.text.page import Picture, Section
 
@@ -273,6 +274,8 @@ def _over_cost(merged: Merged, folder: Path, runs: list[str]) -> list[Picture]:
         return []
     placed = [name for name in ("precision", "device") if frame[name].nunique() > 1]
     names = frame[["scene", *placed]].agg(" · ".join, axis=1)
+    reduced = frame["kind"] == "reduced"
+    frame.loc[reduced, SOLVER] = _common_names(frame.loc[reduced, SOLVER], names[reduced])
     panels = {name: part.to_dict("records") for name, part in frame.groupby(names, sort=False)}
     least = merged.frame.groupby("scene")[list(RIVALS)].min()  # of nearest and interpolated, the best field's
     costless = {name: COLUMN[name].title for name in RIVALS[:3]}
@@ -286,6 +289,16 @@ def _over_cost(merged: Merged, folder: Path, runs: list[str]) -> list[Picture]:
         "a solver of longer steps takes fewer. Horizontal lines are of what takes no step."
     )
     return [Picture(save(error_over_cost(panels, free), folder, "error-over-cost"), caption, runs)]
+
+
+def _common_names(labels: pd.Series, panels: pd.Series) -> pd.Series:
+    """Labels without seeds and the parts that some panel lacks, such as its |S|: a colour has one meaning."""
+    if panels.nunique() == 1:
+        return labels
+    parts = labels.str.split(" · ")
+    known = [{part for own in of for part in own} for _, of in parts.groupby(panels)]
+    common = {part for part in set.intersection(*known) if part.partition("=")[0] not in SEEDS}
+    return parts.map(lambda own: " · ".join(part for part in own if part in common) or "reduced")
 
 
 def _heading(v: _Variant) -> str:
