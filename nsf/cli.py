@@ -117,6 +117,12 @@ def _dispatch(arguments: list[str]) -> int:
     launcher = [o for o in overrides if config.of_launcher(o)]
     experiments = [o.removeprefix("+experiment=") for o in overrides if o.startswith("+experiment=")]
     own = [o for o in overrides if o not in launcher and not o.startswith("+experiment=")]
+    if stage != "point" and not experiments and not any(config.names_scene(o) for o in own):
+        from nsf.paths import groups
+
+        raise ConfigError(
+            f"nsf {stage} needs a scene, as scene=sand; choose one of {', '.join(groups()['scene'])}"
+        )
     if experiments:
         return _experiment(experiments[-1], stage, own, launcher)
     if multirun:
