@@ -1,4 +1,4 @@
-"""What is refused is refused before anything heavy is imported, and what is there already is said likewise."""
+"""What is refused, and what is there already, is told before anything heavy is imported."""
 
 import subprocess
 import sys
@@ -44,7 +44,7 @@ def started(tmp_path, monkeypatch):
         (["run", "-m", "scene=sand", "latent_dim=4,0"], "latent_dim=0 must be"),
         (["run", "scene=sand", "scene.bodies.column.density=0"], "density=0"),
         (["run", "scene=sand", "scene.design.train=[30]"], "1 training cases"),
-        (["run", "scene=squishy_ball", "scene.bodies.ball.shape.file=none.obj"], "none.obj"),
+        (["run", "scene=drop", "scene.geometry.mesh=none.obj"], "none.obj"),
         (["run"], "choose one of block, bread"),
     ],
 )
@@ -59,7 +59,7 @@ def test_a_refused_configuration_imports_nothing_heavy(started, words, told):
 def test_a_chain_whose_results_are_there_imports_nothing_that_computes(started, chain, tiny):
     first = started("run", *tiny, runs=chain.root)
     assert first[0] == 0, first[2]
-    code, out, err, heavy = started("run", *tiny, runs=chain.root)
+    code, out, _, heavy = started("run", *tiny, runs=chain.root)
     assert code == 0
     assert "evaluate: inputs unchanged, reused" in out
     assert "report: nothing it shows has changed, reused" in out
