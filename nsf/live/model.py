@@ -14,6 +14,8 @@ from nsf.deployment import Trust
 from nsf.deployment.trust import CaseDistance, LatentDistance
 from nsf.dynamics import Decoder, ReducedMPM
 from nsf.errors import ConfigError, InstabilityError
+from nsf.export import web
+from nsf.mpm import floor_height
 from nsf.mpm.stability import check_time_step
 from nsf.pipeline import Pipeline
 from nsf.runs import Run
@@ -233,6 +235,16 @@ class LiveModel:
         """The full-order run of a known case; None of other cases."""
         run = self._truths.get(case)
         return Truth(Trajectory.open(run.file(TRAJECTORY)), self.shown) if run else None
+
+    @property
+    def floor(self) -> float | None:
+        """Height of a horizontal floor at rest [m]."""
+        return floor_height(list(self._pipeline.deployed.colliders))
+
+    def solids(self, case: Case) -> list[dict]:
+        """The solids of a case, for a page."""
+        scene = self._pipeline.deployed.with_parameters(case)
+        return [web.solid(name, own) for name, own in zip(scene.collider_names, scene.colliders, strict=True)]
 
     def roles(self, step: int) -> np.ndarray:
         """[n] set of each shown particle in the step that starts at `step`: 2 S, 1 N only, 0 neither."""
