@@ -124,8 +124,8 @@ def test_it_plays(opened):
     tab = opened()
     assert tab.title() == "sand, friction angle=26°"
     assert tab.text_content("#play") == "Pause"
-    begun = float(tab.evaluate("document.body.dataset.frame"))
-    tab.wait_for_function(f"Number(document.body.dataset.frame) != {begun}")
+    begun = tab.evaluate("document.body.dataset.frame")
+    tab.wait_for_selector(f"body:not([data-frame='{begun}'])")
     tab.click("#play")
     assert tab.text_content("#play") == "Play"
     still = drawn(tab)
