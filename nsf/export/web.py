@@ -67,7 +67,7 @@ def script(entry: str) -> str:
     def add(module: str) -> None:
         if module in texts:
             return
-        text = _read(f"{module}.mjs")
+        text = _text("live", "web", f"{module}.mjs")
         texts[module] = ""  # a circle of imports ends here; functions are called after all are there
         wanted = [(own.split(", "), other) for own, other in _IMPORT.findall(text)]
         for _, other in wanted:
@@ -109,7 +109,7 @@ def page(entry: str, title: str, data: bytes = b"", connects: bool = False) -> s
         connects: whether it reaches its own server.
     """
     deflated = base64.b64encode(zlib.compress(data, 9)).decode() if data else ""
-    return HTML.from_string(_read("page.html")).render(
+    return HTML.from_string(_text("export", "page.html")).render(
         title=title,
         policy=policy(entry, connects),
         style=Markup(_style()),
@@ -191,9 +191,9 @@ def _hashed(text: str) -> str:
 
 @cache
 def _style() -> str:
-    return "\n" + _read("page.css")
+    return "\n" + _text("export", "page.css")
 
 
 @cache
-def _read(name: str) -> str:
-    return files("nsf").joinpath("live", "web", name).read_text(encoding="utf-8")
+def _text(*path: str) -> str:
+    return files("nsf").joinpath(*path).read_text(encoding="utf-8")

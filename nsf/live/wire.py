@@ -97,7 +97,7 @@ def state_message(moment: Moment) -> str:
     As JSON; the second is `LiveRun.away`.
     """
     run = moment.run
-    return json.dumps({"values": run.case.numbers, "away": run.away, "diverged": run.diverged})
+    return json.dumps({"values": list(run.case.parameters.values()), "away": run.away, "diverged": run.diverged})
 
 
 def asked_values(message: str | bytes) -> list[float]:

@@ -79,6 +79,7 @@ export class Run {
     /** @type {Solid[]} */ this.solids = [];
     /** @type {Float64Array[]} */ this.latents = [];
     /** @type {number[][]} gravity of each step */ this.gravities = [];
+    /** @type {number[][]} parameters of each step */ this.given = [];
     /** @type {(number[] | null)[]} gravity of a hand in each step */ this.hands = [];
     /** @type {number[] | null} gravity of a hand from now on */ this.hand = null;
     this.change = new Float64Array(operators.latents);
@@ -102,6 +103,7 @@ export class Run {
     this.latents = [Float64Array.from(this.start.xhat)];
     this.change = Float64Array.from(this.start.change);
     this.gravities = [];
+    this.given = [];
     this.diverged = false;
   }
 
@@ -121,7 +123,7 @@ export class Run {
   rewind(step) {
     if (step >= this.steps) return;
     this.latents.length = step + 1;
-    this.gravities.length = step;
+    this.gravities.length = this.given.length = step;
     this.hands.length = Math.min(this.hands.length, step);
     const [now, before] = [this.latents[step], this.latents[Math.max(0, step - 1)]];
     this.change = step ? now.map((value, i) => value - before[i]) : Float64Array.from(this.start.change);
@@ -152,6 +154,7 @@ export class Run {
       if (n >= this.hands.length) this.hands.push(this.hand);
       this.latents.push(xhat);
       this.gravities.push(gravity);
+      this.given.push(this.parameters);
     }
   }
 }
