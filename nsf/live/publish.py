@@ -119,7 +119,7 @@ def _fields(model: LiveModel, arrays: dict, header: dict, most: int) -> dict:
         kinds["stress"] = np.int8, max(1, most // (6 * len(model.X)))
         _, tau = model.training_frames()
         top = float(np.percentile(von_mises(torch.as_tensor(tau)).numpy(), CLIP)) or 1.0
-        title = "von Mises equivalent of the Kirchhoff stress"
+        title = "von Mises stress"
         header["quantities"] = {"von_mises": {"title": title, "unit": "Pa", "top": top}} | header["quantities"]
     for phase, how in kinds.items():
         told, own = modal_field(model.at.fields[phase], *how)

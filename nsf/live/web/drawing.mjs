@@ -172,6 +172,7 @@ export class Drawing {
     this.radius = told.radius;
     this.cut = false;
     this.time = 0;
+    this.fine = 1; // share of the screen's pixels along a side
     /** @type {Solid[]} */ this.solids = [];
     /** @type {Body[]} */ this.bodies = [];
     [this.points, this.plane, this.solid] = [POINTS, FLOOR, SOLID].map((sources) => program(gl, sources));
@@ -197,7 +198,7 @@ export class Drawing {
 
   /** Draw all. */
   draw() {
-    const { gl, canvas, camera } = this, ratio = window.devicePixelRatio || 1;
+    const { gl, canvas, camera } = this, ratio = this.fine * (window.devicePixelRatio || 1);
     const [wide, tall] = [canvas.clientWidth, canvas.clientHeight].map((v) => Math.max(1, Math.round(v * ratio)));
     if (canvas.width !== wide || canvas.height !== tall) Object.assign(canvas, { width: wide, height: tall });
     const back = this._back(), matrix = camera.view(wide / tall);
@@ -208,6 +209,13 @@ export class Drawing {
     if (this.floor !== null) this._floor(matrix, toned(0.065), back);
     this._points(matrix, camera.pixels(wide, tall), toned(0.195));
     if (this.solids.length) this._solids(matrix);
+  }
+
+  /** Draw fewer pixels from now on, where a browser draws too slowly; true where it helped. */
+  coarsen() {
+    if (this.fine < 0.4) return false;
+    this.fine *= 0.7;
+    return true;
   }
 
   /** @param {Float32Array} matrix @param {number[]} near @param {number[]} far */

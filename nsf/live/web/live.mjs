@@ -13,6 +13,7 @@ const HOLD = 0.7; // [s] for which the end stands before the run begins again
 const MOST = 50000; // steps that a run of a hand may take
 const LOOKS = 24; // moments of a run made anew at which it is looked at
 const SPEEDS = [0.0625, 0.125, 0.25, 0.5, 1, 2, 4];
+const SLOW = 50; // [ms] between two pictures, above which fewer pixels are drawn
 const SHOWN_IN = 4; // [s] about, in which a run is shown at first
 
 /** The model of a page and what is shown of it. */
@@ -280,8 +281,15 @@ async function show() {
     note.textContent = `Steps of ${told.dt} s by operators.${estimate}${shown}`;
     document.body.dataset.step = String(live.step);
   };
-  let last = performance.now(), beyond = 0;
+  let last = performance.now(), beyond = 0, slow = 0;
   const next = (/** @type {number} */ now) => {
+    if (state.playing && document.visibilityState === "visible") {
+      slow = now - last > SLOW ? slow + 1 : 0;
+      if (slow > 5) {
+        drawing.coarsen();
+        slow = 0;
+      }
+    }
     const passed = Math.max(0, Math.min(0.2, (now - last) / 1000));
     last = now;
     if (state.playing) {

@@ -18,6 +18,7 @@ export class Operators {
     /** @type {number} */ this.latents = told.latents;
     /** @type {boolean} */ this.gravity = told.gravity;
     this.network = new Network(packed, "operators", told.layers);
+    this.next = new Float64Array(this.latents);
   }
 
   /**
@@ -29,9 +30,11 @@ export class Operators {
    * @param {Vector} states of the solids [f]
    */
   step(xhat, change, parameters, gravity, states) {
-    const r = this.latents;
-    const out = this.network.outputs([...xhat, ...Array.from(parameters), ...Array.from(states)]);
-    const next = new Float64Array(r);
+    const r = this.latents, { network, next } = this;
+    network.inputs.set(xhat);
+    network.inputs.set(parameters, r);
+    network.inputs.set(states, r + parameters.length);
+    const out = network.outputs();
     for (let i = 0; i < r; i++) {
       let sum = change[i] + out[r * r + i];
       for (let j = 0; j < r; j++) sum += out[i * r + j] * change[j];

@@ -13,16 +13,16 @@ const PIXELS = 160; // of a drag on the picture that go from the middle of the p
  * @param {number} right angle [rad] to the viewer's right
  * @param {number} ahead angle [rad] away from the viewer
  */
-export function tilted(down, { right, toward }, right_, ahead) {
-  const size = Math.hypot(...down), unit = down.map((v) => v / size), angle = Math.hypot(right_, ahead);
+export function tilted(down, axes, right, ahead) {
+  const size = Math.hypot(...down), unit = down.map((v) => v / size), angle = Math.hypot(right, ahead);
   if (angle < 1e-9) return down.slice();
   // The picture's own directions, as they lie across gravity.
-  const across = [right, toward.map((v) => -v)].map((axis) => {
+  const across = [axes.right, axes.toward.map((v) => -v)].map((axis) => {
     const along = axis.reduce((sum, v, c) => sum + v * unit[c], 0), flat = axis.map((v, c) => v - along * unit[c]);
     const length = Math.hypot(...flat) || 1;
     return flat.map((v) => v / length);
   });
-  const aside = unit.map((_, c) => (right_ * across[0][c] + ahead * across[1][c]) / angle);
+  const aside = unit.map((_, c) => (right * across[0][c] + ahead * across[1][c]) / angle);
   return unit.map((v, c) => size * (Math.cos(angle) * v + Math.sin(angle) * aside[c]));
 }
 
