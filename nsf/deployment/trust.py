@@ -43,6 +43,7 @@ class LatentDistance:
 
     def __init__(self, manifold, particles: np.ndarray, device: str | torch.device = "cpu"):
         self._at = manifold.restrict(particles=torch.as_tensor(particles), device=device)
+        self._latents = manifold.training_latents
         known = self._positions(manifold.training_latents)
         self._origin = known.mean(0)  # near which distances lose fewer digits
         self._known = known - self._origin
@@ -60,6 +61,30 @@ class LatentDistance:
             if not own.all():
                 found.append(_nearest(self._known[own], self._known[~own]).cpu().numpy())
         return np.concatenate(found)
+
+    def embedded(self, error: float) -> tuple[np.ndarray, np.ndarray]:
+        """The same distances between few numbers, where positions are modes times coefficients.
+
+        Args:
+            error: by which any distance between training latents may be off [m].
+
+        Returns:
+            [q, K]: distances of its products with coefficients a(x̂) are those of `of`; and [M, q], the
+            products of the training latents.
+        """
+        field, latents = self._at.fields["deformation"], self._latents.to(self._at.device, self._at.dtype)
+        modes = field.modes.flatten(0, 1).double().cpu().numpy() / self._at.points**0.5
+        with torch.no_grad():
+            closed = [] if field.network is None else [field.network(latents)]
+            a = torch.cat([latents, *closed], 1).double().cpu().numpy()
+        R = np.linalg.qr(modes, mode="r")
+        y = (a - a.mean(0)) @ R.T
+        _, _, axes = np.linalg.svd(y, full_matrices=False)
+        left = y @ axes.T
+        rest = np.sqrt(np.cumsum((left**2)[:, ::-1], axis=1)[:, ::-1]).max(0)  # beyond each axis
+        count = max(1, int((2.0 * rest > error).sum()))
+        matrix = axes[:count] @ R
+        return matrix, a @ matrix.T
 
     def _positions(self, latents: torch.Tensor) -> torch.Tensor:
         """g(X_S, x̂) [n, 3 s] over √s: Euclidean distances of rows are RMS distances of particles."""
@@ -102,6 +127,14 @@ class CaseDistance:
         nearest = cdist([at / self._deviation], self._values / self._deviation).min()
         outside = float(np.linalg.norm(beyond / self._deviation))
         return max(float(nearest) / self._spacing, 1.0 + outside / self._spacing if outside else 0.0)
+
+    def plain(self) -> dict:
+        """The training cases, the deviation of each parameter among them, and their spacing."""
+        return {
+            "cases": self._values.tolist(),
+            "deviation": self._deviation.tolist(),
+            "spacing": self._spacing,
+        }
 
     def extremes(self) -> list[dict[str, float]]:
         """First, middle and last training case along each parameter, without repetition."""

@@ -20,7 +20,8 @@ from nsf.evaluation import metrics
 from nsf.evaluation.superresolution import POINTS
 from nsf.kinematics.interpolation import lying_together
 from nsf.kinematics.manifold import Manifold, Restriction
-from nsf.mpm import floor_height, precision_of
+from nsf.export import web
+from nsf.mpm import Collider, floor_height, precision_of
 from nsf.mpm.device import warp_device
 from nsf.progress import Progress
 from nsf.reporting.drawing.style import CLIP
@@ -221,8 +222,17 @@ class Playback:
     @property
     def floor(self) -> float | None:
         """Height of a horizontal floor at rest [m]."""
-        colliders = configuration.build_all(self._settings["scene"]["colliders"], "scene.colliders")
-        return floor_height(list(colliders.values()))
+        return floor_height(list(self._colliders.values()))
+
+    @property
+    def solids(self) -> list[dict]:
+        """The solids, for a page; without those that a program moves, whose way only the scene knows."""
+        programs = (self._settings["scene"].get("forcing") or {}).get("colliders") or {}
+        return [web.solid(name, own) for name, own in self._colliders.items() if name not in programs]
+
+    @cached_property
+    def _colliders(self) -> dict[str, Collider]:
+        return configuration.build_all(self._settings["scene"]["colliders"], "scene.colliders")
 
     @property
     def radius(self) -> float:

@@ -14,6 +14,8 @@ from nsf.deployment import Trust
 from nsf.deployment.trust import CaseDistance, LatentDistance
 from nsf.dynamics import Decoder, ReducedMPM
 from nsf.errors import ConfigError, InstabilityError
+from nsf.export import web
+from nsf.mpm import floor_height
 from nsf.mpm.stability import check_time_step
 from nsf.pipeline import Pipeline
 from nsf.runs import Run
@@ -25,6 +27,8 @@ PRECISION = "fp32"
 _BEYOND = 0.5
 #: Number of steps in the range of a parameter.
 _STEPS = 200
+#: Share of the particles that are shown which lie at the surface, where there are so many.
+_OUTER = 0.7
 _SNAPSHOTS = 64  # training snapshots that bounds and colour scales are taken from
 
 
@@ -163,12 +167,15 @@ class LiveModel:
         run: complete deploy run.
         points: most particles that are shown; the sample particles are always among them.
         device: `cpu`, `cuda`, `cuda:N` or `auto`.
+        surface: whether most of the particles that are shown lie at the surface of the bodies at rest, where
+            there are too many for all.
 
     Attributes:
-        run, manifold.
+        run, manifold, pipeline.
         parameters: what can be asked for; known: cases with a full-order trajectory, ascending.
         title: of the scene.
         particles: P.
+        sample: indices of the sample particles.
         shown: [n] indices of the particles that are shown.
         at: the fields at these particles.
         X: [n, 3] positions of these particles at rest [m].
@@ -179,29 +186,30 @@ class LiveModel:
         DeviceError: the device does not exist.
     """
 
-    def __init__(self, run: Run, points: int = 6000, device: str = "auto"):
+    def __init__(self, run: Run, points: int = 6000, device: str = "auto", surface: bool = False):
         self.run = run
-        self._pipeline = Pipeline.of_run(run, device)
-        self.title = self._pipeline.deployed.config.scene.title
-        self.manifold = self._pipeline.manifold()
-        self._truths = _truths(self._pipeline)
+        self.pipeline = Pipeline.of_run(run, device)
+        self.title = self.pipeline.deployed.config.scene.title
+        self.manifold = self.pipeline.manifold()
+        self._truths = _truths(self.pipeline)
         self.known = tuple(sorted(self._truths))
-        self.parameters = _parameters(self._pipeline, self.known)
+        self.parameters = _parameters(self.pipeline, self.known)
         # Live runs share the samples and sets, which are found in the deployment's own precision.
-        solver = self._pipeline.solver_at(self.manifold, self.initial)
+        solver = self.pipeline.solver_at(self.manifold, self.initial)
         sample = np.unique(np.concatenate([sets.sample for sets in solver.sets]))
         self._sets_at = solver.sets_at
-        self.trust = _trust(run, self.manifold, sample, self._pipeline.device)
+        self.trust = _trust(run, self.manifold, sample, self.pipeline.device)
         self.particles = len(self.manifold.X)
-        self.shown = _shown(self.particles, sample, points)
-        self.at = self.manifold.restrict(self.shown, dtype=torch.float32, device=self._pipeline.device)
+        self.sample = sample
+        self.shown = _shown(self.manifold.X.numpy(), sample, points, surface)
+        self.at = self.manifold.restrict(self.shown, dtype=torch.float32, device=self.pipeline.device)
         self.X = self.manifold.X[self.shown].numpy().astype(np.float32)
         self.spacing = float((solver.setup.constants.volume0.sum() / len(self.shown)) ** (1 / 3))
 
     @property
     def initial(self) -> Case:
         """The first case to show: the first that was deployed."""
-        return self._pipeline.held_out[0]
+        return self.pipeline.held_out[0]
 
     def checked(self, numbers: Sequence[float]) -> Case:
         """The case of some values, or the known one that lies within half a step of each of them.
@@ -217,22 +225,36 @@ class LiveModel:
         steps = [p.step for p in self.parameters]
 
         def off(case: Case) -> float:
-            return max(abs(np.subtract(case.numbers, numbers)) / steps)
+            return max(abs(np.subtract(list(case.parameters.values()), numbers)) / steps)
 
         nearest = min(self.known, key=off, default=None)
         if nearest is not None and off(nearest) <= 0.5:
             return nearest
-        return self._pipeline.scene.case(numbers)
+        return self.pipeline.scene.case(numbers)
 
     def start(self, case: Case) -> LiveRun:
         """A run of a case, at t = 0."""
-        solver = self._pipeline.solver_at(self.manifold, case, precision=PRECISION)
+        solver = self.pipeline.solver_at(self.manifold, case, precision=PRECISION)
         return LiveRun(case, solver, solver.decoder(self.shown, self.at), self.trust)
+
+    def truth_run(self, case: Case) -> Run | None:
+        """The simulate run of a known case; None of other cases."""
+        return self._truths.get(case)
 
     def truth(self, case: Case) -> Truth | None:
         """The full-order run of a known case; None of other cases."""
-        run = self._truths.get(case)
+        run = self.truth_run(case)
         return Truth(Trajectory.open(run.file(TRAJECTORY)), self.shown) if run else None
+
+    @property
+    def floor(self) -> float | None:
+        """Height of a horizontal floor at rest [m]."""
+        return floor_height(list(self.pipeline.deployed.colliders))
+
+    def solids(self, case: Case) -> list[dict]:
+        """The solids of a case, for a page."""
+        scene = self.pipeline.deployed.with_parameters(case)
+        return [web.solid(name, own) for name, own in zip(scene.collider_names, scene.colliders, strict=True)]
 
     def roles(self, step: int) -> np.ndarray:
         """[n] set of each shown particle in the step that starts at `step`: 2 S, 1 N only, 0 neither."""
@@ -293,8 +315,25 @@ def _trust(run: Run, manifold, sample: np.ndarray, device: str) -> Trust:
     return Trust(residual, distance, LatentDistance(manifold, sample, device), CaseDistance(manifold))
 
 
-def _shown(particles: int, sample: np.ndarray, points: int) -> np.ndarray:
+def _shown(X: np.ndarray, sample: np.ndarray, points: int, surface: bool) -> np.ndarray:
     """Indices of the sample particles and of others at random, ascending."""
-    order = np.random.default_rng(0).permutation(particles)
-    others = order[~np.isin(order, sample)][: max(0, points - len(sample))]
-    return np.sort(np.concatenate([sample, others]))
+    order = np.random.default_rng(0).permutation(len(X))
+    others = order[~np.isin(order, sample)]
+    left = max(0, points - len(sample))
+    if surface and len(others) > left:
+        outer = at_surface(X)[others]
+        # The rest of them lies inside, which shows where a body is cut or tears.
+        first = others[outer][: int(_OUTER * left)]
+        others = np.concatenate([first, others[~np.isin(others, first)]])
+    return np.sort(np.concatenate([sample, others[:left]]))
+
+
+def at_surface(X: np.ndarray) -> np.ndarray:
+    """[P] whether particles X [P, 3] lie in a cell that has an empty one beside it."""
+    extent = np.maximum(np.ptp(X, axis=0), 1e-9)
+    edge = 2.0 * (np.prod(extent) / len(X)) ** (1 / 3)  # some eight particles where they fill their box
+    cells = np.floor((X - X.min(0)) / edge).astype(int) + 1
+    filled = np.zeros(cells.max(0) + 2, bool)
+    filled[tuple(cells.T)] = True
+    sides = np.concatenate([np.eye(3, dtype=int), -np.eye(3, dtype=int)])
+    return np.any([~filled[tuple((cells + side).T)] for side in sides], axis=0)

@@ -3,7 +3,6 @@
 import asyncio
 import http
 import logging
-from importlib.resources import files
 
 from websockets.asyncio.server import Server, ServerConnection, broadcast, serve
 from websockets.datastructures import Headers
@@ -11,6 +10,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from nsf.errors import ConfigError
+from nsf.export import web
 from nsf.live.guard import Connection, check_token, name_of, refused
 from nsf.live.player import Moment, Player
 from nsf.live.wire import asked_values, field_message, frame_message, state_message
@@ -27,8 +27,7 @@ _HEADERS = {
     "Cache-Control": "no-store",
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
-    "Content-Security-Policy": "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
-    "connect-src 'self' ws: wss:; img-src data:; frame-ancestors 'none'",
+    "Content-Security-Policy": f"{web.policy('stream', connects=True)}; frame-ancestors 'none'",
 }
 
 
@@ -57,7 +56,7 @@ class Stream:
         self._player, self._host, self._token = player, host, token
         self._rate, self._patience = rate, patience
         self._field = field_message(player.model)
-        self._page = files("nsf.live").joinpath("page.html").read_bytes()
+        self._page = web.page("stream", "nsf serve", connects=True).encode()
         self._clients: set[ServerConnection] = set()
         moment = player.tick()
         self._state, self._frame = state_message(moment), frame_message(moment)

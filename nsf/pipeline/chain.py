@@ -154,7 +154,7 @@ class Pipeline(Plan):
         By the engine that is asked for, of the scene that is deployed, unless others are given.
         """
         if engine is None:
-            engine = self._operators(manifold) if self.engine == Operators.name else self.engine
+            engine = self.operators(manifold) if self.engine == Operators.name else self.engine
         batch = (scene or self.deployed).reduced_batch(
             manifold,
             cases,
@@ -180,8 +180,12 @@ class Pipeline(Plan):
         """
         return self._made(self.taught, partial(teach, self))
 
-    def _operators(self, manifold: Manifold) -> Operators:
-        """The operators that were taught; with them the sample, which is that of the scene of training."""
+    def operators(self, manifold: Manifold) -> Operators:
+        """The operators that were taught; with them the sample, which is that of the scene of training.
+
+        Raises:
+            MissingRunError: none were taught.
+        """
         if self._taught is None:
             self._taught = Operators.load(self.taught.require().file(OPERATORS))
             self.batch_at(manifold, self.split.train[:1], engine=self.projecting, scene=self.scene)

@@ -163,6 +163,27 @@ class StepOperators(nn.Module):
             found.append(xhat)
         return torch.stack(found)
 
+    def raw_layers(self) -> list[tuple[Tensor, Tensor]]:
+        """Weights [out, in] and biases [out] of the same network for raw inputs and outputs.
+
+        Its inputs are x̂, μ and the collider states as `states.collider_states` gives them; its outputs the
+        entries of B [r, r], Δt² f [r] and Δt² G [r, 3], with d' = d + B d + Δt² (f + G g).
+        """
+        (W, b), middle, (V, c) = ((layer.weight, layer.bias) for layer in (self.net[i] for i in (0, 2, 4)))
+        r, n = self.sizes.latents, self.sizes.parameters
+        of_x, of_mu = W[:, :r] / self.x_scale, W[:, r : r + n] / self.mu_scale
+        of_states = W[:, r + n :] @ self.c_matrix.T
+        first = torch.cat([of_x, of_mu, of_states], 1), b - of_x @ self.x_mean - of_mu @ self.mu_mean
+        first = first[0], first[1] - of_states @ self.c_mean
+        B, f, G = torch.cat([V, c[:, None]], 1).tensor_split([r * r, r * r + r])
+        B = (self.a_scale[:, None] / self.d_scale).flatten()[:, None] * B
+        f = self.a_scale[:, None] * f
+        if self.sizes.gravity:
+            G = self.a_scale.repeat_interleave(3)[:, None] * G / self.g_scale
+            f = f - (G.unflatten(0, (r, 3)) * self.g_mean[:, None]).sum(1)
+        last = torch.cat([B, f, G])
+        return [first, middle, (last[:, :-1], last[:, -1])]
+
     def save(self, path: Path | str, taught: Taught) -> None:
         """Write weights, scales and what they were taught on; whole or not at all."""
         content = {

@@ -442,7 +442,7 @@ def test_a_browser_decodes_what_the_server_does(browser, address, model):
         window.on("request", lambda request: asked.append(request.url))
         window.on("pageerror", lambda error: faults.append(str(error)))
         window.goto(url)
-        wait_until(lambda window=window: window.evaluate("state.drawn > 5"))
+        wait_until(lambda window=window: window.evaluate("window.nsf && nsf.state.drawn > 5"))
     one, other = windows
     assert all(u.startswith(url) or u.startswith("data:") for u in asked)
     assert not faults
@@ -452,10 +452,10 @@ def test_a_browser_decodes_what_the_server_does(browser, address, model):
     wait_until(lambda: player.case == angle(34.0))
     for window in windows:
         window.get_by_text("friction angle = 34.00°").wait_for()
-    wait_until(lambda: other.evaluate("state.values[0] === 34 && state.t > 0.1"))
+    wait_until(lambda: other.evaluate("nsf.state.values[0] === 34 && nsf.state.t > 0.1"))
     assert other.screenshot() != before
 
-    shown = other.evaluate("({t: state.t, x: Array.from(state.x)})")
+    shown = other.evaluate("({t: nsf.state.t, x: Array.from(nsf.state.x)})")
     run = player.tick().run
     x = np.reshape(shown["x"], (-1, 3))
     expected = run.positions(round(shown["t"] / run.dt))
@@ -469,6 +469,6 @@ def test_a_browser_says_when_the_stream_ends(browser, address):
     url, _ = address
     window = browser.new_page()
     window.goto(url)
-    wait_until(lambda: window.evaluate("state.drawn > 2"))
-    window.evaluate("socket.send('rubbish')")
+    wait_until(lambda: window.evaluate("window.nsf && nsf.state.drawn > 2"))
+    window.evaluate("nsf.socket.send('rubbish')")
     window.get_by_text("closed (1008) a client may only send").wait_for()

@@ -1,0 +1,199 @@
+"""Pages in one file that load nothing: the modules of `nsf/live/web`, a style, and numbers in one piece.
+
+A page's policy names the hashes of its one script and its one style: nothing else runs in it, whatever a
+title or a unit holds.
+"""
+
+import base64
+import hashlib
+import json
+import re
+import struct
+import zlib
+from collections.abc import Mapping, Sequence
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+from markupsafe import Markup
+
+from nsf.mpm import Collider, HalfSpace, Sphere
+from nsf.reporting.drawing.style import STRESS_COLORS, ColorScale
+from nsf.reporting.text.formats import HTML
+from nsf.storage import writing
+
+#: Arrays begin at multiples of so many bytes, so that a browser views them in place.
+_WORD = 8
+_TYPES = ("f4", "f8", "i1", "i2", "u1", "u2")
+_IMPORT = re.compile(r'^import \{ ([^}]+) \} from "\./(\w+)\.mjs";\n', re.MULTILINE)
+_TOP = re.compile(r"^(export )?(?:async )?(?:function|class|const|let) (\w+)", re.MULTILINE)
+
+
+def packed(header: Mapping, arrays: Mapping[str, np.ndarray]) -> bytes:
+    """A header and arrays in one piece, as `unpacked` in `data.mjs` reads them.
+
+    Returns:
+        Length of the header as uint32, the header (JSON with `arrays`: shape and type of each, padded with
+        spaces), then the arrays, all little-endian, each padded to whole words.
+
+    Raises:
+        ValueError: an array is of a type that no browser views.
+    """
+    arrays = {name: np.ascontiguousarray(a, a.dtype.newbyteorder("<")) for name, a in arrays.items()}
+    told = {name: {"shape": a.shape, "type": f"{a.dtype.kind}{a.itemsize}"} for name, a in arrays.items()}
+    if unknown := [f"{name}: {own['type']}" for name, own in told.items() if own["type"] not in _TYPES]:
+        raise ValueError(f"{', '.join(unknown)}: arrays must be of {', '.join(_TYPES)}")
+    text = json.dumps({**header, "arrays": told}).encode()
+    text += b" " * (-(4 + len(text)) % _WORD)
+    body = b"".join(a.tobytes() + b"\0" * (-a.nbytes % _WORD) for a in arrays.values())
+    return struct.pack("<I", len(text)) + text + body
+
+
+@cache
+def script(entry: str) -> str:
+    """The modules that a page needs as one, each once and after those that it imports.
+
+    Args:
+        entry: module of the page, without its ending.
+
+    Raises:
+        ValueError: a module imports what another does not export, or two have a name in common.
+    """
+    texts: dict[str, str] = {}
+    exported: dict[str, set[str]] = {}
+    names: dict[str, str] = {}
+
+    def add(module: str) -> None:
+        if module in texts:
+            return
+        text = _text("live", "web", f"{module}.mjs")
+        texts[module] = ""  # a circle of imports ends here; functions are called after all are there
+        wanted = [(own.split(", "), other) for own, other in _IMPORT.findall(text)]
+        for _, other in wanted:
+            add(other)
+        for own, other in wanted:
+            if missing := set(own) - exported.get(other, set(own)):
+                raise ValueError(f"{module}.mjs imports {', '.join(missing)}, which {other}.mjs lacks")
+        found = _TOP.findall(text)
+        for _, name in found:
+            if name in names:
+                raise ValueError(f"{module}.mjs and {names[name]}.mjs both have {name}")
+            names[name] = module
+        exported[module] = {name for export, name in found if export}
+        del texts[module]
+        texts[module] = re.sub(r"^export ", "", _IMPORT.sub("", text), flags=re.MULTILINE)
+
+    add(entry)
+    whole = "\n".join(texts.values())
+    if "</script" in whole or re.search(r"^\s*(import|export)\b", whole, re.MULTILINE):
+        raise ValueError(f"{entry}.mjs cannot stand in a page: an import or an end of script is left in it")
+    return f"\n{whole}"
+
+
+def policy(entry: str, connects: bool = False) -> str:
+    """What a page may do: run its one script, be styled, and where it connects, reach its own server."""
+    hashes = (_hashed(text) for text in (script(entry), _style()))
+    allowed = "script-src 'sha256-{}'; style-src 'sha256-{}'; img-src data: blob:".format(*hashes)
+    own = "; connect-src 'self' ws: wss:" if connects else ""
+    return f"default-src 'none'; {allowed}{own}; base-uri 'none'; form-action 'none'"
+
+
+def page(entry: str, title: str, data: bytes = b"", connects: bool = False) -> str:
+    """A page.
+
+    Args:
+        entry: module that it begins with, without its ending.
+        title: until the script gives another.
+        data: what it holds, of `packed`; none where it is loaded.
+        connects: whether it reaches its own server.
+    """
+    deflated = base64.b64encode(zlib.compress(data, 9)).decode() if data else ""
+    return HTML.from_string(_text("export", "page.html")).render(
+        title=title,
+        policy=policy(entry, connects),
+        style=Markup(_style()),
+        script=Markup(script(entry)),
+        data=Markup(deflated),
+    )
+
+
+def write_page(path: Path, *given, **options) -> Path:
+    """Write a `page`; whole or not at all."""
+    with writing(path) as partial:
+        partial.write_text(page(*given, **options), encoding="utf-8")
+    return path
+
+
+def colors() -> list[int]:
+    """[256 × 3] the colours of a scale, of 8 bits."""
+    return ColorScale(1.0, STRESS_COLORS, 1.0, "").pixels(np.linspace(0, 1, 256)).ravel().tolist()
+
+
+def solid(name: str, collider: Collider) -> dict:
+    """A solid as `solids.mjs` has it."""
+    shapes = {HalfSpace: "half-space", Sphere: "sphere"}
+    found = {
+        "name": name,
+        "shape": shapes.get(type(collider), "cuboid"),
+        "position": collider.position.tolist(),
+        "extents": collider.extents.tolist(),
+        "orientation": collider.orientation.ravel().tolist(),
+        "since": collider.since,
+        "until": collider.until if np.isfinite(collider.until) else None,
+        "motion": None,
+    }
+    if collider.motion is not None:
+        times, translations, angles = collider.motion.keyframes()
+        axis, pivot = collider.motion.hinge()
+        held = {"times": times, "translations": translations, "angles": angles, "axis": axis, "pivot": pivot}
+        found["motion"] = {key: values.tolist() for key, values in held.items()}
+    return found
+
+
+def recording(x: np.ndarray, stress: np.ndarray, t: Sequence[float]) -> tuple[dict, dict[str, np.ndarray]]:
+    """A recorded run as `Recording` in `data.mjs` reads it: what is told of it, and its arrays.
+
+    Each plane of values is its difference from the plane before. The bytes are sorted by their significance,
+    because nearly all high bytes are alike.
+
+    Args:
+        x: [F + 1, n, 3] positions at rest and in each frame [m]; kept in 16 bits over their box.
+        stress: [F, n] over the end of its colour scale; kept in 8 bits.
+        t: [F] times [s].
+    """
+    lower, upper = x.min((0, 1)), x.max((0, 1))
+    told = {
+        "t": [float(value) for value in t], "points": x.shape[1],
+        "lower": lower.tolist(), "upper": upper.tolist(),
+    }  # fmt: skip
+    planes = quantised(x, lower, upper, np.uint16), quantised(stress, 0.0, 1.0, np.uint8)
+    return told, dict(zip(("x", "stress"), map(_differences, planes), strict=True))
+
+
+def quantised(values: np.ndarray, lower, upper, kind: type) -> np.ndarray:
+    """Values, clipped to [`lower`, `upper`], as whole numbers from 0 to the largest of `kind`."""
+    largest = np.iinfo(kind).max
+    span = np.maximum(np.subtract(upper, lower), np.finfo(np.float32).tiny)
+    return np.rint(np.clip((values - lower) / span, 0.0, 1.0) * largest).astype(kind)
+
+
+def _differences(planes: np.ndarray) -> np.ndarray:
+    """Each plane less the one before it, modulo the type; [bytes of a number, F, …]."""
+    differences = np.diff(planes, axis=0, prepend=np.zeros_like(planes[:1]))
+    count = np.ascontiguousarray(differences).view(np.uint8).reshape(-1, planes.itemsize)
+    return np.moveaxis(count, 1, 0).reshape(planes.itemsize, *planes.shape)
+
+
+def _hashed(text: str) -> str:
+    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+
+
+@cache
+def _style() -> str:
+    return "\n" + _text("export", "page.css")
+
+
+@cache
+def _text(*path: str) -> str:
+    return files("nsf").joinpath(*path).read_text(encoding="utf-8")

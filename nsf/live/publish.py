@@ -1,0 +1,218 @@
+"""A model that runs in a page: what a file of it holds, and what cannot be put into one."""
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from nsf.data import Case
+from nsf.data.schema import TRAJECTORY
+from nsf.data.trajectory import Trajectory
+from nsf.deployment import Rollout, rollout_file
+from nsf.dynamics.setup import first_changes
+from nsf.engines import Operators
+from nsf.errors import ConfigError
+from nsf.evaluation.metrics import von_mises
+from nsf.export import web
+from nsf.live.model import LiveModel
+from nsf.live.wire import check_field, modal_field, network_arrays, shown
+from nsf.reporting.drawing.style import CLIP
+from nsf.reporting.text.formats import file_name
+from nsf.runs import Run
+
+#: Points of a page, by default; a telephone decodes so many in each frame.
+POINTS = 20_000
+#: Largest page [bytes], which still goes by mail.
+LARGEST = 16_000_000
+#: Bytes of the modes of stress, which are for colour: in 8 bits, those of most energy.
+_STRESS = 4_000_000
+#: Of a full-order run that is shown beside: points and frames.
+_BESIDE, _FRAMES = 2000, 50
+#: Full-order runs that are kept.
+_RUNS = 3
+_TUBE = 0.01  # of the scale of distances, by which a page may be off
+_SNAPSHOTS = 6000  # training snapshots that distances are taken to
+_SAME = 1e-9
+
+
+def write(run: Run, folder: Path, points: int | None = None, device: str = "auto") -> Path:
+    """Write the page of a deployment by operators.
+
+    Args:
+        run: complete deploy run.
+        folder: of the page.
+        points: how many are shown at most; `POINTS` by default.
+        device: where the model is read on: `cpu`, `cuda`, `cuda:N` or `auto`.
+
+    Raises:
+        ConfigError: see `model_data`; the page would be too large to be mailed.
+    """
+    title, data = model_data(LiveModel(run, points or POINTS, device, surface=True))
+    path = web.write_page(folder / f"{run.scene}-live.html", "live", title, data)
+    if (size := path.stat().st_size) > LARGEST:
+        path.unlink()
+        raise ConfigError(
+            f"the page would have {size / 1e6:.1f} MB, at most {LARGEST / 1e6:.0f}; give fewer --points"
+        )
+    return path
+
+
+def model_data(model: LiveModel, stress: int = _STRESS, runs: int = _RUNS) -> tuple[str, bytes]:
+    """Title and data of a page.
+
+    Args:
+        model: of the deployment.
+        stress: bytes of the modes of stress at most.
+        runs: full-order runs at most.
+
+    Raises:
+        ConfigError: its steps are taken by no operators, its field has no modes, or a parameter changes the
+            forcing or the start.
+    """
+    check_field(model)
+    pipeline = model.pipeline
+    if pipeline.engine != Operators.name:
+        raise ConfigError(
+            f"{model.run.id} has engine={pipeline.engine}, whose steps take more than a page can; deploy it "
+            "with engine=operators, which teaches them first"
+        )
+    operators = pipeline.operators(model.manifold)
+    taught, network = operators.taught, operators.model
+    header, order = shown(model), {p.name: i for i, p in enumerate(model.parameters)}
+    header["parameters"] = [header["parameters"][order[name]] for name in taught.parameters]
+    arrays = {"rest": model.X}
+    header["fields"] = _fields(model, arrays, header, stress)
+    with torch.no_grad():
+        layers = [_Layer(*own) for own in network.raw_layers()]
+    arrays |= {f"operators.{name}": a for name, a in network_arrays(layers, "f8").items()}
+    batch = pipeline.batch_at(model.manifold, [model.initial], precision="fp64")
+    header |= {
+        "file": file_name(f"{model.run.scene}-{model.run.hash}"),
+        "latents": model.manifold.latent_dim,
+        "dt": taught.dt,
+        "steps": batch.total_steps,
+        "operators": {
+            "latents": network.sizes.latents, "gravity": network.sizes.gravity, "layers": len(layers)
+        },
+        "start": _start(model),
+        "gravity": _tilt(model, operators),
+        "trust": _trust(model, operators, arrays),
+        "recordings": {},
+    }  # fmt: skip
+    header["cases"] = _cases(model, taught.parameters, arrays, header, runs)
+    return model.title, web.packed(header, arrays)
+
+
+class _Layer:
+    """A linear layer of given weights."""
+
+    def __init__(self, weight: torch.Tensor, bias: torch.Tensor):
+        self.weight, self.bias = weight, bias
+
+
+def _fields(model: LiveModel, arrays: dict, header: dict, most: int) -> dict:
+    """Put the fields of x and, where the method takes τ from one, of τ into a page."""
+    found = {}
+    kinds: dict[str, tuple[type, int | None]] = {"deformation": (np.int16, None)}
+    if model.pipeline.method.neural_stress:
+        kinds["stress"] = np.int8, max(1, most // (6 * len(model.X)))
+        _, tau = model.training_frames()
+        top = float(np.percentile(von_mises(torch.as_tensor(tau)).numpy(), CLIP)) or 1.0
+        title = "von Mises stress"
+        header["quantities"] = {"von_mises": {"title": title, "unit": "Pa", "top": top}} | header["quantities"]
+    for phase, how in kinds.items():
+        told, own = modal_field(model.at.fields[phase], *how)
+        found[phase] = told | {"parameters": model.manifold.takes_parameters(phase)}
+        arrays |= {f"{phase}.{name}": a for name, a in own.items()}
+    return found
+
+
+def _corners(model: LiveModel) -> list[Case]:
+    """The first case, and those at the corners of the box of training with the same program."""
+    first = model.initial
+    corners = itertools.islice(itertools.product(*(p.trained for p in model.parameters)), 16)
+    names = [p.name for p in model.parameters]
+    return [first, *(model.pipeline.scene.case(dict(first) | dict(zip(names, own, strict=True))) for own in corners)]
+
+
+def _start(model: LiveModel) -> dict:
+    """x̂ and what stands for d at t = 0, which no parameter may change."""
+    batch = model.pipeline.batch_at(model.manifold, _corners(model), precision="fp64")
+    span, setups = batch.span_at(0), batch.batch.setups
+    changes = first_changes(span.at_sample, span.sets.sample, setups).cpu().numpy()
+    latents = np.stack([setup.xhat.double().cpu().numpy() for setup in setups])
+    for name, rows in (("velocity", changes), ("shape", latents)):
+        if np.abs(rows - rows[0]).max() > _SAME * max(1.0, np.abs(rows).max()):
+            raise ConfigError(f"a parameter changes the initial {name}, which a page keeps; use nsf view")
+    return {"xhat": latents[0].tolist(), "change": changes[0].tolist()}
+
+
+def _tilt(model: LiveModel, operators: Operators) -> dict | None:
+    """Gravity of the scene, and the largest tilt that was taught [rad]; None without gravity."""
+    down, taught = np.array(model.pipeline.deployed.gravity), operators.taught
+    size = float(np.linalg.norm(down))
+    if not operators.model.sizes.gravity or not size:
+        return None
+    # A ball about the mean of what was taught; its rim is nearest where the mean is off to one side.
+    reach = max(taught.reach - float(np.linalg.norm(down - taught.gravity)), 0.05 * size)
+    return {"down": down.tolist(), "angle": float(2.0 * np.arcsin(min(1.0, 0.5 * reach / size)))}
+
+
+def _trust(model: LiveModel, operators: Operators, arrays: dict) -> dict:
+    """Put the distances to the training runs into a page."""
+    trust, taught = model.trust, operators.taught
+    matrix, known = trust.latent_distance.embedded(_TUBE * trust.distance)
+    known = known[:: -(-len(known) // _SNAPSHOTS)]
+    scale = np.maximum(np.abs(known).max(0), np.finfo(np.float32).tiny) / np.iinfo(np.int16).max
+    arrays |= {"tube.matrix": matrix, "tube.scale": scale, "tube.known": np.rint(known / scale).astype(np.int16)}
+    gravity = {"middle": list(taught.gravity), "reach": taught.reach} if operators.model.sizes.gravity else None
+    return {"distance": trust.distance, "cases": trust.cases.plain(), "gravity": gravity}
+
+
+def _cases(model: LiveModel, names, arrays: dict, header: dict, runs: int) -> list[dict]:
+    """The held-out cases: their parameters, forcing, and the full-order runs of some."""
+    pipeline, found = model.pipeline, []
+    for index, case in enumerate(pipeline.held_out):
+        scene = pipeline.deployed.with_parameters(case)
+        rollout = Rollout.open(model.run.file(rollout_file(index)), model.manifold.latent_dim)
+        own = {
+            "label": str(case).replace("_", " "),
+            "values": [case[name] for name in names],
+            "gravity": {
+                "times": list(scene.acting_gravity.times), "values": [list(v) for v in scene.acting_gravity.values]
+            },
+            "solids": model.solids(case),
+            "estimate": None if rollout.estimate is None else float(np.nan_to_num(rollout.estimate).max()),
+            "recording": None,
+        }  # fmt: skip
+        if case in model.known and len(header["recordings"]) < runs:
+            own["recording"] = f"full{index}"
+            told, planes = _recorded(model, case, header["quantities"])
+            header["recordings"][own["recording"]] = told
+            arrays |= {f"{own['recording']}.{name}": a for name, a in planes.items()}
+        found.append(own)
+    _check_forcing(model, found[0])
+    return found
+
+
+def _check_forcing(model: LiveModel, first: dict) -> None:
+    for case in _corners(model):
+        scene = model.pipeline.deployed.with_parameters(case)
+        gravity = {"times": list(scene.acting_gravity.times), "values": [list(v) for v in scene.acting_gravity.values]}
+        if (gravity, model.solids(case)) != (first["gravity"], first["solids"]):
+            raise ConfigError("a parameter changes gravity or a solid, which a page keeps; use nsf view")
+
+
+def _recorded(model: LiveModel, case: Case, quantities: dict) -> tuple[dict, dict[str, np.ndarray]]:
+    """The full-order run of a case at some of the points that are shown."""
+    chosen = np.sort(np.random.default_rng(1).permutation(len(model.shown))[:_BESIDE])
+    particles = model.shown[chosen]
+    with Trajectory.open(model.truth_run(case).file(TRAJECTORY)) as trajectory:
+        frames = np.unique(np.linspace(0, trajectory.frames - 1, _FRAMES + 1).round().astype(int))
+        x = trajectory.read("x", frames=frames.tolist(), particles=particles)
+        tau = trajectory.read("tau", frames=frames.tolist(), particles=particles)
+        t = frames * trajectory.dt
+    top = quantities.get("von_mises", {"top": 1.0})["top"]
+    stress = von_mises(torch.as_tensor(tau)).numpy() / top
+    return web.recording(np.concatenate([model.X[None, chosen], x]).astype(np.float32), stress, t)

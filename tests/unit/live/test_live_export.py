@@ -1,0 +1,304 @@
+"""A model that runs in a page: its numbers beside Python's, and the page in a browser without a network."""
+
+import json
+import re
+import shutil
+import subprocess
+from html import unescape
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from test_player import wait_until
+
+from nsf.errors import ConfigError
+from nsf.live import publish
+from nsf.live.model import LiveModel, at_surface
+from nsf.deployment import Rollout, rollout_file
+
+WEB = Path(__file__).parents[1] / "web"
+
+
+@pytest.fixture(scope="session")
+def node():
+    """node, which runs the modules of the pages without a browser."""
+    path = shutil.which("node")
+    if path is None:
+        pytest.skip("node is not installed; apt install nodejs")
+    return path
+
+
+@pytest.fixture(scope="session")
+def page(taught_model, tmp_path_factory):
+    """The page of the tiny chain by operators, all of its particles in it."""
+    return publish.write(taught_model.run, tmp_path_factory.mktemp("live"), device="cpu")
+
+
+@pytest.fixture(scope="session")
+def whole(page, node):
+    """Every held-out case to its end, as node takes it."""
+    done = subprocess.run([node, WEB / "whole.mjs", page], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)["found"]
+
+
+def test_the_modules_under_node(node):
+    done = subprocess.run([node, "--test", WEB], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout
+    assert "# pass 0" not in done.stdout
+
+
+def test_raw_layers_are_the_operators(taught_model):
+    model = taught_model.pipeline.operators(taught_model.manifold).model
+    values = torch.from_numpy(np.random.default_rng(0).normal(size=(5, 64)))
+    r, n, f = model.sizes.latents, model.sizes.parameters, model.sizes.features
+    x, d = model.x_mean + values[:, :r] * model.x_scale, values[:, r : 2 * r] * model.d_scale
+    mu = model.mu_mean + values[:, 20 : 20 + n] * model.mu_scale
+    g, states = values[:, 30:33], values[:, 33 : 33 + f]
+    out = torch.cat([x, mu, states], 1)
+    layers = model.raw_layers()
+    for k, (weight, bias) in enumerate(layers):
+        out = out @ weight.T + bias
+        out = torch.nn.functional.silu(out) if k < len(layers) - 1 else out
+    B, rest = out[:, : r * r].unflatten(1, (r, r)), out[:, r * r + r :].unflatten(1, (r, 3))
+    change = d + (B @ d[..., None])[..., 0] + out[:, r * r : r * r + r] + (rest @ g[..., None])[..., 0]
+    _, wanted = model.step(x, d, mu, g, model.collider_state(states))
+    torch.testing.assert_close(change, wanted, rtol=1e-9, atol=1e-12)
+
+
+def test_a_whole_run_is_pythons(whole, taught_model):
+    cases = taught_model.pipeline.held_out
+    assert len(cases) == len(whole) == 3
+    at = taught_model.manifold.restrict(torch.as_tensor(taught_model.shown))
+    for index, found in enumerate(whole):
+        kept = Rollout.open(taught_model.run.file(rollout_file(index)))
+        assert found["steps"] == len(kept.xhat) - 1
+        np.testing.assert_allclose(found["xhat"], kept.xhat[-1], rtol=0, atol=1e-4 * np.abs(kept.xhat).max())
+        xhat = torch.as_tensor(kept.xhat[-1])
+        x = at.position(xhat).numpy()
+        moved = np.abs(x - taught_model.manifold.X[taught_model.shown].numpy()).max()
+        assert moved > taught_model.pipeline.scene.dx  # or nearness would mean nothing
+        off = np.reshape(found["x"], (-1, 3)) - x
+        assert np.abs(off).max() < 1e-3 * taught_model.pipeline.scene.dx
+        tau = at.stress(xhat, torch.as_tensor([cases[index]["friction_angle"]])).numpy()
+        assert np.abs(np.reshape(found["tau"], (-1, 6)) - tau).max() < 0.02 * np.abs(tau).max()
+
+
+def test_distances_to_the_training_runs_are_pythons(whole, taught_model):
+    for index, found in enumerate(whole):
+        xhat = Rollout.open(taught_model.run.file(rollout_file(index))).xhat
+        ratios = taught_model.trust.latent_distance.of(xhat) / taught_model.trust.distance
+        np.testing.assert_allclose(found["ratios"], ratios, atol=0.03)
+        assert found["light"]["ratio"] == pytest.approx(ratios.max(), abs=0.03)
+
+
+def test_most_of_few_points_lie_at_the_surface(chain):
+    X = chain.scene.particles().X
+    outer = at_surface(X)
+    assert 0.2 < outer.mean() < 0.9
+    middle = 0.5 * (X.min(0) + X.max(0))
+    depth = np.linalg.norm((X - middle)[:, :2], axis=1) / np.ptp(X[:, 0])
+    assert depth[outer].mean() > depth[~outer].mean()
+    model = LiveModel(chain.pipeline.deployment, points=100, device="cpu", surface=True)
+    assert len(model.shown) == len(np.unique(model.shown)) == 100
+    assert outer[model.shown].mean() > outer.mean()
+    assert set(model.sample) <= set(model.shown)
+
+
+def test_a_run_that_no_operators_step_is_refused(model, tmp_path):
+    with pytest.raises(ConfigError, match="engine=auto, whose steps take more .* engine=operators"):
+        publish.model_data(model)
+
+
+def test_a_page_that_is_too_large_is_refused(taught_model, tmp_path, monkeypatch):
+    monkeypatch.setattr(publish, "LARGEST", 1000)
+    with pytest.raises(ConfigError, match=r"would have \d.* MB, at most 0; give fewer --points"):
+        publish.write(taught_model.run, tmp_path, device="cpu")
+    assert not list(tmp_path.iterdir())
+
+
+# -- in a browser -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def opened(browser):
+    """(page, size, dark) → a tab of it without a network; a fault or a request fails the test."""
+    faults = []
+
+    def open_page(page, width=1000, height=700, **options):
+        context = browser.new_context(viewport={"width": width, "height": height}, offline=True, **options)
+        tab = context.new_page()
+        tab.on("pageerror", lambda error: faults.append(str(error)))
+        tab.on("request", lambda r: faults.append(r.url) if not r.url.startswith(("file:", "data:")) else None)
+        tab.on("console", lambda m: faults.append(m.text))
+        tab.goto(page.as_uri())
+        tab.wait_for_selector("body[data-ready=true]", timeout=60_000)
+        wait_until(lambda: tab.evaluate("nsf.state.drawn > 1"))
+        return tab
+
+    yield open_page
+    assert not faults
+
+
+def paused(tab, step=0):
+    """Pause, and show a step."""
+    if tab.text_content("#play") == "Pause":
+        tab.click("#play")
+    tab.evaluate(f"nsf.live.seek({step}); nsf.state.changed = true")
+    wait_until(lambda: tab.evaluate("!nsf.state.changed"))
+
+
+def positions(tab) -> np.ndarray:
+    return np.reshape(tab.evaluate("Array.from(nsf.live.deformation.values)"), (-1, 3))
+
+
+def test_it_plays_from_disk_without_a_network(opened, page):
+    tab = opened(page)
+    begun = tab.evaluate("document.body.dataset.step")
+    tab.wait_for_selector(f"body:not([data-step='{begun}'])")
+    assert tab.title() == "Sand column"
+    tab.click("#play")
+    assert tab.text_content("#play") == "Play"
+    tab.click("#reset")
+    tab.click("#step")
+    assert tab.evaluate("nsf.live.cursor") == 1
+    tab.locator("#title").click()
+    tab.keyboard.press("ArrowRight")
+    assert tab.evaluate("nsf.live.cursor") == 2
+    tab.keyboard.press(" ")
+    assert tab.text_content("#play") == "Pause"
+
+
+def test_a_slider_changes_the_run_and_the_light(opened, page, taught_model):
+    tab = opened(page)
+    paused(tab, 24)
+    before, picture = positions(tab), tab.locator("#canvas").screenshot()
+    tab.get_by_label("friction angle").fill("36")
+    wait_until(lambda: np.abs(positions(tab) - before).max() > 1e-4)
+    assert tab.locator("#canvas").screenshot() != picture
+    assert tab.evaluate("nsf.live.run.steps") == 24
+    assert "below 1" in tab.text_content("#light")
+    tab.get_by_label("friction angle").fill("45")
+    tab.get_by_text("distrusted: friction angle is outside of the training values, 22° to 38°").wait_for()
+    tab.select_option("#from", "here")
+    paused(tab, 10)
+    latents = tab.evaluate("nsf.live.run.latents.slice(0, 11).map((x) => Array.from(x))")
+    tab.get_by_label("friction angle").fill("30")
+    tab.click("#step")
+    assert tab.evaluate("nsf.live.run.latents.slice(0, 11).map((x) => Array.from(x))") == latents
+
+
+def test_a_drag_tilts_gravity_and_the_body_follows(opened, page):
+    tab = opened(page)
+    paused(tab, 24)
+    straight = positions(tab)
+    tab.click("#reset")
+    paused(tab, 0)
+    box = tab.locator("#pad").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    tab.mouse.move(x, y)
+    tab.mouse.down()
+    tab.mouse.move(x + 0.45 * box["width"], y, steps=3)
+    tab.mouse.up()
+    assert tab.text_content("#play") == "Pause"  # a hand sets it going
+    gravity = np.array(tab.evaluate("nsf.live.run.hand"))
+    assert np.linalg.norm(gravity) == pytest.approx(4.0)
+    right = np.array(tab.evaluate("nsf.camera.axes.right"))
+    assert gravity @ right > 0.2
+    paused(tab, 24)
+    assert ((positions(tab) - straight) @ right).mean() > 1e-4
+    tab.get_by_text("distrusted: gravity was").wait_for()
+    tab.click("#upright")
+    assert tab.evaluate("nsf.live.run.hand") is None
+    tab.locator("#pad").focus()
+    tab.keyboard.press("ArrowLeft")
+    assert np.array(tab.evaluate("nsf.live.run.hand")) @ right < -0.01
+
+
+def test_a_drag_on_the_picture_turns_it_or_tilts(opened, page):
+    tab = opened(page)
+
+    def drag():
+        tab.mouse.move(300, 300)
+        tab.mouse.down()
+        tab.mouse.move(380, 300, steps=3)
+        tab.mouse.up()
+        return tab.evaluate("[nsf.camera.azimuth, nsf.live.run.hand]")
+
+    first = tab.evaluate("nsf.camera.azimuth")
+    azimuth, hand = drag()
+    assert azimuth != first
+    assert hand is None
+    tab.get_by_label("a drag on the picture tilts").check()
+    again, hand = drag()
+    assert again == azimuth
+    assert hand is not None
+
+
+def test_the_full_order_run_stands_beside(opened, page):
+    tab = opened(page)
+    paused(tab, 24)
+    before = tab.locator("#canvas").screenshot()
+    tab.get_by_label("full-order run beside it").check()
+    wait_until(lambda: tab.locator("#canvas").screenshot() != before)
+    shown = "nsf.live.recordings.get(nsf.live.case.recording)"
+    full = np.reshape(tab.evaluate(f"Array.from({shown}.at({shown}.frameAt(0.12)).x)"), (-1, 3))
+    assert np.abs(full - positions(tab)).max() < 0.02
+    tab.get_by_label("friction angle").fill("31")
+    tab.get_by_text("No full-order run of this was stored").wait_for()
+
+
+def test_what_it_keeps_is_the_picture_and_the_run(opened, page):
+    tab = opened(page)
+    paused(tab, 24)
+    with tab.expect_download() as kept:
+        tab.click("#table")
+    lines = Path(kept.value.path()).read_text().splitlines()
+    assert lines[0].startswith('"t [s]","xhat_0"')
+    rows = np.array([list(map(float, line.split(","))) for line in lines[1:]])
+    assert rows.shape == (25, 1 + 4 + 3 + 1)
+    np.testing.assert_allclose(rows[-1, 1:5], tab.evaluate("Array.from(nsf.live.run.latents[24])"))
+    with tab.expect_download() as kept:
+        tab.click("#picture")
+    assert Path(kept.value.path()).read_bytes().startswith(b"\x89PNG")
+
+
+def test_on_a_phone_in_the_dark(opened, page):
+    tab = opened(page, 390, 800, color_scheme="dark", has_touch=True, is_mobile=True)
+    assert tab.evaluate("document.documentElement.scrollWidth") <= 390
+    assert tab.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(22, 24, 27)"
+    assert tab.locator("#canvas").bounding_box()["height"] > 250
+    assert tab.get_by_role("button", name="Use this device's tilt").is_visible()
+
+
+def test_without_webgl_it_says_so(browser, page):
+    context = browser.new_context(offline=True)
+    tab = context.new_page()
+    tab.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
+    tab.goto(page.as_uri())
+    tab.get_by_text("This browser has no WebGL 2").wait_for()
+
+
+def test_every_control_has_a_name(opened, page):
+    tab = opened(page)
+    nameless = """() => [...document.querySelectorAll("input, select, button, canvas, [tabindex]")].filter((e) =>
+        !(e.ariaLabel || e.getAttribute("aria-label") || e.textContent.trim() || e.labels?.[0]?.textContent.trim()))
+        .map((e) => e.outerHTML)"""
+    assert tab.evaluate(nameless) == []
+
+
+@pytest.mark.parametrize("hostile", ["</script><script>alert(1)</script>", "<img src=x onerror=alert(1)>", "a\"'&amp;"])
+def test_titles_units_and_names_are_text(opened, taught_model, tmp_path, monkeypatch, hostile):
+    from dataclasses import replace
+
+    monkeypatch.setattr(taught_model, "title", hostile)
+    parameters = tuple(replace(p, unit=hostile) for p in taught_model.parameters)
+    monkeypatch.setattr(taught_model, "parameters", parameters)
+    title, data = publish.model_data(taught_model)
+    path = publish.web.write_page(tmp_path / "page.html", "live", title, data)
+    assert unescape(re.search(r"<title>([^<]*)</title>", path.read_text())[1]) == hostile
+    tab = opened(path)
+    assert tab.text_content("#title") == tab.title() == hostile
+    assert hostile in tab.text_content("#panel")
+    assert tab.locator("img").count() == 0

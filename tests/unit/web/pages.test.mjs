@@ -1,0 +1,214 @@
+// The modules of the pages, under node: `node --test tests/unit/web`.
+
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+import { Camera } from "../../../nsf/live/web/camera.mjs";
+import { prefixed, valued } from "../../../nsf/live/web/controls.mjs";
+import { Recording, undifferenced, unpacked } from "../../../nsf/live/web/data.mjs";
+import { Field, Network, displacement, vonMises } from "../../../nsf/live/web/field.mjs";
+import { Operators, Run, valueAt } from "../../../nsf/live/web/operators.mjs";
+import { acts, placed, poseAt, stateOf } from "../../../nsf/live/web/solids.mjs";
+import { tilted } from "../../../nsf/live/web/tilt.mjs";
+import { Trust, lightOf, quantity } from "../../../nsf/live/web/trust.mjs";
+
+const near = (found, wanted, off = 1e-12) => {
+  assert.equal(found.length, wanted.length);
+  wanted.forEach((value, i) => assert.ok(Math.abs(found[i] - value) <= off, `${found} is not ${wanted}`));
+};
+
+/** A buffer as `nsf.export.web.packed` makes it. */
+function packed(header, arrays) {
+  const kinds = new Map([[Float32Array, "f4"], [Float64Array, "f8"], [Int16Array, "i2"], [Uint8Array, "u1"]]);
+  const told = Object.fromEntries(Object.entries(arrays).map(([k, a]) => [k, { shape: [a.length], type: kinds.get(a.constructor) }]));
+  let text = JSON.stringify({ ...header, arrays: told });
+  while ((4 + text.length) % 8) text += " ";
+  const padded = Object.values(arrays).map((a) => Math.ceil(a.byteLength / 8) * 8);
+  const bytes = new Uint8Array(4 + text.length + padded.reduce((a, b) => a + b, 0));
+  new DataView(bytes.buffer).setUint32(0, text.length, true);
+  bytes.set(new TextEncoder().encode(text), 4);
+  let at = 4 + text.length;
+  Object.values(arrays).forEach((a, i) => {
+    bytes.set(new Uint8Array(a.buffer), at);
+    at += padded[i];
+  });
+  return bytes.buffer;
+}
+
+test("arrays are read in place, whatever their kinds", () => {
+  const arrays = { a: Int16Array.of(1, -2, 3), b: Float64Array.of(0.1), c: Uint8Array.of(255), d: Float32Array.of(0.5, 2) };
+  const { header, arrays: found } = unpacked(packed({ title: "x" }, arrays));
+  assert.equal(header.title, "x");
+  for (const [name, own] of Object.entries(arrays)) assert.deepEqual([...found[name]], [...own]);
+});
+
+test("planes come back from their differences, over the end of their type", () => {
+  assert.deepEqual([...undifferenced(Uint8Array.of(250, 3, 10, 255), 2, 1)], [250, 3, 4, 2]);
+  // 300, 5 then 299, 6: differences 65535 and 1; low bytes before high ones.
+  assert.deepEqual([...undifferenced(Uint8Array.of(44, 5, 255, 1, 1, 0, 255, 0), 2, 2)], [300, 5, 299, 6]);
+});
+
+test("a recording is linear between its frames", () => {
+  const low = Uint8Array.of(0, 0, 0, 255, 0, 0, 0, 255, 0), high = Uint8Array.of(0, 0, 0, 255, 0, 0, 0, 255, 0);
+  const header = { recordings: { run: { t: [0, 0.5], points: 1, lower: [0, 0, 0], upper: [2, 4, 6] } } };
+  const arrays = { "run.x": Uint8Array.of(...low, ...high), "run.stress": Uint8Array.of(0, 255) };
+  const run = new Recording({ header, arrays }, "run");
+  near(run.rest, [0, 0, 0]);
+  near(run.at(0).x, [2, 0, 0]);
+  near(run.at(0.5).x, [2, 2, 0]);
+  near(run.at(0.5).stress, [0.5]);
+  near(run.at(9).x, [2, 4, 0]);
+  assert.equal(run.frameAt(0.25), 0.5);
+  assert.equal(run.frameAt(7), 1);
+});
+
+const silu = (z) => z / (1 + Math.exp(-z));
+
+test("a network has SiLU between its layers, and none after the last", () => {
+  const arrays = {
+    "n.weight0": Float32Array.of(1, 2, -1, 0), "n.bias0": Float32Array.of(0.5, 1),
+    "n.weight1": Float32Array.of(2, -3), "n.bias1": Float32Array.of(-1),
+  };
+  const network = new Network({ header: {}, arrays }, "n", 2);
+  network.inputs.set([0.25, -1]);
+  near(network.outputs(), [2 * silu(-1.25) - 3 * silu(0.75) - 1]);
+});
+
+test("a field is mean and modes times latents, then the closure", () => {
+  const header = { fields: { f: { leading: 1, layers: 1, parameters: true } } };
+  const arrays = {
+    "f.mean": Float32Array.of(1, 2, 3), "f.scale": Float32Array.of(0.5, 0.25),
+    "f.modes": Int16Array.of(2, 4, 0, 8, -2, 0), "f.weight0": Float32Array.of(1, 10), "f.bias0": Float32Array.of(1),
+  };
+  // a = [2, 1 + 2 + 10 · 3]
+  near(new Field({ header, arrays }, "f").at([2], [3]), [1 + 2 + 33, 2 + 66, 3 - 2]);
+});
+
+test("von Mises of shear and of pressure; displacement", () => {
+  const tau = Float32Array.of(0, 2, 0, 0, 0, 0, 5, 0, 0, 5, 0, 5, 3, 0, 0, 0, 0, 0);
+  near(vonMises(tau, 2, new Float32Array(3)), [Math.sqrt(3), 0, 1.5], 1e-6);
+  near(displacement(Float32Array.of(3, 4, 0), [0, 0, 0], 10, new Float32Array(1)), [0.5], 1e-6);
+});
+
+/** Operators of one latent without inner layers: B = 0.5 + x̂, f = μ, G = [0, 0, 2]; a state adds to f. */
+function operators() {
+  const header = { operators: { latents: 1, gravity: true, layers: 1 } };
+  const weight = Float64Array.of(1, 0, 0, 0, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0);
+  return new Operators({ header, arrays: { "operators.weight0": weight, "operators.bias0": Float64Array.of(0.5, 0, 0, 0, 2) } });
+}
+
+test("a step by operators", () => {
+  const xhat = Float64Array.of(1), change = Float64Array.of(0.1);
+  operators().step(xhat, change, [0.3], [9, 9, -0.1], [0.05]);
+  // d' = 0.1 + (0.5 + 1) 0.1 + (0.3 + 0.05) + 2 (−0.1)
+  near(change, [0.4]);
+  near(xhat, [1.4]);
+});
+
+function run() {
+  const made = new Run(operators(), { xhat: [0], change: [0] }, 0.1, 100);
+  made.parameters = [0.001];
+  const state = { name: "s", shape: "sphere", position: [0, 0, 0], extents: [1, 0, 0], orientation: [1, 0, 0, 0, 1, 0, 0, 0, 1], motion: null, since: 0, until: null };
+  made.solids = [state];
+  // One state of nine is read by these operators.
+  made.operators.network.layers[0].weight = Float64Array.from({ length: 55 }, (_, i) => ({ 0: 1, 12: 1 })[i] ?? 0);
+  made.operators.network.inputs = new Float64Array(11);
+  return made;
+}
+
+test("a run that is rewound and goes on is the same run", () => {
+  const one = run(), other = run();
+  one.advance(9);
+  other.advance(7);
+  other.rewind(5);
+  assert.equal(other.steps, 5);
+  other.advance(4);
+  one.latents.forEach((xhat, n) => near(other.latents[n], xhat, 1e-14));
+  other.again(9);
+  one.latents.forEach((xhat, n) => assert.deepEqual(other.latents[n], xhat));
+});
+
+test("a hand on gravity acts from its moment on, also when the run is made anew", () => {
+  const one = run();
+  one.advance(5);
+  one.hand = [0, 0, 0.5];
+  one.advance(5);
+  const before = one.latents.map((xhat) => xhat[0]);
+  assert.deepEqual(one.gravities.map((g) => g[2]), [0, 0, 0, 0, 0, 0.5, 0.5, 0.5, 0.5, 0.5]);
+  one.again(10);
+  near(one.latents.map((xhat) => xhat[0]), before, 0);
+  one.restart();
+  one.advance(10);
+  assert.notEqual(one.latents[10][0], before[10]);
+});
+
+test("a run ends where it is not finite, and at the most steps that are kept", () => {
+  const lost = run();
+  lost.parameters = [NaN];
+  lost.advance(4);
+  assert.deepEqual([lost.diverged, lost.steps], [true, 0]);
+  const long = run();
+  long.parameters = [0];
+  long.advance(1000);
+  assert.equal(long.steps, 100);
+});
+
+test("keyframes are linear between and constant outside", () => {
+  const gravity = { times: [0, 1], values: [[0, 0, -4], [2, 0, -4]] };
+  near(valueAt(gravity, 0.25), [0.5, 0, -4]);
+  near(valueAt(gravity, -1), [0, 0, -4]);
+  near(valueAt(gravity, 9), [2, 0, -4]);
+});
+
+const SPIN = {
+  name: "s", shape: "cuboid", position: [1, 0, 0], extents: [1, 1, 1], orientation: [1, 0, 0, 0, 1, 0, 0, 0, 1], since: 0.1, until: 0.3,
+  motion: { times: [0, 1], translations: [[0, 0, 0], [0, 0, 2]], angles: [0, Math.PI], axis: [0, 0, 1], pivot: [0, 0, 0] },
+};
+
+test("a solid's pose and state", () => {
+  near(poseAt(SPIN.motion, 0.5), [0, 0, 1, Math.PI / 2]);
+  const pose = placed(SPIN, 0.5);
+  near(pose.slice(12, 15), [0, 1, 1], 1e-6); // its centre went round by a quarter, and up
+  near(pose.slice(0, 3), [0, 1, 0], 1e-6);
+  near(stateOf([SPIN], 1, 0.1), [0, 0, 0.2, 0.1 * Math.PI, 0, 0, 0.2, 0.1 * Math.PI, 1]);
+  assert.deepEqual([0.05, 0.1, 0.29, 0.3].map((t) => acts(SPIN, t)), [false, true, true, false]);
+});
+
+test("gravity is tilted as the viewer sees it, and keeps its size", () => {
+  const camera = new Camera([0, 0, 0], [1, 1, 1], () => {});
+  camera.azimuth = -Math.PI / 2; // from the south: right is east, ahead is north
+  near(tilted([0, 0, -4], camera.axes, 0, 0), [0, 0, -4]);
+  near(tilted([0, 0, -4], camera.axes, Math.PI / 6, 0), [2, 0, -4 * Math.cos(Math.PI / 6)], 1e-9);
+  near(tilted([0, 0, -4], camera.axes, 0, Math.PI / 6), [0, 2, -4 * Math.cos(Math.PI / 6)], 1e-9);
+});
+
+function trust() {
+  const header = {
+    parameters: [{ name: "angle", unit: "°", trained: [20, 40] }],
+    trust: { distance: 2, cases: { cases: [[20], [30], [40]], deviation: [10], spacing: 1 }, gravity: { middle: [0, 0, -4], reach: 0.5 } },
+  };
+  const arrays = { "tube.matrix": Float64Array.of(1), "tube.scale": Float64Array.of(0.5), "tube.known": Int16Array.of(0, 20) };
+  return new Trust({ header, arrays }, { coefficientsAt: (xhat) => xhat });
+}
+
+test("the light names its reason", () => {
+  const own = trust();
+  near([own.ofLatent([3]), own.ofLatent([9])], [1.5, 0.5]);
+  near([own.ofGravity([0, 0.25, -4]), own.ofCase([26]), own.ofCase([45])], [0.5, 0.4, 1.5]);
+  assert.deepEqual(own.light([30], 0.25, 0), { level: "good", text: "distrust ratio 0.25, below 1", ratio: 0.25 });
+  const why = (...given) => own.light(...given).text;
+  assert.equal(why([41], 0, 0), "distrusted: angle is outside of the training values, 20° to 40°");
+  assert.equal(why([30], 0, 2), "distrusted: gravity was 1 m/s² from that which was taught, 0.5 m/s² at most");
+  assert.equal(why([30], 1.5, 0), "distrusted: the shape left the training runs, ratio 1.50, above 1");
+  assert.equal(why([30], 0, 0, 0.2), "diverged at t = 0.2 s");
+  assert.equal(lightOf(0.2, 2, false).level, "away");
+  assert.equal(lightOf(1.2, 2, false).level, "bad");
+});
+
+test("numbers as text", () => {
+  assert.equal(quantity(0.4, "-"), "0.4");
+  assert.equal(valued(26, "°", 0.175), "26.00°");
+  assert.equal(valued(1500, "Pa", 10), "1500 Pa");
+  assert.equal(prefixed(5432, "Pa"), "5.43 kPa");
+  assert.equal(prefixed(0.0123, "m"), "12.3 mm");
+});
