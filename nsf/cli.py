@@ -274,7 +274,7 @@ def _experiment(name: str, stage: str, overrides: list[str], launcher: list[str]
         code = _sweep(stage, experiment.sweeps, launcher, experiment.stages if stage == "run" else ())
     if stage in ("run", "report"):
         page, missing = experiment.report()
-        _show(page)
+        _show(page, table=stage == "report" or len(experiment.jobs) == 1)
         for told in missing:
             print(f"missing: {told}", file=sys.stderr)
         code = 2 if missing else code
@@ -290,7 +290,7 @@ def _multirun(stage: str, overrides: list[str], launcher: list[str]) -> int:
     code = 0 if stage == "report" else _sweep(stage, [overrides], launcher)
     if stage in ("run", "report"):
         for page in reports(overrides):
-            _show(page)
+            _show(page, table=stage == "report")
     return code
 
 
@@ -300,18 +300,24 @@ def _sweep(stage: str, sweeps: Sequence[list[str]], launcher: list[str], more: S
 
     stages = (*(s for s in _stages(stage) if s != "report"), *more)
     failed = sweep(sweeps, stages, launcher, _primary(stage))
+    if "evaluate" in stages:
+        from nsf.pipeline.outcome import outcome_table
+
+        if table := outcome_table(sweeps, {" ".join(failure.job): failure.error for failure in failed}):
+            _console().print(table)
     for failure in failed:
         print(f"failed: {failure}", file=sys.stderr)
     return 2 if failed else 0
 
 
-def _show(page) -> None:
-    """The result table of a report, on the terminal."""
-    import pandas as pd
+def _show(page, table: bool = True) -> None:
+    """The result table of a report, on the terminal, and where its page is."""
+    if table:
+        import pandas as pd
 
-    from nsf.reporting import console_table
+        from nsf.reporting import console_table
 
-    _console().print(console_table(pd.read_csv(page.parent / "results.csv")))
+        _console().print(console_table(pd.read_csv(page.parent / "results.csv")))
     print(f"open {page.resolve()}")
 
 
