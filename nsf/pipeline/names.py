@@ -4,7 +4,7 @@ Neither torch nor Warp is imported, so that a mistake, or a chain whose results 
 """
 
 from collections.abc import Sequence
-from copy import copy
+from copy import copy, deepcopy
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
@@ -322,13 +322,13 @@ class Names:
     @staticmethod
     def _physics(scene: Draft) -> dict:
         """What the configuration says of a scene's physics."""
-        plain = OmegaConf.to_container(scene.config)
+        plain = scene.plain
         content = {key: plain[key] for key in _SCENE_KEYS}
         return content | {"scene": {k: v for k, v in plain["scene"].items() if k not in NOT_PHYSICS}}
 
     def _content(self, keys: Sequence[str]) -> dict:
-        plain = OmegaConf.to_container(self.config)
-        return {key: plain[key] for key in keys}
+        plain = self.scene.plain
+        return {key: deepcopy(plain[key]) for key in keys}
 
 
 def _device(asked) -> str:
