@@ -239,7 +239,6 @@ class Names:
                 "teaching": asdict(self.teaching),
                 "teacher": self.config.engine.teacher,
                 "cases": [list(map(dict, cases)) for cases in self.lessons],
-                "validation": list(map(dict, self.split.validation)),
                 "dt_multiplier": self.config.deploy.dt_multiplier,
                 "device": self.device,
             }
@@ -252,8 +251,7 @@ class Names:
     def lessons(self) -> list[list[Case]]:
         """Cases of three kinds that the teacher is asked in: of training, between them, and held back.
 
-        Runs in those held back decide which round of teaching is kept, where there are no validation cases.
-        None is a validation or test case.
+        Runs in those held back decide which round of teaching is kept. None is a validation or test case.
         """
         known, seed = sorted(self.split.train), int(self.config.seed)
         taken = [*known, *self.split.validation, *self.split.test]
