@@ -263,8 +263,8 @@ def _reports(words: list[str]) -> int:
         print(f"open {write_list(folder).resolve()}")
         return 0
     found = faults(folder)
-    for fault in found:
-        print(fault, file=sys.stderr)
+    told = found or [f"every report in {folder} is as it was generated"]
+    print(*told, sep="\n", file=sys.stderr if found else sys.stdout)
     return 2 if found else 0
 
 

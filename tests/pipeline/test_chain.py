@@ -22,8 +22,8 @@ from nsf.errors import ConfigError, InstabilityError, MissingRunError, NSFError
 from nsf.evaluation import superresolution
 from nsf.kinematics.manifold import Manifold
 from nsf.mpm import FullOrderMPM
-from nsf.runs import Run
 from nsf.reporting.overview.tables import texts
+from nsf.runs import Run
 from nsf.runs.listing import entries
 
 #: Issue 2, "Done when".
@@ -535,7 +535,9 @@ def test_super_resolution_of_a_deployment(copied, pipeline_at):
     pipeline, said = said_by(pipeline_at, root, *options, stages=["superresolve"])
     run = pipeline.superresolution
     assert run.manifest["parents"] == [pipeline.deployment.id, pipeline.truth(angle(26.0)).id]
-    run_line, line = said
+    run_line, line, *explained = said
+    assert any("what no field can know" in told for told in explained)
+    assert explained[-1].endswith("superresolution.png")
     assert run_line.startswith("superresolve: friction_angle=26°: 1,000 full-order particles in ")
     assert "1,000 points" in line
     assert "at the 500 particles" in line
