@@ -120,7 +120,9 @@ def _fields(model: LiveModel, arrays: dict, header: dict, most: int) -> dict:
         _, tau = model.training_frames()
         top = float(np.percentile(von_mises(torch.as_tensor(tau)).numpy(), CLIP)) or 1.0
         title = "von Mises stress"
-        header["quantities"] = {"von_mises": {"title": title, "unit": "Pa", "top": top}} | header["quantities"]
+        header["quantities"] = {"von_mises": {"title": title, "unit": "Pa", "top": top}} | header[
+            "quantities"
+        ]
     for phase, how in kinds.items():
         told, own = modal_field(model.at.fields[phase], *how)
         found[phase] = told | {"parameters": model.manifold.takes_parameters(phase)}
@@ -133,7 +135,10 @@ def _corners(model: LiveModel) -> list[Case]:
     first = model.initial
     corners = itertools.islice(itertools.product(*(p.trained for p in model.parameters)), 16)
     names = [p.name for p in model.parameters]
-    return [first, *(model.pipeline.scene.case(dict(first) | dict(zip(names, own, strict=True))) for own in corners)]
+    return [
+        first,
+        *(model.pipeline.scene.case(dict(first) | dict(zip(names, own, strict=True))) for own in corners),
+    ]
 
 
 def _start(model: LiveModel) -> dict:
@@ -165,8 +170,14 @@ def _trust(model: LiveModel, operators: Operators, arrays: dict) -> dict:
     matrix, known = trust.latent_distance.embedded(_TUBE * trust.distance)
     known = known[:: -(-len(known) // _SNAPSHOTS)]
     scale = np.maximum(np.abs(known).max(0), np.finfo(np.float32).tiny) / np.iinfo(np.int16).max
-    arrays |= {"tube.matrix": matrix, "tube.scale": scale, "tube.known": np.rint(known / scale).astype(np.int16)}
-    gravity = {"middle": list(taught.gravity), "reach": taught.reach} if operators.model.sizes.gravity else None
+    arrays |= {
+        "tube.matrix": matrix,
+        "tube.scale": scale,
+        "tube.known": np.rint(known / scale).astype(np.int16),
+    }
+    gravity = (
+        {"middle": list(taught.gravity), "reach": taught.reach} if operators.model.sizes.gravity else None
+    )
     return {"distance": trust.distance, "cases": trust.cases.plain(), "gravity": gravity}
 
 
@@ -199,7 +210,10 @@ def _cases(model: LiveModel, names, arrays: dict, header: dict, runs: int) -> li
 def _check_forcing(model: LiveModel, first: dict) -> None:
     for case in _corners(model):
         scene = model.pipeline.deployed.with_parameters(case)
-        gravity = {"times": list(scene.acting_gravity.times), "values": [list(v) for v in scene.acting_gravity.values]}
+        gravity = {
+            "times": list(scene.acting_gravity.times),
+            "values": [list(v) for v in scene.acting_gravity.values],
+        }
         if (gravity, model.solids(case)) != (first["gravity"], first["solids"]):
             raise ConfigError("a parameter changes gravity or a solid, which a page keeps; use nsf view")
 
