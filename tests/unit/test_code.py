@@ -7,7 +7,7 @@ from nsf.config.code import code_of
 
 FILES = {
     "sampling/__init__.py": "from nsf.sampling.own import Own\n",
-    "sampling/own.py": "from nsf.sampling.base import Base\nimport nsf.vectors\n\nclass Own(Base):\n    n = 1\n",
+    "sampling/own.py": "from nsf.sampling.base import Base\n\nclass Own(Base):\n    n = 1\n",
     "sampling/base.py": '"""Text."""\n\nclass Base:\n    pass\n',
     "sampling/other.py": "class Other:\n    pass\n",
     "vectors.py": "def length(): pass\n",
