@@ -4,7 +4,7 @@ Neither torch nor Warp is imported, so that a mistake, or a chain whose results 
 """
 
 from collections.abc import Sequence
-from copy import copy
+from copy import copy, deepcopy
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
@@ -324,15 +324,14 @@ class Names:
     @staticmethod
     def _physics(scene: Draft) -> dict:
         """What the configuration says of a scene's physics."""
-        plain = OmegaConf.to_container(scene.config)
+        plain = scene.plain
         content = {key: plain[key] for key in _SCENE_KEYS}
         if law := code_of(content):
             content["law"] = law
         return content | {"scene": {k: v for k, v in plain["scene"].items() if k not in NOT_PHYSICS}}
 
     def _content(self, keys: Sequence[str]) -> dict:
-        plain = OmegaConf.to_container(self.config)
-        content = {key: plain[key] for key in keys}
+        content = {key: deepcopy(self.scene.plain[key]) for key in keys}
         code = code_of(content)
         return content | {"code": code} if code else content
 

@@ -130,7 +130,9 @@ def opened(browser):
         context = browser.new_context(viewport={"width": width, "height": height}, offline=True, **options)
         tab = context.new_page()
         tab.on("pageerror", lambda error: faults.append(str(error)))
-        tab.on("request", lambda r: faults.append(r.url) if not r.url.startswith(("file:", "data:")) else None)
+        tab.on(
+            "request", lambda r: faults.append(r.url) if not r.url.startswith(("file:", "data:")) else None
+        )
         tab.on("console", lambda m: faults.append(m.text))
         tab.goto(page.as_uri())
         tab.wait_for_selector("body[data-ready=true]", timeout=60_000)
@@ -288,7 +290,9 @@ def test_every_control_has_a_name(opened, page):
     assert tab.evaluate(nameless) == []
 
 
-@pytest.mark.parametrize("hostile", ["</script><script>alert(1)</script>", "<img src=x onerror=alert(1)>", "a\"'&amp;"])
+@pytest.mark.parametrize(
+    "hostile", ["</script><script>alert(1)</script>", "<img src=x onerror=alert(1)>", "a\"'&amp;"]
+)
 def test_titles_units_and_names_are_text(opened, taught_model, tmp_path, monkeypatch, hostile):
     from dataclasses import replace
 
