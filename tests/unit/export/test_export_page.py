@@ -9,9 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
-
 from packing import unpacked
+from PIL import Image
 
 from nsf.errors import ConfigError
 from nsf.export import html
@@ -53,7 +52,9 @@ def test_the_page_is_alone(page):
     text = page.read_text(encoding="utf-8")
     before, _, after = text.partition('id="data"')
     after = after.partition("</script>")[2]
-    assert not re.search(r"(src|href)\s*=(?!\"data:,\")|@import|^import|fetch\(|https?://", before + after, re.M)
+    assert not re.search(
+        r"(src|href)\s*=(?!\"data:,\")|@import|^import|fetch\(|https?://", before + after, re.M
+    )
     policy = unescape(re.search(r'Content-Security-Policy" content="([^"]*)"', text)[1])
     assert policy.startswith("default-src 'none'; script-src 'sha256-")
     assert "unsafe" not in policy
