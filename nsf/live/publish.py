@@ -214,7 +214,7 @@ def _trust(model: LiveModel, operators: Operators, arrays: dict) -> dict:
 
 def _cases(model: LiveModel, names, arrays: dict, header: dict, sizes: Sizes) -> list[dict]:
     """The held-out cases: their parameters, forcing, and the full-order runs of some."""
-    pipeline, found = model.pipeline, []
+    pipeline, found, movable = model.pipeline, [], _movable(model)
     for index, case in enumerate(pipeline.held_out):
         scene = pipeline.deployed.with_parameters(case)
         rollout = Rollout.open(model.run.file(rollout_file(index)), model.manifold.latent_dim)
@@ -222,7 +222,7 @@ def _cases(model: LiveModel, names, arrays: dict, header: dict, sizes: Sizes) ->
             "label": str(case).replace("_", " "),
             "values": [case[name] for name in names],
             "gravity": _gravity(scene),
-            "solids": model.solids(case),
+            "solids": [own | {"movable": movable.get(own["name"])} for own in model.solids(case)],
             "estimate": None if rollout.estimate is None else float(np.nan_to_num(rollout.estimate).max()),
             "recording": None,
         }  # fmt: skip
@@ -232,7 +232,26 @@ def _cases(model: LiveModel, names, arrays: dict, header: dict, sizes: Sizes) ->
             header["recordings"][own["recording"]] = told
             arrays |= {f"{own['recording']}.{name}": a for name, a in planes.items()}
         found.append(own)
-    _check_forcing(model, found[0])
+    _check_forcing(model)
+    return found
+
+
+def _movable(model: LiveModel) -> dict[str, dict]:
+    """Direction, reach [m] and speed [m/s] of the solids that programs move, as training runs have them."""
+    found = {}
+    scenes = [model.pipeline.scene.with_parameters(case) for case in model.pipeline.split.train]
+    for name in model.pipeline.scene.forcing.colliders:
+        index = model.pipeline.scene.collider_names.index(name)
+        motions = [scene.colliders[index].motion.keyframes() for scene in scenes]
+        shifts = np.concatenate([shift for _, shift, _ in motions])
+        axis = np.linalg.svd(np.concatenate([s - s[:1] for _, s, _ in motions]), full_matrices=False)[2][0]
+        axis *= np.sign(axis[np.abs(axis).argmax()])
+        speed = max(np.abs(np.diff(s @ axis) / np.diff(t)).max() for t, s, _ in motions)
+        places = shifts @ axis
+        found[name] = {
+            "axis": axis.tolist(), "low": float(places.min()), "high": float(places.max()),
+            "speed": float(speed),
+        }  # fmt: skip
     return found
 
 
@@ -242,10 +261,17 @@ def _gravity(scene: Scene) -> dict:
     return {"times": list(acting.times), "values": [list(value) for value in acting.values]}
 
 
-def _check_forcing(model: LiveModel, first: dict) -> None:
+def _check_forcing(model: LiveModel) -> None:
+    """Refuse a parameter that changes what a page takes from the case alone.
+
+    Raises:
+        ConfigError: it changes gravity or a solid.
+    """
+    deployed, first = model.pipeline.deployed, None
     for case in _corners(model):
-        scene = model.pipeline.deployed.with_parameters(case)
-        if (_gravity(scene), model.solids(case)) != (first["gravity"], first["solids"]):
+        forcing = _gravity(deployed.with_parameters(case)), model.solids(case)
+        first = first or forcing
+        if forcing != first:
             raise ConfigError("a parameter changes gravity or a solid, which a page keeps; use nsf view")
 
 

@@ -144,9 +144,9 @@ def test_many_may_steer_at_once(model):
 
 
 def wait_until(true):
-    end = time.monotonic() + 20.0
+    end = time.monotonic() + 120.0  # after which something is broken, however busy the machine is
     while not true():
-        assert time.monotonic() < end, "nothing happened within 20 s"
+        assert time.monotonic() < end, "nothing happened within 120 s"
         time.sleep(0.01)
 
 
