@@ -34,11 +34,7 @@ TOOLS = {
         "values of numeric keys that make δ, or δ and the step's time, small at the validation values",
         "key=low..high[:log] … [key=value …] [search.objectives=[delta,step_ms]] [search.trials=20]",
     ),
-    "runs": (
-        "every run there is, filtered by fields, metrics and keys; what differs between two; which changed",
-        "[key=value[,value…] …] [sort=[-]key]\n       nsf runs diff ID ID\n"
-        "       nsf runs verify [key=value[,value…] …]; every file against its recorded sha256",
-    ),
+    "runs": ("every run there is: listed, shown, compared, verified, deleted", None),
     "index": (
         "a page of every run, with a thumbnail each, that sorts and filters in the browser",
         "[folder=PATH]; reports/runs by default",
@@ -125,6 +121,12 @@ def _dispatch(arguments: list[str]) -> int:
     launcher = [o for o in overrides if config.of_launcher(o)]
     experiments = [o.removeprefix("+experiment=") for o in overrides if o.startswith("+experiment=")]
     own = [o for o in overrides if o not in launcher and not o.startswith("+experiment=")]
+    if stage != "point" and not experiments and not any(config.names_scene(o) for o in own):
+        from nsf.paths import groups
+
+        raise ConfigError(
+            f"nsf {stage} needs a scene, as scene=sand; choose one of {', '.join(groups()['scene'])}"
+        )
     if experiments:
         return _experiment(experiments[-1], stage, own, launcher)
     if multirun:
@@ -265,29 +267,10 @@ def _search(words: list[str]) -> int:
 
 
 def _runs(words: list[str]) -> int:
-    """The table of runs, or of what differs between two; or the files that were changed, 2 if any was."""
-    from nsf.reporting.overview.listing import difference_table, entries, runs_table, text
-    from nsf.runs import Run
+    """Runs listed, shown, compared, verified or deleted."""
+    from nsf.reporting.overview.command import main as runs
 
-    if words[:1] == ["diff"]:
-        if len(words) != 3:
-            raise ConfigError(f"nsf runs diff takes two runs, not {len(words) - 1}; `nsf runs` lists them")
-        _console().print(difference_table(*map(Run.named, words[1:])))
-        return 0
-    verify = words[:1] == ["verify"]
-    words = words[verify:]
-    _check_words("runs", words)
-    filters = dict(word.split("=", 1) for word in words)
-    found = entries(filters, filters.pop("sort", "-created"))
-    if verify:
-        faults = [fault for entry in found for fault in entry.run.verify()]
-    else:
-        _console().print(runs_table(found))
-        faults = [f"broken: {entry.run.path}: {entry.fault}" for entry in found if entry.fault]
-    for fault in faults:
-        print(text(fault), file=sys.stderr)
-    print(f"{len(found)} runs" + f", {len(faults)} faults" * verify, file=sys.stderr)
-    return 2 if verify and faults else 0
+    return runs(words, lambda table: _console().print(table))
 
 
 def _primary(stage: str) -> str:

@@ -1,6 +1,6 @@
 """Configuration: Hydra groups in `conf/`, composed, checked, and built into objects."""
 
-from nsf.config.composing import checked, launching, load, of_launcher, read, resolve
+from nsf.config.composing import checked, launching, load, names_scene, of_launcher, read, resolve
 from nsf.config.keys import leaves, naming_the_missing, replaced, section
 from nsf.config.sweeps import check_sweep, jobs, scene_of
 from nsf.config.targets import build, build_all
@@ -16,6 +16,7 @@ __all__ = [
     "leaves",
     "length",
     "load",
+    "names_scene",
     "naming_the_missing",
     "number",
     "of_launcher",

@@ -170,6 +170,11 @@ def of_launcher(override: str) -> bool:
     return override.lstrip("+~").startswith(("hydra/", "hydra."))
 
 
+def names_scene(override: str) -> bool:
+    """Whether an override chooses the scene."""
+    return override.lstrip("+").startswith(("scene=", "scene@"))
+
+
 def launching(overrides: Sequence[str], config_name: str = "config") -> tuple[DictConfig, ConfigLoader]:
     """The configuration from which Hydra launches jobs, and what composes each of them.
 

@@ -1,16 +1,20 @@
 """Reduced runs of held-out cases: their rollouts, whether to believe them, who goes on where not."""
 
+from typing import TYPE_CHECKING, Any
+
 from nsf.deployment.handover import go_on, hand_over
 from nsf.deployment.levels import FULL_ORDER, OPERATORS, PROJECTED, Levels
 from nsf.deployment.rollout import (
     Rollout,
     continuation_file,
-    deploy,
     rollout,
     rollout_file,
     rollouts,
 )
 from nsf.deployment.trust import Trust, calibrate
+
+if TYPE_CHECKING:
+    from nsf.deployment.prediction import deploy
 
 __all__ = [
     "FULL_ORDER",
@@ -28,3 +32,12 @@ __all__ = [
     "rollout_file",
     "rollouts",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    # On demand, so that a live run does not wait for Lightning.
+    if name == "deploy":
+        from nsf.deployment.prediction import deploy
+
+        return deploy
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

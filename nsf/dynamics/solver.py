@@ -79,8 +79,7 @@ class ReducedBatch:
 
     def alone(self, index: int) -> "ReducedBatch":
         """One of the runs, at t = 0 and in a batch of its own."""
-        own = self.batch.setups[index]
-        return ReducedBatch([own], self._spans_of, self.engine, self.why, self._doubt)
+        return ReducedBatch([self.batch.setups[index]], self._spans_of, self.engine, self.why, self._doubt)
 
     @property
     def doubts(self) -> tuple[tuple[float, str], ...]:
@@ -115,11 +114,8 @@ class ReducedBatch:
     def steps_by_span(self, since: int = 0) -> list[tuple[int, Span]]:
         """How many of the steps taken, those before `since` left out, each span of time has had."""
         ends = [*self._starts[1:], self.total_steps]
-        counts = (
-            max(0, min(self.steps_taken, end) - max(start, since))
-            for start, end in zip(self._starts, ends, strict=True)
-        )
-        return list(zip(counts, self._spans, strict=True))
+        parts = zip(self._starts, ends, self._spans, strict=True)
+        return [(max(0, min(self.steps_taken, end) - max(start, since)), span) for start, end, span in parts]
 
     def restart(self) -> None:
         """Go back to t = 0, and to the scene's own forcing; captured graphs stay good."""

@@ -5,14 +5,12 @@ from collections.abc import Sequence
 from nsf.dynamics.setup import Setup
 from nsf.engines.base import Engine
 from nsf.engines.modal import Modal
-from nsf.engines.operators import Operators
+from nsf.engines.names import NAMES, OPERATORS
 from nsf.engines.reference import Reference
 from nsf.errors import ConfigError
 
 #: From the fastest to the one that steps whatever can be stepped.
 ENGINES: tuple[Engine, ...] = (Modal(), Reference())
-#: What `engine=` may be; operators are no name's own, but of a file that `nsf teach` writes.
-NAMES = ("auto", *(engine.name for engine in ENGINES), Operators.name)
 
 
 def choose(wanted: str | Engine, setups: Sequence[Setup]) -> tuple[Engine, str]:
@@ -35,7 +33,7 @@ def choose(wanted: str | Engine, setups: Sequence[Setup]) -> tuple[Engine, str]:
         candidates = list(ENGINES)
     elif wanted in known:
         candidates = [known[wanted]]
-    elif wanted == Operators.name:
+    elif wanted == OPERATORS:
         raise ConfigError(
             "engine=operators needs operators that were taught; give engine=nsf.engines.Operators.load(FILE) "
             "of a teach run"

@@ -1,8 +1,29 @@
 """Full-order material point method (paper section 3). Never imports torch."""
 
+import os
+from contextlib import suppress
+
 import warp as wp
 
+from nsf.gpu import has_driver
+
 wp.config.log_level = wp.LOG_ERROR  # kernels are compiled without a word; errors still show
+
+
+def _begin_without_gpu() -> None:
+    """Start Warp where no GPU can be, without its warning; `nsf doctor` says what is missing."""
+    with suppress(OSError), open(os.devnull, "wb") as nowhere:
+        kept = os.dup(2)  # the warning comes from C++, which knows no sys.stderr
+        try:
+            os.dup2(nowhere.fileno(), 2)
+            wp.init()
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+
+
+if not has_driver():
+    _begin_without_gpu()
 
 from nsf.mpm.boundaries.arrays import BoundaryArrays, DomainWalls  # noqa: E402
 from nsf.mpm.boundaries.colliders import Collider, Cuboid, HalfSpace, Sphere, floor_height  # noqa: E402

@@ -15,10 +15,10 @@ from nsf import config as configuration
 from nsf.data import Case
 from nsf.dynamics import ParticleSets, ReducedBatch, ReducedMPM
 from nsf.engines import Engine, Operators
-from nsf.errors import MissingRunError
 from nsf.kinematics.fields.mlp import MlpField
 from nsf.kinematics.manifold import Manifold
 from nsf.pipeline.plan import Plan
+from nsf.pipeline.reuse import report, reused, simulations
 from nsf.pipeline.stages.deployment import CONFIGURATION, deploy_held_out
 from nsf.pipeline.stages.evaluation import evaluate, superresolve_held_out
 from nsf.pipeline.stages.simulation import Job, Shared, simulate
@@ -27,8 +27,6 @@ from nsf.pipeline.stages.training import train
 from nsf.runs import Run
 from nsf.sampling import SampleSpan
 from nsf.scenes import Scene
-
-STAGES = ("simulate", "train", "teach", "deploy", "evaluate", "report")
 
 
 class Pipeline(Plan):
@@ -67,11 +65,6 @@ class Pipeline(Plan):
         config.device = device
         return cls(config, say, run.root)
 
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """The stages of the chain, `teach` only where the engine that is asked for is taught."""
-        return tuple(name for name in STAGES if name != "teach" or self.teaching is not None)
-
     def run(self, stage: str) -> Run | Path:
         """One stage by name; what it reads must be there, except that `simulate` needs nothing.
 
@@ -89,35 +82,18 @@ class Pipeline(Plan):
         """
         # A changed scene that changes nothing, or trains on what it deploys, names one run twice.
         runs = {self.simulation(*needed): needed for needed in self.needed()}
-        missing = {run: needed for run, needed in runs.items() if not run.complete}
-        told = {line: None for run in runs if run.complete for line in run.manifest.get("warnings", ())}
-        there, spare = len(runs) - len(missing), self._spare(later) if later else set()
-        needless = [run for run in missing if run.id in spare]
-        if there:
-            self.say(f"simulate: {there} of {len(runs)} trajectories are there, reused")
-        if needless:
-            self.say(
-                f"simulate: {len(needless)} of {len(runs)} trajectories are gone, and nothing needs them"
-            )
-            missing = {run: needed for run, needed in missing.items() if run not in needless}
-        warnings = {run: self._resolution(*needed) for run, needed in missing.items()}
-        for line in told | {line: None for lines in warnings.values() for line in lines}:
-            self.say(f"simulate: warning: {line}")
+        missing = simulations(self, runs, later, self.say)
+        warnings = {run: self._resolution(*runs[run]) for run in missing}
+        known = {line for run in runs if run.complete for line in run.manifest.get("warnings", ())}
+        for line in dict.fromkeys(line for lines in warnings.values() for line in lines):
+            if line not in known:
+                self.say(f"simulate: warning: {line}")
         if missing:
             started = time.perf_counter()
-            made = self._simulate(missing, warnings)
+            made = self._simulate({run: runs[run] for run in missing}, warnings)
             elsewhere = f", {len(missing) - made} by another process" if made < len(missing) else ""
             self.say(f"simulate: {made} trajectories in {time.perf_counter() - started:.1f} s{elsewhere}")
         return list(runs)
-
-    def _spare(self, later: Sequence[str]) -> set[str]:
-        """Trajectories, by id, that the stages need not read, as their results are there."""
-        truths = {self.truth(case).id for case in self.held_out}
-        read = {"evaluate": self.evaluation, "superresolve": self.superresolution}
-        over = "evaluate" in later and all(run.complete for name, run in read.items() if name in later)
-        trained = {run.id for run in self.training_data}
-        needed = (set() if over else truths) | (set() if self.training.complete else trained)
-        return (truths | trained) - needed
 
     def _resolution(self, case: Case, scene: Scene) -> list[str]:
         """What a trajectory is too coarse for."""
@@ -225,37 +201,9 @@ class Pipeline(Plan):
         """Errors and costs of the reduced trajectories."""
         return self._made(self.evaluation, partial(evaluate, self))
 
-    @property
-    def _report_folder(self) -> Path:
-        return Path(self.config.report.folder) / self.config.report.name
-
-    def check_report_folder(self) -> None:
-        """Refuse a place where no report could be written.
-
-        Raises:
-            ConfigError: something else stands there.
-            StorageError: the folder above it cannot be written.
-        """
-        from nsf.reporting.swap import check_place
-
-        check_place(self._report_folder)
-
     def report(self) -> Path:
         """The report of every evaluated variant of this scene at these held-out trajectories."""
-        from nsf.reporting.build import build_report
-
-        truths = {self.truth(case).id for case in self.held_out}
-        found = Run.find("evaluate", self.scene.name, root=self.root)
-        runs = [
-            r for r in found if r.complete and truths == {p for p in r.parents if p.startswith("simulate/")}
-        ]
-        if not runs:
-            raise MissingRunError(
-                "no evaluate run of these held-out cases is there; run `nsf run` with the same keys"
-            )
-        page = build_report(runs, self._report_folder, self.config.scene.title, first=self.evaluation)
-        self.say(f"report: {len(runs)} evaluated variants → {page}")
-        return page
+        return report(self, self.say)
 
     def superresolve(self) -> Run:
         """The reduced trajectories at many more points, beside full-order ones of as many particles."""
@@ -270,5 +218,4 @@ class Pipeline(Plan):
                 if not run.complete:
                     make(run)
                     return run
-        self.say(f"{run.stage}: inputs unchanged, reused → {run.id}")
-        return run
+        return reused(run, self.say)

@@ -12,7 +12,8 @@ from nsf import config as configuration
 from nsf.config.documents import text_of
 from nsf.errors import ConfigError, MissingRunError
 from nsf.paths import EXPERIMENTS
-from nsf.pipeline.plan import Plan
+from nsf.pipeline.names import Names
+from nsf.reporting.keeping import unchanged
 from nsf.runs import Run
 from nsf.vectors import is_finite
 
@@ -127,7 +128,6 @@ class Experiment:
         Raises:
             MissingRunError: no job was evaluated.
         """
-        from nsf.reporting.build import build_report
         from nsf.reporting.sources import Study
 
         runs: dict[str, Run] = {}
@@ -135,7 +135,7 @@ class Experiment:
         settings, keys, missing, scales = {}, {}, [], set()
         for job in self.jobs:
             config = configuration.load(job.overrides)
-            plan = Plan(config, root)
+            plan = Names(config, root)
             try:
                 run = plan.evaluated()
             except MissingRunError:
@@ -156,6 +156,11 @@ class Experiment:
             )
         folder = self._folder(config, scales)
         study = Study(self.question, self.paper, settings, keys, missing, self.printed, fine)
+        if page := unchanged(folder, runs.values(), self.title, study=study):
+            say(f"report: nothing it shows has changed, reused → {page}")
+            return page, missing
+        from nsf.reporting.build import build_report
+
         page = build_report(list(runs.values()), folder, self.title, study=study)
         say(f"report: {len(runs)} jobs, {len(missing)} missing → {page}")
         return page, missing
@@ -199,7 +204,7 @@ def _grid(values, where: str) -> dict[str, str]:
     return {key: f"{key}={_values(value)}" for key, value in values.items()}
 
 
-def _why(plan: Plan) -> str:
+def _why(plan: Names) -> str:
     """What became of a job that has no result: the first stage that did not end well."""
     needed = (
         [plan.simulation(v) for v in plan.split.train],

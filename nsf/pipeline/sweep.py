@@ -21,9 +21,10 @@ from nsf import config as configuration
 from nsf.data.schema import TRAJECTORY
 from nsf.errors import ConfigError, LaunchError, NSFError
 from nsf.extras import optional
-from nsf.mpm.device import visible_gpus
-from nsf.pipeline.chain import Pipeline
-from nsf.pipeline.plan import Plan
+from nsf.gpu import has_driver
+from nsf.pipeline.names import Names
+from nsf.pipeline.reuse import done
+from nsf.pipeline.reuse import report as report_of
 
 _SUBMITTED = "*/*_submitted.pkl"  # a file of each job that Slurm took
 _DIED = "its process died (killed, or out of memory or time)"
@@ -50,12 +51,19 @@ def work(config: DictConfig, stages: Sequence[str], say: Callable[[str], object]
         from nsf.reporting.drawing.point import plot_point
 
         return plot_point(config)
-    pipeline = Pipeline(config, say)
+    names = Names(config)
     if len(stages) > 1:
-        stages = [name for name in stages if name != "teach" or name in pipeline.stages]
-        pipeline.check_held_out()  # before hours of simulation and training, not after
+        stages = _of_chain(names, stages)
+        names.check_held_out()  # before hours of simulation and training, not after
     if "report" in stages:
-        pipeline.check_report_folder()
+        names.check_report_folder()
+    if "report" in stages[:1]:
+        return report_of(names, say)
+    if (there := done(names, stages, say)) is not None:
+        return there
+    from nsf.pipeline.chain import Pipeline
+
+    pipeline = Pipeline(config, say)
     if "train" in stages:
         pipeline.check_devices()
     for at, name in enumerate(stages):
@@ -107,7 +115,12 @@ def sweep(
     def check(one: DictConfig) -> None:
         movable.append(one.device == "auto" and OmegaConf.select(one, "trainer.devices", default=1) == 1)
         if "point" not in stages:
-            kept.add(Plan(one).config.data.keep)
+            names = Names(one)
+            kept.add(names.config.data.keep)
+            if done(names, _of_chain(names, stages), lambda line: None) is None:
+                from nsf.pipeline.plan import Plan
+
+                Plan(one)
 
     for overrides in sweeps:
         configuration.check_sweep(overrides, config_name, check)
@@ -133,7 +146,7 @@ def sweep(
                     say(f"not started: the jobs of later scenes, {later}; the same command goes on with them")
                 raise
             if dropped and not any(found):
-                _drop_training([Plan(configuration.load(job, config_name)) for job in scene], say)
+                _drop_training([Names(configuration.load(job, config_name)) for job in scene], say)
             errors += found
     common = set.intersection(*map(set, jobs))
     return [
@@ -149,7 +162,7 @@ def reports(overrides: Sequence[str], say: Callable[[str], object] = print) -> l
     Raises:
         MissingRunError: no job of a scene was evaluated.
     """
-    return [pipeline.report() for pipeline in _reporting(overrides, say)]
+    return [report_of(names, say) for names in _reporting(overrides)]
 
 
 def check_report_folders(overrides: Sequence[str]) -> None:
@@ -159,15 +172,29 @@ def check_report_folders(overrides: Sequence[str]) -> None:
         ConfigError: something else stands there.
         StorageError: the folder above it cannot be written.
     """
-    for pipeline in _reporting(overrides, print):
-        pipeline.check_report_folder()
+    for names in _reporting(overrides):
+        names.check_report_folder()
 
 
-def _reporting(overrides: Sequence[str], say: Callable[[str], object]) -> list[Pipeline]:
+def _reporting(overrides: Sequence[str]) -> list[Names]:
     """One for each page."""
     configs = [configuration.load(job) for job in configuration.jobs([overrides])]
     last = {(config.report.folder, config.report.name): config for config in configs}
-    return [Pipeline(config, say) for config in last.values()]
+    return [Names(config) for config in last.values()]
+
+
+def _of_chain(names: Names, stages: Sequence[str]) -> list[str]:
+    """The stages that a configuration has."""
+    return [name for name in stages if len(stages) == 1 or name != "teach" or name in names.stages]
+
+
+def visible_gpus() -> tuple[str, ...]:
+    """The GPUs that this process may use."""
+    if not has_driver():
+        return ()
+    from nsf.mpm import device
+
+    return device.visible_gpus()
 
 
 @contextmanager
@@ -213,7 +240,7 @@ def _scenes(jobs: Sequence[tuple[str, ...]]) -> list[list[tuple[str, ...]]]:
     return [list(group) for _, group in itertools.groupby(jobs, configuration.scene_of)]
 
 
-def _drop_training(plans: Sequence[Plan], say: Callable[[str], object]) -> None:
+def _drop_training(plans: Sequence[Names], say: Callable[[str], object]) -> None:
     """Delete the trajectories that the jobs trained on, but for those that one of them is held to.
 
     Their manifests stay; `nsf simulate` makes the trajectories again. What another process makes is left.

@@ -6,17 +6,16 @@ from pathlib import Path
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from nsf import config as configuration
-from nsf.engines import NAMES as ENGINES
-from nsf.engines import Operators
+from nsf.engines.names import NAMES as ENGINES
+from nsf.engines.names import OPERATORS
 from nsf.errors import ConfigError
-from nsf.kinematics.fields.basis import BasisField
 from nsf.kinematics.training.tracking import check_tracking
-from nsf.mpm import FP32, FP64, precision_of
 
-#: Precision of stored frames by the name of their type.
-STORED = {"float32": FP32, "float64": FP64}
+#: Types of stored frames.
+STORED = ("float32", "float64")
+PRECISIONS = ("fp32", "fp64")
 #: Engines that operators can be taught by.
-TEACHERS = tuple(name for name in ENGINES if name != Operators.name)
+TEACHERS = tuple(name for name in ENGINES if name != OPERATORS)
 #: Least deployment step in units of the scene's: a thousand reduced steps for one are no reduction.
 _LEAST_STEP = 1e-3
 
@@ -46,36 +45,26 @@ def check_words(c: DictConfig, engine: str) -> None:
     check_tracking(c.tracking)
     one_of("data.resident", c.data.resident, (True, False, "auto"))
     one_of("data.keep", c.data.keep, ("all", "held_out"))
-    one_of("data.dtype", c.data.dtype, tuple(STORED))
+    one_of("data.dtype", c.data.dtype, STORED)
     configuration.text("report.folder", c.report.folder)
     name = c.report.name if isinstance(c.report.name, str | int) else ""
     if str(name) in ("", "..") or Path(str(name)).name != str(name):
         raise ConfigError(f"report.name={c.report.name} must be one folder's name; set report.folder")
-    precision_of(c.precision)
+    if c.precision not in PRECISIONS:
+        raise ConfigError(f"precision={c.precision!r} is unknown; choose one of {', '.join(PRECISIONS)}")
     _check_paper(c.scene.get("paper"))
 
 
-def check_batch(c: DictConfig, engine: str, field, strategy: str) -> None:
-    """Raises ConfigError where a batch is asked for and cannot be deployed, as far as it shows before work.
+def check_batch(c: DictConfig, engine: str) -> None:
+    """Raises ConfigError where a batch is asked for that the engine cannot step.
 
     Args:
         c: the configuration.
         engine: name of the engine that is asked for.
-        field: that is trained.
-        strategy: by which integration particles are found.
     """
     size = configuration.number("deploy.batch", c.deploy.batch, least=1, whole=True)
-    if size == 1:
-        return
-    if not isinstance(field, BasisField):
-        raise ConfigError(
-            f"deploy.batch={size} needs field=basis or joint, whose steps are taken in coefficients; "
-            "set deploy.batch=1"
-        )
-    if engine == "reference":
+    if size > 1 and engine == "reference":
         raise ConfigError(f"deploy.batch={size} needs engine=modal, or auto; set it, or deploy.batch=1")
-    if strategy != "superset":
-        raise ConfigError(f"deploy.batch={size} needs integration=superset; set it, or deploy.batch=1")
 
 
 def factors(key: str, asked) -> list[int]:
@@ -102,7 +91,7 @@ def one_of(key: str, value, options: Sequence) -> None:
 def _check_levels(c: DictConfig, engine: str) -> None:
     """Who goes on with a run by operators; no other engine has an estimate, or a level below."""
     tolerance = OmegaConf.select(c.deploy, "tolerance", default=None)
-    if engine != Operators.name:
+    if engine != OPERATORS:
         if c.deploy.on_distrust == "projected" or tolerance is not None:
             key = "tolerance" if tolerance is not None else "on_distrust"
             raise ConfigError(f"deploy.{key}={c.deploy[key]} needs engine=operators; set it, or leave it out")

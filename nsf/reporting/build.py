@@ -2,8 +2,10 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 
+from nsf.reporting.keeping import MADE_OF, Kept, made_of
 from nsf.reporting.pictures import draw
 from nsf.reporting.rivals import beside_rivals, side_by_side
 from nsf.reporting.sources import Source, Study, file_hash, open_sources
@@ -34,7 +36,8 @@ def build_report(evaluate_runs, folder, title: str, first=None, study: Study | N
     """Write a report of evaluate runs to folder, replacing a report that is there.
 
     Writes `index.html`, `index.md`, `results.csv`, `results.tex`, `sources.json`, charts (svg, png) and
-    pictures (png, gif). Equal runs give equal files, byte for byte.
+    pictures (png, gif). Equal runs give equal files, byte for byte; pictures of a variant whose runs have not
+    changed since the report that is there are taken from it.
 
     Args:
         evaluate_runs: runs of stage `evaluate`; those not complete are passed over.
@@ -52,13 +55,15 @@ def build_report(evaluate_runs, folder, title: str, first=None, study: Study | N
         ConfigError: folder holds something that is not a report.
         StorageError: the disk refused a file.
     """
+    evaluate_runs = list(evaluate_runs)
     merged = merge(open_sources(evaluate_runs, first), study.settings if study else None)
     with replaced(Path(folder)) as fresh:
         merged.csv.map(spreadsheet).to_csv(fresh / "results.csv", index=False)
         fine = _fine(merged, study)
         own = [fine_section(fine, fresh)] if fine else []
         sweep = swept(merged, study, fresh) if study else []
-        sections = [*own, *sweep, *draw(merged, fresh, sweep=bool(sweep), study=study)]
+        kept = Kept.of(Path(folder))
+        sections = [*own, *sweep, *draw(merged, fresh, sweep=bool(sweep), study=study, kept=kept)]
         more = [fine_table(fine, study.settings, fresh)] if fine else []
         page = _page(title, merged, sections, study, more, fine, bool(sweep))
         (fresh / "index.html").write_text(html_page(page), encoding="utf-8")
@@ -71,6 +76,10 @@ def build_report(evaluate_runs, folder, title: str, first=None, study: Study | N
         # What the list of reports shows of this one; the last section compares all variants.
         shown = [picture for section in (*sweep, *own, *sections[-1:]) for picture in section.pictures][:1]
         told["chart"] = {"file": shown[0].files[-1], "caption": shown[0].caption} if shown else None
+        told |= {
+            MADE_OF: made_of(evaluate_runs, title, first, study),
+            "drawn": {s.key: [asdict(picture) for picture in s.pictures] for s in sections if s.key},
+        }
         text = json.dumps(told, indent=2, ensure_ascii=False) + "\n"
         (fresh / MARK).write_text(text, encoding="utf-8", errors="backslashreplace")
     return Path(folder) / "index.html"

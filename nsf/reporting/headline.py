@@ -94,7 +94,8 @@ class Report:
         for _, rows in self.rows.groupby("scene", sort=False):
             told: list[str] = []
             for key in known:
-                if key in rows and len(rows.drop_duplicates([*told, key])) > max(1, _kinds(rows, told)):
+                beside = [*told, *self.seeds]  # a sample's size may follow from its seed
+                if key in rows and len(rows.drop_duplicates([*beside, key])) > max(1, _kinds(rows, beside)):
                     told.append(key)
             found |= set(told)
         return [key for key in known if key in found]
@@ -286,7 +287,8 @@ def _diverged(report: Report) -> str:
 
 def _own(run: Mapping) -> dict[str, str]:
     """Keys of a run's job that no column of results.csv tells."""
-    return {key: value for key, value in (run.get("keys") or {}).items() if key not in _COLUMN_OF}
+    told = {*_COLUMN_OF, "precision", "device"}  # the last two under their own names
+    return {key: value for key, value in (run.get("keys") or {}).items() if key not in told}
 
 
 def _kinds(rows: pd.DataFrame, columns: Sequence[str]) -> int:

@@ -14,11 +14,13 @@ from joblib.externals.loky import ProcessPoolExecutor
 from nsf.reporting.drawing import charts, shapes
 from nsf.reporting.drawing.cost import error_over_cost
 from nsf.reporting.drawing.style import DIFFERENCE_COLORS, STRESS_COLORS, save
+from nsf.reporting.keeping import Kept, code, key_of
 from nsf.reporting.levels import levels_section
 from nsf.reporting.rivals import solvers
 from nsf.reporting.sources import Motion, Study, same_parameter
+from nsf.reporting.study import SEEDS
 from nsf.reporting.tables import Merged, mean_rows, printed_of, variant_labels, variants
-from nsf.reporting.text.columns import COLUMN, MEASURED, RIVALS, parameter_text
+from nsf.reporting.text.columns import COLUMN, MEASURED, RIVALS, SOLVER, parameter_text
 from nsf.reporting.text.formats import file_name
 from nsf.reporting.text.page import Picture, Section
 
@@ -53,6 +55,12 @@ class _Variant:
         self.values = sorted(self.rows.loc[shown, "parameter"], key=_natural)
         self.delta = self.rows.loc[shown, "delta"].mean(skipna=False)
         self.runs = sorted({source.id for source in self.sources})
+
+    def key(self, *how) -> str:
+        """What pictures of this variant are made of, for those that are drawn so."""
+        rows = [list(map(str, row)) for row in self.rows.to_numpy().tolist()]
+        made = {source.id: [source.hashes, source.created] for source in self.sources}
+        return key_of([rows, [source.id for source in self.sources], made, how, code()])
 
     def series(self, held_out_only: bool) -> pd.DataFrame:
         """Frames of the parameter values that this variant's rows come from, each from its own run."""
@@ -94,7 +102,13 @@ class _Variant:
         return self.summary.get("floor")
 
 
-def draw(merged: Merged, folder: Path, sweep: bool = False, study: Study | None = None) -> list[Section]:
+def draw(
+    merged: Merged,
+    folder: Path,
+    sweep: bool = False,
+    study: Study | None = None,
+    kept: Kept | None = None,
+) -> list[Section]:
     """Draw every picture of a report into folder.
 
     Args:
@@ -103,14 +117,16 @@ def draw(merged: Merged, folder: Path, sweep: bool = False, study: Study | None 
         sweep: what varies is a number or a seed, so that bodies move alike: those of one variant a scene
             are shown, and not animated.
         study: what the report is about, which may say what the paper prints of a variant.
+        kept: pictures of the report before this one, which stand where they would be drawn the same.
     """
     groups = variants(merged)
     labels = variant_labels([merged.frame.iloc[members[0]].to_dict() for members in groups])
     known = [_Variant(merged, members, label) for members, label in zip(groups, labels, strict=True)]
     shown = _best(known, ("scene",) if sweep else ("scene", "method"))
+    drawn = _of_variants(shown, folder, not sweep, kept)
     sections = [
-        Section(_heading(v) if len(known) > 1 else "What was simulated", pictures)
-        for v, pictures in zip(shown, _of_variants(shown, folder, animated=not sweep), strict=True)
+        Section(_heading(v) if len(known) > 1 else "What was simulated", pictures, key)
+        for v, (key, pictures) in zip(shown, drawn, strict=True)
     ]
     return [
         *sections,
@@ -129,18 +145,30 @@ def _best(known: list[_Variant], alike: Sequence[str]) -> list[_Variant]:
     return list(best.values())
 
 
-def _of_variants(shown: list[_Variant], folder: Path, animated: bool) -> list[list[Picture]]:
-    """The pictures of each variant; where they are many, drawn in several processes."""
+def _of_variants(
+    shown: list[_Variant], folder: Path, animated: bool, kept: Kept | None
+) -> list[tuple[str, list[Picture]]]:
+    """The pictures of each variant, and what they are made of; where they are many, by several processes."""
     gif_bytes = min(shapes.GIF_BYTES, ANIMATIONS_BYTES // len(shown)) if animated else 0
-    calls = [
-        partial(_of_variant, v, folder, prefix, gif_bytes, brief=len(shown) > MANY)
-        for v, prefix in zip(shown, _prefixes(shown), strict=True)
-    ]
-    processes = min(os.cpu_count() or 1, len(shown))
-    if processes < 2 or len(shown) <= _FEW:
-        return [call() for call in calls]
-    with ProcessPoolExecutor(processes, timeout=_IDLE) as pool:
-        return list(pool.map(operator.call, calls))
+    brief = len(shown) > MANY
+    prefixes = _prefixes(shown)
+    keys = [v.key(prefix, gif_bytes, brief) for v, prefix in zip(shown, prefixes, strict=True)]
+    found: dict[str, list[Picture]] = {}
+    for key in keys:
+        if kept is not None and (told := kept.take(key, folder)) is not None:
+            found[key] = [Picture(**picture) for picture in told]
+    calls = {
+        key: partial(_of_variant, v, folder, prefix, gif_bytes, brief)
+        for v, prefix, key in zip(shown, prefixes, keys, strict=True)
+        if key not in found
+    }
+    processes = min(os.cpu_count() or 1, len(calls))
+    if processes < 2 or len(calls) <= _FEW:
+        found |= {key: call() for key, call in calls.items()}
+    else:
+        with ProcessPoolExecutor(processes, timeout=_IDLE) as pool:
+            found |= zip(calls, pool.map(operator.call, calls.values()), strict=True)
+    return [(key, found[key]) for key in keys]
 
 
 def _of_variant(v: _Variant, folder: Path, prefix: str, gif_bytes: int, brief: bool) -> list[Picture]:
@@ -273,6 +301,8 @@ def _over_cost(merged: Merged, folder: Path, runs: list[str]) -> list[Picture]:
         return []
     placed = [name for name in ("precision", "device") if frame[name].nunique() > 1]
     names = frame[["scene", *placed]].agg(" · ".join, axis=1)
+    reduced = frame["kind"] == "reduced"
+    frame.loc[reduced, SOLVER] = _common_names(frame.loc[reduced, SOLVER], names[reduced])
     panels = {name: part.to_dict("records") for name, part in frame.groupby(names, sort=False)}
     least = merged.frame.groupby("scene")[list(RIVALS)].min()  # of nearest and interpolated, the best field's
     costless = {name: COLUMN[name].title for name in RIVALS[:3]}
@@ -286,6 +316,16 @@ def _over_cost(merged: Merged, folder: Path, runs: list[str]) -> list[Picture]:
         "a solver of longer steps takes fewer. Horizontal lines are of what takes no step."
     )
     return [Picture(save(error_over_cost(panels, free), folder, "error-over-cost"), caption, runs)]
+
+
+def _common_names(labels: pd.Series, panels: pd.Series) -> pd.Series:
+    """Labels without seeds and the parts that some panel lacks, such as its |S|: a colour has one meaning."""
+    if panels.nunique() == 1:
+        return labels
+    parts = labels.str.split(" · ")
+    known = [{part for own in of for part in own} for _, of in parts.groupby(panels)]
+    common = {part for part in set.intersection(*known) if part.partition("=")[0] not in SEEDS}
+    return parts.map(lambda own: " · ".join(part for part in own if part in common) or "reduced")
 
 
 def _heading(v: _Variant) -> str:

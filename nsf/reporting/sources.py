@@ -21,9 +21,9 @@ import numpy as np
 import pandas as pd
 
 from nsf.errors import MissingRunError, SchemaError
+from nsf.reporting.keeping import FILES
 from nsf.reporting.text.columns import COLUMNS, LATER, TEXT
 
-FILES = ("results.csv", "series.csv", "frames.npz", "cost.json", "summary.json")
 _FRAMES = ("parameters", "splits", "t", "x_full", "x_reduced", "stress_full", "stress_reduced")
 _SERIES = (
     "parameter",

@@ -1,23 +1,28 @@
-"""Scenes (paper section 6): one yaml each in `conf/scene`."""
+"""Scenes (paper section 6): one yaml each in `conf/scene`.
 
+Names are imported on first use: shapes and designs can be checked without Warp.
+"""
+
+import importlib
 from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
-from nsf import config as _config
-from nsf.scenes.body import Body
-from nsf.scenes.designs import Design, Grid, LatinHypercube, Sobol, Values
-from nsf.scenes.parameters import Parameter
-from nsf.scenes.programs import (
-    GravityProgram,
-    Keyframes,
-    MotionProgram,
-    RandomPress,
-    RandomPush,
-    RandomShake,
-    RandomTilt,
-)
-from nsf.scenes.scene import Scene
-from nsf.scenes.shapes import Ball, Box, Cylinder, Frame, Mesh, Ribbon, Shape, TentacleBall, mesh_or_ball
-from nsf.scenes.weakness import Weakness
+if TYPE_CHECKING:
+    from nsf.scenes.body import Body
+    from nsf.scenes.designs import Design, Grid, LatinHypercube, Sobol, Values
+    from nsf.scenes.parameters import Parameter
+    from nsf.scenes.programs import (
+        GravityProgram,
+        Keyframes,
+        MotionProgram,
+        RandomPress,
+        RandomPush,
+        RandomShake,
+        RandomTilt,
+    )
+    from nsf.scenes.scene import Scene
+    from nsf.scenes.shapes import Ball, Box, Cylinder, Frame, Mesh, Ribbon, Shape, TentacleBall, mesh_or_ball
+    from nsf.scenes.weakness import Weakness
 
 __all__ = [
     "Ball",
@@ -48,8 +53,42 @@ __all__ = [
     "mesh_or_ball",
 ]
 
+_HOMES = {
+    "Ball": "shapes",
+    "Body": "body",
+    "Box": "shapes",
+    "Cylinder": "shapes",
+    "Design": "designs",
+    "Frame": "shapes",
+    "GravityProgram": "programs",
+    "Grid": "designs",
+    "Keyframes": "programs",
+    "LatinHypercube": "designs",
+    "Mesh": "shapes",
+    "MotionProgram": "programs",
+    "Parameter": "parameters",
+    "RandomPress": "programs",
+    "RandomPush": "programs",
+    "RandomShake": "programs",
+    "RandomTilt": "programs",
+    "Ribbon": "shapes",
+    "Scene": "scene",
+    "Shape": "shapes",
+    "Sobol": "designs",
+    "TentacleBall": "shapes",
+    "Values": "designs",
+    "Weakness": "weakness",
+    "mesh_or_ball": "shapes",
+}
 
-def load(name: str, overrides: Sequence[str] = ()) -> Scene:
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def load(name: str, overrides: Sequence[str] = ()) -> "Scene":
     """Load a scene of `conf/scene` by name.
 
     Args:
@@ -59,4 +98,7 @@ def load(name: str, overrides: Sequence[str] = ()) -> Scene:
     Raises:
         ConfigError: unknown scene, key or value.
     """
-    return Scene.from_config(_config.load([f"scene={name}", *overrides]))
+    from nsf import config
+    from nsf.scenes.scene import Scene
+
+    return Scene.from_config(config.load([f"scene={name}", *overrides]))

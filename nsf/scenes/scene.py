@@ -10,21 +10,19 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from nsf import config as configuration
-from nsf.data import PROGRAM, Case, Split
+from nsf.data import PROGRAM, Case
 from nsf.errors import ConfigError
 from nsf.mpm import Collider, DomainWalls, FullOrderMPM, Gravity, GridGeometry, ParticleConstants, Transfer
 from nsf.mpm.materials import Material
-from nsf.scenes.body import Body
 from nsf.scenes.checks import check_memory, check_particles, check_physics
-from nsf.scenes.designs import Design, case_of
-from nsf.scenes.identity import NOT_PHYSICS
-from nsf.scenes.parameters import Parameter, check_key, parameters_of
+from nsf.scenes.designs import case_of
+from nsf.scenes.draft import Draft
 from nsf.scenes.programs import Programs
 from nsf.vectors import vector
 
 
 @dataclass(frozen=True)
-class Scene:
+class Scene(Draft):
     """A full-order problem: bodies, law, boundaries, time span, problem parameters.
 
     Attributes:
@@ -39,95 +37,36 @@ class Scene:
         template: the same before its interpolations were resolved.
     """
 
-    name: str
-    scale: str
-    dx: float
-    dt: float
-    steps: int
-    size: tuple[float, float, float]
     gravity: tuple[float, float, float]
-    bodies: tuple[Body, ...]
     colliders: tuple[Collider, ...]
     walls: DomainWalls
     material: Material
     transfer: Transfer
     forcing: Programs
     program: int
-    parameters: Mapping[str, Parameter]
-    design: Design
-    config: DictConfig = field(repr=False, compare=False)
-    template: DictConfig = field(repr=False, compare=False)
     _at: dict[tuple, "Scene"] = field(default_factory=dict, init=False, repr=False, compare=False)
-
-    @classmethod
-    def from_config(cls, config: DictConfig) -> "Scene":
-        """Build from a configuration with `scale`, `scene`, `material`, `transfer`.
-
-        Raises:
-            ConfigError: a key is unknown or a value outside its range.
-        """
-        with configuration.naming_the_missing():
-            found = cls._build(configuration.resolve(config), config)
-        for name, parameter in found.parameters.items():
-            check_key(name, parameter.key, [case[name] for case in found.split.cases], config)
-        return found
 
     @classmethod
     def _build(cls, config: DictConfig, template: DictConfig) -> "Scene":
         s = configuration.section(config, "scene")
-        if "title" in s:  # the configuration of a simulation has none
-            configuration.text("scene.title", s.title)
         forcing, program = _programs(s)
-        dt = float(configuration.number("scene.dt", s.dt))
-        steps = configuration.number("scene.steps", s.steps, least=1, whole=True)
         solids = configuration.build_all(s.colliders, "scene.colliders")
-        bodies = configuration.build_all(s.bodies, "scene.bodies")
-        if not bodies:
-            raise ConfigError("scene.bodies={} leaves nothing to simulate; give a body")
-        dx = float(configuration.length("scene.dx", s.dx))
-        size = tuple(configuration.length("scene.size", a) for a in vector("scene.size", s.size, "m"))
-        GridGeometry.of_domain(size, dx)
-        forcing.check(tuple(solids), dt * steps, dt, dx)
+        own = cls._drafted(config, template)
+        dx, dt, duration = own["dx"], own["dt"], own["dt"] * own["steps"]
+        GridGeometry.of_domain(own["size"], dx)
+        forcing.check(tuple(solids), duration, dt, dx)
         for name in forcing.colliders:
-            motion = forcing.motion_of(name, dt * steps, program)
-            solids[name] = replace(solids[name], motion=motion)
+            solids[name] = replace(solids[name], motion=forcing.motion_of(name, duration, program))
         return cls(
-            name=configuration.text("scene.name", s.name),
-            scale=config.scale,
-            dx=dx,
-            dt=dt,
-            steps=steps,
-            size=size,
+            **own,
             gravity=vector("scene.gravity", s.gravity, "m/s²"),
-            bodies=tuple(_body(b, f"scene.bodies.{n}", size, dx) for n, b in bodies.items()),
             colliders=tuple(solids.values()),
             walls=configuration.build(s.walls, "scene.walls"),
             material=configuration.build(config.material, "material"),
             transfer=configuration.build(config.transfer, "transfer"),
             forcing=forcing,
             program=program,
-            parameters=parameters_of(
-                OmegaConf.to_container(configuration.section(config, "scene.parameters"))
-            ),
-            design=configuration.build(configuration.section(config, "scene.design"), "scene.design"),
-            config=config,
-            template=template,
         )
-
-    @cached_property
-    def split(self) -> Split:
-        """The cases that the design draws, by their use.
-
-        Raises:
-            ConfigError: see `Design.split`.
-        """
-        return self.design.split(self.varied)
-
-    @cached_property
-    def varied(self) -> dict[str, Parameter]:
-        """What a case has a value of: the problem parameters, and the program's number if there is any."""
-        program = {PROGRAM: Parameter("scene.program", "")} if self.forcing else {}
-        return dict(self.parameters) | program
 
     @cached_property
     def acting_gravity(self) -> Gravity:
@@ -207,12 +146,7 @@ class Scene:
             ConfigError: a key is unknown, a problem parameter's, or one that changes X, the grid or the
                 steps; a value is refused.
         """
-        if own := [p.key for p in self.parameters.values() if p.key in changes]:
-            raise ConfigError(f"{own[0]} is a problem parameter; set scene.design.test")
-        plain = OmegaConf.to_container(self.config)
-        plain["scene"] = {k: v for k, v in plain["scene"].items() if k not in ("name", *NOT_PHYSICS)}
-        known = configuration.leaves({part: plain[part] for part in ("scene", "material", "transfer")})
-        changed = Scene.from_config(configuration.replaced(self.template, changes, known))
+        changed = self.changed(changes)
         kept = {
             "particles": np.array_equal(changed.particles().X, self.particles().X),
             "grid nodes": (changed.grid, changed.size) == (self.grid, self.size),
@@ -277,16 +211,6 @@ class Scene:
     def grid(self) -> GridGeometry:
         """The background grid."""
         return GridGeometry.of_domain(self.size, self.dx)
-
-    @property
-    def particle_count(self) -> int:
-        """Particles of all bodies together."""
-        return sum(body.particles for body in self.bodies)
-
-    @property
-    def files(self) -> dict[str, str]:
-        """Path and sha256 of every file that the scene is made from beyond its configuration."""
-        return {path: digest for body in self.bodies for path, digest in body.files.items()}
 
     def particles(self) -> ParticleConstants:
         """Particles of every body, in order; μ̂ and λ are the material's, times a body's weakness.
@@ -381,12 +305,3 @@ def _programs(s: DictConfig) -> tuple[Programs, int]:
         configuration.build_all(node.get("colliders", {}), "scene.forcing.colliders"),
     )
     return found, int(configuration.number("scene.program", s.get("program", 0), least=0, whole=True))
-
-
-def _body(body: Body, where: str, size: Sequence[float], dx: float) -> Body:
-    """A body that the grid can hold, with its number of particles."""
-    try:
-        body.check_extent(size, dx)
-        return body.counted(dx)
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from error

@@ -62,19 +62,23 @@ def add(file: str, content: str, project: Path) -> None:
         Pipeline(config.load([option, "scale=small", "device=cpu"]))
 
 
-def train_sand() -> None:
-    """A manifold of the small sand column, with its particles but few steps, values and iterations."""
-    short = ["scene.steps=8", "scene.design.train=[21.0,30.0,38.5]", "trainer.steps=20"]
-    pipeline = Pipeline(config.load(["scene=sand", "scale=small", "device=cpu", *short]))
-    pipeline.simulate()
+#: A chain as a page tells it, with its particles but few steps, values and iterations.
+SHORT = {
+    "sand": ["scene.steps=8", "scene.design.train=[21.0,30.0,38.5]", "trainer.steps=20"],
+    "sway": ["scene.steps=110", "scene.design.train=4", "trainer.steps=20"],
+}
+
+
+def train(scene: str) -> None:
+    """A manifold of a scene, for pages whose commands made one."""
+    pipeline = Pipeline(config.load([f"scene={scene}", "scale=small", "device=cpu", *SHORT[scene]]))
+    pipeline.simulate(("train",))
     pipeline.train()
 
 
 @pytest.mark.parametrize("page", PAGES)
 def test_page(page, project, monkeypatch, capsys):
     text = (DOCS / page).read_text(encoding="utf-8")
-    if "Run.find(" in text:
-        train_sand()
     if "trimesh" in text:
         pytest.importorskip("trimesh")
     found, names = blocks(text), {"__name__": "page"}
@@ -84,6 +88,8 @@ def test_page(page, project, monkeypatch, capsys):
             if title:
                 add(title, content, project)
             elif language == "python":
+                for scene in re.findall(r'Run\.find\("train", "(\w+)"\)', content):
+                    train(scene)
                 exec(compile(content, page, "exec"), names)
             else:
                 assert language == "sh", f"a {language} block without a title"

@@ -15,8 +15,9 @@ import nsf.runs.manifest
 from nsf.cli import main
 from nsf.errors import ConfigError, MissingRunError, NSFError, SchemaError, StorageError
 from nsf.reporting.overview.index import write_index
-from nsf.reporting.overview.listing import difference_table, entries, runs_table
+from nsf.reporting.overview.tables import difference_table, runs_table
 from nsf.runs import Run
+from nsf.runs.listing import entries
 
 MUTATIONS = 40  # of each kind; a few thousand were tried
 

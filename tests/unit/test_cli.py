@@ -152,7 +152,7 @@ MALFORMED = [
     ("scene.paper={nsf:{delta:a}}", "scene.paper.nsf.delta=a must be a finite number"),
     ("scene=null", "scene=null names no option of its group"),
     ("material=5", "material=5 names no option of its group"),
-    ("scene=../../etc/passwd", "unknown scene=../../etc/passwd; choose one of bread"),
+    ("scene=../../etc/passwd", "unknown scene=../../etc/passwd; choose one of block, bread"),
     ("scene.colliders.floor=[]", "scene.colliders.floor=[]: Cannot merge DictConfig with ListConfig"),
     ("data=null", "data=null must map keys to values"),
     ("deploy=5", "deploy=5"),

@@ -6,11 +6,13 @@ file or replaced in a running program, the engine refuses, and the reference ste
 follow the new text, `make mirrors` writes the table anew.
 """
 
+import ast
 import hashlib
 import inspect
 import json
 import pkgutil
 import re
+import sys
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
@@ -51,8 +53,11 @@ MIRRORED = (
 
 
 def edits() -> dict[str, str]:
-    """sha256 of the functions that do not read as in the table, by name; of one that is gone, empty."""
-    recorded, now = _recorded(), _digests()
+    """sha256 of the functions that do not read as in the table, by name; of one that is gone, empty.
+
+    Before the reference is imported its files are read, since nothing can have been replaced yet.
+    """
+    recorded, now = _recorded(), _digests() if "nsf.dynamics" in sys.modules else _digests_on_disk()
     names = sorted(recorded.keys() | now.keys())
     return {name: now.get(name, "") for name in names if recorded.get(name) != now.get(name)}
 
@@ -69,6 +74,38 @@ def _recorded() -> dict[str, str]:
 
 def _digests() -> dict[str, str]:
     return {name: _digest(function) for mirrored in MIRRORED for name, function in _functions(mirrored)}
+
+
+@cache
+def _digests_on_disk() -> dict[str, str]:
+    """As `_digests`, of the text of the files; nothing is imported."""
+    found = {}
+    for mirrored in MIRRORED:
+        module, _, name = mirrored.partition(":")
+        path = Path(__file__).parents[2].joinpath(*module.split(".")[1:]).with_suffix(".py")
+        for inner, node in _defined(ast.parse(_text_of(path)), name):
+            lines = _text_of(path).splitlines(keepends=True)
+            first = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
+            found[f"{mirrored}.{inner}".rstrip(".")] = _sum("".join(lines[first - 1 : node.end_lineno]))
+    return found
+
+
+@cache
+def _text_of(path: Path) -> str:
+    return path.read_text(encoding="utf-8")
+
+
+def _defined(tree: ast.AST, name: str) -> Iterator[tuple[str, ast.FunctionDef]]:
+    """The function of a dotted name, or each of the class of that name with its own name."""
+    kinds = (ast.FunctionDef, ast.ClassDef)
+    for part in name.split("."):
+        tree = next((n for n in ast.iter_child_nodes(tree) if isinstance(n, kinds) and n.name == part), tree)
+    if isinstance(tree, ast.FunctionDef):
+        yield "", tree
+        return
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.FunctionDef):
+            yield node.name, node
 
 
 def _functions(mirrored: str) -> Iterator[tuple[str, Callable]]:
@@ -94,5 +131,10 @@ def _digest(function: Callable) -> str:
         text = inspect.getsource(function)
     except (OSError, TypeError):
         text = repr(function)
+    return _sum(text)
+
+
+def _sum(text: str) -> str:
+    """sha256 of a text without docstrings, comments and white space."""
     text = re.sub(r'(?s:""".*?""")|#.*', "", text)
     return hashlib.sha256("".join(text.split()).encode()).hexdigest()[:16]

@@ -1,12 +1,20 @@
-"""A reduced run as a recurrence of the latent vector, learned from the projected step (docs/method.md)."""
+"""A reduced run as a recurrence of the latent vector, learned from the projected step (docs/method.md).
 
-from nsf.engines.operators.engine import Operators
-from nsf.engines.operators.lessons import Teaching, Yardstick, random_cases
-from nsf.engines.operators.model import Sizes, StepOperators, Terms
-from nsf.engines.operators.states import collider_states, principal
-from nsf.engines.operators.taught import Taught
-from nsf.engines.operators.teach import Course
-from nsf.engines.operators.teacher import Teacher
+Names are imported on first use: what is asked of a teacher can be checked without torch.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from nsf.engines.operators.engine import Operators
+    from nsf.engines.operators.lessons import Yardstick
+    from nsf.engines.operators.model import Sizes, StepOperators, Terms
+    from nsf.engines.operators.states import collider_states, principal
+    from nsf.engines.operators.taught import Taught
+    from nsf.engines.operators.teach import Course
+    from nsf.engines.operators.teacher import Teacher
+    from nsf.engines.operators.teaching import Teaching, random_cases
 
 __all__ = [
     "Course",
@@ -22,3 +30,24 @@ __all__ = [
     "principal",
     "random_cases",
 ]
+
+_HOMES = {
+    "Course": "teach",
+    "Operators": "engine",
+    "Sizes": "model",
+    "StepOperators": "model",
+    "Taught": "taught",
+    "Teacher": "teacher",
+    "Teaching": "teaching",
+    "Terms": "model",
+    "Yardstick": "lessons",
+    "collider_states": "states",
+    "principal": "states",
+    "random_cases": "teaching",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -12,10 +12,11 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from nsf.engines.operators.lessons import Labels, Teaching, Yardstick
+from nsf.engines.operators.lessons import Labels, Yardstick
 from nsf.engines.operators.model import Sizes, StepOperators
 from nsf.engines.operators.states import principal
 from nsf.engines.operators.teacher import Teacher
+from nsf.engines.operators.teaching import Teaching
 from nsf.errors import InstabilityError
 from nsf.storage import writing
 

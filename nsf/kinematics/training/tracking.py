@@ -1,13 +1,17 @@
 """Where the losses of a training are written: CSV always, TensorBoard or MLflow beside it if asked for."""
 
+from __future__ import annotations
+
 import os
 from pathlib import Path
-
-from pytorch_lightning.loggers import CSVLogger, Logger, MLFlowLogger, TensorBoardLogger
+from typing import TYPE_CHECKING
 
 from nsf.errors import ConfigError
 from nsf.extras import optional
 from nsf.storage import locked, writing
+
+if TYPE_CHECKING:
+    from pytorch_lightning.loggers import Logger, MLFlowLogger
 
 #: What `tracking` may be, with the extra that brings it.
 EXTRAS = {"tensorboard": "track", "mlflow": "mlflow"}
@@ -35,10 +39,14 @@ def loggers(folder: Path, tracking: str | None) -> list[Logger]:
         tracking: "tensorboard" writes into `folder`; "mlflow" into `mlflow.db` (SQLite) beside the trainings,
             or to MLFLOW_TRACKING_URI. None: the CSV log alone.
     """
+    from pytorch_lightning.loggers.csv_logs import CSVLogger
+
     # A resumed phase logs into a new version, for CSVLogger deletes what it finds.
     version = str(len(list((folder / "csv").glob("*"))))
     found: list[Logger] = [CSVLogger(folder, name="csv", version=version)]
     if tracking == "tensorboard":
+        from pytorch_lightning.loggers.tensorboard import TensorBoardLogger
+
         found.append(TensorBoardLogger(folder, name="tensorboard", version=version))
     if tracking == "mlflow":
         found.append(_mlflow(folder))
@@ -47,6 +55,8 @@ def loggers(folder: Path, tracking: str | None) -> list[Logger]:
 
 def _mlflow(folder: Path) -> MLFlowLogger:
     """One MLflow run a phase, which a resumed phase goes on with."""
+    from pytorch_lightning.loggers.mlflow import MLFlowLogger
+
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
     trainings, kept = folder.parent.parent.resolve(), folder / "mlflow_run.txt"
     # Two processes that make the tables of a data base at once would fail.

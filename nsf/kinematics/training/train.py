@@ -14,9 +14,9 @@ import torch
 from nsf.data import Snapshots
 from nsf.errors import ConfigError
 from nsf.kinematics.manifold import Manifold
-from nsf.kinematics.training.descent import CHECKPOINT, Descent, Steps, descend
+from nsf.kinematics.training.descent import CHECKPOINT, Descent, Steps
 from nsf.kinematics.training.phases import Fit, at_least, seeded
-from nsf.kinematics.training.ranks import ALONE, Rank
+from nsf.kinematics.training.rank import ALONE, Rank
 from nsf.kinematics.training.schedules import Trainer
 from nsf.kinematics.training.tracking import check_tracking
 from nsf.storage import refusals, writing
@@ -119,6 +119,8 @@ def train(
 
 
 def _phase(descent: Descent, folder: Path, tracking: str | None) -> dict[str, Any]:
+    from nsf.kinematics.training.blocks import descend
+
     name, own = descent.fit.name, folder / descent.fit.name
     steps, probing = _timed(folder / f"{name}_steps.pt", lambda: _steps(descent), descent.rank)
     loss, seconds = descend(descent, steps, own, tracking)

@@ -5,7 +5,6 @@ from functools import partial
 
 from nsf.data import Snapshots
 from nsf.data.schema import TRAJECTORY
-from nsf.kinematics.training.ranks import train_together
 from nsf.kinematics.training.train import train as train_alone
 from nsf.runs import Run
 
@@ -24,6 +23,8 @@ def train(pipeline, run: Run) -> None:
     one = partial(train_alone, folder=run.path, **own)
     with run.record(device=device, seed=c.seed) as record:
         if trainer.devices > 1:
+            from nsf.kinematics.training.ranks import train_together
+
             manifold, metrics = train_together(paths, one, trainer, device, c.data.resident)
         else:
             with contextlib.closing(Snapshots(paths, device, c.data.resident)) as snapshots:

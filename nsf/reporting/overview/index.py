@@ -14,9 +14,10 @@ from nsf.data import Trajectory
 from nsf.data.schema import TRAJECTORY
 from nsf.deployment import Rollout
 from nsf.reporting.drawing.style import FULL, PALETTE, REDUCED, figure, styled
-from nsf.reporting.overview.listing import FIELDS, Entry, entries, text
+from nsf.reporting.overview.tables import texts
 from nsf.reporting.text.formats import HTML
 from nsf.runs import Run
+from nsf.runs.listing import FIELDS, Entry, entries, text
 from nsf.storage import writing
 
 #: What tells variants apart, beside the fields: keys of the configuration, by the heading they get.
@@ -68,7 +69,7 @@ def write_index(folder: Path, root: Path | None = None) -> Path:
 
 def _row(entry: Entry, folder: Path) -> dict:
     """A row of the page: its cells as shown, and the values by which they sort."""
-    shown = list(zip(FIELDS, entry.texts(), (entry.values[field] for field in FIELDS), strict=True))
+    shown = list(zip(FIELDS, texts(entry), (entry.values[field] for field in FIELDS), strict=True))
     settings = [(key, entry.settings.get(key)) for key in _SETTINGS.values()]
     case = {found[1]: value for key, value in entry.settings.items() if (found := _CASE.fullmatch(key))}
     several = "; ".join(f"{name}={text(value)}" for name, value in case.items()) or None

@@ -148,7 +148,10 @@ def plus_minus(mean: float, deviation: float, scale: float = 1.0) -> str:
     """A mean and the deviation of what it is of, as shown; the mean alone where the deviation is none."""
     if not math.isfinite(deviation):
         return number(mean, scale)
-    return f"{number(mean, scale)} ± {scale * deviation:.2g}"
+    spread = scale * deviation
+    return (
+        f"{number(mean, scale)} ± {spread:.2g}" if spread < 99.5 else f"{number(mean, scale)} ± {spread:,.0f}"
+    )
 
 
 def parameter_text(value, name: str = "", unit: str = "") -> str:

@@ -36,10 +36,11 @@ class Picture:
 
 @dataclass(frozen=True)
 class Section:
-    """Pictures under one heading."""
+    """Pictures under one heading; `key` says what they are made of, empty where they are always drawn."""
 
     heading: str
     pictures: list[Picture] = field(default_factory=list)
+    key: str = ""
 
 
 @dataclass(frozen=True)

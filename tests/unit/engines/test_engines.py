@@ -44,16 +44,20 @@ WAYS = [
 OTHERS = [engine for engine in ENGINES if engine.name != "reference"]
 
 
-@pytest.fixture(scope="module", params=SCENES)
-def model(request, tmp_path_factory):
-    """A scene of the paper and fields that were trained on the first steps of two simulations of it."""
-    overrides = [f"scene={request.param}", f"scene.design.train={SCENES[request.param]}"]
+def trained(name, folder, *more):
+    """A scene of the paper, fields trained on the first steps of two simulations of it, a case between."""
+    overrides = [f"scene={name}", f"scene.design.train={SCENES[name]}"]
     overrides += ["scene.steps=12", "field.modes=[6,6,6]", "field.beta=4", "field.depth=1"]
-    overrides += ["trainer.steps=40", "latent_dim=3", "device=cpu", "sampler=random"]
-    pipeline = Pipeline(config.load(overrides), lambda line: None, tmp_path_factory.mktemp("runs"))
+    overrides += ["trainer.steps=40", "latent_dim=3", "device=cpu", "sampler=random", *more]
+    pipeline = Pipeline(config.load(overrides), lambda line: None, folder)
     pipeline.simulate(("train",))
     pipeline.train()
     return pipeline.scene, pipeline.manifold(), pipeline.scene.case(pipeline.split.box.mean(1))
+
+
+@pytest.fixture(scope="module", params=SCENES)
+def model(request, tmp_path_factory):
+    return trained(request.param, tmp_path_factory.mktemp("runs"))
 
 
 @pytest.mark.parametrize("engine", OTHERS, ids=lambda engine: engine.name)
@@ -84,6 +88,21 @@ def test_every_engine_is_the_reference(engine, model):
         assert found.stops == expected.stops, way
         assert one.integration_mean == other.integration_mean or "integration" not in way
     assert taken
+
+
+def test_engines_agree_where_c_depends_on_the_rate(tmp_path):
+    scene, manifold, parameters = trained("toothpaste", tmp_path, "field.affine=rate")
+    one, other = (
+        scene.reduced(
+            manifold, parameters, 40, projector=GaussNewton(tolerance=1e-9), engine=name, device="cpu"
+        )
+        for name in ("modal", "reference")
+    )
+    for solver in (one, other):
+        solver.step(6)
+    assert manifold.takes_rate
+    moved = np.abs(np.diff(other.trajectory().xhat, axis=0)).max()
+    np.testing.assert_allclose(one.trajectory().xhat, other.trajectory().xhat, rtol=0, atol=1e-4 * moved)
 
 
 # -- what runs, and why ---------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ from angles import angle
 
 from nsf.data import Case
 from nsf.dynamics.latent import LatentRecord
+from nsf.dynamics.setup import first_change
 from nsf.engines.operators import (
     Course,
     Operators,
@@ -19,7 +20,6 @@ from nsf.engines.operators import (
     Teaching,
     Yardstick,
     collider_states,
-    first_change,
     principal,
     random_cases,
 )

@@ -9,10 +9,11 @@ import torch
 
 from nsf.data import Snapshots
 from nsf.errors import ConfigError, LaunchError, StorageError
-from nsf.kinematics.training import descent
+from nsf.kinematics.training import blocks, descent
 from nsf.kinematics.training import train as training
 from nsf.kinematics.training.phases import PHASES, seeded
-from nsf.kinematics.training.ranks import SEED_STREAM, Rank, train_together
+from nsf.kinematics.training.rank import SEED_STREAM, Rank
+from nsf.kinematics.training.ranks import train_together
 from nsf.kinematics.training.schedules import FastTrainer, PaperTrainer
 from nsf.kinematics.training.train import WEIGHTS_STREAM, train
 
@@ -39,7 +40,7 @@ def training_in(fields):
 
 def in_short_blocks(until, **arguments):
     """Train in blocks of five steps, and keep each rank's outcome; the first stops before a (phase, step)."""
-    descent.SHORTEST_BLOCK = 5
+    blocks.SHORTEST_BLOCK = 5
     take, phase = descent.Steps._take, training._phase
 
     def kept(descent, folder, tracking):

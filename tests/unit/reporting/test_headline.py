@@ -128,6 +128,19 @@ def test_settings_of_unlike_numbers_of_seeds_say_how_many(tmp_path):
     assert [row[at] for row in rows[1:]] == ["2", "1"]
 
 
+def test_what_follows_from_a_seed_and_what_is_a_column_are_no_settings(tmp_path):
+    jobs = [
+        job("cake", seed=str(k), engine=e, device="cpu", **{"sampler.size": str(40 + k)}) | {"engine": e}
+        for k in range(3)
+        for e in ("modal", "operators")
+    ]
+    for row in jobs:
+        del row["keys"]["sampler.size"]
+    rows, _ = told(write_report(tmp_path / "a", jobs))
+    assert rows[0][:3] == ["scene", "engine", "δ [%]"]
+    assert [row[1] for row in rows[1:]] == ["modal", "operators"]
+
+
 def test_engines_are_settings_and_reports_from_before_them_have_none(tmp_path):
     jobs = [job(delta=0.001 * k, engine=e) | {"engine": e} for k, e in ((1, "modal"), (2, "operators"))]
     rows, _ = told(write_report(tmp_path / "a", jobs))

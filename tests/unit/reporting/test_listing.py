@@ -8,8 +8,9 @@ import pytest
 from rich.console import Console
 
 from nsf.errors import ConfigError
-from nsf.reporting.overview.listing import difference_table, entries, runs_table
+from nsf.reporting.overview.tables import difference_table, runs_table
 from nsf.runs import Run
+from nsf.runs.listing import entries
 
 
 @pytest.fixture(scope="module")
@@ -96,6 +97,8 @@ def test_the_table(root):
         "time",
         "[s]",
         "metric",
+        "case",
+        "r",
     ]
     assert "δ 2 %" in text
     assert "loss of g 0.0167" in text
@@ -112,7 +115,7 @@ def test_what_differs(root):
     rows = [line.split() for line in text.splitlines()]
     assert ["configuration", "latent_dim", "4", "6", "+50", "%"] in rows
     assert ["origin", "the", "same"] in rows
-    assert any(row[-4:] == ["0.02", "0.001", "-95", "%"] and "delta" in row for row in rows)
+    assert any(row[-4:] == ["2", "0.100", "-95", "%"] and "delta" in row for row in rows)
     assert "trials" not in text
     assert "the same" in shown(difference_table(one.run, one.run))
 

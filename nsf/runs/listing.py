@@ -1,32 +1,33 @@
-"""Runs in a table, and what differs between two of them: from manifests and configurations alone."""
+"""Runs as they are listed, filtered and sorted: from manifests and configurations alone."""
 
 import difflib
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from dataclasses import field as attribute
-from datetime import datetime
 from fnmatch import fnmatchcase
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
-from rich.markup import escape
-from rich.table import Table
-
-from nsf.errors import ConfigError, SchemaError
-from nsf.reporting.text.columns import ABSENT, number
-from nsf.runs import Run
+from nsf.errors import ConfigError
+from nsf.paths import CONF
+from nsf.runs.run import Run
 
 #: What a user sees of each run first.
 FIELDS = ("stage", "scene", "id", "created", "status", "seconds", "metric")
 #: The metric that stands for a stage, and how it is told.
-_MAIN = {
+MAIN = {
     "evaluate": ("delta", "δ"),
     "superresolve": ("delta", "δ"),
     "train": ("deformation_loss", "loss of g"),
 }
+#: What is shown in place of a value that is not there.
+ABSENT = "–"
+#: Groups whose option a run's settings tell, by the class that it names.
+_GROUPS = ("field", "trainer", "sampler", "projector", "integration")
 _GENERATIONS = 32  # of runs, each made from the one before; a chain has five
-_ORIGIN = ("commit", "dirty", "device", "seed", "precision", "versions")
+ORIGIN = ("commit", "dirty", "device", "seed", "precision", "versions")
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class Entry:
     @cached_property
     def values(self) -> dict[str, Any]:
         """Fields, numbers unformatted, and metrics by their names."""
-        main, _ = _MAIN.get(self.run.stage, (None, None))
+        main, _ = MAIN.get(self.run.stage, (None, None))
         fields = {
             "stage": self.run.stage,
             "scene": self.run.scene,
@@ -64,38 +65,21 @@ class Entry:
             "seconds": self.manifest.get("seconds"),
             "metric": self.metrics.get(main),
         }
-        return {key: self.manifest.get(key) for key in _ORIGIN} | self.metrics | fields
+        return {key: self.manifest.get(key) for key in ORIGIN} | self.metrics | fields
 
     @cached_property
     def metrics(self) -> dict[str, Any]:
         """The manifest's metrics, one number or text a key."""
-        return _flat(self.manifest.get("metrics") or {})
+        return flat(self.manifest.get("metrics") or {})
 
     @cached_property
     def settings(self) -> dict[str, Any]:
         """The configuration by dotted key: of the runs that this one goes back to, and on top its own.
 
         Where those runs differ, as simulations do in their parameter, the values are a tuple. A broken run
-        has none.
+        has none. Groups are there by the option that was chosen, such as `field` and `method`.
         """
-        return _settings(self.run, self.known, _GENERATIONS)
-
-    def texts(self) -> list[str]:
-        """The fields as shown."""
-        shown = {key: text(value) for key, value in self.values.items()}
-        if self.values["created"]:
-            when = datetime.fromisoformat(self.values["created"]).astimezone()
-            shown["created"] = f"{when:%Y-%m-%d %H:%M:%S}"
-        shown["seconds"] = number(self.values["seconds"])
-        if isinstance(self.values["metric"], int | float):
-            _, title = _MAIN[self.run.stage]
-            percent = title == "δ"
-            shown["metric"] = (
-                f"{title} {number(self.values['metric'], 100 if percent else 1)}" + " %" * percent
-            )
-        elif self.metrics.get("diverged"):
-            shown["metric"] = "diverged"
-        return [shown[field] for field in FIELDS]
+        return _with_options(_settings(self.run, self.known, _GENERATIONS))
 
 
 def entries(filters: Mapping[str, str] | None = None, sort: str = "-created", root: Path | None = None):
@@ -119,51 +103,10 @@ def entries(filters: Mapping[str, str] | None = None, sort: str = "-created", ro
     for name in (*(filters or ()), key):
         _check_key(name, found)
     for name, wanted in (filters or {}).items():
-        found = [entry for entry in found if _matches(_value(entry, name), wanted)]
-    there = [entry for entry in found if _value(entry, key) is not None]
-    there.sort(key=lambda entry: _order(_value(entry, key)), reverse=sort.startswith("-"))
-    return there + [entry for entry in found if _value(entry, key) is None]
-
-
-def runs_table(found: Sequence[Entry]) -> Table:
-    """The runs for the terminal."""
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    for field in FIELDS:
-        heading = "time [s]" if field == "seconds" else field
-        table.add_column(escape(heading), justify="right" if field == "seconds" else "left", no_wrap=True)
-    for entry in found:
-        table.add_row(*map(escape, entry.texts()))
-    return table
-
-
-def difference_table(first: Run, second: Run) -> Table:
-    """What differs between two runs: configuration, origin, and result with its relative change.
-
-    Raises:
-        SchemaError: one of them is broken.
-    """
-    for run in (first, second):
-        if run.fault:
-            raise SchemaError(f"{run.path} is broken ({run.fault}); run `nsf {run.stage}` again")
-    one, two = Entry(first), Entry(second)
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    for heading in ("", "key", first.id, second.id, "change"):
-        table.add_column(heading, overflow="fold")
-    parts = {
-        "configuration": (one.settings, two.settings),
-        "origin": tuple(_flat({k: e.manifest.get(k) for k in _ORIGIN}) for e in (one, two)),
-        "result": tuple(
-            {"status": e.run.status, "seconds": e.values["seconds"]} | e.metrics for e in (one, two)
-        ),
-    }
-    for part, (left, right) in parts.items():
-        keys = [key for key in (left | right) if left.get(key) != right.get(key)]
-        for index, key in enumerate(keys):
-            a, b = left.get(key), right.get(key)
-            table.add_row("" if index else part, key, escape(text(a)), escape(text(b)), _change(a, b))
-        if not keys:
-            table.add_row(part, "the same", "", "", "")
-    return table
+        found = [entry for entry in found if _matches(value_of(entry, name), wanted)]
+    there = [entry for entry in found if value_of(entry, key) is not None]
+    there.sort(key=lambda entry: _order(value_of(entry, key)), reverse=sort.startswith("-"))
+    return there + [entry for entry in found if value_of(entry, key) is None]
 
 
 def _settings(run: Run, known: dict[Run, dict[str, Any]], generations: int) -> dict[str, Any]:
@@ -181,8 +124,27 @@ def _settings(run: Run, known: dict[Run, dict[str, Any]], generations: int) -> d
             values = found.setdefault(key, [])
             values += [v for v in (value if isinstance(value, tuple) else (value,)) if v not in values]
     inherited = {key: values[0] if len(values) == 1 else tuple(values) for key, values in found.items()}
-    known[run] = inherited | _flat(run.config)
+    known[run] = inherited | flat(run.config)
     return known[run]
+
+
+def _with_options(settings: dict[str, Any]) -> dict[str, Any]:
+    """Settings with the option of each group that they come from."""
+    found = {group: _options(group).get(settings.get(f"{group}._target_")) for group in _GROUPS}
+    found["method"] = settings.get("method.name")
+    if found["method"] is not None:  # of a deployment, or of what was made from one
+        found["engine"] = settings.get("engine", "auto")
+    return settings | {group: option for group, option in found.items() if option is not None}
+
+
+@cache
+def _options(group: str) -> dict[Any, str]:
+    """Option of a group by its class, for classes that one option has."""
+    targets: dict[str, list[str]] = {}
+    for path in sorted((CONF / group).glob("*.yaml")):
+        for target in re.findall(r"^_target_:\s*(\S+)", path.read_text(encoding="utf-8"), re.M):
+            targets.setdefault(target, []).append(path.stem)
+    return {target: options[0] for target, options in targets.items() if len(options) == 1}
 
 
 def _check_key(key: str, found: Sequence[Entry]) -> None:
@@ -194,8 +156,10 @@ def _check_key(key: str, found: Sequence[Entry]) -> None:
     raise ConfigError(f"no run has {key!r}; {hint}")
 
 
-def _value(entry: Entry, key: str):
-    return entry.values[key] if key in entry.values else entry.settings.get(key)
+def value_of(entry: Entry, key: str):
+    """A field, metric or setting of a run; None where it has none."""
+    found = entry.values.get(key)
+    return entry.settings.get(key) if found is None else found
 
 
 def _matches(value, wanted: str) -> bool:
@@ -210,14 +174,14 @@ def _order(value) -> tuple[int, float, str]:
     return (1, 0.0, str(value))
 
 
-def _flat(value, prefix: str = "") -> dict[str, Any]:
+def flat(value, prefix: str = "") -> dict[str, Any]:
     """A tree as dotted keys."""
     if not isinstance(value, dict) or not value:
         return {prefix: value} if prefix else {}
     return {
         key: leaf
         for name, child in value.items()
-        for key, leaf in _flat(child, f"{prefix}.{name}" if prefix else str(name)).items()
+        for key, leaf in flat(child, f"{prefix}.{name}" if prefix else str(name)).items()
     }
 
 
@@ -232,10 +196,3 @@ def text(value) -> str:
     if isinstance(value, float):
         return f"{value:.6g}"
     return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in str(value))
-
-
-def _change(a, b) -> str:
-    kinds = (int, float)
-    if isinstance(a, bool) or not isinstance(a, kinds) or not isinstance(b, kinds) or a == 0:
-        return ""
-    return f"{100 * (b - a) / abs(a):+.3g} %"

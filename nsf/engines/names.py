@@ -1,0 +1,6 @@
+"""Names of the engines, for checks that need none of them."""
+
+#: That of the operators, which are of a file that `nsf teach` writes.
+OPERATORS = "operators"
+#: What `engine=` may be: from the fastest to the one that steps whatever can be stepped.
+NAMES = ("auto", "modal", "reference", OPERATORS)

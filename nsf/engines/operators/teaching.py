@@ -1,0 +1,71 @@
+"""What is taught: how, and along which values; checked without torch."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from nsf.data import PROGRAM, Case
+from nsf.errors import ConfigError
+from nsf.scenes.designs import evenly
+
+#: Forcing programs that are drawn for teaching have numbers from here on, for each seed.
+_PROGRAMS = 1_000_000
+
+
+@dataclass(frozen=True)
+class Teaching:
+    """How operators are taught.
+
+    Attributes:
+        width: of both hidden layers.
+        rounds: along the operators' own runs, after the first.
+        steps: of the teacher, about, in all.
+        descent: steps of Adam in each round.
+        rate: learning rate of the first round; half of it later.
+        unroll: steps of a window.
+        noise: on the start of a window [deviations of x̂].
+        tube: deviation of states about training runs [deviations of x̂].
+        gravity: by how much the gravity of labels in the tube is varied [-], of its magnitude.
+
+    Raises:
+        ConfigError: a value outside its range.
+    """
+
+    width: int = 96
+    rounds: int = 3
+    steps: int = 8000
+    descent: int = 3000
+    rate: float = 3e-3
+    unroll: int = 8
+    noise: float = 0.01
+    tube: float = 0.05
+    gravity: float = 0.1
+
+    def __post_init__(self):
+        for name, least in (("width", 1), ("rounds", 0), ("steps", 1), ("descent", 1), ("unroll", 1)):
+            if getattr(self, name) < least:
+                raise ConfigError(f"{name}={getattr(self, name)} must be at least {least}")
+        for name in ("rate", "noise", "tube", "gravity"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
+                raise ConfigError(f"{name}={getattr(self, name)} must be finite and at least 0")
+
+
+def random_cases(box: np.ndarray, count: int, seed: int, taken: Sequence[Case]) -> list[Case]:
+    """Cases in a box, spread evenly and shaken: points of a Hammersley set, each moved by up to 1/count.
+
+    Args:
+        box: [n, 2] smallest and largest value of each parameter.
+        count: how many; one fewer for each that would be a case that is taken.
+        seed: of the generator.
+        taken: cases that are left out, at least one; they name the parameters.
+    """
+    even = np.column_stack([np.arange(count), count * evenly(count, len(box) - 1)])
+    shaken = (even + np.random.default_rng(seed).random(even.shape)) / count % 1.0
+    low, high = box.T
+    rows = low + (high - low) * shaken
+    if PROGRAM in taken[0].names:
+        rows = np.column_stack([rows, _PROGRAMS * (1 + seed) + np.arange(count)])
+    found = [Case(taken[0].names, point, taken[0].units) for point in rows]
+    return [case for case in found if not any(map(case.near, taken))]

@@ -1,0 +1,341 @@
+"""The run of each stage of a configuration, named before anything of it is built.
+
+Neither torch nor Warp is imported, so that a mistake, or a chain whose results are all there, takes a second.
+"""
+
+from collections.abc import Sequence
+from copy import copy
+from dataclasses import asdict
+from functools import cached_property
+from pathlib import Path
+
+from omegaconf import DictConfig, OmegaConf
+
+from nsf import config as configuration
+from nsf.data.case import Case
+from nsf.engines.modal.mirrors import edits
+from nsf.engines.names import OPERATORS
+from nsf.engines.operators.teaching import Teaching, random_cases
+from nsf.errors import ConfigError
+from nsf.gpu import has_driver
+from nsf.pipeline.values import TEACHERS, check_batch, check_numbers, check_words, factors, one_of
+from nsf.reporting.swap import check_place
+from nsf.runs import Run
+from nsf.scenes.draft import Draft
+from nsf.scenes.identity import NOT_PHYSICS
+
+#: Of the chain, in order; each reads the files of the one before it and nothing else.
+STAGES = ("simulate", "train", "teach", "deploy", "evaluate", "report")
+#: Keys of the configuration that a simulation's content depends on.
+_SCENE_KEYS = ("scale", "material", "transfer")
+#: Keys that hold others, none of which is left out.
+_SECTIONS = ("data", "deploy", "evaluation", "super_resolution", "report")
+#: Cases between the training ones whose runs decide which round of teaching is kept.
+HELD_BACK = 3
+#: Fields without `arithmetic`, known without importing them.
+_EXACT = ("nsf.kinematics.fields.basis.BasisField", "nsf.kinematics.fields.joint.JointField")
+
+
+class Names:
+    """The stages of one configuration, as runs.
+
+    Args:
+        config: configuration, as `nsf.config.load` gives it; resolved here.
+        root: folder of runs; `NSF_RUNS` or `runs` by default.
+
+    Attributes:
+        scene: that is trained on; deployed: that of the held-out simulations and of deployment.
+        engine: name of the engine that is asked for; teaching: of operators, None for another engine.
+        coarse: factors of Δx of the full-order runs that a reduced one is held to.
+        split: cases by their use.
+        device: found once, so that a missing GPU is reported before any work.
+
+    Raises:
+        ConfigError: a value is missing or refused; names it.
+        DeviceError: the device does not exist.
+    """
+
+    scene: Draft
+    deployed: Draft
+
+    def __init__(self, config: DictConfig, root: Path | None = None):
+        self.root = root
+        with configuration.naming_the_missing():
+            self._begin(config)
+
+    def _begin(self, config: DictConfig) -> None:
+        for key in _SECTIONS:
+            configuration.section(config, key)
+        check_numbers(config)
+        self.scene = Draft.from_config(config)
+        c = self.config = self.scene.config
+        self.split = self.scene.split
+        if len(self.split.train) <= len(self.split.names):
+            raise ConfigError(
+                f"scene.design has {len(self.split.train)} training cases, and {', '.join(self.split.names)} "
+                f"need{'s' * (len(self.split.names) == 1)} at least {len(self.split.names) + 1}; add some"
+            )
+        # A configuration from before there were engines has no such key.
+        self.engine = OmegaConf.select(c, "engine.name", default="auto")
+        self.teaching: Teaching | None = None
+        if self.engine == OPERATORS:
+            self.teaching = configuration.build(c.engine.teaching, "engine.teaching")
+            one_of("engine.teacher", c.engine.teacher, TEACHERS)
+        self.coarse = factors("evaluation.coarse", OmegaConf.select(c, "evaluation.coarse", default=[]))
+        check_words(c, self.engine)
+        check_batch(c, self.engine)
+        self.deployed = self._changed(c.deploy.changes)
+        self.device = _device(c.device)
+
+    def _changed(self, changes: DictConfig | None) -> Draft:
+        """The scene of the held-out simulations and of deployment."""
+        if not changes:
+            return self.scene
+        if not isinstance(changes, DictConfig):
+            raise ConfigError(f"deploy.changes={changes} must map keys to values, as {{material.nu:0.25}}")
+        if wrong := [key for key in changes if not isinstance(key, str)]:
+            raise ConfigError(f"deploy.changes has the key {wrong[0]}; give dotted keys, as material.nu")
+        try:
+            return self._with_changes(OmegaConf.to_container(changes))
+        except ConfigError as error:
+            raise ConfigError(f"deploy.changes: {error}") from error
+
+    def _with_changes(self, changes: dict) -> Draft:
+        return self.scene.changed(changes)
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The stages of the chain, `teach` only where the engine that is asked for is taught."""
+        return tuple(name for name in STAGES if name != "teach" or self.teaching is not None)
+
+    @property
+    def projecting(self) -> str:
+        """The engine of steps that are projected: that which is asked for, or which operators learn from."""
+        return self.engine if self.teaching is None else self.config.engine.teacher
+
+    @property
+    def held_out(self) -> tuple[Case, ...]:
+        """Cases that are deployed and evaluated."""
+        self.check_held_out()
+        return getattr(self.split, self.config.deploy.split)
+
+    def check_held_out(self) -> None:
+        """Refuse to deploy in no case.
+
+        Raises:
+            ConfigError: the split that is deployed is empty.
+        """
+        split = self.config.deploy.split
+        if not getattr(self.split, split):
+            raise ConfigError(f"deploy.split={split} has no cases; set scene.design.{split}")
+
+    @property
+    def report_folder(self) -> Path:
+        """Where the report goes."""
+        return Path(self.config.report.folder) / self.config.report.name
+
+    def check_report_folder(self) -> None:
+        """Refuse a place where no report could be written.
+
+        Raises:
+            ConfigError: something else stands there.
+            StorageError: the folder above it cannot be written.
+        """
+        check_place(self.report_folder)
+
+    def needed(self) -> list[tuple[Case, Draft]]:
+        """Every case with the scene that is simulated in it: the deployed one where cases are held out."""
+        held_out = getattr(self.split, self.config.deploy.split)
+        plain = {*self.split.cases}.difference(() if self.config.deploy.split == "train" else held_out)
+        needed = [(case, self.scene) for case in plain] + [(case, self.deployed) for case in held_out]
+        return sorted(needed, key=lambda pair: pair[0])
+
+    def simulation(self, case: Case, scene: Draft | None = None) -> Run:
+        """The run of one full-order trajectory, of the scene of training by default."""
+        c = self.config
+        scene = scene or self.scene
+        content = self._physics(scene)
+        content |= {"precision": c.precision, "dtype": c.data.dtype}
+        content["parameters"] = {
+            name: {"key": self.scene.varied[name].key, "value": value} for name, value in case.items()
+        }
+        if scene.files:
+            # A changed mesh under the same path is another simulation.
+            content["files"] = scene.files
+        return Run.open("simulate", self.scene.name, content, root=self.root)
+
+    def truth(self, case: Case) -> Run:
+        """The run of the full-order trajectory that a deployed one is held to."""
+        return self.simulation(case, self.deployed)
+
+    @property
+    def training_data(self) -> list[Run]:
+        """The runs of the trajectories that are trained on."""
+        return [self.simulation(case) for case in self.split.train]
+
+    @property
+    def training(self) -> Run:
+        """The run of the manifold."""
+        content = self._content(("field", "trainer", "latent_dim", "seed"))
+        if content["trainer"].get("devices", 1) == 1:
+            # The bits, and so the name, of a training from before there was the key.
+            content["trainer"].pop("devices", None)
+        content["field"].pop("arithmetic", None)  # of deployment
+        return Run.open("train", self.scene.name, content, self.training_data, root=self.root)
+
+    @property
+    def deployment(self) -> Run:
+        """The run of the reduced trajectories."""
+        keys = ("method", "sampler", "projector", "integration", "precision")
+        content = (
+            self._content(keys)
+            | self._physics(self.deployed)
+            | {
+                "cases": list(map(dict, self.held_out)),
+                "split": self.config.deploy.split,
+                "dt_multiplier": self.config.deploy.dt_multiplier,
+                "on_distrust": self.config.deploy.on_distrust,
+                "device": self.device,
+            }
+        )
+        if self._of_networks:
+            content["arithmetic"] = self.field.arithmetic
+        if self.engine != "auto":
+            content["engine"] = self.engine
+        if self.teaching is not None:
+            content |= {"check": self.config.engine.check, "tolerance": self.config.deploy.tolerance}
+        if changed := edits():  # an edited step is another run, whose result is not there yet
+            content["edited"] = changed
+        parents = [self.training] if self.teaching is None else [self.training, self.taught]
+        return Run.open("deploy", self.scene.name, content, parents, root=self.root)
+
+    @cached_property
+    def field(self):
+        """What is trained; to build it, torch is imported."""
+        return configuration.build(self.config.field, "field")
+
+    @cached_property
+    def _of_networks(self) -> bool:
+        """Whether the field is the paper's networks."""
+        if self.config.field.get("_target_") in _EXACT:
+            return False
+        from nsf.kinematics.fields.mlp import MlpField
+
+        return isinstance(self.field, MlpField)
+
+    @property
+    def taught(self) -> Run:
+        """The run of the operators.
+
+        Raises:
+            ConfigError: the engine that is asked for learns nothing.
+        """
+        if self.teaching is None:
+            raise ConfigError(f"engine={self.engine} is not taught; set engine=operators")
+        content = (
+            self._content(("method", "sampler", "projector", "integration", "precision", "seed"))
+            | self._physics(self.scene)
+            | {
+                "teaching": asdict(self.teaching),
+                "teacher": self.config.engine.teacher,
+                "cases": [list(map(dict, cases)) for cases in self.lessons],
+                "validation": list(map(dict, self.split.validation)),
+                "dt_multiplier": self.config.deploy.dt_multiplier,
+                "device": self.device,
+            }
+        )
+        if changed := edits():
+            content["edited"] = changed
+        return Run.open("teach", self.scene.name, content, [self.training], root=self.root)
+
+    @property
+    def lessons(self) -> list[list[Case]]:
+        """Cases of three kinds that the teacher is asked in: of training, between them, and held back.
+
+        Runs in those held back decide which round of teaching is kept, where there are no validation cases.
+        None is a validation or test case.
+        """
+        known, seed = sorted(self.split.train), int(self.config.seed)
+        taken = [*known, *self.split.validation, *self.split.test]
+        between = random_cases(self.split.box, len(known), seed, taken)
+        back = random_cases(self.split.box, HELD_BACK, seed + 1, [*taken, *between])
+        return [known, between, back]
+
+    @property
+    def evaluation(self) -> Run:
+        """The run of errors and costs."""
+        content = self._content(("evaluation",))
+        content["paper"] = self._content(("scene",))["scene"].get("paper")
+        parents = [self.deployment, *map(self.truth, self.held_out)]
+        return Run.open("evaluate", self.scene.name, content, parents, root=self.root)
+
+    @property
+    def superresolution(self) -> Run:
+        """The run of the deployed fields at more points."""
+        content = self._content(("super_resolution",))
+        parents = [self.deployment, *map(self.truth, self.held_out)]
+        return Run.open("superresolve", self.scene.name, content, parents, root=self.root)
+
+    def evaluated(self) -> Run:
+        """The complete run of errors and costs, of this device or another: it may have been brought here.
+
+        Raises:
+            MissingRunError: there is none; says how far it came.
+        """
+        return self._found("evaluation")
+
+    def superresolved(self) -> Run:
+        """The complete run of the deployed fields at more points, likewise.
+
+        Raises:
+            MissingRunError: there is none.
+        """
+        return self._found("superresolution")
+
+    def _found(self, name: str) -> Run:
+        for device in (self.device, "cuda:0", "cpu"):
+            there = copy(self)
+            there.device = device
+            if getattr(there, name).complete:
+                return getattr(there, name)
+        return getattr(self, name).require()
+
+    def spare(self, later: Sequence[str]) -> set[str]:
+        """Trajectories, by id, that later stages need not read, as their results are there."""
+        truths = {self.truth(case).id for case in self.held_out}
+        read = {"evaluate": self.evaluation, "superresolve": self.superresolution}
+        over = "evaluate" in later and all(run.complete for name, run in read.items() if name in later)
+        trained = {run.id for run in self.training_data}
+        needed = (set() if over else truths) | (set() if self.training.complete else trained)
+        return (truths | trained) - needed
+
+    def reported(self) -> list[Run]:
+        """Every evaluated variant of this scene at these held-out trajectories."""
+        truths = {self.truth(case).id for case in self.held_out}
+        found = Run.find("evaluate", self.scene.name, root=self.root)
+        return [
+            run
+            for run in found
+            if run.complete and truths == {p for p in run.parents if p.startswith("simulate/")}
+        ]
+
+    @staticmethod
+    def _physics(scene: Draft) -> dict:
+        """What the configuration says of a scene's physics."""
+        plain = OmegaConf.to_container(scene.config)
+        content = {key: plain[key] for key in _SCENE_KEYS}
+        return content | {"scene": {k: v for k, v in plain["scene"].items() if k not in NOT_PHYSICS}}
+
+    def _content(self, keys: Sequence[str]) -> dict:
+        plain = OmegaConf.to_container(self.config)
+        return {key: plain[key] for key in keys}
+
+
+def _device(asked) -> str:
+    """The name of the device that is asked for."""
+    if str(asked) in ("auto", "cpu") and not has_driver():
+        return "cpu"
+    from nsf.mpm.device import warp_device
+
+    device = warp_device(asked)
+    return str(device) if device.is_cuda else "cpu"

@@ -1,0 +1,118 @@
+"""Runs that can go: what nothing complete was made from, and how much room it takes."""
+
+import math
+import os
+import re
+import shutil
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from nsf.errors import ConfigError, StorageError
+from nsf.runs.listing import Entry
+from nsf.runs.run import Run
+
+#: Stages whose complete runs are results: nothing is made from them, and they are why the rest was made.
+RESULTS = ("evaluate", "superresolve")
+_AGE = re.compile(r"(\d+(?:\.\d+)?)([hdw])")
+_HOURS = {"h": 1, "d": 24, "w": 168}
+
+
+def dependents(runs: Iterable[Run]) -> dict[Run, set[Run]]:
+    """The complete or running runs that were made from each run, by themselves or through others."""
+    runs = list(runs)
+    found: dict[Run, set[Run]] = {}
+    for run in runs:
+        if run.status not in ("complete", "running"):
+            continue
+        waiting, seen = list(run.parent_runs), set()
+        while waiting:
+            if (parent := waiting.pop()) not in seen:
+                seen.add(parent)
+                found.setdefault(parent, set()).add(run)
+                waiting += parent.parent_runs
+    return found
+
+
+def prunable(asked: Sequence[Entry], everything: Sequence[Run], results: bool = False) -> list[Run]:
+    """Of some runs, those that no complete run depends on, unless that one goes as well.
+
+    Args:
+        asked: the runs that may go.
+        everything: all runs.
+        results: complete runs of the last stages may go, too.
+    """
+    candidates = [
+        entry.run
+        for entry in asked
+        if entry.run.status != "running" and (results or not _is_result(entry.run))
+    ]
+    of = dependents(everything)
+    while True:
+        going = set(candidates)
+        kept = [run for run in candidates if of.get(run, set()) <= going]
+        if len(kept) == len(candidates):
+            return kept
+        candidates = kept
+
+
+def _is_result(run: Run) -> bool:
+    return run.stage in RESULTS and run.status == "complete"
+
+
+def older(entries: Iterable[Entry], age: str) -> list[Entry]:
+    """The runs that were begun longer ago than an age, as 36h, 7d or 2w.
+
+    Raises:
+        ConfigError: it is no age.
+    """
+    if not (found := _AGE.fullmatch(age)):
+        raise ConfigError(f"older={age} is no age; give hours, days or weeks, as 36h, 7d or 2w")
+    before = datetime.now(UTC) - timedelta(hours=float(found[1]) * _HOURS[found[2]])
+    return [e for e in entries if (at := e.values["created"]) and datetime.fromisoformat(at) < before]
+
+
+def size_of(run: Run) -> int:
+    """Bytes of all files in a run's folder."""
+    total = 0
+    for folder, _, names in os.walk(run.path):
+        for name in names:
+            with suppress(OSError):  # removed while we look
+                total += os.lstat(os.path.join(folder, name)).st_size
+    return total
+
+
+def remove(run: Run) -> None:
+    """Delete a run's folder, and those above it that this leaves empty.
+
+    Raises:
+        StorageError: a process is making the run, or the folder cannot be deleted.
+    """
+    making = StorageError(f"{run.id} is being made by another process; wait until it has ended")
+    if run.status == "running":
+        raise making
+    with run.claimed() as claimed:
+        if not claimed:
+            raise making
+        aside = run.path.with_name(f".{run.hash}.removed")  # no one is to see a run that is half gone
+        try:
+            shutil.rmtree(aside, ignore_errors=True)
+            run.path.rename(aside)
+            shutil.rmtree(aside)
+        except OSError as error:
+            raise StorageError(f"{run.path} cannot be deleted: {error.strerror}") from error
+    _drop_empty(run.path.parent, run.root)
+
+
+def _drop_empty(folder: Path, root: Path) -> None:
+    with suppress(OSError):
+        while folder != root:
+            folder.rmdir()
+            folder = folder.parent
+
+
+def bytes_text(count: float) -> str:
+    """Bytes as a reader takes them in: 1.4 GiB."""
+    power = min(4, int(math.log(max(count, 1), 1024)))
+    return f"{count / 1024**power:.3g} {('B', 'KiB', 'MiB', 'GiB', 'TiB')[power]}"
