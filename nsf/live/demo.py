@@ -2,7 +2,6 @@
 
 import webbrowser
 import zlib
-from collections.abc import Callable
 from importlib.resources import files
 from pathlib import Path
 
@@ -33,7 +32,6 @@ def show(
     model: str | None,
     folder: Path | str,
     opened: str = "true",
-    browse: Callable[[str], object] = webbrowser.open,
 ) -> Path:
     """Write the page of a shipped model, and open it in the browser.
 
@@ -41,7 +39,6 @@ def show(
         model: a key of `MODELS`; the first by default.
         folder: of the page.
         opened: `true` or `false`: whether it is opened.
-        browse: opens an address.
 
     Raises:
         ConfigError: there is no such model, or `opened` is neither.
@@ -51,5 +48,5 @@ def show(
     model = next(iter(MODELS)) if model is None else model
     path = web.saved(Path(folder) / f"{model}.html", page(model))
     if opened == "true":
-        browse(path.resolve().as_uri())
+        webbrowser.open(path.resolve().as_uri())
     return path

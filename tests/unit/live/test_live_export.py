@@ -130,15 +130,15 @@ def test_a_page_that_is_too_large_is_refused(taught_model, tmp_path, monkeypatch
 
 def test_a_model_is_there_at_once(capsys, tmp_path, monkeypatch):
     asked = []
+    monkeypatch.setattr("webbrowser.open", asked.append)
     for model in demo.MODELS:
-        path = demo.show(model, tmp_path, browse=asked.append)
+        path = demo.show(model, tmp_path)
         assert demo.MODELS[model] in path.read_text()
     assert asked == [(tmp_path / f"{model}.html").as_uri() for model in demo.MODELS]
     with pytest.raises(ConfigError, match="model=cake is none that is shipped; choose one of block, sand"):
         demo.show("cake", tmp_path)
     with pytest.raises(ConfigError, match="open=no must be true or false"):
         demo.show(None, tmp_path, "no")
-    monkeypatch.setattr(demo.webbrowser, "open", asked.append)
     with pytest.raises(SystemExit) as end:
         main(["demo", "model=sand", f"folder={tmp_path}", "open=false"])
     assert not end.value.code
