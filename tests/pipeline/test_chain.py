@@ -22,8 +22,8 @@ from nsf.errors import ConfigError, InstabilityError, MissingRunError, NSFError
 from nsf.evaluation import superresolution
 from nsf.kinematics.manifold import Manifold
 from nsf.mpm import FullOrderMPM
-from nsf.runs import Run
 from nsf.reporting.overview.tables import texts
+from nsf.runs import Run
 from nsf.runs.listing import entries
 
 #: Issue 2, "Done when".
