@@ -23,7 +23,7 @@ WORKERS ?= 2
 CASES ?= 2400
 SEED ?= 0
 
-.PHONY: help install develop quickstart test fuzz test-slow test-gpu gpu-references test-slurm test-all lint mirrors readme check-reports docs clean
+.PHONY: help install develop quickstart test test-browser fuzz test-slow test-gpu gpu-references test-slurm test-all lint mirrors readme check-reports docs clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -54,6 +54,11 @@ quickstart: install  ## a column of sand in a minute, from simulation to report,
 
 test: develop  ## the tests, without those marked slow or slurm
 	$(PYTEST) -m 'not slow and not slurm' -n $(WORKERS) --dist worksteal
+
+test-browser: develop  ## the pages in Chromium, their modules under node and tsc; apt install chromium nodejs npm
+	@for p in chromium node npx; do command -v $$p >/dev/null || echo "$$p is missing; its tests are skipped: apt install chromium nodejs npm"; done
+	! command -v npx >/dev/null || npx --yes -p typescript@5 tsc -p tests/unit/web/tsconfig.json
+	$(PYTEST) -rs tests/unit/live tests/unit/export/test_export_page.py
 
 test-slow: develop  ## the tests marked slow
 	$(PYTEST) -m slow

@@ -22,7 +22,14 @@ STAGES = {
 TOOLS = {
     "view": ("a deployment in the browser: steer the reduced run, see it beside the full-order one", None),
     "serve": ("a deployment's latent vectors as a stream that many browsers decode", None),
-    "export": ("a deployed run for other programs: HTML page, USD, VTK, ONNX, pictures and film", None),
+    "demo": (
+        "a model that runs in the browser: drag, tilt and steer it, with no server and nothing to train",
+        "[model=block] [folder=PATH] [open=true]; block, metal or sand; reports/demo by default",
+    ),
+    "export": (
+        "a deployed run for other programs: HTML page, the model itself in a page, USD, VTK, ONNX, film",
+        None,
+    ),
     "search": (
         "values of numeric keys that make δ, or δ and the step's time, small at the validation values",
         "key=low..high[:log] … [key=value …] [search.objectives=[delta,step_ms]] [search.trials=20]",
@@ -58,6 +65,7 @@ examples:
   nsf run +experiment=table1 scale=small               every job of experiments/table1.yaml, and its report
   nsf run -m +experiment=sand hydra/launcher=joblib    jobs side by side on this machine
   nsf run -m +experiment=table1 hydra/launcher=slurm   jobs in Slurm's queue (conf/hydra/launcher/slurm.yaml)
+  nsf demo                                             a model in the browser, at once
   nsf export --html --frames                           the newest deployed run as a page and a film
   nsf point material=drucker_prager path=oedometer     plot a law before trusting it
   nsf view                                             the newest deployment in the browser
@@ -171,7 +179,7 @@ def _tool(name: str, words: list[str]) -> int:
 
         return live(name, text, words)
     tools = {
-        "bench": _bench, "doctor": _doctor, "export": _export, "index": _index,
+        "bench": _bench, "demo": _demo, "doctor": _doctor, "export": _export, "index": _index,
         "plan": _plan, "reports": _reports, "runs": _runs, "search": _search,
     }  # fmt: skip
     return tools[name](words)
@@ -203,9 +211,26 @@ def _doctor(words: list[str]) -> int:
 
 def _export(words: list[str]) -> int:
     """A deployed run in other programs' formats."""
+    from nsf.export.command import Page
     from nsf.export.command import main as export
 
-    return export(words)
+    def live(*given):
+        from nsf.live.publish import write
+
+        return write(*given)
+
+    told = "the model itself in one page that runs, is steered and mailed; needs engine=operators"
+    return export(words, {"live": Page(told, live)})
+
+
+def _demo(words: list[str]) -> int:
+    """A page of a model that comes with the package."""
+    asked = _asked("demo", words, "model", "folder", "open")
+    from nsf.live.demo import show
+
+    folder = asked.get("folder", os.path.join(os.environ.get("NSF_REPORTS", "reports"), "demo"))
+    print(f"open {show(asked.get('model'), folder, asked.get('open', 'true')).resolve()}")
+    return 0
 
 
 def _index(words: list[str]) -> int:

@@ -2,16 +2,23 @@
 
 import argparse
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from nsf.errors import ConfigError
 from nsf.export import FORMATS
+
+if TYPE_CHECKING:
+    from nsf.export.playback import Playback
+    from nsf.runs import Run
 
 _DESCRIPTION = "Writes a reduced run for other programs: any number of formats at once."
 _EXAMPLES = """\
 examples:
   nsf export --html                                 the newest deploy run, in a browser
+  nsf export sand --live                            the model itself in a page, to steer without a server
   nsf export deploy/sand/1a2b --vtk --points 1000000   many more points than were trained on
   nsf export runs/deploy/sand/1a2b3c4d5e6f --frames --color displacement --parameter 33
   nsf export 1a2b --usd --onnx --every 5 --output /tmp/sand
@@ -24,7 +31,20 @@ class _Parser(argparse.ArgumentParser):
         raise ConfigError(f"{message}; see `nsf export --help`")
 
 
-def _parser() -> argparse.ArgumentParser:
+@dataclass(frozen=True)
+class Page:
+    """A page of a deployment that holds more than one run, which a higher layer writes.
+
+    Attributes:
+        tells: what it is, for the help.
+        write: (deploy run, folder, points or None, device) → the path to open.
+    """
+
+    tells: str
+    write: "Callable[[Run, Path, int | None, str], Path]"
+
+
+def _parser(pages: Mapping[str, Page]) -> argparse.ArgumentParser:
     parser = _Parser(
         prog="nsf export",
         description=_DESCRIPTION,
@@ -36,7 +56,7 @@ def _parser() -> argparse.ArgumentParser:
         "run", nargs="?", metavar="RUN",
         help="deploy run: its id, the beginning of it or of its hash, or its folder; the newest by default",
     )  # fmt: skip
-    for name, tells in FORMATS.items():
+    for name, tells in (FORMATS | {name: page.tells for name, page in pages.items()}).items():
         parser.add_argument(f"--{name}", action="store_true", help=tells)
     options = (
         ("parameter", str, None, "held-out case, as 26 or E=1500,friction=0.3; the first by default"),
@@ -53,16 +73,25 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def main(arguments: Sequence[str]) -> int:
+def main(arguments: Sequence[str], pages: Mapping[str, Page] | None = None) -> int:
     """Write what the arguments ask for and say where it lies.
+
+    Args:
+        arguments: of the command line.
+        pages: other formats by name.
 
     Raises:
         NSFError: an argument is refused, a run or an extra is missing, or a file cannot be written.
     """
-    asked = _parser().parse_args(arguments)
+    pages = pages or {}
+    asked = _parser(pages).parse_args(arguments)
     formats = [name for name in FORMATS if getattr(asked, name)]
-    if not formats:
-        raise ConfigError(f"no format; give one or more of {', '.join(f'--{name}' for name in FORMATS)}")
+    wanted = {name: page for name, page in pages.items() if getattr(asked, name)}
+    if not formats and not wanted:
+        known = ", ".join(f"--{name}" for name in (*FORMATS, *pages))
+        raise ConfigError(f"no format; give one or more of {known}")
+    if asked.points is not None and asked.points < 1:
+        raise ConfigError(f"points={asked.points} must be a whole number of at least 1")
     import importlib
 
     from nsf.extras import optional
@@ -73,20 +102,31 @@ def main(arguments: Sequence[str]) -> int:
         print(f"export: the newest deploy run, {run.id}")
     else:
         run = Run.named(asked.run, "deploy").require()
-    from nsf.export.playback import Playback
-
     writers = {name: importlib.import_module(f"nsf.export.{name}") for name in formats}
     for needed in (module for writer in writers.values() for module in writer.NEEDS):
         optional(needed, "export")  # before any work
+    folder = asked.output or _reports() / "export" / f"{run.scene}-{run.hash}"
+    if formats:
+        playback = _playback(run, asked)
+    for name, writer in writers.items():
+        _say(name, writer.write(playback, folder))
+    for name, page in wanted.items():
+        _say(name, page.write(run, folder, asked.points, asked.device))
+    return 0
+
+
+def _playback(run: "Run", asked: argparse.Namespace) -> "Playback":
+    from nsf.export.playback import Playback
+
     playback = Playback(run, asked.parameter, asked.points, asked.color, asked.every, asked.fps, asked.device)
     print(f"export: {playback.title}, {len(playback.t)} frames, {len(playback.X):,} points")
     if playback.stopped is not None:
         print(f"export: warning: the run diverged at t = {playback.stopped:.4g} s; it is shown up to there")
-    folder = asked.output or _reports() / "export" / f"{run.scene}-{run.hash}"
-    for name, writer in writers.items():
-        path = writer.write(playback, folder)
-        print(f"export: {name} → {path} ({_size(path) / 2**20:.1f} MiB)")
-    return 0
+    return playback
+
+
+def _say(name: str, path: Path) -> None:
+    print(f"export: {name} → {path} ({_size(path) / 2**20:.1f} MiB)")
 
 
 def _reports() -> Path:

@@ -18,9 +18,9 @@ from nsf.dynamics.interop import torch_device, torch_dtype
 from nsf.errors import ConfigError, MissingRunError, SchemaError
 from nsf.evaluation import metrics
 from nsf.evaluation.superresolution import POINTS
+from nsf.export import web
 from nsf.kinematics.interpolation import lying_together
 from nsf.kinematics.manifold import Manifold, Restriction
-from nsf.export import web
 from nsf.mpm import Collider, floor_height, precision_of
 from nsf.mpm.device import warp_device
 from nsf.progress import Progress

@@ -14,14 +14,17 @@ from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from markupsafe import Markup
 
-from nsf.mpm import Collider, HalfSpace, Sphere
 from nsf.reporting.drawing.style import STRESS_COLORS, ColorScale
 from nsf.reporting.text.formats import HTML
 from nsf.storage import writing
+
+if TYPE_CHECKING:
+    from nsf.mpm import Collider
 
 #: Arrays begin at multiples of so many bytes, so that a browser views them in place.
 _WORD = 8
@@ -118,10 +121,10 @@ def page(entry: str, title: str, data: bytes = b"", connects: bool = False) -> s
     )
 
 
-def write_page(path: Path, *given, **options) -> Path:
-    """Write a `page`; whole or not at all."""
+def saved(path: Path, text: str) -> Path:
+    """Write a page; whole or not at all."""
     with writing(path) as partial:
-        partial.write_text(page(*given, **options), encoding="utf-8")
+        partial.write_text(text, encoding="utf-8")
     return path
 
 
@@ -130,12 +133,11 @@ def colors() -> list[int]:
     return ColorScale(1.0, STRESS_COLORS, 1.0, "").pixels(np.linspace(0, 1, 256)).ravel().tolist()
 
 
-def solid(name: str, collider: Collider) -> dict:
+def solid(name: str, collider: "Collider") -> dict:
     """A solid as `solids.mjs` has it."""
-    shapes = {HalfSpace: "half-space", Sphere: "sphere"}
     found = {
         "name": name,
-        "shape": shapes.get(type(collider), "cuboid"),
+        "shape": collider.name,
         "position": collider.position.tolist(),
         "extents": collider.extents.tolist(),
         "orientation": collider.orientation.ravel().tolist(),

@@ -19,6 +19,7 @@ from nsf.mpm import floor_height
 from nsf.mpm.stability import check_time_step
 from nsf.pipeline import Pipeline
 from nsf.runs import Run
+from nsf.scenes.programs import tilted
 
 #: Precision of live runs, whatever the deployment's: a CPU reads half as much a step. On the sand column this
 #: moves no particle by more than a thousandth of the displacement.
@@ -27,6 +28,8 @@ PRECISION = "fp32"
 _BEYOND = 0.5
 #: Number of steps in the range of a parameter.
 _STEPS = 200
+#: Of the radius of gravity: what is further out is outside, whatever round-off does.
+_OUTSIDE = 1.0 + 1e-6
 #: Share of the particles that are shown which lie at the surface, where there are so many.
 _OUTER = 0.7
 _SNAPSHOTS = 64  # training snapshots that bounds and colour scales are taken from
@@ -99,12 +102,14 @@ class LiveRun:
         steps, dt: number of steps of the whole run, and their length [s].
         reached: last step that can be read.
         finished: whether the run has reached the scene's end or has diverged.
+        by_hand: whether a hand has changed gravity in its course.
         away: how far the case is from the training cases, in units of their spacing.
         diverged: whether the run ended early, with x̂ not finite or a sample particle off the grid.
         seconds: wall time of the steps [s].
     """
 
     def __init__(self, case: Case, solver: ReducedMPM, decoder: Decoder, trust: Trust):
+        self.by_hand = False
         self.case, self.steps, self.dt = case, solver.total_steps, solver.dt
         self.away = trust.cases.of(case)
         self._solver: ReducedMPM | None = solver
@@ -133,12 +138,34 @@ class LiveRun:
         found = slice(first, last + 1)
         self._xhat[found] = latent.xhat[found]
         residuals = latent.residuals[first - 1 : last, -1]
-        self._ratios[found] = self._trust.ratios(latent.xhat[first - 1 : last + 1], residuals)[1:]
+        ratios = self._trust.ratios(latent.xhat[first - 1 : last + 1], residuals)[1:]
+        gravity = self._trust.of_gravity(solver.acting_gravity(latent.t[first - 1 : last]))
+        self._ratios[found] = np.where(gravity > _OUTSIDE, np.maximum(ratios, gravity), ratios)
         self.seconds += time.perf_counter() - started
         self.diverged = lost >= 0
         self.reached = last  # only now, since other threads read all steps up to here
         if self.diverged or last == self.steps:
             self._solver = None
+
+    def goes_on(self, run: "LiveRun", step: int, gravity: Sequence[float]) -> None:
+        """Take over another run of the same case up to a step, and let gravity be another from there on.
+
+        Args:
+            run: that has come as far.
+            step: the last that is taken over.
+            gravity: [3] [m/s²].
+        """
+        solver, kept = self._solver, slice(0, step + 1)
+        assert solver is not None, "the run has begun"
+        self._xhat[kept], self._ratios[kept] = run._xhat[kept], run._ratios[kept]
+        self.reached, self.by_hand = step, True
+        record = solver.record
+        record.xhat[kept] = torch.as_tensor(run._xhat[kept]).to(record.xhat)
+        record.now.copy_(record.xhat[step])
+        record.before.copy_(record.xhat[max(0, step - 1)])
+        record.row.fill_(step)
+        solver.together.resume(step)
+        solver.forcing.gravity = gravity
 
     def xhat(self, step: int) -> np.ndarray:
         """[r] float32 latent vector."""
@@ -198,7 +225,7 @@ class LiveModel:
         solver = self.pipeline.solver_at(self.manifold, self.initial)
         sample = np.unique(np.concatenate([sets.sample for sets in solver.sets]))
         self._sets_at = solver.sets_at
-        self.trust = _trust(run, self.manifold, sample, self.pipeline.device)
+        self.trust = _trust(run, self.manifold, sample, self.pipeline)
         self.particles = len(self.manifold.X)
         self.sample = sample
         self.shown = _shown(self.manifold.X.numpy(), sample, points, surface)
@@ -236,6 +263,28 @@ class LiveModel:
         """A run of a case, at t = 0."""
         solver = self.pipeline.solver_at(self.manifold, case, precision=PRECISION)
         return LiveRun(case, solver, solver.decoder(self.shown, self.at), self.trust)
+
+    @property
+    def tilt(self) -> float | None:
+        """Largest tilt of gravity that programs of training may give [rad]; None where they give none."""
+        if self.trust.gravity is None:
+            return None
+        middle, reach = self.trust.gravity
+        size = float(np.linalg.norm(middle))
+        return float(2.0 * np.arcsin(min(1.0, 0.5 * reach / size))) if size else None
+
+    def tilted(self, run: LiveRun, step: int, tilt: Sequence[float]) -> LiveRun:
+        """A run that goes on from a step of another under gravity that a hand has tilted.
+
+        Args:
+            run: that has come as far.
+            step: from which on.
+            tilt: [2] [rad] along x and y, where gravity points down.
+        """
+        gravity = tilted(np.array([self.pipeline.deployed.gravity]), np.array([tilt]))[0]
+        found = self.start(run.case)
+        found.goes_on(run, step, gravity.tolist())
+        return found
 
     def truth_run(self, case: Case) -> Run | None:
         """The simulate run of a known case; None of other cases."""
@@ -309,10 +358,14 @@ def _possible(pipeline: Pipeline, case: Mapping[str, float]) -> bool:
     return True
 
 
-def _trust(run: Run, manifold, sample: np.ndarray, device: str) -> Trust:
+def _trust(run: Run, manifold, sample: np.ndarray, pipeline: Pipeline) -> Trust:
     """The trust estimate, with the scales that the deployment calibrated."""
     residual, distance = (run.metric("trust", scale) for scale in ("residual_m", "distance_m"))
-    return Trust(residual, distance, LatentDistance(manifold, sample, device), CaseDistance(manifold))
+    scene, gravity = pipeline.scene, None
+    if scene.forcing.gravity:
+        gravity = scene.gravity, scene.forcing.reach(scene.gravity)
+    known = LatentDistance(manifold, sample, pipeline.device)
+    return Trust(residual, distance, known, CaseDistance(manifold), gravity)
 
 
 def _shown(X: np.ndarray, sample: np.ndarray, points: int, surface: bool) -> np.ndarray:

@@ -23,6 +23,8 @@ log = logging.getLogger(__name__)
 FRAMES_PER_SECOND = 30
 #: Gap between the two bodies, over the width of the box that the motion fills.
 _GAP = 0.25
+#: Reach of the tilt, over the largest that was trained.
+_BEYOND = 1.5
 _GREY = (187, 187, 187)
 _GREEN, _AMBER, _RED = "#2B8A3E", "#E69F00", "#C92A2A"
 
@@ -161,7 +163,19 @@ class Page:
             for parameter in self._model.parameters
         ]
         for slider in self._sliders:
-            slider.on_update(self._by_hand(lambda: player.steer([s.value for s in self._sliders])))
+            slider.on_update(self._by_hand(self._steer))
+        self._tilts = []
+        if self._model.tilt is not None:
+            most = round(_BEYOND * float(np.degrees(self._model.tilt)), 1)
+            hint = f"of gravity, from the shown moment on; trained up to {np.degrees(self._model.tilt):.3g}°"
+            self._tilts = [
+                gui.add_slider(
+                    f"tilt along {way} [°]", min=-most, max=most, step=0.1, initial_value=0.0, hint=hint
+                )
+                for way in "xy"
+            ]
+            for slider in self._tilts:
+                slider.on_update(self._by_hand(self._tilt))
         if self._model.known:
             known = gui.add_dropdown(
                 "with full-order run", ["…", *map(str, self._model.known)], initial_value="…"
@@ -194,6 +208,15 @@ class Page:
             for slider, value in zip(self._sliders, chosen[0].numbers, strict=True):
                 slider.value = value
             self._player.steer(chosen[0].numbers)
+
+    def _steer(self) -> None:
+        self._player.steer([slider.value for slider in self._sliders])
+        for slider in self._tilts:
+            slider.value = 0.0
+
+    def _tilt(self) -> None:
+        tilt = np.radians([slider.value for slider in self._tilts])
+        self._player.tilt(tilt.tolist() if tilt.any() else None)
 
     def _toggle(self) -> None:
         self._player.playing = not self._player.playing

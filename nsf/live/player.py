@@ -74,6 +74,7 @@ class Player:
         self._wanted = model.initial
         self._shown = self._run_at(self._wanted)
         self._coming: LiveRun | None = None
+        self._tilts: list[Sequence[float] | None] = []  # asked for, of which the last counts
         self._step = self._held = 0
         self.playing = True
         self.stride = -(-self._shown.steps // _FRAMES)
@@ -110,6 +111,16 @@ class Player:
             self._wanted = self.model.checked(numbers)
             self._wake.notify()
 
+    def tilt(self, tilt: Sequence[float] | None) -> None:
+        """Tilt gravity from the shown step on.
+
+        Args:
+            tilt: [2] [rad], as for `LiveModel.tilted`; None gives gravity back to the scene.
+        """
+        with self._wake:
+            self._tilts.append(tilt)
+            self._wake.notify()
+
     def seek(self, step: int) -> None:
         """Show a step, or the run's last one until the run has come so far."""
         with self._wake:
@@ -135,7 +146,10 @@ class Player:
     def work(self) -> bool:
         """Advance a run by some steps; False if there is nothing to do."""
         if self._coming is None and self._wanted != self._shown.case:
+            self._tilts.clear()  # they were meant for the run that is left
             self._coming = self._run_at(self._wanted)
+        elif self._coming is None and self._tilts:
+            self._coming = self._tilted()
         run = self._coming or self._shown
         idle = run.finished and self._coming is None
         run.advance(_CHUNK)
@@ -147,10 +161,20 @@ class Player:
                 self._shown, self._coming = run, None
         return not idle
 
+    def _tilted(self) -> LiveRun:
+        with self._wake:
+            tilt, step = self._tilts[-1], min(self._step, self._shown.reached)
+            self._tilts.clear()
+        if tilt is None:
+            return self._run_at(self._shown.case)
+        return self.model.tilted(self._shown, step, tilt)
+
     def _run_at(self, case: Case) -> LiveRun:
         return self._runs.get(case) or self.model.start(case)
 
     def _keep(self, run: LiveRun) -> None:
+        if run.by_hand:
+            return
         self._runs[run.case] = run
         self._runs.move_to_end(run.case)
         if len(self._runs) > _KEPT:
@@ -166,7 +190,9 @@ class Player:
                 self._wanted, busy = self._shown.case, True
             if not busy:
                 with self._wake:
-                    self._wake.wait_for(lambda: self._closing or self._wanted != self._shown.case)
+                    self._wake.wait_for(
+                        lambda: self._closing or self._tilts or self._wanted != self._shown.case
+                    )
 
 
 def every(seconds: float, closing: threading.Event, act: Callable[[], None]) -> None:

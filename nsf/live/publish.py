@@ -1,6 +1,8 @@
 """A model that runs in a page: what a file of it holds, and what cannot be put into one."""
 
 import itertools
+import zlib
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,17 +22,13 @@ from nsf.live.wire import check_field, modal_field, network_arrays, shown
 from nsf.reporting.drawing.style import CLIP
 from nsf.reporting.text.formats import file_name
 from nsf.runs import Run
+from nsf.scenes import Scene
+from nsf.storage import writing
 
 #: Points of a page, by default; a telephone decodes so many in each frame.
 POINTS = 20_000
 #: Largest page [bytes], which still goes by mail.
 LARGEST = 16_000_000
-#: Bytes of the modes of stress, which are for colour: in 8 bits, those of most energy.
-_STRESS = 4_000_000
-#: Of a full-order run that is shown beside: points and frames.
-_BESIDE, _FRAMES = 2000, 50
-#: Full-order runs that are kept.
-_RUNS = 3
 _TUBE = 0.01  # of the scale of distances, by which a page may be off
 _SNAPSHOTS = 6000  # training snapshots that distances are taken to
 _SAME = 1e-9
@@ -49,22 +47,37 @@ def write(run: Run, folder: Path, points: int | None = None, device: str = "auto
         ConfigError: see `model_data`; the page would be too large to be mailed.
     """
     title, data = model_data(LiveModel(run, points or POINTS, device, surface=True))
-    path = web.write_page(folder / f"{run.scene}-live.html", "live", title, data)
-    if (size := path.stat().st_size) > LARGEST:
-        path.unlink()
+    page = web.page("live", title, data)
+    if (size := len(page.encode())) > LARGEST:
         raise ConfigError(
             f"the page would have {size / 1e6:.1f} MB, at most {LARGEST / 1e6:.0f}; give fewer --points"
         )
-    return path
+    return web.saved(folder / f"{run.scene}-live.html", page)
 
 
-def model_data(model: LiveModel, stress: int = _STRESS, runs: int = _RUNS) -> tuple[str, bytes]:
+@dataclass(frozen=True)
+class Sizes:
+    """How much of a model goes into a page.
+
+    Attributes:
+        modes: of the deformation at most; None for all.
+        stress: bytes of the modes of stress at most; they are for colour.
+        runs: full-order runs at most; points, frames: of each.
+    """
+
+    modes: int | None = None
+    stress: int = 4_000_000
+    runs: int = 3
+    points: int = 2000
+    frames: int = 50
+
+
+def model_data(model: LiveModel, sizes: Sizes = Sizes()) -> tuple[str, bytes]:
     """Title and data of a page.
 
     Args:
         model: of the deployment.
-        stress: bytes of the modes of stress at most.
-        runs: full-order runs at most.
+        sizes: of what goes into it.
 
     Raises:
         ConfigError: its steps are taken by no operators, its field has no modes, or a parameter changes the
@@ -82,7 +95,7 @@ def model_data(model: LiveModel, stress: int = _STRESS, runs: int = _RUNS) -> tu
     header, order = shown(model), {p.name: i for i, p in enumerate(model.parameters)}
     header["parameters"] = [header["parameters"][order[name]] for name in taught.parameters]
     arrays = {"rest": model.X}
-    header["fields"] = _fields(model, arrays, header, stress)
+    header["fields"] = _fields(model, arrays, header, sizes)
     with torch.no_grad():
         layers = [_Layer(*own) for own in network.raw_layers()]
     arrays |= {f"operators.{name}": a for name, a in network_arrays(layers, "f8").items()}
@@ -100,8 +113,21 @@ def model_data(model: LiveModel, stress: int = _STRESS, runs: int = _RUNS) -> tu
         "trust": _trust(model, operators, arrays),
         "recordings": {},
     }  # fmt: skip
-    header["cases"] = _cases(model, taught.parameters, arrays, header, runs)
+    header["cases"] = _cases(model, taught.parameters, arrays, header, sizes)
     return model.title, web.packed(header, arrays)
+
+
+def ship(run: Run, path: Path, points: int, sizes: Sizes) -> None:
+    """Write the data of a page alone, as `nsf demo` reads them.
+
+    Args:
+        run: complete deploy run by operators.
+        path: of the file.
+        points: how many are shown; sizes: as for `model_data`.
+    """
+    _, data = model_data(LiveModel(run, points, "cpu", surface=True), sizes)
+    with writing(path) as partial:
+        partial.write_bytes(zlib.compress(data, 9))
 
 
 class _Layer:
@@ -111,16 +137,18 @@ class _Layer:
         self.weight, self.bias = weight, bias
 
 
-def _fields(model: LiveModel, arrays: dict, header: dict, most: int) -> dict:
+def _fields(model: LiveModel, arrays: dict, header: dict, sizes: Sizes) -> dict:
     """Put the fields of x and, where the method takes τ from one, of τ into a page."""
     found = {}
-    kinds: dict[str, tuple[type, int | None]] = {"deformation": (np.int16, None)}
+    kinds: dict[str, tuple[type, int | None]] = {"deformation": (np.int16, sizes.modes)}
     if model.pipeline.method.neural_stress:
-        kinds["stress"] = np.int8, max(1, most // (6 * len(model.X)))
+        kinds["stress"] = np.int8, max(1, sizes.stress // (6 * len(model.X)))
         _, tau = model.training_frames()
         top = float(np.percentile(von_mises(torch.as_tensor(tau)).numpy(), CLIP)) or 1.0
         title = "von Mises stress"
-        header["quantities"] = {"von_mises": {"title": title, "unit": "Pa", "top": top}} | header["quantities"]
+        header["quantities"] = {"von_mises": {"title": title, "unit": "Pa", "top": top}} | header[
+            "quantities"
+        ]
     for phase, how in kinds.items():
         told, own = modal_field(model.at.fields[phase], *how)
         found[phase] = told | {"parameters": model.manifold.takes_parameters(phase)}
@@ -133,7 +161,10 @@ def _corners(model: LiveModel) -> list[Case]:
     first = model.initial
     corners = itertools.islice(itertools.product(*(p.trained for p in model.parameters)), 16)
     names = [p.name for p in model.parameters]
-    return [first, *(model.pipeline.scene.case(dict(first) | dict(zip(names, own, strict=True))) for own in corners)]
+    return [
+        first,
+        *(model.pipeline.scene.case(dict(first) | dict(zip(names, own, strict=True))) for own in corners),
+    ]
 
 
 def _start(model: LiveModel) -> dict:
@@ -149,10 +180,14 @@ def _start(model: LiveModel) -> dict:
 
 
 def _tilt(model: LiveModel, operators: Operators) -> dict | None:
-    """Gravity of the scene, and the largest tilt that was taught [rad]; None without gravity."""
-    down, taught = np.array(model.pipeline.deployed.gravity), operators.taught
+    """Gravity of the scene, and the largest tilt that was taught [rad]; None where it has no programs.
+
+    Operators of other scenes take gravity as well, but no shape that their manifold knows leans to a side.
+    """
+    scene, taught = model.pipeline.deployed, operators.taught
+    down = np.array(scene.gravity)
     size = float(np.linalg.norm(down))
-    if not operators.model.sizes.gravity or not size:
+    if not operators.model.sizes.gravity or not size or not scene.forcing.gravity:
         return None
     # A ball about the mean of what was taught; its rim is nearest where the mean is off to one side.
     reach = max(taught.reach - float(np.linalg.norm(down - taught.gravity)), 0.05 * size)
@@ -163,53 +198,92 @@ def _trust(model: LiveModel, operators: Operators, arrays: dict) -> dict:
     """Put the distances to the training runs into a page."""
     trust, taught = model.trust, operators.taught
     matrix, known = trust.latent_distance.embedded(_TUBE * trust.distance)
+    matrix = matrix[:, : len(arrays["deformation.scale"])]  # modes that were left out move little
     known = known[:: -(-len(known) // _SNAPSHOTS)]
     scale = np.maximum(np.abs(known).max(0), np.finfo(np.float32).tiny) / np.iinfo(np.int16).max
-    arrays |= {"tube.matrix": matrix, "tube.scale": scale, "tube.known": np.rint(known / scale).astype(np.int16)}
-    gravity = {"middle": list(taught.gravity), "reach": taught.reach} if operators.model.sizes.gravity else None
+    arrays |= {
+        "tube.matrix": matrix,
+        "tube.scale": scale,
+        "tube.known": np.rint(known / scale).astype(np.int16),
+    }
+    gravity = (
+        {"middle": list(taught.gravity), "reach": taught.reach} if operators.model.sizes.gravity else None
+    )
     return {"distance": trust.distance, "cases": trust.cases.plain(), "gravity": gravity}
 
 
-def _cases(model: LiveModel, names, arrays: dict, header: dict, runs: int) -> list[dict]:
+def _cases(model: LiveModel, names, arrays: dict, header: dict, sizes: Sizes) -> list[dict]:
     """The held-out cases: their parameters, forcing, and the full-order runs of some."""
-    pipeline, found = model.pipeline, []
+    pipeline, found, movable = model.pipeline, [], _movable(model)
     for index, case in enumerate(pipeline.held_out):
         scene = pipeline.deployed.with_parameters(case)
         rollout = Rollout.open(model.run.file(rollout_file(index)), model.manifold.latent_dim)
         own = {
             "label": str(case).replace("_", " "),
             "values": [case[name] for name in names],
-            "gravity": {
-                "times": list(scene.acting_gravity.times), "values": [list(v) for v in scene.acting_gravity.values]
-            },
-            "solids": model.solids(case),
+            "gravity": _gravity(scene),
+            "solids": [own | {"movable": movable.get(own["name"])} for own in model.solids(case)],
             "estimate": None if rollout.estimate is None else float(np.nan_to_num(rollout.estimate).max()),
             "recording": None,
         }  # fmt: skip
-        if case in model.known and len(header["recordings"]) < runs:
+        if case in model.known and len(header["recordings"]) < sizes.runs:
             own["recording"] = f"full{index}"
-            told, planes = _recorded(model, case, header["quantities"])
+            told, planes = _recorded(model, case, header["quantities"], sizes)
             header["recordings"][own["recording"]] = told
             arrays |= {f"{own['recording']}.{name}": a for name, a in planes.items()}
         found.append(own)
-    _check_forcing(model, found[0])
+    _check_forcing(model)
     return found
 
 
-def _check_forcing(model: LiveModel, first: dict) -> None:
+def _movable(model: LiveModel) -> dict[str, dict]:
+    """Direction, reach [m] and speed [m/s] of the solids that programs move, as training runs have them."""
+    found = {}
+    scenes = [model.pipeline.scene.with_parameters(case) for case in model.pipeline.split.train]
+    for name in model.pipeline.scene.forcing.colliders:
+        index = model.pipeline.scene.collider_names.index(name)
+        motions = [scene.colliders[index].motion.keyframes() for scene in scenes]
+        shifts = np.concatenate([shift for _, shift, _ in motions])
+        axis = np.linalg.svd(np.concatenate([s - s[:1] for _, s, _ in motions]), full_matrices=False)[2][0]
+        axis *= np.sign(axis[np.abs(axis).argmax()])
+        speed = max(np.abs(np.diff(s @ axis) / np.diff(t)).max() for t, s, _ in motions)
+        places = shifts @ axis
+        found[name] = {
+            "axis": axis.tolist(), "low": float(places.min()), "high": float(places.max()),
+            "speed": float(speed),
+        }  # fmt: skip
+    return found
+
+
+def _gravity(scene: Scene) -> dict:
+    """Keyframes of gravity."""
+    acting = scene.acting_gravity
+    return {"times": list(acting.times), "values": [list(value) for value in acting.values]}
+
+
+def _check_forcing(model: LiveModel) -> None:
+    """Refuse a parameter that changes what a page takes from the case alone.
+
+    Raises:
+        ConfigError: it changes gravity or a solid.
+    """
+    deployed, first = model.pipeline.deployed, None
     for case in _corners(model):
-        scene = model.pipeline.deployed.with_parameters(case)
-        gravity = {"times": list(scene.acting_gravity.times), "values": [list(v) for v in scene.acting_gravity.values]}
-        if (gravity, model.solids(case)) != (first["gravity"], first["solids"]):
+        forcing = _gravity(deployed.with_parameters(case)), model.solids(case)
+        first = first or forcing
+        if forcing != first:
             raise ConfigError("a parameter changes gravity or a solid, which a page keeps; use nsf view")
 
 
-def _recorded(model: LiveModel, case: Case, quantities: dict) -> tuple[dict, dict[str, np.ndarray]]:
+def _recorded(
+    model: LiveModel, case: Case, quantities: dict, sizes: Sizes
+) -> tuple[dict, dict[str, np.ndarray]]:
     """The full-order run of a case at some of the points that are shown."""
-    chosen = np.sort(np.random.default_rng(1).permutation(len(model.shown))[:_BESIDE])
+    most = min(sizes.points, len(model.shown))
+    chosen = np.sort(np.random.default_rng(1).permutation(len(model.shown))[:most])
     particles = model.shown[chosen]
     with Trajectory.open(model.truth_run(case).file(TRAJECTORY)) as trajectory:
-        frames = np.unique(np.linspace(0, trajectory.frames - 1, _FRAMES + 1).round().astype(int))
+        frames = np.unique(np.linspace(0, trajectory.frames - 1, sizes.frames + 1).round().astype(int))
         x = trajectory.read("x", frames=frames.tolist(), particles=particles)
         tau = trajectory.read("tau", frames=frames.tolist(), particles=particles)
         t = frames * trajectory.dt

@@ -72,7 +72,11 @@ def modal_field(field, kind: type, modes: int | None = None) -> tuple[dict, dict
     """
     mean, table = _host(field.mean), _host(field.modes)[..., :modes]
     scale = np.maximum(np.abs(table).max((0, 1)), np.finfo(np.float32).tiny) / np.iinfo(kind).max
-    arrays = {"mean": mean.astype("f4"), "scale": scale.astype("f4"), "modes": np.rint(table / scale).astype(kind)}
+    arrays = {
+        "mean": mean.astype("f4"),
+        "scale": scale.astype("f4"),
+        "modes": np.rint(table / scale).astype(kind),
+    }
     layers = [] if field.network is None else field.network.layers
     return {"leading": field.leading, "layers": len(layers)}, arrays | network_arrays(layers, "f4")
 
@@ -97,7 +101,9 @@ def state_message(moment: Moment) -> str:
     As JSON; the second is `LiveRun.away`.
     """
     run = moment.run
-    return json.dumps({"values": list(run.case.parameters.values()), "away": run.away, "diverged": run.diverged})
+    return json.dumps(
+        {"values": list(run.case.parameters.values()), "away": run.away, "diverged": run.diverged}
+    )
 
 
 def asked_values(message: str | bytes) -> list[float]:

@@ -12,6 +12,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from nsf import config as configuration
+from nsf.config.code import code_of
 from nsf.data.case import Case
 from nsf.engines.modal.mirrors import edits
 from nsf.engines.names import OPERATORS
@@ -29,7 +30,10 @@ STAGES = ("simulate", "train", "teach", "deploy", "evaluate", "report")
 #: Keys of the configuration that a simulation's content depends on.
 _SCENE_KEYS = ("scale", "material", "transfer")
 #: Keys that hold others, none of which is left out.
-_SECTIONS = ("data", "deploy", "evaluation", "super_resolution", "report")
+_SECTIONS = (
+    *("material", "transfer", "field", "trainer", "method", "sampler", "projector", "integration"),
+    *("data", "deploy", "evaluation", "super_resolution", "report"),
+)
 #: Cases between the training ones whose runs decide which round of teaching is kept.
 HELD_BACK = 3
 #: Fields without `arithmetic`, known without importing them.
@@ -322,11 +326,14 @@ class Names:
         """What the configuration says of a scene's physics."""
         plain = scene.plain
         content = {key: plain[key] for key in _SCENE_KEYS}
+        if law := code_of(content):
+            content["law"] = law
         return content | {"scene": {k: v for k, v in plain["scene"].items() if k not in NOT_PHYSICS}}
 
     def _content(self, keys: Sequence[str]) -> dict:
-        plain = self.scene.plain
-        return {key: deepcopy(plain[key]) for key in keys}
+        content = {key: deepcopy(self.scene.plain[key]) for key in keys}
+        code = code_of(content)
+        return content | {"code": code} if code else content
 
 
 def _device(asked) -> str:

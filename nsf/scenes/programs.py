@@ -111,12 +111,7 @@ class RandomTilt(GravityProgram):
         """See `GravityProgram.of`."""
         times, tilt = _wandering(duration, self.knots, generator)
         tilt *= np.radians(self.angle)
-        found = gravity.at(times)
-        size = np.linalg.norm(found, axis=1, keepdims=True)
-        angle = np.linalg.norm(tilt, axis=1, keepdims=True)
-        down, aside = _unit(found), tilt @ _across(found[0])
-        turned = np.cos(angle) * down + np.sinc(angle / np.pi) * aside
-        return Gravity(times.tolist(), (size * turned).tolist())
+        return Gravity(times.tolist(), tilted(gravity.at(times), tilt).tolist())
 
     def reach(self, gravity: float) -> float:
         """See `GravityProgram.reach`."""
@@ -292,6 +287,14 @@ class Programs:
                     f"{where} may reach {speed:.3g} m/s, more than a cell, {dx:.3g} m, a step of {dt:g} s; "
                     "let it be slower, or choose a smaller scene.dt"
                 )
+
+
+def tilted(gravity: np.ndarray, tilt: np.ndarray) -> np.ndarray:
+    """Gravity [n, 3] [m/s²] turned by tilts [n, 2] [rad] along two directions across its first value."""
+    size = np.linalg.norm(gravity, axis=1, keepdims=True)
+    angle = np.linalg.norm(tilt, axis=1, keepdims=True)
+    aside = tilt @ _across(gravity[0])
+    return size * (np.cos(angle) * _unit(gravity) + np.sinc(angle / np.pi) * aside)
 
 
 def _check_angle(name: str, angle: float) -> None:

@@ -52,6 +52,7 @@ def try_command(command: str, folder: Path, monkeypatch, capsys, experiments: Pa
         # What is only checked are the committed reports.
         reports = ROOT / "reports" if "check=true" in words else folder / "reports"
         monkeypatch.setenv("NSF_REPORTS", str(reports))
+        monkeypatch.setattr("webbrowser.open", lambda address: True)
         with pytest.raises(SystemExit) as ended:
             main([name, *words])
         assert not ended.value.code or "no complete deploy run" in capsys.readouterr().err

@@ -133,7 +133,9 @@ class Body {
     this.offset = offset;
     this.visible = true;
     this._gl = gl;
-    [this.rest, this.x, this.value] = [0, 1, 2].map(() => gl.createBuffer());
+    this.rest = gl.createBuffer();
+    this.x = gl.createBuffer();
+    this.value = gl.createBuffer();
     this._fill(this.rest, Float32Array.from(rest));
     this.show(Float32Array.from(rest), new Float32Array(this.count));
   }
@@ -175,7 +177,9 @@ export class Drawing {
     this.fine = 1; // share of the screen's pixels along a side
     /** @type {Solid[]} */ this.solids = [];
     /** @type {Body[]} */ this.bodies = [];
-    [this.points, this.plane, this.solid] = [POINTS, FLOOR, SOLID].map((sources) => program(gl, sources));
+    this.points = program(gl, POINTS);
+    this.plane = program(gl, FLOOR);
+    this.solid = program(gl, SOLID);
     this.corners = this._buffer(new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]));
     this.shapes = { box: this._shape(box()), ball: this._shape(ball()) };
     this._colors(told.colors);

@@ -49,8 +49,14 @@ export class Network {
 function layer(weight, bias, values, outputs, inner) {
   const n = values.length;
   for (let row = 0, w = 0; row < outputs.length; row++) {
-    let sum = bias[row];
-    for (let i = 0; i < n; i++) sum += weight[w++] * values[i];
+    // Two sums, since an addition waits for the one before it.
+    let sum = bias[row], other = 0, i = 0;
+    for (; i < n - 1; i += 2, w += 2) {
+      sum += weight[w] * values[i];
+      other += weight[w + 1] * values[i + 1];
+    }
+    if (i < n) sum += weight[w++] * values[i];
+    sum += other;
     outputs[row] = inner ? sum / (1 + Math.exp(-sum)) : sum;
   }
 }
@@ -114,9 +120,13 @@ export class Field {
 function combined(mean, modes, a, found) {
   const K = a.length;
   for (let i = 0, m = 0; i < found.length; i++) {
-    let sum = mean[i];
-    for (let k = 0; k < K; k++) sum += modes[m++] * a[k];
-    found[i] = sum;
+    let sum = mean[i], other = 0, k = 0;
+    for (; k < K - 1; k += 2, m += 2) {
+      sum += modes[m] * a[k];
+      other += modes[m + 1] * a[k + 1];
+    }
+    if (k < K) sum += modes[m++] * a[k];
+    found[i] = sum + other;
   }
   return found;
 }

@@ -6,6 +6,7 @@ import { Recording, inflated, unpacked } from "./data.mjs";
 import { Drawing } from "./drawing.mjs";
 import { Field, displacement, vonMises } from "./field.mjs";
 import { Operators, Run } from "./operators.mjs";
+import { along, moved } from "./solids.mjs";
 import { Tilt } from "./tilt.mjs";
 import { Trust } from "./trust.mjs";
 
@@ -38,7 +39,13 @@ export class Live {
 
   /** The last step: that of the scene, or without end once a hand has tilted the run. */
   get end() {
-    return this.run.hands.some(Boolean) || this.run.hand ? MOST : this.told.steps;
+    return this.byHand ? MOST : this.told.steps;
+  }
+
+  /** Whether a hand has tilted gravity or moved a solid. */
+  get byHand() {
+    const { run } = this;
+    return run.hand !== null || run.hands.some(Boolean) || run.solids !== this.case.solids;
   }
 
   /** The step that is shown. */
@@ -90,9 +97,21 @@ export class Live {
     this.run.hand = gravity;
   }
 
+  /**
+   * Move a solid from the moment that is shown on.
+   * @param {number} index
+   * @param {number} place along its direction [m]
+   */
+  move(index, place) {
+    this._forget();
+    const t = this.step * this.told.dt;
+    this.run.solids = this.run.solids.map((own, i) => (i === index ? moved(own, t, place) : own));
+  }
+
   /** Go back to t = 0, without a hand. */
   reset() {
     this.cursor = 0;
+    this.run.solids = this.case.solids;
     this.run.hands = [];
     this.run.hand = null;
     this.anew();
@@ -123,7 +142,7 @@ export class Live {
   /** Whether the run that is shown is that of the case that was taken up. */
   get held() {
     const same = this.parameters.every((value, i) => value === this.case.values[i]);
-    return same && !this.run.hand && !this.run.hands.some(Boolean);
+    return same && !this.byHand;
   }
 
   /** The light, for all steps up to the one that is shown. */
@@ -213,6 +232,17 @@ async function show() {
     if (gravity) set(true);
     change();
   }) : null;
+  /** @type {{ index: number, own: any }[]} */
+  const handles = live.case.solids.flatMap((/** @type {import("./solids.mjs").Solid} */ solid, /** @type {number} */ index) => {
+    if (!solid.movable) return [];
+    const { low, high } = solid.movable, step = (high - low) / 200;
+    const p = { name: `place of ${solid.name}`, unit: "m", lower: low, upper: high, step, trained: [low, high] };
+    return [{ index, own: slider(p, 0, (place) => {
+      live.move(index, place);
+      set(true);
+      change();
+    }) }];
+  });
   const cases = told.cases.map((/** @type {{ label: string }} */ own, /** @type {number} */ i) => [String(i), own.label]);
   const take = (/** @type {string} */ index) => {
     live.take(Number(index));
@@ -241,6 +271,7 @@ async function show() {
     ...sliders.map((own) => own.made),
     choice("from", "a moved slider", [["start", "runs anew from t = 0"], ["here", "goes on from here"]], "start", () => {}),
     ...(tilt ? [tilt.made] : []),
+    ...handles.map(({ own }) => own.made),
     choice("case", "held-out case", cases, "0", take),
     ...(live.recordings.size ? [truth] : []),
     element("div", { id: "light", role: "status" }),
@@ -273,6 +304,8 @@ async function show() {
     time.textContent = `t = ${(live.cursor * told.dt).toFixed(3)} s`;
     frame.max = Math.max(told.steps, live.end === MOST ? live.run.steps : 0);
     frame.value = live.step;
+    for (const { index, own } of handles)
+      if (!own.input.matches(":active, :focus-visible")) own.show(along(live.run.solids[index], live.cursor * told.dt));
     lit(live.light());
     const estimate = live.held && live.case.estimate !== null
       ? ` Estimated distance from the projected run, at most ${(1000 * live.case.estimate).toPrecision(2)} mm.` : "";

@@ -11,7 +11,8 @@
  * @property {Motion | null} motion
  * @property {number} since [s]
  * @property {number | null} until [s]; null for ever
- * @property {boolean} [movable] whether a hand may move it
+ * @property {{ axis: number[], low: number, high: number, speed: number } | null} [movable] by a hand: along which
+ *   direction, from where to where [m], and how fast at most [m/s]
  */
 
 const SAME_TIME = 1e-6; // of a step
@@ -41,6 +42,33 @@ export function poseAt(motion, t) {
   const { times, translations, angles } = motion;
   const shift = [0, 1, 2].map((c) => between(times, (k) => translations[k][c], t));
   return [...shift, between(times, (k) => angles[k], t)];
+}
+
+/**
+ * How far along its direction a solid that a hand may move has come [m].
+ * @param {Solid} solid
+ * @param {number} t [s]
+ */
+export function along(solid, t) {
+  const shift = poseAt(solid.motion, t);
+  return (solid.movable?.axis ?? []).reduce((sum, v, c) => sum + v * shift[c], 0);
+}
+
+/**
+ * The solid as a hand moves it from a time on, to a place along its direction, and lets it stand there.
+ * @param {Solid} solid
+ * @param {number} t [s]
+ * @param {number} place [m]
+ * @returns {Solid}
+ */
+export function moved(solid, t, place) {
+  if (!solid.movable || !solid.motion) return solid;
+  const { axis, speed } = solid.movable, { motion } = solid, way = place - along(solid, t);
+  const past = motion.times.filter((own) => own < t).length, [x, y, z, angle] = poseAt(motion, t);
+  const there = [x, y, z].map((v, c) => v + way * axis[c]);
+  const times = [...motion.times.slice(0, past), t, t + Math.max(Math.abs(way) / speed, 1e-9)];
+  const translations = [...motion.translations.slice(0, past), [x, y, z], there];
+  return { ...solid, motion: { ...motion, times, translations, angles: [...motion.angles.slice(0, past), angle, angle] } };
 }
 
 /**

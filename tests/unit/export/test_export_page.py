@@ -9,9 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
-
 from packing import unpacked
+from PIL import Image
 
 from nsf.errors import ConfigError
 from nsf.export import html

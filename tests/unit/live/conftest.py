@@ -29,3 +29,25 @@ def taught_model(chain, pipeline_at, tmp_path_factory):
     pipeline.simulate()
     pipeline.deploy()
     return LiveModel(pipeline.deployment, device="cpu", surface=True)
+
+
+@pytest.fixture(scope="session")
+def tilting_model(tmp_path_factory):
+    """A tiny soft block under gravity that wanders, by operators that were hardly taught."""
+    from nsf import config
+    from nsf.pipeline import Pipeline
+
+    taught = [f"engine.teaching.{key}" for key in ("steps=1200", "descent=300", "rounds=1", "width=32")]
+    keys = [
+        "scene=block", "scale=small", "device=cpu", "engine=operators", *taught,
+        "scene.dx=0.03", "scene.dt=0.002", "scene.steps=80", "scene.bodies.block.particles=400",
+        "scene.design.train=6", "scene.design.validation=0", "scene.design.test=2",
+        "field.modes=[12,12,12]", "field.beta=4", "field.depth=1", "trainer.steps=200", "latent_dim=4",
+        "sampler.size=40",
+    ]  # fmt: skip
+    pipeline = Pipeline(
+        config.load(keys), say=lambda line: None, root=tmp_path_factory.mktemp("tilting") / "runs"
+    )
+    for stage in ("simulate", "train", "deploy"):
+        pipeline.run(stage)
+    return LiveModel(pipeline.deployment, device="cpu", surface=True)

@@ -1,21 +1,25 @@
 """A model that runs in a page: its numbers beside Python's, and the page in a browser without a network."""
 
+import base64
 import json
 import re
 import shutil
 import subprocess
+import zlib
 from html import unescape
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from packing import unpacked
 from test_player import wait_until
 
-from nsf.errors import ConfigError
-from nsf.live import publish
-from nsf.live.model import LiveModel, at_surface
+from nsf.cli import main
 from nsf.deployment import Rollout, rollout_file
+from nsf.errors import ConfigError
+from nsf.live import demo, publish
+from nsf.live.model import LiveModel, at_surface
 
 WEB = Path(__file__).parents[1] / "web"
 
@@ -33,6 +37,12 @@ def node():
 def page(taught_model, tmp_path_factory):
     """The page of the tiny chain by operators, all of its particles in it."""
     return publish.write(taught_model.run, tmp_path_factory.mktemp("live"), device="cpu")
+
+
+@pytest.fixture(scope="session")
+def tilting_page(tilting_model, tmp_path_factory):
+    """The page of a tiny block under programs of gravity."""
+    return publish.write(tilting_model.run, tmp_path_factory.mktemp("tilting"), device="cpu")
 
 
 @pytest.fixture(scope="session")
@@ -107,7 +117,7 @@ def test_most_of_few_points_lie_at_the_surface(chain):
 
 
 def test_a_run_that_no_operators_step_is_refused(model, tmp_path):
-    with pytest.raises(ConfigError, match="engine=auto, whose steps take more .* engine=operators"):
+    with pytest.raises(ConfigError, match=r"engine=auto, whose steps take more .* engine=operators"):
         publish.model_data(model)
 
 
@@ -116,6 +126,42 @@ def test_a_page_that_is_too_large_is_refused(taught_model, tmp_path, monkeypatch
     with pytest.raises(ConfigError, match=r"would have \d.* MB, at most 0; give fewer --points"):
         publish.write(taught_model.run, tmp_path, device="cpu")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_model_is_there_at_once(capsys, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr("webbrowser.open", asked.append)
+    for model in demo.MODELS:
+        path = demo.show(model, tmp_path)
+        assert demo.MODELS[model] in path.read_text()
+    assert asked == [(tmp_path / f"{model}.html").as_uri() for model in demo.MODELS]
+    with pytest.raises(ConfigError, match="model=cake is none that is shipped; choose one of block, sand"):
+        demo.show("cake", tmp_path)
+    with pytest.raises(ConfigError, match="open=no must be true or false"):
+        demo.show(None, tmp_path, "no")
+    with pytest.raises(SystemExit) as end:
+        main(["demo", "model=sand", f"folder={tmp_path}", "open=false"])
+    assert not end.value.code
+    assert capsys.readouterr().out == f"open {tmp_path / 'sand.html'}\n"
+    assert len(asked) == len(demo.MODELS)
+
+
+def test_a_model_that_is_shipped_is_small():
+    found = [path.stat().st_size for path in Path(demo.__file__).with_name("models").iterdir()]
+    assert len(found) == len(demo.MODELS)
+    assert sum(found) < 3e6
+
+
+def test_a_page_is_asked_for_as_other_formats_are(taught_model, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("NSF_RUNS", str(taught_model.run.root))
+    given = [taught_model.run.id, "--live", "--points", "150", "--device", "cpu", "--output", str(tmp_path)]
+    with pytest.raises(SystemExit) as end:
+        main(["export", *given])
+    assert not end.value.code
+    assert f"live → {tmp_path / 'sand-live.html'}" in capsys.readouterr().out
+    text = re.search(r'id="data">([^<]*)<', (tmp_path / "sand-live.html").read_text())[1]
+    header, arrays = unpacked(zlib.decompress(base64.b64decode(text)))
+    assert header["points"] == len(arrays["rest"]) == 150
 
 
 # -- in a browser -------------------------------------------------------------------------------------------
@@ -191,35 +237,39 @@ def test_a_slider_changes_the_run_and_the_light(opened, page, taught_model):
     assert tab.evaluate("nsf.live.run.latents.slice(0, 11).map((x) => Array.from(x))") == latents
 
 
-def test_a_drag_tilts_gravity_and_the_body_follows(opened, page):
-    tab = opened(page)
-    paused(tab, 24)
-    straight = positions(tab)
-    tab.click("#reset")
+def test_a_drag_tilts_gravity_and_the_body_follows(opened, tilting_page):
+    tab = opened(tilting_page)
     paused(tab, 0)
     box = tab.locator("#pad").bounding_box()
     x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
-    tab.mouse.move(x, y)
-    tab.mouse.down()
-    tab.mouse.move(x + 0.45 * box["width"], y, steps=3)
-    tab.mouse.up()
-    assert tab.text_content("#play") == "Pause"  # a hand sets it going
-    gravity = np.array(tab.evaluate("nsf.live.run.hand"))
-    assert np.linalg.norm(gravity) == pytest.approx(4.0)
     right = np.array(tab.evaluate("nsf.camera.axes.right"))
-    assert gravity @ right > 0.2
-    paused(tab, 24)
-    assert ((positions(tab) - straight) @ right).mean() > 1e-4
-    tab.get_by_text("distrusted: gravity was").wait_for()
+    aside = []
+    for way in (0.3, -0.3):
+        tab.click("#reset")
+        paused(tab, 0)
+        tab.mouse.move(x, y)
+        tab.mouse.down()
+        tab.mouse.move(x + way * box["width"], y, steps=3)
+        tab.mouse.up()
+        assert tab.text_content("#play") == "Pause"  # a hand sets it going
+        gravity = np.array(tab.evaluate("nsf.live.run.hand"))
+        assert np.linalg.norm(gravity) == pytest.approx(9.81)
+        assert np.sign(gravity @ right) == np.sign(way)
+        paused(tab, 60)
+        aside.append((positions(tab) @ right).mean())
+    assert aside[0] - aside[1] > 0.01
     tab.click("#upright")
     assert tab.evaluate("nsf.live.run.hand") is None
     tab.locator("#pad").focus()
-    tab.keyboard.press("ArrowLeft")
-    assert np.array(tab.evaluate("nsf.live.run.hand")) @ right < -0.01
+    for _ in range(10):
+        tab.keyboard.press("ArrowLeft")
+    assert np.array(tab.evaluate("nsf.live.run.hand")) @ right < -1.0
+    tab.click("#step")
+    tab.get_by_text("distrusted: gravity was").wait_for()
 
 
-def test_a_drag_on_the_picture_turns_it_or_tilts(opened, page):
-    tab = opened(page)
+def test_a_drag_on_the_picture_turns_it_or_tilts(opened, tilting_page):
+    tab = opened(tilting_page)
 
     def drag():
         tab.mouse.move(300, 300)
@@ -236,6 +286,24 @@ def test_a_drag_on_the_picture_turns_it_or_tilts(opened, page):
     again, hand = drag()
     assert again == azimuth
     assert hand is not None
+
+
+def test_a_program_of_each_held_out_case_is_followed(opened, tilting_page, tilting_model):
+    tab = opened(tilting_page)
+    for index, case in enumerate(tilting_model.pipeline.held_out):
+        tab.select_option("#case", str(index))
+        paused(tab, 60)
+        kept = Rollout.open(tilting_model.run.file(rollout_file(index))).xhat
+        found = tab.evaluate("Array.from(nsf.live.run.latents[60])")
+        np.testing.assert_allclose(found, kept[60], atol=1e-4 * np.abs(kept).max())
+        scene = tilting_model.pipeline.deployed.with_parameters(case)
+        gravity = tab.evaluate("nsf.live.run.gravities[40]")
+        np.testing.assert_allclose(gravity, scene.acting_gravity.at(40 * scene.dt), atol=1e-9)
+
+
+def test_only_programs_of_gravity_are_tilted_by_hand(opened, page):
+    """A manifold of upright sand alone knows no shape that leans."""
+    assert opened(page).locator("#pad").count() == 0
 
 
 def test_the_full_order_run_stands_beside(opened, page):
@@ -271,7 +339,17 @@ def test_on_a_phone_in_the_dark(opened, page):
     assert tab.evaluate("document.documentElement.scrollWidth") <= 390
     assert tab.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(22, 24, 27)"
     assert tab.locator("#canvas").bounding_box()["height"] > 250
-    assert tab.get_by_role("button", name="Use this device's tilt").is_visible()
+
+
+def test_a_phone_may_tilt_it(opened, tilting_page):
+    tab = opened(tilting_page, 390, 800, has_touch=True, is_mobile=True)
+    tab.get_by_role("button", name="Use this device's tilt").click()
+    turn = "(gamma) => dispatchEvent(new DeviceOrientationEvent('deviceorientation', {beta: 40, gamma}))"
+    tab.evaluate(turn, 0)
+    tab.evaluate(turn, 20)
+    right = np.array(tab.evaluate("nsf.camera.axes.right"))
+    hand = np.array(tab.evaluate("nsf.live.run.hand"))
+    assert hand @ right == pytest.approx(9.81 * np.sin(np.radians(20)), rel=1e-3)
 
 
 def test_without_webgl_it_says_so(browser, page):
@@ -284,8 +362,9 @@ def test_without_webgl_it_says_so(browser, page):
 
 def test_every_control_has_a_name(opened, page):
     tab = opened(page)
-    nameless = """() => [...document.querySelectorAll("input, select, button, canvas, [tabindex]")].filter((e) =>
-        !(e.ariaLabel || e.getAttribute("aria-label") || e.textContent.trim() || e.labels?.[0]?.textContent.trim()))
+    nameless = """() => [...document.querySelectorAll("input, select, button, canvas, [tabindex]")]
+        .filter((e) => ![e.ariaLabel, e.getAttribute("aria-label"), e.textContent, e.labels?.[0]?.textContent]
+            .some((name) => name?.trim()))
         .map((e) => e.outerHTML)"""
     assert tab.evaluate(nameless) == []
 
@@ -300,7 +379,7 @@ def test_titles_units_and_names_are_text(opened, taught_model, tmp_path, monkeyp
     parameters = tuple(replace(p, unit=hostile) for p in taught_model.parameters)
     monkeypatch.setattr(taught_model, "parameters", parameters)
     title, data = publish.model_data(taught_model)
-    path = publish.web.write_page(tmp_path / "page.html", "live", title, data)
+    path = publish.web.saved(tmp_path / "page.html", publish.web.page("live", title, data))
     assert unescape(re.search(r"<title>([^<]*)</title>", path.read_text())[1]) == hostile
     tab = opened(path)
     assert tab.text_content("#title") == tab.title() == hostile

@@ -17,6 +17,7 @@ from nsf.live.coloring import Coloring
 from nsf.live.page import Page, legend, light
 from nsf.live.player import Moment, Player
 
+PATIENCE = 120_000  # [ms] after which something is broken, however busy the machine is
 #: What a client draws is behind its canvas, above which the panel lies.
 SCENE = {"x": 0, "y": 120, "width": 700, "height": 480}
 
@@ -81,8 +82,11 @@ def test_the_legend_names_its_ends(coloring):
 
 
 @pytest.fixture
-def served(model):
+def served(model, monkeypatch):
     """A page that is drawn, and its player."""
+    # Two browsers that draw in software cannot follow 30 pictures a second on a busy machine: what they had
+    # yet to draw would stand in front of what a test waits for.
+    monkeypatch.setattr("nsf.live.page.FRAMES_PER_SECOND", 4)
     player = Player(model)
     page, closing = Page(player, port=0), threading.Event()
     drawing = threading.Thread(target=page.run, args=(closing,))
@@ -97,9 +101,10 @@ def served(model):
 def opened(browser, url):
     """A window of the page, and the addresses it asked for."""
     window, asked = browser.new_page(viewport={"width": 1100, "height": 640}), []
+    window.set_default_timeout(PATIENCE)
     window.on("request", lambda request: asked.append(request.url))
     window.goto(url)
-    window.get_by_role("slider").first.wait_for(timeout=60_000)
+    window.get_by_role("slider").first.wait_for()
     return window, asked
 
 

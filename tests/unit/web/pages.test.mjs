@@ -8,7 +8,7 @@ import { prefixed, valued } from "../../../nsf/live/web/controls.mjs";
 import { Recording, undifferenced, unpacked } from "../../../nsf/live/web/data.mjs";
 import { Field, Network, displacement, vonMises } from "../../../nsf/live/web/field.mjs";
 import { Operators, Run, valueAt } from "../../../nsf/live/web/operators.mjs";
-import { acts, placed, poseAt, stateOf } from "../../../nsf/live/web/solids.mjs";
+import { acts, along, moved, placed, poseAt, stateOf } from "../../../nsf/live/web/solids.mjs";
 import { tilted } from "../../../nsf/live/web/tilt.mjs";
 import { Trust, lightOf, quantity } from "../../../nsf/live/web/trust.mjs";
 
@@ -172,6 +172,16 @@ test("a solid's pose and state", () => {
   near(pose.slice(0, 3), [0, 1, 0], 1e-6);
   near(stateOf([SPIN], 1, 0.1), [0, 0, 0.2, 0.1 * Math.PI, 0, 0, 0.2, 0.1 * Math.PI, 1]);
   assert.deepEqual([0.05, 0.1, 0.29, 0.3].map((t) => acts(SPIN, t)), [false, true, true, false]);
+});
+
+test("a hand moves a solid from where it is, no faster than it may, and keeps what was", () => {
+  const own = { ...SPIN, movable: { axis: [0, 0, 1], low: -1, high: 3, speed: 4 } };
+  const found = moved(own, 0.5, 3);
+  assert.equal(along(own, 0.5), 1);
+  near([0.25, 0.5, 0.75, 1, 9].map((t) => along(found, t)), [0.5, 1, 2, 3, 3]);
+  near(poseAt(found.motion, 0.25), poseAt(own.motion, 0.25));
+  near(poseAt(found.motion, 9), [0, 0, 3, Math.PI / 2]);
+  assert.equal(moved(SPIN, 0.5, 3), SPIN);
 });
 
 test("gravity is tilted as the viewer sees it, and keeps its size", () => {

@@ -1,0 +1,52 @@
+"""Small models that come with the package, each a page at once: `nsf demo`."""
+
+import webbrowser
+import zlib
+from importlib.resources import files
+from pathlib import Path
+
+from nsf.errors import ConfigError
+from nsf.export import web
+
+#: Title of each model that is shipped; the first is shown unless another is asked for.
+MODELS = {
+    "block": "Soft block under gravity that wanders",
+    "sand": "Sand column",
+    "metal": "Squeezed metal frame",
+}
+
+
+def page(model: str) -> str:
+    """The page of a shipped model.
+
+    Raises:
+        ConfigError: there is no such model.
+    """
+    if model not in MODELS:
+        raise ConfigError(f"model={model} is none that is shipped; choose one of {', '.join(MODELS)}")
+    data = files("nsf").joinpath("live", "models", f"{model}.bin").read_bytes()
+    return web.page("live", MODELS[model], zlib.decompress(data))
+
+
+def show(
+    model: str | None,
+    folder: Path | str,
+    opened: str = "true",
+) -> Path:
+    """Write the page of a shipped model, and open it in the browser.
+
+    Args:
+        model: a key of `MODELS`; the first by default.
+        folder: of the page.
+        opened: `true` or `false`: whether it is opened.
+
+    Raises:
+        ConfigError: there is no such model, or `opened` is neither.
+    """
+    if opened not in ("true", "false"):
+        raise ConfigError(f"open={opened} must be true or false")
+    model = next(iter(MODELS)) if model is None else model
+    path = web.saved(Path(folder) / f"{model}.html", page(model))
+    if opened == "true":
+        webbrowser.open(path.resolve().as_uri())
+    return path
