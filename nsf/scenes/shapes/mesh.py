@@ -231,8 +231,5 @@ def _oriented(path: str, triangles: np.ndarray) -> WindingNumber:
     number = surface.of(lower + (upper - lower) * Box((0, 0, 0), (1, 1, 1)).sample(_PROBES))
     if ((number < 0) | (number > 1)).any():
         share = ((number < 0) | (number > 1)).mean()
-        raise ConfigError(
-            f"mesh={path} overlaps itself in {100 * share:.2g} % of its bounding box; "
-            f"{_UNITE}"
-        )
+        raise ConfigError(f"mesh={path} overlaps itself in {100 * share:.2g} % of its bounding box; {_UNITE}")
     return surface
