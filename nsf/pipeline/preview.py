@@ -77,6 +77,7 @@ def stages_table(found: Sequence[Names]) -> Table:
     table = Table(box=None, header_style="bold", pad_edge=False)
     if len(found) > 1:
         table.caption = f"{len(found)} jobs; runs that they share are made once"
+        table.caption_justify = "left"
     for heading, side in (
         ("stage", "left"), ("state", "left"), ("run", "left"), ("time", "right"), ("disk", "right"),
         ("as in", "left"),

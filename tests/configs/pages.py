@@ -52,6 +52,7 @@ def try_command(command: str, folder: Path, monkeypatch, capsys, experiments: Pa
         # What is only checked are the committed reports.
         reports = ROOT / "reports" if "check=true" in words else folder / "reports"
         monkeypatch.setenv("NSF_REPORTS", str(reports))
+        reports.mkdir(exist_ok=True)
         monkeypatch.setattr("webbrowser.open", lambda address: True)
         with pytest.raises(SystemExit) as ended:
             main([name, *words])

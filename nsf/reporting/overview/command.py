@@ -4,7 +4,6 @@ import sys
 from collections.abc import Callable, Sequence
 
 from nsf.errors import ConfigError, StorageError
-from nsf.reporting.overview.tables import difference_table, run_table, runs_table
 from nsf.runs import Run
 from nsf.runs.listing import FIELDS, Entry, entries, text
 from nsf.runs.pruning import bytes_text, dependents, older, prunable, remove, size_of
@@ -57,6 +56,8 @@ def main(words: Sequence[str], print_table: Callable[[object], object]) -> int:
     if {"-h", "--help"} & set(words):
         print(USAGE)
         return 0
+    from nsf.reporting.overview.tables import difference_table, run_table, runs_table  # rich takes 0.1 s
+
     if words[:1] == ["show"]:
         for run in _named("show", words[1:], 1):
             print_table(run_table(run, Run.find()))
