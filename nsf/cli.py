@@ -5,76 +5,9 @@ import signal
 import sys
 from collections.abc import Sequence
 
+from nsf import usage
 from nsf.errors import ConfigError, NSFError
-
-STAGES = {
-    "run": "the whole chain: simulate, train, deploy, evaluate, report; unchanged stages are reused",
-    "simulate": "full-order trajectories of every case",
-    "train": "the manifold: encoder and deformation, stress and affine fields",
-    "teach": "the operators of the reduced step, for engine=operators, which deploy asks for by itself",
-    "deploy": "reduced runs of the held-out cases",
-    "evaluate": "errors and costs of the reduced runs beside the full-order ones",
-    "report": "tables, charts and pictures of every evaluated variant of the scene",
-    "superresolve": "deployed fields at many more points, beside a full-order run of as many particles",
-    "point": "one material point along a deformation path",
-}
-#: Commands that are no stage: what they do, and what they take; None for those with options of their own.
-TOOLS = {
-    "view": ("a deployment in the browser: steer the reduced run, see it beside the full-order one", None),
-    "serve": ("a deployment's latent vectors as a stream that many browsers decode", None),
-    "demo": (
-        "a model that runs in the browser: drag, tilt and steer it, with no server and nothing to train",
-        "[model=block] [folder=PATH] [open=true]; block, metal or sand; reports/demo by default",
-    ),
-    "export": (
-        "a deployed run for other programs: HTML page, the model itself in a page, USD, VTK, ONNX, film",
-        None,
-    ),
-    "search": (
-        "values of numeric keys that make δ, or δ and the step's time, small at the validation values",
-        "key=low..high[:log] … [key=value …] [search.objectives=[delta,step_ms]] [search.trials=20]",
-    ),
-    "plan": (
-        "what nsf run would do: stages and their states, size, time and room; --cfg: the configuration",
-        "[-m] [+experiment=NAME] [key=value …] [--cfg]; nsf run … --dry-run is the same",
-    ),
-    "runs": ("every run there is: listed, shown, compared, verified, deleted", None),
-    "index": (
-        "a page of every run, with a thumbnail each, that sorts and filters in the browser",
-        "[folder=PATH]; reports/runs by default",
-    ),
-    "reports": (
-        "the list of all reports, reports/index.md; check=true: whether one of them was changed since",
-        "[folder=PATH] [check=true]; reports by default",
-    ),
-    "bench": (
-        "time and memory of a step, kernel by kernel; writes reports/speed",
-        "[benches=full_order,scaling,reduced,batch,training,multi_gpu] [particles=10k,200k,1m]\n"
-        "       [scenes=cake,metal] [precision=fp32,fp64] [device=auto] [trials=10] [folder=PATH]; "
-        "sizes that suit the device by default",
-    ),
-    "doctor": ("versions, devices, folders and extras of this installation", ""),
-}
-_EXAMPLES = """\
-examples:
-  nsf run scene=sand scale=small                       the paper's method in a minute or two, on a CPU
-  nsf run scene=sand method=deformation_only           the baseline beside it, in the same report
-  nsf run scene=sand scene.design.test=[23,30.5]       other held-out cases
-  nsf run -m scene=sand latent_dim=4,6 sampler.size=50,150   every combination
-  nsf plan scene=cake scale=paper                      what that would take, before it begins
-  nsf run +experiment=table1 scale=small               every job of experiments/table1.yaml, and its report
-  nsf run -m +experiment=sand hydra/launcher=joblib    jobs side by side on this machine
-  nsf run -m +experiment=table1 hydra/launcher=slurm   jobs in Slurm's queue (conf/hydra/launcher/slurm.yaml)
-  nsf demo                                             a model in the browser, at once
-  nsf export --html --frames                           the newest deployed run as a page and a film
-  nsf point material=drucker_prager path=oedometer     plot a law before trusting it
-  nsf view                                             the newest deployment in the browser
-  nsf search scene=sand scene.design.validation=[27,31] latent_dim=4..8   the r of the smallest δ there
-  nsf runs stage=evaluate scene=sand latent_dim=4 sort=delta   runs by what made them, the best first
-  nsf runs diff 1a2b 3c4d                              what differs between two runs, in keys and in result
-  nsf bench particles=10k,40k precision=fp32           what a step costs on this machine, and its floor
-
-Results lie in ./runs (NSF_RUNS) and ./reports (NSF_REPORTS)."""
+from nsf.usage import STAGES, TOOLS
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -98,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def _dispatch(arguments: list[str]) -> int:
     if not arguments or arguments[0] in ("-h", "--help", "help"):
-        print(_help())
+        print(usage.whole())
         return 0
     if arguments[0] == "--version":
         from importlib.metadata import version
@@ -116,7 +49,7 @@ def _dispatch(arguments: list[str]) -> int:
         hint = f"did you mean {near[0]}?" if near else f"choose one of {', '.join(known)}"
         raise ConfigError(f"unknown stage {stage!r}; {hint}")
     if {"-h", "--help"} & set(overrides):
-        print(_stage_help(stage))
+        print(usage.of_stage(stage))
         return 0
     if stage == "run" and "--dry-run" in overrides:
         return _tool("plan", [o for o in overrides if o != "--dry-run"])
@@ -138,7 +71,7 @@ def _dispatch(arguments: list[str]) -> int:
         raise ConfigError(f"{launcher[0]} is about the jobs of a sweep; add -m")
     from nsf.pipeline.sweep import work
 
-    result = work(config.load(overrides, _primary(stage)), _stages(stage))
+    result = work(config.load(overrides, usage.primary(stage)), _stages(stage))
     if stage in ("run", "report"):
         _show(result)
     return 0
@@ -170,9 +103,9 @@ def _asked(command: str, words: Sequence[str], *known: str) -> dict[str, str]:
 
 
 def _tool(name: str, words: list[str]) -> int:
-    text, usage = TOOLS[name]
-    if usage is not None and {"-h", "--help"} & set(words):
-        print(f"usage: nsf {name} {usage}\n\n{text}")
+    text, words_of = TOOLS[name]
+    if words_of is not None and {"-h", "--help"} & set(words):
+        print(f"usage: nsf {name} {words_of}\n\n{text}")
         return 0
     if name in ("view", "serve"):
         from nsf.live.command import main as live
@@ -288,8 +221,8 @@ def _reports(words: list[str]) -> int:
         print(f"open {write_list(folder).resolve()}")
         return 0
     found = faults(folder)
-    for fault in found:
-        print(fault, file=sys.stderr)
+    told = found or [f"every report in {folder} is as it was generated"]
+    print(*told, sep="\n", file=sys.stderr if found else sys.stdout)
     return 2 if found else 0
 
 
@@ -310,11 +243,6 @@ def _runs(words: list[str]) -> int:
     from nsf.reporting.overview.command import main as runs
 
     return runs(words, lambda table: _console().print(table))
-
-
-def _primary(stage: str) -> str:
-    """Name of the stage's primary configuration file."""
-    return "point" if stage == "point" else "config"
 
 
 def _stages(stage: str) -> tuple[str, ...]:
@@ -363,7 +291,7 @@ def _sweep(stage: str, sweeps: Sequence[list[str]], launcher: list[str], more: S
     from nsf.pipeline.sweep import sweep
 
     stages = (*(s for s in _stages(stage) if s != "report"), *more)
-    failed = sweep(sweeps, stages, launcher, _primary(stage))
+    failed = sweep(sweeps, stages, launcher, usage.primary(stage))
     if "evaluate" in stages:
         from nsf.pipeline.outcome import outcome_table
 
@@ -389,36 +317,6 @@ def _console():
     from rich.console import Console
 
     return Console(width=None if sys.stdout.isatty() else 160)
-
-
-def _help() -> str:
-    width = max(map(len, STAGES))
-    stages = "\n".join(f"  {name:<{width}}  {text}" for name, text in STAGES.items())
-    tools = "\n".join(f"  {name:<{width}}  {text}" for name, (text, _) in TOOLS.items())
-    usage = "usage: nsf STAGE [-m] [+experiment=NAME] [key=value …]"
-    return f"{usage}\n\nstages:\n{stages}\n\nbeside them:\n{tools}\n\n{_EXAMPLES}\n\n{_groups()}"
-
-
-def _groups() -> str:
-    from nsf.paths import EXPERIMENTS, groups
-
-    width = max(map(len, groups()))
-    lines = [f"  {group:<{width}} {' '.join(options)}" for group, options in groups().items()]
-    experiments = " ".join(sorted(path.stem for path in EXPERIMENTS.glob("*.yaml")))
-    lines += ["", "experiments (+experiment=NAME):", f"  {experiments}"]
-    return "\n".join(["configuration groups (group=option):", *lines])
-
-
-def _stage_help(stage: str) -> str:
-    from nsf.paths import CONF
-
-    primary = _primary(stage)
-    experiment = "" if stage == "point" else " [+experiment=NAME]"
-    keys = (CONF / f"{primary}.yaml").read_text(encoding="utf-8")
-    return (
-        f"usage: nsf {stage} [-m]{experiment} [key=value …]\n\n{STAGES[stage]}\n\n{_groups()}\n\n"
-        f"keys and defaults (conf/{primary}.yaml):\n{keys}"
-    )
 
 
 if __name__ == "__main__":

@@ -193,7 +193,7 @@ class Pipeline(Plan):
 
     def deploy(self) -> Run:
         """Reduced trajectories of the held-out cases, through Lightning's `Trainer.predict`."""
-        if self.teaching is not None:
+        if self.teaching is not None and not self.taught.complete:
             self.teach()
         return self._made(self.deployment, partial(deploy_held_out, self))
 

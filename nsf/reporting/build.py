@@ -12,6 +12,7 @@ from nsf.reporting.sources import Source, Study, file_hash, open_sources
 from nsf.reporting.study import FineSource, fine_section, fine_table, over_seeds, swept, trust_table
 from nsf.reporting.swap import MARK, replaced
 from nsf.reporting.tables import (
+    PAPER,
     VARIANT,
     Merged,
     means,
@@ -102,7 +103,9 @@ def _fine(merged: Merged, study: Study | None) -> list[FineSource]:
 
 
 def _page(title: str, merged: Merged, sections, study: Study | None, more, fine, sweep: bool) -> Page:
-    headline, same = without_constants(means(merged, study))
+    found = means(merged, study)
+    headline, same = without_constants(found)
+    printed = found["field"].eq(PAPER).any()
     per_value, same_there = without_constants(merged.frame.drop(columns=[*COSTS, *RIVALS]))
     alike = merged.frame[["scene"] if sweep else ["scene", "method"]].drop_duplicates()
     chosen = (
@@ -118,7 +121,7 @@ def _page(title: str, merged: Merged, sections, study: Study | None, more, fine,
         facts=[*_asked(study), *_facts(merged)],
         warnings=_warnings(merged),
         tables=[
-            Table("Results beside the paper's", rows_of(headline), note),
+            Table("Results beside the paper's" if printed else "Results", rows_of(headline), note),
             *side_by_side(merged),
             *beside_rivals(merged),
             *(over_seeds(merged, study) if study else ()),

@@ -240,6 +240,8 @@ def _over_seeds(report: Report) -> Rows:
             told = (delta.min(skipna=False), delta.max(skipna=False), part[_PAPER].mean(skipna=False))
             body.append([scene, seed, f"{len(delta)}", mean, *(number(value, 100) for value in told)])
     headings = ["scene", "varied", "seeds", "mean δ [%]", "smallest [%]", "largest [%]", "paper's δ [%]"]
+    if report.rows[_PAPER].isna().all():
+        headings, body = headings[:-1], [row[:-1] for row in body]
     return Rows(headings, body, [i > 1 for i in range(len(headings))])
 
 

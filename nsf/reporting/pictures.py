@@ -280,9 +280,11 @@ def _comparison(known: list[_Variant], folder: Path, study: Study | None) -> lis
         )
     runs = sorted({run for v in known for run in v.runs})
     splits = " and ".join(sorted({v.held_out for v in known}))
+    of_paper = any(entry["paper"] is not None for entry in entries)
+    printed = "; the paper's figure where it gives one" if of_paper else ""
     drawings: tuple[tuple[str, Callable, str], ...] = (
         ("delta", charts.delta_per_variant,
-         f"Mean δ over the {splits} values, each of them (dots), and the paper's figure where it gives one."),
+         f"Mean δ over the {splits} values, and each of them (dots){printed}."),
         ("speedup-memory", charts.speedup_and_memory,
          "Speedup of the reduced over the full-order model (line: 1×), and the peak memory of both."),
     )  # fmt: skip

@@ -535,7 +535,9 @@ def test_super_resolution_of_a_deployment(copied, pipeline_at):
     pipeline, said = said_by(pipeline_at, root, *options, stages=["superresolve"])
     run = pipeline.superresolution
     assert run.manifest["parents"] == [pipeline.deployment.id, pipeline.truth(angle(26.0)).id]
-    run_line, line = said
+    run_line, line, *explained = said
+    assert any("what no field can know" in told for told in explained)
+    assert explained[-1].endswith("superresolution.png")
     assert run_line.startswith("superresolve: friction_angle=26°: 1,000 full-order particles in ")
     assert "1,000 points" in line
     assert "at the 500 particles" in line

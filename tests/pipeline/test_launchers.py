@@ -6,10 +6,12 @@ import signal
 import sys
 import time
 from functools import partial
+from types import SimpleNamespace
 
 import pytest
 from forked import SignalAt
 
+from nsf import config as configuration
 from nsf.errors import ConfigError, LaunchError, MissingExtraError
 from nsf.pipeline import sweep as module
 from nsf.pipeline.sweep import sweep
@@ -31,7 +33,7 @@ def test_a_failure_crosses_from_another_process(copied, tiny, monkeypatch):
     assert "exceeds the 8 displacement modes" in runs[9].manifest["error"]
 
 
-def dies_at(config, stages, seed):
+def dies_at(config, stages, seed, labels=()):
     if config.seed == seed:
         os.kill(os.getpid(), signal.SIGKILL)
 
@@ -62,7 +64,7 @@ def test_an_array_that_slurm_refuses_has_no_results_of_an_earlier_one(tmp_path):
         module._launched(SlurmLauncher(), [["scene=sand"]], print, 1)
 
 
-def says_its_gpu(config, stages, folder, beside):
+def says_its_gpu(config, stages, folder, beside, labels=()):
     (folder / f"{config.seed}").write_text(os.environ.get("CUDA_VISIBLE_DEVICES", "all"))
     # The first job ends only once the other process has begun one, so that neither takes them all.
     began = time.monotonic()
@@ -86,6 +88,22 @@ def test_jobs_side_by_side_see_one_gpu_each(tmp_path, monkeypatch, overrides, la
     monkeypatch.setattr(module, "_job", partial(says_its_gpu, folder=tmp_path, beside=bool(launcher)))
     assert not sweep([["seed=1,2,3", *overrides]], ["train"], launcher)
     assert {(tmp_path / f"{seed}").read_text() for seed in (1, 2, 3)} == seen
+
+
+def test_each_line_of_a_job_beside_others_names_it(tmp_path, monkeypatch, capsys, tiny):
+    job = SimpleNamespace(
+        job=SimpleNamespace(num=1), overrides=SimpleNamespace(task=["scene=sand", "seed=2"])
+    )
+    monkeypatch.setattr(module.HydraConfig, "get", lambda: job)
+    monkeypatch.setattr(module, "work", lambda config, stages, say: say("train: begins"))
+    config = configuration.load(tiny)
+    assert module._job(config, ["train"], ["seed=1", "seed=2"]) is None
+    assert capsys.readouterr().out.splitlines() == [
+        "[seed=2] --- scene=sand seed=2",
+        "[seed=2] train: begins",
+    ]
+    assert module._job(config, ["train"]) is None
+    assert capsys.readouterr().out.splitlines() == ["--- scene=sand seed=2", "train: begins"]
 
 
 def raises(config, stages, say):

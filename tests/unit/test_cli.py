@@ -415,6 +415,14 @@ def test_a_folder_that_cannot_be_written_is_told(nsf, tmp_path):
     assert "NSF_REPORTS" in err
 
 
+def test_reports_that_are_as_they_were_are_told_so(nsf, tmp_path):
+    (tmp_path / "none").mkdir()
+    assert nsf("reports", "folder=none", tiny_scene=False)[0] == 0
+    code, out, _ = nsf("reports", "folder=none", "check=true", tiny_scene=False)
+    assert code == 0
+    assert out == "every report in none is as it was generated\n"
+
+
 @pytest.mark.parametrize("check", ["false", "true"])
 def test_a_folder_of_reports_that_is_not_there(nsf, tmp_path, check):
     code, _, err = nsf("reports", "folder=report", f"check={check}", tiny_scene=False)

@@ -25,6 +25,16 @@ from nsf.kinematics.manifold import Manifold
 from nsf.pipeline.stages import results
 from nsf.runs import Run
 
+#: Figures of `superresolve` in words; means over the held-out cases.
+_EXPLAINED = {
+    "delta": "δ of the fields at all points, beside a full-order run of as many particles",
+    "particles_delta": "δ at the training particles, which are among the points",
+    "displacement_error": "displacement error at all points",
+    "interpolation_error": "displacement error where the fine run's own particles are interpolated instead",
+    "full_order_difference": "displacement between the two full-order runs: what no field can know",
+    "smeared": "of these lie more than half a cell from where the fine run has them",
+}
+
 
 def evaluate(pipeline, run: Run) -> None:
     """Write the errors and costs of a pipeline's reduced runs.
@@ -80,11 +90,15 @@ def superresolve_held_out(pipeline, run: Run) -> None:
                 pipeline.say,
             )
         table = results.write_superresolution(record, pipeline.deployed, fine)
+    mean = {name: f"{100 * table[name].mean():.3g} %" for name in _EXPLAINED}
     pipeline.say(
-        f"superresolve: {table['points'][0]:,} points, mean δ {100 * table['delta'].mean():.3g} % "
-        f"({100 * table['particles_delta'].mean():.3g} % at the {len(manifold.X):,} particles), "
+        f"superresolve: {table['points'][0]:,} points, mean δ {mean['delta']} "
+        f"({mean['particles_delta']} at the {len(manifold.X):,} particles), "
         f"queried in {table['seconds'].sum():.1f} s → {run.id}"
     )
+    for name, told in _EXPLAINED.items():
+        pipeline.say(f"superresolve: {mean[name]:>8} {told}")
+    pipeline.say(f"superresolve: open {(run.path / 'superresolution.png').resolve()}")
 
 
 def _truths(pipeline) -> list[Path]:

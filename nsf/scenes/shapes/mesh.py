@@ -17,6 +17,7 @@ from nsf.vectors import length, vector
 EXTENSIONS = (".obj", ".ply", ".stl")
 # A triangle takes some 50 bytes of a file and 500 of memory while a mesh is read.
 _MAX_BYTES = 256 * 2**20
+_UNITE = "pip install manifold3d, and unite its parts: trimesh.boolean.union(trimesh.load(FILE).split())"
 # Points at which a mesh is tested for overlaps of its own parts.
 _PROBES = 2**15
 # How far off a face's middle its two sides are probed, in units of the mesh's extent.
@@ -224,14 +225,11 @@ def _oriented(path: str, triangles: np.ndarray) -> WindingNumber:
     if wrong.any():
         raise ConfigError(
             f"mesh={path} overlaps itself: {wrong.sum()} of its {len(triangles)} faces lie inside another "
-            "part or are doubled; unite its parts into one surface"
+            f"part or are doubled; {_UNITE}"
         )
     # Stretched to the box, as a needle's would hardly be hit otherwise.
     number = surface.of(lower + (upper - lower) * Box((0, 0, 0), (1, 1, 1)).sample(_PROBES))
     if ((number < 0) | (number > 1)).any():
         share = ((number < 0) | (number > 1)).mean()
-        raise ConfigError(
-            f"mesh={path} overlaps itself in {100 * share:.2g} % of its bounding box; "
-            "unite its parts into one surface"
-        )
+        raise ConfigError(f"mesh={path} overlaps itself in {100 * share:.2g} % of its bounding box; {_UNITE}")
     return surface
