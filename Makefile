@@ -10,6 +10,12 @@ TORCH := torch==2.13.0
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
+# With what tests, lint and the documentation need on top, most of it to read what was exported.
+DEVELOPED := $(VENV)/.developed
+# Without a GPU, and where pip has not been told where to look: PyTorch's builds without CUDA, 2 GB less.
+CPU_TORCH = $$( [ "$$(uname -s)" = Linux ] && [ ! -e /proc/driver/nvidia/version ] && [ ! -e /dev/dxg ] && \
+	! $(BIN)/python -m pip config list | grep -q index-url && \
+	echo --extra-index-url https://download.pytorch.org/whl/cpu )
 # One thread a test worker: two workers share two cores.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 WORKERS ?= 2
@@ -17,49 +23,61 @@ WORKERS ?= 2
 CASES ?= 2400
 SEED ?= 0
 
-.PHONY: help install quickstart test test-browser fuzz test-slow test-gpu gpu-references test-slurm test-all lint mirrors readme check-reports docs clean
+.PHONY: help install develop quickstart test test-browser fuzz test-slow test-gpu gpu-references test-slurm test-all lint mirrors readme check-reports docs clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-install: $(INSTALLED)  ## .venv with the package and what it needs
+install: $(INSTALLED)  ## .venv with the package, and what the chain needs
 
 $(INSTALLED): pyproject.toml
 	@'$(PYTHON)' -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
 		{ echo 'Python 3.11 or newer is needed; name one: make install PYTHON=/path/to/python3.11' >&2; exit 1; }
 	'$(PYTHON)' -m venv $(VENV)
-	$(BIN)/python -m pip install $(TORCH) -e '.[dev]'
+	$(BIN)/python -m pip install $(CPU_TORCH) $(TORCH) -e .
 	@touch $@
 
-quickstart: install  ## the sand column at small scale, from simulation to report, by two engines
-	$(BIN)/nsf run -m scene=sand scale=small engine=auto,operators
+develop: $(DEVELOPED)  ## the same, with every extra, and what tests, lint and docs need
 
-test: install  ## the tests, without those marked slow or slurm
+$(DEVELOPED): $(INSTALLED)
+	$(BIN)/python -m pip install $(CPU_TORCH) $(TORCH) -e '.[dev]'
+	@touch $@
+
+quickstart: install  ## a column of sand in a minute, from simulation to report, by two engines
+	$(BIN)/nsf run +experiment=quickstart
+	@echo
+	@echo 'Next, the page above in a browser, and'
+	@echo '  $(BIN)/nsf runs stage=evaluate sort=delta    the runs behind it'
+	@echo '  $(BIN)/nsf plan scene=cake                   what another scene would take'
+	@echo '  $(BIN)/nsf run scene=sand                    the same column with all its cases'
+	@echo '  docs/tutorial.md                               what was done, and how to go on'
+
+test: develop  ## the tests, without those marked slow or slurm
 	$(PYTEST) -m 'not slow and not slurm' -n $(WORKERS) --dist worksteal
 
-test-browser: install  ## the pages in Chromium, their modules under node and tsc; apt install chromium nodejs npm
+test-browser: develop  ## the pages in Chromium, their modules under node and tsc; apt install chromium nodejs npm
 	@for p in chromium node npx; do command -v $$p >/dev/null || echo "$$p is missing; its tests are skipped: apt install chromium nodejs npm"; done
 	! command -v npx >/dev/null || npx --yes -p typescript@5 tsc -p tests/unit/web/tsconfig.json
 	$(PYTEST) -rs tests/unit/live tests/unit/export/test_export_page.py
 
-test-slow: install  ## the tests marked slow
+test-slow: develop  ## the tests marked slow
 	$(PYTEST) -m slow
 
-test-gpu: install  ## the tests marked gpu, on a machine with a GPU
+test-gpu: develop  ## the tests marked gpu, on a machine with a GPU
 	$(PYTEST) -m gpu -rs
 
-gpu-references: install  ## what tests on a GPU compare with, from a CPU, in tests/references/
+gpu-references: develop  ## what tests on a GPU compare with, from a CPU, in tests/references/
 	OMP_NUM_THREADS=1 $(BIN)/python tests/gpu_references.py
 
-fuzz: install  ## malformed inputs by the thousand, drawn from SEED: none runs code, hangs or is believed
+fuzz: develop  ## malformed inputs by the thousand, drawn from SEED: none runs code, hangs or is believed
 	OMP_NUM_THREADS=1 $(BIN)/python tests/fuzz/fuzz.py --cases $(CASES) --seed $(SEED)
 
-test-slurm: install  ## sweeps through a Slurm of one node; on Debian after apt install slurm-wlm munge
+test-slurm: develop  ## sweeps through a Slurm of one node; on Debian after apt install slurm-wlm munge
 	$(PYTEST) -m slurm
 
 test-all: test test-slow test-slurm  ## every test
 
-lint: install  ## ruff and the layers of imports
+lint: develop  ## ruff and the layers of imports
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
@@ -74,7 +92,7 @@ readme: install  ## the figures in README.md, from a report, and the list of rep
 check-reports: install  ## whether reports/ is as it was generated
 	$(BIN)/nsf reports folder=reports check=true
 
-docs: install  ## the documentation, in site/
+docs: develop  ## the documentation, in site/
 	OMP_NUM_THREADS=1 $(BIN)/python -m mkdocs build --strict
 
 clean:  ## remove the environment, caches and builds; runs and reports stay

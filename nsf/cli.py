@@ -34,6 +34,10 @@ TOOLS = {
         "values of numeric keys that make δ, or δ and the step's time, small at the validation values",
         "key=low..high[:log] … [key=value …] [search.objectives=[delta,step_ms]] [search.trials=20]",
     ),
+    "plan": (
+        "what nsf run would do: stages and their states, size, time and room; --cfg: the configuration",
+        "[-m] [+experiment=NAME] [key=value …] [--cfg]; nsf run … --dry-run is the same",
+    ),
     "runs": ("every run there is: listed, shown, compared, verified, deleted", None),
     "index": (
         "a page of every run, with a thumbnail each, that sorts and filters in the browser",
@@ -57,6 +61,7 @@ examples:
   nsf run scene=sand method=deformation_only           the baseline beside it, in the same report
   nsf run scene=sand scene.design.test=[23,30.5]       other held-out cases
   nsf run -m scene=sand latent_dim=4,6 sampler.size=50,150   every combination
+  nsf plan scene=cake scale=paper                      what that would take, before it begins
   nsf run +experiment=table1 scale=small               every job of experiments/table1.yaml, and its report
   nsf run -m +experiment=sand hydra/launcher=joblib    jobs side by side on this machine
   nsf run -m +experiment=table1 hydra/launcher=slurm   jobs in Slurm's queue (conf/hydra/launcher/slurm.yaml)
@@ -113,6 +118,8 @@ def _dispatch(arguments: list[str]) -> int:
     if {"-h", "--help"} & set(overrides):
         print(_stage_help(stage))
         return 0
+    if stage == "run" and "--dry-run" in overrides:
+        return _tool("plan", [o for o in overrides if o != "--dry-run"])
     multirun = bool({"-m", "--multirun"} & set(overrides))
     overrides = [o for o in overrides if o not in ("-m", "--multirun")]
     _check_words(stage, [o for o in overrides if not o.startswith("~")])
@@ -121,12 +128,8 @@ def _dispatch(arguments: list[str]) -> int:
     launcher = [o for o in overrides if config.of_launcher(o)]
     experiments = [o.removeprefix("+experiment=") for o in overrides if o.startswith("+experiment=")]
     own = [o for o in overrides if o not in launcher and not o.startswith("+experiment=")]
-    if stage != "point" and not experiments and not any(config.names_scene(o) for o in own):
-        from nsf.paths import groups
-
-        raise ConfigError(
-            f"nsf {stage} needs a scene, as scene=sand; choose one of {', '.join(groups()['scene'])}"
-        )
+    if stage != "point" and not experiments:
+        _check_scene(stage, own)
     if experiments:
         return _experiment(experiments[-1], stage, own, launcher)
     if multirun:
@@ -139,6 +142,15 @@ def _dispatch(arguments: list[str]) -> int:
     if stage in ("run", "report"):
         _show(result)
     return 0
+
+
+def _check_scene(command: str, overrides: Sequence[str]) -> None:
+    from nsf import config
+    from nsf.paths import groups
+
+    if not any(map(config.names_scene, overrides)):
+        known = ", ".join(groups()["scene"])
+        raise ConfigError(f"nsf {command} needs a scene, as scene=sand; choose one of {known}")
 
 
 def _check_words(command: str, words: Sequence[str]) -> None:
@@ -168,7 +180,7 @@ def _tool(name: str, words: list[str]) -> int:
         return live(name, text, words)
     tools = {
         "bench": _bench, "demo": _demo, "doctor": _doctor, "export": _export, "index": _index,
-        "reports": _reports, "runs": _runs, "search": _search,
+        "plan": _plan, "reports": _reports, "runs": _runs, "search": _search,
     }  # fmt: skip
     return tools[name](words)
 
@@ -230,6 +242,33 @@ def _index(words: list[str]) -> int:
     from nsf.reporting.overview.index import write_index
 
     print(f"open {write_index(Path(folder)).resolve()}")
+    return 0
+
+
+def _plan(words: list[str]) -> int:
+    """What a run would do."""
+    from nsf import config
+    from nsf.pipeline import preview
+
+    flags = {"-m", "--multirun", "--cfg"}
+    asked = [word for word in words if word not in flags]
+    _check_words("plan", [word for word in asked if not word.startswith("~")])
+    own = [o for o in asked if not o.startswith("+experiment=") and not config.of_launcher(o)]
+    if names := [o.removeprefix("+experiment=") for o in asked if o.startswith("+experiment=")]:
+        from nsf.pipeline.experiment import Experiment
+
+        jobs = [job.overrides for job in Experiment.load(names[-1], own).jobs]
+    else:
+        _check_scene("plan", own)
+        jobs = config.jobs([own]) if {"-m", "--multirun"} & set(words) else [tuple(own)]
+    found = preview.plans(jobs)
+    if "--cfg" in words:
+        print("\n---\n".join(map(preview.composed, found)), end="")
+        return 0
+    console = _console()
+    for plan in preview.scenes(found):
+        console.print(preview.scene_table(plan), "")
+    console.print(preview.stages_table(found))
     return 0
 
 
@@ -299,7 +338,7 @@ def _experiment(name: str, stage: str, overrides: list[str], launcher: list[str]
         code = _sweep(stage, experiment.sweeps, launcher, experiment.stages if stage == "run" else ())
     if stage in ("run", "report"):
         page, missing = experiment.report()
-        _show(page)
+        _show(page, table=stage == "report" or len(experiment.jobs) == 1)
         for told in missing:
             print(f"missing: {told}", file=sys.stderr)
         code = 2 if missing else code
@@ -315,7 +354,7 @@ def _multirun(stage: str, overrides: list[str], launcher: list[str]) -> int:
     code = 0 if stage == "report" else _sweep(stage, [overrides], launcher)
     if stage in ("run", "report"):
         for page in reports(overrides):
-            _show(page)
+            _show(page, table=stage == "report")
     return code
 
 
@@ -325,18 +364,24 @@ def _sweep(stage: str, sweeps: Sequence[list[str]], launcher: list[str], more: S
 
     stages = (*(s for s in _stages(stage) if s != "report"), *more)
     failed = sweep(sweeps, stages, launcher, _primary(stage))
+    if "evaluate" in stages:
+        from nsf.pipeline.outcome import outcome_table
+
+        if table := outcome_table(sweeps, {" ".join(failure.job): failure.error for failure in failed}):
+            _console().print(table)
     for failure in failed:
         print(f"failed: {failure}", file=sys.stderr)
     return 2 if failed else 0
 
 
-def _show(page) -> None:
-    """The result table of a report, on the terminal."""
-    import pandas as pd
+def _show(page, table: bool = True) -> None:
+    """The result table of a report, on the terminal, and where its page is."""
+    if table:
+        import pandas as pd
 
-    from nsf.reporting import console_table
+        from nsf.reporting import console_table
 
-    _console().print(console_table(pd.read_csv(page.parent / "results.csv")))
+        _console().print(console_table(pd.read_csv(page.parent / "results.csv")))
     print(f"open {page.resolve()}")
 
 

@@ -1,8 +1,9 @@
-"""Progress of long work for the user: a bar with a rate and an end time, without chatter of libraries."""
+"""Progress of long work for the user: a bar, or lines in a log, without chatter of libraries."""
 
 import contextlib
 import logging
 import sys
+import time
 import warnings
 from collections.abc import Iterator
 
@@ -10,6 +11,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as RichProgress
 from rich.text import Text
+
+#: Between two lines of a log [s].
+EVERY = 10.0
 
 
 class _Rate(ProgressColumn):
@@ -22,16 +26,19 @@ class _Rate(ProgressColumn):
 
 
 class Progress:
-    """A progress bar on standard error.
+    """A progress bar on standard error; where that is a file, a line every ten seconds instead.
 
     Args:
         stage: name of the work.
         total: units of work.
         unit: name of the units.
-        shown: whether this process shows the bar.
+        shown: whether this process shows anything.
     """
 
     def __init__(self, stage: str, total: int, unit: str, shown: bool = True):
+        self._unit, self._total, self._done, self._what = unit, total, 0, stage
+        self._logged = shown and not sys.stderr.isatty()
+        self._began = self._told = time.monotonic()
         self._bar = RichProgress(
             TextColumn("{task.description}"),
             BarColumn(),
@@ -55,11 +62,40 @@ class Progress:
 
     def describe(self, what: str) -> None:
         """Name the present piece of work on the bar."""
-        self._bar.update(self._task, description=f"{self._stage}: {what}")
+        self._what = f"{self._stage}: {what}"
+        self._bar.update(self._task, description=self._what)
 
     def advance(self, amount: int = 1) -> None:
         """Count work done."""
         self._bar.advance(self._task, amount)
+        self._done += amount
+        if self._logged and (now := time.monotonic()) - self._told >= EVERY:
+            self._told, rate = now, self._done / (now - self._began)
+            left = max(0, self._total - self._done) / rate
+            print(
+                f"{label()}{self._what}, {self._done:,} of {self._total:,} {self._unit}, {rate:,.1f}/s, "
+                f"{left:.0f} s left",
+                file=sys.stderr,
+                flush=True,
+            )
+
+
+_LABEL: list[str] = []  # of this process's job
+
+
+def label() -> str:
+    """What each line of this process begins with; empty unless it is one of several side by side."""
+    return f"[{_LABEL[-1]}] " if _LABEL and _LABEL[-1] else ""
+
+
+@contextlib.contextmanager
+def labelled(name: str) -> Iterator[None]:
+    """Begin each line with the name of a job, while the block works."""
+    _LABEL.append(name)
+    try:
+        yield
+    finally:
+        _LABEL.pop()
 
 
 # What Lightning says about choices made on purpose here.

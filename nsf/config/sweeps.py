@@ -85,8 +85,8 @@ def check_sweep(
     """
     options = _options(overrides, config_name)
     first = [values[0] for values in options]
-    for at, values in enumerate(options):
-        for value in values:
-            config = load([*first[:at], value, *first[at + 1 :]], config_name)
-            if check is not None:
-                check(config)
+    each = ((*first[:at], value, *first[at + 1 :]) for at, values in enumerate(options) for value in values)
+    for job in dict.fromkeys(each):
+        config = load(job, config_name)
+        if check is not None:
+            check(config)

@@ -157,7 +157,7 @@ class Experiment:
         folder = self._folder(config, scales)
         study = Study(self.question, self.paper, settings, keys, missing, self.printed, fine)
         if page := unchanged(folder, runs.values(), self.title, study=study):
-            say(f"report: nothing it shows has changed, reused → {page}")
+            say(f"report: {len(runs)} jobs, {len(missing)} missing, unchanged, reused → {page}")
             return page, missing
         from nsf.reporting.build import build_report
 

@@ -4,7 +4,7 @@ Neither torch nor Warp is imported, so that a mistake, or a chain whose results 
 """
 
 from collections.abc import Sequence
-from copy import copy
+from copy import copy, deepcopy
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
@@ -12,6 +12,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from nsf import config as configuration
+from nsf.config.code import code_of
 from nsf.data.case import Case
 from nsf.engines.modal.mirrors import edits
 from nsf.engines.names import OPERATORS
@@ -29,7 +30,10 @@ STAGES = ("simulate", "train", "teach", "deploy", "evaluate", "report")
 #: Keys of the configuration that a simulation's content depends on.
 _SCENE_KEYS = ("scale", "material", "transfer")
 #: Keys that hold others, none of which is left out.
-_SECTIONS = ("data", "deploy", "evaluation", "super_resolution", "report")
+_SECTIONS = (
+    *("material", "transfer", "field", "trainer", "method", "sampler", "projector", "integration"),
+    *("data", "deploy", "evaluation", "super_resolution", "report"),
+)
 #: Cases between the training ones whose runs decide which round of teaching is kept.
 HELD_BACK = 3
 #: Fields without `arithmetic`, known without importing them.
@@ -239,7 +243,6 @@ class Names:
                 "teaching": asdict(self.teaching),
                 "teacher": self.config.engine.teacher,
                 "cases": [list(map(dict, cases)) for cases in self.lessons],
-                "validation": list(map(dict, self.split.validation)),
                 "dt_multiplier": self.config.deploy.dt_multiplier,
                 "device": self.device,
             }
@@ -252,8 +255,7 @@ class Names:
     def lessons(self) -> list[list[Case]]:
         """Cases of three kinds that the teacher is asked in: of training, between them, and held back.
 
-        Runs in those held back decide which round of teaching is kept, where there are no validation cases.
-        None is a validation or test case.
+        Runs in those held back decide which round of teaching is kept. None is a validation or test case.
         """
         known, seed = sorted(self.split.train), int(self.config.seed)
         taken = [*known, *self.split.validation, *self.split.test]
@@ -322,13 +324,16 @@ class Names:
     @staticmethod
     def _physics(scene: Draft) -> dict:
         """What the configuration says of a scene's physics."""
-        plain = OmegaConf.to_container(scene.config)
+        plain = scene.plain
         content = {key: plain[key] for key in _SCENE_KEYS}
+        if law := code_of(content):
+            content["law"] = law
         return content | {"scene": {k: v for k, v in plain["scene"].items() if k not in NOT_PHYSICS}}
 
     def _content(self, keys: Sequence[str]) -> dict:
-        plain = OmegaConf.to_container(self.config)
-        return {key: plain[key] for key in keys}
+        content = {key: deepcopy(self.scene.plain[key]) for key in keys}
+        code = code_of(content)
+        return content | {"code": code} if code else content
 
 
 def _device(asked) -> str:

@@ -95,7 +95,7 @@ def report(names: Names, say: Say) -> Path:
         )
     title, folder = names.config.scene.title, names.report_folder
     if page := unchanged(folder, runs, title, names.evaluation):
-        say(f"report: nothing it shows has changed, reused → {page}")
+        say(f"report: {len(runs)} evaluated variants, unchanged, reused → {page}")
         return page
     from nsf.reporting.build import build_report
 

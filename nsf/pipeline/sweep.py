@@ -25,6 +25,7 @@ from nsf.gpu import has_driver
 from nsf.pipeline.names import Names
 from nsf.pipeline.reuse import done
 from nsf.pipeline.reuse import report as report_of
+from nsf.progress import label, labelled
 
 _SUBMITTED = "*/*_submitted.pkl"  # a file of each job that Slurm took
 _DIED = "its process died (killed, or out of memory or time)"
@@ -126,7 +127,11 @@ def sweep(
         configuration.check_sweep(overrides, config_name, check)
     jobs = configuration.jobs(sweeps, config_name)
     context = HydraContext(config_loader=loader, callbacks=Callbacks())
-    task = partial(_job, stages=tuple(stages))
+    common = set.intersection(*map(set, jobs))
+    # Jobs side by side write into one terminal, or one log.
+    apart = "joblib" in plugin or "submitit" in plugin
+    labels = tuple(" ".join(o for o in job if o not in common) for job in jobs) if apart else ()
+    task = partial(_job, stages=tuple(stages), labels=labels)
     gpus = visible_gpus() if "joblib" in plugin and all(movable) else ()
     if len(gpus) > 1:
         task = partial(_on_a_gpu, task, gpus)
@@ -148,7 +153,6 @@ def sweep(
             if dropped and not any(found):
                 _drop_training([Names(configuration.load(job, config_name)) for job in scene], say)
             errors += found
-    common = set.intersection(*map(set, jobs))
     return [
         Failure(tuple(override for override in job if override not in common), error)
         for job, error in zip(jobs, errors, strict=True)
@@ -221,18 +225,29 @@ def _see_one_gpu(gpus: tuple[str, ...]) -> None:
     os.environ["CUDA_VISIBLE_DEVICES"] = gpus[HydraConfig.get().job.num % len(gpus)]
 
 
-def _job(config: DictConfig, stages: Sequence[str]) -> str | None:
-    """One job, in a process of its own or not. The error goes back as text, which every process can read."""
-    print(f"--- {' '.join(HydraConfig.get().overrides.task)}", flush=True)
-    try:
-        work(configuration.checked(config), stages, partial(print, flush=True))
-    except NSFError as error:
-        print(f"error: {error}", file=sys.stderr, flush=True)
-        return str(error)
-    except Exception as error:
-        traceback.print_exc()
-        return f"{type(error).__name__}: {error}"
+def _job(config: DictConfig, stages: Sequence[str], labels: Sequence[str] = ()) -> str | None:
+    """One job, in a process of its own or not. The error goes back as text, which every process can read.
+
+    Args:
+        config: of the job.
+        stages: as of `work`.
+        labels: by the number of a job, what each of its lines begins with; none where jobs come one by one.
+    """
+    with labelled(labels[HydraConfig.get().job.num] if labels else ""):
+        _say(f"--- {' '.join(HydraConfig.get().overrides.task)}")
+        try:
+            work(configuration.checked(config), stages, _say)
+        except NSFError as error:
+            print(f"{label()}error: {error}", file=sys.stderr, flush=True)
+            return str(error)
+        except Exception as error:
+            traceback.print_exc()
+            return f"{type(error).__name__}: {error}"
     return None
+
+
+def _say(line: str) -> None:
+    print(f"{label()}{line}", flush=True)
 
 
 def _scenes(jobs: Sequence[tuple[str, ...]]) -> list[list[tuple[str, ...]]]:

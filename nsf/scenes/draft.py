@@ -107,6 +107,11 @@ class Draft:
         forced = isinstance(node, Mapping) and any(node.values())
         return dict(self.parameters) | ({PROGRAM: Parameter("scene.program", "")} if forced else {})
 
+    @cached_property
+    def plain(self) -> dict[str, Any]:
+        """The resolved configuration as plain containers, to be read and not changed."""
+        return OmegaConf.to_container(self.config)
+
     @property
     def particle_count(self) -> int:
         """Particles of all bodies together."""

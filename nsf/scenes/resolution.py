@@ -52,6 +52,12 @@ def resolution_warnings(scene: Scene) -> list[str]:
     return found
 
 
+def thinnest(scene: Scene) -> dict[str, float]:
+    """Thickness [m] of the thinnest part of each body, to a few percent; infinite if two cells or more."""
+    names = map(str, scene.config.scene.bodies)
+    return {name: _thinnest_part(b.placing, scene.dx) for name, b in zip(names, scene.bodies, strict=True)}
+
+
 @functools.lru_cache(maxsize=8)
 def _thinnest_part(placing: Placing, dx: float) -> float:
     return thinnest_part(placing.shape, dx, points_of(placing))

@@ -22,6 +22,7 @@ from nsf.errors import ConfigError, InstabilityError, MissingRunError, NSFError
 from nsf.evaluation import superresolution
 from nsf.kinematics.manifold import Manifold
 from nsf.mpm import FullOrderMPM
+from nsf.reporting.overview.tables import texts
 from nsf.runs import Run
 from nsf.runs.listing import entries
 
@@ -398,14 +399,14 @@ def test_what_a_lost_training_needs_is_made_again(copied, pipeline_at):
     root = copied("simulate", "train", "deploy", "evaluate")
     stages = ("train", "deploy", "evaluate")
     pipeline = pipeline_at(root)
-    assert pipeline._spare(stages) == {
+    assert pipeline.spare(stages) == {
         run.id for run in (*pipeline.training_data, pipeline.truth(angle(26.0)))
     }
     shutil.rmtree(pipeline.training.path)
-    assert pipeline._spare(stages) == {pipeline.truth(angle(26.0)).id}
+    assert pipeline.spare(stages) == {pipeline.truth(angle(26.0)).id}
     same, _ = said_by(pipeline_at, root, "deploy.split=train", "evaluation.trials=0")
     shutil.rmtree(same.training.path)
-    assert not same._spare(stages)
+    assert not same.spare(stages)
 
 
 @pytest.mark.parametrize("override", ["material.E=inf", "scene.dt=inf", "projector.tolerance=nan"])
@@ -490,7 +491,7 @@ def test_a_diverged_rollout_is_infinite_and_never_nan(copied, pipeline_at):
     assert pipeline.deployment.manifest["metrics"]["diverged"] == [26.0]
     assert pipeline.evaluation.manifest["metrics"]["diverged"] == [26.0]
     (listed,) = entries({"stage": "evaluate"}, root=root)
-    assert listed.texts()[-1] == "diverged"
+    assert texts(listed)[-1] == "diverged"
     results = pd.read_csv(pipeline.evaluation.path / "results.csv")
     assert (results[["delta", "displacement_error", "stress_error"]] == np.inf).all().all()
     costs = [

@@ -7,15 +7,15 @@ follow the new text, `make mirrors` writes the table anew.
 """
 
 import ast
-import hashlib
 import inspect
 import json
 import pkgutil
-import re
 import sys
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
+
+from nsf.config.code import text_sum
 
 TABLE = Path(__file__).with_name("mirrors.json")
 #: What the kernels stand for: classes, of which every function counts, and functions.
@@ -86,7 +86,7 @@ def _digests_on_disk() -> dict[str, str]:
         for inner, node in _defined(ast.parse(_text_of(path)), name):
             lines = _text_of(path).splitlines(keepends=True)
             first = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
-            found[f"{mirrored}.{inner}".rstrip(".")] = _sum("".join(lines[first - 1 : node.end_lineno]))
+            found[f"{mirrored}.{inner}".rstrip(".")] = text_sum("".join(lines[first - 1 : node.end_lineno]))
     return found
 
 
@@ -131,10 +131,4 @@ def _digest(function: Callable) -> str:
         text = inspect.getsource(function)
     except (OSError, TypeError):
         text = repr(function)
-    return _sum(text)
-
-
-def _sum(text: str) -> str:
-    """sha256 of a text without docstrings, comments and white space."""
-    text = re.sub(r'(?s:""".*?""")|#.*', "", text)
-    return hashlib.sha256("".join(text.split()).encode()).hexdigest()[:16]
+    return text_sum(text)

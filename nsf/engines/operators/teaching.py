@@ -40,7 +40,7 @@ class Teaching:
     rate: float = 3e-3
     unroll: int = 8
     noise: float = 0.01
-    tube: float = 0.05
+    tube: float = 0.02
     gravity: float = 0.1
 
     def __post_init__(self):

@@ -1,0 +1,204 @@
+"""What a run would do, before any work: its stages and their states, its size, and what that will take."""
+
+import math
+import statistics
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from omegaconf import OmegaConf
+from rich.markup import escape
+from rich.table import Table
+
+from nsf import config as configuration
+from nsf.pipeline.names import Names
+from nsf.runs import Run
+from nsf.runs.pruning import bytes_text
+
+_RUNS = {"train": "training", "teach": "taught", "deploy": "deployment", "evaluate": "evaluation"}
+STAGES = ("simulate", *_RUNS)
+#: Key whose value runs of a stage must share for their times to be compared.
+_ALIKE = {"train": "field", "deploy": "engine"}
+
+
+@dataclass
+class Expected:
+    """What the runs of a stage take that are to be made.
+
+    Attributes:
+        runs: how many there are in all; made: how many are there already.
+        seconds, size: of those that are to be made [s, byte]; NaN where nothing like them was ever made.
+        known: from how many runs that is known; like: which.
+    """
+
+    runs: int
+    made: int
+    seconds: float = math.nan
+    size: float = math.nan
+    known: int = 0
+    like: str = ""
+
+    @property
+    def state(self) -> str:
+        """As a reader sees it."""
+        if self.made == self.runs:
+            return "there" if self.runs == 1 else f"all {self.runs} there"
+        return "to be made" if self.runs == 1 else f"{self.runs - self.made} of {self.runs} to be made"
+
+
+def plans(jobs: Sequence[Sequence[str]]) -> list[Names]:
+    """Each job checked as before its work, where it has any.
+
+    Raises:
+        NSFError: of every kind that a run begins with.
+    """
+    found = []
+    for job in jobs:
+        config = configuration.load(job)
+        names = Names(config)
+        names.check_held_out()
+        if any(not run.complete for run in runs_of(names, "simulate")) or not names.evaluation.complete:
+            from nsf.pipeline.plan import Plan
+
+            names = Plan(config)
+            names.check_devices()
+        found.append(names)
+    return found
+
+
+def runs_of(names: Names, stage: str) -> list[Run]:
+    """The runs of a stage, each once; none of `teach` where no operators are taught."""
+    if stage == "simulate":
+        return list(dict.fromkeys(names.simulation(*needed) for needed in names.needed()))
+    return [getattr(names, _RUNS[stage])] if stage in names.stages else []
+
+
+def stages_table(found: Sequence[Names]) -> Table:
+    """State, expected time and room of every stage of some jobs, whose common runs count once."""
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    if len(found) > 1:
+        table.caption = f"{len(found)} jobs; runs that they share are made once"
+    for heading, side in (
+        ("stage", "left"), ("state", "left"), ("run", "left"), ("time", "right"), ("disk", "right"),
+        ("as in", "left"),
+    ):  # fmt: skip
+        table.add_column(heading, justify=side, no_wrap=heading == "run")
+    seconds, size = 0.0, 0.0
+    for stage in STAGES:
+        own = {run: names for names in found for run in runs_of(names, stage)}
+        if not own:
+            continue
+        told = expected(stage, own)
+        if told.made < told.runs:
+            seconds, size = seconds + told.seconds, size + told.size
+        only = next(iter(own)).hash if len(own) == 1 else ""
+        cost = ["", "", ""]
+        if told.made < told.runs:
+            like = f"{told.known} {told.like}" if told.known else "nothing like it was made here"
+            cost = [_time(told.seconds), _size(told.size), like]
+        table.add_row(stage, told.state, only, *map(escape, cost))
+    if seconds:
+        table.add_row("in all", "", "", _time(seconds), _size(size), "")
+    return table
+
+
+def expected(stage: str, runs: dict[Run, Names]) -> Expected:
+    """What the runs of a stage will take, by those of its kind that are there, at best of the same scene."""
+    missing = {run: names for run, names in runs.items() if not run.complete}
+    told = Expected(len(runs), len(runs) - len(missing))
+    if not missing:
+        return told
+    there = [run for run in Run.find(stage, root=next(iter(runs)).root) if run.complete]
+    seconds, size = 0.0, 0.0
+    for run, names in missing.items():
+        alike = [r for r in there if r.manifest.get("device") == names.device and _kind(r) == _kind(run)]
+        near = [r for r in alike if r.scene == run.scene] or alike
+        told.known = len(near)
+        of = run.scene if near and near[0].scene == run.scene else "other scenes"
+        told.like = f"run{'s' * (len(near) > 1)} of {of}"
+        if stage == "simulate":
+            stored = trajectory_bytes(names)
+            rates = [r.manifest["seconds"] / _bytes(r) for r in near if _bytes(r)]
+            seconds += statistics.median(rates) * stored if rates else math.nan
+            size += stored
+        else:
+            seconds += statistics.median(r.manifest["seconds"] for r in near) if near else math.nan
+            size += statistics.median(map(_bytes, near)) if near else math.nan
+    told.seconds, told.size = seconds, size
+    return told
+
+
+def scene_table(names: Names) -> Table:
+    """Particles, grid, resolution and step of a scene, and its cases."""
+    from nsf.mpm.stability import largest_stable_dt
+    from nsf.scenes import Scene
+    from nsf.scenes.resolution import thinnest
+
+    scene = names.scene if isinstance(names.scene, Scene) else Scene.from_config(names.config)
+    case = names.split.cases[0]
+    at = scene.with_parameters(case)
+    stable = min(
+        largest_stable_dt(one.particles(), one.initial_velocity(), one.dx)
+        for one in map(scene.with_parameters, names.split.cases)
+    )
+    table = Table(box=None, show_header=False, pad_edge=False)
+    table.add_column(style="bold")
+    table.add_column(overflow="fold")
+    rows = {
+        "scene": f"{scene.name}, {scene.scale} scale",
+        "particles": f"{scene.particle_count:,}",
+        "grid": f"{' × '.join(map(str, scene.grid.nodes))} nodes, Δx = {scene.dx:.4g} m",
+        "steps": f"{scene.steps:,} of Δt = {scene.dt:.4g} s; up to {stable:.3g} s is stable",
+    }
+    for name, thickness in thinnest(at).items():
+        cells = thickness / scene.dx
+        rows[f"thinnest of {name}"] = "2 cells or more" if math.isinf(cells) else f"{cells:.2g} cells"
+    for part in ("train", "validation", "test"):
+        cases = getattr(names.split, part)
+        rows[part] = f"{len(cases)}: " + "; ".join(case.text for case in cases) if cases else "none"
+    rows["deployed"] = f"on {names.device}, engine {names.engine}, r {names.config.latent_dim}"
+    for key, told in rows.items():
+        table.add_row(key, escape(told))
+    return table
+
+
+def scenes(found: Sequence[Names]) -> list[Names]:
+    """One job for each scene and size."""
+    return list({(n.scene.name, n.scene.particle_count, n.scene.dt): n for n in reversed(found)}.values())[
+        ::-1
+    ]
+
+
+def composed(names: Names) -> str:
+    """The whole configuration, every reference in it resolved, as yaml."""
+    return OmegaConf.to_yaml(names.config, resolve=True)
+
+
+def trajectory_bytes(names: Names) -> float:
+    """Of one trajectory on disk."""
+    from nsf.mpm import FP32, FP64
+    from nsf.mpm.recording import frame_bytes
+
+    stored = FP32 if names.config.data.dtype == "float32" else FP64
+    return (names.scene.steps + 1) * frame_bytes(names.scene.particle_count, stored)
+
+
+def _kind(run: Run) -> str:
+    """What runs of a stage have in common whose times can be compared."""
+    value = run.config.get(_ALIKE.get(run.stage, ""))
+    return str(value.get("_target_") if isinstance(value, dict) else value)
+
+
+def _bytes(run: Run) -> int:
+    return sum(output["bytes"] for output in run.manifest.get("outputs", ()))
+
+
+def _time(seconds: float) -> str:
+    if math.isnan(seconds):
+        return "unknown"
+    if seconds >= 5400:
+        return f"{seconds / 3600:.1f} h"
+    return f"{seconds / 60:.1f} min" if seconds >= 90 else f"{seconds:.0f} s"
+
+
+def _size(size: float) -> str:
+    return "unknown" if math.isnan(size) else bytes_text(size)

@@ -1,0 +1,152 @@
+"""`nsf plan`: what a run would do, said before any work; and what a run says while it works."""
+
+import re
+
+import pytest
+from omegaconf import OmegaConf
+
+from nsf import progress
+from nsf.cli import main
+from nsf.pipeline import preview
+from nsf.pipeline.outcome import outcome_table
+from nsf.progress import Progress, label, labelled
+
+
+@pytest.fixture
+def nsf(chain, tiny, tmp_path, monkeypatch, capsys):
+    """(*words) → exit code and outputs, on the runs of the tiny chain."""
+    monkeypatch.setenv("NSF_RUNS", str(chain.root))
+    monkeypatch.setenv("NSF_REPORTS", str(tmp_path / "reports"))
+
+    def call(command, *words):
+        keys = {word.split("=")[0] for word in words}
+        base = [word for word in tiny if word.split("=")[0] not in keys]
+        with pytest.raises(SystemExit) as end:
+            main([command, *base, *words])
+        return (end.value.code or 0, *capsys.readouterr())
+
+    return call
+
+
+def states(out):
+    """State by stage."""
+    found = re.findall(r"^(simulate|train|teach|deploy|evaluate) +(.+?)(?:  |$)", out, re.M)
+    return {stage: state.strip() for stage, state in found}
+
+
+def test_a_chain_that_is_there(nsf, chain):
+    code, out, _ = nsf("plan")
+    assert code == 0
+    assert states(out) == {
+        "simulate": "all 4 there",
+        "train": "there",
+        "deploy": "there",
+        "evaluate": "there",
+    }
+    assert "in all" not in out
+    assert re.search(r"particles +500\b", out)
+    assert re.search(r"Δt = 0.005 s; up to 0.00\d+ s is stable", out)
+    assert "21" not in out.split("test")[0].split("train")[1]
+    assert chain.pipeline.training.hash in out
+
+
+def test_what_is_to_be_made_is_expected_to_take_what_the_like_of_it_took(nsf, chain):
+    before = {path for path in chain.root.rglob("*")}
+    code, out, _ = nsf("plan", "latent_dim=3")
+    assert code == 0
+    assert states(out) == {
+        "simulate": "all 4 there",
+        "train": "to be made",
+        "deploy": "to be made",
+        "evaluate": "to be made",
+    }
+    assert "run of sand" in out
+    assert re.search(r"^in all +\d+ s", out, re.M)
+    assert {path for path in chain.root.rglob("*")} == before
+
+
+def test_trajectories_take_what_their_bytes_say(chain, tiny):
+    words = [word for word in tiny if not word.startswith("scene.design.train")]
+    (names,) = preview.plans([(*words, "scene.design.train=[21,25,35]")])
+    names.root = chain.root
+    told = preview.expected("simulate", {run: names for run in preview.runs_of(names, "simulate")})
+    of_one = chain.trajectory(26.0).stat().st_size
+    assert (told.runs, told.made) == (4, 1)
+    assert told.size == pytest.approx(3 * of_one, rel=0.2)
+    assert told.seconds > 0
+
+
+def test_a_stage_like_none_before_is_unknown(nsf, tmp_path, monkeypatch):
+    monkeypatch.setenv("NSF_RUNS", str(tmp_path / "none"))
+    _, out, _ = nsf("run", "--dry-run")
+    assert states(out)["simulate"] == "4 of 4 to be made"
+    assert "unknown" in out
+    assert "nothing like it was made here" in out
+    assert not (tmp_path / "none").exists()
+
+
+def test_several_jobs_share_their_runs(nsf):
+    _, out, _ = nsf("plan", "-m", "latent_dim=3,4")
+    assert states(out)["simulate"] == "all 4 there"
+    assert states(out)["train"] == "1 of 2 to be made"
+    assert "2 jobs" in out
+
+
+def test_the_configuration_is_composed(nsf):
+    code, out, _ = nsf("plan", "--cfg", "latent_dim=3")
+    assert code == 0
+    told = OmegaConf.create(out)
+    assert told.latent_dim == 3
+    assert told.scene.dx == 0.02
+    assert "${" not in out
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [(["latent_dim=0"], "latent_dim=0"), (["scene.dt=0.5"], "unstable"), (["--fast"], "not key=value")],
+)
+def test_what_a_run_refuses_a_plan_refuses(nsf, words, told):
+    code, _, err = nsf("plan", *words)
+    assert code == 2
+    assert told in err
+
+
+def test_no_scene_is_told_which_there_are(capsys):
+    for command in ("run", "train", "plan"):
+        with pytest.raises(SystemExit) as end:
+            main([command])
+        assert end.value.code == 2
+        assert "choose one of block, bread, cake" in capsys.readouterr().err
+
+
+def test_a_log_gets_a_line_now_and_then(monkeypatch, capsys):
+    clock = iter([0.0, 4.0, 10.0, 14.0, 20.5])
+    monkeypatch.setattr(progress.time, "monotonic", lambda: next(clock))
+    with labelled("latent_dim=4"), Progress("simulate", 100, "frames") as bar:
+        bar.describe("φ = 30°")
+        for _ in range(4):
+            bar.advance(10)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == [
+        "[latent_dim=4] simulate: φ = 30°, 20 of 100 frames, 2.0/s, 40 s left",
+        "[latent_dim=4] simulate: φ = 30°, 40 of 100 frames, 2.0/s, 31 s left",
+    ]
+    assert label() == ""
+
+
+def test_who_shows_nothing_logs_nothing(monkeypatch, capsys):
+    monkeypatch.setattr(progress, "EVERY", 0.0)
+    with Progress("train", 10, "steps", shown=False) as bar:
+        bar.advance()
+    assert capsys.readouterr().err == ""
+
+
+def test_a_sweep_ends_with_a_table_over_what_it_varied(chain, tiny, monkeypatch):
+    monkeypatch.setenv("NSF_RUNS", str(chain.root))
+    words = [word for word in tiny if not word.startswith("latent_dim")]
+    table = outcome_table([[*words, "latent_dim=4,3"]], {"latent_dim=3": "lost"})
+    columns = {column.header: list(column.cells) for column in table.columns}
+    assert columns["latent_dim"] == ["4", "3"]
+    assert columns["run"] == [chain.pipeline.evaluation.hash, "failed"]
+    assert float(columns[r"δ \[%]" if r"δ \[%]" in columns else "δ [%]"][0]) > 0
+    assert outcome_table([list(tiny)], {}) is None
