@@ -1,4 +1,4 @@
-"""Parts of the site without a second copy in the repository: pictures of the committed reports, live models."""
+"""Parts of the site without a second copy in the repository: pictures of the reports, live models."""
 
 import re
 from pathlib import Path

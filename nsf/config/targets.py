@@ -208,8 +208,9 @@ def _named(target: str, path: tuple[str, ...]) -> Any:
     if target in kind.functions:
         return found
     module, _, name = kind.base.rpartition(".")
-    if not (inspect.isclass(found) and _is_a(found, getattr(importlib.import_module(module), name))):
-        raise ConfigError(f"{where}: _target_: {target} is refused; {_wanted(kind)}")
+    base = getattr(importlib.import_module(module), name)
+    if not (inspect.isclass(found) and _is_a(found, base)):
+        raise ConfigError(f"{where}: _target_: {target} is refused; {_wanted(kind)}{_lacking(found, base)}")
     if inspect.isabstract(found):
         raise ConfigError(f"{where}: _target_: {target} is abstract; name a class derived from it")
     return found
@@ -218,8 +219,21 @@ def _named(target: str, path: tuple[str, ...]) -> Any:
 def _is_a(found: type, base: type) -> bool:
     if not getattr(base, "_is_protocol", False):
         return issubclass(found, base)
+    return found.__module__.startswith("nsf.") and members(base) <= _members(found)
+
+
+def _lacking(found: Any, protocol: type) -> str:
+    """What a class of one's own lacks of a protocol, as the end of a sentence."""
+    if not (inspect.isclass(found) and getattr(protocol, "_is_protocol", False)):
+        return ""
+    if missing := sorted(members(protocol) - _members(found)):
+        return f", which has {', '.join(missing)} as well"
+    return ""
+
+
+def _members(found: type) -> set[str]:
     own = {field.name for field in dataclasses.fields(found)} if dataclasses.is_dataclass(found) else set()
-    return found.__module__.startswith("nsf.") and members(base) <= own | set(dir(found))
+    return own | set(dir(found))
 
 
 def members(protocol: type) -> set[str]:

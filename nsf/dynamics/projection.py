@@ -1,6 +1,5 @@
 """Network inversion: the latent vector of given sample positions (paper section 5.3)."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
@@ -47,13 +46,20 @@ class Projector(Protocol):
     """What a reduced run asks of a projector, which may be one's own.
 
     Attributes:
-        start, solve, iterations, tolerance: as of `GaussNewton`.
+        iterations: k, the most that `solve` takes; its residuals are k + 1, its updates k.
+        tolerance: [1] on ‖Δx̂‖², below which an iteration counts as the last.
     """
 
-    start: Callable[[Latents], torch.Tensor]
-    solve: Callable[..., ProjectionResult]
     iterations: int
     tolerance: float
+
+    def start(self, record: Latents) -> torch.Tensor:
+        """[r] x̂ that the iteration starts from; see `GaussNewton.start`."""
+
+    def solve(
+        self, at, target: torch.Tensor, xhat: torch.Tensor, weights: torch.Tensor | None = None
+    ) -> ProjectionResult:
+        """The x̂ whose g(X_S, x̂) is nearest to the target [s, 3] [m]; see `GaussNewton.solve`."""
 
 
 def check_projector(projector) -> None:
@@ -62,7 +68,7 @@ def check_projector(projector) -> None:
     Raises:
         ConfigError: it lacks one of `start`, `solve`, `iterations` and `tolerance` of `GaussNewton`.
     """
-    missing = [n for n in Projector.__annotations__ if not hasattr(projector, n)]
+    missing = [n for n in ("start", "solve", "iterations", "tolerance") if not hasattr(projector, n)]
     if missing:
         raise ConfigError(
             f"{type(projector).__name__} is no projector: it lacks {', '.join(missing)}; "

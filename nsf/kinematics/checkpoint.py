@@ -217,3 +217,18 @@ def _leaves(node: Any) -> Iterator[Any]:
 
 def _type(tensor: Tensor) -> str:
     return str(tensor.dtype).removeprefix("torch.")
+
+
+def check_filled(manifold: nn.Module) -> None:
+    """Refuse a manifold of which a tensor is in no file, such as a plain attribute of a module.
+
+    Raises:
+        SchemaError: names the attribute.
+    """
+    for module in manifold.modules():
+        for name, value in vars(module).items():
+            if isinstance(value, Tensor) and value.is_meta:
+                raise SchemaError(
+                    f"has no tensor {name!r} of {type(module).__name__}, which is a plain attribute; "
+                    f"call register_buffer({name!r}, …) in its class, so that it is stored and moved"
+                )

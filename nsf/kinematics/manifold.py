@@ -257,6 +257,7 @@ class Manifold(nn.Module, ABC):
             with torch.device("meta"), checkpoint.registering(8 * len(content["state"]) + 64):
                 manifold = kind(*(content[key] for key in about))
             checkpoint.fill(manifold, content["state"])
+            checkpoint.check_filled(manifold)
         except SchemaError as error:
             remedy = "" if ";" in str(error) else "; train again with `nsf train`"
             raise SchemaError(f"{path} {error}{remedy}") from error

@@ -11,7 +11,17 @@ from nsf.reporting.rivals import beside_rivals, side_by_side
 from nsf.reporting.sources import Source, Study, file_hash, open_sources
 from nsf.reporting.study import FineSource, fine_section, fine_table, over_seeds, swept, trust_table
 from nsf.reporting.swap import MARK, replaced
-from nsf.reporting.tables import PAPER, VARIANT, Merged, means, merge, rows_of, variants, without_constants
+from nsf.reporting.tables import (
+    PAPER,
+    VARIANT,
+    Merged,
+    means,
+    merge,
+    rows_of,
+    told_apart,
+    variants,
+    without_constants,
+)
 from nsf.reporting.text.columns import ABSENT, COSTS, RIVALS, axis, parameter_text
 from nsf.reporting.text.formats import Rows, latex_table, spreadsheet
 from nsf.reporting.text.page import Page, Table, html_page, markdown_page
@@ -56,7 +66,8 @@ def build_report(evaluate_runs, folder, title: str, first=None, study: Study | N
         StorageError: the disk refused a file.
     """
     evaluate_runs = list(evaluate_runs)
-    merged = merge(open_sources(evaluate_runs, first), study.settings if study else None)
+    sources = open_sources(evaluate_runs, first)
+    merged = merge(sources, study.settings if study else told_apart(sources))
     with replaced(Path(folder)) as fresh:
         merged.csv.map(spreadsheet).to_csv(fresh / "results.csv", index=False)
         fine = _fine(merged, study)

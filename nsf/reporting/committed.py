@@ -36,7 +36,7 @@ CHAPTERS = {
         "ablation", "field", "width", "latent_dim", "sample_size", "sampler", "timestep", "seeds",
     ),
     "Beyond what was trained": ("extrapolation", "weak_elements", "super_resolution", "path_dependent"),
-    "At small scale, on a CPU": ("small", "levels"),
+    "At small scale, on a CPU": ("small", "levels", "quickstart"),
     "One scene in detail, and speed": ("sand", "speed"),
 }  # fmt: skip
 _OTHERS = "Further reports"

@@ -26,6 +26,8 @@ from nsf.reporting.text.columns import (
     split_rank,
 )
 from nsf.reporting.text.formats import Rows, terminal_table
+from nsf.runs.columns import CASE, TITLES, cell, differing
+from nsf.runs.listing import Entry
 
 VARIANT = ("scene", "method", "field", "r", "engine", "sample", SETTING, "precision", "device")
 """The visible key of a variant; `device` counts by its type."""
@@ -51,6 +53,15 @@ _PAGE_ONLY = [
     "decode_ms", "speedup_total", "memory_full_mib", "memory_reduced_mib", "teach_seconds", "break_even_runs",
     "handed_over", "estimated_error", "true_error",
 ]  # fmt: skip
+
+
+#: Keys that columns of results.csv tell.
+_TOLD = {CASE, "latent_dim", "sampler.size", "method", "field", "engine", "scale", "precision", "device"}
+#: Keys of how a run was evaluated, and of the code: of two runs that differ in these alone the newer counts.
+_PASSING = ("evaluation.", "coarse", "code.", "law.", "edited")
+#: Groups of which the option says it all where it differs.
+_GROUPS = ("field", "trainer", "sampler", "projector", "integration")
+_MOST = 3  # keys in a setting
 
 
 @dataclass(frozen=True)
@@ -264,3 +275,31 @@ def _natural(value) -> tuple[int, float, str]:
         return (0, float(value), "")
     except ValueError:
         return (1, 0.0, re.sub(r"\d+(\.\d+)?", lambda found: f"{float(found[0]):024.9f}", str(value)))
+
+
+def told_apart(sources: Sequence[Source]) -> dict[str, str]:
+    """By run id, `key=value` of what tells a run from others that are alike in every column.
+
+    Args:
+        sources: runs of one report.
+    """
+    alike: dict[tuple, list[Source]] = {}
+    for source in sources:
+        alike.setdefault(variant_key(source.results.iloc[0].to_dict() | {SETTING: ""}), []).append(source)
+    found: dict[str, str] = {}
+    for own in alike.values():
+        known: dict = {}
+        entries = [Entry(source.run, known) for source in own]
+        differ = differing(entries)
+        keys = [key for key in (*differ.keys, *differ.more) if key not in _TOLD]
+        keys = [key for key in keys if not key.startswith(_PASSING)]
+        chosen = [group for group in _GROUPS if group in keys]
+        keys = [key for key in keys if key in chosen or key.partition(".")[0] not in chosen][:_MOST]
+        for entry in entries if keys else ():
+            told = [f"{key}={cell(entry, key)}" for key in sorted(keys, key=_rank)]
+            found[entry.run.id] = ", ".join(told)
+    return found
+
+
+def _rank(key: str) -> int:
+    return list(TITLES).index(key) if key in TITLES else len(TITLES)

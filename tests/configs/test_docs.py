@@ -29,7 +29,7 @@ def project(tmp_path, monkeypatch):
     monkeypatch.setenv("NSF_RUNS", str(tmp_path / "runs"))
     monkeypatch.setenv("NSF_REPORTS", str(tmp_path / "reports"))
     before = set(sys.modules)
-    for package in ("nsf.mpm.materials", "nsf.kinematics.fields"):
+    for package in ("nsf.mpm.materials", "nsf.kinematics.fields", "nsf.dynamics", "nsf.sampling"):
         folder = tmp_path / package.replace(".", "/")
         folder.mkdir(parents=True)
         path = importlib.import_module(package).__path__
@@ -57,7 +57,7 @@ def add(file: str, content: str, project: Path) -> None:
     elif group == "conf/material":
         config.build(config.load([f"material={name}"], "point").material, "material")
     else:
-        assert group in ("conf/scene", "conf/field"), file
+        assert group in ("conf/scene", "conf/field", "conf/projector", "conf/sampler"), file
         option = f"{group.removeprefix('conf/')}={name}"
         Pipeline(config.load([option, "scale=small", "device=cpu"]))
 

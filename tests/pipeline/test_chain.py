@@ -239,7 +239,7 @@ def test_an_edited_step_is_deployed_anew_and_runs(copied, pipeline_at, monkeypat
     monkeypatch.setattr(GaussNewton, "solve", damped)
     pipeline, said = said_by(pipeline_at, root, stages=("deploy",))
     assert pipeline.deployment != before
-    assert "deploy: engine reference, since modal mirrors another text" in said[-2]
+    assert "deploy: engine reference, since nsf.dynamics." in said[-2]
     assert "nsf.dynamics.projection.GaussNewton.solve" in said[-2]
     one, other = (Rollout.open(run.path / "rollout_0.h5").xhat for run in (before, pipeline.deployment))
     assert np.abs(one - other).max() > 1e-3

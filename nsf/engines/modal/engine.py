@@ -51,7 +51,7 @@ class Modal(Engine):
             return "a block of the GPU does not hold the networks of the field"
         if changed := [name.replace(":", ".") for name in edits()]:
             more = f" and {len(changed) - _NAMED} more" if len(changed) > _NAMED else ""
-            return f"modal mirrors another text of {', '.join(changed[:_NAMED])}{more}"
+            return f"{', '.join(changed[:_NAMED])}{more} was edited, and modal copies the step as it was"
         return ""
 
     @override

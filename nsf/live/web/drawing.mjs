@@ -165,7 +165,7 @@ export class Drawing {
    * @throws {Error} in words for a reader, where there is no WebGL 2
    */
   constructor(canvas, camera, told) {
-    const gl = canvas.getContext("webgl2", { antialias: true });
+    const gl = canvas.getContext("webgl2", { antialias: false }); // the points' edges, which are discarded, gain nothing
     if (!gl) throw new Error(NO_WEBGL);
     this.gl = gl;
     this.canvas = canvas;
@@ -174,6 +174,7 @@ export class Drawing {
     this.radius = told.radius;
     this.cut = false;
     this.time = 0;
+    this.shadows = true;
     this.fine = 1; // share of the screen's pixels along a side
     /** @type {Solid[]} */ this.solids = [];
     /** @type {Body[]} */ this.bodies = [];
@@ -215,11 +216,10 @@ export class Drawing {
     if (this.solids.length) this._solids(matrix);
   }
 
-  /** Draw fewer pixels from now on, where a browser draws too slowly; true where it helped. */
+  /** Draw less from now on, where a browser draws too slowly: first no shadows, then fewer pixels. */
   coarsen() {
-    if (this.fine < 0.4) return false;
-    this.fine *= 0.7;
-    return true;
+    if (!this.shadows && this.fine > 0.4) this.fine *= 0.7;
+    this.shadows = false;
   }
 
   /** @param {Float32Array} matrix @param {number[]} near @param {number[]} far */
@@ -248,7 +248,7 @@ export class Drawing {
     gl.uniform1f(points.uniform("floorHeight"), this.floor ?? 0);
     gl.uniform3fv(points.uniform("dark"), dark);
     gl.uniform1i(points.uniform("cut"), Number(this.cut));
-    for (const shadow of this.floor === null ? [0] : [1, 0]) {
+    for (const shadow of this.floor === null || !this.shadows ? [0] : [1, 0]) {
       gl.uniform1i(points.uniform("shadow"), shadow);
       gl.depthMask(!shadow);
       for (const body of this.bodies) {

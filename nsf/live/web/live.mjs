@@ -154,7 +154,8 @@ export class Live {
     let tube = 0;
     for (let k = 0; k <= n; k++) tube = Math.max(tube, this.tube[k] ?? 0);
     const diverged = run.diverged && n === run.steps ? n * run.dt : null;
-    return this.trust.light(this.parameters, tube, n ? this.gravity[n - 1] : 0, diverged);
+    const estimate = this.held ? this.case.estimate : null;
+    return this.trust.light(this.parameters, tube, n ? this.gravity[n - 1] : 0, diverged, estimate);
   }
 
   /** The latent trajectory, as a table. */
@@ -311,7 +312,8 @@ async function show() {
       ? ` Estimated distance from the projected run, at most ${(1000 * live.case.estimate).toPrecision(2)} mm.` : "";
     const shown = live.recordings.size && find("truth").checked && !(live.held && live.case.recording)
       ? " No full-order run of this was stored." : "";
-    note.textContent = `Steps of ${told.dt} s by operators.${estimate}${shown}`;
+    const sides = live.recordings.size && find("truth").checked && !shown ? " Left: the reduced run; right: the full-order one." : "";
+    note.textContent = `Steps of ${told.dt} s by operators.${estimate}${shown}${sides}`;
     document.body.dataset.step = String(live.step);
   };
   let last = performance.now(), beyond = 0, slow = 0;
@@ -352,7 +354,7 @@ async function show() {
   keyed({ " ": () => set(!state.playing), ArrowRight: () => seek(live.step + 1), ArrowLeft: () => seek(live.step - 1), r: reset });
   paint(state.color);
   requestAnimationFrame(next);
-  Object.assign(window, { nsf: { live, state, camera } });
+  Object.assign(window, { nsf: { live, state, camera, drawing } });
   document.body.dataset.ready = "true";
 }
 

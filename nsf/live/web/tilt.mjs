@@ -107,7 +107,11 @@ export class Tilt {
 
   async _device() {
     const kind = /** @type {any} */ (DeviceOrientationEvent);
-    if (kind.requestPermission && (await kind.requestPermission()) !== "granted") return;
+    const answer = await kind.requestPermission?.().catch(() => "denied");
+    if (answer && answer !== "granted") {
+      this.own.textContent = "This device keeps its tilt to itself";
+      return;
+    }
     /** @type {number[] | null} */
     let first = null;
     addEventListener("deviceorientation", ({ beta, gamma }) => {

@@ -88,9 +88,10 @@ export class Trust {
    * @param {number} tube largest `ofLatent` so far
    * @param {number} gravity largest `ofGravity` so far
    * @param {number | null} diverged time at which the run ceased to be finite [s]
+   * @param {number | null} estimate how far the run is from the projected one, as a deployment estimated it [m]
    * @returns {Light}
    */
-  light(parameters, tube, gravity, diverged = null) {
+  light(parameters, tube, gravity, diverged = null, estimate = null) {
     const away = this.ofCase(parameters), ratio = Math.max(tube, away > 1 ? away : 0, gravity > 1 ? gravity : 0);
     if (diverged !== null) return { level: "bad", text: `diverged at t = ${quantity(diverged, "s")}`, ratio: Infinity };
     const outside = this.parameters.findIndex(({ trained: [low, high] }, i) => {
@@ -112,6 +113,11 @@ export class Trust {
       return { level: "bad", text: `distrusted: the shape left the training runs, ratio ${tube.toFixed(2)}, above 1`, ratio };
     if (away > 1)
       return { level: "away", text: `away from the training cases, ratio ${away.toPrecision(3)}, above 1`, ratio };
+    if (estimate !== null && estimate > this.told.distance) {
+      const [most, scale] = [estimate, this.told.distance].map((value) => quantity(1000 * value, "mm", 2));
+      const text = `operators may be ${most} from the projected run; training runs are ${scale} from each other`;
+      return { level: "away", text, ratio };
+    }
     return { level: "good", text: `distrust ratio ${ratio.toFixed(2)}, below 1`, ratio };
   }
 }

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from nsf.errors import MissingRunError, SchemaError
+from nsf.kinematics import checkpoint
 from nsf.kinematics.manifold import Manifold
 from nsf.runs import Run
 
@@ -297,3 +298,13 @@ def test_pickle_bomb(tmp_path, save):
 def test_missing(tmp_path):
     with pytest.raises(MissingRunError, match="nsf train"):
         Manifold.load(tmp_path / "none.pt")
+
+
+def test_a_tensor_that_is_a_plain_attribute_is_named():
+    module = torch.nn.Module()
+    with torch.device("meta"):
+        module.own = torch.zeros(3)
+    with pytest.raises(SchemaError, match=r"no tensor 'own' of Module.*register_buffer"):
+        checkpoint.check_filled(module)
+    module.own = torch.zeros(3)
+    checkpoint.check_filled(module)

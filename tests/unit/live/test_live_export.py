@@ -135,7 +135,9 @@ def test_a_model_is_there_at_once(capsys, tmp_path, monkeypatch):
         path = demo.show(model, tmp_path)
         assert demo.MODELS[model] in path.read_text()
     assert asked == [(tmp_path / f"{model}.html").as_uri() for model in demo.MODELS]
-    with pytest.raises(ConfigError, match="model=cake is none that is shipped; choose one of block, sand"):
+    with pytest.raises(
+        ConfigError, match="model=cake is none that is shipped; choose one of block, sand, metal"
+    ):
         demo.show("cake", tmp_path)
     with pytest.raises(ConfigError, match="open=no must be true or false"):
         demo.show(None, tmp_path, "no")
@@ -343,10 +345,15 @@ def test_on_a_phone_in_the_dark(opened, page):
 
 def test_a_phone_may_tilt_it(opened, tilting_page):
     tab = opened(tilting_page, 390, 800, has_touch=True, is_mobile=True)
+    tab.evaluate("() => { DeviceOrientationEvent.requestPermission = async () => 'denied'; }")
     tab.get_by_role("button", name="Use this device's tilt").click()
+    tab.get_by_role("button", name="This device keeps its tilt to itself").wait_for()
+    tab.evaluate("() => { DeviceOrientationEvent.requestPermission = async () => 'granted'; }")
+    tab.click("#device")
     turn = "(gamma) => dispatchEvent(new DeviceOrientationEvent('deviceorientation', {beta: 40, gamma}))"
-    tab.evaluate(turn, 0)
-    tab.evaluate(turn, 20)
+    for gamma in (0, 20):
+        tab.evaluate(turn, gamma)
+        wait_until(lambda: tab.evaluate("nsf.live.run.hand !== null"))
     right = np.array(tab.evaluate("nsf.camera.axes.right"))
     hand = np.array(tab.evaluate("nsf.live.run.hand"))
     assert hand @ right == pytest.approx(9.81 * np.sin(np.radians(20)), rel=1e-3)

@@ -128,8 +128,8 @@ def test_in_a_browser(browser, served):
     number = window.get_by_role("textbox").first
     number.fill("46")
     number.press("Enter")
-    wait_until(lambda: player.tick().run.value == 46.0)
-    window.get_by_text("beyond the training values").wait_for()
+    wait_until(lambda: player.tick().run.case == angle(46.0))
+    window.get_by_text(re.compile("away from the training cases|distrusted")).wait_for()
     window.get_by_text("no full-order run of this case").wait_for()
     wait_until(lambda: window.screenshot(clip=SCENE) != before)
 
@@ -145,7 +145,7 @@ def test_two_browsers_share_what_is_shown(browser, served):
     number.fill("30")
     number.press("Enter")
     for window, shown in zip((one, other), before, strict=True):
-        window.get_by_text("friction angle = 30°, t = 0.12 s").wait_for()
+        window.get_by_text("friction angle=30°, t = 0.12 s").wait_for()
         wait_until(lambda window=window, shown=shown: window.screenshot(clip=SCENE) != shown)
     one.close()
     drawn = page.drawn

@@ -211,6 +211,8 @@ test("the light names its reason", () => {
   assert.equal(why([30], 0, 2), "distrusted: gravity was 1 m/s² from that which was taught, 0.5 m/s² at most");
   assert.equal(why([30], 1.5, 0), "distrusted: the shape left the training runs, ratio 1.50, above 1");
   assert.equal(why([30], 0, 0, 0.2), "diverged at t = 0.2 s");
+  assert.equal(own.light([30], 0.25, 0, null, 1.9).level, "good");
+  assert.equal(why([30], 0.25, 0, null, 2.5), "operators may be 2500 mm from the projected run; training runs are 2000 mm from each other");
   assert.equal(lightOf(0.2, 2, false).level, "away");
   assert.equal(lightOf(1.2, 2, false).level, "bad");
 });

@@ -1,0 +1,109 @@
+"""The one script of the pages, their policy, and what they hold."""
+
+import base64
+import hashlib
+import re
+import shutil
+import subprocess
+from html import unescape
+from pathlib import Path
+
+import numpy as np
+import pytest
+from packing import unpacked
+
+from nsf.export import web
+from nsf.mpm import Cuboid, HalfSpace, Motion, Sphere
+
+ENTRIES = ("live", "recorded", "stream")
+MODULES = Path(web.__file__).parents[1] / "live/web"
+
+
+@pytest.mark.parametrize("entry", ENTRIES)
+def test_a_page_has_each_module_once_after_those_that_it_imports(entry, tmp_path):
+    text = web.script(entry)
+    assert not re.search(r"^(import|export)\b", text, re.MULTILINE)
+    for module in MODULES.glob("*.mjs"):
+        for name in re.findall(r"^export class (\w+)", module.read_text(), re.MULTILINE):
+            assert text.count(f"class {name} ") <= 1
+    assert text.count("class Camera ") == text.count("class Drawing ") == 1
+    assert text.index("class Camera ") < text.index("new Camera(")
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("node is not installed; apt install nodejs")
+    (tmp_path / "page.mjs").write_text(text)
+    done = subprocess.run([node, "--check", tmp_path / "page.mjs"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.fixture
+def modules(monkeypatch):
+    """(**texts) → the modules there are."""
+
+    def give(**texts):
+        web.script.cache_clear()
+        monkeypatch.setattr(web, "_text", lambda *path: texts[path[-1].removesuffix(".mjs")])
+
+    yield give
+    web.script.cache_clear()
+
+
+def test_modules_that_do_not_fit_are_refused(modules):
+    modules(a='import { one } from "./b.mjs";\none();\n', b="export function one() {}\n")
+    assert web.script("a").split("\n") == ["", "function one() {}", "", "one();", ""]
+    modules(a='import { two } from "./b.mjs";\n', b="export function one() {}\n")
+    with pytest.raises(ValueError, match=r"a\.mjs imports two, which b\.mjs lacks"):
+        web.script("a")
+    modules(
+        a='import { one } from "./b.mjs";\nconst two = 2;\n', b="export function one() {}\nlet two = 1;\n"
+    )
+    with pytest.raises(ValueError, match=r"a\.mjs and b\.mjs both have two"):
+        web.script("a")
+    modules(a='import * as all from "./b.mjs";\n', b="")
+    with pytest.raises(ValueError, match="an import or an end of script is left in it"):
+        web.script("a")
+    modules(a='const end = "</script>";\n')
+    with pytest.raises(ValueError, match="an end of script"):
+        web.script("a")
+
+
+@pytest.mark.parametrize("entry", ENTRIES)
+def test_the_policy_is_of_the_script_and_the_style_alone(entry):
+    page = web.page(entry, "title", connects=entry == "stream")
+    policy = unescape(re.search(r'Content-Security-Policy" content="([^"]*)"', page)[1])
+    for kind, pattern in (
+        ("script", r'<script type="module">(.*?)</script>'),
+        ("style", r"<style>(.*?)</style>"),
+    ):
+        (text,) = re.findall(pattern, page, re.DOTALL)
+        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+        assert f"{kind}-src 'sha256-{digest}'" in policy
+    assert ("connect-src" in policy) == (entry == "stream")
+
+
+def test_arrays_are_aligned_and_of_known_kinds():
+    arrays = {"a": np.arange(3, dtype=np.int8), "b": np.array([[0.5, -1.0]]), "c": np.arange(5, dtype=">i2")}
+    header, found = unpacked(web.packed({"title": "é</script>"}, arrays))
+    assert header["title"] == "é</script>"
+    for name, own in arrays.items():
+        np.testing.assert_array_equal(found[name], own)
+    with pytest.raises(ValueError, match="a: i8: arrays must be of f4"):
+        web.packed({}, {"a": np.arange(3)})
+
+
+def test_solids_are_told_as_they_are():
+    wall = web.solid("wall", HalfSpace(point=[0, 0, 1], normal=[0, 0, 2]))
+    assert (wall["shape"], wall["extents"], wall["until"], wall["motion"]) == (
+        "half-space",
+        [0, 0, 1],
+        None,
+        None,
+    )
+    motion = Motion(
+        times=[0, 1], translations=[[0, 0, 0], [0, 0, 1]], angles=[0, 90], axis=[0, 0, 2], pivot=[1, 0, 0]
+    )
+    plate = web.solid("plate", Cuboid(centre=[1, 2, 3], size=[2, 4, 6], motion=motion, until=0.5))
+    assert (plate["shape"], plate["extents"], plate["until"]) == ("cuboid", [1, 2, 3], 0.5)
+    assert plate["motion"]["angles"] == pytest.approx([0, np.pi / 2])
+    assert plate["motion"]["axis"] == [0, 0, 1]
+    assert web.solid("ball", Sphere(centre=[0, 0, 0], radius=2))["extents"][0] == 2
