@@ -108,6 +108,15 @@ def opened(browser, url):
     return window, asked
 
 
+def settled(window) -> bytes:
+    """The scene once it stands still: what the panel says may be there before it is drawn."""
+    last = b""
+    while (found := window.screenshot(clip=SCENE)) != last:
+        last = found
+        window.wait_for_timeout(1000)
+    return found
+
+
 def test_in_a_browser(browser, served):
     page, player = served
     window, asked = opened(browser, page.url)
@@ -119,7 +128,7 @@ def test_in_a_browser(browser, served):
     player.seek(player.steps)
     wait_until(lambda: player.tick().run.finished)
     window.get_by_text("t = 0.12 s").wait_for()
-    before = window.screenshot(clip=SCENE)
+    before = settled(window)
     window.get_by_label("sample particles").check()
     wait_until(lambda: window.screenshot(clip=SCENE) != before)
     window.get_by_label("sample particles").uncheck()
