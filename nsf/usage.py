@@ -16,8 +16,8 @@ TOOLS = {
     "view": ("a deployment in the browser: steer the reduced run, see it beside the full-order one", None),
     "serve": ("a deployment's latent vectors as a stream that many browsers decode", None),
     "demo": (
-        "a model that runs in the browser, to be steered there, with no server and nothing to train",
-        "[model=sand] [folder=PATH] [open=true]; sand or metal; reports/demo by default",
+        "a model that runs in the browser: drag, tilt and steer it, with no server and nothing to train",
+        "[model=block] [folder=PATH] [open=true]; block, sand or metal; reports/demo by default",
     ),
     "export": (
         "a deployed run for other programs: HTML page, the model itself in a page, USD, VTK, ONNX, film",

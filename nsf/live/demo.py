@@ -10,6 +10,7 @@ from nsf.export import web
 
 #: Title of each model that is shipped; the first is shown unless another is asked for.
 MODELS = {
+    "block": "Soft block under gravity that wanders",
     "sand": "Sand column",
     "metal": "Squeezed metal frame",
 }
