@@ -135,7 +135,9 @@ def test_a_model_is_there_at_once(capsys, tmp_path, monkeypatch):
         path = demo.show(model, tmp_path)
         assert demo.MODELS[model] in path.read_text()
     assert asked == [(tmp_path / f"{model}.html").as_uri() for model in demo.MODELS]
-    with pytest.raises(ConfigError, match="model=cake is none that is shipped; choose one of block, sand, metal"):
+    with pytest.raises(
+        ConfigError, match="model=cake is none that is shipped; choose one of block, sand, metal"
+    ):
         demo.show("cake", tmp_path)
     with pytest.raises(ConfigError, match="open=no must be true or false"):
         demo.show(None, tmp_path, "no")
