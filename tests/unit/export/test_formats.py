@@ -243,7 +243,7 @@ def test_a_missing_extra_names_the_remedy(played, tmp_path, monkeypatch, name, m
 
 def test_every_file_is_a_format_or_serves_one():
     files = {path.stem for path in Path(playback.__file__).parent.glob("*.py")}
-    assert files == {*FORMATS, "__init__", "command", "playback"}
+    assert files == {*FORMATS, "__init__", "command", "playback", "web"}
     for name in FORMATS:
         module = import_module(f"nsf.export.{name}")
         assert callable(module.write)
