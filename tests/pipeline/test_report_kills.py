@@ -1,10 +1,13 @@
 """A report killed while it is written: the old one stays, and the next is as an undisturbed one."""
 
+import json
 import signal
 
 import pytest
 from forked import PlainReport, SignalAt, run_nsf
 
+from nsf.reporting.keeping import MADE_OF
+from nsf.reporting.swap import MARK
 from nsf.storage import locked
 
 #: In the middle of the pictures, before the page, and between the two renames of the exchange.
@@ -17,6 +20,12 @@ MOMENTS = {
 
 def files(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def out_of_date(folder):
+    """Let a report be drawn anew, as where its runs have changed."""
+    told = json.loads((folder / MARK).read_text())
+    (folder / MARK).write_text(json.dumps(told | {MADE_OF: "something else", "drawn": {}}))
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +43,7 @@ def test_a_report_that_was_killed(chain, nsf, tmp_path, undisturbed, moment, kin
     name, expected = undisturbed
     reports = tmp_path / "work/reports"
     assert nsf("report", chain.root, faults=[PlainReport()]).code == 0
+    out_of_date(reports / name)
     old = files(reports / name)
     assert old != expected
 
@@ -56,6 +66,7 @@ def test_a_report_that_a_killed_process_had_put_aside_comes_back(chain, nsf, tmp
     name, _ = undisturbed
     reports = tmp_path / "work/reports"
     assert nsf("report", chain.root, faults=[PlainReport()]).code == 0
+    out_of_date(reports / name)
     old = files(reports / name)
     assert nsf("report", chain.root, faults=[SignalAt(*MOMENTS["exchanging"], signal.SIGKILL)]).code < 0
     assert not (reports / name).exists()
@@ -74,5 +85,7 @@ def test_what_a_living_process_writes_is_left_alone(chain, nsf, tmp_path):
         assert (reports / ".mine.new-abc/page").exists()
     assert not (reports / ".dead.new-abc").exists()
     assert (reports / "dead/page").exists()
+    (written,) = (path.parent for path in reports.glob(f"*/{MARK}"))
+    out_of_date(written)
     assert nsf("report", chain.root, faults=[PlainReport()]).code == 0
     assert not (reports / ".mine.new-abc").exists()
