@@ -34,7 +34,7 @@ $(INSTALLED): pyproject.toml
 	@'$(PYTHON)' -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || \
 		{ echo 'Python 3.11 or newer is needed; name one: make install PYTHON=/path/to/python3.11' >&2; exit 1; }
 	'$(PYTHON)' -m venv $(VENV)
-	$(BIN)/python -m pip install $(CPU_TORCH) $(TORCH) -e .
+	$(BIN)/python -m pip install --no-compile $(CPU_TORCH) $(TORCH) -e .
 	@touch $@
 
 develop: $(DEVELOPED)  ## the same, with every extra, and what tests, lint and docs need
