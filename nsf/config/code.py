@@ -45,7 +45,7 @@ def _sum_of(target: str) -> str:
             if imported.parent == home.parent and imported not in found:
                 found.add(imported)
                 left.append(imported)
-    return text_sum("".join(_text(path) for path in sorted(found)))
+    return text_sum("".join(text_of(path) for path in sorted(found)))
 
 
 @cache
@@ -61,8 +61,12 @@ def _home(target: str) -> Path | None:
 @cache
 def _imported(path: Path) -> dict[str, Path]:
     """Files of this package from which a file takes names, by name."""
+    try:
+        tree = ast.parse(text_of(path))
+    except SyntaxError:  # told of where the file is imported
+        return {}
     found = {}
-    for node in ast.walk(ast.parse(_text(path))):
+    for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module and not node.level:
             for alias in node.names:
                 own = _file(f"{node.module}.{alias.name}") or _file(node.module)
@@ -73,12 +77,13 @@ def _imported(path: Path) -> dict[str, Path]:
 
 def _file(module: str) -> Path | None:
     first, *parts = module.split(".")
-    if first != _PACKAGE.name:
+    if first != _PACKAGE.name or not all(map(str.isidentifier, parts)):
         return None
     path = _PACKAGE.joinpath(*parts)
     return next((p for p in (path.with_suffix(".py"), path / "__init__.py") if p.is_file()), None)
 
 
 @cache
-def _text(path: Path) -> str:
-    return path.read_text(encoding="utf-8")
+def text_of(path: Path) -> str:
+    """The text of a file of this package, read once."""
+    return path.read_text(encoding="utf-8", errors="replace")

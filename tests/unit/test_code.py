@@ -27,12 +27,12 @@ def package(tmp_path, monkeypatch):
     def edited(name: str = "", text: str = "") -> dict[str, str]:
         if name:
             (folder / name).write_text(text)
-        for cached in (code._sum_of, code._home, code._imported, code._text):
+        for cached in (code._sum_of, code._home, code._imported, code.text_of):
             cached.cache_clear()
         return code_of({"sampler": {"_target_": "nsf.sampling.Own", "size": 3}, "seed": 0})
 
     yield edited
-    for cached in (code._sum_of, code._home, code._imported, code._text):
+    for cached in (code._sum_of, code._home, code._imported, code.text_of):
         cached.cache_clear()
 
 
@@ -54,6 +54,12 @@ def test_words_and_other_classes_do_not(package, name, text):
     assert package() == package(name, text)
 
 
+def test_a_file_that_is_no_program_still_counts(package):
+    before = package()
+    assert package("sampling/own.py", "class Own(:\n") != before
+
+
 def test_classes_that_are_not_there_are_left_to_those_who_build_them(package):
     assert code_of({"_target_": "nsf.sampling.gone.Gone"}) == {}
+    assert code_of({"_target_": "nsf./etc/passwd.X"}) == {}
     assert code_of({"_target_": "os.system", "more": [{"_target_": 5}]}) == {}

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 
-from nsf.config.code import text_sum
+from nsf.config.code import text_of, text_sum
 
 TABLE = Path(__file__).with_name("mirrors.json")
 #: What the kernels stand for: classes, of which every function counts, and functions.
@@ -83,16 +83,11 @@ def _digests_on_disk() -> dict[str, str]:
     for mirrored in MIRRORED:
         module, _, name = mirrored.partition(":")
         path = Path(__file__).parents[2].joinpath(*module.split(".")[1:]).with_suffix(".py")
-        for inner, node in _defined(ast.parse(_text_of(path)), name):
-            lines = _text_of(path).splitlines(keepends=True)
+        for inner, node in _defined(ast.parse(text_of(path)), name):
+            lines = text_of(path).splitlines(keepends=True)
             first = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
             found[f"{mirrored}.{inner}".rstrip(".")] = text_sum("".join(lines[first - 1 : node.end_lineno]))
     return found
-
-
-@cache
-def _text_of(path: Path) -> str:
-    return path.read_text(encoding="utf-8")
 
 
 def _defined(tree: ast.AST, name: str) -> Iterator[tuple[str, ast.FunctionDef]]:

@@ -18,6 +18,7 @@ from nsf.reporting.tables import (
     means,
     merge,
     rows_of,
+    told_apart,
     variant_labels,
     without_constants,
 )
@@ -320,3 +321,15 @@ def test_a_cost_of_one_row_is_not_said_of_others(sweep):
     assert "8.97 ms" in without_constants(frame.assign(step_ms_full=8.97), also=COSTS)[1]
     without = without_constants(frame.assign(step_ms_full=float("nan")), also=COSTS)
     assert "step_ms_full" not in without[0]
+
+
+def test_runs_that_no_column_tells_apart_are_told_apart_by_their_keys(tmp_path):
+    """Else the newer one would silently take the place of the other."""
+    one, other = (write_run(tmp_path, Made(noise=noise)) for noise in (0.02, 0.001))
+    baseline = write_run(tmp_path, Made(method="deformation_only", noise=0.02))
+    sources = open_sources([one, other, baseline])
+    told = told_apart(sources)
+    assert told == {one.id: "noise=0.02", other.id: "noise=0.001"}
+    merged = merge(sources, told)
+    assert not merged.superseded
+    assert {source.id for source in merged.source} == {one.id, other.id, baseline.id}
