@@ -6,7 +6,8 @@ Labels are single steps of the teacher; the operators' own runs say from where, 
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import torch
@@ -118,7 +119,8 @@ class Course:
             self._begin(generator)
         else:
             self.labels = Labels.joined([self.labels, *self._along_own_runs(number)])
-        self._descend(number, generator)
+        with _one_thread():
+            self._descend(number, generator)
         runs = self.own_runs(self.yardstick.teacher)
         self.errors.append(self.yardstick.error(runs))
 
@@ -339,6 +341,17 @@ class Course:
         self.seconds = kept["seconds"]
         for teacher, steps in zip((*self.teachers, self.yardstick.teacher), kept["steps"], strict=True):
             teacher.steps = steps
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """So small a network gains nothing by more threads, and its bits would depend on how many there are."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def _ball(shape: torch.Size, generator: torch.Generator) -> Tensor:
