@@ -6,13 +6,13 @@ Labels are single steps of the teacher; the operators' own runs say from where, 
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from nsf.engines.operators.descent import Descent
 from nsf.engines.operators.lessons import Labels, Yardstick
 from nsf.engines.operators.model import Sizes, StepOperators
 from nsf.engines.operators.states import principal
@@ -21,13 +21,12 @@ from nsf.engines.operators.teaching import Teaching
 from nsf.errors import InstabilityError
 from nsf.storage import writing
 
-_BATCH = 1024  # labels of one step of the descent
-_WINDOWS = 48  # unrolled windows of one
-#: They cost several times what single steps do: one step of the descent in so many has them, at this weight.
-_UNROLLED_EVERY, _UNROLLED_WEIGHT = 3, 0.3
 _FAR = 4.0  # deviations from the mean of training latents, beyond which a run of one's own is cut off
 #: Of their own deviation, by which the last change of a state of the tube differs from that of its run.
 _OTHER_CHANGE = 0.1
+#: Moments of each sweep along a run, at least: with dozens of training cases the teacher's own runs use up
+#: all its steps.
+_LEAST_ASKED = 40
 _ASKED = 12  # moments at which it is found how far the teacher's step is from affine
 
 
@@ -41,6 +40,7 @@ class Course:
         yardstick: decides which round is kept.
         teaching: how.
         seed: of network, states and batches.
+        device: where the network descends.
         folder: where finished rounds are kept, for a teaching that is broken off; None for nowhere.
         say: told of each round.
 
@@ -56,11 +56,12 @@ class Course:
         yardstick: Yardstick,
         teaching: Teaching,
         seed: int,
+        device: torch.device | str = "cpu",
         folder: Path | None = None,
         say: Callable[[str], object] = lambda line: None,
     ):
         self.teachers, self.yardstick, self.teaching, self.seed = teachers, yardstick, teaching, seed
-        self._truth, self._folder, self._say = truth, folder, say
+        self._truth, self._device, self._folder, self._say = truth, device, folder, say
         self.seconds, self.best = 0.0, 0
         self.errors: list[float] = []
 
@@ -119,8 +120,7 @@ class Course:
             self._begin(generator)
         else:
             self.labels = Labels.joined([self.labels, *self._along_own_runs(number)])
-        with _one_thread():
-            self._descend(number, generator)
+        self._descend(number, generator)
         runs = self.own_runs(self.yardstick.teacher)
         self.errors.append(self.yardstick.error(runs))
 
@@ -163,7 +163,7 @@ class Course:
         N, runs = self.teachers[0].total_steps, sum(map(len, self.teachers))
         sweeps = runs * (1 + self.teaching.rounds) + (0 if self._truth is None else len(self.teachers[0]))
         left = self.teaching.steps - N * (runs + len(self.yardstick.teacher))
-        return min(N - 1, max(1, left // sweeps))
+        return min(N - 1, max(_LEAST_ASKED, left // sweeps))
 
     def _moments(self, offset: int, count: int) -> Tensor:
         """Steps n ≥ 1 that a sweep asks for, ascending and evenly spread; another offset gives others."""
@@ -262,50 +262,10 @@ class Course:
         return torch.stack(found)
 
     def _descend(self, number: int, generator: torch.Generator) -> None:
-        """Adam on single steps and unrolled windows, with cosine decay."""
-        teaching, model = self.teaching, self.model.float()
-        rows = [getattr(self.labels, name).float() for name in Labels.__dataclass_fields__]
-        xhat, change, acceleration, mu, g, features = rows
-        a_scale = model.a_scale
-        # Far from training runs accelerations are ten to a hundred times as large, and would be all there is.
-        weight = 1.0 / (1.0 + (acceleration / a_scale).square().mean(1) / 4.0)
-        c = model.collider_state(features)
-        windows = [
-            self._windows(teacher, runs) for teacher, runs in zip(self.teachers, self._runs, strict=True)
-        ]
-        optimiser = torch.optim.Adam(model.parameters(), lr=teaching.rate / (1 if number == 0 else 2))
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, teaching.descent)
-        for turn in range(teaching.descent):
-            at = torch.randint(len(xhat), (min(_BATCH, len(xhat)),), generator=generator)
-            found = model.acceleration(xhat[at], change[at], mu[at], g[at], c[at])
-            loss = (weight[at] * ((found - acceleration[at]) / a_scale).square().mean(1)).mean()
-            if teaching.unroll > 1 and turn % _UNROLLED_EVERY == 0:
-                window = windows[turn // _UNROLLED_EVERY % len(windows)]
-                loss = loss + _UNROLLED_WEIGHT * self._unrolled(window, generator)
-            optimiser.zero_grad()
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(model.parameters(), 10.0)
-            optimiser.step()
-            schedule.step()
-        self.model = model.double()
-
-    def _windows(self, teacher: Teacher, runs: Tensor) -> tuple[Tensor, ...]:
-        first = teacher.first_change()
-        changes = torch.cat([first[None], torch.diff(runs, dim=0)])
-        c = self.model.collider_state(teacher.features.float())
-        return runs.float(), changes.float(), teacher.parameters.float(), teacher.gravity.float(), c
-
-    def _unrolled(self, window: tuple[Tensor, ...], generator: torch.Generator) -> Tensor:
-        runs, changes, mu, g, c = window
-        model, unroll = self.model, min(self.teaching.unroll, len(runs) - 1)
-        k = torch.randint(runs.shape[1], (_WINDOWS,), generator=generator)
-        n = torch.randint(len(runs) - unroll, (_WINDOWS,), generator=generator)
-        x, d, loss = runs[n, k], changes[n, k], 0.0
-        x = x + self.teaching.noise * model.x_scale * torch.randn(x.shape, generator=generator)
-        for j in range(unroll):
-            x, d = model.step(x, d, mu[k], g[n + j, k], c[n + j, k])
-            loss = loss + ((x - runs[n + j + 1, k]) / model.d_scale).square().mean()
-        return loss / unroll
+        rate = self.teaching.rate / (1 if number == 0 else 2)
+        model = self.model.to(self._device, torch.float32)
+        Descent(model, self.labels, self.teachers, self._runs, self.teaching, rate, generator).run()
+        self.model = model.to("cpu", torch.float64)
 
     # -- rounds on disk ---------------------------------------------------------------------------------
 
@@ -341,17 +301,6 @@ class Course:
         self.seconds = kept["seconds"]
         for teacher, steps in zip((*self.teachers, self.yardstick.teacher), kept["steps"], strict=True):
             teacher.steps = steps
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """So small a network gains nothing by more threads, and its bits would depend on how many there are."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _ball(shape: torch.Size, generator: torch.Generator) -> Tensor:

@@ -21,7 +21,7 @@ class Teaching:
     Attributes:
         width: of both hidden layers.
         rounds: along the operators' own runs, after the first.
-        steps: of the teacher, about, in all.
+        steps: of the teacher, about, in all; more where each run would be asked at fewer than 40 moments.
         descent: steps of Adam in each round.
         rate: learning rate of the first round; half of it later.
         unroll: steps of a window.

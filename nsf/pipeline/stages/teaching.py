@@ -42,8 +42,10 @@ def _follow(pipeline, manifold: Manifold, record: Record) -> None:
         lessons = [Teacher(_batches(pipeline, manifold, v), progress.advance) for v in (known, between) if v]
         yardstick = _yardstick(pipeline, manifold, progress)
         seed = int(pipeline.config.seed)
-        truth = _truth(pipeline, manifold)
-        course = Course(lessons, truth, yardstick, pipeline.teaching, seed, record.path, progress.describe)
+        truth, device = _truth(pipeline, manifold), pipeline.device
+        course = Course(
+            lessons, truth, yardstick, pipeline.teaching, seed, device, record.path, progress.describe
+        )
         before = time.perf_counter() - started
         operators, steps = course.follow(), course.steps
         broken = course.broken_affinity()

@@ -209,6 +209,23 @@ def test_how_far_a_step_is_from_affine():
     np.testing.assert_allclose(broken(2.0), 2.0 * broken(1.0), rtol=1e-9)
 
 
+@pytest.mark.gpu
+def test_captured_steps_of_the_descent_are_those_of_the_host():
+    """Graphs replay what eager steps do; warming up leaves neither network nor generator changed."""
+    teaching = Teaching(width=8, rounds=0, steps=90, descent=9, unroll=4)
+
+    def taught(device):
+        teacher = Stepper(0.3)
+        yardstick = Yardstick(teacher, lambda run: run[:, None], teacher.run()[:, :, None])
+        return Course([teacher, Stepper(0.3)], None, yardstick, teaching, 0, device).follow().state_dict()
+
+    there, here = taught("cuda"), taught("cpu")
+    for name, values in here.items():
+        assert values.device == there[name].device
+        np.testing.assert_allclose(there[name], values, rtol=0.0, atol=2e-5, err_msg=name)
+    assert float(here["net.4.weight"].abs().max()) > 1e-3  # nine steps have moved it from zero
+
+
 # -- the file -------------------------------------------------------------------------------------------
 
 

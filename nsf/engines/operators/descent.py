@@ -1,0 +1,168 @@
+"""The descent of one round: Adam on what the teacher answered and on unrolled windows of its runs."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+
+import torch
+from torch import Tensor
+
+from nsf.engines.operators.lessons import Labels
+from nsf.engines.operators.model import StepOperators
+from nsf.engines.operators.teacher import Teacher
+from nsf.engines.operators.teaching import Teaching
+
+_BATCH = 1024  # labels of one step of the descent
+_WINDOWS = 48  # unrolled windows of one
+#: They cost several times what single steps do: one step of the descent in so many has them, at this weight.
+_UNROLLED_EVERY, _UNROLLED_WEIGHT = 3, 0.3
+_LARGEST_GRADIENT = 10.0
+_WARM_UP = 3  # steps before a graph is captured, as CUDA asks for
+
+
+class Descent:
+    """Steps of Adam on a network that is changed in place.
+
+    On a GPU each kind of step is captured once as a graph: its hundreds of kernels are so small that
+    launching them one by one takes longer than the whole step on a CPU.
+
+    Args:
+        model: fp32, on the device of the descent.
+        labels: what the teacher answered.
+        teachers: whose runs are unrolled; runs: [N + 1, R, r] of each.
+        teaching: how many steps, and the windows.
+        rate: learning rate at the start; it falls to 0 along a cosine.
+        generator: of batches and noise, on the host.
+    """
+
+    def __init__(
+        self,
+        model: StepOperators,
+        labels: Labels,
+        teachers: Sequence[Teacher],
+        runs: Sequence[Tensor],
+        teaching: Teaching,
+        rate: float,
+        generator: torch.Generator,
+    ):
+        self._model, self._teaching, self._generator = model, teaching, generator
+        self._device = model.x_mean.device
+        rows = [self._here(getattr(labels, name)) for name in Labels.__dataclass_fields__]
+        self._xhat, self._change, self._acceleration, self._mu, self._g, features = rows
+        self._c = model.collider_state(features)
+        # Far from training runs accelerations are ten to a hundred times as large, and would be all there is.
+        self._weight = 1.0 / (1.0 + (self._acceleration / model.a_scale).square().mean(1) / 4.0)
+        self._windows = [self._windows_of(*pair) for pair in zip(teachers, runs, strict=True)]
+        graphs = self._device.type == "cuda"  # which read the rate where it lies
+        self._optimiser = torch.optim.Adam(
+            model.parameters(),
+            lr=torch.tensor(rate, device=self._device) if graphs else rate,
+            capturable=graphs,
+        )
+        self._schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self._optimiser, teaching.descent)
+
+    def run(self) -> None:
+        """All steps."""
+        with _one_thread():
+            step = self._captured() if self._device.type == "cuda" else self._step
+            for turn in range(self._teaching.descent):
+                window = self._window_of(turn)
+                step(window, self._drawn(window))
+                self._schedule.step()
+
+    def _here(self, values: Tensor) -> Tensor:
+        return values.to(self._device, torch.float32)
+
+    def _windows_of(self, teacher: Teacher, runs: Tensor) -> tuple[Tensor, ...]:
+        changes = torch.cat([teacher.first_change()[None], torch.diff(runs, dim=0)])
+        given = runs, changes, teacher.parameters, teacher.gravity, teacher.features
+        runs, changes, mu, gravity, features = map(self._here, given)
+        return runs, changes, mu, gravity, self._model.collider_state(features)
+
+    # -- one step ---------------------------------------------------------------------------------------
+
+    def _window_of(self, turn: int) -> int | None:
+        """Whose windows a step unrolls; None for single steps alone."""
+        if self._teaching.unroll == 1 or turn % _UNROLLED_EVERY:
+            return None
+        return turn // _UNROLLED_EVERY % len(self._windows)
+
+    def _drawn(self, window: int | None) -> list[Tensor]:
+        """Numbers of labels; of windows: their runs, first steps and noise [deviations of x̂]."""
+        count, generator = len(self._xhat), self._generator
+        drawn = [torch.randint(count, (min(_BATCH, count),), generator=generator)]
+        if window is not None:
+            steps, runs, r = self._windows[window][0].shape
+            drawn.append(torch.randint(runs, (_WINDOWS,), generator=generator))
+            drawn.append(torch.randint(steps - self._unroll(steps), (_WINDOWS,), generator=generator))
+            drawn.append(torch.randn(_WINDOWS, r, generator=generator))
+        return drawn
+
+    def _unroll(self, steps: int) -> int:
+        return min(self._teaching.unroll, steps - 1)
+
+    def _step(self, window: int | None, drawn: list[Tensor]) -> None:
+        model, (at, *unrolled) = self._model, drawn
+        found = model.acceleration(self._xhat[at], self._change[at], self._mu[at], self._g[at], self._c[at])
+        off = ((found - self._acceleration[at]) / model.a_scale).square().mean(1)
+        loss = (self._weight[at] * off).mean()
+        if window is not None:
+            loss = loss + _UNROLLED_WEIGHT * self._off_unrolled(self._windows[window], *unrolled)
+        self._optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(model.parameters(), _LARGEST_GRADIENT)
+        self._optimiser.step()
+
+    def _off_unrolled(self, window: tuple[Tensor, ...], k: Tensor, n: Tensor, noise: Tensor) -> Tensor:
+        (runs, changes, mu, g, c), model = window, self._model
+        unroll, loss = self._unroll(len(runs)), 0.0
+        x, d = runs[n, k] + self._teaching.noise * model.x_scale * noise, changes[n, k]
+        for j in range(unroll):
+            x, d = model.step(x, d, mu[k], g[n + j, k], c[n + j, k])
+            loss = loss + ((x - runs[n + j + 1, k]) / model.d_scale).square().mean()
+        return loss / unroll
+
+    # -- graphs -----------------------------------------------------------------------------------------
+
+    def _captured(self) -> Callable[[int | None, list[Tensor]], None]:
+        """The same step as graphs, one for each kind; the network and the optimiser are left as they were."""
+        before = {name: values.clone() for name, values in self._model.state_dict().items()}
+        state = self._generator.get_state()
+        kinds = {self._window_of(turn) for turn in range(self._teaching.descent)}
+        graphs = {window: self._capture(window) for window in sorted(kinds, key=str)}
+        self._generator.set_state(state)
+        self._model.load_state_dict(before)
+        for of_weight in self._optimiser.state.values():
+            for values in of_weight.values():
+                values.zero_()
+
+        def step(window: int | None, drawn: list[Tensor]) -> None:
+            graph, held = graphs[window]
+            for there, values in zip(held, drawn, strict=True):
+                there.copy_(values)
+            graph.replay()
+
+        return step
+
+    def _capture(self, window: int | None) -> tuple[torch.cuda.CUDAGraph, list[Tensor]]:
+        held = [values.to(self._device) for values in self._drawn(window)]
+        aside = torch.cuda.Stream(self._device)
+        aside.wait_stream(torch.cuda.current_stream(self._device))
+        with torch.cuda.stream(aside):
+            for _ in range(_WARM_UP):
+                self._step(window, held)
+        torch.cuda.current_stream(self._device).wait_stream(aside)
+        graph = torch.cuda.CUDAGraph()
+        with torch.cuda.graph(graph):
+            self._step(window, held)
+        return graph, held
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """So small a network gains nothing by more threads, and its bits would depend on how many there are."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
