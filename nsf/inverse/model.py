@@ -33,7 +33,7 @@ class Forcing:
 
     Attributes:
         gravity: [N, 3], or [B, N, 3] of each run [m/s²].
-        solids: [N, f], or [B, N, f]: state of the colliders, as `nsf.engines.operators.collider_states` has it.
+        solids: [N, f], or [B, N, f]: state of the colliders, as `collider_states` of the operators has it.
     """
 
     gravity: Tensor
@@ -131,7 +131,7 @@ class Model:
         return self._net.run(self._xhat.expand_as(first), first, mu, gravity, c).movedim(0, -2)
 
     def at(self, points) -> Restriction:
-        """The fields at particles (indices [n]) or at rest positions [n, 3] [m]; for many calls of `positions`."""
+        """The fields at particles [n] or rest positions [n, 3] [m], for many calls of `positions`."""
         if isinstance(points, Restriction):
             return points
         points = torch.as_tensor(points)
@@ -163,7 +163,7 @@ class Model:
         """[...] how far runs are from what was taught; above 1 a run is not to be believed.
 
         The largest along a run of the distance of its shape from the training runs, in units of theirs from
-        each other; and, above 1, how far parameters and gravity are outside. It takes no projected step, so that
+        each other; and, above 1, how far parameters and gravity are outside. It takes no projected step, so
         it does not see how far the operators are from one (docs/method.md, Trust).
 
         Args:
@@ -195,11 +195,9 @@ class Model:
         return self.trust.latent_distance.nearly(_NEAR * self.trust.distance)
 
     def _outside(self, values: Sequence[float]) -> float:
-        """How far parameters are outside of what was taught, and away from training cases; 0 where neither."""
-        case = dict(zip(self.names, values, strict=True))
-        found = max(
-            self.operators.taught.outside(case, self.operators.taught.gravity)[0], self.trust.cases.of(case)
-        )
+        """How far parameters are outside of what was taught, or from the training cases; 0 up to 1."""
+        case, taught = dict(zip(self.names, values, strict=True)), self.operators.taught
+        found = max(taught.outside(case, np.array(taught.gravity))[0], self.trust.cases.of(case))
         return found if found > 1.0 else 0.0
 
     def _of(self, name: str, mu: Tensor) -> Tensor:
