@@ -3,9 +3,10 @@
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from nsf.inverse.model import Model
     from nsf.kinematics.manifold import Manifold
 
-__all__ = ["Manifold"]
+__all__ = ["Manifold", "Model"]
 
 
 def __getattr__(name: str):
@@ -14,4 +15,8 @@ def __getattr__(name: str):
         from nsf.kinematics.manifold import Manifold
 
         return Manifold
+    if name == "Model":
+        from nsf.inverse.model import Model
+
+        return Model
     raise AttributeError(f"module 'nsf' has no attribute {name!r}")

@@ -72,11 +72,9 @@ class LatentDistance:
             [q, K]: distances of its products with coefficients a(x̂) are those of `of`; and [M, q], the
             products of the training latents.
         """
-        field, latents = self._at.fields["deformation"], self._latents.to(self._at.device, self._at.dtype)
-        modes = field.modes.flatten(0, 1).double().cpu().numpy() / self._at.points**0.5
-        with torch.no_grad():
-            closed = [] if field.network is None else [field.network(latents)]
-            a = torch.cat([latents, *closed], 1).double().cpu().numpy()
+        modes = self._at.fields["deformation"].modes.flatten(0, 1).double().cpu().numpy()
+        modes = modes / self._at.points**0.5
+        a = self._coefficients(self._latents).cpu().numpy()
         R = np.linalg.qr(modes, mode="r")
         y = (a - a.mean(0)) @ R.T
         _, _, axes = np.linalg.svd(y, full_matrices=False)
@@ -85,6 +83,23 @@ class LatentDistance:
         count = max(1, int((2.0 * rest > error).sum()))
         matrix = axes[:count] @ R
         return matrix, a @ matrix.T
+
+    def nearly(self, error: float) -> Callable[[torch.Tensor], torch.Tensor]:
+        """`of` for many latent vectors [n, r], off by `error` [m] at most; [n] on their device.
+
+        Where positions are modes times coefficients it takes a fraction of the time.
+        """
+        if not hasattr(self._at, "fields") or not hasattr(self._at.fields["deformation"], "modes"):
+            return lambda xhat: torch.as_tensor(self.of(xhat.cpu().numpy())).to(xhat)
+        matrix, known = (torch.as_tensor(values, device=self._at.device) for values in self.embedded(error))
+        return lambda xhat: _nearest(self._coefficients(xhat) @ matrix.T, known)
+
+    def _coefficients(self, latents: torch.Tensor) -> torch.Tensor:
+        """a(x̂) [n, K] in fp64, of a field of modes times coefficients."""
+        field, latents = self._at.fields["deformation"], latents.to(self._at.device, self._at.dtype)
+        with torch.no_grad():
+            closed = [] if field.network is None else [field.network(latents)]
+        return torch.cat([latents, *closed], 1).double()
 
     def _positions(self, latents: torch.Tensor) -> torch.Tensor:
         """g(X_S, x̂) [n, 3 s] over √s: Euclidean distances of rows are RMS distances of particles."""

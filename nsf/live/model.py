@@ -11,13 +11,13 @@ import torch
 from nsf.data import Case, Trajectory
 from nsf.data.schema import TRAJECTORY, packed
 from nsf.deployment import Trust
-from nsf.deployment.trust import CaseDistance, LatentDistance
 from nsf.dynamics import Decoder, ReducedMPM
 from nsf.errors import ConfigError, InstabilityError
 from nsf.export import web
 from nsf.mpm import floor_height
 from nsf.mpm.stability import check_time_step
 from nsf.pipeline import Pipeline
+from nsf.pipeline.stages.deployment import trust_of
 from nsf.runs import Run
 from nsf.scenes.programs import tilted
 
@@ -225,7 +225,7 @@ class LiveModel:
         solver = self.pipeline.solver_at(self.manifold, self.initial)
         sample = np.unique(np.concatenate([sets.sample for sets in solver.sets]))
         self._sets_at = solver.sets_at
-        self.trust = _trust(run, self.manifold, sample, self.pipeline)
+        self.trust = trust_of(run, self.manifold, sample, self.pipeline)
         self.particles = len(self.manifold.X)
         self.sample = sample
         self.shown = _shown(self.manifold.X.numpy(), sample, points, surface)
@@ -356,16 +356,6 @@ def _possible(pipeline: Pipeline, case: Mapping[str, float]) -> bool:
     except (ConfigError, InstabilityError):
         return False
     return True
-
-
-def _trust(run: Run, manifold, sample: np.ndarray, pipeline: Pipeline) -> Trust:
-    """The trust estimate, with the scales that the deployment calibrated."""
-    residual, distance = (run.metric("trust", scale) for scale in ("residual_m", "distance_m"))
-    scene, gravity = pipeline.scene, None
-    if scene.forcing.gravity:
-        gravity = scene.gravity, scene.forcing.reach(scene.gravity)
-    known = LatentDistance(manifold, sample, pipeline.device)
-    return Trust(residual, distance, known, CaseDistance(manifold), gravity)
 
 
 def _shown(X: np.ndarray, sample: np.ndarray, points: int, surface: bool) -> np.ndarray:

@@ -14,12 +14,14 @@ from nsf.deployment import (
     PROJECTED,
     Levels,
     Rollout,
+    Trust,
     calibrate,
     continuation_file,
     deploy,
     go_on,
     rollout_file,
 )
+from nsf.deployment.trust import CaseDistance, LatentDistance
 from nsf.dynamics import ReducedBatch, ReducedMPM
 from nsf.kinematics.manifold import Manifold
 from nsf.runs import Record, Run
@@ -74,6 +76,25 @@ def write_configuration(pipeline, record: Record) -> None:
     record.output(CONFIGURATION)
 
 
+def trust_of(run: Run, manifold: Manifold, particles: np.ndarray, pipeline) -> Trust:
+    """The trust estimate of a deploy run, with the scales that it calibrated.
+
+    Args:
+        run: complete.
+        manifold: that it deployed.
+        particles: [s] indices of S, of all spans of time.
+        pipeline: the chain that the run is part of.
+    """
+    residual, distance = (run.metric("trust", scale) for scale in ("residual_m", "distance_m"))
+    known = LatentDistance(manifold, particles, pipeline.device)
+    return Trust(residual, distance, known, CaseDistance(manifold), _range_of_gravity(pipeline.scene))
+
+
+def _range_of_gravity(scene) -> tuple[Sequence[float], float] | None:
+    """Middle [3] and radius [m/s²] of what a scene's programs of gravity may give; None without any."""
+    return (scene.gravity, scene.forcing.reach(scene.gravity)) if scene.forcing.gravity else None
+
+
 def _rollouts(pipeline, manifold: Manifold, record: Record) -> list[Rollout]:
     """The reduced runs; how far they may be believed, and who takes their steps, go on record."""
     started, asked = time.perf_counter(), pipeline.config.deploy
@@ -83,10 +104,8 @@ def _rollouts(pipeline, manifold: Manifold, record: Record) -> list[Rollout]:
         """A run in the training case of some parameters, with its own program."""
         return projected(_case_of(pipeline.split.train, values), device)
 
-    scene, range_of_gravity = pipeline.scene, None
-    if scene.forcing.gravity:
-        range_of_gravity = scene.gravity, scene.forcing.reach(scene.gravity)
-    trust = replace(calibrate(known_at, manifold, pipeline.device), gravity=range_of_gravity)
+    found = calibrate(known_at, manifold, pipeline.device)
+    trust = replace(found, gravity=_range_of_gravity(pipeline.scene))
     record.metrics["trust"] = {
         "residual_m": trust.residual,
         "distance_m": trust.distance,

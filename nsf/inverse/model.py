@@ -1,0 +1,230 @@
+"""`nsf.Model`: a taught run as a function of its problem parameters and forcing, for thousands at once."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nsf.data import PROGRAM
+from nsf.deployment import Trust
+from nsf.dynamics.setup import first_change
+from nsf.engines import Operators
+from nsf.engines.operators import collider_states
+from nsf.errors import ConfigError, ShapeError
+from nsf.inverse.inputs import Polynomial
+from nsf.kinematics.manifold import Restriction
+from nsf.pipeline import Pipeline
+from nsf.pipeline.stages.deployment import trust_of
+from nsf.pipeline.stages.teaching import OPERATORS
+from nsf.runs import Run
+
+#: Frames of a run at which it is asked how far it is from the training runs.
+_LOOKS = 25
+_NEAR = 0.02  # of the scale of distances, by which one may be off
+
+
+@dataclass(frozen=True)
+class Forcing:
+    """What acts on runs from outside at each step.
+
+    Attributes:
+        gravity: [N, 3], or [B, N, 3] of each run [m/s²].
+        solids: [N, f], or [B, N, f]: state of the colliders, as `collider_states` of the operators has it.
+    """
+
+    gravity: Tensor
+    solids: Tensor
+
+
+class Model:
+    """Runs by operators as a function of their problem parameters: batched, and differentiable by torch.
+
+    Args:
+        run: complete deploy run with engine=operators.
+        device: `cpu`, `cuda`, `cuda:N` or `auto`.
+
+    Attributes:
+        run, pipeline, manifold: what it is made of.
+        names: of the problem parameters, in the order of every tensor of them; units: theirs.
+        ranges: [n, 2] what was taught of each.
+        t: [N + 1] times of the frames [s]; dt: step [s].
+        spacing: edge of the cube that a particle fills [m].
+
+    Raises:
+        MissingRunError: the run, or its teaching, is not whole.
+        ConfigError: the run has another engine, or its operators do not fit it.
+        DeviceError: the device does not exist.
+    """
+
+    def __init__(self, run: Run, device: str = "auto"):
+        self.run = run.require()
+        self.pipeline = Pipeline.of_run(run, device, say=lambda line: None)
+        if self.pipeline.engine != Operators.name:
+            raise ConfigError(
+                f"{run.id} has engine={self.pipeline.engine}, whose steps know no gradient; deploy it with "
+                "engine=operators, which teaches them first"
+            )
+        self.manifold = self.pipeline.manifold()
+        taught = next(parent for parent in run.parent_runs if parent.stage == "teach")
+        self.operators = Operators.load(taught.require().file(OPERATORS))
+        self.scene = self.pipeline.deployed
+        one = self.pipeline.batch_at(
+            self.manifold, self.pipeline.split.train[:1], engine=self.operators, scene=self.pipeline.scene
+        ).batch.shared
+        self.device = one.torch_device
+        self.names = self.operators.taught.parameters
+        self.units = tuple(self.scene.parameters[name].unit for name in self.names)
+        self.ranges = np.array(self.operators.taught.ranges)
+        self.dt, self.t = one.dt, one.dt * np.arange(one.total_steps + 1)
+        self.spacing = float(one.constants.volume0.mean() ** (1 / 3))
+        self._sample = one.sets[0].sample
+        self._every = np.unique(np.concatenate([sets.sample for sets in one.sets]))
+        self._net = self.operators.model.to(self.device)
+        self._xhat = one.xhat.to(self.device, torch.float64)
+        self._given: dict[str, Polynomial] = {}
+
+    @classmethod
+    def load(cls, run: Run | Path | str, device: str = "auto") -> "Model":
+        """The model of a deploy run.
+
+        Args:
+            run: the run, its folder, or the beginning of its id or hash.
+            device: as for `Model`.
+        """
+        return cls(run if isinstance(run, Run) else Run.named(str(run), "deploy"), device)
+
+    def tensor(self, parameters: Tensor | Mapping[str, float] | Sequence) -> Tensor:
+        """Parameters [..., n] of a tensor or array, or of a mapping of numbers or arrays by name.
+
+        Raises:
+            ConfigError: a name is unknown or missing. ShapeError: the last axis is not of the parameters.
+        """
+        if isinstance(parameters, Mapping):
+            if wrong := set(self.names) ^ set(parameters):
+                raise ConfigError(f"{sorted(wrong)[0]!r}: give a value for each of {', '.join(self.names)}")
+            own = [torch.as_tensor(parameters[name], dtype=torch.float64) for name in self.names]
+            parameters = torch.stack(torch.broadcast_tensors(*own), -1)
+        found = torch.as_tensor(parameters, dtype=torch.float64, device=self.device)
+        if found.ndim == 0 or found.shape[-1] != len(self.names):
+            raise ShapeError(
+                f"parameters have shape {list(found.shape)}; give [..., {len(self.names)}], as "
+                f"{', '.join(self.names)}"
+            )
+        return found
+
+    def __call__(self, parameters, forcing: Forcing | None = None) -> Tensor:
+        """Latent vectors [..., N + 1, r] of runs, differentiable in parameters and forcing.
+
+        Args:
+            parameters: [..., n], or a mapping of numbers or arrays by name.
+            forcing: of all runs, or of each; the scene's own by default.
+        """
+        mu = self.tensor(parameters)
+        first = self._of("start", mu).expand(*mu.shape[:-1], -1)
+        given = forcing or Forcing(self._of("gravity", mu), self._of("solids", mu))
+        gravity, solids = (values.to(self.device).movedim(-2, 0) for values in (given.gravity, given.solids))
+        c = self._net.collider_state(solids)
+        return self._net.run(self._xhat.expand_as(first), first, mu, gravity, c).movedim(0, -2)
+
+    def at(self, points) -> Restriction:
+        """The fields at particles [n] or rest positions [n, 3] [m], for many calls of `positions`."""
+        if isinstance(points, Restriction):
+            return points
+        points = torch.as_tensor(points)
+        where = {"X": points.double()} if points.is_floating_point() else {"particles": points}
+        return self.manifold.restrict(**where, dtype=torch.float64, device=self.device)
+
+    def positions(self, xhat: Tensor, points) -> Tensor:
+        """Positions [..., n, 3] [m] of points of the body at latent vectors [..., r], differentiable.
+
+        Args:
+            xhat: latent vectors.
+            points: particles or rest positions, as for `at`, or what it gave.
+        """
+        found = self.at(points).position(xhat.flatten(0, -2) if xhat.ndim > 1 else xhat)
+        return found.unflatten(0, xhat.shape[:-1]) if xhat.ndim > 1 else found
+
+    def forcing(self, parameters=None, program: int | None = None) -> Forcing:
+        """The scene's own forcing.
+
+        Args:
+            parameters: [n] or a mapping by name; the middle of the ranges by default.
+            program: number of the run's program, where the scene has programs; as configured by default.
+        """
+        mu = self.ranges.mean(1) if parameters is None else self.tensor(parameters).cpu().numpy()
+        given = (torch.as_tensor(self._inputs(mu, program)[name]) for name in ("gravity", "solids"))
+        return Forcing(*(values.to(self.device) for values in given))
+
+    def distrust(self, xhat: Tensor, parameters, forcing: Forcing | None = None) -> Tensor:
+        """[...] how far runs are from what was taught; above 1 a run is not to be believed.
+
+        The largest along a run of the distance of its shape from the training runs, in units of theirs from
+        each other; and, above 1, how far parameters and gravity are outside. It takes no projected step, so
+        it does not see how far the operators are from one (docs/method.md, Trust).
+
+        Args:
+            xhat: [..., N + 1, r], as this model gave them.
+            parameters, forcing: with which.
+        """
+        mu = self.tensor(parameters).detach()
+        lead, N = mu.shape[:-1], xhat.shape[-2] - 1
+        looks = torch.linspace(0, N, min(N + 1, _LOOKS + 1)).round().long().to(xhat.device)
+        rows = xhat.detach().expand(*lead, *xhat.shape[-2:])[..., looks, :].flatten(0, -2)
+        off = self._distance(torch.nan_to_num(rows, 0.0, 0.0, 0.0)) / self.trust.distance
+        off = torch.where(torch.isfinite(rows).all(-1), off, torch.inf).view(*lead, len(looks)).amax(-1)
+        outside = torch.tensor([self._outside(case) for case in mu.reshape(-1, len(self.names)).tolist()])
+        off = torch.maximum(off, outside.view(lead).to(off))
+        if forcing is not None:
+            gravity = forcing.gravity.detach().cpu()
+            far = (gravity - torch.tensor(self.operators.taught.gravity)).norm(dim=-1).amax(-1)
+            beyond = far / max(self.operators.taught.reach, 1e-30)
+            off = torch.maximum(off, torch.where(beyond > 1.0 + 1e-6, beyond, 0.0).to(off))
+        return off
+
+    @cached_property
+    def trust(self) -> Trust:
+        """The estimate of trust, with the scales that the deployment calibrated."""
+        return trust_of(self.run, self.manifold, self._every, self.pipeline)
+
+    @cached_property
+    def _distance(self):
+        return self.trust.latent_distance.nearly(_NEAR * self.trust.distance)
+
+    def _outside(self, values: Sequence[float]) -> float:
+        """How far parameters are outside of what was taught, or from the training cases; 0 up to 1."""
+        case, taught = dict(zip(self.names, values, strict=True)), self.operators.taught
+        found = max(taught.outside(case, np.array(taught.gravity))[0], self.trust.cases.of(case))
+        return found if found > 1.0 else 0.0
+
+    def _of(self, name: str, mu: Tensor) -> Tensor:
+        """What runs begin with, or what forces them, at parameters."""
+        if name not in self._given:
+            of = partial(self._input, name)
+            self._given[name] = Polynomial(of, self.ranges, (self.names, name)).to(self.device)
+        return self._given[name](mu)
+
+    def _input(self, name: str, mu: np.ndarray) -> np.ndarray:
+        return self._inputs(mu)[name]
+
+    def _inputs(self, mu: Sequence[float], program: int | None = None) -> dict[str, np.ndarray]:
+        """What the scene has at parameters: start d_0 [r], gravity [N, 3], solids [N, f]."""
+        case = dict(zip(self.names, map(float, mu), strict=True))
+        if program is not None:
+            case[PROGRAM] = program
+        scene, steps = self.scene.with_parameters(self.scene.case(case)), len(self.t) - 1
+        rows = torch.as_tensor(self._sample).long()
+        velocity = torch.as_tensor(scene.initial_velocity())[rows]
+        _, jacobian = self._at_sample.position_and_jacobian(self._xhat)
+        return {
+            "start": first_change(jacobian.cpu(), velocity.double(), self.dt).numpy(),
+            "gravity": scene.acting_gravity.at(self.t[:-1]),
+            "solids": collider_states(scene.colliders, self.dt, steps),
+        }
+
+    @cached_property
+    def _at_sample(self) -> Restriction:
+        return self.at(torch.as_tensor(self._sample).long())

@@ -1,0 +1,31 @@
+"""A tiny column of sand that is pushed, by operators that were hardly taught: two parameters."""
+
+import pytest
+
+from nsf.inverse import Model
+
+#: The friction angle, and the speed at which the column starts, which only the scene's configuration knows.
+TWO = (
+    "engine=operators",
+    *(f"engine.teaching.{key}" for key in ("steps=2500", "descent=500", "rounds=1", "width=32")),
+    "+scene.speed=0.1",
+    "scene.bodies.column.velocity=['${scene.speed}',0,0]",
+    "+scene.parameters.friction_angle.range=[22,38]",
+    "+scene.parameters.speed={key:scene.speed,unit:m/s,range:[0.05,0.3]}",
+    "scene.design={_target_:nsf.scenes.Sobol,train:8,validation:4,test:2}",
+)
+
+
+@pytest.fixture(scope="session")
+def deployed(pipeline_at, tmp_path_factory):
+    """The chain, deployed."""
+    pipeline = pipeline_at(tmp_path_factory.mktemp("inverse") / "runs", *TWO)
+    for stage in ("simulate", "train", "deploy"):
+        pipeline.run(stage)
+    return pipeline
+
+
+@pytest.fixture(scope="session")
+def model(deployed):
+    """Its model."""
+    return Model(deployed.deployment, "cpu")
