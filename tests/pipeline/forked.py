@@ -1,12 +1,13 @@
 """The command line in a process of its own that need not import torch again.
 
-A server process imports the package once; each call is a fork of it. `spoil` names a fault that
+A server process imports once what the stages import when they work; each call is a fork of it. `spoil` names a fault that
 the child brings upon itself at an exact moment, so that no test depends on how fast it runs.
 """
 
 import importlib
 import multiprocessing
 import os
+import pkgutil
 import resource
 import shutil
 import signal
@@ -14,8 +15,14 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
+from nsf.pipeline import stages
+
 CONTEXT = multiprocessing.get_context("forkserver")
-CONTEXT.set_forkserver_preload(["nsf.pipeline", "nsf.reporting.build", "hydra"])
+CONTEXT.set_forkserver_preload(
+    ["torch", "warp", "pytorch_lightning", "h5py", "hydra", "scipy.spatial", "nsf.cli", "nsf.pipeline.chain"]
+    + ["nsf.pipeline.sweep", "nsf.pipeline.experiment", "nsf.reporting.build", "matplotlib.backends.backend_svg"]
+    + [f"nsf.pipeline.stages.{module.name}" for module in pkgutil.iter_modules(stages.__path__)]
+)
 
 
 @dataclass(frozen=True)
