@@ -1,14 +1,14 @@
 """Least squares: the parameters under which runs by operators pass the observations, and how sure they are.
 
-Residuals are (y − m(θ))/s with s² = σ² + s_b²: σ of the measurement, and s_b the reduced model's own error at the
-same points and times, as validation runs show it. An estimate is A y with A the pseudo-inverse of the scaled
-Jacobian, so that both errors go through A into the covariance of the estimate,
+Residuals are (y − m(θ))/s with s² = σ² + s_b²: σ of the measurement, and s_b the reduced model's own error
+at the same points and times, as validation runs show it. An estimate is A y with A the pseudo-inverse of
+the scaled Jacobian, so that both errors go through A into the covariance of the estimate,
 
     C = A diag(σ²/s²) Aᵀ + 1/V Σ_v δ_v δ_vᵀ,    δ_v = A b_v/s,
 
-where b_v [m] is the model's error in validation run v, and δ_v how far it alone would put the estimate off. Nothing
-is assumed of how b_v hangs together over points and times. V runs tell a variance with V degrees of freedom, so that
-intervals are Student's, with those of Welch and Satterthwaite.
+where b_v [m] is the model's error in validation run v, and δ_v how far it alone would put the estimate off.
+Nothing is assumed of how b_v hangs together over points and times. V runs tell a variance with V degrees of
+freedom, so that intervals are Student's, with those of Welch and Satterthwaite.
 """
 
 import time
@@ -71,13 +71,16 @@ class Space:
             raise ConfigError(f"there is no parameter {unknown[0]!r}; there are {', '.join(model.names)}")
         taught = dict(zip(model.names, model.ranges.tolist(), strict=True))
         fixed = {name: float(value) for name, value in asked.items() if np.ndim(value) == 0}
-        ranges = {name: list(map(float, asked.get(name, taught[name]))) for name in taught if name not in fixed}
+        ranges = {
+            name: list(map(float, asked.get(name, taught[name]))) for name in taught if name not in fixed
+        }
         for name, (low, high) in [*ranges.items(), *((name, (v, v)) for name, v in fixed.items())]:
             least, most = taught[name]
             slack = 1e-9 * max(abs(least), abs(most))
             if not least - slack <= low <= high <= most + slack:
                 raise ConfigError(
-                    f"{name}={low:g}..{high:g} goes beyond what was taught, {least:g}..{most:g}; stay within, "
+                    f"{name}={low:g}..{high:g} goes beyond what was taught, {least:g}..{most:g}; stay "
+                    f"within, "
                     "or train with a wider range"
                 )
         if empty := [name for name, (low, high) in ranges.items() if low == high]:
@@ -90,7 +93,9 @@ class Space:
     def parameters(self, u: Tensor) -> Tensor:
         """All parameters [..., n] of those sought, u [..., free] in units of their ranges."""
         own = dict(zip(self.free, self.values(u).unbind(-1), strict=True))
-        every = [own.get(name, torch.full_like(u[..., 0], self.fixed.get(name, 0.0))) for name in self.model.names]
+        every = [
+            own.get(name, torch.full_like(u[..., 0], self.fixed.get(name, 0.0))) for name in self.model.names
+        ]
         return torch.stack(every, -1)
 
     def values(self, u: Tensor) -> Tensor:
@@ -138,7 +143,8 @@ class ModelError:
                 found.append(view.of_truth(trajectory) - seen)
         if len(found) < _FEWEST:
             raise ConfigError(
-                f"{len(found)} validation runs cannot tell the model's own error, and intervals without it miss "
+                f"{len(found)} validation runs cannot tell the model's own error, and intervals without "
+                f"it miss "
                 f"the truth; give scene.design.validation at least {_FEWEST} values, better 8, in `nsf run`"
             )
         return cls(np.array(found))
@@ -226,7 +232,8 @@ def fit(
     own = view.observations
     if len(own) < len(space.free):
         raise ConfigError(
-            f"{len(own)} observations cannot tell {len(space.free)} parameters, {', '.join(space.free)}; observe "
+            f"{len(own)} observations cannot tell {len(space.free)} parameters, {', '.join(space.free)}; "
+            f"observe "
             "more, or give one of them as NAME=VALUE"
         )
     s = np.sqrt(own.deviations**2 + error.deviations**2)
@@ -350,9 +357,12 @@ def _check_told_apart(J: np.ndarray, space: Space) -> None:
     for size, way in zip(sizes, ways, strict=True):
         if size * _UNKNOWN <= 1.0:
             parts = [name for name, part in zip(space.free, way, strict=True) if abs(part) > _PART]
-            told = f"do not tell {parts[0]}" if len(parts) == 1 else f"do not tell {' and '.join(parts)} apart"
+            told = (
+                f"do not tell {parts[0]}" if len(parts) == 1 else f"do not tell {' and '.join(parts)} apart"
+            )
             raise ConfigError(
-                f"the observations {told}: they hardly change where {_along(space, way)}; observe other points or "
+                f"the observations {told}: they hardly change where {_along(space, way)}; observe other "
+                f"points or "
                 f"times, or give {parts[0]}=VALUE"
             )
 

@@ -81,7 +81,9 @@ class Observations:
         if not found:
             raise ConfigError(f"{path} observes nothing; give x, y, z of points, or value of a quantity")
         t, what, points, values, deviations = zip(*found, strict=True)
-        return cls(*map(np.array, (t,)), tuple(what), np.array(points), np.array(values), np.array(deviations))
+        return cls(
+            *map(np.array, (t,)), tuple(what), np.array(points), np.array(values), np.array(deviations)
+        )
 
     def check(self, model: Model) -> "Observations":
         """Itself.
@@ -109,7 +111,8 @@ class Observations:
             if off.max() > model.spacing:
                 X = ", ".join(f"{value:.4g}" for value in points[off.argmax()])
                 raise ConfigError(
-                    f"the point ({X}) m lies {off.max():.3g} m from the nearest particle, outside of the body; "
+                    f"the point ({X}) m lies {off.max():.3g} m from the nearest particle, outside of the "
+                    f"body; "
                     "X, Y, Z is where a point is at rest, before the run"
                 )
         return self
@@ -159,7 +162,7 @@ class View:
             found[self._of_points] = (1.0 - shares) * one + shares * two
         for i in self._quantities:
             quantity = QUANTITIES[self.observations.what[i]]
-            frame = int(round(self.observations.t[i] / self._model.dt))
+            frame = round(self.observations.t[i] / self._model.dt)
             frames = slice(0, frame + 1) if quantity.whole else [frame]
             x = torch.as_tensor(trajectory.read("x", frames=frames, particles=self._body).astype(float))
             found[i] = float(quantity.of(x if quantity.whole else x[0], self._X.cpu()))
@@ -180,7 +183,7 @@ class View:
     def _quantity(self, i: int, xhat: Tensor) -> Tensor:
         """[B] of a scalar of the shape."""
         quantity = QUANTITIES[self.observations.what[i]]
-        frame = int(round(self.observations.t[i] / self._model.dt))
+        frame = round(self.observations.t[i] / self._model.dt)
         rows = xhat[:, : frame + 1] if quantity.whole else xhat[:, frame]
         return quantity.of(self._model.positions(rows, self._at_body), self._X)
 
@@ -233,7 +236,11 @@ def _table(path: Path) -> Mapping[str, Sequence]:
         except (ValueError, UnicodeDecodeError) as error:
             raise ConfigError(f"{path} is no CSV file ({first_line(error)})") from error
         found = {name: frame[name].tolist() for name in frame}
-    if not found or len({len(values) for values in found.values()}) > 1 or not len(next(iter(found.values()))):
+    if (
+        not found
+        or len({len(values) for values in found.values()}) > 1
+        or not len(next(iter(found.values())))
+    ):
         raise ConfigError(f"{path} has no rows, or columns of different length; give a row an observation")
     return found
 
@@ -250,7 +257,9 @@ def _row(where: str, at: Mapping[str, float], quantity: str, model: Model) -> li
     end, none = float(model.t[-1]), np.full(3, np.nan)
     if quantity:
         if quantity not in QUANTITIES:
-            raise ConfigError(f"{where}: unknown quantity {quantity!r}; choose one of {', '.join(QUANTITIES)}")
+            raise ConfigError(
+                f"{where}: unknown quantity {quantity!r}; choose one of {', '.join(QUANTITIES)}"
+            )
         if not np.isfinite(at["value"]):
             raise ConfigError(f"{where}: {quantity} has no value; give it [m]")
         t = end if np.isnan(at["t"]) else at["t"]

@@ -1,7 +1,8 @@
 """The command line in a process of its own that need not import torch again.
 
-A server process imports once what the stages import when they work; each call is a fork of it. `spoil` names a fault that
-the child brings upon itself at an exact moment, so that no test depends on how fast it runs.
+A server process imports once what the stages import when they work; each call is a fork of it. `spoil`
+names a fault that the child brings upon itself at an exact moment, so that no test depends on how fast it
+runs.
 """
 
 import importlib
@@ -20,7 +21,12 @@ from nsf.pipeline import stages
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(
     ["torch", "warp", "pytorch_lightning", "h5py", "hydra", "scipy.spatial", "nsf.cli", "nsf.pipeline.chain"]
-    + ["nsf.pipeline.sweep", "nsf.pipeline.experiment", "nsf.reporting.build", "matplotlib.backends.backend_svg"]
+    + [
+        "nsf.pipeline.sweep",
+        "nsf.pipeline.experiment",
+        "nsf.reporting.build",
+        "matplotlib.backends.backend_svg",
+    ]
     + [f"nsf.pipeline.stages.{module.name}" for module in pkgutil.iter_modules(stages.__path__)]
 )
 
