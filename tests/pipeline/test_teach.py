@@ -74,7 +74,8 @@ def test_the_chain(lesson, chain):
     assert run.manifest["parents"] == [pipeline.training.id]
     assert pipeline.deployment.manifest["parents"] == [pipeline.training.id, run.id]
     found = run.manifest["metrics"]
-    assert 300 < found["teacher_steps"] <= 400
+    # 400 are asked for, and each of three runs is asked at 40 moments at least, in each of two rounds.
+    assert 300 < found["teacher_steps"] <= 700
     assert len(found["errors"]) == 2
     assert found["round"] == int(np.argmin(found["errors"]))
     assert found["teach_seconds"] > 0
