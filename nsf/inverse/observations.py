@@ -112,8 +112,7 @@ class Observations:
                 X = ", ".join(f"{value:.4g}" for value in points[off.argmax()])
                 raise ConfigError(
                     f"the point ({X}) m lies {off.max():.3g} m from the nearest particle, outside of the "
-                    f"body; "
-                    "X, Y, Z is where a point is at rest, before the run"
+                    "body; X, Y, Z is where a point is at rest, before the run"
                 )
         return self
 
