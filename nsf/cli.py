@@ -112,8 +112,8 @@ def _tool(name: str, words: list[str]) -> int:
 
         return live(name, text, words)
     tools = {
-        "bench": _bench, "demo": _demo, "doctor": _doctor, "export": _export, "index": _index,
-        "plan": _plan, "reports": _reports, "runs": _runs, "search": _search,
+        "bench": _bench, "calibrate": _calibrate, "demo": _demo, "doctor": _doctor, "export": _export,
+        "index": _index, "plan": _plan, "reports": _reports, "runs": _runs, "search": _search,
     }  # fmt: skip
     return tools[name](words)
 
@@ -129,6 +129,14 @@ def _bench(words: list[str]) -> int:
     page = bench(folder, asked, lambda text: print(text, file=sys.stderr))
     _console().print(table(page.with_name("results.csv")))
     print(f"open {page.resolve()}")
+    return 0
+
+
+def _calibrate(words: list[str]) -> int:
+    """Parameters from observations."""
+    from nsf.inverse.reports.command import calibrate
+
+    print(f"open {calibrate(words).resolve()}")
     return 0
 
 

@@ -27,6 +27,12 @@ TOOLS = {
         "values of numeric keys that make δ, or δ and the step's time, small at the validation values",
         "key=low..high[:log] … [key=value …] [search.objectives=[delta,step_ms]] [search.trials=20]",
     ),
+    "calibrate": (
+        "parameters from observations by runs of engine=operators, how sure they are, a full-order run there",
+        "observations=FILE [run=RUN] [NAME=LOW..HIGH|VALUE …] [program=N] [full_order=true] [starts=64]\n"
+        "       [device=auto] [folder=PATH]; or trials=N [run=RUN,RUN | +experiment=NAME] [seed=0]\n"
+        "       [folder=PATH]: full-order runs at known parameters, observed with noise",
+    ),
     "plan": (
         "what nsf run would do: stages and their states, size, time and room; --cfg: the configuration",
         "[-m] [+experiment=NAME] [key=value …] [--cfg]; nsf run … --dry-run is the same",

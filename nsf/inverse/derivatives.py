@@ -11,6 +11,8 @@ def with_jacobian(of, u: Tensor) -> tuple[Tensor, Tensor]:
     rows = u[:, None].expand(B, n, n).reshape(-1, n)
     ways = torch.eye(n, dtype=u.dtype, device=u.device).expand(B, n, n).reshape(-1, n)
     with torch.no_grad(), forward_ad.dual_level():
-        values, slopes = forward_ad.unpack_dual(of(forward_ad.make_dual(rows, ways.contiguous())))
+        values, slopes = forward_ad.unpack_dual(
+            of(forward_ad.make_dual(rows.contiguous(), ways.contiguous()))
+        )
     slopes = torch.zeros_like(values) if slopes is None else slopes
     return values.view(B, n, -1)[:, 0], slopes.view(B, n, -1).transpose(1, 2)

@@ -105,13 +105,18 @@ class Offsets:
     u: np.ndarray
     off: np.ndarray
 
-    def near(self, u: np.ndarray) -> tuple[np.ndarray, float]:
-        """Second moment [n, n] at a place u [n], and how many cases it is told by.
+    def near(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """Mean [n], covariance [n, n] and degrees of freedom of what an estimate at a place u [n] is off.
 
-        Cases count by w = exp(−|u_v − u|²/2h²), h a quarter of the ranges; they are as many as
-        (Σw)²/Σw² that count alike (Kish 1965).
+        Of one that is yet to come: that the mean is told by few cases is part of the covariance. Cases count
+        by w ∝ exp(−|u_v − u|²/2h²), Σw = 1, h a quarter of the ranges; they are as many as 1/Σw² that count
+        alike (Kish 1965).
         """
         far = np.sum((self.u - u) ** 2, axis=1)
         w = np.exp(-0.5 * (far - far.min()) / _NEAR**2)
-        moment = (self.off * w[:, None]).T @ self.off / w.sum()
-        return moment, float(w.sum() ** 2 / (w**2).sum())
+        w /= w.sum()
+        shared = float(np.sum(w**2))
+        mean = w @ self.off
+        about = self.off - mean
+        covariance = (about * w[:, None]).T @ about / (1.0 - shared) * (1.0 + shared)
+        return mean, covariance, 1.0 / shared - 1.0

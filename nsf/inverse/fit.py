@@ -1,15 +1,15 @@
 """Least squares: the parameters under which runs by operators pass the observations, and how sure they are.
 
 Residuals are (y − m(θ))/s with s² = σ² + s_b²: σ of the measurement, and s_b the reduced model's own error
-at the same points and times, as validation runs show it. An estimate is A y with A the pseudo-inverse of
-the scaled Jacobian, so that both errors go through into the covariance of the estimate,
+at the same points and times, as validation runs show it. In validation run v that error, b_v [m], alone
+would put the parameters off by δ_v = A_v b_v/s, with A_v the pseudo-inverse of the scaled Jacobian there. So
+the estimate is the parameters that fit best less the mean of the δ_v, and its covariance
 
-    C = A diag(σ²/s²) Aᵀ + Σ_v w_v δ_v δ_vᵀ,    δ_v = A_v b_v/s,
+    C = A diag(σ²/s²) Aᵀ + (1 + 1/V) cov δ_v.
 
-where b_v [m] is the model's error in validation run v, A_v the pseudo-inverse of its Jacobian there, and δ_v
-how far it alone would put the estimate off. Runs near the estimate weigh more (`nsf.inverse.error`). Nothing
-is assumed of how b_v hangs together over points and times. V runs tell a variance with V degrees of freedom,
-so that intervals are Student's, with those of Welch and Satterthwaite.
+Runs near the estimate weigh more (`nsf.inverse.error`). Nothing is assumed of how b_v hangs together over
+points and times. V runs tell a covariance with V − 1 degrees of freedom, so that intervals are Student's,
+with those of Welch and Satterthwaite.
 """
 
 import time
@@ -46,6 +46,7 @@ class Fit:
 
     Attributes:
         space: of the parameters; u: [n] the estimate in units of the ranges.
+        fitted: [n] values of the parameters whose run passes the observations best.
         estimate, standard_error, lower, upper: [n] values; the last two hold the truth in 90 % of the cases.
         covariance: [n, n] of u.
         seen: [m] the observations in the fitted run [m]; residuals: [m] in units of s.
@@ -60,6 +61,7 @@ class Fit:
 
     space: Space
     u: np.ndarray
+    fitted: np.ndarray
     estimate: np.ndarray
     standard_error: np.ndarray
     lower: np.ndarray
@@ -136,7 +138,8 @@ def fit(
     _check_told_apart(J, space)
     A = np.linalg.pinv(J)
     noise = (A * (own.deviations / s) ** 2) @ A.T
-    of_model, V = error.offsets(view, model, space, s).near(best.x)
+    off, of_model, V = error.offsets(view, model, space, s).near(best.x)
+    u = np.clip(best.x - off, 0.0, 1.0)
     covariance = noise + of_model
     share = np.diag(of_model) / np.diag(covariance)
     freedom = V / np.maximum(share**2, 1e-12)  # Welch 1947: the measurement's variance is known
@@ -150,14 +153,15 @@ def fit(
     def valued(u: np.ndarray) -> np.ndarray:
         return space.values(torch.as_tensor(u)).numpy()
 
-    slope = np.abs(with_jacobian(space.values, torch.as_tensor(best.x)[None])[1][0].numpy().diagonal())
+    slope = np.abs(with_jacobian(space.values, torch.as_tensor(u)[None])[1][0].numpy().diagonal())
     return Fit(
         space=space,
-        u=best.x,
-        estimate=valued(best.x),
+        u=u,
+        fitted=valued(best.x),
+        estimate=valued(u),
         standard_error=slope * deviation,
-        lower=valued(best.x - reach),
-        upper=valued(best.x + reach),
+        lower=valued(u - reach),
+        upper=valued(u + reach),
         covariance=covariance,
         seen=best.fun * s + own.values,
         residuals=best.fun,

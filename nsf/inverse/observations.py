@@ -15,9 +15,9 @@ from nsf.evaluation.quantities import QUANTITIES
 from nsf.inverse.model import Model
 from nsf.kinematics.interpolation import interpolation
 
-_AXES = ("x", "y", "z")
+AXES = ("x", "y", "z")
 _POINT = ("X", "Y", "Z")
-_KNOWN = ("t", "particle", *_POINT, *_AXES, "quantity", "value", "deviation")
+_KNOWN = ("t", "particle", *_POINT, *AXES, "quantity", "value", "deviation")
 _MOST = 1_000_000  # rows of a file
 #: Particles that a scalar of a shape is taken from.
 _BODY = 2000
@@ -53,7 +53,7 @@ class Observations:
         k, n = x.shape[:2]
         return cls(
             np.repeat(np.asarray(t, float), 3 * n),
-            _AXES * (k * n),
+            AXES * (k * n),
             np.tile(np.repeat(np.asarray(points, float), 3, axis=0), (k, 1)),
             np.asarray(x, float).ravel(),
             np.full(3 * k * n, float(deviation)),
@@ -128,12 +128,12 @@ class View:
     def __init__(self, observations: Observations, model: Model):
         self.observations, self._model = observations.check(model), model
         own = observations
-        self._of_points = np.flatnonzero([what in _AXES for what in own.what])
+        self._of_points = np.flatnonzero([what in AXES for what in own.what])
         self._steps, shares = _between(own.t[self._of_points], model)
         self._shares = torch.as_tensor(shares, device=model.device)
         rows = own.points[self._of_points]
         self._points, self._row = np.unique(rows, axis=0, return_inverse=True)
-        self._axis = np.array([_AXES.index(own.what[i]) for i in self._of_points], int)
+        self._axis = np.array([AXES.index(own.what[i]) for i in self._of_points], int)
         self._quantities = [i for i, what in enumerate(own.what) if what in QUANTITIES]
         X = model.manifold.X
         if self._quantities:
@@ -273,5 +273,5 @@ def _row(where: str, at: Mapping[str, float], quantity: str, model: Model) -> li
         point = X[int(at["particle"])]
     if not np.isfinite(point).all():
         raise ConfigError(f"{where} names no point; give X, Y, Z at rest [m], or particle")
-    seen = [axis for axis in _AXES if not np.isnan(at[axis])]
+    seen = [axis for axis in AXES if not np.isnan(at[axis])]
     return [(at["t"], axis, point, at[axis], at["deviation"]) for axis in seen]

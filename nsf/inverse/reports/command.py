@@ -1,0 +1,144 @@
+"""`nsf calibrate`, `nsf sample` and `nsf design`: their words, and the work."""
+
+import os
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from nsf.errors import ConfigError, MissingRunError
+from nsf.inverse.model import Model
+from nsf.inverse.observations import Observations, View
+from nsf.inverse.space import Space
+from nsf.runs import Run
+
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_RANGE = re.compile(rf"({_NUMBER})\.\.({_NUMBER})")
+_MOST_TRIALS = 10_000
+
+
+def calibrate(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
+    """Parameters from observations, or synthetic trials; gives the page.
+
+    Args:
+        words: `key=value`, as `nsf calibrate --help` has them.
+        say: told what is done.
+
+    Raises:
+        NSFError: a word is refused, a run is missing, or the observations do not tell.
+    """
+    known = ("observations", "trials", "starts", "full_order", "program", "seed")
+    models, asked, named = _begun("calibrate", words, known)
+    if ("trials" in asked) == ("observations" in asked):
+        raise ConfigError(
+            "nsf calibrate takes observations=FILE, or trials=N to calibrate N full-order runs at known "
+            "parameters; give one of them"
+        )
+    if "trials" in asked:
+        if named:
+            raise ConfigError(f"trials={asked['trials']} takes no {next(iter(named))}=; leave it out")
+        from nsf.inverse.reports.trials import report as trials_report
+        from nsf.inverse.trials import Trials
+
+        trials = Trials(
+            _whole(asked, "trials", 20, most=_MOST_TRIALS), seed=_whole(asked, "seed", 0, least=0)
+        )
+        return trials_report(models, trials, _folder(asked, "calibration"), say)
+    from nsf.inverse.reports.calibration import report
+
+    model = _one(models)
+    view = View(Observations.read(asked["observations"], model), model)
+    page, _ = report(
+        view,
+        model,
+        Space.of(model, ranges_of(named)),
+        _folder(asked, f"calibrate_{model.scene.name}"),
+        program=_whole(asked, "program", 0, least=0) if "program" in asked else None,
+        full_order=_flag(asked, "full_order", True),
+        starts=_whole(asked, "starts", 64),
+        say=say,
+    )
+    return page
+
+
+def ranges_of(named: Mapping[str, str]) -> dict[str, list[float] | float]:
+    """Ranges `LOW..HIGH`, or single values, by name.
+
+    Raises:
+        ConfigError: a text is neither.
+    """
+    found: dict[str, list[float] | float] = {}
+    for name, text in named.items():
+        if ends := _RANGE.fullmatch(text):
+            found[name] = [float(ends[1]), float(ends[2])]
+        elif re.fullmatch(_NUMBER, text):
+            found[name] = float(text)
+        else:
+            raise ConfigError(f"{name}={text} is neither a value nor a range; give it as 30 or 25..35")
+    return found
+
+
+def _begun(
+    command: str, words: Sequence[str], known: Sequence[str]
+) -> tuple[list[Model], dict[str, str], dict[str, str]]:
+    """The models that are meant, what is asked by the command's keys, and by names of parameters."""
+    if wrong := [word for word in words if "=" not in word]:
+        raise ConfigError(f"{wrong[0]!r} is not key=value; see `nsf {command} --help`")
+    asked = dict(word.split("=", 1) for word in words)
+    runs = _runs(asked.pop("run", None), asked.pop("+experiment", None))
+    device = asked.pop("device", "auto")
+    models = [Model(run, device) for run in runs]
+    names = {name for model in models for name in model.names}
+    keys = {*known, "folder"}
+    if unknown := [key for key in asked if key not in keys | names]:
+        told = ", ".join(sorted(keys | {"run", "device"}))
+        raise ConfigError(
+            f"nsf {command} has no key {unknown[0]!r}; it takes {told}, and the parameters "
+            f"{', '.join(sorted(names))}"
+        )
+    own = {key: value for key, value in asked.items() if key in keys}
+    return models, own, {key: value for key, value in asked.items() if key not in keys}
+
+
+def _runs(named: str | None, experiment: str | None) -> list[Run]:
+    """The deploy runs of some names, of an experiment's jobs, or the newest one."""
+    if experiment is None:
+        if named is None:
+            return [Run.newest("deploy")]
+        return [Run.named(name, "deploy").require() for name in named.split(",")]
+    from nsf import config
+    from nsf.pipeline.experiment import Experiment
+    from nsf.pipeline.names import Names
+
+    runs = [Names(config.load(job.overrides)).deployment for job in Experiment.load(experiment).jobs]
+    if missing := [run for run in runs if not run.complete]:
+        raise MissingRunError(
+            f"no complete deploy run is there of {len(missing)} jobs of {experiment}, as {missing[0].id}; "
+            f"make them by `nsf run +experiment={experiment}`"
+        )
+    return runs
+
+
+def _one(models: Sequence[Model]) -> Model:
+    if len(models) > 1:
+        raise ConfigError(
+            f"{len(models)} runs are named; name one, as run={models[0].run.scene}/{models[0].run.hash}"
+        )
+    return models[0]
+
+
+def _whole(asked: Mapping[str, str], key: str, default: int, least: int = 1, most: int = 10_000_000) -> int:
+    text = asked.get(key, str(default))
+    if not (re.fullmatch(r"\d{1,9}", text) and least <= int(text) <= most):
+        raise ConfigError(f"{key}={text} must be a whole number from {least} to {most}")
+    return int(text)
+
+
+def _flag(asked: Mapping[str, str], key: str, default: bool) -> bool:
+    text = asked.get(key, str(default).lower())
+    if text not in ("true", "false"):
+        raise ConfigError(f"{key}={text} must be true or false")
+    return text == "true"
+
+
+def _folder(asked: Mapping[str, str], name: str) -> Path:
+    return Path(asked.get("folder") or Path(os.environ.get("NSF_REPORTS", "reports")) / name)
