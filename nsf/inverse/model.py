@@ -153,6 +153,22 @@ class Model:
         found = self.at(points).position(xhat.flatten(0, -2) if xhat.ndim > 1 else xhat)
         return found.unflatten(0, xhat.shape[:-1]) if xhat.ndim > 1 else found
 
+    def check_points(self, points: np.ndarray) -> None:
+        """Refuse rest positions [n, 3] [m] that are not of the body.
+
+        Raises:
+            ConfigError: one is further from the nearest particle than a particle is wide.
+        """
+        from scipy.spatial import cKDTree
+
+        off, _ = cKDTree(self.manifold.X.cpu().numpy()).query(points)
+        if off.max() > self.spacing:
+            X = ", ".join(f"{value:.4g}" for value in points[off.argmax()])
+            raise ConfigError(
+                f"the point ({X}) m lies {off.max():.3g} m from the nearest particle, outside of the body; "
+                "X, Y, Z is where a point is at rest, before the run"
+            )
+
     def forcing(self, parameters=None, program: int | None = None) -> Forcing:
         """The scene's own forcing.
 

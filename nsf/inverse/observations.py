@@ -20,7 +20,7 @@ _POINT = ("X", "Y", "Z")
 _KNOWN = ("t", "particle", *_POINT, *AXES, "quantity", "value", "deviation")
 _MOST = 1_000_000  # rows of a file
 #: Particles that a scalar of a shape is taken from.
-_BODY = 2000
+BODY = 1000
 #: Of Δt: how far a time may be outside of a run.
 _SAME_TIME = 1e-6
 
@@ -102,18 +102,9 @@ class Observations:
             raise ConfigError(
                 f"deviation={bad[0]:g} m must be positive; give the standard deviation of the measurement"
             )
-        known = model.manifold.X.cpu().numpy()
         points = np.unique(self.points[~np.isnan(self.points[:, 0])], axis=0)
         if len(points):
-            from scipy.spatial import cKDTree
-
-            off, _ = cKDTree(known).query(points)
-            if off.max() > model.spacing:
-                X = ", ".join(f"{value:.4g}" for value in points[off.argmax()])
-                raise ConfigError(
-                    f"the point ({X}) m lies {off.max():.3g} m from the nearest particle, outside of the "
-                    "body; X, Y, Z is where a point is at rest, before the run"
-                )
+            model.check_points(points)
         return self
 
 
@@ -137,7 +128,7 @@ class View:
         self._quantities = [i for i, what in enumerate(own.what) if what in QUANTITIES]
         X = model.manifold.X
         if self._quantities:
-            kept = np.sort(np.random.default_rng(0).permutation(len(X))[:_BODY])
+            kept = np.sort(np.random.default_rng(0).permutation(len(X))[:BODY])
             self._body, self._X = kept, X[torch.as_tensor(kept)].to(model.device)
 
     def of_runs(self, xhat: Tensor) -> Tensor:
