@@ -14,8 +14,9 @@ from nsf.inverse.observations import View
 from nsf.inverse.space import UNKNOWN, Space
 
 _FEWEST = 2  # validation runs
-#: Of a parameter's range: how far validation runs tell much of the error at an estimate.
-_NEAR = 0.25
+#: Of the validation runs, the share that tells of the error at an estimate.
+_SHARE = 0.75
+_FREEDOM = 2.0  # degrees that a plane has to leave
 
 
 @dataclass(frozen=True)
@@ -108,15 +109,33 @@ class Offsets:
     def near(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """Mean [n], covariance [n, n] and degrees of freedom of what an estimate at a place u [n] is off.
 
-        Of one that is yet to come: that the mean is told by few cases is part of the covariance. Cases count
-        by w ∝ exp(−|u_v − u|²/2h²), Σw = 1, h a quarter of the ranges; they are as many as 1/Σw² that count
-        alike (Kish 1965).
+        The mean is what a plane has at u that is fitted to the cases, those near u first: by weights
+        w ∝ exp(−|u_v − u|²/2h²), Σw = 1, that as many cases share as three quarters of all would alike,
+        1/Σw² = 3V/4 (Kish 1965). The covariance is about that plane, of one estimate that is yet to come;
+        that few cases tell the plane is part of it. Of hardly more cases than parameters it is the mean.
+
+        Source: Cleveland 1979 (locally weighted regression).
         """
-        far = np.sum((self.u - u) ** 2, axis=1)
-        w = np.exp(-0.5 * (far - far.min()) / _NEAR**2)
-        w /= w.sum()
+        V, n = self.off.shape
+        w = _weights(np.sum((self.u - u) ** 2, axis=1), _SHARE * V)
         shared = float(np.sum(w**2))
-        mean = w @ self.off
-        about = self.off - mean
-        covariance = (about * w[:, None]).T @ about / (1.0 - shared) * (1.0 + shared)
-        return mean, covariance, 1.0 / shared - 1.0
+        rows = np.ones((V, 1))
+        if 1.0 / shared - 1.0 - n >= _FREEDOM:
+            rows = np.column_stack([rows, self.u - u])
+        solve = np.linalg.pinv((rows * w[:, None]).T @ rows) @ (rows * w[:, None]).T
+        about = np.eye(V) - rows @ solve
+        left = about @ self.off
+        covariance = (left * w[:, None]).T @ left / np.sum(w[:, None] * about**2)
+        told = 1.0 + float(np.sum(solve[0] ** 2))
+        return solve[0] @ self.off, told * covariance, max(1.0 / shared - rows.shape[1], 1.0)
+
+
+def _weights(squares: np.ndarray, count: float) -> np.ndarray:
+    """Gaussian weights [V] of squared distances [V] that `count` cases share, by bisection over the width."""
+    low, high = -20.0, 20.0
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        w = np.exp(-0.5 * (squares - squares.min()) / np.exp(middle))
+        w /= w.sum()
+        low, high = (middle, high) if 1.0 / np.sum(w**2) < count else (low, middle)
+    return w

@@ -3,13 +3,13 @@
 Residuals are (y − m(θ))/s with s² = σ² + s_b²: σ of the measurement, and s_b the reduced model's own error
 at the same points and times, as validation runs show it. In validation run v that error, b_v [m], alone
 would put the parameters off by δ_v = A_v b_v/s, with A_v the pseudo-inverse of the scaled Jacobian there. So
-the estimate is the parameters that fit best less the mean of the δ_v, and its covariance
+the estimate is the parameters that fit best less what the δ_v have there on average, and its covariance
 
-    C = A diag(σ²/s²) Aᵀ + (1 + 1/V) cov δ_v.
+    C = A diag(σ²/s²) Aᵀ + cov δ,
 
-Runs near the estimate weigh more (`nsf.inverse.error`). Nothing is assumed of how b_v hangs together over
-points and times. V runs tell a covariance with V − 1 degrees of freedom, so that intervals are Student's,
-with those of Welch and Satterthwaite.
+with cov δ of the δ_v about their average, by a plane that is fitted to those nearest (`nsf.inverse.error`).
+Nothing is assumed of how b_v hangs together over points and times. As few runs tell cov δ, intervals are
+Student's, with the degrees of freedom of Welch and Satterthwaite.
 """
 
 import time
