@@ -60,6 +60,14 @@ class Observations:
         )
 
     @classmethod
+    def of_quantities(cls, values: Mapping[str, float], t: float, deviation: float = 1e-3) -> "Observations":
+        """Scalars of the shape by name [m] at a time [s], all of one deviation [m]."""
+        count = len(values)
+        none = np.full((count, 3), np.nan)
+        own = np.array(list(values.values()), float)
+        return cls(np.full(count, t), tuple(values), none, own, np.full(count, deviation))
+
+    @classmethod
     def read(cls, path: Path | str, model: Model) -> "Observations":
         """Those of a CSV or HDF5 file (docs/howto/inverse.md).
 

@@ -36,7 +36,9 @@ CHAPTERS = {
         "ablation", "field", "width", "latent_dim", "sample_size", "sampler", "timestep", "seeds",
     ),
     "Beyond what was trained": ("extrapolation", "weak_elements", "super_resolution", "path_dependent"),
-    "At small scale, on a CPU": ("small", "levels", "calibration", "quickstart"),
+    "At small scale, on a CPU": (
+        "small", "levels", "calibration", "sensitivities", "design", "quickstart",
+    ),
     "One scene in detail, and speed": ("sand", "speed"),
 }  # fmt: skip
 _OTHERS = "Further reports"

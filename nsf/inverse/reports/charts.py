@@ -42,7 +42,9 @@ def trials_chart(table: pd.DataFrame, reach: np.ndarray, units: Mapping[tuple[st
                 xlabel=axis(shown, unit), ylabel=axis("estimate − truth", unit), title=scene.replace("_", " ")
             )
             panel.grid()
-            panel.legend(fontsize=8)
+            low, high = panel.get_ylim()
+            panel.set_ylim(low, high + 0.22 * (high - low))  # room for the legend
+            panel.legend(fontsize=8, loc="upper left")
         for panel in panels[len(groups) :]:
             panel.set_visible(False)
     return fig

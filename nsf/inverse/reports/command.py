@@ -5,8 +5,10 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from nsf.data import PROGRAM
 from nsf.errors import ConfigError, MissingRunError
-from nsf.inverse.model import Model
+from nsf.evaluation.quantities import QUANTITIES
+from nsf.inverse.model import Forcing, Model
 from nsf.inverse.observations import Observations, View
 from nsf.inverse.space import Space
 from nsf.runs import Run
@@ -58,6 +60,98 @@ def calibrate(words: Sequence[str], say: Callable[[str], object] = print) -> Pat
         say=say,
     )
     return page
+
+
+def sample(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
+    """What drawn parameters bring about; gives the page.
+
+    Args:
+        words: `key=value`, as `nsf sample --help` has them.
+        say: told what is done.
+
+    Raises:
+        NSFError: a word is refused, or a run or an extra is missing.
+    """
+    known = ("of", "runs", "sensitivities", "full_order", "observations", "program", "seed")
+    models, asked, named = _begun("sample", words, known)
+    from nsf.extras import optional
+    from nsf.inverse.reports.sample import report
+    from nsf.inverse.sampling import Asked, Prior
+
+    indices = _whole(asked, "sensitivities", 0, least=0)
+    for needed in ("SALib",) * bool(indices) + ("emcee",) * ("observations" in asked):
+        optional(needed, "inverse")  # before any work
+    model, view = _one(models), None
+    if "observations" in asked:
+        view = View(Observations.read(asked["observations"], model), model)
+    return report(
+        model,
+        Prior.of(model, named),
+        Asked(asked.get("of", "height").split(","), model),
+        _folder(asked, f"sample_{model.scene.name}"),
+        count=_whole(asked, "runs", 10_000),
+        indices=indices,
+        full_order=_whole(asked, "full_order", 0, least=0),
+        view=view,
+        forcing=_forcing(asked, model),
+        seed=_whole(asked, "seed", 0, least=0),
+        say=say,
+    )
+
+
+def design(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
+    """A program of forcing that brings a target about; gives the page.
+
+    Args:
+        words: `key=value`, as `nsf design --help` has them.
+        say: told what is done.
+
+    Raises:
+        NSFError: a word is refused, or a run is missing.
+    """
+    known = ("target", "tilt", "move", "knots", "full_order", "seed", *QUANTITIES)
+    models, asked, named = _begun("design", words, known)
+    from nsf.inverse.design import Moves, Program, Tilt
+    from nsf.inverse.reports.design import report
+
+    model, wanted = _one(models), {name: asked[name] for name in QUANTITIES if name in asked}
+    if ("target" in asked) == bool(wanted):
+        raise ConfigError(
+            f"nsf design takes target=FILE, or a scalar at the end, as {next(iter(QUANTITIES))}=0.1"
+        )
+    if ("tilt" in asked) == ("move" in asked):
+        raise ConfigError("nsf design takes tilt=ANGLE [°] or move=SOLID, what may change; give one of them")
+    knots = _whole(asked, "knots", 6, most=1000)
+    program: Program = (
+        Tilt(model, _number(asked, "tilt"), knots)
+        if "tilt" in asked
+        else Moves(model, tuple(asked["move"].split(",")), knots)
+    )
+    seen = (
+        Observations.read(asked["target"], model)
+        if "target" in asked
+        else Observations.of_quantities({name: _number(asked, name) for name in wanted}, float(model.t[-1]))
+    )
+    values = ranges_of(named)
+    if wide := [name for name, value in values.items() if isinstance(value, list)]:
+        raise ConfigError(f"{wide[0]}={named[wide[0]]} must be one value: the run's own")
+    middle = dict(zip(model.names, model.ranges.mean(1).tolist(), strict=True))
+    page, _ = report(
+        program,
+        View(seen, model),
+        middle | values,
+        _folder(asked, f"design_{model.scene.name}"),
+        run_full_order=_flag(asked, "full_order", True),
+        seed=_whole(asked, "seed", 0, least=0),
+        say=say,
+    )
+    return page
+
+
+def _number(asked: Mapping[str, str], key: str) -> float:
+    if not re.fullmatch(_NUMBER, asked[key]):
+        raise ConfigError(f"{key}={asked[key]} is no number")
+    return float(asked[key])
 
 
 def ranges_of(named: Mapping[str, str]) -> dict[str, list[float] | float]:
@@ -116,6 +210,15 @@ def _runs(named: str | None, experiment: str | None) -> list[Run]:
             f"make them by `nsf run +experiment={experiment}`"
         )
     return runs
+
+
+def _forcing(asked: Mapping[str, str], model: Model) -> Forcing | None:
+    """Of the program that is asked for."""
+    if "program" not in asked:
+        return None
+    if PROGRAM not in model.scene.varied:
+        raise ConfigError(f"program={asked['program']}: {model.scene.name} has no programs; leave it out")
+    return model.forcing(program=_whole(asked, "program", 0, least=0))
 
 
 def _one(models: Sequence[Model]) -> Model:
