@@ -112,8 +112,10 @@ def _tool(name: str, words: list[str]) -> int:
 
         return live(name, text, words)
     tools = {
-        "bench": _bench, "demo": _demo, "doctor": _doctor, "export": _export, "index": _index,
-        "plan": _plan, "reports": _reports, "runs": _runs, "search": _search,
+        "bench": _bench, "calibrate": _calibrate, "demo": _demo, "design": _design, "doctor": _doctor,
+        "export": _export,
+        "index": _index, "plan": _plan, "reports": _reports, "runs": _runs, "sample": _sample,
+        "search": _search,
     }  # fmt: skip
     return tools[name](words)
 
@@ -129,6 +131,22 @@ def _bench(words: list[str]) -> int:
     page = bench(folder, asked, lambda text: print(text, file=sys.stderr))
     _console().print(table(page.with_name("results.csv")))
     print(f"open {page.resolve()}")
+    return 0
+
+
+def _calibrate(words: list[str]) -> int:
+    """Parameters from observations."""
+    from nsf.inverse.reports.command import calibrate
+
+    print(f"open {calibrate(words).resolve()}")
+    return 0
+
+
+def _design(words: list[str]) -> int:
+    """A program of forcing that brings a target about."""
+    from nsf.inverse.reports.command import design
+
+    print(f"open {design(words).resolve()}")
     return 0
 
 
@@ -243,6 +261,14 @@ def _runs(words: list[str]) -> int:
     from nsf.reporting.overview.command import main as runs
 
     return runs(words, lambda table: _console().print(table))
+
+
+def _sample(words: list[str]) -> int:
+    """What drawn parameters bring about."""
+    from nsf.inverse.reports.command import sample
+
+    print(f"open {sample(words).resolve()}")
+    return 0
 
 
 def _stages(stage: str) -> tuple[str, ...]:

@@ -27,6 +27,22 @@ TOOLS = {
         "values of numeric keys that make δ, or δ and the step's time, small at the validation values",
         "key=low..high[:log] … [key=value …] [search.objectives=[delta,step_ms]] [search.trials=20]",
     ),
+    "calibrate": (
+        "parameters from observations by runs of engine=operators, how sure they are, a full-order run there",
+        "observations=FILE [run=RUN] [NAME=LOW..HIGH|VALUE …] [program=N] [full_order=true] [starts=64]\n"
+        "       [device=auto] [folder=PATH]; or trials=N [run=RUN,RUN | +experiment=NAME] [seed=0]\n"
+        "       [folder=PATH]: full-order runs at known parameters, observed with noise",
+    ),
+    "sample": (
+        "parameters drawn from distributions, runs in batches: quantiles, sensitivities, a posterior",
+        "[run=RUN] [NAME=norm(30,2)|LOW..HIGH …] [of=height,run_out,opening,z@X:Y:Z] [runs=10000]\n"
+        "       [sensitivities=1024] [full_order=0] [observations=FILE] [program=N] [seed=0] [folder=PATH]",
+    ),
+    "design": (
+        "a program of forcing that brings a target about, by gradients, and the full-order run along it",
+        "target=FILE|height=0.1|run_out=… tilt=ANGLE|move=SOLID,SOLID [run=RUN] [NAME=VALUE …] [knots=6]\n"
+        "       [full_order=true] [seed=0] [device=auto] [folder=PATH]",
+    ),
     "plan": (
         "what nsf run would do: stages and their states, size, time and room; --cfg: the configuration",
         "[-m] [+experiment=NAME] [key=value …] [--cfg]; nsf run … --dry-run is the same",

@@ -1,18 +1,18 @@
 """Least squares: the parameters under which runs by operators pass the observations, and how sure they are.
 
 Residuals are (y − m(θ))/s with s² = σ² + s_b²: σ of the measurement, and s_b the reduced model's own error
-at the same points and times, as validation runs show it. An estimate is A y with A the pseudo-inverse of
-the scaled Jacobian, so that both errors go through A into the covariance of the estimate,
+at the same points and times, as validation runs show it. In validation run v that error, b_v [m], alone
+would put the parameters off by δ_v = A_v b_v/s, with A_v the pseudo-inverse of the scaled Jacobian there. So
+the estimate is the parameters that fit best less what the δ_v have there on average, and its covariance
 
-    C = A diag(σ²/s²) Aᵀ + 1/V Σ_v δ_v δ_vᵀ,    δ_v = A b_v/s,
+    C = A diag(σ²/s²) Aᵀ + cov δ,
 
-where b_v [m] is the model's error in validation run v, and δ_v how far it alone would put the estimate off.
-Nothing is assumed of how b_v hangs together over points and times. V runs tell a variance with V degrees of
-freedom, so that intervals are Student's, with those of Welch and Satterthwaite.
+with cov δ of the δ_v about their average, by a plane that is fitted to those nearest (`nsf.inverse.error`).
+Nothing is assumed of how b_v hangs together over points and times. As few runs tell cov δ, intervals are
+Student's, with the degrees of freedom of Welch and Satterthwaite.
 """
 
 import time
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,138 +21,23 @@ from scipy import stats
 from scipy.optimize import least_squares
 from scipy.stats import qmc
 from torch import Tensor
-from torch.autograd import forward_ad
 
-from nsf.data import PROGRAM, Trajectory
-from nsf.data.schema import TRAJECTORY
 from nsf.errors import ConfigError, InstabilityError
-from nsf.inverse.model import Model
+from nsf.inverse.derivatives import with_jacobian
+from nsf.inverse.error import ModelError
+from nsf.inverse.model import Forcing, Model
 from nsf.inverse.observations import View
+from nsf.inverse.space import UNKNOWN, Space
 
 #: Share of the truths that an interval is to hold.
 CONFIDENCE = 0.9
-#: Deviation of a value of which nothing is known but its range, in units of the range.
-_UNKNOWN = 12.0**-0.5
 #: Entry of a direction's unit vector from which on a parameter is named as part of it.
 _PART = 0.3
 _POLISHED = 3  # starts that are followed to their end
-_FEWEST = 2  # validation runs
 _STOPS = {
     0: "evaluations used up", 1: "gradient vanishes", 2: "residuals change no more",
     3: "parameters change no more", 4: "residuals and parameters change no more",
 }  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Space:
-    """The parameters that are sought, in units of their ranges; those that are known.
-
-    Attributes:
-        model: whose they are.
-        free: names; ranges: [n, 2] theirs; log: [n] whether they are taken evenly in their logarithm.
-        fixed: values of the others, by name.
-    """
-
-    model: Model
-    free: tuple[str, ...]
-    ranges: np.ndarray
-    log: np.ndarray
-    fixed: Mapping[str, float]
-
-    @classmethod
-    def of(cls, model: Model, asked: Mapping[str, Sequence[float] | float] | None = None) -> "Space":
-        """Ranges, or values that are known, by name; what was taught of the others.
-
-        Raises:
-            ConfigError: a name is unknown, nothing is left to seek, or a range goes beyond what was taught.
-        """
-        asked = dict(asked or {})
-        if unknown := [name for name in asked if name not in model.names]:
-            raise ConfigError(f"there is no parameter {unknown[0]!r}; there are {', '.join(model.names)}")
-        taught = dict(zip(model.names, model.ranges.tolist(), strict=True))
-        fixed = {name: float(value) for name, value in asked.items() if np.ndim(value) == 0}
-        ranges = {
-            name: list(map(float, asked.get(name, taught[name]))) for name in taught if name not in fixed
-        }
-        for name, (low, high) in [*ranges.items(), *((name, (v, v)) for name, v in fixed.items())]:
-            least, most = taught[name]
-            slack = 1e-9 * max(abs(least), abs(most))
-            if not least - slack <= low <= high <= most + slack:
-                raise ConfigError(
-                    f"{name}={low:g}..{high:g} goes beyond what was taught, {least:g}..{most:g}; stay "
-                    f"within, "
-                    "or train with a wider range"
-                )
-        if empty := [name for name, (low, high) in ranges.items() if low == high]:
-            raise ConfigError(f"{empty[0]} has an empty range; give {empty[0]}={ranges[empty[0]][0]:g}")
-        if not ranges:
-            raise ConfigError("every parameter is given; leave out one that is to be found")
-        log = np.array([model.scene.parameters[name].log for name in ranges])
-        return cls(model, tuple(ranges), np.array(list(ranges.values())), log, fixed)
-
-    def parameters(self, u: Tensor) -> Tensor:
-        """All parameters [..., n] of those sought, u [..., free] in units of their ranges."""
-        own = dict(zip(self.free, self.values(u).unbind(-1), strict=True))
-        every = [
-            own.get(name, torch.full_like(u[..., 0], self.fixed.get(name, 0.0))) for name in self.model.names
-        ]
-        return torch.stack(every, -1)
-
-    def values(self, u: Tensor) -> Tensor:
-        """Values [..., free] of u."""
-        low, high = torch.as_tensor(self.ranges).to(u).unbind(1)
-        log = torch.as_tensor(self.log).to(u.device)
-        even = low + u * (high - low)
-        safe_low, safe_high = (torch.where(log, end, torch.ones_like(end)) for end in (low, high))
-        return torch.where(log, safe_low * (safe_high / safe_low) ** u, even)
-
-    def units(self, values: np.ndarray) -> np.ndarray:
-        """u [free] of values."""
-        low, high = self.ranges.T
-        even = (np.asarray(values, float) - low) / (high - low)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            return np.where(self.log, np.log(values / low) / np.log(high / low), even)
-
-
-@dataclass(frozen=True)
-class ModelError:
-    """How far runs by operators are from full-order runs at the observations, in validation cases.
-
-    Attributes:
-        vectors: [V, m] [m].
-    """
-
-    vectors: np.ndarray
-
-    @classmethod
-    def of(cls, view: View, model: Model) -> "ModelError":
-        """From the validation runs of the model's chain.
-
-        Raises:
-            ConfigError: there are too few.
-        """
-        pipeline, found = model.pipeline, []
-        for case in pipeline.split.validation:
-            run = pipeline.simulation(case)
-            if not run.complete:
-                continue
-            forcing = model.forcing(case.parameters, int(case[PROGRAM])) if PROGRAM in case else None
-            with torch.no_grad():
-                seen = view.of_runs(model(model.tensor(case.parameters)[None], forcing))[0].cpu().numpy()
-            with Trajectory.open(run.file(TRAJECTORY)) as trajectory:
-                found.append(view.of_truth(trajectory) - seen)
-        if len(found) < _FEWEST:
-            raise ConfigError(
-                f"{len(found)} validation runs cannot tell the model's own error, and intervals without "
-                f"it miss "
-                f"the truth; give scene.design.validation at least {_FEWEST} values, better 8, in `nsf run`"
-            )
-        return cls(np.array(found))
-
-    @property
-    def deviations(self) -> np.ndarray:
-        """[m] root mean square over the runs [m]."""
-        return np.sqrt(np.mean(self.vectors**2, axis=0))
 
 
 @dataclass(frozen=True)
@@ -161,6 +46,7 @@ class Fit:
 
     Attributes:
         space: of the parameters; u: [n] the estimate in units of the ranges.
+        fitted: [n] values of the parameters whose run passes the observations best.
         estimate, standard_error, lower, upper: [n] values; the last two hold the truth in 90 % of the cases.
         covariance: [n, n] of u.
         seen: [m] the observations in the fitted run [m]; residuals: [m] in units of s.
@@ -175,6 +61,7 @@ class Fit:
 
     space: Space
     u: np.ndarray
+    fitted: np.ndarray
     estimate: np.ndarray
     standard_error: np.ndarray
     lower: np.ndarray
@@ -210,7 +97,7 @@ def fit(
     space: Space | None = None,
     error: ModelError | None = None,
     starts: int = 64,
-    forcing=None,
+    forcing: Forcing | None = None,
 ) -> Fit:
     """The parameters whose run passes the observations best.
 
@@ -233,8 +120,7 @@ def fit(
     if len(own) < len(space.free):
         raise ConfigError(
             f"{len(own)} observations cannot tell {len(space.free)} parameters, {', '.join(space.free)}; "
-            f"observe "
-            "more, or give one of them as NAME=VALUE"
+            "observe more, or give one of them as NAME=VALUE"
         )
     s = np.sqrt(own.deviations**2 + error.deviations**2)
 
@@ -252,9 +138,8 @@ def fit(
     _check_told_apart(J, space)
     A = np.linalg.pinv(J)
     noise = (A * (own.deviations / s) ** 2) @ A.T
-    off = (error.vectors / s) @ A.T
-    V = len(off)
-    of_model = off.T @ off / V
+    off, of_model, V = error.offsets(view, model, space, s).near(best.x)
+    u = np.clip(best.x - off, 0.0, 1.0)
     covariance = noise + of_model
     share = np.diag(of_model) / np.diag(covariance)
     freedom = V / np.maximum(share**2, 1e-12)  # Welch 1947: the measurement's variance is known
@@ -268,14 +153,15 @@ def fit(
     def valued(u: np.ndarray) -> np.ndarray:
         return space.values(torch.as_tensor(u)).numpy()
 
-    slope = np.abs(with_jacobian(space.values, torch.as_tensor(best.x)[None])[1][0].numpy().diagonal())
+    slope = np.abs(with_jacobian(space.values, torch.as_tensor(u)[None])[1][0].numpy().diagonal())
     return Fit(
         space=space,
-        u=best.x,
-        estimate=valued(best.x),
+        u=u,
+        fitted=valued(best.x),
+        estimate=valued(u),
         standard_error=slope * deviation,
-        lower=valued(best.x - reach),
-        upper=valued(best.x + reach),
+        lower=valued(u - reach),
+        upper=valued(u + reach),
         covariance=covariance,
         seen=best.fun * s + own.values,
         residuals=best.fun,
@@ -289,17 +175,6 @@ def fit(
         project=A / s,
         seconds=time.perf_counter() - began,
     )
-
-
-def with_jacobian(of, u: Tensor) -> tuple[Tensor, Tensor]:
-    """Values [B, m] of a function of rows u [B, n], and their derivatives [B, m, n], in one pass forward."""
-    B, n = u.shape
-    rows = u[:, None].expand(B, n, n).reshape(-1, n)
-    ways = torch.eye(n, dtype=u.dtype, device=u.device).expand(B, n, n).reshape(-1, n)
-    with torch.no_grad(), forward_ad.dual_level():
-        values, slopes = forward_ad.unpack_dual(of(forward_ad.make_dual(rows, ways.contiguous())))
-    slopes = torch.zeros_like(values) if slopes is None else slopes
-    return values.view(B, n, -1)[:, 0], slopes.view(B, n, -1).transpose(1, 2)
 
 
 def _best_starts(seen, values: np.ndarray, s: np.ndarray, n: int, starts: int, device) -> list[np.ndarray]:
@@ -355,15 +230,14 @@ def _check_told_apart(J: np.ndarray, space: Space) -> None:
     """
     _, sizes, ways = np.linalg.svd(J, full_matrices=False)
     for size, way in zip(sizes, ways, strict=True):
-        if size * _UNKNOWN <= 1.0:
+        if size * UNKNOWN <= 1.0:
             parts = [name for name, part in zip(space.free, way, strict=True) if abs(part) > _PART]
             told = (
                 f"do not tell {parts[0]}" if len(parts) == 1 else f"do not tell {' and '.join(parts)} apart"
             )
             raise ConfigError(
                 f"the observations {told}: they hardly change where {_along(space, way)}; observe other "
-                f"points or "
-                f"times, or give {parts[0]}=VALUE"
+                f"points or times, or give {parts[0]}=VALUE"
             )
 
 

@@ -16,6 +16,7 @@ from nsf.engines import Operators
 from nsf.engines.operators import collider_states
 from nsf.errors import ConfigError, ShapeError
 from nsf.inverse.inputs import Polynomial
+from nsf.inverse.recurrence import Recurrence
 from nsf.kinematics.manifold import Restriction
 from nsf.pipeline import Pipeline
 from nsf.pipeline.stages.deployment import trust_of
@@ -83,7 +84,7 @@ class Model:
         self.spacing = float(one.constants.volume0.mean() ** (1 / 3))
         self._sample = one.sets[0].sample
         self._every = np.unique(np.concatenate([sets.sample for sets in one.sets]))
-        self._net = self.operators.model.to(self.device)
+        self._recurrence = Recurrence(self.operators.model.to(self.device))
         self._xhat = one.xhat.to(self.device, torch.float64)
         self._given: dict[str, Polynomial] = {}
 
@@ -124,11 +125,15 @@ class Model:
             forcing: of all runs, or of each; the scene's own by default.
         """
         mu = self.tensor(parameters)
-        first = self._of("start", mu).expand(*mu.shape[:-1], -1)
-        given = forcing or Forcing(self._of("gravity", mu), self._of("solids", mu))
-        gravity, solids = (values.to(self.device).movedim(-2, 0) for values in (given.gravity, given.solids))
-        c = self._net.collider_state(solids)
-        return self._net.run(self._xhat.expand_as(first), first, mu, gravity, c).movedim(0, -2)
+        rows = mu.reshape(-1, mu.shape[-1])
+        first = self._of("start", rows).expand(len(rows), -1).clone()
+        given = forcing or Forcing(self._of("gravity", rows), self._of("solids", rows))
+        gravity, solids = (
+            values.to(self.device).flatten(0, -3).movedim(-2, 0) if values.ndim > 2 else values[:, None]
+            for values in (given.gravity, given.solids)
+        )
+        found = self._recurrence(self._xhat.repeat(len(rows), 1), first, rows, gravity, solids)
+        return found.movedim(0, -2).unflatten(0, mu.shape[:-1]) if mu.ndim > 1 else found[:, 0]
 
     def at(self, points) -> Restriction:
         """The fields at particles [n] or rest positions [n, 3] [m], for many calls of `positions`."""
@@ -147,6 +152,22 @@ class Model:
         """
         found = self.at(points).position(xhat.flatten(0, -2) if xhat.ndim > 1 else xhat)
         return found.unflatten(0, xhat.shape[:-1]) if xhat.ndim > 1 else found
+
+    def check_points(self, points: np.ndarray) -> None:
+        """Refuse rest positions [n, 3] [m] that are not of the body.
+
+        Raises:
+            ConfigError: one is further from the nearest particle than a particle is wide.
+        """
+        from scipy.spatial import cKDTree
+
+        off, _ = cKDTree(self.manifold.X.cpu().numpy()).query(points)
+        if off.max() > self.spacing:
+            X = ", ".join(f"{value:.4g}" for value in points[off.argmax()])
+            raise ConfigError(
+                f"the point ({X}) m lies {off.max():.3g} m from the nearest particle, outside of the body; "
+                "X, Y, Z is where a point is at rest, before the run"
+            )
 
     def forcing(self, parameters=None, program: int | None = None) -> Forcing:
         """The scene's own forcing.

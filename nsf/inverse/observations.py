@@ -15,12 +15,12 @@ from nsf.evaluation.quantities import QUANTITIES
 from nsf.inverse.model import Model
 from nsf.kinematics.interpolation import interpolation
 
-_AXES = ("x", "y", "z")
+AXES = ("x", "y", "z")
 _POINT = ("X", "Y", "Z")
-_KNOWN = ("t", "particle", *_POINT, *_AXES, "quantity", "value", "deviation")
+_KNOWN = ("t", "particle", *_POINT, *AXES, "quantity", "value", "deviation")
 _MOST = 1_000_000  # rows of a file
 #: Particles that a scalar of a shape is taken from.
-_BODY = 2000
+BODY = 1000
 #: Of Δt: how far a time may be outside of a run.
 _SAME_TIME = 1e-6
 
@@ -53,11 +53,19 @@ class Observations:
         k, n = x.shape[:2]
         return cls(
             np.repeat(np.asarray(t, float), 3 * n),
-            _AXES * (k * n),
+            AXES * (k * n),
             np.tile(np.repeat(np.asarray(points, float), 3, axis=0), (k, 1)),
             np.asarray(x, float).ravel(),
             np.full(3 * k * n, float(deviation)),
         )
+
+    @classmethod
+    def of_quantities(cls, values: Mapping[str, float], t: float, deviation: float = 1e-3) -> "Observations":
+        """Scalars of the shape by name [m] at a time [s], all of one deviation [m]."""
+        count = len(values)
+        none = np.full((count, 3), np.nan)
+        own = np.array(list(values.values()), float)
+        return cls(np.full(count, t), tuple(values), none, own, np.full(count, deviation))
 
     @classmethod
     def read(cls, path: Path | str, model: Model) -> "Observations":
@@ -102,19 +110,9 @@ class Observations:
             raise ConfigError(
                 f"deviation={bad[0]:g} m must be positive; give the standard deviation of the measurement"
             )
-        known = model.manifold.X.cpu().numpy()
         points = np.unique(self.points[~np.isnan(self.points[:, 0])], axis=0)
         if len(points):
-            from scipy.spatial import cKDTree
-
-            off, _ = cKDTree(known).query(points)
-            if off.max() > model.spacing:
-                X = ", ".join(f"{value:.4g}" for value in points[off.argmax()])
-                raise ConfigError(
-                    f"the point ({X}) m lies {off.max():.3g} m from the nearest particle, outside of the "
-                    f"body; "
-                    "X, Y, Z is where a point is at rest, before the run"
-                )
+            model.check_points(points)
         return self
 
 
@@ -129,16 +127,16 @@ class View:
     def __init__(self, observations: Observations, model: Model):
         self.observations, self._model = observations.check(model), model
         own = observations
-        self._of_points = np.flatnonzero([what in _AXES for what in own.what])
+        self._of_points = np.flatnonzero([what in AXES for what in own.what])
         self._steps, shares = _between(own.t[self._of_points], model)
         self._shares = torch.as_tensor(shares, device=model.device)
         rows = own.points[self._of_points]
         self._points, self._row = np.unique(rows, axis=0, return_inverse=True)
-        self._axis = np.array([_AXES.index(own.what[i]) for i in self._of_points], int)
+        self._axis = np.array([AXES.index(own.what[i]) for i in self._of_points], int)
         self._quantities = [i for i, what in enumerate(own.what) if what in QUANTITIES]
         X = model.manifold.X
         if self._quantities:
-            kept = np.sort(np.random.default_rng(0).permutation(len(X))[:_BODY])
+            kept = np.sort(np.random.default_rng(0).permutation(len(X))[:BODY])
             self._body, self._X = kept, X[torch.as_tensor(kept)].to(model.device)
 
     def of_runs(self, xhat: Tensor) -> Tensor:
@@ -274,5 +272,5 @@ def _row(where: str, at: Mapping[str, float], quantity: str, model: Model) -> li
         point = X[int(at["particle"])]
     if not np.isfinite(point).all():
         raise ConfigError(f"{where} names no point; give X, Y, Z at rest [m], or particle")
-    seen = [axis for axis in _AXES if not np.isnan(at[axis])]
+    seen = [axis for axis in AXES if not np.isnan(at[axis])]
     return [(at["t"], axis, point, at[axis], at["deviation"]) for axis in seen]

@@ -114,6 +114,13 @@ class Pipeline(Plan):
         shared = Shared(self.scene.steps, self.scene.dx, self.stored, self.device, c.precision)
         return simulate(jobs, shared, self.say)
 
+    def full_order(self, cases: Sequence[Case]) -> list[Run]:
+        """Full-order trajectories of any cases of the deployed scene; those that are there are reused."""
+        runs = {self.truth(case): (case, self.deployed) for case in cases}
+        if missing := {run: needed for run, needed in runs.items() if not run.complete}:
+            self._simulate(missing, {run: [] for run in missing})
+        return [self.truth(case) for case in cases]
+
     def train(self) -> Run:
         """The manifold of the training trajectories."""
         return self._made(self.training, partial(train, self))

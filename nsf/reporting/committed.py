@@ -23,7 +23,7 @@ from nsf.reporting.study import fine_means
 from nsf.reporting.swap import MARK
 from nsf.reporting.tables import VARIANT, rows_of, without_constants
 from nsf.reporting.text.columns import RIVALS
-from nsf.reporting.text.formats import markdown, markdown_document, markdown_table, unescaped
+from nsf.reporting.text.formats import Rows, markdown, markdown_document, markdown_table, unescaped
 from nsf.reporting.text.page import DEFINITIONS
 from nsf.runs.provenance import not_ignored
 from nsf.storage import writing
@@ -36,7 +36,9 @@ CHAPTERS = {
         "ablation", "field", "width", "latent_dim", "sample_size", "sampler", "timestep", "seeds",
     ),
     "Beyond what was trained": ("extrapolation", "weak_elements", "super_resolution", "path_dependent"),
-    "At small scale, on a CPU": ("small", "levels", "quickstart"),
+    "At small scale, on a CPU": (
+        "small", "levels", "calibration", "sensitivities", "design", "quickstart",
+    ),
     "One scene in detail, and speed": ("sand", "speed"),
 }  # fmt: skip
 _OTHERS = "Further reports"
@@ -115,7 +117,12 @@ def _place(name: str) -> tuple[int, str, int, str]:
 
 
 def _section(folder: Path, told: dict) -> dict:
-    """What the list says of a report."""
+    """What the list says of a report; one that is of no evaluate runs says so itself."""
+    if listed := told.get("listed"):
+        table = Rows(listed["headings"], listed["body"], listed["numeric"])
+        kept = {"title": told["title"], "lead": told["question"], "paper": told.get("paper"), "finer": None}
+        chart = {"alt": told["title"]} | told["chart"] if told.get("chart") else None
+        return kept | {"table": table, "said": listed["said"], "chart": chart, "made": listed["made"]}
     report = Report(folder, told)
     table, said = headline(report)
     chart = told.get("chart") or _CHART

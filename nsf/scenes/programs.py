@@ -139,7 +139,7 @@ class RandomShake(GravityProgram):
         own, pushed = _wandering(duration, self.knots, generator)
         times = np.union1d(own, gravity.times)
         added = np.stack([np.interp(times, own, way) for way in self.acceleration * pushed.T], 1)
-        found = gravity.at(times) + added @ _across(gravity.at(0.0))
+        found = gravity.at(times) + added @ across(gravity.at(0.0))
         return Gravity(times.tolist(), found.tolist())
 
     def reach(self, gravity: float) -> float:
@@ -293,7 +293,7 @@ def tilted(gravity: np.ndarray, tilt: np.ndarray) -> np.ndarray:
     """Gravity [n, 3] [m/s²] turned by tilts [n, 2] [rad] along two directions across its first value."""
     size = np.linalg.norm(gravity, axis=1, keepdims=True)
     angle = np.linalg.norm(tilt, axis=1, keepdims=True)
-    aside = tilt @ _across(gravity[0])
+    aside = tilt @ across(gravity[0])
     return size * (np.cos(angle) * _unit(gravity) + np.sinc(angle / np.pi) * aside)
 
 
@@ -330,7 +330,7 @@ def _unit(values: np.ndarray) -> np.ndarray:
     return values / np.where(size > 0.0, size, 1.0)
 
 
-def _across(gravity: np.ndarray) -> np.ndarray:
+def across(gravity: np.ndarray) -> np.ndarray:
     """[2, 3] unit vectors across gravity [3]: x and y where it points along z."""
     down = _unit(gravity) if np.any(gravity) else np.array([0.0, 0.0, -1.0])
     axis = np.eye(3)[0 if abs(down[0]) < 0.9 else 1]

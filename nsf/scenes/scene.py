@@ -249,22 +249,25 @@ class Scene(Draft):
                 (`nsf.scenes.checks`); and see `FullOrderMPM`.
             InstabilityError, DeviceError: see `FullOrderMPM`.
         """
-        scene = self.with_parameters(parameters or {})
-        check_memory(scene, precision, device)
-        check_physics(scene)
+        return self.with_parameters(parameters or {}).solver(precision, device)
+
+    def solver(self, precision: str = "fp64", device: str = "auto") -> FullOrderMPM:
+        """The same of the scene as it stands, though its configuration may say another thing."""
+        check_memory(self, precision, device)
+        check_physics(self)
         return FullOrderMPM(
-            scene.particles(),
-            scene.material,
-            scene.grid,
-            scene.dt,
-            gravity=scene.acting_gravity,
-            colliders=scene.colliders,
-            walls=scene.walls,
-            transfer=scene.transfer,
-            v=scene.initial_velocity(),
+            self.particles(),
+            self.material,
+            self.grid,
+            self.dt,
+            gravity=self.acting_gravity,
+            colliders=self.colliders,
+            walls=self.walls,
+            transfer=self.transfer,
+            v=self.initial_velocity(),
             precision=precision,
             device=device,
-            names=scene.collider_names,
+            names=self.collider_names,
         )
 
     def reduced(self, manifold, parameters: Mapping[str, float] | None = None, sample=None, **options):

@@ -63,13 +63,14 @@ class Page:
     tables: Sequence[Table]
     sections: Sequence[Section]
     provenance: Table
+    definitions: Sequence[tuple[str, str]] = DEFINITIONS
 
 
 def html_page(page: Page) -> str:
     """The page with its style inside and its pictures beside it."""
-    return HTML.get_template("report.html").render(vars(page), definitions=DEFINITIONS)
+    return HTML.get_template("report.html").render(vars(page))
 
 
 def markdown_page(page: Page) -> str:
     """The same page for GitHub."""
-    return markdown_document("report.md", **vars(page), definitions=DEFINITIONS)
+    return markdown_document("report.md", **vars(page))

@@ -1,0 +1,340 @@
+"""Forcing programs that bring a target about, by gradients through the recurrence."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from torch import Tensor
+
+from nsf.errors import ConfigError, InstabilityError
+from nsf.inverse.model import Forcing, Model
+from nsf.inverse.observations import View
+from nsf.mpm import Motion
+from nsf.scenes import Keyframes, Scene
+from nsf.scenes.programs import Programs, across
+
+_FEATURES = 9  # of a collider (`collider_states`): shift, angle, both over the coming step, whether it acts
+_STARTS, _LOOKS = 8, 40  # that descend together, and for how many steps, before the best goes on alone
+_RATE = 0.15  # of these steps, in units of the bounds
+_MOST = 60  # steps of the best one
+_HARDLY = 1e-6  # [m] of a solid that does not move
+
+
+class Program(ABC):
+    """Knots that are even in time, linear between, within bounds.
+
+    Attributes:
+        names: of the ways a knot can go; unit: theirs; knots: how many are free.
+    """
+
+    model: Model
+    names: tuple[str, ...]
+    unit: str
+    knots: int
+
+    @property
+    @abstractmethod
+    def bounds(self) -> np.ndarray:
+        """[ways, 2] smallest and largest value."""
+
+    @property
+    @abstractmethod
+    def first(self) -> np.ndarray:
+        """[ways] value at t = 0, which is no knot."""
+
+    @abstractmethod
+    def forcing(self, values: Tensor) -> Forcing:
+        """Of runs whose ways have values [B, N + 1, ways] at the steps, differentiable."""
+
+    @abstractmethod
+    def scene(self, scene: Scene, values: np.ndarray) -> Scene:
+        """A scene with the program in place of its own, at values [N + 1, ways]."""
+
+    def values(self, knots: Tensor) -> Tensor:
+        """[B, N + 1, ways] of knots [B, knots, ways] in units of the bounds."""
+        low, high = torch.as_tensor(self.bounds).to(knots).unbind(1)
+        first = torch.as_tensor(self.first).to(knots).expand(len(knots), 1, -1)
+        every = torch.cat([first, low + knots * (high - low)], 1)
+        at = torch.linspace(0.0, self.knots, len(self.model.t), dtype=knots.dtype, device=knots.device)
+        before = at.floor().clamp_max(self.knots - 1)
+        share, n = (at - before)[:, None], before.long()
+        return every[:, n] * (1.0 - share) + every[:, n + 1] * share
+
+
+@dataclass(frozen=True)
+class Tilt(Program):
+    """Gravity of the scene's size whose direction leaves the scene's.
+
+    Attributes:
+        model: of the runs; angle: the largest tilt [°]; knots: see `Program`.
+
+    Raises:
+        ConfigError: operators were taught no gravity that far off; or the scene has none.
+    """
+
+    model: Model
+    angle: float
+    knots: int = 6
+    names = ("tilt along the first axis", "tilt along the second axis")
+    unit = "°"
+
+    def __post_init__(self):
+        size, taught = float(np.linalg.norm(self.model.scene.gravity)), self.model.operators.taught
+        if not size:
+            raise ConfigError(f"{self.model.scene.name} has no gravity to tilt; move a solid, as move=NAME")
+        most = np.degrees(2.0 * np.arcsin(min(1.0, 0.5 * taught.reach / size)))
+        if not 0.0 < self.angle <= most + 1e-9:
+            raise ConfigError(
+                f"tilt={self.angle:g}° must lie above 0° and within the {most:.3g}° that was taught; or "
+                "teach with a larger engine.teaching.gravity"
+            )
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """See `Program.bounds`; a square within the disc."""
+        return np.array([[-1.0, 1.0]] * 2) * self.angle / np.sqrt(2.0)
+
+    @property
+    def first(self) -> np.ndarray:
+        """See `Program.first`."""
+        return np.zeros(2)
+
+    def forcing(self, values: Tensor) -> Forcing:
+        """See `Program.forcing`."""
+        gravity = torch.tensor(self.model.scene.gravity, dtype=values.dtype, device=values.device)
+        size, tilt = gravity.norm(), torch.deg2rad(values[:, :-1])
+        # At rest the angle has no gradient, but its square has.
+        square = (tilt**2).sum(-1, keepdim=True)
+        angle = torch.where(square > 0.0, square, torch.ones_like(square)).sqrt()
+        sinc = torch.where(square > 1e-12, torch.sin(angle) / angle, 1.0 - square / 6.0)
+        cosine = torch.where(square > 1e-12, torch.cos(angle), 1.0 - square / 2.0)
+        aside = torch.as_tensor(across(np.array(self.model.scene.gravity))).to(values)
+        found = cosine * gravity + size * sinc * (tilt @ aside)
+        return Forcing(found, self._solids.expand(len(values), -1, -1))
+
+    def scene(self, scene: Scene, values: np.ndarray) -> Scene:
+        """See `Program.scene`."""
+        with torch.no_grad():
+            gravity = self.forcing(torch.as_tensor(values)[None]).gravity[0].cpu().numpy()
+        own = Keyframes(self.model.t[:-1].tolist(), gravity.tolist())
+        return replace(scene, forcing=Programs({"designed": own}, scene.forcing.colliders))
+
+    @cached_property
+    def _solids(self) -> Tensor:
+        return self.model.forcing().solids
+
+
+@dataclass(frozen=True)
+class Moves(Program):
+    """Solids that move as training runs moved them, along the same axes and within the same bounds.
+
+    Attributes:
+        model: of the runs; solids: names of colliders; knots: see `Program`.
+
+    Raises:
+        ConfigError: there is no such solid, or no training run moves it.
+    """
+
+    model: Model
+    solids: Sequence[str]
+    knots: int = 6
+    unit = "m"
+
+    def __post_init__(self):
+        there = self.model.scene.collider_names
+        if unknown := [name for name in self.solids if name not in there]:
+            raise ConfigError(f"move={unknown[0]} is no solid of the scene; there are {', '.join(there)}")
+        if still := [name for name in self.solids if not len(self._axes[name])]:
+            raise ConfigError(f"move={still[0]} was never moved in training; operators know nothing of it")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """See `Program`."""
+        return tuple(
+            f"{name} along ({', '.join(f'{a:.2g}' for a in axis)})"
+            for name in self.solids
+            for axis in self._axes[name]
+        )
+
+    @property
+    def bounds(self) -> np.ndarray:
+        """See `Program.bounds`."""
+        return np.concatenate([self._bounds_of(name) for name in self.solids])
+
+    @property
+    def first(self) -> np.ndarray:
+        """See `Program.first`; the middle of where training runs began."""
+        begun = [
+            np.mean([run[0] for run in self._shifts(name)], 0) @ self._axes[name].T for name in self.solids
+        ]
+        return np.concatenate(begun)
+
+    def forcing(self, values: Tensor) -> Forcing:
+        """See `Program.forcing`."""
+        own = self.model.forcing()
+        solids = own.solids.expand(len(values), -1, -1).clone()
+        for c, shift in self._by_collider(values):
+            k = _FEATURES * c
+            solids = solids.clone()
+            solids[..., k : k + 3] = shift[:, :-1]
+            solids[..., k + 4 : k + 7] = torch.diff(shift, dim=1)
+        return Forcing(own.gravity.expand(len(values), -1, -1), solids)
+
+    def scene(self, scene: Scene, values: np.ndarray) -> Scene:
+        """See `Program.scene`."""
+        colliders = list(scene.colliders)
+        for c, shift in self._by_collider(torch.as_tensor(values)[None]):
+            motion = Motion(self.model.t.tolist(), shift[0].cpu().numpy().tolist())
+            colliders[c] = replace(colliders[c], motion=motion)
+        return replace(scene, colliders=tuple(colliders))
+
+    def _by_collider(self, values: Tensor) -> list[tuple[int, Tensor]]:
+        """Number and shift [B, N + 1, 3] of each solid."""
+        found, k = [], 0
+        for name in self.solids:
+            axes = torch.as_tensor(self._axes[name]).to(values)
+            found.append((self.model.scene.collider_names.index(name), values[..., k : k + len(axes)] @ axes))
+            k += len(axes)
+        return found
+
+    def _shifts(self, name: str) -> list[np.ndarray]:
+        """[N + 1, 3] of a solid in each training run [m]."""
+        c, found = self.model.scene.collider_names.index(name), []
+        for case in self.model.pipeline.split.train:
+            scene = self.model.pipeline.scene.with_parameters(case)
+            found.append(scene.forcing_at(self.model.t)["solids"][:, c, :3])
+        return found
+
+    @cached_property
+    def _axes(self) -> dict[str, np.ndarray]:
+        """[ways, 3] of each solid: the axes along which training runs moved it."""
+        axes = {}
+        for name in self.solids:
+            if name not in self.model.scene.collider_names:
+                continue
+            _, sizes, own = np.linalg.svd(np.concatenate(self._shifts(name)), full_matrices=False)
+            axes[name] = own[sizes > _HARDLY]
+        return axes
+
+    def _bounds_of(self, name: str) -> np.ndarray:
+        along = np.concatenate(self._shifts(name)) @ self._axes[name].T
+        return np.stack([along.min(0), along.max(0)], 1)
+
+
+@dataclass(frozen=True)
+class Designed:
+    """What was found.
+
+    Attributes:
+        values: [N + 1, ways] of the program at the steps.
+        xhat: [N + 1, r] of the run by operators; seen: [m] the targets in it [m].
+        cost: sum of squares of (seen − target)/tolerance; stopped: why the search ended.
+        distrust: of the run.
+    """
+
+    values: np.ndarray
+    xhat: np.ndarray
+    seen: np.ndarray
+    cost: float
+    stopped: str
+    distrust: float
+
+
+def design(
+    program: Program, view: View, parameters, seed: int = 0, say: Callable[[str], object] = print
+) -> Designed:
+    """The program whose run comes nearest to targets, by gradients.
+
+    Several random programs descend together (Adam); the best goes on by L-BFGS-B within the bounds.
+
+    Args:
+        program: what may change, and how far.
+        view: of the targets; their deviations are tolerances.
+        parameters: [n] of the run, or a mapping by name.
+        seed: of the random programs.
+        say: told how far it is.
+
+    Raises:
+        InstabilityError: no program gives a run that stays finite.
+    """
+    model, own = program.model, view.observations
+    target, tolerance = (torch.as_tensor(v, device=model.device) for v in (own.values, own.deviations))
+    mu, shape = model.tensor(parameters), (program.knots, len(program.names))
+
+    def cost(knots: Tensor) -> tuple[Tensor, Tensor, Forcing]:
+        forcing = program.forcing(program.values(knots))
+        xhat = model(mu.expand(len(knots), -1), forcing)
+        off = (view.of_runs(xhat) - target) / tolerance
+        return (off**2).sum(1), xhat, forcing
+
+    found = torch.as_tensor(np.random.default_rng(seed).random((_STARTS, *shape)), device=model.device)
+    found[0] = 0.5
+    best, least = found[0].clone(), np.inf
+    first, second = torch.zeros_like(found), torch.zeros_like(found)
+    for step in range(1, _LOOKS + 1):
+        found = found.detach().requires_grad_()
+        costs, _, _ = cost(found)
+        (slope,) = torch.autograd.grad(torch.log1p(costs).sum(), found)
+        now = torch.where(torch.isfinite(costs), costs, torch.inf).detach()
+        if float(now.min()) < least:
+            least, best = float(now.min()), found[now.argmin()].detach().clone()
+        slope = torch.nan_to_num(slope)
+        first, second = 0.9 * first + 0.1 * slope, 0.99 * second + 0.01 * slope**2
+        way = (first / (1 - 0.9**step)) / ((second / (1 - 0.99**step)).sqrt() + 1e-12)
+        found = (found.detach() - _RATE * (1.0 - (step - 1) / _LOOKS) * way).clamp(0.0, 1.0)
+    if not np.isfinite(least):
+        raise InstabilityError("no program gives a run that stays finite; choose narrower bounds")
+    say(f"design: the best of {_STARTS} programs is {np.sqrt(least / len(own)):.3g} tolerances off (RMS)")
+
+    def value(flat: np.ndarray) -> tuple[float, np.ndarray]:
+        knots = torch.as_tensor(flat.reshape(1, *shape), device=model.device).requires_grad_()
+        total = cost(knots)[0].sum()
+        (slope,) = torch.autograd.grad(total, knots)
+        return float(torch.nan_to_num(total.detach(), 1e30, 1e30)), torch.nan_to_num(
+            slope
+        ).cpu().numpy().ravel()
+
+    box = [(0.0, 1.0)] * best.numel()
+    end = minimize(
+        value, best.cpu().numpy().ravel(), jac=True, method="L-BFGS-B", bounds=box, options={"maxiter": _MOST}
+    )
+    knots = torch.as_tensor(end.x.reshape(1, *shape), device=model.device)
+    with torch.no_grad():
+        _, xhat, forcing = cost(knots)
+        seen = view.of_runs(xhat)[0].cpu().numpy()
+        values = program.values(knots)[0].cpu().numpy()
+        distrust = float(model.distrust(xhat, mu.expand(1, -1), forcing)[0])
+    return Designed(values, xhat[0].cpu().numpy(), seen, float(end.fun), str(end.message), distrust)
+
+
+class Recorded:
+    """Positions of a run in memory, read as those of a `Trajectory` are.
+
+    Args:
+        x: [N + 1, P, 3] m.
+    """
+
+    def __init__(self, x: np.ndarray):
+        self._x, self.frames = x, len(x)
+
+    def read(self, _: str, frames, particles: np.ndarray | None = None) -> np.ndarray:
+        """[frames, particles, 3] m."""
+        found = self._x[frames]
+        return found if particles is None else found[:, particles]
+
+
+def full_order(program: Program, designed: Designed, parameters) -> Recorded:
+    """The full-order run of a designed program."""
+    model = program.model
+    values = dict(zip(model.names, model.tensor(parameters).tolist(), strict=True))
+    scene = program.scene(model.scene.with_parameters(model.scene.case(values)), designed.values)
+    solver = scene.solver(model.pipeline.config.precision, model.pipeline.device)
+    frames = [solver.state.numpy()["x"].astype(np.float32)]
+    for _ in range(scene.steps):
+        solver.step()
+        frames.append(solver.state.numpy()["x"].astype(np.float32))
+    return Recorded(np.array(frames))

@@ -1,0 +1,141 @@
+"""How far runs by operators are from full-order runs at what was observed, as validation runs show it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from nsf.data import PROGRAM, Trajectory
+from nsf.data.schema import TRAJECTORY
+from nsf.errors import ConfigError
+from nsf.inverse.derivatives import with_jacobian
+from nsf.inverse.model import Forcing, Model
+from nsf.inverse.observations import View
+from nsf.inverse.space import UNKNOWN, Space
+
+_FEWEST = 2  # validation runs
+#: Of the validation runs, the share that tells of the error at an estimate.
+_SHARE = 0.75
+_FREEDOM = 2.0  # degrees that a plane has to leave
+
+
+@dataclass(frozen=True)
+class ModelError:
+    """What full-order runs of the validation cases have that runs by operators lack.
+
+    Attributes:
+        parameters: [V, n] of the cases.
+        vectors: [V, m] at the observations [m].
+        forcing: of each run, where the runs follow programs.
+    """
+
+    parameters: np.ndarray
+    vectors: np.ndarray
+    forcing: Forcing | None = None
+
+    @classmethod
+    def of(cls, view: View, model: Model) -> "ModelError":
+        """From the validation runs of the model's chain.
+
+        Raises:
+            ConfigError: there are too few.
+        """
+        pipeline = model.pipeline
+        cases = [case for case in pipeline.split.validation if pipeline.simulation(case).complete]
+        if len(cases) < _FEWEST:
+            raise ConfigError(
+                f"{len(cases)} validation runs cannot tell the model's own error, and intervals without it "
+                f"miss the truth; give scene.design.validation at least {_FEWEST} cases, better 8"
+            )
+        parameters, forcing = np.array([[case[name] for name in model.names] for case in cases]), None
+        if PROGRAM in cases[0]:
+            own = [model.forcing(case.parameters, int(case[PROGRAM])) for case in cases]
+            forcing = Forcing(*(torch.stack([getattr(f, k) for f in own]) for k in ("gravity", "solids")))
+        with torch.no_grad():
+            seen = view.of_runs(model(parameters, forcing)).cpu().numpy()
+        truths = []
+        for case in cases:
+            with Trajectory.open(pipeline.simulation(case).file(TRAJECTORY)) as trajectory:
+                truths.append(view.of_truth(trajectory))
+        return cls(parameters, np.array(truths) - seen, forcing)
+
+    @property
+    def deviations(self) -> np.ndarray:
+        """[m] root mean square over the runs [m]."""
+        return np.sqrt(np.mean(self.vectors**2, axis=0))
+
+    def offsets(self, view: View, model: Model, space: Space, scale: np.ndarray) -> "Offsets":
+        """How far off the model's error alone puts an estimate at each validation case.
+
+        By the slopes at that case: δ_v = (JᵀJ + 1/u₀²)⁻¹ Jᵀ b_v/s, with u₀ the deviation of a parameter of
+        which nothing is known but its range.
+
+        Args:
+            view, model, space: of the estimate.
+            scale: s [m].
+        """
+        V, n = len(self.parameters), len(space.free)
+        columns = [model.names.index(name) for name in space.free]
+        u = space.units(self.parameters[:, columns])
+        mu = model.tensor(self.parameters).repeat_interleave(n, 0)
+        forcing = self.forcing and Forcing(
+            *(values.repeat_interleave(n, 0) for values in (self.forcing.gravity, self.forcing.solids))
+        )
+        fixed = [mu[:, k] for k in range(mu.shape[1])]
+
+        def seen(rows: torch.Tensor) -> torch.Tensor:
+            every = list(fixed)
+            for column, values in zip(columns, space.values(rows).unbind(-1), strict=True):
+                every[column] = values
+            return view.of_runs(model(torch.stack(every, -1), forcing))
+
+        J = with_jacobian(seen, torch.as_tensor(u, device=model.device))[1].cpu().numpy() / scale[:, None]
+        normal = np.einsum("vmi,vmj->vij", J, J) + np.eye(n) / UNKNOWN**2
+        off = np.linalg.solve(normal, np.einsum("vmi,vm->vi", J, self.vectors / scale)[..., None])[..., 0]
+        return Offsets(u, off.reshape(V, n))
+
+
+@dataclass(frozen=True)
+class Offsets:
+    """How far off estimates are at some places for the model's error alone, in units of the ranges.
+
+    Attributes:
+        u: [V, n] places; off: [V, n].
+    """
+
+    u: np.ndarray
+    off: np.ndarray
+
+    def near(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """Mean [n], covariance [n, n] and degrees of freedom of what an estimate at a place u [n] is off.
+
+        The mean is what a plane has at u that is fitted to the cases, those near u first: by weights
+        w ∝ exp(−|u_v − u|²/2h²), Σw = 1, that as many cases share as three quarters of all would alike,
+        1/Σw² = 3V/4 (Kish 1965). The covariance is about that plane, of one estimate that is yet to come;
+        that few cases tell the plane is part of it. Of hardly more cases than parameters it is the mean.
+
+        Source: Cleveland 1979 (locally weighted regression).
+        """
+        V, n = self.off.shape
+        w = _weights(np.sum((self.u - u) ** 2, axis=1), _SHARE * V)
+        shared = float(np.sum(w**2))
+        rows = np.ones((V, 1))
+        if 1.0 / shared - 1.0 - n >= _FREEDOM:
+            rows = np.column_stack([rows, self.u - u])
+        solve = np.linalg.pinv((rows * w[:, None]).T @ rows) @ (rows * w[:, None]).T
+        about = np.eye(V) - rows @ solve
+        left = about @ self.off
+        covariance = (left * w[:, None]).T @ left / np.sum(w[:, None] * about**2)
+        told = 1.0 + float(np.sum(solve[0] ** 2))
+        return solve[0] @ self.off, told * covariance, max(1.0 / shared - rows.shape[1], 1.0)
+
+
+def _weights(squares: np.ndarray, count: float) -> np.ndarray:
+    """Gaussian weights [V] of squared distances [V] that `count` cases share, by bisection over the width."""
+    low, high = -20.0, 20.0
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        w = np.exp(-0.5 * (squares - squares.min()) / np.exp(middle))
+        w /= w.sum()
+        low, high = (middle, high) if 1.0 / np.sum(w**2) < count else (low, middle)
+    return w

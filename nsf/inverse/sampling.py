@@ -1,0 +1,344 @@
+"""Uncertainty: parameters drawn from stated distributions, and what runs by operators make of them."""
+
+import ast
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import pandas as pd
+import torch
+from scipy import stats
+from torch import Tensor
+
+from nsf.data import Trajectory
+from nsf.errors import ConfigError, InstabilityError
+from nsf.evaluation.quantities import QUANTITIES
+from nsf.extras import optional
+from nsf.inverse.fit import Fit
+from nsf.inverse.model import Forcing, Model
+from nsf.inverse.observations import AXES, BODY, View
+from nsf.inverse.space import Space
+from nsf.kinematics.interpolation import interpolation
+
+#: Runs that are taken together.
+_BATCH = 500
+#: Times at which quantiles are told, at most.
+_TIMES = 21
+LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
+_CALL = re.compile(r"(\w+)\((.*)\)")
+_POINT = re.compile(rf"([{''.join(AXES)}])@([^:]+):([^:]+):([^:]+)")
+_ENDS = 1e-9  # of a distribution, beyond which nothing is drawn
+
+
+def distribution(text: str):
+    """The frozen distribution of scipy.stats that `norm(30, 2)` stands for, or `LOW..HIGH`, which is uniform.
+
+    Raises:
+        ConfigError: there is no such distribution, or it refuses its numbers.
+    """
+    if len(ends := text.split("..")) == 2:
+        low, high = map(_number, ends)
+        if not low < high:
+            raise ConfigError(f"{text} has nothing between its ends; give the smaller one first")
+        return stats.uniform(low, high - low)
+    found = _CALL.fullmatch(text)
+    family = getattr(stats, found[1], None) if found else None
+    if not isinstance(family, stats.rv_continuous):
+        raise ConfigError(f"{text} is no distribution; give one of scipy.stats, as norm(30,2), or LOW..HIGH")
+    numbers = [_number(part) for part in found[2].split(",")]
+    try:
+        frozen = family(*numbers)
+        spread = frozen.std()
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{text}: {error}; see scipy.stats.{found[1]}") from error
+    if not (np.isfinite(spread) and spread > 0.0):
+        raise ConfigError(f"{text} has no finite spread; see scipy.stats.{found[1]} for its numbers")
+    return frozen
+
+
+def _number(text: str) -> float:
+    try:
+        return float(ast.literal_eval(text.strip()))
+    except (ValueError, SyntaxError, TypeError) as error:
+        raise ConfigError(f"{text.strip()!r} is no number") from error
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What is known of the parameters before anything is observed: they are independent.
+
+    Attributes:
+        model: whose they are; each: a frozen distribution of scipy.stats by name, in the model's order.
+    """
+
+    model: Model
+    each: Mapping[str, object]
+
+    @classmethod
+    def of(cls, model: Model, asked: Mapping[str, str]) -> "Prior":
+        """From texts by name; evenly over the range that was taught, or over its logarithm, of the others.
+
+        Raises:
+            ConfigError: a name is unknown, a text no distribution, or a range goes beyond what was taught.
+        """
+        if unknown := [name for name in asked if name not in model.names]:
+            raise ConfigError(f"there is no parameter {unknown[0]!r}; there are {', '.join(model.names)}")
+        each = {}
+        for name, (low, high) in zip(model.names, model.ranges.tolist(), strict=True):
+            if name not in asked:
+                log = model.scene.parameters[name].log
+                each[name] = stats.loguniform(low, high) if log else stats.uniform(low, high - low)
+                continue
+            each[name] = distribution(asked[name])
+            if ".." in asked[name]:
+                Space.of(model, {name: [*map(_number, asked[name].split(".."))]})
+        return cls(model, each)
+
+    def values(self, u: np.ndarray) -> np.ndarray:
+        """Parameters [..., n] of points [..., n] of the unit cube, by the inverse distribution functions."""
+        u = np.clip(u, _ENDS, 1.0 - _ENDS)
+        return np.stack([own.ppf(u[..., k]) for k, own in enumerate(self.each.values())], -1)
+
+    def draw(self, count: int, seed: int) -> np.ndarray:
+        """[count, n] parameters."""
+        return self.values(np.random.default_rng(seed).random((count, len(self.each))))
+
+    def log_density(self, values: np.ndarray) -> np.ndarray:
+        """[...] of parameters [..., n]; −∞ outside of what was taught."""
+        found = sum(own.logpdf(values[..., k]) for k, own in enumerate(self.each.values()))
+        low, high = self.model.ranges.T
+        inside = np.all((values >= low) & (values <= high), axis=-1)
+        return np.where(inside, found, -np.inf)
+
+
+class Asked:
+    """What is asked of each run over time: quantities of the shape, or a component of a point's position.
+
+    Args:
+        texts: names of quantities, or `z@X:Y:Z` with a point at rest [m].
+        model: of the runs.
+
+    Raises:
+        ConfigError: a text is neither, or the point lies outside of the body.
+    """
+
+    def __init__(self, texts: Sequence[str], model: Model):
+        self.names, self._model = tuple(texts), model
+        self._points: dict[str, tuple[int, np.ndarray]] = {}
+        for text in texts:
+            if text in QUANTITIES:
+                continue
+            if not (found := _POINT.fullmatch(text)):
+                raise ConfigError(
+                    f"of={text} is none of {', '.join(QUANTITIES)}, nor a component of a point at rest, as "
+                    "z@0.5:0.5:0.2"
+                )
+            point = np.array([[_number(part) for part in found.groups()[1:]]])
+            model.check_points(point)
+            self._points[text] = AXES.index(found[1]), point
+        last = len(model.t) - 1
+        self.steps = np.unique(np.linspace(0, last, min(_TIMES, last + 1)).round().astype(int))
+        self.t = model.t[self.steps]
+        kept = np.sort(np.random.default_rng(0).permutation(len(model.manifold.X))[:BODY])
+        self._body, self._X = kept, model.manifold.X[torch.as_tensor(kept)].to(model.device)
+
+    def of(self, xhat: Tensor) -> Tensor:
+        """[B, asked, F] of runs [B, N + 1, r], differentiable [m]."""
+        rows = xhat[:, torch.as_tensor(self.steps, device=xhat.device)]
+        found = []
+        shapes = self._shapes(rows) if any(name in QUANTITIES for name in self.names) else None
+        for name in self.names:
+            if name in self._points:
+                axis, _ = self._points[name]
+                found.append(self._model.positions(rows, self._at[name])[..., 0, axis])
+            else:
+                found.append(shapes[name])
+        return torch.stack(found, 1)
+
+    def of_truth(self, truth: Trajectory) -> np.ndarray:
+        """[asked] of a full-order run at its end."""
+        last = truth.frames - 1
+        found = []
+        for name in self.names:
+            if name in self._points:
+                k, point = self._points[name]
+                x = torch.as_tensor(truth.read("x", frames=[last])[0].astype(float))
+                at = interpolation(torch.as_tensor(point), self._model.manifold.X.cpu())
+                found.append(float(at.value(x[:, None])[0, 0, k]))
+                continue
+            whole = QUANTITIES[name].whole
+            x = truth.read("x", frames=self.steps.tolist() if whole else [last], particles=self._body)
+            x = torch.as_tensor(x.astype(float))
+            found.append(float(QUANTITIES[name].of(x if whole else x[0], self._X.cpu())))
+        return np.array(found)
+
+    def _shapes(self, rows: Tensor) -> dict[str, Tensor]:
+        """[B, F] of each quantity that is asked for; one frame of all runs at a time, as bodies are large."""
+        wanted = [name for name in self.names if name in QUANTITIES]
+        each: dict[str, list[Tensor]] = {name: [] for name in (*wanted, "height")}
+        for frame in rows.unbind(1):
+            x = self._model.positions(frame, self._at_body)
+            for name in each:
+                if not QUANTITIES[name].whole:
+                    each[name].append(QUANTITIES[name].of(x, self._X))
+        heights = torch.stack(each["height"], 1)
+        found = {name: torch.stack(values, 1) for name, values in each.items() if values}
+        if "springback" in wanted:
+            found["springback"] = heights - heights.cummin(1).values
+        return found
+
+    @cached_property
+    def _at_body(self):
+        return self._model.at(self._body)
+
+    @cached_property
+    def _at(self) -> dict:
+        return {name: self._model.at(point) for name, (_, point) in self._points.items()}
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Runs at many parameters.
+
+    Attributes:
+        parameters: [B, n]; values: [B, asked, F] [m]; distrust: [B]; t: [F] [s]; names: of what was asked.
+        seconds: wall time.
+    """
+
+    parameters: np.ndarray
+    values: np.ndarray
+    distrust: np.ndarray
+    t: np.ndarray
+    names: tuple[str, ...]
+    seconds: float
+
+    @property
+    def trusted(self) -> np.ndarray:
+        """[B] whether a run is to be believed."""
+        return (self.distrust <= 1.0) & np.isfinite(self.values).all((1, 2))
+
+    def quantiles(self, levels: Sequence[float] = LEVELS) -> dict[str, np.ndarray]:
+        """[levels, F] of trusted runs, by name.
+
+        Raises:
+            InstabilityError: no run is to be believed.
+        """
+        if not self.trusted.any():
+            raise InstabilityError("no run is to be believed; draw parameters within what was taught")
+        found = np.quantile(self.values[self.trusted], levels, axis=0)
+        return {name: found[:, k] for k, name in enumerate(self.names)}
+
+
+def runs(model: Model, parameters: np.ndarray, asked: Asked, forcing: Forcing | None = None) -> Runs:
+    """Runs at parameters [B, n], in batches."""
+    import time
+
+    began, values, distrust = time.perf_counter(), [], []
+    with torch.no_grad():
+        for part in np.array_split(parameters, max(1, -(-len(parameters) // _BATCH))):
+            mu = model.tensor(part)
+            xhat = model(mu, forcing)
+            values.append(asked.of(xhat).cpu().numpy())
+            distrust.append(model.distrust(xhat, mu, forcing).cpu().numpy())
+    every = np.concatenate(values), np.concatenate(distrust)
+    return Runs(parameters, *every, asked.t, asked.names, time.perf_counter() - began)
+
+
+def sensitivities(
+    prior: Prior,
+    count: int,
+    evaluate: Callable[[np.ndarray], np.ndarray],
+    names: Sequence[str],
+    seed: int = 0,
+) -> pd.DataFrame:
+    """Variance-based indices by Saltelli's design (SALib).
+
+    Args:
+        prior: of the parameters.
+        count: a power of two; the design has count × (parameters + 2) rows.
+        evaluate: parameters [rows, n] → values [rows, asked].
+        names: of what is asked.
+        seed: of the design and of the bootstrap.
+
+    Returns:
+        Rows of quantity and parameter: `first` and `total`, each with half its 95 % interval.
+
+    Raises:
+        MissingExtraError: SALib is not installed.
+
+    Source: Saltelli et al. 2010; Herman and Usher 2017.
+    """
+    optional("SALib", "inverse")
+    from SALib.analyze import sobol as analyze
+    from SALib.sample import sobol as sample
+
+    if count < 2 or count & (count - 1):
+        raise ConfigError(f"sensitivities={count} must be a power of two, as 1024")
+    own = list(prior.each)
+    problem = {"num_vars": len(own), "names": own, "bounds": [[0.0, 1.0]] * len(own)}
+    # One parameter has no other beside it, and SALib wants two.
+    if len(own) == 1:
+        problem = {"num_vars": 2, "names": [*own, "none"], "bounds": [[0.0, 1.0]] * 2}
+    u = sample.sample(problem, count, calc_second_order=False, seed=seed)
+    found = evaluate(prior.values(u[:, : len(own)]))
+    rows = []
+    for k, name in enumerate(names):
+        index = analyze.analyze(problem, found[:, k], calc_second_order=False, seed=seed)
+        for p, parameter in enumerate(own):
+            values = [float(index[key][p]) for key in ("S1", "S1_conf", "ST", "ST_conf")]
+            rows.append([name, parameter, *values])
+    return pd.DataFrame(rows, columns=["quantity", "parameter", "first", "first_95", "total", "total_95"])
+
+
+def posterior(
+    prior: Prior,
+    view: View,
+    found: Fit,
+    draws: int,
+    forcing: Forcing | None = None,
+    seed: int = 0,
+) -> np.ndarray:
+    """Draws [draws, n] of the parameters given observations, by emcee's affine-invariant ensemble.
+
+    The likelihood is that of what the observations say of the parameters: A (y − m(θ))/s less what validation
+    runs are off on average, with the covariance of the estimate (`nsf.inverse.fit`). So it knows of the
+    reduced model's own error.
+
+    Args:
+        prior: of the parameters.
+        view: of the observations; found: their fit, of every parameter.
+        draws: how many, at least; as many again are dropped before them.
+        forcing, seed: of the runs, and of the ensemble.
+
+    Raises:
+        MissingExtraError: emcee is not installed.
+
+    Source: Goodman and Weare 2010; Foreman-Mackey et al. 2013.
+    """
+    emcee = optional("emcee", "inverse")
+    model, space = prior.model, found.space
+    walkers = max(32, 4 * len(space.free))
+    precision = np.linalg.inv(found.covariance)
+    shift = found.u - space.units(found.fitted)
+    low, high = model.ranges.T
+
+    def log_probability(values: np.ndarray) -> np.ndarray:
+        known = prior.log_density(values)
+        with torch.no_grad():
+            inside = np.clip(values, low, high)
+            seen = view.of_runs(model(model.tensor(inside), forcing)).cpu().numpy()
+        off = (view.observations.values - seen) @ found.project.T + shift
+        told = -0.5 * np.einsum("bi,ij,bj->b", off, precision, off)
+        return np.where(np.isfinite(told), told, -np.inf) + known
+
+    generator = np.random.default_rng(seed)
+    deviation = np.minimum(np.sqrt(np.diag(found.covariance)), 0.1)
+    u = np.clip(found.u + deviation * generator.standard_normal((walkers, len(space.free))), 1e-3, 1.0 - 1e-3)
+    begin = space.values(torch.as_tensor(u)).numpy()
+    sampler = emcee.EnsembleSampler(walkers, len(space.free), log_probability, vectorize=True)
+    sampler.random_state = np.random.RandomState(seed).get_state()  # emcee's own
+    steps = -(-draws // walkers)
+    sampler.run_mcmc(begin, 2 * steps)
+    return sampler.get_chain(discard=steps, flat=True)[:draws]

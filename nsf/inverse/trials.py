@@ -1,0 +1,91 @@
+"""Synthetic trials: observations made by full-order runs, and how often intervals hold the truth."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+
+from nsf.data import PROGRAM, Case, Trajectory
+from nsf.data.schema import TRAJECTORY
+from nsf.engines.operators.teaching import random_cases
+from nsf.inverse.fit import Fit, fit
+from nsf.inverse.model import Model
+from nsf.inverse.observations import Observations, View
+from nsf.inverse.space import Space
+
+#: Columns of results.csv.
+COLUMNS = (
+    "scene", "parameter", "trial", "truth", "estimate", "standard_error", "inside_90", "seconds", "distrust",
+)  # fmt: skip
+_SEED = 100  # of the cases, apart from those that operators are taught in
+
+
+@dataclass(frozen=True)
+class Trials:
+    """How trials are made.
+
+    Attributes:
+        count: how many.
+        points, times: how many particles are observed, and at how many times, evenly up to the end.
+        deviation: of the noise on each component [m].
+        seed: of cases, points and noise.
+    """
+
+    count: int = 20
+    points: int = 50
+    times: int = 10
+    deviation: float = 1e-3
+    seed: int = 0
+
+    def cases(self, model: Model) -> list[Case]:
+        """The held-out cases: spread over the ranges, none of them one of the design."""
+        split = model.pipeline.split
+        return random_cases(split.box, self.count, _SEED + self.seed, list(split.cases))
+
+    def observed(self, model: Model, truth: Trajectory, trial: int) -> Observations:
+        """What is observed of a full-order run, with noise."""
+        generator = np.random.default_rng([self.seed, trial])
+        X = model.manifold.X.cpu().numpy()
+        points = X[np.sort(generator.choice(len(X), min(self.points, len(X)), replace=False))]
+        t = model.t[-1] * np.arange(1, self.times + 1) / self.times
+        none = np.zeros((self.times, len(points), 3))
+        exact = Observations.of_points(t, points, none, self.deviation)
+        values = View(exact, model).of_truth(truth)
+        return replace(exact, values=values + self.deviation * generator.standard_normal(len(values)))
+
+
+def run(model: Model, trials: Trials, say: Callable[[str], object] = print) -> tuple[pd.DataFrame, list[Fit]]:
+    """Calibrate each trial as if nothing were known of it.
+
+    Args:
+        model: of the runs.
+        trials: how they are made.
+        say: told of each trial.
+
+    Returns:
+        One row a trial and parameter, with `COLUMNS`: `inside_90` is 1 where the 90 % interval holds the
+        truth, `seconds` what the calibration took, the model's own error included; and the fits.
+    """
+    cases = trials.cases(model)
+    say(f"calibrate: full-order runs of {len(cases)} trials of {model.scene.name}")
+    runs, rows, fits = model.pipeline.full_order(cases), [], []
+    for trial, (case, own) in enumerate(zip(cases, runs, strict=True)):
+        with Trajectory.open(own.file(TRAJECTORY)) as truth:
+            seen = trials.observed(model, truth, trial)
+        began = time.perf_counter()
+        forcing = model.forcing(case.parameters, int(case[PROGRAM])) if PROGRAM in case else None
+        found = fit(View(seen, model), model, Space.of(model), forcing=forcing)
+        seconds = time.perf_counter() - began
+        fits.append(found)
+        for k, name in enumerate(found.space.free):
+            inside = found.lower[k] <= case[name] <= found.upper[k]
+            values = case[name], found.estimate[k], found.standard_error[k], int(inside), seconds
+            rows.append([model.scene.name, name, trial, *values, found.distrust])
+        told = ", ".join(
+            f"{name} {found.estimate[k]:.4g} ± {found.standard_error[k]:.2g} for {case[name]:.4g}"
+            for k, name in enumerate(found.space.free)
+        )
+        say(f"calibrate: trial {trial}: {told}, {seconds:.2f} s")
+    return pd.DataFrame(rows, columns=list(COLUMNS)), fits

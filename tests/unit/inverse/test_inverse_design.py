@@ -1,0 +1,156 @@
+"""Programs that are designed: their gradients, their bounds, and the full-order run that follows them."""
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+
+from nsf.errors import ConfigError
+from nsf.inverse import Model
+from nsf.inverse.design import Moves, Tilt, design, full_order
+from nsf.inverse.observations import Observations, View
+from nsf.inverse.reports.command import design as command
+
+ONE = {"friction_angle": 27.0, "speed": 0.2}
+
+
+def seen_of(model, program, knots):
+    """Targets that a program brings about: two points at two times."""
+    t, points = np.array([0.08, 0.12]), model.manifold.X[[400, 480]].numpy()
+    empty = Observations.of_points(t, points, np.zeros((2, 2, 3)), 1e-4)
+    forcing = program.forcing(program.values(knots))
+    values = View(empty, model).of_runs(model(model.tensor(ONE)[None], forcing))[0]
+    return View(Observations.of_points(t, points, values.reshape(2, 2, 3).numpy(), 1e-4), model)
+
+
+def test_a_tilt_turns_gravity_and_keeps_its_size(model):
+    program = Tilt(model, 4.0, 3)
+    values = program.values(torch.ones(1, 3, 2, dtype=torch.float64))
+    np.testing.assert_allclose(values[0, 0], 0.0)
+    np.testing.assert_allclose(values[0, -1], 4.0 / np.sqrt(2.0))
+    gravity = program.forcing(values).gravity[0].numpy()
+    np.testing.assert_allclose(np.linalg.norm(gravity, axis=1), np.linalg.norm(model.scene.gravity))
+    last = gravity[-1] @ np.array(model.scene.gravity) / np.linalg.norm(gravity[-1]) ** 2
+    assert np.degrees(np.arccos(last)) == pytest.approx(4.0, abs=1e-6)
+
+
+def test_gradients_are_those_of_differences(model):
+    program = Tilt(model, 4.0, 2)
+    knots = torch.rand(1, 2, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+
+    def seen(knots):
+        return model(model.tensor(ONE)[None], program.forcing(program.values(knots)))[0, -1]
+
+    assert torch.autograd.gradcheck(seen, knots.requires_grad_(), eps=1e-4, atol=1e-7, rtol=1e-4)
+    still = torch.full((1, 2, 2), 0.5, dtype=torch.float64, requires_grad=True)
+    (slope,) = torch.autograd.grad(seen(still).sum(), still)
+    assert torch.isfinite(slope).all()
+    assert slope.abs().max() > 1e-6
+
+
+def test_a_target_is_reached_again(model):
+    program = Tilt(model, 4.0, 2)
+    knots = torch.tensor([[[0.9, 0.2], [0.3, 0.7]]], dtype=torch.float64)
+    view = seen_of(model, program, knots)
+    said: list[str] = []
+    found = design(program, view, ONE, say=said.append)
+    assert np.sqrt(found.cost / len(view.observations)) < 0.1
+    np.testing.assert_allclose(found.seen, view.observations.values, atol=2e-5)
+    assert np.abs(found.values).max() <= 4.0 / np.sqrt(2.0) + 1e-9
+    assert found.distrust < np.inf
+    assert said
+
+
+def test_the_full_order_run_follows_the_program(model):
+    program = Tilt(model, 4.0, 2)
+    values = program.values(torch.ones(1, 2, 2, dtype=torch.float64))[0].numpy()
+    upright = np.zeros_like(values)
+    scenes = [program.scene(model.scene.with_parameters(model.scene.case(ONE)), v) for v in (values, upright)]
+    gravity = program.forcing(torch.as_tensor(values)[None]).gravity[0].numpy()
+    np.testing.assert_allclose(scenes[0].acting_gravity.at(model.t[:-1]), gravity, atol=1e-12)
+    one, other = (scene.solver(device="cpu") for scene in scenes)
+    one.step(24), other.step(24)
+    aside = (one.state.numpy()["x"] - other.state.numpy()["x"]).mean(0)
+    assert np.hypot(*aside[:2]) > 1e-4
+    case = model.scene.full_order(model.scene.case(ONE), device="cpu")
+    case.step(24)
+    np.testing.assert_allclose(other.state.numpy()["x"], case.state.numpy()["x"], atol=1e-12)
+
+
+def test_bounds_are_refused(model):
+    with pytest.raises(
+        ConfigError, match=r"tilt=30° must lie above 0° and within the 5\.\d+° that was taught"
+    ):
+        Tilt(model, 30.0)
+    with pytest.raises(ConfigError, match="move=plate is no solid of the scene; there are floor"):
+        Moves(model, ("plate",))
+    with pytest.raises(ConfigError, match="move=floor was never moved in training"):
+        Moves(model, ("floor",))
+
+
+def test_the_command(tmp_path, deployed, model):
+    words = [f"run={deployed.deployment.path}", "device=cpu", f"folder={tmp_path / 'a'}"]
+    command([*words, "run_out=0.09", "tilt=5", "knots=2", "speed=0.2"])
+    program, targets = (pd.read_csv(tmp_path / "a" / f"{name}.csv") for name in ("program", "targets"))
+    assert len(program) == len(model.t)
+    assert targets["what"].tolist() == ["run_out"]
+    assert (targets["fitted"] - targets["full_order"]).abs().max() < 0.02
+    for more, told in (
+        (["tilt=5"], "takes target=FILE, or a scalar at the end"),
+        (["height=0.1"], "takes tilt=ANGLE"),
+        (["height=high", "tilt=5"], "height=high is no number"),
+        (["height=0.1", "tilt=5", "speed=0.1..0.2"], "must be one value"),
+    ):
+        with pytest.raises(ConfigError, match=told):
+            command([*words, *more])
+
+
+# -- solids that move ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def pushed(pipeline_at, tmp_path_factory):
+    """A column that a plate pushes along programs."""
+    pipeline = pipeline_at(
+        tmp_path_factory.mktemp("pushed") / "runs",
+        "engine=operators",
+        *(f"engine.teaching.{key}" for key in ("steps=1500", "descent=300", "rounds=1", "width=24")),
+        "+scene.program=0",
+        "+scene.forcing={gravity:{},colliders:{plate:{_target_:nsf.scenes.RandomPush,direction:[1,0,0],"
+        "reach:[-0.005,0.02],knots:3}}}",
+        "+scene.colliders.plate={_target_:nsf.mpm.Cuboid,centre:[0.38,0.5,0.2],size:[0.1,0.3,0.14],"
+        "kind:separate,friction:0.2}",
+        "+scene.parameters.friction_angle.range=[22,38]",
+        "scene.design={_target_:nsf.scenes.Sobol,train:4,validation:2,test:1}",
+    )
+    for stage in ("simulate", "train", "deploy"):
+        pipeline.run(stage)
+    return Model(pipeline.deployment, "cpu")
+
+
+def test_a_solid_moves_as_in_training(pushed):
+    program = Moves(pushed, ("plate",), 3)
+    assert program.names[0].startswith("plate along (")
+    axis = program._axes["plate"][0]
+    np.testing.assert_allclose(np.abs(axis), [1, 0, 0], atol=1e-9)
+    values = program.values(torch.ones(1, 3, 1, dtype=torch.float64))
+    forcing = program.forcing(values)
+    scene = program.scene(pushed.scene.with_parameters(pushed.scene.case()), values[0].numpy())
+    from nsf.engines.operators import collider_states
+
+    states = collider_states(scene.colliders, pushed.dt, len(pushed.t) - 1)
+    np.testing.assert_allclose(forcing.solids[0], states, atol=1e-9)
+    assert np.abs(states - pushed.forcing().solids.numpy()).max() > 1e-3
+
+
+def test_a_push_is_designed(pushed):
+    program = Moves(pushed, ("plate",), 2)
+    t, points = np.array([0.12]), pushed.manifold.X[[10, 300]].numpy()
+    empty = Observations.of_points(t, points, np.zeros((1, 2, 3)), 1e-4)
+    mu = {"friction_angle": 30.0}
+    knots = torch.tensor([[[0.8], [0.6]]], dtype=torch.float64)
+    run = pushed(pushed.tensor(mu)[None], program.forcing(program.values(knots)))
+    x = View(empty, pushed).of_runs(run)[0].reshape(1, 2, 3).numpy()
+    found = design(program, View(Observations.of_points(t, points, x, 1e-4), pushed), mu)
+    assert np.sqrt(found.cost / 6) < 1.0
+    assert full_order(program, found, mu).read("x", [0, 24]).shape == (2, 500, 3)

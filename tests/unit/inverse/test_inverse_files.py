@@ -1,0 +1,147 @@
+"""Files of observations, and the commands that read them."""
+
+import json
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+
+from nsf.errors import ConfigError
+from nsf.inverse.observations import Observations, View
+from nsf.inverse.reports.command import calibrate, ranges_of
+from nsf.reporting.committed import faults, write_list
+
+POINT = {"t": 0.1, "particle": 5, "x": 0.5, "z": 0.2, "deviation": 1e-3}
+
+
+def csv(tmp_path, rows):
+    pd.DataFrame(rows).to_csv(tmp_path / "seen.csv", index=False)
+    return tmp_path / "seen.csv"
+
+
+def test_points_and_quantities_of_one_file(tmp_path, model):
+    rows = [POINT, {"quantity": "height", "value": 0.1, "deviation": 2e-3}]
+    found = Observations.read(csv(tmp_path, rows), model)
+    assert found.what == ("x", "z", "height")
+    np.testing.assert_allclose(found.t, [0.1, 0.1, model.t[-1]])
+    np.testing.assert_allclose(found.points[0], model.manifold.X[5])
+    np.testing.assert_allclose(found.values, [0.5, 0.2, 0.1])
+    np.testing.assert_allclose(found.deviations, [1e-3, 1e-3, 2e-3])
+    assert View(found, model).of_runs(model([[27.0, 0.2]])).shape == (1, 3)
+
+
+def test_hdf5(tmp_path, model):
+    with h5py.File(tmp_path / "seen.h5", "w") as file:
+        for name, values in POINT.items():
+            file[name] = np.array([values])
+    assert Observations.read(tmp_path / "seen.h5", model).what == ("x", "z")
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ({"pressure": 1.0}, "has the column 'pressure'"),
+        ({"deviation": None}, "no column deviation"),
+        ({"t": np.nan}, "row 1 has no t"),
+        ({"particle": 10**6}, "particle=1e[+]06 must be a whole number below 500"),
+        ({"particle": np.nan}, "names no point"),
+        ({"quantity": "width"}, "unknown quantity 'width'; choose one of height, run_out"),
+        ({"quantity": "height"}, "height has no value"),
+        ({"x": "left"}, "the column x must hold numbers"),
+    ],
+)
+def test_rows_are_refused(tmp_path, model, change, told):
+    row = {name: value for name, value in (POINT | change).items() if value is not None}
+    with pytest.raises(ConfigError, match=told):
+        Observations.read(csv(tmp_path, [row]), model)
+
+
+def test_no_file(tmp_path, model):
+    with pytest.raises(ConfigError, match="is no file; name a CSV or HDF5 file"):
+        Observations.read(tmp_path / "none.csv", model)
+
+
+def test_ranges():
+    assert ranges_of({"a": "25..35", "b": "1e-2", "c": "-1.5..2"}) == {
+        "a": [25, 35],
+        "b": 0.01,
+        "c": [-1.5, 2],
+    }
+    with pytest.raises(
+        ConfigError, match=r"a=wide is neither a value nor a range; give it as 30 or 25\.\.35"
+    ):
+        ranges_of({"a": "wide"})
+
+
+# -- commands -------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def seen(tmp_path, model, deployed):
+    """A file of what a full-order run shows of ten points."""
+    from nsf.data import Trajectory
+
+    case = deployed.split.test[0]
+    with Trajectory.open(deployed.simulation(case).file("trajectory.h5")) as truth:
+        x = truth.read("x", frames=[12, 24])[:, ::50]
+    rows = [
+        {"t": model.t[n], "particle": 50 * k, **dict(zip("xyz", x[j, k], strict=True)), "deviation": 1e-3}
+        for j, n in enumerate((12, 24))
+        for k in range(x.shape[1])
+    ]
+    return csv(tmp_path, rows), case
+
+
+def test_calibrate(tmp_path, deployed, seen, capsys):
+    file, case = seen
+    folder = tmp_path / "reports" / "heap"
+    page = calibrate(
+        [f"run={deployed.deployment.path}", f"observations={file}", f"folder={folder}", "device=cpu"]
+    )
+    assert page == folder / "index.html"
+    estimate = pd.read_csv(folder / "estimate.csv").set_index("parameter")
+    low, high = np.array([[22.0, 38.0], [0.05, 0.3]]).T
+    off = np.abs(estimate["estimate"] - list(case.parameters.values())) / (high - low)
+    assert (off < 0.25).all()
+    residuals = pd.read_csv(folder / "residuals.csv")
+    assert len(residuals) == 60
+    assert (residuals["value"] - residuals["full_order"]).abs().max() < 0.02
+    assert {"points.png", "residuals.svg", "correlation.csv"} <= {p.name for p in folder.iterdir()}
+    told = json.loads((folder / "sources.json").read_text())
+    assert deployed.deployment.id in told["runs"]
+    assert any(run.startswith("simulate/") for run in told["runs"])
+    assert "friction angle" in write_list(folder.parent).read_text()
+    assert faults(folder.parent) == []
+    (folder / "estimate.csv").write_text("changed")
+    assert faults(folder.parent)
+
+
+def test_trials(tmp_path, deployed):
+    folder = tmp_path / "calibration"
+    calibrate([f"run={deployed.deployment.path}", "trials=2", f"folder={folder}", "device=cpu"])
+    table = pd.read_csv(folder / "results.csv")
+    assert list(table) == [
+        "scene", "parameter", "trial", "truth", "estimate", "standard_error", "inside_90", "seconds",
+        "distrust",
+    ]  # fmt: skip
+    assert table["trial"].tolist() == [0, 0, 1, 1]
+    assert set(table["inside_90"]) <= {0, 1}
+    taken = {case[name] for case in deployed.split.cases for name in case}
+    assert not set(table["truth"]) & taken
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ([], "takes observations=FILE, or trials=N"),
+        (["trials=0"], "trials=0 must be a whole number from 1"),
+        (["trials=2", "speed=0.2"], "takes no speed=; leave it out"),
+        (["colour=red"], "has no key 'colour'; it takes .* and the parameters friction_angle, speed"),
+        (["observations=none.csv"], "is no file"),
+        (["friction"], "'friction' is not key=value"),
+    ],
+)
+def test_words_are_refused(deployed, words, told):
+    with pytest.raises(ConfigError, match=told):
+        calibrate([f"run={deployed.deployment.path}", "device=cpu", *words])
