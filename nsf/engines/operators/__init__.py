@@ -14,12 +14,13 @@ if TYPE_CHECKING:
     from nsf.engines.operators.states import collider_states, principal
     from nsf.engines.operators.taught import Taught
     from nsf.engines.operators.teach import Course
-    from nsf.engines.operators.teacher import Teacher
+    from nsf.engines.operators.teacher import Recorded, Teacher
     from nsf.engines.operators.teaching import Teaching, random_cases
 
 __all__ = [
     "Course",
     "Operators",
+    "Recorded",
     "Sizes",
     "StepOperators",
     "Taught",
