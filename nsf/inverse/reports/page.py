@@ -21,7 +21,7 @@ _SHOWN = ("device", "precision", "seed", "created")
 _HEADINGS = ("run", "commit", *_SHOWN)
 _NOTE = (
     "Every number above is computed from these runs; sources.json names them with the hash of each file that "
-    "was written, and the csv files hold the rows in full precision."
+    "was written, and the csv files hold the rows."
 )
 
 

@@ -71,6 +71,7 @@ def report(
     for k, name in enumerate(asked.names):
         rows[name] = made.values[:, k, -1]
     rows["distrust"] = made.distrust
+    rows = rows.map(lambda value: float(f"{value:.6g}"))  # full precision would take a megabyte
     files = {"quantiles.csv": _quantiles(asked, bands), "runs.csv": rows}
     tables = [Table("At the end", _ends(bands), f"{count:,} runs, {lost:,} of them distrusted and left out.")]
     sections = {
