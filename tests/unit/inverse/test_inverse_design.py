@@ -98,7 +98,7 @@ def test_the_command(tmp_path, deployed, model):
     assert targets["what"].tolist() == ["run_out"]
     assert (targets["fitted"] - targets["full_order"]).abs().max() < 0.02
     for more, told in (
-        (["tilt=5"], "takes target=FILE, or a scalar at the end"),
+        (["tilt=5"], "takes target=FILE, or scalars at the end"),
         (["height=0.1"], "takes tilt=ANGLE"),
         (["height=high", "tilt=5"], "height=high is no number"),
         (["height=0.1", "tilt=5", "speed=0.1..0.2"], "must be one value"),
