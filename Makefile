@@ -23,7 +23,7 @@ WORKERS ?= 2
 CASES ?= 2400
 SEED ?= 0
 
-.PHONY: help install develop quickstart test test-browser fuzz test-slow test-gpu gpu-references test-slurm test-all lint mirrors readme check-reports docs clean
+.PHONY: help install develop quickstart test test-browser fuzz test-slow test-gpu gpu-references test-slurm test-all lint mirrors readme check-reports calibration docs clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -91,6 +91,14 @@ readme: install  ## the figures in README.md, from a report, and the list of rep
 
 check-reports: install  ## whether reports/ is as it was generated
 	$(BIN)/nsf reports folder=reports check=true
+
+calibration: install  ## the reports of calibration, sensitivities and design, on a CPU, in an empty NSF_RUNS
+	for e in inverse tilt; do for s in simulate train deploy; do $(BIN)/nsf $$s +experiment=$$e || exit; done; done
+	$(BIN)/nsf calibrate +experiment=inverse trials=20 device=cpu folder=reports/calibration
+	$(BIN)/nsf sample run=jelly_cube of=height,run_out,x@0.44:0.5:0.45 sensitivities=1024 full_order=32 \
+		device=cpu folder=reports/sensitivities
+	$(BIN)/nsf design +experiment=tilt x@0.5:0.5:0.24=0.52 tilt=10 knots=3 friction_angle=30 device=cpu \
+		folder=reports/design
 
 docs: develop  ## the documentation, in site/
 	OMP_NUM_THREADS=1 $(BIN)/python -m mkdocs build --strict

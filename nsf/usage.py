@@ -40,7 +40,7 @@ TOOLS = {
     ),
     "design": (
         "a program of forcing that brings a target about, by gradients, and the full-order run along it",
-        "target=FILE|height=0.1|run_out=… tilt=ANGLE|move=SOLID,SOLID [run=RUN] [NAME=VALUE …] [knots=6]\n"
+        "target=FILE|height=0.1|x@X:Y:Z=0.5 tilt=ANGLE|move=SOLID,SOLID [run=RUN] [NAME=VALUE …] [knots=6]\n"
         "       [full_order=true] [seed=0] [device=auto] [folder=PATH]",
     ),
     "plan": (

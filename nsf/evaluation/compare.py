@@ -12,6 +12,7 @@ from nsf.deployment import FULL_ORDER, Rollout
 from nsf.dynamics import Decoder, ReducedMPM
 from nsf.errors import SchemaError
 from nsf.evaluation import metrics
+from nsf.evaluation.quantities import QUANTITIES, at_end, height
 from nsf.mpm.grid.shape import DEGREES
 
 _CHUNK = 2**24  # values of one field decoded at once
@@ -28,6 +29,7 @@ class Comparison:
         delta, displacement_error, stress_error: totals over frames 1..N, fractions; ∞ when the run diverged.
             Of a run that was handed over, the frames of its continuation count like the reduced ones.
         true_error: largest distance of a frame from the full-order one, RMS over particles [m]; ∞ likewise.
+        quantities: by name, a scalar of the shape at the end less the full-order run's [m]; ∞ likewise.
         reconstruction_delta, reconstruction_stress_error: of the full-order frames encoded and decoded.
         series: one row a frame (design.md).
         pictures: arrays for `frames.npz`.
@@ -37,6 +39,7 @@ class Comparison:
     displacement_error: float
     stress_error: float
     true_error: float
+    quantities: dict[str, float]
     reconstruction_delta: float
     reconstruction_stress_error: float
     series: pd.DataFrame
@@ -156,6 +159,8 @@ def compare(
             L_rom=metrics.angular_momentum(x_rom, v_rom, C_rom, mass, inertia),
             L_fom=metrics.angular_momentum(x, v, C, mass, inertia),
             L_scale=(x.norm(dim=2) * v.norm(dim=2) * mass).sum(1),
+            height_rom=height(x_rom, X),
+            height_fom=height(x, X),
             encoded=encoded,
         )
         inside = [n - start for n in shown_frames if block.start <= n < block.stop]
@@ -187,9 +192,12 @@ def compare(
         errors |= {name: total(*columns) for name, columns in reduced.items()}
         errors["true_error"] = float((column["x_error"].max() / len(X)).sqrt())
     metrics.require_finite(errors, rollout.case.named)
+    ends = [at_end(column[f"height_{of}"], shape[-1], X) for of, shape in (("rom", x_rom), ("fom", x))]
+    off = {name: np.inf if diverged else ends[0][name] - ends[1][name] for name in QUANTITIES}
     xhat[own:] = torch.nan  # full-order frames are no latent vectors
     return Comparison(
         **dict.fromkeys((*reduced, "true_error"), np.inf) | errors,
+        quantities=off,
         series=_series(column, rollout, trajectory.t, split, xhat.cpu(), good),
         pictures={name: np.concatenate(blocks) for name, blocks in kept.items()}
         | {"t": trajectory.t[shown_frames]},

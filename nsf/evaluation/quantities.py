@@ -70,6 +70,17 @@ class Quantity:
     whole: bool = False
 
 
+def at_end(heights: Tensor, x: Tensor, X: Tensor) -> dict[str, float]:
+    """Every quantity at the end of a run [m], by name.
+
+    Args:
+        heights: [frame] `height` of each frame [m].
+        x: [particle, 3] m of the last frame; X: as for `height`.
+    """
+    found = {name: float(own.of(x, X)) for name, own in QUANTITIES.items() if not own.whole}
+    return found | {"springback": float(heights[-1] - heights.min())}
+
+
 #: By the name that files of observations use.
 QUANTITIES = {
     "height": Quantity(height),

@@ -1,5 +1,6 @@
 """What was measured of one run: points of the body over time, and scalars of its shape."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,11 +19,24 @@ from nsf.kinematics.interpolation import interpolation
 AXES = ("x", "y", "z")
 _POINT = ("X", "Y", "Z")
 _KNOWN = ("t", "particle", *_POINT, *AXES, "quantity", "value", "deviation")
+_NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
+_COMPONENT = re.compile(rf"([xyz])@({_NUMBER}):({_NUMBER}):({_NUMBER})")
 _MOST = 1_000_000  # rows of a file
 #: Particles that a scalar of a shape is taken from.
 BODY = 1000
 #: Of Δt: how far a time may be outside of a run.
 _SAME_TIME = 1e-6
+
+
+def component(text: str) -> tuple[str, np.ndarray] | None:
+    """Axis and rest position [3] [m] of a component of a point, as `z@0.5:0.5:0.2`; None of another text."""
+    found = _COMPONENT.fullmatch(text)
+    return (found[1], np.array(found.groups()[1:], float)) if found else None
+
+
+def is_scalar(text: str) -> bool:
+    """Whether a text names a quantity, or a component of a point."""
+    return text in QUANTITIES or component(text) is not None
 
 
 @dataclass(frozen=True)
@@ -60,12 +74,16 @@ class Observations:
         )
 
     @classmethod
-    def of_quantities(cls, values: Mapping[str, float], t: float, deviation: float = 1e-3) -> "Observations":
-        """Scalars of the shape by name [m] at a time [s], all of one deviation [m]."""
+    def of_scalars(cls, values: Mapping[str, float], t: float, deviation: float = 1e-3) -> "Observations":
+        """Quantities and components of points, as `z@X:Y:Z`, by name [m] at a time [s]; one deviation [m]."""
         count = len(values)
-        none = np.full((count, 3), np.nan)
+        points = np.full((count, 3), np.nan)
+        what = list(values)
+        for k, name in enumerate(values):
+            if found := component(name):
+                what[k], points[k] = found
         own = np.array(list(values.values()), float)
-        return cls(np.full(count, t), tuple(values), none, own, np.full(count, deviation))
+        return cls(np.full(count, t), tuple(what), points, own, np.full(count, deviation))
 
     @classmethod
     def read(cls, path: Path | str, model: Model) -> "Observations":

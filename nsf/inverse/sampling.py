@@ -18,7 +18,7 @@ from nsf.evaluation.quantities import QUANTITIES
 from nsf.extras import optional
 from nsf.inverse.fit import Fit
 from nsf.inverse.model import Forcing, Model
-from nsf.inverse.observations import AXES, BODY, View
+from nsf.inverse.observations import AXES, BODY, View, component
 from nsf.inverse.space import Space
 from nsf.kinematics.interpolation import interpolation
 
@@ -28,7 +28,6 @@ _BATCH = 500
 _TIMES = 21
 LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 _CALL = re.compile(r"(\w+)\((.*)\)")
-_POINT = re.compile(rf"([{''.join(AXES)}])@([^:]+):([^:]+):([^:]+)")
 _ENDS = 1e-9  # of a distribution, beyond which nothing is drawn
 
 
@@ -130,14 +129,14 @@ class Asked:
         for text in texts:
             if text in QUANTITIES:
                 continue
-            if not (found := _POINT.fullmatch(text)):
+            if not (found := component(text)):
                 raise ConfigError(
                     f"of={text} is none of {', '.join(QUANTITIES)}, nor a component of a point at rest, as "
                     "z@0.5:0.5:0.2"
                 )
-            point = np.array([[_number(part) for part in found.groups()[1:]]])
+            point = found[1][None]
             model.check_points(point)
-            self._points[text] = AXES.index(found[1]), point
+            self._points[text] = AXES.index(found[0]), point
         last = len(model.t) - 1
         self.steps = np.unique(np.linspace(0, last, min(_TIMES, last + 1)).round().astype(int))
         self.t = model.t[self.steps]

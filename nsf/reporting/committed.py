@@ -37,7 +37,7 @@ CHAPTERS = {
     ),
     "Beyond what was trained": ("extrapolation", "weak_elements", "super_resolution", "path_dependent"),
     "At small scale, on a CPU": (
-        "small", "levels", "calibration", "sensitivities", "design", "quickstart",
+        "small", "levels", "inverse", "calibration", "sensitivities", "tilt", "design", "quickstart",
     ),
     "One scene in detail, and speed": ("sand", "speed"),
 }  # fmt: skip

@@ -51,7 +51,8 @@ _NOTHING = dict.fromkeys((*VARIANT, PLACE), ABSENT) | dict.fromkeys(
 _PAGE_ONLY = [
     "integration_mean", "gamma", "step_ms_coarse", "total_ms_full", "total_ms_reduced", "total_ms_coarse",
     "decode_ms", "speedup_total", "memory_full_mib", "memory_reduced_mib", "teach_seconds", "break_even_runs",
-    "handed_over", "estimated_error", "true_error",
+    "handed_over", "estimated_error", "true_error", "height_error", "run_out_error", "opening_error",
+    "springback_error",
 ]  # fmt: skip
 
 

@@ -76,11 +76,29 @@ def train(scene: str) -> None:
     pipeline.train()
 
 
+#: The same for runs by operators, which few lessons will do for.
+TAUGHT = [
+    "engine=operators", "scene.design.validation=[24,36]", "scene.design.test=[27]",
+    *(f"engine.teaching.{key}" for key in ("steps=300", "descent=100", "rounds=1", "width=16")),
+]  # fmt: skip
+
+
+def deploy(scene: str) -> None:
+    """A deployed run by operators, likewise."""
+    keys = [f"scene={scene}", "scale=small", "device=cpu", *SHORT[scene], *TAUGHT]
+    pipeline = Pipeline(config.load(keys))
+    for stage in ("simulate", "train", "deploy"):
+        pipeline.run(stage)
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_page(page, project, monkeypatch, capsys):
     text = (DOCS / page).read_text(encoding="utf-8")
     if "trimesh" in text:
         pytest.importorskip("trimesh")
+    for extra in ("SALib", "emcee"):
+        if f"import {extra}" in text or f"from {extra}" in text:
+            pytest.importorskip(extra, reason=f"{extra} is not installed; pip install 'nsf[inverse]'")
     found, names = blocks(text), {"__name__": "page"}
     assert len(found) == text.count("\n```") / 2, "a block that is not read: indented, or without a language"
     for language, title, content in found:
@@ -90,6 +108,8 @@ def test_page(page, project, monkeypatch, capsys):
             elif language == "python":
                 for scene in re.findall(r'Run\.find\("train", "(\w+)"\)', content):
                     train(scene)
+                for scene in re.findall(r'Model\.load\("(\w+)"\)', content):
+                    deploy(scene)
                 exec(compile(content, page, "exec"), names)
             else:
                 assert language == "sh", f"a {language} block without a title"

@@ -33,7 +33,8 @@ COLUMNS = [
     "displacement_interpolated", "displacement_coarse", "gamma", "step_ms_full", "step_ms_reduced",
     "step_ms_coarse", "total_ms_full", "total_ms_reduced", "total_ms_coarse", "decode_ms", "speedup_step",
     "speedup_total", "memory_full_mib", "memory_reduced_mib", "teach_seconds", "break_even_runs",
-    "handed_over", "estimated_error", "true_error", "precision", "device", "commit",
+    "handed_over", "estimated_error", "true_error", "height_error", "run_out_error", "opening_error",
+    "springback_error", "precision", "device", "commit",
 ]  # fmt: skip
 STAGES = ("simulate", "train", "deploy", "evaluate")
 

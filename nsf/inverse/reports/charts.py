@@ -127,8 +127,10 @@ def indices_chart(table: pd.DataFrame) -> Figure:
     """Sensitivity indices with their 95 % intervals, a panel a quantity.
 
     Args:
-        table: quantity, parameter, first, first_95, total, total_95, and of others beside them.
+        table: quantity, parameter, first, first_95, total, total_95; and first_full_order, first_same_design
+            and the same of total, of a smaller design, where there were full-order runs.
     """
+    beside = (("same_design", "x", "operators, smaller design"), ("full_order", "o", "full order, the same"))
     groups = list(table.groupby("quantity", sort=False))
     with styled():
         fig = figure(3.2)
@@ -139,6 +141,12 @@ def indices_chart(table: pd.DataFrame) -> Figure:
                     at + 0.36 * (k - 0.5), part[column], 0.34, yerr=part[f"{column}_95"], label=told,
                     color=PALETTE[k],
                 )  # fmt: skip
+                for kind, mark, who in beside:
+                    if f"{column}_{kind}" in part:
+                        panel.plot(
+                            at + 0.36 * (k - 0.5) + 0.08, part[f"{column}_{kind}"], mark, ms=6, mfc="none",
+                            color=INK, label=who if k else None,
+                        )  # fmt: skip
             panel.set_xticks(at, [p.replace("_", " ") for p in part["parameter"]])
             panel.set(ylabel="share of the variance [–]", title=name.replace("_", " "))
             panel.grid(axis="y")

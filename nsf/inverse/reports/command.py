@@ -9,7 +9,7 @@ from nsf.data import PROGRAM
 from nsf.errors import ConfigError, MissingRunError
 from nsf.evaluation.quantities import QUANTITIES
 from nsf.inverse.model import Forcing, Model
-from nsf.inverse.observations import Observations, View
+from nsf.inverse.observations import Observations, View, is_scalar
 from nsf.inverse.space import Space
 from nsf.runs import Run
 
@@ -109,15 +109,16 @@ def design(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
     Raises:
         NSFError: a word is refused, or a run is missing.
     """
-    known = ("target", "tilt", "move", "knots", "full_order", "seed", *QUANTITIES)
+    scalars = [key for word in words if is_scalar(key := word.split("=")[0])]
+    known = ("target", "tilt", "move", "knots", "full_order", "seed", *scalars)
     models, asked, named = _begun("design", words, known)
     from nsf.inverse.design import Moves, Program, Tilt
     from nsf.inverse.reports.design import report
 
-    model, wanted = _one(models), {name: asked[name] for name in QUANTITIES if name in asked}
-    if ("target" in asked) == bool(wanted):
+    model = _one(models)
+    if ("target" in asked) == bool(scalars):
         raise ConfigError(
-            f"nsf design takes target=FILE, or a scalar at the end, as {next(iter(QUANTITIES))}=0.1"
+            f"nsf design takes target=FILE, or scalars at the end, as {next(iter(QUANTITIES))}=0.1"
         )
     if ("tilt" in asked) == ("move" in asked):
         raise ConfigError("nsf design takes tilt=ANGLE [°] or move=SOLID, what may change; give one of them")
@@ -130,7 +131,7 @@ def design(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
     seen = (
         Observations.read(asked["target"], model)
         if "target" in asked
-        else Observations.of_quantities({name: _number(asked, name) for name in wanted}, float(model.t[-1]))
+        else Observations.of_scalars({key: _number(asked, key) for key in scalars}, float(model.t[-1]))
     )
     values = ranges_of(named)
     if wide := [name for name, value in values.items() if isinstance(value, list)]:

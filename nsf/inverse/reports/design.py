@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from nsf.errors import ConfigError
-from nsf.inverse.design import Designed, Program, design, full_order
+from nsf.inverse.design import Designed, Program, Tilt, design, full_order
 from nsf.inverse.error import ModelError
 from nsf.inverse.observations import View
 from nsf.inverse.reports.charts import program_chart, residuals_chart
@@ -64,11 +64,7 @@ def report(
     told = ", ".join(f"{what} {value} mm" for what, value in body)
     say(f"design: off by: {told}")
     ways = dict(zip(program.names, found.values.T, strict=True))
-    warnings = (
-        [f"the run is {found.distrust:.3g} times as far from what was taught as may be believed"]
-        if found.distrust > 1.0
-        else []
-    )
+    warnings = _warnings(program, found)
     for warning in warnings:
         say(f"design: warning: {warning}")
 
@@ -93,6 +89,18 @@ def report(
         asked={"seed": seed, "knots": program.knots, "bounds": program.bounds.tolist()},
     )
     return write(results, folder), found
+
+
+def _warnings(program: Program, found: Designed) -> list[str]:
+    told = []
+    if found.distrust > 1.0:
+        told.append(f"the run is {found.distrust:.3g} times as far from what was taught as may be believed")
+    if isinstance(program, Tilt) and not program.model.scene.forcing.gravity:
+        told.append(
+            "gravity was the same in all training runs, so the fields know no shape that a tilt makes; train "
+            "with scene.forcing.gravity"
+        )
+    return told
 
 
 def _rms(values) -> float:

@@ -21,7 +21,7 @@ _SHOWN = ("device", "precision", "seed", "created")
 _HEADINGS = ("run", "commit", *_SHOWN)
 _NOTE = (
     "Every number above is computed from these runs; sources.json names them with the hash of each file that "
-    "was written, and the csv files hold the rows in full precision."
+    "was written, and the csv files hold the rows."
 )
 
 
@@ -33,7 +33,7 @@ class Results:
         title, lead: of the page.
         tables: the first one is what `nsf reports` shows.
         files: data frames by the name of their csv.
-        runs: everything is computed from.
+        runs: everything is computed from; beside: and these, which sources.json alone names.
         draw: folder → sections of pictures that it wrote there.
         facts, definitions: terms and what they say.
         warnings: sentences.
@@ -47,6 +47,7 @@ class Results:
     files: Mapping[str, pd.DataFrame]
     runs: Sequence[Run]
     draw: Callable[[Path], list[Section]]
+    beside: Sequence[Run] = ()
     facts: Sequence[tuple[str, str]] = ()
     definitions: Sequence[tuple[str, str]] = ()
     warnings: Sequence[str] = ()
@@ -94,7 +95,7 @@ def _provenance(runs: Sequence[Run]) -> Rows:
 def _sources(results: Results, sections: Sequence[Section], folder: Path) -> dict:
     pictures: list[Picture] = [picture for section in sections for picture in section.pictures]
     own = {key: value for key, value in provenance().items() if key != "versions"}
-    table = results.tables[0].content
+    table, runs = results.tables[0].content, (*results.runs, *results.beside)
     chart = {"file": pictures[0].files[-1], "caption": pictures[0].caption} if pictures else None
     return {
         "title": results.title,
@@ -102,7 +103,7 @@ def _sources(results: Results, sections: Sequence[Section], folder: Path) -> dic
         "paper": None,
         "asked": dict(results.asked),
         "files": {path.name: file_hash(path) for path in sorted(folder.iterdir())},
-        "runs": {run.id: {key: run.manifest.get(key) for key in _KEPT} for run in results.runs},
+        "runs": {run.id: {key: run.manifest.get(key) for key in _KEPT} for run in runs},
         "rows": [],
         "pictures": {file: picture.runs for picture in pictures for file in picture.files},
         "chart": chart,
@@ -112,7 +113,7 @@ def _sources(results: Results, sections: Sequence[Section], folder: Path) -> dic
             "body": table.body,
             "numeric": table.numeric,
             "said": results.said or results.tables[0].note,
-            "made": f"{_counted(results.runs)}; {commit_text(own)}.",
+            "made": f"{_counted(runs)}; {commit_text(own)}.",
         },
     }
 

@@ -71,26 +71,38 @@ def report(
     for k, name in enumerate(asked.names):
         rows[name] = made.values[:, k, -1]
     rows["distrust"] = made.distrust
+    rows = rows.map(lambda value: float(f"{value:.6g}"))  # full precision would take a megabyte
     files = {"quantiles.csv": _quantiles(asked, bands), "runs.csv": rows}
     tables = [Table("At the end", _ends(bands), f"{count:,} runs, {lost:,} of them distrusted and left out.")]
-    sections = {"Quantiles over time": ("quantiles", lambda: bands_chart(asked.t, bands, LEVELS, "m"))}
-    used: list[Run] = [model.run, *model.run.parent_runs]
+    sections = {
+        "Quantiles over time": (
+            "quantiles",
+            "Quantiles of trusted runs over time.",
+            lambda: bands_chart(asked.t, bands, LEVELS, "m"),
+        )
+    }
+    beside: list[Run] = []
     if indices:
         table, own = _indices(model, prior, asked, indices, full_order, forcing, seed, say)
-        files["sensitivities.csv"], used = table, [*used, *own]
-        tables.append(
-            Table("Sensitivities at the end", _index_rows(table), _designs(indices, full_order, prior))
+        files["sensitivities.csv"], beside = table, own
+        tables.insert(
+            0, Table("Sensitivities at the end", _index_rows(table), _designs(indices, full_order, prior))
         )
-        sections["Sensitivities"] = ("sensitivities", lambda: indices_chart(table))
+        told = "Shares of the variance at the end that each parameter makes, with 95 % intervals."
+        sections = {"Sensitivities": ("sensitivities", told, lambda: indices_chart(table))} | sections
     if view is not None:
         files["posterior.csv"] = pd.DataFrame(given, columns=list(model.names))
         tables.append(Table("Posterior", _moments(model, given), f"{len(given)} draws."))
-        sections["Posterior"] = ("posterior", lambda: posterior_chart(given, model.names, model.units))
+        sections["Posterior"] = (
+            "posterior",
+            "Draws of the posterior.",
+            lambda: posterior_chart(given, model.names, model.units),
+        )
 
     def draw(fresh: Path) -> list[Section]:
         return [
-            Section(heading, [Picture(save(chart(), fresh, stem), f"{heading}.", ids)])
-            for heading, (stem, chart) in sections.items()
+            Section(heading, [Picture(save(chart(), fresh, stem), told, ids)])
+            for heading, (stem, told, chart) in sections.items()
         ]
 
     title = model.scene.config.scene.get("title") or model.scene.name
@@ -99,7 +111,8 @@ def report(
         lead=_LEAD,
         tables=tables,
         files=files,
-        runs=used,
+        runs=[model.run, *model.run.parent_runs],
+        beside=beside,
         draw=draw,
         facts=[("Runs", f"{count:,} in {made.seconds:.2f} s"), ("Distrusted", f"{lost:,}")],
         definitions=_TERMS,

@@ -12,6 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from nsf.deployment import Rollout
 from nsf.dynamics.setup import reduced_steps
 from nsf.evaluation import Comparison, Rivals, SolverCost, SuperResolution, reduction_ratio
+from nsf.evaluation.quantities import QUANTITIES
 from nsf.mpm import floor_height
 from nsf.runs import Record
 from nsf.scenes import Scene
@@ -77,7 +78,7 @@ def rows(
         "teach_seconds": offline[1],
         "break_even_runs": _break_even(cost, sum(offline)),
         **dict.fromkeys(
-            ("handed_over", "estimated_error", "true_error"), 0.0
+            ("handed_over", "estimated_error", "true_error", *(f"{name}_error" for name in QUANTITIES)), 0.0
         ),  # their place; of each run below
         "precision": config.precision,
         "device": torch.cuda.get_device_name(device) if device.startswith("cuda") else "cpu",
@@ -106,6 +107,7 @@ def rows(
             "handed_over": _handed_over(rollout, config),
             "estimated_error": math.nan if rollout.estimate is None else rollout.estimate.max(),
             "true_error": comparison.true_error,
+            **{f"{name}_error": off for name, off in comparison.quantities.items()},
         }
         found.append(variant | own | (measured if reduced else lost) | share)
     return pd.DataFrame(found)

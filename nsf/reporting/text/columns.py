@@ -66,6 +66,10 @@ _SPEC = (
     Column("handed_over", "handed on", "%", 100.0),
     Column("estimated_error", "estimated error", "m"),
     Column("true_error", "true error", "m"),
+    Column("height_error", "height, off", "m"),
+    Column("run_out_error", "run-out, off", "m"),
+    Column("opening_error", "opening, off", "m"),
+    Column("springback_error", "springback, off", "m"),
     Column("precision", "precision"),
     Column("device", "device"),
     Column("commit", "commit"),
@@ -79,7 +83,8 @@ RIVALS = (
 """Displacement errors of what a reduced run is held to, beside its own."""
 LATER = (
     "engine", *RIVALS, "step_ms_coarse", "total_ms_full", "total_ms_reduced", "total_ms_coarse", "decode_ms",
-    "teach_seconds", "break_even_runs", "handed_over", "estimated_error", "true_error",
+    "teach_seconds", "break_even_runs", "handed_over", "estimated_error", "true_error", "height_error",
+    "run_out_error", "opening_error", "springback_error",
 )  # fmt: skip
 """Columns that older runs and reports lack: they are read as empty."""
 

@@ -121,6 +121,10 @@ def test_pictures(comparison_of, made, truth):
     many = whole.pictures
     off = np.linalg.norm(many["x_reduced"].astype(float) - many["x_full"], axis=2)
     assert whole.true_error == pytest.approx(np.sqrt((off**2).mean(1)).max(), rel=1e-4)
+    ends = [np.sort(many[kind][-1, :, 2])[[2, -3]] for kind in ("x_reduced", "x_full")]
+    drop = np.ptp(ends[0]) - np.ptp(ends[1])
+    assert whole.quantities["height"] == pytest.approx(drop, abs=2e-3)
+    assert set(whole.quantities) == {"height", "run_out", "opening", "springback"}
     assert many["x_full"].shape == (25, 500, 3)
     np.testing.assert_allclose(many["x_full"], truth.read("x"), rtol=1e-6)
     tau = torch.as_tensor(np.asarray(truth.read("tau"))).double()

@@ -8,8 +8,10 @@ import torch
 from nsf.errors import ConfigError
 from nsf.inverse import Model
 from nsf.inverse.design import Moves, Tilt, design, full_order
+from nsf.inverse.error import ModelError
 from nsf.inverse.observations import Observations, View
 from nsf.inverse.reports.command import design as command
+from nsf.inverse.space import Space
 
 ONE = {"friction_angle": 27.0, "speed": 0.2}
 
@@ -96,7 +98,7 @@ def test_the_command(tmp_path, deployed, model):
     assert targets["what"].tolist() == ["run_out"]
     assert (targets["fitted"] - targets["full_order"]).abs().max() < 0.02
     for more, told in (
-        (["tilt=5"], "takes target=FILE, or a scalar at the end"),
+        (["tilt=5"], "takes target=FILE, or scalars at the end"),
         (["height=0.1"], "takes tilt=ANGLE"),
         (["height=high", "tilt=5"], "height=high is no number"),
         (["height=0.1", "tilt=5", "speed=0.1..0.2"], "must be one value"),
@@ -154,3 +156,17 @@ def test_a_push_is_designed(pushed):
     found = design(program, View(Observations.of_points(t, points, x, 1e-4), pushed), mu)
     assert np.sqrt(found.cost / 6) < 1.0
     assert full_order(program, found, mu).read("x", [0, 24]).shape == (2, 500, 3)
+
+
+def test_the_error_of_runs_that_follow_programs(pushed):
+    points = pushed.manifold.X[[10, 300]].numpy()
+    view = View(Observations.of_points(np.array([0.12]), points, np.zeros((1, 2, 3)), 1e-4), pushed)
+    own = ModelError.of(view, pushed)
+    assert own.vectors.shape == (2, 6)
+    assert own.forcing.solids.shape[0] == 2
+    still = ModelError(own.parameters, own.vectors)
+    scale = np.full(6, 1e-3)
+    moved, unmoved = (e.offsets(view, pushed, Space.of(pushed), scale).off for e in (own, still))
+    assert moved.shape == (2, 1)
+    assert np.abs(moved - unmoved).max() > 0.0
+    assert own.deviations.max() < 0.03

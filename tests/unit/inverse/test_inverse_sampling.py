@@ -128,3 +128,30 @@ def test_the_command(tmp_path, deployed):
     assert (tmp_path / "a" / "quantiles.png").is_file()
     with pytest.raises(ConfigError, match="has no programs; leave it out"):
         sample([*words, "program=3"])
+
+
+def test_the_command_with_both_libraries(tmp_path, deployed, model):
+    for name in ("SALib", "emcee"):
+        pytest.importorskip(name, reason=f"{name} is not installed; pip install 'nsf[inverse]'")
+    x = model.positions(model([[27.0, 0.2]])[0, 24], np.arange(0, 500, 40)).numpy()
+    rows = [
+        {"t": model.t[24], "particle": 40 * k, **dict(zip("xyz", at, strict=True)), "deviation": 1e-3}
+        for k, at in enumerate(x)
+    ]
+    pd.DataFrame(rows).to_csv(tmp_path / "seen.csv", index=False)
+    words = [
+        f"run={deployed.deployment.path}",
+        "runs=40",
+        "device=cpu",
+        f"observations={tmp_path / 'seen.csv'}",
+    ]
+    sample([*words, "sensitivities=16", "full_order=2", f"folder={tmp_path / 'a'}"])
+    table = pd.read_csv(tmp_path / "a" / "sensitivities.csv")
+    assert table["parameter"].tolist() == ["friction_angle", "speed"]
+    assert {"first_full_order", "first_same_design", "total_full_order"} <= set(table)
+    drawn = pd.read_csv(tmp_path / "a" / "posterior.csv")
+    low, high = model.ranges.T
+    assert ((drawn >= low) & (drawn <= high)).all(axis=None)
+    assert (tmp_path / "a" / "posterior.png").is_file()
+    taken = pd.read_csv(tmp_path / "a" / "runs.csv")["speed"].to_numpy()
+    assert np.abs(taken[:, None] - drawn["speed"].to_numpy()).min(1).max() < 1e-5

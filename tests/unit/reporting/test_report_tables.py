@@ -35,7 +35,8 @@ def test_columns_are_exactly_those_of_the_design(sweep):
         "displacement_interpolated", "displacement_coarse", "gamma", "step_ms_full", "step_ms_reduced",
         "step_ms_coarse", "total_ms_full", "total_ms_reduced", "total_ms_coarse", "decode_ms", "speedup_step",
         "speedup_total", "memory_full_mib", "memory_reduced_mib", "teach_seconds",
-        "break_even_runs", "handed_over", "estimated_error", "true_error", "precision", "device", "commit",
+        "break_even_runs", "handed_over", "estimated_error", "true_error", "height_error",
+        "run_out_error", "opening_error", "springback_error", "precision", "device", "commit",
     ]  # fmt: skip
     frame = merge_results(sweep)
     assert list(frame.columns) == expected == list(COLUMNS)
