@@ -149,12 +149,12 @@ def test_full_order_runs_teach_without_a_step_of_an_engine(of_runs, monkeypatch)
     found = of_runs.taught.manifest["metrics"]
     assert found["teacher_steps"] == 0
     assert found["broken_affinity"] is None
-    assert len(found["errors"]) == 2
+    assert len(found["errors"]) == 1
     row = pd.read_csv(of_runs.evaluation.path / "results.csv").iloc[0]
     assert row["displacement_error"] < 0.06  # a run that does not move is off by 1
 
 
-def test_full_order_runs_at_validation_values_decide_which_round_is_kept(of_runs, pipeline_at, tmp_path):
+def test_what_full_order_runs_taught_is_held_to_those_of_validation(of_runs, pipeline_at, tmp_path):
     known, between, back = of_runs.lessons
     assert (known, between, back) == (list(map(angle, (22.0, 30.0, 38.0))), [], known)
     held_back = pipeline_at(tmp_path, *TAUGHT, "engine.teacher=runs", "scene.design.validation=[24]")

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -12,12 +13,42 @@ from nsf.engines.operators.teacher import Teacher
 from nsf.engines.operators.teaching import Teaching
 
 _BATCH = 1024  # labels of one step of the descent
-_WINDOWS = 48  # unrolled windows of one
-#: They cost several times what single steps do: one step of the descent in so many has them, at this weight.
-_UNROLLED_EVERY, _UNROLLED_WEIGHT = 3, 0.3
-_UNWEIGHTED = 8  # steps of a window, beyond which errors weigh less in proportion to their squared time
-_LARGEST_GRADIENT = 10.0
 _WARM_UP = 3  # steps before a graph is captured, as CUDA asks for
+
+
+@dataclass(frozen=True)
+class Windows:
+    """How unrolled windows are learned from.
+
+    Attributes:
+        every: one step of the descent in so many has them, as they cost several times what single steps do.
+        count: windows of it.
+        weight: theirs, beside that of single steps.
+        weigh: (x̂ − its target [w, r], steps before it, model) → a step's share in the loss of a window.
+        steepest: length of gradient beyond which it is cut.
+    """
+
+    every: int
+    count: int
+    weight: float
+    weigh: Callable[[Tensor, int, StepOperators], Tensor]
+    steepest: float
+
+
+def _by_changes(off: Tensor, step: int, model: StepOperators) -> Tensor:
+    return (off / model.d_scale).square().mean()
+
+
+def _by_accelerations(off: Tensor, step: int, model: StepOperators) -> Tensor:
+    """In units of what one step's error would grow to; far off, where a window is lost, hardly any more."""
+    squares = (off / ((step + 1) * model.a_scale)).square()
+    return (squares / (1.0 + squares / _LOST)).mean()
+
+
+_LOST = 400.0
+#: Beside the steps of an engine from states of one's choice; and of full-order runs.
+_BESIDE = Windows(every=3, count=48, weight=0.3, weigh=_by_changes, steepest=10.0)
+_ALONE = Windows(every=2, count=128, weight=1.0, weigh=_by_accelerations, steepest=1.0)
 
 
 class Descent:
@@ -30,8 +61,7 @@ class Descent:
         model: fp32, on the device of the descent.
         labels: what the teacher answered.
         teachers: whose runs are unrolled; runs: [N + 1, R, r] of each.
-        teaching: how many steps, and the noise.
-        window: steps that are unrolled.
+        teaching: how many steps, and the windows.
         rate: learning rate at the start; it falls to 0 along a cosine.
         generator: of batches and noise, on the host.
     """
@@ -43,11 +73,11 @@ class Descent:
         teachers: Sequence[Teacher],
         runs: Sequence[Tensor],
         teaching: Teaching,
-        window: int,
         rate: float,
         generator: torch.Generator,
     ):
-        self._model, self._teaching, self._generator, self._window = model, teaching, generator, window
+        self._model, self._teaching, self._generator = model, teaching, generator
+        self._kind = _BESIDE if teachers[0].asked else _ALONE
         self._device = model.x_mean.device
         rows = [self._here(getattr(labels, name)) for name in Labels.__dataclass_fields__]
         self._xhat, self._change, self._acceleration, self._mu, self._g, features = rows
@@ -85,9 +115,9 @@ class Descent:
 
     def _window_of(self, turn: int) -> int | None:
         """Whose windows a step unrolls; None for single steps alone."""
-        if self._window == 1 or turn % _UNROLLED_EVERY:
+        if self._teaching.unroll == 1 or turn % self._kind.every:
             return None
-        return turn // _UNROLLED_EVERY % len(self._windows)
+        return turn // self._kind.every % len(self._windows)
 
     def _drawn(self, window: int | None) -> list[Tensor]:
         """Numbers of labels; of windows: their runs, first steps and noise [deviations of x̂]."""
@@ -95,13 +125,13 @@ class Descent:
         drawn = [torch.randint(count, (min(_BATCH, count),), generator=generator)]
         if window is not None:
             steps, runs, r = self._windows[window][0].shape
-            drawn.append(torch.randint(runs, (_WINDOWS,), generator=generator))
-            drawn.append(torch.randint(steps - self._unroll(steps), (_WINDOWS,), generator=generator))
-            drawn.append(torch.randn(_WINDOWS, r, generator=generator))
+            drawn.append(torch.randint(runs, (self._kind.count,), generator=generator))
+            drawn.append(torch.randint(steps - self._unroll(steps), (self._kind.count,), generator=generator))
+            drawn.append(torch.randn(self._kind.count, r, generator=generator))
         return drawn
 
     def _unroll(self, steps: int) -> int:
-        return min(self._window, steps - 1)
+        return min(self._teaching.unroll, steps - 1)
 
     def _step(self, window: int | None, drawn: list[Tensor]) -> None:
         model, (at, *unrolled) = self._model, drawn
@@ -109,10 +139,10 @@ class Descent:
         off = ((found - self._acceleration[at]) / model.a_scale).square().mean(1)
         loss = (self._weight[at] * off).mean()
         if window is not None:
-            loss = loss + _UNROLLED_WEIGHT * self._off_unrolled(self._windows[window], *unrolled)
+            loss = loss + self._kind.weight * self._off_unrolled(self._windows[window], *unrolled)
         self._optimiser.zero_grad()
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(model.parameters(), _LARGEST_GRADIENT)
+        torch.nn.utils.clip_grad_norm_(model.parameters(), self._kind.steepest)
         self._optimiser.step()
 
     def _off_unrolled(self, window: tuple[Tensor, ...], k: Tensor, n: Tensor, noise: Tensor) -> Tensor:
@@ -121,9 +151,7 @@ class Descent:
         x, d = runs[n, k] + self._teaching.noise * model.x_scale * noise, changes[n, k]
         for j in range(unroll):
             x, d = model.step(x, d, mu[k], g[n + j, k], c[n + j, k])
-            # Further on all errors have grown, and those of the longest windows would be all there is.
-            grown = max(1.0, (j + 1) / _UNWEIGHTED)
-            loss = loss + ((x - runs[n + j + 1, k]) / (grown * model.d_scale)).square().mean()
+            loss = loss + self._kind.weigh(x - runs[n + j + 1, k], j, model)
         return loss / unroll
 
     # -- graphs -----------------------------------------------------------------------------------------

@@ -28,7 +28,6 @@ _OTHER_CHANGE = 0.1
 #: all its steps.
 _LEAST_ASKED = 40
 _ASKED = 12  # moments at which it is found how far the teacher's step is from affine
-_FIRST_WINDOW = 8  # steps of the windows of the first round; each round has windows twice as long
 
 
 class Course:
@@ -97,7 +96,8 @@ class Course:
             InstabilityError: no round gave a run that stays finite.
         """
         best, least = None, math.inf
-        for number in range(self.teaching.rounds + 1):
+        rounds = self.teaching.rounds if self.teachers[0].asked else 0
+        for number in range(rounds + 1):
             started = time.perf_counter()
             kept = self._kept(number)
             if kept is None:
@@ -122,7 +122,7 @@ class Course:
         generator = torch.Generator().manual_seed(1000 * self.seed + number)
         if number == 0:
             self._begin(generator)
-        elif self.teachers[0].asked:
+        else:
             self.labels = Labels.joined([self.labels, *self._along_own_runs(number)])
         self._descend(number, generator)
         runs = self.own_runs(self.yardstick.teacher)
@@ -270,8 +270,7 @@ class Course:
     def _descend(self, number: int, generator: torch.Generator) -> None:
         rate = self.teaching.rate / (1 if number == 0 else 2)
         model = self.model.to(self._device, torch.float32)
-        window = min(self.teaching.unroll, _FIRST_WINDOW << number)
-        Descent(model, self.labels, self.teachers, self._runs, self.teaching, window, rate, generator).run()
+        Descent(model, self.labels, self.teachers, self._runs, self.teaching, rate, generator).run()
         self.model = model.to("cpu", torch.float64)
 
     # -- rounds on disk ---------------------------------------------------------------------------------

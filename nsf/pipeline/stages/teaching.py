@@ -42,7 +42,7 @@ def teach(pipeline, run: Run) -> None:
 def _follow(pipeline, manifold: Manifold, record: Record) -> None:
     started = time.perf_counter()
     teaching, seed, device = pipeline.teaching, int(pipeline.config.seed), pipeline.device
-    work = (teaching.rounds + 1, "rounds") if pipeline.of_runs else (teaching.steps, "teacher's steps")
+    work = (1, "rounds") if pipeline.of_runs else (teaching.steps, "teacher's steps")
     with Progress("teach", *work) as progress:
         truth = _truth(pipeline, manifold)
         if pipeline.of_runs:

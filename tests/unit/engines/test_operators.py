@@ -209,27 +209,6 @@ def test_how_far_a_step_is_from_affine():
     np.testing.assert_allclose(broken(2.0), 2.0 * broken(1.0), rtol=1e-9)
 
 
-def test_windows_are_twice_as_long_in_each_round_up_to_what_is_asked(monkeypatch):
-    taken = []
-
-    class Descent:
-        def __init__(self, *given):
-            taken.append(given[5])
-
-        def run(self):
-            pass
-
-    monkeypatch.setattr("nsf.engines.operators.teach.Descent", Descent)
-    teacher = Stepper(0.3)
-    yardstick = Yardstick(teacher, lambda run: run[:, None], teacher.run()[:, :, None])
-    for unroll, windows in ((20, [8, 16, 20]), (8, [8, 8, 8]), (4, [4, 4, 4])):
-        taken.clear()
-        Course(
-            [teacher], None, yardstick, Teaching(8, rounds=2, steps=90, descent=1, unroll=unroll), 0
-        ).follow()
-        assert taken == windows
-
-
 @pytest.mark.gpu
 def test_captured_steps_of_the_descent_are_those_of_the_host():
     """Graphs replay what eager steps do; warming up leaves neither network nor generator changed."""
