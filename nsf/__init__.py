@@ -2,21 +2,13 @@
 
 from typing import TYPE_CHECKING
 
+from nsf.extras import on_first_use
+
 if TYPE_CHECKING:
     from nsf.inverse.model import Model
     from nsf.kinematics.manifold import Manifold
 
 __all__ = ["Manifold", "Model"]
 
-
-def __getattr__(name: str):
-    # On demand, so that `nsf --help` does not wait for torch.
-    if name == "Manifold":
-        from nsf.kinematics.manifold import Manifold
-
-        return Manifold
-    if name == "Model":
-        from nsf.inverse.model import Model
-
-        return Model
-    raise AttributeError(f"module 'nsf' has no attribute {name!r}")
+# On demand, so that `nsf --help` does not wait for torch.
+__getattr__ = on_first_use(__name__)

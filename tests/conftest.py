@@ -1,5 +1,6 @@
 """What tests of several layers share: one tiny chain, simulated, trained, deployed and evaluated once."""
 
+import gc
 import os
 import shutil
 import signal
@@ -49,6 +50,12 @@ def pytest_runtest_setup(item):
         if min(found.values()) < needed:
             told = " and ".join(f"{library} sees {count}" for library, count in found.items())
             pytest.skip(f"GPUs needed: {needed}; {told}")
+
+
+def pytest_collection_finish(session):
+    """Collections of garbage pass over what stays to the end: libraries and tests, a million objects."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session", autouse=True)

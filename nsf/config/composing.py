@@ -8,8 +8,8 @@ import difflib
 import re
 import typing
 import warnings
-from collections.abc import Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from functools import cache
 from pathlib import Path
 
@@ -147,8 +147,9 @@ def checked(config: DictConfig) -> DictConfig:
     Raises:
         ConfigError: see `load`.
     """
-    resolve(config)
-    return OmegaConf.create(OmegaConf.to_container(config))
+    with _telling_of_depth():
+        targets.check(resolved(config))
+        return OmegaConf.create(OmegaConf.to_container(config))
 
 
 def resolve(config: DictConfig) -> DictConfig:
@@ -157,10 +158,16 @@ def resolve(config: DictConfig) -> DictConfig:
     Raises:
         ConfigError: see `load`.
     """
-    try:
+    with _telling_of_depth():
         plain = resolved(config)
         targets.check(plain)
         return OmegaConf.create(plain)
+
+
+@contextmanager
+def _telling_of_depth() -> Iterator[None]:
+    try:
+        yield
     except RecursionError as error:
         raise ConfigError("the configuration is nested too deeply; flatten it") from error
 

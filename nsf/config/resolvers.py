@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from nsf.errors import ConfigError
@@ -75,9 +75,12 @@ def resolved(config: DictConfig) -> Any:
         ConfigError: a value is missing, refers to nothing, or calls a resolver that is not allowed.
     """
     try:
-        raw = OmegaConf.to_container(config)
+        raw, open_values = OmegaConf.to_container(config), False
         for path, value in leaves(raw):
             _check(".".join(path), value)
+            open_values |= isinstance(value, str) and ("${" in value or value == MISSING)
+        if not open_values:  # most nodes that are built; a second walk would take as long
+            return raw
         if _size(raw) > _MOST:
             raise ConfigError(
                 f"the configuration has more than {_MOST} values, as keys refer to others; have fewer"

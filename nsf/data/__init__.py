@@ -3,8 +3,9 @@
 Names are imported on first use: writing a trajectory needs no torch.
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from nsf.extras import on_first_use
 
 if TYPE_CHECKING:
     from nsf.data.case import PROGRAM, Case
@@ -27,18 +28,4 @@ __all__ = [
     "hash_of_positions",
 ]
 
-_HOMES = {
-    "PROGRAM": "case",
-    "Case": "case",
-    "Standardizer": "normalize",
-    "Snapshots": "snapshots",
-    "Split": "split",
-    "Trajectory": "trajectory",
-    "TrajectoryWriter": "trajectory",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOMES.get(name, 'schema')}"), name)
+__getattr__ = on_first_use(__name__)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -84,3 +85,9 @@ class Standardizer(nn.Module):
     def inverse(self, values: Float[Tensor, "*points component"]) -> Float[Tensor, "*points component"]:
         """values * std + mean, in the unit of the field."""
         return values * self.std + self.mean
+
+
+def deviation(rows: Float[np.ndarray, "row component"]) -> Float[np.ndarray, " component"]:
+    """Standard deviation over rows, in their unit, to divide by: 1 for a component that never varies."""
+    found = rows.std(0)
+    return np.where(found > 0, found, 1.0)

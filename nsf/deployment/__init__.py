@@ -1,6 +1,6 @@
 """Reduced runs of held-out cases: their rollouts, whether to believe them, who goes on where not."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from nsf.deployment.handover import go_on, hand_over
 from nsf.deployment.levels import FULL_ORDER, OPERATORS, PROJECTED, Levels
@@ -12,6 +12,7 @@ from nsf.deployment.rollout import (
     rollouts,
 )
 from nsf.deployment.trust import Trust, calibrate
+from nsf.extras import on_first_use
 
 if TYPE_CHECKING:
     from nsf.deployment.prediction import deploy
@@ -33,11 +34,5 @@ __all__ = [
     "rollouts",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    # On demand, so that a live run does not wait for Lightning.
-    if name == "deploy":
-        from nsf.deployment.prediction import deploy
-
-        return deploy
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+# On demand, so that a live run does not wait for Lightning.
+__getattr__ = on_first_use(__name__)

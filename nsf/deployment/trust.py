@@ -17,6 +17,7 @@ import torch
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial.distance import cdist
 
+from nsf.data.normalize import deviation
 from nsf.dynamics import ReducedMPM
 from nsf.progress import Progress
 
@@ -124,8 +125,7 @@ class CaseDistance:
         # Snapshots keep parameters in float32, of which seven digits are the value's own.
         rows = np.unique(manifold.training_parameters.cpu().numpy(), axis=0).tolist()
         known = self._values = np.array([[float(f"{value:.7g}") for value in row] for row in rows])
-        deviation = known.std(0)
-        self._deviation = np.where(deviation > 0, deviation, 1.0)
+        self._deviation = deviation(known)
         between = cdist(known / self._deviation, known / self._deviation)
         self._spacing = float(minimum_spanning_tree(between).max()) or 1.0
 

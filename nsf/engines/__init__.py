@@ -3,8 +3,9 @@
 Names are imported on first use: most commands step nothing.
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from nsf.extras import on_first_use
 
 if TYPE_CHECKING:
     from nsf.engines.base import Engine
@@ -27,20 +28,4 @@ __all__ = [
     "reduced_batch",
 ]
 
-_HOMES = {
-    "ENGINES": "choice",
-    "NAMES": "names",
-    "Engine": "base",
-    "Modal": "modal",
-    "Operators": "operators",
-    "Reference": "reference",
-    "choose": "choice",
-    "reduced": "building",
-    "reduced_batch": "building",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+__getattr__ = on_first_use(__name__)

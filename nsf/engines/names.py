@@ -4,3 +4,5 @@
 OPERATORS = "operators"
 #: What `engine=` may be: from the fastest to the one that steps whatever can be stepped.
 NAMES = ("auto", "modal", "reference", OPERATORS)
+#: What `engine.teacher=` may be beside those: the full-order runs of training.
+RUNS = "runs"

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from nsf.data import Trajectory
+from nsf.data.normalize import deviation
 from nsf.dynamics import ReducedMPM
 from nsf.errors import InstabilityError, NSFError
 from nsf.evaluation import metrics
@@ -51,17 +52,15 @@ class TrainingRuns:
         latents = manifold.training_latents.cpu().double().numpy().reshape(count, -1, manifold.latent_dim)
         values = manifold.training_parameters.cpu().double().numpy()
         values = values.reshape(count, -1, values.shape[1])[:, 0]
-        mean, deviation = values.mean(0), values.std(0)
-        deviation = np.where(deviation > 0, deviation, 1.0)
+        mean, spread = values.mean(0), deviation(values)
         if len(forcing):
             # A whole program weighs as much as one parameter.
             whole = np.stack(forcing)
-            spread = whole.std(0)
-            weight = np.linalg.norm(spread) or 1.0
+            weight = np.linalg.norm(whole.std(0)) or 1.0
             values = np.hstack([values, whole])
             mean = np.concatenate([mean, whole.mean(0)])
-            deviation = np.concatenate([deviation, np.full(whole.shape[1], weight)])
-        return cls((values - mean) / deviation, latents, mean, deviation)
+            spread = np.concatenate([spread, np.full(whole.shape[1], weight)])
+        return cls((values - mean) / spread, latents, mean, spread)
 
     def standardised(self, parameters: np.ndarray) -> np.ndarray:
         """Parameters [n] in the units of `self.parameters`."""

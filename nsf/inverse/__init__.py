@@ -4,8 +4,9 @@ A run by operators takes a fraction of a millisecond and is differentiable, so t
 for. Names are imported on first use, so that a command's help does not wait for torch.
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from nsf.extras import on_first_use
 
 if TYPE_CHECKING:
     from nsf.inverse.model import Forcing, Model
@@ -14,8 +15,4 @@ __all__ = ["Forcing", "Model"]
 
 _HOMES = {"Forcing": "model", "Model": "model"}
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+__getattr__ = on_first_use(__name__)

@@ -1,7 +1,8 @@
 """The chain from scene to report, stage by stage."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from nsf.extras import on_first_use
 from nsf.pipeline.names import STAGES
 
 if TYPE_CHECKING:
@@ -9,11 +10,5 @@ if TYPE_CHECKING:
 
 __all__ = ["STAGES", "Pipeline"]
 
-
-def __getattr__(name: str) -> Any:
-    # On demand, so that names of runs do not wait for torch.
-    if name == "Pipeline":
-        from nsf.pipeline.chain import Pipeline
-
-        return Pipeline
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+# On demand, so that names of runs do not wait for torch.
+__getattr__ = on_first_use(__name__)

@@ -15,7 +15,7 @@ from nsf import config as configuration
 from nsf.config.code import code_of
 from nsf.data.case import Case
 from nsf.engines.modal.mirrors import edits
-from nsf.engines.names import OPERATORS
+from nsf.engines.names import OPERATORS, RUNS
 from nsf.engines.operators.teaching import Teaching, random_cases
 from nsf.errors import ConfigError
 from nsf.gpu import has_driver
@@ -85,6 +85,11 @@ class Names:
         if self.engine == OPERATORS:
             self.teaching = configuration.build(c.engine.teaching, "engine.teaching")
             one_of("engine.teacher", c.engine.teacher, TEACHERS)
+            if self.of_runs and c.deploy.dt_multiplier != 1:
+                raise ConfigError(
+                    f"engine.teacher={RUNS} teaches steps of the scene's Δt, and deploy.dt_multiplier is "
+                    f"{c.deploy.dt_multiplier:g}; set it to 1, or engine.teacher=auto"
+                )
         self.coarse = factors("evaluation.coarse", OmegaConf.select(c, "evaluation.coarse", default=[]))
         check_words(c, self.engine)
         check_batch(c, self.engine)
@@ -115,7 +120,14 @@ class Names:
     @property
     def projecting(self) -> str:
         """The engine of steps that are projected: that which is asked for, or which operators learn from."""
-        return self.engine if self.teaching is None else self.config.engine.teacher
+        if self.teaching is None:
+            return self.engine
+        return "auto" if self.of_runs else self.config.engine.teacher
+
+    @property
+    def of_runs(self) -> bool:
+        """Whether operators learn from the full-order runs of training, not from the steps of an engine."""
+        return self.teaching is not None and self.config.engine.teacher == RUNS
 
     @property
     def held_out(self) -> tuple[Case, ...]:
@@ -256,8 +268,12 @@ class Names:
         """Cases of three kinds that the teacher is asked in: of training, between them, and held back.
 
         Runs in those held back decide which round of teaching is kept. None is a validation or test case.
+        Where full-order runs are the teacher, there are none between, and those of validation are held back,
+        or, if there are none, those of training.
         """
         known, seed = sorted(self.split.train), int(self.config.seed)
+        if self.of_runs:
+            return [known, [], sorted(self.split.validation) or known]
         taken = [*known, *self.split.validation, *self.split.test]
         between = random_cases(self.split.box, len(known), seed, taken)
         back = random_cases(self.split.box, HELD_BACK, seed + 1, [*taken, *between])

@@ -53,14 +53,9 @@ class Plan(Names):
         with configuration.naming_the_missing():
             self._build()
 
-    def _begin(self, config: DictConfig) -> None:
-        super()._begin(config)
-        self._template = config
-
     def _build(self) -> None:
         """Build and check everything, so that a bad value is refused before any work."""
-        self.scene = Scene.from_config(self._template)
-        c = self.config = self.scene.config
+        self.scene, c = Scene.of(self.scene), self.config
         for name in ("field", "trainer", "method", "sampler", "projector", "integration"):
             setattr(self, name, configuration.build(c[name], name))
         if self.trainer.devices > 1 and not self.field.shardable:

@@ -4,8 +4,9 @@ Reads manifests and the files of `evaluate` runs and nothing else; every number 
 one of them.
 """
 
-import importlib
 from typing import TYPE_CHECKING
+
+from nsf.extras import on_first_use
 
 if TYPE_CHECKING:
     from nsf.reporting.build import build_report
@@ -14,16 +15,5 @@ if TYPE_CHECKING:
 
 __all__ = ["COLUMNS", "build_report", "console_table", "merge_results"]
 
-_HOMES = {
-    "COLUMNS": "text.columns",
-    "build_report": "build",
-    "console_table": "tables",
-    "merge_results": "tables",
-}
-
-
-def __getattr__(name: str):
-    # On demand, so that `nsf runs` does not wait for pandas and matplotlib.
-    if name in _HOMES:
-        return getattr(importlib.import_module(f"nsf.reporting.{_HOMES[name]}"), name)
-    raise AttributeError(f"module 'nsf.reporting' has no attribute {name!r}")
+# On demand, so that `nsf runs` does not wait for pandas and matplotlib.
+__getattr__ = on_first_use(__name__)

@@ -1,7 +1,8 @@
 """Run folders: what made each, what it holds, and whether that is still what its stage left."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from nsf.extras import on_first_use
 from nsf.runs.record import Record
 from nsf.runs.run import Run
 
@@ -10,11 +11,5 @@ if TYPE_CHECKING:
 
 __all__ = ["Record", "Run", "find", "table"]
 
-
-def __getattr__(name: str) -> Any:
-    # On demand: a stage that records its run lists none.
-    if name in ("find", "table"):
-        from nsf.runs import finding
-
-        return getattr(finding, name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+# On demand: a stage that records its run lists none.
+__getattr__ = on_first_use(__name__)

@@ -3,9 +3,10 @@
 Names are imported on first use: shapes and designs can be checked without Warp.
 """
 
-import importlib
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from nsf.extras import on_first_use
 
 if TYPE_CHECKING:
     from nsf.scenes.body import Body
@@ -53,39 +54,7 @@ __all__ = [
     "mesh_or_ball",
 ]
 
-_HOMES = {
-    "Ball": "shapes",
-    "Body": "body",
-    "Box": "shapes",
-    "Cylinder": "shapes",
-    "Design": "designs",
-    "Frame": "shapes",
-    "GravityProgram": "programs",
-    "Grid": "designs",
-    "Keyframes": "programs",
-    "LatinHypercube": "designs",
-    "Mesh": "shapes",
-    "MotionProgram": "programs",
-    "Parameter": "parameters",
-    "RandomPress": "programs",
-    "RandomPush": "programs",
-    "RandomShake": "programs",
-    "RandomTilt": "programs",
-    "Ribbon": "shapes",
-    "Scene": "scene",
-    "Shape": "shapes",
-    "Sobol": "designs",
-    "TentacleBall": "shapes",
-    "Values": "designs",
-    "Weakness": "weakness",
-    "mesh_or_ball": "shapes",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+__getattr__ = on_first_use(__name__)
 
 
 def load(name: str, overrides: Sequence[str] = ()) -> "Scene":

@@ -57,7 +57,7 @@ class Draft:
         with configuration.naming_the_missing():
             found = cls._build(configuration.resolve(config), config)
         for name, parameter in found.parameters.items():
-            check_key(name, parameter.key, [case[name] for case in found.split.cases], config)
+            check_key(name, parameter.key, [case[name] for case in found.split.cases], found.config, config)
         return found
 
     @classmethod

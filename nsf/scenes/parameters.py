@@ -78,20 +78,20 @@ def parameters_of(nodes: Mapping[str, Any]) -> dict[str, Parameter]:
     return found
 
 
-def check_key(name: str, key: str, values: Sequence[float], template: DictConfig) -> None:
+def check_key(name: str, key: str, values: Sequence[float], config: DictConfig, template: DictConfig) -> None:
     """Refuse a problem parameter that holds no number, or changes something else than the physics.
 
     Args:
         name: of the parameter.
         key: of the configuration.
         values: that it takes.
-        template: the configuration with its interpolations, as others may refer to the key.
+        config: the configuration, resolved.
+        template: the same with its interpolations, as others may refer to the key.
 
     Raises:
         ConfigError: says what the key changes.
     """
     where, remedy = f"scene.parameters.{name}.key", "name a key of the material, the motion or the boundaries"
-    config = configuration.resolve(template)
     try:
         own = OmegaConf.select(config, key) if key else None
     except OmegaConfBaseException:  # it is no key, as ../name

@@ -47,6 +47,15 @@ class Scene(Draft):
     _at: dict[tuple, "Scene"] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     @classmethod
+    def of(cls, draft: Draft) -> "Scene":
+        """The whole scene of a draft, whose keys were checked when it was made.
+
+        Raises:
+            ConfigError: a value is outside its range.
+        """
+        return cls._build(draft.config, draft.template)
+
+    @classmethod
     def _build(cls, config: DictConfig, template: DictConfig) -> "Scene":
         s = configuration.section(config, "scene")
         forcing, program = _programs(s)

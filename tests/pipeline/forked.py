@@ -91,6 +91,14 @@ class PlainReport:
         module.draw = lambda merged, folder, **_: []
 
 
+@dataclass(frozen=True)
+class BriefReport:
+    """Of each variant the two pictures that a page of many has: the others are drawn by the same code."""
+
+    def __call__(self):
+        importlib.import_module("nsf.reporting.pictures").MANY = 0
+
+
 def _at(where, call, act):
     owner, name = _owner(where)
     original, calls = getattr(owner, name), []

@@ -4,7 +4,7 @@ import json
 import signal
 
 import pytest
-from forked import PlainReport, SignalAt, run_nsf
+from forked import BriefReport, PlainReport, SignalAt, run_nsf
 
 from nsf.reporting.keeping import MADE_OF
 from nsf.reporting.swap import MARK
@@ -32,7 +32,7 @@ def out_of_date(folder):
 def undisturbed(chain, tiny, tmp_path_factory):
     """The files of a report that nothing interrupted."""
     work = tmp_path_factory.mktemp("undisturbed")
-    assert run_nsf(["report", *tiny], chain.root, work).code == 0
+    assert run_nsf(["report", *tiny], chain.root, work, BriefReport()).code == 0
     (folder,) = (path for path in (work / "reports").iterdir() if path.is_dir())
     return folder.name, files(folder)
 
@@ -48,7 +48,7 @@ def test_a_report_that_was_killed(chain, nsf, tmp_path, undisturbed, moment, kin
     assert old != expected
 
     where, call = MOMENTS[moment]
-    outcome = nsf("report", chain.root, faults=[SignalAt(where, call, kind)])
+    outcome = nsf("report", chain.root, faults=[BriefReport(), SignalAt(where, call, kind)])
     assert outcome.code == (130 if kind == signal.SIGTERM else -signal.SIGKILL), outcome.err
     left = [path for path in reports.iterdir() if ".new-" in path.name or ".old-" in path.name]
     assert bool(left) == (kind == signal.SIGKILL)
@@ -56,7 +56,7 @@ def test_a_report_that_was_killed(chain, nsf, tmp_path, undisturbed, moment, kin
     assert bool(aside) == (kind == signal.SIGKILL and moment == "exchanging")
     assert files(aside[0] if aside else reports / name) == old
 
-    assert nsf("report", chain.root).code == 0
+    assert nsf("report", chain.root, faults=[BriefReport()]).code == 0
     assert files(reports / name) == expected
     assert {path.name for path in reports.iterdir()} == {name, f".{name}.lock"}
 
@@ -68,7 +68,8 @@ def test_a_report_that_a_killed_process_had_put_aside_comes_back(chain, nsf, tmp
     assert nsf("report", chain.root, faults=[PlainReport()]).code == 0
     out_of_date(reports / name)
     old = files(reports / name)
-    assert nsf("report", chain.root, faults=[SignalAt(*MOMENTS["exchanging"], signal.SIGKILL)]).code < 0
+    killed = SignalAt(*MOMENTS["exchanging"], signal.SIGKILL)
+    assert nsf("report", chain.root, faults=[BriefReport(), killed]).code < 0
     assert not (reports / name).exists()
     assert nsf("report", chain.root, "report.name=other", faults=[PlainReport()]).code == 0
     assert files(reports / name) == old

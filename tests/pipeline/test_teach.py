@@ -135,6 +135,37 @@ def test_a_teaching_that_was_broken_off_goes_on(lesson, copied, pipeline_at, mon
     assert metrics[0]["teacher_steps"] == metrics[1]["teacher_steps"]
 
 
+@pytest.fixture
+def of_runs(copied, pipeline_at):
+    """A chain whose operators learn from full-order runs, as far as training."""
+    keys = (*TAUGHT, "engine.teacher=runs", "engine.teaching.unroll=16", "engine.teaching.descent=600")
+    return pipeline_at(copied("simulate", "train"), *keys)
+
+
+def test_full_order_runs_teach_without_a_step_of_an_engine(of_runs, monkeypatch):
+    monkeypatch.setattr("nsf.engines.operators.Teacher.step_from", None)
+    for stage in ("deploy", "evaluate"):
+        of_runs.run(stage)
+    found = of_runs.taught.manifest["metrics"]
+    assert found["teacher_steps"] == 0
+    assert found["broken_affinity"] is None
+    assert len(found["errors"]) == 2
+    row = pd.read_csv(of_runs.evaluation.path / "results.csv").iloc[0]
+    assert row["displacement_error"] < 0.06  # a run that does not move is off by 1
+
+
+def test_full_order_runs_at_validation_values_decide_which_round_is_kept(of_runs, pipeline_at, tmp_path):
+    known, between, back = of_runs.lessons
+    assert (known, between, back) == (list(map(angle, (22.0, 30.0, 38.0))), [], known)
+    held_back = pipeline_at(tmp_path, *TAUGHT, "engine.teacher=runs", "scene.design.validation=[24]")
+    assert held_back.lessons[2] == [angle(24.0)]
+
+
+def test_full_order_runs_teach_their_own_step_alone(pipeline_at, tmp_path):
+    with pytest.raises(ConfigError, match=r"the scene's Δt.*dt_multiplier is 1.5; set it to 1"):
+        pipeline_at(tmp_path, *TAUGHT, "engine.teacher=runs", "deploy.dt_multiplier=1.5")
+
+
 def test_an_engine_that_learns_nothing_is_not_taught(pipeline_at, tmp_path):
     with pytest.raises(ConfigError, match="engine=auto is not taught; set engine=operators"):
         pipeline_at(tmp_path).teach()

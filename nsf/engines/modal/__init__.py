@@ -1,17 +1,13 @@
 """The step for fields that are modes times coefficients: a few compiled kernels, without torch."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from nsf.extras import on_first_use
 
 if TYPE_CHECKING:
     from nsf.engines.modal.engine import Modal
 
 __all__ = ["Modal"]
 
-
-def __getattr__(name: str) -> Any:
-    # On demand, so that `mirrors` does not wait for torch.
-    if name == "Modal":
-        from nsf.engines.modal.engine import Modal
-
-        return Modal
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+# On demand, so that `mirrors` does not wait for torch.
+__getattr__ = on_first_use(__name__)

@@ -3,8 +3,9 @@
 Names are imported on first use: what is asked of a teacher can be checked without torch.
 """
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from nsf.extras import on_first_use
 
 if TYPE_CHECKING:
     from nsf.engines.operators.engine import Operators
@@ -13,12 +14,13 @@ if TYPE_CHECKING:
     from nsf.engines.operators.states import collider_states, principal
     from nsf.engines.operators.taught import Taught
     from nsf.engines.operators.teach import Course
-    from nsf.engines.operators.teacher import Teacher
+    from nsf.engines.operators.teacher import Recorded, Teacher
     from nsf.engines.operators.teaching import Teaching, random_cases
 
 __all__ = [
     "Course",
     "Operators",
+    "Recorded",
     "Sizes",
     "StepOperators",
     "Taught",
@@ -31,23 +33,4 @@ __all__ = [
     "random_cases",
 ]
 
-_HOMES = {
-    "Course": "teach",
-    "Operators": "engine",
-    "Sizes": "model",
-    "StepOperators": "model",
-    "Taught": "taught",
-    "Teacher": "teacher",
-    "Teaching": "teaching",
-    "Terms": "model",
-    "Yardstick": "lessons",
-    "collider_states": "states",
-    "principal": "states",
-    "random_cases": "teaching",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+__getattr__ = on_first_use(__name__)

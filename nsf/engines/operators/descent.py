@@ -15,6 +15,7 @@ _BATCH = 1024  # labels of one step of the descent
 _WINDOWS = 48  # unrolled windows of one
 #: They cost several times what single steps do: one step of the descent in so many has them, at this weight.
 _UNROLLED_EVERY, _UNROLLED_WEIGHT = 3, 0.3
+_UNWEIGHTED = 8  # steps of a window, beyond which errors weigh less in proportion to their squared time
 _LARGEST_GRADIENT = 10.0
 _WARM_UP = 3  # steps before a graph is captured, as CUDA asks for
 
@@ -29,7 +30,8 @@ class Descent:
         model: fp32, on the device of the descent.
         labels: what the teacher answered.
         teachers: whose runs are unrolled; runs: [N + 1, R, r] of each.
-        teaching: how many steps, and the windows.
+        teaching: how many steps, and the noise.
+        window: steps that are unrolled.
         rate: learning rate at the start; it falls to 0 along a cosine.
         generator: of batches and noise, on the host.
     """
@@ -41,10 +43,11 @@ class Descent:
         teachers: Sequence[Teacher],
         runs: Sequence[Tensor],
         teaching: Teaching,
+        window: int,
         rate: float,
         generator: torch.Generator,
     ):
-        self._model, self._teaching, self._generator = model, teaching, generator
+        self._model, self._teaching, self._generator, self._window = model, teaching, generator, window
         self._device = model.x_mean.device
         rows = [self._here(getattr(labels, name)) for name in Labels.__dataclass_fields__]
         self._xhat, self._change, self._acceleration, self._mu, self._g, features = rows
@@ -82,7 +85,7 @@ class Descent:
 
     def _window_of(self, turn: int) -> int | None:
         """Whose windows a step unrolls; None for single steps alone."""
-        if self._teaching.unroll == 1 or turn % _UNROLLED_EVERY:
+        if self._window == 1 or turn % _UNROLLED_EVERY:
             return None
         return turn // _UNROLLED_EVERY % len(self._windows)
 
@@ -98,7 +101,7 @@ class Descent:
         return drawn
 
     def _unroll(self, steps: int) -> int:
-        return min(self._teaching.unroll, steps - 1)
+        return min(self._window, steps - 1)
 
     def _step(self, window: int | None, drawn: list[Tensor]) -> None:
         model, (at, *unrolled) = self._model, drawn
@@ -118,7 +121,9 @@ class Descent:
         x, d = runs[n, k] + self._teaching.noise * model.x_scale * noise, changes[n, k]
         for j in range(unroll):
             x, d = model.step(x, d, mu[k], g[n + j, k], c[n + j, k])
-            loss = loss + ((x - runs[n + j + 1, k]) / model.d_scale).square().mean()
+            # Further on all errors have grown, and those of the longest windows would be all there is.
+            grown = max(1.0, (j + 1) / _UNWEIGHTED)
+            loss = loss + ((x - runs[n + j + 1, k]) / (grown * model.d_scale)).square().mean()
         return loss / unroll
 
     # -- graphs -----------------------------------------------------------------------------------------

@@ -28,6 +28,7 @@ _OTHER_CHANGE = 0.1
 #: all its steps.
 _LEAST_ASKED = 40
 _ASKED = 12  # moments at which it is found how far the teacher's step is from affine
+_FIRST_WINDOW = 8  # steps of the windows of the first round; each round has windows twice as long
 
 
 class Course:
@@ -70,12 +71,15 @@ class Course:
         """Steps of the teacher so far."""
         return sum(teacher.steps for teacher in (*self.teachers, self.yardstick.teacher))
 
-    def broken_affinity(self) -> float:
+    def broken_affinity(self) -> float | None:
         """How far the teacher's step is from affine in the last change d, along its runs at training values.
 
         Half the second difference of d', for changes of d by a tenth of its deviation either way, in
-        deviations of d' − d; RMS. It is 0 where no contact opens or slips within such a change.
+        deviations of d' − d; RMS. It is 0 where no contact opens or slips within such a change, and None of a
+        teacher that cannot be asked.
         """
+        if not self.teachers[0].asked:
+            return None
         generator, teacher, own = torch.Generator().manual_seed(self.seed), self.teachers[0], self._runs[0]
         asked = self._moments(0, min(_ASKED, teacher.total_steps - 1))
         xhat, before = own[asked], own[asked - 1]
@@ -118,7 +122,7 @@ class Course:
         generator = torch.Generator().manual_seed(1000 * self.seed + number)
         if number == 0:
             self._begin(generator)
-        else:
+        elif self.teachers[0].asked:
             self.labels = Labels.joined([self.labels, *self._along_own_runs(number)])
         self._descend(number, generator)
         runs = self.own_runs(self.yardstick.teacher)
@@ -136,6 +140,8 @@ class Course:
             asked = self._moments(0, self._share)
             parts.append(self._asked(first, asked, self._truth[asked], self._truth[asked - 1]))
         for teacher, own in zip(self.teachers, self._runs, strict=True):
+            if not teacher.asked:
+                continue
             asked = self._moments(1, self._share)
             xhat, change = own[asked], own[asked] - own[asked - 1]
 
@@ -264,7 +270,8 @@ class Course:
     def _descend(self, number: int, generator: torch.Generator) -> None:
         rate = self.teaching.rate / (1 if number == 0 else 2)
         model = self.model.to(self._device, torch.float32)
-        Descent(model, self.labels, self.teachers, self._runs, self.teaching, rate, generator).run()
+        window = min(self.teaching.unroll, _FIRST_WINDOW << number)
+        Descent(model, self.labels, self.teachers, self._runs, self.teaching, window, rate, generator).run()
         self.model = model.to("cpu", torch.float64)
 
     # -- rounds on disk ---------------------------------------------------------------------------------

@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
+from typing_extensions import override
 
 from nsf.dynamics.setup import first_changes
 from nsf.dynamics.solver import ReducedBatch
@@ -19,11 +20,14 @@ class Teacher:
         told: called with each number of steps taken.
 
     Attributes:
+        asked: whether its step may begin anywhere, and not along its runs alone.
         parameters: μ [R, n]; start: x̂_0 [R, r]; all in fp64 on the host.
         gravity: [N, R, 3] [m/s²], and features: [N, R, f] state of the colliders, at each step.
         programs: whether the runs follow forcing programs.
         setup: of the first run. total_steps: N; dt: step [s]; steps: how many were taken here.
     """
+
+    asked = True
 
     def __init__(self, batches: Sequence[ReducedBatch], told: Callable[[int], object] = lambda steps: None):
         self._batches, self._told, self.steps = batches, told, 0
@@ -87,6 +91,25 @@ class Teacher:
     def _count(self, steps: int) -> None:
         self.steps += steps
         self._told(steps)
+
+
+class Recorded(Teacher):
+    """Full-order runs in place of steps of an engine: what is learned is how their latent vectors go on.
+
+    Args:
+        batches: of the reduced runs in the same cases, at t = 0; none of their steps is taken.
+        runs: [N + 1, R, r] latent vectors of the full-order runs.
+    """
+
+    asked = False
+
+    def __init__(self, batches: Sequence[ReducedBatch], runs: torch.Tensor):
+        super().__init__(batches)
+        self._runs = runs
+
+    @override
+    def run(self) -> torch.Tensor:
+        return self._runs
 
 
 def _host(values: torch.Tensor) -> torch.Tensor:

@@ -20,11 +20,12 @@ class Teaching:
 
     Attributes:
         width: of both hidden layers.
-        rounds: along the operators' own runs, after the first.
+        rounds: along the operators' own runs, after the first; of a teacher that cannot be asked, with longer
+            windows.
         steps: of the teacher, about, in all; more where each run would be asked at fewer than 40 moments.
         descent: steps of Adam in each round.
         rate: learning rate of the first round; half of it later.
-        unroll: steps of a window.
+        unroll: steps of a window, at most: 8 in the first round, twice as many in each that follows.
         noise: on the start of a window [deviations of x̂].
         tube: deviation of states about training runs [deviations of x̂].
         gravity: by how much the gravity of labels in the tube is varied [-], of its magnitude.

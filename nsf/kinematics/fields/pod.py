@@ -8,7 +8,12 @@ import torch
 from torch import Tensor
 
 from nsf.data import Snapshots
+from nsf.errors import ConfigError
 
+#: Snapshots whose Gram matrix [M, M] is formed; more would take hours and gigabytes.
+MOST_SNAPSHOTS = 8192
+# Of the subspace iteration: turns, and columns beyond the modes that are wanted.
+_TURNS, _MORE = 6, 20
 SLAB_ENTRIES = 1 << 26  # float64 values of a slab: 0.5 GiB
 # Eigenvalues below this share of the largest are round-off: snapshots are float32, six digits of amplitude.
 RANK_TOLERANCE = 1e-12
@@ -28,7 +33,9 @@ def decompose(snapshots: Snapshots, name: str, components: int, count: int) -> t
     """Coefficients of the snapshots in their leading modes.
 
     With deviations A [M, P c]: A Aᵀ = V diag(w) Vᵀ, coefficients a = V √w, and the modes are B = Aᵀ a / w, so
-    that A ≈ a Bᵀ with B orthonormal. The M×M Gram matrix is summed over particle slabs.
+    that A ≈ a Bᵀ with B orthonormal. The M×M Gram matrix is summed over particle slabs. Of more than
+    `MOST_SNAPSHOTS` the leading V and w are found by subspace iteration (Halko, Martinsson and Tropp 2011,
+    algorithm 4.4), which asks for products with the Gram matrix alone.
 
     Args:
         snapshots: of every training frame.
@@ -39,14 +46,25 @@ def decompose(snapshots: Snapshots, name: str, components: int, count: int) -> t
         a [M, K] float64, largest mode first, in the field's unit times √(P c); and the unresolved share of
         the energy, 1 − Σ a² / ‖A‖².
     """
-    G = gram(snapshots, name, components)
-    a = leading(G, count)
-    total = float(G.diagonal().sum())
+    if snapshots.M <= MOST_SNAPSHOTS:
+        G = gram(snapshots, name, components)
+        a, total = leading(G, count), float(G.diagonal().sum())
+    else:
+        a, total = _iterated(snapshots, name, components, count)
     return a, max(0.0, 1 - float(a.square().sum()) / total) if total > 0 else 0.0
 
 
 def gram(snapshots: Snapshots, name: str, components: int) -> Tensor:
-    """A Aᵀ [M, M] of a field's deviations A [M, P c] from their mean."""
+    """A Aᵀ [M, M] of a field's deviations A [M, P c] from their mean.
+
+    Raises:
+        ConfigError: there are more than `MOST_SNAPSHOTS`.
+    """
+    if snapshots.M > MOST_SNAPSHOTS:
+        raise ConfigError(
+            f"this field compares each of {snapshots.M:,} snapshots with each, and takes {MOST_SNAPSHOTS:,} "
+            "at most; choose field=basis, or fewer training cases"
+        )
     G = torch.zeros(snapshots.M, snapshots.M, dtype=torch.float64, device=snapshots.X.device)
     for _, _, deviations in slabs(snapshots, name, components):
         rows = deviations.flatten(1)
@@ -57,7 +75,26 @@ def gram(snapshots: Snapshots, name: str, components: int) -> Tensor:
 def leading(G: Tensor, count: int) -> Tensor:
     """The first coefficients [M, K ≤ count] of deviations whose Gram matrix [M, M] is given."""
     energies, vectors = torch.linalg.eigh(G)
-    energies, vectors = energies.flip(0), vectors.flip(1)
+    return _coefficients(energies.flip(0), vectors.flip(1), count)
+
+
+def _iterated(snapshots: Snapshots, name: str, components: int, count: int) -> tuple[Tensor, float]:
+    """As `leading` of the Gram matrix G, which is not formed, and its trace."""
+    generator = torch.Generator().manual_seed(0)
+    shape = snapshots.M, min(count + _MORE, snapshots.M)
+    V = torch.randn(shape, generator=generator, dtype=torch.float64).to(snapshots.X.device)
+    for _ in range(_TURNS):
+        Q, V, total = torch.linalg.qr(V).Q, torch.zeros_like(V), 0.0
+        for _, _, deviations in slabs(snapshots, name, components):
+            rows = deviations.flatten(1)
+            V.addmm_(rows, rows.T @ Q)
+            total += float(rows.square().sum())
+    energies, turn = torch.linalg.eigh(Q.T @ V)
+    return _coefficients(energies.flip(0), Q @ turn.flip(1), count), total
+
+
+def _coefficients(energies: Tensor, vectors: Tensor, count: int) -> Tensor:
+    """V √w of the first `count` pairs above round-off, given with the largest first."""
     rank = int((energies > RANK_TOLERANCE * energies[0].clamp_min(torch.finfo(torch.float64).tiny)).sum())
     kept = min(count, rank)
     return vectors[:, :kept] * energies[:kept].sqrt()

@@ -17,6 +17,8 @@ from nsf.kinematics.training.phases import PHASES, Fit, at_least, per_phase, see
 
 # Budget of g with e, h and l: as the paper's epochs.
 SHARES = {"deformation": 0.2, "stress": 0.4, "affine": 0.4}
+# A field fitted to whole snapshots sees all of them in a step, up to so many; of more, so many drawn anew.
+MOST_AT_ONCE, DRAWN = 8192, 2048
 BATCH_STREAM = 1 << 20  # keeps the epochs' permutations apart from the steps' generators
 
 
@@ -124,7 +126,7 @@ class FastTrainer(Trainer):
     """Adam with cosine decay to zero, for a number of steps or a time.
 
     A field fitted to points (mlp) sees random particles of random frames in a step; one fitted to whole
-    snapshots (basis) sees all of them in every step.
+    snapshots (basis) sees all of them in every step, or 2,048 at random where they are more than 8,192.
 
     Attributes:
         steps: optimiser steps of g, h and l, one number for all, [g, h=l] or [g, h, l]; None: as many as the
@@ -178,10 +180,11 @@ class FastTrainer(Trainer):
     def batch(
         self, step: int, fit: Fit, frames: int, particles: int, seed: int, generator: torch.Generator
     ) -> tuple[Tensor | slice, Tensor | slice]:
-        if not fit.pointwise:
-            return slice(None), slice(None)
 
         def draw(population: int, count: int) -> Tensor:
             return torch.randint(population, (count,), generator=generator, device=generator.device)
+
+        if not fit.pointwise:
+            return slice(None) if frames <= MOST_AT_ONCE else draw(frames, DRAWN), slice(None)
 
         return draw(frames, self.frames_per_batch), draw(particles, self.particles_per_batch)

@@ -1,13 +1,15 @@
 """The stage `teach`: operators of the deployed step, taught by another engine."""
 
 import time
+from collections.abc import Callable
 
 import numpy as np
 import torch
 
-from nsf.data import Case
+from nsf.data import Case, Trajectory
+from nsf.data.schema import TRAJECTORY
 from nsf.dynamics import ReducedBatch
-from nsf.engines.operators import Course, Taught, Teacher, Yardstick
+from nsf.engines.operators import Course, Recorded, Taught, Teacher, Yardstick
 from nsf.kinematics.manifold import Manifold
 from nsf.progress import Progress
 from nsf.runs import Record, Run
@@ -28,24 +30,33 @@ def teach(pipeline, run: Run) -> None:
     manifold, c = pipeline.manifold().to(pipeline.device), pipeline.config
     with run.record(device=pipeline.device, seed=c.seed, precision=c.precision) as record:
         _follow(pipeline, manifold, record)
-    found = record.metrics
+    found, known = record.metrics, len(pipeline.split.train)
+    steps = f"{found['teacher_steps']} steps of the teacher"
+    asked = f"{known} full-order runs" if pipeline.of_runs else steps
     pipeline.say(
-        f"teach: {found['teacher_steps']} steps of the teacher in {found['teach_seconds']:.1f} s, "
+        f"teach: {asked} in {found['teach_seconds']:.1f} s, "
         f"{100 * min(found['errors']):.2g} % off in cases held back → {run.id}"
     )
 
 
 def _follow(pipeline, manifold: Manifold, record: Record) -> None:
     started = time.perf_counter()
-    with Progress("teach", pipeline.teaching.steps, "teacher's steps") as progress:
-        known, between, _ = pipeline.lessons
-        lessons = [Teacher(_batches(pipeline, manifold, v), progress.advance) for v in (known, between) if v]
-        yardstick = _yardstick(pipeline, manifold, progress)
-        seed = int(pipeline.config.seed)
-        truth, device = _truth(pipeline, manifold), pipeline.device
-        course = Course(
-            lessons, truth, yardstick, pipeline.teaching, seed, device, record.path, progress.describe
-        )
+    teaching, seed, device = pipeline.teaching, int(pipeline.config.seed), pipeline.device
+    work = (teaching.rounds + 1, "rounds") if pipeline.of_runs else (teaching.steps, "teacher's steps")
+    with Progress("teach", *work) as progress:
+        truth = _truth(pipeline, manifold)
+        if pipeline.of_runs:
+            lessons, yardstick = _recorded(pipeline, manifold, truth)
+            truth = None  # is the teacher
+        else:
+            lessons, yardstick = _asked(pipeline, manifold, progress)
+
+        def told(line: str) -> None:
+            progress.describe(line)
+            if pipeline.of_runs:
+                progress.advance(1)
+
+        course = Course(lessons, truth, yardstick, teaching, seed, device, record.path, told)
         before = time.perf_counter() - started
         operators, steps = course.follow(), course.steps
         broken = course.broken_affinity()
@@ -73,21 +84,44 @@ def _truth(pipeline, manifold: Manifold) -> torch.Tensor | None:
     return latents.unflatten(0, (len(cases), -1)).transpose(0, 1)[:, order]
 
 
-def _yardstick(pipeline, manifold: Manifold, progress: Progress) -> Yardstick:
-    """The teacher's own runs in cases that are held back.
+def _asked(pipeline, manifold: Manifold, progress: Progress) -> tuple[list[Teacher], Yardstick]:
+    """An engine's runs, and its own runs in cases that are held back.
 
-    Not full-order runs: where the teacher is off, a round could pass by straying towards them by chance.
+    Not full-order runs there: where the teacher is off, a round could pass by straying towards them.
     """
-    teacher = Teacher(_batches(pipeline, manifold, pipeline.lessons[2]), progress.advance)
-    # S may lie where little is like the rest, as beside a tear: these are of the whole body.
-    looked_at = np.sort(np.random.default_rng(0).permutation(len(manifold.X))[:_LOOKED_AT])
-    at = manifold.restrict(torch.as_tensor(looked_at), device=manifold.X.device)
+    *cases, back = pipeline.lessons
+    lessons = [Teacher(_batches(pipeline, manifold, v), progress.advance) for v in cases if v]
+    teacher, positions = Teacher(_batches(pipeline, manifold, back), progress.advance), _positions(manifold)
+    truth = torch.stack([positions(run) for run in teacher.run().unbind(1)], 1)
+    return lessons, Yardstick(teacher, positions, truth)
+
+
+def _recorded(pipeline, manifold: Manifold, latents: torch.Tensor) -> tuple[list[Teacher], Yardstick]:
+    """Full-order runs of training, whose latents [N + 1, K, r] are given, and those held back."""
+    known, _, back = pipeline.lessons
+    truth = []
+    for case in back:
+        with Trajectory.open(pipeline.simulation(case).require().file(TRAJECTORY)) as trajectory:
+            truth.append(torch.as_tensor(trajectory.read("x", particles=_looked_at(manifold))).double())
+    lessons = [Recorded(_batches(pipeline, manifold, known), latents)]
+    beside = Teacher(_batches(pipeline, manifold, back))
+    return lessons, Yardstick(beside, _positions(manifold), torch.stack(truth, 1))
+
+
+def _looked_at(manifold: Manifold) -> np.ndarray:
+    """Particles of the whole body: S may lie where little is like the rest, as beside a tear."""
+    return np.sort(np.random.default_rng(0).permutation(len(manifold.X))[:_LOOKED_AT])
+
+
+def _positions(manifold: Manifold) -> Callable[[torch.Tensor], torch.Tensor]:
+    """xhat [N + 1, r] → positions [N + 1, s, 3] [m] of the particles that are looked at."""
+    at = manifold.restrict(torch.as_tensor(_looked_at(manifold)), device=manifold.X.device)
 
     def positions(run: torch.Tensor) -> torch.Tensor:
         with torch.no_grad():
             return at.position(run.to(at.device)).cpu()
 
-    return Yardstick(teacher, positions, torch.stack([positions(run) for run in teacher.run().unbind(1)], 1))
+    return positions
 
 
 def _batches(pipeline, manifold: Manifold, cases: list[Case]) -> list[ReducedBatch]:

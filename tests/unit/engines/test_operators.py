@@ -173,7 +173,7 @@ def test_a_constant_speed_is_no_state():
 class Stepper:
     """A teacher of two runs with d' = 0.9 d + q d², whose own runs are what they are whatever q is."""
 
-    total_steps, dt, steps, programs = 30, 0.01, 0, False
+    total_steps, dt, steps, programs, asked = 30, 0.01, 0, False, True
     parameters, gravity = torch.tensor([[0.0], [1.0]]).double(), torch.zeros(30, 2, 3).double()
     start, features = torch.tensor([[0.0, 1.0], [0.5, 0.0]]).double(), torch.zeros(30, 2, 0).double()
 
@@ -207,6 +207,27 @@ def test_how_far_a_step_is_from_affine():
     assert broken(0.0) < 1e-12
     assert broken(1.0) > 1e-4
     np.testing.assert_allclose(broken(2.0), 2.0 * broken(1.0), rtol=1e-9)
+
+
+def test_windows_are_twice_as_long_in_each_round_up_to_what_is_asked(monkeypatch):
+    taken = []
+
+    class Descent:
+        def __init__(self, *given):
+            taken.append(given[5])
+
+        def run(self):
+            pass
+
+    monkeypatch.setattr("nsf.engines.operators.teach.Descent", Descent)
+    teacher = Stepper(0.3)
+    yardstick = Yardstick(teacher, lambda run: run[:, None], teacher.run()[:, :, None])
+    for unroll, windows in ((20, [8, 16, 20]), (8, [8, 8, 8]), (4, [4, 4, 4])):
+        taken.clear()
+        Course(
+            [teacher], None, yardstick, Teaching(8, rounds=2, steps=90, descent=1, unroll=unroll), 0
+        ).follow()
+        assert taken == windows
 
 
 @pytest.mark.gpu

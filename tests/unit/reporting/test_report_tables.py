@@ -10,6 +10,7 @@ from rich.console import Console
 from synthetic import TEST, Made, seal, write_run
 
 from nsf.errors import MissingRunError, SchemaError
+from nsf.paths import CONF
 from nsf.reporting import COLUMNS, console_table, merge_results
 from nsf.reporting.rivals import beside_rivals, side_by_side, solvers, where_rivals_win
 from nsf.reporting.sources import open_sources
@@ -334,3 +335,15 @@ def test_runs_that_no_column_tells_apart_are_told_apart_by_their_keys(tmp_path):
     merged = merge(sources, told)
     assert not merged.superseded
     assert {source.id for source in merged.source} == {one.id, other.id, baseline.id}
+
+
+def test_console_table_of_many_variants_fits_a_terminal():
+    """No word is parted: of what differs, the table of every scene of the paper has most."""
+    frame = pd.read_csv(CONF.parent / "reports/table1/results.csv")
+    stream = io.StringIO()
+    Console(file=stream, width=100).print(console_table(frame))
+    lines = stream.getvalue().splitlines()
+    assert max(map(len, lines)) <= 100
+    words = {word for line in lines for word in line.split()}
+    assert {"jelly_cube", "deformation_only", "δ", "displacement", "speedup,", "[×]"} <= words
+    assert set(map(number, frame["speedup_step"])) <= words
