@@ -99,6 +99,9 @@ calibration: install  ## the reports of calibration, sensitivities and design, o
 		device=cpu folder=reports/sensitivities
 	$(BIN)/nsf design +experiment=tilt x@0.5:0.5:0.24=0.52 tilt=10 knots=3 friction_angle=30 device=cpu \
 		folder=reports/design
+	for s in simulate train deploy; do $(BIN)/nsf $$s scene=block engine=operators device=cpu || exit; done
+	$(BIN)/nsf design run=block x@0.4:0.4:0.26=0.42 tilt=30 knots=4 E=6000 density=100 device=cpu \
+		folder=reports/design_block
 
 docs: develop  ## the documentation, in site/
 	OMP_NUM_THREADS=1 $(BIN)/python -m mkdocs build --strict
