@@ -79,7 +79,7 @@ def report(
     results = Results(
         title=f"{title}: design",
         lead=_LEAD,
-        tables=[Table("How far off", Rows(["", "off [mm]"], body, [False, True]), f"{len(rows)} targets.")],
+        tables=[Table("How far off", Rows(["", "off [mm]"], body, [False, True]), f"{len(rows)} target{'s' * (len(rows) != 1)}.")],
         files={"program.csv": pd.DataFrame({"t": model.t} | ways), "targets.csv": rows},
         runs=[model.run, *model.run.parent_runs],
         draw=draw,
