@@ -76,10 +76,11 @@ def report(
         return [Section("Program", [*pictures, Picture(files, "Targets less what the runs have.", ids)])]
 
     title = model.scene.config.scene.get("title") or model.scene.name
+    count = f"{len(rows)} target{'s' * (len(rows) != 1)}."
     results = Results(
         title=f"{title}: design",
         lead=_LEAD,
-        tables=[Table("How far off", Rows(["", "off [mm]"], body, [False, True]), f"{len(rows)} target{'s' * (len(rows) != 1)}.")],
+        tables=[Table("How far off", Rows(["", "off [mm]"], body, [False, True]), count)],
         files={"program.csv": pd.DataFrame({"t": model.t} | ways), "targets.csv": rows},
         runs=[model.run, *model.run.parent_runs],
         draw=draw,
