@@ -107,15 +107,14 @@ class Observations:
         if not found:
             raise ConfigError(f"{path} observes nothing; give x, y, z of points, or value of a quantity")
         t, what, points, values, deviations = zip(*found, strict=True)
-        return cls(
-            *map(np.array, (t,)), tuple(what), np.array(points), np.array(values), np.array(deviations)
-        )
+        return cls(np.array(t), tuple(what), np.array(points), np.array(values), np.array(deviations))
 
     def check(self, model: Model) -> "Observations":
         """Itself.
 
         Raises:
-            ConfigError: a time is outside of the run, a point outside of the body, a deviation not positive.
+            ConfigError: a time is outside of the run, a point outside of the body, a deviation not positive,
+                or a value not finite.
         """
         end = float(model.t[-1])
         if len(late := self.t[(self.t < -_SAME_TIME * model.dt) | (self.t > end + _SAME_TIME * model.dt)]):
@@ -123,11 +122,13 @@ class Observations:
                 f"t={late[0]:g} s is outside of the run, 0 … {end:g} s; leave the observation out, or train "
                 "with more scene.steps"
             )
-        if not (np.isfinite(self.deviations) & (self.deviations > 0.0)).all():
-            bad = self.deviations[~(self.deviations > 0.0)]
+        if len(bad := self.deviations[~(np.isfinite(self.deviations) & (self.deviations > 0.0))]):
             raise ConfigError(
-                f"deviation={bad[0]:g} m must be positive; give the standard deviation of the measurement"
+                f"deviation={bad[0]:g} m must be positive and finite; give the standard deviation of the "
+                "measurement"
             )
+        if len(bad := self.values[~np.isfinite(self.values)]):
+            raise ConfigError(f"an observed value is {bad[0]:g} m; give finite positions")
         points = np.unique(self.points[~np.isnan(self.points[:, 0])], axis=0)
         if len(points):
             model.check_points(points)

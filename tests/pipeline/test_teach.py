@@ -152,6 +152,7 @@ def test_full_order_runs_teach_without_a_step_of_an_engine(of_runs, monkeypatch)
     assert len(found["errors"]) == 1
     row = pd.read_csv(of_runs.evaluation.path / "results.csv").iloc[0]
     assert row["displacement_error"] < 0.06  # a run that does not move is off by 1
+    assert Operators.load(of_runs.taught.path / "operators.pt").taught.reach == 0.0  # one gravity was seen
 
 
 def test_what_full_order_runs_taught_is_held_to_those_of_validation(of_runs, pipeline_at, tmp_path):

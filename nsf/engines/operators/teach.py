@@ -212,7 +212,9 @@ class Course:
 
     @property
     def reach(self) -> float:
-        """How far gravity is varied [m/s²]; 0 where there is none."""
+        """How far gravity is varied [m/s²]; 0 where there is none, or no step of varied gravity is asked."""
+        if not self.teachers[0].asked:
+            return 0.0
         largest = max(float(teacher.gravity.norm(dim=-1).max()) for teacher in self.teachers)
         return self.teaching.gravity * largest
 

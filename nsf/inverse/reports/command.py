@@ -114,6 +114,7 @@ def design(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
     models, asked, named = _begun("design", words, known)
     from nsf.inverse.design import Moves, Program, Tilt
     from nsf.inverse.reports.design import report
+    from nsf.inverse.space import check_taught
 
     model = _one(models)
     if ("target" in asked) == bool(scalars):
@@ -136,6 +137,9 @@ def design(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
     values = ranges_of(named)
     if wide := [name for name, value in values.items() if isinstance(value, list)]:
         raise ConfigError(f"{wide[0]}={named[wide[0]]} must be one value: the run's own")
+    for name, value in values.items():
+        if name in model.names:
+            check_taught(model, name, value, value)
     middle = dict(zip(model.names, model.ranges.mean(1).tolist(), strict=True))
     page, _ = report(
         program,

@@ -17,6 +17,8 @@ from nsf.reporting.text.columns import number
 from nsf.reporting.text.formats import Rows
 from nsf.reporting.text.page import Picture, Section, Table
 
+#: Tolerances (RMS) beyond which the targets count as missed.
+_MISSED = 3.0
 _LEAD = "A program of forcing that is to bring a target about, found by gradients through runs by operators."
 _TERMS = (
     ("off", "root mean square, over the targets, of the target less what a run has."),
@@ -64,7 +66,8 @@ def report(
     told = ", ".join(f"{what} {value} mm" for what, value in body)
     say(f"design: off by: {told}")
     ways = dict(zip(program.names, found.values.T, strict=True))
-    warnings = _warnings(program, found)
+    missed = (rows["value"] - rows["fitted"]) / rows["tolerance"]
+    warnings = _warnings(program, found, _rms(missed))
     for warning in warnings:
         say(f"design: warning: {warning}")
 
@@ -92,8 +95,14 @@ def report(
     return write(results, folder), found
 
 
-def _warnings(program: Program, found: Designed) -> list[str]:
+def _warnings(program: Program, found: Designed, missed: float) -> list[str]:
+    """What a reader must know of a program whose run misses its targets by so many tolerances (RMS)."""
     told = []
+    if missed > _MISSED:
+        told.append(
+            f"no program was found that reaches the targets; the best misses them by {missed:.3g} "
+            "tolerances; allow wider bounds or more knots, or choose targets nearer by"
+        )
     if found.distrust > 1.0:
         told.append(f"the run is {found.distrust:.3g} times as far from what was taught as may be believed")
     if isinstance(program, Tilt) and not program.model.scene.forcing.gravity:

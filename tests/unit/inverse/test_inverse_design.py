@@ -102,9 +102,17 @@ def test_the_command(tmp_path, deployed, model):
         (["height=0.1"], "takes tilt=ANGLE"),
         (["height=high", "tilt=5"], "height=high is no number"),
         (["height=0.1", "tilt=5", "speed=0.1..0.2"], "must be one value"),
+        (["height=0.1", "tilt=5", "speed=9"], "speed=9 goes beyond what was taught"),
     ):
         with pytest.raises(ConfigError, match=told):
             command([*words, *more])
+
+
+def test_a_target_out_of_reach_is_said(tmp_path, deployed):
+    words = [f"run={deployed.deployment.path}", "device=cpu", f"folder={tmp_path / 'a'}", "full_order=false"]
+    told = []
+    command([*words, "height=5", "tilt=5", "knots=2"], told.append)
+    assert any("no program was found that reaches the targets" in line for line in told)
 
 
 # -- solids that move ------------------------------------------------------------------------------------

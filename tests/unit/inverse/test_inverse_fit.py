@@ -165,7 +165,8 @@ def test_parameters_that_are_not_told_apart_are_named(model, seen, no_error):
     [
         ({"cohesion": 1.0}, "there is no parameter 'cohesion'; there are friction_angle, speed"),
         ({"speed": [0.01, 0.2]}, "speed=0.01..0.2 goes beyond what was taught, 0.07"),
-        ({"speed": 0.5}, "speed=0.5..0.5 goes beyond what was taught"),
+        ({"speed": 0.5}, "speed=0.5 goes beyond what was taught"),
+        ({"speed": [0.2, 0.1]}, "speed=0.2..0.1 is the wrong way round; give speed=0.1..0.2"),
         ({"speed": [0.2, 0.2]}, "speed has an empty range; give speed=0.2"),
         ({"speed": 0.2, "friction_angle": 27.0}, "every parameter is given"),
     ],
@@ -180,6 +181,8 @@ def test_ranges_are_refused(model, asked, told):
     [
         ({"t": 0.5}, r"t=0\.5 s is outside of the run, 0 … 0\.12 s"),
         ({"deviations": 0.0}, r"deviation=0 m must be positive"),
+        ({"deviations": np.inf}, r"deviation=inf m must be positive and finite"),
+        ({"values": np.inf}, r"an observed value is inf m; give finite positions"),
         ({"points": 2.0}, r"the point \(2, 2, 2\) m lies .* outside of the body"),
     ],
 )
