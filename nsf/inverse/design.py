@@ -136,7 +136,7 @@ class Moves(Program):
         model: of the runs; solids: names of colliders; knots: see `Program`.
 
     Raises:
-        ConfigError: there is no such solid, or no training run moves it.
+        ConfigError: there is no such solid, no training run moves it, or it turns.
     """
 
     model: Model
@@ -150,6 +150,9 @@ class Moves(Program):
             raise ConfigError(f"move={unknown[0]} is no solid of the scene; there are {', '.join(there)}")
         if still := [name for name in self.solids if not len(self._axes[name])]:
             raise ConfigError(f"move={still[0]} was never moved in training; operators know nothing of it")
+        colliders = dict(zip(there, self.model.scene.colliders, strict=True))
+        if turning := [n for n in self.solids if (m := colliders[n].motion) is not None and len(m.angles)]:
+            raise ConfigError(f"move={turning[0]} turns as well; only solids that shift alone are designed")
 
     @property
     def names(self) -> tuple[str, ...]:

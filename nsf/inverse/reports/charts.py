@@ -88,7 +88,7 @@ def residuals_chart(rows: pd.DataFrame) -> Figure:
         ):
             if column in rows:
                 off = 1e3 * (rows["value"] - rows[column])
-                jitter = (k - 0.5) * 0.006 * max(float(rows["t"].max()), 1e-9)
+                jitter = (k - 0.5) * 0.006 * float(np.ptp(rows["t"]))
                 panel.plot(rows["t"] + jitter, off, "o", ms=3, alpha=0.5, label=told, color=PALETTE[k])
         panel.axhline(0.0, color=MUTED, lw=0.8)
         panel.set(xlabel="time t [s]", ylabel="observed − run [mm]")

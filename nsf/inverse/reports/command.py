@@ -11,6 +11,7 @@ from nsf.evaluation.quantities import QUANTITIES
 from nsf.inverse.model import Forcing, Model
 from nsf.inverse.observations import Observations, View, is_scalar
 from nsf.inverse.space import Space
+from nsf.reporting.swap import check_place
 from nsf.runs import Run
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
@@ -78,7 +79,13 @@ def sample(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
     from nsf.inverse.reports.sample import report
     from nsf.inverse.sampling import Asked, Prior
 
-    indices = _whole(asked, "sensitivities", 0, least=0)
+    indices, full_order = (_whole(asked, key, 0, least=0) for key in ("sensitivities", "full_order"))
+    if full_order and not indices:
+        raise ConfigError("full_order= are runs beside sensitivities; give sensitivities= too")
+    if full_order and "program" in asked:
+        raise ConfigError(
+            "full-order runs beside sensitivities follow the scene's own program; leave program= out"
+        )
     for needed in ("SALib",) * bool(indices) + ("emcee",) * ("observations" in asked):
         optional(needed, "inverse")  # before any work
     model, view = _one(models), None
@@ -91,7 +98,7 @@ def sample(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
         _folder(asked, f"sample_{model.scene.name}"),
         count=_whole(asked, "runs", 10_000),
         indices=indices,
-        full_order=_whole(asked, "full_order", 0, least=0),
+        full_order=full_order,
         view=view,
         forcing=_forcing(asked, model),
         seed=_whole(asked, "seed", 0, least=0),
@@ -249,4 +256,7 @@ def _flag(asked: Mapping[str, str], key: str, default: bool) -> bool:
 
 
 def _folder(asked: Mapping[str, str], name: str) -> Path:
-    return Path(asked.get("folder") or Path(os.environ.get("NSF_REPORTS", "reports")) / name)
+    """Where the page goes, refused at once where none could be written."""
+    folder = Path(asked.get("folder") or Path(os.environ.get("NSF_REPORTS", "reports")) / name)
+    check_place(folder)
+    return folder

@@ -88,7 +88,10 @@ def report(
         tables.insert(
             0, Table("Sensitivities at the end", _index_rows(table), _designs(indices, full_order, prior))
         )
-        told = "Shares of the variance at the end that each parameter makes, with 95 % intervals."
+        told = (
+            "Shares of the variance at the end that each parameter makes over its stated distribution, "
+            "whatever was observed, distrusted runs among them, with 95 % intervals."
+        )
         sections = {"Sensitivities": ("sensitivities", told, lambda: indices_chart(table))} | sections
     if view is not None:
         files["posterior.csv"] = pd.DataFrame(given, columns=list(model.names))

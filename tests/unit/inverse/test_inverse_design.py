@@ -1,5 +1,7 @@
 """Programs that are designed: their gradients, their bounds, and the full-order run that follows them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -12,6 +14,7 @@ from nsf.inverse.error import ModelError
 from nsf.inverse.observations import Observations, View
 from nsf.inverse.reports.command import design as command
 from nsf.inverse.space import Space
+from nsf.mpm import Motion
 
 ONE = {"friction_angle": 27.0, "speed": 0.2}
 
@@ -112,6 +115,10 @@ def test_a_target_out_of_reach_is_said(tmp_path, deployed):
     words = [f"run={deployed.deployment.path}", "device=cpu", f"folder={tmp_path / 'a'}", "full_order=false"]
     told = []
     command([*words, "height=5", "tilt=5", "knots=2"], told.append)
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "mine.txt").write_text("not a report")
+    with pytest.raises(ConfigError, match="is not a report"):  # before any work
+        command([*words[:-2], f"folder={tmp_path / 'b'}", "height=0.1", "tilt=5"], pytest.fail)
     assert any("no program was found that reaches the targets" in line for line in told)
 
 
@@ -151,6 +158,15 @@ def test_a_solid_moves_as_in_training(pushed):
     states = collider_states(scene.colliders, pushed.dt, len(pushed.t) - 1)
     np.testing.assert_allclose(forcing.solids[0], states, atol=1e-9)
     assert np.abs(states - pushed.forcing().solids.numpy()).max() > 1e-3
+
+
+def test_a_solid_that_turns_is_refused(pushed, monkeypatch):
+    (plate,) = (c for c in pushed.scene.colliders if c.motion is not None)
+    motion = Motion([0.0, 1.0], [[0.0] * 3, [0.01, 0.0, 0.0]], [0.0, 5.0], [0, 0, 1], [0.4, 0.5, 0.2])
+    turning = tuple(replace(c, motion=motion) if c is plate else c for c in pushed.scene.colliders)
+    monkeypatch.setattr(pushed, "scene", replace(pushed.scene, colliders=turning))
+    with pytest.raises(ConfigError, match="move=plate turns as well"):
+        Moves(pushed, ("plate",))
 
 
 def test_a_push_is_designed(pushed):

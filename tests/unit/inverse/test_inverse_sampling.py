@@ -155,3 +155,15 @@ def test_the_command_with_both_libraries(tmp_path, deployed, model):
     assert (tmp_path / "a" / "posterior.png").is_file()
     taken = pd.read_csv(tmp_path / "a" / "runs.csv")["speed"].to_numpy()
     assert np.abs(taken[:, None] - drawn["speed"].to_numpy()).min(1).max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("more", "told"),
+    [
+        (["full_order=2"], "give sensitivities= too"),
+        (["sensitivities=16", "full_order=2", "program=3"], "follow the scene's own program"),
+    ],
+)
+def test_full_order_runs_that_would_show_something_else_are_refused(tmp_path, deployed, more, told):
+    with pytest.raises(ConfigError, match=told):
+        sample([f"run={deployed.deployment.path}", "device=cpu", f"folder={tmp_path / 'a'}", *more])
