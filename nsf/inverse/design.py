@@ -10,6 +10,7 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
+from nsf.engines.operators.states import FEATURES
 from nsf.errors import ConfigError, InstabilityError
 from nsf.inverse.model import Forcing, Model
 from nsf.inverse.observations import View
@@ -17,7 +18,6 @@ from nsf.mpm import Motion
 from nsf.scenes import Keyframes, Scene
 from nsf.scenes.programs import Programs, across
 
-_FEATURES = 9  # of a collider (`collider_states`): shift, angle, both over the coming step, whether it acts
 _STARTS, _LOOKS = 8, 40  # that descend together, and for how many steps, before the best goes on alone
 _RATE = 0.15  # of these steps, in units of the bounds
 _MOST = 60  # steps of the best one
@@ -181,7 +181,7 @@ class Moves(Program):
         own = self.model.forcing()
         solids = own.solids.expand(len(values), -1, -1).clone()
         for c, shift in self._by_collider(values):
-            k = _FEATURES * c
+            k = FEATURES * c
             solids = solids.clone()
             solids[..., k : k + 3] = shift[:, :-1]
             solids[..., k + 4 : k + 7] = torch.diff(shift, dim=1)
@@ -314,7 +314,7 @@ def design(
     return Designed(values, xhat[0].cpu().numpy(), seen, float(end.fun), str(end.message), distrust)
 
 
-class Recorded:
+class Held:
     """Positions of a run in memory, read as those of a `Trajectory` are.
 
     Args:
@@ -330,7 +330,7 @@ class Recorded:
         return found if particles is None else found[:, particles]
 
 
-def full_order(program: Program, designed: Designed, parameters) -> Recorded:
+def full_order(program: Program, designed: Designed, parameters) -> Held:
     """The full-order run of a designed program."""
     model = program.model
     values = dict(zip(model.names, model.tensor(parameters).tolist(), strict=True))
@@ -340,4 +340,4 @@ def full_order(program: Program, designed: Designed, parameters) -> Recorded:
     for _ in range(scene.steps):
         solver.step()
         frames.append(solver.state.numpy()["x"].astype(np.float32))
-    return Recorded(np.array(frames))
+    return Held(np.array(frames))

@@ -268,8 +268,8 @@ class Names:
         """Cases of three kinds that the teacher is asked in: of training, between them, and held back.
 
         Runs in those held back decide which round of teaching is kept. None is a validation or test case.
-        Where full-order runs are the teacher, there are none between, and those of validation are held back,
-        or, if there are none, those of training.
+        Where full-order runs are the teacher there is one round, which decides nothing: there are no cases
+        between, and it is told how far runs at validation values are off, or, if there are none, at training.
         """
         known, seed = sorted(self.split.train), int(self.config.seed)
         if self.of_runs:

@@ -145,8 +145,7 @@ def design(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
     if wide := [name for name, value in values.items() if isinstance(value, list)]:
         raise ConfigError(f"{wide[0]}={named[wide[0]]} must be one value: the run's own")
     for name, value in values.items():
-        if name in model.names:
-            check_taught(model, name, value, value)
+        check_taught(model, name, value, value)
     middle = dict(zip(model.names, model.ranges.mean(1).tolist(), strict=True))
     page, _ = report(
         program,
