@@ -5,20 +5,25 @@ simulation of a case is the same configuration with these keys replaced.
 """
 
 import difflib
+import os
+import pickle
 import re
 import typing
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException, OverrideParseException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import MarkedYAMLError, YAMLError
 
@@ -102,8 +107,29 @@ def read(path: Path) -> DictConfig:
 
 
 def _compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
-    check_sizes(CONF)
-    config = _with_hydra(config_name, overrides)
+    files, overrides = check_sizes(CONF), list(overrides)
+    parsed = OverridesParser.create().parse_overrides(overrides)
+    if any(one.is_sweep_override() or one.key_or_group.startswith("hydra") for one in parsed):
+        parsed = []
+    values = [one for one in parsed if not _chooses(one)]
+    choices = (line for line in overrides if line not in {one.input_line for one in values})
+    config = pickle.loads(_chosen(config_name, tuple(choices), files))
+    ConfigLoaderImpl._apply_overrides_to_config(values, config)
+    OmegaConf.set_struct(config, False)
+    return config
+
+
+def _chooses(override: Override) -> bool:
+    """Whether an override, which is none of Hydra's own, may choose an option of a group."""
+    group = override.key_or_group
+    named = "/" in group or override.package is not None or (CONF / group).is_dir()
+    return named and not isinstance(override.value(), dict)
+
+
+@lru_cache(maxsize=64)
+def _chosen(config_name: str, choices: tuple[str, ...], _files: tuple[tuple[Path, int, int], ...]) -> bytes:
+    """What Hydra composes of options, pickled: it takes most of the time, and many jobs share them."""
+    config = _with_hydra(config_name, choices)
     own = _of_hydra(config)
     if own != _default_hydra():
         changed = [f"hydra.{key}" for key, value in own.items() if value != _default_hydra().get(key)]
@@ -112,7 +138,8 @@ def _compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
             "leave it out: only the command line says how jobs are launched"
         )
     del config["hydra"]
-    return config
+    OmegaConf.set_struct(config, True)
+    return pickle.dumps(config)
 
 
 def initialized(**named: str) -> AbstractContextManager:
@@ -147,9 +174,7 @@ def checked(config: DictConfig) -> DictConfig:
     Raises:
         ConfigError: see `load`.
     """
-    with _telling_of_depth():
-        targets.check(resolved(config))
-        return OmegaConf.create(OmegaConf.to_container(config))
+    return pickle.loads(_packed(config)[0])
 
 
 def resolve(config: DictConfig) -> DictConfig:
@@ -158,10 +183,55 @@ def resolve(config: DictConfig) -> DictConfig:
     Raises:
         ConfigError: see `load`.
     """
+    return pickle.loads(_packed(config)[1])
+
+
+#: By the text of a configuration, what `_packed` made of the last ones.
+_PACKED: dict[str, tuple[bytes, bytes]] = {}
+
+
+def _packed(config: DictConfig) -> tuple[bytes, bytes]:
+    """A configuration and the same resolved, both checked and pickled: one is asked for again and again."""
     with _telling_of_depth():
-        plain = resolved(config)
-        targets.check(plain)
-        return OmegaConf.create(plain)
+        raw = OmegaConf.to_container(config)
+        text = f"{os.environ.get('NSF_REPORTS')}{raw}"
+        if text not in _PACKED:
+            plain = resolved(config)
+            targets.check(plain)
+            _PACKED[text] = pickle.dumps(OmegaConf.create(raw)), pickle.dumps(OmegaConf.create(plain))
+            if len(_PACKED) > 64:
+                del _PACKED[next(iter(_PACKED))]
+        return _PACKED[text]
+
+
+def resolve_again(
+    config: DictConfig, values: Mapping[str, float], known: DictConfig, paths: Iterable[tuple[str, ...]]
+) -> DictConfig:
+    """`resolve` in a fraction of its time, where a configuration gets other values of a few keys.
+
+    Args:
+        config: as it was before; it gets the values.
+        values: by dotted key.
+        known: what `resolve` made of it before; it is changed and returned.
+        paths: of the values that follow these keys (`nsf.config.resolvers.following`).
+
+    Raises:
+        ConfigError: see `load`.
+    """
+    for key, value in values.items():
+        OmegaConf.update(config, key, value)
+        OmegaConf.update(known, key, value)
+    try:
+        for path in paths:
+            of, into = config, known
+            for part in path[:-1]:
+                of, into = (node[int(part) if isinstance(node, ListConfig) else part] for node in (of, into))
+            last = int(path[-1]) if isinstance(of, ListConfig) else path[-1]
+            value = of[last]
+            into[last] = resolved(value) if OmegaConf.is_config(value) else value
+    except OmegaConfBaseException:
+        return resolve(config)  # which says what is wrong
+    return known
 
 
 @contextmanager
