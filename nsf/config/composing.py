@@ -195,13 +195,14 @@ def _packed(config: DictConfig) -> tuple[bytes, bytes]:
     with _telling_of_depth():
         raw = OmegaConf.to_container(config)
         text = f"{os.environ.get('NSF_REPORTS')}{raw}"
-        if text not in _PACKED:
+        if (found := _PACKED.get(text)) is None:
             plain = resolved(config)
             targets.check(plain)
-            _PACKED[text] = pickle.dumps(OmegaConf.create(raw)), pickle.dumps(OmegaConf.create(plain))
+            found = pickle.dumps(OmegaConf.create(raw)), pickle.dumps(OmegaConf.create(plain))
+            _PACKED[text] = found
             if len(_PACKED) > 64:
-                del _PACKED[next(iter(_PACKED))]
-        return _PACKED[text]
+                _PACKED.pop(next(iter(_PACKED)), None)
+        return found
 
 
 def resolve_again(
