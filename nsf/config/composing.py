@@ -16,11 +16,8 @@ from functools import cache, lru_cache
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
-from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException, OverrideParseException
 from hydra.types import RunMode
 from omegaconf import DictConfig, ListConfig, OmegaConf
@@ -107,29 +104,15 @@ def read(path: Path) -> DictConfig:
 
 
 def _compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
-    files, overrides = check_sizes(CONF), list(overrides)
-    parsed = OverridesParser.create().parse_overrides(overrides)
-    if any(one.is_sweep_override() or one.key_or_group.startswith("hydra") for one in parsed):
-        parsed = []
-    values = [one for one in parsed if not _chooses(one)]
-    choices = (line for line in overrides if line not in {one.input_line for one in values})
-    config = pickle.loads(_chosen(config_name, tuple(choices), files))
-    ConfigLoaderImpl._apply_overrides_to_config(values, config)
-    OmegaConf.set_struct(config, False)
-    return config
-
-
-def _chooses(override: Override) -> bool:
-    """Whether an override, which is none of Hydra's own, may choose an option of a group."""
-    group = override.key_or_group
-    named = "/" in group or override.package is not None or (CONF / group).is_dir()
-    return named and not isinstance(override.value(), dict)
+    return pickle.loads(_composed(config_name, tuple(overrides), check_sizes(CONF)))
 
 
 @lru_cache(maxsize=64)
-def _chosen(config_name: str, choices: tuple[str, ...], _files: tuple[tuple[Path, int, int], ...]) -> bytes:
-    """What Hydra composes of options, pickled: it takes most of the time, and many jobs share them."""
-    config = _with_hydra(config_name, choices)
+def _composed(
+    config_name: str, overrides: tuple[str, ...], _files: tuple[tuple[Path, int, int], ...]
+) -> bytes:
+    """What Hydra makes of overrides and of the files as they are, pickled: jobs ask for the same again."""
+    config = _with_hydra(config_name, overrides)
     own = _of_hydra(config)
     if own != _default_hydra():
         changed = [f"hydra.{key}" for key, value in own.items() if value != _default_hydra().get(key)]
@@ -138,7 +121,6 @@ def _chosen(config_name: str, choices: tuple[str, ...], _files: tuple[tuple[Path
             "leave it out: only the command line says how jobs are launched"
         )
     del config["hydra"]
-    OmegaConf.set_struct(config, True)
     return pickle.dumps(config)
 
 
