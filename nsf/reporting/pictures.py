@@ -17,6 +17,7 @@ from nsf.reporting.keeping import Kept, code, key_of
 from nsf.reporting.levels import levels_section
 from nsf.reporting.rivals import over_cost
 from nsf.reporting.sources import Motion, Study, same_parameter
+from nsf.reporting.study import SEEDS
 from nsf.reporting.tables import Merged, mean_rows, printed_of, variant_labels, variants
 from nsf.reporting.text.columns import MEASURED, parameter_text
 from nsf.reporting.text.formats import file_name
@@ -326,15 +327,15 @@ def _charts(v: _Variant, folder: Path, prefix: str, brief: bool) -> list[Picture
 
 def _comparison(known: list[_Variant], folder: Path, study: Study | None) -> list[Picture]:
     entries = []
-    for v in known:
-        row = next(row for row in mean_rows(v.merged, v.members) if row["split"] == v.held_out)
-        values = v.rows.loc[v.rows["split"] == v.held_out, "delta"]
-        printed = printed_of(v.merged, v.members, study)
+    for label, alike in _over_seeds(known, study):
+        rows = [
+            next(row for row in mean_rows(v.merged, v.members) if row["split"] == v.held_out) for v in alike
+        ]
+        values = pd.concat([v.rows.loc[v.rows["split"] == v.held_out, "delta"] for v in alike])
+        printed = printed_of(alike[0].merged, alike[0].members, study)
         paper = None if pd.isna(printed) else printed
-        measured = {name: row[name] for name in MEASURED}
-        entries.append(
-            measured | {"label": v.label, "mean": row["delta"], "values": list(values), "paper": paper}
-        )
+        mean = pd.DataFrame(rows)[["delta", *MEASURED]].mean(skipna=False).to_dict()
+        entries.append(mean | {"label": label, "mean": mean["delta"], "values": list(values), "paper": paper})
     runs = sorted({run for v in known for run in v.runs})
     splits = " and ".join(sorted({v.held_out for v in known}))
     of_paper = any(entry["paper"] is not None for entry in entries)
@@ -351,6 +352,23 @@ def _comparison(known: list[_Variant], folder: Path, study: Study | None) -> lis
         Picture(save(drawn(entries), folder, stem), caption, runs) for stem, drawn, caption in drawings
     ]
     return [*pictures, *over_cost(known[0].merged, folder, runs)]
+
+
+def _over_seeds(known: list[_Variant], study: Study | None) -> list[tuple[str, list[_Variant]]]:
+    """Variants whose jobs differ in seeds alone, by what their labels have in common."""
+    groups: dict[object, list[_Variant]] = {}
+    for v in known:
+        keys = study.keys.get(v.runs[0]) if study else None
+        groups.setdefault(
+            tuple(i for i in keys.items() if i[0] not in SEEDS) if keys else v.label, []
+        ).append(v)
+    found = []
+    for alike in groups.values():
+        parts = [v.label.split(" · ") for v in alike]
+        common = [part for part in parts[0] if all(part in other for other in parts)]
+        several = [f"{len(alike)} seeds"] if len(alike) > 1 else []
+        found.append((" · ".join([*common, *several]), alike))
+    return found
 
 
 def _heading(v: _Variant) -> str:
