@@ -177,8 +177,8 @@ class View:
         shadow = np.zeros(shape, np.float32)
         shadow.reshape(-1)[index] = 1.0
         at = self._pixels(self.camera.project(face.corners), scale)
-        shadow *= _outlined(at[:, :2], shape, True)
-        canvas *= 1 - _SHADOW * _blurred(shadow, radius * scale)[..., None]
+        shadow = _blurred(shadow, radius * scale) * _outlined(at[:, :2], shape, True)
+        canvas *= 1 - _SHADOW * shadow[..., None]
 
 
 def _box_of(at: np.ndarray, shape) -> tuple[slice, slice]:

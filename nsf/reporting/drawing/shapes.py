@@ -284,7 +284,7 @@ def _radius(X: np.ndarray) -> float:
     """A sphere's radius [m] at which particles X [n, 3] look closed: from how near their neighbours are."""
     neighbours = min(8, len(X) - 1)
     reach = cKDTree(X).query(X, neighbours + 1)[0][:, -1]
-    return max(0.55 * float(np.median(reach)), 1e-9)
+    return max(0.58 * float(np.median(reach)), 1e-9)
 
 
 def _percentile(values: np.ndarray, percent: float) -> float:
