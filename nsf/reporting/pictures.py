@@ -100,7 +100,10 @@ class _Variant:
                 place = {0: "worst, ", len(ranked) - 1: "best, "}.get(i, "") if len(ranked) > 1 else ""
                 delta = ranked[i][1]
                 told = f"{place}δ {100 * delta:.2g} %" if np.isfinite(delta) else place.rstrip(", ")
-                found.append(shapes.Case(motions[value], told, beside.get(value)))
+                motion, other = motions[value], beside.get(value)
+                if other is not None and other.x_full.shape != motion.x_full.shape:
+                    other = None  # its run kept other particles or frames
+                found.append(shapes.Case(motion, told, other))
         return found
 
     def _motions(self, values) -> list[Motion]:
