@@ -1,5 +1,6 @@
 """Error over cost: what each solver of a scene needs, and how near it is."""
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 
@@ -53,13 +54,12 @@ def error_over_cost(
 
 def _colors(names: Sequence[str]) -> dict[str, str]:
     """A colour for each reduced solver: operators and projected steps have those of the charts of levels."""
-    operators, projected = LEVELS["operators"], LEVELS["projected step"]
-    others = [color for color in PALETTE if color not in (operators, projected)]
-    alone = {kind: [n for n in names if ("operators" in n) == kind] for kind in (True, False)}
-    found = {n: others[i % len(others)] for i, n in enumerate(names)}
-    for kind, color in ((True, operators), (False, projected)):
-        found |= {n: color for n in alone[kind][:1]}
-    return found
+    known = {
+        next((n for n in names if "operators" in n), None): LEVELS["operators"],
+        next((n for n in names if "operators" not in n), None): LEVELS["projected step"],
+    }
+    others = itertools.cycle(color for color in PALETTE if color not in known.values())
+    return {n: known.get(n) or next(others) for n in names}
 
 
 def _point(panel, solver: Mapping, colors: Mapping[str, str]) -> None:
