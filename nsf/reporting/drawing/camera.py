@@ -15,7 +15,7 @@ _OCCLUSION = 0.40  # how much nearer surroundings darken what lies behind them
 _SHADOW, _EDGE = 0.20, 0.45  # how dark a shadow is, and an edge of a solid
 _GLAZE = 0.06  # white mixed in, so that the dark end of a colour map still shows its shape
 _SMOOTH = 0.9  # of a sphere's radius, over which a surface is made of spheres
-_BEYOND = 0.25  # of the body's extent: how far a window opens for the solids beside it
+_BEYOND = 0.35  # of the body's extent: how far a window opens for the solids beside it
 _OVERSAMPLE = 2
 
 
