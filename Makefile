@@ -16,6 +16,9 @@ DEVELOPED := $(VENV)/.developed
 CPU_TORCH = $$( [ "$$(uname -s)" = Linux ] && [ ! -e /proc/driver/nvidia/version ] && [ ! -e /dev/dxg ] && \
 	! $(BIN)/python -m pip config list | grep -q index-url && \
 	echo --extra-index-url https://download.pytorch.org/whl/cpu )
+# Of what was installed, the parts that only tests and builds of those packages use: 200 MB, most of them torch's.
+UNUSED = $(VENV)/lib/python*/site-packages -mindepth 2 \( -type d -name tests -o -path '*/torch/test' \
+	-o -path '*/torch/bin/*[tT]est*' -o -path '*/torch/bin/protoc*' \)
 # One thread a test worker: two workers share two cores.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 WORKERS ?= 2
@@ -35,6 +38,7 @@ $(INSTALLED): pyproject.toml
 		{ echo 'Python 3.11 or newer is needed; name one: make install PYTHON=/path/to/python3.11' >&2; exit 1; }
 	'$(PYTHON)' -m venv $(VENV)
 	$(BIN)/python -m pip install --no-compile $(CPU_TORCH) $(TORCH) -e .
+	find $(UNUSED) -prune -exec rm -rf {} +
 	@touch $@
 
 develop: $(DEVELOPED)  ## the same, with every extra, and what tests, lint and docs need

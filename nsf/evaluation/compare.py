@@ -13,6 +13,7 @@ from nsf.dynamics import Decoder, ReducedMPM
 from nsf.errors import SchemaError
 from nsf.evaluation import metrics
 from nsf.evaluation.quantities import QUANTITIES, at_end, height
+from nsf.evaluation.surroundings import surroundings
 from nsf.mpm.grid.shape import DEGREES
 
 _CHUNK = 2**24  # values of one field decoded at once
@@ -200,7 +201,8 @@ def compare(
         quantities=off,
         series=_series(column, rollout, trajectory.t, split, xhat.cpu(), good),
         pictures={name: np.concatenate(blocks) for name, blocks in kept.items()}
-        | {"t": trajectory.t[shown_frames]},
+        | {"t": trajectory.t[shown_frames]}
+        | surroundings(scene, trajectory.t[shown_frames]),
     )
 
 

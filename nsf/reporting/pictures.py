@@ -12,20 +12,21 @@ import pandas as pd
 from joblib.externals.loky import ProcessPoolExecutor
 
 from nsf.reporting.drawing import charts, shapes
-from nsf.reporting.drawing.cost import error_over_cost
 from nsf.reporting.drawing.style import DIFFERENCE_COLORS, STRESS_COLORS, save
 from nsf.reporting.keeping import Kept, code, key_of
 from nsf.reporting.levels import levels_section
-from nsf.reporting.rivals import solvers
+from nsf.reporting.rivals import over_cost
 from nsf.reporting.sources import Motion, Study, same_parameter
 from nsf.reporting.study import SEEDS
 from nsf.reporting.tables import Merged, mean_rows, printed_of, variant_labels, variants
-from nsf.reporting.text.columns import COLUMN, MEASURED, RIVALS, SOLVER, parameter_text
+from nsf.reporting.text.columns import MEASURED, parameter_text
 from nsf.reporting.text.formats import file_name
 from nsf.reporting.text.page import Picture, Section
 
 ROWS = 6  # parameter values in one picture of final shapes
-ANIMATED, FRAMES = 2, 31  # parameter values and frames of an animation
+ENDS = 2  # parameter values of strips and animations: the worst and the best
+FRAMES = 31  # of an animation
+BASELINE = "deformation_only"
 ANIMATIONS_BYTES = 6 * 2**20  # of all on a page
 # Of one on a page of many: to fit, it would give up half its frames and size, so these are never drawn.
 CROWDED_BYTES, CROWDED_ANIMATED, CROWDED_FRAMES = 2**19, 1, 16
@@ -80,26 +81,46 @@ class _Variant:
                 told.append(f"at {parameter_text(value, '', unit)} from {at:.3g} s on")
         return f" The full-order solver goes on {', '.join(told)}." if told else ""
 
-    def motions(self, limit: int) -> list[Motion]:
-        """At most `limit` held-out parameter values, evenly over their range, ends included."""
-        chosen = np.unique(
-            np.linspace(0, len(self.values) - 1, min(limit, len(self.values))).round().astype(int)
-        )
-        wanted = [self.values[i] for i in chosen]
+    def ranked(self) -> list[tuple]:
+        """Held-out values and their δ, the worst first; a run that diverged is the worst."""
+        shown = self.rows["split"] == self.held_out
+        deltas = self.rows.loc[shown].groupby("parameter")["delta"].mean(numeric_only=True)
+        return sorted(deltas.items(), key=lambda item: -np.nan_to_num(item[1], nan=np.inf, posinf=np.inf))
+
+    def cases(self, limit: int, baseline: "_Variant | None" = None) -> list[shapes.Case]:
+        """At most `limit` held-out values, evenly from the worst to the best, which are always among them."""
+        ranked = self.ranked()
+        chosen = np.unique(np.linspace(0, len(ranked) - 1, min(limit, len(ranked))).round().astype(int))
+        values = [ranked[i][0] for i in chosen]
+        motions = {m.parameter: m for m in self._motions(values)}
+        beside = {m.parameter: m for m in baseline._motions(values)} if baseline else {}
+        found = []
+        for i, value in zip(chosen, values, strict=True):
+            if value in motions:
+                place = {0: "worst, ", len(ranked) - 1: "best, "}.get(i, "") if len(ranked) > 1 else ""
+                delta = ranked[i][1]
+                told = f"{place}δ {100 * delta:.2g} %" if np.isfinite(delta) else place.rstrip(", ")
+                motion, other = motions[value], beside.get(value)
+                if other is not None and other.x_full.shape != motion.x_full.shape:
+                    other = None  # its run kept other particles or frames
+                found.append(shapes.Case(motion, told, other))
+        return found
+
+    def _motions(self, values) -> list[Motion]:
+        """The particles of some held-out values, each of its own run."""
         owned: dict[str, list] = {source.id: [] for source in self.sources}
         for value, split, source in zip(
             self.rows["parameter"], self.rows["split"], self.sources, strict=True
         ):
-            if split == self.held_out and value in wanted:
+            if split == self.held_out and value in values:
                 owned[source.id].append(value)
         opened = {source.id: source for source in self.sources}
-        motions = [motion for run, values in owned.items() for motion in opened[run].motions(values)]
-        return sorted(motions, key=lambda motion: wanted.index(motion.parameter))
+        return [motion for run, own in owned.items() for motion in opened[run].motions(own)]
 
     @property
-    def floor(self) -> float | None:
-        """Height of the floor [m] where the scene states one."""
-        return self.summary.get("floor")
+    def alike(self) -> tuple[str, ...]:
+        """What it is deployed on: the scene, and what was changed in it after training."""
+        return self.scene, str(self.summary.get("changes") or "")
 
 
 def draw(
@@ -122,8 +143,8 @@ def draw(
     groups = variants(merged)
     labels = variant_labels([merged.frame.iloc[members[0]].to_dict() for members in groups])
     known = [_Variant(merged, members, label) for members, label in zip(groups, labels, strict=True)]
-    shown = _best(known, ("scene",) if sweep else ("scene", "method"))
-    drawn = _of_variants(shown, folder, not sweep, kept)
+    shown = _best(known, by_method=not sweep)
+    drawn = _of_variants(shown, known, folder, not sweep, kept)
     sections = [
         Section(_heading(v) if len(known) > 1 else "What was simulated", pictures, key)
         for v, (key, pictures) in zip(shown, drawn, strict=True)
@@ -135,31 +156,50 @@ def draw(
     ]
 
 
-def _best(known: list[_Variant], alike: Sequence[str]) -> list[_Variant]:
-    """Of variants alike in these columns the one of the smallest mean held-out δ: all would drown a page."""
+def _best(known: list[_Variant], by_method: bool) -> list[_Variant]:
+    """Of variants of one scene, and method, that of the smallest mean held-out δ: all would drown a page.
+
+    One that the full-order solver ends shows that solver, and is taken only where there is no other.
+    """
     best: dict[tuple, _Variant] = {}
     for v in known:
-        key = tuple(v.rows[name].iloc[0] for name in alike)
-        if key not in best or not best[key].delta <= v.delta:
+        key = (*v.alike, v.method if by_method else "")
+        if key not in best or _order(v) < _order(best[key]):
             best[key] = v
     return list(best.values())
 
 
+def _order(v: _Variant) -> tuple[bool, float]:
+    return bool(v.continued()), v.delta if np.isfinite(v.delta) else np.inf
+
+
+def _baseline(v: _Variant, known: list[_Variant]) -> _Variant | None:
+    """The variant without a stress field that is shown beside one with it, if there is one."""
+    if v.method != "nsf":
+        return None
+    found = [other for other in known if other.method == BASELINE and other.alike == v.alike]
+    return min(found, key=_order, default=None)
+
+
 def _of_variants(
-    shown: list[_Variant], folder: Path, animated: bool, kept: Kept | None
+    shown: list[_Variant], known: list[_Variant], folder: Path, animated: bool, kept: Kept | None
 ) -> list[tuple[str, list[Picture]]]:
     """The pictures of each variant, and what they are made of; where they are many, by several processes."""
     gif_bytes = min(shapes.GIF_BYTES, ANIMATIONS_BYTES // len(shown)) if animated else 0
     brief = len(shown) > MANY
     prefixes = _prefixes(shown)
-    keys = [v.key(prefix, gif_bytes, brief) for v, prefix in zip(shown, prefixes, strict=True)]
+    beside = [_baseline(v, known) for v in shown]
+    keys = [
+        v.key(prefix, gif_bytes, brief, b.key() if b else "")
+        for v, prefix, b in zip(shown, prefixes, beside, strict=True)
+    ]
     found: dict[str, list[Picture]] = {}
     for key in keys:
         if kept is not None and (told := kept.take(key, folder)) is not None:
             found[key] = [Picture(**picture) for picture in told]
     calls = {
-        key: partial(_of_variant, v, folder, prefix, gif_bytes, brief)
-        for v, prefix, key in zip(shown, prefixes, keys, strict=True)
+        key: partial(_of_variant, v, folder, prefix, gif_bytes, brief, b)
+        for v, prefix, b, key in zip(shown, prefixes, beside, keys, strict=True)
         if key not in found
     }
     processes = min(os.cpu_count() or 1, len(calls))
@@ -171,56 +211,77 @@ def _of_variants(
     return [(key, found[key]) for key in keys]
 
 
-def _of_variant(v: _Variant, folder: Path, prefix: str, gif_bytes: int, brief: bool) -> list[Picture]:
+def _of_variant(
+    v: _Variant, folder: Path, prefix: str, gif_bytes: int, brief: bool, beside: _Variant | None
+) -> list[Picture]:
     """Bodies, then charts; no animation for 0 bytes, and of a brief one strip and error alone."""
-    animation = [] if brief or not gif_bytes else _animation(v, folder, prefix, gif_bytes)
-    return [*animation, *_stills(v, folder, prefix, brief), *_charts(v, folder, prefix, brief)]
+    animation = [] if brief or not gif_bytes else _animation(v, folder, prefix, gif_bytes, beside)
+    return [*animation, *_stills(v, folder, prefix, brief, beside), *_charts(v, folder, prefix, brief)]
 
 
-def _animation(v: _Variant, folder: Path, prefix: str, gif_bytes: int) -> list[Picture]:
+def _animation(
+    v: _Variant, folder: Path, prefix: str, gif_bytes: int, beside: _Variant | None
+) -> list[Picture]:
     name, unit = v.parameter
     crowded = gif_bytes < CROWDED_BYTES
-    motions = v.motions(CROWDED_ANIMATED if crowded else ANIMATED)
-    if not motions:
+    cases = v.cases(CROWDED_ANIMATED if crowded else ENDS, beside)
+    if not cases:
         return []
     shapes.animation(
-        motions, folder / f"{prefix}animation.gif", name, unit, v.floor,
+        cases, folder / f"{prefix}animation.gif", name, unit,
         frames=CROWDED_FRAMES if crowded else FRAMES, max_bytes=gif_bytes,
     )  # fmt: skip
-    told = f"{name} " + " and ".join(parameter_text(m.parameter, "", unit) for m in motions)
+    cut = shapes.is_cut_open(cases[0].motion.x_full[0])
     caption = (
-        f"The full-order model (left) and the reduced one (right) at {told}, held out from training"
-        f"{'; the front half is cut away' if shapes.is_cut_open(motions) else ''}.{v.continued()}"
+        f"The full-order model (left) and the reduced one (right) at {_told(cases, name, unit)}, held out "
+        f"from training{'; the front half is cut away' if cut else ''}.{_beside(cases)}{v.continued()}"
     )
     return [Picture([f"{prefix}animation.gif"], _held_out(caption, v), v.runs)]
 
 
-def _stills(v: _Variant, folder: Path, prefix: str, brief: bool) -> list[Picture]:
+def _stills(v: _Variant, folder: Path, prefix: str, brief: bool, beside: _Variant | None) -> list[Picture]:
     name, unit = v.parameter
-    motions, continued = v.motions(ROWS), v.continued()
-    if not motions:
+    cases, continued = v.cases(ENDS, beside), v.continued()
+    if not cases:
         return []
-    strip = save(
-        shapes.strip(motions[0], name, unit, v.floor), folder, f"{prefix}strip", ("png",), [STRESS_COLORS]
-    )
+    strip = save(shapes.strip(cases, name, unit), folder, f"{prefix}strip", ("png",), [STRESS_COLORS])
+    whole = "Bodies over time, cut open" if shapes.hides_stress(cases[0].motion) else "Whole bodies over time"
     told = (
-        f"Whole bodies over time at {name} {parameter_text(motions[0].parameter, '', unit)}: full-order "
-        f"above, reduced below.{continued}"
+        f"{whole}, at {_told(cases, name, unit)}: of each full-order above, reduced below."
+        f"{_beside(cases)}{continued}"
     )
     pictures = [Picture(strip, told, v.runs)]
     if brief:
         return pictures
+    cases = sorted(v.cases(ROWS), key=lambda case: _natural(case.motion.parameter))
     final = save(
-        shapes.final_shapes(motions, name, unit, v.floor),
+        shapes.final_shapes(cases, name, unit),
         folder, f"{prefix}final-shapes", ("png",), [STRESS_COLORS, DIFFERENCE_COLORS],
     )  # fmt: skip
-    cut = shapes.is_cut_open(motions)
+    cut = shapes.is_cut_open(cases[0].motion.x_full[0])
     told = (
         f"The last frame of each parameter value{', the front half cut away' if cut else ''}; "
         "the right column shows how far each particle of the reduced model lies from where the "
         f"full-order one puts it.{continued}"
     )
     return [*pictures, Picture(final, told, v.runs)]
+
+
+def _told(cases: Sequence[shapes.Case], name: str, unit: str) -> str:
+    """The cases in words, with their place among all."""
+    places = {"worst": "the worst", "best": "the best"}
+    parts = []
+    for case in cases:
+        place = places.get(case.remark.partition(",")[0], "")
+        value = parameter_text(case.motion.parameter, "", unit)
+        parts.append(f"{value} ({place})" if place else value)
+    return f"{name} {' and '.join(parts)}"
+
+
+def _beside(cases: Sequence[shapes.Case]) -> str:
+    if all(case.baseline is None for case in cases):
+        return ""
+    return " Beside them the baseline without a stress field, which takes τ from the deformation alone."
 
 
 def _charts(v: _Variant, folder: Path, prefix: str, brief: bool) -> list[Picture]:
@@ -269,15 +330,15 @@ def _charts(v: _Variant, folder: Path, prefix: str, brief: bool) -> list[Picture
 
 def _comparison(known: list[_Variant], folder: Path, study: Study | None) -> list[Picture]:
     entries = []
-    for v in known:
-        row = next(row for row in mean_rows(v.merged, v.members) if row["split"] == v.held_out)
-        values = v.rows.loc[v.rows["split"] == v.held_out, "delta"]
-        printed = printed_of(v.merged, v.members, study)
+    for label, alike in _over_seeds(known, study):
+        rows = [
+            next(row for row in mean_rows(v.merged, v.members) if row["split"] == v.held_out) for v in alike
+        ]
+        values = pd.concat([v.rows.loc[v.rows["split"] == v.held_out, "delta"] for v in alike])
+        printed = printed_of(alike[0].merged, alike[0].members, study)
         paper = None if pd.isna(printed) else printed
-        measured = {name: row[name] for name in MEASURED}
-        entries.append(
-            measured | {"label": v.label, "mean": row["delta"], "values": list(values), "paper": paper}
-        )
+        mean = pd.DataFrame(rows)[["delta", *MEASURED]].mean(skipna=False).to_dict()
+        entries.append(mean | {"label": label, "mean": mean["delta"], "values": list(values), "paper": paper})
     runs = sorted({run for v in known for run in v.runs})
     splits = " and ".join(sorted({v.held_out for v in known}))
     of_paper = any(entry["paper"] is not None for entry in entries)
@@ -293,41 +354,24 @@ def _comparison(known: list[_Variant], folder: Path, study: Study | None) -> lis
     pictures = [
         Picture(save(drawn(entries), folder, stem), caption, runs) for stem, drawn, caption in drawings
     ]
-    return [*pictures, *_over_cost(known[0].merged, folder, runs)]
+    return [*pictures, *over_cost(known[0].merged, folder, runs)]
 
 
-def _over_cost(merged: Merged, folder: Path, runs: list[str]) -> list[Picture]:
-    """Error over cost, a panel a scene; none where nothing was timed."""
-    frame = solvers(merged)
-    if frame["span_ms"].isna().all():
-        return []
-    placed = [name for name in ("precision", "device") if frame[name].nunique() > 1]
-    names = frame[["scene", *placed]].agg(" · ".join, axis=1)
-    reduced = frame["kind"] == "reduced"
-    frame.loc[reduced, SOLVER] = _common_names(frame.loc[reduced, SOLVER], names[reduced])
-    panels = {name: part.to_dict("records") for name, part in frame.groupby(names, sort=False)}
-    least = merged.frame.groupby("scene")[list(RIVALS)].min()  # of nearest and interpolated, the best field's
-    costless = {name: COLUMN[name].title for name in RIVALS[:3]}
-    free = {
-        name: {title: least.loc[of[0]["scene"], column] for column, title in costless.items()}
-        for name, of in panels.items()
-    }
-    caption = (
-        "Displacement error over time, for each solver of a scene: the full-order one (vertical line), on "
-        "coarser grids (squares), and reduced ones (dots). Time is that for one Δt of the full-order solver: "
-        "a solver of longer steps takes fewer. Horizontal lines are of what takes no step."
-    )
-    return [Picture(save(error_over_cost(panels, free), folder, "error-over-cost"), caption, runs)]
-
-
-def _common_names(labels: pd.Series, panels: pd.Series) -> pd.Series:
-    """Labels without seeds and the parts that some panel lacks, such as its |S|: a colour has one meaning."""
-    if panels.nunique() == 1:
-        return labels
-    parts = labels.str.split(" · ")
-    known = [{part for own in of for part in own} for _, of in parts.groupby(panels)]
-    common = {part for part in set.intersection(*known) if part.partition("=")[0] not in SEEDS}
-    return parts.map(lambda own: " · ".join(part for part in own if part in common) or "reduced")
+def _over_seeds(known: list[_Variant], study: Study | None) -> list[tuple[str, list[_Variant]]]:
+    """Variants whose jobs differ in seeds alone, by what their labels have in common."""
+    groups: dict[object, list[_Variant]] = {}
+    for v in known:
+        keys = study.keys.get(v.runs[0]) if study else None
+        groups.setdefault(
+            tuple(i for i in keys.items() if i[0] not in SEEDS) if keys else v.label, []
+        ).append(v)
+    found = []
+    for alike in groups.values():
+        parts = [v.label.split(" · ") for v in alike]
+        common = [part for part in parts[0] if all(part in other for other in parts)]
+        several = [f"{len(alike)} seeds"] if len(alike) > 1 else []
+        found.append((" · ".join([*common, *several]), alike))
+    return found
 
 
 def _heading(v: _Variant) -> str:

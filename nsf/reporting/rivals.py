@@ -2,9 +2,13 @@
 
 import math
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 import pandas as pd
 
+from nsf.reporting.drawing.cost import error_over_cost
+from nsf.reporting.drawing.style import save
+from nsf.reporting.study import SEEDS
 from nsf.reporting.tables import (
     VARIANT,
     Merged,
@@ -15,7 +19,7 @@ from nsf.reporting.tables import (
     without_constants,
 )
 from nsf.reporting.text.columns import COLUMN, RIVALS, SOLVER, device_type
-from nsf.reporting.text.page import Table
+from nsf.reporting.text.page import Picture, Table
 
 _FULL = "full order"
 _PLACE = ("scene", "precision", "device")
@@ -174,3 +178,37 @@ def _percent(value: float) -> str:
 def _listed(texts: Iterable[str]) -> str:
     *others, last = texts
     return f"{', '.join(others)} and {last}" if others else last
+
+
+def over_cost(merged: Merged, folder: Path, runs: list[str]) -> list[Picture]:
+    """Error over cost, a panel a scene; none where nothing was timed."""
+    frame = solvers(merged)
+    if frame["span_ms"].isna().all():
+        return []
+    placed = [name for name in ("precision", "device") if frame[name].nunique() > 1]
+    names = frame[["scene", *placed]].agg(" · ".join, axis=1)
+    reduced = frame["kind"] == "reduced"
+    frame.loc[reduced, SOLVER] = _common_names(frame.loc[reduced, SOLVER], names[reduced])
+    panels = {name: part.to_dict("records") for name, part in frame.groupby(names, sort=False)}
+    least = merged.frame.groupby("scene")[list(RIVALS)].min()  # of nearest and interpolated, the best field's
+    costless = {name: COLUMN[name].title for name in RIVALS[:3]}
+    free = {
+        name: {title: least.loc[of[0]["scene"], column] for column, title in costless.items()}
+        for name, of in panels.items()
+    }
+    caption = (
+        "Displacement error over time, for each solver of a scene: the full-order one (vertical line), on "
+        "coarser grids (squares), and reduced ones (dots). Time is that for one Δt of the full-order solver: "
+        "a solver of longer steps takes fewer. Horizontal lines are of what takes no step."
+    )
+    return [Picture(save(error_over_cost(panels, free), folder, "error-over-cost"), caption, runs)]
+
+
+def _common_names(labels: pd.Series, panels: pd.Series) -> pd.Series:
+    """Labels without seeds and the parts that some panel lacks, such as its |S|: a colour has one meaning."""
+    if panels.nunique() == 1:
+        return labels
+    parts = labels.str.split(" · ")
+    known = [{part for own in of for part in own} for _, of in parts.groupby(panels)]
+    common = {part for part in set.intersection(*known) if part.partition("=")[0] not in SEEDS}
+    return parts.map(lambda own: " · ".join(part for part in own if part in common) or "reduced")

@@ -1,12 +1,12 @@
 """What a report reads: evaluate runs, each file checked against its manifest before a number is used.
 
 Besides the keys every evaluate run has, `summary.json` may hold these, all optional:
-`title` and `scale` (of the scene), `parameter_name`, `parameter_unit`, `particles`, `training_seconds`,
-`floor` (height [m], null where the scene has none) and `paper`: the `place` where the paper speaks of the
-scene, and by method the figures it prints, called as in results.csv, and `training_seconds`. `trust` is
-a list, one entry a case: {"parameter", "away", "trust", "distrusted", "distrusted_at", "handed_over_at"}
-(docs/design.md). `rivals` is likewise a list, with the displacement errors of each rival; `coarse` holds, by
-factor of Δx, that of a coarse full-order run, or `why` there is none.
+`title` and `scale` (of the scene), `parameter_name`, `parameter_unit`, `particles`, `training_seconds` and
+`paper`: the `place` where the paper speaks of the scene, and by method the figures it prints, called as in
+results.csv, and `training_seconds`. `trust` is a list, one entry a case: {"parameter", "away", "trust",
+"distrusted", "distrusted_at", "handed_over_at"} (docs/design.md). `rivals` is likewise a list, with the
+displacement errors of each rival; `coarse` holds, by factor of Δx, that of a coarse full-order run, or `why`
+there is none.
 """
 
 import hashlib
@@ -25,6 +25,10 @@ from nsf.reporting.keeping import FILES
 from nsf.reporting.text.columns import COLUMNS, LATER, TEXT
 
 _FRAMES = ("parameters", "splits", "t", "x_full", "x_reduced", "stress_full", "stress_reduced")
+_AROUND = (
+    "gravity",
+    *(f"solid_{name}" for name in ("shape", "extents", "position", "orientation", "active")),
+)
 _SERIES = (
     "parameter",
     "split",
@@ -42,7 +46,8 @@ class Motion:
     """One parameter value's particles for pictures: x [F,n,3] m, equivalents of τ [F,n] Pa, t [F] s.
 
     `stopped` is the time [s] up to which a reduced run that diverged was good (later frames hold that
-    state), None for one that reached the end.
+    state), None for one that reached the end. `surroundings` are gravity and colliders, as
+    `nsf.evaluation.surroundings` names them; runs of before do not tell them.
     """
 
     parameter: float | str
@@ -53,6 +58,7 @@ class Motion:
     stress_full: np.ndarray
     stress_reduced: np.ndarray
     stopped: float | None = None
+    surroundings: Mapping[str, np.ndarray] = field(default_factory=dict)
 
 
 class Source:
@@ -110,6 +116,7 @@ class Source:
             if absent:
                 raise SchemaError(f"{self._path('frames.npz')} lacks {absent}; run `nsf evaluate` again")
             arrays = {key: stored[key] for key in _FRAMES}
+            around = {key: stored[key] for key in _AROUND if key in stored}
         rows = [(value, _where(arrays["parameters"], value)) for value in parameters]
         return [
             Motion(
@@ -118,6 +125,7 @@ class Source:
                 arrays["t"],
                 *(arrays[key][row] for key in _FRAMES[3:]),
                 stopped=self._stopped(value),
+                surroundings={key: values[row] for key, values in around.items()},
             )
             for value, row in rows
             if row is not None

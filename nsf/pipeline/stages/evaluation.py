@@ -89,7 +89,7 @@ def superresolve_held_out(pipeline, run: Run) -> None:
                 pipeline.device,
                 pipeline.say,
             )
-        table = results.write_superresolution(record, pipeline.deployed, fine)
+        table = results.write_superresolution(record, pipeline.deployed, pipeline.held_out, fine)
     mean = {name: f"{100 * table[name].mean():.3g} %" for name in _EXPLAINED}
     pipeline.say(
         f"superresolve: {table['points'][0]:,} points, mean δ {mean['delta']} "

@@ -9,11 +9,12 @@ import pandas as pd
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from nsf.data import Case
 from nsf.deployment import Rollout
 from nsf.dynamics.setup import reduced_steps
 from nsf.evaluation import Comparison, Rivals, SolverCost, SuperResolution, reduction_ratio
 from nsf.evaluation.quantities import QUANTITIES
-from nsf.mpm import floor_height
+from nsf.evaluation.surroundings import surroundings
 from nsf.runs import Record
 from nsf.scenes import Scene
 from nsf.storage import write_json, writing
@@ -202,7 +203,6 @@ def summarise(
         "parameter_unit": _parameter(scene)[1],
         "cases": [dict(rollout.case) for rollout in rollouts],
         "particles": len(manifold.X),
-        "floor": floor_height(scene.colliders),
         "training_seconds": seconds,
         "changes": OmegaConf.to_container(config.deploy).get("changes") or {},
         "delta": mean("delta") if math.isfinite(mean("delta")) else None,
@@ -253,7 +253,9 @@ def write(
     record.metrics["diverged"] = results.loc[np.isinf(results["delta"]), "parameter"].tolist()
 
 
-def write_superresolution(record: Record, scene: Scene, fine: Sequence[SuperResolution]) -> pd.DataFrame:
+def write_superresolution(
+    record: Record, scene: Scene, cases: Sequence[Case], fine: Sequence[SuperResolution]
+) -> pd.DataFrame:
     """Write `superresolution.csv` and `superresolution.png` into a run's folder; gives the table."""
     from nsf.reporting.drawing.shapes import fine_shapes
     from nsf.reporting.drawing.style import PIXELS, STRESS_COLORS, write_png
@@ -262,7 +264,9 @@ def write_superresolution(record: Record, scene: Scene, fine: Sequence[SuperReso
     with writing(record.path / "superresolution.csv") as partial:
         table.to_csv(partial, index=False)
     name, unit = _parameter(scene)
-    picture = fine_shapes(fine, name.replace("_", " "), unit, floor_height(scene.colliders))
+    end = np.array([scene.dt * scene.steps])
+    around = [surroundings(scene.with_parameters(case), end) for case in cases]
+    picture = fine_shapes(fine, around, name.replace("_", " "), unit)
     with writing(record.path / "superresolution.png") as partial:
         write_png(picture, partial, PIXELS, [STRESS_COLORS])
     for name in ("superresolution.csv", "superresolution.png"):

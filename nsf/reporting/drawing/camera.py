@@ -1,15 +1,21 @@
-"""An orthographic camera that draws particles as shaded spheres into an array of pixels; z is up."""
+"""An orthographic camera that draws particles as a shaded surface into an array of pixels; z is up."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from PIL import Image, ImageFilter
+from PIL import Image, ImageDraw, ImageFilter
+from scipy.ndimage import uniform_filter
+
+from nsf.reporting.drawing.solids import Face
 
 _LIGHT = np.array([-0.45, 0.65, 0.62])  # in camera axes: from the upper left, in front
-_AMBIENT = 0.72  # share of a sphere's colour that light does not model: keeps the colour map readable
+_AMBIENT = 0.62  # share of a surface's colour that light does not model: keeps the colour map readable
 _OCCLUSION = 0.40  # how much nearer surroundings darken what lies behind them
-_FLOOR, _FLOOR_EDGE, _SHADOW = 0.945, 0.80, 0.20
-_GLAZE = 0.09  # white mixed in, so that the dark end of a colour map still shows its shape
+_SHADOW, _EDGE = 0.20, 0.45  # how dark a shadow is, and an edge of a solid
+_GLAZE = 0.06  # white mixed in, so that the dark end of a colour map still shows its shape
+_SMOOTH = 0.9  # of a sphere's radius, over which a surface is made of spheres
+_BEYOND = 0.35  # of the body's extent: how far a window opens for the solids beside it
 _OVERSAMPLE = 2
 
 
@@ -41,27 +47,33 @@ class Camera:
 
 @dataclass(frozen=True)
 class View:
-    """A camera's window: `low`, `high` [m] in right and up, `width` [pixel], an optional floor height [m]."""
+    """A camera's window: `low`, `high` [m] in right and up, `width` [pixel]."""
 
     camera: Camera
     low: np.ndarray
     high: np.ndarray
     width: int
-    floor: float | None = None
 
     @classmethod
     def around(
-        cls, x: np.ndarray, width: int, floor: float | None = None, camera: Camera | None = None
+        cls, x: np.ndarray, width: int, camera: Camera | None = None, beside: np.ndarray | None = None
     ) -> "View":
-        """The window that holds every point of x [..., 3], and a margin of the floor about them."""
+        """The window that holds every point of x [..., 3] and, within reason, the points `beside` [k, 3]."""
         points = x.reshape(-1, 3)
         points = points[np.isfinite(points).all(axis=1)]
         camera = camera or Camera.facing(points)
         flat = camera.project(points)[:, :2]
         low, high = flat.min(axis=0), flat.max(axis=0)
-        margin = 0.07 * max(high - low)
-        # Twice the margin below, where the length scale stands.
-        return cls(camera, low - margin * np.array([1.0, 2.0]), high + margin, width, floor)
+        reach = _BEYOND * max(high - low)
+        if beside is not None and len(beside):
+            there = camera.project(beside)[:, :2]
+            low, high = (
+                np.maximum(np.minimum(low, there.min(axis=0)), low - reach),
+                np.minimum(np.maximum(high, there.max(axis=0)), high + reach),
+            )
+        margin = 0.04 * max(high - low)
+        # More below, where the length scale stands.
+        return cls(camera, low - margin * np.array([1.0, 2.5]), high + margin, width)
 
     @property
     def height(self) -> int:
@@ -74,26 +86,42 @@ class View:
         """Width of the window [m]."""
         return float(self.high[0] - self.low[0])
 
-    def picture(self, x: np.ndarray, colors: np.ndarray, radius: float) -> np.ndarray:
-        """Particles x [n,3] m as shaded spheres of colors [n,3] in 0..1: pixels [height,width,3], 8 bits.
+    def picture(
+        self, x: np.ndarray, colors: np.ndarray, radius: float, faces: Sequence[Face] = ()
+    ) -> np.ndarray:
+        """Particles x [n,3] m of colors [n,3] in 0..1 as one surface: pixels [height,width,3], 8 bits.
 
-        Particles that are not finite are left out.
+        Each is a sphere of this radius [m]; shape and colour are smooth over about as much. Particles that
+        are not finite are left out. Of solids, `faces` are what is seen.
         """
         scale = self.width * _OVERSAMPLE / self.metres_across
         shape = (self.height * _OVERSAMPLE, self.width * _OVERSAMPLE)
         alive = np.isfinite(x).all(axis=1)
-        canvas = self._ground(x[alive], radius, scale, shape)
-        index, depth, tone, owner = _spheres(
-            self._pixels(self.camera.project(x[alive]), scale), radius, scale, shape
-        )
+        x, colors = x[alive], colors[alive]
+        canvas = np.ones((*shape, 3), np.float32)
+        nearest = np.full(shape, -np.inf, np.float32)
+        for face in faces:
+            if face.opacity == 1.0:
+                self._paint(face, canvas, nearest, scale)
+                if face.ground:
+                    self._shade(face, x, canvas, radius, scale)
+        index, depth, owner = _spheres(self._pixels(self.camera.project(x), scale), radius, scale, shape)
         front = _foremost(index, depth, shape[0] * shape[1])
         covered = front >= 0
-        front = front[covered]
-        if len(front):
-            shade = tone[front] * _occlusion(covered.reshape(shape), depth[front], reach=3 * radius * scale)
-            canvas.reshape(-1, 3)[covered] = (_GLAZE + (1 - _GLAZE) * colors[alive][owner[front]]) * shade[
-                :, None
-            ]
+        depths = np.zeros(shape, np.float32)
+        depths.reshape(-1)[covered] = depth[front[covered]]
+        if covered.any():
+            own = np.zeros((*shape, 3), np.float32)
+            own.reshape(-1, 3)[covered] = colors[owner[front[covered]]]
+            covered = covered.reshape(shape)
+            part = _box_of(np.argwhere(covered), shape)
+            surface = _surface(covered[part], depths[part], own[part], radius, scale)
+            seen = covered[part] & (depths[part] > nearest[part])
+            canvas[part][seen] = surface[seen]
+            nearest[part][seen] = depths[part][seen]
+        for face in sorted(faces, key=lambda face: self.camera.project(face.corners)[:, 2].mean()):
+            if face.opacity < 1.0:
+                self._paint(face, canvas, nearest, scale)
         fine = canvas.reshape(self.height, _OVERSAMPLE, self.width, _OVERSAMPLE, 3)
         return (255 * np.clip(fine.mean(axis=(1, 3)), 0, 1)).astype(np.uint8)
 
@@ -116,47 +144,111 @@ class View:
         row = (self.high[1] - projected[:, 1]) * scale
         return np.stack([column, row, projected[:, 2]], axis=1)
 
-    def _ground(self, x: np.ndarray, radius: float, scale: float, shape) -> np.ndarray:
-        """White, the floor as a band up to its horizon line, and the shadow of the particles on it."""
-        canvas = np.ones((*shape, 3), np.float32)
-        if self.floor is None or not len(x):
-            return canvas
-        _, up, toward = self.camera.axes
-        middle = 0.5 * (np.quantile(x[:, :2], 0.01, axis=0) + np.quantile(x[:, :2], 0.99, axis=0))
-        behind = middle - toward[:2] / np.hypot(*toward[:2]) * 0.33 * self.metres_across
-        horizon = int((self.high[1] - np.append(behind, self.floor) @ up) * scale)
-        horizon = int(np.clip(horizon, 0, shape[0]))
-        canvas[horizon:] = _FLOOR
-        canvas[horizon : horizon + _OVERSAMPLE] = _FLOOR_EDGE
-        light = _LIGHT @ self.camera.axes
-        fallen = x - (x[:, 2:] - self.floor) / light[2] * light
-        index, *_ = _spheres(
-            self._pixels(self.camera.project(fallen), scale), radius, scale, shape, squash=0.35
+    def _paint(self, face: Face, canvas: np.ndarray, nearest: np.ndarray, scale: float) -> None:
+        """Draw a face where nothing is nearer; an opaque one hides what comes later and lies behind."""
+        at = self._pixels(self.camera.project(face.corners), scale)
+        inside, edge = (_outlined(at[:, :2], nearest.shape, fill) for fill in (True, False))
+        part = _box_of(at[:, 1::-1], nearest.shape)
+        (dx, dy, d0), *_ = np.linalg.lstsq(
+            np.column_stack([at[:, :2], np.ones(len(at))]), at[:, 2], rcond=None
         )
+        rows, columns = (np.arange(span.start, span.stop, dtype=np.float32) for span in part)
+        depth = d0 + dx * columns + dy * rows[:, None]
+        seen = depth >= nearest[part] - 1e-4 * self.metres_across
+        for mask, color, opacity in (
+            (inside[part] & seen, face.color, face.opacity),
+            (edge[part] & seen, 0.75 * face.color, _EDGE),
+        ):
+            into = canvas[part]
+            into[mask] = (1 - opacity) * into[mask] + np.float32(opacity) * color.astype(np.float32)
+        if face.opacity == 1.0:
+            mask = inside[part] & seen
+            nearest[part][mask] = depth[mask]
+
+    def _shade(self, face: Face, x: np.ndarray, canvas: np.ndarray, radius: float, scale: float) -> None:
+        """The shadow of the particles on a face."""
+        light, normal = _LIGHT @ self.camera.axes, face.normal
+        if light @ normal < 0.1 or not len(x):
+            return
+        above = (x - face.corners[0]) @ normal
+        fallen = x - (above / (light @ normal))[:, None] * light
+        shape = canvas.shape[:2]
+        index, *_ = _spheres(self._pixels(self.camera.project(fallen), scale), radius, scale, shape, 0.35)
         shadow = np.zeros(shape, np.float32)
         shadow.reshape(-1)[index] = 1.0
-        shadow[:horizon] = 0.0
-        canvas *= 1 - _SHADOW * _blurred(shadow, radius * scale)[..., None]
-        return canvas
+        at = self._pixels(self.camera.project(face.corners), scale)
+        shadow = _blurred(shadow, radius * scale) * _outlined(at[:, :2], shape, True)
+        canvas *= 1 - _SHADOW * shadow[..., None]
+
+
+def _box_of(at: np.ndarray, shape) -> tuple[slice, slice]:
+    """Rows and columns that hold the pixels at [k, 2] (row, column), within a picture."""
+    low = np.clip(np.floor(at.min(axis=0)) - 1, 0, shape).astype(int)
+    high = np.clip(np.ceil(at.max(axis=0)) + 2, 0, shape).astype(int)
+    return slice(low[0], high[0]), slice(low[1], high[1])
+
+
+def _outlined(corners: np.ndarray, shape, fill: bool) -> np.ndarray:
+    """Pixels within a polygon of corners [k, 2] (column, row), or on its outline."""
+    picture = Image.new("1", (shape[1], shape[0]))
+    points = [(float(column), float(row)) for column, row in corners]
+    if fill:
+        ImageDraw.Draw(picture).polygon(points, fill=1)
+    else:
+        ImageDraw.Draw(picture).line([*points, points[0]], fill=1, width=_OVERSAMPLE)
+    return np.array(picture)
+
+
+def _surface(
+    covered: np.ndarray, depth: np.ndarray, colors: np.ndarray, radius: float, scale: float
+) -> np.ndarray:
+    """Colours [h, w, 3] of one surface in place of spheres: depth and colour smooth, lit by the smooth one.
+
+    What lies more than two radii before or behind its surroundings takes no part in them.
+
+    Args:
+        covered: [h, w] where there are particles.
+        depth: [h, w] nearness [m] there.
+        colors: [h, w, 3] of the particle that is seen.
+        radius: of a particle [m].
+        scale: pixels a metre.
+    """
+    size = max(3, round(2 * _SMOOTH * radius * scale))
+
+    def smooth(values: np.ndarray) -> np.ndarray:
+        return uniform_filter(uniform_filter(values, size, mode="constant"), size, mode="constant")
+
+    weight = covered.astype(np.float32)
+    rough = smooth(depth * weight) / np.maximum(smooth(weight), 1e-6)
+    weight *= np.exp(-(((depth - rough) / (2.0 * radius)) ** 2))
+    total = np.maximum(smooth(weight), 1e-6)
+    even = np.where(weight > 0.1, smooth(depth * weight) / total, depth)
+    slope_row, slope_column = np.gradient(even * scale)
+    slope_row[~covered] = slope_column[~covered] = 0.0
+    light = _LIGHT / np.linalg.norm(_LIGHT)
+    facing = (light[2] - slope_column * light[0] + slope_row * light[1]) / np.sqrt(
+        1.0 + slope_row**2 + slope_column**2
+    )
+    tone = _AMBIENT + (1 - _AMBIENT) * np.clip(facing, 0.0, 1.0)
+    tone[covered] *= _occlusion(covered, depth[covered], reach=3 * radius * scale)
+    blended = np.stack([smooth(colors[..., k] * weight) / total for k in range(3)], axis=-1)
+    return (_GLAZE + (1 - _GLAZE) * blended) * tone[..., None]
 
 
 def _spheres(centre: np.ndarray, radius: float, scale: float, shape, squash: float = 1.0):
-    """Pixels that spheres cover: flat index, nearness [m], brightness, and the particle each belongs to."""
+    """Pixels that spheres cover: flat index, nearness [m], and the particle each belongs to."""
     pixels = max(radius * scale, 0.8)
     reach = int(np.ceil(pixels))
     dx, dy = np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1))
     inside = dx**2 + (dy / squash) ** 2 <= pixels**2
     dx, dy = dx[inside], dy[inside]
     bulge = np.sqrt(np.maximum(0.0, 1 - (dx**2 + dy**2) / pixels**2))
-    light = _LIGHT / np.linalg.norm(_LIGHT)
-    facing = np.maximum(0.0, (dx * light[0] - dy * light[1]) / pixels + bulge * light[2])
-    tone = _AMBIENT + (1 - _AMBIENT) * facing
     column = np.round(centre[:, 0]).astype(int)[:, None] + dx
     row = np.round(centre[:, 1]).astype(int)[:, None] + dy
     seen = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
     depth = centre[:, 2:3] + bulge * radius
     owner = np.broadcast_to(np.arange(len(centre))[:, None], seen.shape)
-    return (row * shape[1] + column)[seen], depth[seen], np.broadcast_to(tone, seen.shape)[seen], owner[seen]
+    return (row * shape[1] + column)[seen], depth[seen], owner[seen]
 
 
 def _foremost(index: np.ndarray, depth: np.ndarray, pixels: int) -> np.ndarray:

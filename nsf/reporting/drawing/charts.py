@@ -29,6 +29,7 @@ OVER_TIME = {
     "linear_momentum_error": "linear momentum error",
     "angular_momentum_error": "angular momentum error",
 }
+LOST = 1000.0  # [%] error from which a run is lost, by how much tells nothing: axes end there
 
 
 def error_over_time(
@@ -151,7 +152,7 @@ def delta_per_variant(variants: list[dict], dots: str = "one parameter value") -
         papers = [(i, 100 * v["paper"]) for i, v in enumerate(variants) if v["paper"] is not None]
         if papers:
             y, x = np.array(papers).T
-            panel.plot(x, y, "|", ms=15, mew=2.6, color="#D55E00", label="paper")
+            panel.plot(x, y, "|", ms=15, mew=2.6, color=PAPER, label="paper")
         every = _finite([x for v in variants for x in (*v["values"], v["mean"], v["paper"] or v["mean"])])
         shown = every[~np.isnan(every)]
         logarithmic = len(shown) > 0 and shown.min() > 0 and shown.max() > 30 * shown.min()
@@ -159,8 +160,11 @@ def delta_per_variant(variants: list[dict], dots: str = "one parameter value") -
             panel.set_xscale("log")
             plain_ticks(panel.xaxis)
         average = 100 * _finite([v["mean"] for v in variants])
-        for y in np.flatnonzero(np.isnan(average)):
-            panel.text(0.01, float(y), "diverged", transform=panel.get_yaxis_transform(), va="center")
+        for y in np.flatnonzero(~(average <= LOST)):
+            told = "diverged" if np.isnan(average[y]) else f"off by more than {LOST:,.0f} %"
+            at_end = {"transform": panel.get_yaxis_transform(), "ha": "right", "va": "center"}
+            panel.text(0.99, float(y), told, **at_end)
+        average[average > LOST] = np.nan
         if logarithmic:  # a bar's length means nothing on a logarithmic axis
             panel.plot(average, at, "D", ms=8, color=REDUCED, label="mean", zorder=1.9)
         else:
@@ -168,6 +172,7 @@ def delta_per_variant(variants: list[dict], dots: str = "one parameter value") -
         panel.set_yticks(at, [v["label"] for v in variants])
         panel.set_ylim(len(variants) - 0.45, -0.55)
         panel.set_xlabel("relative deformation error δ [%]")
+        panel.set_xlim(right=min(panel.get_xlim()[1], LOST))
         panel.grid(axis="x")
         panel.tick_params(axis="y", length=0)
         _legend_above(fig, panel, None)
@@ -239,9 +244,9 @@ def _rms(values) -> float:
 
 
 def _error_scale(panel, values) -> None:
-    """Logarithmic once the errors span more than a factor of 30, else linear from zero."""
+    """Logarithmic once the errors span more than a factor of 30, else linear from zero; to `LOST` at most."""
     values = np.asarray(values, float)
-    values = values[np.isfinite(values) & (values > 0)]
+    values = np.minimum(values[np.isfinite(values) & (values > 0)], LOST)
     panel.grid(axis="y")
     if len(values) and np.max(values) > 30 * np.quantile(values, 0.05):
         panel.set_yscale("log")
@@ -306,31 +311,21 @@ def rings(rows: Sequence[Mapping[str, Mapping[str, float]]]) -> Figure:
 
 
 def speedup_and_memory(variants: list[dict]) -> Figure:
-    """Speedup [×] and peak memory [MiB] of each variant.
+    """Speedup [×] and peak memory [MiB] of each variant, both logarithmic: engines differ a thousandfold.
 
     Args:
         variants: per variant `label, speedup_step, speedup_total, memory_full_mib, memory_reduced_mib`;
             what was not measured is NaN and is said so.
     """
     with styled():
-        fig = figure(1.7 + 0.62 * len(variants))
+        fig = figure(1.7 + 0.46 * len(variants))
         left, right = fig.subplots(1, 2, sharey=True)
-        light = "#56B4E9"
-        _pairs(
-            left,
-            variants,
-            ("speedup_step", "speedup_total"),
-            ("one step", "whole simulation"),
-            (REDUCED, light),
-        )
-        _pairs(
-            right,
-            variants,
-            ("memory_full_mib", "memory_reduced_mib"),
-            ("full-order", "reduced"),
-            (FULL, REDUCED),
-        )
+        speedups = {"speedup_step": ("one step", "#009E73"), "speedup_total": ("whole simulation", "#CC79A7")}
+        memory = {"memory_full_mib": ("full-order", FULL), "memory_reduced_mib": ("reduced", REDUCED)}
+        _pairs(left, variants, speedups)
+        _pairs(right, variants, memory)
         left.axvline(1, color=INK, lw=1)
+        left.set_xlim(left=min(left.get_xlim()[0], 0.8))
         left.set_xlabel("speedup over full-order [×]")
         right.set_xlabel("peak memory [MiB]")
         left.set_yticks(np.arange(len(variants)), [v["label"] for v in variants])
@@ -361,18 +356,31 @@ def _ring(pie, key, stages: Mapping[str, float], title: str) -> None:
     )
 
 
-def _pairs(panel, variants: list[dict], columns, labels, colors) -> None:
-    """Two bars a variant, each with its number at its end."""
-    height = 0.36
-    at = np.arange(len(variants))
-    for k, (column, label, color) in enumerate(zip(columns, labels, colors, strict=True)):
+def _pairs(panel, variants: list[dict], columns: Mapping[str, tuple[str, str]]) -> None:
+    """Two dots a variant, by column with their label and colour, each with its number beside it."""
+    panel.set_xscale("log")
+    for k, (column, (label, color)) in enumerate(columns.items()):
         values = np.array([v[column] for v in variants], float)
-        shown = np.nan_to_num(values)
-        bars = panel.barh(at + (k - 0.5) * height, shown, height=height * 0.92, color=color, label=label)
-        texts = ["not measured" if np.isnan(value) else number(value) for value in values]
-        panel.bar_label(bars, texts, padding=3, fontsize=8.5, color=INK)
-    panel.margins(x=0.16)
-    panel.set_xlim(left=0)
+        at = np.arange(len(variants)) + (0.36 * k - 0.18)
+        panel.plot(values, at, "o", ms=6, color=color, label=label)
+        for x, y in zip(values, at, strict=True):
+            if np.isfinite(x):
+                panel.annotate(
+                    number(x),
+                    (x, y),
+                    (6, 0),
+                    textcoords="offset points",
+                    va="center",
+                    fontsize=8.5,
+                    color=INK,
+                )
+            else:
+                panel.text(
+                    0.02, y, "not measured", transform=panel.get_yaxis_transform(), va="center", fontsize=8.5
+                )
+    low, high = panel.get_xlim()
+    panel.set_xlim(low, high * (high / low) ** 0.16)  # room for the last numbers
+    plain_ticks(panel.xaxis, "{:,g}".format)
     panel.grid(axis="x")
     panel.tick_params(axis="y", length=0)
     panel.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2, columnspacing=1.2, handlelength=1.2)

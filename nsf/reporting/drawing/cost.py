@@ -1,12 +1,14 @@
 """Error over cost: what each solver of a scene needs, and how near it is."""
 
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 
 from matplotlib.figure import Figure
 
-from nsf.reporting.drawing.charts import plain_ticks
-from nsf.reporting.drawing.style import FULL, INK, MUTED, figure, line_style, styled
+from nsf.reporting.drawing.charts import LOST, plain_ticks
+from nsf.reporting.drawing.levels import LEVELS
+from nsf.reporting.drawing.style import FULL, INK, MUTED, PALETTE, figure, styled
 
 _ACROSS = 3  # panels in a row
 _COARSE = {"ls": "", "marker": "s", "ms": 7, "mfc": "white", "mec": FULL, "mew": 1.6}
@@ -24,7 +26,7 @@ def error_over_cost(
         free: by scene, the errors (fractions) of what costs nothing, by name: horizontal lines.
     """
     reduced = dict.fromkeys(s["solver"] for of in panels.values() for s in of if s["kind"] == "reduced")
-    styles = {name: line_style(i) for i, name in enumerate(reduced)}
+    colors = _colors(list(reduced))
     names = list(dict.fromkeys(name for of in free.values() for name in of))
     rows = math.ceil(len(panels) / _ACROSS)
     with styled():
@@ -32,13 +34,14 @@ def error_over_cost(
         drawn = fig.subplots(rows, min(_ACROSS, len(panels)), squeeze=False).ravel()
         for panel, (scene, solvers) in zip(drawn, panels.items(), strict=False):
             for solver in solvers:
-                _point(panel, solver, styles)
+                _point(panel, solver, colors)
             for i, name in enumerate(names):
                 if _drawable(error := free.get(scene, {}).get(name)):
                     panel.axhline(100 * error, color=MUTED, ls=_LINES[i % len(_LINES)], lw=1.2, label=name)
             panel.set(xscale="log", yscale="log", title=scene)
             panel.set(xlabel="time for one full-order Δt [ms]", ylabel="displacement error [%]")
             panel.margins(0.12)
+            panel.set_ylim(top=min(panel.get_ylim()[1], LOST))
             panel.grid()
             for line in (panel.xaxis, panel.yaxis):
                 plain_ticks(line)
@@ -49,7 +52,17 @@ def error_over_cost(
     return fig
 
 
-def _point(panel, solver: Mapping, styles: Mapping[str, dict]) -> None:
+def _colors(names: Sequence[str]) -> dict[str, str]:
+    """A colour for each reduced solver: operators and projected steps have those of the charts of levels."""
+    known = {
+        next((n for n in names if "operators" in n), None): LEVELS["operators"],
+        next((n for n in names if "operators" not in n), None): LEVELS["projected step"],
+    }
+    others = itertools.cycle(color for color in PALETTE if color not in known.values())
+    return {n: known.get(n) or next(others) for n in names}
+
+
+def _point(panel, solver: Mapping, colors: Mapping[str, str]) -> None:
     """One solver, where its time and error are known."""
     name, x, y = solver["solver"], solver["span_ms"], solver["displacement_error"]
     if solver["kind"] == "full":
@@ -62,7 +75,7 @@ def _point(panel, solver: Mapping, styles: Mapping[str, dict]) -> None:
                 name.rpartition(" ")[2] + "Δx", (x, 100 * y), (5, 4), textcoords="offset points", color=INK
             )
         else:
-            panel.plot(x, 100 * y, "o", ms=7, color=styles[name]["color"], label=name)
+            panel.plot(x, 100 * y, "o", ms=7, color=colors[name], label=name)
 
 
 def _drawable(value) -> bool:

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from nsf.reporting.drawing.charts import plain_ticks
+from nsf.reporting.drawing.charts import LOST, plain_ticks
 from nsf.reporting.drawing.style import FULL, INK, PALETTE, figure, line_style, styled
 
 #: Title and colour of each level, in the order of `by`.
@@ -26,12 +26,14 @@ def levels_over_time(runs: Mapping[str, pd.DataFrame]) -> Figure:
         runs: by name, rows of `series.csv` of one run, `by` among them.
     """
     with styled():
+        mixed: list = []
         fig = figure(3.6 + 0.3 * len(runs))
         error, strips = fig.subplots(2, 1, sharex=True, height_ratios=[3.0, 0.36 * len(runs)])
         for i, (name, series) in enumerate(runs.items()):
             alone = [color for k, color in enumerate(LEVELS.values()) if (series["by"].dropna() == k).all()]
             style = {"color": alone[0]} if alone else line_style(i) | {"color": INK}
-            error.plot(series["t"], 100 * series["displacement_error"], label=name, **style)
+            line = error.plot(series["t"], 100 * series["displacement_error"], label=name, **style)
+            mixed += [] if alone else line
             taken = series["by"].notna().to_numpy()
             ends, by = series["t"].to_numpy()[taken], series["by"].to_numpy()[taken].astype(int)
             starts = np.append(series["t"].iloc[0], ends[:-1])
@@ -40,14 +42,15 @@ def levels_over_time(runs: Mapping[str, pd.DataFrame]) -> Figure:
                 spans = list(zip(starts[own], (ends - starts)[own], strict=True))
                 strips.broken_barh(spans, (i - 0.36, 0.72), color=color, lw=0)
         error.set(ylabel="displacement error [%]", yscale="log")
+        error.set_ylim(top=min(error.get_ylim()[1], LOST))
         plain_ticks(error.yaxis)
         error.grid(axis="y")
         strips.set_yticks(range(len(runs)), list(runs))
         strips.set(xlabel="time t [s]", ylim=(len(runs) - 0.5, -0.5))
         strips.tick_params(axis="y", length=0)
-        error.legend(loc="upper left")
         shown = sorted({int(level) for series in runs.values() for level in series["by"].dropna()})
         known = [(title, color) for i, (title, color) in enumerate(LEVELS.items()) if i in shown]
         patches = [strips.fill_between([], [], color=color, label=title) for title, color in known]
-        fig.legend(handles=patches, loc="outside upper left", ncols=3)
+        # Lines have a legend where colours do not say whose they are: above, where no line strikes it.
+        fig.legend(handles=[*patches, *mixed], loc="outside upper left", ncols=3)
     return fig

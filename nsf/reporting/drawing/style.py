@@ -24,7 +24,7 @@ DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (5, 2, 1.5, 2)))
 FULL, REDUCED, PAPER = "#7f7f7f", "#0072B2", "#000000"
 
 STRESS_COLORS, DIFFERENCE_COLORS, SIGNED_COLORS = "viridis", "magma", "coolwarm"
-CLIP = 97.0  # [%] percentile of the full-order stress at which the colour scale ends
+CLIP = 93.0  # [%] percentile of the full-order stress at which the colour scale ends
 
 PASCALS = ((1e6, "MPa"), (1e3, "kPa"), (1.0, "Pa"), (1e-3, "mPa"), (1e-6, "µPa"))
 METRES = ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm"))

@@ -82,15 +82,15 @@ def test_a_file_that_was_changed_after_its_run_is_no_reason_to_stand(runs, folde
 
 
 def test_only_variants_whose_runs_changed_are_drawn(runs, folder, drawn):
-    before = {path.name: path.read_bytes() for path in folder.glob("nsf-*")}
-    table = runs[1].path / "results.csv"
+    before = {path.name: path.read_bytes() for path in folder.glob("deformation_only-*")}
+    table = runs[0].path / "results.csv"
     table.write_text(table.read_text().replace("cuda:0", "cuda:1"))
-    seal(runs[1])
+    seal(runs[0])
     build_report(runs, folder, "Sand")
-    assert drawn == ["deformation_only-"]
-    assert {path.name: path.read_bytes() for path in folder.glob("nsf-*")} == before
+    assert drawn == ["nsf-"]
+    assert {path.name: path.read_bytes() for path in folder.glob("deformation_only-*")} == before
     told = json.loads((folder / "sources.json").read_text())
-    assert {name for name in told["pictures"] if name.startswith("nsf-")} == set(before)
+    assert {name for name in told["pictures"] if name.startswith("deformation_only-")} == set(before)
 
 
 def test_a_picture_that_was_changed_is_drawn_again(runs, folder, drawn):

@@ -12,7 +12,7 @@ from nsf.reporting.drawing import charts
 from nsf.reporting.drawing.camera import Camera, View
 from nsf.reporting.drawing.cost import error_over_cost
 from nsf.reporting.drawing.point import point_chart, point_response
-from nsf.reporting.drawing.shapes import animation, final_shapes, is_cut_open, strip
+from nsf.reporting.drawing.shapes import Case, animation, final_shapes, hides_stress, is_cut_open, strip
 from nsf.reporting.drawing.style import save
 from nsf.reporting.sources import Motion
 
@@ -76,7 +76,7 @@ def test_error_over_cost_has_a_point_for_each_solver_that_was_timed():
 
 def test_a_strip_shows_both_models_from_the_first_frame_to_the_last():
     (motion,) = motions(1)
-    figure = strip(motion)
+    figure = strip([Case(motion)])
     told = [text.get_text() for text in figure.texts]
     assert "t = 0 s" in told
     assert "t = 0.6 s" in told
@@ -86,9 +86,33 @@ def test_a_strip_shows_both_models_from_the_first_frame_to_the_last():
     assert not np.array_equal(pictures[0], pictures[4])
 
 
+def test_a_strip_has_the_worst_and_the_best_and_the_baseline_below():
+    worst, best = motions(2, particles=60)
+    lost = replace(worst, stopped=0.2)
+    figure = strip([Case(worst, "worst, δ 3 %", lost), Case(best, "best, δ 1 %")], "friction angle", "°")
+    told = [text.get_text() for text in figure.texts]
+    assert [text for text in told if "angle" in text] == [
+        "full-order, friction angle 22.5°",
+        "reduced, friction angle 22.5°, worst, δ 3 %",
+        "deformation only, friction angle 22.5°",
+        f"full-order, friction angle {TEST[1]:g}°",
+        f"reduced, friction angle {TEST[1]:g}°, best, δ 1 %",
+    ]
+    assert "diverged; shown as at t = 0.2 s" in told
+
+
+def test_a_strip_is_cut_open_where_the_surface_carries_no_stress():
+    (motion,) = motions(1, particles=4000, frames=2)
+    motion = replace(motion, x_full=motion.x_full[:1])
+    X = motion.x_full[0]
+    inside = (np.abs(X - X.mean(axis=0)) < 0.3 * np.ptp(X, axis=0)).all(axis=1)
+    assert hides_stress(replace(motion, stress_full=np.where(inside, 10.0, 0.1)[None]))
+    assert not hides_stress(replace(motion, stress_full=np.ones((1, 4000))))
+
+
 def test_pictures_of_a_diverged_run_say_when_it_stopped():
     good, lost = motions(2)
-    figure = final_shapes([good, replace(lost, stopped=0.12)])
+    figure = final_shapes([Case(good), Case(replace(lost, stopped=0.12))])
     notes = [text.get_text() for text in figure.texts if "diverged" in text.get_text()]
     assert notes == ["diverged; shown as at t = 0.12 s"]
 
@@ -180,7 +204,7 @@ def test_particles_that_are_not_finite_are_left_out():
 
 
 def test_final_shapes_have_a_row_a_value_and_units():
-    figure = final_shapes(motions(3, particles=50), "friction angle", "°", floor=0.13)
+    figure = final_shapes([Case(m) for m in motions(3, particles=50)], "friction angle", "°")
     assert sum(bool(panel.images) for panel in figure.axes) == 3 * 3
     told = [text.get_text() for text in figure.texts] + labels(figure)
     assert "friction angle 32.5°, t = 0.6 s" in told
@@ -193,16 +217,18 @@ def test_a_thin_body_is_shown_whole():
     flat = (1.0, 0.1, 1.0)
     for scale, whole in (((1.0, 1.0, 1.0), False), (flat, True)):
         shown = [replace(m, x_full=m.x_full * scale, x_reduced=m.x_reduced * scale) for m in motions(1)]
-        assert is_cut_open(shown) is not whole
         X = shown[0].x_full[0]
+        assert is_cut_open(X) is not whole
         front = (X - X.mean(0)) @ (Camera.facing(X).axes[2] * (1.0, 1.0, 0.0)) > 0.0
         relaxed = [replace(shown[0], stress_full=np.where(front, 0.0, shown[0].stress_full))]
-        one, other = (final_shapes(some).axes[0].images[0].get_array() for some in (shown, relaxed))
+        one, other = (
+            final_shapes([Case(m) for m in some]).axes[0].images[0].get_array() for some in (shown, relaxed)
+        )
         assert (one != other).any() == whole
 
 
 def test_animation_gives_way_to_the_limit(tmp_path):
-    shown = motions(1, particles=400, frames=12)
+    shown = [Case(m) for m in motions(1, particles=400, frames=12)]
     animation(shown, tmp_path / "large.gif", frames=12, width=160)
     animation(shown, tmp_path / "small.gif", frames=12, width=160, max_bytes=40_000)
     large, small = ((tmp_path / name).stat().st_size for name in ("large.gif", "small.gif"))
@@ -227,6 +253,7 @@ def test_an_axis_of_errors_has_ticks_however_many_decades_it_spans(largest):
     frame = pd.DataFrame({"parameter": 6.0, "t": t, "delta": np.geomspace(1e-2, largest, 50)})
     (panel,) = charts.error_over_time(frame, columns=("delta",)).axes
     low, high = panel.get_ylim()
+    assert high < 2 * charts.LOST  # beyond it a run is lost, by how much tells nothing
     shown = [tick for tick in panel.get_yticks() if low <= tick <= high]
     assert 3 <= len(shown) <= 12
     assert len(panel.get_xticks()) <= 7

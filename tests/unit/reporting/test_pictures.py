@@ -1,0 +1,45 @@
+"""Which variants a report shows in pictures."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from nsf.reporting import pictures
+from nsf.reporting.sources import Study
+
+
+def variant(delta, scene="sand", method="nsf", changes="", ended="", label="", run="evaluate/sand/1"):
+    return SimpleNamespace(
+        delta=delta, scene=scene, method=method, alike=(scene, changes), continued=lambda: ended,
+        label=label, runs=[run],
+    )  # fmt: skip
+
+
+def test_a_run_that_the_full_order_solver_ends_is_shown_where_there_is_no_other():
+    ended, lost = variant(1e-6, ended=" The full-order solver goes on."), variant(np.inf)
+    assert pictures._best([ended, lost], by_method=True) == [lost]
+    assert pictures._best([ended], by_method=True) == [ended]
+    near, far = variant(0.01), variant(0.02)
+    assert pictures._best([far, lost, near], by_method=True) == [near]
+
+
+def test_each_change_of_the_deployed_scene_is_shown():
+    plain, some, more = (variant(d, changes=c) for d, c in ((0.01, ""), (0.02, "8 %"), (0.1, "30 %")))
+    assert pictures._best([plain, some, more], by_method=False) == [plain, some, more]
+
+
+def test_the_baseline_is_of_the_same_scene_and_stands_beside_nsf_alone():
+    own, other = (variant(0.3, scene, pictures.BASELINE) for scene in ("sand", "cake"))
+    shown = variant(0.01)
+    assert pictures._baseline(shown, [shown, other, own]) is own
+    assert pictures._baseline(own, [shown, other, own]) is None
+    assert pictures._baseline(shown, [shown, other]) is None
+
+
+def test_variants_that_differ_in_seeds_alone_are_one_in_charts():
+    labels = ("sand · |S| 43 · seed=0", "sand · |S| 47 · seed=1", "cake · |S| 50 · seed=0")
+    known = [variant(0.0, label=label, run=str(i)) for i, label in enumerate(labels)]
+    keys = {str(i): {"scene": label.partition(" ")[0], "seed": label[-1]} for i, label in enumerate(labels)}
+    study = Study("?", "", {}, keys, [])
+    assert pictures._over_seeds(known, study) == [("sand · 2 seeds", known[:2]), (labels[2], known[2:])]
+    assert [name for name, _ in pictures._over_seeds(known, None)] == list(labels)
