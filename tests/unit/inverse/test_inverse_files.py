@@ -49,12 +49,17 @@ def test_hdf5(tmp_path, model):
         ({"quantity": "width"}, "unknown quantity 'width'; choose one of height, run_out"),
         ({"quantity": "height"}, "height has no value"),
         ({"x": "left"}, "the column x must hold numbers"),
+        ({"deviation": np.nan}, r"row 1: deviation=nan m must be positive and finite"),
+        ({"deviation": 0.0}, r"row 1: deviation=0 m must be positive"),
+        ({"z": np.inf}, r"row 1: an observed value is inf m"),
+        ({"t": 9.0}, r"row 1: t=9 s is outside of the run"),
+        ({"particle": None, "X": 3.0, "Y": 0.0, "Z": 0.0}, r"row 1: the point \(3, 0, 0\) m lies"),
     ],
 )
 def test_rows_are_refused(tmp_path, model, change, told):
     row = {name: value for name, value in (POINT | change).items() if value is not None}
     with pytest.raises(ConfigError, match=told):
-        Observations.read(csv(tmp_path, [row]), model)
+        Observations.read(csv(tmp_path, [row]), model).check(model)
 
 
 def test_no_file(tmp_path, model):
