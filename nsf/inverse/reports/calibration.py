@@ -9,7 +9,6 @@ import torch
 
 from nsf.data import PROGRAM, Trajectory
 from nsf.data.schema import TRAJECTORY
-from nsf.errors import ConfigError
 from nsf.inverse.fit import CONFIDENCE, Fit, fit
 from nsf.inverse.model import Model
 from nsf.inverse.observations import AXES, View
@@ -60,14 +59,6 @@ def report(
         starts: see `fit`.
         say: told what is done.
     """
-    forced = PROGRAM in model.scene.varied
-    if forced != (program is not None):
-        what = (
-            "needs program=N, the program of the observed run"
-            if forced
-            else "has no programs; leave out program"
-        )
-        raise ConfigError(f"{model.scene.name} {what}")
     forcing = None if program is None else model.forcing(program=program)
     found = fit(view, model, space, starts=starts, forcing=forcing)
     say(f"calibrate: {_told(found, model)} in {found.seconds:.2f} s")
