@@ -275,17 +275,17 @@ class Trust:
         """How far what forces a run is outside of what programs of training do.
 
         Args:
-            gravity: [n, 3] at the start of each step [m/s²].
-            solids: [n, f] state of the solids there, as `collider_states` gives it; dt: step [s].
+            gravity: [..., 3] at the start of each step [m/s²].
+            solids: [..., f] state of the solids there, as `collider_states` gives it; dt: step [s].
 
         Returns:
-            [n] distance from the middle over the radius or half of the range, where that is above 1; else 0,
-            since a forcing that is inside tells nothing of where the run goes.
+            [...] distance from the middle over the radius or half of the range, where that is above 1; else
+            0, since a forcing that is inside tells nothing of where the run goes.
         """
-        found = np.zeros(len(gravity))
+        found = np.zeros(gravity.shape[:-1])
         if self.gravity is not None:
             middle, radius = self.gravity
-            found = np.linalg.norm(gravity - np.asarray(middle), axis=1) / radius
+            found = np.linalg.norm(gravity - np.asarray(middle), axis=-1) / radius
         if self.solids is not None:
             found = np.maximum(found, self.solids.of(solids, dt))
         return np.where(found > 1.0 + _ROUND_OFF, found, 0.0)

@@ -87,6 +87,11 @@ class Fit:
         return self.covariance / np.outer(deviation, deviation)
 
     @property
+    def misfit(self) -> float:
+        """Root mean square of the residuals, by the degrees of freedom; about 1 where all is as stated."""
+        return float(np.sqrt(np.sum(self.residuals**2) / max(1, len(self.residuals) - len(self.u))))
+
+    @property
     def at_end(self) -> list[str]:
         """Parameters whose estimate is at an end of their range, where the truth may lie outside."""
         return [name for name, u in zip(self.space.free, self.u, strict=True) if min(u, 1.0 - u) < 1e-6]

@@ -224,9 +224,8 @@ class Model:
         gravity, solids = (v.detach().cpu().numpy() for v in (forcing.gravity, forcing.solids))
         taught = self.operators.taught
         far = np.linalg.norm(gravity - taught.gravity, axis=-1).max(-1) / max(taught.reach, 1e-30)
-        moved = 0.0 if self.trust.solids is None else self.trust.solids.of(solids, self.dt).max(-1)
-        found = np.maximum(far, moved)
-        return np.where(found > 1.0 + 1e-6, found, 0.0)
+        programs = self.trust.of_forcing(gravity, solids, self.dt).max(-1)
+        return np.maximum(np.where(far > 1.0 + 1e-6, far, 0.0), programs)
 
     def _of(self, name: str, mu: Tensor) -> Tensor:
         """What runs begin with, or what forces them, at parameters."""

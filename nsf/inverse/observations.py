@@ -115,6 +115,10 @@ class Observations:
         """Where an observation is from, before what is wrong with it."""
         return f"{self.where[k]}: " if self.where else ""
 
+    def place(self, k: int) -> str:
+        """An observation in words: where it is from, what, and when."""
+        return f"{self._at(k)}{self.what[k]} at t = {self.t[k]:g} s"
+
     def check(self, model: Model) -> "Observations":
         """Itself.
 
@@ -246,7 +250,7 @@ def _between(t: np.ndarray, model: Model) -> tuple[np.ndarray, np.ndarray]:
 def _table(path: Path) -> Mapping[str, Sequence]:
     """Columns of a file by name."""
     if not path.is_file():
-        raise ConfigError(f"observations={path} is no file; name a CSV or HDF5 file")
+        raise ConfigError(f"{path} is no file; name a CSV or HDF5 file of observations")
     if path.suffix in (".h5", ".hdf5"):
         import h5py
 

@@ -13,8 +13,8 @@ from nsf.inverse.observations import View
 from nsf.inverse.sampling import Prior
 
 _WALKERS, _TRIED = 64, 512  # of the sampler, and points of the prior and about the estimate to begin at
-_STEPS, _MOST_STEPS = 100, 1500  # of the chain between looks at its length, and at most
-_LENGTH = 20.0  # autocorrelation times that a chain should have
+_STEPS, _MOST_STEPS = 100, 2000  # of the chain between looks at its length, and at most
+_LENGTH = 50.0  # autocorrelation times that a chain should have, as emcee has it
 _ACCEPTED = 0.1  # share of its proposals
 
 

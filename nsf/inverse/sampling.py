@@ -288,7 +288,7 @@ def sensitivities(
     from SALib.sample import sobol as sample
 
     if count < 2 or count & (count - 1):
-        raise ConfigError(f"sensitivities={count} must be a power of two, as 1024")
+        raise ConfigError(f"a design of {count} must be of a power of two, as 1024")
     own = list(prior.each)
     problem = {"num_vars": len(own), "names": own, "bounds": [[0.0, 1.0]] * len(own)}
     # One parameter has no other beside it, and SALib wants two.

@@ -81,6 +81,9 @@ def sample(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
     from nsf.inverse.sampling import Asked, Prior
 
     indices, full_order = (_whole(asked, key, 0, least=0) for key in ("sensitivities", "full_order"))
+    for key, base in (("sensitivities", indices), ("full_order", full_order)):
+        if base == 1 or base & (base - 1):
+            raise ConfigError(f"{key}={base} must be a power of two, as 32 or 1024")
     if full_order and not indices:
         raise ConfigError("full_order= are runs beside sensitivities; give sensitivities= too")
     for needed in ("SALib",) * bool(indices) + ("emcee",) * ("observations" in asked):
@@ -186,6 +189,9 @@ def _begun(
     """The models that are meant, what is asked by the command's keys, and by names of parameters."""
     if wrong := [word for word in words if "=" not in word]:
         raise ConfigError(f"{wrong[0]!r} is not key=value; see `nsf {command} --help`")
+    given = [word.split("=", 1)[0] for word in words]
+    if twice := [key for key in given if given.count(key) > 1]:
+        raise ConfigError(f"{twice[0]}= is given twice; give it once")
     asked = dict(word.split("=", 1) for word in words)
     runs = _runs(asked.pop("run", None), asked.pop("+experiment", None))
     device = asked.pop("device", "auto")

@@ -12,6 +12,7 @@ from nsf.inverse.fit import fit
 from nsf.inverse.model import Model
 from nsf.inverse.observations import View
 from nsf.inverse.posterior import posterior
+from nsf.inverse.reports.calibration import warnings_of
 from nsf.inverse.reports.charts import bands_chart, indices_chart, posterior_chart
 from nsf.inverse.reports.page import Results, write
 from nsf.inverse.sampling import LEVELS, Asked, Prior, runs, sensitivities
@@ -65,7 +66,7 @@ def report(
     else:
         found = fit(view, model, Space.of(model), forcing=forcing)
         given = posterior(prior, view, found, _DRAWS, forcing, seed)
-        warnings += [given.warning] if given.warning else []
+        warnings += warnings_of(found, view.observations) + ([given.warning] if given.warning else [])
         say(f"sample: posterior given {len(view.observations)} observations: {given.told}")
         drawn = given.values[np.random.default_rng(seed).integers(0, len(given.values), count)]
     made = runs(model, drawn, asked, forcing)

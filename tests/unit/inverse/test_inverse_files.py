@@ -1,6 +1,7 @@
 """Files of observations, and the commands that read them."""
 
 import json
+import re
 
 import h5py
 import numpy as np
@@ -122,6 +123,20 @@ def test_calibrate(tmp_path, deployed, seen, capsys):
     assert faults(folder.parent)
 
 
+def test_an_observation_that_no_run_passes_is_said(tmp_path, deployed, seen):
+    file, _ = seen
+    rows = pd.read_csv(file)
+    words = [f"run={deployed.deployment.path}", "device=cpu", "full_order=false", f"folder={tmp_path / 'a'}"]
+    said: list[str] = []
+    calibrate([*words, f"observations={file}"], said.append)
+    assert not any("no run passes" in line for line in said)
+    rows.loc[6, "x"] *= 1000.0  # in mm, unlike the others
+    calibrate([*words, f"observations={csv(tmp_path, rows)}"], said.append)
+    assert any(
+        re.search(r"no run passes the observations.*, and .*row 7: x at t = 0\.06 s", line) for line in said
+    )
+
+
 def test_trials(tmp_path, deployed):
     folder = tmp_path / "calibration"
     calibrate([f"run={deployed.deployment.path}", "trials=2", f"folder={folder}", "device=cpu"])
@@ -145,6 +160,7 @@ def test_trials(tmp_path, deployed):
         (["colour=red"], "has no key 'colour'; it takes .* and the parameters friction_angle, speed"),
         (["observations=none.csv"], "is no file"),
         (["friction"], "'friction' is not key=value"),
+        (["trials=2", "trials=3"], "trials= is given twice"),
     ],
 )
 def test_words_are_refused(deployed, words, told):

@@ -98,7 +98,7 @@ def test_sensitivities_of_a_known_function(model):
     table = sensitivities(prior, 512, linear, ["sum"])
     assert table["first"].tolist() == pytest.approx([9 / 25, 16 / 25], abs=0.02)
     assert table["total"].tolist() == pytest.approx([9 / 25, 16 / 25], abs=0.02)
-    with pytest.raises(ConfigError, match="sensitivities=100 must be a power of two"):
+    with pytest.raises(ConfigError, match="a design of 100 must be of a power of two"):
         sensitivities(prior, 100, linear, ["sum"])
 
 
@@ -113,7 +113,7 @@ def test_a_posterior_is_the_estimate_where_the_prior_is_wide(model):
     made = posterior(Prior.of(model, {}), view, found, 2000)
     drawn = made.values
     assert drawn.shape == (2000, 2)
-    assert made.length >= 20.0
+    assert made.length >= 50.0
     assert made.warning == ""
     np.testing.assert_allclose(drawn.mean(0), found.estimate, atol=0.3 * found.standard_error.max())
     assert (np.abs(drawn.std(0) / found.standard_error - 1.0) < 0.3).all()
@@ -128,9 +128,9 @@ def test_a_posterior_is_the_estimate_where_the_prior_is_wide(model):
 
 
 def test_a_chain_that_is_too_short_or_stands_still_is_said():
-    good = Posterior(np.zeros((3, 1)), 100, 25.0, 0.5)
+    good = Posterior(np.zeros((3, 1)), 100, 65.0, 0.5)
     assert good.warning == ""
-    assert "25 autocorrelation times; 50 % of the proposals" in good.told
+    assert "65 autocorrelation times; 50 % of the proposals" in good.told
     assert "is 3 autocorrelation times long" in replace(good, length=3.0).warning
     assert "accepts 1 % of the proposals" in replace(good, accepted=0.01).warning
 
@@ -179,6 +179,8 @@ def test_the_command_with_both_libraries(tmp_path, deployed, model):
     ("more", "told"),
     [
         (["full_order=2"], "give sensitivities= too"),
+        (["sensitivities=100", "of=none"], "sensitivities=100 must be a power of two"),
+        (["sensitivities=16", "full_order=3", "of=none"], "full_order=3 must be a power of two"),
         (["sensitivities=16", "full_order=2", "program=3"], "has no programs; leave it out"),
     ],
 )
