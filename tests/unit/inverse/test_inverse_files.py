@@ -132,9 +132,7 @@ def test_an_observation_that_no_run_passes_is_said(tmp_path, deployed, seen):
     assert not any("no run passes" in line for line in said)
     rows.loc[6, "x"] *= 1000.0  # in mm, unlike the others
     calibrate([*words, f"observations={csv(tmp_path, rows)}"], said.append)
-    assert any(
-        re.search(r"no run passes the observations.*row 7: x at t = 0\.06 s", line) for line in said
-    )
+    assert any(re.search(r"no run passes the observations.*row 7: x at t = 0\.06 s", line) for line in said)
 
 
 def test_trials(tmp_path, deployed):
