@@ -1,6 +1,15 @@
 """Configuration: Hydra groups in `conf/`, composed, checked, and built into objects."""
 
-from nsf.config.composing import checked, launching, load, names_scene, of_launcher, read, resolve
+from nsf.config.composing import (
+    checked,
+    launching,
+    load,
+    names_scene,
+    of_launcher,
+    read,
+    resolve,
+    resolve_again,
+)
 from nsf.config.keys import leaves, naming_the_missing, replaced, section
 from nsf.config.sweeps import check_sweep, jobs, scene_of
 from nsf.config.targets import build, build_all
@@ -23,6 +32,7 @@ __all__ = [
     "read",
     "replaced",
     "resolve",
+    "resolve_again",
     "scene_of",
     "section",
     "text",

@@ -27,14 +27,25 @@ def text_of(path: Path) -> str:
     return _text_of(path, status.st_mtime_ns, status.st_size)
 
 
-def check_sizes(folder: Path) -> None:
+def check_sizes(folder: Path) -> tuple[tuple[Path, int, int], ...]:
     """Refuse yaml files of a folder and those below that no parser would come to the end of.
+
+    Returns:
+        path, time of change [ns] and size [bytes] of each.
 
     Raises:
         ConfigError: as for `text_of`, of files that are long or have aliases.
     """
-    for path in sorted(folder.rglob("*.yaml")):
-        if path.stat().st_size > _LONGEST or {b"&", b"*"} <= {*re.findall(rb"[&*]", path.read_bytes())}:
+    stats = [(path, path.stat()) for path in sorted(folder.rglob("*.yaml"))]
+    found = tuple((path, status.st_mtime_ns, status.st_size) for path, status in stats)
+    _check_sizes(found)
+    return found
+
+
+@lru_cache(maxsize=8)
+def _check_sizes(files: tuple[tuple[Path, int, int], ...]) -> None:
+    for path, _, size in files:
+        if size > _LONGEST or {b"&", b"*"} <= {*re.findall(rb"[&*]", path.read_bytes())}:
             text_of(path)
 
 

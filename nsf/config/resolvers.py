@@ -111,6 +111,30 @@ def _check(key: str, value: Any) -> None:
             )
 
 
+def following(config: DictConfig, key: str) -> list[tuple[str, ...]]:
+    """Paths of the values of a configuration that may follow a key, directly or through others."""
+    referring = {
+        path: [_target(*found, path) for found in _REFERENCE.findall(value)]
+        + [("scale",)] * ("scaled" in value)
+        for path, value in leaves(OmegaConf.to_container(config))
+        if isinstance(value, str) and "${" in value
+    }
+    found, keys = [], [tuple(key.split("."))]
+    while keys:
+        own = keys.pop()
+        for path in list(referring):
+            if any(own[: len(target)] == target[: len(own)] for target in referring[path]):
+                del referring[path]
+                found.append(path)
+                keys.append(path)
+    return found
+
+
+def _target(dots: str, name: str, path: tuple[str, ...]) -> tuple[str, ...]:
+    """The path that a reference leads to from where it stands."""
+    return (path[: len(path) - len(dots)] if dots else ()) + tuple(re.findall(r"[\w-]+", name))
+
+
 def _size(raw: Any) -> int:
     """How many values a tree has once every reference in it is replaced by what it refers to."""
     known: dict[tuple[str, ...], int] = {}
@@ -126,9 +150,7 @@ def _size(raw: Any) -> int:
         return known[path]
 
     def referred(dots: str, name: str, path: tuple[str, ...]) -> int:
-        target = path[: len(path) - len(dots)] if dots else ()
-        target += tuple(re.findall(r"[\w-]+", name))
-        node = raw
+        target, node = _target(dots, name, path), raw
         for part in target:
             try:
                 node = node[int(part) if isinstance(node, list) else part]

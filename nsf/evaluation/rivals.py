@@ -150,24 +150,23 @@ def coarse_run(
     try:
         coarse = coarse_scene(scene, parameters, factor)
         solver = coarse.full_order(precision=precision, device=device)
-        frames = [solver.state.numpy()["x"]]
-        for _ in range(coarse.steps):
-            solver.step(1)
-            frames.append(solver.state.numpy()["x"])
+        own = torch.as_tensor(coarse.particles().X)
+        carried = interpolation(torch.as_tensor(X), own)
+
+        def moved() -> np.ndarray:
+            return carried.value(torch.as_tensor(solver.state.numpy()["x"]) - own).numpy()
+
+        at = np.arange(scene.steps + 1) * (coarse.steps / scene.steps)
+        below = np.minimum(at.astype(int), coarse.steps - 1)
+        x, ahead, taken = np.empty((len(at), *X.shape)), moved(), 0
+        for frame, share in enumerate(at - below):
+            while taken <= below[frame]:
+                solver.step(1)
+                last, ahead, taken = ahead, moved(), taken + 1
+            x[frame] = X + (1.0 - share) * last + share * ahead
     except NSFError as error:
         return str(error)
-    own = torch.as_tensor(coarse.particles().X)
-    carried = interpolation(torch.as_tensor(X), own)
-    moved = torch.stack([carried.value(torch.as_tensor(x) - own) for x in frames]).numpy()
-    at = np.arange(scene.steps + 1) * (coarse.steps / scene.steps)
-    below = np.minimum(at.astype(int), coarse.steps - 1)
-    share = (at - below)[:, None, None]
-    return CoarseRun(
-        x=X + (1.0 - share) * moved[below] + share * moved[below + 1],
-        steps=coarse.steps,
-        dx=coarse.dx,
-        particles=len(own),
-    )
+    return CoarseRun(x=x, steps=coarse.steps, dx=coarse.dx, particles=len(own))
 
 
 @dataclass(frozen=True)

@@ -90,7 +90,7 @@ def model_data(model: LiveModel, sizes: Sizes = Sizes()) -> tuple[str, bytes]:
             f"{model.run.id} has engine={pipeline.engine}, whose steps take more than a page can; deploy it "
             "with engine=operators, which teaches them first"
         )
-    operators = pipeline.operators(model.manifold)
+    operators = pipeline.operators()
     taught, network = operators.taught, operators.model
     header, order = shown(model), {p.name: i for i, p in enumerate(model.parameters)}
     header["parameters"] = [header["parameters"][order[name]] for name in taught.parameters]

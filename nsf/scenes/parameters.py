@@ -9,7 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from nsf import config as configuration
-from nsf.config.resolvers import leaves
+from nsf.config.resolvers import following, leaves
 from nsf.config.targets import filled
 from nsf.errors import ConfigError
 from nsf.vectors import numbers
@@ -98,9 +98,10 @@ def check_key(name: str, key: str, values: Sequence[float], config: DictConfig, 
         own = None
     if not isinstance(own, int | float) or isinstance(own, bool):
         raise ConfigError(f"{where}={key!r} names no key that holds a number; {remedy}")
-    other = template.copy()
-    OmegaConf.update(other, key, float(next(value for value in (*values, own + 1.0) if value != own)))
-    before, after = (dict(leaves(OmegaConf.to_container(c))) for c in (config, configuration.resolve(other)))
+    value = float(next(value for value in (*values, own + 1.0) if value != own))
+    paths = following(template, key)
+    other = configuration.resolve_again(template.copy(), {key: value}, config.copy(), paths)
+    before, after = (dict(leaves(OmegaConf.to_container(c))) for c in (config, other))
     changed = [".".join(path) for path, value in after.items() if before.get(path) != value]
     if shared := [name for name in changed if _SHARED.match(name)]:
         raise ConfigError(

@@ -1,6 +1,7 @@
 """Scenes: what is simulated (paper section 6)."""
 
 import math
+import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -10,6 +11,7 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from nsf import config as configuration
+from nsf.config.resolvers import following
 from nsf.data import PROGRAM, Case
 from nsf.errors import ConfigError
 from nsf.mpm import Collider, DomainWalls, FullOrderMPM, Gravity, GridGeometry, ParticleConstants, Transfer
@@ -129,7 +131,7 @@ class Scene(Draft):
         """
         if (asked := tuple(parameters.items())) in self._at:
             return self._at[asked]
-        config = self.template.copy()
+        values = {}
         for name, value in parameters.items():
             if name not in self.varied:
                 raise ConfigError(
@@ -137,10 +139,22 @@ class Scene(Draft):
                 )
             if not (isinstance(value, int | float | np.number) and math.isfinite(value)):
                 raise ConfigError(f"{name}={value!r} must be a finite number")
-            value = int(value) if name == PROGRAM else float(value)
-            OmegaConf.update(config, self.varied[name].key, value)
-        self._at[asked] = Scene._build(configuration.resolve(config), config)
+            values[self.varied[name].key] = int(value) if name == PROGRAM else float(value)
+        config, template = pickle.loads(self._packed)
+        paths = (path for name in parameters for path in self._following[name])
+        config = configuration.resolve_again(template, values, config, paths)
+        self._at[asked] = Scene._build(config, template)
         return self._at[asked]
+
+    @cached_property
+    def _packed(self) -> bytes:
+        """Both configurations: to unpack them takes a third of what copies take."""
+        return pickle.dumps((self.config, self.template))
+
+    @cached_property
+    def _following(self) -> dict[str, list[tuple[str, ...]]]:
+        """Paths of the values that follow each parameter's key."""
+        return {name: following(self.template, parameter.key) for name, parameter in self.varied.items()}
 
     def with_changes(self, changes: Mapping[str, Any]) -> "Scene":
         """The scene with other values of some configuration keys, and the same particles at rest and steps.

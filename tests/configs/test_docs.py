@@ -20,11 +20,12 @@ PAGES = sorted(p.relative_to(DOCS).as_posix() for p in DOCS.glob("**/*.md") if p
 
 
 @pytest.fixture
-def project(tmp_path, monkeypatch):
+def project(page, tmp_path, monkeypatch):
     """A checkout to which a page adds its files: `conf`, `experiments` and what extends the package."""
-    for folder in ("conf", "experiments"):
-        shutil.copytree(ROOT / folder, tmp_path / folder)
-    monkeypatch.setattr(config.composing, "CONF", tmp_path / "conf")
+    shutil.copytree(ROOT / "experiments", tmp_path / "experiments")
+    if 'title="conf/' in (DOCS / page).read_text(encoding="utf-8"):  # others share what Hydra composed
+        shutil.copytree(ROOT / "conf", tmp_path / "conf")
+        monkeypatch.setattr(config.composing, "CONF", tmp_path / "conf")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("NSF_RUNS", str(tmp_path / "runs"))
     monkeypatch.setenv("NSF_REPORTS", str(tmp_path / "reports"))

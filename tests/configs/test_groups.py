@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 
 from nsf import config
 from nsf.mpm.materials import PATHS, deformation_path, drive
@@ -39,6 +40,8 @@ def test_scene_is_runnable(name, scale):
     assert (scene.name, scene.scale) == (name, scale)
     for case in scene.split.cases:
         at = scene.with_parameters(case)
+        assert at.config == config.resolve(at.template)
+        assert all(OmegaConf.select(at.template, scene.varied[name].key) == v for name, v in case.items())
         constants = at.particles()
         assert len(constants) == sum(body.particles for body in at.bodies)
         check_time_step(constants, at.initial_velocity(), at.dx, at.dt)

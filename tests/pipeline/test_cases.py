@@ -75,12 +75,13 @@ def test_results_name_the_cases(made):
     assert [rollout.case.units for rollout in rollouts] == [("°", "Pa")] * 2
 
 
-def test_a_report_names_the_cases(made):
+def test_a_report_names_the_cases(made, monkeypatch):
+    monkeypatch.setattr("nsf.reporting.pictures.MANY", 0)  # two pictures of a variant
     pipeline, _ = made
     page = pipeline.report()
     text = page.read_text()
     assert all(str(case) in text for case in pipeline.held_out)
-    assert len(list(page.parent.glob("*.png"))) >= 4
+    assert len(list(page.parent.glob("*.png"))) >= 3
 
 
 def test_a_case_is_exported_that_is_the_nearest(made):

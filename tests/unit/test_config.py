@@ -1,6 +1,7 @@
 """Configuration: composed, resolved, checked."""
 
 import re
+import shutil
 
 import pytest
 from omegaconf import OmegaConf
@@ -210,13 +211,20 @@ def test_an_experiment_takes_a_plus():
 
 
 def test_broken_yaml_names_file_and_line(tmp_path, monkeypatch):
-    import shutil
-
     shutil.copytree(CONF, tmp_path / "conf")
     (tmp_path / "conf/method/broken.yaml").write_text("_target_: nsf.dynamics.Method\nname: [\n")
     monkeypatch.setattr(config.composing, "CONF", tmp_path / "conf")
     with pytest.raises(ConfigError, match=r"broken\.yaml.*line [23].*correct the yaml"):
         config.load(["method=broken"])
+
+
+def test_a_yaml_that_is_edited_is_read_again(tmp_path, monkeypatch):
+    shutil.copytree(CONF, tmp_path / "conf")
+    monkeypatch.setattr(config.composing, "CONF", tmp_path / "conf")
+    before, file = config.load(["scene=sand"]), tmp_path / "conf/scene/sand.yaml"
+    assert config.load(["scene=sand"]) == before
+    file.write_text(file.read_text(encoding="utf-8") + "  more: 1\n", encoding="utf-8")
+    assert config.load(["scene=sand"]).scene == {**before.scene, "more": 1}
 
 
 def test_jobs_are_every_combination_once():

@@ -1,9 +1,11 @@
 """Evaluate runs and one report, made once for these tests."""
 
+from contextlib import contextmanager
+
 import pytest
 from synthetic import Made, write_run
 
-from nsf.reporting import build_report
+from nsf.reporting import build, build_report, pictures
 
 SWEEP = (
     Made(),
@@ -23,3 +25,22 @@ def sweep(tmp_path_factory):
 def report(sweep, tmp_path_factory):
     """The folder of a report of the sweep."""
     return build_report(sweep, tmp_path_factory.mktemp("reports") / "sand", "Sand & friends").parent
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Drawing takes seconds, and some tests are about the rest."""
+    monkeypatch.setattr(build, "draw", lambda merged, folder, **_: [])
+
+
+@pytest.fixture(scope="module")
+def few_pictures():
+    """A context in which a variant has the two pictures that it has on a page of many."""
+
+    @contextmanager
+    def few():
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(pictures, "MANY", 0)
+            yield
+
+    return few

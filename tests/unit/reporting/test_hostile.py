@@ -77,11 +77,6 @@ def markdown_kinds(text: str) -> list[str]:
     return [kind for kind in kinds if not kind.startswith("code")]
 
 
-@pytest.fixture
-def no_pictures(monkeypatch):
-    monkeypatch.setattr(build, "draw", lambda merged, folder, **_: [])
-
-
 def hostile(root, text: str, seed: int = 0):
     """An evaluate run that says a text wherever it can; a run for each seed."""
     made = Made(particles=30, frames=4, parameters=TEST[:2], splits=("test",) * 2, seed=seed)

@@ -15,11 +15,12 @@ SMALL = {"particles": 30, "frames": 4, "parameters": TEST[:2], "splits": ("test"
 
 
 @pytest.fixture(scope="module")
-def built(tmp_path_factory):
-    """Two variants of one scene, and their report beside them; not to be changed."""
+def built(tmp_path_factory, few_pictures):
+    """Two variants of one scene, and their report of few pictures beside them; not to be changed."""
     root = tmp_path_factory.mktemp("runs")
     runs = [write_run(root, Made(**SMALL)), write_run(root, Made(method="deformation_only", **SMALL))]
-    build_report(runs, root / "report", "Sand")
+    with few_pictures():
+        build_report(runs, root / "report", "Sand")
     return root, runs
 
 
@@ -38,7 +39,8 @@ def folder(runs, tmp_path):
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """The prefixes of the variants whose pictures are drawn."""
+    """The prefixes of the variants whose few pictures are drawn."""
+    monkeypatch.setattr(pictures, "MANY", 0)
     found, true = [], pictures._of_variant
 
     def noted(v, folder, prefix, *how, **more):

@@ -21,12 +21,6 @@ ERRORS = ("error-over-time.png", "error-over-time.svg")
 TINY = Made(particles=30, frames=4, parameters=TEST[:2], splits=("test",) * 2)
 
 
-@pytest.fixture
-def no_pictures(monkeypatch):
-    """Drawing takes seconds, and some tests are about the rest."""
-    monkeypatch.setattr(build, "draw", lambda merged, folder, **_: [])
-
-
 def files(folder):
     return {path.name: path.read_bytes() for path in folder.iterdir()}
 
@@ -123,15 +117,16 @@ def test_numbers_on_the_page_come_from_the_csv(tmp_path, no_pictures):
 
 
 @pytest.fixture(scope="module")
-def diverged(tmp_path_factory):
-    """A run of two values, one of which diverged, and its report."""
+def diverged(tmp_path_factory, few_pictures):
+    """A run of two values, one of which diverged, and its report of few pictures."""
     run = write_run(tmp_path_factory.mktemp("runs"), TINY)
     for name in ("results.csv", "series.csv"):
         rows = pd.read_csv(run.path / name)
         rows.loc[rows["parameter"] == TEST[0], "delta"] = float("inf")
         rows.to_csv(run.path / name, index=False)
     seal(run)
-    return run, build_report([run], tmp_path_factory.mktemp("reports") / "diverged", "t").parent
+    with few_pictures():
+        return run, build_report([run], tmp_path_factory.mktemp("reports") / "diverged", "t").parent
 
 
 def test_a_diverged_run_still_gives_a_report_that_says_so(diverged):
@@ -152,9 +147,10 @@ def test_a_folder_that_cannot_be_made_names_the_remedy(tmp_path):
         build_report([run], tmp_path / "reports" / "sand", "t")
 
 
-def test_equal_runs_give_equal_files(diverged, tmp_path):
+def test_equal_runs_give_equal_files(diverged, tmp_path, few_pictures):
     run, folder = diverged
-    assert files(build_report([run], tmp_path / "again", "t").parent) == files(folder)
+    with few_pictures():
+        assert files(build_report([run], tmp_path / "again", "t").parent) == files(folder)
 
 
 @pytest.mark.parametrize("fault", [KeyboardInterrupt(), RuntimeError("broke"), OSError(28, "No space left")])

@@ -160,7 +160,7 @@ def test_the_band_spans_the_values_and_a_diverged_run_leaves_a_gap():
     assert (panel.get_xscale(), panel.get_xlabel(), panel.get_ylabel()) == ("log", "|S| [–]", "δ [%]")
 
 
-def test_latex_is_the_first_table_of_the_page(tmp_path):
+def test_latex_is_the_first_table_of_the_page(tmp_path, no_pictures):
     found, keys, settings = runs(tmp_path, sizes={20: 0.02, 150: 0.004})
     study = Study("How many?", "Two.", settings, keys, [])
     folder = build_report(found, tmp_path / "report", "Sand & 50 %", study=study).parent
@@ -179,7 +179,7 @@ def test_latex_is_the_first_table_of_the_page(tmp_path):
     assert lines[-1] == r"\end{tabular}"
 
 
-def test_sources_tell_what_a_study_varied_and_its_chart(tmp_path):
+def test_sources_tell_what_a_study_varied_and_its_chart(tmp_path, no_pictures):
     found, keys, settings = runs(tmp_path, sizes={20: 0.02, 150: 0.004})
     printed = ({"sampler.size": "20", "delta": 0.005},)
     study = Study("How many?", "Two.", settings, keys, ["one: not run"], printed)

@@ -184,6 +184,33 @@ def test_keys_that_refer_to_the_parameter_follow_it():
     assert tilted.with_parameters({"tilt": 90.0}).gravity[0] == pytest.approx(4.0)
 
 
+@pytest.mark.parametrize(
+    "way",
+    [
+        ["+scene.down='${scene.tilt}'", "scene.gravity=['${scene.down}',0.0,0.0]"],
+        [
+            "+scene.all={tilt: '${scene.tilt}'}",
+            "+scene.copy='${scene.all}'",
+            "scene.gravity=['${scene.copy.tilt}',0,0]",
+        ],
+        ["scene.gravity=['${..tilt}',0,0]"],
+        ["scene.gravity=['${oc.select:scene.tilt,7}',0,0]"],
+    ],
+    ids=["twice", "with all keys beside it", "relatively", "if it is there"],
+)
+def test_keys_follow_the_parameter_in_any_way(way):
+    scene = load("sand", [FEW, *TILTED, *way])
+    tilted = scene.with_parameters({"tilt": 30.0})
+    assert tilted.gravity[0] == 30.0
+    assert tilted.config == configuration.resolve(tilted.template)
+
+
+def test_a_parameter_that_a_key_cannot_follow_is_told():
+    scene = load("sand", [FEW, *TILTED, "+scene.share='${per:${scene.tilt}}'"])
+    with pytest.raises(ConfigError, match=r"scene\.share: \$\{per:0\.0\} divides by zero"):
+        scene.with_parameters({"tilt": 0.0})
+
+
 def test_a_parameter_that_is_no_key_is_refused():
     with pytest.raises(ConfigError, match=r"scene\.tilt"):
         load("sand", [FEW, f"{KEY}=scene.tilt"])
