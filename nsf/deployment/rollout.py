@@ -14,6 +14,7 @@ from nsf.data import Case, hdf5
 from nsf.deployment.levels import FULL_ORDER, LEVELS, OPERATORS, PROJECTED, Levels
 from nsf.deployment.trust import Trust, first_distrusted
 from nsf.dynamics import STOP_REASONS, ReducedBatch, ReducedMPM
+from nsf.engines.operators.states import collider_states
 from nsf.errors import SchemaError
 from nsf.storage import writing
 from nsf.timing import synchronizer
@@ -28,8 +29,6 @@ _REAL = ("<f4", "<f8")  # types of the arrays: that of the run
 #: Steps between looks at the trust of a run that is to be handed over: a look reads back, and what was
 #: done since the last one is lost.
 _LOOK = 20
-#: Of the radius of gravity: what is further out is outside, whatever round-off does.
-_OUTSIDE = 1.0 + 1e-6
 #: Times less than this share of Δt apart are the same.
 _SAME_TIME = 1e-6
 
@@ -298,12 +297,18 @@ def _ratios(solver: ReducedMPM, trust: Trust, diverged: int) -> np.ndarray:
     for off in (solver.doubt[0], trust.cases.of(solver.setup.given)):
         if off > 1.0:
             ratios = np.maximum(ratios, off)
-    # A step takes the gravity of its start.
-    gravity = trust.of_gravity(solver.acting_gravity(latent.t[:-1]))
-    ratios[1:] = np.maximum(ratios[1:], np.where(gravity > _OUTSIDE, gravity, 0.0))
+    ratios[1:] = np.maximum(ratios[1:], forcing_ratios(solver, trust))
     if diverged >= 0:
         ratios[diverged:] = np.inf
     return ratios
+
+
+def forcing_ratios(solver: ReducedMPM, trust: Trust, first: int = 0) -> np.ndarray:
+    """`Trust.of_forcing` at each step taken from a first one on; a step takes the gravity of its start."""
+    taken, dt = solver.steps_taken, solver.together.dt
+    colliders = solver.together.batch.forcing.colliders_of(solver.index)
+    solids = collider_states(colliders, dt, taken)[first:]
+    return trust.of_forcing(solver.acting_gravity(dt * np.arange(first, taken)), solids, dt)
 
 
 def _whole_step_before(t: np.ndarray, step: int, dt: float) -> int:

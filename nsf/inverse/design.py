@@ -54,11 +54,20 @@ class Program(ABC):
     def scene(self, scene: Scene, values: np.ndarray) -> Scene:
         """A scene with the program in place of its own, at values [N + 1, ways]."""
 
+    @property
+    def strides(self) -> np.ndarray:
+        """[ways, 2] smallest and largest change from a knot to the next."""
+        return np.array([[-np.inf, np.inf]] * len(self.names))
+
     def values(self, knots: Tensor) -> Tensor:
-        """[B, N + 1, ways] of knots [B, knots, ways] in units of the bounds."""
+        """[B, N + 1, ways] of knots [B, knots, ways], each from 0 to 1 of what is in reach of the last."""
         low, high = torch.as_tensor(self.bounds).to(knots).unbind(1)
-        first = torch.as_tensor(self.first).to(knots).expand(len(knots), 1, -1)
-        every = torch.cat([first, low + knots * (high - low)], 1)
+        back, on = torch.as_tensor(self.strides).to(knots).unbind(1)
+        found = [torch.as_tensor(self.first).to(knots).expand(len(knots), -1)]
+        for share in knots.unbind(1):
+            least, most = torch.maximum(low, found[-1] + back), torch.minimum(high, found[-1] + on)
+            found.append(least + share * (most - least))
+        every = torch.stack(found, 1)
         at = torch.linspace(0.0, self.knots, len(self.model.t), dtype=knots.dtype, device=knots.device)
         before = at.floor().clamp_max(self.knots - 1)
         share, n = (at - before)[:, None], before.long()
@@ -73,7 +82,7 @@ class Tilt(Program):
         model: of the runs; angle: the largest tilt [°]; knots: see `Program`.
 
     Raises:
-        ConfigError: operators were taught no gravity that far off; or the scene has none.
+        ConfigError: operators were taught no gravity so far off in every direction; or the scene has none.
     """
 
     model: Model
@@ -83,10 +92,10 @@ class Tilt(Program):
     unit = "°"
 
     def __post_init__(self):
-        size, taught = float(np.linalg.norm(self.model.scene.gravity)), self.model.operators.taught
-        if not size:
+        if not np.any(self.model.scene.gravity):
             raise ConfigError(f"{self.model.scene.name} has no gravity to tilt; move a solid, as move=NAME")
-        most = np.degrees(2.0 * np.arcsin(min(1.0, 0.5 * taught.reach / size)))
+        taught = self.model.operators.taught
+        most = _largest_tilt(np.array(self.model.scene.gravity), np.array(taught.gravity), taught.reach)
         if not 0.0 < self.angle <= most + 1e-9:
             raise ConfigError(
                 f"tilt={self.angle:g}° must lie above 0° and within the {most:.3g}° that was taught; or "
@@ -128,15 +137,27 @@ class Tilt(Program):
         return self.model.forcing().solids
 
 
+def _largest_tilt(gravity: np.ndarray, middle: np.ndarray, reach: float) -> float:
+    """Largest angle [°] by which gravity [3] may tilt either way and stay within a ball [3] [m/s²].
+
+    Tilted by θ away from the middle m it is off by |g|² + |m|² − 2 |g| |m| cos(θ + φ), squared, with φ the
+    angle between both.
+    """
+    size, around = np.linalg.norm(gravity), max(float(np.linalg.norm(middle)), 1e-30)
+    between = np.arccos(np.clip(gravity @ middle / (size * around), -1.0, 1.0))
+    cosine = (size**2 + around**2 - reach**2) / (2.0 * size * around)
+    return max(0.0, float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)) - between)))
+
+
 @dataclass(frozen=True)
 class Moves(Program):
-    """Solids that move as training runs moved them, along the same axes and within the same bounds.
+    """Solids that move as programs of training moved them: along the same axes, as far and as fast at most.
 
     Attributes:
         model: of the runs; solids: names of colliders; knots: see `Program`.
 
     Raises:
-        ConfigError: there is no such solid, no training run moves it, or it turns.
+        ConfigError: there is no such solid, no program of training moves it, or it turns.
     """
 
     model: Model
@@ -148,8 +169,12 @@ class Moves(Program):
         there = self.model.scene.collider_names
         if unknown := [name for name in self.solids if name not in there]:
             raise ConfigError(f"move={unknown[0]} is no solid of the scene; there are {', '.join(there)}")
-        if still := [name for name in self.solids if not len(self._axes[name])]:
-            raise ConfigError(f"move={still[0]} was never moved in training; operators know nothing of it")
+        programs = self.model.pipeline.scene.forcing.colliders
+        if still := [name for name in self.solids if name not in programs or not len(self._axes[name])]:
+            raise ConfigError(
+                f"move={still[0]} follows no program in training runs, so operators know no other way of it; "
+                f"train with scene.forcing.colliders.{still[0]}"
+            )
         colliders = dict(zip(there, self.model.scene.colliders, strict=True))
         if turning := [n for n in self.solids if (m := colliders[n].motion) is not None and len(m.angles)]:
             raise ConfigError(f"move={turning[0]} turns as well; only solids that shift alone are designed")
@@ -169,12 +194,18 @@ class Moves(Program):
         return np.concatenate([self._bounds_of(name) for name in self.solids])
 
     @property
+    def strides(self) -> np.ndarray:
+        """See `Program.strides`; at rest, or at a velocity between the ends of those in training."""
+        steps = (len(self.model.t) - 1) / self.knots
+        along = [self._changes(name) @ self._axes[name].T for name in self.solids]
+        return steps * np.concatenate(
+            [np.stack([own.min(0, initial=0.0), own.max(0, initial=0.0)], 1) for own in along]
+        )
+
+    @property
     def first(self) -> np.ndarray:
         """See `Program.first`; the middle of where training runs began."""
-        begun = [
-            np.mean([run[0] for run in self._shifts(name)], 0) @ self._axes[name].T for name in self.solids
-        ]
-        return np.concatenate(begun)
+        return np.concatenate([self._begun(name) @ self._axes[name].T for name in self.solids])
 
     def forcing(self, values: Tensor) -> Forcing:
         """See `Program.forcing`."""
@@ -199,8 +230,10 @@ class Moves(Program):
         """Number and shift [B, N + 1, 3] of each solid."""
         found, k = [], 0
         for name in self.solids:
-            axes = torch.as_tensor(self._axes[name]).to(values)
-            found.append((self.model.scene.collider_names.index(name), values[..., k : k + len(axes)] @ axes))
+            own, begun = self._axes[name], self._begun(name)
+            axes, aside = (torch.as_tensor(v).to(values) for v in (own, begun - begun @ own.T @ own))
+            shift = aside + values[..., k : k + len(axes)] @ axes
+            found.append((self.model.scene.collider_names.index(name), shift))
             k += len(axes)
         return found
 
@@ -219,9 +252,17 @@ class Moves(Program):
         for name in self.solids:
             if name not in self.model.scene.collider_names:
                 continue
-            _, sizes, own = np.linalg.svd(np.concatenate(self._shifts(name)), full_matrices=False)
+            _, sizes, own = np.linalg.svd(self._changes(name), full_matrices=False)
             axes[name] = own[sizes > _HARDLY]
         return axes
+
+    def _begun(self, name: str) -> np.ndarray:
+        """[3] where a solid is at t = 0, on average over training runs [m]."""
+        return np.mean([run[0] for run in self._shifts(name)], 0)
+
+    def _changes(self, name: str) -> np.ndarray:
+        """[n, 3] of a solid's shift in each step of all training runs [m]."""
+        return np.concatenate([np.diff(run, axis=0) for run in self._shifts(name)])
 
     def _bounds_of(self, name: str) -> np.ndarray:
         along = np.concatenate(self._shifts(name)) @ self._axes[name].T
@@ -277,18 +318,19 @@ def design(
     found = torch.as_tensor(np.random.default_rng(seed).random((_STARTS, *shape)), device=model.device)
     found[0] = 0.5
     best, least = found[0].clone(), np.inf
-    first, second = torch.zeros_like(found), torch.zeros_like(found)
-    for step in range(1, _LOOKS + 1):
-        found = found.detach().requires_grad_()
+    adam = torch.optim.Adam([found.requires_grad_()], lr=_RATE, betas=(0.9, 0.99))
+    slower = torch.optim.lr_scheduler.LinearLR(adam, 1.0, 1.0 / _LOOKS, _LOOKS)
+    for _ in range(_LOOKS):
         costs, _, _ = cost(found)
-        (slope,) = torch.autograd.grad(torch.log1p(costs).sum(), found)
         now = torch.where(torch.isfinite(costs), costs, torch.inf).detach()
         if float(now.min()) < least:
             least, best = float(now.min()), found[now.argmin()].detach().clone()
-        slope = torch.nan_to_num(slope)
-        first, second = 0.9 * first + 0.1 * slope, 0.99 * second + 0.01 * slope**2
-        way = (first / (1 - 0.9**step)) / ((second / (1 - 0.99**step)).sqrt() + 1e-12)
-        found = (found.detach() - _RATE * (1.0 - (step - 1) / _LOOKS) * way).clamp(0.0, 1.0)
+        (slope,) = torch.autograd.grad(torch.log1p(costs).sum(), found)
+        found.grad = torch.nan_to_num(slope)
+        adam.step()
+        slower.step()
+        with torch.no_grad():
+            found.clamp_(0.0, 1.0)
     if not np.isfinite(least):
         raise InstabilityError("no program gives a run that stays finite; choose narrower bounds")
     say(f"design: the best of {_STARTS} programs is {np.sqrt(least / len(own)):.3g} tolerances off (RMS)")

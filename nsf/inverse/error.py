@@ -8,10 +8,10 @@ import torch
 from nsf.data import PROGRAM, Trajectory
 from nsf.data.schema import TRAJECTORY
 from nsf.errors import ConfigError
-from nsf.inverse.derivatives import with_jacobian
 from nsf.inverse.model import Forcing, Model
 from nsf.inverse.observations import View
-from nsf.inverse.space import UNKNOWN, Space
+from nsf.inverse.recurrence import with_jacobian
+from nsf.inverse.space import Space
 
 _FEWEST = 2  # validation runs
 #: Of the validation runs, the share that tells of the error at an estimate.
@@ -67,14 +67,14 @@ class ModelError:
     def offsets(self, view: View, model: Model, space: Space, scale: np.ndarray) -> "Offsets":
         """How far off the model's error alone puts an estimate at each validation case.
 
-        By the slopes at that case: δ_v = (JᵀJ + 1/u₀²)⁻¹ Jᵀ b_v/s, with u₀ the deviation of a parameter of
-        which nothing is known but its range.
+        By the slopes at that case: δ_v = J⁺ b_v/s, with the pseudo-inverse that an estimate has too. Like an
+        estimate over all that was taught it stays within the ranges, and nothing else holds it.
 
         Args:
             view, model, space: of the estimate.
             scale: s [m].
         """
-        V, n = len(self.parameters), len(space.free)
+        n = len(space.free)
         columns = [model.names.index(name) for name in space.free]
         u = space.units(self.parameters[:, columns])
         mu = model.tensor(self.parameters).repeat_interleave(n, 0)
@@ -90,9 +90,9 @@ class ModelError:
             return view.of_runs(model(torch.stack(every, -1), forcing))
 
         J = with_jacobian(seen, torch.as_tensor(u, device=model.device))[1].cpu().numpy() / scale[:, None]
-        normal = np.einsum("vmi,vmj->vij", J, J) + np.eye(n) / UNKNOWN**2
-        off = np.linalg.solve(normal, np.einsum("vmi,vm->vi", J, self.vectors / scale)[..., None])[..., 0]
-        return Offsets(u, off.reshape(V, n))
+        off = np.einsum("vnm,vm->vn", np.linalg.pinv(J), self.vectors / scale)
+        low, high = space.units(model.ranges[columns].T)
+        return Offsets(u, np.clip(u + off, np.minimum(low, u), np.maximum(high, u)) - u)
 
 
 @dataclass(frozen=True)
@@ -126,8 +126,8 @@ class Offsets:
         about = np.eye(V) - rows @ solve
         left = about @ self.off
         covariance = (left * w[:, None]).T @ left / np.sum(w[:, None] * about**2)
-        told = 1.0 + float(np.sum(solve[0] ** 2))
-        return solve[0] @ self.off, told * covariance, max(1.0 / shared - rows.shape[1], 1.0)
+        wider = 1.0 + float(np.sum(solve[0] ** 2))
+        return solve[0] @ self.off, wider * covariance, max(1.0 / shared - rows.shape[1], 1.0)
 
 
 def _weights(squares: np.ndarray, count: float) -> np.ndarray:

@@ -2,7 +2,8 @@
 
 Residuals are (y − m(θ))/s with s² = σ² + s_b²: σ of the measurement, and s_b the reduced model's own error
 at the same points and times, as validation runs show it. In validation run v that error, b_v [m], alone
-would put the parameters off by δ_v = A_v b_v/s, with A_v the pseudo-inverse of the scaled Jacobian there. So
+would put the parameters off by δ_v = A_v b_v/s, with A_v the pseudo-inverse of the scaled Jacobian there, as
+A is that of the Jacobian at the estimate. The ranges end both, and nothing draws either to their middle. So
 the estimate is the parameters that fit best less what the δ_v have there on average, and its covariance
 
     C = A diag(σ²/s²) Aᵀ + cov δ,
@@ -23,10 +24,10 @@ from scipy.stats import qmc
 from torch import Tensor
 
 from nsf.errors import ConfigError, InstabilityError
-from nsf.inverse.derivatives import with_jacobian
 from nsf.inverse.error import ModelError
 from nsf.inverse.model import Forcing, Model
 from nsf.inverse.observations import View
+from nsf.inverse.recurrence import with_jacobian
 from nsf.inverse.space import UNKNOWN, Space
 
 #: Share of the truths that an interval is to hold.
@@ -86,6 +87,11 @@ class Fit:
         return self.covariance / np.outer(deviation, deviation)
 
     @property
+    def misfit(self) -> float:
+        """Root mean square of the residuals, by the degrees of freedom; about 1 where all is as stated."""
+        return float(np.sqrt(np.sum(self.residuals**2) / max(1, len(self.residuals) - len(self.u))))
+
+    @property
     def at_end(self) -> list[str]:
         """Parameters whose estimate is at an end of their range, where the truth may lie outside."""
         return [name for name, u in zip(self.space.free, self.u, strict=True) if min(u, 1.0 - u) < 1e-6]
@@ -119,8 +125,8 @@ def fit(
     own = view.observations
     if len(own) < len(space.free):
         raise ConfigError(
-            f"{len(own)} observations cannot tell {len(space.free)} parameters, {', '.join(space.free)}; "
-            "observe more, or give one of them as NAME=VALUE"
+            f"{len(own)} observation{'s' * (len(own) != 1)} cannot tell {len(space.free)} parameters, "
+            f"{', '.join(space.free)}; observe more, or give one of them as NAME=VALUE"
         )
     s = np.sqrt(own.deviations**2 + error.deviations**2)
 
@@ -232,11 +238,11 @@ def _check_told_apart(J: np.ndarray, space: Space) -> None:
     for size, way in zip(sizes, ways, strict=True):
         if size * UNKNOWN <= 1.0:
             parts = [name for name, part in zip(space.free, way, strict=True) if abs(part) > _PART]
-            told = (
+            what = (
                 f"do not tell {parts[0]}" if len(parts) == 1 else f"do not tell {' and '.join(parts)} apart"
             )
             raise ConfigError(
-                f"the observations {told}: they hardly change where {_along(space, way)}; observe other "
+                f"the observations {what}: they hardly change where {_along(space, way)}; observe other "
                 f"points or times, or give {parts[0]}=VALUE"
             )
 

@@ -1,6 +1,6 @@
 """`nsf.Model`: a taught run as a function of its problem parameters and forcing, for thousands at once."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -87,6 +87,7 @@ class Model:
         self._recurrence = Recurrence(self.operators.model.to(self.device))
         self._xhat = one.xhat.to(self.device, torch.float64)
         self._given: dict[str, Polynomial] = {}
+        self._built: dict[tuple, dict[str, np.ndarray]] = {}
 
     @classmethod
     def load(cls, run: Run | Path | str, device: str = "auto") -> "Model":
@@ -153,8 +154,8 @@ class Model:
         found = self.at(points).position(xhat.flatten(0, -2) if xhat.ndim > 1 else xhat)
         return found.unflatten(0, xhat.shape[:-1]) if xhat.ndim > 1 else found
 
-    def check_points(self, points: np.ndarray) -> None:
-        """Refuse rest positions [n, 3] [m] that are not of the body.
+    def check_points(self, points: np.ndarray, where: Callable[[int], str] = lambda k: "") -> None:
+        """Refuse rest positions [n, 3] [m] that are not of the body; `where` begins the message of one.
 
         Raises:
             ConfigError: one is further from the nearest particle than a particle is wide.
@@ -165,8 +166,8 @@ class Model:
         if off.max() > self.spacing:
             X = ", ".join(f"{value:.4g}" for value in points[off.argmax()])
             raise ConfigError(
-                f"the point ({X}) m lies {off.max():.3g} m from the nearest particle, outside of the body; "
-                "X, Y, Z is where a point is at rest, before the run"
+                f"{where(int(off.argmax()))}the point ({X}) m lies {off.max():.3g} m from the nearest "
+                "particle, outside of the body; X, Y, Z is where a point is at rest, before the run"
             )
 
     def forcing(self, parameters=None, program: int | None = None) -> Forcing:
@@ -184,8 +185,8 @@ class Model:
         """[...] how far runs are from what was taught; above 1 a run is not to be believed.
 
         The largest along a run of the distance of its shape from the training runs, in units of theirs from
-        each other; and, above 1, how far parameters and gravity are outside. It takes no projected step, so
-        it does not see how far the operators are from one (docs/method.md, Trust).
+        each other; and, above 1, how far parameters, gravity and solids are outside. It takes no projected
+        step, so it does not see how far the operators are from one (docs/method.md, Trust).
 
         Args:
             xhat: [..., N + 1, r], as this model gave them.
@@ -200,10 +201,7 @@ class Model:
         outside = torch.tensor([self._outside(case) for case in mu.reshape(-1, len(self.names)).tolist()])
         off = torch.maximum(off, outside.view(lead).to(off))
         if forcing is not None:
-            gravity = forcing.gravity.detach().cpu()
-            far = (gravity - torch.tensor(self.operators.taught.gravity)).norm(dim=-1).amax(-1)
-            beyond = far / max(self.operators.taught.reach, 1e-30)
-            off = torch.maximum(off, torch.where(beyond > 1.0 + 1e-6, beyond, 0.0).to(off))
+            off = torch.maximum(off, torch.as_tensor(self._forced(forcing)).to(off))
         return off
 
     @cached_property
@@ -221,6 +219,14 @@ class Model:
         found = max(taught.outside(case, np.array(taught.gravity))[0], self.trust.cases.of(case))
         return found if found > 1.0 else 0.0
 
+    def _forced(self, forcing: Forcing) -> np.ndarray:
+        """[] or [B] how far gravity and solids are outside of what was taught; 0 up to 1."""
+        gravity, solids = (v.detach().cpu().numpy() for v in (forcing.gravity, forcing.solids))
+        taught = self.operators.taught
+        far = np.linalg.norm(gravity - taught.gravity, axis=-1).max(-1) / max(taught.reach, 1e-30)
+        programs = self.trust.of_forcing(gravity, solids, self.dt).max(-1)
+        return np.maximum(np.where(far > 1.0 + 1e-6, far, 0.0), programs)
+
     def _of(self, name: str, mu: Tensor) -> Tensor:
         """What runs begin with, or what forces them, at parameters."""
         if name not in self._given:
@@ -232,10 +238,15 @@ class Model:
         return self._inputs(mu)[name]
 
     def _inputs(self, mu: Sequence[float], program: int | None = None) -> dict[str, np.ndarray]:
-        """What the scene has at parameters: start d_0 [r], gravity [N, 3], solids [N, f]."""
+        """What the scene has at parameters: start d_0 [r], gravity [N, 3], solids [N, f]; built once."""
         case = dict(zip(self.names, map(float, mu), strict=True))
         if program is not None:
             case[PROGRAM] = program
+        if (key := tuple(case.items())) not in self._built:
+            self._built[key] = self._inputs_of(case)
+        return self._built[key]
+
+    def _inputs_of(self, case: Mapping[str, float]) -> dict[str, np.ndarray]:
         scene, steps = self.scene.with_parameters(self.scene.case(case)), len(self.t) - 1
         rows = torch.as_tensor(self._sample).long()
         velocity = torch.as_tensor(scene.initial_velocity())[rows]

@@ -48,6 +48,7 @@ class Observations:
         what: [m] `x`, `y` or `z` of a point, or the name of a quantity.
         points: [m, 3] rest position of each point [m]; NaN of quantities.
         values, deviations: [m] [m].
+        where: [m] the row of a file that each is from, for messages; empty of those from no file.
     """
 
     t: np.ndarray
@@ -55,6 +56,7 @@ class Observations:
     points: np.ndarray
     values: np.ndarray
     deviations: np.ndarray
+    where: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.t)
@@ -100,14 +102,22 @@ class Observations:
         rows = len(next(iter(table.values())))
         column = {name: _numbers(path, name, table, rows) for name in _KNOWN if name != "quantity"}
         names = [str(name) if isinstance(name, str) else "" for name in table.get("quantity", [""] * rows)]
-        found: list[tuple[float, str, np.ndarray, float, float]] = []
+        found: list[tuple[float, str, np.ndarray, float, float, str]] = []
         for row in range(rows):
-            at = {name: values[row] for name, values in column.items()}
-            found += _row(f"{path}, row {row + 1}", at, names[row], model)
+            at, where = {name: values[row] for name, values in column.items()}, f"{path}, row {row + 1}"
+            found += [(*seen, where) for seen in _row(where, at, names[row], model)]
         if not found:
             raise ConfigError(f"{path} observes nothing; give x, y, z of points, or value of a quantity")
-        t, what, points, values, deviations = zip(*found, strict=True)
-        return cls(np.array(t), tuple(what), np.array(points), np.array(values), np.array(deviations))
+        t, what, points, values, deviations, places = zip(*found, strict=True)
+        return cls(np.array(t), what, np.array(points), np.array(values), np.array(deviations), places)
+
+    def _at(self, k: int) -> str:
+        """Where an observation is from, before what is wrong with it."""
+        return f"{self.where[k]}: " if self.where else ""
+
+    def place(self, k: int) -> str:
+        """An observation in words: where it is from, what, and when."""
+        return f"{self._at(k)}{self.what[k]} at t = {self.t[k]:g} s"
 
     def check(self, model: Model) -> "Observations":
         """Itself.
@@ -116,22 +126,32 @@ class Observations:
             ConfigError: a time is outside of the run, a point outside of the body, a deviation not positive,
                 or a value not finite.
         """
-        end = float(model.t[-1])
-        if len(late := self.t[(self.t < -_SAME_TIME * model.dt) | (self.t > end + _SAME_TIME * model.dt)]):
-            raise ConfigError(
-                f"t={late[0]:g} s is outside of the run, 0 … {end:g} s; leave the observation out, or train "
-                "with more scene.steps"
-            )
-        if len(bad := self.deviations[~(np.isfinite(self.deviations) & (self.deviations > 0.0))]):
-            raise ConfigError(
-                f"deviation={bad[0]:g} m must be positive and finite; give the standard deviation of the "
-                "measurement"
-            )
-        if len(bad := self.values[~np.isfinite(self.values)]):
-            raise ConfigError(f"an observed value is {bad[0]:g} m; give finite positions")
-        points = np.unique(self.points[~np.isnan(self.points[:, 0])], axis=0)
-        if len(points):
-            model.check_points(points)
+        end, slack = float(model.t[-1]), _SAME_TIME * model.dt
+        for wrong, told in (
+            (
+                (self.t < -slack) | (self.t > end + slack),
+                lambda k: (
+                    f"t={self.t[k]:g} s is outside of the run, 0 … {end:g} s; leave the observation "
+                    "out, or train with more scene.steps"
+                ),
+            ),
+            (
+                ~(np.isfinite(self.deviations) & (self.deviations > 0.0)),
+                lambda k: (
+                    f"deviation={self.deviations[k]:g} m must be positive and finite; give the standard "
+                    "deviation of the measurement"
+                ),
+            ),
+            (
+                ~np.isfinite(self.values),
+                lambda k: f"an observed value is {self.values[k]:g} m; give finite positions",
+            ),
+        ):
+            if wrong.any():
+                raise ConfigError(self._at(k := int(wrong.argmax())) + told(k))
+        of_points = np.flatnonzero(~np.isnan(self.points[:, 0]))
+        if len(of_points):
+            model.check_points(self.points[of_points], lambda k: self._at(int(of_points[k])))
         return self
 
 
@@ -230,7 +250,7 @@ def _between(t: np.ndarray, model: Model) -> tuple[np.ndarray, np.ndarray]:
 def _table(path: Path) -> Mapping[str, Sequence]:
     """Columns of a file by name."""
     if not path.is_file():
-        raise ConfigError(f"observations={path} is no file; name a CSV or HDF5 file")
+        raise ConfigError(f"{path} is no file; name a CSV or HDF5 file of observations")
     if path.suffix in (".h5", ".hdf5"):
         import h5py
 

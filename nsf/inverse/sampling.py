@@ -16,9 +16,8 @@ from nsf.data import Trajectory
 from nsf.errors import ConfigError, InstabilityError
 from nsf.evaluation.quantities import QUANTITIES
 from nsf.extras import optional
-from nsf.inverse.fit import Fit
 from nsf.inverse.model import Forcing, Model
-from nsf.inverse.observations import AXES, BODY, View, component
+from nsf.inverse.observations import AXES, BODY, component
 from nsf.inverse.space import Space
 from nsf.kinematics.interpolation import interpolation
 
@@ -100,9 +99,24 @@ class Prior:
         u = np.clip(u, _ENDS, 1.0 - _ENDS)
         return np.stack([own.ppf(u[..., k]) for k, own in enumerate(self.each.values())], -1)
 
-    def draw(self, count: int, seed: int) -> np.ndarray:
-        """[count, n] parameters."""
-        return self.values(np.random.default_rng(seed).random((count, len(self.each))))
+    def draw(self, count: int, seed: int, taught: bool = False) -> np.ndarray:
+        """[count, n] parameters; those within what was taught alone where that is asked for.
+
+        Raises:
+            ConfigError: nothing of a distribution is within.
+        """
+        u = np.random.default_rng(seed).random((count, len(self.each)))
+        if taught:
+            for k, (name, own) in enumerate(self.each.items()):
+                least, most = self.model.ranges[k]
+                low, high = own.cdf([least, most])
+                if high - low < _ENDS:
+                    raise ConfigError(
+                        f"the distribution of {name} has nothing within what was taught, "
+                        f"{least:g}..{most:g}; give another, or train with a wider range"
+                    )
+                u[:, k] = low + u[:, k] * (high - low)
+        return self.values(u)
 
     def log_density(self, values: np.ndarray) -> np.ndarray:
         """[...] of parameters [..., n]; −∞ outside of what was taught."""
@@ -274,7 +288,7 @@ def sensitivities(
     from SALib.sample import sobol as sample
 
     if count < 2 or count & (count - 1):
-        raise ConfigError(f"sensitivities={count} must be a power of two, as 1024")
+        raise ConfigError(f"a design of {count} must be of a power of two, as 1024")
     own = list(prior.each)
     problem = {"num_vars": len(own), "names": own, "bounds": [[0.0, 1.0]] * len(own)}
     # One parameter has no other beside it, and SALib wants two.
@@ -289,55 +303,3 @@ def sensitivities(
             values = [float(index[key][p]) for key in ("S1", "S1_conf", "ST", "ST_conf")]
             rows.append([name, parameter, *values])
     return pd.DataFrame(rows, columns=["quantity", "parameter", "first", "first_95", "total", "total_95"])
-
-
-def posterior(
-    prior: Prior,
-    view: View,
-    found: Fit,
-    draws: int,
-    forcing: Forcing | None = None,
-    seed: int = 0,
-) -> np.ndarray:
-    """Draws [draws, n] of the parameters given observations, by emcee's affine-invariant ensemble.
-
-    The likelihood is that of what the observations say of the parameters: A (y − m(θ))/s less what validation
-    runs are off on average, with the covariance of the estimate (`nsf.inverse.fit`). So it knows of the
-    reduced model's own error.
-
-    Args:
-        prior: of the parameters.
-        view: of the observations; found: their fit, of every parameter.
-        draws: how many, at least; as many again are dropped before them.
-        forcing, seed: of the runs, and of the ensemble.
-
-    Raises:
-        MissingExtraError: emcee is not installed.
-
-    Source: Goodman and Weare 2010; Foreman-Mackey et al. 2013.
-    """
-    emcee = optional("emcee", "inverse")
-    model, space = prior.model, found.space
-    walkers = max(32, 4 * len(space.free))
-    precision = np.linalg.inv(found.covariance)
-    shift = found.u - space.units(found.fitted)
-    low, high = model.ranges.T
-
-    def log_probability(values: np.ndarray) -> np.ndarray:
-        known = prior.log_density(values)
-        with torch.no_grad():
-            inside = np.clip(values, low, high)
-            seen = view.of_runs(model(model.tensor(inside), forcing)).cpu().numpy()
-        off = (view.observations.values - seen) @ found.project.T + shift
-        told = -0.5 * np.einsum("bi,ij,bj->b", off, precision, off)
-        return np.where(np.isfinite(told), told, -np.inf) + known
-
-    generator = np.random.default_rng(seed)
-    deviation = np.minimum(np.sqrt(np.diag(found.covariance)), 0.1)
-    u = np.clip(found.u + deviation * generator.standard_normal((walkers, len(space.free))), 1e-3, 1.0 - 1e-3)
-    begin = space.values(torch.as_tensor(u)).numpy()
-    sampler = emcee.EnsembleSampler(walkers, len(space.free), log_probability, vectorize=True)
-    sampler.random_state = np.random.RandomState(seed).get_state()  # emcee's own
-    steps = -(-draws // walkers)
-    sampler.run_mcmc(begin, 2 * steps)
-    return sampler.get_chain(discard=steps, flat=True)[:draws]

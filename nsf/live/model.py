@@ -11,6 +11,7 @@ import torch
 from nsf.data import Case, Trajectory
 from nsf.data.schema import TRAJECTORY, packed
 from nsf.deployment import Trust
+from nsf.deployment.rollout import forcing_ratios
 from nsf.dynamics import Decoder, ReducedMPM
 from nsf.errors import ConfigError, InstabilityError
 from nsf.export import web
@@ -28,8 +29,6 @@ PRECISION = "fp32"
 _BEYOND = 0.5
 #: Number of steps in the range of a parameter.
 _STEPS = 200
-#: Of the radius of gravity: what is further out is outside, whatever round-off does.
-_OUTSIDE = 1.0 + 1e-6
 #: Share of the particles that are shown which lie at the surface, where there are so many.
 _OUTER = 0.7
 _SNAPSHOTS = 64  # training snapshots that bounds and colour scales are taken from
@@ -139,8 +138,8 @@ class LiveRun:
         self._xhat[found] = latent.xhat[found]
         residuals = latent.residuals[first - 1 : last, -1]
         ratios = self._trust.ratios(latent.xhat[first - 1 : last + 1], residuals)[1:]
-        gravity = self._trust.of_gravity(solver.acting_gravity(latent.t[first - 1 : last]))
-        self._ratios[found] = np.where(gravity > _OUTSIDE, np.maximum(ratios, gravity), ratios)
+        forced = forcing_ratios(solver, self._trust, first - 1)[: last - first + 1]
+        self._ratios[found] = np.maximum(ratios, forced)
         self.seconds += time.perf_counter() - started
         self.diverged = lost >= 0
         self.reached = last  # only now, since other threads read all steps up to here

@@ -159,8 +159,11 @@ def of_runs(copied, pipeline_at):
 
 def test_full_order_runs_teach_without_a_step_of_an_engine(of_runs, monkeypatch):
     monkeypatch.setattr("nsf.engines.operators.Teacher.step_from", None)
+    said = []
+    monkeypatch.setattr(of_runs, "say", said.append)
     for stage in ("deploy", "evaluate"):
         of_runs.run(stage)
+    assert any("% off in the training cases, as there are no validation cases" in line for line in said)
     found = of_runs.taught.manifest["metrics"]
     assert found["teacher_steps"] == 0
     assert found["broken_affinity"] is None

@@ -9,10 +9,9 @@ import torch
 
 from nsf.data import PROGRAM, Trajectory
 from nsf.data.schema import TRAJECTORY
-from nsf.errors import ConfigError
 from nsf.inverse.fit import CONFIDENCE, Fit, fit
 from nsf.inverse.model import Model
-from nsf.inverse.observations import AXES, View
+from nsf.inverse.observations import AXES, Observations, View
 from nsf.inverse.reports.charts import points_chart, residuals_chart
 from nsf.inverse.reports.page import Results, write
 from nsf.inverse.space import Space
@@ -25,6 +24,8 @@ _LEAD = (
     "The parameters under which runs by operators pass what was observed, with the uncertainty that the "
     "measurement and the reduced model's own error leave."
 )
+#: Deviations (RMS) beyond which the observations count as missed.
+_MISFIT = 3.0
 _TERMS = (
     ("estimate", "the parameters that fit best, less what validation runs near them are off on average."),
     ("standard error", "of the estimate: of the measurement, and of the reduced model's own error."),
@@ -60,18 +61,10 @@ def report(
         starts: see `fit`.
         say: told what is done.
     """
-    forced = PROGRAM in model.scene.varied
-    if forced != (program is not None):
-        what = (
-            "needs program=N, the program of the observed run"
-            if forced
-            else "has no programs; leave out program"
-        )
-        raise ConfigError(f"{model.scene.name} {what}")
     forcing = None if program is None else model.forcing(program=program)
     found = fit(view, model, space, starts=starts, forcing=forcing)
     say(f"calibrate: {_told(found, model)} in {found.seconds:.2f} s")
-    rows, warnings = _residuals(view, found), _warnings(found)
+    rows, warnings = _residuals(view, found), warnings_of(found, view.observations)
     runs = [model.run, *model.run.parent_runs]
     if full_order:
         values = dict(zip(space.free, found.estimate.tolist(), strict=True)) | dict(space.fixed)
@@ -123,11 +116,19 @@ def _told(found: Fit, model: Model) -> str:
     return ", ".join(f"{axis(n, units[n])} {value:.4g} ± {error:.2g}" for n, value, error in parts)
 
 
-def _warnings(found: Fit) -> list[str]:
+def warnings_of(found: Fit, own: Observations) -> list[str]:
+    """What a reader must know of an estimate before they use it."""
     told = [
         f"{name} ends at an end of its range, and the truth may lie beyond; train with a wider range"
         for name in found.at_end
     ]
+    if found.misfit > _MISFIT:
+        k = int(np.abs(found.residuals).argmax())
+        told.append(
+            f"no run passes the observations: the best misses them by {found.misfit:.3g} deviations (RMS), "
+            f"the model's own error among these, {own.place(k)} by {abs(found.residuals[k]):.3g}; look for "
+            "a wrong unit, point or time"
+        )
     if found.distrust > 1.0:
         told.append(
             f"the fitted run is {found.distrust:.3g} times as far from what was taught as may be believed"

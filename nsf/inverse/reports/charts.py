@@ -74,11 +74,11 @@ def points_chart(body: np.ndarray, observed: np.ndarray, fitted: np.ndarray, t: 
     return fig
 
 
-def residuals_chart(rows: pd.DataFrame) -> Figure:
-    """Residuals over time [mm], of the fitted run and of the full-order run at the estimate.
+def residuals_chart(rows: pd.DataFrame, less: str = "observed") -> Figure:
+    """Residuals over time [mm], of the run by operators and of the full-order run.
 
     Args:
-        rows: of residuals.csv.
+        rows: of residuals.csv; less: what `value` is.
     """
     with styled():
         fig = figure(3.4)
@@ -88,10 +88,11 @@ def residuals_chart(rows: pd.DataFrame) -> Figure:
         ):
             if column in rows:
                 off = 1e3 * (rows["value"] - rows[column])
-                jitter = (k - 0.5) * 0.006 * float(np.ptp(rows["t"]))
+                jitter = (k - 0.5) * 0.006 * float(rows["t"].max())
                 panel.plot(rows["t"] + jitter, off, "o", ms=3, alpha=0.5, label=told, color=PALETTE[k])
         panel.axhline(0.0, color=MUTED, lw=0.8)
-        panel.set(xlabel="time t [s]", ylabel="observed − run [mm]")
+        panel.set(xlabel="time t [s]", ylabel=f"{less} − run [mm]")
+        panel.set_xlim(0.0, 1.05 * float(rows["t"].max()) or None)
         panel.grid()
         panel.legend()
     return fig
@@ -150,7 +151,7 @@ def indices_chart(table: pd.DataFrame) -> Figure:
             panel.set_xticks(at, [p.replace("_", " ") for p in part["parameter"]])
             panel.set(ylabel="share of the variance [–]", title=name.replace("_", " "))
             panel.grid(axis="y")
-        panel.legend(fontsize=8)
+        fig.legend(*panel.get_legend_handles_labels(), loc="outside upper left", ncols=4)
     return fig
 
 

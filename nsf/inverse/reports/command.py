@@ -8,7 +8,7 @@ from pathlib import Path
 from nsf.data import PROGRAM
 from nsf.errors import ConfigError, MissingRunError
 from nsf.evaluation.quantities import QUANTITIES
-from nsf.inverse.model import Forcing, Model
+from nsf.inverse.model import Model
 from nsf.inverse.observations import Observations, View, is_scalar
 from nsf.inverse.space import Space
 from nsf.reporting.swap import check_place
@@ -49,13 +49,14 @@ def calibrate(words: Sequence[str], say: Callable[[str], object] = print) -> Pat
     from nsf.inverse.reports.calibration import report
 
     model = _one(models)
+    program = _program(asked, model)
     view = View(Observations.read(asked["observations"], model), model)
     page, _ = report(
         view,
         model,
         Space.of(model, ranges_of(named)),
         _folder(asked, f"calibrate_{model.scene.name}"),
-        program=_whole(asked, "program", 0, least=0) if "program" in asked else None,
+        program=program,
         full_order=_flag(asked, "full_order", True),
         starts=_whole(asked, "starts", 64),
         say=say,
@@ -80,15 +81,15 @@ def sample(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
     from nsf.inverse.sampling import Asked, Prior
 
     indices, full_order = (_whole(asked, key, 0, least=0) for key in ("sensitivities", "full_order"))
+    for key, base in (("sensitivities", indices), ("full_order", full_order)):
+        if base == 1 or base & (base - 1):
+            raise ConfigError(f"{key}={base} must be a power of two, as 32 or 1024")
     if full_order and not indices:
         raise ConfigError("full_order= are runs beside sensitivities; give sensitivities= too")
-    if full_order and "program" in asked:
-        raise ConfigError(
-            "full-order runs beside sensitivities follow the scene's own program; leave program= out"
-        )
     for needed in ("SALib",) * bool(indices) + ("emcee",) * ("observations" in asked):
         optional(needed, "inverse")  # before any work
     model, view = _one(models), None
+    program = _program(asked, model)
     if "observations" in asked:
         view = View(Observations.read(asked["observations"], model), model)
     return report(
@@ -100,7 +101,7 @@ def sample(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
         indices=indices,
         full_order=full_order,
         view=view,
-        forcing=_forcing(asked, model),
+        program=program,
         seed=_whole(asked, "seed", 0, least=0),
         say=say,
     )
@@ -188,6 +189,9 @@ def _begun(
     """The models that are meant, what is asked by the command's keys, and by names of parameters."""
     if wrong := [word for word in words if "=" not in word]:
         raise ConfigError(f"{wrong[0]!r} is not key=value; see `nsf {command} --help`")
+    given = [word.split("=", 1)[0] for word in words]
+    if twice := [key for key in given if given.count(key) > 1]:
+        raise ConfigError(f"{twice[0]}= is given twice; give it once")
     asked = dict(word.split("=", 1) for word in words)
     runs = _runs(asked.pop("run", None), asked.pop("+experiment", None))
     device = asked.pop("device", "auto")
@@ -223,13 +227,18 @@ def _runs(named: str | None, experiment: str | None) -> list[Run]:
     return runs
 
 
-def _forcing(asked: Mapping[str, str], model: Model) -> Forcing | None:
-    """Of the program that is asked for."""
-    if "program" not in asked:
-        return None
+def _program(asked: Mapping[str, str], model: Model) -> int | None:
+    """The program that runs follow; None where the scene has no programs."""
     if PROGRAM not in model.scene.varied:
-        raise ConfigError(f"program={asked['program']}: {model.scene.name} has no programs; leave it out")
-    return model.forcing(program=_whole(asked, "program", 0, least=0))
+        if "program" in asked:
+            raise ConfigError(f"program={asked['program']}: {model.scene.name} has no programs; leave it out")
+        return None
+    if "program" not in asked:
+        raise ConfigError(
+            f"the runs of {model.scene.name} follow programs; give the number of one, as program=3, that of "
+            "the observed run where there are observations"
+        )
+    return _whole(asked, "program", 0, least=0)
 
 
 def _one(models: Sequence[Model]) -> Model:

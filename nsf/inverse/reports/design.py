@@ -75,7 +75,7 @@ def report(
         ids = [model.run.id]
         files = save(program_chart(model.t, ways, program.unit), fresh, "program")
         pictures = [Picture(files, "The program over time.", ids)]
-        files = save(residuals_chart(rows), fresh, "targets")
+        files = save(residuals_chart(rows, "target"), fresh, "targets")
         return [Section("Program", [*pictures, Picture(files, "Targets less what the runs have.", ids)])]
 
     title = model.scene.config.scene.get("title") or model.scene.name

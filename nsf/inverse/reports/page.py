@@ -32,7 +32,7 @@ class Results:
     Attributes:
         title, lead: of the page.
         tables: the first one is what `nsf reports` shows.
-        files: data frames by the name of their csv.
+        files: data frames by the name of their csv, or csv.gz.
         runs: everything is computed from; beside: and these, which sources.json alone names.
         draw: folder → sections of pictures that it wrote there.
         facts, definitions: terms and what they say.
@@ -64,7 +64,9 @@ def write(results: Results, folder: Path) -> Path:
     """
     with replaced(folder) as fresh:
         for name, frame in results.files.items():
-            frame.map(spreadsheet).to_csv(fresh / name, index=False)
+            # The hour would make another file of the same rows.
+            packed = {"compression": {"method": "gzip", "mtime": 0}} if name.endswith(".gz") else {}
+            frame.map(spreadsheet).to_csv(fresh / name, index=False, **packed)
         sections = results.draw(fresh)
         page = Page(
             title=results.title,

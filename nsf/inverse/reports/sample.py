@@ -6,14 +6,16 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from nsf.data import Trajectory
+from nsf.data import PROGRAM, Trajectory
 from nsf.data.schema import TRAJECTORY
 from nsf.inverse.fit import fit
-from nsf.inverse.model import Forcing, Model
+from nsf.inverse.model import Model
 from nsf.inverse.observations import View
+from nsf.inverse.posterior import posterior
+from nsf.inverse.reports.calibration import warnings_of
 from nsf.inverse.reports.charts import bands_chart, indices_chart, posterior_chart
 from nsf.inverse.reports.page import Results, write
-from nsf.inverse.sampling import LEVELS, Asked, Prior, posterior, runs, sensitivities
+from nsf.inverse.sampling import LEVELS, Asked, Prior, runs, sensitivities
 from nsf.inverse.space import Space
 from nsf.reporting.drawing.style import save
 from nsf.reporting.text.columns import axis, number
@@ -40,11 +42,11 @@ def report(
     indices: int = 0,
     full_order: int = 0,
     view: View | None = None,
-    forcing: Forcing | None = None,
+    program: int | None = None,
     seed: int = 0,
     say: Callable[[str], object] = print,
 ) -> Path:
-    """Draw, run, and write `quantiles.csv`, `runs.csv`, and what else is asked for.
+    """Draw, run, and write `quantiles.csv`, `runs.csv.gz`, and what else is asked for.
 
     Args:
         model, prior, asked: of the runs.
@@ -53,16 +55,20 @@ def report(
         indices: base of the design of sensitivities, a power of two; 0 for none.
         full_order: base of a design of full-order runs beside it; 0 for none.
         view: of observations, for a posterior.
-        forcing: of all runs.
+        program: number of the program that all runs follow, where the scene has programs.
         seed: of everything that is drawn.
         say: told what is done.
     """
-    ids, drawn = [model.run.id], prior.draw(count, seed)
-    if view is not None:
+    ids, warnings = [model.run.id], []
+    forcing = None if program is None else model.forcing(program=program)
+    if view is None:
+        drawn = prior.draw(count, seed)
+    else:
         found = fit(view, model, Space.of(model), forcing=forcing)
         given = posterior(prior, view, found, _DRAWS, forcing, seed)
-        say(f"sample: posterior of {len(given)} draws, given {len(view.observations)} observations")
-        drawn = given[np.random.default_rng(seed).integers(0, len(given), count)]
+        warnings += warnings_of(found, view.observations) + ([given.warning] if given.warning else [])
+        say(f"sample: posterior given {len(view.observations)} observations: {given.told}")
+        drawn = given.values[np.random.default_rng(seed).integers(0, len(given.values), count)]
     made = runs(model, drawn, asked, forcing)
     lost = int((~made.trusted).sum())
     say(f"sample: {count:,} runs in {made.seconds:.2f} s, {lost:,} of them distrusted")
@@ -71,8 +77,8 @@ def report(
     for k, name in enumerate(asked.names):
         rows[name] = made.values[:, k, -1]
     rows["distrust"] = made.distrust
-    rows = rows.map(lambda value: float(f"{value:.6g}"))  # full precision would take a megabyte
-    files = {"quantiles.csv": _quantiles(asked, bands), "runs.csv": rows}
+    rows = rows.map(lambda value: float(f"{value:.6g}"))
+    files = {"quantiles.csv": _quantiles(asked, bands), "runs.csv.gz": rows}
     tables = [Table("At the end", _ends(bands), f"{count:,} runs, {lost:,} of them distrusted and left out.")]
     sections = {
         "Quantiles over time": (
@@ -83,7 +89,7 @@ def report(
     }
     beside: list[Run] = []
     if indices:
-        table, own = _indices(model, prior, asked, indices, full_order, forcing, seed, say)
+        table, own = _indices(model, prior, asked, indices, full_order, program, seed, say)
         files["sensitivities.csv"], beside = table, own
         tables.insert(
             0, Table("Sensitivities at the end", _index_rows(table), _designs(indices, full_order, prior))
@@ -94,12 +100,12 @@ def report(
         )
         sections = {"Sensitivities": ("sensitivities", told, lambda: indices_chart(table))} | sections
     if view is not None:
-        files["posterior.csv"] = pd.DataFrame(given, columns=list(model.names))
-        tables.append(Table("Posterior", _moments(model, given), f"{len(given)} draws."))
+        files["posterior.csv"] = pd.DataFrame(given.values, columns=list(model.names))
+        tables.append(Table("Posterior", _moments(model, given.values), f"{given.told}."))
         sections["Posterior"] = (
             "posterior",
             "Draws of the posterior.",
-            lambda: posterior_chart(given, model.names, model.units),
+            lambda: posterior_chart(given.values, model.names, model.units),
         )
 
     def draw(fresh: Path) -> list[Section]:
@@ -119,13 +125,20 @@ def report(
         draw=draw,
         facts=[("Runs", f"{count:,} in {made.seconds:.2f} s"), ("Distrusted", f"{lost:,}")],
         definitions=_TERMS,
-        asked={"count": count, "of": asked.names, "seed": seed, "sensitivities": indices},
+        warnings=warnings,
+        asked={"count": count, "of": asked.names, "seed": seed, "sensitivities": indices}
+        | ({} if program is None else {"program": program}),
     )
+    for warning in warnings:
+        say(f"sample: warning: {warning}")
     return write(results, folder)
 
 
-def _indices(model, prior, asked, count, full_order, forcing, seed, say) -> tuple[pd.DataFrame, list[Run]]:
+def _indices(model, prior, asked, count, full_order, program, seed, say) -> tuple[pd.DataFrame, list[Run]]:
     """Indices at the last time by operators, and by full-order runs of a smaller design of the same kind."""
+
+    forcing = None if program is None else model.forcing(program=program)
+    own = {} if program is None else {PROGRAM: program}
 
     def by_operators(values: np.ndarray) -> np.ndarray:
         return runs(model, values, asked, forcing).values[..., -1]
@@ -136,7 +149,8 @@ def _indices(model, prior, asked, count, full_order, forcing, seed, say) -> tupl
     made: list[Run] = []
 
     def by_full_order(values: np.ndarray) -> np.ndarray:
-        cases = [model.scene.case(dict(zip(model.names, row, strict=True))) for row in values.tolist()]
+        named = [dict(zip(model.names, row, strict=True)) for row in values.tolist()]
+        cases = [model.scene.case(values | own) for values in named]
         made.extend(model.pipeline.full_order(cases))
         found = []
         for run in made:

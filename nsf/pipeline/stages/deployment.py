@@ -21,8 +21,9 @@ from nsf.deployment import (
     go_on,
     rollout_file,
 )
-from nsf.deployment.trust import CaseDistance, LatentDistance
+from nsf.deployment.trust import CaseDistance, LatentDistance, SolidsRange
 from nsf.dynamics import ReducedBatch, ReducedMPM
+from nsf.engines.operators import collider_states
 from nsf.kinematics.manifold import Manifold
 from nsf.runs import Record, Run
 from nsf.storage import writing
@@ -87,12 +88,22 @@ def trust_of(run: Run, manifold: Manifold, particles: np.ndarray, pipeline) -> T
     """
     residual, distance = (run.metric("trust", scale) for scale in ("residual_m", "distance_m"))
     known = LatentDistance(manifold, particles, pipeline.device)
-    return Trust(residual, distance, known, CaseDistance(manifold), _range_of_gravity(pipeline.scene))
+    forcing = _range_of_gravity(pipeline.scene), _range_of_solids(pipeline)
+    return Trust(residual, distance, known, CaseDistance(manifold), *forcing)
 
 
 def _range_of_gravity(scene) -> tuple[Sequence[float], float] | None:
     """Middle [3] and radius [m/s²] of what a scene's programs of gravity may give; None without any."""
     return (scene.gravity, scene.forcing.reach(scene.gravity)) if scene.forcing.gravity else None
+
+
+def _range_of_solids(pipeline) -> SolidsRange | None:
+    """What programs of training did with the solids; None where they move none."""
+    scene = pipeline.scene
+    if not scene.forcing.colliders:
+        return None
+    runs = [scene.with_parameters(case).colliders for case in pipeline.split.train]
+    return SolidsRange(np.stack([collider_states(run, scene.dt, scene.steps) for run in runs]), scene.dt)
 
 
 def _rollouts(pipeline, manifold: Manifold, record: Record) -> list[Rollout]:
@@ -105,7 +116,7 @@ def _rollouts(pipeline, manifold: Manifold, record: Record) -> list[Rollout]:
         return projected(_case_of(pipeline.split.train, values), device)
 
     found = calibrate(known_at, manifold, pipeline.device)
-    trust = replace(found, gravity=_range_of_gravity(pipeline.scene))
+    trust = replace(found, gravity=_range_of_gravity(pipeline.scene), solids=_range_of_solids(pipeline))
     record.metrics["trust"] = {
         "residual_m": trust.residual,
         "distance_m": trust.distance,

@@ -33,9 +33,12 @@ def teach(pipeline, run: Run) -> None:
     found, known = record.metrics, len(pipeline.split.train)
     steps = f"{found['teacher_steps']} steps of the teacher"
     asked = f"{known} full-order runs" if pipeline.of_runs else steps
+    # Full-order runs in cases that nothing was learned from are those of validation alone.
+    back = not pipeline.of_runs or pipeline.split.validation
+    where = "in cases held back" if back else "in the training cases, as there are no validation cases"
     pipeline.say(
         f"teach: {asked} in {found['teach_seconds']:.1f} s, "
-        f"{100 * min(found['errors']):.2g} % off in cases held back → {run.id}"
+        f"{100 * min(found['errors']):.2g} % off {where} → {run.id}"
     )
 
 

@@ -11,9 +11,11 @@ from angles import AnyCase, angle
 
 from nsf.deployment import Trust, calibrate, rollout
 from nsf.deployment.rollout import _whole_step_before
-from nsf.deployment.trust import QUANTILE, STRAY, CaseDistance, LatentDistance
+from nsf.deployment.trust import QUANTILE, STRAY, CaseDistance, LatentDistance, SolidsRange
 from nsf.dynamics import Taylor
+from nsf.engines.operators import collider_states
 from nsf.kinematics.manifold import Manifold
+from nsf.mpm import Cuboid, Motion
 
 
 class Line:
@@ -223,3 +225,51 @@ def test_a_run_to_be_handed_over_stops_at_the_first_distrusted_step(run_at):
 def test_the_hand_over_is_at_a_full_order_frame(multiplier, step, expected):
     """The last step n < `step` for which n times the multiplier is whole; else the start."""
     assert _whole_step_before(0.004 * multiplier * np.arange(20), step, 0.004) == expected
+
+
+# -- solids that programs move ---------------------------------------------------------------------------
+
+
+def pressed(depth, stroke=0.1, aside=0.0, dt=0.01):
+    """States of a plate that presses and stops."""
+    motion = Motion([0.0, stroke], [[aside, 0.0, 0.0], [aside, 0.0, depth]])
+    plate = Cuboid((0.5, 0.5, 0.3), (0.1, 0.1, 0.1), "separate", motion=motion)
+    return collider_states([plate], dt, round(0.2 / dt))
+
+
+@pytest.fixture(scope="module")
+def plates():
+    """What plates did in training: depths from 10 to 50 mm, speeds from 0.1 to 0.5 m/s, 5 mm aside."""
+    runs = [
+        pressed(d, aside=a)
+        for d, a in ((0.01, -5e-3), (0.02, 5e-3), (0.04, 0.0), (0.05, 4e-3), (0.05, -5e-3))
+    ]
+    return SolidsRange(np.stack(runs), 0.01)
+
+
+def test_solids_that_move_as_in_training_are_believed(plates):
+    assert plates.of(pressed(0.03, aside=2e-3), 0.01).max() <= 1.0
+    assert plates.of(pressed(0.03, aside=2e-3, dt=0.004), 0.004).max() <= 1.0
+    assert plates.of(pressed(0.05, aside=-5e-3), 0.01).shape == (20,)
+
+
+@pytest.mark.parametrize(
+    "other",
+    [pressed(0.08, stroke=0.16), pressed(0.04, stroke=0.04), pressed(-0.02), pressed(0.03, aside=0.02)],
+    ids=["deeper", "faster", "backwards", "further aside"],
+)  # fmt: skip
+def test_solids_that_go_where_none_was_are_distrusted(plates, other):
+    assert plates.of(other, 0.01).max() > 1.0
+
+
+def test_a_solid_that_never_turned_may_not_turn(plates):
+    motion = Motion([0.0, 0.1], [[0.0] * 3, [0.0, 0.0, 0.03]], [0.0, 5.0], [0, 0, 1], [0.5, 0.5, 0.3])
+    plate = Cuboid((0.5, 0.5, 0.3), (0.1, 0.1, 0.1), "separate", motion=motion)
+    assert plates.of(collider_states([plate], 0.01, 20), 0.01).max() == np.inf
+
+
+def test_what_forces_a_run_counts_only_outside(plates, tiny_trust):
+    trust = replace(tiny_trust, solids=plates)
+    gravity = np.zeros((20, 3))
+    np.testing.assert_array_equal(trust.of_forcing(gravity, pressed(0.03), 0.01), 0.0)
+    assert trust.of_forcing(gravity, pressed(0.04, stroke=0.04), 0.01)[:4].min() > 1.0

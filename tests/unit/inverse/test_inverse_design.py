@@ -1,5 +1,6 @@
 """Programs that are designed: their gradients, their bounds, and the full-order run that follows them."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -8,11 +9,13 @@ import pytest
 import torch
 
 from nsf.errors import ConfigError
-from nsf.inverse import Model
+from nsf.inverse import Forcing, Model
 from nsf.inverse.design import Moves, Tilt, design, full_order
 from nsf.inverse.error import ModelError
 from nsf.inverse.observations import Observations, View
+from nsf.inverse.reports.command import calibrate, sample
 from nsf.inverse.reports.command import design as command
+from nsf.inverse.sampling import Asked, runs
 from nsf.inverse.space import Space
 from nsf.mpm import Motion
 
@@ -89,8 +92,31 @@ def test_bounds_are_refused(model):
         Tilt(model, 30.0)
     with pytest.raises(ConfigError, match="move=plate is no solid of the scene; there are floor"):
         Moves(model, ("plate",))
-    with pytest.raises(ConfigError, match="move=floor was never moved in training"):
+    with pytest.raises(ConfigError, match="move=floor follows no program in training runs"):
         Moves(model, ("floor",))
+
+
+def test_a_tilt_stays_within_what_was_taught_on_every_side(model, monkeypatch):
+    taught, size = model.operators.taught, np.linalg.norm(model.scene.gravity)
+    # As where training runs tilt to one side.
+    aside = replace(taught, gravity=(0.4 * taught.reach, 0.0, -float(size)))
+    monkeypatch.setattr(model.operators, "taught", aside)
+    (most,) = (float(text) for text in re.findall(r"within the ([\d.]+)°", str(refused(model))))
+    program = Tilt(model, 0.99 * most, 1)
+    # Its bounds are a square in the disc.
+    knots = torch.tensor([[[u, v]] for u in (0.0, 1.0) for v in (0.0, 1.0)], dtype=torch.float64)
+    gravity = program.forcing(program.values(knots)).gravity.numpy()
+    assert np.linalg.norm(gravity - aside.gravity, axis=-1).max() <= aside.reach
+    angle = np.radians(most)
+    worst = size * np.array([-np.sin(angle), 0.0, -np.cos(angle)])
+    assert np.linalg.norm(worst - aside.gravity) == pytest.approx(aside.reach, rel=0.01)
+
+
+def refused(model):
+    """The refusal of a tilt that is too large."""
+    with pytest.raises(ConfigError) as told:
+        Tilt(model, 90.0)
+    return told.value
 
 
 def test_the_command(tmp_path, deployed, model):
@@ -158,6 +184,54 @@ def test_a_solid_moves_as_in_training(pushed):
     states = collider_states(scene.colliders, pushed.dt, len(pushed.t) - 1)
     np.testing.assert_allclose(forcing.solids[0], states, atol=1e-9)
     assert np.abs(states - pushed.forcing().solids.numpy()).max() > 1e-3
+
+
+def test_a_solid_moves_no_faster_than_in_training(pushed):
+    program = Moves(pushed, ("plate",), 24)
+    trained = np.abs(np.concatenate([np.diff(run, axis=0) for run in program._shifts("plate")])).max()
+    generator = torch.Generator().manual_seed(0)
+    knots = torch.rand(20, 24, 1, dtype=torch.float64, generator=generator).round()
+    forcing = program.forcing(program.values(knots))
+    assert np.abs(np.diff(forcing.solids[..., 9:12].numpy(), axis=1)).max() <= trained * (1 + 1e-9)
+    shifts = forcing.solids[..., 9:12]
+    assert shifts[..., 0].max() <= max(run[:, 0].max() for run in program._shifts("plate")) + 1e-12
+    # The gradient passes on from a knot to those after it.
+    again = knots.mul(0.5).add(0.25).requires_grad_()
+    (slope,) = torch.autograd.grad(program.values(again)[:, -1].sum(), again)
+    assert (slope != 0.0).sum() > len(again)
+
+
+def test_distrust_sees_solids(pushed):
+    own, mu = pushed.forcing(), {"friction_angle": 30.0}
+    assert float(pushed.distrust(pushed(mu, own), mu, own)) < 1.0
+    states = own.solids.clone()
+    plate = slice(9, 18)  # shift, angle, their changes, whether it acts
+    fast = states.clone()
+    fast[:, plate][:, 4] *= 20.0
+    far = states.clone()
+    far[:, plate][:, 0] += 0.05
+    for other in (fast, far):
+        forcing = Forcing(own.gravity, other)
+        # The run itself is that of the program: only what forces it is another.
+        assert float(pushed.distrust(pushed(mu, own), mu, forcing)) > 1.0
+    both = Forcing(own.gravity, torch.stack([states, far]))
+    run = pushed(mu, own).expand(2, -1, -1)
+    inside, outside = pushed.distrust(run, pushed.tensor([[30.0], [30.0]]), both).tolist()
+    assert inside < 1.0 < outside
+
+
+def test_runs_of_programs_ask_for_the_program(pushed, tmp_path):
+    words = [f"run={pushed.run.path}", "device=cpu", f"folder={tmp_path / 'a'}"]
+    with pytest.raises(
+        ConfigError, match=r"the runs of .* follow programs; give the number of one, as program=3"
+    ):
+        sample([*words, "runs=20"])
+    with pytest.raises(ConfigError, match="give the number of one, as program=3"):
+        calibrate([*words, "observations=none.csv"])
+    sample([*words, "runs=20", "program=1"])
+    asked, first = Asked(["height"], pushed), pd.read_csv(tmp_path / "a" / "runs.csv.gz").iloc[0]
+    one = runs(pushed, np.array([[first["friction_angle"]]]), asked, pushed.forcing(program=1))
+    assert first["height"] == pytest.approx(one.values[0, 0, -1], rel=1e-5)
 
 
 def test_a_solid_that_turns_is_refused(pushed, monkeypatch):

@@ -1,6 +1,7 @@
 """Files of observations, and the commands that read them."""
 
 import json
+import re
 
 import h5py
 import numpy as np
@@ -49,12 +50,17 @@ def test_hdf5(tmp_path, model):
         ({"quantity": "width"}, "unknown quantity 'width'; choose one of height, run_out"),
         ({"quantity": "height"}, "height has no value"),
         ({"x": "left"}, "the column x must hold numbers"),
+        ({"deviation": np.nan}, r"row 1: deviation=nan m must be positive and finite"),
+        ({"deviation": 0.0}, r"row 1: deviation=0 m must be positive"),
+        ({"z": np.inf}, r"row 1: an observed value is inf m"),
+        ({"t": 9.0}, r"row 1: t=9 s is outside of the run"),
+        ({"particle": None, "X": 3.0, "Y": 0.0, "Z": 0.0}, r"row 1: the point \(3, 0, 0\) m lies"),
     ],
 )
 def test_rows_are_refused(tmp_path, model, change, told):
     row = {name: value for name, value in (POINT | change).items() if value is not None}
     with pytest.raises(ConfigError, match=told):
-        Observations.read(csv(tmp_path, [row]), model)
+        Observations.read(csv(tmp_path, [row]), model).check(model)
 
 
 def test_no_file(tmp_path, model):
@@ -117,6 +123,18 @@ def test_calibrate(tmp_path, deployed, seen, capsys):
     assert faults(folder.parent)
 
 
+def test_an_observation_that_no_run_passes_is_said(tmp_path, deployed, seen):
+    file, _ = seen
+    rows = pd.read_csv(file)
+    words = [f"run={deployed.deployment.path}", "device=cpu", "full_order=false", f"folder={tmp_path / 'a'}"]
+    said: list[str] = []
+    calibrate([*words, f"observations={file}"], said.append)
+    assert not any("no run passes" in line for line in said)
+    rows.loc[6, "x"] *= 1000.0  # in mm, unlike the others
+    calibrate([*words, f"observations={csv(tmp_path, rows)}"], said.append)
+    assert any(re.search(r"no run passes the observations.*row 7: x at t = 0\.06 s", line) for line in said)
+
+
 def test_trials(tmp_path, deployed):
     folder = tmp_path / "calibration"
     calibrate([f"run={deployed.deployment.path}", "trials=2", f"folder={folder}", "device=cpu"])
@@ -140,6 +158,7 @@ def test_trials(tmp_path, deployed):
         (["colour=red"], "has no key 'colour'; it takes .* and the parameters friction_angle, speed"),
         (["observations=none.csv"], "is no file"),
         (["friction"], "'friction' is not key=value"),
+        (["trials=2", "trials=3"], "trials= is given twice"),
     ],
 )
 def test_words_are_refused(deployed, words, told):

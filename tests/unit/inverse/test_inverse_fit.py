@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from nsf.errors import ConfigError
-from nsf.inverse.derivatives import with_jacobian
 from nsf.inverse.error import ModelError, Offsets
 from nsf.inverse.fit import fit
 from nsf.inverse.observations import Observations, View
+from nsf.inverse.recurrence import with_jacobian
 from nsf.inverse.space import Space
 
 TRUTH = {"friction_angle": 27.0, "speed": 0.2}
@@ -60,6 +60,18 @@ def test_its_standard_error_is_that_of_many_noises(model, seen, no_error):
     assert 0.5 < np.sqrt(np.mean(off**2)) < 1.6
     np.testing.assert_allclose(found[0].correlation, found[0].correlation.T)
     assert (found[0].share < 1e-6).all()
+
+
+def test_the_models_own_error_puts_off_as_far_as_a_fit_would_be(model, seen, no_error):
+    """Neither is drawn to the middle of the ranges, however little the observations say."""
+    view, space = View(seen, model), Space.of(model)
+    u = torch.as_tensor(space.units(no_error.parameters))
+    J = with_jacobian(lambda rows: view.of_runs(model(space.parameters(rows))), u)[1].numpy()
+    least = np.linalg.svd(J, compute_uv=False).min(1)
+    scale = np.full(len(seen), 12.0**-0.5 * least.min() / 1.2)  # of which the least said is hardly told
+    error = replace(no_error, vectors=np.einsum("vmn,n->vm", J, [0.03, -0.02]))
+    off = error.offsets(view, model, space, scale).off
+    np.testing.assert_allclose(off, np.tile([0.03, -0.02], (4, 1)), atol=1e-6)
 
 
 def test_the_models_own_error_moves_and_widens(model, seen, no_error):
@@ -147,7 +159,7 @@ def test_fewer_observations_than_parameters(model, seen, no_error):
     one = Observations(seen.t[:1], seen.what[:1], seen.points[:1], seen.values[:1], seen.deviations[:1])
     own = replace(no_error, vectors=no_error.vectors[:, :1])
     with pytest.raises(
-        ConfigError, match="1 observations cannot tell 2 parameters, friction_angle, speed; obs"
+        ConfigError, match="1 observation cannot tell 2 parameters, friction_angle, speed; obs"
     ):
         fit(View(one, model), model, error=own)
 

@@ -120,6 +120,32 @@ def test_a_direction_is_a_polynomial_of_its_angle():
     assert torch.autograd.gradcheck(found, mu)
 
 
+def test_scenes_that_are_built_grow_with_the_parameters_alone():
+    built = []
+
+    def of(mu):
+        built.append(mu)
+        return mu[0] * np.array([np.sin(mu[1]), np.cos(mu[1])]) + mu[2:] @ np.arange(14.0).reshape(7, 2)
+
+    ranges = np.array([[1.0, 3.0], [0.1, 0.9], *([[0.0, 1.0]] * 7)])
+    found = Polynomial(of, ranges, ("abcdefghi", "motion"))
+    assert len(built) < 250  # all products of nine parameters would be 9**9
+    mu = torch.rand(4, 9, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    mu = torch.as_tensor(ranges[:, 0]) + mu * torch.as_tensor(np.ptp(ranges, axis=1))
+    np.testing.assert_allclose(found(mu), [of(row) for row in mu.numpy()], atol=1e-8)
+
+
+def test_a_scene_is_built_once(model, monkeypatch):
+    again = nsf.Model(model.run, "cpu")
+    built = []
+    own = type(again)._inputs_of
+    monkeypatch.setattr(
+        type(again), "_inputs_of", lambda self, case: built.append(dict(case)) or own(self, case)
+    )
+    torch.testing.assert_close(again(ONE), model(ONE))
+    assert len(built) == len({tuple(case.items()) for case in built}) < 30
+
+
 def test_what_no_parameter_changes_is_held_once():
     found = Polynomial(lambda mu: np.eye(3), np.array([[1.0, 3.0]]), (("E",), "motion"))
     assert not found.varies

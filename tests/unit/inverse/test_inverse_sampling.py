@@ -11,8 +11,9 @@ from nsf.errors import ConfigError, InstabilityError
 from nsf.inverse.error import ModelError
 from nsf.inverse.fit import fit
 from nsf.inverse.observations import Observations, View
+from nsf.inverse.posterior import Posterior, posterior
 from nsf.inverse.reports.command import sample
-from nsf.inverse.sampling import Asked, Prior, distribution, posterior, runs, sensitivities
+from nsf.inverse.sampling import Asked, Prior, distribution, runs, sensitivities
 
 
 def test_distributions_are_those_of_scipy():
@@ -97,7 +98,7 @@ def test_sensitivities_of_a_known_function(model):
     table = sensitivities(prior, 512, linear, ["sum"])
     assert table["first"].tolist() == pytest.approx([9 / 25, 16 / 25], abs=0.02)
     assert table["total"].tolist() == pytest.approx([9 / 25, 16 / 25], abs=0.02)
-    with pytest.raises(ConfigError, match="sensitivities=100 must be a power of two"):
+    with pytest.raises(ConfigError, match="a design of 100 must be of a power of two"):
         sensitivities(prior, 100, linear, ["sum"])
 
 
@@ -109,18 +110,35 @@ def test_a_posterior_is_the_estimate_where_the_prior_is_wide(model):
     own = ModelError(np.array([[24.0, 0.1], [30.0, 0.2], [36.0, 0.28]]), np.zeros((3, len(seen))))
     view = View(seen, model)
     found = fit(view, model, error=own)
-    drawn = posterior(Prior.of(model, {}), view, found, 2000)
+    made = posterior(Prior.of(model, {}), view, found, 2000)
+    drawn = made.values
     assert drawn.shape == (2000, 2)
+    assert made.length >= 50.0
+    assert made.warning == ""
     np.testing.assert_allclose(drawn.mean(0), found.estimate, atol=0.3 * found.standard_error.max())
     assert (np.abs(drawn.std(0) / found.standard_error - 1.0) < 0.3).all()
-    narrow = posterior(Prior.of(model, {"friction_angle": "norm(33,0.01)"}), view, found, 500)
+    narrow = posterior(Prior.of(model, {"friction_angle": "norm(33,0.01)"}), view, found, 500).values
     assert narrow[:, 0].mean() > found.estimate[0] + 2 * found.standard_error[0]
+    # Nothing of this prior is where the estimate is.
+    apart = posterior(Prior.of(model, {"friction_angle": "33..35"}), view, found, 500).values
+    assert apart[:, 0].min() >= 33.0
+    assert 0.0 < np.ptp(apart[:, 0]) < 2.0
+    with pytest.raises(ConfigError, match=r"friction_angle has nothing within what was taught, 23.*36.4779"):
+        posterior(Prior.of(model, {"friction_angle": "norm(60,1)"}), view, found, 500)
+
+
+def test_a_chain_that_is_too_short_or_stands_still_is_said():
+    good = Posterior(np.zeros((3, 1)), 100, 65.0, 0.5)
+    assert good.warning == ""
+    assert "65 autocorrelation times; 50 % of the proposals" in good.told
+    assert "is 3 autocorrelation times long" in replace(good, length=3.0).warning
+    assert "accepts 1 % of the proposals" in replace(good, accepted=0.01).warning
 
 
 def test_the_command(tmp_path, deployed):
     words = [f"run={deployed.deployment.path}", "runs=50", "of=height,run_out", "device=cpu"]
     sample([*words, "friction_angle=norm(30,2)", f"folder={tmp_path / 'a'}"])
-    rows = pd.read_csv(tmp_path / "a" / "runs.csv")
+    rows = pd.read_csv(tmp_path / "a" / "runs.csv.gz")
     assert list(rows) == ["friction_angle", "speed", "height", "run_out", "distrust"]
     bands = pd.read_csv(tmp_path / "a" / "quantiles.csv")
     assert set(bands["quantity"]) == {"height", "run_out"}
@@ -153,7 +171,7 @@ def test_the_command_with_both_libraries(tmp_path, deployed, model):
     low, high = model.ranges.T
     assert ((drawn >= low) & (drawn <= high)).all(axis=None)
     assert (tmp_path / "a" / "posterior.png").is_file()
-    taken = pd.read_csv(tmp_path / "a" / "runs.csv")["speed"].to_numpy()
+    taken = pd.read_csv(tmp_path / "a" / "runs.csv.gz")["speed"].to_numpy()
     assert np.abs(taken[:, None] - drawn["speed"].to_numpy()).min(1).max() < 1e-5
 
 
@@ -161,7 +179,9 @@ def test_the_command_with_both_libraries(tmp_path, deployed, model):
     ("more", "told"),
     [
         (["full_order=2"], "give sensitivities= too"),
-        (["sensitivities=16", "full_order=2", "program=3"], "follow the scene's own program"),
+        (["sensitivities=100", "of=none"], "sensitivities=100 must be a power of two"),
+        (["sensitivities=16", "full_order=3", "of=none"], "full_order=3 must be a power of two"),
+        (["sensitivities=16", "full_order=2", "program=3"], "has no programs; leave it out"),
     ],
 )
 def test_full_order_runs_that_would_show_something_else_are_refused(tmp_path, deployed, more, told):
