@@ -96,7 +96,7 @@ def frame_message(moment: Moment) -> bytes:
 
 
 def state_message(moment: Moment, playing: bool) -> str:
-    """The shown values of the parameters, how far they are from training, and whether the run diverged or plays.
+    """The shown values of the parameters, how far they are from training, and whether it diverged or plays.
 
     As JSON; the second is `LiveRun.away`.
     """

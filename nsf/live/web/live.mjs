@@ -3,10 +3,9 @@
 import { Camera } from "./camera.mjs";
 import { button, choice, counted, download, element, fail, find, headed, keyed, legend, lit, onLook, slider, tick } from "./controls.mjs";
 import { Recording, inflated, unpacked } from "./data.mjs";
-import { Drawing } from "./drawing.mjs";
+import { Drawing, Pace } from "./drawing.mjs";
 import { Field, displacement, vonMises } from "./field.mjs";
 import { Operators, Run } from "./operators.mjs";
-import { Pace } from "./pace.mjs";
 import { along, moved } from "./solids.mjs";
 import { Tilt } from "./tilt.mjs";
 import { Trust } from "./trust.mjs";

@@ -3,9 +3,8 @@
 import { Camera } from "./camera.mjs";
 import { button, choice, counted, element, fail, find, headed, keyed, legend, onLook, tick } from "./controls.mjs";
 import { Recording, inflated, unpacked } from "./data.mjs";
-import { Drawing } from "./drawing.mjs";
+import { Drawing, Pace } from "./drawing.mjs";
 import { displacement } from "./field.mjs";
-import { Pace } from "./pace.mjs";
 
 const HOLD = 0.7; // [s] for which the last frame stands before the run begins again
 
@@ -36,7 +35,7 @@ async function play() {
     legend(told.quantities[color], told.colors);
   };
   frame.oninput = () => seek(Number(frame.value));
-  const speeds = ["0.25", "0.5", "1", "2"].map((v) => /** @type {[string, string]} */ ([v, v]));
+  const speeds = ["0.25", "0.5", "1", "2"].map((v) => /** @type {[string, string]} */ ([v, `${v} ×`]));
   const colors = /** @type {[string, string][]} */ ([["von_mises", "von Mises stress"], ["displacement", "displacement"]]);
   const cut = tick("cut", "cut open", (on) => {
     drawing.cut = on;

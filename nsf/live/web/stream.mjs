@@ -3,9 +3,8 @@
 import { Camera } from "./camera.mjs";
 import { button, element, fail, find, headed, keyed, legend, lit, onLook, slider, tick, valued } from "./controls.mjs";
 import { unpacked } from "./data.mjs";
-import { Drawing } from "./drawing.mjs";
+import { Drawing, Pace } from "./drawing.mjs";
 import { Field, displacement } from "./field.mjs";
-import { Pace } from "./pace.mjs";
 import { lightOf } from "./trust.mjs";
 
 /** Follow the stream beside the page's own address, whose query holds the token where there is one. */

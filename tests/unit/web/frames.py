@@ -1,6 +1,7 @@
-"""Pictures a second of a page of 20 000 points in Chromium with software drawing: `python tests/unit/web/frames.py`.
+"""Pictures a second of a page of 20 000 points in Chromium with software drawing.
 
-The points are those of the shipped sand column, each many times over, beside one another.
+`python tests/unit/web/frames.py` prints them, and the processor time that each takes. The points are those of the
+shipped sand column, each many times over, beside one another.
 """
 
 import os
@@ -61,12 +62,12 @@ def processor_time() -> dict[str, float]:
     found: dict[str, float] = {}
     for folder in Path("/proc").glob("[0-9]*"):
         try:
-            told, fields = (folder / "cmdline").read_bytes(), (folder / "stat").read_text().rpartition(")")[2].split()
+            told, stat = (folder / "cmdline").read_bytes(), (folder / "stat").read_text()
         except OSError:
             continue
         if kind := re.search(rb"--type=([a-z-]+)", told):
-            name = kind[1].decode()
-            found[name] = found.get(name, 0.0) + (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+            name, ticks = kind[1].decode(), sum(map(int, stat.rpartition(")")[2].split()[11:13]))
+            found[name] = found.get(name, 0.0) + ticks / os.sysconf("SC_CLK_TCK")
     return found
 
 
@@ -75,12 +76,14 @@ def measured(tab) -> None:
     for when in ("at first", "later"):
         before = processor_time()
         pictures, script = tab.evaluate(PLAYED, SECONDS)
-        took = {k: 1000 * (v - before.get(k, 0.0)) / (pictures * SECONDS) for k, v in processor_time().items()}
-        told = ", ".join(f"{k} {v:.0f}" for k, v in took.items() if v >= 1)
+        taken = {kind: now - before.get(kind, 0.0) for kind, now in processor_time().items()}
+        each = {kind: 1000 * seconds / (pictures * SECONDS) for kind, seconds in taken.items()}
+        told = ", ".join(f"{kind} {time:.0f}" for kind, time in each.items() if time >= 1)
         print(f"{when}: {pictures:.1f} pictures/s; ms of processor time each: {told}; script {script:.1f}")
     for how, step in (("playing", None), ("standing", 60)):
         if step is not None:
-            tab.evaluate(f"nsf.state.playing && document.getElementById('play').click(); nsf.live.seek({step})")
+            tab.click("#play")
+            tab.evaluate(f"nsf.live.seek({step})")
             tab.wait_for_timeout(2000)
         times = []
         for value in np.linspace(22, 38, 9):
