@@ -1,7 +1,7 @@
 """Pictures a second of a page of 20 000 points in Chromium with software drawing.
 
-`python tests/unit/web/frames.py` prints them, and the processor time that each takes. The points are those of the
-shipped sand column, each many times over, beside one another.
+`python tests/unit/web/frames.py` prints them, and the processor time that each takes. The points are those of
+the shipped sand column, each many times over, beside one another.
 """
 
 import os
