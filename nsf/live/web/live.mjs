@@ -200,7 +200,7 @@ async function show() {
   const truths = new Map([...live.recordings].map(([name, own]) => [name, drawing.body(own.rest, beside, told.radius * Math.cbrt(told.points / own.points))]));
 
   const frame = element("input", { id: "frame", type: "range", min: 0, max: told.steps, value: 0, step: 1, ariaLabel: "step" });
-  const time = element("output", { id: "time" }), note = element("small", { id: "note" });
+  const time = element("output", { id: "time" }), note = element("small", { id: "note" }), sides = element("small");
   const set = (/** @type {boolean} */ on) => {
     state.playing = on;
     if (on && live.cursor >= live.end) live.seek(0);
@@ -276,7 +276,7 @@ async function show() {
     ...(tilt ? [tilt.made] : []),
     ...handles.map(({ own }) => own.made),
     choice("case", "held-out case", cases, "0", take),
-    ...(live.recordings.size ? [truth] : []),
+    ...(live.recordings.size ? [element("div", {}, truth, sides)] : []),
     element("div", { id: "light", role: "status" }),
     choice("color", "colour", colors, state.color, paint),
     tick("cut", "cut open", (on) => {
@@ -312,10 +312,9 @@ async function show() {
     lit(live.light());
     const estimate = live.held && live.case.estimate !== null
       ? ` Estimated distance from the projected run, at most ${(1000 * live.case.estimate).toPrecision(2)} mm.` : "";
-    const shown = live.recordings.size && find("truth").checked && !(live.held && live.case.recording)
-      ? " No full-order run of this was stored." : "";
-    const sides = live.recordings.size && find("truth").checked && !shown ? " Left: the reduced run; right: the full-order one." : "";
-    note.textContent = `Steps of ${told.dt} s by operators.${estimate}${shown}${sides}`;
+    const stored = live.held && live.case.recording ? "Left: the reduced run; right: the full-order one." : "No full-order run of this was stored.";
+    sides.textContent = live.recordings.size && find("truth").checked ? stored : "";
+    note.textContent = `Steps of ${told.dt} s by operators.${estimate}`;
     document.body.dataset.step = String(live.step);
   };
   const pace = new Pace(drawing);
