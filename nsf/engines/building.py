@@ -88,7 +88,8 @@ def _setup(scene, manifold, parameters, sample: Sample, engine: str | Engine, op
     parameters = scene.case(parameters or {})
     scene = scene.with_parameters(parameters)
     if sample is None:
-        sample = int(scene.config.scene.reduced.sample)
+        known = isinstance(engine, Operators)
+        sample = engine.samples if known else int(scene.config.scene.reduced.sample)
     if isinstance(sample, int | np.integer):
         check_well_posed(int(sample), manifold.latent_dim)
         sample = RandomSampler(size=int(sample))

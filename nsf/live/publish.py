@@ -88,7 +88,7 @@ def model_data(model: LiveModel, sizes: Sizes = Sizes()) -> tuple[str, bytes]:
     check_field(model)
     pipeline = model.pipeline
     _check_engine(model.run, pipeline.engine)
-    operators = pipeline.operators(model.manifold)
+    operators = pipeline.operators()
     taught, network = operators.taught, operators.model
     header, order = shown(model), {p.name: i for i, p in enumerate(model.parameters)}
     header["parameters"] = [header["parameters"][order[name]] for name in taught.parameters]

@@ -160,8 +160,10 @@ class Pipeline(Plan):
 
         By the engine that is asked for, of the scene that is deployed, unless others are given.
         """
+        if self.teaching is not None and self.taught.complete:
+            self.operators()  # which bring the sample, whoever takes the steps
         if engine is None:
-            engine = self.operators(manifold) if self.engine == Operators.name else self.engine
+            engine = self.operators() if self.engine == Operators.name else self.engine
         batch = (scene or self.deployed).reduced_batch(
             manifold,
             cases,
@@ -187,15 +189,15 @@ class Pipeline(Plan):
         """
         return self._made(self.taught, partial(teach, self))
 
-    def operators(self, manifold: Manifold) -> Operators:
-        """The operators that were taught; with them the sample, which is that of the scene of training.
+    def operators(self) -> Operators:
+        """The operators that were taught; the sample that they know is that of all runs from here on.
 
         Raises:
             MissingRunError: none were taught.
         """
         if self._taught is None:
             self._taught = Operators.load(self.taught.require().file(OPERATORS))
-            self.batch_at(manifold, self.split.train[:1], engine=self.projecting, scene=self.scene)
+            self._samples = self._taught.samples
         return self._taught
 
     def deploy(self) -> Run:

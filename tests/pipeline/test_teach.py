@@ -15,7 +15,7 @@ from nsf.dynamics import Method, Taylor
 from nsf.engines import Operators
 from nsf.engines.operators import Course
 from nsf.errors import ConfigError, MissingRunError
-from nsf.sampling import SampleSpan
+from nsf.sampling import RandomSampler, SampleSpan
 
 ANGLE = {"friction_angle": 26.0}
 TAUGHT = (
@@ -43,6 +43,21 @@ def lesson(chain, pipeline_at, tmp_path_factory):
 def taught(lesson):
     pipeline, _ = lesson
     return Operators.load(pipeline.taught.path / "operators.pt")
+
+
+def test_the_sample_is_kept_with_the_operators(lesson, pipeline_at, monkeypatch):
+    """A sampler that learns from steps on a GPU may choose otherwise each time it is asked."""
+    pipeline, _ = lesson
+    again = pipeline_at(pipeline.root, *TAUGHT)
+    monkeypatch.setattr(
+        RandomSampler, "choose", lambda self, manifold, candidates, size, device: candidates[:size]
+    )
+    manifold = again.manifold()
+    for engine in (None, "modal"):
+        batch = again.batch_at(manifold, [angle(26.0)], engine=engine)
+        known = pipeline.batch_at(manifold, [angle(26.0)]).batch.shared.samples
+        for one, other in zip(batch.batch.shared.samples, known, strict=True):
+            np.testing.assert_array_equal(one.particles, other.particles)
 
 
 @pytest.fixture

@@ -19,6 +19,7 @@ from nsf.engines.operators.recurrence import Recurrence
 from nsf.engines.operators.states import collider_states
 from nsf.engines.operators.taught import Taught
 from nsf.mpm import Gravity
+from nsf.sampling.sampler import SampleSpan
 
 
 class Operators(Engine):
@@ -29,12 +30,14 @@ class Operators(Engine):
     Args:
         model: the operators, in fp64 on the host.
         taught: what they were taught on.
+        samples: the sample that they know, by span of time. A sampler that learns from steps of a GPU, which
+            adds in any order, may choose another one each time.
     """
 
     name: ClassVar[str] = "operators"
 
-    def __init__(self, model: StepOperators, taught: Taught):
-        self.model, self.taught = model, taught
+    def __init__(self, model: StepOperators, taught: Taught, samples: Sequence[SampleSpan]):
+        self.model, self.taught, self.samples = model, taught, samples
 
     @classmethod
     def load(cls, path: Path | str) -> "Operators":

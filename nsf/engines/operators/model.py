@@ -6,19 +6,22 @@
 """
 
 import pickle
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
 from nsf.engines.operators.taught import Taught
-from nsf.errors import MissingRunError, SchemaError, first_line
+from nsf.errors import ConfigError, MissingRunError, SchemaError, first_line
 from nsf.runs.manifest import verified
+from nsf.sampling.sampler import SampleSpan
 from nsf.storage import writing
 
 FORMAT = "nsf-operators"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -184,18 +187,19 @@ class StepOperators(nn.Module):
         last = torch.cat([B, f, G])
         return [first, middle, (last[:, :-1], last[:, -1])]
 
-    def save(self, path: Path | str, taught: Taught) -> None:
-        """Write weights, scales and what they were taught on; whole or not at all."""
+    def save(self, path: Path | str, taught: Taught, samples: Sequence[SampleSpan]) -> None:
+        """Write weights, scales, what they were taught on and the sample; whole or not at all."""
         content = {
             "format": FORMAT, "format_version": FORMAT_VERSION, "sizes": vars(self.sizes), "dt": self.dt,
-            "taught": taught.plain(), "state": dict(self.state_dict()),
+            "taught": taught.plain(), "samples": [_plain(sample) for sample in samples],
+            "state": dict(self.state_dict()),
         }  # fmt: skip
         with writing(Path(path)) as temporary:
             torch.save(content, temporary)
 
     @classmethod
-    def load(cls, path: Path | str) -> tuple["StepOperators", Taught]:
-        """Read operators, and what they were taught on, onto the host.
+    def load(cls, path: Path | str) -> tuple["StepOperators", Taught, list[SampleSpan]]:
+        """Read operators, what they were taught on and the sample, onto the host.
 
         Raises:
             MissingRunError: there is no such file.
@@ -205,17 +209,34 @@ class StepOperators(nn.Module):
         content = _read(path)
         try:
             taught, sizes = Taught.read(content["taught"]), Sizes(**content["sizes"])
+            samples = [_sample(span) for span in content["samples"]]
             with torch.device("meta"):  # whatever sizes the file claims, nothing of theirs is made
                 model = cls(sizes, taught.dt)
             model.load_state_dict(content["state"], assign=True)
             if not all(bool(torch.isfinite(values).all()) for values in model.state_dict().values()):
                 raise ValueError("a value is not finite")
-        except (RuntimeError, KeyError, TypeError, AttributeError, ValueError) as error:
+        except (RuntimeError, KeyError, TypeError, AttributeError, ValueError, ConfigError) as error:
             raise SchemaError(
                 f"{path}: its contents do not fit each other ({first_line(error)}); teach again with "
                 "`nsf teach`"
             ) from error
-        return model.double().requires_grad_(False).eval(), taught
+        return model.double().requires_grad_(False).eval(), taught, samples
+
+
+def _plain(sample: SampleSpan) -> dict:
+    weights = sample.weights
+    return {
+        "start": float(sample.start),
+        "particles": torch.as_tensor(np.asarray(sample.particles, np.int64)),
+        "weights": None if weights is None else torch.as_tensor(np.asarray(weights, np.float64)),
+    }
+
+
+def _sample(plain: dict) -> SampleSpan:
+    weights = plain["weights"]
+    return SampleSpan(
+        plain["start"], plain["particles"].numpy(), None if weights is None else weights.numpy()
+    )
 
 
 def _read(path: Path) -> dict:

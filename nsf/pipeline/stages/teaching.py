@@ -61,7 +61,7 @@ def _follow(pipeline, manifold: Manifold, record: Record) -> None:
         operators, steps = course.follow(), course.steps
         broken = course.broken_affinity()
     taught = Taught.of(lessons[0].setup, *course.gravity)
-    operators.save(record.path / OPERATORS, taught)
+    operators.save(record.path / OPERATORS, taught, lessons[0].setup.samples)
     record.output(OPERATORS)
     for left in record.path.glob("round_*.pt"):
         left.unlink()

@@ -27,7 +27,9 @@ from nsf.engines.operators.recurrence import Recurrence, make_recurrence, places
 from nsf.errors import ConfigError, MissingRunError, SchemaError
 from nsf.mpm import Cuboid, HalfSpace, Motion, precision_of
 from nsf.mpm.device import warp_device
+from nsf.sampling import SampleSpan
 
+SAMPLES = (SampleSpan(0.0, np.arange(3)), SampleSpan(0.5, np.array([1, 7]), np.array([0.5, 1.5])))
 TAUGHT = Taught(
     manifold="aa", scene="bb", sample="cc", dt=0.01, method="nsf", projector="gn", parameters=("angle",),
     ranges=((20.0, 40.0),), gravity=(0.0, 0.0, -10.0), reach=1.0,
@@ -231,9 +233,13 @@ def test_captured_steps_of_the_descent_are_those_of_the_host():
 
 def test_a_file_gives_what_was_saved(tmp_path):
     model = operators()
-    model.save(tmp_path / "operators.pt", TAUGHT)
-    found, taught = StepOperators.load(tmp_path / "operators.pt")
+    model.save(tmp_path / "operators.pt", TAUGHT, SAMPLES)
+    found, taught, samples = StepOperators.load(tmp_path / "operators.pt")
     assert taught == TAUGHT
+    for one, known in zip(samples, SAMPLES, strict=True):
+        assert one.start == known.start
+        np.testing.assert_array_equal(one.particles, known.particles)
+        np.testing.assert_array_equal(one.weights, known.weights)
     assert (found.sizes, found.dt) == (model.sizes, model.dt)
     values = given(model, 5)
     assert torch.equal(found.step(*values)[0], model.step(*values)[0])
@@ -249,7 +255,12 @@ class Evil:
     ("spoil", "message"),
     [
         (lambda content: content | {"format": "other"}, "holds no operators"),
-        (lambda content: content | {"format_version": 9}, "has format_version 9, this nsf reads 1"),
+        (lambda content: content | {"format_version": 9}, "has format_version 9, this nsf reads 2"),
+        (lambda content: content | {"samples": [{"start": 0.0}]}, "do not fit each other"),
+        (
+            lambda content: content | {"samples": [content["samples"][1] | {"weights": torch.zeros(2)}]},
+            "2 sample particles must be as many positive numbers",
+        ),
         (lambda content: content | {"taught": {}}, "do not say what they were taught on"),
         (lambda content: content | {"sizes": content["sizes"] | {"width": 10**9}}, "do not fit each other"),
         (lambda content: content | {"sizes": content["sizes"] | {"latents": "4"}}, "do not fit each other"),
@@ -262,7 +273,7 @@ class Evil:
 )  # fmt: skip
 def test_a_bad_file_is_refused(tmp_path, capsys, spoil, message):
     path = tmp_path / "operators.pt"
-    operators().save(path, TAUGHT)
+    operators().save(path, TAUGHT, SAMPLES)
     torch.save(spoil(torch.load(path, weights_only=True)), path)
     with pytest.raises(SchemaError, match=re.escape(message)):
         Operators.load(path)
@@ -273,7 +284,7 @@ def test_a_file_that_is_cut_short_or_missing(tmp_path):
     path = tmp_path / "operators.pt"
     with pytest.raises(MissingRunError, match="run `nsf teach` first"):
         Operators.load(path)
-    operators().save(path, TAUGHT)
+    operators().save(path, TAUGHT, SAMPLES)
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(SchemaError, match="truncated"):
         Operators.load(path)

@@ -60,7 +60,7 @@ def test_the_modules_under_node(node):
 
 
 def test_raw_layers_are_the_operators(taught_model):
-    model = taught_model.pipeline.operators(taught_model.manifold).model
+    model = taught_model.pipeline.operators().model
     values = torch.from_numpy(np.random.default_rng(0).normal(size=(5, 64)))
     r, n, f = model.sizes.latents, model.sizes.parameters, model.sizes.features
     x, d = model.x_mean + values[:, :r] * model.x_scale, values[:, r : 2 * r] * model.d_scale
