@@ -26,6 +26,9 @@ examples:
 --usd, --onnx and --frames need pip install 'nsf[export]'."""
 
 
+_OF_FORMATS = ("parameter", "color", "every", "fps")  # options that say nothing to a page of several runs
+
+
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str):
         raise ConfigError(f"{message}; see `nsf export --help`")
@@ -61,9 +64,9 @@ def _parser(pages: Mapping[str, Page]) -> argparse.ArgumentParser:
     options = (
         ("parameter", str, None, "held-out case, as 26 or E=1500,friction=0.3; the first by default"),
         ("points", int, None, "how many; more than the particles are points in between (super-resolution)"),
-        ("color", str, "von_mises", "von_mises or displacement"),
-        ("every", int, 1, "takes each EVERY-th step"),
-        ("fps", float, 30.0, "frames shown a second"),
+        ("color", str, None, "von_mises, the default, or displacement"),
+        ("every", int, None, "takes each EVERY-th step; all by default"),
+        ("fps", float, None, "frames shown a second (30)"),
         ("device", str, "auto", "where the fields are decoded: cpu, cuda, cuda:N or auto"),
         ("output", Path, None, "folder; export/<scene>-<hash> in ./reports (NSF_REPORTS) by default"),
     )
@@ -92,6 +95,11 @@ def main(arguments: Sequence[str], pages: Mapping[str, Page] | None = None) -> i
         raise ConfigError(f"no format; give one or more of {known}")
     if asked.points is not None and asked.points < 1:
         raise ConfigError(f"points={asked.points} must be a whole number of at least 1")
+    if not formats and (unused := [f"--{name}" for name in _OF_FORMATS if getattr(asked, name) is not None]):
+        raise ConfigError(
+            f"--{', --'.join(wanted)} holds every held-out case, which the page shows as its reader asks; "
+            f"leave out {', '.join(unused)}"
+        )
     import importlib
 
     from nsf.extras import optional
@@ -118,7 +126,8 @@ def main(arguments: Sequence[str], pages: Mapping[str, Page] | None = None) -> i
 def _playback(run: "Run", asked: argparse.Namespace) -> "Playback":
     from nsf.export.playback import Playback
 
-    playback = Playback(run, asked.parameter, asked.points, asked.color, asked.every, asked.fps, asked.device)
+    given = {name: value for name in _OF_FORMATS if (value := getattr(asked, name)) is not None}
+    playback = Playback(run, points=asked.points, device=asked.device, **given)
     print(f"export: {playback.title}, {len(playback.t)} frames, {len(playback.X):,} points")
     if playback.stopped is not None:
         print(f"export: warning: the run diverged at t = {playback.stopped:.4g} s; it is shown up to there")

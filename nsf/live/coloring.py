@@ -22,6 +22,7 @@ from nsf.reporting.drawing.style import (
 
 #: End of the scale of the distance to the truth, over the end of the scale of the displacement.
 _DISTANCE = 0.05
+DISTANCE = "distance to the truth"
 #: Colours of a particle in neither set, in N only, and in S.
 ROLES = ("#BBBBBB", PALETTE[0], PALETTE[1])
 _ROLES = np.array([[int(color[i : i + 2], 16) for i in (1, 3, 5)] for color in ROLES], np.uint8)
@@ -62,7 +63,7 @@ class Coloring:
             "von Mises stress": ColorScale.up_to(np.percentile(equivalent, CLIP), STRESS_COLORS, PASCALS),
             "pressure": ColorScale.up_to(np.percentile(abs(mean), CLIP), SIGNED_COLORS, PASCALS, signed=True),
             "displacement": ColorScale.up_to(moved, STRESS_COLORS, METRES),
-            "distance to the truth": ColorScale.up_to(_DISTANCE * moved, DIFFERENCE_COLORS, METRES),
+            DISTANCE: ColorScale.up_to(_DISTANCE * moved, DIFFERENCE_COLORS, METRES),
             "particle sets": None,
         }
 
@@ -81,10 +82,10 @@ class Coloring:
         if scale is None:
             colors = _ROLES[self._model.roles(step)]
             return Picture(x, colors, x_full, colors if truth else None)
-        if by == "distance to the truth":
-            # Without a truth the distance is unknown, and the colour says nothing.
-            distance = np.zeros(len(x)) if x_full is None else np.linalg.norm(x - x_full, axis=1)
-            reduced, full = distance, np.zeros(len(x))
+        if by == DISTANCE:
+            if x_full is None:  # the distance is unknown, which no colour of the scale says
+                return Picture(x, np.broadcast_to(_ROLES[0], x.shape), None, None)
+            reduced, full = np.linalg.norm(x - x_full, axis=1), np.zeros(len(x))
         elif by == "displacement":
             reduced, full = (
                 None if a is None else np.linalg.norm(a - self._model.X, axis=1) for a in (x, x_full)

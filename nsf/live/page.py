@@ -12,7 +12,7 @@ import viser
 import websockets.asyncio.server as websockets
 from matplotlib.colors import to_hex
 
-from nsf.live.coloring import ROLES, SAMPLE, Coloring, Picture
+from nsf.live.coloring import DISTANCE, ROLES, SAMPLE, Coloring, Picture
 from nsf.live.guard import Connection, refused
 from nsf.live.player import Moment, Player, every
 from nsf.reporting.drawing.style import ColorScale
@@ -25,6 +25,7 @@ FRAMES_PER_SECOND = 30
 _GAP = 0.25
 #: Reach of the tilt, over the largest that was trained.
 _BEYOND = 1.5
+_OTHER = "…"  # of the cases with a full-order run
 _GREY = (187, 187, 187)
 _GREEN, _AMBER, _RED = "#2B8A3E", "#E69F00", "#C92A2A"
 
@@ -176,11 +177,12 @@ class Page:
             ]
             for slider in self._tilts:
                 slider.on_update(self._by_hand(self._tilt))
+        self._known = None
         if self._model.known:
-            known = gui.add_dropdown(
-                "with full-order run", ["…", *map(str, self._model.known)], initial_value="…"
+            self._known = gui.add_dropdown(
+                "with full-order run", [_OTHER, *map(str, self._model.known)], initial_value=_OTHER
             )
-            known.on_update(self._by_hand(lambda: self._go_to(known.value)))
+            self._known.on_update(self._by_hand(self._go_to))
         self._light = gui.add_html("")
         self._play = gui.add_button("pause")
         self._play.on_click(lambda _: self._toggle())
@@ -202,12 +204,12 @@ class Page:
 
         return on_update
 
-    def _go_to(self, text: str) -> None:
-        chosen = [case for case in self._model.known if str(case) == text]
-        if chosen:
-            for slider, value in zip(self._sliders, chosen[0].numbers, strict=True):
-                slider.value = value
-            self._player.steer(chosen[0].numbers)
+    def _go_to(self) -> None:
+        for case in self._model.known:
+            if str(case) == self._known.value:
+                for slider, value in zip(self._sliders, case.parameters.values(), strict=True):
+                    slider.value = value
+                self._steer()
 
     def _steer(self) -> None:
         self._player.steer([slider.value for slider in self._sliders])
@@ -233,12 +235,15 @@ class Page:
         """Go on by a frame, and show it if it differs from the last one."""
         moment = self._player.tick()
         controls = (self._by.value, self._cut.value, self._show_sample.value)
-        told = (moment.run, moment.step, moment.run.finished, *controls)
+        asked = (slider.value for slider in self._sliders)
+        told = (moment.run, moment.step, moment.run.finished, *controls, *asked)
         if told == self._last:
             return
         self._last = told
-        if moment.run.case != self._truth_case:
-            self._truth_case, self._truth = moment.run.case, self._model.truth(moment.run.case)
+        # A hand that tilts gravity makes another problem, of which there is no full-order run.
+        case = None if moment.run.by_hand else moment.run.case
+        if case != self._truth_case:
+            self._truth_case, self._truth = case, case and self._model.truth(case)
         picture = self._coloring.picture(moment, self._truth, self._by.value)
         with self._server.atomic():
             self._show(picture, moment)
@@ -257,18 +262,32 @@ class Page:
             self._sample.points = x[kept & (self._model.roles(moment.step) == 2)]
         if self._time.value != moment.step:
             self._time.value = moment.step
+        self._name(moment)
         self._light.content = light(moment)
-        self._legend.content = legend(self._coloring.scales[self._by.value], self._by.value)
-        self._told.content = self._what_it_took(moment)
+        by = self._by.value
+        unknown = by == DISTANCE and self._truth is None
+        self._legend.content = _small("grey: unknown") if unknown else legend(self._coloring.scales[by], by)
+        self._told.content = self._what_it_took(moment, int(kept.sum()))
 
-    def _what_it_took(self, moment: Moment) -> str:
+    def _name(self, moment: Moment) -> None:
+        """Let the controls name the case that is shown, once no other is on its way."""
+        case = moment.run.case
+        if case != self._player.case:
+            return
+        for slider, value in zip(self._sliders, case.parameters.values(), strict=True):
+            if slider.value != value:  # the case of a full-order run is taken where a slider is near it
+                slider.value = value
+        named = str(case) if self._truth else _OTHER
+        if self._known is not None and self._known.value != named:
+            self._known.value = named
+
+    def _what_it_took(self, moment: Moment, drawn: int) -> str:
         run = moment.run
-        shown = f"{run.case.named.replace('_', ' ')}, t = {moment.t:.3g} s"
+        tilted = ", gravity tilted by hand" if run.by_hand else ""
+        shown = f"{run.case.named.replace('_', ' ')}{tilted}, t = {moment.t:.3g} s"
         rate = f"; {run.reached / run.seconds:.0f} latent steps a second" if run.seconds else ""
-        known = "" if self._truth else "<br>no full-order run of this case"
-        return _small(
-            f"{shown}<br>{len(self._model.shown):,} of {self._model.particles:,} particles{rate}{known}"
-        )
+        known = "" if self._truth else f"<br>no full-order run of this {'program' if run.by_hand else 'case'}"
+        return _small(f"{shown}<br>{drawn:,} of {self._model.particles:,} particles{rate}{known}")
 
 
 def light(moment: Moment) -> str:

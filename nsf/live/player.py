@@ -102,13 +102,15 @@ class Player:
         return self._wanted
 
     def steer(self, numbers: Sequence[float]) -> None:
-        """Ask for other values of the parameters, in their order.
+        """Ask for other values of the parameters, in their order, under the scene's own gravity.
 
         Raises:
             ConfigError: a value is missing, not finite, or out of reach.
         """
         with self._wake:
             self._wanted = self.model.checked(numbers)
+            if self._tilts or any(run is not None and run.by_hand for run in (self._shown, self._coming)):
+                self._tilts.append(None)
             self._wake.notify()
 
     def tilt(self, tilt: Sequence[float] | None) -> None:

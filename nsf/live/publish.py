@@ -19,6 +19,7 @@ from nsf.evaluation.metrics import von_mises
 from nsf.export import web
 from nsf.live.model import LiveModel
 from nsf.live.wire import check_field, modal_field, network_arrays, shown
+from nsf.pipeline import Pipeline
 from nsf.reporting.drawing.style import CLIP
 from nsf.reporting.text.formats import file_name
 from nsf.runs import Run
@@ -46,6 +47,7 @@ def write(run: Run, folder: Path, points: int | None = None, device: str = "auto
     Raises:
         ConfigError: see `model_data`; the page would be too large to be mailed.
     """
+    _check_engine(run, Pipeline.of_run(run, device).engine)  # a model takes long to build
     title, data = model_data(LiveModel(run, points or POINTS, device, surface=True))
     page = web.page("live", title, data)
     if (size := len(page.encode())) > LARGEST:
@@ -85,11 +87,7 @@ def model_data(model: LiveModel, sizes: Sizes = Sizes()) -> tuple[str, bytes]:
     """
     check_field(model)
     pipeline = model.pipeline
-    if pipeline.engine != Operators.name:
-        raise ConfigError(
-            f"{model.run.id} has engine={pipeline.engine}, whose steps take more than a page can; deploy it "
-            "with engine=operators, which teaches them first"
-        )
+    _check_engine(model.run, pipeline.engine)
     operators = pipeline.operators()
     taught, network = operators.taught, operators.model
     header, order = shown(model), {p.name: i for i, p in enumerate(model.parameters)}
@@ -128,6 +126,14 @@ def ship(run: Run, path: Path, points: int, sizes: Sizes) -> None:
     _, data = model_data(LiveModel(run, points, "cpu", surface=True), sizes)
     with writing(path) as partial:
         partial.write_bytes(zlib.compress(data, 9))
+
+
+def _check_engine(run: Run, engine: str) -> None:
+    if engine != Operators.name:
+        raise ConfigError(
+            f"{run.id} has engine={engine}, whose steps take more than a page can; deploy it with "
+            "engine=operators, which teaches them first"
+        )
 
 
 class _Layer:

@@ -13,7 +13,7 @@ from nsf.errors import ConfigError
 from nsf.export import web
 from nsf.live.guard import Connection, check_token, name_of, refused
 from nsf.live.player import Moment, Player
-from nsf.live.wire import asked_values, field_message, frame_message, state_message
+from nsf.live.wire import field_message, frame_message, obey, state_message
 
 log = logging.getLogger(__name__)
 
@@ -35,8 +35,8 @@ class Stream:
     """Serves a page, the deformation field, and the latent vector of each frame.
 
     `/` is the page, `/field` what it decodes with (`wire.field_message`), `/stream` a WebSocket: a binary
-    message a frame, and a text message where another case is shown. A client may send values
-    (`wire.asked_values`). One that sends anything else, or that does not keep up for `patience`, is closed.
+    message a frame, and a text message where another case is shown, or it is paused. A client may send what
+    `wire.obey` knows. One that sends anything else, or that does not keep up for `patience`, is closed.
 
     Args:
         player: what is shown; all clients see the same.
@@ -59,7 +59,7 @@ class Stream:
         self._page = web.page("stream", "nsf serve", connects=True).encode()
         self._clients: set[ServerConnection] = set()
         moment = player.tick()
-        self._state, self._frame = state_message(moment), frame_message(moment)
+        self._state, self._frame = state_message(moment, player.playing), frame_message(moment)
 
     @property
     def clients(self) -> int:
@@ -101,7 +101,7 @@ class Stream:
             await asyncio.sleep(due - clock.time())
 
     def _send(self, moment: Moment) -> None:
-        state, frame = state_message(moment), frame_message(moment)
+        state, frame = state_message(moment, self._player.playing), frame_message(moment)
         # Written without waiting: a client that does not read holds nobody up, and its pongs fail to come.
         if state != self._state:
             broadcast(self._clients, state)
@@ -132,7 +132,7 @@ class Stream:
         why = "closed by itself"
         try:
             async for message in connection:
-                self._player.steer(asked_values(message))
+                obey(self._player, message)
                 await asyncio.sleep(_PACE)
         except ConfigError as error:
             why = f"sent rubbish: {error}"

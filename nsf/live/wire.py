@@ -8,7 +8,7 @@ import torch
 from nsf.errors import ConfigError
 from nsf.export import web
 from nsf.live.model import LiveModel
-from nsf.live.player import Moment
+from nsf.live.player import Moment, Player
 
 FIELDS = ("basis", "joint")  # the fields of linear modes
 
@@ -95,34 +95,40 @@ def frame_message(moment: Moment) -> bytes:
     return np.concatenate([[moment.t, moment.trust], moment.xhat]).astype("<f4").tobytes()
 
 
-def state_message(moment: Moment) -> str:
-    """The shown values of the parameters, how far they are from training, and whether the run diverged.
+def state_message(moment: Moment, playing: bool) -> str:
+    """The shown values of the parameters, how far they are from training, and whether it diverged or plays.
 
     As JSON; the second is `LiveRun.away`.
     """
     run = moment.run
-    return json.dumps(
-        {"values": list(run.case.parameters.values()), "away": run.away, "diverged": run.diverged}
-    )
+    told = {"values": list(run.case.parameters.values()), "away": run.away, "diverged": run.diverged}
+    return json.dumps(told | {"playing": playing})
 
 
-def asked_values(message: str | bytes) -> list[float]:
-    """The values that a client asks for by `{"values": [31.5]}`, in the parameters' order.
+def obey(player: Player, message: str | bytes) -> None:
+    """Do what a client asks for.
+
+    Args:
+        player: of the server.
+        message: `{"values": [31.5]}` steers to values in the parameters' order, `{"playing": false}` pauses.
 
     Raises:
-        ConfigError: the message is anything else.
+        ConfigError: the message is anything else, or a value is out of reach.
     """
     try:
         asked = json.loads(message) if isinstance(message, str) else None
     except (ValueError, RecursionError):
         asked = None
-    values = asked.get("values") if isinstance(asked, dict) and len(asked) == 1 else None
-    if not isinstance(values, list) or any(type(value) not in (int, float) for value in values):
-        raise ConfigError('a client may only send {"values": [number, …]}')
-    try:
-        return list(map(float, values))
-    except OverflowError as error:
-        raise ConfigError("the value is too large") from error
+    match asked:
+        case {"playing": bool(playing), **more} if not more:
+            player.playing = playing
+        case {"values": list(values), **more} if not more and all(type(v) in (int, float) for v in values):
+            try:
+                player.steer(list(map(float, values)))
+            except OverflowError as error:
+                raise ConfigError("the value is too large") from error
+        case _:
+            raise ConfigError('a client may only send {"values": [number, …]} or {"playing": true or false}')
 
 
 def check_field(model: LiveModel) -> None:

@@ -17,6 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from types import SimpleNamespace
 
 import inputs
 import torch
@@ -484,9 +485,8 @@ def requests(shop: Workshop, draw: random.Random) -> Case:
 
 def messages(shop: Workshop, draw: random.Random) -> Case:
     """What a client of the stream may send, malformed."""
-    text = json.dumps(
-        {"values": draw.choice((1, [1.5], ["nan"], None, [1, 2], {"a": 1}, [True], [2**2000], [-1e308]))}
-    )
+    value = draw.choice((1, [1.5], ["nan"], None, [1, 2], {"a": 1}, [True], [2**2000], [-1e308], True))
+    text = json.dumps({draw.choice(("values", "values", "playing")): value})
     message = draw.choice(
         (text, text[:-1], f"[{text}]", "[" * 100_000, "NaN", '{"values": [NaN]}', '{"values": [1e999]}')
     )
@@ -495,9 +495,9 @@ def messages(shop: Workshop, draw: random.Random) -> Case:
         message = message.decode("utf-8", "replace")
 
     def hand_over() -> None:
-        from nsf.live.wire import asked_values
+        from nsf.live.wire import obey
 
-        asked_values(message)
+        obey(SimpleNamespace(playing=True, steer=lambda values: None), message)
 
     return Case(repr(message[:200]), hand_over)
 

@@ -26,7 +26,7 @@ export class Camera {
   reset() {
     this.azimuth = -1.08;
     this.elevation = 0.3;
-    this.distance = 0.95 * this.size;
+    this.distance = 1.05 * this.size;
     this.centre = this.lower.map((v, c) => 0.5 * (v + this.upper[c]));
     this.changed();
   }

@@ -112,6 +112,12 @@ export function prefixed(value, unit) {
   return `${Number((value / factor).toPrecision(3))} ${prefix}${unit}`;
 }
 
+/** How many points are shown. @param {number} points @param {number} particles of the model */
+export function counted(points, particles) {
+  const [shown, all] = [points, particles].map((n) => n.toLocaleString("en"));
+  return points > particles ? `${shown} points` : points === particles ? `${all} particles` : `${shown} of ${all} particles`;
+}
+
 /**
  * Show the scale of colours of a quantity.
  * @param {Quantity} shown

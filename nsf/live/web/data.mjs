@@ -73,21 +73,19 @@ export class Recording {
     this.stresses = undifferenced(/** @type {Uint8Array} */ (arrays[`${name}.stress`]), this.points, 1);
     this.rest = this._placed(0, 0, 0, new Float32Array(3 * this.points));
     this.x = this.rest.slice();
-    this.stress = new Float32Array(this.points);
   }
 
   /**
-   * Positions [n, 3] and von Mises stress [n] over the end of its scale, in a frame or between two of them.
+   * Positions [n, 3], which the next call overwrites, and how von Mises stress of some points is found, over the end of
+   * its scale; in a frame or between two of them.
    * @param {number} frame
    */
   at(frame) {
     const k = Math.min(Math.max(0, Math.floor(frame)), this.frames - 1), after = Math.min(k + 1, this.frames - 1);
-    const part = Math.min(1, Math.max(0, frame - k));
+    const part = Math.min(1, Math.max(0, frame - k)), { stresses, points } = this;
     this._placed(k + 1, after + 1, part, this.x);
-    const { stresses, stress, points } = this;
-    for (let i = 0; i < points; i++)
-      stress[i] = ((1 - part) * stresses[k * points + i] + part * stresses[after * points + i]) / 255;
-    return { x: this.x, stress };
+    const stress = (/** @type {number} */ p) => ((1 - part) * stresses[k * points + p] + part * stresses[after * points + p]) / 255;
+    return { x: this.x, stressOf: (/** @type {Uint32Array} */ rows) => Float32Array.from(rows, stress) };
   }
 
   /**

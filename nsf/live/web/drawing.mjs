@@ -1,31 +1,33 @@
 // Points, their shadows, the floor and solids, in WebGL 2.
 
+import { Body } from "./body.mjs";
 import { placed, acts } from "./solids.mjs";
 
 /** @typedef {import("./camera.mjs").Camera} Camera */
 /** @typedef {import("./data.mjs").Numbers} Numbers */
+/** @typedef {import("./body.mjs").Cut} Cut */
 /** @typedef {import("./solids.mjs").Solid} Solid */
 /** @typedef {{ use: () => void, uniform: (name: string) => WebGLUniformLocation | null, attribute: (name: string) => number }} Program */
 
 const NO_WEBGL = "This browser has no WebGL 2; switch on hardware acceleration, or try another browser.";
 
+const SLOW = 40; // [ms] between two pictures, above which they are drawn coarser
+const OFTEN = 4; // such pictures in a row
+const REST = 250; // [ms] after which what stands still is drawn whole
+const COARSEST = 3;
+const MOST_PIXELS = 2; // of the canvas along one of the page; a telephone's three cost twice as much
+
 const POINTS = [
   `#version 300 es
-in vec3 x, rest; in float value;
-uniform mat4 view; uniform vec3 offset, middle; uniform vec2 across;
-uniform float pixels, floorHeight; uniform bool shadow, cut;
-out float shade;
+in vec4 point; uniform mat4 view; uniform float pixels; uniform sampler2D colors; flat out vec3 color;
 void main() {
-  if (cut && dot(rest.xy - middle.xy, across) > 0.0) { gl_Position = vec4(2.0, 2.0, 2.0, 1.0); return; }
-  shade = value;
-  vec3 at = x + offset;
-  if (shadow) at = vec3(at.xy + 0.35 * (at.z - floorHeight) * vec2(0.8, 0.5), floorHeight);
-  gl_Position = view * vec4(at, 1.0);
+  color = mix(textureLod(colors, vec2(clamp(point.w, 0.0, 1.0) * 0.996 + 0.002, 0.5), 0.0).rgb, vec3(1.0), 0.06);
+  gl_Position = view * vec4(point.xyz, 1.0);
   gl_PointSize = max(1.5, pixels / gl_Position.w);
 }`,
   `#version 300 es
 precision mediump float;
-in float shade; uniform sampler2D colors; uniform bool shadow; uniform vec3 dark; out vec4 pixel;
+flat in vec3 color; uniform bool shadow; uniform vec3 dark; out vec4 pixel;
 void main() {
   vec2 p = 2.0 * gl_PointCoord - 1.0;
   float r = dot(p, p);
@@ -33,8 +35,7 @@ void main() {
   if (shadow) { pixel = vec4(dark, 1.0); return; }
   vec3 normal = vec3(p.x, -p.y, sqrt(1.0 - r));
   float light = 0.70 + 0.34 * max(0.0, dot(normal, normalize(vec3(-0.45, 0.65, 0.62))));
-  vec3 color = texture(colors, vec2(clamp(shade, 0.0, 1.0) * 0.996 + 0.002, 0.5)).rgb;
-  pixel = vec4(light * mix(color, vec3(1.0), 0.06), 1.0);
+  pixel = vec4(light * color, 1.0);
 }`,
 ];
 const FLOOR = [
@@ -96,7 +97,7 @@ function box() {
       for (const [u, v] of [[-1, -1], [1, -1], [1, 1], [-1, -1], [1, 1], [-1, 1]]) {
         const x = [0, 0, 0], normal = [0, 0, 0];
         x[axis] = normal[axis] = side;
-        x[(axis + 1) % 3] = u;
+        x[(axis + 1) % 3] = side * u; // anticlockwise as it is seen from outside
         x[(axis + 2) % 3] = v;
         found.push(...x, ...normal);
       }
@@ -119,43 +120,6 @@ function ball(rings = 16) {
   return new Float32Array(found);
 }
 
-/** A body of points. */
-class Body {
-  /**
-   * @param {WebGL2RenderingContext} gl
-   * @param {Numbers} rest [n, 3] [m]
-   * @param {number} radius of a point [m]
-   * @param {number[]} offset [3] [m] by which all are drawn aside
-   */
-  constructor(gl, rest, radius, offset) {
-    this.count = rest.length / 3;
-    this.radius = radius;
-    this.offset = offset;
-    this.visible = true;
-    this._gl = gl;
-    this.rest = gl.createBuffer();
-    this.x = gl.createBuffer();
-    this.value = gl.createBuffer();
-    this._fill(this.rest, Float32Array.from(rest));
-    this.show(Float32Array.from(rest), new Float32Array(this.count));
-  }
-
-  /**
-   * @param {Float32Array} x [n, 3] [m]
-   * @param {Float32Array} values [n] over the end of their scale
-   */
-  show(x, values) {
-    this._fill(this.x, x);
-    this._fill(this.value, values);
-  }
-
-  /** @param {WebGLBuffer} buffer @param {Float32Array} values */
-  _fill(buffer, values) {
-    this._gl.bindBuffer(this._gl.ARRAY_BUFFER, buffer);
-    this._gl.bufferData(this._gl.ARRAY_BUFFER, values, this._gl.DYNAMIC_DRAW);
-  }
-}
-
 /** What a canvas shows. */
 export class Drawing {
   /**
@@ -165,7 +129,8 @@ export class Drawing {
    * @throws {Error} in words for a reader, where there is no WebGL 2
    */
   constructor(canvas, camera, told) {
-    const gl = canvas.getContext("webgl2", { antialias: false }); // the points' edges, which are discarded, gain nothing
+    // Edges of points, which are discarded, gain nothing from antialiasing; a canvas that lets through is costly to blend.
+    const gl = canvas.getContext("webgl2", { antialias: false, alpha: false });
     if (!gl) throw new Error(NO_WEBGL);
     this.gl = gl;
     this.canvas = canvas;
@@ -174,13 +139,13 @@ export class Drawing {
     this.radius = told.radius;
     this.cut = false;
     this.time = 0;
-    this.shadows = true;
-    this.fine = 1; // share of the screen's pixels along a side
+    this.level = 0; // 0 draws all; then without shadows, then with fewer pixels each
     /** @type {Solid[]} */ this.solids = [];
     /** @type {Body[]} */ this.bodies = [];
     this.points = program(gl, POINTS);
     this.plane = program(gl, FLOOR);
     this.solid = program(gl, SOLID);
+    this.drawn = gl.createBuffer();
     this.corners = this._buffer(new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]));
     this.shapes = { box: this._shape(box()), ball: this._shape(ball()) };
     this._colors(told.colors);
@@ -196,30 +161,25 @@ export class Drawing {
    * @param {number} [radius] of its points [m]
    */
   body(rest, offset = [0, 0, 0], radius = this.radius) {
-    const made = new Body(this.gl, rest, radius, offset);
+    const made = new Body(rest, radius, offset);
     this.bodies.push(made);
     return made;
   }
 
   /** Draw all. */
   draw() {
-    const { gl, canvas, camera } = this, ratio = this.fine * (window.devicePixelRatio || 1);
+    const { gl, canvas, camera, level } = this, fine = 0.7 ** Math.max(0, level - 1);
+    const ratio = fine * Math.min(MOST_PIXELS, window.devicePixelRatio || 1);
     const [wide, tall] = [canvas.clientWidth, canvas.clientHeight].map((v) => Math.max(1, Math.round(v * ratio)));
     if (canvas.width !== wide || canvas.height !== tall) Object.assign(canvas, { width: wide, height: tall });
     const back = this._back(), matrix = camera.view(wide / tall);
     gl.viewport(0, 0, wide, tall);
     gl.clearColor(back[0], back[1], back[2], 1);
     gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    const toned = (/** @type {number} */ by) => back.map((v) => (v > 0.5 ? v - by : v + by));
-    if (this.floor !== null) this._floor(matrix, toned(0.065), back);
-    this._points(matrix, camera.pixels(wide, tall), toned(0.195));
+    const light = back[1] > 0.5, toned = (/** @type {number} */ by) => back.map((v) => Math.max(0, v + by));
+    if (this.floor !== null) this._floor(matrix, toned(light ? -0.065 : 0.14), back);
+    this._points(matrix, camera.pixels(wide, tall), toned(light ? -0.195 : -0.03));
     if (this.solids.length) this._solids(matrix);
-  }
-
-  /** Draw less from now on, where a browser draws too slowly: first no shadows, then fewer pixels. */
-  coarsen() {
-    if (!this.shadows && this.fine > 0.4) this.fine *= 0.7;
-    this.shadows = false;
   }
 
   /** @param {Float32Array} matrix @param {number[]} near @param {number[]} far */
@@ -240,28 +200,28 @@ export class Drawing {
 
   /** @param {Float32Array} matrix @param {number} pixels @param {number[]} dark */
   _points(matrix, pixels, dark) {
-    const { gl, points, camera } = this;
+    const { gl, points, camera, canvas, floor } = this;
+    const middle = camera.lower.map((v, c) => 0.5 * (v + camera.upper[c]));
+    /** @type {Cut | null} */ const cut = this.cut ? { x: middle, across: [0.47, -0.88] } : null;
     points.use();
     gl.uniformMatrix4fv(points.uniform("view"), false, matrix);
-    gl.uniform3fv(points.uniform("middle"), camera.lower.map((v, c) => 0.5 * (v + camera.upper[c])));
-    gl.uniform2f(points.uniform("across"), 0.47, -0.88);
-    gl.uniform1f(points.uniform("floorHeight"), this.floor ?? 0);
     gl.uniform3fv(points.uniform("dark"), dark);
-    gl.uniform1i(points.uniform("cut"), Number(this.cut));
-    for (const shadow of this.floor === null || !this.shadows ? [0] : [1, 0]) {
-      gl.uniform1i(points.uniform("shadow"), shadow);
-      gl.depthMask(!shadow);
-      for (const body of this.bodies) {
-        if (!body.visible) continue;
-        gl.uniform1f(points.uniform("pixels"), 2 * pixels * body.radius);
-        gl.uniform3fv(points.uniform("offset"), body.offset);
-        this._attribute(points, "x", body.x, 3);
-        this._attribute(points, "rest", body.rest, 3);
-        this._attribute(points, "value", body.value, 1);
-        gl.drawArrays(gl.POINTS, 0, body.count);
-      }
+    const draw = (/** @type {number} */ radius, /** @type {Float32Array} */ drawn) => {
+      gl.uniform1f(points.uniform("pixels"), 2 * pixels * radius);
+      gl.bindBuffer(gl.ARRAY_BUFFER, this.drawn);
+      gl.bufferData(gl.ARRAY_BUFFER, drawn, gl.STREAM_DRAW);
+      this._attribute(points, "point", this.drawn, 4);
+      gl.drawArrays(gl.POINTS, 0, drawn.length / 4);
+    };
+    const bodies = this.bodies.filter((own) => own.visible);
+    if (floor !== null && this.level === 0) {
+      gl.uniform1i(points.uniform("shadow"), 1);
+      gl.depthMask(false);
+      for (const body of bodies) draw(1.2 * body.radius, body.shadow(floor, cut));
+      gl.depthMask(true);
     }
-    gl.depthMask(true);
+    gl.uniform1i(points.uniform("shadow"), 0);
+    for (const body of bodies) draw(body.radius, body.seen(matrix, canvas.width, canvas.height, pixels, cut));
   }
 
   /** @param {Float32Array} matrix */
@@ -270,6 +230,7 @@ export class Drawing {
     shader.use();
     gl.uniformMatrix4fv(shader.uniform("view"), false, matrix);
     gl.enable(gl.BLEND);
+    gl.enable(gl.CULL_FACE);
     gl.depthMask(false);
     for (const solid of this.solids) {
       if (!acts(solid, this.time)) continue;
@@ -286,12 +247,13 @@ export class Drawing {
       gl.uniformMatrix4fv(shader.uniform("pose"), false, pose);
       gl.uniform3fv(shader.uniform("extents"), extents);
       gl.uniform1i(shader.uniform("ball"), Number(round));
-      gl.uniform4f(shader.uniform("tint"), 0.45, 0.52, 0.62, 0.45);
+      gl.uniform4f(shader.uniform("tint"), 0.45, 0.52, 0.62, 0.4);
       this._attribute(shader, "x", shape.buffer, 3, 24, 0);
       this._attribute(shader, "normal", shape.buffer, 3, 24, 12);
       gl.drawArrays(gl.TRIANGLES, 0, shape.count);
     }
     gl.depthMask(true);
+    gl.disable(gl.CULL_FACE);
     gl.disable(gl.BLEND);
   }
 
@@ -367,4 +329,46 @@ function cross(a, b) {
 function unit(a) {
   const size = Math.hypot(...a);
   return a.map((v) => v / size);
+}
+
+/**
+ * Says in which frames to draw, and how finely: what moves is drawn as coarsely as the browser needs to keep up, what
+ * stands still is drawn whole.
+ */
+export class Pace {
+  /** @param {{ level: number }} drawing whose level says how coarse it is */
+  constructor(drawing) {
+    this.drawing = drawing;
+    this.level = 0; // of pictures that move
+    this.slow = 0;
+    this.moving = false;
+    this.since = this.last = 0; // [ms]
+  }
+
+  /**
+   * Whether a picture is drawn in this frame, and how coarse.
+   * @param {number} now [ms]
+   * @param {boolean} changed whether there is anything new in it
+   */
+  draws(now, changed) {
+    const { drawing } = this, passed = now - this.last;
+    this.last = now;
+    if (changed) {
+      this.slow = this.moving && passed > SLOW ? this.slow + 1 : 0;
+      if (this.slow >= OFTEN) {
+        this.level = Math.min(this.level + 1, COARSEST);
+        this.slow = 0;
+      }
+      this.moving = true;
+      this.since = now;
+      drawing.level = this.level;
+      return true;
+    }
+    if (!this.moving || now - this.since < REST) return false;
+    this.moving = false;
+    const fine = drawing.level === 0;
+    drawing.level = 0;
+    this.level = Math.max(0, this.level - 1); // what was slow for a while may be fast again
+    return !fine;
+  }
 }

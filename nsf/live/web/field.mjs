@@ -99,34 +99,41 @@ export class Field {
   }
 
   /**
-   * Values [n, c], which the next call overwrites.
+   * Values [n, c] at all points, or at some, which the next call overwrites.
    * @param {Vector} xhat [r]
    * @param {Vector} parameters [n]
+   * @param {Uint32Array | null} rows of the points
+   * @param {number} components c of a point
    */
-  at(xhat, parameters) {
+  at(xhat, parameters, rows = null, components = 1) {
     const a = this.coefficientsAt(xhat, parameters), { scaled, scale } = this;
     for (let k = 0; k < a.length; k++) scaled[k] = a[k] * scale[k];
-    return combined(this.mean, this.modes, scaled, this.values);
+    return combined(this.mean, this.modes, scaled, this.values, rows, components);
   }
 }
 
 /**
  * mean + modes · a.
- * @param {Numbers} mean [n]
- * @param {Numbers} modes [n, K]
+ * @param {Numbers} mean [n, c]
+ * @param {Numbers} modes [n, c, K]
  * @param {Float64Array} a [K]
- * @param {Float32Array} found [n]
+ * @param {Float32Array} found [n, c]
+ * @param {Uint32Array | null} rows of n; all by default
+ * @param {number} components c
  */
-function combined(mean, modes, a, found) {
-  const K = a.length;
-  for (let i = 0, m = 0; i < found.length; i++) {
-    let sum = mean[i], other = 0, k = 0;
-    for (; k < K - 1; k += 2, m += 2) {
-      sum += modes[m] * a[k];
-      other += modes[m + 1] * a[k + 1];
+function combined(mean, modes, a, found, rows, components) {
+  const K = a.length, count = rows ? rows.length : mean.length / components;
+  for (let q = 0, to = 0; q < count; q++) {
+    let i = components * (rows ? rows[q] : q), m = i * K;
+    for (let c = 0; c < components; c++, i++) {
+      let sum = mean[i], other = 0, k = 0;
+      for (; k < K - 1; k += 2, m += 2) {
+        sum += modes[m] * a[k];
+        other += modes[m + 1] * a[k + 1];
+      }
+      if (k < K) sum += modes[m++] * a[k];
+      found[to++] = sum + other;
     }
-    if (k < K) sum += modes[m++] * a[k];
-    found[i] = sum + other;
   }
   return found;
 }
@@ -135,10 +142,11 @@ function combined(mean, modes, a, found) {
  * Von Mises equivalent [n] of stress [n, 6] in the order xx xy xz yy yz zz, over the end of its scale.
  * @param {Float32Array} tau [Pa]
  * @param {number} top [Pa]
- * @param {Float32Array} found
+ * @param {number} count n
  */
-export function vonMises(tau, top, found) {
-  for (let p = 0, i = 0; p < found.length; p++, i += 6) {
+export function vonMises(tau, top, count) {
+  const found = new Float32Array(count);
+  for (let p = 0, i = 0; p < count; p++, i += 6) {
     const xx = tau[i], yy = tau[i + 3], zz = tau[i + 5];
     const shear = tau[i + 1] ** 2 + tau[i + 2] ** 2 + tau[i + 4] ** 2;
     found[p] = Math.sqrt(0.5 * ((xx - yy) ** 2 + (yy - zz) ** 2 + (zz - xx) ** 2) + 3 * shear) / top;
@@ -147,14 +155,12 @@ export function vonMises(tau, top, found) {
 }
 
 /**
- * Displacement [n] of points [n, 3], over the end of its scale.
- * @param {Float32Array} x [m]
+ * Displacement of some points of [n, 3], over the end of its scale.
+ * @param {Numbers} x [m]
  * @param {Numbers} rest [m]
  * @param {number} top [m]
- * @param {Float32Array} found
+ * @param {Uint32Array} rows of the points
  */
-export function displacement(x, rest, top, found) {
-  for (let p = 0, i = 0; p < found.length; p++, i += 3)
-    found[p] = Math.hypot(x[i] - rest[i], x[i + 1] - rest[i + 1], x[i + 2] - rest[i + 2]) / top;
-  return found;
+export function displacement(x, rest, top, rows) {
+  return Float32Array.from(rows, (p) => Math.hypot(x[3 * p] - rest[3 * p], x[3 * p + 1] - rest[3 * p + 1], x[3 * p + 2] - rest[3 * p + 2]) / top);
 }

@@ -1,9 +1,9 @@
 // A model that runs in the page: closure, operators and modes are in the file, and a hand steers it.
 
 import { Camera } from "./camera.mjs";
-import { button, choice, download, element, fail, find, headed, keyed, legend, lit, onLook, slider, tick } from "./controls.mjs";
+import { button, choice, counted, download, element, fail, find, headed, keyed, legend, lit, onLook, slider, tick } from "./controls.mjs";
 import { Recording, inflated, unpacked } from "./data.mjs";
-import { Drawing } from "./drawing.mjs";
+import { Drawing, Pace } from "./drawing.mjs";
 import { Field, displacement, vonMises } from "./field.mjs";
 import { Operators, Run } from "./operators.mjs";
 import { along, moved } from "./solids.mjs";
@@ -14,7 +14,6 @@ const HOLD = 0.7; // [s] for which the end stands before the run begins again
 const MOST = 50000; // steps that a run of a hand may take
 const LOOKS = 24; // moments of a run made anew at which it is looked at
 const SPEEDS = [0.0625, 0.125, 0.25, 0.5, 1, 2, 4];
-const SLOW = 50; // [ms] between two pictures, above which fewer pixels are drawn
 const SHOWN_IN = 4; // [s] about, in which a run is shown at first
 
 /** The model of a page and what is shown of it. */
@@ -191,15 +190,17 @@ async function show() {
   const change = () => { state.changed = true; };
   const first = told.dt * told.steps / SHOWN_IN;
   const speed = SPEEDS.reduce((best, own) => (Math.abs(Math.log(own / first)) < Math.abs(Math.log(best / first)) ? own : best));
-  headed(told.title, `a reduced model that runs in this page: ${told.points.toLocaleString("en")} of ${told.particles.toLocaleString("en")} particles, ${told.latents} latent coordinates, ${told.run}`);
+  headed(told.title, `a reduced model that runs in this page: ${counted(told.points, told.particles)}, ${told.latents} latent coordinates, ${told.run}`);
 
   const camera = new Camera(told.lower, told.upper, change), drawing = new Drawing(find("canvas"), camera, told);
-  const body = drawing.body(live.rest), values = new Float32Array(told.points);
-  const beside = [1.25 * (told.upper[0] - told.lower[0]), 0, 0];
+  const body = drawing.body(live.rest);
+  // To the right as the camera looks at first, so that both are as far from it.
+  const { right } = camera.axes, wide = right.reduce((sum, v, c) => sum + Math.abs(v) * (told.upper[c] - told.lower[c]), 0);
+  const beside = right.map((v) => 1.1 * wide * v);
   const truths = new Map([...live.recordings].map(([name, own]) => [name, drawing.body(own.rest, beside, told.radius * Math.cbrt(told.points / own.points))]));
 
   const frame = element("input", { id: "frame", type: "range", min: 0, max: told.steps, value: 0, step: 1, ariaLabel: "step" });
-  const time = element("output", { id: "time" }), note = element("small", { id: "note" });
+  const time = element("output", { id: "time" }), note = element("small", { id: "note" }), sides = element("small");
   const set = (/** @type {boolean} */ on) => {
     state.playing = on;
     if (on && live.cursor >= live.end) live.seek(0);
@@ -258,6 +259,7 @@ async function show() {
   });
   const colors = Object.entries(told.quantities).map(([name, { title }]) => /** @type {[string, string]} */ ([name, title]));
   const picture = () => {
+    drawing.level = 0;
     render();
     find("canvas").toBlob((/** @type {Blob} */ png) => download(`${told.file}.png`, png));
   };
@@ -270,11 +272,11 @@ async function show() {
       frame),
     element("div", { className: "row" }, time, choice("speed", "speed", SPEEDS.map((v) => [String(v), `${v} ×`]), String(speed), () => {})),
     ...sliders.map((own) => own.made),
-    choice("from", "a moved slider", [["start", "runs anew from t = 0"], ["here", "goes on from here"]], "start", () => {}),
+    choice("from", "moved sliders act", [["start", "from t = 0"], ["here", "from now on"]], "start", () => {}),
     ...(tilt ? [tilt.made] : []),
     ...handles.map(({ own }) => own.made),
     choice("case", "held-out case", cases, "0", take),
-    ...(live.recordings.size ? [truth] : []),
+    ...(live.recordings.size ? [element("div", {}, truth, sides)] : []),
     element("div", { id: "light", role: "status" }),
     choice("color", "colour", colors, state.color, paint),
     tick("cut", "cut open", (on) => {
@@ -286,16 +288,16 @@ async function show() {
   );
 
   const render = () => {
-    const { xhat, parameters } = live, x = live.deformation.at(xhat, parameters);
-    const top = told.quantities[state.color].top, byStress = state.color === "von_mises" && live.stress;
-    body.show(x, byStress ? vonMises(byStress.at(xhat, parameters), top, values) : displacement(x, live.rest, top, values));
+    const { xhat, parameters, stress } = live, top = told.quantities[state.color].top, byStress = state.color === "von_mises" && stress;
+    const x = live.deformation.at(xhat, parameters);
+    body.show(x, (rows) => byStress ? vonMises(byStress.at(xhat, parameters, rows, 6), top, rows.length) : displacement(x, live.rest, top, rows));
     const wanted = find("case") && live.held && live.recordings.size && find("truth").checked ? live.case.recording : null;
     for (const [name, own] of truths) {
       own.visible = name === wanted;
       const run = live.recordings.get(name);
       if (!own.visible || !run) continue;
       const found = run.at(run.frameAt(live.cursor * told.dt));
-      own.show(found.x, byStress ? found.stress : displacement(found.x, run.rest, top, new Float32Array(run.points)));
+      own.show(found.x, (rows) => byStress ? found.stressOf(rows) : displacement(found.x, run.rest, top, rows));
     }
     drawing.solids = live.run.solids;
     drawing.time = live.cursor * told.dt;
@@ -310,21 +312,14 @@ async function show() {
     lit(live.light());
     const estimate = live.held && live.case.estimate !== null
       ? ` Estimated distance from the projected run, at most ${(1000 * live.case.estimate).toPrecision(2)} mm.` : "";
-    const shown = live.recordings.size && find("truth").checked && !(live.held && live.case.recording)
-      ? " No full-order run of this was stored." : "";
-    const sides = live.recordings.size && find("truth").checked && !shown ? " Left: the reduced run; right: the full-order one." : "";
-    note.textContent = `Steps of ${told.dt} s by operators.${estimate}${shown}${sides}`;
+    const stored = live.held && live.case.recording ? "Left: the reduced run; right: the full-order one." : "No full-order run of this was stored.";
+    sides.textContent = live.recordings.size && find("truth").checked ? stored : "";
+    note.textContent = `Steps of ${told.dt} s by operators.${estimate}`;
     document.body.dataset.step = String(live.step);
   };
-  let last = performance.now(), beyond = 0, slow = 0;
+  const pace = new Pace(drawing);
+  let last = performance.now(), beyond = 0;
   const next = (/** @type {number} */ now) => {
-    if (state.playing && document.visibilityState === "visible") {
-      slow = now - last > SLOW ? slow + 1 : 0;
-      if (slow > 5) {
-        drawing.coarsen();
-        slow = 0;
-      }
-    }
     const passed = Math.max(0, Math.min(0.2, (now - last) / 1000));
     last = now;
     if (state.playing) {
@@ -339,7 +334,7 @@ async function show() {
         change();
       }
     }
-    if (state.changed) {
+    if (pace.draws(now, state.changed)) {
       state.changed = false;
       const began = performance.now();
       render();

@@ -1,9 +1,9 @@
 // The player of a recorded run.
 
 import { Camera } from "./camera.mjs";
-import { button, choice, element, fail, find, headed, keyed, legend, onLook, tick } from "./controls.mjs";
+import { button, choice, counted, element, fail, find, headed, keyed, legend, onLook, tick } from "./controls.mjs";
 import { Recording, inflated, unpacked } from "./data.mjs";
-import { Drawing } from "./drawing.mjs";
+import { Drawing, Pace } from "./drawing.mjs";
 import { displacement } from "./field.mjs";
 
 const HOLD = 0.7; // [s] for which the last frame stands before the run begins again
@@ -14,10 +14,8 @@ async function play() {
   data.remove();
   const { header: told } = packed, run = new Recording(packed, "run"), F = run.frames;
   const state = { frame: 0, playing: true, color: told.color, changed: true };
-  const count = told.points.toLocaleString("en");
-  const many = told.points > told.particles ? "points" : `of ${told.particles.toLocaleString("en")} particles`;
   const stopped = told.stopped === null ? "" : `; diverged at t = ${told.stopped.toPrecision(3)} s, shown up to there`;
-  headed(told.title, `reduced run ${told.run}, ${count} ${many}${stopped} · drag turns, shift-drag moves, the wheel zooms, a double click resets`);
+  headed(told.title, `reduced run ${told.run}, ${counted(told.points, told.particles)}${stopped} · drag turns, shift-drag moves, the wheel zooms, a double click resets`);
 
   const frame = element("input", { id: "frame", type: "range", min: 0, max: F - 1, value: 0, step: 1, ariaLabel: "frame" });
   const time = element("output", { id: "time" });
@@ -37,7 +35,7 @@ async function play() {
     legend(told.quantities[color], told.colors);
   };
   frame.oninput = () => seek(Number(frame.value));
-  const speeds = ["0.25", "0.5", "1", "2"].map((v) => /** @type {[string, string]} */ ([v, v]));
+  const speeds = ["0.25", "0.5", "1", "2"].map((v) => /** @type {[string, string]} */ ([v, `${v} ×`]));
   const colors = /** @type {[string, string][]} */ ([["von_mises", "von Mises stress"], ["displacement", "displacement"]]);
   const cut = tick("cut", "cut open", (on) => {
     drawing.cut = on;
@@ -53,18 +51,18 @@ async function play() {
   const camera = new Camera(run.lower, run.upper, () => { state.changed = true; });
   const drawing = new Drawing(find("canvas"), camera, told), body = drawing.body(run.rest);
   drawing.solids = told.solids;
-  const moved = new Float32Array(run.points);
   const draw = () => {
-    const { x, stress } = run.at(state.frame), k = Math.floor(state.frame), after = Math.min(k + 1, F - 1);
+    const { x, stressOf } = run.at(state.frame), k = Math.floor(state.frame), after = Math.min(k + 1, F - 1);
     const t = run.t[k] + (state.frame - k) * (run.t[after] - run.t[k]);
     const top = told.quantities.displacement.top;
-    body.show(x, state.color === "von_mises" ? stress : displacement(x, run.rest, top, moved));
+    body.show(x, state.color === "von_mises" ? stressOf : (rows) => displacement(x, run.rest, top, rows));
     drawing.time = t;
     drawing.draw();
     time.textContent = `t = ${t.toFixed(3)} s`;
     frame.value = Math.round(state.frame);
     document.body.dataset.frame = state.frame.toFixed(2);
   };
+  const pace = new Pace(drawing);
   let last = performance.now(), beyond = 0;
   const next = (/** @type {number} */ now) => {
     const passed = Math.max(0, Math.min(0.2, (now - last) / 1000));
@@ -75,7 +73,7 @@ async function play() {
       state.frame = beyond > HOLD ? 0 : Math.min(gone, F - 1);
       state.changed ||= beyond === 0 || beyond <= passed;
     }
-    if (state.changed) draw();
+    if (pace.draws(now, state.changed)) draw();
     state.changed = false;
     requestAnimationFrame(next);
   };

@@ -1,9 +1,9 @@
 // The page of `nsf serve`: it decodes the latent vectors that a server sends.
 
 import { Camera } from "./camera.mjs";
-import { element, fail, find, headed, legend, lit, onLook, slider, valued } from "./controls.mjs";
+import { button, element, fail, find, headed, keyed, legend, lit, onLook, slider, tick, valued } from "./controls.mjs";
 import { unpacked } from "./data.mjs";
-import { Drawing } from "./drawing.mjs";
+import { Drawing, Pace } from "./drawing.mjs";
 import { Field, displacement } from "./field.mjs";
 import { lightOf } from "./trust.mjs";
 
@@ -14,7 +14,7 @@ async function follow() {
   const buffer = await answer.arrayBuffer(), packed = unpacked(buffer), { header: told, arrays } = packed;
   const field = new Field(packed, "deformation"), rest = arrays.rest;
   const state = {
-    frames: 0, bytes: 0, drawn: 0, t: 0, trust: 0, away: 0, diverged: false,
+    frames: 0, bytes: 0, drawn: 0, changed: false, t: 0, trust: 0, away: 0, diverged: false, playing: true,
     values: /** @type {number[]} */ ([]), newest: /** @type {Float32Array | null} */ (null), x: field.values,
   };
   headed(told.title, `reduced run ${told.run} · drag turns, shift-drag moves, the wheel zooms, a double click resets`);
@@ -22,26 +22,37 @@ async function follow() {
   const cost = element("small", { id: "cost" });
   const socket = new WebSocket(location.href.replace(/^http/, "ws").replace(/\/(\?|$)/, "/stream$1"));
   socket.binaryType = "arraybuffer";
+  const send = (/** @type {object} */ wanted) => {
+    if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(wanted));
+  };
+  const turn = () => send({ playing: !state.playing });
+  const time = element("output", { id: "time" }), play = button("play", "Pause", turn, "space; for all who look");
   const sliders = told.parameters.map((/** @type {import("./controls.mjs").Parameter} */ p) =>
     slider(p, p.trained[0], () => {
-      const values = sliders.map((/** @type {any} */ s) => Number(s.input.value));
-      if (socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify({ values }));
+      send({ values: sliders.map((/** @type {any} */ s) => Number(s.input.value)) });
     }),
   );
-  find("panel").append(...sliders.map((/** @type {any} */ s) => s.made), light, shown, cost);
-  /** @type {Drawing | null} */
-  let drawing = null;
-  const camera = new Camera(told.lower, told.upper, () => drawing?.draw());
-  drawing = new Drawing(find("canvas"), camera, told);
-  const body = drawing.body(rest), values = new Float32Array(told.points);
+  const change = () => { state.changed = true; };
+  const camera = new Camera(told.lower, told.upper, change), drawing = new Drawing(find("canvas"), camera, told);
+  const pace = new Pace(drawing);
+  const cut = tick("cut", "cut open", (on) => {
+    drawing.cut = on;
+    change();
+  });
+  find("panel").append(
+    element("div", { className: "row" }, play, time), ...sliders.map((/** @type {any} */ s) => s.made), light, cut, shown, cost,
+  );
+  const body = drawing.body(rest);
   drawing.solids = told.solids;
   camera.follow(find("canvas"));
-  onLook(() => drawing?.draw());
+  onLook(change);
+  keyed({ " ": turn });
   legend(told.quantities.displacement, told.colors);
 
   socket.onmessage = ({ data }) => {
     if (typeof data === "string") {
       Object.assign(state, JSON.parse(data));
+      play.textContent = state.playing ? "Pause" : "Play";
       // While a slider is dragged, what is shown lags behind it.
       if (!sliders.some((/** @type {any} */ s) => s.input.matches(":active")))
         sliders.forEach((/** @type {any} */ s, /** @type {number} */ i) => s.show(state.values[i]));
@@ -53,22 +64,24 @@ async function follow() {
   };
   socket.onclose = ({ code, reason }) => { find("fault").textContent = `closed (${code}) ${reason}; reload to join again`; };
 
-  const draw = () => {
+  const draw = (/** @type {number} */ now) => {
     if (state.newest) {
       [state.t, state.trust] = state.newest;
       const x = field.at(state.newest.subarray(2), []);
       state.newest = null;
-      body.show(x, displacement(x, rest, told.quantities.displacement.top, values));
+      body.show(x, (rows) => displacement(x, rest, told.quantities.displacement.top, rows));
       drawing.time = state.t;
-      drawing.draw();
       state.drawn++;
+      change();
       lit(lightOf(state.trust, state.away, state.diverged));
-      const at = told.parameters.map((/** @type {any} */ p, /** @type {number} */ i) => `${p.name} = ${valued(state.values[i], p.unit, p.step)}`);
-      shown.textContent = `${at.join(", ")}, t = ${state.t.toFixed(3)} s`;
+      time.textContent = `t = ${state.t.toFixed(3)} s`;
+      shown.textContent = told.parameters.map((/** @type {any} */ p, /** @type {number} */ i) => `${p.name} = ${valued(state.values[i], p.unit, p.step)}`).join(", ");
     }
+    if (pace.draws(now, state.changed)) drawing.draw();
+    state.changed = false;
     requestAnimationFrame(draw);
   };
-  draw();
+  requestAnimationFrame(draw);
   let before = { frames: 0, bytes: 0 };
   setInterval(() => {
     const [frames, bytes] = [state.frames - before.frames, state.bytes - before.bytes];

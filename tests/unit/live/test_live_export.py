@@ -116,9 +116,19 @@ def test_most_of_few_points_lie_at_the_surface(chain):
     assert set(model.sample) <= set(model.shown)
 
 
-def test_a_run_that_no_operators_step_is_refused(model, tmp_path):
+def test_a_run_that_no_operators_step_is_refused(model, tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match=r"engine=auto, whose steps take more .* engine=operators"):
         publish.model_data(model)
+    monkeypatch.setattr(publish, "LiveModel", None)  # which takes minutes of a large run
+    with pytest.raises(ConfigError, match=r"engine=auto, whose steps take more .* engine=operators"):
+        publish.write(model.run, tmp_path, device="cpu")
+
+
+def test_options_of_other_formats_are_refused(capsys):
+    with pytest.raises(SystemExit) as end:
+        main(["export", "sand", "--live", "--parameter", "26", "--every", "2"])
+    assert end.value.code == 2
+    assert "page shows as its reader asks; leave out --parameter, --every" in capsys.readouterr().err
 
 
 def test_a_page_that_is_too_large_is_refused(taught_model, tmp_path, monkeypatch):

@@ -57,6 +57,8 @@ def test_colours_say_what_they_are_of(model, coloring, run):
     assert len(np.unique(colors("displacement").colors_reduced, axis=0)) > 20
     assert len(np.unique(colors("distance to the truth").colors_full, axis=0)) == 1
     assert len(np.unique(colors("distance to the truth").colors_reduced, axis=0)) > 5
+    unknown = coloring.picture(Moment(run, run.steps), None, "distance to the truth").colors_reduced
+    assert (unknown == 0xBB).all()  # a grey that is not on the scale, where no distance is "small"
     sample = colors("particle sets").colors_reduced[model.roles(0) == 2]
     assert len(np.unique(sample, axis=0)) == 1
     assert not np.array_equal(colors("pressure").colors_full, colors("von Mises stress").colors_full)
@@ -144,7 +146,52 @@ def test_in_a_browser(browser, served):
     wait_until(lambda: player.tick().run.case == angle(46.0))
     window.get_by_text(re.compile("away from the training cases|distrusted")).wait_for()
     window.get_by_text("no full-order run of this case").wait_for()
+    page._by.value = "distance to the truth"
+    window.get_by_text("grey: unknown").wait_for()
     wait_until(lambda: window.screenshot(clip=SCENE) != shown)
+
+
+def test_what_is_displayed_is_what_is_labelled(tilting_model):
+    """Controls name the case and the gravity that are shown; a run beside it is of the same problem."""
+    player = Player(tilting_model)
+    page, (known, *_) = Page(player, port=0), tilting_model.known
+
+    def shown():
+        while player.work():
+            pass
+        player.seek(20)
+        page.draw()
+        return page._told.content
+
+    try:
+        player.playing = False
+        player.steer(list(known.parameters.values()))
+        assert "no full-order run" not in shown()
+        assert page._full.visible
+        assert page._known.value == str(known)
+        page._tilts[0].value = 5.0
+        page._tilt()
+        assert "gravity tilted by hand" in shown()
+        assert "no full-order run of this program" in page._told.content
+        assert not page._full.visible
+        assert page._known.value == "…"
+        page._known.value = str(known)
+        page._go_to()  # the same case: the hand lets go
+        assert "tilted by hand" not in shown()
+        assert page._tilts[0].value == 0.0
+        assert page._full.visible
+        values = list(known.parameters.values())
+        for slider, value, p in zip(page._sliders, values, tilting_model.parameters, strict=True):
+            slider.value = value + 0.3 * p.step
+        page._steer()
+        shown()
+        assert [slider.value for slider in page._sliders] == values
+        page._cut.value = True
+        drawn = int(page._behind.sum())
+        assert 0 < drawn < len(tilting_model.shown)
+        assert f"{drawn:,} of {tilting_model.particles:,} particles" in shown()
+    finally:
+        page.close()
 
 
 def test_two_browsers_share_what_is_shown(browser, served):

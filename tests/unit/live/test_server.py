@@ -4,6 +4,7 @@ import asyncio
 import json
 import logging
 import math
+import re
 import socket
 import struct
 import threading
@@ -25,7 +26,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from nsf.errors import ConfigError
 from nsf.live.player import Player
 from nsf.live.server import Stream
-from nsf.live.wire import asked_values, field_message, frame_message
+from nsf.live.wire import field_message, frame_message, obey
 
 
 @asynccontextmanager
@@ -67,6 +68,7 @@ def test_a_frame_is_time_trust_and_latent(model):
                 "values": [26.0],
                 "away": 0.5,
                 "diverged": False,
+                "playing": True,
             }
             found = await frames(client, 60)
             made = player.tick().run
@@ -101,6 +103,7 @@ RUBBISH = [
     '{"values": 34}', '{"values": [NaN]}', '{"values": [Infinity]}', '{"values": [1e999]}',
     '{"values": [47]}',
     '{"values": []}', '{"values": [34, 1]}', '{"values": [34], "more": 1}', '{"value": [34]}',
+    '{"playing": 1}', '{"playing": null}', '{"playing": true, "values": [34]}',
     '{"values": [1' + "0" * 320 + "]}", "[" * 250, b"\0\1\2\3",
 ]  # fmt: skip
 
@@ -108,7 +111,7 @@ RUBBISH = [
 @pytest.mark.parametrize("message", RUBBISH, ids=[str(m)[:24] for m in RUBBISH])
 def test_rubbish_is_refused(message, player):
     with pytest.raises(ConfigError):
-        player.steer(asked_values(message))
+        obey(player, message)
     assert player.case == angle(26.0)
 
 
@@ -454,6 +457,11 @@ def test_a_browser_decodes_what_the_server_does(browser, address, model):
         window.get_by_text("friction angle = 34.00°").wait_for()
     wait_until(lambda: other.evaluate("nsf.state.values[0] === 34 && nsf.state.t > 0.1"))
     assert other.screenshot() != before
+
+    one.get_by_role("button", name="Pause").click()
+    other.get_by_role("button", name="Play").wait_for()
+    assert not player.playing
+    assert re.fullmatch(r"t = 0\.\d{3} s", other.text_content("#time"))
 
     shown = other.evaluate("({t: nsf.state.t, x: Array.from(nsf.state.x)})")
     run = player.tick().run

@@ -3,9 +3,11 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
+import { Body } from "../../../nsf/live/web/body.mjs";
 import { Camera } from "../../../nsf/live/web/camera.mjs";
 import { prefixed, valued } from "../../../nsf/live/web/controls.mjs";
 import { Recording, undifferenced, unpacked } from "../../../nsf/live/web/data.mjs";
+import { Pace } from "../../../nsf/live/web/drawing.mjs";
 import { Field, Network, displacement, vonMises } from "../../../nsf/live/web/field.mjs";
 import { Operators, Run, valueAt } from "../../../nsf/live/web/operators.mjs";
 import { acts, along, moved, placed, poseAt, stateOf } from "../../../nsf/live/web/solids.mjs";
@@ -56,7 +58,7 @@ test("a recording is linear between its frames", () => {
   near(run.rest, [0, 0, 0]);
   near(run.at(0).x, [2, 0, 0]);
   near(run.at(0.5).x, [2, 2, 0]);
-  near(run.at(0.5).stress, [0.5]);
+  near(run.at(0.5).stressOf(Uint32Array.of(0)), [0.5]);
   near(run.at(9).x, [2, 4, 0]);
   assert.equal(run.frameAt(0.25), 0.5);
   assert.equal(run.frameAt(7), 1);
@@ -81,13 +83,15 @@ test("a field is mean and modes times latents, then the closure", () => {
     "f.modes": Int16Array.of(2, 4, 0, 8, -2, 0), "f.weight0": Float32Array.of(1, 10), "f.bias0": Float32Array.of(1),
   };
   // a = [2, 1 + 2 + 10 · 3]
-  near(new Field({ header, arrays }, "f").at([2], [3]), [1 + 2 + 33, 2 + 66, 3 - 2]);
+  const field = new Field({ header, arrays }, "f");
+  near(field.at([2], [3]), [1 + 2 + 33, 2 + 66, 3 - 2]);
+  near(field.at([2], [3], Uint32Array.of(2, 0), 1).subarray(0, 2), [3 - 2, 1 + 2 + 33]);
 });
 
 test("von Mises of shear and of pressure; displacement", () => {
   const tau = Float32Array.of(0, 2, 0, 0, 0, 0, 5, 0, 0, 5, 0, 5, 3, 0, 0, 0, 0, 0);
-  near(vonMises(tau, 2, new Float32Array(3)), [Math.sqrt(3), 0, 1.5], 1e-6);
-  near(displacement(Float32Array.of(3, 4, 0), [0, 0, 0], 10, new Float32Array(1)), [0.5], 1e-6);
+  near(vonMises(tau, 2, 3), [Math.sqrt(3), 0, 1.5], 1e-6);
+  near(displacement(Float32Array.of(9, 9, 9, 3, 4, 0), [0, 0, 0, 0, 0, 0], 10, Uint32Array.of(1)), [0.5], 1e-6);
 });
 
 /** Operators of one latent without inner layers: B = 0.5 + x̂, f = μ, G = [0, 0, 2]; a state adds to f. */
@@ -223,4 +227,59 @@ test("numbers as text", () => {
   assert.equal(valued(1500, "Pa", 10), "1500 Pa");
   assert.equal(prefixed(5432, "Pa"), "5.43 kPa");
   assert.equal(prefixed(0.0123, "m"), "12.3 mm");
+});
+
+/** A block of points on a lattice, 20 of them on each side, a millimetre apart. */
+const lattice = () => Float32Array.from({ length: 3 * 20 ** 3 }, (_, i) => {
+  const p = Math.floor(i / 3);
+  return 1e-3 * [p % 20, Math.floor(p / 20) % 20, Math.floor(p / 400)][i % 3];
+});
+
+test("points are left out that others hide, and no other", () => {
+  const rest = lattice(), body = new Body(rest, 0.8e-3, [0, 0, 0]), camera = new Camera([0, 0, 0], [0.02, 0.02, 0.02], () => {});
+  body.show(rest, (rows) => rows);
+  camera.approach(1.5); // so that the nearest corner is in the picture
+  const view = camera.view(1.5), pixels = camera.pixels(600, 400);
+  const rows = Array.from(body.seen(view, 600, 400, pixels, null).filter((_, i) => i % 4 === 3));
+  assert.ok(rows.length < 0.35 * body.count, `${rows.length}`);
+  // Every point of a side that the camera sees is there: of those at the top, and those towards it.
+  const { toward } = camera.axes, sides = toward.map((v) => (v > 0 ? 19e-3 : 0));
+  const outer = Array.from({ length: body.count }, (_, p) => p).filter((p) => [0, 1, 2].some((c) => Math.abs(rest[3 * p + c] - sides[c]) < 1e-6));
+  assert.deepEqual(outer.filter((p) => !rows.includes(p)), []);
+  // A cut shows what was inside.
+  const cut = { x: [0.01, 0.01], across: [0.47, -0.88] };
+  const inner = body.seen(view, 600, 400, pixels, cut).filter((_, i) => i % 4 === 3);
+  assert.ok(inner.every((p) => (rest[3 * p] - 0.01) * 0.47 - (rest[3 * p + 1] - 0.01) * 0.88 <= 0));
+  assert.ok(inner.some((p) => !rows.includes(p)));
+  // Behind the camera none is seen.
+  camera.centre = [0, 9, 0];
+  assert.equal(body.seen(camera.view(1.5), 600, 400, pixels, null).length, 0);
+});
+
+test("a shadow lies on the floor, slanted, with few points in a place", () => {
+  const rest = lattice(), body = new Body(rest, 0.8e-3, [1, 0, 0]), found = body.shadow(-1e-3, null);
+  assert.ok(found.length / 4 < 0.2 * body.count);
+  const places = Array.from({ length: found.length / 4 }, (_, k) => found.subarray(4 * k, 4 * k + 3));
+  assert.ok(places.every(([x, y, z]) => Math.abs(z + 1e-3) < 1e-9 && x > 0.999 && x < 1.03 && y > -1e-6 && y < 0.03));
+  // No place of the whole shadow is far from those that are drawn.
+  for (let p = 0; p < body.count; p += 7) {
+    const [x, y, z] = rest.subarray(3 * p, 3 * p + 3), at = [1 + x + 0.28 * (z + 1e-3), y + 0.175 * (z + 1e-3)];
+    assert.ok(places.some(([a, b]) => Math.hypot(a - at[0], b - at[1]) < 2 * 0.8e-3));
+  }
+});
+
+test("what moves is drawn coarser where it is slow, and whole once it stands", () => {
+  const drawing = { level: 0 }, pace = new Pace(drawing);
+  let now = 0;
+  const frames = (count, each, changed) => Array.from({ length: count }, () => pace.draws((now += each), changed));
+  assert.ok(frames(20, 16, true).every(Boolean));
+  assert.equal(drawing.level, 0);
+  frames(9, 80, true);
+  assert.equal(drawing.level, 2);
+  assert.deepEqual(frames(40, 16, false).filter(Boolean), [true]);
+  assert.equal(drawing.level, 0);
+  frames(2, 16, true);
+  assert.equal(drawing.level, 1); // it was slow, and may have been so for a while only
+  frames(99, 80, true);
+  assert.equal(drawing.level, 3);
 });
