@@ -26,7 +26,7 @@ WORKERS ?= 2
 CASES ?= 2400
 SEED ?= 0
 
-.PHONY: help install develop quickstart test test-browser fuzz test-slow test-gpu gpu-references test-slurm test-all lint mirrors readme check-reports calibration docs clean
+.PHONY: help install develop quickstart test test-browser fuzz test-slow test-gpu gpu-references test-slurm test-all lint mirrors readme check-reports calibration models docs clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -114,6 +114,13 @@ calibration: install  ## the reports of calibration, sensitivities and design, o
 	for s in simulate train deploy; do $(BIN)/nsf $$s scene=block engine=operators device=cpu || exit; done
 	$(BIN)/nsf design run=block x@0.4:0.4:0.26=0.42 tilt=30 knots=4 E=6000 density=100 device=cpu \
 		folder=reports/design_block
+
+# Runs by operators at small scale, as reports/small and reports/forcing have them.
+models: install  ## the models of nsf demo, of deploy runs by operators here, as in block=ID sand=ID
+	for m in block sand metal; do case $$m in block) id='$(block)';; sand) id='$(sand)';; metal) id='$(metal)';; esac; \
+		[ -z "$$id" ] || $(BIN)/python -c "from pathlib import Path; from nsf.live.publish import Sizes, ship; \
+		from nsf.runs import Run; ship(Run.named('$$id', 'deploy'), Path('nsf/live/models/$$m.bin'), 1300, \
+		Sizes(modes=24, stress=200_000, runs=2, points=500, frames=30))" || exit; done
 
 docs: develop  ## the documentation, in site/
 	OMP_NUM_THREADS=1 $(BIN)/python -m mkdocs build --strict
