@@ -35,11 +35,11 @@ warnings.filterwarnings(
     "ignore", message=r"\s*'hydra/launcher/joblib' is validated against ConfigStore schema"
 )
 
-#: How jobs of a sweep are launched, unless told otherwise: without files of Hydra's own.
+#: How jobs of a sweep are launched, unless told otherwise: without files of Hydra's own, loggers left alone.
 _SWEEP = (
     "hydra/launcher=serial",
-    "hydra/job_logging=disabled",
-    "hydra/hydra_logging=disabled",
+    "hydra/job_logging=none",
+    "hydra/hydra_logging=none",
     "hydra.output_subdir=null",
     "hydra.sweep.dir=${oc.env:NSF_RUNS,runs}/multirun",
     "hydra.sweep.subdir=.",

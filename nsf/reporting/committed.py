@@ -31,14 +31,14 @@ from nsf.storage import writing
 LIST = "index.md"
 #: Headings, and the folders under each in their order; the last heading is of all others.
 CHAPTERS = {
-    "Main results": ("table1", "operators"),
+    "Main results": ("table1", "operators", "forcing"),
     "What the method needs": (
         "ablation", "field", "width", "latent_dim", "sample_size", "sampler", "timestep", "seeds",
     ),
     "Beyond what was trained": ("extrapolation", "weak_elements", "super_resolution", "path_dependent"),
     "At small scale, on a CPU": (
-        "small", "levels", "inverse", "calibration", "calibration_frame", "sensitivities", "tilt", "design",
-        "quickstart",
+        "small", "levels", "teaching", "inverse", "calibration", "calibration_frame", "sensitivities", "tilt",
+        "design", "quickstart",
     ),
     "One scene in detail, and speed": ("sand", "speed"),
 }  # fmt: skip
