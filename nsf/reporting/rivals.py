@@ -190,7 +190,8 @@ def over_cost(merged: Merged, folder: Path, runs: list[str]) -> list[Picture]:
     reduced = frame["kind"] == "reduced"
     frame.loc[reduced, SOLVER] = _common_names(frame.loc[reduced, SOLVER], names[reduced])
     panels = {name: part.to_dict("records") for name, part in frame.groupby(names, sort=False)}
-    least = merged.frame.groupby("scene")[list(RIVALS)].min()  # of nearest and interpolated, the best field's
+    means = pd.DataFrame([mean_rows(merged, members)[0] for members in variants(merged)])
+    least = means.groupby("scene")[list(RIVALS)].min()  # of nearest and interpolated, the best field's
     costless = {name: COLUMN[name].title for name in RIVALS[:3]}
     free = {
         name: {title: least.loc[of[0]["scene"], column] for column, title in costless.items()}

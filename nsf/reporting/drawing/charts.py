@@ -259,10 +259,10 @@ def _error_scale(panel, values) -> None:
 def plain_ticks(axis_line, text: Callable[[float], str] = "{:g}".format) -> None:
     """Give a logarithmic axis ticks as plain numbers, or as `text` says: at 1, 2 and 5 of a decade.
 
-    At more of it where the axis spans less than a factor of 4, at 1 alone from four decades on.
+    At more of it where the axis spans less than a factor of 4, at 1 alone from three decades on.
     """
     low, high = axis_line.get_view_interval()
-    few = (1, 2, 5) if high < 1e4 * low else (1,)
+    few = (1, 2, 5) if high < 1e3 * low else (1,)
     subs = (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8) if high < 4 * low else few
     axis_line.set_major_locator(LogLocator(subs=subs))
     axis_line.set_major_formatter(FuncFormatter(lambda v, _: text(v)))

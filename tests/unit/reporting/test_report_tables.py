@@ -4,6 +4,7 @@ import io
 import json
 from dataclasses import replace
 
+import numpy as np
 import pandas as pd
 import pytest
 from rich.console import Console
@@ -11,8 +12,8 @@ from synthetic import TEST, Made, seal, write_run
 
 from nsf.errors import MissingRunError, SchemaError
 from nsf.paths import CONF
-from nsf.reporting import COLUMNS, console_table, merge_results
-from nsf.reporting.rivals import beside_rivals, side_by_side, solvers, where_rivals_win
+from nsf.reporting import COLUMNS, console_table, merge_results, rivals
+from nsf.reporting.rivals import beside_rivals, over_cost, side_by_side, solvers, where_rivals_win
 from nsf.reporting.sources import open_sources
 from nsf.reporting.tables import (
     PAPER,
@@ -219,6 +220,17 @@ def test_coarse_runs_stand_with_the_solvers(tmp_path):
     assert table.content.headings[-4:] == [COLUMN[name].heading for name in RIVALS]
     assert table.content.body[0][-4:] == ["100", "9", "5", "20"]
     assert "sand has no run at Δx × 3: a wall is too thin." in table.note
+
+
+def test_lines_of_rivals_are_means_over_held_out_values(tmp_path, monkeypatch):
+    merged = merge(open_sources([write_run(tmp_path, Made(engine="modal", rivals=True))]))
+    test = merged.frame["split"] == "test"
+    merged.frame.loc[test, "displacement_nearest"] = np.linspace(0.1, 0.5, int(test.sum()))
+    drawn = {}
+    monkeypatch.setattr(rivals, "error_over_cost", lambda panels, free: drawn.update(free))
+    monkeypatch.setattr(rivals, "save", lambda figure, folder, name: name)
+    over_cost(merged, tmp_path, [])
+    assert drawn["sand"][COLUMN["displacement_nearest"].title] == pytest.approx(0.3)
 
 
 def test_runs_that_were_held_to_no_rival_have_no_such_table(sweep):
