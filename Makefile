@@ -116,7 +116,8 @@ calibration: install  ## the reports of calibration, sensitivities and design, o
 		folder=reports/design_block
 
 # Runs by operators at small scale, as reports/small and reports/forcing have them.
-models: install  ## the models of nsf demo, of deploy runs by operators here, as in block=ID sand=ID
+models: install  ## write the models of nsf demo: make models block=DEPLOY_ID sand=DEPLOY_ID metal=DEPLOY_ID
+	@[ -n "$(block)$(sand)$(metal)" ] || { echo 'name a run: make models block=ID' >&2; exit 2; }
 	for m in block sand metal; do case $$m in block) id='$(block)';; sand) id='$(sand)';; metal) id='$(metal)';; esac; \
 		[ -z "$$id" ] || $(BIN)/python -c "from pathlib import Path; from nsf.live.publish import Sizes, ship; \
 		from nsf.runs import Run; ship(Run.named('$$id', 'deploy'), Path('nsf/live/models/$$m.bin'), 1300, \

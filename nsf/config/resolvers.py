@@ -119,7 +119,7 @@ def following(config: DictConfig, key: str) -> list[tuple[str, ...]]:
         for path, value in leaves(OmegaConf.to_container(config))
         if isinstance(value, str) and "${" in value
     }
-    found, keys = [], [tuple(key.split("."))]
+    found, keys = [], [_target("", key, ())]
     while keys:
         own = keys.pop()
         for path in list(referring):

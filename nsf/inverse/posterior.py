@@ -77,7 +77,7 @@ def posterior(
 
     Raises:
         ConfigError: the prior leaves nothing of what was taught.
-        InstabilityError: no run of the prior stays finite.
+        InstabilityError: fewer points than walkers have a posterior above 0.
         MissingExtraError: emcee is not installed.
 
     Source: Goodman and Weare 2010; Foreman-Mackey et al. 2013.
@@ -103,9 +103,9 @@ def posterior(
     about = space.values(torch.as_tensor(np.clip(about, 1e-3, 1.0 - 1e-3))).numpy()
     tried = np.concatenate([prior.draw(_TRIED, seed, taught=True), about])
     heights = log_probability(tried)
-    begin = tried[np.argsort(-heights, kind="stable")[:_WALKERS]]
-    if not np.isfinite(heights).sum() >= _WALKERS:
+    if np.isfinite(heights).sum() < _WALKERS:
         raise InstabilityError("hardly a run of the prior stays finite; give a prior within what was taught")
+    begin = tried[np.argsort(-heights, kind="stable")[:_WALKERS]]
     sampler = emcee.EnsembleSampler(_WALKERS, len(space.free), log_probability, vectorize=True)
     sampler.random_state = np.random.RandomState(seed).get_state()  # emcee's own
     steps, length = 0, 0.0

@@ -33,8 +33,8 @@ _NOTE = (
 )
 _BESIDE = (
     "Displacement errors, means over held-out values. Nothing moves is 100 % by definition; the nearest "
-    "training run is that of the nearest parameters; the latent vectors of training runs are interpolated "
-    "over the parameters; the coarse full order is the full-order solver on a coarser grid, with as many "
+    "training run is that of the nearest parameters and program; the latent vectors of training runs are "
+    "interpolated over both; the coarse full order is the full-order solver on a coarser grid, with as many "
     "particles a cell. The first three take no step."
 )
 

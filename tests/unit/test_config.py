@@ -7,6 +7,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from nsf import config
+from nsf.config.resolvers import following
 from nsf.errors import ConfigError
 from nsf.paths import CONF, groups
 
@@ -256,3 +257,8 @@ def test_an_interval_is_for_a_search():
 def test_a_launcher_that_is_not_there(overrides, quoted):
     with pytest.raises(ConfigError, match=re.escape(quoted)):
         config.launching(overrides)
+
+
+def test_what_follows_an_entry_of_a_list_is_found_however_it_is_named():
+    config = OmegaConf.create({"a": [1.0, 2.0], "b": "${a[1]}", "c": "${b}"})
+    assert sorted(following(config, "a.1")) == sorted(following(config, "a[1]")) == [("b",), ("c",)]

@@ -83,7 +83,7 @@ def sample(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
     indices, full_order = (_whole(asked, key, 0, least=0) for key in ("sensitivities", "full_order"))
     for key, base in (("sensitivities", indices), ("full_order", full_order)):
         if base == 1 or base & (base - 1):
-            raise ConfigError(f"{key}={base} must be a power of two, as 32 or 1024")
+            raise ConfigError(f"{key}={base} must be a power of two of at least 2, as 32 or 1024")
     if full_order and not indices:
         raise ConfigError("full_order= are runs beside sensitivities; give sensitivities= too")
     for needed in ("SALib",) * bool(indices) + ("emcee",) * ("observations" in asked):

@@ -45,6 +45,7 @@ def upright(motion: Motion) -> Motion:
         return ((x - centre) @ turn.T + centre).astype(np.float32)
 
     placed = {
+        "gravity": around["gravity"] @ turn.T,
         "solid_position": turned(around["solid_position"]),
         "solid_orientation": turn @ around["solid_orientation"],
     }

@@ -50,6 +50,13 @@ def test_gravity_points_down_in_pictures():
     assert upright(level) is level
 
 
+def test_an_upright_body_stays_as_it_is():
+    inclined = motion(around(("half-space", (0, 0, 1), (0.0, 0.0, 0.13)), gravity=(3.0, 0.0, -9.0)))
+    once = upright(inclined)
+    np.testing.assert_allclose(upright(once).x_full, once.x_full, atol=1e-7)
+    assert np.abs(once.x_full - inclined.x_full).max() > 0.01
+
+
 def test_the_ground_hides_what_lies_beneath_it():
     for height, seen in ((0.05, True), (0.6, False)):
         shown = motion(around(("half-space", (0, 0, 1), (0.0, 0.0, height))))
