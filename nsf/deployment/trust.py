@@ -28,8 +28,7 @@ QUANTILE = 0.95
 STRAY = 2.0
 #: Of a value: what float32 may have moved it by.
 _ROUND_OFF = 1e-6
-#: Of how far the extreme one of training's programs stands out. With one, 7 % of new programs of press were
-#: outside; with two, none of 200.
+#: Of how far the extreme one of training's programs stands out: a new one of the kind may stand out further.
 _AGAIN = 2.0
 _ROWS = 256  # steps decoded, and held with their distances to all training snapshots, at once
 
