@@ -134,7 +134,7 @@ def scene_table(names: Names) -> Table:
     from nsf.scenes import Scene
     from nsf.scenes.resolution import thinnest
 
-    scene = names.scene if isinstance(names.scene, Scene) else Scene.from_config(names.config)
+    scene = names.scene if isinstance(names.scene, Scene) else Scene.from_config(names.scene.template)
     case = names.split.cases[0]
     at = scene.with_parameters(case)
     stable = min(

@@ -7,7 +7,9 @@ from omegaconf import OmegaConf
 
 from nsf import progress
 from nsf.cli import main
+from nsf.config import load
 from nsf.pipeline import preview
+from nsf.pipeline.names import Names
 from nsf.pipeline.outcome import outcome_table
 from nsf.progress import Progress, label, labelled
 
@@ -63,6 +65,12 @@ def test_what_is_to_be_made_is_expected_to_take_what_the_like_of_it_took(nsf, ch
     assert "run of sand" in out
     assert re.search(r"^in all +\d+ s", out, re.M)
     assert {path for path in chain.root.rglob("*")} == before
+
+
+def test_a_scene_whose_parameter_others_refer_to():
+    names = Names(load(["scene=cake", "scale=small", "device=cpu"]))  # as of a chain that is there
+    shown = preview.scene_table(names)
+    assert "12,500" in list(shown.columns[1].cells)
 
 
 def test_trajectories_take_what_their_bytes_say(chain, tiny):
