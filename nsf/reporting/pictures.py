@@ -61,7 +61,7 @@ class _Variant:
         """What pictures of this variant are made of, for those that are drawn so."""
         rows = [list(map(str, row)) for row in self.rows.to_numpy().tolist()]
         made = {source.id: [source.hashes, source.created] for source in self.sources}
-        return key_of([rows, [source.id for source in self.sources], made, how, code()])
+        return key_of([rows, [source.id for source in self.sources], made, self.breakdown, how, code()])
 
     def series(self, held_out_only: bool) -> pd.DataFrame:
         """Frames of the parameter values that this variant's rows come from, each from its own run."""
@@ -143,6 +143,7 @@ def draw(
     groups = variants(merged)
     labels = variant_labels([merged.frame.iloc[members[0]].to_dict() for members in groups])
     known = [_Variant(merged, members, label) for members, label in zip(groups, labels, strict=True)]
+    _lend_stages(known)
     shown = _best(known, by_method=not sweep)
     drawn = _of_variants(shown, known, folder, not sweep, kept)
     sections = [
@@ -154,6 +155,14 @@ def draw(
         *levels_section(known, folder),
         Section("All variants" if len(known) > 1 else "Error and cost", _comparison(known, folder, study)),
     ]
+
+
+def _lend_stages(known: list[_Variant]) -> None:
+    """Show the stages of the projected step where a variant's own step has but one, as operators have."""
+    for v in known:
+        if len(v.breakdown.get("reduced", {})) == 1:
+            others = [o for o in known if (o.alike, o.method) == (v.alike, v.method)]
+            v.breakdown = max((o.breakdown for o in others), key=lambda b: len(b.get("reduced", {})))
 
 
 def _best(known: list[_Variant], by_method: bool) -> list[_Variant]:
