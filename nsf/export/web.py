@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 #: Arrays begin at multiples of so many bytes, so that a browser views them in place.
 _WORD = 8
 _TYPES = ("f4", "f8", "i1", "i2", "u1", "u2")
-_IMPORT = re.compile(r'^import \{ ([^}]+) \} from "\./(\w+)\.mjs";\n', re.MULTILINE)
+_IMPORT = re.compile(r'^import \{ ([^}]+) \} from "\.{1,2}/(\w+)\.mjs";\n', re.MULTILINE)
 _TOP = re.compile(r"^(export )?(?:async )?(?:function|class|const|let) (\w+)", re.MULTILINE)
 
 
@@ -58,7 +58,7 @@ def script(entry: str) -> str:
     """The modules that a page needs as one, each once and after those that it imports.
 
     Args:
-        entry: module of the page, without its ending.
+        entry: of the page, a module in `pages`, without its ending.
 
     Raises:
         ValueError: a module imports what another does not export, or two have a name in common.
@@ -67,10 +67,10 @@ def script(entry: str) -> str:
     exported: dict[str, set[str]] = {}
     names: dict[str, str] = {}
 
-    def add(module: str) -> None:
+    def add(module: str, *folder: str) -> None:
         if module in texts:
             return
-        text = _text("live", "web", f"{module}.mjs")
+        text = _text("live", "web", *folder, f"{module}.mjs")
         texts[module] = ""  # a circle of imports ends here; functions are called after all are there
         wanted = [(own.split(", "), other) for own, other in _IMPORT.findall(text)]
         for _, other in wanted:
@@ -87,7 +87,7 @@ def script(entry: str) -> str:
         del texts[module]
         texts[module] = re.sub(r"^export ", "", _IMPORT.sub("", text), flags=re.MULTILINE)
 
-    add(entry)
+    add(entry, "pages")
     whole = "\n".join(texts.values())
     if "</script" in whole or re.search(r"^\s*(import|export)\b", whole, re.MULTILINE):
         raise ValueError(f"{entry}.mjs cannot stand in a page: an import or an end of script is left in it")
@@ -106,7 +106,7 @@ def page(entry: str, title: str, data: bytes = b"", connects: bool = False) -> s
     """A page.
 
     Args:
-        entry: module that it begins with, without its ending.
+        entry: module in `pages` that it begins with, without its ending.
         title: until the script gives another.
         data: what it holds, of `packed`; none where it is loaded.
         connects: whether it reaches its own server.

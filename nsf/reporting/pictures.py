@@ -97,13 +97,11 @@ class _Variant:
         found = []
         for i, value in zip(chosen, values, strict=True):
             if value in motions:
-                place = {0: "worst, ", len(ranked) - 1: "best, "}.get(i, "") if len(ranked) > 1 else ""
-                delta = ranked[i][1]
-                told = f"{place}δ {100 * delta:.2g} %" if np.isfinite(delta) else place.rstrip(", ")
+                place = {0: "worst", len(ranked) - 1: "best"}.get(i, "") if len(ranked) > 1 else ""
                 motion, other = motions[value], beside.get(value)
                 if other is not None and other.x_full.shape != motion.x_full.shape:
                     other = None  # its run kept other particles or frames
-                found.append(shapes.Case(motion, told, other))
+                found.append(shapes.Case(motion, place, ranked[i][1], other))
         return found
 
     def _motions(self, values) -> list[Motion]:
@@ -241,11 +239,12 @@ def _animation(
         frames=CROWDED_FRAMES if crowded else FRAMES, max_bytes=gif_bytes,
     )  # fmt: skip
     cut = shapes.is_cut_open(cases[0].motion.x_full[0])
+    held_out = "" if v.held_out == "train" else ", held out from training"
     caption = (
-        f"The full-order model (left) and the reduced one (right) at {_told(cases, name, unit)}, held out "
-        f"from training{'; the front half is cut away' if cut else ''}.{_beside(cases)}{v.continued()}"
+        f"The full-order model (left) and the reduced one (right) at {_told(cases, name, unit)}{held_out}"
+        f"{'; the front half is cut away' if cut else ''}.{_beside(cases)}{v.continued()}"
     )
-    return [Picture([f"{prefix}animation.gif"], _held_out(caption, v), v.runs)]
+    return [Picture([f"{prefix}animation.gif"], caption, v.runs)]
 
 
 def _stills(v: _Variant, folder: Path, prefix: str, brief: bool, beside: _Variant | None) -> list[Picture]:
@@ -278,13 +277,10 @@ def _stills(v: _Variant, folder: Path, prefix: str, brief: bool, beside: _Varian
 
 def _told(cases: Sequence[shapes.Case], name: str, unit: str) -> str:
     """The cases in words, with their place among all."""
-    places = {"worst": "the worst", "best": "the best"}
-    parts = []
-    for case in cases:
-        place = places.get(case.remark.partition(",")[0], "")
-        value = parameter_text(case.motion.parameter, "", unit)
-        parts.append(f"{value} ({place})" if place else value)
-    return f"{name} {' and '.join(parts)}"
+    told = [
+        parameter_text(c.motion.parameter, "", unit) + (f" (the {c.place})" if c.place else "") for c in cases
+    ]
+    return f"{name} {' and '.join(told)}"
 
 
 def _beside(cases: Sequence[shapes.Case]) -> str:
@@ -394,10 +390,6 @@ def _prefixes(shown: list[_Variant]) -> list[str]:
     scenes = len({v.scene for v in shown}) > 1
     heads = [file_name(f"{v.scene}-{v.method}-" if scenes else f"{v.method}-") for v in shown]
     return heads if len(set(heads)) == len(heads) else [f"{i}-{head}" for i, head in enumerate(heads)]
-
-
-def _held_out(caption: str, v: _Variant) -> str:
-    return caption.replace(", held out from training", "") if v.held_out == "train" else caption
 
 
 def _has(series: pd.DataFrame, column: str) -> bool:

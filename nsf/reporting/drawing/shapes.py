@@ -37,11 +37,25 @@ _STRESS = "von Mises equivalent of the Kirchhoff stress"
 
 @dataclass(frozen=True)
 class Case:
-    """A case in pictures: its motion, what is remarked of it, and the baseline's motion in the same case."""
+    """A case in pictures.
+
+    Attributes:
+        motion: of both models; baseline: of the baseline in the same case.
+        place: "worst" or "best" of its variant's cases, or nothing.
+        delta: δ as a fraction, where it is to be said.
+    """
 
     motion: Motion
-    remark: str = ""
+    place: str = ""
+    delta: float = np.nan
     baseline: Motion | None = None
+
+    @property
+    def remark(self) -> str:
+        """What is said of it in a picture."""
+        return ", ".join(
+            [self.place] * bool(self.place) + [f"δ {100 * self.delta:.2g} %"] * bool(np.isfinite(self.delta))
+        )
 
     def models(self) -> Iterator[tuple[str, Motion, np.ndarray, np.ndarray]]:
         """Of each model its name, its motion, x [F, n, 3] [m] and the equivalent of τ [F, n] [Pa]."""

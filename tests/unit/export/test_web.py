@@ -23,7 +23,7 @@ MODULES = Path(web.__file__).parents[1] / "live/web"
 def test_a_page_has_each_module_once_after_those_that_it_imports(entry, tmp_path):
     text = web.script(entry)
     assert not re.search(r"^(import|export)\b", text, re.MULTILINE)
-    for module in MODULES.glob("*.mjs"):
+    for module in MODULES.rglob("*.mjs"):
         for name in re.findall(r"^export class (\w+)", module.read_text(), re.MULTILINE):
             assert text.count(f"class {name} ") <= 1
     assert text.count("class Camera ") == text.count("class Drawing ") == 1

@@ -89,7 +89,7 @@ def test_a_strip_shows_both_models_from_the_first_frame_to_the_last():
 def test_a_strip_has_the_worst_and_the_best_and_the_baseline_below():
     worst, best = motions(2, particles=60)
     lost = replace(worst, stopped=0.2)
-    figure = strip([Case(worst, "worst, δ 3 %", lost), Case(best, "best, δ 1 %")], "friction angle", "°")
+    figure = strip([Case(worst, "worst", 0.03, lost), Case(best, "best", 0.01)], "friction angle", "°")
     told = [text.get_text() for text in figure.texts]
     assert [text for text in told if "angle" in text] == [
         "full-order, friction angle 22.5°",

@@ -1,14 +1,14 @@
 // A model that runs in the page: closure, operators and modes are in the file, and a hand steers it.
 
-import { Camera } from "./camera.mjs";
-import { button, choice, counted, download, element, fail, find, headed, keyed, legend, lit, onLook, slider, tick } from "./controls.mjs";
-import { Recording, inflated, unpacked } from "./data.mjs";
-import { Drawing, Pace } from "./drawing.mjs";
-import { Field, displacement, vonMises } from "./field.mjs";
-import { Operators, Run } from "./operators.mjs";
-import { along, moved } from "./solids.mjs";
-import { Tilt } from "./tilt.mjs";
-import { Trust } from "./trust.mjs";
+import { Camera } from "../camera.mjs";
+import { button, choice, counted, download, element, fail, find, headed, keyed, legend, lit, onLook, slider, tick } from "../controls.mjs";
+import { Recording, inflated, unpacked } from "../data.mjs";
+import { Drawing, Pace } from "../drawing.mjs";
+import { Field, displacement, vonMises } from "../field.mjs";
+import { Operators, Run } from "../operators.mjs";
+import { along, moved } from "../solids.mjs";
+import { Tilt } from "../tilt.mjs";
+import { Trust } from "../trust.mjs";
 
 const HOLD = 0.7; // [s] for which the end stands before the run begins again
 const MOST = 50000; // steps that a run of a hand may take
@@ -18,7 +18,7 @@ const SHOWN_IN = 4; // [s] about, in which a run is shown at first
 
 /** The model of a page and what is shown of it. */
 export class Live {
-  /** @param {import("./data.mjs").Packed} packed */
+  /** @param {import("../data.mjs").Packed} packed */
   constructor(packed) {
     const { header: told, arrays } = packed;
     this.told = told;
@@ -223,7 +223,7 @@ async function show() {
   };
   frame.oninput = () => seek(Number(frame.value));
   /** @type {any[]} */
-  const sliders = told.parameters.map((/** @type {import("./controls.mjs").Parameter} */ p, /** @type {number} */ i) =>
+  const sliders = told.parameters.map((/** @type {import("../controls.mjs").Parameter} */ p, /** @type {number} */ i) =>
     slider(p, live.case.values[i], () => {
       live.steer(sliders.map((own) => Number(own.input.value)), find("from").value === "here");
       change();
@@ -235,7 +235,7 @@ async function show() {
     change();
   }) : null;
   /** @type {{ index: number, own: any }[]} */
-  const handles = live.case.solids.flatMap((/** @type {import("./solids.mjs").Solid} */ solid, /** @type {number} */ index) => {
+  const handles = live.case.solids.flatMap((/** @type {import("../solids.mjs").Solid} */ solid, /** @type {number} */ index) => {
     if (!solid.movable) return [];
     const { low, high } = solid.movable, step = (high - low) / 200;
     const p = { name: `place of ${solid.name}`, unit: "m", lower: low, upper: high, step, trained: [low, high] };

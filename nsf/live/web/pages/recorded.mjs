@@ -1,10 +1,10 @@
 // The player of a recorded run.
 
-import { Camera } from "./camera.mjs";
-import { button, choice, counted, element, fail, find, headed, keyed, legend, onLook, tick } from "./controls.mjs";
-import { Recording, inflated, unpacked } from "./data.mjs";
-import { Drawing, Pace } from "./drawing.mjs";
-import { displacement } from "./field.mjs";
+import { Camera } from "../camera.mjs";
+import { button, choice, counted, element, fail, find, headed, keyed, legend, onLook, tick } from "../controls.mjs";
+import { Recording, inflated, unpacked } from "../data.mjs";
+import { Drawing, Pace } from "../drawing.mjs";
+import { displacement } from "../field.mjs";
 
 const HOLD = 0.7; // [s] for which the last frame stands before the run begins again
 

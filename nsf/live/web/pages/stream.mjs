@@ -1,11 +1,11 @@
 // The page of `nsf serve`: it decodes the latent vectors that a server sends.
 
-import { Camera } from "./camera.mjs";
-import { button, element, fail, find, headed, keyed, legend, lit, onLook, slider, tick, valued } from "./controls.mjs";
-import { unpacked } from "./data.mjs";
-import { Drawing, Pace } from "./drawing.mjs";
-import { Field, displacement } from "./field.mjs";
-import { lightOf } from "./trust.mjs";
+import { Camera } from "../camera.mjs";
+import { button, element, fail, find, headed, keyed, legend, lit, onLook, slider, tick, valued } from "../controls.mjs";
+import { unpacked } from "../data.mjs";
+import { Drawing, Pace } from "../drawing.mjs";
+import { Field, displacement } from "../field.mjs";
+import { lightOf } from "../trust.mjs";
 
 /** Follow the stream beside the page's own address, whose query holds the token where there is one. */
 async function follow() {
@@ -27,7 +27,7 @@ async function follow() {
   };
   const turn = () => send({ playing: !state.playing });
   const time = element("output", { id: "time" }), play = button("play", "Pause", turn, "space; for all who look");
-  const sliders = told.parameters.map((/** @type {import("./controls.mjs").Parameter} */ p) =>
+  const sliders = told.parameters.map((/** @type {import("../controls.mjs").Parameter} */ p) =>
     slider(p, p.trained[0], () => {
       send({ values: sliders.map((/** @type {any} */ s) => Number(s.input.value)) });
     }),
