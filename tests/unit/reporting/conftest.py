@@ -6,12 +6,21 @@ import pytest
 from synthetic import Made, write_run
 
 from nsf.reporting import build, build_report, pictures
+from nsf.reporting.drawing import style
 
 SWEEP = (
     Made(),
     Made(sample=50, noise=0.007),
     Made(method="deformation_only", noise=0.05, dirty=True),
 )
+
+
+@pytest.fixture(scope="session", autouse=True)
+def coarse():
+    """Half the pixels an inch: to write a picture takes longer than to draw it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(style, "PIXELS", style.PIXELS // 2)
+        yield
 
 
 @pytest.fixture(scope="session")
@@ -22,9 +31,9 @@ def sweep(tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def report(sweep, tmp_path_factory):
+def report(sweep, made_once):
     """The folder of a report of the sweep."""
-    return build_report(sweep, tmp_path_factory.mktemp("reports") / "sand", "Sand & friends").parent
+    return made_once("reports", lambda root: build_report(sweep, root / "sand", "Sand & friends")) / "sand"
 
 
 @pytest.fixture
