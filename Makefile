@@ -22,6 +22,8 @@ UNUSED = $(VENV)/lib/python*/site-packages -mindepth 2 \( -type d -name tests -o
 # One thread a test worker: two workers share two cores.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest
 WORKERS ?= 2
+# What Python compiles of torch and the rest is kept: it takes six seconds of every process that imports them.
+unexport PYTHONDONTWRITEBYTECODE
 # Of make fuzz.
 CASES ?= 2400
 SEED ?= 0
