@@ -21,7 +21,7 @@ from nsf.live.player import Moment, Player
 
 PATIENCE = 120_000  # [ms] after which something is broken, however busy the machine is
 #: What a client draws is behind its canvas, above which the panel lies.
-SCENE = {"x": 0, "y": 100, "width": 500, "height": 300}
+SCENE = {"x": 0, "y": 120, "width": 700, "height": 480}
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +104,7 @@ def served(model, monkeypatch):
 
 def opened(browser, url):
     """A window of the page, and the addresses it asked for."""
-    window, asked = browser.new_page(viewport={"width": 900, "height": 420}), []
+    window, asked = browser.new_page(viewport={"width": 1100, "height": 640}), []
     window.set_default_timeout(PATIENCE)
     window.on("request", lambda request: asked.append(request.url))
     window.goto(url)
