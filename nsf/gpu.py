@@ -1,7 +1,10 @@
-"""Whether this machine could use a GPU at all, found without a library that would."""
+"""What concerns a GPU, without a library that would use it."""
 
 import ctypes
+import gc
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cache
 
 _LIBRARIES = {
@@ -20,3 +23,15 @@ def has_driver() -> bool:
             continue
         return True
     return False
+
+
+@contextmanager
+def without_collection() -> Iterator[None]:
+    """Leave garbage alone while launches are captured: arrays of a GPU cannot be freed in a capture."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if collects:
+            gc.enable()

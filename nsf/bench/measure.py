@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import warp as wp
 
+from nsf.gpu import without_collection
 from nsf.timing import MemoryProbe, synchronizer
 
 _TRIAL_SECONDS = 0.05  # of a trial, at least: the clock and the last synchronisation are lost in it
@@ -133,7 +134,7 @@ def pass_time(call: Callable[[], None], device: str, trials: int = 5) -> float:
 
     call()
     if wp.get_device(device).is_cuda:
-        with wp.ScopedCapture(device=device) as capture:
+        with without_collection(), wp.ScopedCapture(device=device) as capture:
             many()
 
         def many() -> None:

@@ -1,11 +1,11 @@
 """The only door between torch and Warp: shared memory, shared stream."""
 
-import gc
 from contextlib import contextmanager, nullcontext
 
 import torch
 import warp as wp
 
+from nsf.gpu import without_collection
 from nsf.mpm.precision import Precision
 
 TORCH_DTYPES = {"fp32": torch.float32, "fp64": torch.float64}
@@ -64,16 +64,5 @@ def captured(device):
     be freed.
     """
     graph = torch.cuda.CUDAGraph()
-    with _without_collection(), torch.cuda.graph(graph), on_torch_stream(device):
+    with without_collection(), torch.cuda.graph(graph), on_torch_stream(device):
         yield graph
-
-
-@contextmanager
-def _without_collection():
-    collects = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if collects:
-            gc.enable()

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from nsf.errors import ConfigError, InstabilityError, ShapeError
+from nsf.gpu import without_collection
 from nsf.mpm.boundaries.arrays import BoundaryArrays, DomainWalls
 from nsf.mpm.boundaries.colliders import Collider
 from nsf.mpm.device import warp_device
@@ -248,7 +249,7 @@ class FullOrderMPM:
         elif self._graph is None:
             # The first step runs uncaptured, so that every kernel is compiled and loaded.
             self._run()
-            with wp.ScopedCapture(device=self.device) as capture:
+            with without_collection(), wp.ScopedCapture(device=self.device) as capture:
                 self._run()
             self._graph = capture.graph
         else:
@@ -265,7 +266,7 @@ class FullOrderMPM:
             self._run_stages(timer)
         else:
             _ = self.increment  # allocated outside the graph
-            with wp.ScopedCapture(device=self.device) as capture:
+            with without_collection(), wp.ScopedCapture(device=self.device) as capture:
                 self._run_stages(timer.captured)
             wp.capture_launch(capture.graph)
             timer.add_launch()

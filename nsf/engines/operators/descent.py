@@ -11,6 +11,7 @@ from nsf.engines.operators.lessons import Labels
 from nsf.engines.operators.model import StepOperators
 from nsf.engines.operators.teacher import Teacher
 from nsf.engines.operators.teaching import Teaching
+from nsf.gpu import without_collection
 
 _BATCH = 1024  # labels of one step of the descent
 _WARM_UP = 3  # steps before a graph is captured, as CUDA asks for
@@ -185,7 +186,7 @@ class Descent:
                 self._step(window, held)
         torch.cuda.current_stream(self._device).wait_stream(aside)
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph):
+        with without_collection(), torch.cuda.graph(graph):
             self._step(window, held)
         return graph, held
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from nsf.gpu import without_collection
 from nsf.kinematics.training.phases import PHASES, Fit, seed_of
 from nsf.kinematics.training.rank import ALONE, Rank
 from nsf.kinematics.training.schedules import Trainer
@@ -99,7 +100,7 @@ class Steps:
         if self._graph is None:
             self._graph = torch.cuda.CUDAGraph()
             self._graph.register_generator_state(self._generator)
-            with torch.cuda.graph(self._graph, stream=self._stream):
+            with without_collection(), torch.cuda.graph(self._graph, stream=self._stream):
                 self._loss = self._descend(step)
         self._graph.replay()
         return self._loss
