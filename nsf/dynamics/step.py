@@ -49,6 +49,7 @@ class Step(GridSpan):
             "p2g": self.p2g,
             "g2p": self.update_g2p,
             "inversion": self.project,
+            **self.closing,
         }
 
     def infer(self) -> None:
@@ -77,6 +78,7 @@ class Step(GridSpan):
 
     @override
     def enter(self, first: bool) -> None:
+        super().enter(first)
         if first:
             self.inference.begin_moving(self.record.now, self.initial_velocity, self.first_rate()[0])
         else:

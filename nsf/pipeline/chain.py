@@ -14,11 +14,12 @@ from omegaconf import DictConfig
 from nsf import config as configuration
 from nsf.data import Case
 from nsf.dynamics import ParticleSets, ReducedBatch, ReducedMPM
-from nsf.engines import Engine, Operators
+from nsf.engines import Closed, Engine, Operators
 from nsf.kinematics.fields.mlp import MlpField
 from nsf.kinematics.manifold import Manifold
 from nsf.pipeline.plan import Plan
 from nsf.pipeline.reuse import report, reused, simulations
+from nsf.pipeline.stages.closing import close
 from nsf.pipeline.stages.deployment import CONFIGURATION, deploy_held_out
 from nsf.pipeline.stages.evaluation import evaluate, superresolve_held_out
 from nsf.pipeline.stages.simulation import Job, Shared, simulate
@@ -160,10 +161,10 @@ class Pipeline(Plan):
 
         By the engine that is asked for, of the scene that is deployed, unless others are given.
         """
-        if self.teaching is not None and self.taught.complete:
+        if self.is_taught and self.taught.complete:
             self.operators()  # which bring the sample, whoever takes the steps
         if engine is None:
-            engine = self.operators() if self.engine == Operators.name else self.engine
+            engine = self.operators() if self.is_taught else self.engine
         batch = (scene or self.deployed).reduced_batch(
             manifold,
             cases,
@@ -182,27 +183,28 @@ class Pipeline(Plan):
         return batch
 
     def teach(self) -> Run:
-        """The operators of the deployed step, where the engine that is asked for steps by them.
+        """The operators of the deployed step, or its closure, as the engine that is asked for needs them.
 
         Raises:
             ConfigError: it does not.
         """
-        return self._made(self.taught, partial(teach, self))
+        return self._made(self.taught, partial(teach if self.closing is None else close, self))
 
     def operators(self) -> Operators:
-        """The operators that were taught; the sample that they know is that of all runs from here on.
+        """The operators or closure that were taught; their sample is that of all runs from here on.
 
         Raises:
             MissingRunError: none were taught.
         """
         if self._taught is None:
-            self._taught = Operators.load(self.taught.require().file(OPERATORS))
+            kind = Operators if self.closing is None else Closed
+            self._taught = kind.load(self.taught.require().file(OPERATORS))
             self._samples = self._taught.samples
         return self._taught
 
     def deploy(self) -> Run:
         """Reduced trajectories of the held-out cases, through Lightning's `Trainer.predict`."""
-        if self.teaching is not None and not self.taught.complete:
+        if self.is_taught and not self.taught.complete:
             self.teach()
         return self._made(self.deployment, partial(deploy_held_out, self))
 

@@ -14,8 +14,9 @@ from omegaconf import DictConfig, OmegaConf
 from nsf import config as configuration
 from nsf.config.code import code_of
 from nsf.data.case import Case
+from nsf.engines.closed.closing import Closing
 from nsf.engines.modal.mirrors import edits
-from nsf.engines.names import OPERATORS, RUNS
+from nsf.engines.names import CLOSED, OPERATORS, RUNS
 from nsf.engines.operators.teaching import Teaching, random_cases
 from nsf.errors import ConfigError
 from nsf.gpu import has_driver
@@ -49,7 +50,8 @@ class Names:
 
     Attributes:
         scene: that is trained on; deployed: that of the held-out simulations and of deployment.
-        engine: name of the engine that is asked for; teaching: of operators, None for another engine.
+        engine: name of the engine that is asked for; teaching: of operators, None for another engine;
+            closing: of a closure, likewise.
         coarse: factors of Δx of the full-order runs that a reduced one is held to.
         split: cases by their use.
         device: found once, so that a missing GPU is reported before any work.
@@ -90,6 +92,14 @@ class Names:
                     f"engine.teacher={RUNS} teaches steps of the scene's Δt, and deploy.dt_multiplier is "
                     f"{c.deploy.dt_multiplier:g}; set it to 1, or engine.teacher=auto"
                 )
+        self.closing: Closing | None = None
+        if self.engine == CLOSED:
+            self.closing = configuration.build(c.engine.closing, "engine.closing")
+            if c.deploy.dt_multiplier != 1:
+                raise ConfigError(
+                    f"engine={CLOSED} learns from steps of the scene's Δt, and deploy.dt_multiplier is "
+                    f"{c.deploy.dt_multiplier:g}; set it to 1, or engine=auto"
+                )
         self.coarse = factors("evaluation.coarse", OmegaConf.select(c, "evaluation.coarse", default=[]))
         check_words(c, self.engine)
         check_batch(c, self.engine)
@@ -115,11 +125,18 @@ class Names:
     @property
     def stages(self) -> tuple[str, ...]:
         """The stages of the chain, `teach` only where the engine that is asked for is taught."""
-        return tuple(name for name in STAGES if name != "teach" or self.teaching is not None)
+        return tuple(name for name in STAGES if name != "teach" or self.is_taught)
+
+    @property
+    def is_taught(self) -> bool:
+        """Whether the engine that is asked for is of a file that the stage `teach` writes."""
+        return self.teaching is not None or self.closing is not None
 
     @property
     def projecting(self) -> str:
-        """The engine of steps that are projected: that which is asked for, or which operators learn from."""
+        """The engine of steps that are projected: that which is asked for, or which learned ones build on."""
+        if self.closing is not None:
+            return "auto"
         if self.teaching is None:
             return self.engine
         return "auto" if self.of_runs else self.config.engine.teacher
@@ -222,7 +239,7 @@ class Names:
             content |= {"check": self.config.engine.check, "tolerance": self.config.deploy.tolerance}
         if changed := edits():  # an edited step is another run, whose result is not there yet
             content["edited"] = changed
-        parents = [self.training] if self.teaching is None else [self.training, self.taught]
+        parents = [self.training, self.taught] if self.is_taught else [self.training]
         return Run.open("deploy", self.scene.name, content, parents, root=self.root)
 
     @cached_property
@@ -241,24 +258,28 @@ class Names:
 
     @property
     def taught(self) -> Run:
-        """The run of the operators.
+        """The run of the operators, or of a closure.
 
         Raises:
             ConfigError: the engine that is asked for learns nothing.
         """
-        if self.teaching is None:
-            raise ConfigError(f"engine={self.engine} is not taught; set engine=operators")
+        if not self.is_taught:
+            raise ConfigError(
+                f"engine={self.engine} is not taught; set engine={OPERATORS} or engine={CLOSED}"
+            )
         content = (
             self._content(("method", "sampler", "projector", "integration", "precision", "seed"))
             | self._physics(self.scene)
-            | {
+            | {"cases": [list(map(dict, cases)) for cases in self.lessons], "device": self.device}
+        )
+        if self.closing is not None:
+            content["closing"] = asdict(self.closing)
+        else:
+            content |= {
                 "teaching": asdict(self.teaching),
                 "teacher": self.config.engine.teacher,
-                "cases": [list(map(dict, cases)) for cases in self.lessons],
                 "dt_multiplier": self.config.deploy.dt_multiplier,
-                "device": self.device,
             }
-        )
         if changed := edits():
             content["edited"] = changed
         return Run.open("teach", self.scene.name, content, [self.training], root=self.root)
@@ -272,7 +293,7 @@ class Names:
         between, and it is told how far runs at validation values are off, or, if there are none, at training.
         """
         known, seed = sorted(self.split.train), int(self.config.seed)
-        if self.of_runs:
+        if self.of_runs or self.closing is not None:
             return [known, [], sorted(self.split.validation) or known]
         taken = [*known, *self.split.validation, *self.split.test]
         between = random_cases(self.split.box, len(known), seed, taken)

@@ -6,8 +6,8 @@ from pathlib import Path
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from nsf import config as configuration
+from nsf.engines.names import CLOSED, OPERATORS, RUNS
 from nsf.engines.names import NAMES as ENGINES
-from nsf.engines.names import OPERATORS, RUNS
 from nsf.errors import ConfigError
 from nsf.kinematics.training.tracking import check_tracking
 
@@ -15,7 +15,7 @@ from nsf.kinematics.training.tracking import check_tracking
 STORED = ("float32", "float64")
 PRECISIONS = ("fp32", "fp64")
 #: What operators can be taught by: engines, or the full-order runs of training.
-TEACHERS = (*(name for name in ENGINES if name != OPERATORS), RUNS)
+TEACHERS = (*(name for name in ENGINES if name not in (CLOSED, OPERATORS)), RUNS)
 #: Least deployment step in units of the scene's: a thousand reduced steps for one are no reduction.
 _LEAST_STEP = 1e-3
 

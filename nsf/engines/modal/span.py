@@ -69,21 +69,32 @@ class ModalSpan(GridSpan):
     @property
     @override
     def stages(self) -> Stages:
-        return {"inference": self.infer, "p2g": self.p2g, "g2p": self.update_g2p, "inversion": self.project}
+        own = {"inference": self.infer, "p2g": self.p2g, "g2p": self.update_g2p, "inversion": self.project}
+        return own | self.closing
 
     @override
     def enter(self, first: bool) -> None:
-        record, state = self.record, self.coefficients
+        super().enter(first)
+        state = self.coefficients
         with on_torch_stream(self._arena.device):
             for side in (_PREPARING, _CLEARING):  # where a step was left in its midst
                 self._arena.meet(side)
-            for xhat in (record.before, record.now):
-                state.latent.copy_(xhat.view_as(state.latent))
-                self._projection.evaluate.launch()
+            self._evaluate()
             if first:  # of the latents alone: the heads read it, while v is the initial velocity
                 state.rate[:, : state.latent.shape[1]] = self._projection.sigma * self.first_rate()
             state.first.fill_(int(first))
             state.step += 1  # what an earlier step stamped is of no account
+
+    def _evaluate(self) -> None:
+        """Find the coefficients and their rate of the record's last two latent vectors."""
+        for xhat in (self.record.before, self.record.now):
+            self.coefficients.latent.copy_(xhat.view_as(self.coefficients.latent))
+            self._projection.evaluate.launch()
+
+    @override
+    def close(self) -> None:
+        super().close()
+        self._evaluate()
 
     def infer(self) -> None:
         """x and v, the particles that S needs, and their τ and C (paper sections 5.1 and 5.4).

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -96,7 +97,7 @@ class Descent:
 
     def run(self) -> None:
         """All steps."""
-        with _one_thread():
+        with one_thread():
             step = self._captured() if self._device.type == "cuda" else self._step
             for turn in range(self._teaching.descent):
                 window = self._window_of(turn)
@@ -155,44 +156,58 @@ class Descent:
             loss = loss + self._kind.weigh(x - runs[n + j + 1, k], j, model)
         return loss / unroll
 
-    # -- graphs -----------------------------------------------------------------------------------------
-
     def _captured(self) -> Callable[[int | None, list[Tensor]], None]:
-        """The same step as graphs, one for each kind; the network and the optimiser are left as they were."""
-        before = {name: values.clone() for name, values in self._model.state_dict().items()}
+        """The same step as graphs, one for each kind."""
         state = self._generator.get_state()
         kinds = {self._window_of(turn) for turn in range(self._teaching.descent)}
-        graphs = {window: self._capture(window) for window in sorted(kinds, key=str)}
+        graphs = {
+            window: graphed(partial(self._step, window), self._drawn(window), self._model, self._optimiser)
+            for window in sorted(kinds, key=str)
+        }
         self._generator.set_state(state)
-        self._model.load_state_dict(before)
-        for of_weight in self._optimiser.state.values():
-            for values in of_weight.values():
-                values.zero_()
+        return lambda window, drawn: graphs[window](drawn)
 
-        def step(window: int | None, drawn: list[Tensor]) -> None:
-            graph, held = graphs[window]
-            for there, values in zip(held, drawn, strict=True):
-                there.copy_(values)
-            graph.replay()
 
-        return step
+def graphed(
+    step: Callable[[list[Tensor]], object],
+    drawn: list[Tensor],
+    model: torch.nn.Module,
+    optimiser: torch.optim.Optimizer,
+) -> Callable[[list[Tensor]], None]:
+    """A step of a descent as one graph; the network and the optimiser are left as they were.
 
-    def _capture(self, window: int | None) -> tuple[torch.cuda.CUDAGraph, list[Tensor]]:
-        held = [values.to(self._device) for values in self._drawn(window)]
-        aside = torch.cuda.Stream(self._device)
-        aside.wait_stream(torch.cuda.current_stream(self._device))
-        with torch.cuda.stream(aside):
-            for _ in range(_WARM_UP):
-                self._step(window, held)
-        torch.cuda.current_stream(self._device).wait_stream(aside)
-        graph = torch.cuda.CUDAGraph()
-        with without_collection(), torch.cuda.graph(graph):
-            self._step(window, held)
-        return graph, held
+    Args:
+        step: given what was drawn for it, on the device.
+        drawn: as it will be, on the host.
+        model, optimiser: that the step changes.
+    """
+    device = next(model.parameters()).device
+    before = {name: values.clone() for name, values in model.state_dict().items()}
+    held = [values.to(device) for values in drawn]
+    aside = torch.cuda.Stream(device)
+    aside.wait_stream(torch.cuda.current_stream(device))
+    with torch.cuda.stream(aside):
+        for _ in range(_WARM_UP):
+            step(held)
+    torch.cuda.current_stream(device).wait_stream(aside)
+    graph = torch.cuda.CUDAGraph()
+    with without_collection(), torch.cuda.graph(graph):
+        step(held)
+    model.load_state_dict(before)
+    for of_weight in optimiser.state.values():
+        for values in of_weight.values():
+            values.zero_()
+
+    def take(drawn: list[Tensor]) -> None:
+        for there, values in zip(held, drawn, strict=True):
+            there.copy_(values)
+        graph.replay()
+
+    return take
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
+def one_thread() -> Iterator[None]:
     """So small a network gains nothing by more threads, and its bits would depend on how many there are."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

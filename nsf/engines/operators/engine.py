@@ -46,7 +46,7 @@ class Operators(Engine):
         Raises:
             MissingRunError, SchemaError: see `StepOperators.load`.
         """
-        return cls(*StepOperators.load(path))
+        return cls(*StepOperators.load(path, cls.name))
 
     @override
     def refusal(self, setups: Sequence[Setup]) -> str:

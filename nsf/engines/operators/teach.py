@@ -226,33 +226,9 @@ class Course:
         return middle.tolist(), float((known - middle).norm(dim=1).max()) + self.reach
 
     def _model(self, truth: Tensor, changes: Tensor) -> StepOperators:
-        first = self.teachers[0]
-        c_mean, c_matrix = principal(list(first.features.transpose(0, 1).numpy()), first.programs)
         weightless = self.reach == 0.0 and not any(bool(t.gravity.any()) for t in self.teachers)
-        sizes = Sizes(
-            latents=truth.shape[-1], parameters=first.parameters.shape[1], features=len(c_mean),
-            states=c_matrix.shape[1], gravity=not weightless, width=self.teaching.width,
-        )  # fmt: skip
-        state = torch.random.get_rng_state()
-        torch.manual_seed(self.seed)
-        model = StepOperators(sizes, first.dt).double()
-        torch.random.set_rng_state(state)
-
-        def deviation(values: Tensor) -> Tensor:
-            found = values.flatten(0, -2).std(0)
-            return found.clamp_min(1e-9 * float(found.max().clamp_min(1e-30)))
-
-        scales = {
-            "x_mean": truth.flatten(0, -2).mean(0), "x_scale": deviation(truth),
-            "mu_mean": first.parameters.mean(0), "mu_scale": _spread(first.parameters),
-            "c_mean": torch.as_tensor(c_mean), "c_matrix": torch.as_tensor(c_matrix),
-            "d_scale": deviation(changes), "a_scale": deviation(torch.diff(changes, dim=0)),
-            "g_mean": first.gravity.flatten(0, 1).mean(0),
-            "g_scale": first.gravity.norm(dim=-1).max().clamp_min(1e-30),
-        }  # fmt: skip
-        for name, value in scales.items():
-            getattr(model, name).copy_(value)
-        return model
+        accelerations, width = torch.diff(changes, dim=0), self.teaching.width
+        return standardised(self.teachers[0], truth, changes, accelerations, width, not weightless, self.seed)
 
     def own_runs(self, teacher: Teacher) -> Tensor:
         """[N + 1, R, r] runs of the operators at the teacher's values; what strays far is held."""
@@ -309,6 +285,49 @@ class Course:
         self.seconds = kept["seconds"]
         for teacher, steps in zip((*self.teachers, self.yardstick.teacher), kept["steps"], strict=True):
             teacher.steps = steps
+
+
+def standardised(
+    teacher: Teacher,
+    truth: Tensor,
+    changes: Tensor,
+    accelerations: Tensor,
+    width: int,
+    gravity: bool,
+    seed: int,
+) -> StepOperators:
+    """A network that gives nothing yet, with the scales of what it will be given and give.
+
+    Args:
+        teacher: in training cases.
+        truth, changes, accelerations: [..., r] latents, their changes, and what is to be learned.
+        width: of hidden layers; gravity: whether there is any; seed: of the weights.
+    """
+    c_mean, c_matrix = principal(list(teacher.features.transpose(0, 1).numpy()), teacher.programs)
+    sizes = Sizes(
+        latents=truth.shape[-1], parameters=teacher.parameters.shape[1], features=len(c_mean),
+        states=c_matrix.shape[1], gravity=gravity, width=width,
+    )  # fmt: skip
+    state = torch.random.get_rng_state()
+    torch.manual_seed(seed)
+    model = StepOperators(sizes, teacher.dt).double()
+    torch.random.set_rng_state(state)
+
+    def deviation(values: Tensor) -> Tensor:
+        found = values.flatten(0, -2).std(0)
+        return found.clamp_min(1e-9 * float(found.max().clamp_min(1e-30)))
+
+    scales = {
+        "x_mean": truth.flatten(0, -2).mean(0), "x_scale": deviation(truth),
+        "mu_mean": teacher.parameters.mean(0), "mu_scale": _spread(teacher.parameters),
+        "c_mean": torch.as_tensor(c_mean), "c_matrix": torch.as_tensor(c_matrix),
+        "d_scale": deviation(changes), "a_scale": deviation(accelerations),
+        "g_mean": teacher.gravity.flatten(0, 1).mean(0),
+        "g_scale": teacher.gravity.norm(dim=-1).max().clamp_min(1e-30),
+    }  # fmt: skip
+    for name, value in scales.items():
+        getattr(model, name).copy_(value)
+    return model
 
 
 def _ball(shape: torch.Size, generator: torch.Generator) -> Tensor:

@@ -109,7 +109,9 @@ def _range_of_solids(pipeline) -> SolidsRange | None:
 def _rollouts(pipeline, manifold: Manifold, record: Record) -> list[Rollout]:
     """The reduced runs; how far they may be believed, and who takes their steps, go on record."""
     started, asked = time.perf_counter(), pipeline.config.deploy
-    projected = partial(pipeline.solver_at, manifold, engine=pipeline.projecting)
+    # What a closure was fitted to is believed as it goes on, closed.
+    steps_by = pipeline.projecting if pipeline.closing is None else None
+    projected = partial(pipeline.solver_at, manifold, engine=steps_by)
 
     def known_at(values: Mapping[str, float], device: str) -> ReducedMPM:
         """A run in the training case of some parameters, with its own program."""

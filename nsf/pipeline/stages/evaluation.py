@@ -54,7 +54,7 @@ def evaluate(pipeline, run: Run) -> None:
         cost = _cost(pipeline, manifold, rollouts[0], beside[0].factors)
         engine = str(pipeline.deployment.manifest["metrics"].get("engine", ""))
         seconds = pipeline.training.metric("training_seconds")
-        offline = seconds, 0.0 if pipeline.teaching is None else pipeline.taught.metric("teach_seconds")
+        offline = seconds, pipeline.taught.metric("teach_seconds") if pipeline.is_taught else 0.0
         own = cost, pipeline.device, run.manifest, engine, offline
         table = results.rows(pipeline.config, manifold, rollouts, comparisons, beside, *own)
         held = comparisons, beside, rollouts

@@ -9,6 +9,7 @@ import torch
 from nsf.data import Case, Trajectory
 from nsf.data.schema import TRAJECTORY
 from nsf.dynamics import ReducedBatch
+from nsf.engines import Engine
 from nsf.engines.operators import Course, Recorded, Taught, Teacher, Yardstick
 from nsf.kinematics.manifold import Manifold
 from nsf.progress import Progress
@@ -47,9 +48,9 @@ def _follow(pipeline, manifold: Manifold, record: Record) -> None:
     teaching, seed, device = pipeline.teaching, int(pipeline.config.seed), pipeline.device
     work = (1, "rounds") if pipeline.of_runs else (teaching.steps, "teacher's steps")
     with Progress("teach", *work) as progress:
-        truth = _truth(pipeline, manifold)
+        truth = truth_of(pipeline, manifold)
         if pipeline.of_runs:
-            lessons, yardstick = _recorded(pipeline, manifold, truth)
+            lessons, yardstick = recorded(pipeline, manifold, truth)
             truth = None  # is the teacher
         else:
             lessons, yardstick = _asked(pipeline, manifold, progress)
@@ -77,7 +78,7 @@ def _follow(pipeline, manifold: Manifold, record: Record) -> None:
     }
 
 
-def _truth(pipeline, manifold: Manifold) -> torch.Tensor | None:
+def truth_of(pipeline, manifold: Manifold) -> torch.Tensor | None:
     """[N + 1, K, r] training latents, by ascending case; None where a step is not one of theirs."""
     if pipeline.config.deploy.dt_multiplier != 1.0:
         return None
@@ -93,21 +94,21 @@ def _asked(pipeline, manifold: Manifold, progress: Progress) -> tuple[list[Teach
     Not full-order runs there: where the teacher is off, a round could pass by straying towards them.
     """
     *cases, back = pipeline.lessons
-    lessons = [Teacher(_batches(pipeline, manifold, v), progress.advance) for v in cases if v]
-    teacher, positions = Teacher(_batches(pipeline, manifold, back), progress.advance), _positions(manifold)
+    lessons = [Teacher(batches(pipeline, manifold, v), progress.advance) for v in cases if v]
+    teacher, positions = Teacher(batches(pipeline, manifold, back), progress.advance), _positions(manifold)
     truth = torch.stack([positions(run) for run in teacher.run().unbind(1)], 1)
     return lessons, Yardstick(teacher, positions, truth)
 
 
-def _recorded(pipeline, manifold: Manifold, latents: torch.Tensor) -> tuple[list[Teacher], Yardstick]:
+def recorded(pipeline, manifold: Manifold, latents: torch.Tensor) -> tuple[list[Teacher], Yardstick]:
     """Full-order runs of training, whose latents [N + 1, K, r] are given, and those held back."""
     known, _, back = pipeline.lessons
     truth = []
     for case in back:
         with Trajectory.open(pipeline.simulation(case).require().file(TRAJECTORY)) as trajectory:
             truth.append(torch.as_tensor(trajectory.read("x", particles=_looked_at(manifold))).double())
-    lessons = [Recorded(_batches(pipeline, manifold, known), latents)]
-    beside = Teacher(_batches(pipeline, manifold, back))
+    lessons = [Recorded(batches(pipeline, manifold, known), latents)]
+    beside = Teacher(batches(pipeline, manifold, back))
     return lessons, Yardstick(beside, _positions(manifold), torch.stack(truth, 1))
 
 
@@ -127,10 +128,13 @@ def _positions(manifold: Manifold) -> Callable[[torch.Tensor], torch.Tensor]:
     return positions
 
 
-def _batches(pipeline, manifold: Manifold, cases: list[Case]) -> list[ReducedBatch]:
-    """Runs of the scene of training by the teacher's engine; one by one where it steps them so."""
-    asked = {"engine": pipeline.projecting, "scene": pipeline.scene}
-    first = pipeline.batch_at(manifold, cases[:1], **asked)
-    if first.engine == "reference" or pipeline.integration.strategy == "search":
+def batches(
+    pipeline, manifold: Manifold, cases: list[Case], engine: str | Engine | None = None
+) -> list[ReducedBatch]:
+    """Runs of the scene of training by an engine, the teacher's by default; one by one where it must be."""
+    asked = {"engine": engine or pipeline.projecting, "scene": pipeline.scene}
+    alone = pipeline.batch_at(manifold, cases[:1], engine=pipeline.projecting, scene=pipeline.scene)
+    first = alone if engine is None else pipeline.batch_at(manifold, cases[:1], **asked)
+    if alone.engine == "reference" or pipeline.integration.strategy == "search":
         return [first, *(pipeline.batch_at(manifold, [case], **asked) for case in cases[1:])]
     return [pipeline.batch_at(manifold, cases, **asked)]

@@ -1,0 +1,69 @@
+"""What is added to x̂ after a step was projected, for the runs of a batch."""
+
+import numpy as np
+import torch
+
+from nsf.dynamics.batch import Batch
+from nsf.dynamics.latent import LatentRecord
+from nsf.engines.closed.linear import Known
+from nsf.engines.operators.model import StepOperators
+from nsf.engines.operators.recurrence import Recurrence
+from nsf.engines.operators.states import collider_states
+
+
+class Closure:
+    """c(x̂_n, d_n, μ, g_n) of each run, by the compiled loop of operators.
+
+    Args:
+        model: c, as operators of which a step would be x̂ + d + c.
+        batch: the runs.
+        first: [B, r] what stands for d at t = 0.
+    """
+
+    def __init__(self, model: StepOperators, batch: Batch, first: torch.Tensor):
+        one = batch.shared
+        self._record, self._forcing, self._known = batch.record, batch.forcing, batch.forcing.version
+        self._steps, self._dt = one.total_steps, one.dt
+        self._first = first.to(one.torch_device, torch.float64)
+        self._change = self._first.clone()
+        self._beside = LatentRecord(batch.record.now, one.total_steps, 1)  # the record of x̂ + d + c
+        parameters = torch.stack([setup.parameters for setup in batch.setups]).to("cpu", torch.float64)
+        where = {"precision": one.precision, "device": one.device}
+        self._loop = Recurrence(model, parameters, *self._acting(), record=self._beside, **where)
+        manifold = one.manifold
+        runs = manifold.training_latents.unflatten(0, (int(manifold.training_trajectories[-1]) + 1, -1))
+        self._within = Known.of(runs.transpose(0, 1)).to(one.torch_device, torch.float64)
+        self._rows = torch.arange(len(batch), device=one.torch_device)
+
+    def _acting(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Gravity [B, N, 3] and state of the colliders [B, N, f] at each step, as now known."""
+        t, runs = self._dt * np.arange(self._steps), range(len(self._forcing))
+        states = [collider_states(self._forcing.colliders_of(run), self._dt, self._steps) for run in runs]
+        return torch.as_tensor(self._forcing.gravity_at(t)), torch.as_tensor(np.stack(states))
+
+    def refresh(self) -> None:
+        """Take what a hand has changed since; before a step, for a captured one cannot ask."""
+        if self._forcing.version != self._known:
+            self._known = self._forcing.version
+            self._loop.follow(*self._acting())
+
+    def begin(self, first: bool) -> None:
+        """Go on from the latents of the record; `first`: at t = 0."""
+        now, before = self._record.now, self._record.before
+        self._change.copy_(self._first if first else now.double() - before.double())
+
+    def add(self) -> None:
+        """Add c to the x̂_{n+1} that was recorded last."""
+        record, loop = self._record, self._loop
+        self._beside.row.copy_(record.row - 1)
+        xhat, change = self._within.within(record.before.double(), self._change)
+        loop.begin(xhat, change)
+        loop.advance(1)
+        record.now += loop.change.view_as(change) - change
+        record.xhat[self._rows, record.row] = record.now
+        self._change.copy_(record.now.double() - record.before.double())
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes on the device."""
+        return self._loop.nbytes + self._beside.nbytes
