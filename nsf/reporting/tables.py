@@ -63,7 +63,7 @@ _SPARED, _WIDTH = ("displacement_error", "stress_error", "step_ms_reduced", "ste
 _TOLD = {CASE, "latent_dim", "sampler.size", "method", "field", "engine", "scale", "precision", "device"}
 #: Keys of how a run was evaluated, and of the code: of two runs that differ in these alone the newer counts.
 _PASSING = ("evaluation.", "coarse", "code.", "law.", "edited")
-#: Groups of which the option says it all where it differs.
+#: Groups of which the option may say all where it differs.
 _GROUPS = ("field", "trainer", "sampler", "projector", "integration")
 _MOST = 3  # keys in a setting
 
@@ -309,11 +309,20 @@ def told_apart(sources: Sequence[Source]) -> dict[str, str]:
         keys = [key for key in (*differ.keys, *differ.more) if key not in _TOLD]
         keys = [key for key in keys if not key.startswith(_PASSING)]
         chosen = [group for group in _GROUPS if group in keys]
-        keys = [key for key in keys if key in chosen or key.partition(".")[0] not in chosen][:_MOST]
+        keys = [key for key in keys if key in chosen or not _said(key, chosen, entries)][:_MOST]
         for entry in entries if keys else ():
             told = [f"{key}={cell(entry, key)}" for key in sorted(keys, key=_rank)]
             found[entry.run.id] = ", ".join(told)
     return found
+
+
+def _said(key: str, chosen: Sequence[str], entries: Sequence[Entry]) -> bool:
+    """Whether the option of a key's group says the key's value in every run."""
+    group = key.partition(".")[0]
+    if group not in chosen:
+        return False
+    pairs = {(cell(entry, group), cell(entry, key)) for entry in entries}
+    return len(pairs) == len({option for option, _ in pairs})
 
 
 def _rank(key: str) -> int:

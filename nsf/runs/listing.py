@@ -130,21 +130,42 @@ def _settings(run: Run, known: dict[Run, dict[str, Any]], generations: int) -> d
 
 def _with_options(settings: dict[str, Any]) -> dict[str, Any]:
     """Settings with the option of each group that they come from."""
-    found = {group: _options(group).get(settings.get(f"{group}._target_")) for group in _GROUPS}
+    found = {group: _option(group, settings) for group in _GROUPS}
     found["method"] = settings.get("method.name")
     if found["method"] is not None:  # of a deployment, or of what was made from one
         found["engine"] = settings.get("engine", "auto")
     return settings | {group: option for group, option in found.items() if option is not None}
 
 
+def _option(group: str, settings: dict[str, Any]) -> str | None:
+    """The option that settings come from: of those of their class that whose keys, then values, fit best.
+
+    A class that no option of this checkout has is told by its name.
+    """
+    target = settings.get(f"{group}._target_")
+    if not isinstance(target, str):
+        return None
+    options = _options(group).get(target, {})
+    own = {key.split(".")[1]: value for key, value in settings.items() if key.startswith(f"{group}.")}
+
+    def fit(option: str) -> tuple[bool, int, int]:
+        keys = options[option]
+        return keys.keys() <= own.keys(), len(keys), sum(text(own.get(k)) == v for k, v in keys.items())
+
+    return max(options, key=fit, default=target.rpartition(".")[2])
+
+
 @cache
-def _options(group: str) -> dict[Any, str]:
-    """Option of a group by its class, for classes that one option has."""
-    targets: dict[str, list[str]] = {}
+def _options(group: str) -> dict[str, dict[str, dict[str, str]]]:
+    """The options of each class of a group, with their keys and values as they stand."""
+    found: dict[str, dict[str, dict[str, str]]] = {}
     for path in sorted((CONF / group).glob("*.yaml")):
-        for target in re.findall(r"^_target_:\s*(\S+)", path.read_text(encoding="utf-8"), re.M):
-            targets.setdefault(target, []).append(path.stem)
-    return {target: options[0] for target, options in targets.items() if len(options) == 1}
+        keys = dict(
+            re.findall(r"^(\w+):[ \t]*([^\n#]*?)[ \t]*(?:#.*)?$", path.read_text(encoding="utf-8"), re.M)
+        )
+        if target := keys.pop("_target_", None):
+            found.setdefault(target, {})[path.stem] = keys
+    return found
 
 
 def _check_key(key: str, found: Sequence[Entry]) -> None:

@@ -349,6 +349,37 @@ def test_runs_that_no_column_tells_apart_are_told_apart_by_their_keys(tmp_path):
     assert {source.id for source in merged.source} == {one.id, other.id, baseline.id}
 
 
+RANDOM = {"_target_": "nsf.sampling.RandomSampler", "size": 50, "seed": 0}
+REGION = RANDOM | {"lower": [0.1] * 3, "upper": [0.9] * 3, "phases": []}
+GREEDY = {"_target_": "nsf.sampling.GreedySampler", "size": 50}
+OWN = {"_target_": "nsf.sampling.own.OwnSampler", "size": 50}
+GAUSS_NEWTON, TAYLOR = ({"_target_": f"nsf.dynamics.{name}"} for name in ("GaussNewton", "Taylor"))
+
+
+@pytest.mark.parametrize(
+    ("configs", "told"),
+    [
+        ([{"sampler": RANDOM}, {"sampler": GREEDY}], ["sampler=random", "sampler=greedy"]),
+        ([{"sampler": RANDOM}, {"sampler": REGION}], ["sampler=random", "sampler=region"]),
+        ([{"sampler": RANDOM}, {"sampler": OWN}], ["sampler=random", "sampler=OwnSampler"]),
+        (
+            [{"projector": GAUSS_NEWTON | {"iterations": n}} for n in (1, 2)] + [{"projector": TAYLOR}],
+            [
+                "projector.iterations=1, projector=gauss_newton",
+                "projector.iterations=2, projector=gauss_newton",
+                "projector.iterations=–, projector=taylor",
+            ],
+        ),
+    ],
+)
+def test_options_and_their_keys_tell_runs_apart(tmp_path, configs, told):
+    runs = [write_run(tmp_path, Made(), **config) for config in configs]
+    sources = open_sources(runs)
+    found = told_apart(sources)
+    assert [found[run.id] for run in runs] == told
+    assert len(merge(sources, found).source) == len(runs) * len(sources[0].results)
+
+
 def test_console_table_of_many_variants_fits_a_terminal():
     """No word is parted: of what differs, the table of every scene of the paper has most."""
     frame = pd.read_csv(CONF.parent / "reports/table1/results.csv")
