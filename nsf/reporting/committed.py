@@ -37,8 +37,8 @@ CHAPTERS = {
     ),
     "Beyond what was trained": ("extrapolation", "weak_elements", "super_resolution", "path_dependent"),
     "At small scale, on a CPU": (
-        "small", "closed", "levels", "teaching", "inverse", "calibration", "calibration_frame", "sensitivities",
-        "tilt", "design", "quickstart",
+        "small", "closed", "levels", "teaching", "inverse", "calibration", "calibration_frame",
+        "sensitivities", "tilt", "design", "quickstart",
     ),
     "One scene in detail, and speed": ("sand", "speed"),
 }  # fmt: skip
