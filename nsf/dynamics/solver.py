@@ -392,7 +392,8 @@ class ReducedMPM:
         span = self.together.span
         with torch.no_grad(), on_torch_stream(self.device):
             for name, stage in span.stages.items():
-                if name != "inversion":
-                    stage()
+                if name == "inversion":
+                    break
+                stage()
             position, jacobian = span.at_sample.position_and_jacobian(self.record.now)
         return span.x[: span.s] - position, jacobian

@@ -95,6 +95,8 @@ class Names:
         self.closing: Closing | None = None
         if self.engine == CLOSED:
             self.closing = configuration.build(c.engine.closing, "engine.closing")
+            if self.scene.steps < 2:
+                raise ConfigError(f"engine={CLOSED} needs runs of 2 steps or more; raise scene.steps")
             if c.deploy.dt_multiplier != 1:
                 raise ConfigError(
                     f"engine={CLOSED} learns from steps of the scene's Δt, and deploy.dt_multiplier is "

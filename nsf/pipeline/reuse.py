@@ -95,10 +95,10 @@ def report(names: Names, say: Say) -> Path:
         )
     title, folder = names.config.scene.title, names.report_folder
     if page := unchanged(folder, runs, title, names.evaluation):
-        say(f"report: {len(runs)} evaluated runs, unchanged, reused → {page}")
+        say(f"report: evaluated runs: {len(runs)}, unchanged, reused → {page}")
         return page
     from nsf.reporting.build import build_report
 
     page = build_report(runs, folder, title, first=names.evaluation)
-    say(f"report: {len(runs)} evaluated runs → {page}")
+    say(f"report: evaluated runs: {len(runs)} → {page}")
     return page

@@ -10,6 +10,9 @@ from nsf.reporting.study import SEEDS
 from nsf.reporting.text.columns import parameter_text
 from nsf.reporting.text.page import Picture, Section
 
+#: Columns that variants have in common whose steps are the same but for the engine.
+_ALIKE = ("method", "field", "r", "precision", "device")
+
 
 def levels_section(known: Sequence, folder: Path) -> list[Section]:
     """A picture a scene in which a run had more than one level, at the first such value; none without one.
@@ -59,3 +62,19 @@ def _seeds(variant) -> set[str]:
 
 def _is_mixed(rows, value) -> bool:
     return "by" in rows and bool(rows.loc[rows["parameter"] == value, "by"].nunique() > 1)
+
+
+def lend_stages(known) -> None:
+    """Show the stages of a projected step beside a run by operators, whose own step has but one.
+
+    That of a variant like it but for the engine, without a closure.
+    """
+    for v in known:
+        if len(v.breakdown.get("reduced", {})) != 1:
+            continue
+        for other in known:
+            stages = other.breakdown.get("reduced", {})
+            alike = all(other.rows[key].iloc[0] == v.rows[key].iloc[0] for key in _ALIKE)
+            if len(stages) > 1 and "closure" not in stages and alike and other.alike == v.alike:
+                v.breakdown, v.timed = v.breakdown | {"reduced": stages}, "the projected step's"
+                break

@@ -14,7 +14,7 @@ from joblib.externals.loky import ProcessPoolExecutor
 from nsf.reporting.drawing import charts, shapes
 from nsf.reporting.drawing.style import DIFFERENCE_COLORS, STRESS_COLORS, save
 from nsf.reporting.keeping import Kept, code, key_of
-from nsf.reporting.levels import levels_section
+from nsf.reporting.levels import lend_stages, levels_section
 from nsf.reporting.rivals import over_cost
 from nsf.reporting.sources import Motion, Study, same_parameter
 from nsf.reporting.study import SEEDS
@@ -48,6 +48,7 @@ class _Variant:
         self.sources = [self.merged.source[i] for i in self.members]
         newest = max(self.sources, key=lambda source: (source.created, source.id))
         self.summary, self.breakdown = newest.summary, newest.cost.get("breakdown", {})
+        self.timed = "a step's"  # whose time the breakdown is
         self.parameter = newest.parameter
         self.scene, self.method = self.rows["scene"].iloc[0], self.rows["method"].iloc[0]
         splits = set(self.rows["split"])
@@ -61,7 +62,9 @@ class _Variant:
         """What pictures of this variant are made of, for those that are drawn so."""
         rows = [list(map(str, row)) for row in self.rows.to_numpy().tolist()]
         made = {source.id: [source.hashes, source.created] for source in self.sources}
-        return key_of([rows, [source.id for source in self.sources], made, self.breakdown, how, code()])
+        return key_of(
+            [rows, [source.id for source in self.sources], made, self.breakdown, self.timed, how, code()]
+        )
 
     def series(self, held_out_only: bool) -> pd.DataFrame:
         """Frames of the parameter values that this variant's rows come from, each from its own run."""
@@ -141,7 +144,7 @@ def draw(
     groups = variants(merged)
     labels = variant_labels([merged.frame.iloc[members[0]].to_dict() for members in groups])
     known = [_Variant(merged, members, label) for members, label in zip(groups, labels, strict=True)]
-    _lend_stages(known)
+    lend_stages(known)
     shown = _best(known, by_method=not sweep)
     drawn = _of_variants(shown, known, folder, not sweep, kept)
     sections = [
@@ -153,14 +156,6 @@ def draw(
         *levels_section(known, folder),
         Section("All variants" if len(known) > 1 else "Error and cost", _comparison(known, folder, study)),
     ]
-
-
-def _lend_stages(known: list[_Variant]) -> None:
-    """Show the stages of the projected step where a variant's own step has but one, as operators have."""
-    for v in known:
-        if len(v.breakdown.get("reduced", {})) == 1:
-            others = [o for o in known if (o.alike, o.method) == (v.alike, v.method)]
-            v.breakdown = max((o.breakdown for o in others), key=lambda b: len(b.get("reduced", {})))
 
 
 def _best(known: list[_Variant], by_method: bool) -> list[_Variant]:
@@ -327,7 +322,7 @@ def _charts(v: _Variant, folder: Path, prefix: str, brief: bool) -> list[Picture
     if any(v.breakdown.values()):
         add(
             "runtime", charts.runtime_breakdown(v.breakdown),
-            "Where a step's time goes, stage by stage; measuring takes a little time too, so that the sum "
+            f"Where {v.timed} time goes, stage by stage; measuring takes a little time too, so that the sum "
             "may exceed the step in the table.",
         )  # fmt: skip
     return pictures

@@ -148,9 +148,10 @@ def _option(group: str, settings: dict[str, Any]) -> str | None:
     options = _options(group).get(target, {})
     own = {key.split(".")[1]: value for key, value in settings.items() if key.startswith(f"{group}.")}
 
-    def fit(option: str) -> tuple[bool, int, int]:
+    def fit(option: str) -> tuple[int, int, int]:
         keys = options[option]
-        return keys.keys() <= own.keys(), len(keys), sum(text(own.get(k)) == v for k, v in keys.items())
+        alike = sum(text(own.get(key)) == value for key, value in keys.items())
+        return -len(keys.keys() - own.keys()), len(keys), alike
 
     return max(options, key=fit, default=target.rpartition(".")[2])
 

@@ -9,7 +9,7 @@ import torch
 from angles import angle
 
 from nsf.engines import Closed, Operators
-from nsf.engines.closed import Closing
+from nsf.engines.closed import Closing, Linearised
 from nsf.engines.closed.linear import Known
 from nsf.engines.operators import Taught
 from nsf.engines.reference import Reference
@@ -129,7 +129,9 @@ def test_runs_together_are_as_alone_and_begin_again(engine, batch):
     together.step(together.total_steps)
     alone = batch(engine)
     for _ in range(2):
-        alone.step(alone.total_steps)
+        for n in range(alone.total_steps):
+            alone.step()
+            assert torch.equal(alone.batch.record.xhat[0, n + 1], alone.xhat[0])
         torch.testing.assert_close(
             alone.batch.record.xhat[0], together.batch.record.xhat[1], rtol=0, atol=1e-9
         )
@@ -137,6 +139,72 @@ def test_runs_together_are_as_alone_and_begin_again(engine, batch):
         alone.restart()
     alone.step(alone.total_steps)
     assert torch.equal(alone.batch.record.xhat, found)
+
+
+def test_a_run_outside_of_training_is_corrected_as_at_the_edge(engine, batch):
+    """Else a network would be asked where it knows nothing, step after step."""
+    far, further = (batch(engine) for _ in range(2))
+    pushes = []
+    for run, way in ((far, 5.0), (further, 50.0)):
+        run.batch.record.now += way
+        run.batch.record.before += way
+        run.batch.record.row.fill_(2)
+        closure = run.span.closure
+        closure._change.zero_()
+        before = run.xhat.clone()
+        closure.add()
+        pushes.append(run.xhat - before)
+    torch.testing.assert_close(*pushes, rtol=1e-9, atol=1e-12)
+    assert pushes[0].abs().max() > 0
+
+
+def test_the_equations_of_a_projection_are_those_before_the_closure(engine, batch):
+    found = []
+    for by in (engine, "modal"):
+        run = batch(by).runs[0]
+        run.step(6)
+        found.append(run.equations_at(5, run.record.xhat[5] * 0 + 0.3, run.record.xhat[4] * 0 + 0.29))
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-9)
+
+
+class Springs:
+    """A teacher whose step is known: P − d = A x̂ + W d + D of each step."""
+
+    def __init__(self, r=3, runs=2, steps=9):
+        torch.manual_seed(0)
+        self.A, self.W = (0.1 * torch.randn(r, r, dtype=torch.float64) for _ in range(2))
+        self.lacks = torch.randn(steps, runs, r, dtype=torch.float64)
+        self.total_steps, self.first = steps, torch.randn(runs, r, dtype=torch.float64)
+        x, d, found = torch.zeros(runs, r, dtype=torch.float64), self.first, []
+        for n in range(steps):
+            found.append(x)
+            d = d + x @ self.A.T + d @ self.W.T + self.lacks[n]
+            x = x + d
+        self.runs = torch.stack([*found, x])
+
+    def first_change(self):
+        return self.first
+
+    def step_from(self, n, xhat, change):
+        return xhat + change + xhat @ self.A.T + change @ self.W.T
+
+
+@pytest.mark.parametrize("stride", [1, 4])
+def test_a_known_step_is_linearised(stride):
+    springs = Springs()
+    found = Linearised.along(springs, springs.runs, stride)
+    torch.testing.assert_close(found.defect, springs.lacks, rtol=0, atol=1e-10)
+    for slopes, known in ((found.of_x, springs.A), (found.of_d, springs.W)):
+        assert len(slopes) == -(-9 // stride)
+        torch.testing.assert_close(slopes, known.expand_as(slopes), rtol=0, atol=1e-10)
+    assert found.lost == 0.0
+
+
+def test_a_step_that_is_lost_is_counted():
+    springs = Springs()
+    springs.step_from = lambda n, xhat, change: xhat * float("nan")
+    assert Linearised.along(springs, springs.runs, 4).lost == 1.0
 
 
 @pytest.mark.gpu
@@ -182,7 +250,9 @@ def test_it_is_used_on_nothing_else(engine, batch):
     ("value", "told"),
     [
         ({"unroll": 0}, "unroll=0 must be at least 1"),
+        ({"stride": 10**20}, "stride=1.* must be at least 1 and at most 10,000"),
         ({"rate": float("nan")}, "rate=nan must be finite"),
+        ({"rate": 0.0}, "rate=0 fits nothing"),
         ({"single": -1.0}, "single=-1.0 must be finite and at least 0"),
     ],
 )

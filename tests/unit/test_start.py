@@ -67,7 +67,7 @@ def test_a_chain_whose_results_are_there_imports_nothing_that_computes(started, 
     code, out, _, heavy = started("run", *tiny, runs=chain.root)
     assert code == 0
     assert "evaluate: inputs unchanged, reused" in out
-    assert "report: 1 evaluated runs, unchanged, reused" in out
+    assert "report: evaluated runs: 1, unchanged, reused" in out
     assert not {"torch", "warp", "pytorch_lightning", "matplotlib"} & {*heavy}
 
 

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 
 from nsf.errors import ConfigError
 
+_MOST = {"width": 4096, "stride": 10_000, "descent": 10_000_000, "unroll": 10_000, "batch": 100_000}
+
 
 @dataclass(frozen=True)
 class Closing:
@@ -34,12 +36,14 @@ class Closing:
     single: float = 0.01
 
     def __post_init__(self):
-        for name in ("width", "stride", "descent", "unroll", "batch"):
-            if getattr(self, name) < 1:
-                raise ConfigError(f"{name}={getattr(self, name)} must be at least 1")
+        for name, most in _MOST.items():
+            if not 1 <= getattr(self, name) <= most:
+                raise ConfigError(f"{name}={getattr(self, name)} must be at least 1 and at most {most:,}")
         for name in ("rate", "noise", "single"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
                 raise ConfigError(f"{name}={getattr(self, name)} must be finite and at least 0")
+        if self.rate == 0:
+            raise ConfigError("rate=0 fits nothing; give a positive one")
 
     @property
     def courses(self) -> tuple[tuple[int, int], ...]:

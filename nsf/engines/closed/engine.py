@@ -15,7 +15,7 @@ from nsf.errors import ConfigError
 
 
 class Closed(Operators):
-    """The projected step of the fastest engine that can, and what full-order runs show that it lacks.
+    """The projected step of the fastest engine that can, plus a learned correction, the closure.
 
     x̂_{n+1} = x̂_n + P(x̂_n, d_n) + c(x̂_n, d_n, μ, g_n): P projects; c, the closure, is affine in d and in
     gravity as operators are, and was fitted for one manifold, scene, sample and Δt.

@@ -19,8 +19,8 @@ from nsf.engines.operators.descent import graphed, one_thread
 from nsf.engines.operators.model import StepOperators
 from nsf.engines.operators.teacher import Teacher
 
-_LABELS = 1024  # single steps beside the windows of a step of the descent
-_FAR_X, _FAR_D = 4.0, 3.0  # deviations, beyond which a window is not followed
+_SINGLE = 1024  # single steps beside the windows of a step of the descent
+_FAR_X, _FAR_D = 4.0, 3.0  # deviations, to which tanh limits e and δ, so that a lost window stays bounded
 _BESIDE_X, _BESIDE_D = 0.01, 0.1  # noise on single steps, in deviations
 _STEEPEST = 0.1  # length of gradient beyond which it is cut
 
@@ -59,7 +59,7 @@ class Fit:
     def run(self, told: Callable[[int], object] = lambda steps: None) -> None:
         """All steps; `told` of each number of them that was taken."""
         for unroll, steps in self._closing.courses:
-            self._descend(min(unroll, len(self._d) - 1), steps, told)
+            self._descend(min(unroll, len(self._d)), steps, told)
 
     def _descend(self, unroll: int, steps: int, told: Callable[[int], object]) -> None:
         graphs = self._device.type == "cuda"  # which read the rate where it lies
@@ -84,9 +84,9 @@ class Fit:
     def _drawn(self, unroll: int) -> list[Tensor]:
         """Runs, first steps and noise of windows; runs, steps and noise of single steps."""
         (N, R, r), size, generator = self._d.shape, self._closing.batch, self._generator
-        k, n = (torch.randint(most, (size,), generator=generator) for most in (R, N - unroll))
-        single = [torch.randint(most, (_LABELS,), generator=generator) for most in (R, N)]
-        start, *beside = (torch.randn(rows, r, generator=generator) for rows in (size, _LABELS, _LABELS))
+        k, n = (torch.randint(most, (size,), generator=generator) for most in (R, N - unroll + 1))
+        single = [torch.randint(most, (_SINGLE,), generator=generator) for most in (R, N)]
+        start, *beside = (torch.randn(rows, r, generator=generator) for rows in (size, _SINGLE, _SINGLE))
         return [k, n, start, *single, *beside]
 
     def _off(self, unroll: int, k: Tensor, n: Tensor, start: Tensor) -> Tensor:

@@ -21,6 +21,7 @@ class Linearised:
         defect: [N, R, r] d_{n+1} − P(x̂_n, d_n): what the step lacks.
         of_x, of_d: [M, R, r, r] ∂(P − d)/∂x̂ and ∂(P − d)/∂d at every `stride`-th step.
         stride: steps between these.
+        lost: share of all of these numbers that were not finite, and are taken for 0.
     """
 
     runs: Tensor
@@ -29,13 +30,11 @@ class Linearised:
     of_x: Tensor
     of_d: Tensor
     stride: int
+    lost: float
 
     @classmethod
     def along(cls, teacher: Teacher, runs: Tensor, stride: int) -> "Linearised":
-        """About runs [N + 1, R, r] in the teacher's cases, by its steps.
-
-        A step that is not finite is taken for one without a defect.
-        """
+        """About runs [N + 1, R, r] in the teacher's cases, by its steps, from two on."""
         changes = torch.cat([teacher.first_change()[None], torch.diff(runs, dim=0)])
         N = teacher.total_steps
 
@@ -57,10 +56,10 @@ class Linearised:
         defect = [changes[n + 1] - changes[n] - bend(n, runs[n], changes[n]) for n in range(N)]
         sizes = {True: _OF_X * _deviation(runs), False: _OF_D * _deviation(changes)}
         of_x, of_d = ([slope(n, own, of) for n in range(0, N, stride)] for of, own in sizes.items())
-        defect, of_x, of_d = (
-            torch.stack(values).nan_to_num(0.0, 0.0, 0.0) for values in (defect, of_x, of_d)
-        )
-        return cls(runs, changes[:N], defect, of_x, of_d, stride)
+        found = [torch.stack(values) for values in (defect, of_x, of_d)]
+        finite = torch.cat([torch.isfinite(values).flatten() for values in found])
+        found = [values.nan_to_num(0.0, 0.0, 0.0) for values in found]
+        return cls(runs, changes[:N], *found, stride, 1.0 - float(finite.double().mean()))
 
 
 @dataclass(frozen=True)

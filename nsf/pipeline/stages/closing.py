@@ -1,5 +1,6 @@
 """The stage `teach` of `engine=closed`: what the projected step lacks of the full-order runs of training."""
 
+import math
 import time
 
 import torch
@@ -23,7 +24,7 @@ def close(pipeline, run: Run) -> None:
         run: its teach run.
 
     Raises:
-        InstabilityError: the fit did not stay finite.
+        InstabilityError: the fit, or a run with it, did not stay finite, or most projected steps did not.
     """
     manifold, c = pipeline.manifold().to(pipeline.device), pipeline.config
     with run.record(device=pipeline.device, seed=c.seed, precision=c.precision) as record:
@@ -31,6 +32,12 @@ def close(pipeline, run: Run) -> None:
     found = record.metrics
     before, after = (100.0 * error for error in found["errors"])
     where = "validation" if pipeline.split.validation else "training"
+    if after >= before:
+        pipeline.say("teach: warning: the closure makes no run better; deploy with engine=auto")
+    if found["lost"]:
+        pipeline.say(
+            f"teach: warning: {100 * found['lost']:.2g} % of what was asked of the step was not finite"
+        )
     pipeline.say(
         f"teach: a closure by {found['teacher_steps']} projected steps in {found['teach_seconds']:.1f} s; in "
         f"{where} cases {after:.2g} % off, {before:.2g} % without it → {run.id}"
@@ -53,20 +60,19 @@ def _follow(pipeline, manifold: Manifold, record: Record) -> None:
         generator = torch.Generator().manual_seed(seed)
         Fit(model, teacher, linearised, closing, generator).run(progress.advance)
     model = model.to("cpu", torch.float64).requires_grad_(False).eval()
-    if not all(bool(torch.isfinite(values).all()) for values in model.state_dict().values()):
+    taught, samples = Taught.of(teacher.setup, *teacher.known_gravity), teacher.setup.samples
+    seconds, engine = time.perf_counter() - started, Closed(model, taught, samples)
+    errors = [_off(pipeline, manifold, yardstick, by) for by in (pipeline.projecting, engine)]
+    if linearised.lost > 0.5 or not math.isfinite(errors[1]):
         raise InstabilityError(
-            "the closure did not stay finite; lower engine.closing.rate or engine.closing.unroll, or deploy "
-            "with engine=auto"
+            "runs with the closure do not stay finite; lower engine.closing.rate or engine.closing.unroll, "
+            "or deploy with engine=auto"
         )
-    known = teacher.gravity.flatten(0, 1)
-    reach = float((known - known.mean(0)).norm(dim=1).max())
-    taught, samples = Taught.of(teacher.setup, known.mean(0).tolist(), reach), teacher.setup.samples
-    seconds = time.perf_counter() - started
     model.save(record.path / OPERATORS, taught, samples, Closed.name)
     record.output(OPERATORS)
-    engine = Closed(model, taught, samples)
-    errors = [_off(pipeline, manifold, yardstick, by) for by in (pipeline.projecting, engine)]
-    record.metrics |= {"teach_seconds": seconds, "teacher_steps": teacher.steps, "errors": errors}
+    record.metrics |= {
+        "teach_seconds": seconds, "teacher_steps": teacher.steps, "errors": errors, "lost": linearised.lost,
+    }  # fmt: skip
 
 
 def _off(pipeline, manifold: Manifold, yardstick: Yardstick, engine) -> float:

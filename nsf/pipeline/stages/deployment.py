@@ -109,7 +109,7 @@ def _range_of_solids(pipeline) -> SolidsRange | None:
 def _rollouts(pipeline, manifold: Manifold, record: Record) -> list[Rollout]:
     """The reduced runs; how far they may be believed, and who takes their steps, go on record."""
     started, asked = time.perf_counter(), pipeline.config.deploy
-    # What a closure was fitted to is believed as it goes on, closed.
+    # Trust is calibrated on closed runs where these are deployed.
     steps_by = pipeline.projecting if pipeline.closing is None else None
     projected = partial(pipeline.solver_at, manifold, engine=steps_by)
 

@@ -9,7 +9,7 @@ from matplotlib.colors import to_hex
 
 from nsf.deployment.levels import LEVELS as BY
 from nsf.reporting.drawing.levels import LEVELS, levels_over_time, name_of
-from nsf.reporting.levels import levels_section
+from nsf.reporting.levels import lend_stages, levels_section
 
 
 def series_of(*by: int, parameter: float = 0.6) -> pd.DataFrame:
@@ -71,3 +71,24 @@ def test_a_picture_where_a_run_has_more_than_one_level(tmp_path):
     assert "speed 0.6 m/s" in one.caption
     assert two.runs == ["evaluate/other"]
     assert {path.name for path in tmp_path.glob("*.png")} == {"jelly_cube-levels.png", "sand-levels.png"}
+
+
+def timed(engine, stages, device="cpu"):
+    row = {"method": "nsf", "field": "basis", "r": 6, "precision": "fp64", "device": device, "engine": engine}
+    breakdown = {"reduced": dict.fromkeys(stages, 0.5), "full_order": {"p2g": float(len(stages))}}
+    return SimpleNamespace(
+        rows=pd.DataFrame([row]), breakdown=breakdown, timed="a step's", alike=("sand", "")
+    )
+
+
+def test_beside_operators_stand_the_stages_of_the_projected_step():
+    operators, other = (timed("operators", ["recurrence"], device) for device in ("cpu", "cuda:0"))
+    closed = timed("closed", ["inference", "p2g", "inversion", "closure"])
+    modal = timed("modal", ["inference", "p2g", "inversion"])
+    lend_stages([operators, other, closed, modal])
+    assert list(operators.breakdown["reduced"]) == ["inference", "p2g", "inversion"]
+    assert operators.breakdown["full_order"] == {"p2g": 1.0}  # its own
+    assert operators.timed == "the projected step's"
+    assert list(other.breakdown["reduced"]) == ["recurrence"]  # measured on another device
+    assert list(closed.breakdown["reduced"])[-1] == "closure"
+    assert closed.timed == modal.timed == other.timed == "a step's"
