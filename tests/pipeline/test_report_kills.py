@@ -37,9 +37,8 @@ def undisturbed(chain, tiny, tmp_path_factory):
     return folder.name, files(folder)
 
 
-@pytest.mark.parametrize("kind", [signal.SIGKILL, signal.SIGTERM], ids=lambda kind: kind.name)
 @pytest.mark.parametrize("moment", MOMENTS)
-def test_a_report_that_was_killed(chain, nsf, tmp_path, undisturbed, moment, kind):
+def test_a_report_that_was_killed(chain, nsf, tmp_path, undisturbed, moment):
     name, expected = undisturbed
     reports = tmp_path / "work/reports"
     assert nsf("report", chain.root, faults=[PlainReport()]).code == 0
@@ -48,13 +47,14 @@ def test_a_report_that_was_killed(chain, nsf, tmp_path, undisturbed, moment, kin
     assert old != expected
 
     where, call = MOMENTS[moment]
-    outcome = nsf("report", chain.root, faults=[BriefReport(), SignalAt(where, call, kind)])
-    assert outcome.code == (130 if kind == signal.SIGTERM else -signal.SIGKILL), outcome.err
-    left = [path for path in reports.iterdir() if ".new-" in path.name or ".old-" in path.name]
-    assert bool(left) == (kind == signal.SIGKILL)
-    aside = [path for path in left if ".old-" in path.name]
-    assert bool(aside) == (kind == signal.SIGKILL and moment == "exchanging")
-    assert files(aside[0] if aside else reports / name) == old
+    for kind in (signal.SIGTERM, signal.SIGKILL):
+        outcome = nsf("report", chain.root, faults=[BriefReport(), SignalAt(where, call, kind)])
+        assert outcome.code == (130 if kind == signal.SIGTERM else -signal.SIGKILL), outcome.err
+        left = [path for path in reports.iterdir() if ".new-" in path.name or ".old-" in path.name]
+        assert bool(left) == (kind == signal.SIGKILL)
+        aside = [path for path in left if ".old-" in path.name]
+        assert bool(aside) == (kind == signal.SIGKILL and moment == "exchanging")
+        assert files(aside[0] if aside else reports / name) == old
 
     assert nsf("report", chain.root, faults=[BriefReport()]).code == 0
     assert files(reports / name) == expected
