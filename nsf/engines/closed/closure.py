@@ -1,14 +1,13 @@
 """What is added to x̂ after a step was projected, for the runs of a batch."""
 
-import numpy as np
 import torch
 
 from nsf.dynamics.batch import Batch
 from nsf.dynamics.latent import LatentRecord
 from nsf.engines.closed.linear import Known
+from nsf.engines.operators.engine import acting
 from nsf.engines.operators.model import StepOperators
 from nsf.engines.operators.recurrence import Recurrence
-from nsf.engines.operators.states import collider_states
 
 
 class Closure:
@@ -22,30 +21,23 @@ class Closure:
 
     def __init__(self, model: StepOperators, batch: Batch, first: torch.Tensor):
         one = batch.shared
-        self._record, self._forcing, self._known = batch.record, batch.forcing, batch.forcing.version
-        self._steps, self._dt = one.total_steps, one.dt
+        self._batch, self._record, self._known = batch, batch.record, batch.forcing.version
         self._first = first.to(one.torch_device, torch.float64)
         self._change = self._first.clone()
         self._beside = LatentRecord(batch.record.now, one.total_steps, 1)  # the record of x̂ + d + c
         parameters = torch.stack([setup.parameters for setup in batch.setups]).to("cpu", torch.float64)
         where = {"precision": one.precision, "device": one.device}
-        self._loop = Recurrence(model, parameters, *self._acting(), record=self._beside, **where)
+        self._loop = Recurrence(model, parameters, *acting(batch), record=self._beside, **where)
         manifold = one.manifold
         runs = manifold.training_latents.unflatten(0, (int(manifold.training_trajectories[-1]) + 1, -1))
         self._within = Known.of(runs.transpose(0, 1)).to(one.torch_device, torch.float64)
         self._rows = torch.arange(len(batch), device=one.torch_device)
 
-    def _acting(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Gravity [B, N, 3] and state of the colliders [B, N, f] at each step, as now known."""
-        t, runs = self._dt * np.arange(self._steps), range(len(self._forcing))
-        states = [collider_states(self._forcing.colliders_of(run), self._dt, self._steps) for run in runs]
-        return torch.as_tensor(self._forcing.gravity_at(t)), torch.as_tensor(np.stack(states))
-
     def refresh(self) -> None:
         """Take what a hand has changed since; before a step, for a captured one cannot ask."""
-        if self._forcing.version != self._known:
-            self._known = self._forcing.version
-            self._loop.follow(*self._acting())
+        if self._batch.forcing.version != self._known:
+            self._known = self._batch.forcing.version
+            self._loop.follow(*acting(self._batch))
 
     def begin(self, first: bool) -> None:
         """Go on from the latents of the record; `first`: at t = 0."""

@@ -72,6 +72,14 @@ class Operators(Engine):
         return self.taught.outside(setup.given, np.asarray(gravity.values))
 
 
+def acting(batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:
+    """Gravity [B, N, 3] [m/s²] and state of the colliders [B, N, f] at each step, as now known."""
+    one, forcing = batch.shared, batch.forcing
+    t, runs = one.dt * np.arange(one.total_steps), range(len(forcing))
+    states = [collider_states(forcing.colliders_of(run), one.dt, one.total_steps) for run in runs]
+    return torch.as_tensor(forcing.gravity_at(t)), torch.as_tensor(np.stack(states))
+
+
 class OperatorRun:
     """Where the runs of a batch are, for all spans of time.
 
@@ -86,16 +94,9 @@ class OperatorRun:
         self._batch, self._known = batch, batch.forcing.version
         self._first, self._record = first.to(one.torch_device), batch.record
         parameters = torch.stack([setup.parameters for setup in batch.setups]).to("cpu", torch.float64)
-        self._gravity, self._states = map(_shared, self._forcing())
+        self._gravity, self._states = map(_shared, acting(batch))
         self._of = partial(Recurrence, model, parameters, precision=one.precision, device=one.device)
         self.recurrence = self._of(self._gravity, self._states, record=batch.record)
-
-    def _forcing(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Gravity [B, N, 3] and state of the colliders [B, N, f] at each step, as now known."""
-        one, forcing = self._batch.shared, self._batch.forcing
-        t, runs = one.dt * np.arange(one.total_steps), range(len(forcing))
-        states = [collider_states(forcing.colliders_of(run), one.dt, one.total_steps) for run in runs]
-        return torch.as_tensor(forcing.gravity_at(t)), torch.as_tensor(np.stack(states))
 
     def take(self, steps: int) -> None:
         """Take steps; what a hand has changed holds from here on."""
@@ -103,7 +104,7 @@ class OperatorRun:
             self._known, since = self._batch.forcing.version, int(self._record.row.max())
             self._gravity, self._states = (
                 _shared(torch.cat([held[:, :since].expand(len(now), -1, -1), now[:, since:]], 1))
-                for held, now in zip((self._gravity, self._states), self._forcing(), strict=True)
+                for held, now in zip((self._gravity, self._states), acting(self._batch), strict=True)
             )
             before = self.recurrence
             self.recurrence = self._of(self._gravity, self._states, record=self._record)

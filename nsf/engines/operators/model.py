@@ -216,9 +216,8 @@ class StepOperators(nn.Module):
         """
         path = Path(path)
         content = _read(path)
-        if (
-            own := content.get("engine", OPERATORS)
-        ) != engine:  # files from before there was another say none
+        own = content.get("engine", OPERATORS)  # files from before there was another engine say none
+        if own != engine:
             raise SchemaError(
                 f"{path} was taught for engine={own}, not for engine={engine}; pass another file"
             )
