@@ -22,6 +22,7 @@ _OPTIONAL = {"stages", "each", "printed"}
 _MORE_STAGES = ("superresolve",)  # that a job may do after those of `nsf run`
 #: Keys that a column of results.csv tells of.
 _COLUMNS = ("scene", "method", "field", "latent_dim", "engine", "sampler.size", "precision", "device")
+_MEASURING = "evaluation."  # keys of how runs are measured, which tell no two models apart
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,8 @@ class Job:
 
     Attributes:
         overrides: `key=value` in Hydra's grammar.
-        setting: those of them that tell the job from others alike in all columns of results.csv.
+        setting: those of them that tell the job from others alike in all columns of results.csv, but for how
+            runs are measured.
     """
 
     overrides: tuple[str, ...]
@@ -38,8 +40,8 @@ class Job:
 
     @property
     def keys(self) -> dict[str, str]:
-        """Value by key."""
-        return dict(override.split("=", 1) for override in self.overrides)
+        """Value by key, of what a run is; `evaluation` says how it is measured."""
+        return dict(one.split("=", 1) for one in self.overrides if not one.startswith(_MEASURING))
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,8 @@ class Experiment:
 
         def setting(job: tuple[str, ...]) -> str:
             alike = [set(other) for other in found if told(other) == told(job)]
-            return ", ".join(override for override in job if override not in set.intersection(*alike))
+            apart = (override for override in job if override not in set.intersection(*alike))
+            return ", ".join(override for override in apart if not override.startswith(_MEASURING))
 
         return [Job(job, setting(job)) for job in found]
 
