@@ -153,14 +153,13 @@ def over_seeds(merged: Merged, study: Study) -> list[Table]:
         for name, group in _settings(part, _told(part, SEEDS), alone=merged.frame["scene"].iloc[0]):
             if group[seed].nunique() < 2:
                 continue
-            rows = merged.frame.loc[group["row"], list(_ERRORS)].assign(seed=group[seed].array)
-            means = rows.groupby("seed").agg(lambda values: values.mean(skipna=False))
+            rows = merged.frame.loc[group["row"]].assign(seed=group[seed].array)
+            means = rows.groupby("seed")[list(_ERRORS)].agg(lambda values: values.mean(skipna=False))
             cells = (
                 plus_minus(means[e].mean(skipna=False), means[e].std(skipna=False), COLUMN[e].scale)
                 for e in _ERRORS
             )
-            of_runs = merged.frame.loc[group["row"]].assign(seed=group[seed].array)
-            deltas = of_runs.pivot_table("delta", "seed", "parameter", dropna=False).to_numpy()
+            deltas = rows.pivot_table("delta", "seed", "parameter", dropna=False).to_numpy()
             body.append([name, seed, f"{len(means)}", *cells, _between(interval(deltas))])
     if not body:
         return []

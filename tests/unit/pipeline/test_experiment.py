@@ -47,6 +47,14 @@ def test_a_setting_tells_what_columns_do_not(written):
     assert settings == ["", "", "sampler=random", "sampler=greedy"]
 
 
+def test_how_runs_are_measured_is_no_setting(written):
+    jobs = "jobs: [{scene: sand, seed: 0}, {scene: sand, seed: 1, evaluation.trials: 0}]"
+    found = written(TEXT[: TEXT.index("jobs:")] + jobs).jobs
+    assert [job.setting for job in found] == ["seed=0", "seed=1"]
+    assert "evaluation.trials=0" in found[1].overrides
+    assert [set(job.keys) for job in found] == [set(found[0].keys)] * 2
+
+
 def test_keys_of_a_job(written):
     *_, last = written(TEXT).jobs
     assert last.keys["sampler"] == "greedy"
