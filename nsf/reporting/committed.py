@@ -31,7 +31,7 @@ from nsf.storage import writing
 LIST = "index.md"
 #: Headings, and the folders under each in their order; the last heading is of all others.
 CHAPTERS = {
-    "Main results": ("table1", "operators", "forcing"),
+    "Main results": ("table1", "operators", "operators_seeds", "forcing"),
     "What the method needs": (
         "ablation", "field", "width", "latent_dim", "sample_size", "sampler", "timestep", "seeds",
     ),
