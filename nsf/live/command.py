@@ -3,7 +3,9 @@
 import argparse
 import logging
 import threading
+import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
@@ -70,10 +72,19 @@ def _view(run: Run, options: argparse.Namespace) -> None:
     page = Page(player, options.host, options.port)
     if options.host not in LOOPBACK:
         print(f"view: warning: whoever reaches {options.host} can look and steer; nsf serve asks for a token")
-    print(f"view: open {page.url} (Ctrl-C ends)", flush=True)
+    closing = threading.Event()
     try:
-        with player:
-            page.run(threading.Event())
+        # Drawing has a thread of its own, and this one only waits: Python drops an interrupt that it raises
+        # where an object is deleted, and one raised inside a lock may leave the lock held.
+        with player, ThreadPoolExecutor(1) as pool:
+            drawing = pool.submit(page.run, closing)
+            print(f"view: open {page.url} (Ctrl-C ends)", flush=True)
+            try:
+                while not drawing.done():
+                    time.sleep(0.1)
+                drawing.result()
+            finally:
+                closing.set()
     finally:
         page.close()
 
