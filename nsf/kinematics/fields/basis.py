@@ -66,6 +66,9 @@ class BasisField:
             one network of that many times the width.
         noise: deviation of the noise added to xhat in training, in units of xhat's deviation. It keeps the
             Jacobian and the heads regular beside the training trajectories.
+        noise_floor: least deviation of that noise as a displacement, over the deviation of the strongest
+            coordinate. A sample tells displacements to some error, which is many deviations of a weak
+            coordinate; without the floor, heads of many coordinates follow errors alone.
         head_parameters: the heads see the (standardised) problem parameters beside xhat.
         affine: `latent`: C follows from xhat, as in the paper; `rate`: from xhat and dx̂/dt.
         rate_noise: deviation of the noise on dx̂/dt in training with `affine=rate`, in units of dx̂/dt's
@@ -79,6 +82,7 @@ class BasisField:
     depth: int = 3
     members: int = 1
     noise: float = 0.01
+    noise_floor: float = 0.003
     head_parameters: bool = True
     affine: str = "latent"
     rate_noise: float = 0.1
@@ -92,6 +96,7 @@ class BasisField:
         at_least("depth", self.depth, 1, MOST_DEEP)
         at_least("members", self.members, 1, MOST_MEMBERS)
         at_least("noise", self.noise, 0)
+        at_least("noise_floor", self.noise_floor, 0)
 
     @property
     def manifold(self) -> type[BasisManifold]:
@@ -134,6 +139,7 @@ class BasisField:
             "depth": self.depth,
             "members": self.members,
             "noise": self.noise,
+            "noise_floor": self.noise_floor,
             "head_parameters": self.head_parameters,
             "affine": self.affine,
             "unresolved": [prepared[name]["unresolved"] for name, _ in TARGETS.values()],
@@ -180,12 +186,14 @@ class BasisField:
         latents = manifold.training_latents.float()
         parameters = manifold.standard_parameters(manifold.training_parameters.float())
         rates = (manifold.training_rates / field.rate).float() if field.rates else None
+        noise = (self.noise**2 + manifold.floor.square()).sqrt().float()
+        spread = manifold.spread.float()
 
         def loss(rows: Tensor | slice, particles: Tensor | slice, generator: torch.Generator) -> Tensor:
             xhat = latents[rows]
             # A committee's members each see noise of their own.
             shape = xhat.shape if self.members == 1 else (self.members, *xhat.shape)
-            inputs = xhat + self.noise * torch.randn(shape, generator=generator, device=xhat.device)
+            inputs = (xhat + noise * torch.randn(shape, generator=generator, device=xhat.device)) / spread
             if manifold.takes_parameters(phase):
                 inputs = torch.cat([inputs, parameters[rows].expand(*shape[:-1], -1)], -1)
             outputs = network(inputs)
@@ -237,6 +245,18 @@ class BasisManifold(Manifold):
                 hyperparameters.get("members", 1),  # files from before there were members
                 latent_dim if phase == "affine" and self.takes_rate else 0,
             )
+
+    @property
+    def floor(self) -> Tensor:
+        """Least deviation [r] of the noise on each coordinate in training, in units of its own deviation."""
+        leading = self.fields["deformation"].leading
+        least = self.hyperparameters.get("noise_floor", 0.0)  # files from before there was one
+        return least * leading.max() / leading
+
+    @property
+    def spread(self) -> Tensor:
+        """What each coordinate [r] is divided by before a network sees it: its deviation with that noise."""
+        return (1 + self.floor.square()).sqrt()
 
     @property
     def layered(self) -> bool:
@@ -323,10 +343,10 @@ class BasisManifold(Manifold):
         field, parameters = self.fields[phase], self.standard_parameters
         if field.network is None:
             return None
-        latent = torch.zeros(self.latent_dim, device=parameters.mean.device)
-        mean, std = [latent], [latent + 1]
+        latent = torch.zeros_like(self.spread)
+        mean, std = [latent], [self.spread]
         if self.takes_parameters(phase):
-            mean, std = [latent, parameters.mean], [latent + 1, parameters.std]
+            mean, std = [latent, parameters.mean], [self.spread, parameters.std]
         scale = field.output_scale
         return field.network.in_raw_units(
             torch.cat(mean), torch.cat(std), torch.zeros_like(scale), scale, like.dtype, like.device

@@ -197,6 +197,24 @@ def test_widths(snapshots):
         assert hidden == (5 if manifold.field == "mlp" else field.depth)
 
 
+def test_heads_follow_strong_coordinates_and_ignore_those_below_the_floor(snapshots, tmp_path):
+    r, moved = 4, []
+    schedule = FastTrainer(steps=250, learning_rate=1e-2)
+    for floor in (0.0, 0.2):
+        field = BasisField(modes=[9, 7, 8], beta=4, depth=2, noise_floor=floor)
+        manifold, _ = training.train(snapshots, field, schedule, r, 0, tmp_path / str(floor), "cpu", None)
+        sigma = manifold.fields["deformation"].leading
+        torch.testing.assert_close(manifold.spread, (1 + (floor * sigma[0] / sigma) ** 2).sqrt())
+        near = manifold.training_latents[5] + torch.eye(r).double()
+        restricted, parameters = manifold.restrict(), manifold.training_parameters[5]
+        here = restricted.stress(manifold.training_latents[5], parameters)
+        moved.append((restricted.stress(near, parameters) - here).flatten(1).norm(dim=1) / here.norm())
+    without, with_floor = moved
+    assert (with_floor[:2] > 0.2).all()
+    assert (without[2:] > 0.2).all()
+    assert (with_floor[2:] < 0.05).all()
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
@@ -205,6 +223,7 @@ def test_widths(snapshots):
         (lambda: BasisField(modes=[9, 0]), "modes="),
         (lambda: BasisField(depth=0), "depth=0"),
         (lambda: BasisField(noise=-0.1), "noise=-0.1"),
+        (lambda: BasisField(noise_floor=-0.1), "noise_floor=-0.1"),
         (lambda: BasisField(members=0), "members=0"),
         (lambda: FastTrainer(), "budget_minutes=null"),
         (lambda: FastTrainer(steps=0), "steps=0"),
