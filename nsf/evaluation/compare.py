@@ -10,6 +10,7 @@ import torch
 from nsf.data import Trajectory
 from nsf.deployment import FULL_ORDER, Rollout
 from nsf.dynamics import Decoder, ReducedMPM
+from nsf.dynamics.setup import Setup
 from nsf.errors import SchemaError
 from nsf.evaluation import metrics
 from nsf.evaluation.quantities import QUANTITIES, at_end, height
@@ -125,8 +126,12 @@ def compare(
     rate = torch.diff(xhat, dim=0, prepend=xhat[:1]) / trajectory.dt
     rate[0] = solver.first_rate
     inertia = scene.dx**2 * (DEGREES[scene.transfer.shape] + 1) / 12.0
-    shown_particles, shown_frames = _shown(trajectory.particles, frames, *pictures)
-    kept = {name: [] for name in ("x_full", "x_reduced", "stress_full", "stress_reduced")}
+    steps = np.minimum((trajectory.t / setup.dt).round(), solver.total_steps - 1).astype(
+        int
+    )  # that start there
+    samples = [solver.sets_at(int(step)).sample for step in steps]
+    shown_particles, shown_frames = _shown(trajectory.particles, frames, *pictures, np.concatenate(samples))
+    kept = {name: [] for name in ("x_full", "x_reduced", "stress_full", "stress_reduced", "role")}
     rows: dict[str, list] = {}
 
     def note(**values: torch.Tensor) -> None:
@@ -174,6 +179,8 @@ def compare(
             shown = values[inside][:, shown_particles]
             shown = metrics.von_mises(shown) if name.startswith("stress") else shown
             kept[name].append(shown.float().cpu().numpy())
+        roles = [_roles(setup, x_rom[n], samples[start + n])[shown_particles] for n in inside]
+        kept["role"].append(np.array(roles, np.int8).reshape(len(inside), len(shown_particles)))
 
     column = {name: torch.cat(values) for name, values in rows.items()}
 
@@ -285,9 +292,18 @@ def _reduced_fields(
     return tuple(torch.cat(fields) for fields in zip(*parts, strict=True))
 
 
+def _roles(setup: Setup, x: torch.Tensor, sample: np.ndarray) -> np.ndarray:
+    """[P] set of each particle in a step from the positions x [P, 3]: 2 in S, 1 in N alone, 0 in neither."""
+    role = setup.search.needed(x, torch.as_tensor(sample, device=x.device)).cpu().numpy().astype(np.int8)
+    role[sample] = 2
+    return role
+
+
 def _shown(
-    particles: int, frames: int, most_particles: int, most_frames: int
+    particles: int, frames: int, most_particles: int, most_frames: int, sample: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Particles (a fixed random subset) and frames (even, with the first and the last) for pictures."""
-    chosen = np.sort(np.random.default_rng(0).permutation(particles)[:most_particles])
+    """Particles and frames for pictures: S and a fixed random subset; even, with the first and the last."""
+    order = np.concatenate([np.unique(sample), np.random.default_rng(0).permutation(particles)])
+    _, first = np.unique(order, return_index=True)
+    chosen = np.sort(order[np.sort(first)[:most_particles]])
     return chosen, np.unique(np.linspace(0, frames - 1, min(frames, most_frames)).round().astype(int))

@@ -13,8 +13,8 @@ from nsf.reporting.drawing.style import (
     CLIP,
     DIFFERENCE_COLORS,
     METRES,
-    PALETTE,
     PASCALS,
+    ROLES,
     SIGNED_COLORS,
     STRESS_COLORS,
     ColorScale,
@@ -23,8 +23,6 @@ from nsf.reporting.drawing.style import (
 #: End of the scale of the distance to the truth, over the end of the scale of the displacement.
 _DISTANCE = 0.05
 DISTANCE = "distance to the truth"
-#: Colours of a particle in neither set, in N only, and in S.
-ROLES = ("#BBBBBB", PALETTE[0], PALETTE[1])
 _ROLES = np.array([[int(color[i : i + 2], 16) for i in (1, 3, 5)] for color in ROLES], np.uint8)
 SAMPLE = tuple(_ROLES[2].tolist())
 

@@ -12,10 +12,10 @@ import viser
 import websockets.asyncio.server as websockets
 from matplotlib.colors import to_hex
 
-from nsf.live.coloring import DISTANCE, ROLES, SAMPLE, Coloring, Picture
+from nsf.live.coloring import DISTANCE, SAMPLE, Coloring, Picture
 from nsf.live.guard import Connection, refused
 from nsf.live.player import Moment, Player, every
-from nsf.reporting.drawing.style import ColorScale
+from nsf.reporting.drawing.style import ROLES, ColorScale
 from nsf.reporting.text.columns import axis
 
 log = logging.getLogger(__name__)

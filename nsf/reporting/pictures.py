@@ -267,7 +267,20 @@ def _stills(v: _Variant, folder: Path, prefix: str, brief: bool, beside: _Varian
         "the right column shows how far each particle of the reduced model lies from where the "
         f"full-order one puts it.{continued}"
     )
-    return [*pictures, Picture(final, told, v.runs)]
+    return [*pictures, Picture(final, told, v.runs), *_sets(v, folder, prefix)]
+
+
+def _sets(v: _Variant, folder: Path, prefix: str) -> list[Picture]:
+    """S and N of the best case, where the run tells them."""
+    case = v.cases(ENDS)[-1]
+    if case.motion.role is None:
+        return []
+    drawn = save(shapes.particle_sets(case, *v.parameter), folder, f"{prefix}particle-sets", ("png",))
+    told = (
+        "The sample particles S and the integration particles N that a projected step of them needs, as seen "
+        "through the body."
+    )
+    return [Picture(drawn, told, v.runs)]
 
 
 def _told(cases: Sequence[shapes.Case], name: str, unit: str) -> str:

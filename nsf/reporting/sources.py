@@ -47,7 +47,8 @@ class Motion:
 
     `stopped` is the time [s] up to which a reduced run that diverged was good (later frames hold that
     state), None for one that reached the end. `surroundings` are gravity and colliders, as
-    `nsf.evaluation.surroundings` names them; runs of before do not tell them.
+    `nsf.evaluation.surroundings` names them; `role` [F,n] is 2 in S, 1 in N alone, 0 in neither. Runs of
+    before do not tell these.
     """
 
     parameter: float | str
@@ -59,6 +60,7 @@ class Motion:
     stress_reduced: np.ndarray
     stopped: float | None = None
     surroundings: Mapping[str, np.ndarray] = field(default_factory=dict)
+    role: np.ndarray | None = None
 
 
 class Source:
@@ -117,6 +119,7 @@ class Source:
                 raise SchemaError(f"{self._path('frames.npz')} lacks {absent}; run `nsf evaluate` again")
             arrays = {key: stored[key] for key in _FRAMES}
             around = {key: stored[key] for key in _AROUND if key in stored}
+            roles = stored.get("role")
         rows = [(value, _where(arrays["parameters"], value)) for value in parameters]
         return [
             Motion(
@@ -126,6 +129,7 @@ class Source:
                 *(arrays[key][row] for key in _FRAMES[3:]),
                 stopped=self._stopped(value),
                 surroundings={key: values[row] for key, values in around.items()},
+                role=None if roles is None else roles[row],
             )
             for value, row in rows
             if row is not None

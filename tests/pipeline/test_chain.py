@@ -129,7 +129,11 @@ def test_files_of_an_evaluation(chain):
     assert frames["parameters"].tolist() == [26.0]
     assert frames["splits"].tolist() == ["test"]
     assert frames["x_full"].shape == frames["x_reduced"].shape == (1, 3, 100, 3)
-    assert frames["stress_full"].shape == frames["stress_reduced"].shape == (1, 3, 100)
+    assert (
+        frames["stress_full"].shape == frames["stress_reduced"].shape == frames["role"].shape == (1, 3, 100)
+    )
+    assert ((frames["role"] == 2).sum(axis=2) == 20).all()  # S is among the particles of pictures
+    assert set(np.unique(frames["role"])) <= {0, 1, 2}
     cost = json.loads((path / "cost.json").read_text())
     assert set(cost["breakdown"]["reduced"]) == {"inference", "p2g", "g2p", "inversion"}
     assert cost["trials"] == 2

@@ -6,6 +6,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
@@ -18,6 +19,7 @@ from nsf.reporting.drawing.style import (
     DIFFERENCE_COLORS,
     METRES,
     PASCALS,
+    ROLES,
     STRESS_COLORS,
     ColorScale,
     styled,
@@ -31,6 +33,7 @@ if TYPE_CHECKING:
 GIF_BYTES = 2**20
 _THIN = 0.5  # of the larger horizontal extent: below it a body, as a slice or a frame, counts as thin
 _INSIDE = 0.5  # share of all particles' stress below which a surface tells little of it
+_WHITE = 250  # of 255: a brighter pixel shows no particle
 _LOOKS = 7  # frames by which a window is chosen
 _STRESS = "von Mises equivalent of the Kirchhoff stress"
 
@@ -187,6 +190,39 @@ def fine_shapes(
     return sheet.fig
 
 
+def particle_sets(case: Case, name: str = "parameter", unit: str = "", count: int = 4) -> Figure:
+    """S and N in `count` frames of a reduced run, in front of the particles that are in neither.
+
+    Args:
+        case: whose motion tells the role of each particle; positions in metres.
+        name, unit: of the problem parameter.
+    """
+    stage = Stage([case])
+    (case,) = stage.cases
+    m = case.motion
+    frames = np.linspace(0, len(m.t) - 1, count).round().astype(int)
+    view = stage.view(520)
+    with styled():
+        sheet = Sheet(view, rows=1, columns=count, titles=[f"t = {m.t[frame]:.3g} s" for frame in frames])
+        _name(sheet, 0, [parameter_text(m.parameter, name, unit), case.remark], m)
+        for column, frame in enumerate(frames):
+            x, role = m.x_reduced[frame], m.role[frame]
+            picture = stage.picture(view, m, frame, x, _in_color(x, ROLES[0]))
+            for number, opacity in ((1, 0.5), (2, 1.0)):
+                own = x[role == number]
+                over = view.picture(own, _in_color(own, ROLES[number]), stage.radius)
+                covered = (over < _WHITE).any(axis=-1, keepdims=True)
+                picture = np.where(covered, (1 - opacity) * picture + opacity * over, picture).astype(
+                    np.uint8
+                )
+            sheet.show(0, column, picture)
+        sheet.legend(
+            dict(zip(("in neither", "integration particles N", "sample particles S"), ROLES, strict=True))
+        )
+        sheet.scale_bar()
+    return sheet.fig
+
+
 def strip(cases: Sequence[Case], name: str = "parameter", unit: str = "", count: int = 5) -> Figure:
     """The motion of each case in `count` pictures, a row a model.
 
@@ -273,12 +309,18 @@ def hides_stress(motion: Motion) -> bool:
     return is_cut_open(X) and bool(seen < _INSIDE * everywhere)
 
 
+def _in_color(x: np.ndarray, color: str) -> np.ndarray:
+    """One colour for each of the particles x [n, 3]."""
+    return np.broadcast_to(to_rgb(color), x.shape)
+
+
 def _of(case: Case, rows) -> Case:
     """Some particles of a case."""
 
     def some(motion: Motion) -> Motion:
-        names = ("x_full", "x_reduced", "stress_full", "stress_reduced")
-        return replace(motion, **{name: getattr(motion, name)[:, rows] for name in names})
+        names = ("x_full", "x_reduced", "stress_full", "stress_reduced", "role")
+        known = {name: values for name in names if (values := getattr(motion, name)) is not None}
+        return replace(motion, **{name: values[:, rows] for name, values in known.items()})
 
     return replace(case, motion=some(case.motion), baseline=case.baseline and some(case.baseline))
 

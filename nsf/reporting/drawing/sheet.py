@@ -1,9 +1,12 @@
 """Rows and columns of pictures of one view, with names, colour bars and a length scale."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
+from matplotlib.lines import Line2D
 from PIL import Image
 
 from nsf.reporting.drawing.camera import View
@@ -54,6 +57,14 @@ class Sheet:
         bar.outline.set_visible(False)
         bar.ax.tick_params(labelsize=8.5, pad=2)
         bar.set_label(f"{title} [{scale.unit}]", fontsize=9, labelpad=2)
+
+    def legend(self, colors: Mapping[str, str]) -> None:
+        """What colours stand for, below the pictures."""
+        dots = [
+            Line2D([], [], color=color, label=name, linestyle="none", marker="o", markersize=6)
+            for name, color in colors.items()
+        ]
+        self.fig.legend(handles=dots, loc="lower center", ncols=len(dots), fontsize=9, frameon=False)
 
     def scale_bar(self) -> None:
         """A length of 1, 2 or 5 times a power of ten, about a fifth of the first picture."""

@@ -19,6 +19,8 @@ INK, MUTED, GRID, WARNING = "#222222", "#666666", "#dddddd", "#B04A00"
 
 # Okabe and Ito 2008, without the yellow that vanishes on white; black last.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
+#: Colours of a particle in neither set, in N only, and in S.
+ROLES = ("#BBBBBB", PALETTE[0], PALETTE[1])
 DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (5, 2, 1.5, 2)))
 
 FULL, REDUCED, PAPER = "#7f7f7f", "#0072B2", "#000000"

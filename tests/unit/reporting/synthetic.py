@@ -79,6 +79,7 @@ def write_payload(path: Path, made: Made) -> None:
     motions = [collapse(made, rng, value, t) for value in made.parameters]
     columns = ("x_full", "x_reduced", "stress_full", "stress_reduced")
     arrays = {key: np.stack([m[key] for m in motions]).astype(np.float32) for key in columns}
+    arrays["role"] = rng.integers(0, 3, arrays["stress_full"].shape, np.int8)
     np.savez(
         path / "frames.npz", parameters=np.array(made.parameters), splits=np.array(made.splits), t=t, **arrays
     )

@@ -83,8 +83,9 @@ def test_pictures_of_many_variants_are_the_same_from_several_processes(sweep, tm
 
 
 def test_pictures_are_of_the_best_sample_of_each_method(report):
-    drawn = {path.name for path in report.glob("*final-shapes.png")}
-    assert drawn == {"nsf-final-shapes.png", "deformation_only-final-shapes.png"}
+    for stem in ("final-shapes", "particle-sets"):
+        drawn = {path.name for path in report.glob(f"*{stem}.png")}
+        assert drawn == {f"nsf-{stem}.png", f"deformation_only-{stem}.png"}
     assert "smallest mean held-out δ" in (report / "index.md").read_text()
     assert "nsf · |S| 150" in (report / "index.html").read_text()
 
