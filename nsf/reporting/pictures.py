@@ -107,6 +107,10 @@ class _Variant:
                 found.append(shapes.Case(motion, place, ranked[i][1], other))
         return found
 
+    def at(self, value, place: str) -> list[shapes.Case]:
+        """The case of a held-out value, if the run kept its particles."""
+        return [shapes.Case(motion, place, dict(self.ranked())[value]) for motion in self._motions([value])]
+
     def _motions(self, values) -> list[Motion]:
         """The particles of some held-out values, each of its own run."""
         owned: dict[str, list] = {source.id: [] for source in self.sources}
@@ -153,9 +157,42 @@ def draw(
     ]
     return [
         *sections,
+        *(_at_settings(known, folder, study) if sweep and study else []),
         *levels_section(known, folder),
         Section("All variants" if len(known) > 1 else "Error and cost", _comparison(known, folder, study)),
     ]
+
+
+def _at_settings(known: list[_Variant], folder: Path, study: Study) -> list[Section]:
+    """The last frame of one held-out case of each scene, by every setting, or by some evenly."""
+    pictures = []
+    for scene in dict.fromkeys(v.scene for v in known):
+        alike: dict[tuple, _Variant] = {}  # of several seeds the first
+        for v in known:
+            keys = study.keys.get(v.runs[0], {})
+            if v.scene == scene and v.method == "nsf":
+                alike.setdefault(tuple((k, str(e)) for k, e in keys.items() if k not in SEEDS), v)
+        varied = {key for key, _ in set().union(*alike) - set.intersection(*map(set, alike))}
+        chosen = np.unique(np.linspace(0, len(alike) - 1, min(ROWS, len(alike))).round().astype(int))
+        (worst, _), *_ = min(alike.values(), key=_order).ranked()
+        rows = [
+            case
+            for keys, v in (list(alike.items())[i] for i in chosen)
+            for case in v.at(worst, ", ".join(f"{key}={value}" for key, value in keys if key in varied))
+        ]
+        if len(rows) > 1:
+            v = next(iter(alike.values()))
+            drawn = save(
+                shapes.final_shapes(rows, *v.parameter),
+                folder, file_name(f"{scene}-settings"), ("png",), [STRESS_COLORS, DIFFERENCE_COLORS],
+            )  # fmt: skip
+            told = (
+                "The last frame by each setting, or by some of them evenly, at the held-out value that is "
+                "worst where the mean δ is best; the right column shows how far particles lie from the "
+                "full-order run."
+            )
+            pictures.append(Picture(drawn, told, sorted({run for v in alike.values() for run in v.runs})))
+    return [Section("Bodies at each setting", pictures)] if pictures else []
 
 
 def _best(known: list[_Variant], by_method: bool) -> list[_Variant]:

@@ -10,7 +10,8 @@ import pytest
 from synthetic import Made, write_run
 
 from nsf.reporting import build_report
-from nsf.reporting.drawing import charts
+from nsf.reporting.drawing import charts, shapes
+from nsf.reporting.pictures import draw
 from nsf.reporting.sources import Study, open_sources
 from nsf.reporting.study import _settings, _told, interval, over_seeds, swept
 from nsf.reporting.tables import means, merge, rows_of
@@ -224,3 +225,27 @@ def test_latex_escapes():
 def test_latex_knows_every_sign_of_a_table(sweep):
     text = latex_table(rows_of(means(merge(open_sources(sweep)))), "Sand", "")
     assert text.isascii()
+
+
+def test_bodies_at_each_setting_stand_below_each_other(tmp_path, monkeypatch):
+    seen = []
+    draw_shapes = shapes.final_shapes
+    monkeypatch.setattr(
+        shapes, "final_shapes", lambda cases, *a: seen.append(cases) or draw_shapes(cases, *a)
+    )
+    found, keys, settings = runs(tmp_path, sizes={20: 0.02, 150: 0.004}, seeds=("0", "1"))
+    merged = merge(open_sources(found), settings)
+    (section,) = [s for s in draw(merged, tmp_path, True, of(keys)) if s.heading == "Bodies at each setting"]
+    (picture,) = section.pictures
+    assert picture.files == ["sand-settings.png"]
+    assert (tmp_path / "sand-settings.png").is_file()
+    cases = seen[-1]
+    assert [case.place for case in cases] == ["sampler.size=20", "sampler.size=150"]
+    assert len({case.motion.parameter for case in cases}) == 1
+    assert cases[0].delta > cases[1].delta
+
+
+def test_seeds_are_no_settings(tmp_path):
+    found, keys, settings = runs(tmp_path, seeds=("0", "1"))
+    sections = draw(merge(open_sources(found), settings), tmp_path, True, of(keys))
+    assert "Bodies at each setting" not in [section.heading for section in sections]
