@@ -39,11 +39,34 @@ CHAPTERS = {
     "Beyond what was trained": ("extrapolation", "weak_elements", "super_resolution", "path_dependent"),
     "At small scale, on a CPU": (
         "small", "closed", "levels", "teaching", "inverse", "calibration", "calibration_frame",
-        "sensitivities", "tilt", "design", "quickstart",
+        "sensitivities", "tilt", "design", "figures", "quickstart",
     ),
     "One scene in detail, and speed": ("sand", "speed"),
 }  # fmt: skip
 _OTHERS = "Further reports"
+#: The paper's figures and tables that have a number or a picture: what they show, and (report, file) for each.
+OF_THE_PAPER = (
+    ("Figure 1, section 6.1", "cake, cut at several angles", ("table1", "cake-nsf-final-shapes.png")),
+    ("Figure 4", "sample and integration particles", ("figures", "sand-nsf-particle-sets.png")),
+    ("Figure 5", "bread beside the baseline", ("table1", "bread-nsf-strip.png")),
+    ("Figure 6", "sand at many more points", ("super_resolution", "sand-basis-superresolution.png")),
+    ("Figure 7", "sand at several friction angles", ("sand", "nsf-final-shapes.png")),
+    ("Table 1", "seven scenes", ("table1", "delta.png")),
+    ("Figures 8 and 9", "metal at several hardening coefficients", ("table1", "metal-nsf-final-shapes.png")),
+    ("Figure 10", "toothpaste at several inclinations", ("table1", "toothpaste-nsf-final-shapes.png")),
+    ("Figure 11", "toothpaste with fewer sample particles", ("figures", "toothpaste-settings.png"),
+     ("sample_size", "delta-over-sampler-size.png")),
+    ("Figure 12", "jelly cube beside the baseline", ("table1", "jelly_cube-nsf-strip.png")),
+    ("Figure 13", "squishy ball beside the baseline", ("table1", "squishy_ball-nsf-strip.png")),
+    ("Figure 14", "bread with perturbed weak elements", ("weak_elements", "final-shapes.png")),
+    ("Figure 15", "training data of bread", ("figures", "bread-nsf-final-shapes.png")),
+    ("Figure 16", "training data of sand", ("figures", "sand-nsf-final-shapes.png")),
+    ("Figure 17", "sand beyond the friction angles of training", ("extrapolation", "final-shapes.png")),
+    ("Figure 18", "where the time of a step goes", ("table1", "cake-nsf-runtime.png"),
+     ("table1", "metal-nsf-runtime.png")),
+    ("Sections 6.1 and 6.3", "1.5 Δt", ("timestep", "delta-over-deploy-dt-multiplier.png"),
+     ("figures", "cake-settings.png"), ("figures", "metal-settings.png")),
+)  # fmt: skip
 _CHART = {"file": "delta.png", "caption": "Mean δ, each value, and the paper's."}  # of reports that name none
 _REBUILD = "build it again with `nsf report`"
 
@@ -107,7 +130,19 @@ def _list(folder: Path) -> str:
     for name in sorted(sections, key=_place):
         chapters[_place(name)[1]].append(sections[name] | {"name": name})
     filled = {heading: reports for heading, reports in chapters.items() if reports}
-    return markdown_document("list.md", chapters=filled, definitions=DEFINITIONS)
+    return markdown_document(
+        "list.md", chapters=filled, definitions=DEFINITIONS, of_the_paper=_of_the_paper(folder)
+    )
+
+
+def _of_the_paper(folder: Path) -> list[dict]:
+    """Where each of the paper's figures has its like here; those whose report is not there have none."""
+    known = {report.name: _sources(report)["files"] for report in _reports(folder)}
+    found = []
+    for figure, shows, *pictures in OF_THE_PAPER:
+        here = [f"{name}/{file}" for name, file in pictures if file in known.get(name, {})]
+        found.append({"figure": figure, "shows": shows, "pictures": here})
+    return found if any(entry["pictures"] for entry in found) else []
 
 
 def _place(name: str) -> tuple[int, str, int, str]:

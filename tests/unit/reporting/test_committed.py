@@ -73,6 +73,20 @@ def test_every_experiment_has_its_place():
     assert placed == {path.stem for path in EXPERIMENTS.glob("*.yaml")} | others
 
 
+def test_each_figure_of_the_paper_links_to_its_like_where_that_is_there(tmp_path, monkeypatch):
+    assert "The paper's figures" not in committed.write_list(tmp_path).read_text()
+    write_report(tmp_path / "table1", [job()], chart="delta.png")
+    wanted = (("Table 1", "seven scenes", ("table1", "delta.png")), ("Figure 4", "S", ("figures", "s.png")))
+    monkeypatch.setattr(committed, "OF_THE_PAPER", wanted)
+    text = committed.write_list(tmp_path).read_text()
+    assert "| Table 1 | seven scenes | [table1/delta.png](table1/delta.png) |\n| Figure 4 | S | – |\n" in text
+
+
+def test_figures_of_the_paper_are_sought_in_reports_that_have_a_place():
+    placed = {name for names in committed.CHAPTERS.values() for name in names}
+    assert {name for _, _, *pictures in committed.OF_THE_PAPER for name, _ in pictures} <= placed
+
+
 def test_the_paper_the_chart_and_what_is_missing(tmp_path):
     jobs = [job(**{"sampler.size": "50"}), job(**{"sampler.size": "20"}) | {"delta": float("inf")}]
     told = {"paper": "Section 6.3: 0.2 %.", "missing": ["a: not run", "b: not run"]}
