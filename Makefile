@@ -28,7 +28,7 @@ unexport PYTHONDONTWRITEBYTECODE
 CASES ?= 2400
 SEED ?= 0
 
-.PHONY: help install develop quickstart test test-browser fuzz test-slow test-gpu gpu-references test-slurm test-all lint mirrors readme check-reports calibration models docs clean
+.PHONY: help install develop quickstart test test-browser fuzz test-slow test-gpu gpu-references test-slurm test-all lint mirrors readme check-reports reproduce calibration models docs clean
 
 help:  ## this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -96,6 +96,22 @@ readme: install  ## the figures in README.md, from a report, and the list of rep
 	$(BIN)/nsf reports folder=reports
 
 check-reports: install  ## whether reports/ is as it was generated
+	$(BIN)/nsf reports folder=reports check=true
+
+# Every experiment with a committed report, those of the paper's size first; calibration makes the others.
+REPRODUCED := table1 operators operators_seeds field width latent_dim ablation sample_size sampler timestep seeds \
+	extrapolation weak_elements super_resolution path_dependent sand forcing small closed levels teaching \
+	noise_floor figures
+
+reproduce: install  ## every report, from nothing, on one GPU; the same command goes on where it was stopped
+	@echo 'first a small scene, whose rates tell how long the others take'
+	$(BIN)/nsf run scene=jelly_cube scale=paper engine=operators
+	@for e in $(REPRODUCED); do $(BIN)/nsf plan +experiment=$$e | sed -n "s/^in all/in all, $$e:/p"; done
+	@failed=; for e in $(REPRODUCED); do $(BIN)/nsf run +experiment=$$e || failed="$$failed $$e"; done; \
+		[ -z "$$failed" ] || { echo "not whole:$$failed; make reproduce goes on" >&2; exit 1; }
+	NSF_RUNS=$${NSF_RUNS:-runs}-calibration $(MAKE) calibration
+	$(BIN)/nsf bench
+	$(BIN)/nsf reports folder=reports
 	$(BIN)/nsf reports folder=reports check=true
 
 # Two moduli of a pressed frame, as docs/howto/inverse.md has them.

@@ -44,7 +44,7 @@ CHAPTERS = {
     "One scene in detail, and speed": ("sand", "speed"),
 }  # fmt: skip
 _OTHERS = "Further reports"
-#: The paper's figures and tables that have a number or a picture: what they show, and (report, file) for each.
+#: The paper's figures and tables with a number or a picture: what they show, and (report, file) for each.
 OF_THE_PAPER = (
     ("Figure 1, section 6.1", "cake, cut at several angles", ("table1", "cake-nsf-final-shapes.png")),
     ("Figure 4", "sample and integration particles", ("figures", "sand-nsf-particle-sets.png")),
