@@ -87,7 +87,8 @@ def test_the_models_own_error_moves_and_widens(model, seen, no_error):
     found, exact = fit(view, model, error=own), fit(view, model, error=no_error)
     low, high = model.ranges[0]
     assert (found.fitted - found.estimate)[0] / (high - low) == pytest.approx(0.02, abs=0.008)
-    assert (found.standard_error > 2 * exact.standard_error).all()
+    assert found.standard_error[0] > exact.standard_error[0]
+    assert found.standard_error[1] > 2 * exact.standard_error[1]  # it scatters as by the second parameter
     assert found.share[1] > 0.5
 
 
