@@ -126,11 +126,9 @@ def compare(
     rate = torch.diff(xhat, dim=0, prepend=xhat[:1]) / trajectory.dt
     rate[0] = solver.first_rate
     inertia = scene.dx**2 * (DEGREES[scene.transfer.shape] + 1) / 12.0
-    steps = np.minimum((trajectory.t / setup.dt).round(), solver.total_steps - 1).astype(
-        int
-    )  # that start there
-    samples = [solver.sets_at(int(step)).sample for step in steps]
-    shown_particles, shown_frames = _shown(trajectory.particles, frames, *pictures, np.concatenate(samples))
+    shown_frames = np.unique(np.linspace(0, frames - 1, min(frames, pictures[1])).round().astype(int))
+    samples = {n: _sample_at(solver, trajectory.t[n]) for n in shown_frames}
+    shown_particles = _shown(trajectory.particles, pictures[0], np.concatenate(list(samples.values())))
     kept = {name: [] for name in ("x_full", "x_reduced", "stress_full", "stress_reduced", "role")}
     rows: dict[str, list] = {}
 
@@ -299,11 +297,13 @@ def _roles(setup: Setup, x: torch.Tensor, sample: np.ndarray) -> np.ndarray:
     return role
 
 
-def _shown(
-    particles: int, frames: int, most_particles: int, most_frames: int, sample: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Particles and frames for pictures: S and a fixed random subset; even, with the first and the last."""
+def _sample_at(solver: ReducedMPM, t: float) -> np.ndarray:
+    """[s] indices of S in the step that starts at t [s], or in the last one."""
+    return solver.sets_at(min(round(t / solver.setup.dt), solver.total_steps - 1)).sample
+
+
+def _shown(particles: int, most: int, sample: np.ndarray) -> np.ndarray:
+    """Particles for pictures: those of S, with repetitions, and a fixed random subset; `most` at most."""
     order = np.concatenate([np.unique(sample), np.random.default_rng(0).permutation(particles)])
     _, first = np.unique(order, return_index=True)
-    chosen = np.sort(order[np.sort(first)[:most_particles]])
-    return chosen, np.unique(np.linspace(0, frames - 1, min(frames, most_frames)).round().astype(int))
+    return np.sort(order[np.sort(first)[:most]])

@@ -280,11 +280,11 @@ def _rounded(parameter):
 
 
 def _sort_key(row) -> tuple:
-    key = map(_natural, variant_key(row))
-    return (row["scene"], row["method"] != "nsf", *key, split_rank(row["split"]), _natural(row["parameter"]))
+    key = map(natural, variant_key(row))
+    return (row["scene"], row["method"] != "nsf", *key, split_rank(row["split"]), natural(row["parameter"]))
 
 
-def _natural(value) -> tuple[int, float, str]:
+def natural(value) -> tuple[int, float, str]:
     """Numbers by size, then text, with the numbers in it by size."""
     try:
         return (0, float(value), "")

@@ -149,9 +149,8 @@ def test_a_reduced_run_meets_moving_colliders_in_every_span(
             felt = max(felt, (without - expected).abs().max())
             solver.step()
             # What G2P gave is there until the next step.
-            assert (
-                span.x[: span.s] - expected
-            ).abs().max() <= 1e-11  # [m] the inversion ends before round-off
+            off = (span.x[: span.s] - expected).abs().max()
+            assert off <= 1e-11  # [m] the inversion ends before round-off
             sizes.add(len(sample))
         else:
             solver.step()

@@ -43,10 +43,10 @@ MIRRORED = (
     "nsf.dynamics.latent:LatentRecord.add",
     "nsf.dynamics.latent:LatentRecord.predicted",
     "nsf.kinematics.fields.basis:BasisManifold.restrict",
-    "nsf.kinematics.fields.basis:BasisRestriction",
     "nsf.kinematics.fields.modal:at_rate",
     "nsf.kinematics.fields.modal:ModalField.at",
     "nsf.kinematics.fields.modal:RestrictedField",
+    "nsf.kinematics.fields.modal:ModalRestriction",
     "nsf.kinematics.fields.networks:FullyConnected.forward",
     "nsf.kinematics.fields.networks:FullyConnected.forward_and_tangents",
 )

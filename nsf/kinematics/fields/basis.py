@@ -15,7 +15,7 @@ not in the paper, whose fields are `mlp`; it takes their place in every equation
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -29,15 +29,14 @@ from nsf.kinematics.fields import pod
 from nsf.kinematics.fields.modal import (
     ModalFactors,
     ModalField,
-    ModalModule,
+    ModalRestriction,
     PlacedFields,
-    RateModule,
     RestrictedField,
     at_rate,
 )
 from nsf.kinematics.fields.networks import Committee, FullyConnected
 from nsf.kinematics.interpolation import Interpolation, interpolation
-from nsf.kinematics.manifold import Manifold, Restriction
+from nsf.kinematics.manifold import Manifold
 from nsf.kinematics.training.phases import (
     MOST_DEEP,
     MOST_MEMBERS,
@@ -45,7 +44,6 @@ from nsf.kinematics.training.phases import (
     TARGETS,
     Fit,
     at_least,
-    joined,
     per_phase,
 )
 from nsf.kinematics.training.rates import latent_rates
@@ -278,7 +276,7 @@ class BasisManifold(Manifold):
 
     @override
     @torch.no_grad()
-    def restrict(self, particles=None, X=None, dtype=torch.float64, device="cpu") -> BasisRestriction:
+    def restrict(self, particles=None, X=None, dtype=torch.float64, device="cpu") -> ModalRestriction:
         rows, points = self.points(particles, X)
         points = points.to(self.X.device)
         like = torch.empty(0, dtype=dtype, device=device)
@@ -298,7 +296,7 @@ class BasisManifold(Manifold):
             )
 
         own = self.latent_dim, self.takes_parameters("stress"), self.takes_rate
-        return BasisRestriction(fields, gradient, *own)
+        return ModalRestriction(fields, gradient, *own)
 
     @torch.no_grad()
     def factors(self, name: str, particles, dtype: torch.dtype, device: torch.device | str) -> ModalFactors:
@@ -343,76 +341,10 @@ class BasisManifold(Manifold):
         field, parameters = self.fields[phase], self.standard_parameters
         if field.network is None:
             return None
-        latent = torch.zeros_like(self.spread)
-        mean, std = [latent], [self.spread]
+        mean, std = [torch.zeros(self.latent_dim, device=parameters.mean.device)], [self.spread]
         if self.takes_parameters(phase):
-            mean, std = [latent, parameters.mean], [self.spread, parameters.std]
+            mean, std = [*mean, parameters.mean], [*std, parameters.std]
         scale = field.output_scale
         return field.network.in_raw_units(
             torch.cat(mean), torch.cat(std), torch.zeros_like(scale), scale, like.dtype, like.device
         )
-
-
-class BasisRestriction(Restriction):
-    """Modes at n points.
-
-    Args:
-        fields: by phase.
-        gradient: makes ∂g/∂X, a field of 9 components; called when first needed.
-        takes_parameters: whether h and l see the problem parameters.
-        takes_rate: whether l sees dx̂/dt.
-    """
-
-    def __init__(
-        self,
-        fields: Mapping[str, RestrictedField],
-        gradient: Callable[[], RestrictedField],
-        latent_dim: int,
-        takes_parameters: bool,
-        takes_rate: bool,
-    ):
-        self.fields, self.latent_dim, self.takes_rate = fields, latent_dim, takes_rate
-        mean = fields["deformation"].mean
-        self.points, self.dtype, self.device = len(mean), mean.dtype, mean.device
-        self._make_gradient = gradient
-        self._takes_parameters = takes_parameters
-        self._identity = torch.eye(latent_dim, dtype=self.dtype, device=self.device)
-
-    @override
-    def position(self, xhat):
-        return self.fields["deformation"].values(xhat.to(self.dtype))
-
-    @override
-    def position_and_jacobian(self, xhat):
-        return self.fields["deformation"].values_and_jacobian(xhat.to(self.dtype), self._identity)
-
-    @override
-    def deformation_gradient(self, xhat):
-        return self._gradient.values(xhat.to(self.dtype)).unflatten(-1, (3, 3))
-
-    @functools.cached_property
-    def _gradient(self) -> RestrictedField:
-        return self._make_gradient()
-
-    @override
-    def stress(self, xhat, parameters):
-        return self.fields["stress"].values(self._inputs(xhat, parameters))
-
-    @override
-    def affine(self, xhat, parameters, rate=None):
-        return self.fields["affine"].values(self._inputs(xhat, parameters), rate).unflatten(-1, (3, 3))
-
-    @override
-    def module(self, phase):
-        kind = RateModule if phase == "affine" and self.takes_rate else ModalModule
-        return kind(self.fields[phase], phase, phase != "deformation" and self._takes_parameters)
-
-    @override
-    def subset(self, rows):
-        fields = PlacedFields(lambda phase: self.fields[phase].subset(rows))
-        own = self.latent_dim, self._takes_parameters, self.takes_rate
-        return BasisRestriction(fields, lambda: self._gradient.subset(rows), *own)
-
-    def _inputs(self, xhat: Tensor, parameters: Tensor) -> Tensor:
-        xhat = xhat.to(self.dtype)
-        return joined(xhat, parameters) if self._takes_parameters else xhat

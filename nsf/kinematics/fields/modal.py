@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -12,6 +13,7 @@ from typing_extensions import override
 
 from nsf.errors import ShapeError
 from nsf.kinematics.fields.networks import Committee, FullyConnected
+from nsf.kinematics.manifold import Restriction
 from nsf.kinematics.training.phases import joined, shaped
 
 
@@ -234,3 +236,68 @@ class RateModule(ModalModule):
     @override
     def forward(self, xhat: Tensor, parameters: Tensor, rate: Tensor) -> Tensor:
         return self._values(xhat, parameters, rate)
+
+
+class ModalRestriction(Restriction):
+    """Modes at n points.
+
+    Args:
+        fields: by phase.
+        gradient: makes ∂g/∂X, a field of 9 components; called when first needed.
+        takes_parameters: whether h and l see the problem parameters.
+        takes_rate: whether l sees dx̂/dt.
+    """
+
+    def __init__(
+        self,
+        fields: Mapping[str, RestrictedField],
+        gradient: Callable[[], RestrictedField],
+        latent_dim: int,
+        takes_parameters: bool,
+        takes_rate: bool,
+    ):
+        self.fields, self.latent_dim, self.takes_rate = fields, latent_dim, takes_rate
+        mean = fields["deformation"].mean
+        self.points, self.dtype, self.device = len(mean), mean.dtype, mean.device
+        self._make_gradient = gradient
+        self._takes_parameters = takes_parameters
+        self._identity = torch.eye(latent_dim, dtype=self.dtype, device=self.device)
+
+    @override
+    def position(self, xhat):
+        return self.fields["deformation"].values(xhat.to(self.dtype))
+
+    @override
+    def position_and_jacobian(self, xhat):
+        return self.fields["deformation"].values_and_jacobian(xhat.to(self.dtype), self._identity)
+
+    @override
+    def deformation_gradient(self, xhat):
+        return self._gradient.values(xhat.to(self.dtype)).unflatten(-1, (3, 3))
+
+    @functools.cached_property
+    def _gradient(self) -> RestrictedField:
+        return self._make_gradient()
+
+    @override
+    def stress(self, xhat, parameters):
+        return self.fields["stress"].values(self._inputs(xhat, parameters))
+
+    @override
+    def affine(self, xhat, parameters, rate=None):
+        return self.fields["affine"].values(self._inputs(xhat, parameters), rate).unflatten(-1, (3, 3))
+
+    @override
+    def module(self, phase):
+        kind = RateModule if phase == "affine" and self.takes_rate else ModalModule
+        return kind(self.fields[phase], phase, phase != "deformation" and self._takes_parameters)
+
+    @override
+    def subset(self, rows):
+        fields = PlacedFields(lambda phase: self.fields[phase].subset(rows))
+        own = self.latent_dim, self._takes_parameters, self.takes_rate
+        return ModalRestriction(fields, lambda: self._gradient.subset(rows), *own)
+
+    def _inputs(self, xhat: Tensor, parameters: Tensor) -> Tensor:
+        xhat = xhat.to(self.dtype)
+        return joined(xhat, parameters) if self._takes_parameters else xhat

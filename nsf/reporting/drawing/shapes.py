@@ -191,7 +191,7 @@ def fine_shapes(
 
 
 def particle_sets(case: Case, name: str = "parameter", unit: str = "", count: int = 4) -> Figure:
-    """S and N in `count` frames of a reduced run, in front of the particles that are in neither.
+    """S and N in `count` frames of a reduced run, as seen through the body.
 
     Args:
         case: whose motion tells the role of each particle; positions in metres.

@@ -18,7 +18,8 @@ from nsf.dynamics.step import Step, steps_of
 from nsf.engines import ENGINES, NAMES, Engine
 from nsf.engines.modal import mirrors
 from nsf.errors import ConfigError
-from nsf.kinematics.fields.basis import BasisManifold, BasisRestriction
+from nsf.kinematics.fields.basis import BasisManifold
+from nsf.kinematics.fields.modal import ModalRestriction
 from nsf.mpm import FullOrderMPM, Solver
 from nsf.pipeline import Pipeline
 
@@ -169,7 +170,7 @@ def broken(*arguments, **options):
         (Step, "infer"),
         (Step, "project"),
         (LatentRecord, "add"),
-        (BasisRestriction, "position_and_jacobian"),
+        (ModalRestriction, "position_and_jacobian"),
     ],
     ids=lambda of: getattr(of, "__name__", of),
 )

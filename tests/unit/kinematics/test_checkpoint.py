@@ -98,7 +98,7 @@ def test_foreign(path, change, message):
         "nsf.kinematics.manifold.Manifold",
         "nsf.kinematics.fields.basis.BasisField",
         "nsf.kinematics.fields.basis.Manifold",  # imported there, and not its own
-        "nsf.kinematics.fields.basis.BasisRestriction",
+        "nsf.kinematics.fields.modal.ModalRestriction",
         "nsf.kinematics.fields.basis.coefficients",
         "nsf.kinematics.fields.basis.BasisManifold.load",
         "nsf.kinematics.fields.joint.BasisManifold",

@@ -84,7 +84,10 @@ def test_each_figure_of_the_paper_links_to_its_like_where_that_is_there(tmp_path
 
 def test_figures_of_the_paper_are_sought_in_reports_that_have_a_place():
     placed = {name for names in committed.CHAPTERS.values() for name in names}
-    assert {name for _, _, *pictures in committed.OF_THE_PAPER for name, _ in pictures} <= placed
+    sought = {picture for _, _, *pictures in committed.OF_THE_PAPER for picture in pictures}
+    assert {name for name, _ in sought} <= placed
+    committed_ones = EXPERIMENTS.parent / "reports"
+    assert [picture for picture in sorted(sought) if not committed_ones.joinpath(*picture).is_file()] == []
 
 
 def test_the_paper_the_chart_and_what_is_missing(tmp_path):

@@ -249,3 +249,11 @@ def test_seeds_are_no_settings(tmp_path):
     found, keys, settings = runs(tmp_path, seeds=("0", "1"))
     sections = draw(merge(open_sources(found), settings), tmp_path, True, of(keys))
     assert "Bodies at each setting" not in [section.heading for section in sections]
+
+
+def test_a_sweep_of_the_baseline_alone_has_no_bodies_of_settings(tmp_path):
+    made = [Made(method="deformation_only", sample=size) for size in (20, 150)]
+    found = [write_run(tmp_path, one) for one in made]
+    keys = {run.id: {"sampler.size": str(one.sample)} for run, one in zip(found, made, strict=True)}
+    sections = draw(merge(open_sources(found)), tmp_path, True, of(keys))
+    assert "Bodies at each setting" not in [section.heading for section in sections]
