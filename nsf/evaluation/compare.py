@@ -16,6 +16,7 @@ from nsf.evaluation import metrics
 from nsf.evaluation.quantities import QUANTITIES, at_end, height
 from nsf.evaluation.surroundings import surroundings
 from nsf.mpm.grid.shape import DEGREES
+from nsf.vectors import evenly
 
 _CHUNK = 2**24  # values of one field decoded at once
 _SAME_TIME = 1e-9  # [s]
@@ -126,7 +127,7 @@ def compare(
     rate = torch.diff(xhat, dim=0, prepend=xhat[:1]) / trajectory.dt
     rate[0] = solver.first_rate
     inertia = scene.dx**2 * (DEGREES[scene.transfer.shape] + 1) / 12.0
-    shown_frames = np.unique(np.linspace(0, frames - 1, min(frames, pictures[1])).round().astype(int))
+    shown_frames = evenly(frames, pictures[1])
     samples = {n: _sample_at(solver, trajectory.t[n]) for n in shown_frames}
     shown_particles = _shown(trajectory.particles, pictures[0], np.concatenate(list(samples.values())))
     kept = {name: [] for name in ("x_full", "x_reduced", "stress_full", "stress_reduced", "role")}
@@ -291,7 +292,10 @@ def _reduced_fields(
 
 
 def _roles(setup: Setup, x: torch.Tensor, sample: np.ndarray) -> np.ndarray:
-    """[P] set of each particle in a step from the positions x [P, 3]: 2 in S, 1 in N alone, 0 in neither."""
+    """[P] set of each particle: 2 in S, 1 in N alone, 0 in neither.
+
+    N is what a projected step from the positions x [P, 3] needs, no superset of it that a span may have.
+    """
     role = setup.search.needed(x, torch.as_tensor(sample, device=x.device)).cpu().numpy().astype(np.int8)
     role[sample] = 2
     return role
@@ -303,7 +307,13 @@ def _sample_at(solver: ReducedMPM, t: float) -> np.ndarray:
 
 
 def _shown(particles: int, most: int, sample: np.ndarray) -> np.ndarray:
-    """Particles for pictures: those of S, with repetitions, and a fixed random subset; `most` at most."""
-    order = np.concatenate([np.unique(sample), np.random.default_rng(0).permutation(particles)])
+    """Indices [n] of the particles for pictures, sorted, n ≤ most: those of S first, then a random subset.
+
+    Args:
+        particles: P; most: of them, where S may have more.
+        sample: indices of S, an index more than once too.
+    """
+    drawn = (np.random.default_rng(0).permutation(rows) for rows in (np.unique(sample), particles))
+    order = np.concatenate(list(drawn))
     _, first = np.unique(order, return_index=True)
     return np.sort(order[np.sort(first)[:most]])

@@ -305,7 +305,10 @@ class LiveModel:
         return [web.solid(name, own) for name, own in zip(scene.collider_names, scene.colliders, strict=True)]
 
     def roles(self, step: int) -> np.ndarray:
-        """[n] set of each shown particle in the step that starts at `step`: 2 S, 1 N only, 0 neither."""
+        """[n] set of each shown particle in the step that starts at `step`: 2 S, 1 N only, 0 neither.
+
+        N is the set that the step has, which may hold more particles than it needs (`integration=superset`).
+        """
         sets = self._sets_at(step)
         role = np.zeros(self.particles, np.int8)
         role[sets.integration], role[sets.sample] = 1, 2

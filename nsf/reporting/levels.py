@@ -9,16 +9,17 @@ from nsf.reporting.drawing.style import save
 from nsf.reporting.study import SEEDS
 from nsf.reporting.text.columns import parameter_text
 from nsf.reporting.text.page import Picture, Section
+from nsf.reporting.variant import Variant
 
 #: Columns that variants have in common whose steps are the same but for the engine.
 _ALIKE = ("method", "field", "r", "precision", "device")
 
 
-def levels_section(known: Sequence, folder: Path) -> list[Section]:
+def levels_section(known: Sequence[Variant], folder: Path) -> list[Section]:
     """A picture a scene in which a run had more than one level, at the first such value; none without one.
 
     Args:
-        known: variants, with `scene`, `values`, `parameter`, `runs` and `series` (`nsf.reporting.pictures`).
+        known: the variants of the report.
         folder: of the report.
     """
     pictures = []

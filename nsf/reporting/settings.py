@@ -1,9 +1,7 @@
 """The bodies of a sweep at each of its settings, below each other."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-
-import numpy as np
 
 from nsf.reporting.drawing import shapes
 from nsf.reporting.drawing.style import DIFFERENCE_COLORS, STRESS_COLORS, save
@@ -12,37 +10,55 @@ from nsf.reporting.study import SEEDS
 from nsf.reporting.text.formats import file_name
 from nsf.reporting.text.page import Picture, Section
 from nsf.reporting.variant import ROWS, Variant, order
+from nsf.vectors import evenly
+
+_TOLD = (
+    "Last frame at each setting, at most six of them, all at one held-out value: the worst one of the "
+    "setting with the smallest mean δ. The right column has the distance from the full-order run."
+)
+
+Setting = tuple[tuple[str, str], ...]  # keys and values
 
 
 def settings_section(known: Sequence[Variant], folder: Path, study: Study) -> list[Section]:
-    """The last frame of one held-out case of each scene, by every setting, or by some evenly."""
+    """The last frame of one held-out case of each scene at its settings; variants without it are left out.
+
+    Args:
+        known: the variants of the report.
+        folder: where pictures go.
+        study: what the sweep varies.
+    """
     pictures = []
     for scene in dict.fromkeys(v.scene for v in known):
-        alike: dict[tuple, Variant] = {}  # of several seeds the first
-        for v in known:
-            keys = study.keys.get(v.runs[0], {})
-            if v.scene == scene and v.method == "nsf":
-                alike.setdefault(tuple((k, str(e)) for k, e in keys.items() if k not in SEEDS), v)
-        if len(alike) < 2:
-            continue
-        varied = {key for key, _ in set().union(*alike) - set.intersection(*map(set, alike))}
-        chosen = np.unique(np.linspace(0, len(alike) - 1, min(ROWS, len(alike))).round().astype(int))
-        (worst, _), *_ = min(alike.values(), key=order).ranked()
-        rows = [
-            case
-            for keys, v in (list(alike.items())[i] for i in chosen)
-            for case in v.at(worst, ", ".join(f"{key}={value}" for key, value in keys if key in varied))
-        ]
-        if len(rows) > 1:
-            v = next(iter(alike.values()))
+        settings = _by_setting([v for v in known if v.scene == scene and v.method == "nsf"], study)
+        if len(rows := _rows(settings)) > 1:
+            first = next(iter(settings.values()))
             drawn = save(
-                shapes.final_shapes(rows, *v.parameter),
+                shapes.final_shapes(rows, *first.parameter),
                 folder, file_name(f"{scene}-settings"), ("png",), [STRESS_COLORS, DIFFERENCE_COLORS],
             )  # fmt: skip
-            told = (
-                "The last frame by each setting, or by some of them evenly, at the held-out value that is "
-                "worst where the mean δ is best; the right column shows how far particles lie from the "
-                "full-order run."
-            )
-            pictures.append(Picture(drawn, told, sorted({run for v in alike.values() for run in v.runs})))
+            pictures.append(Picture(drawn, _TOLD, sorted({run for v in settings.values() for run in v.runs})))
     return [Section("Bodies at each setting", pictures)] if pictures else []
+
+
+def _by_setting(variants: Sequence[Variant], study: Study) -> dict[Setting, Variant]:
+    """The variants by what was set, of several seeds the first."""
+    found: dict[Setting, Variant] = {}
+    for v in variants:
+        keys = study.keys.get(v.runs[0], {})
+        found.setdefault(tuple((key, str(value)) for key, value in keys.items() if key not in SEEDS), v)
+    return found
+
+
+def _rows(settings: Mapping[Setting, Variant]) -> list[shapes.Case]:
+    """One case at the settings, or at some of them evenly, each named by what differs."""
+    if len(settings) < 2:
+        return []
+    varied = {key for key, _ in set().union(*settings) - set.intersection(*map(set, settings))}
+    (worst, _), *_ = min(settings.values(), key=order).ranked()
+    shown = [list(settings.items())[i] for i in evenly(len(settings), ROWS)]
+    return [
+        case
+        for setting, v in shown
+        for case in v.case_at(worst, ", ".join(f"{key}={value}" for key, value in setting if key in varied))
+    ]

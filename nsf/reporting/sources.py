@@ -47,8 +47,8 @@ class Motion:
 
     `stopped` is the time [s] up to which a reduced run that diverged was good (later frames hold that
     state), None for one that reached the end. `surroundings` are gravity and colliders, as
-    `nsf.evaluation.surroundings` names them; `role` [F,n] is 2 in S, 1 in N alone, 0 in neither. Runs of
-    before do not tell these.
+    `nsf.evaluation.surroundings` names them; `role` [F,n] is 2 in S, 1 in N alone, 0 in neither,
+    of a projected step from there. Older runs have neither surroundings nor roles.
     """
 
     parameter: float | str

@@ -10,6 +10,7 @@ from nsf.reporting.keeping import code, key_of
 from nsf.reporting.sources import Motion, same_parameter
 from nsf.reporting.tables import Merged, natural
 from nsf.reporting.text.columns import parameter_text
+from nsf.vectors import evenly
 
 ROWS = 6  # parameter values, or settings, in one picture of final shapes
 ENDS = 2  # parameter values of strips and animations: the worst and the best
@@ -17,7 +18,17 @@ ENDS = 2  # parameter values of strips and animations: the worst and the best
 
 @dataclass
 class Variant:
-    """One variant's rows, with everything of its runs that pictures need."""
+    """One variant's rows, with everything of its runs that pictures need.
+
+    Attributes:
+        merged: all rows of the report; members: which are this variant's.
+        label: its name beside others.
+        rows, sources: of the members, in one order; runs: their ids.
+        scene, method, parameter: of all of them; parameter is name and unit.
+        summary: of the newest run; breakdown: its time by stage, and timed: whose time that is. `lend_stages`
+            may replace these two.
+        held_out: the split that is shown; values: its parameter values; delta: mean δ over them, a fraction.
+    """
 
     merged: Merged
     members: list[int]
@@ -73,7 +84,7 @@ class Variant:
     def cases(self, limit: int, baseline: "Variant | None" = None) -> list[shapes.Case]:
         """At most `limit` held-out values, evenly from the worst to the best, which are always among them."""
         ranked = self.ranked()
-        chosen = np.unique(np.linspace(0, len(ranked) - 1, min(limit, len(ranked))).round().astype(int))
+        chosen = evenly(len(ranked), limit)
         values = [ranked[i][0] for i in chosen]
         motions = {m.parameter: m for m in self._motions(values)}
         beside = {m.parameter: m for m in baseline._motions(values)} if baseline else {}
@@ -82,13 +93,13 @@ class Variant:
             if value in motions:
                 place = {0: "worst", len(ranked) - 1: "best"}.get(i, "") if len(ranked) > 1 else ""
                 motion, other = motions[value], beside.get(value)
-                if other is not None and other.x_full.shape != motion.x_full.shape:
-                    other = None  # its run kept other particles or frames
+                if other is not None and len(other.t) != len(motion.t):
+                    other = None  # its run kept other frames
                 found.append(shapes.Case(motion, place, ranked[i][1], other))
         return found
 
-    def at(self, value, place: str) -> list[shapes.Case]:
-        """The case of a held-out value, if the run kept its particles."""
+    def case_at(self, value, place: str) -> list[shapes.Case]:
+        """The case of a held-out value under the name `place`; none where this variant has not got it."""
         return [shapes.Case(motion, place, dict(self.ranked())[value]) for motion in self._motions([value])]
 
     def _motions(self, values) -> list[Motion]:
@@ -109,5 +120,5 @@ class Variant:
 
 
 def order(v: Variant) -> tuple[bool, float]:
-    """The better a variant, the smaller; one that the full-order solver ends comes after all others."""
+    """Sort key by mean δ, the smallest first; a variant that the full-order solver ends comes last."""
     return bool(v.continued()), v.delta if np.isfinite(v.delta) else np.inf

@@ -133,7 +133,7 @@ def test_files_of_an_evaluation(chain):
         frames["stress_full"].shape == frames["stress_reduced"].shape == frames["role"].shape == (1, 3, 100)
     )
     assert ((frames["role"] == 2).sum(axis=2) == 20).all()  # S is among the particles of pictures
-    assert set(np.unique(frames["role"])) <= {0, 1, 2}
+    assert set(np.unique(frames["role"])) == {0, 1, 2}  # S moves as particles about it do, not as all do
     cost = json.loads((path / "cost.json").read_text())
     assert set(cost["breakdown"]["reduced"]) == {"inference", "p2g", "g2p", "inversion"}
     assert cost["trials"] == 2

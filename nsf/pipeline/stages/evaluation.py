@@ -4,8 +4,6 @@ import contextlib
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from nsf.data import Trajectory
 from nsf.data.schema import TRAJECTORY
 from nsf.deployment import Rollout, continuation_file, rollout_file
@@ -24,6 +22,7 @@ from nsf.evaluation import (
 from nsf.kinematics.manifold import Manifold
 from nsf.pipeline.stages import results
 from nsf.runs import Run
+from nsf.vectors import evenly
 
 #: Figures of `superresolve` in words; means over the held-out cases.
 _EXPLAINED = {
@@ -73,7 +72,7 @@ def superresolve_held_out(pipeline, run: Run) -> None:
     c, asked, steps = pipeline.config, pipeline.config.super_resolution, pipeline.scene.steps
     truths, manifold = _truths(pipeline), pipeline.manifold()
     # Evenly spread, without frame 0, at which nothing has moved.
-    frames = np.unique(np.linspace(0, steps, min(asked.frames, steps) + 1).round().astype(int))[1:]
+    frames = evenly(steps + 1, asked.frames + 1)[1:]
     with run.record(device=pipeline.device, precision=c.precision) as record:
         rollouts = _rollouts(pipeline, manifold)
         with contextlib.ExitStack() as files:

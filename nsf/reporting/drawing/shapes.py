@@ -26,6 +26,7 @@ from nsf.reporting.drawing.style import (
 )
 from nsf.reporting.sources import Motion
 from nsf.reporting.text.columns import parameter_text
+from nsf.vectors import evenly
 
 if TYPE_CHECKING:
     from nsf.evaluation import SuperResolution
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 GIF_BYTES = 2**20
 _THIN = 0.5  # of the larger horizontal extent: below it a body, as a slice or a frame, counts as thin
 _INSIDE = 0.5  # share of all particles' stress below which a surface tells little of it
+#: Of particles in N alone and in S over the whole body: S stands out, and both are seen through it.
+_OPACITIES = 0.5, 1.0
 _WHITE = 250  # of 255: a brighter pixel shows no particle
 _LOOKS = 7  # frames by which a window is chosen
 _STRESS = "von Mises equivalent of the Kirchhoff stress"
@@ -44,7 +47,7 @@ class Case:
 
     Attributes:
         motion: of both models; baseline: of the baseline in the same case.
-        place: "worst" or "best" of its variant's cases, or nothing.
+        place: which of several it is: "worst" or "best" of its variant's cases, or a setting; or nothing.
         delta: δ as a fraction, where it is to be said.
     """
 
@@ -83,21 +86,28 @@ class Stage:
         ]
         X = upright_ones[0].motion.x_full[0]
         self.camera, self.radius = Camera.facing(X), _radius(X)
-        self.cut = cut and is_cut_open(X)
-        kept = self._behind(X) if self.cut else slice(None)
-        self.cases = [_of(case, kept) for case in upright_ones]
+        self.cut, self._middle = cut and is_cut_open(X), X.mean(axis=0, dtype=float)
+        self.cases = [self._cut(case) for case in upright_ones] if self.cut else upright_ones
         self._whole = [case.motion for case in upright_ones]
         self._reach = reaches(self._whole)
 
-    def _behind(self, X: np.ndarray) -> np.ndarray:
-        """Which particles start behind the middle, as the camera sees them."""
+    def _cut(self, case: Case) -> Case:
+        """The case without its front half."""
+        baseline = case.baseline and self._behind(case.baseline)
+        return replace(case, motion=self._behind(case.motion), baseline=baseline)
+
+    def _behind(self, motion: Motion) -> Motion:
+        """The particles that start behind the middle, as the camera sees them; each run kept its own."""
         toward = self.camera.axes[2] * (1.0, 1.0, 0.0)
-        return (X.astype(float) - X.mean(axis=0, dtype=float)) @ toward <= 0.0
+        rows = (motion.x_full[0].astype(float) - self._middle) @ toward <= 0.0
+        names = ("x_full", "x_reduced", "stress_full", "stress_reduced", "role")
+        known = {name: values for name in names if (values := getattr(motion, name)) is not None}
+        return replace(motion, **{name: values[:, rows] for name, values in known.items()})
 
     @cached_property
     def _window(self) -> View:
         motions = self._whole
-        frames = np.unique(np.linspace(0, len(motions[0].t) - 1, _LOOKS).round().astype(int))
+        frames = evenly(len(motions[0].t), _LOOKS)
         x = np.concatenate([m.x_full[frames].reshape(-1, 3) for m in motions])
         seen = [face.corners for m in motions for frame in frames for face in self.faces(m, int(frame))]
         return View.around(x, 100, self.camera, np.concatenate(seen) if seen else None)
@@ -194,33 +204,38 @@ def particle_sets(case: Case, name: str = "parameter", unit: str = "", count: in
     """S and N in `count` frames of a reduced run, as seen through the body.
 
     Args:
-        case: whose motion tells the role of each particle; positions in metres.
+        case: whose motion has `role`; positions in metres.
         name, unit: of the problem parameter.
+        count: of frames; all where there are fewer.
     """
     stage = Stage([case])
     (case,) = stage.cases
     m = case.motion
-    frames = np.linspace(0, len(m.t) - 1, count).round().astype(int)
+    frames = evenly(len(m.t), count)
     view = stage.view(520)
     with styled():
-        sheet = Sheet(view, rows=1, columns=count, titles=[f"t = {m.t[frame]:.3g} s" for frame in frames])
+        titles = [f"t = {m.t[frame]:.3g} s" for frame in frames]
+        sheet = Sheet(view, rows=1, columns=len(frames), titles=titles)
         _name(sheet, 0, [parameter_text(m.parameter, name, unit), case.remark], m)
         for column, frame in enumerate(frames):
             x, role = m.x_reduced[frame], m.role[frame]
             picture = stage.picture(view, m, frame, x, _in_color(x, ROLES[0]))
-            for number, opacity in ((1, 0.5), (2, 1.0)):
+            for number, opacity in enumerate(_OPACITIES, 1):
                 own = x[role == number]
                 over = view.picture(own, _in_color(own, ROLES[number]), stage.radius)
-                covered = (over < _WHITE).any(axis=-1, keepdims=True)
-                picture = np.where(covered, (1 - opacity) * picture + opacity * over, picture).astype(
-                    np.uint8
-                )
+                picture = _laid_over(picture, over, opacity)
             sheet.show(0, column, picture)
         sheet.legend(
             dict(zip(("in neither", "integration particles N", "sample particles S"), ROLES, strict=True))
         )
         sheet.scale_bar()
     return sheet.fig
+
+
+def _laid_over(picture: np.ndarray, over: np.ndarray, opacity: float) -> np.ndarray:
+    """Pixels with those of another picture over them, where that shows a particle."""
+    mixed = (1 - opacity) * picture + opacity * over
+    return np.where((over < _WHITE).any(axis=-1, keepdims=True), mixed, picture).astype(np.uint8)
 
 
 def strip(cases: Sequence[Case], name: str = "parameter", unit: str = "", count: int = 5) -> Figure:
@@ -234,7 +249,7 @@ def strip(cases: Sequence[Case], name: str = "parameter", unit: str = "", count:
     """
     stage = Stage(cases, cut=hides_stress(cases[0].motion))
     motion = stage.cases[0].motion
-    frames = np.unique(np.linspace(0, len(motion.t) - 1, count).round().astype(int))
+    frames = evenly(len(motion.t), count)
     stress = _stress_scale([case.motion.stress_full for case in stage.cases])
     view = stage.view(420)
     rows = [(case, *model) for case in stage.cases for model in case.models()]
@@ -273,7 +288,7 @@ def animation(
     width = 2 * width // len(titles)
     view = stage.view(width)
     times = stage.cases[0].motion.t
-    chosen = np.unique(np.linspace(0, len(times) - 1, min(frames, len(times))).round().astype(int))
+    chosen = evenly(len(times), frames)
     images = []
     with styled():
         inches = len(titles) * width / 100 + 0.5
@@ -314,17 +329,6 @@ def _in_color(x: np.ndarray, color: str) -> np.ndarray:
     return np.broadcast_to(to_rgb(color), x.shape)
 
 
-def _of(case: Case, rows) -> Case:
-    """Some particles of a case."""
-
-    def some(motion: Motion) -> Motion:
-        names = ("x_full", "x_reduced", "stress_full", "stress_reduced", "role")
-        known = {name: values for name in names if (values := getattr(motion, name)) is not None}
-        return replace(motion, **{name: values[:, rows] for name, values in known.items()})
-
-    return replace(case, motion=some(case.motion), baseline=case.baseline and some(case.baseline))
-
-
 def _name(sheet: Sheet, row: int, told: Sequence[str], motion: Motion | None) -> None:
     """Name a row; over a run that diverged, that what stands there is its last good state."""
     stopped = motion.stopped if motion is not None else None
@@ -333,7 +337,9 @@ def _name(sheet: Sheet, row: int, told: Sequence[str], motion: Motion | None) ->
 
 
 def _stress_scale(values: Sequence[np.ndarray]) -> ColorScale:
-    return ColorScale.up_to(np.percentile(np.stack(values), CLIP), STRESS_COLORS, PASCALS)
+    return ColorScale.up_to(
+        np.percentile(np.concatenate([own.ravel() for own in values]), CLIP), STRESS_COLORS, PASCALS
+    )
 
 
 def _radius(X: np.ndarray) -> float:

@@ -14,7 +14,7 @@ from nsf.deployment import FULL_ORDER, OPERATORS, PROJECTED, Rollout, go_on
 from nsf.dynamics import Method
 from nsf.errors import InstabilityError, SchemaError
 from nsf.evaluation import at_frames, compare, metrics
-from nsf.evaluation.compare import levels_at_frames, trust_at_frames
+from nsf.evaluation.compare import _shown, levels_at_frames, trust_at_frames
 
 ERRORS = ["delta", "displacement_error", "stress_error"]
 MOMENTA = ["linear_momentum_error", "angular_momentum_error"]
@@ -314,3 +314,13 @@ def test_trust_at_frames_between_deployment_steps(made):
     run = replace(made, t=np.array([0.0, 1.5, 3.0]), trust=np.array([0.0, 0.5, np.inf]), handed_over=-1)
     found = trust_at_frames(run, np.array([0.0, 1.0, 1.5, 2.0, 3.0]))
     np.testing.assert_array_equal(found, [0.0, 0.5, 0.5, np.inf, np.inf])
+
+
+@pytest.mark.parametrize(("most", "kept"), [(30, 20), (20, 20), (8, 8)])
+def test_pictures_have_the_sample_and_others_by_chance(most, kept):
+    sample = np.repeat(np.arange(100, 120), 2)  # a particle that counts twice
+    shown = _shown(500, most, sample)
+    assert len(shown) == len(np.unique(shown)) == most
+    assert (np.diff(shown) > 0).all()
+    assert np.isin(shown, sample).sum() == kept
+    assert np.ptp(shown[np.isin(shown, sample)]) > 9  # no end of S alone, where S has too many

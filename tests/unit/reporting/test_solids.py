@@ -90,3 +90,20 @@ def test_a_wall_between_viewer_and_body_is_not_drawn():
     ball = motion(around(("sphere", (0.1, 0.0, 0.0), (0.5, 0.5, 0.5))))
     (disc,) = faces(ball, 0, TOWARD, reaches([ball]))
     np.testing.assert_allclose(np.linalg.norm(disc.corners - 0.5, axis=1), 0.1, rtol=1e-6)
+
+
+def test_runs_that_kept_other_particles_are_each_cut_behind_the_middle():
+    """The particles of pictures hold S, which differs from run to run."""
+    first = motion({})
+    order = np.random.default_rng(5).permutation(200)
+    names = ("x_full", "x_reduced", "stress_full", "stress_reduced")
+    other = replace(first, **{name: getattr(first, name)[:, order] for name in names})
+    one, two = Stage([Case(first, baseline=other), Case(other)], cut=True).cases
+    for cut in (one.motion, one.baseline, two.motion):
+        behind = (cut.x_full[0] - first.x_full[0].mean(axis=0)) @ (TOWARD * (1.0, 1.0, 0.0))
+        assert 20 < len(behind) < 180
+        assert (behind <= 1e-6).all()
+    for name in names:
+        np.testing.assert_array_equal(
+            np.sort(getattr(one.motion, name), axis=1), np.sort(getattr(two.motion, name), axis=1)
+        )
