@@ -104,7 +104,7 @@ REPRODUCED := table1 operators operators_seeds field width latent_dim ablation s
 	noise_floor figures
 
 reproduce: install  ## every report, from nothing, on one GPU; the same command goes on where it was stopped
-	@echo 'first a small scene, whose rates tell how long the others take'
+	@echo 'first the jelly cube at the paper'\''s size, whose rates tell how long the others take at most'
 	$(BIN)/nsf run scene=jelly_cube scale=paper engine=operators
 	@for e in $(REPRODUCED); do $(BIN)/nsf plan +experiment=$$e | sed -n "s/^in all/in all, $$e:/p"; done
 	@failed=; for e in $(REPRODUCED); do $(BIN)/nsf run +experiment=$$e || failed="$$failed $$e"; done; \

@@ -20,7 +20,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     # A terminated process leaves as after Ctrl-C: nothing half-written, the manifest says so.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        sys.exit(_dispatch(arguments))
+        code = _dispatch(arguments)
+        sys.stdout.flush()
+        sys.exit(code)
+    except BrokenPipeError:  # who reads the output, such as `head`, has enough of it
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
     except NSFError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(2)

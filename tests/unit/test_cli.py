@@ -3,6 +3,8 @@
 import os
 import re
 import signal
+import subprocess
+import sys
 
 import pandas as pd
 import pytest
@@ -52,6 +54,15 @@ def test_help_of_a_stage(nsf, stage):
     assert code == 0
     assert f"usage: nsf {stage}" in out
     assert "device: " in out
+
+
+def test_a_reader_that_has_enough_is_no_error():
+    """As with `nsf --help | head`."""
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run([sys.executable, "-m", "nsf.cli", "--help"], stdout=write, stderr=subprocess.PIPE)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (1, b"")
 
 
 def test_version(capsys):

@@ -64,9 +64,9 @@ class BasisField:
             one network of that many times the width.
         noise: deviation of the noise added to xhat in training, in units of xhat's deviation. It keeps the
             Jacobian and the heads regular beside the training trajectories.
-        noise_floor: least deviation of that noise as a displacement, over the deviation of the strongest
-            coordinate. A sample tells displacements to some error, which is many deviations of a weak
-            coordinate; without the floor, heads of many coordinates follow errors alone.
+        noise_floor: ε; with σ the deviations of the coordinates, the noise on coordinate k has the deviation
+            √(noise² + (ε max σ / σ_k)²), in units of σ_k. Not in the paper; for errors of the sample's
+            positions, which are large in units of a weak σ_k. With `joint` σ is that of joint coefficients.
         head_parameters: the heads see the (standardised) problem parameters beside xhat.
         affine: `latent`: C follows from xhat, as in the paper; `rate`: from xhat and dx̂/dt.
         rate_noise: deviation of the noise on dx̂/dt in training with `affine=rate`, in units of dx̂/dt's
@@ -246,14 +246,14 @@ class BasisManifold(Manifold):
 
     @property
     def floor(self) -> Tensor:
-        """Least deviation [r] of the noise on each coordinate in training, in units of its own deviation."""
+        """ε max σ / σ_k [r], dimensionless (`noise_floor`)."""
         leading = self.fields["deformation"].leading
         least = self.hyperparameters.get("noise_floor", 0.0)  # files from before there was one
         return least * leading.max() / leading
 
     @property
     def spread(self) -> Tensor:
-        """What each coordinate [r] is divided by before a network sees it: its deviation with that noise."""
+        """Of coordinates in units of σ, the deviation [r] with the floor's noise, by which networks see them."""
         return (1 + self.floor.square()).sqrt()
 
     @property
