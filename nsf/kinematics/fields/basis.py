@@ -253,7 +253,7 @@ class BasisManifold(Manifold):
 
     @property
     def spread(self) -> Tensor:
-        """Of coordinates in units of σ, the deviation [r] with the floor's noise, by which networks see them."""
+        """Deviation [r] of coordinates in units of σ with the floor's noise; networks see x̂ over it."""
         return (1 + self.floor.square()).sqrt()
 
     @property
