@@ -72,6 +72,11 @@ class Model:
         self.manifold = self.pipeline.manifold()
         taught = next(parent for parent in run.parent_runs if parent.stage == "teach")
         self.operators = Operators.load(taught.require().file(OPERATORS))
+        if self.operators.model.sizes.memory:
+            raise ConfigError(
+                f"{run.id} has operators with a memory, whose steps know no gradient here; deploy it with "
+                "engine.teaching.memory=[]"
+            )
         self.scene = self.pipeline.deployed
         one = self.pipeline.batch_at(
             self.manifold, self.pipeline.split.train[:1], engine=self.operators, scene=self.pipeline.scene

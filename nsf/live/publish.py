@@ -91,6 +91,11 @@ def model_data(model: LiveModel, sizes: Sizes = Sizes()) -> tuple[str, bytes]:
     _check_engine(model.run, pipeline.engine)
     operators = pipeline.operators()
     taught, network = operators.taught, operators.model
+    if network.sizes.memory:
+        raise ConfigError(
+            f"{model.run.id} has operators with a memory, which a page has not; deploy it with "
+            "engine.teaching.memory=[]"
+        )
     header, order = shown(model), {p.name: i for i, p in enumerate(model.parameters)}
     header["parameters"] = [header["parameters"][order[name]] for name in taught.parameters]
     arrays = {"rest": model.X}

@@ -87,6 +87,11 @@ class Names:
         if self.engine == OPERATORS:
             self.teaching = configuration.build(c.engine.teaching, "engine.teaching")
             one_of("engine.teacher", c.engine.teacher, TEACHERS)
+            if self.teaching.memory and not self.of_runs:
+                raise ConfigError(
+                    f"engine.teaching.memory={list(self.teaching.memory)} is learned from full-order runs "
+                    f"alone; set engine.teacher={RUNS}, or engine.teaching.memory=[]"
+                )
             if self.of_runs and c.deploy.dt_multiplier != 1:
                 raise ConfigError(
                     f"engine.teacher={RUNS} teaches steps of the scene's Δt, and deploy.dt_multiplier is "

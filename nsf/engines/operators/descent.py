@@ -82,7 +82,7 @@ class Descent:
         self._kind = _BESIDE if teachers[0].asked else _ALONE
         self._device = model.x_mean.device
         rows = [self._here(getattr(labels, name)) for name in Labels.__dataclass_fields__]
-        self._xhat, self._change, self._acceleration, self._mu, self._g, features = rows
+        self._xhat, self._change, self._acceleration, self._mu, self._g, features, self._lag = rows
         self._c = model.collider_state(features)
         # Far from training runs accelerations are ten to a hundred times as large, and would be all there is.
         self._weight = 1.0 / (1.0 + (self._acceleration / model.a_scale).square().mean(1) / 4.0)
@@ -111,7 +111,8 @@ class Descent:
         changes = torch.cat([teacher.first_change()[None], torch.diff(runs, dim=0)])
         given = runs, changes, teacher.parameters, teacher.gravity, teacher.features
         runs, changes, mu, gravity, features = map(self._here, given)
-        return runs, changes, mu, gravity, self._model.collider_state(features)
+        lags = self._model.lags_along(changes[1:])
+        return runs, changes, mu, gravity, self._model.collider_state(features), lags
 
     # -- one step ---------------------------------------------------------------------------------------
 
@@ -137,7 +138,8 @@ class Descent:
 
     def _step(self, window: int | None, drawn: list[Tensor]) -> None:
         model, (at, *unrolled) = self._model, drawn
-        found = model.acceleration(self._xhat[at], self._change[at], self._mu[at], self._g[at], self._c[at])
+        labels = self._xhat, self._change, self._mu, self._g, self._c, self._lag
+        found = model.acceleration(*(values[at] for values in labels))
         off = ((found - self._acceleration[at]) / model.a_scale).square().mean(1)
         loss = (self._weight[at] * off).mean()
         if window is not None:
@@ -148,11 +150,12 @@ class Descent:
         self._optimiser.step()
 
     def _off_unrolled(self, window: tuple[Tensor, ...], k: Tensor, n: Tensor, noise: Tensor) -> Tensor:
-        (runs, changes, mu, g, c), model = window, self._model
+        (runs, changes, mu, g, c, lags), model = window, self._model
         unroll, loss = self._unroll(len(runs)), 0.0
-        x, d = runs[n, k] + self._teaching.noise * model.x_scale * noise, changes[n, k]
+        x, d, lag = runs[n, k] + self._teaching.noise * model.x_scale * noise, changes[n, k], lags[n, k]
         for j in range(unroll):
-            x, d = model.step(x, d, mu[k], g[n + j, k], c[n + j, k])
+            x, d = model.step(x, d, mu[k], g[n + j, k], c[n + j, k], lag)
+            lag = model.next_lag(lag, d)
             loss = loss + self._kind.weigh(x - runs[n + j + 1, k], j, model)
         return loss / unroll
 

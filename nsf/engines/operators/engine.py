@@ -110,12 +110,15 @@ class OperatorRun:
             self.recurrence = self._of(self._gravity, self._states, record=self._record)
             self.recurrence.latent.copy_(before.latent)
             self.recurrence.change.copy_(before.change)
+            self.recurrence.lag.copy_(before.lag)
         self.recurrence.advance(steps)
 
     def enter(self, first: bool) -> None:
         """Begin with the latents of the record."""
         now, before = (latest.double() for latest in (self._record.now, self._record.before))
-        self.recurrence.begin(now, self._first if first else now - before)
+        row = int(self._record.row.max())
+        known = None if first else self._record.xhat[:, : row + 1]
+        self.recurrence.begin(now, self._first if first else now - before, known)
 
     def pushed(self, push: torch.Tensor, since: int = 0) -> torch.Tensor:
         """[B, N + 1, r] latents of the same runs from a step on, with [B, N, r] added to their changes."""
@@ -125,7 +128,7 @@ class OperatorRun:
         record.xhat[:, since] = own[:, since]
         again = self._of(self._gravity, self._states, record=record, push=push)
         now, before = own[:, since].double(), own[:, max(0, since - 1)].double()
-        again.begin(now, now - before if since else self._first)
+        again.begin(now, now - before if since else self._first, own[:, : since + 1])
         again.advance(steps - since)
         return record.xhat
 

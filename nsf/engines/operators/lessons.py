@@ -42,6 +42,7 @@ class Labels:
     Attributes:
         xhat, change: [M, r] states; acceleration: [M, r] d' − d.
         parameters: [M, n]; gravity: [M, 3] [m/s²]; features: [M, f] of the colliders.
+        lag: [M, lags] of the memory.
     """
 
     xhat: Tensor
@@ -50,6 +51,7 @@ class Labels:
     parameters: Tensor
     gravity: Tensor
     features: Tensor
+    lag: Tensor
 
     @classmethod
     def joined(cls, parts: Sequence["Labels"]) -> "Labels":

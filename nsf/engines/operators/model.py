@@ -3,6 +3,9 @@
     d' = d + B(x̂, μ, c) d + Δt² [f(x̂, μ, c) + G(x̂, μ, c) g],    d = x̂_n − x̂_{n−1},    x̂_{n+1} = x̂_n + d'
 
 μ are the problem parameters and c is the state of what moves. docs/method.md derives it. Not in the paper.
+With a memory, B, f and G also see lags e_k, by how much x̂ is ahead of its mean over the last time T_k:
+
+    e_k ← exp(−Δt/T_k) (e_k + d'),    e_k = 0 at t = 0
 """
 
 import pickle
@@ -33,6 +36,7 @@ class Sizes:
         latents: r; parameters: n; features: of collider states; states: C, what varies among these.
         gravity: whether there is any.
         width: of both hidden layers.
+        memory: how many lags there are, each of r numbers.
     """
 
     latents: int
@@ -41,11 +45,17 @@ class Sizes:
     states: int
     gravity: bool
     width: int
+    memory: int = 0
+
+    @property
+    def lags(self) -> int:
+        """Numbers of all lags."""
+        return self.memory * self.latents
 
     @property
     def inputs(self) -> int:
         """Inputs of the network."""
-        return self.latents + self.parameters + self.states
+        return self.latents + self.parameters + self.states + self.lags
 
     @property
     def outputs(self) -> int:
@@ -77,6 +87,7 @@ class StepOperators(nn.Module):
         c_mean: [features], c_matrix: [features, C]: of collider states (`states.principal`).
         d_scale, a_scale: [r] deviation of d and of d' − d in training runs.
         g_mean: [3], g_scale: [] [m/s²]; f + G g is found as (f + G ḡ) + G (g − ḡ).
+        lag_decay: [memory] exp(−Δt/T) of each lag; lag_scale: [lags] their deviations; only with a memory.
     """
 
     def __init__(self, sizes: Sizes, dt: float):
@@ -97,6 +108,8 @@ class StepOperators(nn.Module):
             "d_scale": torch.ones(r), "a_scale": torch.ones(r),
             "g_mean": torch.zeros(3), "g_scale": torch.ones(()),
         }  # fmt: skip
+        if sizes.memory:
+            buffers |= {"lag_decay": torch.zeros(sizes.memory), "lag_scale": torch.ones(sizes.lags)}
         for name, value in buffers.items():
             self.register_buffer(name, value)
 
@@ -104,21 +117,40 @@ class StepOperators(nn.Module):
         """c [..., C] of collider states [..., features] (`states.collider_states`)."""
         return (features - self.c_mean) @ self.c_matrix
 
-    def _outputs(self, xhat: Tensor, parameters: Tensor, c: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+    def next_lag(self, lag: Tensor, change: Tensor) -> Tensor:
+        """The lags [..., lags] after a step that changed x̂ by d' [..., r]."""
+        if not self.sizes.memory:
+            return lag
+        moved = lag.unflatten(-1, (self.sizes.memory, -1)) + change.unsqueeze(-2)
+        return (self.lag_decay[:, None] * moved).flatten(-2)
+
+    def lags_along(self, changes: Tensor) -> Tensor:
+        """The lags [N + 1, ..., lags] of runs from t = 0 on, whose steps change x̂ by d' [N, ..., r]."""
+        found = [changes.new_zeros(*changes.shape[1:-1], self.sizes.lags)]
+        for change in changes if self.sizes.memory else ():
+            found.append(self.next_lag(found[-1], change))
+        return torch.stack(found) if self.sizes.memory else found[0].expand(len(changes) + 1, *found[0].shape)
+
+    def _outputs(
+        self, xhat: Tensor, parameters: Tensor, c: Tensor, lag: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor | None]:
         """B, f and G in units of the scales, f at the mean gravity."""
         r, lead = self.sizes.latents, xhat.shape[:-1]
         given = [(xhat - self.x_mean) / self.x_scale, (parameters - self.mu_mean) / self.mu_scale, c]
+        if self.sizes.memory:
+            given.append(lag / self.lag_scale)
         out = self.net(torch.cat([values.expand(*lead, values.shape[-1]) for values in given], -1))
         B, f = out[..., : r * r].unflatten(-1, (r, r)), out[..., r * r : r * r + r]
         return B, f, out[..., r * r + r :].unflatten(-1, (r, 3)) if self.sizes.gravity else None
 
-    def terms(self, xhat: Tensor, parameters: Tensor, c: Tensor) -> Terms:
+    def terms(self, xhat: Tensor, parameters: Tensor, c: Tensor, lag: Tensor | None = None) -> Terms:
         """B, f and G at latent vectors.
 
         Args:
             xhat: [..., r]; parameters: μ [..., n] or [n]; c: [..., C] or [C].
+            lag: [..., lags], asked for with a memory.
         """
-        B, f, G = self._outputs(xhat, parameters, c)
+        B, f, G = self._outputs(xhat, parameters, c, lag)
         B = self.a_scale[:, None] * B / self.d_scale
         if G is not None:
             f = f - G @ (self.g_mean / self.g_scale)
@@ -126,25 +158,38 @@ class StepOperators(nn.Module):
         return Terms(B, self.a_scale * f / self.dt**2, G)
 
     def acceleration(
-        self, xhat: Tensor, change: Tensor, parameters: Tensor, gravity: Tensor, c: Tensor
+        self,
+        xhat: Tensor,
+        change: Tensor,
+        parameters: Tensor,
+        gravity: Tensor,
+        c: Tensor,
+        lag: Tensor | None = None,
     ) -> Tensor:
         """d' − d [..., r]; arguments as for `step`."""
-        B, f, G = self._outputs(xhat, parameters, c)
+        B, f, G = self._outputs(xhat, parameters, c, lag)
         found = (B @ (change / self.d_scale)[..., None])[..., 0] + f
         if G is not None:
             found = found + (G @ ((gravity - self.g_mean) / self.g_scale)[..., None])[..., 0]
         return self.a_scale * found
 
     def step(
-        self, xhat: Tensor, change: Tensor, parameters: Tensor, gravity: Tensor, c: Tensor
+        self,
+        xhat: Tensor,
+        change: Tensor,
+        parameters: Tensor,
+        gravity: Tensor,
+        c: Tensor,
+        lag: Tensor | None = None,
     ) -> tuple[Tensor, Tensor]:
         """x̂_{n+1} and d' [..., r].
 
         Args:
             xhat, change: [..., r] x̂_n and d = x̂_n − x̂_{n−1}.
             parameters: μ [..., n]; gravity: [..., 3] [m/s²]; c: [..., C]; each may lack leading axes.
+            lag: [..., lags] with a memory (`lags_along`, `next_lag`).
         """
-        change = change + self.acceleration(xhat, change, parameters, gravity, c)
+        change = change + self.acceleration(xhat, change, parameters, gravity, c, lag)
         return xhat + change, change
 
     def run(self, xhat: Tensor, change: Tensor, parameters: Tensor, gravity: Tensor, c: Tensor) -> Tensor:
@@ -159,19 +204,19 @@ class StepOperators(nn.Module):
         Returns:
             [N + 1, ..., r] latent vectors.
         """
-        found = [xhat]
+        found, lag = [xhat], xhat.new_zeros(*xhat.shape[:-1], self.sizes.lags)
         for n, state in enumerate(c):
-            xhat, change = self.step(
-                xhat, change, parameters, gravity if gravity.ndim == 1 else gravity[n], state
-            )
+            g = gravity if gravity.ndim == 1 else gravity[n]
+            xhat, change = self.step(xhat, change, parameters, g, state, lag)
+            lag = self.next_lag(lag, change)
             found.append(xhat)
         return torch.stack(found)
 
     def raw_layers(self) -> list[tuple[Tensor, Tensor]]:
         """Weights [out, in] and biases [out] of the same network for raw inputs and outputs.
 
-        Its inputs are x̂, μ and the collider states as `states.collider_states` gives them; its outputs the
-        entries of B [r, r], Δt² f [r] and Δt² G [r, 3], with d' = d + B d + Δt² (f + G g).
+        Without a memory. Its inputs are x̂, μ and the collider states as `states.collider_states` gives them;
+        its outputs the entries of B [r, r], Δt² f [r] and Δt² G [r, 3], with d' = d + B d + Δt² (f + G g).
         """
         (W, b), middle, (V, c) = ((layer.weight, layer.bias) for layer in (self.net[i] for i in (0, 2, 4)))
         r, n = self.sizes.latents, self.sizes.parameters

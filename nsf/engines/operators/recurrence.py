@@ -21,8 +21,8 @@ def _make_given(precision: Precision):
 
     Weights are [inputs, outputs], flat, with all scales in them; `bias` [B, width] is the first layer's with
     what μ adds; `states` is [B or 1, N C], `gravity` [B or 1, 3 N] as the network takes it, `push` [B, N r]
-    what is added to each change. `latent` and `change` [B r] are x̂_n and d in fp64, the rest is the
-    `LatentRecord`'s.
+    what is added to each change. `latent` and `change` [B r] are x̂_n and d in fp64, `lag` [B lags] is the
+    memory and `decay` [memory] what is left of it after a step; the rest is the `LatentRecord`'s.
     """
     real = precision.real
 
@@ -39,6 +39,8 @@ def _make_given(precision: Precision):
         push: wp.array2d(dtype=wp.float64)
         latent: wp.array(dtype=wp.float64)
         change: wp.array(dtype=wp.float64)
+        lag: wp.array(dtype=wp.float64)
+        decay: wp.array(dtype=wp.float64)
         xhat: wp.array2d(dtype=real)
         before: wp.array2d(dtype=real)
         xhats: wp.array2d(dtype=real)
@@ -55,9 +57,9 @@ def block_of(width: int) -> int:
 def places(precision: Precision, sizes: Sizes) -> tuple[bool, bool]:
     """Whether a GPU's block holds the outer layers' weights, and a thread its column of the middle one's."""
     real = np.dtype(precision.numpy).itemsize
-    inputs = sizes.latents + sizes.states
+    inputs = sizes.latents + sizes.states + sizes.lags
     weights = real * sizes.width * (inputs + sizes.outputs)
-    values = real * (inputs + 2 * sizes.width + sizes.outputs) + 16 * sizes.latents
+    values = real * (inputs + 2 * sizes.width + sizes.outputs) + 16 * sizes.latents + 8 * sizes.lags
     return weights + values + 256 <= SHARED - TAKEN, real * sizes.width <= _REGISTERS
 
 
@@ -75,8 +77,8 @@ def make_recurrence(precision: Precision, sizes: Sizes, pushed: bool = False):
     """
     kept, column = places(precision, sizes)
     constants = {
-        "R": sizes.latents, "STATES": sizes.states, "WIDTH": sizes.width, "OUTPUTS": sizes.outputs,
-        "GRAVITY": sizes.gravity, "PUSHED": pushed, "KEPT": kept, "COLUMN": column,
+        "R": sizes.latents, "STATES": sizes.states, "MEMORY": sizes.memory, "WIDTH": sizes.width,
+        "OUTPUTS": sizes.outputs, "GRAVITY": sizes.gravity, "PUSHED": pushed, "KEPT": kept, "COLUMN": column,
     }  # fmt: skip
     Given = _make_given(precision)
 
@@ -99,7 +101,10 @@ def folded(model: StepOperators, parameters: torch.Tensor) -> dict[str, torch.Te
     """
     r, n = model.sizes.latents, model.sizes.parameters
     W, b = model.net[0].weight, model.net[0].bias
-    of_x, of_mu, of_c = W[:, :r] / model.x_scale, W[:, r : r + n], W[:, r + n :]
+    of_x, of_mu, rest = W[:, :r] / model.x_scale, W[:, r : r + n], W[:, r + n :]
+    if model.sizes.memory:
+        of_c, of_lag = rest.tensor_split([model.sizes.states], 1)
+        rest = torch.cat([of_c, of_lag / model.lag_scale], 1)
     mu = (parameters - model.mu_mean) / model.mu_scale
     last, last_bias = model.net[4].weight, model.net[4].bias
     # Rows are of B [r, r], which takes d as it is, of f [r] and of G [r, 3], which takes a gravity in units.
@@ -108,7 +113,7 @@ def folded(model: StepOperators, parameters: torch.Tensor) -> dict[str, torch.Te
         unit.append(model.a_scale.repeat_interleave(3))
     unit = torch.cat(unit)
     return {
-        "first": torch.cat([of_x, of_c], 1).T.flatten(),
+        "first": torch.cat([of_x, rest], 1).T.flatten(),
         "bias": b - of_x @ model.x_mean + mu @ of_mu.T,
         "middle": model.net[2].weight.T.flatten(),
         "middle_bias": model.net[2].bias,
@@ -129,7 +134,7 @@ class Recurrence:
         push: [B, N, r] added to each change; None for nothing.
 
     Attributes:
-        latent, change: [B r] x̂_n and d, in fp64.
+        latent, change, lag: [B r] x̂_n and d and [B lags] the memory, in fp64.
     """
 
     def __init__(
@@ -151,8 +156,11 @@ class Recurrence:
         held = {name: values.detach().to(where, dtype).contiguous() for name, values in held.items()}
         none = torch.zeros(0, 0, dtype=torch.float64, device=where)
         held["push"] = none if push is None else push.to(where).flatten(1)
-        self.latent, self.change = (none.new_zeros(count * r) for _ in range(2))
-        held |= {"latent": self.latent, "change": self.change, "row": record.row}
+        self.latent, self.change, self.lag = (
+            none.new_zeros(count * size) for size in (r, r, model.sizes.lags)
+        )
+        held |= {"latent": self.latent, "change": self.change, "lag": self.lag, "row": record.row}
+        held["decay"] = model.lag_decay.to(where, torch.float64) if model.sizes.memory else none.flatten()
         recorded = {"xhat": record.now, "before": record.before, "xhats": record.xhat}
         held |= {name: values.view(count, -1) for name, values in recorded.items()}
         self._held = held
@@ -175,10 +183,19 @@ class Recurrence:
         for name, values in self._acting(gravity, features).items():
             self._held[name].copy_(values)
 
-    def begin(self, xhat: torch.Tensor, change: torch.Tensor) -> None:
-        """Go on from x̂_n and d [B, r]."""
+    def begin(self, xhat: torch.Tensor, change: torch.Tensor, before: torch.Tensor | None = None) -> None:
+        """Go on from x̂_n and d [B, r].
+
+        Args:
+            before: [B, n + 1, r] the runs up to there, which a memory asks for; None at t = 0.
+        """
         self.latent.view(self._count, -1).copy_(xhat)
         self.change.view(self._count, -1).copy_(change)
+        if before is None or not self._model.sizes.memory:
+            self.lag.zero_()
+        else:
+            changes = torch.diff(before.detach().to("cpu", torch.float64), dim=1).transpose(0, 1)
+            self.lag.copy_(self._model.lags_along(changes)[-1].flatten())
 
     def advance(self, steps: int) -> None:
         """Take steps of every run, in one launch."""

@@ -181,9 +181,9 @@ class Course:
         """Labels that runs of the teacher itself are; runs [N + 1, R, r]."""
         first = teacher.first_change()[None]
         changes = torch.cat([first, torch.diff(runs, dim=0)])
-        return self._labelled(
-            teacher, torch.arange(len(runs) - 1), runs[:-1], changes[:-1], torch.diff(changes, dim=0)
-        )
+        moments, accelerations = torch.arange(len(runs) - 1), torch.diff(changes, dim=0)
+        lag = self.model.lags_along(changes[1:-1])
+        return self._labelled(teacher, moments, runs[:-1], changes[:-1], accelerations, lag=lag)
 
     def _asked(
         self, teacher: Teacher, moments: Tensor, xhat: Tensor, before: Tensor, gravity: Tensor | None = None
@@ -200,11 +200,12 @@ class Course:
 
     @staticmethod
     def _labelled(
-        teacher: Teacher, moments, xhat: Tensor, change: Tensor, acceleration: Tensor, gravity=None
+        teacher: Teacher, moments, xhat: Tensor, change: Tensor, acceleration: Tensor, gravity=None, lag=None
     ) -> Labels:
         like = xhat.shape[:-1]
         gravity = teacher.gravity[moments] if gravity is None else gravity
-        given = teacher.parameters, gravity, teacher.features[moments]
+        lag = xhat[..., :0] if lag is None else lag
+        given = teacher.parameters, gravity, teacher.features[moments], lag
         rows = [xhat, change, acceleration, *(values.expand(*like, -1) for values in given)]
         return Labels(*(values.flatten(0, 1).clone() for values in rows))
 
@@ -228,20 +229,29 @@ class Course:
     def _model(self, truth: Tensor, changes: Tensor) -> StepOperators:
         weightless = self.reach == 0.0 and not any(bool(t.gravity.any()) for t in self.teachers)
         accelerations, width = torch.diff(changes, dim=0), self.teaching.width
-        return standardised(self.teachers[0], truth, changes, accelerations, width, not weightless, self.seed)
+        return standardised(
+            self.teachers[0],
+            truth,
+            changes,
+            accelerations,
+            width,
+            not weightless,
+            self.seed,
+            self.teaching.memory,
+        )
 
     def own_runs(self, teacher: Teacher) -> Tensor:
         """[N + 1, R, r] runs of the operators at the teacher's values; what strays far is held."""
         model, limit = self.model, _FAR
         c = model.collider_state(teacher.features)
         x, d = teacher.start, teacher.first_change()
-        found = [x]
+        lag, found = x.new_zeros(len(x), model.sizes.lags), [x]
         with torch.no_grad():
             for state, g in zip(c, teacher.gravity, strict=True):
-                there, change = model.step(x, d, teacher.parameters, g, state)
+                there, change = model.step(x, d, teacher.parameters, g, state, lag)
                 near = (((there - model.x_mean) / model.x_scale).abs() < limit).all(-1, keepdim=True)
                 d = torch.where(near, change, 0.0)
-                x = torch.where(near, there, x)
+                x, lag = torch.where(near, there, x), model.next_lag(lag, d)
                 found.append(x)
         return torch.stack(found)
 
@@ -295,18 +305,20 @@ def standardised(
     width: int,
     gravity: bool,
     seed: int,
+    memory: Sequence[float] = (),
 ) -> StepOperators:
     """A network that gives nothing yet, with the scales of what it will be given and give.
 
     Args:
         teacher: in training cases.
-        truth, changes, accelerations: [..., r] latents, their changes, and what is to be learned.
+        truth, changes, accelerations: [N, R, r] latents, their changes, and what is to be learned.
         width: of hidden layers; gravity: whether there is any; seed: of the weights.
+        memory: times of lags [s].
     """
     c_mean, c_matrix = principal(list(teacher.features.transpose(0, 1).numpy()), teacher.programs)
     sizes = Sizes(
         latents=truth.shape[-1], parameters=teacher.parameters.shape[1], features=len(c_mean),
-        states=c_matrix.shape[1], gravity=gravity, width=width,
+        states=c_matrix.shape[1], gravity=gravity, width=width, memory=len(memory),
     )  # fmt: skip
     state = torch.random.get_rng_state()
     torch.manual_seed(seed)
@@ -327,6 +339,9 @@ def standardised(
     }  # fmt: skip
     for name, value in scales.items():
         getattr(model, name).copy_(value)
+    if memory:
+        model.lag_decay.copy_(torch.exp(-teacher.dt / torch.tensor(memory, dtype=torch.float64)))
+        model.lag_scale.copy_(deviation(model.lags_along(torch.diff(truth, dim=0))))
     return model
 
 

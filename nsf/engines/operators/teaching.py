@@ -9,7 +9,9 @@ import numpy as np
 from nsf.data import PROGRAM, Case
 from nsf.errors import ConfigError
 from nsf.scenes.designs import evenly
+from nsf.vectors import is_finite
 
+_MOST_LAGS = 16
 #: Forcing programs that are drawn for teaching have numbers from here on, for each seed.
 _PROGRAMS = 1_000_000
 
@@ -28,6 +30,7 @@ class Teaching:
         noise: on the start of a window [deviations of x̂].
         tube: deviation of states about training runs [deviations of x̂].
         gravity: by how much the gravity of labels in the tube is varied [-], of its magnitude.
+        memory: times [s] of lags that the operators see; taught by full-order runs alone.
 
     Raises:
         ConfigError: a value outside its range.
@@ -42,8 +45,15 @@ class Teaching:
     noise: float = 0.01
     tube: float = 0.02
     gravity: float = 0.1
+    memory: Sequence[float] = ()
 
     def __post_init__(self):
+        object.__setattr__(self, "memory", tuple(self.memory))
+        for seconds in self.memory:
+            if not (is_finite(seconds) and seconds > 0):
+                raise ConfigError(f"memory={list(self.memory)} must be times in seconds, each above 0")
+        if len(self.memory) > _MOST_LAGS:
+            raise ConfigError(f"memory has {len(self.memory)} times; {_MOST_LAGS} at most")
         for name, least in (("width", 1), ("rounds", 0), ("steps", 1), ("descent", 1), ("unroll", 1)):
             if getattr(self, name) < least:
                 raise ConfigError(f"{name}={getattr(self, name)} must be at least {least}")

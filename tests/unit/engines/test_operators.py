@@ -1,5 +1,6 @@
 """Operators: what a step is by construction, how a file is read, and what the compiled loop computes."""
 
+import math
 import re
 
 import numpy as np
@@ -41,16 +42,19 @@ WIDTHS = [(4, 16), (4, 160), (4, 400), (8, 128), (4, 1100)]
 PRECISIONS = [("fp64", 1e-12), ("fp32", 1e-5)]
 
 
-def operators(states=2, gravity=True, width=16, latents=4):
+def operators(states=2, gravity=True, width=16, latents=4, memory=0):
     """Operators of random weights and scales."""
     torch.manual_seed(0)
-    model = StepOperators(Sizes(latents, 1, 9 * bool(states), states, gravity, width), 0.01).double()
+    sizes = Sizes(latents, 1, 9 * bool(states), states, gravity, width, memory)
+    model = StepOperators(sizes, 0.01).double()
     with torch.no_grad():
         model.net[4].weight.normal_(std=0.4 / width**0.5)
         model.net[4].bias.normal_(std=0.1)
     for name, values in model.named_buffers():
         scaled = 0.5 + torch.rand(values.shape).double()
         values.copy_(0.01 * scaled if name in ("d_scale", "a_scale") else scaled)
+    if memory:
+        model.lag_decay.copy_(torch.linspace(0.5, 0.9, memory))
     return model
 
 
@@ -365,6 +369,38 @@ def test_the_loop_is_torch(device, name, tolerance, states, gravity):
     assert_is_torch(operators(states, gravity), device, name, tolerance)
 
 
+@pytest.mark.parametrize("states", [0, 2])
+@pytest.mark.parametrize(("name", "tolerance"), PRECISIONS)
+def test_the_loop_with_a_memory_is_torch(device, name, tolerance, states):
+    model = operators(states, memory=2)
+    assert_is_torch(model, device, name, tolerance)
+    remembered = recurrence(model, device)[2]
+    model.lag_decay.zero_()
+    assert (recurrence(model, device)[2] - remembered).abs().max() > 1e-3  # it matters
+
+
+def test_a_memory_goes_on_from_a_record(device):
+    model = operators(memory=2)
+    whole, record, _ = recurrence(model, device)
+    whole.advance(STEPS)
+    again, other, _ = recurrence(model, device)
+    again.advance(5)
+    again.begin(other.now, other.now - other.before, other.xhat[:, :6])
+    again.advance(STEPS - 5)
+    torch.testing.assert_close(other.xhat, record.xhat, rtol=0, atol=1e-12)
+
+
+def test_lags_of_a_steady_change():
+    """e_n = d a (1 − aⁿ)/(1 − a), with a = exp(−Δt/T), which tends to T dx̂/dt for short steps."""
+    model = operators(memory=2)
+    change = torch.tensor([0.01, -0.02, 0.0, 0.03]).double()
+    lags = model.lags_along(change.expand(50, 3, 4)).unflatten(-1, (2, 4))
+    for k, a in enumerate(model.lag_decay.tolist()):
+        for n in (0, 1, 7, 50):
+            expected = change * a * (1 - a**n) / (1 - a)
+            torch.testing.assert_close(lags[n, 1, k], expected, rtol=1e-12, atol=0)
+
+
 @pytest.mark.parametrize(("latents", "width"), WIDTHS)
 @pytest.mark.parametrize(("name", "tolerance"), PRECISIONS)
 def test_the_loop_of_a_width_is_torch(device, name, tolerance, latents, width):
@@ -416,8 +452,9 @@ def test_what_is_added_to_each_change(device):
 @pytest.mark.parametrize(("latents", "width"), WIDTHS)
 @pytest.mark.parametrize("name", ["fp32", "fp64"])
 def test_the_loop_compiles_for_a_gpu(name, latents, width, tmp_path):
-    for gravity, pushed in ((True, False), (False, True)):
-        kernel = make_recurrence(precision_of(name), Sizes(latents, 1, 9, 2, gravity, width), pushed)
+    for gravity, pushed, memory in ((True, False, 2), (False, True, 0)):
+        sizes = Sizes(latents, 1, 9, 2, gravity, width, memory)
+        kernel = make_recurrence(precision_of(name), sizes, pushed)
         wp.compile_aot_module(kernel.module, arch=90, module_dir=tmp_path, use_ptx=True)
     assert len(list(tmp_path.glob("*.ptx"))) == 2
 
@@ -446,7 +483,13 @@ def test_cases_between_fill_a_box_of_two_parameters():
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"width": 0}, "width=0 must be at least 1"), ({"noise": -1.0}, "noise=-1.0 must be finite")],
+    [
+        ({"width": 0}, "width=0 must be at least 1"),
+        ({"noise": -1.0}, "noise=-1.0 must be finite"),
+        ({"memory": [0.1, 0.0]}, "memory=[0.1, 0.0] must be times in seconds"),
+        ({"memory": [math.nan]}, "memory=[nan] must be times in seconds"),
+        ({"memory": [0.1] * 17}, "memory has 17 times; 16 at most"),
+    ],
 )
 def test_bad_teaching(options, message):
     with pytest.raises(ConfigError, match=re.escape(message)):

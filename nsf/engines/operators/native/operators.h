@@ -8,8 +8,8 @@ const int lane = threadIdx.x, lanes = blockDim.x;
 #define NSF_SYNC
 constexpr int lane = 0, lanes = 1;
 #endif
-constexpr int IN = R + STATES;
-NSF_SHARED double x[R], d[R];
+constexpr int LAGS = MEMORY * R, IN = R + STATES + LAGS;
+NSF_SHARED double x[R], d[R], lag[LAGS + 1];
 NSF_SHARED alignas(32) real in[IN], one[WIDTH], two[WIDTH], out[OUTPUTS];
 // A layer has a column of each output: W [inputs, outputs], so that neighbours read neighbours.
 struct First { enum { inputs = IN, outputs = WIDTH }; };
@@ -76,9 +76,11 @@ for (int i = lane; i < R; i += lanes) {
     x[i] = given.latent.data[run * R + i];
     d[i] = given.change.data[run * R + i];
 }
+for (int i = lane; i < LAGS; i += lanes) lag[i] = given.lag.data[run * LAGS + i];
 NSF_SYNC;
 for (long long n = begin; n < begin + steps; ++n) {
-    for (int i = lane; i < IN; i += lanes) in[i] = i < R ? real(x[i]) : states[n * STATES + i - R];
+    for (int i = lane; i < IN; i += lanes)
+        in[i] = i < R ? real(x[i]) : i < R + STATES ? states[n * STATES + i - R] : real(lag[i - R - STATES]);
     NSF_SYNC;
     layer(First(), first, bias, in, one, silu);
     NSF_SYNC;
@@ -107,6 +109,7 @@ for (long long n = begin; n < begin + steps; ++n) {
         d[i] = next[i];
         x[i] += next[i];
         xhats[(n + 1) * R + i] = real(x[i]);
+        for (int k = 0; k < MEMORY; ++k) lag[k * R + i] = given.decay.data[k] * (lag[k * R + i] + next[i]);
     }
     NSF_SYNC;
 }
@@ -116,6 +119,7 @@ for (int i = lane; i < R; i += lanes) {
     given.xhat.data[run * R + i] = real(x[i]);
     given.before.data[run * R + i] = begin + steps > 0 ? xhats[(begin + steps - 1) * R + i] : real(x[i]);
 }
+for (int i = lane; i < LAGS; i += lanes) given.lag.data[run * LAGS + i] = lag[i];
 if (lane == 0) given.row.data[run] = begin + steps;
 #undef NSF_SHARED
 #undef NSF_SYNC
