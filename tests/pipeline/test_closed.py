@@ -1,6 +1,7 @@
 """Projected steps with a closure, from its fit to its errors, on the tiny chain; and what is refused."""
 
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pandas as pd
@@ -11,7 +12,8 @@ from angles import angle
 from nsf.engines import Closed, Operators
 from nsf.engines.closed import Closing, Linearised
 from nsf.engines.closed.linear import Known
-from nsf.engines.operators import Taught
+from nsf.engines.operators import StepOperators, Taught
+from nsf.engines.operators.teacher import Teacher
 from nsf.engines.reference import Reference
 from nsf.errors import ConfigError, SchemaError
 
@@ -84,6 +86,34 @@ def test_a_step_is_a_projected_step_and_what_the_closure_gives(engine, batch):
     pushed = model.acceleration(xhat, change, setup.parameters, torch.as_tensor(setup.gravity.values[0]), c)
     assert pushed.abs().max() > 1e-6
     torch.testing.assert_close(closed.xhat - projected.xhat, pushed, rtol=1e-9, atol=1e-12)
+
+
+def test_a_closure_with_a_memory_sees_the_lags(engine, batch):
+    """The second step is that of the projection from there, and what the closure gives at the first's lags."""
+    plain = engine.model
+    sizes = replace(plain.sizes, memory=2)
+    model = StepOperators(sizes, plain.dt).double().requires_grad_(False)
+    known = {name: values for name, values in plain.state_dict().items() if name != "net.0.weight"}
+    model.load_state_dict(known, strict=False)
+    model.net[0].weight[:, : plain.sizes.inputs] = plain.net[0].weight
+    model.lag_decay.copy_(torch.tensor([0.5, 0.9]))
+    model.lag_scale.copy_(0.1 * plain.d_scale.repeat(2))
+    closed = batch(Closed(model, engine.taught, engine.samples))
+    closed.step(2)
+    start, once, twice = closed.batch.record.xhat[:, :3].double().unbind(1)
+    projected = Teacher([batch("modal")]).step_from(1, once, once - start)
+    setup = closed.batch.setups[0]
+    c = model.collider_state(torch.zeros(sizes.features, dtype=torch.float64))
+    given = setup.parameters, torch.as_tensor(setup.gravity.values[0]), c
+    near = Known.of(_runs(setup.manifold)).within(once, once - start)
+    lag = model.next_lag(torch.zeros(1, sizes.lags, dtype=torch.float64), once - start)
+    expected = model.acceleration(*near, *given, lag)
+    assert (expected - model.acceleration(*near, *given, 0.0 * lag)).abs().max() > 1e-6
+    torch.testing.assert_close(twice - projected, expected, rtol=1e-6, atol=1e-10)
+    again = batch(Closed(model, engine.taught, engine.samples))
+    again.step(1)
+    again.step(1)
+    assert torch.equal(again.batch.record.xhat[:, 2], closed.batch.record.xhat[:, 2])
 
 
 def _runs(manifold):

@@ -310,6 +310,13 @@ def test_what_is_not_deployed_together_is_refused_before_any_work(nsf, override,
     assert "deploy.batch=1" in err
 
 
+def test_a_memory_is_learned_from_full_order_runs_alone(nsf):
+    code, _, err = nsf("run", "engine=operators", "engine.teaching.memory=[0.1]")
+    assert code == 2
+    assert "engine.teaching.memory=[0.1] is learned from full-order runs alone" in err
+    assert "engine.teacher=runs" in err
+
+
 def test_the_example_of_the_style_guide(nsf, monkeypatch):
     """|S| = 1 with the paper's r = 6."""
     monkeypatch.setattr(chain_module(), "simulate", lambda *arguments: pytest.fail("simulate began"))

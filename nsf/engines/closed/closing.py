@@ -1,8 +1,10 @@
 """How a closure is fitted; checked without torch."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+from nsf.engines.operators.teaching import times_of_lags
 from nsf.errors import ConfigError
 
 _MOST = {"width": 4096, "stride": 10_000, "descent": 10_000_000, "unroll": 10_000, "batch": 100_000}
@@ -21,6 +23,7 @@ class Closing:
         rate: learning rate at the start; it falls to 0 along a cosine.
         noise: on the start of a window [deviations of x̂].
         single: weight of single steps beside the windows.
+        memory: times [s] of lags that the closure sees, as operators may.
 
     Raises:
         ConfigError: a value outside its range.
@@ -34,8 +37,10 @@ class Closing:
     rate: float = 1e-3
     noise: float = 0.03
     single: float = 0.01
+    memory: Sequence[float] = ()
 
     def __post_init__(self):
+        object.__setattr__(self, "memory", times_of_lags(self.memory))
         for name, most in _MOST.items():
             if not 1 <= getattr(self, name) <= most:
                 raise ConfigError(f"{name}={getattr(self, name)} must be at least 1 and at most {most:,}")

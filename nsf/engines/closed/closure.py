@@ -1,5 +1,7 @@
 """What is added to x̂ after a step was projected, for the runs of a batch."""
 
+import copy
+
 import torch
 
 from nsf.dynamics.batch import Batch
@@ -24,6 +26,8 @@ class Closure:
         self._batch, self._record, self._known = batch, batch.record, batch.forcing.version
         self._first = first.to(one.torch_device, torch.float64)
         self._change = self._first.clone()
+        self._decayed = copy.deepcopy(model).to(one.torch_device)  # of which the memory alone is asked here
+        self._lag = self._change.new_zeros(len(self._change), model.sizes.lags)
         self._beside = LatentRecord(batch.record.now, one.total_steps, 1)  # the record of x̂ + d + c
         parameters = torch.stack([setup.parameters for setup in batch.setups]).to("cpu", torch.float64)
         where = {"precision": one.precision, "device": one.device}
@@ -43,6 +47,11 @@ class Closure:
         """Go on from the latents of the record; `first`: at t = 0."""
         now, before = self._record.now, self._record.before
         self._change.copy_(self._first if first else now.double() - before.double())
+        if first:
+            self._lag.zero_()
+        elif self._lag.numel():
+            runs = self._record.xhat[:, : int(self._record.row.max()) + 1].double().transpose(0, 1)
+            self._lag.copy_(self._decayed.lags_along(torch.diff(runs, dim=0))[-1])
 
     def add(self) -> None:
         """Add c to the x̂_{n+1} that was recorded last."""
@@ -50,10 +59,12 @@ class Closure:
         self._beside.row.copy_(record.row - 1)
         xhat, change = self._within.within(record.before.double(), self._change)
         loop.begin(xhat, change)
+        loop.lag.copy_(self._lag.flatten())
         loop.advance(1)
         record.now += loop.change.view_as(change) - change
         record.xhat[self._rows, record.row] = record.now
         self._change.copy_(record.now.double() - record.before.double())
+        self._lag.copy_(self._decayed.next_lag(self._lag, self._change))
 
     @property
     def nbytes(self) -> int:

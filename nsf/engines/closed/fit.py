@@ -15,12 +15,12 @@ from torch import Tensor
 
 from nsf.engines.closed.closing import Closing
 from nsf.engines.closed.linear import Known, Linearised
-from nsf.engines.operators.descent import graphed, one_thread
+from nsf.engines.operators.descent import graphed, one_thread, softly
 from nsf.engines.operators.model import StepOperators
 from nsf.engines.operators.teacher import Teacher
 
 _SINGLE = 1024  # single steps beside the windows of a step of the descent
-_FAR_X, _FAR_D = 4.0, 3.0  # deviations, to which tanh limits e and δ, so that a lost window stays bounded
+_FAR_X, _FAR_D = 4.0, 3.0  # deviations, to which e and δ are held, so that a lost window stays bounded
 _BESIDE_X, _BESIDE_D = 0.01, 0.1  # noise on single steps, in deviations
 _STEEPEST = 0.1  # length of gradient beyond which it is cut
 
@@ -55,6 +55,7 @@ class Fit:
         self._known = Known.of(own.runs).to(self._device, torch.float32)
         self._mu, self._g = here(teacher.parameters), here(teacher.gravity)
         self._c = model.collider_state(here(teacher.features))
+        self._lag = model.lags_along(self._d[1:])
 
     def run(self, told: Callable[[int], object] = lambda steps: None) -> None:
         """All steps; `told` of each number of them that was taken."""
@@ -92,15 +93,16 @@ class Fit:
     def _off(self, unroll: int, k: Tensor, n: Tensor, start: Tensor) -> Tensor:
         model, loss = self._model, 0.0
         e, delta = self._closing.noise * model.x_scale * start, torch.zeros_like(start)
+        behind = torch.zeros_like(self._lag[n, k])  # how far the lags are off
         for j in range(unroll):
             m = n + j
             there = self._known.within(self._x[m, k] + e, self._d[m, k] + delta)
-            answer = (
-                model.acceleration(*there, self._mu[k], self._g[m, k], self._c[m, k]) - self._defect[m, k]
-            )
+            given = self._mu[k], self._g[m, k], self._c[m, k], self._lag[m, k] + behind
+            answer = model.acceleration(*there, *given) - self._defect[m, k]
             answer = answer + self._times(self._of_x, m, k, e) + self._times(self._of_d, m, k, delta)
-            delta = _softly(delta + answer, _FAR_D * model.d_scale)
-            e = _softly(e + delta, _FAR_X * model.x_scale)
+            delta = softly(delta + answer, _FAR_D * model.d_scale)
+            e = softly(e + delta, _FAR_X * model.x_scale)
+            behind = model.next_lag(behind, delta)
             loss = loss + torch.log1p(100.0 * (e / model.x_scale).square().mean(1)).mean()
         return loss / (100.0 * unroll)
 
@@ -117,9 +119,5 @@ class Fit:
         model = self._model
         x = self._x[n, k] + _BESIDE_X * model.x_scale * of_x
         d = self._d[n, k] + _BESIDE_D * model.d_scale * of_d
-        found = model.acceleration(x, d, self._mu[k], self._g[n, k], self._c[n, k])
+        found = model.acceleration(x, d, self._mu[k], self._g[n, k], self._c[n, k], self._lag[n, k])
         return ((found - self._defect[n, k]) / model.a_scale).square().mean()
-
-
-def _softly(values: Tensor, most: Tensor) -> Tensor:
-    return most * torch.tanh(values / most)

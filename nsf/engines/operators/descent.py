@@ -15,6 +15,7 @@ from nsf.engines.operators.teaching import Teaching
 from nsf.gpu import without_collection
 
 _BATCH = 1024  # labels of one step of the descent
+_FAR = 8.0  # deviations, to which long windows hold how far x̂ and d are off, so that a lost one stays bounded
 _WARM_UP = 3  # steps before a graph is captured, as CUDA asks for
 
 
@@ -155,6 +156,9 @@ class Descent:
         x, d, lag = runs[n, k] + self._teaching.noise * model.x_scale * noise, changes[n, k], lags[n, k]
         for j in range(unroll):
             x, d = model.step(x, d, mu[k], g[n + j, k], c[n + j, k], lag)
+            if self._kind is _ALONE:
+                d = changes[n + j + 1, k] + softly(d - changes[n + j + 1, k], _FAR * model.d_scale)
+                x = runs[n + j + 1, k] + softly(x - runs[n + j + 1, k], _FAR * model.x_scale)
             lag = model.next_lag(lag, d)
             loss = loss + self._kind.weigh(x - runs[n + j + 1, k], j, model)
         return loss / unroll
@@ -169,6 +173,11 @@ class Descent:
         }
         self._generator.set_state(state)
         return lambda window, drawn: graphs[window](drawn)
+
+
+def softly(values: Tensor, most: Tensor) -> Tensor:
+    """Values held within ±most by tanh, small ones nearly as they are."""
+    return most * torch.tanh(values / most)
 
 
 def graphed(

@@ -125,8 +125,9 @@ class Course:
         else:
             self.labels = Labels.joined([self.labels, *self._along_own_runs(number)])
         self._descend(number, generator)
+        finite = all(bool(torch.isfinite(weights).all()) for weights in self.model.parameters())
         runs = self.own_runs(self.yardstick.teacher)
-        self.errors.append(self.yardstick.error(runs))
+        self.errors.append(self.yardstick.error(runs) if finite else math.inf)
 
     def _begin(self, generator: torch.Generator) -> None:
         """Runs of the teacher, states of the truth and of the tube, and the scales of the operators."""

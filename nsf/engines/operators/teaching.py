@@ -48,18 +48,27 @@ class Teaching:
     memory: Sequence[float] = ()
 
     def __post_init__(self):
-        object.__setattr__(self, "memory", tuple(self.memory))
-        for seconds in self.memory:
-            if not (is_finite(seconds) and seconds > 0):
-                raise ConfigError(f"memory={list(self.memory)} must be times in seconds, each above 0")
-        if len(self.memory) > _MOST_LAGS:
-            raise ConfigError(f"memory has {len(self.memory)} times; {_MOST_LAGS} at most")
+        object.__setattr__(self, "memory", times_of_lags(self.memory))
         for name, least in (("width", 1), ("rounds", 0), ("steps", 1), ("descent", 1), ("unroll", 1)):
             if getattr(self, name) < least:
                 raise ConfigError(f"{name}={getattr(self, name)} must be at least {least}")
         for name in ("rate", "noise", "tube", "gravity"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
                 raise ConfigError(f"{name}={getattr(self, name)} must be finite and at least 0")
+
+
+def times_of_lags(memory: Sequence[float]) -> tuple[float, ...]:
+    """The times [s] of a memory.
+
+    Raises:
+        ConfigError: one is not above 0, or there are too many.
+    """
+    for seconds in memory:
+        if not (is_finite(seconds) and seconds > 0):
+            raise ConfigError(f"memory={list(memory)} must be times in seconds, each above 0")
+    if len(memory) > _MOST_LAGS:
+        raise ConfigError(f"memory has {len(memory)} times; {_MOST_LAGS} at most")
+    return tuple(memory)
 
 
 def random_cases(box: np.ndarray, count: int, seed: int, taken: Sequence[Case]) -> list[Case]:

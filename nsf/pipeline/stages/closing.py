@@ -54,7 +54,9 @@ def _follow(pipeline, manifold: Manifold, record: Record) -> None:
         teacher = Teacher(batches(pipeline, manifold, sorted(pipeline.split.train)), progress.advance)
         linearised = Linearised.along(teacher, runs, closing.stride)
     gravity, changes = bool(teacher.gravity.any()), torch.diff(runs, dim=0)
-    model = standardised(teacher, runs, changes, linearised.defect, closing.width, gravity, seed)
+    model = standardised(
+        teacher, runs, changes, linearised.defect, closing.width, gravity, seed, closing.memory
+    )
     model = model.to(pipeline.device, torch.float32)
     with Progress("teach", closing.turns, "steps of the fit") as progress:
         generator = torch.Generator().manual_seed(seed)

@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import zlib
+from dataclasses import replace
 from html import unescape
 from pathlib import Path
 
@@ -122,6 +123,13 @@ def test_a_run_that_no_operators_step_is_refused(model, tmp_path, monkeypatch):
     monkeypatch.setattr(publish, "LiveModel", None)  # which takes minutes of a large run
     with pytest.raises(ConfigError, match=r"engine=auto, whose steps take more .* engine=operators"):
         publish.write(model.run, tmp_path, device="cpu")
+
+
+def test_operators_with_a_memory_are_refused(taught_model, monkeypatch):
+    model = taught_model.pipeline.operators().model
+    monkeypatch.setattr(model, "sizes", replace(model.sizes, memory=1))
+    with pytest.raises(ConfigError, match=r"memory, which a page has not; .* engine.teaching.memory=\[\]"):
+        publish.model_data(taught_model)
 
 
 def test_options_of_other_formats_are_refused(capsys):
