@@ -89,7 +89,7 @@ def test_a_step_is_a_projected_step_and_what_the_closure_gives(engine, batch):
 
 
 def test_a_closure_with_a_memory_sees_the_lags(engine, batch):
-    """The second step is that of the projection from there, and what the closure gives at the first's lags."""
+    """The second step is that of the projection, and what the closure gives at the lags of the first."""
     plain = engine.model
     sizes = replace(plain.sizes, memory=2)
     model = StepOperators(sizes, plain.dt).double().requires_grad_(False)
