@@ -25,7 +25,7 @@ from nsf.engines.operators import (
     random_cases,
 )
 from nsf.engines.operators.recurrence import Recurrence, make_recurrence, places
-from nsf.errors import ConfigError, MissingRunError, SchemaError
+from nsf.errors import ConfigError, InstabilityError, MissingRunError, SchemaError
 from nsf.mpm import Cuboid, HalfSpace, Motion, precision_of
 from nsf.mpm.device import warp_device
 from nsf.sampling import SampleSpan
@@ -213,6 +213,58 @@ def test_how_far_a_step_is_from_affine():
     assert broken(0.0) < 1e-12
     assert broken(1.0) > 1e-4
     np.testing.assert_allclose(broken(2.0), 2.0 * broken(1.0), rtol=1e-9)
+
+
+class Yielding:
+    """Runs to learn from, of a spring that knows the way it came: d' = d − 0.04 x − 0.1 e, e a lag."""
+
+    total_steps, dt, steps, programs, asked = 60, 0.01, 0, False, False
+    parameters, gravity = torch.zeros(8, 1).double(), torch.zeros(60, 8, 3).double()
+    start, features = torch.zeros(8, 1).double(), torch.zeros(60, 8, 0).double()
+    decay = math.exp(-0.01 / 0.1)
+
+    def __init__(self):
+        self._first = torch.randn(8, 1, generator=torch.Generator().manual_seed(4)).double()
+
+    def __len__(self):
+        return 8
+
+    def first_change(self):
+        return 0.1 * self._first
+
+    def run(self):
+        x, d, e, found = self.start, self.first_change(), torch.zeros(8, 1).double(), [self.start]
+        for _ in range(60):
+            d = d - 0.04 * x - 0.1 * e
+            x, e = x + d, self.decay * (e + d)
+            found.append(x)
+        return torch.stack(found)
+
+
+def test_what_depends_on_the_way_takes_a_memory():
+    def error(*memory):
+        teacher = Yielding()
+        yardstick = Yardstick(teacher, lambda run: run[:, None], teacher.run()[:, :, None])
+        teaching = Teaching(16, rounds=0, descent=300, unroll=16, noise=0.0, memory=memory)
+        course = Course([teacher], None, yardstick, teaching, 0)
+        course.follow()
+        return course.errors[0]
+
+    remembered = error(0.1)
+    assert remembered < 0.15
+    assert remembered < 0.5 * error()
+
+
+def test_a_round_that_ends_in_nan_is_not_kept(monkeypatch):
+    def lost(descent):
+        descent._model.net[4].weight.data.fill_(math.nan)
+
+    monkeypatch.setattr("nsf.engines.operators.teach.Descent.run", lost)
+    teacher = Stepper(0.0)
+    yardstick = Yardstick(teacher, lambda run: run[:, None], teacher.run()[:, :, None])
+    course = Course([teacher], None, yardstick, Teaching(8, rounds=1, steps=90, descent=1, unroll=1), 0)
+    with pytest.raises(InstabilityError, match="no round of teaching gave operators whose runs stay finite"):
+        course.follow()
 
 
 @pytest.mark.gpu
