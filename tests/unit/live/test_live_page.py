@@ -4,6 +4,7 @@ import io
 import re
 import socket
 import threading
+import time
 import urllib.request
 
 import numpy as np
@@ -202,11 +203,20 @@ def test_two_browsers_share_what_is_shown(browser, served):
     other.get_by_role("button", name="play", exact=True).wait_for()
     player.seek(player.steps)
     before = [window.screenshot(clip=SCENE) for window in (one, other)]
-    number = other.get_by_role("textbox").first
-    number.fill("30")
-    number.press("Enter")
+    number, asked = other.get_by_role("textbox").first, "friction angle=30°, t = 0.12 s"
+
+    def typed() -> bool:
+        """What the page says of the seek may come while one types, and take the place of what was typed."""
+        number.fill("30")
+        number.press("Enter")
+        until = time.monotonic() + 20.0
+        while time.monotonic() < until and not other.get_by_text(asked).count():
+            other.wait_for_timeout(100)
+        return bool(other.get_by_text(asked).count())
+
+    wait_until(typed)
     for window, shown in zip((one, other), before, strict=True):
-        window.get_by_text("friction angle=30°, t = 0.12 s").wait_for()
+        window.get_by_text(asked).wait_for()
         wait_until(lambda window=window, shown=shown: window.screenshot(clip=SCENE) != shown)
     one.close()
     drawn = page.drawn
