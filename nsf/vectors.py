@@ -17,7 +17,7 @@ def is_finite(value) -> bool:
         return False
 
 
-def evenly(count: int, most: int) -> np.ndarray:
+def spaced(count: int, most: int) -> np.ndarray:
     """At most `most` of the indices 0 … count − 1, evenly spread, the first and the last among them."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 

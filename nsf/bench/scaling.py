@@ -20,7 +20,7 @@ from nsf.kinematics.interpolation import interpolation, lying_together
 from nsf.mpm import FullOrderMPM
 from nsf.pipeline import Pipeline
 from nsf.scenes import Scene
-from nsf.vectors import evenly
+from nsf.vectors import spaced
 
 SIZES = {
     "cuda": (10_000, 30_000, 100_000, 300_000, 1_000_000, 2_000_000, 4_000_000),
@@ -172,7 +172,7 @@ def _built(
 
 def frames_of(steps: int) -> np.ndarray:
     """Steps after which δ is taken, of a run of so many."""
-    return evenly(steps + 1, _FRAMES + 1)[1:]
+    return spaced(steps + 1, _FRAMES + 1)[1:]
 
 
 def positions_after(solver: FullOrderMPM, steps: Sequence[int]) -> list[torch.Tensor]:

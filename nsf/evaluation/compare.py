@@ -16,7 +16,7 @@ from nsf.evaluation import metrics
 from nsf.evaluation.quantities import QUANTITIES, at_end, height
 from nsf.evaluation.surroundings import surroundings
 from nsf.mpm.grid.shape import DEGREES
-from nsf.vectors import evenly
+from nsf.vectors import spaced
 
 _CHUNK = 2**24  # values of one field decoded at once
 _SAME_TIME = 1e-9  # [s]
@@ -127,7 +127,7 @@ def compare(
     rate = torch.diff(xhat, dim=0, prepend=xhat[:1]) / trajectory.dt
     rate[0] = solver.first_rate
     inertia = scene.dx**2 * (DEGREES[scene.transfer.shape] + 1) / 12.0
-    shown_frames = evenly(frames, pictures[1])
+    shown_frames = spaced(frames, pictures[1])
     samples = {n: _sample_at(solver, trajectory.t[n]) for n in shown_frames}
     shown_particles = _shown(trajectory.particles, pictures[0], np.concatenate(list(samples.values())))
     kept = {name: [] for name in ("x_full", "x_reduced", "stress_full", "stress_reduced", "role")}

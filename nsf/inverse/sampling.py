@@ -20,7 +20,7 @@ from nsf.inverse.model import Forcing, Model
 from nsf.inverse.observations import AXES, BODY, component
 from nsf.inverse.space import Space
 from nsf.kinematics.interpolation import interpolation
-from nsf.vectors import evenly
+from nsf.vectors import spaced
 
 #: Runs that are taken together.
 _BATCH = 500
@@ -152,7 +152,7 @@ class Asked:
             point = found[1][None]
             model.check_points(point)
             self._points[text] = AXES.index(found[0]), point
-        self.steps = evenly(len(model.t), _TIMES)
+        self.steps = spaced(len(model.t), _TIMES)
         self.t = model.t[self.steps]
         kept = np.sort(np.random.default_rng(0).permutation(len(model.manifold.X))[:BODY])
         self._body, self._X = kept, model.manifold.X[torch.as_tensor(kept)].to(model.device)

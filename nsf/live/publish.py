@@ -25,7 +25,7 @@ from nsf.reporting.text.formats import file_name
 from nsf.runs import Run
 from nsf.scenes import Scene
 from nsf.storage import writing
-from nsf.vectors import evenly
+from nsf.vectors import spaced
 
 #: Points of a page, by default; a telephone decodes so many in each frame.
 POINTS = 20_000
@@ -295,7 +295,7 @@ def _recorded(
     chosen = np.sort(np.random.default_rng(1).permutation(len(model.shown))[:most])
     particles = model.shown[chosen]
     with Trajectory.open(model.truth_run(case).file(TRAJECTORY)) as trajectory:
-        frames = evenly(trajectory.frames, sizes.frames + 1)
+        frames = spaced(trajectory.frames, sizes.frames + 1)
         x = trajectory.read("x", frames=frames.tolist(), particles=particles)
         tau = trajectory.read("tau", frames=frames.tolist(), particles=particles)
         t = frames * trajectory.dt

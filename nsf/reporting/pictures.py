@@ -12,16 +12,16 @@ from joblib.externals.loky import ProcessPoolExecutor
 from nsf.reporting.drawing import charts, shapes
 from nsf.reporting.drawing.style import DIFFERENCE_COLORS, STRESS_COLORS, save
 from nsf.reporting.keeping import Kept
-from nsf.reporting.levels import lend_stages, levels_section
 from nsf.reporting.rivals import over_cost
-from nsf.reporting.settings import settings_section
+from nsf.reporting.sections.levels import lend_stages, levels_section
+from nsf.reporting.sections.settings import settings_section
+from nsf.reporting.sections.variant import ENDS, ROWS, Variant, order
 from nsf.reporting.sources import Study
 from nsf.reporting.study import SEEDS
 from nsf.reporting.tables import Merged, mean_rows, natural, printed_of, variant_labels, variants
 from nsf.reporting.text.columns import MEASURED, parameter_text
 from nsf.reporting.text.formats import file_name
 from nsf.reporting.text.page import Picture, Section
-from nsf.reporting.variant import ENDS, ROWS, Variant, order
 
 FRAMES = 31  # of an animation
 BASELINE = "deformation_only"

@@ -62,6 +62,17 @@ def silent(engine: Closed, pushes: bool = False) -> Closed:
     return engine
 
 
+def remembering(plain: StepOperators) -> StepOperators:
+    """The same network, which also sees two lags through weights by chance."""
+    model = StepOperators(replace(plain.sizes, memory=2), plain.dt).double().requires_grad_(False)
+    known = {name: values for name, values in plain.state_dict().items() if name != "net.0.weight"}
+    model.load_state_dict(known, strict=False)
+    model.net[0].weight[:, : plain.sizes.inputs] = plain.net[0].weight
+    model.lag_decay.copy_(torch.tensor([0.5, 0.9]))
+    model.lag_scale.copy_(0.1 * plain.d_scale.repeat(2))
+    return model
+
+
 def test_held_out_errors_are_smaller_than_without_it(chain, lesson):
     pipeline, said = lesson
     errors = [
@@ -90,14 +101,8 @@ def test_a_step_is_a_projected_step_and_what_the_closure_gives(engine, batch):
 
 def test_a_closure_with_a_memory_sees_the_lags(engine, batch):
     """The second step is that of the projection, and what the closure gives at the lags of the first."""
-    plain = engine.model
-    sizes = replace(plain.sizes, memory=2)
-    model = StepOperators(sizes, plain.dt).double().requires_grad_(False)
-    known = {name: values for name, values in plain.state_dict().items() if name != "net.0.weight"}
-    model.load_state_dict(known, strict=False)
-    model.net[0].weight[:, : plain.sizes.inputs] = plain.net[0].weight
-    model.lag_decay.copy_(torch.tensor([0.5, 0.9]))
-    model.lag_scale.copy_(0.1 * plain.d_scale.repeat(2))
+    model = remembering(engine.model)
+    sizes = model.sizes
     closed = batch(Closed(model, engine.taught, engine.samples))
     closed.step(2)
     start, once, twice = closed.batch.record.xhat[:, :3].double().unbind(1)
@@ -114,6 +119,17 @@ def test_a_closure_with_a_memory_sees_the_lags(engine, batch):
     again.step(1)
     again.step(1)
     assert torch.equal(again.batch.record.xhat[:, 2], closed.batch.record.xhat[:, 2])
+
+
+def test_a_hand_on_gravity_leaves_the_memory(engine, batch):
+    """What a hand sets to the gravity there is changes nothing of a run by operators."""
+    own = Operators(remembering(engine.model), engine.taught, engine.samples)
+    left, handed = batch(own), batch(own)
+    left.step(8)
+    handed.step(4)
+    handed.hand().gravity = tuple(handed.batch.setups[0].gravity.values[0])
+    handed.step(4)
+    assert torch.equal(left.batch.record.xhat[:, :9], handed.batch.record.xhat[:, :9])
 
 
 def _runs(manifold):

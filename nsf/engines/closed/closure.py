@@ -47,19 +47,15 @@ class Closure:
         """Go on from the latents of the record; `first`: at t = 0."""
         now, before = self._record.now, self._record.before
         self._change.copy_(self._first if first else now.double() - before.double())
-        if first:
-            self._lag.zero_()
-        elif self._lag.numel():
-            runs = self._record.xhat[:, : int(self._record.row.max()) + 1].double().transpose(0, 1)
-            self._lag.copy_(self._decayed.lags_along(torch.diff(runs, dim=0))[-1])
+        known = self._record.xhat[:, : int(self._record.row.max()) + 1]
+        self._lag.copy_(self._decayed.lags_after(known))
 
     def add(self) -> None:
         """Add c to the x̂_{n+1} that was recorded last."""
         record, loop = self._record, self._loop
         self._beside.row.copy_(record.row - 1)
         xhat, change = self._within.within(record.before.double(), self._change)
-        loop.begin(xhat, change)
-        loop.lag.copy_(self._lag.flatten())
+        loop.begin(xhat, change, self._lag)
         loop.advance(1)
         record.now += loop.change.view_as(change) - change
         record.xhat[self._rows, record.row] = record.now

@@ -91,7 +91,7 @@ class OperatorRun:
 
     def __init__(self, model: StepOperators, batch: Batch, first: torch.Tensor):
         one = batch.shared
-        self._batch, self._known = batch, batch.forcing.version
+        self._model, self._batch, self._known = model, batch, batch.forcing.version
         self._first, self._record = first.to(one.torch_device), batch.record
         parameters = torch.stack([setup.parameters for setup in batch.setups]).to("cpu", torch.float64)
         self._gravity, self._states = map(_shared, acting(batch))
@@ -116,9 +116,12 @@ class OperatorRun:
     def enter(self, first: bool) -> None:
         """Begin with the latents of the record."""
         now, before = (latest.double() for latest in (self._record.now, self._record.before))
-        row = int(self._record.row.max())
-        known = None if first else self._record.xhat[:, : row + 1]
-        self.recurrence.begin(now, self._first if first else now - before, known)
+        lag = self._lag(int(self._record.row.max()))
+        self.recurrence.begin(now, self._first if first else now - before, lag)
+
+    def _lag(self, step: int) -> torch.Tensor:
+        """[B, lags] of the recorded runs at a step."""
+        return self._model.lags_after(self._record.xhat[:, : step + 1])
 
     def pushed(self, push: torch.Tensor, since: int = 0) -> torch.Tensor:
         """[B, N + 1, r] latents of the same runs from a step on, with [B, N, r] added to their changes."""
@@ -128,7 +131,7 @@ class OperatorRun:
         record.xhat[:, since] = own[:, since]
         again = self._of(self._gravity, self._states, record=record, push=push)
         now, before = own[:, since].double(), own[:, max(0, since - 1)].double()
-        again.begin(now, now - before if since else self._first, own[:, : since + 1])
+        again.begin(now, now - before if since else self._first, self._lag(since))
         again.advance(steps - since)
         return record.xhat
 

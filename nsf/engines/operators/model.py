@@ -131,6 +131,10 @@ class StepOperators(nn.Module):
             found.append(self.next_lag(found[-1], change))
         return torch.stack(found) if self.sizes.memory else found[0].expand(len(changes) + 1, *found[0].shape)
 
+    def lags_after(self, runs: Tensor) -> Tensor:
+        """The lags [B, lags] at the end of runs [B, n + 1, r] from t = 0 on."""
+        return self.lags_along(torch.diff(runs.detach().to(self.x_mean), dim=1).transpose(0, 1))[-1]
+
     def _outputs(
         self, xhat: Tensor, parameters: Tensor, c: Tensor, lag: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor | None]:

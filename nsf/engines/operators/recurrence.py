@@ -183,19 +183,14 @@ class Recurrence:
         for name, values in self._acting(gravity, features).items():
             self._held[name].copy_(values)
 
-    def begin(self, xhat: torch.Tensor, change: torch.Tensor, before: torch.Tensor | None = None) -> None:
-        """Go on from x̂_n and d [B, r].
-
-        Args:
-            before: [B, n + 1, r] the runs up to there, which a memory asks for; None at t = 0.
-        """
+    def begin(self, xhat: torch.Tensor, change: torch.Tensor, lag: torch.Tensor | None = None) -> None:
+        """Go on from x̂_n and d [B, r], and with a memory from its lags [B, lags]; None at t = 0."""
         self.latent.view(self._count, -1).copy_(xhat)
         self.change.view(self._count, -1).copy_(change)
-        if before is None or not self._model.sizes.memory:
+        if lag is None:
             self.lag.zero_()
         else:
-            changes = torch.diff(before.detach().to("cpu", torch.float64), dim=1).transpose(0, 1)
-            self.lag.copy_(self._model.lags_along(changes)[-1].flatten())
+            self.lag.copy_(lag.flatten())
 
     def advance(self, steps: int) -> None:
         """Take steps of every run, in one launch."""

@@ -230,16 +230,8 @@ class Course:
     def _model(self, truth: Tensor, changes: Tensor) -> StepOperators:
         weightless = self.reach == 0.0 and not any(bool(t.gravity.any()) for t in self.teachers)
         accelerations, width = torch.diff(changes, dim=0), self.teaching.width
-        return standardised(
-            self.teachers[0],
-            truth,
-            changes,
-            accelerations,
-            width,
-            not weightless,
-            self.seed,
-            self.teaching.memory,
-        )
+        how = {"width": width, "gravity": not weightless, "seed": self.seed, "memory": self.teaching.memory}
+        return standardised(self.teachers[0], truth, changes, accelerations, **how)
 
     def own_runs(self, teacher: Teacher) -> Tensor:
         """[N + 1, R, r] runs of the operators at the teacher's values; what strays far is held."""

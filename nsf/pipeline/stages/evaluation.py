@@ -22,7 +22,7 @@ from nsf.evaluation import (
 from nsf.kinematics.manifold import Manifold
 from nsf.pipeline.stages import results
 from nsf.runs import Run
-from nsf.vectors import evenly
+from nsf.vectors import spaced
 
 #: Figures of `superresolve` in words; means over the held-out cases.
 _EXPLAINED = {
@@ -72,7 +72,7 @@ def superresolve_held_out(pipeline, run: Run) -> None:
     c, asked, steps = pipeline.config, pipeline.config.super_resolution, pipeline.scene.steps
     truths, manifold = _truths(pipeline), pipeline.manifold()
     # Evenly spread, without frame 0, at which nothing has moved.
-    frames = evenly(steps + 1, asked.frames + 1)[1:]
+    frames = spaced(steps + 1, asked.frames + 1)[1:]
     with run.record(device=pipeline.device, precision=c.precision) as record:
         rollouts = _rollouts(pipeline, manifold)
         with contextlib.ExitStack() as files:

@@ -29,6 +29,7 @@ OVER_TIME = {
     "linear_momentum_error": "linear momentum error",
     "angular_momentum_error": "angular momentum error",
 }
+_LETTER, _ENTRY = 5.5, 40.0  # [pt] width of a letter of a legend at most, and of what is about an entry
 LOST = 1000.0  # [%] error from which a run is lost, by how much tells nothing: axes end there
 
 
@@ -273,9 +274,10 @@ def _legend_above(fig: Figure, panel, title: str | None) -> None:
     handles, labels = panel.get_legend_handles_labels()
     order = sorted(range(len(labels)), key=lambda i: labels[i] != "mean")
     handles, labels = [handles[i] for i in order], [labels[i] for i in order]
+    columns = int(72.0 * fig.get_figwidth() / (_LETTER * max(map(len, labels)) + _ENTRY))
     legend = fig.legend(
-        handles, labels, title=title, loc="outside upper left", ncols=min(len(labels), 6), columnspacing=1.4,
-        handlelength=2.2, alignment="left",
+        handles, labels, title=title, loc="outside upper left", ncols=max(1, min(len(labels), 6, columns)),
+        columnspacing=1.4, handlelength=2.2, alignment="left",
     )  # fmt: skip
     legend.get_title().set_fontsize(9)
 

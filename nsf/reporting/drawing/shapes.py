@@ -26,7 +26,7 @@ from nsf.reporting.drawing.style import (
 )
 from nsf.reporting.sources import Motion
 from nsf.reporting.text.columns import parameter_text
-from nsf.vectors import evenly
+from nsf.vectors import spaced
 
 if TYPE_CHECKING:
     from nsf.evaluation import SuperResolution
@@ -107,7 +107,7 @@ class Stage:
     @cached_property
     def _window(self) -> View:
         motions = self._whole
-        frames = evenly(len(motions[0].t), _LOOKS)
+        frames = spaced(len(motions[0].t), _LOOKS)
         x = np.concatenate([m.x_full[frames].reshape(-1, 3) for m in motions])
         seen = [face.corners for m in motions for frame in frames for face in self.faces(m, int(frame))]
         return View.around(x, 100, self.camera, np.concatenate(seen) if seen else None)
@@ -211,7 +211,7 @@ def particle_sets(case: Case, name: str = "parameter", unit: str = "", count: in
     stage = Stage([case])
     (case,) = stage.cases
     m = case.motion
-    frames = evenly(len(m.t), count)
+    frames = spaced(len(m.t), count)
     view = stage.view(520)
     with styled():
         titles = [f"t = {m.t[frame]:.3g} s" for frame in frames]
@@ -249,7 +249,7 @@ def strip(cases: Sequence[Case], name: str = "parameter", unit: str = "", count:
     """
     stage = Stage(cases, cut=hides_stress(cases[0].motion))
     motion = stage.cases[0].motion
-    frames = evenly(len(motion.t), count)
+    frames = spaced(len(motion.t), count)
     stress = _stress_scale([case.motion.stress_full for case in stage.cases])
     view = stage.view(420)
     rows = [(case, *model) for case in stage.cases for model in case.models()]
@@ -288,7 +288,7 @@ def animation(
     width = 2 * width // len(titles)
     view = stage.view(width)
     times = stage.cases[0].motion.t
-    chosen = evenly(len(times), frames)
+    chosen = spaced(len(times), frames)
     images = []
     with styled():
         inches = len(titles) * width / 100 + 0.5

@@ -267,6 +267,19 @@ def test_a_round_that_ends_in_nan_is_not_kept(monkeypatch):
         course.follow()
 
 
+def test_a_window_that_is_lost_moves_no_weight_to_nan():
+    """Unrolled over all steps in fp32, so steep a network ends beyond all numbers."""
+    teacher = Yielding()
+    yardstick = Yardstick(teacher, lambda run: run[:, None], teacher.run()[:, :, None])
+    teaching = Teaching(8, rounds=0, descent=4, unroll=59, memory=(0.1,))
+    course = Course([teacher], None, yardstick, teaching, 0)
+    generator = torch.Generator().manual_seed(0)
+    course._begin(generator)
+    course.model.net[4].weight.data.fill_(1e30)
+    course._descend(0, generator)
+    assert all(bool(torch.isfinite(weights).all()) for weights in course.model.parameters())
+
+
 @pytest.mark.gpu
 def test_captured_steps_of_the_descent_are_those_of_the_host():
     """Graphs replay what eager steps do; warming up leaves neither network nor generator changed."""
@@ -437,7 +450,7 @@ def test_a_memory_goes_on_from_a_record(device):
     whole.advance(STEPS)
     again, other, _ = recurrence(model, device)
     again.advance(5)
-    again.begin(other.now, other.now - other.before, other.xhat[:, :6])
+    again.begin(other.now, other.now - other.before, model.lags_after(other.xhat[:, :6]))
     again.advance(STEPS - 5)
     torch.testing.assert_close(other.xhat, record.xhat, rtol=0, atol=1e-12)
 

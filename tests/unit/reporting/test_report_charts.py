@@ -126,6 +126,16 @@ def test_error_over_time_has_a_line_a_value_in_per_cent(series):
     assert figure.legends[0].get_title().get_text() == "friction angle [°]"
 
 
+def test_a_legend_of_long_names_stays_within_the_picture(series, tmp_path):
+    values = sorted(series["parameter"].unique())
+    long = {value: f"E={4000.12 + value} Pa, density=8{value}.6157 kg/m³, program=2002" for value in values}
+    many = [series.assign(parameter=series["parameter"].map(long) + str(k)) for k in range(3)]
+    figure = charts.error_over_time(pd.concat(many))
+    figure.savefig(tmp_path / "x.png")
+    assert len(figure.legends[0].get_texts()) == 3 * len(values) > 4
+    assert figure.legends[0].get_window_extent().x1 <= figure.bbox.x1
+
+
 def test_every_axis_names_its_unit(series):
     figures = [charts.error_over_time(series), charts.reconstruction_and_rollout(series, "angle", "°")]
     for figure in figures:

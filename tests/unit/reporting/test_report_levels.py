@@ -9,7 +9,7 @@ from matplotlib.colors import to_hex
 
 from nsf.deployment.levels import LEVELS as BY
 from nsf.reporting.drawing.levels import LEVELS, levels_over_time, name_of
-from nsf.reporting.levels import lend_stages, levels_section
+from nsf.reporting.sections.levels import lend_stages, levels_section
 
 
 def series_of(*by: int, parameter: float = 0.6) -> pd.DataFrame:

@@ -5,12 +5,12 @@ from pathlib import Path
 
 from nsf.reporting.drawing import shapes
 from nsf.reporting.drawing.style import DIFFERENCE_COLORS, STRESS_COLORS, save
+from nsf.reporting.sections.variant import ROWS, Variant, order
 from nsf.reporting.sources import Study
 from nsf.reporting.study import SEEDS
 from nsf.reporting.text.formats import file_name
 from nsf.reporting.text.page import Picture, Section
-from nsf.reporting.variant import ROWS, Variant, order
-from nsf.vectors import evenly
+from nsf.vectors import spaced
 
 _TOLD = (
     "Last frame at each setting, at most six of them, all at one held-out value: the worst one of the "
@@ -56,7 +56,7 @@ def _rows(settings: Mapping[Setting, Variant]) -> list[shapes.Case]:
         return []
     varied = {key for key, _ in set().union(*settings) - set.intersection(*map(set, settings))}
     (worst, _), *_ = min(settings.values(), key=order).ranked()
-    shown = [list(settings.items())[i] for i in evenly(len(settings), ROWS)]
+    shown = [list(settings.items())[i] for i in spaced(len(settings), ROWS)]
     return [
         case
         for setting, v in shown

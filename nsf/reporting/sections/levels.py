@@ -6,10 +6,10 @@ from pathlib import Path
 
 from nsf.reporting.drawing.levels import levels_over_time, name_of
 from nsf.reporting.drawing.style import save
+from nsf.reporting.sections.variant import Variant
 from nsf.reporting.study import SEEDS
 from nsf.reporting.text.columns import parameter_text
 from nsf.reporting.text.page import Picture, Section
-from nsf.reporting.variant import Variant
 
 #: Columns that variants have in common whose steps are the same but for the engine.
 _ALIKE = ("method", "field", "r", "precision", "device")

@@ -10,7 +10,7 @@ from nsf.reporting.keeping import code, key_of
 from nsf.reporting.sources import Motion, same_parameter
 from nsf.reporting.tables import Merged, natural
 from nsf.reporting.text.columns import parameter_text
-from nsf.vectors import evenly
+from nsf.vectors import spaced
 
 ROWS = 6  # parameter values, or settings, in one picture of final shapes
 ENDS = 2  # parameter values of strips and animations: the worst and the best
@@ -84,7 +84,7 @@ class Variant:
     def cases(self, limit: int, baseline: "Variant | None" = None) -> list[shapes.Case]:
         """At most `limit` held-out values, evenly from the worst to the best, which are always among them."""
         ranked = self.ranked()
-        chosen = evenly(len(ranked), limit)
+        chosen = spaced(len(ranked), limit)
         values = [ranked[i][0] for i in chosen]
         motions = {m.parameter: m for m in self._motions(values)}
         beside = {m.parameter: m for m in baseline._motions(values)} if baseline else {}
