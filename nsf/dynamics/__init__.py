@@ -4,7 +4,7 @@ from nsf.dynamics.batch import Batch
 from nsf.dynamics.inference import Decoder
 from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
 from nsf.dynamics.latent import LatentState, LatentTrajectory
-from nsf.dynamics.methods import Method
+from nsf.dynamics.methods import History, Method
 from nsf.dynamics.projection import STOP_REASONS, GaussNewton, ProjectionResult, Taylor, stop_reasons
 from nsf.dynamics.setup import NSF, Setup
 from nsf.dynamics.solver import ReducedBatch, ReducedMPM
@@ -15,6 +15,7 @@ __all__ = [
     "Batch",
     "Decoder",
     "GaussNewton",
+    "History",
     "Integration",
     "LatentState",
     "LatentTrajectory",

@@ -49,13 +49,17 @@ class Inference:
         self, xhat: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor | None]:
         """x [n, 3] [m], v [n, 3] [m/s], τ [n, 3, 3] [Pa] and C [n, 3, 3] [1/s], None for zero, at x̂_n [r]."""
+        rate = (xhat - self.before) / self.dt
+        self.before.copy_(xhat)
+        return *self.motion(xhat), self.stress(xhat), self.affine(xhat, rate)
+
+    def motion(self, xhat: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """x [n, 3] [m] and v [n, 3] [m/s] at x̂_n [r]."""
         x = self.at.position(xhat)
         # Backward difference, not the grid velocity: the reduced model has no v field (section 5.1).
         v = (x - self.previous) / self.dt
         self.previous.copy_(x)
-        rate = (xhat - self.before) / self.dt
-        self.before.copy_(xhat)
-        return x, v, self.stress(xhat), self.affine(xhat, rate)
+        return x, v
 
 
 class Decoder:

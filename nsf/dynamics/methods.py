@@ -1,4 +1,4 @@
-"""Where the reduced step takes τ and C from: the four methods of the ablation (paper section 6.1)."""
+"""Where the reduced step takes τ and C from: the four methods of the ablation (paper section 6.1), and `History`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -57,6 +57,20 @@ class Method:
         if self.neural_affine:
             return lambda xhat, rate: at.affine(xhat, parameters, rate)
         return lambda xhat, rate: None
+
+
+@dataclass(frozen=True)
+class History(Method):
+    """τ and C follow the grid at every particle, as at full order; x and v are the manifold's.
+
+    Each particle keeps F_e, the law's history variables and C. Under forcing that no training run had, the
+    stress of a plastic body depends on the way to a state, which no field of x̂ can tell. Such a step needs
+    every particle, so it costs what a full-order step costs. The fields h and l say where a run begins
+    in its midst, and what a latent vector is decoded to.
+
+    Not in the paper. Internal variables at the points of integration, with reduced kinematics, are those of
+    Ryckelynck 2009 (hyper-reduction of mechanical models with internal variables).
+    """
 
 
 class StressNeural:

@@ -9,7 +9,7 @@ from nsf.data import hash_of_positions
 from nsf.dynamics.inference import AffineSource, Decoder, StressSource
 from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
 from nsf.dynamics.interop import torch_device, torch_dtype
-from nsf.dynamics.methods import Method
+from nsf.dynamics.methods import History, Method
 from nsf.dynamics.projection import GaussNewton, Taylor, check_projector
 from nsf.errors import ConfigError, ShapeError
 from nsf.kinematics.manifold import Restriction
@@ -110,7 +110,7 @@ class Setup:
     def _found_sets(self) -> list[ParticleSets]:
         """Particle sets of each span; supersets go over the training trajectories, decoded from latents."""
         P = len(self.constants)
-        if self.integration.strategy == "search":
+        if self.integration.strategy == "search" or isinstance(self.method, History):
             return [
                 ParticleSets(s.particles, np.append(s.particles, np.delete(np.arange(P), s.particles)), None)
                 for s in self.samples

@@ -364,7 +364,7 @@ class ReducedMPM:
 
         Source: paper section 5.4, b.
         """
-        if self.setup.integration.strategy == "search" or self.span.latent_only:
+        if self.sets[0].nodes is None or self.span.latent_only:
             return 0
         everything, search, worst = self.decoder(), self.setup.search, 0
         for n in range(self.steps_taken if steps is None else steps):

@@ -8,12 +8,16 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
+import warp as wp
 from typing_extensions import override
 
 from nsf.dynamics.batch import Batch
 from nsf.dynamics.inference import Inference
 from nsf.dynamics.integration import ParticleSets
+from nsf.dynamics.interop import as_scalars
+from nsf.dynamics.methods import History
 from nsf.dynamics.span import GridSpan, Stages
+from nsf.mpm.transfer import make_g2p_stress
 from nsf.sampling.sampler import SampleSpan
 
 
@@ -126,8 +130,86 @@ class SearchingStep(Step):
         return [float(np.mean(self._sizes))] if self._sizes else super().mean_sizes
 
 
+class HistoryStep(Step):
+    """τ and C of each particle come from the grid and from what the particle went through (`History`).
+
+    x and v are inferred from x̂ as in any step. Then every particle takes the full-order step, in which F_e, the
+    history variables, τ and C go on; what it does to x and v is kept at S alone, to find x̂_{n+1}.
+    """
+
+    def __init__(self, batch: Batch, sample: SampleSpan, sets: ParticleSets):
+        super().__init__(batch, sample, sets)
+        one, n = batch.shared, len(sets.integration)
+        material, precision = one.scene.material, one.precision
+        self._law = make_g2p_stress(
+            precision, one.transfer.shape, material.functions(precision), material.history_size
+        )
+        vecH = wp.types.vector(length=material.history_size, dtype=precision.real)
+        self._F_e = wp.zeros(n, dtype=precision.mat33, device=one.device)
+        self._history = wp.zeros(n, dtype=vecH, device=one.device)
+        self._moduli = as_scalars(self.mu), as_scalars(self.lam)
+        self._params = material.params(precision)
+
+    @property
+    @override
+    def stages(self) -> Stages:
+        return {
+            "inference": self.infer,
+            "transfer": self.load,
+            "p2g": self.p2g,
+            "grid": self.grid_step.update,
+            "g2p": self.g2p_stress,
+            "inversion": self.project,
+            **self.closing,
+        }
+
+    @override
+    def infer(self) -> None:
+        self.inferred = self.inference.motion(self.record.now)
+
+    @override
+    def load(self) -> None:
+        for array, values in zip((self.x, self.v), self.inferred, strict=True):
+            array.copy_(values)
+
+    def g2p_stress(self) -> None:
+        """Grid → particles, F_e ← returnMap(f F_e), τ ← τ(F_e); as `FullOrderMPM.g2p_stress`."""
+        own = self.particles
+        inputs = [*self.grid_step.gathering, *self._moduli, self._params]
+        inputs += [own.x, own.v, own.C, self._F_e, self._history, own.tau]
+        wp.launch(self._law, dim=len(self.x), inputs=inputs, device=self.batch.shared.device)
+
+    @override
+    def enter(self, first: bool) -> None:
+        super().enter(first)
+        one, xhat = self.batch.shared, self.record.now
+        material, n = one.scene.material, len(self.x)
+        if first:
+            self.tau.zero_()
+            self.C.zero_()
+            F_e, history = np.tile(np.eye(3), (n, 1, 1)), material.initial_history(n)
+        else:  # in the midst of a run, of which x̂ alone is known
+            rate = (xhat - self.record.before) / one.dt
+            C = self.inference.affine(xhat, rate)
+            self.C.copy_(torch.zeros_like(self.C) if C is None else C)
+            tau = self.inference.stress(xhat).double().cpu().numpy()
+            tau = np.nan_to_num(0.5 * (tau + tau.transpose(0, 2, 1)), nan=0.0, posinf=0.0, neginf=0.0)
+            moduli = self.mu.double().cpu().numpy(), self.lam.double().cpu().numpy()
+            tau *= material.carried_share(tau, *moduli)[:, None, None]
+            self.tau.copy_(torch.as_tensor(tau))
+            F_e, history = material.stretch_of(tau, *moduli), material.history_of(tau)
+        self._F_e.assign(F_e)
+        self._history.assign(history)
+
+    @property
+    @override
+    def nbytes(self) -> int:
+        return super().nbytes + self._F_e.capacity + self._history.capacity
+
+
 def steps_of(batch: Batch) -> Sequence[Step]:
     """The reference's step for each span of time of a batch of one run."""
     one = batch.shared
     kind = SearchingStep if one.integration.strategy == "search" else Step
+    kind = HistoryStep if isinstance(one.method, History) else kind
     return [kind(batch, sample, sets) for sample, sets in zip(one.samples, one.sets, strict=True)]

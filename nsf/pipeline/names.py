@@ -296,13 +296,15 @@ class Names:
         """Cases of three kinds that the teacher is asked in: of training, between them, and held back.
 
         Runs in those held back decide which round of teaching is kept. None is a validation or test case.
-        Where full-order runs are the teacher there is one round, which decides nothing: there are no cases
-        between, and it is told how far runs at validation values are off, or, if there are none, at training.
+        Where runs are the teacher there is one round, which decides nothing: it is told how far runs at
+        validation values are off, or, if there are none, at training. Between are as many as asked for.
         """
         known, seed = sorted(self.split.train), int(self.config.seed)
-        if self.of_runs or self.closing is not None:
-            return [known, [], sorted(self.split.validation) or known]
         taken = [*known, *self.split.validation, *self.split.test]
+        if self.of_runs or self.closing is not None:
+            drawn = self.teaching.runs if self.of_runs else 0
+            between = random_cases(self.split.box, drawn, seed, taken) if drawn else []
+            return [known, between, sorted(self.split.validation) or known]
         between = random_cases(self.split.box, len(known), seed, taken)
         back = random_cases(self.split.box, HELD_BACK, seed + 1, [*taken, *between])
         return [known, between, back]

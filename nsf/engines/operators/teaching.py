@@ -30,7 +30,8 @@ class Teaching:
         noise: on the start of a window [deviations of x̂].
         tube: deviation of states about training runs [deviations of x̂].
         gravity: by how much the gravity of labels in the tube is varied [-], of its magnitude.
-        memory: times [s] of lags that the operators see; taught by full-order runs alone.
+        memory: times [s] of lags that the operators see; taught by runs alone.
+        runs: projected runs in drawn cases, of which operators learn beside full-order ones.
 
     Raises:
         ConfigError: a value outside its range.
@@ -46,10 +47,18 @@ class Teaching:
     tube: float = 0.02
     gravity: float = 0.1
     memory: Sequence[float] = ()
+    runs: int = 0
 
     def __post_init__(self):
         object.__setattr__(self, "memory", times_of_lags(self.memory))
-        for name, least in (("width", 1), ("rounds", 0), ("steps", 1), ("descent", 1), ("unroll", 1)):
+        for name, least in (
+            ("runs", 0),
+            ("width", 1),
+            ("rounds", 0),
+            ("steps", 1),
+            ("descent", 1),
+            ("unroll", 1),
+        ):
             if getattr(self, name) < least:
                 raise ConfigError(f"{name}={getattr(self, name)} must be at least {least}")
         for name in ("rate", "noise", "tube", "gravity"):

@@ -46,11 +46,12 @@ def teach(pipeline, run: Run) -> None:
 def _follow(pipeline, manifold: Manifold, record: Record) -> None:
     started = time.perf_counter()
     teaching, seed, device = pipeline.teaching, int(pipeline.config.seed), pipeline.device
-    work = (1, "rounds") if pipeline.of_runs else (teaching.steps, "teacher's steps")
+    work = (1 + teaching.runs, "runs") if pipeline.of_runs else (teaching.steps, "teacher's steps")
     with Progress("teach", *work) as progress:
         truth = truth_of(pipeline, manifold)
         if pipeline.of_runs:
             lessons, yardstick = recorded(pipeline, manifold, truth)
+            lessons += drawn(pipeline, manifold, lambda steps: progress.advance(steps / truth.shape[0]))
             truth = None  # is the teacher
         else:
             lessons, yardstick = _asked(pipeline, manifold, progress)
@@ -110,6 +111,24 @@ def recorded(pipeline, manifold: Manifold, latents: torch.Tensor) -> tuple[list[
     lessons = [Recorded(batches(pipeline, manifold, known), latents)]
     beside = Teacher(batches(pipeline, manifold, back))
     return lessons, Yardstick(beside, _positions(manifold), torch.stack(truth, 1))
+
+
+def drawn(pipeline, manifold: Manifold, told: Callable[[float], object]) -> list[Teacher]:
+    """Projected runs in the drawn cases between, those that are lost left out; of none, no teacher."""
+    _, between, _ = pipeline.lessons
+    if not between:
+        return []
+    beside = Teacher(batches(pipeline, manifold, between), told)
+    runs = beside.run()
+    kept = torch.isfinite(runs).all(-1).all(0)
+    cases = [case for case, good in zip(between, kept.tolist(), strict=True) if good]
+    if len(cases) < len(between):
+        pipeline.say(f"teach: warning: {len(between) - len(cases)} of {len(between)} projected runs are lost")
+    if not cases:
+        return []
+    found = Recorded(batches(pipeline, manifold, cases), runs[:, kept])
+    found.steps = beside.steps
+    return [found]
 
 
 def _looked_at(manifold: Manifold) -> np.ndarray:
