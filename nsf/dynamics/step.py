@@ -133,8 +133,8 @@ class SearchingStep(Step):
 class HistoryStep(Step):
     """τ and C of each particle come from the grid and from what the particle went through (`History`).
 
-    x and v are inferred from x̂ as in any step. Then every particle takes the full-order step, in which F_e, the
-    history variables, τ and C go on; what it does to x and v is kept at S alone, to find x̂_{n+1}.
+    x and v are inferred from x̂ as in any step. Then every particle takes the full-order step, in which F_e,
+    the history variables, τ and C go on; what it does to x and v is kept at S alone, to find x̂_{n+1}.
     """
 
     def __init__(self, batch: Batch, sample: SampleSpan, sets: ParticleSets):
