@@ -1,4 +1,4 @@
-"""Where the reduced step takes τ and C from: the methods of the ablation (paper section 6.1), and `History`."""
+"""Where the reduced step takes τ and C from: the paper's methods (section 6.1), and `History`."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -13,8 +13,9 @@ from nsf.deployment import FULL_ORDER, OPERATORS, PROJECTED, Levels, Rollout, ro
 from nsf.deployment.levels import estimated_errors
 from nsf.dynamics import Method, Taylor
 from nsf.engines import Operators
-from nsf.engines.operators import Course
+from nsf.engines.operators import Course, Teacher
 from nsf.errors import ConfigError, MissingRunError
+from nsf.pipeline.stages import teaching
 from nsf.sampling import RandomSampler, SampleSpan
 
 ANGLE = {"friction_angle": 26.0}
@@ -178,6 +179,50 @@ def test_what_full_order_runs_taught_is_held_to_those_of_validation(of_runs, pip
     assert (known, between, back) == (list(map(angle, (22.0, 30.0, 38.0))), [], known)
     held_back = pipeline_at(tmp_path, *TAUGHT, "engine.teacher=runs", "scene.design.validation=[24]")
     assert held_back.lessons[2] == [angle(24.0)]
+
+
+@pytest.fixture
+def drawn(copied, pipeline_at):
+    """(say) → the same chain with stress that particles carry, and three projected runs to learn from."""
+    root = copied("simulate", "train")
+
+    def build(say=lambda line: None):
+        keys = ("engine.teacher=runs", "engine.teaching.unroll=16", "engine.teaching.descent=600")
+        return pipeline_at(root, *TAUGHT, *keys, "engine.teaching.runs=3", "method=history", say=say)
+
+    return build
+
+
+def test_projected_runs_in_drawn_cases_teach_too(drawn):
+    pipeline = drawn()
+    known, between, _ = pipeline.lessons
+    assert len(between) == 3
+    assert not {*between} & {angle(26.0), *known}
+    for stage in ("deploy", "evaluate"):
+        pipeline.run(stage)
+    assert pipeline.taught.manifest["metrics"]["teacher_steps"] == 3 * pipeline.scene.steps
+    row = pd.read_csv(pipeline.evaluation.path / "results.csv").iloc[0]
+    assert row["displacement_error"] < 0.06
+    assert row["method"] == "history"
+
+
+def test_projected_runs_that_are_lost_teach_nothing(drawn, monkeypatch):
+    said = []
+    pipeline, run = drawn(said.append), Teacher.run
+
+    def lost(teacher):
+        found = run(teacher)
+        if len(teacher) == 3:
+            found[7:, 1] = torch.nan
+        return found
+
+    monkeypatch.setattr(Teacher, "run", lost)
+    lessons = teaching.drawn(pipeline, pipeline.manifold(), lambda steps: None)
+    assert [len(teacher) for teacher in lessons] == [2]
+    assert said == ["teach: warning: 1 of 3 projected runs are lost"]
+    assert bool(torch.isfinite(lessons[0].run()).all())
+    monkeypatch.setattr(Teacher, "run", lambda teacher: torch.full_like(run(teacher), torch.nan))
+    assert teaching.drawn(pipeline, pipeline.manifold(), lambda steps: None) == []
 
 
 def test_full_order_runs_teach_their_own_step_alone(pipeline_at, tmp_path):

@@ -18,7 +18,7 @@ from nsf.kinematics.training.phases import PHASES, Fit, at_least, per_phase, see
 # Budget of g with e, h and l: as the paper's epochs.
 SHARES = {"deformation": 0.2, "stress": 0.4, "affine": 0.4}
 # A field fitted to whole snapshots sees all of them in a step, up to so many; of more, so many drawn anew.
-MOST_AT_ONCE, DRAWN = 8192, 2048
+MOST_AT_ONCE, DRAWN = 6000, 2048
 BATCH_STREAM = 1 << 20  # keeps the epochs' permutations apart from the steps' generators
 
 

@@ -1,4 +1,4 @@
-"""`method=history`: stress and C that particles carry, beside a full-order run that is put onto the manifold."""
+"""`method=history`: stress and C that particles carry, beside full-order steps put onto the manifold."""
 
 import numpy as np
 import pytest

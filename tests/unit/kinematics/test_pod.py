@@ -92,7 +92,7 @@ def many(low_rank):
 
 def test_many_snapshots_have_the_same_modes_without_their_gram_matrix(many, monkeypatch):
     exact, unresolved = pod.decompose(many, "x", 3, 5)
-    monkeypatch.setattr(pod, "MOST_SNAPSHOTS", M - 1)
+    monkeypatch.setattr(pod, "MOST_SOLVED", M - 1)
     monkeypatch.setattr(pod, "_MORE", 8)
     monkeypatch.setattr(pod, "gram", None)
     found, left_out = pod.decompose(many, "x", 3, 5)
