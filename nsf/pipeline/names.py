@@ -92,6 +92,11 @@ class Names:
                     f"engine.teaching.memory={list(self.teaching.memory)} is learned from full-order runs "
                     f"alone; set engine.teacher={RUNS}, or engine.teaching.memory=[]"
                 )
+            if self.teaching.runs and not self.of_runs:
+                raise ConfigError(
+                    f"engine.teaching.runs={self.teaching.runs} stand beside full-order runs; set "
+                    f"engine.teacher={RUNS}, or engine.teaching.runs=0"
+                )
             if self.of_runs and c.deploy.dt_multiplier != 1:
                 raise ConfigError(
                     f"engine.teacher={RUNS} teaches steps of the scene's Δt, and deploy.dt_multiplier is "

@@ -8,6 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from nsf import config as configuration
 from nsf.data import Case
+from nsf.dynamics import History
 from nsf.errors import ConfigError, DeviceError
 from nsf.kinematics.fields.basis import BasisField
 from nsf.mpm import FP32, FP64, Precision
@@ -64,12 +65,34 @@ class Plan(Names):
                 "every step, in seconds: set trainer.devices=1"
             )
         check_batched(c, self.field, self.integration.strategy)
+        if isinstance(self.method, History):
+            self._check_history()
         self.deployed = self._changed(c.deploy.changes)
         X = self.scene.particles().X
         for region in self.sampler.regions:
             check_well_posed(region.size, c.latent_dim)
             region.candidates(X)
         self._check_cases()
+
+    def _check_history(self) -> None:
+        """Refuse what asks for a step that x̂ and its last change determine: particles carry their stress."""
+        if self.closing is not None:
+            raise ConfigError("engine=closed corrects steps of a stress field; set method=nsf")
+        if self.teaching is not None and not self.of_runs:
+            raise ConfigError(
+                f"engine.teacher={self.config.engine.teacher} is asked for single steps, which "
+                "depend on what particles went through with method=history; set engine.teacher=runs, or method=nsf"
+            )
+        if (size := self.config.deploy.batch) != 1:
+            raise ConfigError(
+                f"deploy.batch={size} needs the compiled engine, and method=history the reference; "
+                "set deploy.batch=1, or method=nsf"
+            )
+        if len(self.sampler.regions) > 1:
+            raise ConfigError(
+                f"the sampler has {len(self.sampler.regions)} samples in a run, and method=history takes one; "
+                "set sampler.phases=[], or another sampler"
+            )
 
     def _with_changes(self, changes: dict) -> Draft:
         whole = isinstance(self.scene, Scene)

@@ -206,6 +206,13 @@ def test_projected_runs_in_drawn_cases_teach_too(drawn):
     assert row["method"] == "history"
 
 
+def test_drawn_runs_stand_beside_full_order_ones(pipeline_at, tmp_path):
+    with pytest.raises(ConfigError, match=r"runs=3 stand beside full-order runs; set engine\.teacher=runs"):
+        pipeline_at(tmp_path, *TAUGHT, "engine.teaching.runs=3")
+    with pytest.raises(ConfigError, match="runs=-1 must be at least 0"):
+        pipeline_at(tmp_path, *TAUGHT, "engine.teacher=runs", "engine.teaching.runs=-1")
+
+
 def test_projected_runs_that_are_lost_teach_nothing(drawn, monkeypatch):
     said = []
     pipeline, run = drawn(said.append), Teacher.run

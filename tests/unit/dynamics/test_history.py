@@ -112,6 +112,27 @@ def test_two_samples_in_one_run_are_refused(chain, tiny_manifold):
         choose("auto", [setup])
 
 
+@pytest.mark.parametrize(
+    ("keys", "told"),
+    [
+        (["engine=closed"], "engine=closed corrects steps of a stress field; set method=nsf"),
+        (
+            ["engine=operators"],
+            "teacher=auto is asked for single steps.*; set engine.teacher=runs, or",
+        ),
+        (["deploy.batch=2"], "deploy.batch=2 needs the compiled engine.*; set deploy.batch=1, or method=nsf"),
+        (
+            ["sampler=region", "sampler.phases=[{start: 0.5, size: 30}]"],
+            r"2 samples in a run, and method=history takes one; set sampler.phases=\[\]",
+        ),
+    ],
+    ids=lambda value: value if isinstance(value, str) else value[0],
+)
+def test_what_asks_for_steps_without_a_history_is_refused(pipeline_at, tmp_path, keys, told):
+    with pytest.raises(ConfigError, match=told):
+        pipeline_at(tmp_path, "method=history", *keys)
+
+
 def test_the_compiled_engine_leaves_it_to_the_reference(solver_of):
     solver = solver_of()
     assert solver.engine == "reference"
