@@ -81,7 +81,8 @@ class Plan(Names):
         if self.teaching is not None and not self.of_runs:
             raise ConfigError(
                 f"engine.teacher={self.config.engine.teacher} is asked for single steps, which "
-                "depend on what particles went through with method=history; set engine.teacher=runs, or method=nsf"
+                "depend on what particles went through with method=history; set engine.teacher=runs, "
+                "or method=nsf"
             )
         if (size := self.config.deploy.batch) != 1:
             raise ConfigError(
@@ -90,8 +91,8 @@ class Plan(Names):
             )
         if len(self.sampler.regions) > 1:
             raise ConfigError(
-                f"the sampler has {len(self.sampler.regions)} samples in a run, and method=history takes one; "
-                "set sampler.phases=[], or another sampler"
+                f"the sampler has {len(self.sampler.regions)} samples in a run, and method=history takes "
+                "one; set sampler.phases=[], or another sampler"
             )
 
     def _with_changes(self, changes: dict) -> Draft:
