@@ -11,6 +11,8 @@ from nsf.errors import ConfigError
 PROGRAM = "program"
 # Relative; values equal to this are one value. Wider than a float32 round trip (6e-8).
 TOLERANCE = 1e-6
+_NEXT = re.compile(r", (?=[A-Za-z]\w*=)")  # between two parameters of `Case.named`
+_ONE = re.compile(r"([A-Za-z]\w*)=([-+]?[\d.]+(?:e[-+]?\d+)?)(°| \S.*)?", re.ASCII)
 
 
 @dataclass(frozen=True, order=True)
@@ -46,6 +48,19 @@ class Case(Mapping[str, float]):
     def of(cls, values: Mapping[str, float], units: Sequence[str] = ()) -> "Case":
         """The case of a mapping from name to value."""
         return cls(tuple(values), tuple(values.values()), units)
+
+    @classmethod
+    def read(cls, named: str) -> "Case":
+        """The case that `named` tells of, whose values have six digits there.
+
+        Raises:
+            ConfigError: it tells of none.
+        """
+        found = [_ONE.fullmatch(part) for part in _NEXT.split(named)]
+        if not all(found):
+            raise ConfigError(f"{named!r} names no case, as E=1500 Pa, friction=0.3 does")
+        names, values, units = zip(*(one.groups(default="") for one in found if one), strict=True)
+        return cls(names, values, [unit.strip() for unit in units])
 
     def __getitem__(self, name: str) -> float:
         try:

@@ -70,6 +70,13 @@ OF_THE_PAPER = (
     ("Sections 6.1 and 6.3", "1.5 Δt", ("timestep", "delta-over-deploy-dt-multiplier.png"),
      ("figures", "cake-settings.png"), ("figures", "metal-settings.png")),
 )  # fmt: skip
+#: Charts that the list shows below the main one of each report that has them, and what they show.
+FURTHER = {
+    "error-map.png": "Displacement error of held-out cases in the plane of both parameters: a panel for each "
+    "method, the best first, with the training cases as grey crosses.",
+    "error-over-cost.png": "Displacement error over the time for one full-order Δt, for each solver of a "
+    "scene; horizontal lines are rivals that take no step.",
+}
 _CHART = {"file": "delta.png", "caption": "Mean δ, each value, and the paper's."}  # of reports that name none
 _REBUILD = "build it again with `nsf report`"
 
@@ -161,8 +168,8 @@ def _section(folder: Path, told: dict) -> dict:
     if listed := told.get("listed"):
         table = Rows(listed["headings"], listed["body"], listed["numeric"])
         kept = {"title": told["title"], "lead": told["question"], "paper": told.get("paper"), "finer": None}
-        chart = {"alt": told["title"]} | told["chart"] if told.get("chart") else None
-        return kept | {"table": table, "said": listed["said"], "chart": chart, "made": listed["made"]}
+        charts = [{"alt": told["title"]} | told["chart"]] if told.get("chart") else []
+        return kept | {"table": table, "said": listed["said"], "charts": charts, "made": listed["made"]}
     report = Report(folder, told)
     table, said = headline(report)
     chart = told.get("chart") or _CHART
@@ -173,7 +180,14 @@ def _section(folder: Path, told: dict) -> dict:
         "table": table,
         "said": said,
         "finer": fine_means(folder) if (folder / "superresolution.csv").is_file() else None,
-        "chart": {"alt": told["title"]} | chart if chart["file"] in told["files"] else None,
+        "charts": [
+            *([{"alt": told["title"]} | chart] if chart["file"] in told["files"] else []),
+            *(
+                {"alt": shows, "file": file, "caption": shows}
+                for file, shows in FURTHER.items()
+                if file in told["files"] and file != chart["file"]
+            ),
+        ],
         "made": _made(report),
     }
 
@@ -200,13 +214,13 @@ def _bench_section(folder: Path) -> dict:
     page = (folder / LIST).read_text(encoding="utf-8")
     title, lead = map(unescaped, page.split("\n\n")[:2])
     charts = re.findall(r"^!\[(.*)\]\(([\w-]+\.png)\)$", page, re.MULTILINE)
-    chart = [{"alt": unescaped(alt), "file": file, "caption": unescaped(alt)} for alt, file in charts[:1]]
+    shown = [{"alt": unescaped(alt), "file": file, "caption": unescaped(alt)} for alt, file in charts[:1]]
     rows = pd.read_csv(folder / "results.csv")
     devices, commits = (", ".join(sorted(rows[name].astype(str).unique())) for name in ("device", "commit"))
     return {
         "title": title.removeprefix("# "),
         "lead": lead,
-        "chart": chart[0] if chart else None,
+        "charts": shown,
         "made": f"{len(rows)} rows on {devices}, {commits}.",
     } | dict.fromkeys(("paper", "table", "said", "finer"))
 

@@ -13,12 +13,21 @@ from nsf.reporting.drawing import charts, shapes
 from nsf.reporting.drawing.style import DIFFERENCE_COLORS, STRESS_COLORS, save
 from nsf.reporting.keeping import Kept
 from nsf.reporting.rivals import over_cost
+from nsf.reporting.sections.cases import cases_section
 from nsf.reporting.sections.levels import lend_stages, levels_section
 from nsf.reporting.sections.settings import settings_section
 from nsf.reporting.sections.variant import ENDS, ROWS, Variant, order
 from nsf.reporting.sources import Study
 from nsf.reporting.study import SEEDS
-from nsf.reporting.tables import Merged, mean_rows, natural, printed_of, variant_labels, variants
+from nsf.reporting.tables import (
+    Merged,
+    first_rows,
+    mean_rows,
+    natural,
+    printed_of,
+    variant_labels,
+    variants,
+)
 from nsf.reporting.text.columns import MEASURED, parameter_text
 from nsf.reporting.text.formats import file_name
 from nsf.reporting.text.page import Picture, Section
@@ -51,8 +60,9 @@ def draw(
         kept: pictures of the report before this one, which stand where they would be drawn the same.
     """
     groups = variants(merged)
-    labels = variant_labels([merged.frame.iloc[members[0]].to_dict() for members in groups])
-    known = [Variant(merged, members, label) for members, label in zip(groups, labels, strict=True)]
+    first = first_rows(merged)
+    own = zip(groups, variant_labels(first), first, strict=True)
+    known = [Variant(merged, members, label, row["scene"]) for members, label, row in own]
     lend_stages(known)
     shown = _best(known, by_method=not sweep)
     drawn = _of_variants(shown, known, folder, not sweep, kept)
@@ -64,12 +74,13 @@ def draw(
         *sections,
         *(settings_section(known, folder, study) if sweep and study else []),
         *levels_section(known, folder),
+        *cases_section([alike for _, alike in _over_seeds(known, study)], folder),
         Section("All variants" if len(known) > 1 else "Error and cost", _comparison(known, folder, study)),
     ]
 
 
 def _best(known: list[Variant], by_method: bool) -> list[Variant]:
-    """Of variants of one scene, and method, that of the smallest mean held-out δ: all would drown a page.
+    """Of variants of one body and method that of the smallest mean held-out δ: all would drown a page.
 
     One that the full-order solver ends shows that solver, and is taken only where there is no other.
     """
@@ -294,15 +305,15 @@ def _over_seeds(known: list[Variant], study: Study | None) -> list[tuple[str, li
 
 
 def _heading(v: Variant) -> str:
-    return v.label if v.label.startswith(v.scene) else f"{v.scene} · {v.label}"
+    return v.label if v.label.startswith(v.body) else f"{v.body} · {v.label}"
 
 
 def _prefixes(shown: list[Variant]) -> list[str]:
     """File name heads that tell the variants of a report apart; none where there is one variant."""
     if len(shown) == 1:
         return [""]
-    scenes = len({v.scene for v in shown}) > 1
-    heads = [file_name(f"{v.scene}-{v.method}-" if scenes else f"{v.method}-") for v in shown]
+    several = len({v.body for v in shown}) > 1
+    heads = [file_name(f"{v.body}-{v.method}-" if several else f"{v.method}-") for v in shown]
     return heads if len(set(heads)) == len(heads) else [f"{i}-{head}" for i, head in enumerate(heads)]
 
 

@@ -12,6 +12,7 @@ from nsf.reporting.study import SEEDS
 from nsf.reporting.tables import (
     VARIANT,
     Merged,
+    first_rows,
     mean_rows,
     rows_of,
     variant_labels,
@@ -40,20 +41,25 @@ _BESIDE = (
 
 
 def solvers(merged: Merged) -> pd.DataFrame:
-    """A row a scene and solver: errors (fractions), times [ms] and memory [MiB]; NaN where not measured.
+    """A row a body and solver: errors (fractions), times [ms] and memory [MiB]; NaN where not measured.
 
-    A variant stands once, with the means of its held-out values; the full-order solver, and each coarse one,
-    once for each precision and type of device. `span_ms` is the time for one Δt of the full-order solver:
-    a solver of longer steps takes fewer. `kind` is `full`, `coarse` or `reduced`.
+    A body is the `scene` of `first_rows`. A variant stands once, with the means of its held-out values; the
+    full-order solver, and each coarse one, once for each precision and type of device. `span_ms` is the time
+    for one Δt of the full-order solver: a solver of longer steps takes fewer. `kind` is `full`, `coarse` or
+    `reduced`.
     """
     groups = variants(merged)
-    rows = [merged.frame.iloc[members[0]].to_dict() for members in groups]
+    rows = first_rows(merged)
     labels = variant_labels([row | dict.fromkeys(_PLACE, "") for row in rows])
     places: dict[tuple, list[tuple[list[int], str]]] = {}
     for row, members, label in zip(rows, groups, labels, strict=True):
         place = (row["scene"], row["precision"], device_type(row["device"]))
         places.setdefault(place, []).append((members, label))
-    rows = [row for own in places.values() for row in _of_place(merged, *zip(*own, strict=True))]
+    rows = [
+        row | {"scene": place[0]}
+        for place, own in places.items()
+        for row in _of_place(merged, *zip(*own, strict=True))
+    ]
     return pd.DataFrame(rows)
 
 
@@ -190,7 +196,8 @@ def over_cost(merged: Merged, folder: Path, runs: list[str]) -> list[Picture]:
     reduced = frame["kind"] == "reduced"
     frame.loc[reduced, SOLVER] = _common_names(frame.loc[reduced, SOLVER], names[reduced])
     panels = {name: part.to_dict("records") for name, part in frame.groupby(names, sort=False)}
-    means = pd.DataFrame([mean_rows(merged, members)[0] for members in variants(merged)])
+    own = zip(variants(merged), first_rows(merged), strict=True)
+    means = pd.DataFrame([mean_rows(merged, members)[0] | {"scene": row["scene"]} for members, row in own])
     least = means.groupby("scene")[list(RIVALS)].min()  # of nearest and interpolated, the best field's
     costless = {name: COLUMN[name].title for name in RIVALS[:3]}
     free = {

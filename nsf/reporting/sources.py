@@ -12,6 +12,7 @@ there is none.
 import hashlib
 import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -20,9 +21,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from nsf.errors import MissingRunError, SchemaError
+from nsf.errors import MissingRunError, NSFError, SchemaError
 from nsf.reporting.keeping import FILES
 from nsf.reporting.text.columns import COLUMNS, LATER, TEXT
+from nsf.runs import Run
 
 _FRAMES = ("parameters", "splits", "t", "x_full", "x_reduced", "stress_full", "stress_reduced")
 _AROUND = (
@@ -95,6 +97,44 @@ class Source:
         Such jobs go side by side, and their trainings tell nothing of what one costs.
         """
         return self.summary.get("training_seconds") if self.cost.get("trials") else None
+
+    @cached_property
+    def material(self) -> str:
+        """The name of the material it is deployed with; empty where the deploy run is not there."""
+        material = self._deployed.config.get("material") if self._deployed else None
+        target = str(material.get("_target_", "")) if isinstance(material, Mapping) else ""
+        return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", target.rpartition(".")[2]).lower()
+
+    @cached_property
+    def logarithmic(self) -> set[str]:
+        """Names of the parameters that the design draws evenly in their logarithm, as far as it is known."""
+        from nsf import config  # 0.3 s that most reports need not pay
+
+        if self._deployed is None:
+            return set()
+        try:
+            scene = config.read(self._deployed.file("configuration.yaml")).get("scene")
+            parameters = scene.get("parameters") if isinstance(scene, Mapping) else None
+        except NSFError:  # of an older nsf
+            return set()
+        found = parameters.items() if isinstance(parameters, Mapping) else ()
+        return {str(name) for name, one in found if isinstance(one, Mapping) and one.get("log") is True}
+
+    @cached_property
+    def training_cases(self) -> list[dict[str, float]]:
+        """The values of the parameters in each case that was trained on, as far as the runs are there."""
+        trained = _whole(self._deployed, "train") if self._deployed else []
+        told = [run.config.get("parameters") for train in trained for run in _whole(train, "simulate")]
+        cases = [
+            {name: one.get("value") for name, one in parameters.items() if isinstance(one, Mapping)}
+            for parameters in told
+            if isinstance(parameters, Mapping)
+        ]
+        return [case for case in cases if all(isinstance(value, int | float) for value in case.values())]
+
+    @cached_property
+    def _deployed(self) -> Run | None:
+        return next(iter(_whole(self.run, "deploy")), None)
 
     @cached_property
     def series(self) -> pd.DataFrame:
@@ -175,6 +215,12 @@ def open_sources(evaluate_runs, first=None) -> list[Source]:
         )
     chosen = first.id if first else None
     return sorted(sources, key=lambda s: (s.id == chosen, s.created, s.id), reverse=True)
+
+
+def _whole(run: Run, stage: str) -> list[Run]:
+    """The runs of a stage that a run was made from, those that are there and whose configuration is whole."""
+    found = [parent for parent in run.parent_runs if parent.stage == stage]
+    return [parent for parent in found if parent.manifest and not parent.fault]
 
 
 def same_parameter(a, b) -> bool:

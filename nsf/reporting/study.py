@@ -11,7 +11,7 @@ import pandas as pd
 from nsf.reporting.drawing import charts
 from nsf.reporting.drawing.style import save
 from nsf.reporting.sources import Source, Study, checked_hash
-from nsf.reporting.tables import Merged, paper_row, printed_of, rows_of, variant_labels, variants
+from nsf.reporting.tables import Merged, first_rows, paper_row, printed_of, rows_of, variant_labels, variants
 from nsf.reporting.text.columns import COLUMN, Column, axis, number, parameter_text, plus_minus
 from nsf.reporting.text.formats import Rows, file_name, spreadsheet
 from nsf.reporting.text.page import Picture, Section, Table
@@ -83,11 +83,16 @@ def swept(merged: Merged, study: Study, folder: Path) -> list[Section]:
 
 
 def _held_out(merged: Merged, study: Study) -> pd.DataFrame:
-    """One row a job and held-out value: the job's keys, its run, δ, the paper's, and the row of `merged`."""
-    printed = {i: printed_of(merged, members, study) for members in variants(merged) for i in members}
+    """One row a job and held-out value: the job's keys, its run, δ, the paper's, and the row of `merged`.
+
+    The scene is that of `first_rows`, with its material where there are several.
+    """
+    groups = list(zip(variants(merged), first_rows(merged), strict=True))
+    printed = {i: printed_of(merged, members, study) for members, _ in groups for i in members}
+    body = {i: first["scene"] for members, first in groups for i in members}
     rows = [
-        {_SCENE: row["scene"]}
-        | study.keys.get(source.id, {})
+        {_SCENE: body[i]}
+        | {key: value for key, value in study.keys.get(source.id, {}).items() if key != _SCENE}
         | {_RUN: source.id, "delta": row["delta"], _PAPER: printed[i], "row": i}
         for i, (row, source) in enumerate(zip(merged.frame.to_dict("records"), merged.source, strict=True))
         if row["split"] != "train"

@@ -130,6 +130,28 @@ def variants(merged: Merged) -> list[list[int]]:
     return list(groups.values())
 
 
+def first_rows(merged: Merged) -> list[dict]:
+    """The first row of each variant, whose `scene` has the material beside it where there are several.
+
+    This is a body: `block · von_mises`. Its `setting` does not tell the material again.
+    """
+    own = [(merged.frame.iloc[i].to_dict(), merged.source[i].material) for i, *_ in variants(merged)]
+    materials: dict[str, set[str]] = {}
+    for row, material in own:
+        materials.setdefault(row["scene"], set()).add(material)
+    return [
+        row | {"scene": f"{row['scene']} · {material}", SETTING: setting_without(row[SETTING], ["material"])}
+        if material and len(materials[row["scene"]]) > 1
+        else row
+        for row, material in own
+    ]
+
+
+def setting_without(setting: str, keys: Sequence[str]) -> str:
+    """A setting without what it tells of some keys."""
+    return ", ".join(part for part in setting.split(", ") if part.partition("=")[0] not in keys)
+
+
 def means(merged: Merged, study: Study | None = None) -> pd.DataFrame:
     """Mean over parameter values, a row a variant and split; the paper's figures follow those of its method.
 
@@ -310,9 +332,13 @@ def told_apart(sources: Sequence[Source]) -> dict[str, str]:
         keys = [key for key in keys if not key.startswith(_PASSING)]
         chosen = [group for group in _GROUPS if group in keys]
         keys = [key for key in keys if key in chosen or not _said(key, chosen, entries)][:_MOST]
-        for entry in entries if keys else ():
-            told = [f"{key}={cell(entry, key)}" for key in sorted(keys, key=_rank)]
-            found[entry.run.id] = ", ".join(told)
+        # Keys of a law that others lack do not differ, and the class of one is no key.
+        several = len({source.material for source in own}) > 1
+        for source, entry in zip(own, entries, strict=True):
+            told = [f"material={source.material}"] if several else []
+            told += [f"{key}={cell(entry, key)}" for key in sorted(keys, key=_rank)]
+            if told:
+                found[entry.run.id] = ", ".join(told)
     return found
 
 

@@ -55,7 +55,7 @@ def error_over_time(
                     **line_style(i),
                 )
             panel.set(xlabel="time t [s]", ylabel=f"{OVER_TIME.get(column, column)} [%]")
-            _error_scale(panel, 100 * series[column])
+            error_scale(panel, 100 * series[column])
             # The whole time span, where runs diverged early too.
             panel.set_xlim(-0.01 * series["t"].max(), 1.01 * series["t"].max())
             panel.xaxis.set_major_locator(MaxNLocator(5))  # three panels have no room for more
@@ -128,7 +128,7 @@ def reconstruction_and_rollout(series: pd.DataFrame, name: str = "parameter", un
         panel.plot(at, high, "o", ms=8, color=REDUCED, label="rollout: reduced dynamics")
         panel.set_xticks(at, [f"{parameter_text(value)}\n{part['split'].iloc[0]}" for value, part in groups])
         panel.set(xlabel=axis(name, unit), ylabel="RMS over frames of δ [%]", xlim=(-0.5, len(groups) - 0.5))
-        _error_scale(panel, np.concatenate([low, high]))
+        error_scale(panel, np.concatenate([low, high]))
         _legend_above(fig, panel, None)
     return fig
 
@@ -212,7 +212,7 @@ def delta_over(
                 every.append(100 * delta)
                 known.add(value)
             panel.set(title=scene, xlabel=x, ylabel="δ [%]")
-            _error_scale(panel, every)
+            error_scale(panel, every)
         if max(known) > 10 * min(known):
             drawn[0].set_xscale("log")
             plain_ticks(drawn[0].xaxis)
@@ -244,7 +244,7 @@ def _rms(values) -> float:
     return float(np.sqrt(np.nanmean(values**2)))
 
 
-def _error_scale(panel, values) -> None:
+def error_scale(panel, values) -> None:
     """Logarithmic once the errors span more than a factor of 30, else linear from zero; to `LOST` at most."""
     values = np.asarray(values, float)
     values = np.minimum(values[np.isfinite(values) & (values > 0)], LOST)

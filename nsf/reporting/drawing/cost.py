@@ -26,7 +26,7 @@ def error_over_cost(
         free: by scene, the errors (fractions) of what costs nothing, by name: horizontal lines.
     """
     reduced = dict.fromkeys(s["solver"] for of in panels.values() for s in of if s["kind"] == "reduced")
-    colors = _colors(list(reduced))
+    colors = solver_colors(list(reduced))
     names = list(dict.fromkeys(name for of in free.values() for name in of))
     rows = math.ceil(len(panels) / _ACROSS)
     with styled():
@@ -52,7 +52,7 @@ def error_over_cost(
     return fig
 
 
-def _colors(names: Sequence[str]) -> dict[str, str]:
+def solver_colors(names: Sequence[str]) -> dict[str, str]:
     """A colour for each reduced solver: operators and projected steps have those of the charts of levels."""
     known = {
         next((n for n in names if "operators" in n), None): LEVELS["operators"],

@@ -9,6 +9,7 @@ from nsf.reporting.drawing.style import save
 from nsf.reporting.sections.variant import Variant
 from nsf.reporting.study import SEEDS
 from nsf.reporting.text.columns import parameter_text
+from nsf.reporting.text.formats import file_name
 from nsf.reporting.text.page import Picture, Section
 
 #: Columns that variants have in common whose steps are the same but for the engine.
@@ -16,15 +17,15 @@ _ALIKE = ("method", "field", "r", "precision", "device")
 
 
 def levels_section(known: Sequence[Variant], folder: Path) -> list[Section]:
-    """A picture a scene in which a run had more than one level, at the first such value; none without one.
+    """A picture a body in which a run had more than one level, at the first such value; none without one.
 
     Args:
         known: the variants of the report.
         folder: of the report.
     """
     pictures = []
-    for scene in dict.fromkeys(variant.scene for variant in known):
-        own = [variant for variant in known if variant.scene == scene]
+    for body in dict.fromkeys(variant.body for variant in known):
+        own = [variant for variant in known if variant.body == body]
         series = [variant.series(held_out_only=True) for variant in own]
         mixed = [
             part["parameter"].iloc[0]
@@ -51,7 +52,8 @@ def levels_section(known: Sequence[Variant], folder: Path) -> list[Section]:
             "each step: the operators; the projected step, where the estimated error passed its tolerance or "
             "the run was not to be believed; and the operators again, where they are well."
         )
-        stem = "levels" if len({variant.scene for variant in known}) == 1 else f"{scene}-levels"
+        alone = len({variant.body for variant in known}) == 1
+        stem = "levels" if alone else file_name(f"{body}-levels")
         pictures.append(Picture(save(levels_over_time(shown), folder, stem), caption, sorted(runs)))
     return [Section("Who took the steps", pictures)] if pictures else []
 

@@ -21,7 +21,7 @@ Setting = tuple[tuple[str, str], ...]  # keys and values
 
 
 def settings_section(known: Sequence[Variant], folder: Path, study: Study) -> list[Section]:
-    """The last frame of one held-out case of each scene at its settings; variants without it are left out.
+    """The last frame of one held-out case of each body at its settings; variants without it are left out.
 
     Args:
         known: the variants of the report.
@@ -29,13 +29,13 @@ def settings_section(known: Sequence[Variant], folder: Path, study: Study) -> li
         study: what the sweep varies.
     """
     pictures = []
-    for scene in dict.fromkeys(v.scene for v in known):
-        settings = _by_setting([v for v in known if v.scene == scene and v.method == "nsf"], study)
+    for body in dict.fromkeys(v.body for v in known):
+        settings = _by_setting([v for v in known if v.body == body and v.method == "nsf"], study)
         if len(rows := _rows(settings)) > 1:
             first = next(iter(settings.values()))
             drawn = save(
                 shapes.final_shapes(rows, *first.parameter),
-                folder, file_name(f"{scene}-settings"), ("png",), [STRESS_COLORS, DIFFERENCE_COLORS],
+                folder, file_name(f"{body}-settings"), ("png",), [STRESS_COLORS, DIFFERENCE_COLORS],
             )  # fmt: skip
             pictures.append(Picture(drawn, _TOLD, sorted({run for v in settings.values() for run in v.runs})))
     return [Section("Bodies at each setting", pictures)] if pictures else []

@@ -23,6 +23,7 @@ class Variant:
     Attributes:
         merged: all rows of the report; members: which are this variant's.
         label: its name beside others.
+        body: the scene, with the material beside it where the report has the scene with several.
         rows, sources: of the members, in one order; runs: their ids.
         scene, method, parameter: of all of them; parameter is name and unit.
         summary: of the newest run; breakdown: its time by stage, and timed: whose time that is. `lend_stages`
@@ -33,6 +34,7 @@ class Variant:
     merged: Merged
     members: list[int]
     label: str
+    body: str = ""
 
     def __post_init__(self):
         self.rows = self.merged.frame.iloc[self.members]
@@ -42,6 +44,7 @@ class Variant:
         self.timed = "a step's"  # whose time the breakdown is
         self.parameter = newest.parameter
         self.scene, self.method = self.rows["scene"].iloc[0], self.rows["method"].iloc[0]
+        self.body = self.body or self.scene
         splits = set(self.rows["split"])
         self.held_out = next((s for s in ("test", "validation") if s in splits), self.rows["split"].iloc[0])
         shown = self.rows["split"] == self.held_out
@@ -115,8 +118,8 @@ class Variant:
 
     @property
     def alike(self) -> tuple[str, ...]:
-        """What it is deployed on: the scene, and what was changed in it after training."""
-        return self.scene, str(self.summary.get("changes") or "")
+        """What it is deployed on: the scene and material, and what was changed in it after training."""
+        return self.body, str(self.summary.get("changes") or "")
 
 
 def order(v: Variant) -> tuple[bool, float]:

@@ -37,6 +37,21 @@ def test_texts_of_a_case():
     assert two(1500, 0.3).column == "E=1500 Pa, friction=0.3"
 
 
+@pytest.mark.parametrize(
+    "case", [one(-26.5), two(1.5e7, 3e-5), Case(("tilt", "v"), (5, 2), ("°", "m/s, up"))]
+)
+def test_a_case_is_read_from_its_text(case):
+    read = Case.read(case.named)
+    assert read == case
+    assert read.units == tuple(unit.strip("-") for unit in case.units)
+
+
+@pytest.mark.parametrize("text", ["", "26", "E=", "E=warm", "E=1500Pa", "E=1, 2=3", "E=1e999", "<E>=1"])
+def test_text_that_is_no_case_is_refused(text):
+    with pytest.raises(ConfigError):
+        Case.read(text)
+
+
 @pytest.mark.parametrize("numbers", [(math.nan,), ("warm",), (1.0, 2.0), ()])
 def test_a_case_has_a_finite_number_for_each_name(numbers):
     with pytest.raises(ConfigError):

@@ -44,12 +44,12 @@ class Made:
     rivals: bool = False  # whether it was held to them
 
 
-def write_run(root: Path, made: Made, **config) -> Run:
+def write_run(root: Path, made: Made, parents=(), **config) -> Run:
     """Record one evaluate run under root, with the date, code and state that `made` asks for.
 
-    `config` is more of its configuration.
+    `parents` are the runs that it is made from, `config` is more of its configuration.
     """
-    run = Run.open(stage="evaluate", scene=made.scene, config=asdict(made) | config, root=root)
+    run = Run.open("evaluate", made.scene, asdict(made) | config, parents, root)
     with run.record(device=made.device, seed=made.seed, precision="fp64") as record:
         write_payload(run.path, made)
         for name in FILES:

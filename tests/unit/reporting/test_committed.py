@@ -101,6 +101,22 @@ def test_the_paper_the_chart_and_what_is_missing(tmp_path):
     assert "∞: 1 of the 2 reduced runs diverged." in text
 
 
+def test_maps_and_errors_over_cost_stand_below_the_main_chart(tmp_path):
+    folder = write_report(tmp_path / "forcing", [job()], chart="delta.png")
+    told = json.loads((folder / "sources.json").read_text())
+    assert "error-map" not in committed.write_list(tmp_path).read_text()
+    for name in ("error-over-cost.png", "error-map.png"):
+        told["files"][name] = ""
+    (folder / "sources.json").write_text(json.dumps(told))
+    text = committed.write_list(tmp_path).read_text()
+    shown = [re.escape(f"![{committed.FURTHER[name]}](forcing/{name})") for name in committed.FURTHER]
+    places = [re.search(mark, text).start() for mark in (r"!\[Forcing\]\(forcing/delta.png\)", *shown)]
+    assert places == sorted(places)
+    told["chart"]["file"] = "error-map.png"
+    (folder / "sources.json").write_text(json.dumps(told))
+    assert committed.write_list(tmp_path).read_text().count("](forcing/error-map.png)") == 1
+
+
 def test_a_report_of_before_these_keys_is_listed(tmp_path):
     """Such as tell neither paper, scale, keys, chart nor what is missing."""
     folder = write_report(tmp_path / "table1", [job(), job("bread")], chart="delta.png")

@@ -23,7 +23,7 @@ def series_of(*by: int, parameter: float = 0.6) -> pd.DataFrame:
 def variant(label, *series, scene="jelly_cube"):
     rows = pd.concat(series)
     return SimpleNamespace(
-        scene=scene, label=label, parameter=("speed", "m/s"), runs=[f"evaluate/{label}"],
+        scene=scene, body=scene, label=label, parameter=("speed", "m/s"), runs=[f"evaluate/{label}"],
         series=lambda held_out_only: rows,
     )  # fmt: skip
 
