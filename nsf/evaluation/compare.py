@@ -9,7 +9,7 @@ import torch
 
 from nsf.data import Trajectory
 from nsf.deployment import FULL_ORDER, Rollout
-from nsf.dynamics import Decoder, ReducedMPM
+from nsf.dynamics import Decoder, History, ReducedMPM
 from nsf.dynamics.setup import Setup
 from nsf.errors import SchemaError
 from nsf.evaluation import metrics
@@ -88,7 +88,8 @@ def compare(
     """Errors of a rollout against the trajectory of the same case.
 
     Args:
-        solver: the reduced solver of the rollout: it says what the method takes τ and C from.
+        solver: the reduced solver of the rollout: it says what the method takes τ and C from. Where particles
+            carried them, it takes the run once more.
         trajectory: the full-order run.
         rollout: the reduced run.
         split: `test`, `validation` or `train`.
@@ -137,13 +138,14 @@ def compare(
         for name, value in values.items():
             rows.setdefault(name, []).append(value.cpu())
 
+    carried = _Carried(solver) if _carries(solver, rollout, trajectory) else None
     previous = decoder.position(xhat[0])
     per_chunk = max(1, _CHUNK // (9 * trajectory.particles))
     for start in range(0, frames, per_chunk):
         block = slice(start, min(start + per_chunk, frames))
         x, tau, C, v = (tensor(trajectory.read(name, frames=block)) for name in ("x", "tau", "C", "v"))
         C = C.view(*C.shape[:2], 3, 3)
-        x_rom, C_rom, tau_rom = _reduced_fields(decoder, xhat[:own], rate[:own], continuation, block)
+        x_rom, C_rom, tau_rom = _reduced_fields(decoder, xhat[:own], rate[:own], continuation, block, carried)
         v_rom = torch.diff(torch.cat([previous[None], x_rom]), dim=0) / trajectory.dt
         if start == 0:
             v_rom[0] = v[0]
@@ -270,6 +272,7 @@ def _reduced_fields(
     rate: torch.Tensor,
     continuation: Trajectory | None,
     frames: slice,
+    carried: "_Carried | None",
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     """x [F, P, 3] [m], C [F, P, 3, 3] [1/s] and τ [F, P, 6] [Pa] of some frames of a reduced run.
 
@@ -277,18 +280,51 @@ def _reduced_fields(
         decoder: the fields at every particle.
         xhat, rate: [own, r] x̂ and dx̂/dt of the frames up to the hand-over; the later frames are read.
         continuation: full-order frames, of which the first is the last of `xhat`.
-        frames: which, of the whole run.
+        frames: which, of the whole run; those before them were asked for already.
+        carried: gives τ and C in place of the fields.
     """
     own, parts = len(xhat), []
     latent, its_rate = (values[frames.start : frames.stop] for values in (xhat, rate))
     if len(latent):
-        tau = decoder.stress(latent)[..., _UPPER[0], _UPPER[1]]
-        parts.append((decoder.position(latent), decoder.affine(latent, its_rate), tau))
+        if carried is None:
+            C, tau = decoder.affine(latent, its_rate), decoder.stress(latent)
+        else:
+            C, tau = carried.next(len(latent))
+        parts.append((decoder.position(latent), C, tau[..., _UPPER[0], _UPPER[1]]))
     if frames.stop > own:
         since = slice(max(frames.start, own) - own + 1, frames.stop - own + 1)
         x, C, tau = (torch.as_tensor(continuation.read(k, frames=since)).to(xhat) for k in ("x", "C", "tau"))
         parts.append((x, C.unflatten(2, (3, 3)), tau))
     return tuple(torch.cat(fields) for fields in zip(*parts, strict=True))
+
+
+def _carries(solver: ReducedMPM, rollout: Rollout, trajectory: Trajectory) -> bool:
+    """Whether the solver takes the steps of the rollout itself, and its particles carry their stress."""
+    own = not solver.span.latent_only and rollout.handed_over < 0 and rollout.diverged < 0
+    return isinstance(solver.setup.method, History) and own and solver.dt == trajectory.dt
+
+
+class _Carried:
+    """τ and C that particles carry along a run, frame by frame from t = 0 on.
+
+    Args:
+        solver: takes the run's steps once more.
+    """
+
+    def __init__(self, solver: ReducedMPM):
+        solver.restart()
+        self._solver, self._first = solver, True
+
+    def next(self, frames: int) -> tuple[torch.Tensor, torch.Tensor]:
+        """C [F, P, 3, 3] [1/s] and τ [F, P, 3, 3] [Pa] of the next frames."""
+        found = []
+        for _ in range(frames):
+            if not self._first:
+                self._solver.step()
+            self._first, span = False, self._solver.span
+            order = torch.as_tensor(span.order, device=span.tau.device)
+            found.append([torch.empty_like(a).index_copy_(0, order, a) for a in (span.C, span.tau)])
+        return tuple(torch.stack(values) for values in zip(*found, strict=True))
 
 
 def _roles(setup: Setup, x: torch.Tensor, sample: np.ndarray) -> np.ndarray:

@@ -11,7 +11,7 @@ from angles import angle
 import nsf.scenes
 from nsf.data import Trajectory
 from nsf.deployment import FULL_ORDER, OPERATORS, PROJECTED, Rollout, go_on
-from nsf.dynamics import Method
+from nsf.dynamics import History, Method
 from nsf.errors import InstabilityError, SchemaError
 from nsf.evaluation import at_frames, compare, metrics
 from nsf.evaluation.compare import _shown, levels_at_frames, trust_at_frames
@@ -249,6 +249,32 @@ def test_a_method_is_held_to_the_stress_and_affine_momentum_it_used(
     assert baseline.delta == pytest.approx(neural.delta, rel=1e-12)
     errors = [c.series["angular_momentum_error"].max() for c in (neural, baseline)]
     assert errors[0] != pytest.approx(errors[1], rel=1e-6)
+
+
+def test_stress_that_particles_carried_is_what_counts(chain, tiny_manifold, truth):
+    """With `method=history`, in chunks of any length, though the fields say otherwise."""
+    method = History("history", neural_stress=True, neural_affine=True)
+
+    def solver():
+        options = {"method": method, "device": "cpu"}
+        return chain.scene.reduced(tiny_manifold, {"friction_angle": 26.0}, 20, **options)
+
+    run, carried = solver(), []
+    for _ in range(len(truth.t) - 1):
+        run.step()
+        tau = np.empty((len(run.state), 3, 3))
+        tau[run.span.order] = run.span.tau.numpy()
+        carried.append(tau[:, [0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2]])
+    rollout = rollout_of(truth.t, run.record.xhat.numpy().copy())
+    full = truth.read("tau").astype(float)
+    expected = metrics.stress_error(torch.tensor(np.stack(carried)), torch.tensor(full[1:]))
+    found = compare(solver(), truth, rollout, "test", (50, 4))
+    assert found.stress_error == pytest.approx(expected, rel=1e-9)
+    plain = chain.scene.reduced(tiny_manifold, {"friction_angle": 26.0}, 20, device="cpu")
+    decoded = compare(plain, truth, rollout, "test", (50, 4))
+    assert found.stress_error != pytest.approx(decoded.stress_error, rel=1e-2)
+    assert found.delta == pytest.approx(decoded.delta, rel=1e-12)
+    assert found.series["stress_error"].isna().iloc[0]  # nothing is loaded at t = 0
 
 
 def test_other_particles_are_refused(chain, tiny, tiny_manifold, made, tmp_path):
