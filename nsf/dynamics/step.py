@@ -17,6 +17,7 @@ from nsf.dynamics.integration import ParticleSets
 from nsf.dynamics.interop import as_scalars
 from nsf.dynamics.methods import History
 from nsf.dynamics.span import GridSpan, Stages
+from nsf.mpm import stressed
 from nsf.mpm.transfer import make_g2p_stress
 from nsf.sampling.sampler import SampleSpan
 
@@ -185,9 +186,9 @@ class HistoryStep(Step):
         one, xhat = self.batch.shared, self.record.now
         material, n = one.scene.material, len(self.x)
         if first:
-            self.tau.zero_()
             self.C.zero_()
-            F_e, history = np.tile(np.eye(3), (n, 1, 1)), material.initial_history(n)
+            tau, F_e = np.zeros((n, 3, 3)), np.tile(np.eye(3), (n, 1, 1))
+            carried = {"tau": tau, "F_e": F_e, "history": material.initial_history(n)}
         else:  # in the midst of a run, of which x̂ alone is known
             rate = (xhat - self.record.before) / one.dt
             C = self.inference.affine(xhat, rate)
@@ -195,11 +196,10 @@ class HistoryStep(Step):
             tau = self.inference.stress(xhat).double().cpu().numpy()
             tau = np.nan_to_num(0.5 * (tau + tau.transpose(0, 2, 1)), nan=0.0, posinf=0.0, neginf=0.0)
             moduli = self.mu.double().cpu().numpy(), self.lam.double().cpu().numpy()
-            tau *= material.carried_share(tau, *moduli)[:, None, None]
-            self.tau.copy_(torch.as_tensor(tau))
-            F_e, history = material.stretch_of(tau, *moduli), material.history_of(tau)
-        self._F_e.assign(F_e)
-        self._history.assign(history)
+            carried, _ = stressed(material, tau, *moduli)
+        self.tau.copy_(torch.as_tensor(carried["tau"]))
+        self._F_e.assign(carried["F_e"])
+        self._history.assign(carried["history"])
 
     @property
     @override

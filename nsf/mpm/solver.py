@@ -24,6 +24,7 @@ from nsf.mpm.transfer import Transfer, make_g2p_stress
 from nsf.timing import StageTimer
 
 _NEVER = 2**31 - 1
+_OFF_THE_EDGE = 1e-2  # of a stress
 
 
 class State(Protocol):
@@ -216,14 +217,11 @@ class FullOrderMPM:
             InstabilityError: Δt is too long for v, or a particle is non-finite or off the grid.
         """
         check_time_step(self.constants, v, self.grid.geometry.dx, self.dt)
-        tau, moduli = np.asarray(tau, np.float64), (self.constants.mu, self.constants.lam)
+        tau = np.asarray(tau, np.float64)
         if not np.isfinite(tau).all():
             raise InstabilityError(f"the stress to resume from at step {steps} is not finite")
-        share = self.material.carried_share(tau, *moduli)
-        self.beyond_law = int((share < 1.0).sum())
-        tau = share[:, None, None] * tau
-        F_e = self.material.stretch_of(tau, *moduli)
-        state = {"x": x, "v": v, "C": C, "F_e": F_e, "tau": tau, "history": self.material.history_of(tau)}
+        carried, self.beyond_law = stressed(self.material, tau, self.constants.mu, self.constants.lam)
+        state = {"x": x, "v": v, "C": C} | carried
         for name, values in state.items():
             getattr(self.state, name).assign(values)
         self.grid_step.forcing.start_from(steps)
@@ -365,6 +363,37 @@ class FullOrderMPM:
                 f"domain [0, {self.grid.geometry.upper}] m; "
                 f"enlarge the domain, add a boundary or reduce dt={self.dt:g} s"
             )
+
+
+def stressed(
+    material: Material, tau: np.ndarray, mu: np.ndarray, lam: np.ndarray
+) -> tuple[dict[str, np.ndarray], int]:
+    """What particles carry of which the stress alone is known.
+
+    Args:
+        material: the law.
+        tau: [P, 3, 3] symmetric Kirchhoff stress [Pa].
+        mu, lam: [P] Lamé parameters [Pa].
+
+    Returns:
+        tau, scaled down where it was beyond the law, F_e [P, 3, 3] that carries it, and history [P, H]; and
+        the number of particles whose stress was beyond the law.
+    """
+    share = material.carried_share(tau, mu, lam)
+    beyond = share < 1.0
+    tau = share[:, None, None] * tau
+    # At the edge of what the law carries round-off decides.
+    while (lost := _uncarried(material, tau, mu, lam)).any():
+        tau = np.where(lost, 1.0 - _OFF_THE_EDGE, 1.0)[:, None, None] * tau
+        beyond |= lost
+    carried = {"tau": tau, "F_e": material.stretch_of(tau, mu, lam), "history": material.history_of(tau)}
+    return carried, int(beyond.sum())
+
+
+def _uncarried(material: Material, tau: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
+    """[P] whether no deformation carries a stress, by the principal stresses that `stretch_of` takes."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return ~np.isfinite(material.stretches_of(np.linalg.eigh(tau)[0], mu, lam)).all(1)
 
 
 def diagnosed(
