@@ -116,8 +116,8 @@ class Levels:
         estimate = np.where(np.arange(N + 1) <= n, estimate, estimate[n])
         again = run.together.alone(run.index).runs[0]
         _copy(run, solver, 0, n)
+        _stand(solver, n)
         while n < N:
-            _stand(solver, n)
             block = min(self.every, N - n)
             solver.step(block)
             n += block
@@ -133,6 +133,8 @@ class Levels:
                 by[n : n + own] = OPERATORS
                 estimate[n : n + own], estimate[n + own :] = ahead[:own], ahead[own]
                 n += own
+            if n < N:  # looking ahead has moved the solver; with method=history its stress begins anew
+                _stand(solver, n)
         return estimate
 
     def _well(self, again: ReducedMPM, solver: ReducedMPM, n: int, estimate: float, trust: Trust) -> bool:

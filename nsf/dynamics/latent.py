@@ -116,7 +116,10 @@ class LatentState:
         return len(self._run.setup.constants)
 
     def numpy(self) -> dict[str, np.ndarray]:
-        """Every particle's x, v [P, 3], C, tau [P, 3, 3], as of the full-order state, and xhat [r]."""
+        """Every particle's x, v [P, 3], C, tau [P, 3, 3], as of the full-order state, and xhat [r].
+
+        C and tau are the fields', also where particles carry others (`History`).
+        """
         run = self._run
         decoder, now = run.decoder(), run.xhat[None]
         x = decoder.position(run.xhat)

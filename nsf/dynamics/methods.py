@@ -69,7 +69,7 @@ class History(Method):
     in its midst, and what a latent vector is decoded to.
 
     Not in the paper. Internal variables at the points of integration, with reduced kinematics, are those of
-    Ryckelynck 2009 (hyper-reduction of mechanical models with internal variables).
+    Ryckelynck 2009 (Hyper-reduction of mechanical models involving internal variables).
     """
 
 

@@ -126,8 +126,8 @@ class ReducedBatch:
     def resume(self, step: int) -> None:
         """Go on from the latent vectors of the record as the end of so many steps."""
         self.steps_taken = step
-        self._enter(self.span_at(step))
         with on_torch_stream(self.device):
+            self._enter(self.span_at(step))
             self.batch.forcing.start_from(step)
 
     def step(self, n: int = 1) -> None:

@@ -23,7 +23,7 @@ class Reference(Engine):
         if len(setups) > 1:
             return f"it evaluates fields for one run at a time, not {len(setups)}: set deploy.batch=1"
         if isinstance(setups[0].method, History) and len(setups[0].samples) > 1:
-            return "method=history carries what particles went through over one sample: set a sampler of one"
+            return "method=history takes one sample in a run: set sampler.phases=[]"
         return ""
 
     @override

@@ -89,7 +89,8 @@ def compare(
 
     Args:
         solver: the reduced solver of the rollout: it says what the method takes τ and C from. Where particles
-            carried them, it takes the run once more.
+            carried them, in a run of its own steps at the scene's Δt to the end, it takes the run once more;
+            else the fields count.
         trajectory: the full-order run.
         rollout: the reduced run.
         split: `test`, `validation` or `train`.

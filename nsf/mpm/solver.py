@@ -370,6 +370,8 @@ def stressed(
 ) -> tuple[dict[str, np.ndarray], int]:
     """What particles carry of which the stress alone is known.
 
+    A stress beyond yield is kept; the first return map brings it back.
+
     Args:
         material: the law.
         tau: [P, 3, 3] symmetric Kirchhoff stress [Pa].
@@ -392,7 +394,7 @@ def stressed(
 
 def _uncarried(material: Material, tau: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
     """[P] whether no deformation carries a stress, by the principal stresses that `stretch_of` takes."""
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         return ~np.isfinite(material.stretches_of(np.linalg.eigh(tau)[0], mu, lam)).all(1)
 
 

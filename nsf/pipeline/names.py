@@ -89,7 +89,7 @@ class Names:
             one_of("engine.teacher", c.engine.teacher, TEACHERS)
             if self.teaching.memory and not self.of_runs:
                 raise ConfigError(
-                    f"engine.teaching.memory={list(self.teaching.memory)} is learned from full-order runs "
+                    f"engine.teaching.memory={list(self.teaching.memory)} is learned from runs "
                     f"alone; set engine.teacher={RUNS}, or engine.teaching.memory=[]"
                 )
             if self.teaching.runs and not self.of_runs:
@@ -292,6 +292,8 @@ class Names:
                 "teacher": self.config.engine.teacher,
                 "dt_multiplier": self.config.deploy.dt_multiplier,
             }
+            if not self.teaching.runs:  # as it was named before there was the key
+                content["teaching"].pop("runs")
         if changed := edits():
             content["edited"] = changed
         return Run.open("teach", self.scene.name, content, [self.training], root=self.root)

@@ -383,6 +383,31 @@ def test_the_estimate_is_how_far_projected_runs_are(reduced, lesson, levels_of):
     assert (batch.batch.record.residuals[:, 1:, -1] > 0).all()
 
 
+def test_projected_steps_that_go_on_keep_their_history(drawn, tiny_trust):
+    """Operators end in NaN after 6 steps; from there on each particle goes through all steps to the end."""
+    pipeline = drawn()
+    manifold = pipeline.manifold()
+    levels = Levels(lambda cases: pipeline.batch_at(manifold, cases, engine="auto"), 4)
+    batch = pipeline.batch_at(manifold, [angle(26.0)], engine="auto")
+    batch.step(24)
+    known = batch.batch.record.xhat[0].clone()
+    operators = levels.projected([angle(26.0)])
+    operators.step(24)
+    operators.batch.record.xhat[0, 7:] = torch.nan
+    by = np.full(24, PROJECTED, np.int8)
+    by[:6] = OPERATORS
+    solver = levels.projected([angle(26.0)]).runs[0]
+    levels._shared(operators.runs[0], solver, np.zeros(25), by, tiny_trust)
+    alone = levels.projected([angle(26.0)]).runs[0]
+    alone.record.xhat[:7] = known[:7]
+    alone.record.now.copy_(known[6])
+    alone.record.before.copy_(known[5])
+    alone.record.row.fill_(6)
+    alone.together.resume(6)
+    alone.step(18)
+    assert torch.equal(solver.record.xhat, alone.record.xhat)
+
+
 def test_beyond_a_tolerance_the_projected_step_goes_on(reduced, levels_of, tiny_trust):
     own = rollouts(reduced().together, [angle(26.0)], tiny_trust, levels=levels_of())[0]
     assert (own.by_operators, own.levels.tolist()) == (24, [OPERATORS] * 24)

@@ -313,7 +313,7 @@ def test_what_is_not_deployed_together_is_refused_before_any_work(nsf, override,
 def test_a_memory_is_learned_from_full_order_runs_alone(nsf):
     code, _, err = nsf("run", "engine=operators", "engine.teaching.memory=[0.1]")
     assert code == 2
-    assert "engine.teaching.memory=[0.1] is learned from full-order runs alone" in err
+    assert "engine.teaching.memory=[0.1] is learned from runs alone" in err
     assert "engine.teacher=runs" in err
 
 

@@ -12,7 +12,7 @@ from nsf.errors import ConfigError
 
 #: Snapshots whose Gram matrix [M, M] is formed; more would take hours and gigabytes.
 MOST_SNAPSHOTS = 8192
-#: Snapshots up to which all its eigenvalues are found, for which 8,000 take a core a quarter of an hour.
+#: Snapshots up to which `decompose` finds all its eigenvalues: at 8,000 a quarter of an hour on a core.
 MOST_SOLVED = 6000
 # Of the subspace iteration: turns, and columns beyond the modes that are wanted.
 _TURNS, _MORE = 6, 20

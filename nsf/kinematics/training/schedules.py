@@ -126,7 +126,7 @@ class FastTrainer(Trainer):
     """Adam with cosine decay to zero, for a number of steps or a time.
 
     A field fitted to points (mlp) sees random particles of random frames in a step; one fitted to whole
-    snapshots (basis) sees all of them in every step, or 2,048 at random where they are more than 8,192.
+    snapshots (basis) sees all of them in every step, or 2,048 at random where they are more than 6,000.
 
     Attributes:
         steps: optimiser steps of g, h and l, one number for all, [g, h=l] or [g, h, l]; None: as many as the

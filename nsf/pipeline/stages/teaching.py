@@ -34,6 +34,8 @@ def teach(pipeline, run: Run) -> None:
     found, known = record.metrics, len(pipeline.split.train)
     steps = f"{found['teacher_steps']} steps of the teacher"
     asked = f"{known} full-order runs" if pipeline.of_runs else steps
+    if drawn_cases := pipeline.of_runs and len(pipeline.lessons[1]):
+        asked += f" and {drawn_cases} projected ones"
     # Full-order runs in cases that nothing was learned from are those of validation alone.
     back = not pipeline.of_runs or pipeline.split.validation
     where = "in cases held back" if back else "in the training cases, as there are no validation cases"
@@ -51,7 +53,7 @@ def _follow(pipeline, manifold: Manifold, record: Record) -> None:
         truth = truth_of(pipeline, manifold)
         if pipeline.of_runs:
             lessons, yardstick = recorded(pipeline, manifold, truth)
-            lessons += drawn(pipeline, manifold, lambda steps: progress.advance(steps / truth.shape[0]))
+            lessons += drawn(pipeline, manifold, lambda steps: progress.advance(steps / pipeline.scene.steps))
             truth = None  # is the teacher
         else:
             lessons, yardstick = _asked(pipeline, manifold, progress)
@@ -118,15 +120,19 @@ def drawn(pipeline, manifold: Manifold, told: Callable[[float], object]) -> list
     _, between, _ = pipeline.lessons
     if not between:
         return []
-    beside = Teacher(batches(pipeline, manifold, between), told)
+    taken = batches(pipeline, manifold, between)
+    beside = Teacher(taken, told)
     runs = beside.run()
-    kept = torch.isfinite(runs).all(-1).all(0)
+    on_grid = torch.tensor([run.left_grid() < 0 for batch in taken for run in batch.runs])
+    kept = torch.isfinite(runs).all(-1).all(0) & on_grid
     cases = [case for case, good in zip(between, kept.tolist(), strict=True) if good]
     if len(cases) < len(between):
         pipeline.say(f"teach: warning: {len(between) - len(cases)} of {len(between)} projected runs are lost")
     if not cases:
         return []
-    found = Recorded(batches(pipeline, manifold, cases), runs[:, kept])
+    if len(cases) < len(between):
+        taken = batches(pipeline, manifold, cases)
+    found = Recorded(taken, runs[:, kept])
     found.steps = beside.steps
     return [found]
 

@@ -92,7 +92,7 @@ def _cases(errors: Mapping[str, Mapping[Case, float]], variants: _Alike) -> Case
     case = next(iter(next(iter(errors.values()))))
     names = tuple(case.parameters)
     units = dict(zip(case.names, case.units, strict=True))
-    logarithmic = set().union(*(source.logarithmic for source in sources[:1]))
+    logarithmic = sources[0].logarithmic
     trained = next(filter(None, (source.training_cases for source in sources)), [])
     return Cases(
         variants[0].body,

@@ -19,7 +19,8 @@ DEFINITIONS = (
     (
         "method",
         "nsf takes stress and affine momentum from their fields, neural_stress_only the stress alone "
-        "(C = 0), neural_affine_only the affine momentum alone (τ from ∂g/∂X), deformation_only neither.",
+        "(C = 0), neural_affine_only the affine momentum alone (τ from ∂g/∂X), deformation_only neither; "
+        "history: particles carry both, as at full order.",
     ),
     ("speedup", "full-order over reduced wall time, of one step and of the whole simulation."),
 )

@@ -108,13 +108,14 @@ def test_the_way_to_a_state_counts(solver_of):
 def test_two_samples_in_one_run_are_refused(chain, tiny_manifold):
     spans = [SampleSpan(0.0, np.arange(30)), SampleSpan(0.5, np.arange(40))]
     setup = Setup(tiny_manifold, chain.scene, spans, ANGLE, method=HISTORY, device="cpu")
-    with pytest.raises(ConfigError, match="history carries what particles went through over one sample"):
+    with pytest.raises(ConfigError, match="history takes one sample in a run"):
         choose("auto", [setup])
 
 
 @pytest.mark.parametrize(
     ("keys", "told"),
     [
+        (["engine=modal"], "engine=modal does not know method=history; set engine=auto, or method=nsf"),
         (["engine=closed"], "engine=closed corrects steps of a stress field; set method=nsf"),
         (
             ["engine=operators"],
