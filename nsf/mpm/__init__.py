@@ -31,9 +31,10 @@ from nsf.mpm.boundaries.motion import Motion  # noqa: E402
 from nsf.mpm.forcing import Forcing, Gravity, Hand  # noqa: E402
 from nsf.mpm.grid.nodes import Grid, GridGeometry  # noqa: E402
 from nsf.mpm.precision import FP32, FP64, Precision, precision_of  # noqa: E402
-from nsf.mpm.solver import FullOrderMPM, Solver, diagnosed, stressed  # noqa: E402
+from nsf.mpm.solver import FullOrderMPM, Solver, diagnosed  # noqa: E402
 from nsf.mpm.state import ParticleConstants, ParticleState  # noqa: E402
 from nsf.mpm.step import GridStep  # noqa: E402
+from nsf.mpm.stressed import stressed  # noqa: E402
 from nsf.mpm.transfer import Transfer  # noqa: E402
 
 __all__ = [

@@ -20,11 +20,11 @@ from nsf.mpm.precision import Precision, precision_of
 from nsf.mpm.stability import MAX_ELASTIC_CFL, check_time_step, make_particle_check, wave_speed_at
 from nsf.mpm.state import ParticleConstants, ParticleState, cell_order
 from nsf.mpm.step import GridStep
+from nsf.mpm.stressed import stressed
 from nsf.mpm.transfer import Transfer, make_g2p_stress
 from nsf.timing import StageTimer
 
 _NEVER = 2**31 - 1
-_OFF_THE_EDGE = 1e-2  # of a stress
 
 
 class State(Protocol):
@@ -363,39 +363,6 @@ class FullOrderMPM:
                 f"domain [0, {self.grid.geometry.upper}] m; "
                 f"enlarge the domain, add a boundary or reduce dt={self.dt:g} s"
             )
-
-
-def stressed(
-    material: Material, tau: np.ndarray, mu: np.ndarray, lam: np.ndarray
-) -> tuple[dict[str, np.ndarray], int]:
-    """What particles carry of which the stress alone is known.
-
-    A stress beyond yield is kept; the first return map brings it back.
-
-    Args:
-        material: the law.
-        tau: [P, 3, 3] symmetric Kirchhoff stress [Pa].
-        mu, lam: [P] Lamé parameters [Pa].
-
-    Returns:
-        tau, scaled down where it was beyond the law, F_e [P, 3, 3] that carries it, and history [P, H]; and
-        the number of particles whose stress was beyond the law.
-    """
-    share = material.carried_share(tau, mu, lam)
-    beyond = share < 1.0
-    tau = share[:, None, None] * tau
-    # At the edge of what the law carries round-off decides.
-    while (lost := _uncarried(material, tau, mu, lam)).any():
-        tau = np.where(lost, 1.0 - _OFF_THE_EDGE, 1.0)[:, None, None] * tau
-        beyond |= lost
-    carried = {"tau": tau, "F_e": material.stretch_of(tau, mu, lam), "history": material.history_of(tau)}
-    return carried, int(beyond.sum())
-
-
-def _uncarried(material: Material, tau: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
-    """[P] whether no deformation carries a stress, by the principal stresses that `stretch_of` takes."""
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        return ~np.isfinite(material.stretches_of(np.linalg.eigh(tau)[0], mu, lam)).all(1)
 
 
 def diagnosed(
