@@ -63,22 +63,21 @@ class Fit:
             self._descend(min(unroll, len(self._d)), steps, told)
 
     def _descend(self, unroll: int, steps: int, told: Callable[[int], object]) -> None:
-        graphs = self._device.type == "cuda"  # which read the rate where it lies
-        rate = torch.tensor(self._closing.rate, device=self._device) if graphs else self._closing.rate
-        optimiser = torch.optim.Adam(self._model.parameters(), lr=rate, capturable=graphs)
+        optimiser = torch.optim.Adam(self._model.parameters(), lr=self._closing.rate)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
 
-        def step(drawn: list[Tensor]) -> None:
+        def gradient(drawn: list[Tensor]) -> None:
             loss = self._off(unroll, *drawn[:3]) + self._closing.single * self._single(*drawn[3:])
-            optimiser.zero_grad()
+            self._model.zero_grad(set_to_none=False)
             loss.backward()
             torch.nn.utils.clip_grad_norm_(self._model.parameters(), _STEEPEST)
-            optimiser.step()
 
         with one_thread():
-            take = graphed(step, self._drawn(unroll), self._model, optimiser) if graphs else step
+            graphs = self._device.type == "cuda"
+            descend = graphed(gradient, self._drawn(unroll), self._device) if graphs else gradient
             for _ in range(steps):
-                take(self._drawn(unroll))
+                descend(self._drawn(unroll))
+                optimiser.step()
                 schedule.step()
                 told(1)
 

@@ -1,4 +1,4 @@
-"""The descent of one round: Adam on what the teacher answered and on unrolled windows of its runs."""
+"""The descent of one round: on what the teacher answered and on unrolled windows of its runs."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -27,24 +27,29 @@ class Windows:
         every: one step of the descent in so many has them, as they cost several times what single steps do.
         count: windows of it.
         weight: theirs, beside that of single steps.
-        weigh: (x̂ − its target [w, r], steps before it, model) → a step's share in the loss of a window.
+        weigh: (x̂ − its target [w, r], steps before it, model, moves [r]) → a step's share in a window's loss.
         steepest: length of gradient beyond which it is cut.
     """
 
     every: int
     count: int
     weight: float
-    weigh: Callable[[Tensor, int, StepOperators], Tensor]
+    weigh: Callable[[Tensor, int, StepOperators, Tensor], Tensor]
     steepest: float
 
 
-def _by_changes(off: Tensor, step: int, model: StepOperators) -> Tensor:
+def _by_changes(off: Tensor, step: int, model: StepOperators, moves: Tensor) -> Tensor:
     return (off / model.d_scale).square().mean()
 
 
-def _by_accelerations(off: Tensor, step: int, model: StepOperators) -> Tensor:
-    """In units of what one step's error would grow to; far off, where a window is lost, hardly any more."""
-    squares = (off / ((step + 1) * model.a_scale)).square()
+def _by_accelerations(off: Tensor, step: int, model: StepOperators, moves: Tensor) -> Tensor:
+    """In units of what one step's error would grow to; far off, where a window is lost, hardly any more.
+
+    The unit of a coordinate is the geometric mean of its own acceleration and of that which would move
+    particles as far as all coordinates do: a strong one counts for more, and a weak one for something.
+    """
+    common = (moves * model.a_scale).square().mean().sqrt() / moves
+    squares = (off / ((step + 1) * (model.a_scale * common).sqrt())).square()
     return (squares / (1.0 + squares / _LOST)).mean()
 
 
@@ -55,15 +60,17 @@ _ALONE = Windows(every=2, count=128, weight=1.0, weigh=_by_accelerations, steepe
 
 
 class Descent:
-    """Steps of Adam on a network that is changed in place.
+    """Steps on a network that is changed in place.
 
-    On a GPU each kind of step is captured once as a graph: its hundreds of kernels are so small that
-    launching them one by one takes longer than the whole step on a CPU.
+    Muon moves the matrices and Adam the biases: so few steps leave Adam alone far from the least loss.
+    On a GPU the gradient of each kind of step is captured once as a graph: its hundreds of kernels are so
+    small that launching them one by one takes longer than the whole step on a CPU.
 
     Args:
         model: fp32, on the device of the descent.
         labels: what the teacher answered.
         teachers: whose runs are unrolled; runs: [N + 1, R, r] of each.
+        moves: [r] how far particles move with each coordinate, RMS [m].
         teaching: how many steps, and the windows.
         rate: learning rate at the start; it falls to 0 along a cosine.
         generator: of batches and noise, on the host.
@@ -75,6 +82,7 @@ class Descent:
         labels: Labels,
         teachers: Sequence[Teacher],
         runs: Sequence[Tensor],
+        moves: Tensor,
         teaching: Teaching,
         rate: float,
         generator: torch.Generator,
@@ -82,28 +90,29 @@ class Descent:
         self._model, self._teaching, self._generator = model, teaching, generator
         self._kind = _BESIDE if teachers[0].asked else _ALONE
         self._device = model.x_mean.device
+        self._moves = self._here(moves)
         rows = [self._here(getattr(labels, name)) for name in Labels.__dataclass_fields__]
         self._xhat, self._change, self._acceleration, self._mu, self._g, features, self._lag = rows
         self._c = model.collider_state(features)
         # Far from training runs accelerations are ten to a hundred times as large, and would be all there is.
         self._weight = 1.0 / (1.0 + (self._acceleration / model.a_scale).square().mean(1) / 4.0)
         self._windows = [self._windows_of(*pair) for pair in zip(teachers, runs, strict=True)]
-        graphs = self._device.type == "cuda"  # which read the rate where it lies
-        self._optimiser = torch.optim.Adam(
-            model.parameters(),
-            lr=torch.tensor(rate, device=self._device) if graphs else rate,
-            capturable=graphs,
-        )
-        self._schedule = torch.optim.lr_scheduler.CosineAnnealingLR(self._optimiser, teaching.descent)
+        matrices, biases = ([w for w in model.parameters() if w.ndim == n] for n in (2, 1))
+        as_adam = {"weight_decay": 0.0, "adjust_lr_fn": "match_rms_adamw"}  # one rate is fit for both
+        optimisers = torch.optim.Muon(matrices, lr=rate, **as_adam), torch.optim.Adam(biases, lr=rate)
+        course = torch.optim.lr_scheduler.CosineAnnealingLR
+        self._stepping = [(each, course(each, teaching.descent)) for each in optimisers]
 
     def run(self) -> None:
         """All steps."""
         with one_thread():
-            step = self._captured() if self._device.type == "cuda" else self._step
+            descend = self._captured() if self._device.type == "cuda" else self._descend
             for turn in range(self._teaching.descent):
                 window = self._window_of(turn)
-                step(window, self._drawn(window))
-                self._schedule.step()
+                descend(window, self._drawn(window))
+                for optimiser, schedule in self._stepping:
+                    optimiser.step()
+                    schedule.step()
 
     def _here(self, values: Tensor) -> Tensor:
         return values.to(self._device, torch.float32)
@@ -137,7 +146,8 @@ class Descent:
     def _unroll(self, steps: int) -> int:
         return min(self._teaching.unroll, steps - 1)
 
-    def _step(self, window: int | None, drawn: list[Tensor]) -> None:
+    def _descend(self, window: int | None, drawn: list[Tensor]) -> None:
+        """The gradient of one step's loss."""
         model, (at, *unrolled) = self._model, drawn
         labels = self._xhat, self._change, self._mu, self._g, self._c, self._lag
         found = model.acceleration(*(values[at] for values in labels))
@@ -145,12 +155,11 @@ class Descent:
         loss = (self._weight[at] * off).mean()
         if window is not None:
             loss = loss + self._kind.weight * self._off_unrolled(self._windows[window], *unrolled)
-        self._optimiser.zero_grad()
+        model.zero_grad(set_to_none=False)
         loss.backward()
         for weights in model.parameters():  # a slope that overflows in a long window tells no way
             weights.grad.nan_to_num_(0.0, 0.0, 0.0)
         torch.nn.utils.clip_grad_norm_(model.parameters(), self._kind.steepest)
-        self._optimiser.step()
 
     def _off_unrolled(self, window: tuple[Tensor, ...], k: Tensor, n: Tensor, noise: Tensor) -> Tensor:
         (runs, changes, mu, g, c, lags), model = window, self._model
@@ -162,15 +171,15 @@ class Descent:
                 d = changes[n + j + 1, k] + softly(d - changes[n + j + 1, k], _FAR * model.d_scale)
                 x = runs[n + j + 1, k] + softly(x - runs[n + j + 1, k], _FAR * model.x_scale)
             lag = model.next_lag(lag, d)
-            loss = loss + self._kind.weigh(x - runs[n + j + 1, k], j, model)
+            loss = loss + self._kind.weigh(x - runs[n + j + 1, k], j, model, self._moves)
         return loss / unroll
 
     def _captured(self) -> Callable[[int | None, list[Tensor]], None]:
-        """The same step as graphs, one for each kind."""
+        """The same gradient as graphs, one for each kind."""
         state = self._generator.get_state()
         kinds = {self._window_of(turn) for turn in range(self._teaching.descent)}
         graphs = {
-            window: graphed(partial(self._step, window), self._drawn(window), self._model, self._optimiser)
+            window: graphed(partial(self._descend, window), self._drawn(window), self._device)
             for window in sorted(kinds, key=str)
         }
         self._generator.set_state(state)
@@ -183,34 +192,25 @@ def softly(values: Tensor, most: Tensor) -> Tensor:
 
 
 def graphed(
-    step: Callable[[list[Tensor]], object],
-    drawn: list[Tensor],
-    model: torch.nn.Module,
-    optimiser: torch.optim.Optimizer,
+    descend: Callable[[list[Tensor]], object], drawn: list[Tensor], device: torch.device
 ) -> Callable[[list[Tensor]], None]:
-    """A step of a descent as one graph; the network and the optimiser are left as they were.
+    """What finds a gradient, as one graph that adds to gradients where they lie.
 
     Args:
-        step: given what was drawn for it, on the device.
+        descend: given what was drawn for it, on the device; it sets gradients to zero, not to None.
         drawn: as it will be, on the host.
-        model, optimiser: that the step changes.
+        device: of the network.
     """
-    device = next(model.parameters()).device
-    before = {name: values.clone() for name, values in model.state_dict().items()}
     held = [values.to(device) for values in drawn]
     aside = torch.cuda.Stream(device)
     aside.wait_stream(torch.cuda.current_stream(device))
     with torch.cuda.stream(aside):
         for _ in range(_WARM_UP):
-            step(held)
+            descend(held)
     torch.cuda.current_stream(device).wait_stream(aside)
     graph = torch.cuda.CUDAGraph()
     with without_collection(), torch.cuda.graph(graph):
-        step(held)
-    model.load_state_dict(before)
-    for of_weight in optimiser.state.values():
-        for values in of_weight.values():
-            values.zero_()
+        descend(held)
 
     def take(drawn: list[Tensor]) -> None:
         for there, values in zip(held, drawn, strict=True):

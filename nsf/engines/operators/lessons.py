@@ -9,6 +9,9 @@ from torch import Tensor
 
 from nsf.engines.operators.teacher import Teacher
 
+#: Of the strongest coordinate's movement, what a coordinate is taken to move at least.
+_HARDLY = 1e-3
+
 
 @dataclass(frozen=True)
 class Yardstick:
@@ -33,6 +36,12 @@ class Yardstick:
             moved = (truth - truth[0]).square().sum()
             errors.append(((self.positions(run) - truth).square().sum() / moved).sqrt())
         return float(torch.stack(errors).mean())
+
+    def moves(self, xhat: Tensor, scale: Tensor) -> Tensor:
+        """[r] how far particles move with each coordinate, RMS [m] a unit of it; at x̂ [r], by ± scale [r]."""
+        either = [self.positions(xhat + way * torch.diag(scale)) for way in (1.0, -1.0)]
+        found = ((either[0] - either[1]).square().sum(-1).mean(1).sqrt() / (2.0 * scale)).double()
+        return found.clamp_min(max(_HARDLY * float(found.max()), torch.finfo(found.dtype).tiny))
 
 
 @dataclass

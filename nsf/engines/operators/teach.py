@@ -250,8 +250,9 @@ class Course:
 
     def _descend(self, number: int, generator: torch.Generator) -> None:
         rate = self.teaching.rate / (1 if number == 0 else 2)
+        moves = self.yardstick.moves(self.model.x_mean, self.model.x_scale)
         model = self.model.to(self._device, torch.float32)
-        Descent(model, self.labels, self.teachers, self._runs, self.teaching, rate, generator).run()
+        Descent(model, self.labels, self.teachers, self._runs, moves, self.teaching, rate, generator).run()
         self.model = model.to("cpu", torch.float64)
 
     # -- rounds on disk ---------------------------------------------------------------------------------

@@ -24,8 +24,8 @@ class Teaching:
         width: of both hidden layers.
         rounds: along the operators' own runs, after the first; none where full-order runs are the teacher.
         steps: of the teacher, about, in all; more where each run would be asked at fewer than 40 moments.
-        descent: steps of Adam in each round.
-        rate: learning rate of the first round; half of it later.
+        descent: steps in each round: Muon on matrices, Adam on biases.
+        rate: learning rate of the first round, of both; half of it later.
         unroll: steps of a window.
         noise: on the start of a window [deviations of x̂].
         tube: deviation of states about training runs [deviations of x̂].
@@ -41,7 +41,7 @@ class Teaching:
     rounds: int = 3
     steps: int = 8000
     descent: int = 3000
-    rate: float = 3e-3
+    rate: float = 1e-2
     unroll: int = 8
     noise: float = 0.01
     tube: float = 0.02

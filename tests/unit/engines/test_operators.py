@@ -24,6 +24,7 @@ from nsf.engines.operators import (
     principal,
     random_cases,
 )
+from nsf.engines.operators.descent import _by_accelerations
 from nsf.engines.operators.recurrence import Recurrence, make_recurrence, places
 from nsf.errors import ConfigError, InstabilityError, MissingRunError, SchemaError
 from nsf.mpm import Cuboid, HalfSpace, Motion, precision_of
@@ -280,9 +281,39 @@ def test_a_window_that_is_lost_moves_no_weight_to_nan():
     assert all(bool(torch.isfinite(weights).all()) for weights in course.model.parameters())
 
 
+def test_how_far_particles_move_with_a_coordinate():
+    """Of linear modes it is their RMS over particles; what moves nothing counts as 1/1000 of the most."""
+    modes = torch.tensor(
+        [[[2.0, 0.0, 0.0], [0.0, 2.0, 0.0]], [[0.0, 0.0, 0.3], [0.0, 0.4, 0.0]], 2 * [[0.0] * 3]]
+    )
+    yardstick = Yardstick(Stepper(0.0), lambda run: torch.einsum("nr,rsi->nsi", run, modes), torch.zeros(1))
+    found = yardstick.moves(torch.tensor([0.3, -1.0, 2.0]), torch.tensor([0.5, 2.0, 1.0]))
+    np.testing.assert_allclose(found, [2.0, 0.125**0.5, 0.002], rtol=1e-6)
+
+
+def test_windows_weigh_coordinates_whatever_their_unit():
+    """In another unit of x̂ the loss is the same; an error that moves particles further counts for more."""
+    model, moves = operators(), torch.tensor([1.0, 0.3, 0.1, 0.03]).double()
+    off, unit = (
+        1e-3 * torch.randn(5, 4, generator=torch.Generator().manual_seed(0)).double(),
+        torch.tensor(7.0),
+    )
+    before = _by_accelerations(off, 3, model, moves)
+    far = [
+        _by_accelerations(0.01 * model.a_scale[i] * torch.eye(4)[i].double(), 0, model, moves) for i in (0, 3)
+    ]
+    model.a_scale[1] *= unit
+    scaled = torch.tensor([1.0, 7.0, 1.0, 1.0]).double()
+    np.testing.assert_allclose(_by_accelerations(scaled * off, 3, model, moves / scaled), before, rtol=1e-12)
+    assert far[0] > 10.0 * far[1] > 0.0
+
+
 @pytest.mark.gpu
 def test_captured_steps_of_the_descent_are_those_of_the_host():
-    """Graphs replay what eager steps do; warming up leaves neither network nor generator changed."""
+    """Graphs replay what eager steps do; warming up leaves neither network nor generator changed.
+
+    Muon multiplies in bfloat16, which rounds otherwise on each device.
+    """
     teaching = Teaching(width=8, rounds=0, steps=90, descent=9, unroll=4)
 
     def taught(device):
@@ -293,8 +324,8 @@ def test_captured_steps_of_the_descent_are_those_of_the_host():
     there, here = taught("cuda"), taught("cpu")
     for name, values in here.items():
         assert values.device == there[name].device
-        np.testing.assert_allclose(there[name], values, rtol=0.0, atol=2e-5, err_msg=name)
-    assert float(here["net.4.weight"].abs().max()) > 1e-3  # nine steps have moved it from zero
+        np.testing.assert_allclose(there[name], values, rtol=0.0, atol=1e-3, err_msg=name)
+    assert float(here["net.4.weight"].abs().max()) > 1e-2  # nine steps have moved it from zero
 
 
 # -- the file -------------------------------------------------------------------------------------------
