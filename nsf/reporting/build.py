@@ -15,6 +15,7 @@ from nsf.reporting.tables import (
     PAPER,
     VARIANT,
     Merged,
+    bodies,
     means,
     merge,
     rows_of,
@@ -103,6 +104,7 @@ def _fine(merged: Merged, study: Study | None) -> list[FineSource]:
 
 
 def _page(title: str, merged: Merged, sections, study: Study | None, more, fine, sweep: bool) -> Page:
+    merged = bodies(merged)
     found = means(merged, study)
     headline, same = without_constants(found)
     printed = found["field"].eq(PAPER).any()

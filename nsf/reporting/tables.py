@@ -3,7 +3,7 @@
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pandas as pd
 import rich.console
@@ -130,21 +130,27 @@ def variants(merged: Merged) -> list[list[int]]:
     return list(groups.values())
 
 
-def first_rows(merged: Merged) -> list[dict]:
-    """The first row of each variant, whose `scene` has the material beside it where there are several.
+def bodies(merged: Merged) -> Merged:
+    """The same results with bodies for scenes: with the material beside it where there are several.
 
-    This is a body: `block · von_mises`. Its `setting` does not tell the material again.
+    A body is `block · von_mises`. Its `setting` does not tell the material again.
     """
-    own = [(merged.frame.iloc[i].to_dict(), merged.source[i].material) for i, *_ in variants(merged)]
     materials: dict[str, set[str]] = {}
-    for row, material in own:
-        materials.setdefault(row["scene"], set()).add(material)
-    return [
-        row | {"scene": f"{row['scene']} · {material}", SETTING: setting_without(row[SETTING], ["material"])}
-        if material and len(materials[row["scene"]]) > 1
-        else row
-        for row, material in own
+    own = list(zip(merged.frame["scene"], (source.material for source in merged.source), strict=True))
+    for scene, material in own:
+        materials.setdefault(scene, set()).add(material)
+    told = [f"{scene} · {m}" if m and len(materials[scene]) > 1 else scene for scene, m in own]
+    settings = [
+        setting if body == scene else setting_without(setting, ["material"])
+        for setting, body, (scene, _) in zip(merged.frame[SETTING], told, own, strict=True)
     ]
+    return replace(merged, frame=merged.frame.assign(scene=told, **{SETTING: settings}))
+
+
+def first_rows(merged: Merged) -> list[dict]:
+    """The first row of each variant; its `scene` is the body."""
+    frame = bodies(merged).frame
+    return [frame.iloc[i].to_dict() for i, *_ in variants(merged)]
 
 
 def setting_without(setting: str, keys: Sequence[str]) -> str:

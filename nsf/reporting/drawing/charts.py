@@ -163,8 +163,8 @@ def delta_per_variant(variants: list[dict], dots: str = "one parameter value") -
         average = 100 * _finite([v["mean"] for v in variants])
         for y in np.flatnonzero(~(average <= LOST)):
             told = "diverged" if np.isnan(average[y]) else f"off by more than {LOST:,.0f} %"
-            at_end = {"transform": panel.get_yaxis_transform(), "ha": "right", "va": "center"}
-            panel.text(0.99, float(y), told, **at_end)
+            beside = {"transform": panel.get_yaxis_transform(), "ha": "left", "va": "center"}
+            panel.text(1.01, float(y), told, **beside)
         average[average > LOST] = np.nan
         if logarithmic:  # a bar's length means nothing on a logarithmic axis
             panel.plot(average, at, "D", ms=8, color=REDUCED, label="mean", zorder=1.9)

@@ -200,6 +200,9 @@ def test_a_report_has_a_chart_a_map_and_pictures_of_each_body(tmp_path, few_pict
     told = json.loads((folder / "sources.json").read_text())
     assert set(told["pictures"]["error-map.png"]) == set(runs)
     text = (folder / "index.md").read_text()
+    rows = [row.split(" | ") for row in text.splitlines() if row.startswith("| block")]
+    assert {row[0] for row in rows} == {"| block · fixed_corotated", "| block · von_mises"}
+    assert "material=" not in text[: text.index("## Where the numbers come from")]
     assert (
         text.index("## Over the parameters") < text.index("](error-map.png)") < text.index("## All variants")
     )
