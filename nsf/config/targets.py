@@ -40,6 +40,7 @@ _SHAPE = Kind("nsf.scenes", "nsf.scenes.Shape", ("nsf.scenes.mesh_or_ball",))
 KINDS = {
     "engine.closing": Kind("nsf.engines.closed", "nsf.engines.closed.Closing"),
     "engine.teaching": Kind("nsf.engines.operators", "nsf.engines.operators.Teaching"),
+    "engine.teaching.symmetry": Kind("nsf.scenes", "nsf.scenes.Symmetry"),
     "field": Kind("nsf.kinematics.fields", "nsf.kinematics.training.train.Field"),
     "integration": Kind("nsf.dynamics", "nsf.dynamics.Integration"),
     "material": Kind("nsf.mpm.materials", "nsf.mpm.materials.Material"),
@@ -49,6 +50,7 @@ KINDS = {
     "trainer": Kind("nsf.kinematics.training", "nsf.kinematics.training.schedules.Trainer"),
     "transfer": Kind("nsf.mpm", "nsf.mpm.Transfer"),
     "scene.design": Kind("nsf.scenes", "nsf.scenes.Design"),
+    "scene.reduced.symmetry": Kind("nsf.scenes", "nsf.scenes.Symmetry"),
     "scene.walls": Kind("nsf.mpm", "nsf.mpm.DomainWalls"),
     "scene.colliders.*": Kind("nsf.mpm", "nsf.mpm.Collider"),
     "scene.colliders.*.motion": Kind("nsf.mpm", "nsf.mpm.Motion"),

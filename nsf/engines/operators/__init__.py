@@ -11,14 +11,15 @@ if TYPE_CHECKING:
     from nsf.engines.operators.engine import Operators
     from nsf.engines.operators.lessons import Yardstick
     from nsf.engines.operators.model import Sizes, StepOperators, Terms
-    from nsf.engines.operators.states import collider_states, principal
+    from nsf.engines.operators.states import collider_states, mirrored_states, principal
     from nsf.engines.operators.taught import Taught
     from nsf.engines.operators.teach import Course
-    from nsf.engines.operators.teacher import Recorded, Teacher
+    from nsf.engines.operators.teacher import Mirrored, Recorded, Teacher
     from nsf.engines.operators.teaching import Teaching, random_cases
 
 __all__ = [
     "Course",
+    "Mirrored",
     "Operators",
     "Recorded",
     "Sizes",
@@ -29,6 +30,7 @@ __all__ = [
     "Terms",
     "Yardstick",
     "collider_states",
+    "mirrored_states",
     "principal",
     "random_cases",
 ]

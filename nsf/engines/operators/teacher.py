@@ -8,7 +8,8 @@ from typing_extensions import override
 
 from nsf.dynamics.setup import first_changes
 from nsf.dynamics.solver import ReducedBatch
-from nsf.engines.operators.states import collider_states
+from nsf.engines.operators.states import collider_states, mirrored_states
+from nsf.scenes.symmetry import Image
 
 
 class Teacher:
@@ -119,6 +120,33 @@ class Recorded(Teacher):
     @override
     def run(self) -> torch.Tensor:
         return self._runs
+
+
+class Mirrored(Recorded):
+    """Recorded runs and their images in the mirror planes of a scene, which are runs as well.
+
+    Args:
+        lesson: the runs.
+        images: of the scene, itself first.
+        seen: (latent vectors [..., r], image) → those of the image.
+    """
+
+    def __init__(
+        self, lesson: Recorded, images: Sequence[Image], seen: Callable[[torch.Tensor, Image], torch.Tensor]
+    ):
+        vars(self).update(vars(lesson))
+        start, first = lesson.start, lesson.first_change()
+        self.start = torch.cat([seen(start, image) for image in images])
+        self._first = self.start - torch.cat([seen(start - first, image) for image in images])
+        self._runs = torch.cat([seen(lesson.run(), image) for image in images], 1)
+        self.parameters = lesson.parameters.repeat(len(images), 1)
+        turned = [lesson.gravity @ torch.as_tensor(image.R).T for image in images]
+        states = [mirrored_states(lesson.features.numpy(), image) for image in images]
+        self.gravity, self.features = torch.cat(turned, 1), torch.as_tensor(np.concatenate(states, 1))
+
+    @override
+    def first_change(self) -> torch.Tensor:
+        return self._first
 
 
 def _host(values: torch.Tensor) -> torch.Tensor:

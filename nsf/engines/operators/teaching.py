@@ -9,6 +9,7 @@ import numpy as np
 from nsf.data import PROGRAM, Case
 from nsf.errors import ConfigError
 from nsf.scenes.designs import evenly
+from nsf.scenes.symmetry import Symmetry
 from nsf.vectors import is_finite
 
 _MOST_LAGS = 16
@@ -32,6 +33,7 @@ class Teaching:
         gravity: by how much the gravity of labels in the tube is varied [-], of its magnitude.
         memory: times [s] of lags that the operators see; taught by runs alone.
         runs: projected runs in drawn cases, of which operators learn beside full-order ones.
+        symmetry: of the scene; what runs teach, their mirror images teach as well.
 
     Raises:
         ConfigError: a value outside its range.
@@ -48,6 +50,7 @@ class Teaching:
     gravity: float = 0.1
     memory: Sequence[float] = ()
     runs: int = 0
+    symmetry: Symmetry | None = None
 
     def __post_init__(self):
         object.__setattr__(self, "memory", times_of_lags(self.memory))

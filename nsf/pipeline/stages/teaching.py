@@ -10,15 +10,18 @@ from nsf.data import Case, Trajectory
 from nsf.data.schema import TRAJECTORY
 from nsf.dynamics import ReducedBatch
 from nsf.engines import Engine
-from nsf.engines.operators import Course, Recorded, Taught, Teacher, Yardstick
+from nsf.engines.operators import Course, Mirrored, Recorded, Taught, Teacher, Yardstick
 from nsf.kinematics.manifold import Manifold
 from nsf.progress import Progress
 from nsf.runs import Record, Run
+from nsf.scenes.symmetry import Image, Symmetry
 
 #: File of a teach run with the operators.
 OPERATORS = "operators.pt"
 #: Particles that say how far a round's runs are off.
 _LOOKED_AT = 1000
+#: Shapes whose images are found together.
+_SEEN_AT_ONCE = 200
 
 
 def teach(pipeline, run: Run) -> None:
@@ -54,6 +57,9 @@ def _follow(pipeline, manifold: Manifold, record: Record) -> None:
         if pipeline.of_runs:
             lessons, yardstick = recorded(pipeline, manifold, truth)
             lessons += drawn(pipeline, manifold, lambda steps: progress.advance(steps / pipeline.scene.steps))
+            if teaching.symmetry:
+                images, seen = teaching.symmetry.images(pipeline.scene), mirror(manifold, teaching.symmetry)
+                lessons = [Mirrored(lesson, images, seen) for lesson in lessons]
             truth = None  # is the teacher
         else:
             lessons, yardstick = _asked(pipeline, manifold, progress)
@@ -135,6 +141,24 @@ def drawn(pipeline, manifold: Manifold, told: Callable[[float], object]) -> list
     found = Recorded(taken, runs[:, kept])
     found.steps = beside.steps
     return [found]
+
+
+def mirror(manifold: Manifold, symmetry: Symmetry) -> Callable[[torch.Tensor, Image], torch.Tensor]:
+    """(xhat [..., r], image) → the latent vectors whose shapes are nearest to the shapes' images."""
+    X = manifold.X.cpu().numpy().astype(np.float64)
+
+    def seen(xhat: torch.Tensor, image: Image) -> torch.Tensor:
+        if np.array_equal(image.R, np.eye(3)):
+            return xhat
+        behind = manifold.restrict(X=symmetry.at(X, image.R.T), device=manifold.X.device)
+        found = []
+        with torch.no_grad():
+            for part in xhat.flatten(0, -2).split(_SEEN_AT_ONCE):
+                x = symmetry.at(behind.position(part.to(behind.device)).cpu().numpy(), image.R)
+                found.append(manifold.encode(torch.as_tensor(x, device=behind.device)).cpu().double())
+        return torch.cat(found).view(xhat.shape)
+
+    return seen
 
 
 def _looked_at(manifold: Manifold) -> np.ndarray:
