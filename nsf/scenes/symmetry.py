@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -11,12 +11,20 @@ from nsf.vectors import direction, vector
 
 if TYPE_CHECKING:
     from nsf.mpm import Collider
-    from nsf.scenes.scene import Scene
+    from nsf.scenes.body import Body
 
 _MOST = 48  # images of a cube; more come of planes at an odd angle
 _POINTS = 1000  # of each body, and about each collider
 _NEAR = 1e-6  # of the domain's longest edge
 _EDGE = 0.003  # of the points, which round-off may put outside
+
+
+class Solids(Protocol):
+    """What of a `nsf.scenes.Scene` has to be its own image: the domain's edges [m], bodies and colliders."""
+
+    size: Sequence[float]
+    bodies: "Sequence[Body]"
+    colliders: "Sequence[Collider]"
 
 
 @dataclass(frozen=True)
@@ -70,7 +78,7 @@ class Symmetry:
         """Where points x [..., 3] [m] are in an image."""
         return np.asarray(self.centre) + (x - np.asarray(self.centre)) @ R.T
 
-    def images(self, scene: "Scene") -> list[Image]:
+    def images(self, scene: Solids) -> list[Image]:
         """The images of a scene, itself first.
 
         Raises:
@@ -79,7 +87,7 @@ class Symmetry:
         """
         return [Image(R, self._partners(scene, R)) for R in self.group()]
 
-    def _partners(self, scene: "Scene", R: np.ndarray) -> tuple[int, ...]:
+    def _partners(self, scene: Solids, R: np.ndarray) -> tuple[int, ...]:
         size = np.asarray(scene.size, float)
         domain, near = np.stack([np.zeros(3), size]), _NEAR * float(size.max())
         if not np.allclose(np.sort(self.at(domain, R), axis=0), domain, atol=near):
