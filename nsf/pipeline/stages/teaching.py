@@ -55,10 +55,11 @@ def _follow(pipeline, manifold: Manifold, record: Record) -> None:
     with Progress("teach", *work) as progress:
         truth = truth_of(pipeline, manifold)
         if pipeline.of_runs:
+            images = teaching.symmetry.images(pipeline.scene) if teaching.symmetry else []
             lessons, yardstick = recorded(pipeline, manifold, truth)
             lessons += drawn(pipeline, manifold, lambda steps: progress.advance(steps / pipeline.scene.steps))
             if teaching.symmetry:
-                images, seen = teaching.symmetry.images(pipeline.scene), mirror(manifold, teaching.symmetry)
+                seen = mirror(manifold, teaching.symmetry)
                 lessons = [Mirrored(lesson, images, seen) for lesson in lessons]
             truth = None  # is the teacher
         else:
