@@ -72,11 +72,16 @@ class Standardizer(nn.Module):
         return cls(mean.float(), std.float())
 
     @classmethod
-    def of(cls, snapshots: Snapshots, field: str) -> "Standardizer":
-        """Of every frame and particle of a field, read a slab of particles at a time."""
+    def of(
+        cls, snapshots: Snapshots, field: str, origin: Float[Tensor, "particle component"] | None = None
+    ) -> "Standardizer":
+        """Of every frame and particle of a field less an origin, read a slab of particles at a time."""
         width = max(1, _BLOCK_BYTES // (8 * 9 * snapshots.M))
         starts = range(0, snapshots.P, width)
-        return cls.fit(snapshots.slab(field, slice(start, start + width)) for start in starts)
+        slabs = (slice(start, start + width) for start in starts)
+        return cls.fit(
+            snapshots.slab(field, own) - (0 if origin is None else origin[own].float()) for own in slabs
+        )
 
     def forward(self, values: Float[Tensor, "*points component"]) -> Float[Tensor, "*points component"]:
         """(values - mean) / std, dimensionless."""

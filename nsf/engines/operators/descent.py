@@ -13,6 +13,7 @@ from nsf.engines.operators.model import StepOperators
 from nsf.engines.operators.teacher import Teacher
 from nsf.engines.operators.teaching import Teaching
 from nsf.gpu import without_collection
+from nsf.optimisers import muon_and_adam
 
 _BATCH = 1024  # labels of one step of the descent
 _FAR = 8.0  # deviations, to which long windows hold how far x̂ and d are off, so that a lost one stays bounded
@@ -97,9 +98,7 @@ class Descent:
         # Far from training runs accelerations are ten to a hundred times as large, and would be all there is.
         self._weight = 1.0 / (1.0 + (self._acceleration / model.a_scale).square().mean(1) / 4.0)
         self._windows = [self._windows_of(*pair) for pair in zip(teachers, runs, strict=True)]
-        matrices, biases = ([w for w in model.parameters() if w.ndim == n] for n in (2, 1))
-        as_adam = {"weight_decay": 0.0, "adjust_lr_fn": "match_rms_adamw"}  # one rate is fit for both
-        optimisers = torch.optim.Muon(matrices, lr=rate, **as_adam), torch.optim.Adam(biases, lr=rate)
+        optimisers = muon_and_adam(model, rate)
         course = torch.optim.lr_scheduler.CosineAnnealingLR
         self._stepping = [(each, course(each, teaching.descent)) for each in optimisers]
 

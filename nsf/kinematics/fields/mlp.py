@@ -1,9 +1,16 @@
-"""`field=mlp`: the paper's encoder and three multilayer perceptrons (section 4 and its appendices)."""
+"""`field=mlp`: the paper's encoder and three multilayer perceptrons (section 4 and its appendices).
+
+    g(X, x̂) = X + g_θ(X, x̂),   h(X, x̂, μ) = h_θ(w(X), x̂, μ),   l likewise,   w(X) = [X ; sin, cos of 2^k ω X]
+
+The paper's layers, widths and activations. In place of its hours of training g learns displacements, h and l
+see waves of X and the problem parameters, and x̂ has noise in training and, once g is trained, principal axes.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -15,21 +22,31 @@ from nsf.errors import ConfigError
 from nsf.kinematics.fields.encoder import Encoder
 from nsf.kinematics.fields.networks import ARITHMETIC, FullyConnected, TensorCores
 from nsf.kinematics.manifold import Manifold, Restriction, identity
-from nsf.kinematics.training.phases import PHASES, TARGETS, Fit, joined, per_phase, shaped
+from nsf.kinematics.training.phases import PHASES, TARGETS, Fit, at_least, joined, per_phase, shaped
+from nsf.vectors import spaced
 
 HIDDEN_LAYERS = 5
+MOST_OCTAVES = 12  # beyond which waves are shorter than the gaps between particles
+_WAVE = 1.5  # [rad per deviation of X] of the longest wave: about one across a body
+_PROBED = 512  # particles and frames of which means over all are taken
 ENCODED_POINTS = 1 << 22  # particles of whole frames encoded at once
 ACTIVATION_BYTES = 1 << 30  # of one layer, when many latents are evaluated at once
 
 
 @dataclass(frozen=True)
 class MlpField:
-    """The paper's networks to the letter.
+    """The paper's networks.
 
     Attributes:
         beta: β, the hidden layers' width over d (3, 6, 9 for g, h, l): one for all, [g, h=l] or [g, h, l].
-        stress_parameters: h depends on the problem parameters too, for scenes whose μ enters the return map
-            (section 4.5, last paragraph).
+        octaves: of the waves of X that h and l see beside X; 0 is the paper's.
+        noise, noise_floor: of x̂ in training, as of `BasisField`, where σ_k is the deviation of the
+            displacement [m] by coordinate k, RMS over particles; while g is trained, noise alone, in
+            deviations of x̂.
+        tangent: weight of the squared error of displacements from a frame to the next, over their variance,
+            beside that of positions, while g is trained; 0 is the paper's.
+        head_parameters: h and l see the (standardised) problem parameters; in the paper h does where μ enters
+            the return map (section 4.5, last paragraph).
         arithmetic: of h and l where they are deployed on a GPU (`MlpManifold.arithmetic`); training does not
             depend on it.
         affine: `latent` alone, the paper's l(X, x̂).
@@ -40,12 +57,19 @@ class MlpField:
     shardable: ClassVar[bool] = True
 
     beta: int | Sequence[int] = (48, 72, 72)
-    stress_parameters: bool = False
+    octaves: int = 4
+    noise: float = 0.01
+    noise_floor: float = 0.003
+    tangent: float = 0.1
+    head_parameters: bool = True
     arithmetic: str | None = "tf32"
     affine: str = "latent"
 
     def __post_init__(self) -> None:
         per_phase("beta", self.beta)
+        at_least("octaves", self.octaves, 0, MOST_OCTAVES)
+        for key in ("noise", "noise_floor", "tangent"):
+            at_least(key, getattr(self, key), 0)
         if self.affine != "latent":
             raise ConfigError(
                 f"field.affine={self.affine}: C of field=mlp is a function of the latent vector alone; "
@@ -56,10 +80,19 @@ class MlpField:
             raise ConfigError(f"field.arithmetic={self.arithmetic} is unknown; choose {known} or null")
 
     def prepare(self, snapshots: Snapshots, latent_dim: int) -> dict[str, Any]:
-        """What the snapshots determine before training: mean and deviation of X, x, tau and C."""
-        standard = {name: Standardizer.of(snapshots, name) for name, _ in TARGETS.values()}
+        """What the snapshots determine before training.
+
+        Returns:
+            Mean and deviation of X, of displacements ("x"), tau and C; and how far particles come from a
+            frame to the next ("pace"), the mean square in units of the displacements' deviation.
+        """
+        origin = {"x": snapshots.X}
+        standard = {name: Standardizer.of(snapshots, name, origin.get(name)) for name, _ in TARGETS.values()}
         standard["X"] = Standardizer.fit([snapshots.X])
-        return {name: [s.mean.cpu(), s.std.cpu()] for name, s in standard.items()}
+        few = spaced(snapshots.P, _PROBED)
+        on = torch.diff(snapshots.slab("x", few), dim=0)[torch.diff(snapshots.trajectory) == 0]
+        pace = float((on / standard["x"].std).square().mean()) if len(on) else 0.0
+        return {name: [s.mean.cpu(), s.std.cpu()] for name, s in standard.items()} | {"pace": pace}
 
     def build(
         self, snapshots: Snapshots, prepared: dict[str, Any], latent_dim: int, generator: torch.Generator
@@ -69,14 +102,15 @@ class MlpField:
             "particles": snapshots.P,
             "frames": snapshots.M,
             "beta": list(per_phase("beta", self.beta)),
-            "stress_parameters": self.stress_parameters,
+            "octaves": self.octaves,
+            "head_parameters": self.head_parameters,
         }
         manifold = MlpManifold(
             latent_dim, snapshots.x_sha256, list(snapshots.parameter_names), hyperparameters
         )
         manifold.describe(snapshots)
-        for name, (mean, std) in prepared.items():
-            manifold.standard[name] = Standardizer(mean, std)
+        for name in manifold.standard:
+            manifold.standard[name] = Standardizer(*prepared[name])
         manifold.encoder.initialise(generator)
         for decoder in manifold.decoders.values():
             decoder.initialise(generator)
@@ -87,33 +121,54 @@ class MlpField:
 
         Every target is standardised, so each loss is the mean squared error over its variance.
         """
-        standard, decoders = manifold.standard, manifold.decoders
+        standard, decoders, r = manifold.standard, manifold.decoders, manifold.latent_dim
+        X, last, pace = manifold.X.float(), snapshots.M - 1, prepared["pace"] or 1.0
+
+        def displaced(rows):
+            return standard["x"](snapshots.gather("x", rows, slice(None)) - X)
+
+        def decode(phase, particles, latents):
+            at = manifold.inputs(phase, X[particles])
+            at = torch.cat([standard["X"](at[:, :3]), at[:, 3:]], 1)
+            return decoders[phase](pair(at, latents)).float()
 
         def deformation(rows, particles, generator):
-            x = standard["x"](snapshots.gather("x", rows, slice(None)))
-            xhat = manifold.encoder(x)
-            return error("deformation", xhat, particles, x[:, particles])
+            now = displaced(rows)
+            xhat = manifold.encoder(now)
+            drawn = torch.randn(xhat.shape, generator=generator, device=xhat.device)
+            noisy = xhat + self.noise * xhat.detach().std(0, correction=0) * drawn
+            found = decode("deformation", particles, noisy)
+            loss = (found - now[:, particles]).square().mean()
+            if self.tangent:
+                later = (rows + 1).clamp(max=last)
+                goes_on = snapshots.trajectory[later] == snapshots.trajectory[rows]
+                then = displaced(later)
+                moved = decode("deformation", particles, noisy + manifold.encoder(then) - xhat) - found
+                off = (moved - (then - now)[:, particles]).square().mean((1, 2))
+                loss = loss + self.tangent / pace * (goes_on * off).mean()
+            return loss
 
-        def decoded(phase):
+        def decoded(phase, share):
             name = TARGETS[phase][0]
             latents = manifold.decoder_latents(phase)[snapshots.rows]
+            noise = (self.noise**2 * share.square() + 1 - share.square()).sqrt().float()
 
             def loss(rows, particles, generator):
                 values = standard[name](snapshots.gather(name, rows, particles))
-                return error(phase, latents[rows], particles, values)
+                xhat, mu = latents[rows].tensor_split([r], 1)
+                drawn = noise * torch.randn(xhat.shape, generator=generator, device=xhat.device)
+                found = decode(phase, particles, torch.cat([xhat + drawn, mu], 1))
+                return (found - values).square().mean()
 
             return loss
-
-        def error(phase, latents, particles, values):
-            X = standard["X"](manifold.X[particles].float())
-            predicted = decoders[phase](pair(X, latents))
-            return (predicted.float() - values).square().mean()
 
         both = nn.ModuleList([manifold.encoder, decoders["deformation"]])
         yield Fit("deformation", both, deformation, pointwise=True)
         manifold.encode_training(snapshots.whole)
+        share = manifold.turn(self.noise_floor)
+        manifold.encode_training(snapshots.whole)
         for phase in PHASES[1:]:
-            yield Fit(phase, decoders[phase], decoded(phase), pointwise=True)
+            yield Fit(phase, decoders[phase], decoded(phase, share), pointwise=True)
 
 
 def pair(X: Tensor, latents: Tensor) -> Tensor:
@@ -138,7 +193,8 @@ class MlpManifold(Manifold):
         beta = dict(zip(PHASES, hyperparameters["beta"], strict=True))
         self.decoders = nn.ModuleDict()
         for phase, (_, d) in TARGETS.items():
-            inputs = 3 + latent_dim + (len(self.parameter_names) if self._has_parameters(phase) else 0)
+            inputs = 3 + 6 * self._octaves(phase) + latent_dim
+            inputs += len(self.parameter_names) if self._has_parameters(phase) else 0
             widths = (inputs, *[beta[phase] * d] * HIDDEN_LAYERS, d)
             self.decoders[phase] = FullyConnected(widths, "elu")
         self.standard = nn.ModuleDict(
@@ -146,7 +202,19 @@ class MlpManifold(Manifold):
         )
 
     def _has_parameters(self, phase: str) -> bool:
-        return phase == "stress" and self.hyperparameters["stress_parameters"]
+        return phase != "deformation" and self.hyperparameters["head_parameters"]
+
+    def _octaves(self, phase: str) -> int:
+        return 0 if phase == "deformation" else self.hyperparameters["octaves"]
+
+    def inputs(self, phase: str, X: Tensor) -> Tensor:
+        """X [n, 3] m and, of h and l, its waves, [n, 3 + 6 octaves]."""
+        octaves = self._octaves(phase)
+        if not octaves:
+            return X
+        standard = (X - self.standard["X"].mean.to(X)) / self.standard["X"].std.to(X)
+        angles = [_WAVE * 2**k * standard for k in range(octaves)]
+        return torch.cat([X, *map(torch.sin, angles), *map(torch.cos, angles)], 1)
 
     def decoder_latents(self, phase: str) -> Tensor:
         """Training latents as the phase's decoder takes them: with standardised μ if it depends on μ."""
@@ -154,6 +222,45 @@ class MlpManifold(Manifold):
         if self._has_parameters(phase):
             inputs.append(self.standard_parameters(self.training_parameters.float()))
         return torch.cat(inputs, -1)
+
+    @torch.no_grad()
+    def turn(self, floor: float) -> Tensor:
+        """Turn the latent space to its principal axes, as displacements; g(X, e(x)) stays as it is.
+
+        Coordinates of the turned space move particles independently, the first one the farthest. The unit of
+        the k-th is √(σ_k² + (ε σ_1)²), with σ_k the deviation of the displacement by it, RMS over particles.
+
+        Args:
+            floor: ε.
+
+        Returns:
+            [r] σ_k over its unit.
+        """
+        xhat = self.training_latents
+        mean = xhat.mean(0)
+        covariance = (xhat - mean).T @ (xhat - mean) / len(xhat)
+        at = self.restrict(torch.as_tensor(spaced(len(self.X), _PROBED)), device=self.X.device)
+        rows = torch.as_tensor(spaced(len(xhat), _PROBED))
+        metric = sum(torch.einsum("ncj,nck->jk", J, J) for J in map(at.jacobian, xhat[rows]))
+        metric = metric / (at.points * len(rows))
+        metric += (
+            1e-12 * metric.trace().clamp(min=1e-12) * torch.eye(len(metric)).to(metric)
+        )  # a coordinate may move nothing
+        root = torch.linalg.cholesky(metric)
+        squares, axes = torch.linalg.eigh(root.T @ covariance @ root)
+        sigma = squares.flip(0).clamp(min=0).sqrt()
+        unit = (sigma.square() + (max(floor, 1e-9) * sigma[0]).square()).sqrt()
+        unit = torch.where(unit > 0, unit, 1.0)
+        back = torch.linalg.solve(root.T, axes.flip(1)) * unit  # x̂ = mean + back x̂'
+        back *= torch.where(back.sum(0) < 0, -1.0, 1.0)  # an axis has two directions; always the same one
+        last, first = self.encoder.linear[-1], self.decoders["deformation"].layers[0]
+        along = first.weight[:, 3:].double()
+        first.bias.add_(along @ mean)
+        first.weight[:, 3:] = (along @ back).float()
+        weight, bias = last.weight.double(), last.bias.double()
+        last.weight.copy_(torch.linalg.solve(back, weight))
+        last.bias.copy_(torch.linalg.solve(back, bias - mean))
+        return sigma / unit
 
     @torch.no_grad()
     def encode_training(self, snapshots: Snapshots) -> None:
@@ -169,24 +276,27 @@ class MlpManifold(Manifold):
     @torch.no_grad()
     def encode(self, x: Tensor, tau: Tensor | None = None) -> Tensor:
         self.check_frames(x)
-        frames = (frames.to(self.X.device).float() for frames in x.split(self._frames_at_once()))
+        X = self.X.float()
+        frames = (frames.to(X) - X for frames in x.split(self._frames_at_once()))
         return torch.cat([self.encoder(self.standard["x"](frame)).double() for frame in frames])
 
     @override
     def restrict(self, particles=None, X=None, dtype=torch.float64, device="cpu") -> MlpRestriction:
         _, points = self.points(particles, X)
+        points = points.to(dtype=dtype, device=device)
         return MlpRestriction(
-            points.to(dtype=dtype, device=device),
+            {phase: self.inputs(phase, points) for phase in PHASES},
             {phase: self._deployed(phase, dtype, device) for phase in PHASES},
-            self._has_parameters("stress"),
+            self.inputs,
+            self.hyperparameters["head_parameters"],
             self.latent_dim,
         )
 
     def _deployed(self, phase: str, dtype: torch.dtype, device: torch.device | str) -> nn.Module:
-        """The decoder from (X [m], xhat, μ) to the field in its own unit."""
+        """The decoder from (X [m] and its waves, xhat, μ) to displacement, tau or C in their own unit."""
         X, parameters, values = self.standard["X"], self.standard_parameters, self.standard[TARGETS[phase][0]]
-        latent = torch.zeros(self.latent_dim, device=X.mean.device)
-        mean, std = [X.mean, latent], [X.std, latent + 1]
+        plain = torch.zeros(6 * self._octaves(phase) + self.latent_dim, device=X.mean.device)
+        mean, std = [X.mean, plain], [X.std, plain + 1]
         if self._has_parameters(phase):
             mean, std = [*mean, parameters.mean], [*std, parameters.std]
         raw = self.decoders[phase].in_raw_units(
@@ -197,59 +307,82 @@ class MlpManifold(Manifold):
 
 
 class MlpRestriction(Restriction):
-    """The three decoders at points X [n, 3]; they take and give raw units."""
+    """The three decoders at n points; they take and give raw units.
 
-    def __init__(self, X: Tensor, decoders: dict[str, nn.Module], takes_parameters: bool, latent_dim: int):
-        self.X, self.decoders, self.latent_dim = X, decoders, latent_dim
-        self.points, self.dtype, self.device = X.shape[0], X.dtype, X.device
-        inputs = torch.eye(3 + latent_dim, dtype=X.dtype, device=X.device)
-        self._along_X, self._along_xhat = inputs[:3], inputs[3:]
-        self._takes_parameters = takes_parameters
+    Args:
+        inputs: of each phase's decoder at the points, X [n, 3] first.
+        decoders: by phase; that of the deformation gives displacements.
+        at: (phase, X) ↦ the inputs at other points.
+        takes_parameters: whether h and l see the problem parameters.
+    """
+
+    def __init__(
+        self,
+        inputs: Mapping[str, Tensor],
+        decoders: Mapping[str, nn.Module],
+        at: Callable[[str, Tensor], Tensor],
+        takes_parameters: bool,
+        latent_dim: int,
+    ):
+        self.inputs, self.decoders, self.latent_dim = inputs, decoders, latent_dim
+        self.X = inputs["deformation"]
+        self.points, self.dtype, self.device = len(self.X), self.X.dtype, self.X.device
+        directions = torch.eye(3 + latent_dim, dtype=self.dtype, device=self.device)
+        self._along_X, self._along_xhat = directions[:3], directions[3:]
+        self._at, self._takes_parameters = at, takes_parameters
 
     @override
     def position(self, xhat):
-        return self._decode("deformation", xhat)
+        return self.X + self._decode("deformation", xhat)
 
     @override
     def position_and_jacobian(self, xhat):
-        return self._derive(xhat, self._along_xhat)
+        displacement, jacobian = self._derive(xhat, self._along_xhat)
+        return self.X + displacement, jacobian
+
+    def jacobian(self, xhat: Tensor) -> Tensor:
+        """∂g/∂xhat [n, 3, r]."""
+        return self._derive(xhat, self._along_xhat)[1]
 
     @override
     def deformation_gradient(self, xhat):
-        return self._derive(xhat, self._along_X)[1]
+        return self._along_X[:, :3] + self._derive(xhat, self._along_X)[1]
 
     @override
     def stress(self, xhat, parameters):
-        if self._takes_parameters:
-            xhat = joined(xhat, parameters)
-        return self._decode("stress", xhat)
+        return self._decode("stress", self._latents(xhat, parameters))
 
     @override
     def affine(self, xhat, parameters, rate=None):
-        return self._decode("affine", xhat).unflatten(-1, (3, 3))
+        return self._decode("affine", self._latents(xhat, parameters)).unflatten(-1, (3, 3))
 
     @override
     def module(self, phase):
-        return PointModule(self.decoders[phase], phase, phase == "stress" and self._takes_parameters)
+        takes_parameters = self._takes_parameters and phase != "deformation"
+        return PointModule(self.decoders[phase], phase, partial(self._at, phase), takes_parameters)
 
     @override
     def subset(self, rows):
-        return MlpRestriction(self.X[rows], self.decoders, self._takes_parameters, self.latent_dim)
+        inputs = {phase: values[rows] for phase, values in self.inputs.items()}
+        return MlpRestriction(inputs, self.decoders, self._at, self._takes_parameters, self.latent_dim)
+
+    def _latents(self, xhat: Tensor, parameters: Tensor) -> Tensor:
+        return joined(xhat, parameters) if self._takes_parameters else xhat
 
     def _decode(self, phase: str, latents: Tensor) -> Tensor:
         decoder = self.decoders[phase]
         parts = self._parts(latents, decoder.width)
-        values = torch.cat([decoder(pair(self.X, part)) for part in parts])
+        values = torch.cat([decoder(pair(self.inputs[phase], part)) for part in parts])
         return values if latents.ndim == 2 else values[0]
 
     def _derive(self, xhat: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
-        """g and its derivatives along some inputs, the last axis of the result."""
+        """The displacement and its derivatives along some inputs, the last axis of the result."""
         decoder = self.decoders["deformation"]
         parts = self._parts(xhat, decoder.width * len(directions))
         pairs = [decoder.forward_and_tangents(pair(self.X, part), directions) for part in parts]
-        x, derivatives = (torch.cat(values) for values in zip(*pairs, strict=True))
+        u, derivatives = (torch.cat(values) for values in zip(*pairs, strict=True))
         derivatives = derivatives.transpose(-1, -2)
-        return (x, derivatives) if xhat.ndim == 2 else (x[0], derivatives[0])
+        return (u, derivatives) if xhat.ndim == 2 else (u[0], derivatives[0])
 
     def _parts(self, latents: Tensor, width: int) -> tuple[Tensor, ...]:
         """The batch of latents in parts whose activations fit in memory."""
@@ -261,11 +394,14 @@ class MlpRestriction(Restriction):
 class PointModule(nn.Module):
     """A decoder as a module: a function of the points too."""
 
-    def __init__(self, decoder: FullyConnected, phase: str, takes_parameters: bool):
+    def __init__(
+        self, decoder: nn.Module, phase: str, at: Callable[[Tensor], Tensor], takes_parameters: bool
+    ):
         super().__init__()
-        self.decoder, self.phase, self.takes_parameters = decoder, phase, takes_parameters
+        self.decoder, self.phase, self.at, self.takes_parameters = decoder, phase, at, takes_parameters
 
     @override
     def forward(self, X: Tensor, xhat: Tensor, parameters: Tensor) -> Tensor:
         latents = joined(xhat, parameters) if self.takes_parameters else xhat
-        return shaped(self.phase, self.decoder(pair(X, latents)))
+        values = shaped(self.phase, self.decoder(pair(self.at(X), latents)))
+        return X + values if self.phase == "deformation" else values

@@ -47,15 +47,17 @@ class FieldTraining(pl.LightningModule):
         self.step, self.loss, self.seconds = 0, float("nan"), 0.0
 
     @override
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        return self.descent.optimizer()
+    def configure_optimizers(self) -> list[torch.optim.Optimizer]:
+        return self.descent.optimizers()
 
     @override
     def on_train_start(self) -> None:
         # Lightning's wrapper of the optimizer adds a millisecond to every step.
         # Through Lightning where it has to exchange gradients, which costs a little.
         backward = Tensor.backward if self.descent.rank.alone else self.manual_backward
-        self.taker = Steps(self.descent, self.optimizers(use_pl_optimizer=False), self.steps, backward)
+        found = self.optimizers(use_pl_optimizer=False)
+        optimizers = found if isinstance(found, list) else [found]
+        self.taker = Steps(self.descent, optimizers, self.steps, backward)
         self.progress.advance(self.step)
 
     @override
@@ -71,7 +73,7 @@ class FieldTraining(pl.LightningModule):
         self.progress.advance(last - first)
         metrics = {
             "loss": self.loss,
-            "learning_rate": self.descent.schedule.rate_at(last - 1, self.steps),
+            "learning_rate": self.descent.rate_at(last - 1, self.steps),
             "steps_per_second": (last - first) / (time.perf_counter() - started),
         }
         for logger in self.loggers:

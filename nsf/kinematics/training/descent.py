@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -12,7 +12,9 @@ from nsf.gpu import without_collection
 from nsf.kinematics.training.phases import PHASES, Fit, seed_of
 from nsf.kinematics.training.rank import ALONE, Rank
 from nsf.kinematics.training.schedules import Trainer
+from nsf.optimisers import muon_and_adam
 
+MUON = 5.0  # times the schedule's rate is that of Muon
 EAGER_STEPS = 3  # before a capture, as torch asks
 CHECKPOINT = "last.ckpt"  # of a phase, in its folder
 
@@ -43,22 +45,30 @@ class Descent:
         local = (self.resident or not self.fit.pointwise) and self.rank.alone
         return self.device.type == "cuda" and self.schedule.stationary and local
 
-    def optimizer(self) -> torch.optim.Optimizer:
-        """Adam, as in the paper; `Steps` sets its rate."""
-        return torch.optim.Adam(
-            self.fit.network.parameters(), fused=True, capturable=self.device.type == "cuda"
-        )
+    def optimizers(self) -> list[torch.optim.Optimizer]:
+        """Adam, as in the paper, or with Muon, where the schedule has it; `Steps` sets the rate."""
+        if self._by_muon:
+            return muon_and_adam(self.fit.network, MUON * self.schedule.rate_at(0, 1))
+        return [torch.optim.Adam(self.fit.network.parameters(), fused=True)]
+
+    def rate_at(self, step: int, steps: int) -> float:
+        """Learning rate at a step."""
+        return self.schedule.rate_at(step, steps) * (MUON if self._by_muon else 1.0)
+
+    @property
+    def _by_muon(self) -> bool:
+        return self.schedule.muon and self.fit.pointwise
 
 
 class Steps:
     """Takes the optimiser steps of a phase.
 
-    On a GPU a step can cost more to launch than to compute (field=basis, H200: 2.5 ms against 0.4 ms), so
+    On a GPU a gradient can cost more to launch than to compute (field=basis, H200: 2.5 ms against 0.4 ms), so
     after some eager steps one is captured as a CUDA graph and replayed: the same kernels and the same bits.
 
     Args:
         descent: the phase.
-        optimizer: of its network, already in the state it starts from.
+        optimizers: of its network, already in the state they start from.
         steps: how many there are in all.
         backward: fills the gradients of a loss.
     """
@@ -66,14 +76,11 @@ class Steps:
     def __init__(
         self,
         descent: Descent,
-        optimizer: torch.optim.Optimizer,
+        optimizers: Sequence[torch.optim.Optimizer],
         steps: int,
         backward: Callable[[Tensor], None] = Tensor.backward,
     ):
-        self.descent, self.optimizer, self.steps, self.backward = descent, optimizer, steps, backward
-        self._rate = torch.zeros((), device=descent.device)
-        for group in optimizer.param_groups:
-            group["lr"] = self._rate
+        self.descent, self.optimizers, self.steps, self.backward = descent, optimizers, steps, backward
         self._generator = torch.Generator(descent.device)
         self._graph: torch.cuda.CUDAGraph | None = None
         self._eager_left = EAGER_STEPS if descent.replayable else steps
@@ -91,9 +98,17 @@ class Steps:
             return float(total) / (last - first)
 
     def _take(self, step: int) -> Tensor:
-        descent = self.descent
-        self._rate.fill_(descent.schedule.rate_at(step, self.steps))
+        descent, rate = self.descent, self.descent.rate_at(step, self.steps)
         self._generator.manual_seed(seed_of(descent.seed, PHASES.index(descent.fit.name), step))
+        loss = self._gradient(step)
+        for optimizer in self.optimizers:
+            for group in optimizer.param_groups:
+                group["lr"] = rate
+            optimizer.step()
+        return loss
+
+    def _gradient(self, step: int) -> Tensor:
+        """Fill the gradients; returns the loss."""
         if self._eager_left > 0:
             self._eager_left -= 1
             return self._descend(step)
@@ -107,14 +122,16 @@ class Steps:
 
     def _descend(self, step: int) -> Tensor:
         descent = self.descent
+        fit = descent.fit
         rows, particles = descent.schedule.batch(
-            step, descent.fit, descent.frames, descent.particles, descent.seed, self._generator
+            step, fit, descent.frames, descent.particles, descent.seed, self._generator
         )
-        low = descent.schedule.bf16 and descent.fit.pointwise and descent.device.type == "cuda"
+        # What g changes by from a frame to the next is below the round-off of bfloat16.
+        coarse = fit.pointwise and fit.name != "deformation"
+        low = descent.schedule.bf16 and coarse and descent.device.type == "cuda"
         # A cached cast of a weight would be a tensor of one step in the graph of all.
         with torch.autocast(descent.device.type, torch.bfloat16, enabled=low, cache_enabled=False):
-            loss = descent.fit.loss(rows, particles, self._generator)
-        self.optimizer.zero_grad()
+            loss = fit.loss(rows, particles, self._generator)
+        fit.network.zero_grad()
         self.backward(loss)
-        self.optimizer.step()
         return loss.detach()

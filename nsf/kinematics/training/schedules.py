@@ -28,15 +28,17 @@ class Trainer(ABC):
     Attributes:
         frames_per_batch: snapshots that a step sees, of all devices together.
         devices: GPUs that train together, or processes on a CPU; a batch and the data are shared among them.
-        bf16: on a GPU, evaluate a field fitted to points in bfloat16 while it trains.
+        bf16: on a GPU, evaluate h and l of a field fitted to points in bfloat16 while they train.
         stationary: batches have one shape and know the step through the generator alone, so a step can be
             captured once and replayed.
+        muon: a field fitted to points is moved by Muon, at five times the rate, and not by Adam alone.
     """
 
     frames_per_batch: int
     devices: int = 1
     bf16: bool = False
     stationary: ClassVar[bool] = False
+    muon: ClassVar[bool] = False
 
     def share(self) -> Trainer:
         """The schedule of one of the devices: the same steps, with its part of each batch."""
@@ -61,7 +63,7 @@ class Trainer(ABC):
 
     @abstractmethod
     def rate_at(self, step: int, steps: int) -> float:
-        """Adam's learning rate at a step."""
+        """Learning rate of Adam at a step."""
 
     @abstractmethod
     def batch(
@@ -123,7 +125,7 @@ class PaperTrainer(Trainer):
 
 @dataclass(frozen=True)
 class FastTrainer(Trainer):
-    """Adam with cosine decay to zero, for a number of steps or a time.
+    """Cosine decay to zero, for a number of steps or a time.
 
     A field fitted to points (mlp) sees random particles of random frames in a step; one fitted to whole
     snapshots (basis) sees all of them in every step, or 2,048 at random where they are more than 6,000.
@@ -133,13 +135,14 @@ class FastTrainer(Trainer):
             budget allows.
         learning_rate: at the first step.
         frames_per_batch, particles_per_batch: points of a step, for a field fitted to points.
-        bf16: on a GPU, evaluate a field fitted to points in bfloat16 while it trains.
+        bf16: on a GPU, evaluate h and l of a field fitted to points in bfloat16 while they train.
         budget_minutes: limit on the training of all three networks [min], or None. The rate is measured once
             at the start of each phase; the steps it allows are recorded, and as `steps` make the same bits.
         devices: see `Trainer`; each takes frames_per_batch / devices frames of a step.
     """
 
     stationary: ClassVar[bool] = True
+    muon: ClassVar[bool] = True
 
     steps: int | Sequence[int] | None = None
     learning_rate: float = 2e-3

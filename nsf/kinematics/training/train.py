@@ -146,7 +146,7 @@ def _seconds_per_step(descent: Descent) -> float:
     """Measured on real steps, which are then undone."""
     network = descent.fit.network
     state = {key: value.clone() for key, value in network.state_dict().items()}
-    steps = Steps(descent, descent.optimizer(), 1 << 30)
+    steps = Steps(descent, descent.optimizers(), 1 << 30)
     steps.take(0, PROBE_STEPS)  # warm-up
     taken, started = 0, time.perf_counter()
     while time.perf_counter() - started < PROBE_SECONDS:

@@ -2,13 +2,15 @@
 
 import os
 import signal
-from functools import partial
+from dataclasses import replace
+from functools import cache, partial
 
 import pytest
 import torch
 
 from nsf.data import Snapshots
 from nsf.errors import ConfigError, LaunchError, StorageError
+from nsf.kinematics.fields.mlp import MlpManifold
 from nsf.kinematics.training import blocks, descent
 from nsf.kinematics.training import train as training
 from nsf.kinematics.training.phases import PHASES, seeded
@@ -16,6 +18,7 @@ from nsf.kinematics.training.rank import SEED_STREAM, Rank
 from nsf.kinematics.training.ranks import train_together
 from nsf.kinematics.training.schedules import FastTrainer, PaperTrainer
 from nsf.kinematics.training.train import WEIGHTS_STREAM, train
+from nsf.optimisers import muon_and_adam
 
 LATENT, SEED = 2, 3
 TOGETHER = FastTrainer(steps=[20, 12, 12], frames_per_batch=6, particles_per_batch=16, devices=2)
@@ -59,6 +62,12 @@ def in_short_blocks(until, **arguments):
     return train(**arguments)
 
 
+@pytest.fixture
+def turned_once(monkeypatch):
+    """The manifold of several fits is turned by the first of them alone."""
+    monkeypatch.setattr(MlpManifold, "turn", cache(MlpManifold.turn))
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("ranks")
@@ -91,7 +100,7 @@ def test_the_weights_of_all_ranks_agree(together, folder):
     assert [together[1][f"{phase}_steps"] for phase in PHASES] == [20, 12, 12]
 
 
-def test_a_step_is_that_of_the_mean_gradient(together, files, fields):
+def test_a_step_is_that_of_the_mean_gradient(together, files, fields, turned_once):
     """The same training in one process, which adds the gradients of both shards."""
     field, whole, share = fields["mlp"], Snapshots(files), TOGETHER.share()
     assert share.frames_per_batch == 3
@@ -99,31 +108,31 @@ def test_a_step_is_that_of_the_mean_gradient(together, files, fields):
     manifold = field.build(whole, prepared, LATENT, seeded("cpu", SEED, WEIGHTS_STREAM))
     shards = [Snapshots(files, shard=(number, 2)) for number in range(2)]
     for fits in zip(*(field.fits(manifold, shard, prepared) for shard in shards), strict=True):
-        optimizer = torch.optim.Adam(fits[0].network.parameters(), fused=True)
+        optimizers = muon_and_adam(fits[0].network, 1.0)
         steps = share.steps_of(fits[0].name, shards[0].M)
         for step in range(steps):
-            optimizer.zero_grad()
+            fits[0].network.zero_grad()
             for number, (fit, shard) in enumerate(zip(fits, shards, strict=True)):
                 seed = Rank(number, 2).seed(SEED)
                 generator = seeded("cpu", seed, PHASES.index(fit.name), step)
                 rows, particles = share.batch(step, fit, shard.M, shard.P, seed, generator)
                 (fit.loss(rows, particles, generator) / 2).backward()
-            for group in optimizer.param_groups:
-                group["lr"] = torch.tensor(share.rate_at(step, steps))
-            optimizer.step()
+            for optimizer in optimizers:
+                for group in optimizer.param_groups:
+                    group["lr"] = descent.MUON * share.rate_at(step, steps)
+                optimizer.step()
     found = together[0]
     for name, value in manifold.state_dict().items():
         torch.testing.assert_close(found.state_dict()[name], value, rtol=1e-4, atol=1e-6, msg=name)
 
 
-def test_a_shard_has_the_losses_of_its_rows(files, fields):
+def test_a_shard_has_the_losses_of_its_rows(files, fields, turned_once):
     whole, shard = Snapshots(files), Snapshots(files, shard=(1, 2))
-    prepared = fields["mlp"].prepare(whole, LATENT)
-    manifold = fields["mlp"].build(whole, prepared, LATENT, seeded("cpu", 0))
+    field = replace(fields["mlp"], noise=0.0, noise_floor=0.0, tangent=0.0)
+    prepared = field.prepare(whole, LATENT)
+    manifold = field.build(whole, prepared, LATENT, seeded("cpu", 0))
     rows, particles = torch.tensor([0, 7]), torch.tensor([3, 140, 5])
-    for of_all, of_shard in zip(
-        *(fields["mlp"].fits(manifold, s, prepared) for s in (whole, shard)), strict=True
-    ):
+    for of_all, of_shard in zip(*(field.fits(manifold, s, prepared) for s in (whole, shard)), strict=True):
         loss = of_shard.loss(rows, particles, None)
         assert loss == of_all.loss(shard.rows[rows], particles, None)
         assert loss != of_all.loss(rows, particles, None)
