@@ -60,7 +60,7 @@ class MlpField:
     octaves: int = 4
     noise: float = 0.01
     noise_floor: float = 0.003
-    tangent: float = 0.1
+    tangent: float = 1.0
     head_parameters: bool = True
     arithmetic: str | None = "tf32"
     affine: str = "latent"

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+from nsf.kinematics.training.tensor_cores import tf32
 
 
 def _push_elu(tangents: Tensor, z: Tensor) -> Tensor:
@@ -125,23 +126,10 @@ class TensorCores(nn.Module):
         """[..., inputs] → [..., outputs], of the inputs' type."""
         first, last = self.ends
         z = self.activation(first(inputs.float())).to(self.low)
-        with _tf32():
+        with tf32():
             for layer in self.hidden:
                 z = self.activation(layer(z))
         return last(z.float()).to(inputs.dtype)
-
-
-@contextlib.contextmanager
-def _tf32() -> Iterator[None]:
-    matmul = torch.backends.cuda.matmul
-    # From torch 2.9 on the two names must not be mixed.
-    name, on = ("fp32_precision", "tf32") if hasattr(matmul, "fp32_precision") else ("allow_tf32", True)
-    before = getattr(matmul, name)
-    setattr(matmul, name, on)
-    try:
-        yield
-    finally:
-        setattr(matmul, name, before)
 
 
 class Committee(nn.Module):

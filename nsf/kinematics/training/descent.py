@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -12,6 +13,7 @@ from nsf.gpu import without_collection
 from nsf.kinematics.training.phases import PHASES, Fit, seed_of
 from nsf.kinematics.training.rank import ALONE, Rank
 from nsf.kinematics.training.schedules import Trainer
+from nsf.kinematics.training.tensor_cores import tf32
 from nsf.optimisers import muon_and_adam
 
 MUON = 5.0  # times the schedule's rate is that of Muon
@@ -126,12 +128,13 @@ class Steps:
         rows, particles = descent.schedule.batch(
             step, fit, descent.frames, descent.particles, descent.seed, self._generator
         )
-        # What g changes by from a frame to the next is below the round-off of bfloat16.
-        coarse = fit.pointwise and fit.name != "deformation"
-        low = descent.schedule.bf16 and coarse and descent.device.type == "cuda"
-        # A cached cast of a weight would be a tensor of one step in the graph of all.
-        with torch.autocast(descent.device.type, torch.bfloat16, enabled=low, cache_enabled=False):
-            loss = fit.loss(rows, particles, self._generator)
-        fit.network.zero_grad()
-        self.backward(loss)
+        fast = descent.schedule.bf16 and fit.pointwise and descent.device.type == "cuda"
+        # What g changes by from a frame to the next is below bfloat16's round-off, and above that of tf32.
+        low = fast and fit.name != "deformation"
+        with tf32() if fast else contextlib.nullcontext():
+            # A cached cast of a weight would be a tensor of one step in the graph of all.
+            with torch.autocast(descent.device.type, torch.bfloat16, enabled=low, cache_enabled=False):
+                loss = fit.loss(rows, particles, self._generator)
+            fit.network.zero_grad()
+            self.backward(loss)
         return loss.detach()

@@ -28,7 +28,7 @@ class Trainer(ABC):
     Attributes:
         frames_per_batch: snapshots that a step sees, of all devices together.
         devices: GPUs that train together, or processes on a CPU; a batch and the data are shared among them.
-        bf16: on a GPU, evaluate h and l of a field fitted to points in bfloat16 while they train.
+        bf16: on a GPU, evaluate h and l of a field fitted to points in bfloat16, and g in tf32, in training.
         stationary: batches have one shape and know the step through the generator alone, so a step can be
             captured once and replayed.
         muon: a field fitted to points is moved by Muon, at five times the rate, and not by Adam alone.
@@ -135,7 +135,7 @@ class FastTrainer(Trainer):
             budget allows.
         learning_rate: at the first step.
         frames_per_batch, particles_per_batch: points of a step, for a field fitted to points.
-        bf16: on a GPU, evaluate h and l of a field fitted to points in bfloat16 while they train.
+        bf16: on a GPU, evaluate h and l of a field fitted to points in bfloat16, and g in tf32, in training.
         budget_minutes: limit on the training of all three networks [min], or None. The rate is measured once
             at the start of each phase; the steps it allows are recorded, and as `steps` make the same bits.
         devices: see `Trainer`; each takes frames_per_batch / devices frames of a step.
