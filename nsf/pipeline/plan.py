@@ -67,6 +67,8 @@ class Plan(Names):
         check_batched(c, self.field, self.integration.strategy)
         if isinstance(self.method, History):
             self._check_history()
+        if self.of_runs and self.teaching.symmetry:
+            self.teaching.symmetry.images(self.scene)  # refuses planes that the scene has not
         self.deployed = self._changed(c.deploy.changes)
         X = self.scene.particles().X
         for region in self.sampler.regions:

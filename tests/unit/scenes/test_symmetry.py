@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from nsf import scenes
+from nsf import config, scenes
 from nsf.engines.operators import Mirrored, collider_states, mirrored_states
 from nsf.errors import ConfigError
 from nsf.mpm import Motion
+from nsf.pipeline import Pipeline
+from nsf.pipeline.stages.teaching import mirror
 from nsf.scenes import Symmetry
 
 X, Y, Z, DIAGONAL = [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, -1, 0]
@@ -136,3 +138,33 @@ def test_a_lesson_and_its_images():
         torch.testing.assert_close(found.gravity[:, own], lesson.gravity @ R.T)
         torch.testing.assert_close(found.parameters[own], lesson.parameters)
     assert not found.asked
+
+
+def test_planes_that_the_scene_has_not_are_refused_before_any_work():
+    wrong = ["scene=block", "scale=small", "engine=operators", "scene.reduced.symmetry.mirrors=[[0,0,1]]"]
+    with pytest.raises(ConfigError, match="symmetry"):
+        Pipeline(config.load(wrong))
+
+
+class Shifts:
+    """A manifold whose latent vector is a shift of the body along x and y [m]."""
+
+    X = torch.rand(30, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+    def restrict(self, X, device):
+        shift = torch.eye(2, 3, dtype=torch.float64)
+        points = torch.as_tensor(X)
+        return SimpleNamespace(device="cpu", position=lambda xhat: points + (xhat @ shift)[:, None])
+
+    def encode(self, x):
+        return (x - self.X).mean(1)[:, :2]
+
+
+def test_a_shift_seen_in_mirrors():
+    symmetry = Symmetry((0.4, 0.1, 0.0), [X, DIAGONAL])
+    seen, xhat = mirror(Shifts(), symmetry), torch.tensor([[[0.3, 0.2]], [[-0.1, 0.5]]]).double()
+    found = [seen(xhat, SimpleNamespace(R=R)) for R in symmetry.group()]
+    for R, shifts in zip(symmetry.group(), found, strict=True):
+        turned = xhat @ torch.as_tensor(R[:2, :2]).T
+        torch.testing.assert_close(shifts, turned)
+    assert len({tuple(shifts.flatten().round(decimals=6).tolist()) for shifts in found}) == 8
