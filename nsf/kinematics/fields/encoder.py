@@ -26,7 +26,7 @@ def convolved_lengths(particles: int) -> list[int]:
 
 
 class Encoder(nn.Module):
-    """e: all positions of a frame → xhat.
+    """e: displacements of all particles in a frame → xhat.
 
     One-dimensional convolutions along the particle index with x, y, z as channels, the result in one row,
     Linear → 32, Linear → r, with ELU between the layers.
@@ -52,7 +52,7 @@ class Encoder(nn.Module):
             xavier(layer, generator)
 
     def forward(self, x: Tensor) -> Tensor:
-        """Standardised positions [F, P, 3] → latents [F, r]."""
+        """Standardised displacements [F, P, 3] → latents [F, r]."""
         features = x.transpose(1, 2)
         for convolution in self.convolutions:
             features = F.elu(convolution(features))

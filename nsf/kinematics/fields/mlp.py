@@ -1,16 +1,16 @@
 """`field=mlp`: the paper's encoder and three multilayer perceptrons (section 4 and its appendices).
 
-    g(X, x̂) = X + g_θ(X, x̂),   h(X, x̂, μ) = h_θ(w(X), x̂, μ),   l likewise,   w(X) = [X ; sin, cos of 2^k ω X]
+    g(X, x̂) = X + g_θ(X, x̂),   h(X, x̂, μ) = h_θ(w(X), x̂, μ),   l likewise
 
-The paper's layers, widths and activations. In place of its hours of training g learns displacements, h and l
-see waves of X and the problem parameters, and x̂ has noise in training and, once g is trained, principal axes.
+w(X) is X with sines and cosines of it (`Waves`). The paper's layers, widths and activations. In place of its
+hours of training g learns displacements, h and l see waves of X and the problem parameters, and x̂ has noise
+in training and, once g is trained, principal axes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -23,11 +23,12 @@ from nsf.kinematics.fields.encoder import Encoder
 from nsf.kinematics.fields.networks import ARITHMETIC, FullyConnected, TensorCores
 from nsf.kinematics.manifold import Manifold, Restriction, identity
 from nsf.kinematics.training.phases import PHASES, TARGETS, Fit, at_least, joined, per_phase, shaped
-from nsf.vectors import spaced
+from nsf.vectors import number, spaced
 
 HIDDEN_LAYERS = 5
-MOST_OCTAVES = 12  # beyond which waves are shorter than the gaps between particles
+MOST_OCTAVES = 7  # the last one's waves are as short as the gaps of 64 particles across a body
 _WAVE = 1.5  # [rad per deviation of X] of the longest wave: about one across a body
+_LEAST = 1e-9  # of the farthest coordinate's way: gives one that moves nothing a unit
 _PROBED = 512  # particles and frames of which means over all are taken
 ENCODED_POINTS = 1 << 22  # particles of whole frames encoded at once
 ACTIVATION_BYTES = 1 << 30  # of one layer, when many latents are evaluated at once
@@ -42,14 +43,14 @@ class MlpField:
         octaves: of the waves of X that h and l see beside X; 0 is the paper's.
         noise, noise_floor: of x̂ in training, as of `BasisField`, where σ_k is the deviation of the
             displacement [m] by coordinate k, RMS over particles; while g is trained, noise alone, in
-            deviations of x̂.
-        tangent: weight of the squared error of displacements from a frame to the next, over their variance,
-            beside that of positions, while g is trained; 0 is the paper's.
+            deviations of the batch's x̂, and none for a batch of one frame.
+        tangent: weight of the squared error of displacements from a frame to the next, over their mean
+            square, beside that of displacements, while g is trained; 0 is the paper's.
         head_parameters: h and l see the (standardised) problem parameters; in the paper h does where μ enters
             the return map (section 4.5, last paragraph).
         arithmetic: of h and l where they are deployed on a GPU (`MlpManifold.arithmetic`); training does not
             depend on it.
-        affine: `latent` alone, the paper's l(X, x̂).
+        affine: `latent` alone: C does not depend on dx̂/dt.
 
     Source: Zong et al. 2023, section 4.5, appendices "Training Details" and "Network architecture", table 1.
     """
@@ -67,12 +68,12 @@ class MlpField:
 
     def __post_init__(self) -> None:
         per_phase("beta", self.beta)
-        at_least("octaves", self.octaves, 0, MOST_OCTAVES)
+        at_least("octaves", number("octaves", self.octaves, whole=True), 0, MOST_OCTAVES)
         for key in ("noise", "noise_floor", "tangent"):
             at_least(key, getattr(self, key), 0)
         if self.affine != "latent":
             raise ConfigError(
-                f"field.affine={self.affine}: C of field=mlp is a function of the latent vector alone; "
+                f"field.affine={self.affine}: C of field=mlp does not depend on the latent vector's rate; "
                 "choose field.affine=latent, or field=basis or joint"
             )
         if self.arithmetic not in (None, *ARITHMETIC):
@@ -80,19 +81,13 @@ class MlpField:
             raise ConfigError(f"field.arithmetic={self.arithmetic} is unknown; choose {known} or null")
 
     def prepare(self, snapshots: Snapshots, latent_dim: int) -> dict[str, Any]:
-        """What the snapshots determine before training.
-
-        Returns:
-            Mean and deviation of X, of displacements ("x"), tau and C; and how far particles come from a
-            frame to the next ("pace"), the mean square in units of the displacements' deviation.
-        """
-        origin = {"x": snapshots.X}
-        standard = {name: Standardizer.of(snapshots, name, origin.get(name)) for name, _ in TARGETS.values()}
+        """What the snapshots determine before training: mean and deviation of X, displacements, tau and C."""
+        standard = {name: Standardizer.of(snapshots, name) for name in ("tau", "C")}
         standard["X"] = Standardizer.fit([snapshots.X])
-        few = spaced(snapshots.P, _PROBED)
-        on = torch.diff(snapshots.slab("x", few), dim=0)[torch.diff(snapshots.trajectory) == 0]
-        pace = float((on / standard["x"].std).square().mean()) if len(on) else 0.0
-        return {name: [s.mean.cpu(), s.std.cpu()] for name, s in standard.items()} | {"pace": pace}
+        moved = Standardizer.of(snapshots, "x", origin=snapshots.X)
+        # A metre counts as much along each axis, though the body may hardly move along one.
+        standard["x"] = Standardizer(moved.mean, moved.std.square().mean().sqrt().expand(3))
+        return {name: [s.mean.cpu(), s.std.cpu()] for name, s in standard.items()}
 
     def build(
         self, snapshots: Snapshots, prepared: dict[str, Any], latent_dim: int, generator: torch.Generator
@@ -119,18 +114,20 @@ class MlpField:
     def fits(self, manifold: MlpManifold, snapshots: Snapshots, prepared: dict[str, Any]) -> Iterator[Fit]:
         """Step 1: g and e together; steps 2 and 3: h and l on the latents of the trained encoder.
 
-        Every target is standardised, so each loss is the mean squared error over its variance.
+        Every target is standardised, so a loss is the mean squared error over its variance; g's has the
+        tangent's besides. Of snapshots shared among n devices, a frame's next one is n frames later.
         """
         standard, decoders, r = manifold.standard, manifold.decoders, manifold.latent_dim
-        X, last, pace = manifold.X.float(), snapshots.M - 1, prepared["pace"] or 1.0
+        X, frame, trajectory = manifold.X.float(), snapshots.frame, snapshots.trajectory
+        places = {phase: manifold.inputs(phase, X) for phase in PHASES}
+        places = {phase: torch.cat([standard["X"](X), at[:, 3:]], 1) for phase, at in places.items()}
+        pace = self._pace(snapshots, standard["x"])
 
         def displaced(rows):
             return standard["x"](snapshots.gather("x", rows, slice(None)) - X)
 
         def decode(phase, particles, latents):
-            at = manifold.inputs(phase, X[particles])
-            at = torch.cat([standard["X"](at[:, :3]), at[:, 3:]], 1)
-            return decoders[phase](pair(at, latents)).float()
+            return decoders[phase](pair(places[phase][particles], latents)).float()
 
         def deformation(rows, particles, generator):
             now = displaced(rows)
@@ -140,8 +137,8 @@ class MlpField:
             found = decode("deformation", particles, noisy)
             loss = (found - now[:, particles]).square().mean()
             if self.tangent:
-                later = (rows + 1).clamp(max=last)
-                goes_on = snapshots.trajectory[later] == snapshots.trajectory[rows]
+                later = (rows + 1).clamp(max=snapshots.M - 1)
+                goes_on = (trajectory[later] == trajectory[rows]) & (frame[later] > frame[rows])
                 then = displaced(later)
                 moved = decode("deformation", particles, noisy + manifold.encoder(then) - xhat) - found
                 off = (moved - (then - now)[:, particles]).square().mean((1, 2))
@@ -163,12 +160,41 @@ class MlpField:
             return loss
 
         both = nn.ModuleList([manifold.encoder, decoders["deformation"]])
-        yield Fit("deformation", both, deformation, pointwise=True)
+        yield Fit("deformation", both, deformation, pointwise=True, fine=True)
         manifold.encode_training(snapshots.whole)
         share = manifold.turn(self.noise_floor)
         manifold.encode_training(snapshots.whole)
         for phase in PHASES[1:]:
             yield Fit(phase, decoders[phase], decoded(phase, share), pointwise=True)
+
+    def _pace(self, snapshots: Snapshots, standard: Standardizer) -> float:
+        """Mean square of displacements from a frame to the next, in units of `standard`; 1 if none moves."""
+        few = snapshots.slab("x", spaced(snapshots.P, _PROBED))
+        goes_on = (torch.diff(snapshots.trajectory) == 0) & (torch.diff(snapshots.frame) > 0)
+        steps = torch.diff(few, dim=0)[goes_on] / standard.std
+        return float(steps.square().mean()) or 1.0 if len(steps) else 1.0
+
+
+@dataclass(frozen=True)
+class Waves:
+    """X with its sines and cosines, so that a network tells near particles apart.
+
+    Of octave k = 0, 1, ... they are those of ω 2^k (X − mean)/std, ω = 1.5.
+
+    Attributes:
+        mean, std: [3] m of the particles at rest.
+        octaves: how many.
+    """
+
+    mean: Tensor
+    std: Tensor
+    octaves: int
+
+    def __call__(self, X: Tensor) -> Tensor:
+        """X [n, 3] m and its waves, [n, 3 + 6 octaves]."""
+        standard = (X - self.mean.to(X)) / self.std.to(X)
+        angles = [_WAVE * 2**k * standard for k in range(self.octaves)]
+        return torch.cat([X, *map(torch.sin, angles), *map(torch.cos, angles)], 1)
 
 
 def pair(X: Tensor, latents: Tensor) -> Tensor:
@@ -207,14 +233,14 @@ class MlpManifold(Manifold):
     def _octaves(self, phase: str) -> int:
         return 0 if phase == "deformation" else self.hyperparameters["octaves"]
 
+    @property
+    def waves(self) -> Waves:
+        """Those that h and l see."""
+        return Waves(self.standard["X"].mean, self.standard["X"].std, self.hyperparameters["octaves"])
+
     def inputs(self, phase: str, X: Tensor) -> Tensor:
-        """X [n, 3] m and, of h and l, its waves, [n, 3 + 6 octaves]."""
-        octaves = self._octaves(phase)
-        if not octaves:
-            return X
-        standard = (X - self.standard["X"].mean.to(X)) / self.standard["X"].std.to(X)
-        angles = [_WAVE * 2**k * standard for k in range(octaves)]
-        return torch.cat([X, *map(torch.sin, angles), *map(torch.cos, angles)], 1)
+        """X [n, 3] m and, of h and l, its waves."""
+        return self.waves(X) if self._octaves(phase) else X
 
     def decoder_latents(self, phase: str) -> Tensor:
         """Training latents as the phase's decoder takes them: with standardised μ if it depends on μ."""
@@ -227,8 +253,10 @@ class MlpManifold(Manifold):
     def turn(self, floor: float) -> Tensor:
         """Turn the latent space to its principal axes, as displacements; g(X, e(x)) stays as it is.
 
-        Coordinates of the turned space move particles independently, the first one the farthest. The unit of
-        the k-th is √(σ_k² + (ε σ_1)²), with σ_k the deviation of the displacement by it, RMS over particles.
+        Over the training snapshots, coordinates of the turned space do not correlate, and the mean of JᵀJ,
+        J = ∂g/∂x̂ at particles, is diagonal: they move particles independently, the first one the farthest.
+        The unit of the k-th is √(σ_k² + (ε σ_1)²), with σ_k [m] the deviation of the displacement by it, RMS
+        over particles. Weights are fp32, so encode the training snapshots again afterwards. Not in the paper.
 
         Args:
             floor: ε.
@@ -239,17 +267,10 @@ class MlpManifold(Manifold):
         xhat = self.training_latents
         mean = xhat.mean(0)
         covariance = (xhat - mean).T @ (xhat - mean) / len(xhat)
-        at = self.restrict(torch.as_tensor(spaced(len(self.X), _PROBED)), device=self.X.device)
-        rows = torch.as_tensor(spaced(len(xhat), _PROBED))
-        metric = sum(torch.einsum("ncj,nck->jk", J, J) for J in map(at.jacobian, xhat[rows]))
-        metric = metric / (at.points * len(rows))
-        metric += (
-            1e-12 * metric.trace().clamp(min=1e-12) * torch.eye(len(metric)).to(metric)
-        )  # a coordinate may move nothing
-        root = torch.linalg.cholesky(metric)
+        root = torch.linalg.cholesky(self._metric())
         squares, axes = torch.linalg.eigh(root.T @ covariance @ root)
         sigma = squares.flip(0).clamp(min=0).sqrt()
-        unit = (sigma.square() + (max(floor, 1e-9) * sigma[0]).square()).sqrt()
+        unit = (sigma.square() + (max(floor, _LEAST) * sigma[0]).square()).sqrt()
         unit = torch.where(unit > 0, unit, 1.0)
         back = torch.linalg.solve(root.T, axes.flip(1)) * unit  # x̂ = mean + back x̂'
         back *= torch.where(back.sum(0) < 0, -1.0, 1.0)  # an axis has two directions; always the same one
@@ -261,6 +282,15 @@ class MlpManifold(Manifold):
         last.weight.copy_(torch.linalg.solve(back, weight))
         last.bias.copy_(torch.linalg.solve(back, bias - mean))
         return sigma / unit
+
+    def _metric(self) -> Tensor:
+        """Mean of JᵀJ [r, r] m² over particles and training snapshots, positive definite."""
+        at = self.restrict(torch.as_tensor(spaced(len(self.X), _PROBED)), device=self.X.device)
+        rows = torch.as_tensor(spaced(len(self.training_latents), _PROBED))
+        found = map(at.jacobian, self.training_latents[rows])
+        metric = sum(torch.einsum("ncj,nck->jk", J, J) for J in found) / (at.points * len(rows))
+        least = _LEAST**2 * metric.trace().clamp(min=_LEAST)  # a coordinate may move nothing
+        return metric + least * torch.eye(len(metric)).to(metric)
 
     @torch.no_grad()
     def encode_training(self, snapshots: Snapshots) -> None:
@@ -284,10 +314,11 @@ class MlpManifold(Manifold):
     def restrict(self, particles=None, X=None, dtype=torch.float64, device="cpu") -> MlpRestriction:
         _, points = self.points(particles, X)
         points = points.to(dtype=dtype, device=device)
+        seen = self.waves(points) if self.hyperparameters["octaves"] else points
         return MlpRestriction(
-            {phase: self.inputs(phase, points) for phase in PHASES},
+            {phase: points if phase == "deformation" else seen for phase in PHASES},
             {phase: self._deployed(phase, dtype, device) for phase in PHASES},
-            self.inputs,
+            self.waves,
             self.hyperparameters["head_parameters"],
             self.latent_dim,
         )
@@ -312,7 +343,7 @@ class MlpRestriction(Restriction):
     Args:
         inputs: of each phase's decoder at the points, X [n, 3] first.
         decoders: by phase; that of the deformation gives displacements.
-        at: (phase, X) ↦ the inputs at other points.
+        waves: with which h and l see other points.
         takes_parameters: whether h and l see the problem parameters.
     """
 
@@ -320,7 +351,7 @@ class MlpRestriction(Restriction):
         self,
         inputs: Mapping[str, Tensor],
         decoders: Mapping[str, nn.Module],
-        at: Callable[[str, Tensor], Tensor],
+        waves: Waves,
         takes_parameters: bool,
         latent_dim: int,
     ):
@@ -329,7 +360,7 @@ class MlpRestriction(Restriction):
         self.points, self.dtype, self.device = len(self.X), self.X.dtype, self.X.device
         directions = torch.eye(3 + latent_dim, dtype=self.dtype, device=self.device)
         self._along_X, self._along_xhat = directions[:3], directions[3:]
-        self._at, self._takes_parameters = at, takes_parameters
+        self._waves, self._takes_parameters = waves, takes_parameters
 
     @override
     def position(self, xhat):
@@ -358,13 +389,14 @@ class MlpRestriction(Restriction):
 
     @override
     def module(self, phase):
-        takes_parameters = self._takes_parameters and phase != "deformation"
-        return PointModule(self.decoders[phase], phase, partial(self._at, phase), takes_parameters)
+        head = phase != "deformation"
+        waves = self._waves if head and self._waves.octaves else None
+        return PointModule(self.decoders[phase], phase, waves, head and self._takes_parameters)
 
     @override
     def subset(self, rows):
         inputs = {phase: values[rows] for phase, values in self.inputs.items()}
-        return MlpRestriction(inputs, self.decoders, self._at, self._takes_parameters, self.latent_dim)
+        return MlpRestriction(inputs, self.decoders, self._waves, self._takes_parameters, self.latent_dim)
 
     def _latents(self, xhat: Tensor, parameters: Tensor) -> Tensor:
         return joined(xhat, parameters) if self._takes_parameters else xhat
@@ -394,14 +426,13 @@ class MlpRestriction(Restriction):
 class PointModule(nn.Module):
     """A decoder as a module: a function of the points too."""
 
-    def __init__(
-        self, decoder: nn.Module, phase: str, at: Callable[[Tensor], Tensor], takes_parameters: bool
-    ):
+    def __init__(self, decoder: nn.Module, phase: str, waves: Waves | None, takes_parameters: bool):
         super().__init__()
-        self.decoder, self.phase, self.at, self.takes_parameters = decoder, phase, at, takes_parameters
+        self.decoder, self.phase, self.waves, self.takes_parameters = decoder, phase, waves, takes_parameters
 
     @override
     def forward(self, X: Tensor, xhat: Tensor, parameters: Tensor) -> Tensor:
         latents = joined(xhat, parameters) if self.takes_parameters else xhat
-        values = shaped(self.phase, self.decoder(pair(self.at(X), latents)))
+        points = self.waves(X) if self.waves else X
+        values = shaped(self.phase, self.decoder(pair(points, latents)))
         return X + values if self.phase == "deformation" else values

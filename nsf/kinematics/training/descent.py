@@ -16,7 +16,7 @@ from nsf.kinematics.training.schedules import Trainer
 from nsf.kinematics.training.tensor_cores import tf32
 from nsf.optimisers import muon_and_adam
 
-MUON = 5.0  # times the schedule's rate is that of Muon
+MUON = 5.0  # times the schedule's rate with Muon, of all weights; 0.002 is a rate for Adam alone
 EAGER_STEPS = 3  # before a capture, as torch asks
 CHECKPOINT = "last.ckpt"  # of a phase, in its folder
 
@@ -54,7 +54,7 @@ class Descent:
         return [torch.optim.Adam(self.fit.network.parameters(), fused=True)]
 
     def rate_at(self, step: int, steps: int) -> float:
-        """Learning rate at a step."""
+        """Learning rate at a step, of every optimizer."""
         return self.schedule.rate_at(step, steps) * (MUON if self._by_muon else 1.0)
 
     @property
@@ -129,8 +129,7 @@ class Steps:
             step, fit, descent.frames, descent.particles, descent.seed, self._generator
         )
         fast = descent.schedule.bf16 and fit.pointwise and descent.device.type == "cuda"
-        # What g changes by from a frame to the next is below bfloat16's round-off, and above that of tf32.
-        low = fast and fit.name != "deformation"
+        low = fast and not fit.fine
         with tf32() if fast else contextlib.nullcontext():
             # A cached cast of a weight would be a tensor of one step in the graph of all.
             with torch.autocast(descent.device.type, torch.bfloat16, enabled=low, cache_enabled=False):

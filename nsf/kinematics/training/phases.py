@@ -36,12 +36,14 @@ class Fit:
         loss: (rows, particles, generator) ↦ scalar; rows index snapshots, particles the particles of each,
             and every random number comes from the generator.
         pointwise: a sample is one particle of one frame; else a whole snapshot, and `particles` is unused.
+        fine: the loss has differences that are below the round-off of bfloat16.
     """
 
     name: str
     network: nn.Module
     loss: Callable[[Tensor | slice, Tensor | slice, torch.Generator], Tensor]
     pointwise: bool
+    fine: bool = False
 
 
 #: Units of a layer, layers, networks: more of them fill memory, or take days before a slip is seen.

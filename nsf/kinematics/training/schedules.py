@@ -28,10 +28,10 @@ class Trainer(ABC):
     Attributes:
         frames_per_batch: snapshots that a step sees, of all devices together.
         devices: GPUs that train together, or processes on a CPU; a batch and the data are shared among them.
-        bf16: on a GPU, evaluate h and l of a field fitted to points in bfloat16, and g in tf32, in training.
+        bf16: on a GPU, evaluate a field fitted to points in bfloat16 in training; in tf32 if `fine`.
         stationary: batches have one shape and know the step through the generator alone, so a step can be
             captured once and replayed.
-        muon: a field fitted to points is moved by Muon, at five times the rate, and not by Adam alone.
+        muon: a field fitted to points is moved by Muon and Adam at five times the rate, not by Adam alone.
     """
 
     frames_per_batch: int
@@ -133,9 +133,9 @@ class FastTrainer(Trainer):
     Attributes:
         steps: optimiser steps of g, h and l, one number for all, [g, h=l] or [g, h, l]; None: as many as the
             budget allows.
-        learning_rate: at the first step.
+        learning_rate: at the first step; a field fitted to points has five times as much (`muon`).
         frames_per_batch, particles_per_batch: points of a step, for a field fitted to points.
-        bf16: on a GPU, evaluate h and l of a field fitted to points in bfloat16, and g in tf32, in training.
+        bf16: on a GPU, evaluate a field fitted to points in bfloat16 in training; in tf32 if `fine`.
         budget_minutes: limit on the training of all three networks [min], or None. The rate is measured once
             at the start of each phase; the steps it allows are recorded, and as `steps` make the same bits.
         devices: see `Trainer`; each takes frames_per_batch / devices frames of a step.

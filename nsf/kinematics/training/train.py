@@ -78,8 +78,8 @@ def train(
 
     Returns:
         The manifold on the host, and for each phase its steps, last loss (mean squared error over the
-        variance of the field) and seconds; `training_seconds` adds those and the preparation's. Time
-        before an interrupt counts, work that an interrupt undid does not.
+        variance of the field, and what a field adds) and seconds; `training_seconds` adds those and the
+        preparation's. Time before an interrupt counts, work that an interrupt undid does not.
 
     Raises:
         ConfigError: a value is out of range.

@@ -104,7 +104,7 @@ def test_usd_holds_attributes_and_time_samples(played, tmp_path, monkeypatch):
 def mlp(own_root, tiny):
     """The tiny chain with the paper's networks, its stress field a function of μ too."""
     keys = [key for key in tiny if not key.startswith(("field.", "trainer."))]
-    keys += ["field=mlp", "field.beta=3", "trainer.steps=20"]
+    keys += ["field=mlp", "field.beta=3", "trainer.steps=100"]
     pipeline = Pipeline(config.load(keys), say=lambda line: None, root=own_root)
     pipeline.train()
     return pipeline.deploy()

@@ -78,23 +78,92 @@ def test_stress_and_affine_see_waves_and_the_deformation_does_not(untrained):
         torch.testing.assert_close(waves[:, :3], X)
         sines, cosines = waves[:, 3:].chunk(2, 1)
         torch.testing.assert_close(sines**2 + cosines**2, torch.ones_like(sines))
+        standard = (X - untrained.X.mean(0)) / untrained.X.std(0, correction=0)
+        torch.testing.assert_close(sines[:, :3], torch.sin(1.5 * standard), rtol=1e-5, atol=1e-5)
         # Each octave has twice the frequency of the one before.
         torch.testing.assert_close(sines[:, 3:6], 2 * sines[:, :3] * cosines[:, :3])
         assert untrained.decoders[phase].layers[0].in_features == 3 + 6 * 4 + LATENT + 1
 
 
-def test_noise_of_the_heads_is_that_of_the_coordinates(snapshots):
-    """A head sees a coordinate at the floor with as much noise as it varies, whatever `noise` is."""
-    field = replace(FIELD, noise=0.0, noise_floor=100.0)  # the floor is far above every coordinate
+def seen_by(network, loss, *batch):
+    """The latent part [F, r] of what a network is given, at its first particle, in each call."""
+    given, first = [], network.layers[0].in_features
+    hook = network.register_forward_pre_hook(lambda network, inputs: given.append(inputs[0].detach()))
+    loss(*batch)
+    hook.remove()
+    places = 3 if network.layers[-1].out_features == 3 else 27
+    assert {values.shape[-1] for values in given} == {first}
+    return [values[:, 0, places : places + LATENT].double() for values in given]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.2])
+def test_noise_of_g_is_in_deviations_of_the_batch_s_latents(snapshots, noise):
+    field = replace(FIELD, noise=noise)
+    manifold = field.build(snapshots, field.prepare(snapshots, LATENT), LATENT, seeded("cpu", 0))
+    manifold.encode_training(snapshots)
+    fit = next(field.fits(manifold, snapshots, field.prepare(snapshots, LATENT)))
+    rows = torch.arange(26)
+    off = []
+    for draw in range(40):
+        batch = rows, torch.arange(2), seeded("cpu", draw)
+        now, then = seen_by(manifold.decoders["deformation"], fit.loss, *batch)
+        off.append(now - manifold.training_latents)
+        # The same noise on a frame and on the next one, or their difference would be its own.
+        steps = torch.diff(manifold.training_latents, dim=0)[:12]
+        torch.testing.assert_close((then - now)[:12], steps, rtol=0, atol=1e-6)
+    expected = noise * manifold.training_latents.std(0, correction=0)
+    torch.testing.assert_close(torch.cat(off).std(0), expected, rtol=0.1, atol=1e-6)
+
+
+@pytest.mark.parametrize(("noise", "floor"), [(0.0, 0.0), (0.3, 0.0), (0.0, 0.5), (0.3, 0.5)])
+def test_noise_of_the_heads_is_that_of_the_coordinates(snapshots, noise, floor):
+    """√(noise² σ_k² + (ε σ_1)²) of coordinate k, as displacement."""
+    field = replace(FIELD, noise=noise, noise_floor=floor)
     prepared = field.prepare(snapshots, LATENT)
     manifold = field.build(snapshots, prepared, LATENT, seeded("cpu", 0))
     _, stress, _ = field.fits(manifold, snapshots, prepared)
-    seen = []
-    stress.network.register_forward_pre_hook(lambda network, given: seen.append(given[0]))
-    stress.loss(torch.arange(26), torch.arange(2), seeded("cpu", 1))
-    noise = seen[0][:, 0, 3 + 24 : 3 + 24 + LATENT].double() - manifold.training_latents
-    assert 0.5 < float(noise.std()) < 1.5
-    assert float(manifold.training_latents.std()) < 0.05
+    off = torch.cat(
+        [
+            seen_by(stress.network, stress.loss, torch.arange(26), torch.arange(2), seeded("cpu", draw))[0]
+            - manifold.training_latents
+            for draw in range(40)
+        ]
+    )
+    _, metric = covariance_and_metric(manifold)
+    unit = metric.detach().diagonal().sqrt()
+    sigma = unit * manifold.training_latents.std(0, correction=0)
+    expected = (noise**2 * sigma**2 + (floor * sigma[0]) ** 2).sqrt()
+    torch.testing.assert_close(off.std(0) * unit, expected, rtol=0.1, atol=float(1e-6 * sigma[0]))
+
+
+def test_a_metre_counts_as_much_along_each_axis(snapshots):
+    mean, std = FIELD.prepare(snapshots, LATENT)["x"]
+    u = snapshots.slab("x", slice(None)) - snapshots.X.float()
+    torch.testing.assert_close(std, u.std((0, 1), correction=0).square().mean().sqrt().expand(3))
+    torch.testing.assert_close(mean, u.mean((0, 1)))
+
+
+@pytest.mark.parametrize("field", [FIELD, MlpField(beta=4, octaves=0, head_parameters=False)])
+def test_deployed_fields_are_those_that_were_trained(snapshots, field):
+    prepared = field.prepare(snapshots, LATENT)
+    manifold = field.build(snapshots, prepared, LATENT, seeded("cpu", 0))
+    manifold.encode_training(snapshots)
+    rows, particles = torch.tensor([4, 20]), torch.arange(150)
+    mu, xhat = manifold.training_parameters[rows], manifold.training_latents[rows]
+    at = manifold.restrict()
+    found = {"tau": at.stress(xhat, mu), "C": at.affine(xhat, mu).flatten(-2)}
+    for fit, name in zip(list(replace_noise(field, manifold, snapshots, prepared))[1:], found, strict=True):
+        values = snapshots.gather(name, rows, particles)
+        off = (found[name] - values) / prepared[name][1]
+        torch.testing.assert_close(
+            off.square().mean().float(), fit.loss(rows, particles, None).detach(), rtol=1e-4, atol=0
+        )
+
+
+def replace_noise(field, manifold, snapshots, prepared):
+    """The fits of a field without noise, whose latent space is left as it is."""
+    manifold.turn = lambda floor: torch.ones(LATENT, dtype=torch.float64)
+    return replace(field, noise=0.0).fits(manifold, snapshots, prepared)
 
 
 @pytest.mark.parametrize(
@@ -123,7 +192,14 @@ def test_a_checkpoint_from_before_is_refused(untrained, tmp_path):
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("octaves", -1), ("octaves", 13), ("noise", -0.1), ("noise_floor", -1), ("tangent", -1)],
+    [
+        ("octaves", -1),
+        ("octaves", 8),
+        ("octaves", 2.5),
+        ("noise", -0.1),
+        ("noise_floor", -1),
+        ("tangent", -1),
+    ],
 )
 def test_refusals(key, value):
     with pytest.raises(ConfigError, match=f"{key}={value}"):
