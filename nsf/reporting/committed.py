@@ -33,7 +33,7 @@ LIST = "index.md"
 CHAPTERS = {
     "Main results": ("table1", "operators", "operators_seeds", "forcing"),
     "What the method needs": (
-        "ablation", "field", "width", "latent_dim", "noise_floor", "floors", "sample_size", "sampler",
+        "ablation", "field", "mlp", "width", "latent_dim", "noise_floor", "floors", "sample_size", "sampler",
         "timestep", "seeds",
     ),
     "Beyond what was trained": ("extrapolation", "weak_elements", "super_resolution", "path_dependent"),
