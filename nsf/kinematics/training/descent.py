@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from nsf.gpu import without_collection
+from nsf.kinematics.training.optimisers import muon_and_adam
 from nsf.kinematics.training.phases import PHASES, Fit, seed_of
 from nsf.kinematics.training.rank import ALONE, Rank
 from nsf.kinematics.training.schedules import Trainer
 from nsf.kinematics.training.tensor_cores import tf32
-from nsf.optimisers import muon_and_adam
 
 MUON = 5.0  # times the schedule's rate with Muon, of all weights; 0.002 is a rate for Adam alone
 EAGER_STEPS = 3  # before a capture, as torch asks

@@ -13,12 +13,12 @@ from nsf.errors import ConfigError, LaunchError, StorageError
 from nsf.kinematics.fields.mlp import MlpManifold
 from nsf.kinematics.training import blocks, descent
 from nsf.kinematics.training import train as training
+from nsf.kinematics.training.optimisers import muon_and_adam
 from nsf.kinematics.training.phases import PHASES, seeded
 from nsf.kinematics.training.rank import SEED_STREAM, Rank
 from nsf.kinematics.training.ranks import train_together
 from nsf.kinematics.training.schedules import FastTrainer, PaperTrainer
 from nsf.kinematics.training.train import WEIGHTS_STREAM, train
-from nsf.optimisers import muon_and_adam
 
 LATENT, SEED = 2, 3
 TOGETHER = FastTrainer(steps=[20, 12, 12], frames_per_batch=6, particles_per_batch=16, devices=2)
