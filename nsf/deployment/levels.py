@@ -4,8 +4,10 @@ Every so many steps a projected step is taken from the operators' own state. Wha
 the defect, is added to their changes, from one such step to the next, and they run once more: how far this
 run is from the first estimates how far the first is from the projected one. Where the estimate passes a
 tolerance, or the run leaves what it was taught or trained on, the projected step goes on, and after as many
-steps the operators try again. What they miss then adds to what they missed before. Where the projected step
-is not to be believed either, the full-order solver goes on, to the end (`nsf.deployment.handover`).
+steps the operators try again. What they miss then adds to what they missed before. Stress that particles
+carry (method history) cannot begin in the midst of a run: the projected step then takes the whole run, from
+t = 0. Where the projected step is not to be believed either, the full-order solver goes on, to the end
+(`nsf.deployment.handover`).
 """
 
 from collections.abc import Callable, Sequence
@@ -17,7 +19,7 @@ import torch
 
 from nsf.data import Case
 from nsf.deployment.trust import Trust
-from nsf.dynamics import ReducedBatch, ReducedMPM
+from nsf.dynamics import History, ReducedBatch, ReducedMPM
 
 #: Who takes a step.
 OPERATORS, PROJECTED, FULL_ORDER = range(3)
@@ -68,8 +70,12 @@ class Levels:
             by, solver = np.full(run.steps_taken, OPERATORS, np.int8), run
             if own < len(by):
                 solver = projected.alone(run.index).runs[0]
-                by[own:] = PROJECTED
-                estimate = self._shared(run, solver, estimate, by, trust)
+                if isinstance(solver.setup.method, History):
+                    by[:], estimate = PROJECTED, np.zeros(len(by) + 1)
+                    solver.step(len(by))
+                else:
+                    by[own:] = PROJECTED
+                    estimate = self._shared(run, solver, estimate, by, trust)
             found.append((solver, estimate, by))
         return found
 
@@ -133,7 +139,7 @@ class Levels:
                 by[n : n + own] = OPERATORS
                 estimate[n : n + own], estimate[n + own :] = ahead[:own], ahead[own]
                 n += own
-            if n < N:  # looking ahead has moved the solver; with method=history its stress begins anew
+            if n < N:  # looking ahead has moved the solver
                 _stand(solver, n)
         return estimate
 

@@ -6,7 +6,7 @@ import torch
 from angles import angle
 
 from nsf.deployment import OPERATORS, PROJECTED, Levels, Rollout, rollouts
-from nsf.dynamics import ReducedBatch
+from nsf.dynamics import History, ReducedBatch
 from nsf.dynamics.span import Span
 
 STEPS, CHANGE = 24, 1e-3
@@ -72,8 +72,10 @@ class Returning(Line):
 def batch_of(chain, tiny_manifold):
     """(span, cases) → runs whose steps that class of spans takes."""
 
-    def build(span, cases=(angle(26.0),), doubt=None):
+    def build(span, cases=(angle(26.0),), doubt=None, **changed):
         runs = [chain.pipeline.solver_at(tiny_manifold, case, engine="modal").setup for case in cases]
+        for run in runs:
+            vars(run).update(changed)
 
         def spans(batch):
             at = tiny_manifold.restrict(batch.shared.samples[0].particles, dtype=torch.float64)
@@ -88,9 +90,9 @@ def batch_of(chain, tiny_manifold):
 def shared(batch_of, tiny_trust):
     """(operators, projected step, how) → the run at 26° that both take."""
 
-    def run(operators, projected, *how, values=(26.0,), doubt=None):
+    def run(operators, projected, *how, values=(26.0,), doubt=None, **changed):
         cases = list(map(angle, values))
-        levels = Levels(lambda cases: batch_of(projected, cases), *how)
+        levels = Levels(lambda cases: batch_of(projected, cases, **changed), *how)
         return rollouts(batch_of(operators, cases, doubt), cases, tiny_trust, levels=levels)
 
     return run
@@ -110,6 +112,19 @@ def test_a_run_that_leaves_comes_home(shared, batch_of, tmp_path):
     kept = Rollout.open(tmp_path / "rollout_0.h5")
     np.testing.assert_array_equal(kept.levels, found.levels)
     assert kept.by_operators == found.by_operators == 21
+
+
+def test_a_run_whose_particles_carry_stress_is_taken_anew(shared, batch_of):
+    """From t = 0: in its midst the stress that they would carry is not known."""
+    method = History("history", neural_stress=True, neural_affine=True)
+    (found,) = shared(Kicked, Line, 1, 1e-4, method=method)
+    assert (found.levels == PROJECTED).all()
+    assert (found.estimate == 0.0).all()
+    straight = batch_of(Line).runs[0]
+    straight.step(STEPS)
+    np.testing.assert_array_equal(found.xhat, straight.record.xhat.numpy())
+    (kept,) = shared(Line, Line, 1, 1e-4, method=method)
+    assert (kept.levels == OPERATORS).all()
 
 
 def test_each_run_of_a_batch_comes_home_by_itself(shared):
