@@ -33,8 +33,8 @@ LIST = "index.md"
 CHAPTERS = {
     "Main results": ("table1", "operators", "operators_seeds", "forcing"),
     "What the method needs": (
-        "ablation", "field", "mlp", "width", "latent_dim", "forcing_r", "noise_floor", "floors", "sample_size",
-        "sampler", "timestep", "seeds",
+        "ablation", "field", "mlp", "width", "latent_dim", "forcing_r", "noise_floor", "floors",
+        "sample_size", "sampler", "timestep", "seeds",
     ),
     "Beyond what was trained": ("extrapolation", "weak_elements", "super_resolution", "path_dependent"),
     "At small scale, on a CPU": (
