@@ -24,8 +24,10 @@ AXES = {
     "latent_dim": ("latent coordinates r", "–", "r"),
     "field.beta": ("hidden width β over d", "–", None),
     "deploy.dt_multiplier": ("deployment step", "full-order Δt", None),
+    "trainer.steps": ("steps of training of each network", "–", None),
 }
 """Keys that are an axis: its title and unit, and the column of results.csv that tells what became of it."""
+_STEPS, _SECONDS = "trainer.steps", ("training time", "s")  # shown in place of steps where runs tell it
 
 _TABLE, _PICTURE = "superresolution.csv", "superresolution.png"
 _HEADING = "At many more points"
@@ -105,6 +107,9 @@ def _over(key: str, frame: pd.DataFrame, merged: Merged, study: Study, folder: P
     title, unit, column = AXES[key]
     shown = frame[frame[key].notna()]
     source = merged.frame[column].loc[shown["row"]].array if column else shown[key]
+    seconds = [merged.source[row].training_seconds for row in shown["row"]]
+    if key == _STEPS and None not in seconds:
+        (title, unit), source = _SECONDS, seconds
     shown = shown.assign(x=pd.to_numeric(pd.Series(source, index=shown.index), errors="coerce"))
     panels, papers = {}, {}
     by_scene = list(shown.dropna(subset="x").groupby(_SCENE, sort=False))

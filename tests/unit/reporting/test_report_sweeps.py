@@ -98,6 +98,22 @@ def test_an_interval_holds_the_mean_of_as_many_as_it_says():
     assert 0.87 <= held / 200 <= 0.99
 
 
+def test_delta_over_training_has_its_time_where_every_run_tells_it(tmp_path, drawn):
+    made = Made(particles=30, frames=4, parameters=VALUES, splits=("test",) * 2)
+    found = [write_run(tmp_path, replace(made, training_seconds=s, noise=1 / s)) for s in (10, 40, 250)]
+    steps = dict(zip((run.id for run in found), ("100", "500", "3000"), strict=True))
+    keys = {name: {"scene": "sand", "trainer.steps": taken} for name, taken in steps.items()}
+    merged = merge(open_sources(found), steps)
+    swept(merged, of(keys), tmp_path)
+    ((_, (panels, x, _)),) = drawn
+    assert (x, sorted(panels["sand"]["mean"])) == ("training time [s]", [10, 40, 250])
+    for source in merged.source:
+        source.cost["trials"] = 0  # side by side, whose times tell nothing
+    swept(merged, of(keys), tmp_path)
+    _, (panels, x, _) = drawn[1]
+    assert (x, sorted(panels["sand"]["mean"])) == ("steps of training of each network [–]", [100, 500, 3000])
+
+
 def test_an_interval_of_equal_values_is_a_point_and_of_lost_runs_none():
     assert interval(np.full((3, 2), 0.25)) == (0.25, 0.25)
     assert np.isnan(interval(np.array([[0.1, np.inf], [0.1, 0.1]]))).all()
