@@ -98,7 +98,7 @@ readme: install  ## the figures in README.md, from a report, and the list of rep
 check-reports: install  ## whether reports/ is as it was generated
 	$(BIN)/nsf reports folder=reports check=true
 
-# Every experiment with a committed report, those of the paper's size first; calibration makes the others.
+# Every experiment, those of the paper's size first; calibration makes `inverse` and `tilt`.
 REPRODUCED := table1 operators floors operators_seeds field width latent_dim ablation sample_size sampler timestep seeds \
 	extrapolation weak_elements super_resolution path_dependent sand forcing small closed levels teaching \
 	noise_floor figures mlp forcing_r training

@@ -4,10 +4,10 @@ Every so many steps a projected step is taken from the operators' own state. Wha
 the defect, is added to their changes, from one such step to the next, and they run once more: how far this
 run is from the first estimates how far the first is from the projected one. Where the estimate passes a
 tolerance, or the run leaves what it was taught or trained on, the projected step goes on, and after as many
-steps the operators try again. What they miss then adds to what they missed before. Stress that particles
-carry (method history) cannot begin in the midst of a run: the projected step then takes the whole run, from
-t = 0. Where the projected step is not to be believed either, the full-order solver goes on, to the end
-(`nsf.deployment.handover`).
+steps the operators try again. What they miss then adds to what they missed before. With method history
+particles carry stress that nobody knows in the midst of a run by operators: there the projected step takes
+the whole run anew, from t = 0. Where the projected step is not to be believed either, the full-order solver
+goes on, to the end (`nsf.deployment.handover`).
 """
 
 from collections.abc import Callable, Sequence
@@ -32,7 +32,7 @@ _ROWS = 256  # steps decoded at once
 
 @dataclass(frozen=True)
 class Levels:
-    """How runs by operators are watched, and when the projected step goes on.
+    """How runs by operators are watched, and when the projected step goes on, or takes a run anew.
 
     Attributes:
         projected: cases → runs of the projected step at t = 0.
@@ -58,7 +58,8 @@ class Levels:
 
         Returns:
             Of each run: the solver that holds all of it, its estimated error [N + 1] [m], which stays as it
-            is while the projected step goes on, and who took each step [N], `OPERATORS` or `PROJECTED`.
+            is while the projected step goes on and is 0 of a run taken anew, and who took each step [N],
+            `OPERATORS` or `PROJECTED`.
         """
         projected = self.projected(cases)
         estimates = estimated_errors(batch, projected, self.every)

@@ -24,7 +24,7 @@ AXES = {
     "latent_dim": ("latent coordinates r", "–", "r"),
     "field.beta": ("hidden width β over d", "–", None),
     "deploy.dt_multiplier": ("deployment step", "full-order Δt", None),
-    "trainer.steps": ("steps of training of each network", "–", None),
+    "trainer.steps": ("training steps of each network", "–", None),
 }
 """Keys that are an axis: its title and unit, and the column of results.csv that tells what became of it."""
 _STEPS, _SECONDS = "trainer.steps", ("training time", "s")  # shown in place of steps where runs tell it
@@ -103,13 +103,20 @@ def _held_out(merged: Merged, study: Study) -> pd.DataFrame:
 
 
 def _over(key: str, frame: pd.DataFrame, merged: Merged, study: Study, folder: Path) -> Picture:
-    """δ over one key, a panel a scene, a line for each setting of the other keys."""
+    """δ over one key, a panel a scene, a line for each setting of the other keys.
+
+    In place of training steps stands their time, the mean over seeds, where every run tells it.
+    """
     title, unit, column = AXES[key]
     shown = frame[frame[key].notna()]
     source = merged.frame[column].loc[shown["row"]].array if column else shown[key]
-    seconds = [merged.source[row].training_seconds for row in shown["row"]]
-    if key == _STEPS and None not in seconds:
-        (title, unit), source = _SECONDS, seconds
+    if key == _STEPS:
+        seconds = [merged.source[row].training_seconds for row in shown["row"]]
+        if None not in seconds:
+            alike = shown.columns.drop([*SEEDS, _RUN, "delta", "row"], errors="ignore")
+            alike = [shown[name] for name in alike]
+            (title, unit), of_rows = _SECONDS, pd.Series(seconds, shown.index)
+            source = of_rows.groupby(alike, dropna=False).transform("mean")
     shown = shown.assign(x=pd.to_numeric(pd.Series(source, index=shown.index), errors="coerce"))
     panels, papers = {}, {}
     by_scene = list(shown.dropna(subset="x").groupby(_SCENE, sort=False))
@@ -348,7 +355,7 @@ def estimate_note(rows: pd.DataFrame) -> str:
         rows: `estimated_error` and `true_error` [m], `tolerance` [m] or none, and `handed_over`, the share of
             the steps that operators did not take.
     """
-    known = rows[rows["estimated_error"].notna()]
+    known = rows[rows["estimated_error"].notna() & (rows["handed_over"] < 1.0)]
     if len(known) < _ESTIMATED:
         return ""
     agreement = spearman(known["estimated_error"], known["true_error"])

@@ -9,12 +9,14 @@ import pytest
 import torch
 from angles import angle
 
+from nsf.data import Trajectory
 from nsf.deployment import FULL_ORDER, OPERATORS, PROJECTED, Levels, Rollout, rollout, rollouts
 from nsf.deployment.levels import estimated_errors
 from nsf.dynamics import Method, Taylor
 from nsf.engines import Operators
 from nsf.engines.operators import Course, Teacher
 from nsf.errors import ConfigError, MissingRunError
+from nsf.evaluation import compare
 from nsf.pipeline.stages import teaching
 from nsf.sampling import RandomSampler, SampleSpan
 
@@ -183,12 +185,13 @@ def test_what_full_order_runs_taught_is_held_to_those_of_validation(of_runs, pip
 
 @pytest.fixture
 def drawn(copied, pipeline_at):
-    """(say) → the same chain with stress that particles carry, and three projected runs to learn from."""
+    """(say, keys) → the same chain with stress that particles carry, and three projected runs as lessons."""
     root = copied("simulate", "train")
 
-    def build(say=lambda line: None):
+    def build(say=lambda line: None, *more):
         keys = ("engine.teacher=runs", "engine.teaching.unroll=16", "engine.teaching.descent=600")
-        return pipeline_at(root, *TAUGHT, *keys, "engine.teaching.runs=3", "method=history", say=say)
+        keys += "engine.teaching.runs=3", "method=history", *more
+        return pipeline_at(root, *TAUGHT, *keys, say=say)
 
     return build
 
@@ -204,6 +207,18 @@ def test_projected_runs_in_drawn_cases_teach_too(drawn):
     row = pd.read_csv(pipeline.evaluation.path / "results.csv").iloc[0]
     assert row["displacement_error"] < 0.06
     assert row["method"] == "history"
+    doubted = drawn(lambda line: None, "deploy.tolerance=1e-9")  # taken anew by projected steps
+    for stage in ("deploy", "evaluate"):
+        doubted.run(stage)
+    anew = pd.read_csv(doubted.evaluation.path / "results.csv").iloc[0]
+    assert (anew["handed_over"], anew["estimated_error"]) == (1.0, 0.0)
+    taken = Rollout.open(doubted.deployment.path / "rollout_0.h5")
+    with Trajectory.open(doubted.truth(angle(26.0)).file("trajectory.h5")) as truth:
+        projected = doubted.solver_at(doubted.manifold(), angle(26.0), engine="auto")
+        carried = compare(projected, truth, taken, "test", (50, 4)).stress_error
+        fields = doubted.solver_at(doubted.manifold(), angle(26.0))
+        assert carried != pytest.approx(compare(fields, truth, taken, "test", (50, 4)).stress_error)
+    assert anew["stress_error"] == pytest.approx(carried)
 
 
 def test_drawn_runs_stand_beside_full_order_ones(pipeline_at, tmp_path):

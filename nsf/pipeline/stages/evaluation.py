@@ -111,6 +111,11 @@ def _rollouts(pipeline, manifold: Manifold) -> list[Rollout]:
     return [Rollout.open(file, manifold.latent_dim) for file in files]
 
 
+def _took(pipeline, rollout: Rollout) -> str | None:
+    """The engine of a run that operators began and none of whose steps are theirs; None: as configured."""
+    return None if rollout.by is None or rollout.by_operators else pipeline.projecting
+
+
 def _compare(
     pipeline, manifold: Manifold, rollout: Rollout, truth: Path, index: int
 ) -> tuple[Comparison, Rivals]:
@@ -120,7 +125,7 @@ def _compare(
         rest = None
         if rollout.handed_over >= 0:
             rest = files.enter_context(Trajectory.open(pipeline.deployment.file(continuation_file(index))))
-        solver = pipeline.solver_at(manifold, rollout.case)
+        solver = pipeline.solver_at(manifold, rollout.case, engine=_took(pipeline, rollout))
         shown = (asked.picture_particles, asked.picture_frames)
         found = compare(solver, trajectory, rollout, pipeline.config.deploy.split, shown, rest)
         forced = pipeline.split.train if pipeline.scene.forcing else ()

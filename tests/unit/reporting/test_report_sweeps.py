@@ -107,11 +107,17 @@ def test_delta_over_training_has_its_time_where_every_run_tells_it(tmp_path, dra
     swept(merged, of(keys), tmp_path)
     ((_, (panels, x, _)),) = drawn
     assert (x, sorted(panels["sand"]["mean"])) == ("training time [s]", [10, 40, 250])
+    for name in keys:  # of several seeds, the mean
+        keys[name] |= {"trainer.steps": "100" if steps[name] == "500" else steps[name], "seed": steps[name]}
+    swept(merged, of(keys), tmp_path)
+    assert sorted(drawn[1][1][0]["sand"]["mean"]) == [25, 250]
+    for name in keys:
+        keys[name] = {"scene": "sand", "trainer.steps": steps[name]}
     for source in merged.source:
         source.cost["trials"] = 0  # side by side, whose times tell nothing
     swept(merged, of(keys), tmp_path)
-    _, (panels, x, _) = drawn[1]
-    assert (x, sorted(panels["sand"]["mean"])) == ("steps of training of each network [–]", [100, 500, 3000])
+    _, (panels, x, _) = drawn[2]
+    assert (x, sorted(panels["sand"]["mean"])) == ("training steps of each network [–]", [100, 500, 3000])
 
 
 def test_an_interval_of_equal_values_is_a_point_and_of_lost_runs_none():
