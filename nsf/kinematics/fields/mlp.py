@@ -28,7 +28,7 @@ from nsf.vectors import number, spaced
 
 HIDDEN_LAYERS = 5
 MOST_OCTAVES = 7  # the last one's waves are as short as the gaps of 64 particles across a body
-_LEAST = 1e-9  # of the farthest coordinate's way: gives one that moves nothing a unit
+_LEAST = 1e-9  # of what is usual, by which to divide: a coordinate may move nothing, and values may be zero
 _PROBED = 512  # particles and frames of which means over all are taken
 ENCODED_POINTS = 1 << 22  # particles of whole frames encoded at once
 
@@ -45,6 +45,9 @@ class MlpField:
             deviations of the batch's x̂, and none for a batch of one frame.
         tangent: weight of the squared error of displacements from a frame to the next, over their mean
             square, beside that of displacements, while g is trained; 0 is the paper's.
+        evenness: e; while h and l are trained a frame counts 1/(1 + e m), m the mean square of its
+            standardised values over that of all frames, so that frames of little stress are learned too; 0 is
+            the paper's.
         head_parameters: h and l see the (standardised) problem parameters; in the paper h does where μ enters
             the return map (section 4.5, last paragraph).
         arithmetic: of h and l where they are deployed on a GPU (`MlpManifold.arithmetic`); training does not
@@ -61,6 +64,7 @@ class MlpField:
     noise: float = 0.01
     noise_floor: float = 0.003
     tangent: float = 1.0
+    evenness: float = 3.0
     head_parameters: bool = True
     arithmetic: str | None = "tf32"
     affine: str = "latent"
@@ -68,7 +72,7 @@ class MlpField:
     def __post_init__(self) -> None:
         per_phase("beta", self.beta)
         at_least("octaves", number("octaves", self.octaves, whole=True), 0, MOST_OCTAVES)
-        for key in ("noise", "noise_floor", "tangent"):
+        for key in ("noise", "noise_floor", "tangent", "evenness"):
             at_least(key, getattr(self, key), 0)
         if self.affine != "latent":
             raise ConfigError(
@@ -113,8 +117,9 @@ class MlpField:
     def fits(self, manifold: MlpManifold, snapshots: Snapshots, prepared: dict[str, Any]) -> Iterator[Fit]:
         """Step 1: g and e together; steps 2 and 3: h and l on the latents of the trained encoder.
 
-        Every target is standardised, so a loss is the mean squared error over its variance; g's has the
-        tangent's besides. Of snapshots shared among n devices, a frame's next one is n frames later.
+        Every target is standardised, so a loss is the mean squared error over its variance. g's has the
+        tangent's besides, and frames of h and l have weights (`evenness`). Of snapshots shared among n
+        devices, a frame's next one is n frames later.
         """
         standard, decoders, r = manifold.standard, manifold.decoders, manifold.latent_dim
         X, frame, trajectory = manifold.X.float(), snapshots.frame, snapshots.trajectory
@@ -148,13 +153,14 @@ class MlpField:
             name = TARGETS[phase][0]
             latents = manifold.decoder_latents(phase)[snapshots.rows]
             noise = (self.noise**2 * share.square() + 1 - share.square()).sqrt().float()
+            weights = self._weights(standard[name](snapshots.slab(name, spaced(snapshots.P, _PROBED))))
 
             def loss(rows, particles, generator):
                 values = standard[name](snapshots.gather(name, rows, particles))
                 xhat, mu = latents[rows].tensor_split([r], 1)
                 drawn = noise * torch.randn(xhat.shape, generator=generator, device=xhat.device)
                 found = decode(phase, particles, torch.cat([xhat + drawn, mu], 1))
-                return (found - values).square().mean()
+                return (weights[rows] * (found - values).square().mean((1, 2))).mean()
 
             return loss
 
@@ -165,6 +171,12 @@ class MlpField:
         manifold.encode_training(snapshots.whole)
         for phase in PHASES[1:]:
             yield Fit(phase, decoders[phase], decoded(phase, share), pointwise=True)
+
+    def _weights(self, values: Tensor) -> Tensor:
+        """Weight [M] of each frame of standardised values [M, n, d], in the mean 1."""
+        squares = values.square().mean((1, 2))
+        weights = 1.0 / (1.0 + self.evenness * squares / squares.mean().clamp(min=_LEAST))
+        return weights / weights.mean()
 
     def _pace(self, snapshots: Snapshots, standard: Standardizer) -> float:
         """Mean square of displacements from a frame to the next, in units of `standard`; 1 if none moves."""

@@ -136,6 +136,24 @@ def test_noise_of_the_heads_is_that_of_the_coordinates(snapshots, noise, floor):
     torch.testing.assert_close(off.std(0) * unit, expected, rtol=0.1, atol=float(1e-6 * sigma[0]))
 
 
+@pytest.mark.parametrize("phase", [1, 2])
+def test_a_frame_counts_for_less_by_its_own_size(snapshots, phase):
+    """The loss of each frame alone, with the same untrained network, over that without weights."""
+    losses = []
+    for evenness in (0.0, 2.0):
+        field = replace(FIELD, noise=0.0, noise_floor=0.0, evenness=evenness)
+        prepared = field.prepare(snapshots, LATENT)
+        manifold = field.build(snapshots, prepared, LATENT, seeded("cpu", 0))
+        fit = list(field.fits(manifold, snapshots, prepared))[phase]
+        rows = torch.arange(26).split(1)
+        losses.append(torch.stack([fit.loss(row, slice(None), seeded("cpu", 0)) for row in rows]).detach())
+    name = ("tau", "C")[phase - 1]
+    squares = manifold.standard[name](snapshots.slab(name, slice(None))).square().mean((1, 2))
+    expected = 1.0 / (1.0 + 2.0 * squares / squares.mean())
+    torch.testing.assert_close(losses[1] / losses[0], expected / expected.mean(), rtol=1e-4, atol=0)
+    assert expected.max() > 1.5 * expected.min()
+
+
 def test_a_metre_counts_as_much_along_each_axis(snapshots):
     mean, std = FIELD.prepare(snapshots, LATENT)["x"]
     u = snapshots.slab("x", slice(None)) - snapshots.X.float()
@@ -161,9 +179,9 @@ def test_deployed_fields_are_those_that_were_trained(snapshots, field):
 
 
 def replace_noise(field, manifold, snapshots, prepared):
-    """The fits of a field without noise, whose latent space is left as it is."""
+    """The fits of a field without noise and weights, whose latent space is left as it is."""
     manifold.turn = lambda floor: torch.ones(LATENT, dtype=torch.float64)
-    return replace(field, noise=0.0).fits(manifold, snapshots, prepared)
+    return replace(field, noise=0.0, evenness=0.0).fits(manifold, snapshots, prepared)
 
 
 @pytest.mark.parametrize(

@@ -128,7 +128,7 @@ def test_a_step_is_that_of_the_mean_gradient(together, files, fields, turned_onc
 
 def test_a_shard_has_the_losses_of_its_rows(files, fields, turned_once):
     whole, shard = Snapshots(files), Snapshots(files, shard=(1, 2))
-    field = replace(fields["mlp"], noise=0.0, noise_floor=0.0, tangent=0.0)
+    field = replace(fields["mlp"], noise=0.0, noise_floor=0.0, tangent=0.0, evenness=0.0)
     prepared = field.prepare(whole, LATENT)
     manifold = field.build(whole, prepared, LATENT, seeded("cpu", 0))
     rows, particles = torch.tensor([0, 7]), torch.tensor([3, 140, 5])
