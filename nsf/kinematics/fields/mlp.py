@@ -61,7 +61,7 @@ class MlpField:
 
     beta: int | Sequence[int] = (48, 72, 72)
     octaves: int = 4
-    noise: float = 0.01
+    noise: float = 0.003
     noise_floor: float = 0.003
     tangent: float = 1.0
     evenness: float = 3.0
