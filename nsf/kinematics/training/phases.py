@@ -46,22 +46,20 @@ class Fit:
     fine: bool = False
 
 
-#: Units of a layer, layers, networks: more of them fill memory, or take days before a slip is seen.
-MOST_WIDE, MOST_DEEP, MOST_MEMBERS = 16384, 256, 256
+#: Units of a layer, layers, networks, steps: more of them fill memory, or take days before a slip is seen.
+MOST_WIDE, MOST_DEEP, MOST_MEMBERS, MOST_STEPS = 16384, 256, 256, 10_000_000
 
 
-def per_phase(key: str, value: int | Sequence[int]) -> tuple[int, int, int]:
+def per_phase(key: str, value: int | Sequence[int], most: int = MOST_WIDE) -> tuple[int, int, int]:
     """A count for g, h and l, given as one for all, a pair (g, h and l) or a triple.
 
     Raises:
-        ConfigError: another number of entries, or an entry that is no whole number from 1 to `MOST_WIDE`.
+        ConfigError: another number of entries, or an entry that is no whole number from 1 to `most`.
     """
     entries = (value,) if isinstance(value, int) else tuple(value)
-    if len(entries) not in (1, 2, 3) or any(
-        not isinstance(n, int) or not 1 <= n <= MOST_WIDE for n in entries
-    ):
+    if len(entries) not in (1, 2, 3) or any(not isinstance(n, int) or not 1 <= n <= most for n in entries):
         raise ConfigError(
-            f"{key}={value} is not one, two or three whole numbers from 1 to {MOST_WIDE}; "
+            f"{key}={value} is not one, two or three whole numbers from 1 to {most}; "
             "give n, [g, h=l] or [g, h, l]"
         )
     return (*entries, *entries[-1:] * (3 - len(entries)))

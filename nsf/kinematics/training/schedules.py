@@ -13,7 +13,7 @@ from torch import Tensor
 from typing_extensions import override
 
 from nsf.errors import ConfigError
-from nsf.kinematics.training.phases import PHASES, Fit, at_least, per_phase, seeded
+from nsf.kinematics.training.phases import MOST_STEPS, PHASES, Fit, at_least, per_phase, seeded
 
 # Budget of g with e, h and l: as the paper's epochs.
 SHARES = {"deformation": 0.2, "stress": 0.4, "affine": 0.4}
@@ -158,7 +158,7 @@ class FastTrainer(Trainer):
                 "steps=null and budget_minutes=null leave training without an end; set one of them"
             )
         if self.steps is not None:
-            per_phase("steps", self.steps)
+            per_phase("steps", self.steps, MOST_STEPS)
         for key in ("learning_rate", "budget_minutes"):
             value = getattr(self, key)
             if value is not None and not value > 0:
@@ -169,7 +169,7 @@ class FastTrainer(Trainer):
 
     @override
     def steps_of(self, phase: str, frames: int) -> int | None:
-        return None if self.steps is None else per_phase("steps", self.steps)[PHASES.index(phase)]
+        return None if self.steps is None else per_phase("steps", self.steps, MOST_STEPS)[PHASES.index(phase)]
 
     @override
     def seconds_of(self, phase: str) -> float | None:

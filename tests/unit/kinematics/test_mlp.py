@@ -222,3 +222,10 @@ def test_a_checkpoint_from_before_is_refused(untrained, tmp_path):
 def test_refusals(key, value):
     with pytest.raises(ConfigError, match=f"{key}={value}"):
         MlpField(**{key: value})
+
+
+def test_steps_may_be_more_than_units_of_a_layer():
+    steps = FastTrainer(steps=[5, 40_000])
+    assert [steps.steps_of(phase, 26) for phase in ("deformation", "affine")] == [5, 40_000]
+    with pytest.raises(ConfigError, match=r"beta=40000 is not .* from 1 to 16384"):
+        MlpField(beta=40_000)
