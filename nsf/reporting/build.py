@@ -5,11 +5,12 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
+from nsf.reporting.finer import FineSource, fine_section, fine_table
 from nsf.reporting.keeping import MADE_OF, Kept, made_of
 from nsf.reporting.pictures import draw
 from nsf.reporting.rivals import beside_rivals, side_by_side
 from nsf.reporting.sources import Source, Study, file_hash, open_sources
-from nsf.reporting.study import FineSource, fine_section, fine_table, over_seeds, swept, trust_table
+from nsf.reporting.study import over_seeds, swept, trust_table
 from nsf.reporting.swap import MARK, replaced
 from nsf.reporting.tables import (
     PAPER,

@@ -1,7 +1,6 @@
-"""What the report of a study tells beyond its variants: what is varied, finer points, and trust."""
+"""What the report of a study tells beyond its variants: what is varied, and trust."""
 
 import math
-import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -10,10 +9,10 @@ import pandas as pd
 
 from nsf.reporting.drawing import charts
 from nsf.reporting.drawing.style import save
-from nsf.reporting.sources import Source, Study, checked_hash
+from nsf.reporting.sources import Study
 from nsf.reporting.tables import Merged, first_rows, paper_row, printed_of, rows_of, variant_labels, variants
-from nsf.reporting.text.columns import COLUMN, Column, axis, number, parameter_text, plus_minus
-from nsf.reporting.text.formats import Rows, file_name, spreadsheet
+from nsf.reporting.text.columns import COLUMN, axis, number, plus_minus
+from nsf.reporting.text.formats import Rows
 from nsf.reporting.text.page import Picture, Section, Table
 
 _SCENE, _RUN, _PAPER = "scene", "run", "the paper's δ"
@@ -28,34 +27,6 @@ AXES = {
 }
 """Keys that are an axis: its title and unit, and the column of results.csv that tells what became of it."""
 _STEPS, _SECONDS = "trainer.steps", ("training time", "s")  # shown in place of steps where runs tell it
-
-_TABLE, _PICTURE = "superresolution.csv", "superresolution.png"
-_HEADING = "At many more points"
-_PERCENT = ("%", 100.0)
-_COLUMNS = (
-    Column("factor", "points for each particle"),
-    Column("points", "points"),
-    Column("delta", "δ at the points", *_PERCENT),
-    Column("particles_delta", "δ at the particles", *_PERCENT),
-    Column("displacement_error", "displacement error at the points", *_PERCENT),
-    Column("particles_displacement_error", "displacement error at the particles", *_PERCENT),
-    Column("full_order_difference", "few beside many full-order particles", *_PERCENT),
-    Column("interpolation_error", "interpolation", *_PERCENT),
-    Column("smeared", "smeared", *_PERCENT),
-    Column("seconds", "query", "s"),
-    Column("full_order_seconds", "fine full-order run", "s"),
-)
-_NOTE = (
-    "The reduced run's fields, beside a full-order run of as many particles on the same grid, at the frames "
-    "that super_resolution.frames spreads over the run. The training particles are among the points. "
-    "Displacement errors too: of a full-order run of the training particles beside the fine one, at those "
-    "they share, which is what no field can know (few beside many); and of the fine run's own positions at "
-    "the training particles, interpolated to the points left out (interpolation). Smeared is the share of "
-    "these that interpolation puts more than half a grid cell away in the last frame. The query is of all "
-    "these frames together; values are queried together too, and share its time equally."
-)
-_MEANS = ("points", "delta", "particles_delta", "full_order_difference", "interpolation_error", "seconds")
-_TOLD = ("scene", "method", "field", "r", "engine", "sample")  # of a variant, in results.csv
 
 _RENAMED = {
     "method": "variant",
@@ -235,87 +206,6 @@ def _settings(frame: pd.DataFrame, told: Sequence[str], alone: str) -> list[tupl
         (" · ".join(str(value) for value in values if not pd.isna(value)), group)
         for values, group in frame.groupby(told, dropna=False, sort=False)
     ]
-
-
-class FineSource:
-    """A superresolve run whose files are whole, and the evaluate run of the same deployment.
-
-    Raises:
-        SchemaError: a file is missing or differs from its manifest.
-    """
-
-    def __init__(self, run, source: Source):
-        self.run, self.id, self.manifest, self.of = run, run.id, run.manifest, source
-        self.hashes = {name: checked_hash(run, name) for name in (_TABLE, _PICTURE)}
-        self.table = pd.read_csv(Path(run.path) / _TABLE)
-        self.summary: dict = {}
-
-    @property
-    def created(self) -> str:
-        """When the run was made (ISO), by its manifest."""
-        return str(self.manifest.get("created", ""))
-
-
-def fine_table(fine: Sequence[FineSource], settings, folder: Path) -> Table:
-    """A row a run and parameter value; the numbers in full go to `superresolution.csv` in the folder.
-
-    Args:
-        fine: runs.
-        settings: by evaluate run id, what tells jobs of a scene apart; empty where nothing does.
-        folder: of the report.
-    """
-    variants = [_variant(f, settings) for f in fine]
-    varied = [name for name in variants[0] if len({variant[name] for variant in variants}) > 1]
-    known = ["scene", *(name for name in varied if name != "scene")]
-    frames = [f.table.assign(**variant) for f, variant in zip(fine, variants, strict=True)]
-    frame = pd.concat(frames, ignore_index=True)[[*known, *fine[0].table]]
-    frame.map(spreadsheet).to_csv(folder / _TABLE, index=False)
-    units = {f.of.results["scene"].iloc[0]: f.of.parameter[1] for f in fine}
-    body = [
-        [
-            *(str(row[name]) for name in known),
-            parameter_text(row["parameter"], "", units[row["scene"]]),
-            *(column.text(row[column.name]) for column in _COLUMNS),
-        ]
-        for row in frame.to_dict("records")
-    ]
-    headings = [*known, "parameter", *(c.heading for c in _COLUMNS)]
-    return Table(_HEADING, Rows(headings, body, [False] * len(headings)), _NOTE)
-
-
-def fine_means(folder: Path) -> Rows:
-    """Means over parameter values of a report's `superresolution.csv`, a row a variant."""
-    frame = pd.read_csv(folder / _TABLE)
-    known = list(frame.columns[: frame.columns.get_loc("parameter")])
-    columns = [column for column in _COLUMNS if column.name in _MEANS]
-    means = frame.groupby(known, sort=False, as_index=False)[[column.name for column in columns]].mean()
-    body = [
-        [*(str(row[name]) for name in known), *(column.text(row[column.name]) for column in columns)]
-        for row in means.to_dict("records")
-    ]
-    headings = [*known, *(column.heading for column in columns)]
-    return Rows(headings, body, [i >= len(known) for i in range(len(headings))])
-
-
-def _variant(f: FineSource, settings) -> dict:
-    """What tells a job from others."""
-    return f.of.results.iloc[0][list(_TOLD)].to_dict() | {"setting": settings.get(f.of.id, "")}
-
-
-def fine_section(fine: Sequence[FineSource], folder: Path) -> Section:
-    """The picture of each run."""
-    pictures = []
-    for index, f in enumerate(fine):
-        variant = _variant(f, {})
-        name = file_name(f"{variant['scene']}-{variant['field']}-superresolution{index or ''}") + ".png"
-        shutil.copyfile(Path(f.run.path) / _PICTURE, folder / name)
-        caption = (
-            f"The last frame of {variant['scene']} ({variant['field']} field): the reduced run at its "
-            "particles, the same at many more points, and a full-order run of as many particles; whole "
-            "bodies, coloured by how far they moved."
-        )
-        pictures.append(Picture([name], caption, [f.id]))
-    return Section(_HEADING, pictures)
 
 
 def trust_table(merged: Merged, renamed: Mapping[str, str]) -> list[Table]:

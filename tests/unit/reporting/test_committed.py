@@ -11,7 +11,7 @@ from finished import job, write_report
 from nsf.cli import main
 from nsf.errors import SchemaError
 from nsf.paths import EXPERIMENTS
-from nsf.reporting import committed, study
+from nsf.reporting import committed, finer
 
 
 @pytest.fixture
@@ -146,11 +146,11 @@ def test_benchmarks_are_listed_by_their_first_lines(tmp_path):
 def test_points_beyond_the_particles_have_their_means(tmp_path):
     folder = write_report(tmp_path / "super_resolution", [job(field="basis"), job(field="mlp")])
     rows = [
-        dict.fromkeys((c.name for c in study._COLUMNS), value) | {"field": field, "parameter": 1.0}
+        dict.fromkeys((c.name for c in finer._COLUMNS), value) | {"field": field, "parameter": 1.0}
         for field, value in (("basis", 0.01), ("basis", 0.03), ("mlp", 0.5))
     ]
     frame = pd.DataFrame(rows)
-    frame[["field", "parameter", *(c.name for c in study._COLUMNS)]].to_csv(
+    frame[["field", "parameter", *(c.name for c in finer._COLUMNS)]].to_csv(
         folder / "superresolution.csv", index=False
     )
     text = committed.write_list(tmp_path).read_text()
