@@ -7,7 +7,7 @@ tolerance, or the run leaves what it was taught or trained on, the projected ste
 steps the operators try again. What they miss then adds to what they missed before. With method history
 particles carry stress that nobody knows in the midst of a run by operators: there the projected step takes
 the whole run anew, from t = 0. Where the projected step is not to be believed either, the full-order solver
-goes on, to the end (`nsf.deployment.handover`).
+goes on, to the end (`nsf.deployment.handover`). Operators that are too far off at validation runs take none.
 """
 
 from collections.abc import Callable, Sequence
@@ -39,12 +39,14 @@ class Levels:
         every: steps from one projected step to the next.
         tolerance: [m] largest estimated error; None for any.
         on_distrust: whether the projected step goes on where a run is not to be believed.
+        near: whether operators were near enough at validation runs; else the projected step takes all runs.
     """
 
     projected: Callable[[Sequence[Case]], ReducedBatch]
     every: int
     tolerance: float | None = None
     on_distrust: bool = False
+    near: bool = True
 
     def watched(
         self, batch: ReducedBatch, cases: Sequence[Case], trust: Trust
@@ -62,22 +64,24 @@ class Levels:
             `OPERATORS` or `PROJECTED`.
         """
         projected = self.projected(cases)
+        if not self.near:
+            return [_anew(projected.alone(run.index).runs[0]) for run in batch.runs]
         estimates = estimated_errors(batch, projected, self.every)
         found = []
         for run, estimate in zip(batch.runs, estimates, strict=True):
             own = self._believed(estimate, _ratios(run, 0, run.steps_taken, trust))
             if self.on_distrust and run.doubt[0] > 1.0:
                 own = 0
-            by, solver = np.full(run.steps_taken, OPERATORS, np.int8), run
-            if own < len(by):
-                solver = projected.alone(run.index).runs[0]
-                if isinstance(solver.setup.method, History):
-                    by[:], estimate = PROJECTED, np.zeros(len(by) + 1)
-                    solver.step(len(by))
-                else:
-                    by[own:] = PROJECTED
-                    estimate = self._shared(run, solver, estimate, by, trust)
-            found.append((solver, estimate, by))
+            by = np.full(run.steps_taken, OPERATORS, np.int8)
+            if own == len(by):
+                found.append((run, estimate, by))
+                continue
+            solver = projected.alone(run.index).runs[0]
+            if isinstance(solver.setup.method, History):
+                found.append(_anew(solver))
+            else:
+                by[own:] = PROJECTED
+                found.append((solver, self._shared(run, solver, estimate, by, trust), by))
         return found
 
     def _believed(self, estimate: np.ndarray, ratios: np.ndarray) -> int:
@@ -177,6 +181,13 @@ class Levels:
             if self._believed(found, ratios) < len(found) - 1:
                 break
         return found, ratios
+
+
+def _anew(solver: ReducedMPM) -> tuple[ReducedMPM, np.ndarray, np.ndarray]:
+    """The projected step, at t = 0, takes a run to its end; what `Levels.watched` gives of it."""
+    steps = solver.total_steps
+    solver.step(steps)
+    return solver, np.zeros(steps + 1), np.full(steps, PROJECTED, np.int8)
 
 
 def estimated_errors(batch: ReducedBatch, projected: ReducedBatch, every: int) -> np.ndarray:

@@ -159,6 +159,12 @@ class Names:
         return self.teaching is not None and self.config.engine.teacher == RUNS
 
     @property
+    def error_ratio(self) -> float | None:
+        """Times the projected step's error at validation runs, that operators' may be; None for any."""
+        # A configuration from before there was the key has none.
+        return OmegaConf.select(self.config, "deploy.error_ratio", default=None)
+
+    @property
     def held_out(self) -> tuple[Case, ...]:
         """Cases that are deployed and evaluated."""
         self.check_held_out()
@@ -249,6 +255,8 @@ class Names:
             content["engine"] = self.engine
         if self.teaching is not None:
             content |= {"check": self.config.engine.check, "tolerance": self.config.deploy.tolerance}
+            if self.of_runs and self.error_ratio is not None:
+                content["error_ratio"] = self.error_ratio
         if changed := edits():  # an edited step is another run, whose result is not there yet
             content["edited"] = changed
         parents = [self.training, self.taught] if self.is_taught else [self.training]

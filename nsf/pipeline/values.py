@@ -99,6 +99,9 @@ def _check_levels(c: DictConfig, engine: str) -> None:
     configuration.number("engine.check", c.engine.check, least=1, whole=True)
     if tolerance is not None and not configuration.number("deploy.tolerance", tolerance) > 0:
         raise ConfigError(f"deploy.tolerance={tolerance} m must be positive, or null for none")
+    ratio = OmegaConf.select(c.deploy, "error_ratio", default=None)
+    if ratio is not None and not configuration.number("deploy.error_ratio", ratio) > 0:
+        raise ConfigError(f"deploy.error_ratio={ratio} must be positive, or null for any")
 
 
 def _check_paper(stated) -> None:

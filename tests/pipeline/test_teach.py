@@ -190,7 +190,7 @@ def drawn(copied, pipeline_at):
 
     def build(say=lambda line: None, *more):
         keys = ("engine.teacher=runs", "engine.teaching.unroll=16", "engine.teaching.descent=600")
-        keys += "engine.teaching.runs=3", "method=history", *more
+        keys += "engine.teaching.runs=3", "method=history", "deploy.error_ratio=null", *more
         return pipeline_at(root, *TAUGHT, *keys, say=say)
 
     return build
@@ -219,6 +219,26 @@ def test_projected_runs_in_drawn_cases_teach_too(drawn):
         fields = doubted.solver_at(doubted.manifold(), angle(26.0))
         assert carried != pytest.approx(compare(fields, truth, taken, "test", (50, 4)).stress_error)
     assert anew["stress_error"] == pytest.approx(carried)
+
+
+@pytest.mark.parametrize("method", ["history", "nsf"])
+def test_operators_too_far_off_at_validation_runs_take_no_step(drawn, method):
+    said = []
+    pipeline = drawn(said.append, f"method={method}", "deploy.error_ratio=1e-3")
+    pipeline.run("deploy")
+    told = pipeline.taught.manifest["metrics"]
+    assert 0.0 < told["projected_error"] < 1e3 * min(told["errors"])
+    assert any("so that the projected step takes all runs" in line for line in said)
+    taken = Rollout.open(pipeline.deployment.path / "rollout_0.h5")
+    projected = pipeline.solver_at(pipeline.manifold(), angle(26.0), engine="auto")
+    projected.step(24)
+    np.testing.assert_array_equal(taken.xhat, projected.record.xhat.numpy())
+    assert (taken.by_operators, taken.estimate.max()) == (0, 0.0)
+    near = drawn(said.append, f"method={method}", "deploy.error_ratio=1e3")
+    assert near.taught.id == pipeline.taught.id
+    assert near.deployment.id != pipeline.deployment.id
+    near.run("deploy")
+    assert Rollout.open(near.deployment.path / "rollout_0.h5").by_operators == 24
 
 
 def test_drawn_runs_stand_beside_full_order_ones(pipeline_at, tmp_path):
@@ -485,6 +505,7 @@ def test_a_rollout_keeps_who_took_its_steps(lesson, tmp_path):
         (("deploy.tolerance=0.001",), "deploy.tolerance=0.001 needs engine=operators"),
         (("deploy.on_distrust=projected",), "deploy.on_distrust=projected needs engine=operators"),
         ((*TAUGHT, "deploy.tolerance=-1.0"), "deploy.tolerance=-1.0 m must be positive, or null"),
+        ((*TAUGHT, "deploy.error_ratio=0"), "deploy.error_ratio=0 must be positive, or null for any"),
         ((*TAUGHT, "engine.check=0"), "engine.check=0 must be a whole number of at least 1"),
         ((*TAUGHT, "engine.teacher=operators"), "engine.teacher=operators is unknown"),
         ((*TAUGHT, "engine.teaching.width=0"), "engine.teaching: width=0 must be at least 1"),

@@ -158,7 +158,24 @@ def _levels(pipeline, manifold: Manifold) -> Levels | None:
         pipeline.config.engine.check,
         asked.tolerance,
         asked.on_distrust != "report",
+        _near(pipeline),
     )
+
+
+def _near(pipeline) -> bool:
+    """Whether operators were near enough at validation runs, beside the projected step; tells where not."""
+    if pipeline.error_ratio is None or not pipeline.of_runs:
+        return True
+    taught = pipeline.taught
+    own, projected = min(taught.manifest["metrics"]["errors"]), taught.metric("projected_error")
+    if own <= pipeline.error_ratio * projected:
+        return True
+    pipeline.say(
+        f"deploy: warning: operators are {100 * own:.2g} % off at validation runs and the projected step "
+        f"{100 * projected:.2g} %, so that the projected step takes all runs; deploy.error_ratio=null leaves "
+        "them to operators"
+    )
+    return False
 
 
 def _told(rollout: Rollout) -> list[str]:

@@ -50,7 +50,7 @@ def evaluate(pipeline, run: Run) -> None:
             for index, (rollout, truth) in enumerate(zip(rollouts, truths, strict=True))
         ]
         comparisons, beside = zip(*found, strict=True)
-        cost = _cost(pipeline, manifold, rollouts[0], beside[0].factors)
+        cost = _cost(pipeline, manifold, rollouts, beside[0].factors)
         engine = str(pipeline.deployment.manifest["metrics"].get("engine", ""))
         seconds = pipeline.training.metric("training_seconds")
         offline = seconds, pipeline.taught.metric("teach_seconds") if pipeline.is_taught else 0.0
@@ -133,12 +133,13 @@ def _compare(
         return found, rivals(solver, trajectory, pipeline.coarse, known)
 
 
-def _cost(pipeline, manifold: Manifold, rollout: Rollout, factors: Sequence[int]) -> dict:
+def _cost(pipeline, manifold: Manifold, rollouts: Sequence[Rollout], factors: Sequence[int]) -> dict:
     """Content of `cost.json`, measured in the first held-out case.
 
     Args:
         pipeline, manifold: that are timed.
-        rollout: the reduced run of that case, which is decoded.
+        rollouts: the reduced runs; that of the first case is decoded. Where operators took no step of any,
+            the projected step is timed.
         factors: of Δx of the coarse full-order runs that there are.
     """
     c, scene, case = pipeline.config, pipeline.deployed, pipeline.held_out[0]
@@ -146,9 +147,11 @@ def _cost(pipeline, manifold: Manifold, rollout: Rollout, factors: Sequence[int]
         return results.costs({})
     full = Subject(lambda: scene.full_order(case, c.precision, pipeline.device), scene.steps)
     steps = reduced_steps(scene.steps, c.deploy.dt_multiplier)
-    reduced = Subject(lambda: pipeline.solver_at(manifold, case), steps)
+    took = {_took(pipeline, rollout) for rollout in rollouts}
+    engine = None if None in took else pipeline.projecting
+    reduced = Subject(lambda: pipeline.solver_at(manifold, case, engine=engine), steps)
     coarse = coarse_subjects(scene, case, factors, c.precision, pipeline.device)
     subjects = {"full_order": full, "reduced": reduced, **coarse}
     measured = measure(subjects, c.evaluation.trials, pipeline.device)
-    decoding = decoding_ms(pipeline.solver_at(manifold, case), rollout, c.evaluation.trials)
+    decoding = decoding_ms(pipeline.solver_at(manifold, case), rollouts[0], c.evaluation.trials)
     return results.costs(measured, decoding)

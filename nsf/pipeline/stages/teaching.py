@@ -42,9 +42,10 @@ def teach(pipeline, run: Run) -> None:
     # Full-order runs in cases that nothing was learned from are those of validation alone.
     back = not pipeline.of_runs or pipeline.split.validation
     where = "in cases held back" if back else "in the training cases, as there are no validation cases"
+    beside = f", the projected step {100 * found['projected_error']:.2g} %" if pipeline.of_runs else ""
     pipeline.say(
         f"teach: {asked} in {found['teach_seconds']:.1f} s, "
-        f"{100 * min(found['errors']):.2g} % off {where} → {run.id}"
+        f"{100 * min(found['errors']):.2g} % off {where}{beside} → {run.id}"
     )
 
 
@@ -74,18 +75,21 @@ def _follow(pipeline, manifold: Manifold, record: Record) -> None:
         before = time.perf_counter() - started
         operators, steps = course.follow(), course.steps
         broken = course.broken_affinity()
+        beside, last = {}, time.perf_counter()
+        if pipeline.of_runs:
+            beside["projected_error"] = yardstick.error(yardstick.teacher.run())
     taught = Taught.of(lessons[0].setup, *course.gravity)
     operators.save(record.path / OPERATORS, taught, lessons[0].setup.samples)
     record.output(OPERATORS)
     for left in record.path.glob("round_*.pt"):
         left.unlink()
     record.metrics |= {
-        "teach_seconds": before + course.seconds,
+        "teach_seconds": before + course.seconds + time.perf_counter() - last,
         "teacher_steps": steps,
         "errors": course.errors,
         "broken_affinity": broken,
         "round": course.best,
-    }
+    } | beside
 
 
 def truth_of(pipeline, manifold: Manifold) -> torch.Tensor | None:
