@@ -80,6 +80,11 @@ class Rollout:
         return np.where(handed, FULL_ORDER, by).astype(np.int8)
 
     @property
+    def handed_on(self) -> float:
+        """Share of steps that projected steps took in a run that operators began; 0 of any other run."""
+        return 0.0 if self.by is None else float((self.levels == PROJECTED).mean())
+
+    @property
     def by_operators(self) -> int:
         """How many steps operators took."""
         return int((self.levels == OPERATORS).sum())

@@ -31,7 +31,13 @@ _VALUES = "scene.design.test"  # jobs with this key are about certain held-out v
 _PAPER = "paper"
 _DEVIATION = ", deviation"
 _RUNS, _DIVERGED, _SEEDS = "runs", "diverged", "seeds"  # how many are in a row of `groups`
-_MEASURED = ("delta", "displacement_error", "stress_error", "speedup_step", "speedup_total")
+_MEASURED = (
+    "delta_static", "delta", "displacement_error", "displacement_worst", "displacement_interpolated",
+    "stress_error",
+    "speedup_step", "speedup_total", "speedup_shown", "break_even_runs", "handed_over",
+)  # fmt: skip
+#: Of these the deviation over seeds stands beside the mean.
+_SCATTERED = ("delta", "displacement_error", "stress_error", "speedup_step", "speedup_total", "speedup_shown")
 _COLUMN_OF = {
     "scene": "scene",
     "method": "method",
@@ -66,6 +72,12 @@ class Report:
                 "build the report again with `nsf report`"
             )
         frame = frame.assign(**{name: np.nan for name in LATER if name not in frame})
+        still = frame["displacement_static"] / frame["displacement_error"]
+        shown = frame["total_ms_full"] / (frame["total_ms_reduced"] + frame["decode_ms"])
+        worst = frame["displacement_error"]
+        frame = frame.assign(
+            delta_static=frame["delta"] * still, speedup_shown=shown, displacement_worst=worst
+        )
         runs = [self.told["runs"][row["run"]] for row in self.told["rows"]]
         keys = pd.DataFrame([_own(run) for run in runs], index=frame.index).replace("null", np.nan)
         frame = frame.join(keys)
@@ -118,6 +130,8 @@ class Report:
             row = dict(zip(alike, values, strict=True))
             row |= {name: part[name].iloc[0] if part[name].nunique() == 1 else ABSENT for name in others}
             row |= {name: part[name].mean(skipna=False) for name in (*_MEASURED, *RIVALS, _PAPER)}
+            row["delta_static"] = part["delta_static"].mean()  # not of runs that diverged
+            row["displacement_worst"] = part["displacement_worst"].max()
             row |= {f"{name}{_DEVIATION}": value for name, value in self._deviations(part).items()}
             row |= {_RUNS: len(part), _DIVERGED: int(np.isinf(part["delta"]).sum())}
             rows.append(row | {_SEEDS: len(part[self.seeds].drop_duplicates()) if self.seeds else 1})
@@ -126,11 +140,11 @@ class Report:
         return frame.iloc[np.lexsort(ranks[::-1])].reset_index(drop=True)
 
     def _deviations(self, part: pd.DataFrame) -> dict[str, float]:
-        """Standard deviation over seeds of each measure's mean over held-out values; NaN of one seed."""
+        """Standard deviation over seeds of the mean over held-out values; none without several seeds."""
         if not self.seeds:
-            return dict.fromkeys(_MEASURED, np.nan)
-        means = part.groupby(self.seeds, dropna=False)[list(_MEASURED)].agg(lambda v: v.mean(skipna=False))
-        return {name: means[name].std(skipna=False) for name in _MEASURED}
+            return {}
+        means = part.groupby(self.seeds, dropna=False)[list(_SCATTERED)].agg(lambda v: v.mean(skipna=False))
+        return {name: means[name].std(skipna=False) for name in _SCATTERED}
 
     @property
     def small(self) -> set[str]:
@@ -174,14 +188,20 @@ def _flat(report: Report) -> Rows:
     groups = report.groups
     order = dict.fromkeys(("scene", "method", "field", "engine", *report.settings, "r", "sample"))
     shown = [key for key in order if key == "scene" or groups[key].nunique() > 1]
-    measured = [name for name in _MEASURED if groups[name].notna().any()]
+    measured = [name for name in _MEASURED if np.isfinite(groups[name]).any() or name == "delta"]
+    measured = [name for name in measured if name != "handed_over" or groups[name].any()]
+    if (groups[_RUNS] == 1).all():
+        measured.remove("displacement_worst")
     seeds = [_SEEDS] if groups[_SEEDS].nunique() > 1 else []
     paper = ["paper's δ [%]"] if groups[_PAPER].notna().any() else []
     body = [
         [_text(key, row[key]) for key in shown]
         + [f"{row[name]}" for name in seeds]
         + [number(row[_PAPER], 100) for _ in paper]
-        + [plus_minus(row[name], row[f"{name}{_DEVIATION}"], COLUMN[name].scale) for name in measured]
+        + [
+            plus_minus(row[name], row.get(f"{name}{_DEVIATION}", np.nan), COLUMN[name].scale)
+            for name in measured
+        ]
         for row in groups.to_dict("records")
     ]
     headings = [*map(_title, shown), *seeds, *paper, *(COLUMN[name].heading for name in measured)]
@@ -226,7 +246,7 @@ def _both_errors(row: Mapping) -> str:
     """δ and the stress error of a row of `groups`, or how many of its runs diverged."""
     if row[_DIVERGED]:
         return f"{row[_DIVERGED]} of {row[_RUNS]} diverged"
-    delta = plus_minus(row["delta"], row[f"delta{_DEVIATION}"], 100)
+    delta = plus_minus(row["delta"], row.get(f"delta{_DEVIATION}", np.nan), 100)
     return f"{delta} ({number(row['stress_error'], 100)})"
 
 
@@ -247,8 +267,12 @@ def _over_seeds(report: Report) -> Rows:
 
 def _averaged(report: Report) -> str:
     """What the numbers are means over."""
-    told = "each held-out value by itself" if "parameter" in report.settings else "means over held-out values"
-    return f"{told} and, where several were run, seeds (± their standard deviation)" if report.seeds else told
+    kind = "validation" if set(report.rows["split"]) == {"validation"} else "held-out"
+    alone = "parameter" in report.settings
+    told = f"each {kind} value by itself" if alone else f"means over {kind} values"
+    if not report.seeds:
+        return f"{told}, of one seed"
+    return f"{told} and, where several were run, seeds (± their standard deviation)"
 
 
 def _best(report: Report) -> str:

@@ -20,6 +20,7 @@ SEEDS = ("seed", "sampler.seed")
 _ERRORS = ("delta", "displacement_error", "stress_error")
 AXES = {
     "sampler.size": ("sample particles |S|", "–", "sample"),
+    "sampler.cells": ("cells with sample particles", "–", None),
     "latent_dim": ("latent coordinates r", "–", "r"),
     "field.beta": ("hidden width β over d", "–", None),
     "deploy.dt_multiplier": ("deployment step", "full-order Δt", None),

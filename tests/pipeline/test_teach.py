@@ -1,5 +1,6 @@
 """Operators from their teaching to their errors, on the tiny chain; and what they are refused for."""
 
+import json
 import re
 import shutil
 
@@ -497,6 +498,25 @@ def test_a_rollout_keeps_who_took_its_steps(lesson, tmp_path):
     assert row["teach_seconds"] == pytest.approx(pipeline.taught.manifest["metrics"]["teach_seconds"])
     offline = row["teach_seconds"] + pipeline.training.manifest["metrics"]["training_seconds"]
     assert row["break_even_runs"] > offline / (1e-3 * 40 * row["step_ms_full"])
+
+
+def test_a_run_that_is_handed_on_costs_what_its_steps_cost(lesson, pipeline_at):
+    pipeline, _ = lesson
+    tolerance = 0.5 * Rollout.open(pipeline.deployment.path / "rollout_0.h5").estimate.max()
+    handed = pipeline_at(pipeline.root, *TAUGHT, f"deploy.tolerance={tolerance}")
+    for stage in ("deploy", "evaluate"):
+        handed.run(stage)
+    row = pd.read_csv(handed.evaluation.path / "results.csv").iloc[0]
+    cost = json.loads((handed.evaluation.path / "cost.json").read_text())
+    share = row["handed_over"]
+    assert 0.0 < share < 1.0
+    for name in ("step_ms", "total_ms"):
+        own, projected = (cost[solver][name] for solver in ("reduced", "projected"))
+        assert row[f"{name}_reduced"] == pytest.approx((1.0 - share) * own + share * projected)
+        assert row[f"speedup_{name[:-3]}"] == pytest.approx(row[f"{name}_full"] / row[f"{name}_reduced"])
+    saved = 1e-3 * (row["total_ms_full"] - row["total_ms_reduced"])
+    offline = row["teach_seconds"] + handed.training.manifest["metrics"]["training_seconds"]
+    assert row["break_even_runs"] == (pytest.approx(offline / saved) if saved > 0.0 else np.inf)
 
 
 @pytest.mark.parametrize(

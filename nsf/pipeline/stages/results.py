@@ -33,6 +33,7 @@ def costs(measured: Mapping[str, SolverCost], decode_ms: float = math.nan) -> di
     return {
         "full_order": full.as_dict(),
         "reduced": reduced.as_dict(),
+        **{name: measured[name].as_dict() for name in ("projected",) if name in measured},
         "coarse": {
             name.removeprefix(_COARSE): found.as_dict()
             for name, found in measured.items()
@@ -63,7 +64,7 @@ def rows(
     """Content of `results.csv`, one row a case; errors are fractions, ∞ where a run diverged.
 
     `engine` took the steps of the rollouts; empty where their run does not say. `offline` are the times of
-    training and of teaching [s].
+    training and of teaching [s]. A run costs what its steps cost, those by operators and projected ones.
     """
     commit = str(manifest.get("commit") or "unknown")[:12] + ("-dirty" if manifest.get("dirty") else "")
     variant = {
@@ -73,11 +74,17 @@ def rows(
         "r": manifold.latent_dim,
         "engine": engine,
     }
+
+    def costs_of(share: float) -> dict[str, float]:
+        as_run = _handed_on(cost, share)
+        return _costs_in_a_row(as_run, next(iter(rivals[0].coarse), None)) | {
+            "teach_seconds": offline[1],
+            "break_even_runs": _break_even(as_run, sum(offline)),
+        }
+
     measured = {
         "gamma": reduction_ratio(len(manifold.X), manifold.latent_dim),
-        **_costs_in_a_row(cost, next(iter(rivals[0].coarse), None)),
-        "teach_seconds": offline[1],
-        "break_even_runs": _break_even(cost, sum(offline)),
+        **costs_of(0.0),
         **dict.fromkeys(
             ("handed_over", "estimated_error", "true_error", *(f"{name}_error" for name in QUANTITIES)), 0.0
         ),  # their place; of each run below
@@ -110,7 +117,8 @@ def rows(
             "true_error": comparison.true_error,
             **{f"{name}_error": off for name, off in comparison.quantities.items()},
         }
-        found.append(variant | own | (measured if reduced else lost) | share)
+        measures = measured | costs_of(rollout.handed_on) if reduced else lost
+        found.append(variant | own | measures | share)
     return pd.DataFrame(found)
 
 
@@ -123,6 +131,16 @@ def _beside(rivals: Rivals) -> dict[str, float]:
         "displacement_interpolated": rivals.interpolated,
         "displacement_coarse": first.get("displacement_error", math.nan),
     }
+
+
+def _handed_on(cost: dict, share: float) -> dict:
+    """`cost.json` of a run of which projected steps took a share, as steps by operators and they cost."""
+    if not share or "projected" not in cost:
+        return cost
+    own, other = cost["reduced"], cost["projected"]
+    times = {name: (1.0 - share) * own[name] + share * other[name] for name in ("step_ms", "total_ms")}
+    memory = max(own["memory_mib"], other["memory_mib"])
+    return cost | {"reduced": own | times | {"memory_mib": memory}}
 
 
 def _costs_in_a_row(cost: dict, factor: int | None) -> dict[str, float]:

@@ -99,6 +99,9 @@ _MORE = (
     Column("step_ms", "step", "ms"),
     Column("total_ms", "run", "ms"),
     Column("shown_ms", "run, frames decoded", "ms"),
+    Column("speedup_shown", "speedup, frames decoded", "×"),
+    Column("displacement_worst", "its largest", "%", 100.0),
+    Column("delta_static", "δ if nothing moves", "%", 100.0),
     Column("memory_mib", "memory", "MiB"),
 )
 COLUMN = {column.name: column for column in (*_SPEC, *_MORE)}

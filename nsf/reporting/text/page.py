@@ -22,7 +22,23 @@ DEFINITIONS = (
         "(C = 0), neural_affine_only the affine momentum alone (τ from ∂g/∂X), deformation_only neither; "
         "history: particles carry both, as at full order.",
     ),
-    ("speedup", "full-order over reduced wall time, of one step and of the whole simulation."),
+    (
+        "speedup",
+        "full-order over reduced wall time, of one step, of the whole simulation, and of the simulation with "
+        "the positions of all particles decoded at every frame, as a full-order run has them. A run is "
+        "charged with the steps that it took, by operators or projected.",
+    ),
+    (
+        "rivals",
+        "without a reduced step: nothing moves; the training run of the nearest parameters; latent vectors "
+        "of the same fields, interpolated over the parameters between training runs.",
+    ),
+    (
+        "runs until it pays",
+        "reduced runs, without decoding, that save as much time as training and teaching took; training runs "
+        "are not counted.",
+    ),
+    ("handed on", "share of steps that operators left to projected ones, or these to the full-order solver."),
 )
 
 

@@ -40,6 +40,25 @@ def test_means_over_values_and_seeds_a_row_a_scene_and_setting(tmp_path):
     )
 
 
+def test_what_a_mean_hides_stands_beside_it(tmp_path):
+    """A still body has a δ of δ over the displacement error; frames are decoded beside a run."""
+    costs = {"total_ms_full": 60.0, "total_ms_reduced": 2.0, "decode_ms": 10.0, "break_even_runs": 7.0}
+    rivals = {"displacement_static": 1.0, "displacement_interpolated": 0.3}
+    jobs = [
+        job(delta=delta, parameter=value) | costs | rivals | {"displacement_error": off, "handed_over": share}
+        for value, delta, off, share in ((1.0, 0.001, 0.02, 0.0), (2.0, 0.002, 0.08, 0.5))
+    ]
+    rows, _ = told(write_report(tmp_path / "a", jobs))
+    shown = dict(zip(*rows, strict=True))
+    assert float(shown["δ if nothing moves [%]"]) == pytest.approx(100 * (0.001 / 0.02 + 0.002 / 0.08) / 2)
+    assert (shown["displacement error [%]"], shown["its largest [%]"]) == ("5", "8")
+    assert (shown["interpolated latents [%]"], shown["runs until it pays"]) == ("30", "7")
+    assert (shown["speedup, frames decoded [×]"], shown["handed on [%]"]) == ("5", "25")
+    jobs = [job() | {"handed_over": 0.0}]
+    headings = told(write_report(tmp_path / "b", jobs))[0][0]
+    assert not {"its largest [%]", "handed on [%]", "δ if nothing moves [%]"} & {*headings}
+
+
 def test_training_values_count_only_where_there_are_no_others(tmp_path):
     jobs = [job(delta=0.001), job(delta=0.5, parameter=3.0) | {"split": "train"}]
     assert told(write_report(tmp_path / "a", jobs))[0][1][2] == "0.100"

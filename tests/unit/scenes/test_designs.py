@@ -1,6 +1,8 @@
 """Designs of experiments, and the parameters that they draw."""
 
 import math
+import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -51,6 +53,16 @@ def test_more_sobol_cases_keep_those_of_fewer():
     assert many.train[:6] == few.train
     assert many.test[:3] == few.test
     assert many.validation == few.validation
+
+
+@pytest.mark.parametrize("design", [Sobol(6, 3, 2), LatinHypercube(6, 3, 2), Grid((3, 2), 3, 2)])
+def test_test_cases_may_be_others_beside_the_same_training(design):
+    own, other = (replace(design, test_seed=seed).split(RANGES) for seed in (None, 7))
+    assert (own.train, own.validation) == (other.train, other.validation)
+    assert not {*own.test} & {*other.test}
+    assert other.test == replace(design, seed=7).split(RANGES).test  # as are the numbers of programs
+    with pytest.raises(ConfigError, match=re.escape("scene.design.test_seed=-1 must be a whole number")):
+        replace(design, test_seed=-1)
 
 
 def test_a_drawn_value_is_what_its_text_says():
