@@ -7,7 +7,8 @@ tolerance, or the run leaves what it was taught or trained on, the projected ste
 steps the operators try again. What they miss then adds to what they missed before. With method history
 particles carry stress that nobody knows in the midst of a run by operators: there the projected step takes
 the whole run anew, from t = 0. Where the projected step is not to be believed either, the full-order solver
-goes on, to the end (`nsf.deployment.handover`). Operators that are too far off at validation runs take none.
+goes on, to the end (`nsf.deployment.handover`). Where operators are
+too far off at validation runs, they take no step.
 """
 
 from collections.abc import Callable, Sequence
@@ -64,8 +65,6 @@ class Levels:
             `OPERATORS` or `PROJECTED`.
         """
         projected = self.projected(cases)
-        if not self.near:
-            return [_anew(projected.alone(run.index).runs[0]) for run in batch.runs]
         estimates = estimated_errors(batch, projected, self.every)
         found = []
         for run, estimate in zip(batch.runs, estimates, strict=True):
@@ -184,7 +183,14 @@ class Levels:
 
 
 def _anew(solver: ReducedMPM) -> tuple[ReducedMPM, np.ndarray, np.ndarray]:
-    """The projected step, at t = 0, takes a run to its end; what `Levels.watched` gives of it."""
+    """Take a run by projected steps from t = 0 to its end.
+
+    Args:
+        solver: at t = 0, alone in its batch.
+
+    Returns:
+        It, its distance from the projected run, 0 [N + 1] [m], and `PROJECTED` [N].
+    """
     steps = solver.total_steps
     solver.step(steps)
     return solver, np.zeros(steps + 1), np.full(steps, PROJECTED, np.int8)

@@ -80,8 +80,8 @@ class Rollout:
         return np.where(handed, FULL_ORDER, by).astype(np.int8)
 
     @property
-    def handed_on(self) -> float:
-        """Share of steps that projected steps took in a run that operators began; 0 of any other run."""
+    def projected_share(self) -> float:
+        """Share of steps, in a run with operators, that the projected step took; 0 of any other run."""
         return 0.0 if self.by is None else float((self.levels == PROJECTED).mean())
 
     @property
@@ -215,9 +215,13 @@ def rollouts(
         levels: who goes on with runs by operators, and how these are watched; their time counts too. None
             where no operators step, or nobody looks.
     """
-    if levels is None:
-        seconds = _timed_run(batch, trust if until_distrusted else None) / len(batch)
-        watched = [(run, None, None) for run in batch.runs]
+    if levels is None or not levels.near:
+        taken = batch if levels is None else levels.projected(cases)
+        seconds = _timed_run(taken, trust if until_distrusted else None) / len(batch)
+        by = estimate = None
+        if levels is not None:
+            by, estimate = np.full(taken.total_steps, PROJECTED, np.int8), np.zeros(taken.total_steps + 1)
+        watched = [(run, estimate, by) for run in taken.runs]
     else:
         seconds, started = _timed_run(batch, None), time.perf_counter()
         watched = levels.watched(batch, cases, trust)

@@ -311,8 +311,8 @@ class Names:
         """Cases of three kinds that the teacher is asked in: of training, between them, and held back.
 
         Runs in those held back decide which round of teaching is kept. None is a validation or test case.
-        Where runs are the teacher there is one round, which decides nothing: it is told how far runs at
-        validation values are off, or, if there are none, at training. Between are as many as asked for.
+        Where runs are the teacher there is one round; how far its runs at validation values are off, or, if
+        there are none, at training, is what `deploy.error_ratio` is held to. Between are as many as asked.
         """
         known, seed = sorted(self.split.train), int(self.config.seed)
         taken = [*known, *self.split.validation, *self.split.test]
@@ -329,6 +329,8 @@ class Names:
         """The run of errors and costs."""
         content = self._content(("evaluation",))
         content["paper"] = self._content(("scene",))["scene"].get("paper")
+        if self.teaching is not None and self.config.evaluation.trials:
+            content["charged"] = "with projected steps"  # before, a run was timed by operators alone
         parents = [self.deployment, *map(self.truth, self.held_out)]
         return Run.open("evaluate", self.scene.name, content, parents, root=self.root)
 

@@ -90,6 +90,11 @@ def one_of(key: str, value, options: Sequence) -> None:
 
 def _check_levels(c: DictConfig, engine: str) -> None:
     """Who goes on with a run by operators; no other engine has an estimate, or a level below."""
+    ratio = OmegaConf.select(c.deploy, "error_ratio", default=None)
+    if ratio is not None and not configuration.number("deploy.error_ratio", ratio) > 0:
+        raise ConfigError(
+            f"deploy.error_ratio={ratio} must be positive, or null to leave all runs to operators"
+        )
     tolerance = OmegaConf.select(c.deploy, "tolerance", default=None)
     if engine != OPERATORS:
         if c.deploy.on_distrust == "projected" or tolerance is not None:
@@ -99,9 +104,6 @@ def _check_levels(c: DictConfig, engine: str) -> None:
     configuration.number("engine.check", c.engine.check, least=1, whole=True)
     if tolerance is not None and not configuration.number("deploy.tolerance", tolerance) > 0:
         raise ConfigError(f"deploy.tolerance={tolerance} m must be positive, or null for none")
-    ratio = OmegaConf.select(c.deploy, "error_ratio", default=None)
-    if ratio is not None and not configuration.number("deploy.error_ratio", ratio) > 0:
-        raise ConfigError(f"deploy.error_ratio={ratio} must be positive, or null for any")
 
 
 def _check_paper(stated) -> None:

@@ -31,13 +31,14 @@ _VALUES = "scene.design.test"  # jobs with this key are about certain held-out v
 _PAPER = "paper"
 _DEVIATION = ", deviation"
 _RUNS, _DIVERGED, _SEEDS = "runs", "diverged", "seeds"  # how many are in a row of `groups`
+_WORST = "displacement_worst"
 _MEASURED = (
-    "delta_static", "delta", "displacement_error", "displacement_worst", "displacement_interpolated",
-    "stress_error",
+    "delta", "displacement_error", _WORST, "displacement_interpolated", "delta_static", "stress_error",
     "speedup_step", "speedup_total", "speedup_shown", "break_even_runs", "handed_over",
 )  # fmt: skip
 #: Of these the deviation over seeds stands beside the mean.
 _SCATTERED = ("delta", "displacement_error", "stress_error", "speedup_step", "speedup_total", "speedup_shown")
+_SPLITS = ({"train"}, {"validation"})
 _COLUMN_OF = {
     "scene": "scene",
     "method": "method",
@@ -72,12 +73,10 @@ class Report:
                 "build the report again with `nsf report`"
             )
         frame = frame.assign(**{name: np.nan for name in LATER if name not in frame})
-        still = frame["displacement_static"] / frame["displacement_error"]
         shown = frame["total_ms_full"] / (frame["total_ms_reduced"] + frame["decode_ms"])
-        worst = frame["displacement_error"]
-        frame = frame.assign(
-            delta_static=frame["delta"] * still, speedup_shown=shown, displacement_worst=worst
-        )
+        # Nothing moves has a displacement error of 1.
+        still = frame["delta"] / frame["displacement_error"]
+        frame = frame.assign(delta_static=still, speedup_shown=shown)
         runs = [self.told["runs"][row["run"]] for row in self.told["rows"]]
         keys = pd.DataFrame([_own(run) for run in runs], index=frame.index).replace("null", np.nan)
         frame = frame.join(keys)
@@ -129,9 +128,10 @@ class Report:
         for values, part in self.rows.fillna(dict.fromkeys(alike, ABSENT)).groupby(alike, sort=False):
             row = dict(zip(alike, values, strict=True))
             row |= {name: part[name].iloc[0] if part[name].nunique() == 1 else ABSENT for name in others}
-            row |= {name: part[name].mean(skipna=False) for name in (*_MEASURED, *RIVALS, _PAPER)}
+            averaged = [name for name in (*_MEASURED, *RIVALS, _PAPER) if name != _WORST]
+            row |= {name: part[name].mean(skipna=False) for name in averaged}
             row["delta_static"] = part["delta_static"].mean()  # not of runs that diverged
-            row["displacement_worst"] = part["displacement_worst"].max()
+            row[_WORST] = part["displacement_error"].max()
             row |= {f"{name}{_DEVIATION}": value for name, value in self._deviations(part).items()}
             row |= {_RUNS: len(part), _DIVERGED: int(np.isinf(part["delta"]).sum())}
             rows.append(row | {_SEEDS: len(part[self.seeds].drop_duplicates()) if self.seeds else 1})
@@ -171,10 +171,9 @@ def headline(report: Report) -> tuple[Rows, str]:
     """The table, and what is to be said of it."""
     varied = [key for key in report.settings if key in _NUMBERS]
     if not report.settings and report.seeds:
-        said = "Shown: of each seed the mean over held-out values; ± their standard deviation over seeds."
-        return _over_seeds(
-            report
-        ), f"{said}{_rivals(report)}{_diverged(report)}"  # the paper's figure stands in each row
+        said = f"Shown: of each seed the mean over {_values(report)} values; ± their deviation over seeds."
+        # The paper's figure stands in each row.
+        return _over_seeds(report), f"{said}{_rivals(report)}{_diverged(report)}"
     if len(report.groups) <= (FEW if varied else MANY):
         table, said = _flat(report), f"Shown: {_averaged(report)}."
     else:
@@ -188,10 +187,9 @@ def _flat(report: Report) -> Rows:
     groups = report.groups
     order = dict.fromkeys(("scene", "method", "field", "engine", *report.settings, "r", "sample"))
     shown = [key for key in order if key == "scene" or groups[key].nunique() > 1]
-    measured = [name for name in _MEASURED if np.isfinite(groups[name]).any() or name == "delta"]
-    measured = [name for name in measured if name != "handed_over" or groups[name].any()]
-    if (groups[_RUNS] == 1).all():
-        measured.remove("displacement_worst")
+    hidden = {_WORST} if (groups[_RUNS] == 1).all() else set()
+    hidden |= set() if groups["handed_over"].any() else {"handed_over"}
+    measured = [name for name in _MEASURED if name not in hidden and groups[name].notna().any()]
     seeds = [_SEEDS] if groups[_SEEDS].nunique() > 1 else []
     paper = ["paper's δ [%]"] if groups[_PAPER].notna().any() else []
     body = [
@@ -267,12 +265,19 @@ def _over_seeds(report: Report) -> Rows:
 
 def _averaged(report: Report) -> str:
     """What the numbers are means over."""
-    kind = "validation" if set(report.rows["split"]) == {"validation"} else "held-out"
     alone = "parameter" in report.settings
-    told = f"each {kind} value by itself" if alone else f"means over {kind} values"
+    told = f"each {_values(report)} value by itself" if alone else f"means over {_values(report)} values"
     if not report.seeds:
         return f"{told}, of one seed"
     return f"{told} and, where several were run, seeds (± their standard deviation)"
+
+
+def _values(report: Report) -> str:
+    """Which parameter values the rows are of."""
+    splits = set(report.rows["split"])
+    return (
+        {"train": "training", "validation": "validation"}[splits.pop()] if splits in _SPLITS else "held-out"
+    )
 
 
 def _best(report: Report) -> str:

@@ -83,16 +83,16 @@ class _Drawn(Design):
     test_seed: int | None = None
 
     def __post_init__(self):
-        _check_seed(self.test_seed)
-        for part, least in (("train", 1), ("test", 1), ("validation", 0), ("seed", 0)):
-            number(f"scene.design.{part}", getattr(self, part), least=least, whole=True)
+        for part, least in (("train", 1), ("test", 1), ("validation", 0), ("seed", 0), ("test_seed", 0)):
+            if part != "test_seed" or self.test_seed is not None:
+                number(f"scene.design.{part}", getattr(self, part), least=least, whole=True)
 
     def split(self, parameters: Mapping[str, Parameter]) -> Split:
         """See `Design.split`."""
-        counts = self.train, self.validation, self.test
+        other = self.seed if self.test_seed is None else self.test_seed
+        parts = (self.train, self.seed), (self.validation, self.seed), (self.test, other)
         drawn, dimensions = [], len(parameters) - (PROGRAM in parameters)
-        for part, count in enumerate(counts):
-            seed = self.seed if part < 2 or self.test_seed is None else self.test_seed
+        for part, (count, seed) in enumerate(parts):
             points = self._points(count, dimensions, np.random.default_rng([seed, part]))
             first = _first_program(seed, part, count)
             drawn.append(_cases(parameters, points, type(self).__name__, first))
@@ -109,7 +109,8 @@ class Sobol(_Drawn):
 
     Attributes:
         train, validation, test: numbers of cases; powers of two fill the ranges most evenly.
-        seed: of the scrambles; test_seed: of that of the test cases, where these are to be others.
+        seed: of the scrambles.
+        test_seed: of the test cases; None: seed.
 
     Source: Sobol 1967; Owen 1998 (scrambling); scipy.stats.qmc.
     """
@@ -128,7 +129,8 @@ class LatinHypercube(_Drawn):
 
     Attributes:
         train, validation, test: numbers of cases.
-        seed: of the draws; test_seed: of that of the test cases, where these are to be others.
+        seed: of the draws.
+        test_seed: of the test cases; None: seed.
 
     Source: McKay, Beckman, Conover 1979; scipy.stats.qmc.
     """
@@ -146,7 +148,8 @@ class Grid(Design):
     Attributes:
         train: number of values along each parameter.
         validation, test: numbers of cases.
-        seed: of the held-out cases; test_seed: of the test cases, where these are to be others.
+        seed: of the held-out cases.
+        test_seed: of the test cases; None: seed.
     """
 
     train: Sequence[int]
@@ -156,9 +159,9 @@ class Grid(Design):
     test_seed: int | None = None
 
     def __post_init__(self):
-        _check_seed(self.test_seed)
         for count in self.train:
             number("scene.design.train", count, least=1, whole=True)
+        self._held_out()  # is checked
 
     def split(self, parameters: Mapping[str, Parameter]) -> Split:
         """See `Design.split`."""
@@ -168,16 +171,14 @@ class Grid(Design):
                 f"scene.design.train={list(self.train)} must be {len(own)} numbers of values, "
                 f"one for each of {', '.join(own)}"
             )
-        held_out = Sobol(1, self.test, self.validation, self.seed, self.test_seed).split(parameters)
+        held_out = self._held_out().split(parameters)
         ends = [np.linspace(0.0, 1.0, n) if n > 1 else np.array([0.5]) for n in self.train]
         points = np.stack(np.meshgrid(*ends, indexing="ij"), -1).reshape(-1, len(ends))
         train = _cases(parameters, points, "Grid", _first_program(self.seed, 0, len(points)))
         return _split(train, held_out.validation, held_out.test)
 
-
-def _check_seed(test_seed: int | None) -> None:
-    if test_seed is not None:
-        number("scene.design.test_seed", test_seed, least=0, whole=True)
+    def _held_out(self) -> Sobol:
+        return Sobol(1, self.test, self.validation, self.seed, self.test_seed)
 
 
 def case_of(parameters: Mapping[str, Parameter], given, where: str) -> Case:

@@ -225,21 +225,46 @@ def test_projected_runs_in_drawn_cases_teach_too(drawn):
 @pytest.mark.parametrize("method", ["history", "nsf"])
 def test_operators_too_far_off_at_validation_runs_take_no_step(drawn, method):
     said = []
-    pipeline = drawn(said.append, f"method={method}", "deploy.error_ratio=1e-3")
-    pipeline.run("deploy")
-    told = pipeline.taught.manifest["metrics"]
-    assert 0.0 < told["projected_error"] < 1e3 * min(told["errors"])
-    assert any("so that the projected step takes all runs" in line for line in said)
-    taken = Rollout.open(pipeline.deployment.path / "rollout_0.h5")
-    projected = pipeline.solver_at(pipeline.manifold(), angle(26.0), engine="auto")
+    held_back = f"method={method}", "scene.design.validation=[24]"
+    first = drawn(said.append, *held_back)
+    for stage in ("simulate", "teach"):
+        first.run(stage)
+    told, manifold = first.taught.manifest["metrics"], first.manifold()
+    projected = first.solver_at(manifold, angle(24.0), engine="auto")
     projected.step(24)
-    np.testing.assert_array_equal(taken.xhat, projected.record.xhat.numpy())
-    assert (taken.by_operators, taken.estimate.max()) == (0, 0.0)
-    near = drawn(said.append, f"method={method}", "deploy.error_ratio=1e3")
-    assert near.taught.id == pipeline.taught.id
-    assert near.deployment.id != pipeline.deployment.id
-    near.run("deploy")
-    assert Rollout.open(near.deployment.path / "rollout_0.h5").by_operators == 24
+    with Trajectory.open(first.simulation(angle(24.0)).file("trajectory.h5")) as trajectory:
+        truth = torch.as_tensor(trajectory.read("x")).double()
+    off = (manifold.restrict().position(projected.record.xhat) - truth).square().sum().sqrt()
+    off = float(off / (truth - truth[0]).square().sum().sqrt())
+    assert told["projected_error"] == pytest.approx(off, rel=1e-6)
+    ratio = told["errors"][0] / off
+    for error_ratio, by_operators in ((0.99 * ratio, 0), (1.01 * ratio, 24)):
+        said.clear()
+        pipeline = drawn(said.append, *held_back, f"deploy.error_ratio={error_ratio}")
+        pipeline.run("deploy")
+        taken = Rollout.open(pipeline.deployment.path / "rollout_0.h5")
+        assert taken.by_operators == by_operators
+        assert any("so that the projected step takes all runs" in line for line in said) == (
+            by_operators == 0
+        )
+        if by_operators == 0:
+            alone = pipeline.solver_at(manifold, angle(26.0), engine="auto")
+            alone.step(24)
+            np.testing.assert_array_equal(taken.xhat, alone.record.xhat.numpy())
+            assert (taken.estimate.max(), taken.projected_share) == (0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("lost", "ratio"), [(True, "1e-3"), (False, "null")], ids=["a lost validation run", "no ratio"]
+)
+def test_nothing_is_beyond_a_projected_step_that_is_lost(drawn, monkeypatch, lost, ratio):
+    pipeline = drawn(lambda line: None, "scene.design.validation=[24]", f"deploy.error_ratio={ratio}")
+    monkeypatch.setattr(Teacher, "left_grid", lambda teacher: [lost] * len(teacher))
+    monkeypatch.setattr(teaching, "drawn", lambda *args: [])
+    for stage in ("simulate", "deploy"):
+        pipeline.run(stage)
+    assert (pipeline.taught.manifest["metrics"]["projected_error"] is None) == lost
+    assert Rollout.open(pipeline.deployment.path / "rollout_0.h5").by_operators == 24
 
 
 def test_drawn_runs_stand_beside_full_order_ones(pipeline_at, tmp_path):
@@ -525,7 +550,8 @@ def test_a_run_that_is_handed_on_costs_what_its_steps_cost(lesson, pipeline_at):
         (("deploy.tolerance=0.001",), "deploy.tolerance=0.001 needs engine=operators"),
         (("deploy.on_distrust=projected",), "deploy.on_distrust=projected needs engine=operators"),
         ((*TAUGHT, "deploy.tolerance=-1.0"), "deploy.tolerance=-1.0 m must be positive, or null"),
-        ((*TAUGHT, "deploy.error_ratio=0"), "deploy.error_ratio=0 must be positive, or null for any"),
+        (("deploy.error_ratio=-3",), "deploy.error_ratio=-3 must be positive"),
+        ((*TAUGHT, "deploy.error_ratio=0"), "deploy.error_ratio=0 must be positive, or null to leave"),
         ((*TAUGHT, "engine.check=0"), "engine.check=0 must be a whole number of at least 1"),
         ((*TAUGHT, "engine.teacher=operators"), "engine.teacher=operators is unknown"),
         ((*TAUGHT, "engine.teaching.width=0"), "engine.teaching: width=0 must be at least 1"),

@@ -70,6 +70,10 @@ class Teacher:
             self._count(batch.total_steps * len(batch))
         return torch.cat(found).transpose(0, 1)
 
+    def left_grid(self) -> list[bool]:
+        """[R] whether each run, which was taken to its end, left the grid."""
+        return [run.left_grid() >= 0 for batch in self._batches for run in batch.runs]
+
     def step_from(
         self, step: int, xhat: torch.Tensor, change: torch.Tensor, gravity: torch.Tensor | None = None
     ) -> torch.Tensor:

@@ -163,11 +163,17 @@ def _levels(pipeline, manifold: Manifold) -> Levels | None:
 
 
 def _near(pipeline) -> bool:
-    """Whether operators were near enough at validation runs, beside the projected step; tells where not."""
-    if pipeline.error_ratio is None or not pipeline.of_runs:
+    """Whether operators were near enough at validation runs, beside the projected step; tells where not.
+
+    True as well where there are no such runs, or the projected step loses one of them.
+    """
+    if pipeline.error_ratio is None or not pipeline.of_runs or not pipeline.split.validation:
         return True
     taught = pipeline.taught
-    own, projected = min(taught.manifest["metrics"]["errors"]), taught.metric("projected_error")
+    told = taught.manifest["metrics"]
+    if "projected_error" in told and told["projected_error"] is None:  # not finite
+        return True
+    own, projected = min(told["errors"]), taught.metric("projected_error")
     if own <= pipeline.error_ratio * projected:
         return True
     pipeline.say(

@@ -138,8 +138,8 @@ def _cost(pipeline, manifold: Manifold, rollouts: Sequence[Rollout], factors: Se
 
     Args:
         pipeline, manifold: that are timed.
-        rollouts: the reduced runs; that of the first case is decoded. Where projected steps went on with
-            a run that operators began, they are timed as well.
+        rollouts: the reduced runs; that of the first case is decoded. Where projected steps took
+            some of a run with operators, they are timed as well.
         factors: of Δx of the coarse full-order runs that there are.
     """
     c, scene, case = pipeline.config, pipeline.deployed, pipeline.held_out[0]
@@ -148,12 +148,12 @@ def _cost(pipeline, manifold: Manifold, rollouts: Sequence[Rollout], factors: Se
     full = Subject(lambda: scene.full_order(case, c.precision, pipeline.device), scene.steps)
     steps = reduced_steps(scene.steps, c.deploy.dt_multiplier)
     reduced = Subject(lambda: pipeline.solver_at(manifold, case), steps)
-    handed = {}
-    if any(rollout.handed_on for rollout in rollouts):
+    beside = {}
+    if any(rollout.projected_share for rollout in rollouts):
         engine = pipeline.projecting
-        handed["projected"] = Subject(lambda: pipeline.solver_at(manifold, case, engine=engine), steps)
+        beside["projected"] = Subject(lambda: pipeline.solver_at(manifold, case, engine=engine), steps)
     coarse = coarse_subjects(scene, case, factors, c.precision, pipeline.device)
-    subjects = {"full_order": full, "reduced": reduced, **handed, **coarse}
+    subjects = {"full_order": full, "reduced": reduced, **beside, **coarse}
     measured = measure(subjects, c.evaluation.trials, pipeline.device)
     decoding = decoding_ms(pipeline.solver_at(manifold, case), rollouts[0], c.evaluation.trials)
     return results.costs(measured, decoding)

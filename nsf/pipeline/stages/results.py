@@ -74,30 +74,12 @@ def rows(
         "r": manifold.latent_dim,
         "engine": engine,
     }
-
-    def costs_of(share: float) -> dict[str, float]:
-        as_run = _handed_on(cost, share)
-        return _costs_in_a_row(as_run, next(iter(rivals[0].coarse), None)) | {
-            "teach_seconds": offline[1],
-            "break_even_runs": _break_even(as_run, sum(offline)),
-        }
-
-    measured = {
-        "gamma": reduction_ratio(len(manifold.X), manifold.latent_dim),
-        **costs_of(0.0),
-        **dict.fromkeys(
-            ("handed_over", "estimated_error", "true_error", *(f"{name}_error" for name in QUANTITIES)), 0.0
-        ),  # their place; of each run below
-        "precision": config.precision,
-        "device": torch.cuda.get_device_name(device) if device.startswith("cuda") else "cpu",
-        "commit": commit,
-    }
     # What a step costs whose particles have left the grid is no one's speedup, nor is half a reduced run's.
     costly = (
         "step_ms_reduced", "total_ms_reduced", "decode_ms", "speedup_step", "speedup_total",
         "memory_reduced_mib", "break_even_runs",
     )  # fmt: skip
-    lost = measured | dict.fromkeys(costly, math.nan)
+    device_name = torch.cuda.get_device_name(device) if device.startswith("cuda") else "cpu"
     found = []
     for rollout, comparison, beside in zip(rollouts, comparisons, rivals, strict=True):
         own = {
@@ -110,15 +92,21 @@ def rows(
             "stress_error": comparison.stress_error,
             **_beside(beside),
         }
-        reduced = rollout.diverged < 0 and rollout.handed_over < 0
-        share = {
+        as_run = _cost_of_share(cost, rollout.projected_share)
+        times = _costs_in_a_row(as_run, next(iter(rivals[0].coarse), None))
+        times |= {"teach_seconds": offline[1], "break_even_runs": _break_even(as_run, sum(offline))}
+        if rollout.diverged >= 0 or rollout.handed_over >= 0:
+            times |= dict.fromkeys(costly, math.nan)
+        off = {
             "handed_over": _handed_over(rollout, config),
             "estimated_error": math.nan if rollout.estimate is None else rollout.estimate.max(),
             "true_error": comparison.true_error,
+            **{f"{name}_error": math.nan for name in QUANTITIES},
             **{f"{name}_error": off for name, off in comparison.quantities.items()},
         }
-        measures = measured | costs_of(rollout.handed_on) if reduced else lost
-        found.append(variant | own | measures | share)
+        gamma = {"gamma": reduction_ratio(len(manifold.X), manifold.latent_dim)}
+        place = {"precision": config.precision, "device": device_name, "commit": commit}
+        found.append(variant | own | gamma | times | off | place)
     return pd.DataFrame(found)
 
 
@@ -133,8 +121,8 @@ def _beside(rivals: Rivals) -> dict[str, float]:
     }
 
 
-def _handed_on(cost: dict, share: float) -> dict:
-    """`cost.json` of a run of which projected steps took a share, as steps by operators and they cost."""
+def _cost_of_share(cost: dict, share: float) -> dict:
+    """`cost.json` of a run with operators, of which the projected step took a share."""
     if not share or "projected" not in cost:
         return cost
     own, other = cost["reduced"], cost["projected"]

@@ -1,5 +1,6 @@
 """The stage `teach`: operators of the deployed step, taught by another engine."""
 
+import math
 import time
 from collections.abc import Callable
 
@@ -75,16 +76,19 @@ def _follow(pipeline, manifold: Manifold, record: Record) -> None:
         before = time.perf_counter() - started
         operators, steps = course.follow(), course.steps
         broken = course.broken_affinity()
-        beside, last = {}, time.perf_counter()
+        last, beside = time.perf_counter(), {}
         if pipeline.of_runs:
-            beside["projected_error"] = yardstick.error(yardstick.teacher.run())
+            runs = yardstick.teacher.run()
+            lost = any(yardstick.teacher.left_grid())
+            beside["projected_error"] = math.inf if lost else yardstick.error(runs)
+        spent = before + course.seconds + time.perf_counter() - last
     taught = Taught.of(lessons[0].setup, *course.gravity)
     operators.save(record.path / OPERATORS, taught, lessons[0].setup.samples)
     record.output(OPERATORS)
     for left in record.path.glob("round_*.pt"):
         left.unlink()
     record.metrics |= {
-        "teach_seconds": before + course.seconds + time.perf_counter() - last,
+        "teach_seconds": spent,
         "teacher_steps": steps,
         "errors": course.errors,
         "broken_affinity": broken,
@@ -134,8 +138,7 @@ def drawn(pipeline, manifold: Manifold, told: Callable[[float], object]) -> list
     taken = batches(pipeline, manifold, between)
     beside = Teacher(taken, told)
     runs = beside.run()
-    on_grid = torch.tensor([run.left_grid() < 0 for batch in taken for run in batch.runs])
-    kept = torch.isfinite(runs).all(-1).all(0) & on_grid
+    kept = torch.isfinite(runs).all(-1).all(0) & ~torch.tensor(beside.left_grid())
     cases = [case for case, good in zip(between, kept.tolist(), strict=True) if good]
     if len(cases) < len(between):
         pipeline.say(f"teach: warning: {len(between) - len(cases)} of {len(between)} projected runs are lost")

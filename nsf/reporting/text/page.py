@@ -25,13 +25,14 @@ DEFINITIONS = (
     (
         "speedup",
         "full-order over reduced wall time, of one step, of the whole simulation, and of the simulation with "
-        "the positions of all particles decoded at every frame, as a full-order run has them. A run is "
-        "charged with the steps that it took, by operators or projected.",
+        "the positions of all particles decoded at every frame, as a full-order run has them. Times of "
+        "operators do not hold the checks that tell the estimate.",
     ),
     (
         "rivals",
         "without a reduced step: nothing moves; the training run of the nearest parameters; latent vectors "
-        "of the same fields, interpolated over the parameters between training runs.",
+        "of the same fields, interpolated over the parameters between training runs. Coarse full order is "
+        "the full-order solver on a coarser grid.",
     ),
     (
         "runs until it pays",

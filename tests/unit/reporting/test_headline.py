@@ -42,21 +42,35 @@ def test_means_over_values_and_seeds_a_row_a_scene_and_setting(tmp_path):
 
 def test_what_a_mean_hides_stands_beside_it(tmp_path):
     """A still body has a δ of δ over the displacement error; frames are decoded beside a run."""
-    costs = {"total_ms_full": 60.0, "total_ms_reduced": 2.0, "decode_ms": 10.0, "break_even_runs": 7.0}
-    rivals = {"displacement_static": 1.0, "displacement_interpolated": 0.3}
+    costs = {
+        "total_ms_full": 60.0,
+        "total_ms_reduced": 2.0,
+        "decode_ms": 10.0,
+    }
+    rivals = {"displacement_interpolated": 0.3}
     jobs = [
-        job(delta=delta, parameter=value) | costs | rivals | {"displacement_error": off, "handed_over": share}
-        for value, delta, off, share in ((1.0, 0.001, 0.02, 0.0), (2.0, 0.002, 0.08, 0.5))
+        job(delta=0.001 * value, parameter=value)
+        | {"displacement_error": off, "handed_over": share, "break_even_runs": 5.0 + value, **costs, **rivals}
+        for value, off, share in ((1.0, 0.02, 0.0), (2.0, 0.08, 0.5))
     ]
-    rows, _ = told(write_report(tmp_path / "a", jobs))
+    rows, said = told(write_report(tmp_path / "a", jobs))
+    assert "means over held-out values, of one seed" in said
     shown = dict(zip(*rows, strict=True))
     assert float(shown["δ if nothing moves [%]"]) == pytest.approx(100 * (0.001 / 0.02 + 0.002 / 0.08) / 2)
     assert (shown["displacement error [%]"], shown["its largest [%]"]) == ("5", "8")
-    assert (shown["interpolated latents [%]"], shown["runs until it pays"]) == ("30", "7")
+    assert (shown["interpolated latents [%]"], shown["runs until it pays"]) == ("30", "6.50")
     assert (shown["speedup, frames decoded [×]"], shown["handed on [%]"]) == ("5", "25")
-    jobs = [job() | {"handed_over": 0.0}]
-    headings = told(write_report(tmp_path / "b", jobs))[0][0]
-    assert not {"its largest [%]", "handed on [%]", "δ if nothing moves [%]"} & {*headings}
+    own = {"handed_over": 0.0, "break_even_runs": np.inf, "split": "validation"}
+    jobs = [job(parameter=value) | own for value in (1.0, 2.0)]
+    rows, said = told(write_report(tmp_path / "b", jobs))
+    assert "handed on [%]" not in rows[0]
+    assert "means over validation values" in said
+    shown = dict(zip(*rows, strict=True))
+    assert (shown["runs until it pays"], shown["δ if nothing moves [%]"]) == ("∞", "10")
+    jobs = [job(delta=np.inf)]  # one run a row, and it diverged
+    rows, _ = told(write_report(tmp_path / "c", jobs))
+    assert "its largest [%]" not in rows[0]
+    assert dict(zip(*rows, strict=True))["displacement error [%]"] == "∞"
 
 
 def test_training_values_count_only_where_there_are_no_others(tmp_path):
