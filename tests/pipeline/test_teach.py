@@ -255,10 +255,15 @@ def test_operators_too_far_off_at_validation_runs_take_no_step(drawn, method):
 
 
 @pytest.mark.parametrize(
-    ("lost", "ratio"), [(True, "1e-3"), (False, "null")], ids=["a lost validation run", "no ratio"]
+    ("held_back", "lost", "ratio"),
+    [("[24]", True, "1e-3"), ("[24]", False, "null"), ("[]", False, "1e-3")],
+    ids=["a lost validation run", "no ratio", "no validation run"],
 )
-def test_nothing_is_beyond_a_projected_step_that_is_lost(drawn, monkeypatch, lost, ratio):
-    pipeline = drawn(lambda line: None, "scene.design.validation=[24]", f"deploy.error_ratio={ratio}")
+def test_operators_keep_their_runs_where_nothing_tells_that_they_are_off(
+    drawn, monkeypatch, held_back, lost, ratio
+):
+    keys = f"scene.design.validation={held_back}", f"deploy.error_ratio={ratio}"
+    pipeline = drawn(lambda line: None, *keys)
     monkeypatch.setattr(Teacher, "left_grid", lambda teacher: [lost] * len(teacher))
     monkeypatch.setattr(teaching, "drawn", lambda *args: [])
     for stage in ("simulate", "deploy"):
