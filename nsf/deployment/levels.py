@@ -7,8 +7,8 @@ tolerance, or the run leaves what it was taught or trained on, the projected ste
 steps the operators try again. What they miss then adds to what they missed before. With method history
 particles carry stress that nobody knows in the midst of a run by operators: there the projected step takes
 the whole run anew, from t = 0. Where the projected step is not to be believed either, the full-order solver
-goes on, to the end (`nsf.deployment.handover`). Where operators are
-too far off at validation runs, they take no step.
+goes on, to the end (`nsf.deployment.handover`). Where operators are too far off at validation runs, they take
+no step.
 """
 
 from collections.abc import Callable, Sequence
