@@ -20,7 +20,15 @@ from nsf.engines.names import CLOSED, OPERATORS, RUNS
 from nsf.engines.operators.teaching import Teaching, random_cases
 from nsf.errors import ConfigError
 from nsf.gpu import has_driver
-from nsf.pipeline.values import TEACHERS, check_batch, check_numbers, check_words, factors, one_of
+from nsf.pipeline.values import (
+    TEACHERS,
+    check_batch,
+    check_lessons,
+    check_numbers,
+    check_words,
+    factors,
+    one_of,
+)
 from nsf.reporting.swap import check_place
 from nsf.runs import Run
 from nsf.scenes.draft import Draft
@@ -87,21 +95,7 @@ class Names:
         if self.engine == OPERATORS:
             self.teaching = configuration.build(c.engine.teaching, "engine.teaching")
             one_of("engine.teacher", c.engine.teacher, TEACHERS)
-            if self.teaching.memory and not self.of_runs:
-                raise ConfigError(
-                    f"engine.teaching.memory={list(self.teaching.memory)} is learned from runs "
-                    f"alone; set engine.teacher={RUNS}, or engine.teaching.memory=[]"
-                )
-            if self.teaching.runs and not self.of_runs:
-                raise ConfigError(
-                    f"engine.teaching.runs={self.teaching.runs} stand beside full-order runs; set "
-                    f"engine.teacher={RUNS}, or engine.teaching.runs=0"
-                )
-            if self.of_runs and c.deploy.dt_multiplier != 1:
-                raise ConfigError(
-                    f"engine.teacher={RUNS} teaches steps of the scene's Δt, and deploy.dt_multiplier is "
-                    f"{c.deploy.dt_multiplier:g}; set it to 1, or engine.teacher=auto"
-                )
+            check_lessons(c, self.teaching, self.of_runs)
         self.closing: Closing | None = None
         if self.engine == CLOSED:
             self.closing = configuration.build(c.engine.closing, "engine.closing")

@@ -8,6 +8,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from nsf import config as configuration
 from nsf.engines.names import CLOSED, OPERATORS, RUNS
 from nsf.engines.names import NAMES as ENGINES
+from nsf.engines.operators.teaching import Teaching
 from nsf.errors import ConfigError
 from nsf.kinematics.training.tracking import check_tracking
 
@@ -65,6 +66,31 @@ def check_batch(c: DictConfig, engine: str) -> None:
     size = configuration.number("deploy.batch", c.deploy.batch, least=1, whole=True)
     if size > 1 and engine == "reference":
         raise ConfigError(f"deploy.batch={size} needs engine=modal, or auto; set it, or deploy.batch=1")
+
+
+def check_lessons(c: DictConfig, teaching: Teaching, of_runs: bool) -> None:
+    """Raises ConfigError where a value does not go with what teaches operators.
+
+    Args:
+        c: the configuration.
+        teaching: of operators.
+        of_runs: whether they learn from full-order runs, and not from the steps of an engine.
+    """
+    if teaching.memory and not of_runs:
+        raise ConfigError(
+            f"engine.teaching.memory={list(teaching.memory)} is learned from runs "
+            f"alone; set engine.teacher={RUNS}, or engine.teaching.memory=[]"
+        )
+    if teaching.runs and not of_runs:
+        raise ConfigError(
+            f"engine.teaching.runs={teaching.runs} stand beside full-order runs; set "
+            f"engine.teacher={RUNS}, or engine.teaching.runs=0"
+        )
+    if of_runs and c.deploy.dt_multiplier != 1:
+        raise ConfigError(
+            f"engine.teacher={RUNS} teaches steps of the scene's Δt, and deploy.dt_multiplier is "
+            f"{c.deploy.dt_multiplier:g}; set it to 1, or engine.teacher=auto"
+        )
 
 
 def factors(key: str, asked) -> list[int]:
