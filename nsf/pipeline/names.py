@@ -20,15 +20,7 @@ from nsf.engines.names import CLOSED, OPERATORS, RUNS
 from nsf.engines.operators.teaching import Teaching, random_cases
 from nsf.errors import ConfigError
 from nsf.gpu import has_driver
-from nsf.pipeline.values import (
-    TEACHERS,
-    check_batch,
-    check_lessons,
-    check_numbers,
-    check_words,
-    factors,
-    one_of,
-)
+from nsf.pipeline.values import check_batch, check_lessons, check_numbers, check_words, factors
 from nsf.reporting.swap import check_place
 from nsf.runs import Run
 from nsf.scenes.draft import Draft
@@ -94,7 +86,6 @@ class Names:
         self.teaching: Teaching | None = None
         if self.engine == OPERATORS:
             self.teaching = configuration.build(c.engine.teaching, "engine.teaching")
-            one_of("engine.teacher", c.engine.teacher, TEACHERS)
             check_lessons(c, self.teaching, self.of_runs)
         self.closing: Closing | None = None
         if self.engine == CLOSED:

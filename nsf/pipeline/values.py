@@ -69,13 +69,14 @@ def check_batch(c: DictConfig, engine: str) -> None:
 
 
 def check_lessons(c: DictConfig, teaching: Teaching, of_runs: bool) -> None:
-    """Raises ConfigError where a value does not go with what teaches operators.
+    """Raises ConfigError where the teacher is unknown, or a value does not go with it.
 
     Args:
         c: the configuration.
         teaching: of operators.
         of_runs: whether they learn from full-order runs, and not from the steps of an engine.
     """
+    one_of("engine.teacher", c.engine.teacher, TEACHERS)
     if teaching.memory and not of_runs:
         raise ConfigError(
             f"engine.teaching.memory={list(teaching.memory)} is learned from runs "
