@@ -298,6 +298,17 @@ def test_projected_runs_that_are_lost_teach_nothing(drawn, monkeypatch):
     assert teaching.drawn(pipeline, pipeline.manifold(), lambda steps: None) == []
 
 
+def test_projected_runs_in_drawn_cases_are_the_same_by_several_processes(drawn, monkeypatch):
+    pipeline, told = drawn(), []
+    alone = teaching.drawn(pipeline, pipeline.manifold(), lambda steps: None)
+    monkeypatch.setattr(teaching, "_LEAST_RUNS", 1)
+    monkeypatch.setattr(teaching, "cpu_count", lambda: 2)
+    monkeypatch.setattr(Teacher, "run", None)  # of this process, which takes none
+    (beside,) = teaching.drawn(pipeline, pipeline.manifold(), told.append)
+    np.testing.assert_array_equal(beside.run(), alone[0].run())
+    assert (beside.steps, alone[0].steps, told) == (72, 72, [24, 24, 24])
+
+
 def test_full_order_runs_teach_their_own_step_alone(pipeline_at, tmp_path):
     with pytest.raises(ConfigError, match=r"the scene's Δt.*dt_multiplier is 1.5; set it to 1"):
         pipeline_at(tmp_path, *TAUGHT, "engine.teacher=runs", "deploy.dt_multiplier=1.5")

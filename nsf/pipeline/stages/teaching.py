@@ -3,9 +3,13 @@
 import math
 import time
 from collections.abc import Callable
+from functools import cache, partial
+from pathlib import Path
 
 import numpy as np
 import torch
+from joblib.externals.loky import ProcessPoolExecutor, cpu_count
+from omegaconf import OmegaConf
 
 from nsf.data import Case, Trajectory
 from nsf.data.schema import TRAJECTORY
@@ -23,6 +27,9 @@ OPERATORS = "operators.pt"
 _LOOKED_AT = 1000
 #: Shapes whose images are found together.
 _SEEN_AT_ONCE = 200
+#: Drawn runs of a process, at least: it takes seconds to start.
+_LEAST_RUNS = 8
+_IDLE = 60  # [s] after which a process ends that nobody asks any more
 
 
 def teach(pipeline, run: Run) -> None:
@@ -136,9 +143,13 @@ def drawn(pipeline, manifold: Manifold, told: Callable[[float], object]) -> list
     if not between:
         return []
     taken = batches(pipeline, manifold, between)
-    beside = Teacher(taken, told)
-    runs = beside.run()
-    kept = torch.isfinite(runs).all(-1).all(0) & ~torch.tensor(beside.left_grid())
+    processes = min(cpu_count(), len(between) // _LEAST_RUNS)
+    if processes > 1 and len(taken) == len(between) and taken[0].device.is_cpu:
+        runs, left = _side_by_side(pipeline, between, processes, told)
+    else:
+        beside = Teacher(taken, told)
+        runs, left = beside.run(), beside.left_grid()
+    kept = torch.isfinite(runs).all(-1).all(0) & ~torch.tensor(left)
     cases = [case for case, good in zip(between, kept.tolist(), strict=True) if good]
     if len(cases) < len(between):
         pipeline.say(f"teach: warning: {len(between) - len(cases)} of {len(between)} projected runs are lost")
@@ -147,8 +158,37 @@ def drawn(pipeline, manifold: Manifold, told: Callable[[float], object]) -> list
     if len(cases) < len(between):
         taken = batches(pipeline, manifold, cases)
     found = Recorded(taken, runs[:, kept])
-    found.steps = beside.steps
+    found.steps = (len(runs) - 1) * len(between)
     return [found]
+
+
+def _side_by_side(
+    pipeline, cases: list[Case], processes: int, told: Callable[[float], object]
+) -> tuple[torch.Tensor, list[bool]]:
+    """Runs [N + 1, R, r] that are taken one by one, and whether each left the grid; by several processes."""
+    runs, left = [], []
+    one = partial(_alone, type(pipeline), OmegaConf.to_yaml(pipeline.scene.template), pipeline.root)
+    with ProcessPoolExecutor(processes, timeout=_IDLE) as pool:
+        for run, gone in pool.map(one, cases):
+            runs.append(run)
+            left.append(gone)
+            told(len(run) - 1)
+    return torch.from_numpy(np.stack(runs, 1)), left
+
+
+def _alone(kind: type, text: str, root: Path | None, case: Case) -> tuple[np.ndarray, bool]:
+    """One run [N + 1, r] in a process of its own, and whether it left the grid."""
+    pipeline, manifold = _opened(kind, text, root)
+    teacher = Teacher(batches(pipeline, manifold, [case]))
+    return teacher.run()[:, 0].numpy(), teacher.left_grid()[0]
+
+
+@cache
+def _opened(kind: type, text: str, root: Path | None) -> tuple:
+    """The pipeline of a configuration and its manifold, in a process that has one core."""
+    torch.set_num_threads(1)
+    pipeline = kind(OmegaConf.create(text), lambda line: None, root)
+    return pipeline, pipeline.manifold().to(pipeline.device)
 
 
 def mirror(manifold: Manifold, symmetry: Symmetry) -> Callable[[torch.Tensor, Image], torch.Tensor]:
