@@ -24,8 +24,6 @@ MULTIPLIERS = (1.5, 2.0, 3.0)
 ARITHMETICS = {"cuda": (None, *ARITHMETIC), "cpu": (None,)}
 #: Trials of networks at most, and steps of one: theirs cost alike from the first to the last.
 _MOST, _FEW = 3, 200
-#: As in the experiment table1.
-MLP_TRAINING = ("trainer.steps=null", "trainer.budget_minutes=1")
 _CHUNK = 2**26  # positions decoded at once
 #: Passes of a step each of which needs the one before it: x and v at S, those of the particles that its nodes
 #: need, their τ and C, P2G, G2P, what the projection takes from S, and its solution.
@@ -48,8 +46,8 @@ def run(settings: Settings, say: Callable[[str], object]) -> Result:
             end: Pipeline(config.load([*overrides, *own]), say=say) for end, own in samplers(scene).items()
         }
         measured(chains, settings, found, say)
-        overrides += ["field=mlp", *(MLP_TRAINING if scale == "paper" else ())]
-        measured_networks(Pipeline(config.load(overrides), say=say), settings, found, say)
+        networks = config.load([*overrides, "field=mlp"])
+        measured_networks(Pipeline(networks, say=say), settings, found, say)
     return found
 
 

@@ -33,7 +33,7 @@ LIST = "index.md"
 CHAPTERS = {
     "Main results": ("table1", "operators", "operators_seeds", "forcing"),
     "What the method needs": (
-        "ablation", "field", "mlp", "width", "latent_dim", "forcing_r", "noise_floor", "floors",
+        "ablation", "field", "mlp", "mlp_noise", "width", "latent_dim", "forcing_r", "noise_floor", "floors",
         "sample_size", "sampler", "cells", "timestep", "training", "seeds",
     ),
     "Beyond what was trained": ("extrapolation", "weak_elements", "super_resolution", "path_dependent"),

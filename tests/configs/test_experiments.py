@@ -7,7 +7,6 @@ import pytest
 import yaml
 
 from nsf import config
-from nsf.bench.reduced import MLP_TRAINING
 from nsf.paths import CONF, EXPERIMENTS, groups
 from nsf.pipeline import Pipeline
 from nsf.pipeline.experiment import Experiment
@@ -72,11 +71,6 @@ def test_the_experiments_of_table1s_scenes_share_its_runs():
     for name, keys in (("ablation", {"method": "nsf"}), ("field", {})):
         jobs = [job for job in _small(name) if keys.items() <= job.keys.items()]
         assert {Plan(config.load(job.overrides)).evaluation.id for job in jobs} <= table1
-
-
-def test_the_benchmark_of_networks_takes_table1s():
-    (mlp, *_) = [job for job in Experiment.load("table1").jobs if "field=mlp" in job.overrides]
-    assert set(MLP_TRAINING) <= set(mlp.overrides)
 
 
 @pytest.mark.parametrize("overrides", _jobs(), ids=" ".join)
