@@ -71,10 +71,9 @@ class Progress:
         self._done += amount
         if self._logged and (now := time.monotonic()) - self._told >= EVERY:
             self._told, rate = now, self._done / (now - self._began)
-            left = max(0, self._total - self._done) / rate
+            left = f", {max(0, self._total - self._done) / rate:.0f} s left" if rate else ""
             print(
-                f"{label()}{self._what}, {self._done:,} of {self._total:,} {self._unit}, {rate:,.1f}/s, "
-                f"{left:.0f} s left",
+                f"{label()}{self._what}, {self._done:,} of {self._total:,} {self._unit}, {rate:,.1f}/s{left}",
                 file=sys.stderr,
                 flush=True,
             )
