@@ -22,7 +22,7 @@ from nsf.reporting.rivals import where_rivals_win
 from nsf.reporting.sources import file_hash
 from nsf.reporting.swap import MARK
 from nsf.reporting.tables import VARIANT, rows_of, without_constants
-from nsf.reporting.text.columns import RIVALS
+from nsf.reporting.text.columns import ABSENT, RIVALS, SETTING
 from nsf.reporting.text.formats import Rows, markdown, markdown_document, markdown_table, unescaped
 from nsf.reporting.text.page import DEFINITIONS
 from nsf.runs.provenance import not_ignored
@@ -81,8 +81,12 @@ _CHART = {"file": "delta.png", "caption": "Mean δ, each value, and the paper's.
 _REBUILD = "build it again with `nsf report`"
 
 BEGIN, END = "<!-- figures:begin -->", "<!-- figures:end -->"
-REPORT, EXPERIMENT = Path("reports/table1"), "table1"
+REPORT, EXPERIMENT = Path("reports/table1_seeds"), "table1_seeds"
 _SHOWN = {"method": "nsf", "field": "basis"}  # one row a scene
+#: Whose runs are shown, where there are any, and whose δ stands beside theirs.
+_ENGINE, _BESIDE = "operators", "modal"
+_PROJECTED = "projected_delta"
+_OF_SEEDS = (SETTING, "sample")  # columns in which seeds may differ
 _ERRORS = ("delta", "displacement_error", "stress_error")
 _COSTS = ("speedup_step", "memory_full_mib", "memory_reduced_mib")
 _PAPER = "paper_delta"
@@ -246,7 +250,9 @@ def _sources(report: Path) -> dict:
 
 
 def figures(report: Path) -> str:
-    """The mean held-out results of this project's method beside the paper's δ, as markdown.
+    """The mean held-out results of this project's method beside the paper's δ, over all seeds, as markdown.
+
+    Runs by operators are shown where there are any, and the δ of projected steps beside theirs.
 
     Args:
         report: folder of the report, relative to README.md.
@@ -257,22 +263,33 @@ def figures(report: Path) -> str:
     frame = pd.read_csv(report / "results.csv")
     for column, value in {"split": "test", **_SHOWN}.items():
         frame = frame[frame[column] == value]
-    alike = [name for name in VARIANT if name in frame]
+    projected = frame[frame["engine"] == _BESIDE].groupby("scene")["delta"].agg(_mean)
+    if (by_operators := frame["engine"] == _ENGINE).any():
+        frame = frame[by_operators]
+    alike = [name for name in VARIANT if name in frame and name not in _OF_SEEDS]
     frame = frame.assign(**{name: nan for name in RIVALS if name not in frame})
     frame = frame.fillna(dict.fromkeys(alike, ""))
     variants = frame.groupby(alike, sort=False, as_index=False)
-    # A value that diverged leaves the mean infinite, one that was not measured leaves it empty.
-    means = variants[[*_ERRORS, *_COSTS, *RIVALS]].agg(lambda values: values.mean(skipna=False))
+    means = variants[[*_ERRORS, *_COSTS, *RIVALS]].agg(_mean)
+    sizes = variants["sample"].agg(lambda values: values.iloc[0] if values.nunique() == 1 else ABSENT)
+    means["sample"] = sizes["sample"]
     means[_PAPER] = [_printed(row["scene"], row["method"]) for row in means.to_dict("records")]
-    described = [name for name in means if name not in (*_ERRORS, *_COSTS, *RIVALS, _PAPER)]
-    table, same = without_constants(means[[*described, _PAPER, *_ERRORS, *_COSTS]], keep=("scene",))
+    means[_PROJECTED] = [100 * projected.get(scene, nan) for scene in means["scene"]]
+    described = [name for name in (*alike, "sample") if name in means]
+    columns = [*described, _PAPER, _PROJECTED, *_ERRORS, *_COSTS]
+    table, same = without_constants(means[columns], keep=("scene",))
     return (
-        f"Means over held-out parameter values ({markdown(same)}).\n\n"
-        + markdown_table(rows_of(table, {_PAPER: "paper's δ [%]"}))
+        f"Means over held-out parameter values and seeds ({markdown(same)}).\n\n"
+        + markdown_table(rows_of(table, {_PAPER: "paper's δ [%]", _PROJECTED: "δ, projected steps [%]"}))
         + (f"\n\n{markdown(told)}" if (told := where_rivals_win(means)) else "")
         + f"\n\nFrom [`{folder}/results.csv`]({folder}/results.csv); the whole report is "
         f"[`index.md`]({folder}/index.md)."
     )
+
+
+def _mean(values: pd.Series) -> float:
+    """Infinite where one diverged, NaN where one was not measured."""
+    return values.mean(skipna=False)
 
 
 def _printed(scene: str, method: str) -> float:

@@ -142,6 +142,13 @@ def test_a_log_gets_a_line_now_and_then(monkeypatch, capsys):
     assert label() == ""
 
 
+def test_a_log_tells_of_work_that_has_not_begun(monkeypatch, capsys):
+    monkeypatch.setattr(progress, "EVERY", 0.0)
+    with Progress("train", 10, "steps") as bar:
+        bar.advance(0)
+    assert capsys.readouterr().err == "train, 0 of 10 steps, 0.0/s\n"
+
+
 def test_who_shows_nothing_logs_nothing(monkeypatch, capsys):
     monkeypatch.setattr(progress, "EVERY", 0.0)
     with Progress("train", 10, "steps", shown=False) as bar:
