@@ -250,9 +250,10 @@ def _sources(report: Path) -> dict:
 
 
 def figures(report: Path) -> str:
-    """The mean held-out results of this project's method beside the paper's δ, over all seeds, as markdown.
+    """The mean held-out results of this project's method beside the paper's δ, as markdown.
 
-    Runs by operators are shown where there are any, and the δ of projected steps beside theirs.
+    Means are over all settings of a scene, which are to be seeds. Runs by operators are shown where there are
+    any, and the δ of projected steps beside theirs.
 
     Args:
         report: folder of the report, relative to README.md.
@@ -263,9 +264,10 @@ def figures(report: Path) -> str:
     frame = pd.read_csv(report / "results.csv")
     for column, value in {"split": "test", **_SHOWN}.items():
         frame = frame[frame[column] == value]
-    projected = frame[frame["engine"] == _BESIDE].groupby("scene")["delta"].agg(_mean)
+    projected, own = {}, "δ [%]"
     if (by_operators := frame["engine"] == _ENGINE).any():
-        frame = frame[by_operators]
+        projected = frame[frame["engine"] == _BESIDE].groupby("scene")["delta"].agg(_mean)
+        frame, own = frame[by_operators], "δ, operators [%]"
     alike = [name for name in VARIANT if name in frame and name not in _OF_SEEDS]
     frame = frame.assign(**{name: nan for name in RIVALS if name not in frame})
     frame = frame.fillna(dict.fromkeys(alike, ""))
@@ -275,12 +277,12 @@ def figures(report: Path) -> str:
     means["sample"] = sizes["sample"]
     means[_PAPER] = [_printed(row["scene"], row["method"]) for row in means.to_dict("records")]
     means[_PROJECTED] = [100 * projected.get(scene, nan) for scene in means["scene"]]
-    described = [name for name in (*alike, "sample") if name in means]
-    columns = [*described, _PAPER, _PROJECTED, *_ERRORS, *_COSTS]
+    titles = {_PAPER: "paper's δ [%]", _PROJECTED: "δ, projected steps [%]", "delta": own}
+    columns = [*alike, "sample", _PAPER, _PROJECTED, *_ERRORS, *_COSTS]
     table, same = without_constants(means[columns], keep=("scene",))
     return (
         f"Means over held-out parameter values and seeds ({markdown(same)}).\n\n"
-        + markdown_table(rows_of(table, {_PAPER: "paper's δ [%]", _PROJECTED: "δ, projected steps [%]"}))
+        + markdown_table(rows_of(table, titles))
         + (f"\n\n{markdown(told)}" if (told := where_rivals_win(means)) else "")
         + f"\n\nFrom [`{folder}/results.csv`]({folder}/results.csv); the whole report is "
         f"[`index.md`]({folder}/index.md)."

@@ -81,7 +81,9 @@ class Report:
         keys = pd.DataFrame([_own(run) for run in runs], index=frame.index).replace("null", np.nan)
         frame = frame.join(keys)
         records = frame.to_dict("records")
-        numbers = frame.groupby(["scene", "method", "field"])["sample"].transform("nunique")
+        # A sample's size may follow from its seed.
+        alike = ["scene", "method", "field", *(set(SEEDS) & set(frame))]
+        numbers = frame.groupby(alike, dropna=False)["sample"].transform("nunique")
         told = zip(records, runs, numbers > 1, strict=True)
         frame[_PAPER] = [self._printed(row, run, compared) for row, run, compared in told]
         held_out = frame["split"] != "train"

@@ -69,13 +69,13 @@ def test_figures_are_means_of_held_out_values(tmp_path):
 def test_figures_are_of_operators_over_seeds_and_the_projected_error_stands_beside_them(tmp_path):
     whole = pd.read_csv(results(tmp_path, {"nsf": 0.002}) / "results.csv")
     parts = [
-        whole.assign(engine=engine, setting=f"seed={seed}", delta=whole["delta"] * factor)
+        whole.assign(engine=engine, setting=f"seed={seed}", sample=50 + seed, delta=whole["delta"] * factor)
         for engine, seed, factor in (("modal", 0, 1.0), ("operators", 0, 0.5), ("operators", 1, 1.0))
     ]
     pd.concat(parts).to_csv(tmp_path / "results.csv", index=False)
     text = figures(tmp_path)
-    assert "| scene | paper's δ [%] | δ, projected steps [%] | δ [%] |" in text
-    assert "| sand | 0.400 | 0.200 | 0.150 |" in text
+    assert "| scene | \\|S\\| | paper's δ [%] | δ, projected steps [%] | δ, operators [%] |" in text
+    assert "| sand | – | 0.400 | 0.200 | 0.150 |" in text
     assert "engine operators" in text
 
 

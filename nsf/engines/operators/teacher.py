@@ -108,11 +108,11 @@ class Teacher:
 
 
 class Recorded(Teacher):
-    """Full-order runs in place of steps of an engine: what is learned is how their latent vectors go on.
+    """Recorded runs in place of steps of an engine: what is learned is how their latent vectors go on.
 
     Args:
         batches: of the reduced runs in the same cases, at t = 0; none of their steps is taken.
-        runs: [N + 1, R, r] latent vectors of the full-order runs.
+        runs: [N + 1, R, r] latent vectors of the full-order runs, or of projected ones.
     """
 
     asked = False

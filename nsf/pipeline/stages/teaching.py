@@ -29,7 +29,6 @@ _LOOKED_AT = 1000
 _SEEN_AT_ONCE = 200
 #: Drawn runs of a process, at least: it takes seconds to start.
 _LEAST_RUNS = 8
-_IDLE = 60  # [s] after which a process ends that nobody asks any more
 
 
 def teach(pipeline, run: Run) -> None:
@@ -165,10 +164,10 @@ def drawn(pipeline, manifold: Manifold, told: Callable[[float], object]) -> list
 def _side_by_side(
     pipeline, cases: list[Case], processes: int, told: Callable[[float], object]
 ) -> tuple[torch.Tensor, list[bool]]:
-    """Runs [N + 1, R, r] that are taken one by one, and whether each left the grid; by several processes."""
+    """x̂ [N + 1, R, r] of projected runs, and whether each left the grid; by several processes."""
     runs, left = [], []
     one = partial(_alone, type(pipeline), OmegaConf.to_yaml(pipeline.scene.template), pipeline.root)
-    with ProcessPoolExecutor(processes, timeout=_IDLE) as pool:
+    with ProcessPoolExecutor(processes, initializer=torch.set_num_threads, initargs=(1,)) as pool:
         for run, gone in pool.map(one, cases):
             runs.append(run)
             left.append(gone)
@@ -185,8 +184,7 @@ def _alone(kind: type, text: str, root: Path | None, case: Case) -> tuple[np.nda
 
 @cache
 def _opened(kind: type, text: str, root: Path | None) -> tuple:
-    """The pipeline of a configuration and its manifold, in a process that has one core."""
-    torch.set_num_threads(1)
+    """The pipeline of a configuration and its manifold, once in a process."""
     pipeline = kind(OmegaConf.create(text), lambda line: None, root)
     return pipeline, pipeline.manifold().to(pipeline.device)
 

@@ -161,6 +161,12 @@ def test_settings_of_unlike_numbers_of_seeds_say_how_many(tmp_path):
     assert [row[at] for row in rows[1:]] == ["2", "1"]
 
 
+def test_a_sample_whose_size_follows_from_its_seed_is_beside_the_papers(tmp_path):
+    jobs = [job(seed=str(k)) | {"sample": 40 + k} for k in range(2)]
+    rows, _ = told(write_report(tmp_path / "a", jobs))
+    assert dict(zip(*rows, strict=True))["paper's δ [%]"] == "0.400"
+
+
 def test_what_follows_from_a_seed_and_what_is_a_column_are_no_settings(tmp_path):
     jobs = [
         job("cake", seed=str(k), engine=e, device="cpu", **{"sampler.size": str(40 + k)}) | {"engine": e}
