@@ -65,7 +65,7 @@ def test_the_page_shows_every_row_and_chart(speed):
     page = (speed / "index.md").read_text()
     assert page.count("| full_order_200 |") == 1 + 4
     for name in re.findall(r"\]\((.*?\.png)\)", page):
-        assert (speed / name).stat().st_size > 5000
+        assert (speed / name).stat().st_size > 3000  # and no empty axes
         assert (speed / name).with_suffix(".svg").is_file()
     assert re.findall(r"\]\((.*?)\)", page) == ["step-cpu.png", "kernels-cpu.png"]
 
