@@ -31,10 +31,10 @@ from nsf.storage import writing
 LIST = "index.md"
 #: Headings, and the folders under each in their order; the last heading is of all others.
 CHAPTERS = {
-    "Main results": ("table1", "table1_seeds", "operators", "operators_seeds", "forcing"),
+    "Main results": ("table1", "table1_seeds", "operators", "forcing"),
     "What the method needs": (
-        "ablation", "field", "mlp", "mlp_noise", "width", "latent_dim", "forcing_r", "noise_floor", "floors",
-        "sample_size", "sampler", "cells", "timestep", "training", "seeds",
+        "ablation", "mlp", "mlp_noise", "width", "latent_dim", "forcing_r", "noise_floor", "floors",
+        "sample_size", "sampler", "cells", "timestep", "training",
     ),
     "Beyond what was trained": ("extrapolation", "weak_elements", "super_resolution", "path_dependent"),
     "At small scale, on a CPU": (
