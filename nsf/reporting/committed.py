@@ -33,7 +33,7 @@ LIST = "index.md"
 CHAPTERS = {
     "Main results": ("table1", "table1_seeds", "operators", "forcing"),
     "What the method needs": (
-        "ablation", "mlp", "mlp_noise", "width", "latent_dim", "forcing_r", "noise_floor", "floors",
+        "ablation", "mlp", "mlp_steps", "width", "latent_dim", "forcing_r", "noise_floor", "floors",
         "sample_size", "sampler", "cells", "timestep", "training",
     ),
     "Beyond what was trained": ("extrapolation", "weak_elements", "super_resolution", "path_dependent"),
