@@ -36,6 +36,10 @@ _MEASURED = (
     "delta", "displacement_error", _WORST, "displacement_interpolated", "delta_static", "stress_error",
     "speedup_step", "speedup_total", "speedup_shown", "break_even_runs", "handed_over",
 )  # fmt: skip
+_BESIDE = {
+    "stress_error": "the stress error [%]",
+    "integration_share": "N in % of all particles",
+}
 #: Of these the deviation over seeds stands beside the mean.
 _SCATTERED = ("delta", "displacement_error", "stress_error", "speedup_step", "speedup_total", "speedup_shown")
 _SPLITS = ({"train"}, {"validation"})
@@ -76,7 +80,8 @@ class Report:
         shown = frame["total_ms_full"] / (frame["total_ms_reduced"] + frame["decode_ms"])
         # Nothing moves has a displacement error of 1.
         still = frame["delta"] / frame["displacement_error"]
-        frame = frame.assign(delta_static=still, speedup_shown=shown)
+        share = frame["integration_mean"] / (frame["gamma"] * frame["r"].astype(float) / 3)  # γ = 3 P / r
+        frame = frame.assign(delta_static=still, speedup_shown=shown, integration_share=share)
         runs = [self.told["runs"][row["run"]] for row in self.told["rows"]]
         keys = pd.DataFrame([_own(run) for run in runs], index=frame.index).replace("null", np.nan)
         frame = frame.join(keys)
@@ -133,6 +138,7 @@ class Report:
             averaged = [name for name in (*_MEASURED, *RIVALS, _PAPER) if name != _WORST]
             row |= {name: part[name].mean(skipna=False) for name in averaged}
             row["delta_static"] = part["delta_static"].mean()  # not of runs that diverged
+            row["integration_share"] = part["integration_share"].mean()
             row[_WORST] = part["displacement_error"].max()
             row |= {f"{name}{_DEVIATION}": value for name, value in self._deviations(part).items()}
             row |= {_RUNS: len(part), _DIVERGED: int(np.isinf(part["delta"]).sum())}
@@ -180,7 +186,8 @@ def headline(report: Report) -> tuple[Rows, str]:
         table, said = _flat(report), f"Shown: {_averaged(report)}."
     else:
         table = _pivot(report, varied)
-        said = f"Shown: δ [%], in brackets the stress error [%]; {_averaged(report)}.{_best(report)}"
+        beside = _BESIDE[_bracketed(report)]
+        said = f"Shown: δ [%], in brackets {beside}; {_averaged(report)}.{_best(report)}"
     return table, f"{said}{_beside_paper(report)}{_rivals(report)}{_diverged(report)}"
 
 
@@ -210,8 +217,8 @@ def _flat(report: Report) -> Rows:
 
 
 def _pivot(report: Report, varied: Sequence[str]) -> Rows:
-    """Mean δ and stress error, settings down and scenes across, or as it takes fewer rows."""
-    groups, settings = report.groups, report.settings
+    """Mean δ and what stands in brackets, settings down and scenes across, or as it takes fewer rows."""
+    groups, settings, bracketed = report.groups, report.settings, _bracketed(report)
     kinds = _kinds(groups, settings)
     if groups["scene"].nunique() > kinds:
         down, across = ["scene"], settings
@@ -226,28 +233,32 @@ def _pivot(report: Report, varied: Sequence[str]) -> Rows:
     printed = {at for (_, at), row in found.items() if not np.isnan(row[_PAPER])}
     headings = [_title(key) for key in down]
     for at in columns:
-        name = " · ".join(
-            _named(key, value) for key, value in zip(across, at, strict=True) if value != ABSENT
-        )
+        name = _told(across, at)
         headings += [name, f"{name}, the paper"] if at in printed else [name]
     body = []
     for values in _sorted(groups, down):
         body.append([_text(key, value) for key, value in zip(down, values, strict=True)])
         for at in columns:
             row = found.get((values, at))
-            body[-1].append(_both_errors(row) if row else "")
+            body[-1].append(_with_bracket(row, bracketed) if row else "")
             if at in printed:
                 body[-1].append(number(row[_PAPER], 100) if row else "")
     numeric = [*map(_is_number, down), *(True for _ in headings[len(down) :])]
     return Rows(headings, body, numeric)
 
 
-def _both_errors(row: Mapping) -> str:
-    """δ and the stress error of a row of `groups`, or how many of its runs diverged."""
+def _bracketed(report: Report) -> str:
+    """What stands beside δ: where samples are compared, how many particles they need."""
+    sampled = any(key == "sample" or key.startswith("sampler") for key in report.settings)
+    return "integration_share" if sampled else "stress_error"
+
+
+def _with_bracket(row: Mapping, bracketed: str) -> str:
+    """δ and another mean of a row of `groups`, or how many of its runs diverged."""
     if row[_DIVERGED]:
         return f"{row[_DIVERGED]} of {row[_RUNS]} diverged"
     delta = plus_minus(row["delta"], row.get(f"delta{_DEVIATION}", np.nan), 100)
-    return f"{delta} ({number(row['stress_error'], 100)})"
+    return f"{delta} ({number(row[bracketed], 100)})"
 
 
 def _over_seeds(report: Report) -> Rows:
@@ -289,8 +300,8 @@ def _best(report: Report) -> str:
         finite = part[np.isfinite(part["delta"])]
         if len(finite):
             row = finite.loc[finite["delta"].idxmin()]
-            where = [_named(key, row[key]) for key in report.settings if row[key] != ABSENT]
-            told.append(f"{number(row['delta'], 100)} % on {scene} ({', '.join(where)})")
+            where = _told(report.settings, [row[key] for key in report.settings], ", ")
+            told.append(f"{number(row['delta'], 100)} % on {scene} ({where})")
     return f" Smallest δ: {'; '.join(told)}." if told else ""
 
 
@@ -368,6 +379,12 @@ def _named(key: str, value) -> str:
     """A setting away from its heading: numbers need their title."""
     text = _text(key, value)
     return f"{_title(key)} {text}" if _is_number(key) else text
+
+
+def _told(keys: Sequence[str], values: Sequence, separator: str = " · ") -> str:
+    """Settings away from their headings; where none is set, those of the scene's yaml hold."""
+    named = [_named(key, value) for key, value in zip(keys, values, strict=True) if value != ABSENT]
+    return separator.join(named) or "as the scene has it"
 
 
 def _is_number(key: str) -> bool:

@@ -138,10 +138,21 @@ def test_very_many_settings_have_the_number_down_and_the_rest_across(tmp_path):
     sizes = [str(10 * k) for k in range(1, 10)]
     jobs = [job(sampler=s, **{"sampler.size": size}) for s in ("random", "cubature") for size in sizes]
     jobs.append(job("bread", sampler="random", **{"sampler.size": "15"}))
-    rows, _ = told(write_report(tmp_path / "a", jobs))
+    rows, said = told(write_report(tmp_path / "a", jobs))
     assert rows[0] == ["S", "sand · random", "sand · cubature", "bread · random"]
     assert [row[0] for row in rows[1:4]] == ["10", "15", "20"]
-    assert rows[2] == ["15", "", "", "0.100 (2)"]
+    # One integration particle of two, as γ r / 3 = 2: where samples are compared, N stands beside δ.
+    assert rows[2] == ["15", "", "", "0.100 (50)"]
+    assert "in brackets N in % of all particles" in said
+
+
+def test_a_setting_that_no_key_changes_has_a_name(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "MANY", 3)
+    own = [job(scene) for scene in ("a", "b", "sand")]
+    jobs = [*own, *(job(scene, sampler="cells") for scene in ("a", "b", "sand"))]
+    rows, said = told(write_report(tmp_path / "a", jobs))
+    assert rows[0][1:] == ["as the scene has it", "as the scene has it, the paper", "cells", "cells, the paper"]
+    assert "on a (as the scene has it)" in said
 
 
 def test_seeds_alone_show_their_scatter(tmp_path):
