@@ -148,10 +148,11 @@ def test_very_many_settings_have_the_number_down_and_the_rest_across(tmp_path):
 
 def test_a_setting_that_no_key_changes_has_a_name(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "MANY", 3)
-    own = [job(scene) for scene in ("a", "b", "sand")]
-    jobs = [*own, *(job(scene, sampler="cells") for scene in ("a", "b", "sand"))]
+    plain = [job(scene) for scene in ("a", "b", "sand")]
+    jobs = [*plain, *(job(scene, sampler="cells") for scene in ("a", "b", "sand"))]
     rows, said = told(write_report(tmp_path / "a", jobs))
-    assert rows[0][1:] == ["as the scene has it", "as the scene has it, the paper", "cells", "cells, the paper"]
+    own = "as the scene has it"
+    assert rows[0] == ["scene", own, f"{own}, the paper", "cells", "cells, the paper"]
     assert "on a (as the scene has it)" in said
 
 
