@@ -68,9 +68,18 @@ def test_the_ablation_is_every_method_of_the_paper_on_every_scene():
 def test_the_experiments_of_table1s_scenes_share_its_runs():
     """Hours of work are done once: an evaluate run has one identity in all of them."""
     table1 = {Plan(config.load(job.overrides)).evaluation.id for job in _small("table1")}
-    for name, keys in (("ablation", {"method": "nsf"}), ("field", {})):
-        jobs = [job for job in _small(name) if keys.items() <= job.keys.items()]
-        assert {Plan(config.load(job.overrides)).evaluation.id for job in jobs} <= table1
+    jobs = [job for job in _small("ablation") if job.keys["method"] == "nsf"]
+    assert {Plan(config.load(job.overrides)).evaluation.id for job in jobs} <= table1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["mlp_steps", "table1", "sand"])
+def test_the_papers_networks_are_trained_once(name):
+    def trained(experiment):
+        jobs = [job for job in _small(experiment) if job.keys.get("field") == "mlp"]
+        return {Plan(config.load(job.overrides)).training.id for job in jobs}
+
+    assert trained(name) <= trained("mlp")
 
 
 @pytest.mark.parametrize("overrides", _jobs(), ids=" ".join)
