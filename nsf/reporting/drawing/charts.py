@@ -30,6 +30,7 @@ OVER_TIME = {
     "angular_momentum_error": "angular momentum error",
 }
 _LETTER, _ENTRY = 5.5, 40.0  # [pt] width of a letter of a legend at most, and of what is about an entry
+_ACROSS = 4  # panels of scenes in a row
 LOST = 1000.0  # [%] error from which a run is lost, by how much tells nothing: axes end there
 
 
@@ -195,8 +196,12 @@ def delta_over(
     names = list(dict.fromkeys(name for lines in panels.values() for name in lines))
     known = {x for lines in panels.values() for line in lines.values() for x in line}
     with styled():
-        fig = figure(3.7)
-        drawn = fig.subplots(1, len(panels), squeeze=False, sharex=True)[0]
+        rows = math.ceil(len(panels) / _ACROSS)
+        fig = figure(0.9 + 2.8 * rows)
+        grid = fig.subplots(rows, min(_ACROSS, len(panels)), squeeze=False, sharex=True).ravel()
+        drawn = grid[: len(panels)]
+        for panel in grid[len(panels) :]:
+            panel.axis("off")
         for panel, (scene, lines) in zip(drawn, panels.items(), strict=True):
             every = []
             for name, line in lines.items():
@@ -211,8 +216,10 @@ def delta_over(
                 panel.plot(value, 100 * delta, "X", ms=8, color=PAPER, label="the paper")
                 every.append(100 * delta)
                 known.add(value)
-            panel.set(title=scene, xlabel=x, ylabel="δ [%]")
+            panel.set(title=scene, ylabel="δ [%]")
+            panel.tick_params(labelbottom=True)
             error_scale(panel, every)
+        fig.supxlabel(x)
         if max(known) > 10 * min(known):
             drawn[0].set_xscale("log")
             plain_ticks(drawn[0].xaxis)
