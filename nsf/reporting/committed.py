@@ -31,7 +31,7 @@ from nsf.storage import writing
 LIST = "index.md"
 #: Headings, and the folders under each in their order; the last heading is of all others.
 CHAPTERS = {
-    "Main results": ("table1", "table1_seeds", "operators", "forcing"),
+    "Main results": ("table1", "table1_seeds", "operators", "operators_seeds", "forcing"),
     "What the method needs": (
         "ablation", "mlp", "mlp_steps", "width", "latent_dim", "forcing_r", "noise_floor", "floors",
         "sample_size", "sampler", "cells", "timestep", "training",

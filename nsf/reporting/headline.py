@@ -36,10 +36,7 @@ _MEASURED = (
     "delta", "displacement_error", _WORST, "displacement_interpolated", "delta_static", "stress_error",
     "speedup_step", "speedup_total", "speedup_shown", "break_even_runs", "handed_over",
 )  # fmt: skip
-_BESIDE = {
-    "stress_error": "the stress error [%]",
-    "integration_share": "N in % of all particles",
-}
+_SHARE = "integration_share"  # N over all particles
 #: Of these the deviation over seeds stands beside the mean.
 _SCATTERED = ("delta", "displacement_error", "stress_error", "speedup_step", "speedup_total", "speedup_shown")
 _SPLITS = ({"train"}, {"validation"})
@@ -138,7 +135,7 @@ class Report:
             averaged = [name for name in (*_MEASURED, *RIVALS, _PAPER) if name != _WORST]
             row |= {name: part[name].mean(skipna=False) for name in averaged}
             row["delta_static"] = part["delta_static"].mean()  # not of runs that diverged
-            row["integration_share"] = part["integration_share"].mean()
+            row[_SHARE] = part[_SHARE].mean()
             row[_WORST] = part["displacement_error"].max()
             row |= {f"{name}{_DEVIATION}": value for name, value in self._deviations(part).items()}
             row |= {_RUNS: len(part), _DIVERGED: int(np.isinf(part["delta"]).sum())}
@@ -186,8 +183,8 @@ def headline(report: Report) -> tuple[Rows, str]:
         table, said = _flat(report), f"Shown: {_averaged(report)}."
     else:
         table = _pivot(report, varied)
-        beside = _BESIDE[_bracketed(report)]
-        said = f"Shown: δ [%], in brackets {beside}; {_averaged(report)}.{_best(report)}"
+        share = ", and N in % of all particles" if _SHARE in _bracketed(report) else ""
+        said = f"Shown: δ [%], in brackets the stress error [%]{share}; {_averaged(report)}.{_best(report)}"
     return table, f"{said}{_beside_paper(report)}{_rivals(report)}{_diverged(report)}"
 
 
@@ -240,25 +237,25 @@ def _pivot(report: Report, varied: Sequence[str]) -> Rows:
         body.append([_text(key, value) for key, value in zip(down, values, strict=True)])
         for at in columns:
             row = found.get((values, at))
-            body[-1].append(_with_bracket(row, bracketed) if row else "")
+            body[-1].append(_with_brackets(row, bracketed) if row else "")
             if at in printed:
                 body[-1].append(number(row[_PAPER], 100) if row else "")
     numeric = [*map(_is_number, down), *(True for _ in headings[len(down) :])]
     return Rows(headings, body, numeric)
 
 
-def _bracketed(report: Report) -> str:
-    """What stands beside δ: where samples are compared, how many particles they need."""
+def _bracketed(report: Report) -> list[str]:
+    """What stands beside δ: the stress error and, where samples are compared, the share of N."""
     sampled = any(key == "sample" or key.startswith("sampler") for key in report.settings)
-    return "integration_share" if sampled else "stress_error"
+    return ["stress_error", *([_SHARE] if sampled else [])]
 
 
-def _with_bracket(row: Mapping, bracketed: str) -> str:
-    """δ and another mean of a row of `groups`, or how many of its runs diverged."""
+def _with_brackets(row: Mapping, bracketed: Sequence[str]) -> str:
+    """δ and other means of a row of `groups`, or how many of its runs diverged."""
     if row[_DIVERGED]:
         return f"{row[_DIVERGED]} of {row[_RUNS]} diverged"
     delta = plus_minus(row["delta"], row.get(f"delta{_DEVIATION}", np.nan), 100)
-    return f"{delta} ({number(row[bracketed], 100)})"
+    return f"{delta} ({', '.join(number(row[name], 100) for name in bracketed)})"
 
 
 def _over_seeds(report: Report) -> Rows:

@@ -142,8 +142,8 @@ def test_very_many_settings_have_the_number_down_and_the_rest_across(tmp_path):
     assert rows[0] == ["S", "sand · random", "sand · cubature", "bread · random"]
     assert [row[0] for row in rows[1:4]] == ["10", "15", "20"]
     # One integration particle of two, as γ r / 3 = 2: where samples are compared, N stands beside δ.
-    assert rows[2] == ["15", "", "", "0.100 (50)"]
-    assert "in brackets N in % of all particles" in said
+    assert rows[2] == ["15", "", "", "0.100 (2, 50)"]
+    assert "in brackets the stress error [%], and N in % of all particles" in said
 
 
 def test_a_setting_that_no_key_changes_has_a_name(tmp_path, monkeypatch):

@@ -197,7 +197,7 @@ def test_the_band_spans_the_values_and_a_diverged_run_leaves_a_gap():
     np.testing.assert_allclose(panel.lines[0].get_ydata(), [3.0, np.nan, 1.5])
     corners = panel.collections[0].get_paths()[0].vertices[:, 1]
     assert (corners.min(), corners.max()) == pytest.approx((2.0, 4.0))
-    assert (panel.get_xscale(), panel.get_xlabel(), panel.get_ylabel()) == ("log", "|S| [–]", "δ [%]")
+    assert (panel.get_xscale(), figure.get_supxlabel(), panel.get_ylabel()) == ("log", "|S| [–]", "δ [%]")
 
 
 def test_latex_is_the_first_table_of_the_page(tmp_path, no_pictures):
