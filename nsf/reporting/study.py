@@ -128,7 +128,8 @@ def _scatter(frame: pd.DataFrame, merged: Merged, folder: Path) -> Picture:
             entries.append({"label": f"{name} · {len(values)} × {seed}", "paper": paper} | told)
     caption = (
         "δ, averaged over the held-out values, for each seed (dots): seed is of the networks' first weights "
-        "and batches, sampler.seed of the sample particles; their mean, and what the paper prints."
+        "and batches, sampler.seed of the sample particles; and their mean"
+        + (", and what the paper prints." if any(entry["paper"] is not None for entry in entries) else ".")
     )
     figure = charts.delta_per_variant(entries, dots="one seed")
     return Picture(save(figure, folder, "delta-over-seeds"), caption, sorted(set(frame[_RUN])))
@@ -204,9 +205,22 @@ def _settings(frame: pd.DataFrame, told: Sequence[str], alone: str) -> list[tupl
     if not told:
         return [(alone, frame)] if len(frame) else []
     return [
-        (" · ".join(str(value) for value in values if not pd.isna(value)), group)
+        (_name(dict(zip(told, values, strict=True))), group)
         for values, group in frame.groupby(told, dropna=False, sort=False)
     ]
+
+
+def _name(setting: Mapping[str, object]) -> str:
+    """Values of a setting, those that say nothing alone after their key; none twice, as a body's material."""
+    parts: list[str] = []
+    for key, value in setting.items():
+        text = "" if pd.isna(value) else str(value)
+        if text == "null" or text.replace(".", "", 1).isdigit():
+            title = AXES[key][0] if key in AXES else key.rpartition(".")[2].replace("_", " ")
+            text = f"{title} {text}"
+        if text and text not in " · ".join(parts).split(" · "):
+            parts.append(text)
+    return " · ".join(parts)
 
 
 def trust_table(merged: Merged, renamed: Mapping[str, str]) -> list[Table]:

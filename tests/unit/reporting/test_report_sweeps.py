@@ -9,11 +9,11 @@ import pandas as pd
 import pytest
 from synthetic import Made, write_run
 
-from nsf.reporting import build_report
+from nsf.reporting import build_report, study
 from nsf.reporting.drawing import charts, shapes
 from nsf.reporting.pictures import draw
 from nsf.reporting.sources import Study, open_sources
-from nsf.reporting.study import _settings, _told, interval, over_seeds, swept
+from nsf.reporting.study import _name, _settings, _told, interval, over_seeds, swept
 from nsf.reporting.tables import means, merge, rows_of
 from nsf.reporting.text.columns import plus_minus
 from nsf.reporting.text.formats import latex, latex_table
@@ -78,7 +78,9 @@ def test_seeds_are_summed_up_for_each_setting(tmp_path):
     found, keys, settings = runs(tmp_path, sizes={20: 0.02, 50: 0.008}, seeds=("0", "1", "2"))
     merged = merge(open_sources(found), settings)
     (table,) = over_seeds(merged, of(keys))
-    assert [row[:3] for row in table.content.body] == [["20", "seed", "3"], ["50", "seed", "3"]]
+    assert [row[:3] for row in table.content.body] == [
+        [f"sample particles |S| {size}", "seed", "3"] for size in (20, 50)
+    ]
     own = merged.frame[merged.frame["sample"] == "20"].groupby("setting")["delta"].mean()
     assert table.content.body[0][3] == plus_minus(own.mean(), own.std(), 100)
     assert "±" in table.content.body[0][3]
@@ -139,6 +141,19 @@ def test_what_the_paper_prints_of_single_jobs_stands_beside_them(tmp_path, drawn
     printed = table[table["field"] == "the paper"]
     assert printed[["sample", "delta"]].to_numpy().tolist() == [["20", 0.03], ["50", 0.01]]
     assert len(means(merged)) == len(table) - 1  # the scene's figure alone
+
+
+def test_a_setting_tells_the_key_of_a_number_and_a_material_once():
+    setting = {
+        "scene": "block · von_mises",
+        "material": "von_mises",
+        "deploy.error_ratio": "1.25",
+        "field.beta": 8,
+    }
+    assert _name(setting) == "block · von_mises · error ratio 1.25 · hidden width β over d 8"
+    assert (
+        _name({"engine": "operators", "deploy.error_ratio": "null"}) == "operators · error ratio null"
+    )
 
 
 def test_seeds_alone_are_dots(tmp_path, drawn):
