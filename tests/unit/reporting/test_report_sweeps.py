@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from synthetic import Made, write_run
 
-from nsf.reporting import build_report, study
+from nsf.reporting import build_report
 from nsf.reporting.drawing import charts, shapes
 from nsf.reporting.pictures import draw
 from nsf.reporting.sources import Study, open_sources
@@ -151,9 +151,7 @@ def test_a_setting_tells_the_key_of_a_number_and_a_material_once():
         "field.beta": 8,
     }
     assert _name(setting) == "block · von_mises · error ratio 1.25 · hidden width β over d 8"
-    assert (
-        _name({"engine": "operators", "deploy.error_ratio": "null"}) == "operators · error ratio null"
-    )
+    assert _name({"engine": "operators", "deploy.error_ratio": "null"}) == "operators · error ratio null"
 
 
 def test_seeds_alone_are_dots(tmp_path, drawn):
