@@ -212,14 +212,15 @@ def _settings(frame: pd.DataFrame, told: Sequence[str], alone: str) -> list[tupl
 
 def _name(setting: Mapping[str, object]) -> str:
     """Values of a setting, those that say nothing alone after their key; none twice, as a body's material."""
-    parts: list[str] = []
+    parts: dict[str, None] = {}
     for key, value in setting.items():
-        text = "" if pd.isna(value) else str(value)
-        if text == "null" or text.replace(".", "", 1).isdigit():
+        if pd.isna(value):
+            continue
+        text = str(value)
+        if text == "null" or not pd.isna(pd.to_numeric(text, errors="coerce")):
             title = AXES[key][0] if key in AXES else key.rpartition(".")[2].replace("_", " ")
             text = f"{title} {text}"
-        if text and text not in " · ".join(parts).split(" · "):
-            parts.append(text)
+        parts |= dict.fromkeys(text.split(" · "))
     return " · ".join(parts)
 
 

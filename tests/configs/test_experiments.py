@@ -79,7 +79,9 @@ def test_the_papers_networks_are_trained_once(name):
         jobs = [job for job in _small(experiment) if job.keys.get("field") == "mlp"]
         return {Plan(config.load(job.overrides)).training.id for job in jobs}
 
-    assert trained(name) <= trained("mlp")
+    found = trained(name)
+    assert found
+    assert found <= trained("mlp")
 
 
 @pytest.mark.parametrize("overrides", _jobs(), ids=" ".join)

@@ -149,8 +149,9 @@ def test_a_setting_tells_the_key_of_a_number_and_a_material_once():
         "material": "von_mises",
         "deploy.error_ratio": "1.25",
         "field.beta": 8,
+        "field.noise": "1e-05",
     }
-    assert _name(setting) == "block · von_mises · error ratio 1.25 · hidden width β over d 8"
+    assert _name(setting) == "block · von_mises · error ratio 1.25 · hidden width β over d 8 · noise 1e-05"
     assert _name({"engine": "operators", "deploy.error_ratio": "null"}) == "operators · error ratio null"
 
 
@@ -211,6 +212,14 @@ def test_the_band_spans_the_values_and_a_diverged_run_leaves_a_gap():
     corners = panel.collections[0].get_paths()[0].vertices[:, 1]
     assert (corners.min(), corners.max()) == pytest.approx((2.0, 4.0))
     assert (panel.get_xscale(), figure.get_supxlabel(), panel.get_ylabel()) == ("log", "|S| [–]", "δ [%]")
+
+
+def test_more_than_four_scenes_take_a_second_row():
+    scenes = [f"scene {k}" for k in range(6)]
+    figure = charts.delta_over({scene: {"mean": {1.0: [0.1], 2.0: [0.2]}} for scene in scenes}, "r [–]", {})
+    drawn = [panel for panel in figure.axes if panel.axison]
+    assert [panel.get_title("left") or panel.get_title() for panel in drawn] == scenes
+    assert [panel.get_subplotspec().rowspan.start for panel in drawn] == [0, 0, 0, 0, 1, 1]
 
 
 def test_latex_is_the_first_table_of_the_page(tmp_path, no_pictures):
