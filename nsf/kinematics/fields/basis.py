@@ -1,9 +1,11 @@
 """`field=basis`: linear modes of the snapshots with a nonlinear closure of the latent vector.
 
     g(X, xhat)    = X + ū(X) + Σ_k b_k(X) a_k,   a = [σ · xhat ; closure(xhat)]
-    h(X, xhat, μ) = τ̄(X) + Σ_k t_k(X) d_k(xhat, μ),   l likewise
+    h(X, xhat, μ) = Σ_k t_k(X) [d_k(xhat, μ) − d_k(xhat₀, μ)]
+    l(X, xhat, μ) = C̄(X) + Σ_k c_k(X) b_k(xhat, μ)
 
-or with `affine=rate`, since C is a velocity gradient, and a state may be passed at different speeds,
+with xhat₀ of the body at rest where the training runs begin free of stress, else without d_k(xhat₀, μ); or
+with `affine=rate`, since C is a velocity gradient, and a state may be passed at different speeds,
 
     l(X, xhat, dx̂/dt, μ) = C̄(X) + Σ_k c_k(X) [b_k(xhat, μ) + Σ_j M_kj(xhat, μ) dx̂_j/dt]
 
@@ -34,7 +36,7 @@ from nsf.kinematics.fields.modal import (
     RestrictedField,
     at_rate,
 )
-from nsf.kinematics.fields.networks import Committee, FullyConnected
+from nsf.kinematics.fields.networks import Committee, FromRest, FullyConnected
 from nsf.kinematics.interpolation import Interpolation, interpolation
 from nsf.kinematics.manifold import Manifold
 from nsf.kinematics.training.phases import (
@@ -140,6 +142,7 @@ class BasisField:
             "noise_floor": self.noise_floor,
             "head_parameters": self.head_parameters,
             "affine": self.affine,
+            "free_at_rest": _begin_free(snapshots),
             "unresolved": [prepared[name]["unresolved"] for name, _ in TARGETS.values()],
         }
         manifold = self.manifold(
@@ -157,6 +160,7 @@ class BasisField:
             field.calibrate(coefficients)
             if field.network is not None:
                 field.network.initialise(generator)
+        manifold.keep_rest()
         coefficients = prepared["x"]["coefficients"][:, :latent_dim]
         manifold.training_latents.copy_(coefficients / manifold.fields["deformation"].leading)
         return manifold
@@ -205,6 +209,12 @@ class BasisField:
         return loss
 
 
+def _begin_free(snapshots: Snapshots) -> bool:
+    """Whether every training run begins free of stress."""
+    first = torch.nonzero(snapshots.frame == 0).flatten()
+    return not any(snapshots.gather("tau", row[None], slice(None)).any() for row in first)
+
+
 def _slope(local: Interpolation, values: Tensor) -> Tensor:
     """∂/∂X of a field [P, 3, ...] at points [n, 9, ...]."""
     return local.gradient(values).movedim(-1, 2).flatten(1, 2)
@@ -242,6 +252,7 @@ class BasisManifold(Manifold):
                 hyperparameters["depth"],
                 hyperparameters.get("members", 1),  # files from before there were members
                 latent_dim if phase == "affine" and self.takes_rate else 0,
+                latent_dim if phase == "stress" and hyperparameters.get("free_at_rest", False) else 0,
             )
 
     @property
@@ -257,10 +268,22 @@ class BasisManifold(Manifold):
         return (1 + self.floor.square()).sqrt()
 
     @property
+    def rest_latent(self) -> Tensor:
+        """xhat [r] of the particles at X, free of stress."""
+        X = self.X[None]
+        return self.encode(X, X.new_zeros(*X.shape[:2], 6))[0]
+
+    def keep_rest(self) -> None:
+        """Tell the stress network the latent vector of rest, once the encoder is known."""
+        network = self.fields["stress"].network
+        if isinstance(network, FromRest):
+            network.rest.copy_(self.rest_latent / self.spread)
+
+    @property
     def layered(self) -> bool:
         """Whether every network is one of layers with SiLU, or a mean of such, as `factors` takes apart."""
-        networks = [field.network for field in self.fields.values()]
-        return all(network is None or isinstance(network, FullyConnected | Committee) for network in networks)
+        known = None | FullyConnected | Committee | FromRest
+        return all(isinstance(field.network, known) for field in self.fields.values())
 
     def takes_parameters(self, phase: str) -> bool:
         """Whether the phase's network sees the problem parameters."""
@@ -319,9 +342,8 @@ class BasisManifold(Manifold):
             base = points if name == "deformation" else 0
             mean, table = field.mean, field.modes
         network, scale = self._deployed(phase, like), float(field.scale)
-        members = self.hyperparameters.get("members", 1)
         mean = (base + mean[rows]).to(like)
-        return ModalFactors(mean, table, rows, field.leading, scale, network, members, field.rates)
+        return ModalFactors(mean, table, rows, field.leading, scale, network, field.members, field.rates)
 
     def _slopes(self, device: torch.device | str) -> tuple[Tensor, Tensor]:
         """∂/∂X of the deformation's mean [P, 9] and of its modes [P, 9, K], in fp32, at the particles.

@@ -4,9 +4,9 @@ A latent vector of positions alone is one of shapes: where the same shape is met
 in loading and unloading, no h(X, xhat) tells them apart. Here xhat are the leading coefficients of the joint
 snapshots
 
-    [ (x − x̄)/s_x ; √w (τ − τ̄)/s_τ ],    s² the variance of each field, summed over particles,
+    [ (x − x̄)/s_x ; √w τ/s_τ ],    s² the mean square of each part, summed over particles,
 
-over their deviation. As before, g(X, xhat) is linear in xhat plus a closure: its leading modes are now the
+over their root mean square. As before, g(X, xhat) is linear in xhat plus a closure: its leading modes are the
 parts of the joint modes that are displacements, and the closure's those of the displacements they leave out.
 So the inversion is as before, r unknowns and 3|S| equations; but a direction of xhat that is mostly stress
 moves few particles, and is told by positions as badly as it moves them. At small scale that outweighs the
@@ -98,6 +98,7 @@ class JointField(BasisField):
         ):
             for particles, _, modes in pod.modes(snapshots, name, components, latent):
                 encoder[particles] = (modes * (prepared["weights"][name] / scale.to(modes))).float()
+        manifold.keep_rest()
         return manifold
 
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from nsf.errors import ShapeError
-from nsf.kinematics.fields.networks import Committee, FullyConnected
+from nsf.kinematics.fields.networks import Committee, FromRest, FullyConnected
 from nsf.kinematics.manifold import Restriction
 from nsf.kinematics.training.phases import joined, shaped
 
@@ -41,6 +41,7 @@ class ModalField(nn.Module):
         inputs, width, depth: of the network; there is none if no coefficient is left to it.
         members: networks whose mean it is.
         rates: r if the coefficients depend on dx̂/dt, else 0.
+        from_rest: r if the coefficients that the network finds are to be zero at rest (`FromRest`), else 0.
     """
 
     def __init__(
@@ -54,6 +55,7 @@ class ModalField(nn.Module):
         depth: int,
         members: int,
         rates: int = 0,
+        from_rest: int = 0,
     ):
         super().__init__()
         self.register_buffer("mean", torch.zeros(particles, components, dtype=torch.float64))
@@ -65,10 +67,13 @@ class ModalField(nn.Module):
             self.register_buffer("rate", torch.ones(rates, dtype=torch.float64))
         closed = modes - leading
         widths = (inputs, *[width] * depth, closed * (1 + rates))
-        self.network: FullyConnected | Committee | None = None
+        self.network: FullyConnected | Committee | FromRest | None = None
         if closed:
             several = members > 1
-            self.network = Committee(members, widths, "silu") if several else FullyConnected(widths, "silu")
+            network = Committee(members, widths, "silu") if several else FullyConnected(widths, "silu")
+            self.network = FromRest(network, from_rest) if from_rest else network
+        #: Networks of which the deployed one consists.
+        self.members = members * (2 if from_rest else 1)
 
     def calibrate(self, coefficients: Tensor) -> None:
         """Take the scales from the coefficients [M, K] of the training snapshots."""
@@ -179,7 +184,7 @@ class ModalFactors:
         leading: σ [r] of the coefficients that are latents; [0] for h and l.
         scale: of the others, with which the network's last layer was multiplied.
         network: of the others, in raw units; None if there is none.
-        members: how many networks it is the mean of.
+        members: how many networks it is a sum of.
         rates: r where the network gives b and M of `at_rate`, else 0.
     """
 

@@ -42,6 +42,7 @@ class FullyConnected(nn.Module):
 
     def __init__(self, widths: Sequence[int], activation: str):
         super().__init__()
+        self.kind = activation
         self.activation, self.push = ACTIVATIONS[activation]
         self.layers = nn.ModuleList(nn.Linear(i, o) for i, o in itertools.pairwise(widths))
 
@@ -51,9 +52,14 @@ class FullyConnected(nn.Module):
             xavier(layer, generator)
 
     @property
+    def widths(self) -> tuple[int, ...]:
+        """(inputs, hidden..., outputs)."""
+        return self.layers[0].in_features, *(layer.out_features for layer in self.layers)
+
+    @property
     def width(self) -> int:
         """Values the widest layer holds for one row of input."""
-        return max(layer.out_features for layer in self.layers)
+        return max(self.widths[1:])
 
     def forward(self, inputs: Tensor) -> Tensor:
         """[..., inputs] → [..., outputs]."""
@@ -157,11 +163,6 @@ class Committee(nn.Module):
             for member in weight:
                 nn.init.xavier_uniform_(member, generator=generator)
 
-    @property
-    def width(self) -> int:
-        """Values the widest layer of a member holds for one row of input."""
-        return max(self.widths[1:])
-
     def forward(self, inputs: Tensor) -> Tensor:
         """[members, n, inputs], rows of its own for each member → [members, n, outputs]."""
         act, _ = ACTIVATIONS[self.activation]
@@ -170,24 +171,90 @@ class Committee(nn.Module):
             inputs = act(torch.baddbmm(b, inputs, w.mT))
         return torch.baddbmm(bias, inputs, weight.mT)
 
-    @torch.no_grad()
     def mean(self) -> FullyConnected:
         """The members' mean as one network in double precision: side by side, averaged by the last layer."""
-        members = len(self.weights[0])
-        inner = [members * width for width in self.widths[1:-1]]
-        merged = FullyConnected((self.widths[0], *inner, self.widths[-1]), self.activation)
-        merged.to(self.weights[0].device, torch.float64)
-        last = len(merged.layers) - 1
-        for k, (layer, w, b) in enumerate(zip(merged.layers, self.weights, self.biases, strict=True)):
-            weight, bias = w.double(), b.double()
-            if k == last:
-                layer.weight.copy_(torch.cat(list(weight), 1) / members)
-                layer.bias.copy_(bias.mean(0)[0])
-            else:
-                layer.weight.copy_(weight.flatten(0, 1) if k == 0 else torch.block_diag(*weight))
-                layer.bias.copy_(bias.flatten())
-        return merged
+        layers = list(zip(self.weights, self.biases, strict=True))
+        each = [[(w[n], b[n, 0]) for w, b in layers] for n in range(len(self.weights[0]))]
+        return beside(each, [1 / len(each)] * len(each), self.activation)
 
     def in_raw_units(self, *standardisation, **place) -> FullyConnected:
         """The mean, frozen, for raw inputs and outputs; arguments as for `FullyConnected.in_raw_units`."""
         return self.mean().in_raw_units(*standardisation, **place)
+
+
+class FromRest(nn.Module):
+    """network(x̂, μ) − network(x̂₀, μ): zero at x̂₀ whatever μ is.
+
+    Args:
+        network: what is trained; its first inputs are x̂.
+        latent_dim: r.
+
+    Attributes:
+        rest: x̂₀ [r] in the unit of the network's inputs.
+    """
+
+    def __init__(self, network: FullyConnected | Committee, latent_dim: int):
+        super().__init__()
+        self.network = network
+        self.register_buffer("rest", torch.zeros(latent_dim, dtype=torch.float64))
+
+    def initialise(self, generator: torch.Generator) -> None:
+        """Draw every weight from `generator`."""
+        self.network.initialise(generator)
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """(inputs, hidden..., outputs)."""
+        return self.network.widths
+
+    def forward(self, inputs: Tensor) -> Tensor:
+        """[..., inputs] → [..., outputs]."""
+        rest = self.rest.to(inputs).expand(*inputs.shape[:-1], -1)
+        rest = torch.cat([rest, inputs[..., len(self.rest) :]], -1)
+        return self.network(inputs) - self.network(rest)
+
+    @torch.no_grad()
+    def in_raw_units(
+        self,
+        input_mean: Tensor,
+        input_std: Tensor,
+        output_mean: Tensor,
+        output_std: Tensor,
+        dtype: torch.dtype,
+        device: torch.device | str,
+    ) -> FullyConnected:
+        """The difference as one network of twice the width; arguments as of `FullyConnected.in_raw_units`."""
+        standardisation = input_mean, input_std, torch.zeros_like(output_mean), output_std
+        raw = self.network.in_raw_units(*standardisation, dtype=torch.float64, device=self.rest.device)
+        first, *later = [(layer.weight, layer.bias) for layer in raw.layers]
+        r = len(self.rest)
+        rest = self.rest * input_std[:r].to(self.rest) + input_mean[:r].to(self.rest)
+        along, across = first[0].split([r, first[0].shape[1] - r], 1)
+        still = torch.cat([torch.zeros_like(along), across], 1), first[1] + along @ rest
+        both = beside([[first, *later], [still, *later]], [1, -1], raw.kind)
+        both.layers[-1].bias.copy_(output_mean)
+        return both.requires_grad_(False).to(dtype=dtype, device=device)
+
+
+@torch.no_grad()
+def beside(
+    networks: Sequence[Sequence[tuple[Tensor, Tensor]]], shares: Sequence[float], activation: str
+) -> FullyConnected:
+    """Σ_k share_k network_k as one network in double precision, whose hidden layers are side by side.
+
+    Args:
+        networks: weights [out, in] and biases [out] of each one's layers, of which all have two or more.
+        shares: one for each network.
+        activation: a key of `ACTIVATIONS`.
+    """
+    first, *hidden, last = [list(zip(*layer, strict=True)) for layer in zip(*networks, strict=True)]
+    weights = [torch.cat(first[0]), *(torch.block_diag(*W) for W, _ in hidden)]
+    biases = [torch.cat(b) for _, b in (first, *hidden)]
+    weights.append(torch.cat([share * W for share, W in zip(shares, last[0], strict=True)], 1))
+    biases.append(sum(share * b for share, b in zip(shares, last[1], strict=True)))
+    merged = FullyConnected((weights[0].shape[1], *(len(b) for b in biases)), activation)
+    merged.to(weights[0].device, torch.float64)
+    for layer, weight, bias in zip(merged.layers, weights, biases, strict=True):
+        layer.weight.copy_(weight)
+        layer.bias.copy_(bias)
+    return merged

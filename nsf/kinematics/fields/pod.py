@@ -19,25 +19,30 @@ _TURNS, _MORE = 6, 20
 SLAB_ENTRIES = 1 << 26  # float64 values of a slab: 0.5 GiB
 # Eigenvalues below this share of the largest are round-off: snapshots are float32, six digits of amplitude.
 RANK_TOLERANCE = 1e-12
+#: Fields whose modes are those of deviations from zero, their value at rest, in place of the mean.
+FROM_ZERO = ("tau",)
 
 
 def slabs(snapshots: Snapshots, name: str, components: int) -> Iterator[tuple[slice, Tensor, Tensor]]:
-    """Particle slabs of a field: (particles, mean [n, c], deviations from it [M, n, c]) in float64."""
+    """Particle slabs of a field: (particles, mean [n, c], deviations from it [M, n, c]) in float64.
+
+    Of a field in `FROM_ZERO` the mean is given as zero.
+    """
     width = max(1, SLAB_ENTRIES // (snapshots.M * components))
     for start in range(0, snapshots.P, width):
         particles = slice(start, min(start + width, snapshots.P))
         values = snapshots.slab(name, particles).double()
-        mean = values.mean(0)
+        mean = torch.zeros_like(values[0]) if name in FROM_ZERO else values.mean(0)
         yield particles, mean, values - mean
 
 
 def decompose(snapshots: Snapshots, name: str, components: int, count: int) -> tuple[Tensor, float]:
     """Coefficients of the snapshots in their leading modes.
 
-    With deviations A [M, P c]: A Aᵀ = V diag(w) Vᵀ, coefficients a = V √w, and the modes are B = Aᵀ a / w, so
-    that A ≈ a Bᵀ with B orthonormal. The M×M Gram matrix is summed over particle slabs. Of more than
-    `MOST_SOLVED` the leading V and w are found by subspace iteration (Halko, Martinsson and Tropp 2011,
-    algorithm 4.4), which asks for products with the Gram matrix alone.
+    With deviations A [M, P c] (`slabs`): A Aᵀ = V diag(w) Vᵀ, coefficients a = V √w, and the modes are
+    B = Aᵀ a / w, so that A ≈ a Bᵀ with B orthonormal. The M×M Gram matrix is summed over particle slabs. Of
+    more than `MOST_SOLVED` the leading V and w are found by subspace iteration (Halko, Martinsson and Tropp
+    2011, algorithm 4.4), which asks for products with the Gram matrix alone.
 
     Args:
         snapshots: of every training frame.
@@ -57,7 +62,7 @@ def decompose(snapshots: Snapshots, name: str, components: int, count: int) -> t
 
 
 def gram(snapshots: Snapshots, name: str, components: int) -> Tensor:
-    """A Aᵀ [M, M] of a field's deviations A [M, P c] from their mean.
+    """A Aᵀ [M, M] of a field's deviations A [M, P c] from its mean (`slabs`).
 
     Raises:
         ConfigError: there are more than `MOST_SNAPSHOTS`.

@@ -37,7 +37,7 @@ def unit(columns):
 
 @pytest.mark.parametrize("weight", [1.0, 0.25])
 def test_latents_are_the_coefficients_of_joint_snapshots(snapshots, frames, weight):
-    x, tau = map(deviations, frames)
+    x, tau = deviations(frames[0]), frames[1].flatten(1)
     left, _, _ = torch.linalg.svd(torch.cat([x / x.norm(), weight**0.5 * tau / tau.norm()], 1))
     manifold = built(JointField(modes=MODES, stress_weight=weight), snapshots)
     latents = manifold.training_latents

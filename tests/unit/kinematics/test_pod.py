@@ -52,6 +52,7 @@ def low_rank():
         parameter_names=(),
         parameters=torch.zeros(M, 0),
         t=rows.float(),
+        frame=rows,
         data=data,
     )
 
