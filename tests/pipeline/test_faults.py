@@ -181,7 +181,7 @@ def bit(path):
 
 def nan_weights(path):
     content = torch.load(path, weights_only=True)
-    content["state"]["fields.stress.network.network.layers.0.weight"][0, 0] = float("nan")
+    content["state"]["fields.stress.network.layers.0.weight"][0, 0] = float("nan")
     torch.save(content, path)
 
 
@@ -242,10 +242,10 @@ def test_a_file_that_was_changed_after_its_run(refused, copied, pipeline_at, of,
         (READ[0], nan_in("particles/mass", 3), "non-finite values of particles/mass"),
         (READ[0], nan_in("frames/t", 3), "non-finite values of frames/t"),
         (READ[0], another_file, "has a link in the place of frames/x"),
-        (READ[1], nan_weights, "non-finite values of fields.stress.network.network.layers.0.weight"),
+        (READ[1], nan_weights, "non-finite values of fields.stress.network.layers.0.weight"),
         (READ[2], nan_in("xhat", (7, 1)), "non-finite values of xhat"),
         (READ[3], nan_in("frames/x", (9, 1, 1)), "non-finite values of x, as in frame 9"),
-        (READ[4], nan_weights, "non-finite values of fields.stress.network.network.layers.0.weight"),
+        (READ[4], nan_weights, "non-finite values of fields.stress.network.layers.0.weight"),
     ],
 )
 def test_values_that_no_run_leaves(refused, copied, pipeline_at, of, change, told, replace):

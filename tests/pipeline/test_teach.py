@@ -103,7 +103,7 @@ def test_the_chain(lesson, chain):
     assert (row["engine"], row["integration_mean"]) == ("operators", 0)
     projected = pd.read_csv(chain.pipeline.evaluation.path / "results.csv").iloc[0]
     # Of 0.4 thousand steps of the teacher; a run that does not move is off by 1.
-    assert projected["displacement_error"] < 0.05
+    assert projected["displacement_error"] < 0.03
     assert row["displacement_error"] < 0.06
 
 
@@ -454,7 +454,7 @@ def test_the_estimate_is_how_far_projected_runs_are(reduced, lesson, levels_of):
     for run, other, estimate in zip(batch.runs, projected.runs, found, strict=True):
         off = at.position(run.record.xhat) - at.position(other.record.xhat)
         error = off.square().sum(-1).mean(-1).sqrt().numpy()
-        assert error[-1] > 1e-6
+        assert error[-1] > 1e-5
         # Of operators that were hardly taught, which carry a defect on as badly as they step.
         assert 0.3 * error.max() < estimate.max() < 5.0 * error.max()
     assert (batch.batch.record.residuals[:, 1:, -1] > 0).all()

@@ -1,11 +1,9 @@
 """`field=basis`: linear modes of the snapshots with a nonlinear closure of the latent vector.
 
     g(X, xhat)    = X + ū(X) + Σ_k b_k(X) a_k,   a = [σ · xhat ; closure(xhat)]
-    h(X, xhat, μ) = Σ_k t_k(X) [d_k(xhat, μ) − d_k(xhat₀, μ)]
-    l(X, xhat, μ) = C̄(X) + Σ_k c_k(X) b_k(xhat, μ)
+    h(X, xhat, μ) = Σ_k t_k(X) d_k(xhat, μ),   l(X, xhat, μ) = C̄(X) + Σ_k c_k(X) b_k(xhat, μ)
 
-with xhat₀ of the body at rest where the training runs begin free of stress, else without d_k(xhat₀, μ); or
-with `affine=rate`, since C is a velocity gradient, and a state may be passed at different speeds,
+or with `affine=rate`, since C is a velocity gradient, and a state may be passed at different speeds,
 
     l(X, xhat, dx̂/dt, μ) = C̄(X) + Σ_k c_k(X) [b_k(xhat, μ) + Σ_j M_kj(xhat, μ) dx̂_j/dt]
 
@@ -36,7 +34,7 @@ from nsf.kinematics.fields.modal import (
     RestrictedField,
     at_rate,
 )
-from nsf.kinematics.fields.networks import Committee, FromRest, FullyConnected
+from nsf.kinematics.fields.networks import Committee, FullyConnected, zero_at_rest
 from nsf.kinematics.interpolation import Interpolation, interpolation
 from nsf.kinematics.manifold import Manifold
 from nsf.kinematics.training.phases import (
@@ -52,6 +50,10 @@ from nsf.kinematics.training.rates import latent_rates
 
 AFFINE = ("latent", "rate")
 ENCODED_ENTRIES = 1 << 26  # values encoded at once
+
+# Stress fades to that of rest within this share of the noise of training, which tells no such states apart.
+_REACH = 0.02
+_LEAST_NOISE = 0.01  # [deviations of x̂] in this place, where there is less
 
 
 @dataclass(frozen=True)
@@ -142,7 +144,7 @@ class BasisField:
             "noise_floor": self.noise_floor,
             "head_parameters": self.head_parameters,
             "affine": self.affine,
-            "free_at_rest": _begin_free(snapshots),
+            "free_at_rest": self.depth > 1 and _begin_free(snapshots),
             "unresolved": [prepared[name]["unresolved"] for name, _ in TARGETS.values()],
         }
         manifold = self.manifold(
@@ -157,10 +159,9 @@ class BasisField:
             for particles, mean, modes in pod.modes(snapshots, name, components, coefficients):
                 origin = manifold.X[particles].to(mean) if phase == "deformation" else 0
                 field.mean[particles], field.modes[particles] = mean - origin, modes.float()
-            field.calibrate(coefficients)
             if field.network is not None:
                 field.network.initialise(generator)
-        manifold.keep_rest()
+            field.calibrate(coefficients)
         coefficients = prepared["x"]["coefficients"][:, :latent_dim]
         manifold.training_latents.copy_(coefficients / manifold.fields["deformation"].leading)
         return manifold
@@ -209,6 +210,10 @@ class BasisField:
         return loss
 
 
+def _layered(network: nn.Module | None) -> bool:
+    return isinstance(network, FullyConnected | Committee)
+
+
 def _begin_free(snapshots: Snapshots) -> bool:
     """Whether every training run begins free of stress."""
     first = torch.nonzero(snapshots.frame == 0).flatten()
@@ -252,7 +257,6 @@ class BasisManifold(Manifold):
                 hyperparameters["depth"],
                 hyperparameters.get("members", 1),  # files from before there were members
                 latent_dim if phase == "affine" and self.takes_rate else 0,
-                latent_dim if phase == "stress" and hyperparameters.get("free_at_rest", False) else 0,
             )
 
     @property
@@ -273,17 +277,15 @@ class BasisManifold(Manifold):
         X = self.X[None]
         return self.encode(X, X.new_zeros(*X.shape[:2], 6))[0]
 
-    def keep_rest(self) -> None:
-        """Tell the stress network the latent vector of rest, once the encoder is known."""
-        network = self.fields["stress"].network
-        if isinstance(network, FromRest):
-            network.rest.copy_(self.rest_latent / self.spread)
-
     @property
     def layered(self) -> bool:
         """Whether every network is one of layers with SiLU, or a mean of such, as `factors` takes apart."""
-        known = None | FullyConnected | Committee | FromRest
-        return all(isinstance(field.network, known) for field in self.fields.values())
+        return all(field.network is None or _layered(field.network) for field in self.fields.values())
+
+    def frees(self, phase: str) -> bool:
+        """Whether the phase's coefficients are made zero at rest (`zero_at_rest`)."""
+        asked = phase == "stress" and self.hyperparameters.get("free_at_rest", False)
+        return asked and _layered(self.fields[phase].network)
 
     def takes_parameters(self, phase: str) -> bool:
         """Whether the phase's network sees the problem parameters."""
@@ -342,8 +344,9 @@ class BasisManifold(Manifold):
             base = points if name == "deformation" else 0
             mean, table = field.mean, field.modes
         network, scale = self._deployed(phase, like), float(field.scale)
+        members = self.hyperparameters.get("members", 1) * (2 if self.frees(phase) else 1)
         mean = (base + mean[rows]).to(like)
-        return ModalFactors(mean, table, rows, field.leading, scale, network, field.members, field.rates)
+        return ModalFactors(mean, table, rows, field.leading, scale, network, members, field.rates)
 
     def _slopes(self, device: torch.device | str) -> tuple[Tensor, Tensor]:
         """∂/∂X of the deformation's mean [P, 9] and of its modes [P, 9, K], in fp32, at the particles.
@@ -366,7 +369,12 @@ class BasisManifold(Manifold):
         mean, std = [torch.zeros(self.latent_dim, device=parameters.mean.device)], [self.spread]
         if self.takes_parameters(phase):
             mean, std = [*mean, parameters.mean], [*std, parameters.std]
-        scale = field.output_scale
-        return field.network.in_raw_units(
-            torch.cat(mean), torch.cat(std), torch.zeros_like(scale), scale, like.dtype, like.device
-        )
+        scale, dtype = field.output_scale, torch.float64 if self.frees(phase) else like.dtype
+        standardisation = torch.cat(mean), torch.cat(std), torch.zeros_like(scale), scale
+        network = field.network.in_raw_units(*standardisation, dtype, self.X.device)
+        if self.frees(phase):
+            noise = max(self.hyperparameters["noise"], _LEAST_NOISE)
+            reach = _REACH * (noise**2 + self.floor.square()).sqrt()
+            members = self.hyperparameters.get("members", 1)
+            network = zero_at_rest(network, members, self.rest_latent, reach)
+        return network.to(like)

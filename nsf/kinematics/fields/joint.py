@@ -98,7 +98,6 @@ class JointField(BasisField):
         ):
             for particles, _, modes in pod.modes(snapshots, name, components, latent):
                 encoder[particles] = (modes * (prepared["weights"][name] / scale.to(modes))).float()
-        manifold.keep_rest()
         return manifold
 
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from nsf.errors import ShapeError
-from nsf.kinematics.fields.networks import Committee, FromRest, FullyConnected
+from nsf.kinematics.fields.networks import Committee, FullyConnected
 from nsf.kinematics.manifold import Restriction
 from nsf.kinematics.training.phases import joined, shaped
 
@@ -41,7 +41,6 @@ class ModalField(nn.Module):
         inputs, width, depth: of the network; there is none if no coefficient is left to it.
         members: networks whose mean it is.
         rates: r if the coefficients depend on dx̂/dt, else 0.
-        from_rest: r if the coefficients that the network finds are to be zero at rest (`FromRest`), else 0.
     """
 
     def __init__(
@@ -55,7 +54,6 @@ class ModalField(nn.Module):
         depth: int,
         members: int,
         rates: int = 0,
-        from_rest: int = 0,
     ):
         super().__init__()
         self.register_buffer("mean", torch.zeros(particles, components, dtype=torch.float64))
@@ -67,20 +65,21 @@ class ModalField(nn.Module):
             self.register_buffer("rate", torch.ones(rates, dtype=torch.float64))
         closed = modes - leading
         widths = (inputs, *[width] * depth, closed * (1 + rates))
-        self.network: FullyConnected | Committee | FromRest | None = None
+        self.network: FullyConnected | Committee | None = None
         if closed:
             several = members > 1
-            network = Committee(members, widths, "silu") if several else FullyConnected(widths, "silu")
-            self.network = FromRest(network, from_rest) if from_rest else network
-        #: Networks of which the deployed one consists.
-        self.members = members * (2 if from_rest else 1)
+            self.network = Committee(members, widths, "silu") if several else FullyConnected(widths, "silu")
 
     def calibrate(self, coefficients: Tensor) -> None:
-        """Take the scales from the coefficients [M, K] of the training snapshots."""
+        """Take scales and the network's last bias from the coefficients [M, K] of the training snapshots."""
         leading, closed = coefficients.tensor_split([self.leading.numel()], 1)
         self.leading.copy_(leading.square().mean(0).sqrt())
         if closed.numel():
-            self.scale.copy_(closed.square().mean().sqrt())
+            mean = closed.mean(0)
+            self.scale.copy_((closed - mean).square().mean().sqrt())
+            if isinstance(self.network, FullyConnected | Committee):
+                with torch.no_grad():  # else training would have to find the mean of modes about zero
+                    self.network.output_bias[..., : len(mean)] = mean / self.scale
 
     @property
     def output_scale(self) -> Tensor:

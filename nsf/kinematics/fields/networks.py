@@ -32,6 +32,10 @@ def xavier(layer: nn.Linear | nn.Conv1d, generator: torch.Generator) -> None:
     nn.init.zeros_(layer.bias)
 
 
+#: K of `zero_at_rest`, and c, at which silu is about as large as its argument.
+FADING, _BIAS = 4.0, 4.0
+
+
 class FullyConnected(nn.Module):
     """Linear layers of the given widths with an activation between them.
 
@@ -60,6 +64,11 @@ class FullyConnected(nn.Module):
     def width(self) -> int:
         """Values the widest layer holds for one row of input."""
         return max(self.widths[1:])
+
+    @property
+    def output_bias(self) -> Tensor:
+        """[outputs], of the last layer."""
+        return self.layers[-1].bias
 
     def forward(self, inputs: Tensor) -> Tensor:
         """[..., inputs] → [..., outputs]."""
@@ -163,6 +172,11 @@ class Committee(nn.Module):
             for member in weight:
                 nn.init.xavier_uniform_(member, generator=generator)
 
+    @property
+    def output_bias(self) -> Tensor:
+        """[members, outputs], of the last layer."""
+        return self.biases[-1][:, 0]
+
     def forward(self, inputs: Tensor) -> Tensor:
         """[members, n, inputs], rows of its own for each member → [members, n, outputs]."""
         act, _ = ACTIVATIONS[self.activation]
@@ -182,58 +196,67 @@ class Committee(nn.Module):
         return self.mean().in_raw_units(*standardisation, **place)
 
 
-class FromRest(nn.Module):
-    """network(x̂, μ) − network(x̂₀, μ): zero at x̂₀ whatever μ is.
+@torch.no_grad()
+def zero_at_rest(raw: FullyConnected, members: int, rest: Tensor, reach: Tensor) -> FullyConnected:
+    """The network, but zero at x̂₀ whatever μ is, and as before from a few times `reach` on.
+
+    Of each member N = W silu(z) + b its value at rest is taken, which fades as x̂ leaves x̂₀:
+
+        N(x̂, μ) − W silu(z(x̂₀, μ) − K ρ) − b silu(c − K ρ)/silu(c),   ρ = Σ_k t_k tanh(t_k/2),
+
+    with t = (x̂ − x̂₀)/reach. This is a network of SiLU layers too, so that whatever evaluates `raw` evaluates
+    it: silu(t) + silu(−t) = t tanh(t/2), and silu(ρ) − silu(−ρ) = ρ hands ρ on.
 
     Args:
-        network: what is trained; its first inputs are x̂.
-        latent_dim: r.
+        raw: of inputs (x̂, μ), with two hidden layers or more, each of the members side by side.
+        members: how many networks it is a sum of.
+        rest: x̂₀ [r].
+        reach: [r], of the unit of x̂.
 
-    Attributes:
-        rest: x̂₀ [r] in the unit of the network's inputs.
+    Returns:
+        A network of twice as many members in double precision.
     """
+    r, layers = len(rest), [(layer.weight.double(), layer.bias.double()) for layer in raw.layers]
+    # What finds ρ of the units of the layer before: 2 r halves of t tanh(t/2), later ρ and −ρ.
+    sums, fading = torch.ones(1, 2 * r).to(rest), torch.tensor([[1.0, -1.0]]).to(rest)
+    networks = []
+    for n in range(members):
+        ((first, b_first), *hidden, (out, b_out)) = _member(layers, members, n)
+        w = len(first)
+        slopes = torch.cat([torch.diag(1 / reach), torch.diag(-1 / reach)])
+        padded = F.pad(slopes, (0, first.shape[1] - r))
+        own = [(F.pad(first, (0, 0, 0, 2 * r)), F.pad(b_first, (0, 2 * r)))]
+        still = torch.cat([torch.zeros_like(first[:, :r]), first[:, r:]], 1)
+        taken = [(torch.cat([still, padded]), torch.cat([b_first + first[:, :r] @ rest, -slopes @ rest]))]
+        distance = sums
+        for k, (W, b) in enumerate(hidden):
+            before = distance.shape[1]
+            if k < len(hidden) - 1:
+                row = torch.cat([distance, -distance])
+                own.append((F.pad(W, (0, before, 0, 2)), F.pad(b, (0, 2))))
+                more = F.pad(row, (w, 0))
+                taken.append((torch.cat([F.pad(W, (0, before)), more]), F.pad(b, (0, 2))))
+                distance = fading
+            else:
+                own.append((F.pad(W, (0, before, 0, 1)), F.pad(b, (0, 1))))
+                still = torch.cat([F.pad(W, (0, before)), W.new_zeros(1, w + before)])
+                still[:, w:] -= FADING * distance
+                taken.append((still, torch.cat([b, b.new_tensor([_BIAS])])))
+        bias = b_out / F.silu(b_out.new_tensor(_BIAS))
+        own.append((F.pad(out, (0, 1)), b_out))
+        taken.append((torch.cat([-out, -bias[:, None]], 1), torch.zeros_like(b_out)))
+        networks += [own, taken]
+    return beside(networks, [1] * len(networks), raw.kind).requires_grad_(False)
 
-    def __init__(self, network: FullyConnected | Committee, latent_dim: int):
-        super().__init__()
-        self.network = network
-        self.register_buffer("rest", torch.zeros(latent_dim, dtype=torch.float64))
 
-    def initialise(self, generator: torch.Generator) -> None:
-        """Draw every weight from `generator`."""
-        self.network.initialise(generator)
-
-    @property
-    def widths(self) -> tuple[int, ...]:
-        """(inputs, hidden..., outputs)."""
-        return self.network.widths
-
-    def forward(self, inputs: Tensor) -> Tensor:
-        """[..., inputs] → [..., outputs]."""
-        rest = self.rest.to(inputs).expand(*inputs.shape[:-1], -1)
-        rest = torch.cat([rest, inputs[..., len(self.rest) :]], -1)
-        return self.network(inputs) - self.network(rest)
-
-    @torch.no_grad()
-    def in_raw_units(
-        self,
-        input_mean: Tensor,
-        input_std: Tensor,
-        output_mean: Tensor,
-        output_std: Tensor,
-        dtype: torch.dtype,
-        device: torch.device | str,
-    ) -> FullyConnected:
-        """The difference as one network of twice the width; arguments as of `FullyConnected.in_raw_units`."""
-        standardisation = input_mean, input_std, torch.zeros_like(output_mean), output_std
-        raw = self.network.in_raw_units(*standardisation, dtype=torch.float64, device=self.rest.device)
-        first, *later = [(layer.weight, layer.bias) for layer in raw.layers]
-        r = len(self.rest)
-        rest = self.rest * input_std[:r].to(self.rest) + input_mean[:r].to(self.rest)
-        along, across = first[0].split([r, first[0].shape[1] - r], 1)
-        still = torch.cat([torch.zeros_like(along), across], 1), first[1] + along @ rest
-        both = beside([[first, *later], [still, *later]], [1, -1], raw.kind)
-        both.layers[-1].bias.copy_(output_mean)
-        return both.requires_grad_(False).to(dtype=dtype, device=device)
+def _member(layers: list[tuple[Tensor, Tensor]], members: int, n: int) -> list[tuple[Tensor, Tensor]]:
+    """Layers of one of the networks that `layers` hold side by side; of the last bias its share."""
+    own = [b.unflatten(0, (members, -1))[n] for _, b in layers[:-1]]
+    blocks = [layers[0][0].unflatten(0, (members, -1))[n]]
+    for W, _ in layers[1:-1]:
+        blocks.append(W.unflatten(0, (members, -1)).unflatten(2, (members, -1))[n, :, n])
+    blocks.append(layers[-1][0].unflatten(1, (members, -1))[:, n])
+    return list(zip(blocks, [*own, layers[-1][1] / members], strict=True))
 
 
 @torch.no_grad()

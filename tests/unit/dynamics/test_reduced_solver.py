@@ -30,8 +30,6 @@ from nsf.timing import StageTimer
 
 ANGLE = {"friction_angle": 26.0}
 SEARCH = Integration("search", 0)
-#: As wide as the runs of a field that was trained for seconds stray from the training runs.
-WIDE = Integration("superset", 2)
 #: Never converged, so that coefficients are not carried along by their derivative.
 EXACT = GaussNewton(tolerance=1e-14)
 
@@ -190,7 +188,7 @@ def test_passing_the_end_is_refused(solver_of):
 
 def test_search_and_superset_are_the_same_run(solver_of, corner):
     """Superset and searched N move S alike: 'there is no approximation in this step'."""
-    searching, fixed = (solver_of(corner, integration=how) for how in (SEARCH, WIDE))
+    searching, fixed = solver_of(corner, integration=SEARCH), solver_of(corner)
     one, other = run(searching), run(fixed)
     assert len(corner) < searching.integration_mean == fixed.integration_mean < fixed.span.size < 500
     assert searching.span.size == 500
@@ -222,8 +220,7 @@ def test_every_particle_takes_its_own_mass_and_volume_along(solver_of, corner, m
 
 
 def test_nothing_is_needed_outside_the_superset(solver_of, corner):
-    for sample, integration in ((corner, WIDE), (20, WIDE), (corner, SEARCH)):
-        solver = solver_of(sample, integration=integration)
+    for solver in (solver_of(corner), solver_of(), solver_of(corner, integration=SEARCH)):
         run(solver)
         assert solver.needed_outside() == 0
 

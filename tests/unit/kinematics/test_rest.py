@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 import torch
+import torch.nn.functional as F
 
 from nsf.data import Snapshots, TrajectoryWriter
 from nsf.kinematics.fields.basis import BasisField
 from nsf.kinematics.fields.joint import JointField
-from nsf.kinematics.fields.networks import Committee, FromRest, FullyConnected
+from nsf.kinematics.fields.networks import Committee, FullyConnected, zero_at_rest
 from nsf.kinematics.training.phases import seeded
 
 PARTICLES, FRAMES, LATENT, MEMBERS = 80, 11, 2, 3
 ROUND_OFF = 1e-13
-WIDTHS = (LATENT + 1, 7, 5, 4)
 
 
 @pytest.fixture(scope="module")
@@ -33,29 +33,36 @@ def loaded(tmp_path_factory):
     return Snapshots(paths)
 
 
-@pytest.fixture(params=[1, MEMBERS])
-def network(request):
-    several = request.param > 1
-    net = FromRest(Committee(MEMBERS, WIDTHS, "silu") if several else FullyConnected(WIDTHS, "silu"), LATENT)
+@pytest.fixture(params=[(1, 2), (1, 4), (MEMBERS, 2), (MEMBERS, 3)], ids=str)
+def raw(request):
+    """A network of members side by side in raw units, with as many hidden layers, and its members."""
+    members, depth = request.param
+    widths = (LATENT + 1, *[7] * depth, 4)
+    net = Committee(members, widths, "silu") if members > 1 else FullyConnected(widths, "silu")
     net.initialise(torch.Generator().manual_seed(0))
     for name, value in net.named_parameters():
         if "bias" in name:  # zero biases would hide a wrong one
             torch.nn.init.normal_(value, generator=torch.Generator().manual_seed(1))
-    net.rest.copy_(torch.tensor([0.7, -1.2]))
-    return net
+    inputs = torch.tensor([[0.5, 0.2, 3.0], [2.0, 0.3, 4.0]]).double()
+    outputs = torch.tensor([[0.0], [5.0]]).double().expand(2, 4)
+    return net.in_raw_units(*inputs, *outputs, torch.float64, "cpu"), members
 
 
-def test_deployed_network_is_the_difference(network):
-    mean, std = torch.tensor([0.5, 0.2, 3.0]).double(), torch.tensor([2.0, 0.3, 4.0]).double()
-    shift, scale = torch.full((WIDTHS[-1],), 2.0).double(), torch.full((WIDTHS[-1],), 5.0).double()
-    raw = network.in_raw_units(mean, std, shift, scale, torch.float64, "cpu")
-    inputs = torch.randn(6, WIDTHS[0], generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    rows = ((inputs - mean) / std).expand(MEMBERS, -1, -1)
-    expected = network.double()(rows)
-    expected = expected.mean(0) if expected.ndim == 3 and len(expected) == MEMBERS else expected
-    torch.testing.assert_close(raw(inputs), shift + scale * expected.reshape(-1, 6, WIDTHS[-1])[0])
-    inputs[:, :LATENT] = network.rest * std[:LATENT] + mean[:LATENT]
-    assert (raw(inputs) - shift).abs().max() < ROUND_OFF
+REST, REACH = torch.tensor([0.7, -1.2]).double(), torch.tensor([0.01, 0.03]).double()
+
+
+def test_a_network_is_zero_at_rest_and_as_before_elsewhere(raw):
+    network, members = raw
+    freed = zero_at_rest(network, members, REST, REACH)
+    draw = torch.Generator().manual_seed(2)
+    parameters, along = (torch.randn(6, n, generator=draw).double() for n in (1, LATENT))
+    along = F.pad(F.normalize(along, dim=1) * REACH, (0, 1))
+    still = torch.cat([REST.expand(6, -1), parameters], 1)
+    assert freed(still).abs().max() < ROUND_OFF < 0.1 < network(still).abs().min(1).values.max()
+    taken = [(freed(at) - network(at)).norm() for at in (still + s * along for s in (0, 0.5, 1, 2))]
+    assert taken == sorted(taken, reverse=True)
+    away = still + 20 * along
+    torch.testing.assert_close(freed(away), network(away), rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize("field", [BasisField, JointField])
@@ -74,7 +81,7 @@ def test_a_body_at_rest_is_free_of_stress_at_every_parameter(loaded, field, memb
         assert at.stress(encoded, parameters).abs().max() < 1e-5 * moved
     parts = manifold.factors("stress", torch.arange(3), torch.float64, "cpu")
     assert parts.members == 2 * members
-    assert [len(b) for _, b in parts.layers[:-1]] == [2 * members * 24] * 2
+    assert [len(b) for _, b in parts.layers[:-1]] == [2 * members * (24 + 2 * LATENT), 2 * members * (24 + 1)]
 
 
 def test_runs_that_begin_under_stress_keep_it(snapshots):
