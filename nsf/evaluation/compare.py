@@ -29,7 +29,8 @@ class Comparison:
     """What one case gave.
 
     Attributes:
-        delta, displacement_error, stress_error: totals over frames 1..N, fractions; ∞ when the run diverged.
+        delta, displacement_error, stress_error: totals over frames 1..N, fractions; ∞ when the run diverged;
+            of stress also where it is not finite.
             Of a run that was handed over, the frames of its continuation count like the reduced ones.
         true_error: largest distance of a frame from the full-order one, RMS over particles [m]; ∞ likewise.
         quantities: by name, a scalar of the shape at the end less the full-order run's [m]; ∞ likewise.
@@ -198,8 +199,11 @@ def compare(
         "displacement_error": ("x_error", "u_norm"),
         "stress_error": ("tau_error", "tau_norm"),
     }
+    lost = set(reduced) if diverged else set()
+    if not column["tau_error"].isfinite().all():  # a law has none of a body that is turned inside out
+        lost.add("stress_error")
+    errors |= {name: total(*columns) for name, columns in reduced.items() if name not in lost}
     if not diverged:
-        errors |= {name: total(*columns) for name, columns in reduced.items()}
         errors["true_error"] = float((column["x_error"].max() / len(X)).sqrt())
     metrics.require_finite(errors, rollout.case.named)
     ends = [at_end(column[f"height_{of}"], shape[-1], X) for of, shape in (("rom", x_rom), ("fom", x))]

@@ -51,8 +51,8 @@ from nsf.kinematics.training.rates import latent_rates
 AFFINE = ("latent", "rate")
 ENCODED_ENTRIES = 1 << 26  # values encoded at once
 
-# Stress fades to that of rest within this share of the noise of training, which tells no such states apart.
-_REACH = 0.02
+# Stress fades to none within this share of the noise of training: less than a body moves in its first step.
+_REACH = 0.002
 _LEAST_NOISE = 0.01  # [deviations of x̂] in this place, where there is less
 
 

@@ -216,6 +216,22 @@ def test_a_run_that_is_not_finite_and_does_not_say_so_has_no_errors(made, compar
         comparison_of(replace(made, xhat=xhat))
 
 
+def test_stress_that_is_not_finite_is_as_far_off_as_can_be(made, comparison_of, monkeypatch):
+    """As of the law of a body that is turned inside out; where the body is, is known all the same."""
+    comparing = sys.modules["nsf.evaluation.compare"]
+    whole, fields = comparison_of(made), comparing._reduced_fields
+
+    def broken(*args):
+        x, C, tau = fields(*args)
+        tau[5, 7] = torch.nan
+        return x, C, tau
+
+    monkeypatch.setattr(comparing, "_reduced_fields", broken)
+    found = comparison_of(made)
+    assert found.stress_error == np.inf
+    assert (found.delta, found.true_error) == (whole.delta, whole.true_error)
+
+
 def test_a_truth_that_never_moves_has_no_displacement_error(made, comparison_of, truth, monkeypatch):
     plain = Trajectory.read
 

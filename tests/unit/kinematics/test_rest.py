@@ -78,7 +78,7 @@ def test_a_body_at_rest_is_free_of_stress_at_every_parameter(loaded, field, memb
         moved = at.stress(manifold.rest_latent + 0.3, parameters).abs().max()
         assert at.stress(manifold.rest_latent, parameters).abs().max() < ROUND_OFF * moved
         # Stored frames are float32.
-        assert at.stress(encoded, parameters).abs().max() < 1e-5 * moved
+        assert at.stress(encoded, parameters).abs().max() < 1e-3 * moved
     parts = manifold.factors("stress", torch.arange(3), torch.float64, "cpu")
     assert parts.members == 2 * members
     assert [len(b) for _, b in parts.layers[:-1]] == [2 * members * (24 + 2 * LATENT), 2 * members * (24 + 1)]
