@@ -15,7 +15,7 @@ from matplotlib.transforms import offset_copy
 
 from nsf.reporting.drawing.charts import LOST, error_scale, plain_ticks
 from nsf.reporting.drawing.cost import solver_colors
-from nsf.reporting.drawing.style import FULL, INK, WARNING, WIDTH, figure, styled
+from nsf.reporting.drawing.style import FULL, INK, WARNING, WIDTH, figure, legend_above, styled
 from nsf.reporting.text.columns import axis, number
 from nsf.reporting.text.formats import plain
 
@@ -89,7 +89,7 @@ def error_over_parameters(bodies: Sequence[Cases]) -> Figure:
         known = [Line2D([], [], ls="-", marker="o", ms=5, color=c, label=name) for name, c in colors.items()]
         if any(_lost(errors).any() for cases in bodies for _, errors in cases.errors.values()):
             known.append(Line2D([], [], **_LOST | {"color": FULL}, label="lost"))
-        fig.legend(handles=known, loc="outside upper left", ncols=4, handlelength=2.2)
+        legend_above(fig, known, [line.get_label() for line in known], 4)
     return fig
 
 

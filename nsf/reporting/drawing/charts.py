@@ -16,6 +16,7 @@ from nsf.reporting.drawing.style import (
     REDUCED,
     STAGE_TITLES,
     figure,
+    legend_above,
     line_style,
     stage_colors,
     styled,
@@ -29,7 +30,6 @@ OVER_TIME = {
     "linear_momentum_error": "linear momentum error",
     "angular_momentum_error": "angular momentum error",
 }
-_LETTER, _ENTRY = 5.5, 40.0  # [pt] width of a letter of a legend at most, and of what is about an entry
 _ACROSS = 4  # panels of scenes in a row
 LOST = 1000.0  # [%] error from which a run is lost, by how much tells nothing: axes end there
 
@@ -226,7 +226,7 @@ def delta_over(
         told = {line.get_label(): line for panel in drawn for line in panel.lines}
         told |= {name: told.pop(name) for name in ("the paper",) if name in told}  # last
         if len(told) > 1:
-            fig.legend(told.values(), told.keys(), loc="outside upper left", ncols=6, handlelength=2.2)
+            legend_above(fig, told.values(), told.keys(), 6)
     return fig
 
 
@@ -281,12 +281,7 @@ def _legend_above(fig: Figure, panel, title: str | None) -> None:
     handles, labels = panel.get_legend_handles_labels()
     order = sorted(range(len(labels)), key=lambda i: labels[i] != "mean")
     handles, labels = [handles[i] for i in order], [labels[i] for i in order]
-    columns = int(72.0 * fig.get_figwidth() / (_LETTER * max(map(len, labels)) + _ENTRY))
-    legend = fig.legend(
-        handles, labels, title=title, loc="outside upper left", ncols=max(1, min(len(labels), 6, columns)),
-        columnspacing=1.4, handlelength=2.2, alignment="left",
-    )  # fmt: skip
-    legend.get_title().set_fontsize(9)
+    legend_above(fig, handles, labels, 6, title=title, columnspacing=1.4, alignment="left")
 
 
 def _subscript(k: int) -> str:

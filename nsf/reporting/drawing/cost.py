@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from nsf.reporting.drawing.charts import LOST, plain_ticks
 from nsf.reporting.drawing.levels import LEVELS
-from nsf.reporting.drawing.style import FULL, INK, MUTED, PALETTE, figure, styled
+from nsf.reporting.drawing.style import FULL, INK, MUTED, PALETTE, figure, legend_above, styled
 
 _ACROSS = 3  # panels in a row
 _COARSE = {"ls": "", "marker": "s", "ms": 7, "mfc": "white", "mec": FULL, "mew": 1.6}
@@ -48,7 +48,7 @@ def error_over_cost(
         for panel in drawn[len(panels) :]:
             panel.axis("off")
         told = {line.get_label(): line for panel in drawn for line in panel.lines}
-        fig.legend(told.values(), told.keys(), loc="outside upper left", ncols=4, handlelength=2.2)
+        legend_above(fig, told.values(), told.keys(), 4)
     return fig
 
 
