@@ -34,7 +34,7 @@ CHAPTERS = {
     "Main results": ("table1", "table1_seeds", "operators", "operators_seeds", "forcing"),
     "What the method needs": (
         "ablation", "mlp", "mlp_steps", "width", "latent_dim", "forcing_r", "noise_floor", "floors",
-        "sample_size", "sampler", "cells", "timestep", "training", "cake_noise", "stress",
+        "sample_size", "sampler", "cells", "timestep", "training", "cake_noise", "cake_runs", "stress",
     ),
     "Beyond what was trained": ("extrapolation", "weak_elements", "super_resolution", "path_dependent"),
     "At small scale, on a CPU": (
