@@ -1,6 +1,8 @@
 """Charts of errors, latent coordinates and costs: data in, figure out, units on every axis."""
 
 import math
+import re
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -31,6 +33,7 @@ OVER_TIME = {
     "angular_momentum_error": "angular momentum error",
 }
 _ACROSS = 4  # panels of scenes in a row
+_LINE = 60  # letters of a label beside a chart, in a line
 LOST = 1000.0  # [%] error from which a run is lost, by how much tells nothing: axes end there
 
 
@@ -171,7 +174,7 @@ def delta_per_variant(variants: list[dict], dots: str = "one parameter value") -
             panel.plot(average, at, "D", ms=8, color=REDUCED, label="mean", zorder=1.9)
         else:
             panel.barh(at, average, height=0.58, color=REDUCED, alpha=0.75, label="mean")
-        panel.set_yticks(at, [v["label"] for v in variants])
+        panel.set_yticks(at, _wrapped(variants))
         panel.set_ylim(len(variants) - 0.45, -0.55)
         panel.set_xlabel("relative deformation error δ [%]")
         panel.set_xlim(right=min(panel.get_xlim()[1], LOST))
@@ -314,6 +317,12 @@ def rings(rows: Sequence[Mapping[str, Mapping[str, float]]]) -> Figure:
     return fig
 
 
+def _wrapped(variants: list[dict]) -> list[str]:
+    """Labels in lines that leave room for the chart beside them; lists break between their entries."""
+    spaced = (re.sub(r",(?=[^\[\]]*\])", ", ", v["label"]) for v in variants)
+    return ["\n".join(textwrap.wrap(label, _LINE, break_on_hyphens=False)) for label in spaced]
+
+
 def speedup_and_memory(variants: list[dict]) -> Figure:
     """Speedup [×] and peak memory [MiB] of each variant, both logarithmic: engines differ a thousandfold.
 
@@ -332,7 +341,7 @@ def speedup_and_memory(variants: list[dict]) -> Figure:
         left.set_xlim(left=min(left.get_xlim()[0], 0.8))
         left.set_xlabel("speedup over full-order [×]")
         right.set_xlabel("peak memory [MiB]")
-        left.set_yticks(np.arange(len(variants)), [v["label"] for v in variants])
+        left.set_yticks(np.arange(len(variants)), _wrapped(variants))
         left.set_ylim(len(variants) - 0.4, -0.6)
     return fig
 
