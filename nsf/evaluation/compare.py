@@ -29,8 +29,8 @@ class Comparison:
     """What one case gave.
 
     Attributes:
-        delta, displacement_error, stress_error: totals over frames 1..N, fractions; ∞ when the run diverged;
-            of stress also where it is not finite.
+        delta, displacement_error, stress_error: totals over frames 1..N, fractions; ∞ when the run diverged.
+            `stress_error` is also ∞ where the run's stress is not finite in some frame.
             Of a run that was handed over, the frames of its continuation count like the reduced ones.
         true_error: largest distance of a frame from the full-order one, RMS over particles [m]; ∞ likewise.
         quantities: by name, a scalar of the shape at the end less the full-order run's [m]; ∞ likewise.
@@ -200,7 +200,9 @@ def compare(
         "stress_error": ("tau_error", "tau_norm"),
     }
     lost = set(reduced) if diverged else set()
-    if not column["tau_error"].isfinite().all():  # a law has none of a body that is turned inside out
+    if (
+        not column["tau_error"][1:].isfinite().all()
+    ):  # a law has no stress of a body that is turned inside out
         lost.add("stress_error")
     errors |= {name: total(*columns) for name, columns in reduced.items() if name not in lost}
     if not diverged:
@@ -245,7 +247,8 @@ def _series(
     def moving(error: str, norm: str) -> torch.Tensor:
         # Where hardly anything has moved or is loaded yet, as at t = 0, a ratio to that tells nothing.
         hardly = column[norm] <= _HARDLY**2 * column[norm].max()
-        return by_frame(error, norm).masked_fill(hardly, torch.nan)
+        errors = by_frame(error, norm).masked_fill(hardly, torch.nan)
+        return errors.masked_fill(~column[error].isfinite(), torch.inf)
 
     def momentum(name: str) -> torch.Tensor:
         errors = metrics.momentum_error(column[f"{name}_rom"], column[f"{name}_fom"], column[f"{name}_scale"])

@@ -44,7 +44,7 @@ def field_launches(
             factors = one.manifold.factors(name, **options)
             if factors.table.shape[2]:
                 heads.append((factors, found))
-            else:  # the same in every snapshot
+            else:  # the same in every snapshot, or none
                 found.unflatten(0, (-1, n)).copy_(_as_matrices(factors.mean))
     stored = [arena.halved(factors.table, factors.rows) for factors, _ in heads]
     parameters = torch.stack([setup.parameters for setup in setups])

@@ -51,9 +51,9 @@ from nsf.kinematics.training.rates import latent_rates
 AFFINE = ("latent", "rate")
 ENCODED_ENTRIES = 1 << 26  # values encoded at once
 
-# Stress fades to none within this share of the noise of training: less than a body moves in its first step.
+# Reach of `zero_at_rest` over the noise of training: at five of it, a hundredth of the noise, nothing is taken.
 _REACH = 0.002
-_LEAST_NOISE = 0.01  # [deviations of x̂] in this place, where there is less
+_LEAST_NOISE = 0.01  # [deviations of x̂] taken where training has less
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class BasisField:
         beta: hidden widths over d (3, 6, 9) of the closure and the two heads, given like `modes`.
         depth: hidden layers of each network.
         members: networks of each phase, trained side by side on noise of their own, and averaged; deployed as
-            one network of that many times the width.
+            one network of that many times the width, of stress of twice as many (`zero_at_rest`).
         noise: deviation of the noise added to xhat in training, in units of xhat's deviation. It keeps the
             Jacobian and the heads regular beside the training trajectories.
         noise_floor: ε; with σ the deviations of the coordinates, the noise on coordinate k has the deviation
@@ -215,9 +215,9 @@ def _layered(network: nn.Module | None) -> bool:
 
 
 def _begin_free(snapshots: Snapshots) -> bool:
-    """Whether every training run begins free of stress."""
+    """Whether every training run begins free of stress; at X, as every run does."""
     first = torch.nonzero(snapshots.frame == 0).flatten()
-    return not any(snapshots.gather("tau", row[None], slice(None)).any() for row in first)
+    return len(first) > 0 and not any(snapshots.gather("tau", row[None], slice(None)).any() for row in first)
 
 
 def _slope(local: Interpolation, values: Tensor) -> Tensor:

@@ -39,7 +39,8 @@ class JointField(BasisField):
     """Modes, their networks, and what stress weighs in the latent vector.
 
     Attributes:
-        stress_weight: w of the stress's variance in that of a joint snapshot, where that of positions is one.
+        stress_weight: w of the mean square of stress in a joint snapshot, where that of displacements
+            from their mean is one.
             Small, as the inversion sees positions alone: the more stress weighs, the less they tell of xhat.
 
     Raises:
@@ -70,9 +71,10 @@ class JointField(BasisField):
         prepared = super().prepare(snapshots, latent_dim)
         grams = {name: pod.gram(snapshots, name, d) for name, d in map(TARGETS.get, _PHASES)}
         energies = {name: float(gram.diagonal().sum()) for name, gram in grams.items()}
+        of_none = {"x": "the same", "tau": "zero"}
         for name, energy in energies.items():
             if not energy > 0:
-                raise ConfigError(f"{name} is the same in every snapshot; field=joint needs it to vary")
+                raise ConfigError(f"{name} is {of_none[name]} in every snapshot; field=joint needs more")
         weights = {"x": 1 / energies["x"], "tau": self.stress_weight / energies["tau"]}
         latent = pod.leading(sum(weights[name] * gram for name, gram in grams.items()), latent_dim)
         # What displacements are left beside those that go with the latents.

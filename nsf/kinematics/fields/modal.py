@@ -16,6 +16,8 @@ from nsf.kinematics.fields.networks import Committee, FullyConnected
 from nsf.kinematics.manifold import Restriction
 from nsf.kinematics.training.phases import joined, shaped
 
+_CONSTANT = 1e-6  # deviation over size of coefficients below which they are taken to be constant
+
 
 def at_rate(outputs: Tensor, rate: Tensor) -> Tensor:
     """Coefficients b + M dx̂/dt [..., K] from outputs [..., (1 + r) K], b and then the r columns of M.
@@ -75,8 +77,10 @@ class ModalField(nn.Module):
         leading, closed = coefficients.tensor_split([self.leading.numel()], 1)
         self.leading.copy_(leading.square().mean(0).sqrt())
         if closed.numel():
-            mean = closed.mean(0)
-            self.scale.copy_((closed - mean).square().mean().sqrt())
+            mean, size = closed.mean(0), closed.square().mean().sqrt()
+            deviation = (closed - mean).square().mean().sqrt()
+            # Coefficients that never change deviate by round-off, which is no scale.
+            self.scale.copy_(torch.where(deviation > _CONSTANT * size, deviation, size))
             if isinstance(self.network, FullyConnected | Committee):
                 with torch.no_grad():  # else training would have to find the mean of modes about zero
                     self.network.output_bias[..., : len(mean)] = mean / self.scale

@@ -32,7 +32,7 @@ def xavier(layer: nn.Linear | nn.Conv1d, generator: torch.Generator) -> None:
     nn.init.zeros_(layer.bias)
 
 
-#: K of `zero_at_rest`, and c, at which silu is about as large as its argument.
+#: Of `zero_at_rest`: how fast what is taken fades, and what the unit that carries the bias has before SiLU.
 FADING, _BIAS = 4.0, 4.0
 
 
@@ -200,12 +200,13 @@ class Committee(nn.Module):
 def zero_at_rest(raw: FullyConnected, members: int, rest: Tensor, reach: Tensor) -> FullyConnected:
     """The network, but zero at x̂₀ whatever μ is, and as before from a few times `reach` on.
 
-    Of each member N = W silu(z) + b its value at rest is taken, which fades as x̂ leaves x̂₀:
+    Of each member N = W silu(z) + b, with z what its last hidden layer has before SiLU, the value at rest is
+    taken, which fades as x̂ leaves x̂₀:
 
         N(x̂, μ) − W silu(z(x̂₀, μ) − K ρ) − b silu(c − K ρ)/silu(c),   ρ = Σ_k t_k tanh(t_k/2),
 
-    with t = (x̂ − x̂₀)/reach. This is a network of SiLU layers too, so that whatever evaluates `raw` evaluates
-    it: silu(t) + silu(−t) = t tanh(t/2), and silu(ρ) − silu(−ρ) = ρ hands ρ on.
+    with t = (x̂ − x̂₀)/reach, K = `FADING` and c = `_BIAS`. This is a network of SiLU layers too, so that whatever
+    evaluates `raw` evaluates it: silu(t) + silu(−t) = t tanh(t/2), and silu(ρ) − silu(−ρ) = ρ hands ρ on.
 
     Args:
         raw: of inputs (x̂, μ), with two hidden layers or more, each of the members side by side.
@@ -217,8 +218,8 @@ def zero_at_rest(raw: FullyConnected, members: int, rest: Tensor, reach: Tensor)
         A network of twice as many members in double precision.
     """
     r, layers = len(rest), [(layer.weight.double(), layer.bias.double()) for layer in raw.layers]
-    # What finds ρ of the units of the layer before: 2 r halves of t tanh(t/2), later ρ and −ρ.
-    sums, fading = torch.ones(1, 2 * r).to(rest), torch.tensor([[1.0, -1.0]]).to(rest)
+    # Weights that give ρ from the layer before: of silu(±t_k), r each, and later of silu(±ρ).
+    sums, difference = torch.ones(1, 2 * r).to(rest), torch.tensor([[1.0, -1.0]]).to(rest)
     networks = []
     for n in range(members):
         ((first, b_first), *hidden, (out, b_out)) = _member(layers, members, n)
@@ -236,7 +237,7 @@ def zero_at_rest(raw: FullyConnected, members: int, rest: Tensor, reach: Tensor)
                 own.append((F.pad(W, (0, before, 0, 2)), F.pad(b, (0, 2))))
                 more = F.pad(row, (w, 0))
                 taken.append((torch.cat([F.pad(W, (0, before)), more]), F.pad(b, (0, 2))))
-                distance = fading
+                distance = difference
             else:
                 own.append((F.pad(W, (0, before, 0, 1)), F.pad(b, (0, 1))))
                 still = torch.cat([F.pad(W, (0, before)), W.new_zeros(1, w + before)])

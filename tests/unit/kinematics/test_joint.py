@@ -94,5 +94,5 @@ def test_refused_weights(weight):
 def test_a_field_that_never_changes(snapshots, monkeypatch):
     gram = pod.gram
     monkeypatch.setattr(pod, "gram", lambda s, name, d: (name != "tau") * gram(s, name, d))
-    with pytest.raises(ConfigError, match="tau is the same in every snapshot"):
+    with pytest.raises(ConfigError, match="tau is zero in every snapshot"):
         JointField(modes=MODES).prepare(snapshots, LATENT)

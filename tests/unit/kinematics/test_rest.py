@@ -8,6 +8,7 @@ import torch.nn.functional as F
 from nsf.data import Snapshots, TrajectoryWriter
 from nsf.kinematics.fields.basis import BasisField
 from nsf.kinematics.fields.joint import JointField
+from nsf.kinematics.fields.modal import ModalField
 from nsf.kinematics.fields.networks import Committee, FullyConnected, zero_at_rest
 from nsf.kinematics.training.phases import seeded
 
@@ -58,7 +59,8 @@ def test_a_network_is_zero_at_rest_and_as_before_elsewhere(raw):
     parameters, along = (torch.randn(6, n, generator=draw).double() for n in (1, LATENT))
     along = F.pad(F.normalize(along, dim=1) * REACH, (0, 1))
     still = torch.cat([REST.expand(6, -1), parameters], 1)
-    assert freed(still).abs().max() < ROUND_OFF < 0.1 < network(still).abs().min(1).values.max()
+    assert freed(still).abs().max() < ROUND_OFF
+    assert (network(still).abs() > 0.1).any(1).all()
     taken = [(freed(at) - network(at)).norm() for at in (still + s * along for s in (0, 0.5, 1, 2))]
     assert taken == sorted(taken, reverse=True)
     away = still + 20 * along
@@ -84,10 +86,33 @@ def test_a_body_at_rest_is_free_of_stress_at_every_parameter(loaded, field, memb
     assert [len(b) for _, b in parts.layers[:-1]] == [2 * members * (24 + 2 * LATENT), 2 * members * (24 + 1)]
 
 
+@pytest.mark.parametrize("noise", [{}, {"noise": 0.0, "noise_floor": 0.0}], ids=["noise", "none"])
+def test_stress_of_what_has_moved_is_the_fields(loaded, noise):
+    kind = BasisField(modes=[4, 6, 1], beta=4, depth=2, **noise)
+    manifold = kind.build(loaded, kind.prepare(loaded, LATENT), LATENT, seeded("cpu", 0))
+    moved, parameters = manifold.training_latents[1:FRAMES], torch.ones(FRAMES - 1, 1).double()
+    found = manifold.restrict().stress(moved, parameters)
+    manifold.hyperparameters["free_at_rest"] = False
+    torch.testing.assert_close(found, manifold.restrict().stress(moved, parameters), rtol=1e-6, atol=0.0)
+
+
+def test_one_hidden_layer_knows_no_rest(loaded):
+    kind = BasisField(modes=[4, 6, 1], beta=4, depth=1)
+    manifold = kind.build(loaded, kind.prepare(loaded, LATENT), LATENT, seeded("cpu", 0))
+    assert not manifold.hyperparameters["free_at_rest"]
+
+
+def test_coefficients_that_never_change_have_their_size_as_scale():
+    field = ModalField(5, 6, 1, 0, LATENT, 4, 2, 1)
+    field.calibrate(torch.full((7, 1), -3.0).double())
+    assert (field.scale, field.network.output_bias) == (3.0, -1.0)
+
+
 def test_runs_that_begin_under_stress_keep_it(snapshots):
     """Those of the fixture do: there nothing is known of the stress at rest."""
     kind = BasisField(modes=[9, 7, 8], beta=4, depth=2)
     manifold = kind.build(snapshots, kind.prepare(snapshots, LATENT), LATENT, seeded("cpu", 0))
     assert not manifold.hyperparameters["free_at_rest"]
     stress = manifold.restrict().stress(manifold.rest_latent, torch.tensor([0.9]).double())
-    assert stress.abs().max() > 0
+    moved = manifold.restrict().stress(manifold.rest_latent + 0.3, torch.tensor([0.9]).double())
+    assert stress.abs().max() > 1e-3 * moved.abs().max()
