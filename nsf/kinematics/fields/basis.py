@@ -51,7 +51,7 @@ from nsf.kinematics.training.rates import latent_rates
 AFFINE = ("latent", "rate")
 ENCODED_ENTRIES = 1 << 26  # values encoded at once
 
-# Reach of `zero_at_rest` over the noise of training: at five of it, a hundredth of the noise, nothing is taken.
+# Reach of `zero_at_rest` over the noise of training: at a hundredth of the noise nothing is taken any more.
 _REACH = 0.002
 _LEAST_NOISE = 0.01  # [deviations of x̂] taken where training has less
 

@@ -205,8 +205,8 @@ def zero_at_rest(raw: FullyConnected, members: int, rest: Tensor, reach: Tensor)
 
         N(x̂, μ) − W silu(z(x̂₀, μ) − K ρ) − b silu(c − K ρ)/silu(c),   ρ = Σ_k t_k tanh(t_k/2),
 
-    with t = (x̂ − x̂₀)/reach, K = `FADING` and c = `_BIAS`. This is a network of SiLU layers too, so that whatever
-    evaluates `raw` evaluates it: silu(t) + silu(−t) = t tanh(t/2), and silu(ρ) − silu(−ρ) = ρ hands ρ on.
+    with t = (x̂ − x̂₀)/reach, K = `FADING` and c = `_BIAS`. This is a network of SiLU layers too, so that
+    whatever evaluates `raw` evaluates it: silu(t) + silu(−t) = t tanh(t/2), and silu(ρ) − silu(−ρ) = ρ.
 
     Args:
         raw: of inputs (x̂, μ), with two hidden layers or more, each of the members side by side.
