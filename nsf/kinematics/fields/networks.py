@@ -32,6 +32,8 @@ def xavier(layer: nn.Linear | nn.Conv1d, generator: torch.Generator) -> None:
     nn.init.zeros_(layer.bias)
 
 
+Layer = tuple[Tensor, Tensor]  # weights [out, in] and biases [out]
+
 #: Of `zero_at_rest`: how fast what is taken fades, and what the unit that carries the bias has before SiLU.
 FADING, _BIAS = 4.0, 4.0
 
@@ -217,40 +219,50 @@ def zero_at_rest(raw: FullyConnected, members: int, rest: Tensor, reach: Tensor)
     Returns:
         A network of twice as many members in double precision.
     """
-    r, layers = len(rest), [(layer.weight.double(), layer.bias.double()) for layer in raw.layers]
-    # Weights that give ρ from the layer before: of silu(±t_k), r each, and later of silu(±ρ).
-    sums, difference = torch.ones(1, 2 * r).to(rest), torch.tensor([[1.0, -1.0]]).to(rest)
-    networks = []
+    layers, networks = [(layer.weight.double(), layer.bias.double()) for layer in raw.layers], []
     for n in range(members):
-        ((first, b_first), *hidden, (out, b_out)) = _member(layers, members, n)
-        w = len(first)
-        slopes = torch.cat([torch.diag(1 / reach), torch.diag(-1 / reach)])
-        padded = F.pad(slopes, (0, first.shape[1] - r))
-        own = [(F.pad(first, (0, 0, 0, 2 * r)), F.pad(b_first, (0, 2 * r)))]
-        still = torch.cat([torch.zeros_like(first[:, :r]), first[:, r:]], 1)
-        taken = [(torch.cat([still, padded]), torch.cat([b_first + first[:, :r] @ rest, -slopes @ rest]))]
-        distance = sums
-        for k, (W, b) in enumerate(hidden):
-            before = distance.shape[1]
-            if k < len(hidden) - 1:
-                row = torch.cat([distance, -distance])
-                own.append((F.pad(W, (0, before, 0, 2)), F.pad(b, (0, 2))))
-                more = F.pad(row, (w, 0))
-                taken.append((torch.cat([F.pad(W, (0, before)), more]), F.pad(b, (0, 2))))
-                distance = difference
-            else:
-                own.append((F.pad(W, (0, before, 0, 1)), F.pad(b, (0, 1))))
-                still = torch.cat([F.pad(W, (0, before)), W.new_zeros(1, w + before)])
-                still[:, w:] -= FADING * distance
-                taken.append((still, torch.cat([b, b.new_tensor([_BIAS])])))
-        bias = b_out / F.silu(b_out.new_tensor(_BIAS))
-        own.append((F.pad(out, (0, 1)), b_out))
-        taken.append((torch.cat([-out, -bias[:, None]], 1), torch.zeros_like(b_out)))
-        networks += [own, taken]
+        own = _member(layers, members, n)
+        taken = _taken(own, rest, reach)
+        networks += [[_padded(layer, like) for layer, like in zip(own, taken, strict=True)], taken]
     return beside(networks, [1] * len(networks), raw.kind).requires_grad_(False)
 
 
-def _member(layers: list[tuple[Tensor, Tensor]], members: int, n: int) -> list[tuple[Tensor, Tensor]]:
+def _taken(layers: Sequence[Layer], rest: Tensor, reach: Tensor) -> list[Layer]:
+    """What `zero_at_rest` adds to one network; hidden layers have further units beside its own."""
+    (first, b_first), *hidden, (W, b) = layers[:-1]
+    r, (out, b_out) = len(rest), layers[-1]
+    slopes = torch.cat([torch.diag(1 / reach), torch.diag(-1 / reach)])
+    found = [
+        _beside_own(
+            first, b_first + first[:, :r] @ rest, F.pad(slopes, (0, first.shape[1] - r)), -slopes @ rest
+        )
+    ]
+    found[0][0][: len(first), :r] = 0  # x̂ is x̂₀ there
+    # Weights that give ρ from the layer before: of silu(±t_k), r each, and later of silu(±ρ).
+    distance = torch.ones(1, 2 * r).to(rest)
+    for V, c in hidden:
+        more = F.pad(torch.cat([distance, -distance]), (len(V), 0))
+        found.append(_beside_own(F.pad(V, (0, distance.shape[1])), c, more, c.new_zeros(2)))
+        distance = torch.tensor([[1.0, -1.0]]).to(rest)
+    faded = torch.cat([W, -FADING * distance.expand(len(W), -1)], 1)
+    bias = F.pad(-FADING * distance, (W.shape[1], 0))
+    found.append(_beside_own(faded, b, bias, b.new_tensor([_BIAS])))
+    share = -b_out / F.silu(b_out.new_tensor(_BIAS))
+    return [*found, (torch.cat([-out, share[:, None]], 1), torch.zeros_like(b_out))]
+
+
+def _beside_own(W: Tensor, b: Tensor, more: Tensor, bias: Tensor) -> Layer:
+    """A layer with further units."""
+    return torch.cat([W, more]), torch.cat([b, bias])
+
+
+def _padded(layer: Layer, like: Layer) -> Layer:
+    """A layer with zeros up to the size of another."""
+    (W, b), (V, c) = layer, like
+    return F.pad(W, (0, V.shape[1] - W.shape[1], 0, len(V) - len(W))), F.pad(b, (0, len(c) - len(b)))
+
+
+def _member(layers: Sequence[Layer], members: int, n: int) -> list[Layer]:
     """Layers of one of the networks that `layers` hold side by side; of the last bias its share."""
     own = [b.unflatten(0, (members, -1))[n] for _, b in layers[:-1]]
     blocks = [layers[0][0].unflatten(0, (members, -1))[n]]
@@ -261,9 +273,7 @@ def _member(layers: list[tuple[Tensor, Tensor]], members: int, n: int) -> list[t
 
 
 @torch.no_grad()
-def beside(
-    networks: Sequence[Sequence[tuple[Tensor, Tensor]]], shares: Sequence[float], activation: str
-) -> FullyConnected:
+def beside(networks: Sequence[Sequence[Layer]], shares: Sequence[float], activation: str) -> FullyConnected:
     """Σ_k share_k network_k as one network in double precision, whose hidden layers are side by side.
 
     Args:
