@@ -35,7 +35,7 @@ def xavier(layer: nn.Linear | nn.Conv1d, generator: torch.Generator) -> None:
 Layer = tuple[Tensor, Tensor]  # weights [out, in] and biases [out]
 
 #: Of `zero_at_rest`: how fast what is taken fades, and what the unit that carries the bias has before SiLU.
-FADING, _BIAS = 4.0, 4.0
+_FADING, _BIAS = 4.0, 4.0
 
 
 class FullyConnected(nn.Module):
@@ -207,7 +207,7 @@ def zero_at_rest(raw: FullyConnected, members: int, rest: Tensor, reach: Tensor)
 
         N(x̂, μ) − W silu(z(x̂₀, μ) − K ρ) − b silu(c − K ρ)/silu(c),   ρ = Σ_k t_k tanh(t_k/2),
 
-    with t = (x̂ − x̂₀)/reach, K = `FADING` and c = `_BIAS`. This is a network of SiLU layers too, so that
+    with t = (x̂ − x̂₀)/reach, K = `_FADING` and c = `_BIAS`. This is a network of SiLU layers too, so that
     whatever evaluates `raw` evaluates it: silu(t) + silu(−t) = t tanh(t/2), and silu(ρ) − silu(−ρ) = ρ.
 
     Args:
@@ -244,8 +244,8 @@ def _taken(layers: Sequence[Layer], rest: Tensor, reach: Tensor) -> list[Layer]:
         more = F.pad(torch.cat([distance, -distance]), (len(V), 0))
         found.append(_beside_own(F.pad(V, (0, distance.shape[1])), c, more, c.new_zeros(2)))
         distance = torch.tensor([[1.0, -1.0]]).to(rest)
-    faded = torch.cat([W, -FADING * distance.expand(len(W), -1)], 1)
-    bias = F.pad(-FADING * distance, (W.shape[1], 0))
+    faded = torch.cat([W, -_FADING * distance.expand(len(W), -1)], 1)
+    bias = F.pad(-_FADING * distance, (W.shape[1], 0))
     found.append(_beside_own(faded, b, bias, b.new_tensor([_BIAS])))
     share = -b_out / F.silu(b_out.new_tensor(_BIAS))
     return [*found, (torch.cat([-out, share[:, None]], 1), torch.zeros_like(b_out))]

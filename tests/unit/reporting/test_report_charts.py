@@ -117,6 +117,27 @@ def test_pictures_of_a_diverged_run_say_when_it_stopped():
     assert notes == ["diverged; shown as at t = 0.12 s"]
 
 
+def test_a_legend_and_labels_of_long_settings_leave_the_chart_its_room(tmp_path):
+    names = [
+        f"history · operators engine · deploy.error_ratio={k}.25, material.yield_stress=400.0"
+        for k in range(4)
+    ]
+    solvers = [{"solver": n, "kind": "reduced", "span_ms": 1.0, "displacement_error": 0.1} for n in names]
+    figure = error_over_cost({"block": solvers}, {"block": {}})
+    figure.savefig(tmp_path / "cost.png")
+    assert figure.legends[0].get_window_extent().x1 <= figure.bbox.x1
+
+    label = "nsf · |S| 1,040 · scene.design.train=[" + ",".join(map(str, range(25))) + "]"
+    variants = [{"label": label, "mean": 0.01, "values": [0.01], "paper": None}]
+    figure = charts.delta_per_variant(variants)
+    figure.savefig(tmp_path / "delta.png")
+    (panel,) = figure.axes
+    (shown,) = (text.get_text() for text in panel.get_yticklabels())
+    assert shown.replace("\n", " ").replace(", ", ",") == label
+    assert not any(line.startswith(",") for line in shown.splitlines())
+    assert panel.get_window_extent().width > 0.4 * figure.bbox.width
+
+
 def test_error_over_time_has_a_line_a_value_in_per_cent(series):
     figure = charts.error_over_time(series, name="friction angle", unit="°")
     for panel, column in zip(figure.axes, ("delta", "displacement_error"), strict=True):
