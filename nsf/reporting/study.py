@@ -11,7 +11,7 @@ from nsf.reporting.drawing import charts
 from nsf.reporting.drawing.style import save
 from nsf.reporting.sources import Study
 from nsf.reporting.tables import Merged, first_rows, paper_row, printed_of, rows_of, variant_labels, variants
-from nsf.reporting.text.columns import COLUMN, axis, number, plus_minus
+from nsf.reporting.text.columns import COLUMN, axis, brief, number, plus_minus
 from nsf.reporting.text.formats import Rows
 from nsf.reporting.text.page import Picture, Section, Table
 
@@ -216,8 +216,8 @@ def _name(setting: Mapping[str, object]) -> str:
     for key, value in setting.items():
         if pd.isna(value):
             continue
-        text = str(value)
-        if text == "null" or not pd.isna(pd.to_numeric(text, errors="coerce")):
+        text = brief(str(value))
+        if text == "null" or text.startswith("[") or not pd.isna(pd.to_numeric(text, errors="coerce")):
             title = AXES[key][0] if key in AXES else key.rpartition(".")[2].replace("_", " ")
             text = f"{title} {text}"
         parts |= dict.fromkeys(text.split(" · "))

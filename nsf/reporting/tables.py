@@ -22,6 +22,7 @@ from nsf.reporting.text.columns import (
     TEXT,
     TRAINING,
     VALUES,
+    brief,
     device_type,
     number,
     split_rank,
@@ -236,7 +237,9 @@ def variant_labels(rows: list[dict]) -> list[str]:
     form = {"field": "{} field", "r": "r {}", "engine": "{} engine", "sample": "|S| {}"}
     return [
         " · ".join(
-            form.get(name, "{}").format(row[name]) for name in VARIANT if name in varying and row[name]
+            form.get(name, "{}").format(brief(str(row[name])))
+            for name in VARIANT
+            if name in varying and row[name]
         )
         for row in rows
     ]
@@ -296,7 +299,7 @@ def console_table(frame: pd.DataFrame) -> rich.table.Table:
 
 def _cell(name: str, value) -> str:
     if name in TEXT:
-        return ABSENT if pd.isna(value) else str(value)
+        return ABSENT if pd.isna(value) else brief(str(value))
     if name == "parameter" and not isinstance(value, str):
         return f"{value:g}"
     return COLUMN[name].text(value) if name in COLUMN else number(value)

@@ -1,6 +1,7 @@
 """What each column of `results.csv` is called, its unit, and how its numbers are written."""
 
 import math
+import re
 from dataclasses import dataclass
 
 from nsf.data.case import with_unit
@@ -131,6 +132,7 @@ MEASURED = ("delta", "displacement_error", "stress_error", *RIVALS, "handed_over
 """Columns that are averaged over parameter values."""
 
 ABSENT = "–"
+_LISTED = 6  # entries of a list that is shown whole
 
 
 def number(value, scale: float = 1.0) -> str:
@@ -150,6 +152,16 @@ def number(value, scale: float = 1.0) -> str:
         return f"{shown:.2e}"
     digits = max(0, 2 - math.floor(math.log10(abs(shown))))
     return f"{shown:.{digits}f}"
+
+
+def brief(text: str) -> str:
+    """A text with the ends and the count of each list of more than six entries: `[0 to 28, 25 values]`."""
+
+    def told(found: re.Match) -> str:
+        values = [value.strip() for value in found[1].split(",")]
+        return f"[{values[0]} to {values[-1]}, {len(values)} values]" if len(values) > _LISTED else found[0]
+
+    return re.sub(r"\[([^\[\]{}]*)\]", told, text)
 
 
 def plus_minus(mean: float, deviation: float, scale: float = 1.0) -> str:

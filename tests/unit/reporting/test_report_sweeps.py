@@ -12,10 +12,11 @@ from synthetic import Made, write_run
 from nsf.reporting import build_report
 from nsf.reporting.drawing import charts, shapes
 from nsf.reporting.pictures import draw
+from nsf.reporting.sections.settings import _told as told_of_settings
 from nsf.reporting.sources import Study, open_sources
 from nsf.reporting.study import _name, _settings, _told, interval, over_seeds, swept
 from nsf.reporting.tables import means, merge, rows_of
-from nsf.reporting.text.columns import plus_minus
+from nsf.reporting.text.columns import brief, plus_minus
 from nsf.reporting.text.formats import latex, latex_table
 
 VALUES = (22.5, 27.5)
@@ -301,3 +302,18 @@ def test_a_sweep_of_the_baseline_alone_has_no_bodies_of_settings(tmp_path):
     keys = {run.id: {"sampler.size": str(one.sample)} for run, one in zip(found, made, strict=True)}
     sections = draw(merge(open_sources(found)), tmp_path, True, of(keys))
     assert "Bodies at each setting" not in [section.heading for section in sections]
+
+
+def test_a_long_list_is_told_by_its_ends_and_its_length():
+    values = ",".join(map(str, range(25)))
+    assert brief(f"design.train=[{values}], seed=0") == "design.train=[0 to 24, 25 values], seed=0"
+    assert brief("evaluation.values=[1,2,3,4,5,6]") == "evaluation.values=[1,2,3,4,5,6]"
+    assert _name({"engine": "modal", "design.train": f"[{values}]"}) == "modal · train [0 to 24, 25 values]"
+
+
+def test_a_picture_tells_no_key_that_tells_no_more_than_those_before_it():
+    modal = (("engine", "modal"), ("seed", "0"))
+    operators = (("engine", "operators"), ("seed", "0"), ("engine.teacher", "runs"))
+    more = (*operators, ("scene.design.train", "[1,2]"))
+    assert told_of_settings([modal, operators, more]) == ["engine", "scene.design.train"]
+    assert told_of_settings([modal]) == []
