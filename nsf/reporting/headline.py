@@ -19,6 +19,7 @@ from nsf.reporting.text.columns import (
     RIVALS,
     TEXT,
     axis,
+    brief,
     number,
     parameter_text,
     plus_minus,
@@ -27,7 +28,7 @@ from nsf.reporting.text.formats import Rows
 
 FEW = 15  # rows of a table in which a number is varied; of more, settings and scenes go down and across
 MANY = 24  # rows where none is, as in the paper's Table 1
-_VALUES = "scene.design.test"  # jobs with this key are about certain held-out values, so each counts
+_VALUES = "scene.design.test"  # jobs with this key, and of one seed, are about single held-out values
 _PAPER = "paper"
 _DEVIATION = ", deviation"
 _RUNS, _DIVERGED, _SEEDS = "runs", "diverged", "seeds"  # how many are in a row of `groups`
@@ -103,7 +104,7 @@ class Report:
             *jobs,
             "r",
             "sample",
-            *(["parameter"] if _VALUES in keys else []),
+            *(["parameter"] if _VALUES in keys and not self.seeds else []),
         ]
         found: set[str] = set()
         for _, rows in self.rows.groupby("scene", sort=False):
@@ -367,7 +368,7 @@ def _text(key: str, value) -> str:
     if not isinstance(value, str):
         return parameter_text(value)
     if not value.startswith("{"):
-        return value
+        return brief(value)
     entries = (entry.partition(":") for entry in value.strip("{}").split(","))
     return ", ".join(f"{name.rpartition('.')[2]} {changed}" for name, _, changed in entries)
 

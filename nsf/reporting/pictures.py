@@ -25,6 +25,7 @@ from nsf.reporting.tables import (
     mean_rows,
     natural,
     printed_of,
+    setting_without,
     variant_labels,
     variants,
 )
@@ -297,10 +298,12 @@ def _over_seeds(known: list[Variant], study: Study | None) -> list[tuple[str, li
         ).append(v)
     found = []
     for alike in groups.values():
-        parts = [v.label.split(" · ") for v in alike]
-        common = [part for part in parts[0] if all(part in other for other in parts)]
-        several = [f"{len(alike)} seeds"] if len(alike) > 1 else []
-        found.append((" · ".join([*common, *several]), alike))
+        if len(alike) == 1:
+            found.append((alike[0].label, alike))
+            continue
+        parts = [[setting_without(part, SEEDS) for part in v.label.split(" · ")] for v in alike]
+        common = [part for part in parts[0] if part and all(part in other for other in parts)]
+        found.append((" · ".join([*common, f"{len(alike)} seeds"]), alike))
     return found
 
 

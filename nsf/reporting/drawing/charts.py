@@ -319,7 +319,7 @@ def rings(rows: Sequence[Mapping[str, Mapping[str, float]]]) -> Figure:
 
 def _wrapped(variants: list[dict]) -> list[str]:
     """Labels in lines that leave room for the chart beside them; lists break between their entries."""
-    spaced = (re.sub(r",(?=[^\[\]]*\])", ", ", v["label"]) for v in variants)
+    spaced = (re.sub(r",\s*(?=[^\[\]]*\])", ", ", v["label"]) for v in variants)
     return ["\n".join(textwrap.wrap(label, _LINE, break_on_hyphens=False)) for label in spaced]
 
 

@@ -229,6 +229,24 @@ def test_values_that_the_jobs_name_count_one_by_one(tmp_path):
     assert "each held-out value by itself" in said
 
 
+def test_values_that_jobs_of_several_seeds_name_are_averaged(tmp_path):
+    jobs = [
+        job(parameter=value, seed=seed, **{"scene.design.test": "[41,44]", "field": field})
+        for value in (41.0, 44.0)
+        for seed in ("0", "1")
+        for field in ("basis", "mlp")
+    ]
+    rows, said = told(write_report(tmp_path / "a", jobs))
+    assert [row[:2] for row in rows] == [["scene", "field"], ["sand", "basis"], ["sand", "mlp"]]
+    assert "by itself" not in said
+
+
+def test_a_long_list_is_short_in_the_table(tmp_path):
+    lists = [f"[{','.join(map(str, range(count)))}]" for count in (8, 12)]
+    rows, _ = told(write_report(tmp_path / "a", [job(**{"scene.design.train": one}) for one in lists]))
+    assert [row[1] for row in rows[1:]] == ["[0 to 7, 8 values]", "[0 to 11, 12 values]"]
+
+
 def test_changes_are_named_by_the_last_part_of_their_keys(tmp_path):
     changes = ("null", "{scene.bodies.slice.weakness.perturbation:0.08,a.b:2}")
     rows, _ = told(write_report(tmp_path / "a", [job(**{"deploy.changes": c}) for c in changes]))

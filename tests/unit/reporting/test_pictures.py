@@ -43,3 +43,11 @@ def test_variants_that_differ_in_seeds_alone_are_one_in_charts():
     study = Study("?", "", {}, keys, [])
     assert pictures._over_seeds(known, study) == [("sand · 2 seeds", known[:2]), (labels[2], known[2:])]
     assert [name for name, _ in pictures._over_seeds(known, None)] == list(labels)
+
+
+def test_what_is_varied_beside_the_seed_is_told_in_charts():
+    labels = [f"nsf · |S| {40 + i} · noise={i // 2}, seed={i % 2}" for i in range(4)]
+    known = [variant(0.0, label=label, run=str(i)) for i, label in enumerate(labels)]
+    keys = {str(i): {"noise": f"{i // 2}", "seed": f"{i % 2}"} for i in range(4)}
+    named = [name for name, _ in pictures._over_seeds(known, Study("?", "", {}, keys, []))]
+    assert named == ["nsf · noise=0 · 2 seeds", "nsf · noise=1 · 2 seeds"]
