@@ -179,7 +179,7 @@ def _facts(merged: Merged) -> list[tuple[str, str]]:
             ("Parameter", f"{name}: {told}"),
             (
                 "Particles",
-                f"{_particles(source, rows):,} full-order; {', '.join(map(str, latent))} latent coordinates",
+                f"{source.particles:,} full-order; {', '.join(map(str, latent))} latent coordinates",
             ),
             (
                 "Simulated",
@@ -206,11 +206,6 @@ def _smaller(merged: Merged) -> str:
     """A word of caution beside the paper's figure, where a run is not of the paper's size."""
     scales = {s.summary.get("scale") for s in merged.source if s.summary.get("paper")} - {None, "paper"}
     return f"The paper's δ is of its full size, these runs are of {min(scales)} scale. " if scales else ""
-
-
-def _particles(source: Source, rows) -> int:
-    """Particles of the full-order model; from γ = 3P/r where the summary does not say."""
-    return int(source.summary.get("particles") or round(rows["gamma"].iloc[0] * rows["r"].iloc[0] / 3))
 
 
 def _scale(source: Source) -> str:

@@ -41,7 +41,7 @@ CHAPTERS = {
         "small", "closed", "levels", "teaching", "inverse", "calibration", "calibration_frame",
         "sensitivities", "tilt", "design", "figures", "quickstart",
     ),
-    "One scene in detail, and speed": ("sand", "speed"),
+    "One scene in detail, and speed": ("sand", "large", "speed"),
 }  # fmt: skip
 _OTHERS = "Further reports"
 #: The paper's figures and tables with a number or a picture: what they show, and (report, file) for each.

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from nsf.reporting.drawing.cost import error_over_cost
+from nsf.reporting.drawing.cost import error_over_cost, step_over_particles
 from nsf.reporting.drawing.style import save
 from nsf.reporting.study import SEEDS
 from nsf.reporting.tables import (
@@ -66,7 +66,7 @@ def solvers(merged: Merged) -> pd.DataFrame:
 def _of_place(merged: Merged, same: Sequence[list[int]], labels: Sequence[str]) -> list[dict]:
     """The full-order solver, coarse ones, then the variants of one scene, precision and type of device."""
     means = [mean_rows(merged, members)[0] for members in same]  # held-out values come first
-    head = {name: means[0][name] for name in _PLACE}
+    head = {name: means[0][name] for name in _PLACE} | {"particles": merged.source[same[0][0]].particles}
     cost = pd.DataFrame(means)[["step_ms_full", "total_ms_full", "memory_full_mib"]].astype(float).median()
     full = dict.fromkeys(_ERRORS, 0.0) | {SOLVER: _FULL, "kind": "full"}
     full |= {"step_ms": cost["step_ms_full"], "span_ms": cost["step_ms_full"]}
@@ -209,7 +209,32 @@ def over_cost(merged: Merged, folder: Path, runs: list[str]) -> list[Picture]:
         "coarser grids (squares), and reduced ones (dots). Time is that for one Δt of the full-order solver: "
         "a solver of longer steps takes fewer. Horizontal lines are of what takes no step."
     )
-    return [Picture(save(error_over_cost(panels, free), folder, "error-over-cost"), caption, runs)]
+    pictures = [Picture(save(error_over_cost(panels, free), folder, "error-over-cost"), caption, runs)]
+    return [*pictures, *_over_particles(frame, placed, folder, runs)]
+
+
+def _over_particles(
+    frame: pd.DataFrame, placed: Sequence[str], folder: Path, runs: Sequence[str]
+) -> list[Picture]:
+    """The time of each solver over the particles of a scene, a panel a scene with several numbers of them."""
+    scenes = frame["scene"].str.replace(r" · [\d,]+ particles$", "", regex=True)
+    names = pd.concat([scenes, frame[list(placed)]], axis=1).agg(" · ".join, axis=1)
+    panels = {
+        name: {
+            solver: own.set_index("particles")["span_ms"].sort_index().to_dict()
+            for solver, own in part.groupby(SOLVER, sort=False)
+        }
+        for name, part in frame.groupby(names, sort=False)
+        if part["particles"].nunique() > 1
+    }
+    if not panels:
+        return []
+    caption = (
+        "Time for one Δt of the full-order solver over the particles of the scene, for each solver. "
+        "Each number of particles has a Δt and a field of its own."
+    )
+    drawn = save(step_over_particles(panels), folder, "step-over-particles")
+    return [Picture(drawn, caption, list(runs))]
 
 
 def _common_names(labels: pd.Series, panels: pd.Series) -> pd.Series:

@@ -98,6 +98,12 @@ class Source:
         """
         return self.summary.get("training_seconds") if self.cost.get("trials") else None
 
+    @property
+    def particles(self) -> int:
+        """Particles of the full-order model; from γ = 3P/r where the summary does not say."""
+        first = self.results.iloc[0]
+        return int(self.summary.get("particles") or round(first["gamma"] * float(first["r"]) / 3))
+
     @cached_property
     def material(self) -> str:
         """The name of the material it is deployed with; empty where the deploy run is not there."""

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,16 @@ import pandas as pd
 from nsf.reporting.drawing import charts
 from nsf.reporting.drawing.style import save
 from nsf.reporting.sources import Study
-from nsf.reporting.tables import Merged, first_rows, paper_row, printed_of, rows_of, variant_labels, variants
+from nsf.reporting.tables import (
+    SIZE,
+    Merged,
+    first_rows,
+    paper_row,
+    printed_of,
+    rows_of,
+    variant_labels,
+    variants,
+)
 from nsf.reporting.text.columns import COLUMN, axis, brief, number, plus_minus
 from nsf.reporting.text.formats import Rows
 from nsf.reporting.text.page import Picture, Section, Table
@@ -23,6 +33,7 @@ AXES = {
     "sampler.cells": ("cells with sample particles", "–", None),
     "latent_dim": ("latent coordinates r", "–", "r"),
     "field.beta": ("hidden width β over d", "–", None),
+    "scene.bodies.column.particles": ("particles", "–", None),
     "deploy.dt_multiplier": ("deployment step", "full-order Δt", None),
     "trainer.steps": ("training steps of each network", "–", None),
 }
@@ -61,7 +72,7 @@ def _held_out(merged: Merged, study: Study) -> pd.DataFrame:
 
     The scene is that of `first_rows`, with its material where there are several.
     """
-    groups = list(zip(variants(merged), first_rows(merged), strict=True))
+    groups = list(zip(variants(merged), first_rows(merged, sized=False), strict=True))
     printed = {i: printed_of(merged, members, study) for members, _ in groups for i in members}
     body = {i: first["scene"] for members, first in groups for i in members}
     rows = [
@@ -92,7 +103,8 @@ def _over(key: str, frame: pd.DataFrame, merged: Merged, study: Study, folder: P
     shown = shown.assign(x=pd.to_numeric(pd.Series(source, index=shown.index), errors="coerce"))
     panels, papers = {}, {}
     by_scene = list(shown.dropna(subset="x").groupby(_SCENE, sort=False))
-    told = list(dict.fromkeys(name for _, part in by_scene for name in _told(part, (key, *SEEDS))))
+    hidden = (key, *SEEDS, *(SIZE if fnmatchcase(key, SIZE[0]) else ()))
+    told = list(dict.fromkeys(name for _, part in by_scene for name in _told(part, hidden)))
     for scene, part in by_scene:
         panels[scene] = {
             name: group.groupby("x")["delta"].apply(list).to_dict()

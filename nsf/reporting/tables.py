@@ -4,6 +4,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 
 import pandas as pd
 import rich.console
@@ -67,6 +68,8 @@ _PASSING = ("evaluation.", "coarse", "code.", "law.", "edited")
 #: Groups of which the option may say all where it differs.
 _GROUPS = ("field", "trainer", "sampler", "projector", "integration")
 _MOST = 3  # keys in a setting
+SIZE = ("scene.bodies.*.particles", "scene.dx", "scene.dt", "scene.steps")
+"""Keys that go with the number of particles of a scene."""
 
 
 @dataclass(frozen=True)
@@ -131,32 +134,43 @@ def variants(merged: Merged) -> list[list[int]]:
     return list(groups.values())
 
 
-def bodies(merged: Merged) -> Merged:
-    """The same results with bodies for scenes: with the material beside it where there are several.
+def bodies(merged: Merged, sized: bool = True) -> Merged:
+    """The same results with bodies for scenes: with material or number of particles where there are several.
 
-    A body is `block · von_mises`. Its `setting` does not tell the material again.
+    A body is `block · von_mises` or `sand · 250,000 particles`. Its `setting` tells neither again.
+
+    Args:
+        merged: results.
+        sized: whether bodies of several numbers of particles are several.
     """
+    own = list(zip(merged.frame["scene"], merged.source, strict=True))
     materials: dict[str, set[str]] = {}
-    own = list(zip(merged.frame["scene"], (source.material for source in merged.source), strict=True))
-    for scene, material in own:
-        materials.setdefault(scene, set()).add(material)
-    told = [f"{scene} · {m}" if m and len(materials[scene]) > 1 else scene for scene, m in own]
-    settings = [
-        setting if body == scene else setting_without(setting, ["material"])
-        for setting, body, (scene, _) in zip(merged.frame[SETTING], told, own, strict=True)
-    ]
+    sizes: dict[str, set[int]] = {}
+    for scene, source in own:
+        materials.setdefault(scene, set()).add(source.material)
+        sizes.setdefault(scene, set()).add(source.particles)
+    told, settings = [], []
+    for (scene, source), setting in zip(own, merged.frame[SETTING], strict=True):
+        parts, known = [scene], []
+        if source.material and len(materials[scene]) > 1:
+            parts, known = [*parts, source.material], ["material"]
+        if sized and len(sizes[scene]) > 1:
+            parts, known = [*parts, f"{source.particles:,} particles"], [*known, *SIZE]
+        told.append(" · ".join(parts))
+        settings.append(setting_without(setting, known))
     return replace(merged, frame=merged.frame.assign(scene=told, **{SETTING: settings}))
 
 
-def first_rows(merged: Merged) -> list[dict]:
-    """The first row of each variant; its `scene` is the body."""
-    frame = bodies(merged).frame
+def first_rows(merged: Merged, sized: bool = True) -> list[dict]:
+    """The first row of each variant; its `scene` is the body, of one size or, if not `sized`, of all."""
+    frame = bodies(merged, sized).frame
     return [frame.iloc[i].to_dict() for i, *_ in variants(merged)]
 
 
 def setting_without(setting: str, keys: Sequence[str]) -> str:
-    """A setting without what it tells of some keys."""
-    return ", ".join(part for part in setting.split(", ") if part.partition("=")[0] not in keys)
+    """A setting without what it tells of some keys, which may be patterns (`scene.bodies.*.particles`)."""
+    told = ((part, part.partition("=")[0]) for part in setting.split(", "))
+    return ", ".join(part for part, key in told if not any(fnmatchcase(key, known) for known in keys))
 
 
 def means(merged: Merged, study: Study | None = None) -> pd.DataFrame:

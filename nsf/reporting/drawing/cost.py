@@ -10,6 +10,7 @@ from nsf.reporting.drawing.charts import LOST, plain_ticks
 from nsf.reporting.drawing.levels import LEVELS
 from nsf.reporting.drawing.style import FULL, INK, MUTED, PALETTE, figure, legend_above, styled
 
+_FULL = "full order"  # begins the names of full-order solvers
 _ACROSS = 3  # panels in a row
 _COARSE = {"ls": "", "marker": "s", "ms": 7, "mfc": "white", "mec": FULL, "mew": 1.6}
 _LINES = ((0, (6, 2)), (0, (2, 1.5)), (0, (1, 3)))
@@ -45,6 +46,36 @@ def error_over_cost(
             panel.grid()
             for line in (panel.xaxis, panel.yaxis):
                 plain_ticks(line)
+        for panel in drawn[len(panels) :]:
+            panel.axis("off")
+        told = {line.get_label(): line for panel in drawn for line in panel.lines}
+        legend_above(fig, told.values(), told.keys(), 4)
+    return fig
+
+
+def step_over_particles(panels: Mapping[str, Mapping[str, Mapping[int, float]]]) -> Figure:
+    """Time for one full-order Δt [ms] over the number of particles, both logarithmic: a panel a scene.
+
+    Args:
+        panels: by scene, then by solver, the time [ms] at each number of particles; NaN where not measured.
+    """
+    names = list(dict.fromkeys(name for of in panels.values() for name in of))
+    colors = solver_colors([name for name in names if not name.startswith(_FULL)])
+    rows = math.ceil(len(panels) / _ACROSS)
+    with styled():
+        fig = figure(0.9 + 3.4 * rows)
+        drawn = fig.subplots(rows, min(_ACROSS, len(panels)), squeeze=False).ravel()
+        for panel, (scene, solvers) in zip(drawn, panels.items(), strict=False):
+            for name, times in solvers.items():
+                color, dash = colors.get(name, FULL), "-" if name in (_FULL, *colors) else "--"
+                panel.plot(list(times), list(times.values()), dash, marker="o", ms=5, color=color, label=name)
+            sizes = sorted({size for times in solvers.values() for size in times})
+            panel.set(xscale="log", yscale="log", title=scene)
+            panel.set(xlabel="particles [–]", ylabel="time for one full-order Δt [ms]")
+            panel.set_xticks(sizes, [f"{size:,}" for size in sizes])
+            panel.minorticks_off()
+            panel.grid()
+            plain_ticks(panel.yaxis)
         for panel in drawn[len(panels) :]:
             panel.axis("off")
         told = {line.get_label(): line for panel in drawn for line in panel.lines}

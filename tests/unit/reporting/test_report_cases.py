@@ -2,14 +2,16 @@
 
 import json
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import pytest
 from synthetic import Made, seal, write_run
 
 from nsf.data import Case
-from nsf.reporting import build_report
+from nsf.reporting import build_report, rivals
 from nsf.reporting.drawing.cases import Cases, Parameter, error_maps, error_over_parameters
+from nsf.reporting.rivals import solvers
 from nsf.reporting.sources import Study, open_sources
 from nsf.reporting.study import _held_out
 from nsf.reporting.tables import first_rows, merge, told_apart, variant_labels
@@ -164,6 +166,37 @@ def test_two_materials_of_one_scene_are_two_bodies(tmp_path):
     assert set(_held_out(merged, study)["scene"]) == {row["scene"] for row in rows}
     alone = open_sources(runs[:1])
     assert [row["scene"] for row in first_rows(merge(alone))] == ["block"]
+
+
+def test_several_numbers_of_particles_of_one_scene_are_several_bodies(tmp_path):
+    """Else their full-order times would be one, and one chart of error over time of all sizes."""
+    sizes = (300, 1200)
+    runs = [write_run(tmp_path, Made(full_order=size)) for size in sizes]
+    told = {
+        run.id: f"scene.bodies.column.particles={size}, scene.dx=0.1, trainer.steps=9"
+        for run, size in zip(runs, sizes, strict=True)
+    }
+    merged = merge(open_sources(runs), told)
+    rows = first_rows(merged)
+    assert [row["scene"] for row in rows] == ["sand · 300 particles", "sand · 1,200 particles"]
+    assert {row["setting"] for row in rows} == {"trainer.steps=9"}
+    assert {row["scene"] for row in first_rows(merged, sized=False)} == {"sand"}
+    full = solvers(merged).query("kind == 'full'")
+    assert list(full["particles"]) == [300, 1200]
+    assert full["scene"].is_unique
+
+
+def test_time_over_particles_is_drawn_where_a_scene_has_several(tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(rivals, "step_over_particles", lambda panels: drawn.append(panels) or plt.figure())
+    runs = [write_run(tmp_path, Made(full_order=size)) for size in (300, 1200)]
+    of = {run.id: f"scene.bodies.column.particles={i}" for i, run in enumerate(runs)}
+    for own, expected in ((runs[:1], 1), (runs, 2)):
+        pictures = rivals.over_cost(merge(open_sources(own), of), tmp_path, [])
+        assert len(pictures) == expected
+    ((scene, solvers_there),) = drawn[0].items()
+    assert scene == "sand"
+    assert {tuple(times) for times in solvers_there.values()} == {(300, 1200)}
 
 
 def test_a_report_has_a_chart_a_map_and_pictures_of_each_body(tmp_path, few_pictures, monkeypatch):
