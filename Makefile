@@ -102,7 +102,7 @@ check-reports: install  ## whether reports/ is as it was generated
 REPRODUCED := table1 table1_seeds operators floors operators_seeds width latent_dim ablation sample_size sampler timestep \
 	extrapolation weak_elements super_resolution path_dependent sand forcing small closed levels teaching \
 	noise_floor figures mlp mlp_steps forcing_r training cells cake_noise cake_runs stress \
-	large
+	large training_runs
 
 reproduce: install  ## every report, from nothing, on one GPU; the same command goes on where it was stopped
 	@echo 'first the jelly cube at the paper'\''s size, whose rates tell how long the others take at most'

@@ -35,6 +35,7 @@ CHAPTERS = {
     "What the method needs": (
         "ablation", "mlp", "mlp_steps", "width", "latent_dim", "forcing_r", "noise_floor", "floors",
         "sample_size", "sampler", "cells", "timestep", "training", "cake_noise", "cake_runs", "stress",
+        "training_runs",
     ),
     "Beyond what was trained": ("extrapolation", "weak_elements", "super_resolution", "path_dependent"),
     "At small scale, on a CPU": (

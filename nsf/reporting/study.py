@@ -34,10 +34,12 @@ AXES = {
     "latent_dim": ("latent coordinates r", "–", "r"),
     "field.beta": ("hidden width β over d", "–", None),
     "scene.bodies.column.particles": ("particles", "–", None),
+    "scene.design.train": ("training runs", "–", None),
     "deploy.dt_multiplier": ("deployment step", "full-order Δt", None),
     "trainer.steps": ("training steps of each network", "–", None),
 }
 """Keys that are an axis: its title and unit, and the column of results.csv that tells what became of it."""
+_TRAIN = "scene.design.train"  # a list, of which the length is shown
 _STEPS, _SECONDS = "trainer.steps", ("training time", "s")  # shown in place of steps where runs tell it
 
 _RENAMED = {
@@ -88,7 +90,8 @@ def _held_out(merged: Merged, study: Study) -> pd.DataFrame:
 def _over(key: str, frame: pd.DataFrame, merged: Merged, study: Study, folder: Path) -> Picture:
     """δ over one key, a panel a scene, a line for each setting of the other keys.
 
-    In place of training steps stands their time, the mean over seeds, where every run tells it.
+    In place of training steps stands their time, the mean over seeds, where every run tells it. Over training
+    runs there is a line for interpolating them.
     """
     title, unit, column = AXES[key]
     shown = frame[frame[key].notna()]
@@ -100,6 +103,8 @@ def _over(key: str, frame: pd.DataFrame, merged: Merged, study: Study, folder: P
             alike = [shown[name] for name in alike]
             (title, unit), of_rows = _SECONDS, pd.Series(seconds, shown.index)
             source = of_rows.groupby(alike, dropna=False).transform("mean")
+    if key == _TRAIN:
+        source = shown[key].str.count(",") + 1
     shown = shown.assign(x=pd.to_numeric(pd.Series(source, index=shown.index), errors="coerce"))
     panels, papers = {}, {}
     by_scene = list(shown.dropna(subset="x").groupby(_SCENE, sort=False))
@@ -110,6 +115,8 @@ def _over(key: str, frame: pd.DataFrame, merged: Merged, study: Study, folder: P
             name: group.groupby("x")["delta"].apply(list).to_dict()
             for name, group in _settings(part, told, alone="mean")
         }
+        if key == _TRAIN:
+            panels[scene] |= _interpolated(merged, part)
         if study.printed is not None:
             papers[scene] = part[["x", _PAPER]].dropna().drop_duplicates().to_numpy().tolist()
         else:
@@ -122,9 +129,22 @@ def _over(key: str, frame: pd.DataFrame, merged: Merged, study: Study, folder: P
         f"Mean δ (line) against {title}, and from the smallest to the largest over the held-out values"
         f"{' and seeds' if seeds else ''} (band). Where a run diverged, the line has a gap."
         + (" The cross is what the paper prints." if any(papers.values()) else "")
+        + (" Interpolating the latent vectors of the training runs takes no step." if key == _TRAIN else "")
     )
     stem = f"delta-over-{key.replace('.', '-').replace('_', '-')}"
     return Picture(save(figure, folder, stem), caption, sorted(set(shown[_RUN])))
+
+
+def _interpolated(merged: Merged, part: pd.DataFrame) -> dict[str, dict[float, list[float]]]:
+    """δ of interpolated latents at each x of rows of `_held_out`; nothing where a run was not held to them.
+
+    Both errors of a run divide the same distance, by the positions and by the displacements.
+    """
+    rows = merged.frame.loc[part["row"]]
+    delta = rows["displacement_interpolated"] * rows["delta"] / rows["displacement_error"]
+    if not np.isfinite(delta.astype(float)).all():
+        return {}
+    return {"interpolated latents": delta.groupby(part["x"].to_numpy()).apply(list).to_dict()}
 
 
 def _scatter(frame: pd.DataFrame, merged: Merged, folder: Path) -> Picture:

@@ -317,3 +317,30 @@ def test_a_picture_tells_no_key_that_tells_no_more_than_those_before_it():
     more = (*operators, ("scene.design.train", "[1,2]"))
     assert told_of_settings([modal, operators, more]) == ["engine", "scene.design.train"]
     assert told_of_settings([modal]) == []
+
+
+def test_over_training_runs_stands_the_error_of_interpolating_them(tmp_path, drawn):
+    lists = ("[21,38.5]", "[21,29.75,38.5]")
+    made = [
+        Made(
+            particles=30, frames=4, parameters=VALUES, splits=("test",) * 2, noise=noise, seed=i, rivals=True
+        )
+        for i, noise in enumerate((0.008, 0.004))
+    ]
+    found = [write_run(tmp_path, one) for one in made]
+    keys = {
+        run.id: {"scene": "sand", "scene.design.train": one} for run, one in zip(found, lists, strict=True)
+    }
+    settings = {run.id: f"scene.design.train={one}" for run, one in zip(found, lists, strict=True)}
+    merged = merge(open_sources(found), settings)
+    swept(merged, of(keys), tmp_path)
+    ((_, (panels, x, _)),) = drawn
+    assert x == "training runs [–]"
+    assert {name: tuple(line) for name, line in panels["sand"].items()} == {
+        "mean": (2, 3),
+        "interpolated latents": (2, 3),
+    }
+    rows = merged.frame
+    expected = rows["displacement_interpolated"] / rows["displacement_error"] * rows["delta"]
+    shown = sorted(value for values in panels["sand"]["interpolated latents"].values() for value in values)
+    np.testing.assert_allclose(shown, sorted(expected))
