@@ -77,6 +77,7 @@ FURTHER = {
     "method, the best first, with the training cases as grey crosses.",
     "error-over-cost.png": "Displacement error over the time for one full-order Δt, for each solver of a "
     "scene; horizontal lines are rivals that take no step.",
+    "step-over-particles.png": "Time for one full-order Δt over the particles of the scene, for each solver.",
 }
 _CHART = {"file": "delta.png", "caption": "Mean δ, each value, and the paper's."}  # of reports that name none
 _REBUILD = "build it again with `nsf report`"

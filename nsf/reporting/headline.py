@@ -11,7 +11,7 @@ import pandas as pd
 from nsf.errors import SchemaError
 from nsf.reporting.rivals import where_rivals_win
 from nsf.reporting.sources import printed_delta
-from nsf.reporting.study import AXES, SEEDS
+from nsf.reporting.study import AXES, SEEDS, TRAIN
 from nsf.reporting.text.columns import (
     ABSENT,
     COLUMN,
@@ -20,6 +20,7 @@ from nsf.reporting.text.columns import (
     TEXT,
     axis,
     brief,
+    counted,
     number,
     parameter_text,
     plus_minus,
@@ -28,7 +29,7 @@ from nsf.reporting.text.formats import Rows
 
 FEW = 15  # rows of a table in which a number is varied; of more, settings and scenes go down and across
 MANY = 24  # rows where none is, as in the paper's Table 1
-_VALUES = "scene.design.test"  # jobs with this key, and of one seed, are about single held-out values
+_VALUES = "scene.design.test"  # jobs of one scene and seed with this key are about single held-out values
 _PAPER = "paper"
 _DEVIATION = ", deviation"
 _RUNS, _DIVERGED, _SEEDS = "runs", "diverged", "seeds"  # how many are in a row of `groups`
@@ -83,12 +84,18 @@ class Report:
         runs = [self.told["runs"][row["run"]] for row in self.told["rows"]]
         keys = pd.DataFrame([_own(run) for run in runs], index=frame.index).replace("null", np.nan)
         frame = frame.join(keys)
+        if TRAIN in frame:
+            frame[TRAIN] = counted(frame[TRAIN], frame["scene"])
         records = frame.to_dict("records")
         # A sample's size may follow from its seed.
         alike = ["scene", "method", "field", *(set(SEEDS) & set(frame))]
         numbers = frame.groupby(alike, dropna=False)["sample"].transform("nunique")
         told = zip(records, runs, numbers > 1, strict=True)
         frame[_PAPER] = [self._printed(row, run, compared) for row, run, compared in told]
+        particles = (frame["gamma"] * frame["r"].astype(float) / 3).round()
+        several = particles.groupby(frame["scene"]).transform("nunique") > 1
+        sized = frame["scene"] + " · " + particles.map("{:,.0f} particles".format)
+        frame["scene"] = frame["scene"].where(~several, sized)
         held_out = frame["split"] != "train"
         return frame[held_out] if held_out.any() else frame
 
@@ -97,6 +104,7 @@ class Report:
         """Columns of `rows` that tell apart what is compared within a scene, as few as can."""
         keys = list(dict.fromkeys(key for run in self.told["runs"].values() for key in _own(run)))
         jobs = [key for key in keys if key not in SEEDS] if keys else ["setting"]
+        alone = not self.seeds and self.rows["scene"].nunique() == 1
         known = [
             "method",
             "field",
@@ -104,7 +112,7 @@ class Report:
             *jobs,
             "r",
             "sample",
-            *(["parameter"] if _VALUES in keys and not self.seeds else []),
+            *(["parameter"] if _VALUES in keys and alone else []),
         ]
         found: set[str] = set()
         for _, rows in self.rows.groupby("scene", sort=False):

@@ -15,6 +15,7 @@ from nsf.reporting.tables import (
     first_rows,
     mean_rows,
     rows_of,
+    setting_without,
     variant_labels,
     variants,
     without_constants,
@@ -41,7 +42,7 @@ _BESIDE = (
 
 
 def solvers(merged: Merged) -> pd.DataFrame:
-    """A row a body and solver: errors (fractions), times [ms] and memory [MiB]; NaN where not measured.
+    """A row a body and solver: errors (fractions), times [ms], memory [MiB], particles; NaN if not measured.
 
     A body is the `scene` of `first_rows`. A variant stands once, with the means of its held-out values; the
     full-order solver, and each coarse one, once for each precision and type of device. `span_ms` is the time
@@ -221,7 +222,7 @@ def _over_particles(
     names = pd.concat([scenes, frame[list(placed)]], axis=1).agg(" · ".join, axis=1)
     panels = {
         name: {
-            solver: own.set_index("particles")["span_ms"].sort_index().to_dict()
+            solver: own.groupby("particles")["span_ms"].median().to_dict()
             for solver, own in part.groupby(SOLVER, sort=False)
         }
         for name, part in frame.groupby(names, sort=False)
@@ -241,7 +242,7 @@ def _common_names(labels: pd.Series, panels: pd.Series) -> pd.Series:
     """Labels without seeds and the parts that some panel lacks, such as its |S|: a colour has one meaning."""
     if panels.nunique() == 1:
         return labels
-    parts = labels.str.split(" · ")
+    parts = labels.map(lambda label: [setting_without(part, SEEDS) for part in label.split(" · ")])
     known = [{part for own in of for part in own} for _, of in parts.groupby(panels)]
-    common = {part for part in set.intersection(*known) if part.partition("=")[0] not in SEEDS}
+    common = set.intersection(*known) - {""}
     return parts.map(lambda own: " · ".join(part for part in own if part in common) or "reduced")

@@ -21,7 +21,7 @@ from nsf.reporting.tables import (
     variant_labels,
     variants,
 )
-from nsf.reporting.text.columns import COLUMN, axis, brief, number, plus_minus
+from nsf.reporting.text.columns import COLUMN, axis, counted, distinct, number, plus_minus
 from nsf.reporting.text.formats import Rows
 from nsf.reporting.text.page import Picture, Section, Table
 
@@ -39,7 +39,7 @@ AXES = {
     "trainer.steps": ("training steps of each network", "–", None),
 }
 """Keys that are an axis: its title and unit, and the column of results.csv that tells what became of it."""
-_TRAIN = "scene.design.train"  # a list, of which the length is shown
+TRAIN = "scene.design.train"  # a list, of which the length is shown
 _STEPS, _SECONDS = "trainer.steps", ("training time", "s")  # shown in place of steps where runs tell it
 
 _RENAMED = {
@@ -84,7 +84,8 @@ def _held_out(merged: Merged, study: Study) -> pd.DataFrame:
         for i, (row, source) in enumerate(zip(merged.frame.to_dict("records"), merged.source, strict=True))
         if row["split"] != "train"
     ]
-    return pd.DataFrame(rows)
+    frame = pd.DataFrame(rows)
+    return frame.assign(**{TRAIN: counted(frame[TRAIN], frame[_SCENE])}) if TRAIN in frame else frame
 
 
 def _over(key: str, frame: pd.DataFrame, merged: Merged, study: Study, folder: Path) -> Picture:
@@ -103,20 +104,19 @@ def _over(key: str, frame: pd.DataFrame, merged: Merged, study: Study, folder: P
             alike = [shown[name] for name in alike]
             (title, unit), of_rows = _SECONDS, pd.Series(seconds, shown.index)
             source = of_rows.groupby(alike, dropna=False).transform("mean")
-    if key == _TRAIN:
-        source = shown[key].str.count(",") + 1
     shown = shown.assign(x=pd.to_numeric(pd.Series(source, index=shown.index), errors="coerce"))
-    panels, papers = {}, {}
+    panels, papers, interpolated = {}, {}, False
     by_scene = list(shown.dropna(subset="x").groupby(_SCENE, sort=False))
     hidden = (key, *SEEDS, *(SIZE if fnmatchcase(key, SIZE[0]) else ()))
     told = list(dict.fromkeys(name for _, part in by_scene for name in _told(part, hidden)))
     for scene, part in by_scene:
         panels[scene] = {
             name: group.groupby("x")["delta"].apply(list).to_dict()
-            for name, group in _settings(part, told, alone="mean")
+            for name, group in _settings(part, told, alone="reduced" if key == TRAIN else "mean")
         }
-        if key == _TRAIN:
+        if key == TRAIN:
             panels[scene] |= _interpolated(merged, part)
+            interpolated |= "interpolated latents" in panels[scene]
         if study.printed is not None:
             papers[scene] = part[["x", _PAPER]].dropna().drop_duplicates().to_numpy().tolist()
         else:
@@ -129,20 +129,23 @@ def _over(key: str, frame: pd.DataFrame, merged: Merged, study: Study, folder: P
         f"Mean δ (line) against {title}, and from the smallest to the largest over the held-out values"
         f"{' and seeds' if seeds else ''} (band). Where a run diverged, the line has a gap."
         + (" The cross is what the paper prints." if any(papers.values()) else "")
-        + (" Interpolating the latent vectors of the training runs takes no step." if key == _TRAIN else "")
+        + (" Interpolating the latent vectors of the training runs takes no step." if interpolated else "")
     )
     stem = f"delta-over-{key.replace('.', '-').replace('_', '-')}"
     return Picture(save(figure, folder, stem), caption, sorted(set(shown[_RUN])))
 
 
 def _interpolated(merged: Merged, part: pd.DataFrame) -> dict[str, dict[float, list[float]]]:
-    """δ of interpolated latents at each x of rows of `_held_out`; nothing where a run was not held to them.
+    """δ of interpolated latents at each x of rows of `_held_out`; nothing where they were not measured.
 
-    Both errors of a run divide the same distance, by the positions and by the displacements.
+    Both errors of a run divide the same distance, one by the positions and one by the displacements, so their
+    ratio is that of the full-order run, whichever reduced run tells it.
     """
-    rows = merged.frame.loc[part["row"]]
-    delta = rows["displacement_interpolated"] * rows["delta"] / rows["displacement_error"]
-    if not np.isfinite(delta.astype(float)).all():
+    rows = merged.frame.loc[part["row"]].reset_index(drop=True)
+    ratio = (rows["delta"] / rows["displacement_error"]).astype(float)
+    ratio = ratio.groupby([rows["gamma"] * rows["r"], rows["parameter"]]).transform("median")
+    delta = rows["displacement_interpolated"].astype(float) * ratio
+    if not np.isfinite(delta).all():
         return {}
     return {"interpolated latents": delta.groupby(part["x"].to_numpy()).apply(list).to_dict()}
 
@@ -236,10 +239,10 @@ def _settings(frame: pd.DataFrame, told: Sequence[str], alone: str) -> list[tupl
     """
     if not told:
         return [(alone, frame)] if len(frame) else []
-    return [
-        (_name(dict(zip(told, values, strict=True))), group)
-        for values, group in frame.groupby(told, dropna=False, sort=False)
-    ]
+    groups = list(frame.groupby(told, dropna=False, sort=False))
+    settings = [dict(zip(told, values, strict=True)) for values, _ in groups]
+    names = distinct([_name(setting) for setting in settings])
+    return [(name, group) for name, (_, group) in zip(names, groups, strict=True)]
 
 
 def _name(setting: Mapping[str, object]) -> str:
@@ -248,7 +251,7 @@ def _name(setting: Mapping[str, object]) -> str:
     for key, value in setting.items():
         if pd.isna(value):
             continue
-        text = brief(str(value))
+        text = str(value)
         if text == "null" or text.startswith("[") or not pd.isna(pd.to_numeric(text, errors="coerce")):
             title = AXES[key][0] if key in AXES else key.rpartition(".")[2].replace("_", " ")
             text = f"{title} {text}"

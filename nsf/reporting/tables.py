@@ -25,6 +25,7 @@ from nsf.reporting.text.columns import (
     VALUES,
     brief,
     device_type,
+    distinct,
     number,
     split_rank,
 )
@@ -143,22 +144,25 @@ def bodies(merged: Merged, sized: bool = True) -> Merged:
         merged: results.
         sized: whether bodies of several numbers of particles are several.
     """
-    own = list(zip(merged.frame["scene"], merged.source, strict=True))
+    own = list(zip(merged.frame["scene"], merged.source, merged.frame[SETTING], strict=True))
     materials: dict[str, set[str]] = {}
-    sizes: dict[str, set[int]] = {}
-    for scene, source in own:
+    sizes: dict[str, dict[int, set[str]]] = {}  # by scene, then number of particles: what settings tell of it
+    for scene, source, setting in own:
         materials.setdefault(scene, set()).add(source.material)
-        sizes.setdefault(scene, set()).add(source.particles)
-    told, settings = [], []
-    for (scene, source), setting in zip(own, merged.frame[SETTING], strict=True):
+        told = ", ".join(part for part in setting.split(", ") if not setting_without(part, SIZE))
+        sizes.setdefault(scene, {}).setdefault(source.particles, set()).add(told)
+    bodies_there, settings = [], []
+    for scene, source, setting in own:
         parts, known = [scene], []
         if source.material and len(materials[scene]) > 1:
             parts, known = [*parts, source.material], ["material"]
         if sized and len(sizes[scene]) > 1:
-            parts, known = [*parts, f"{source.particles:,} particles"], [*known, *SIZE]
-        told.append(" · ".join(parts))
+            parts = [*parts, f"{source.particles:,} particles"]
+            # What goes with the number of particles is told by it; two Δx of one number are not.
+            known += SIZE if all(len(alike) == 1 for alike in sizes[scene].values()) else ()
+        bodies_there.append(" · ".join(parts))
         settings.append(setting_without(setting, known))
-    return replace(merged, frame=merged.frame.assign(scene=told, **{SETTING: settings}))
+    return replace(merged, frame=merged.frame.assign(scene=bodies_there, **{SETTING: settings}))
 
 
 def first_rows(merged: Merged, sized: bool = True) -> list[dict]:
@@ -249,14 +253,9 @@ def variant_labels(rows: list[dict]) -> list[str]:
     """Short names of variants: the method, and whatever else differs among them."""
     varying = {name for name in VARIANT if len({str(row[name]) for row in rows}) > 1} | {"method"}
     form = {"field": "{} field", "r": "r {}", "engine": "{} engine", "sample": "|S| {}"}
-    return [
-        " · ".join(
-            form.get(name, "{}").format(brief(str(row[name])))
-            for name in VARIANT
-            if name in varying and row[name]
-        )
-        for row in rows
-    ]
+    told = [[name for name in VARIANT if name in varying and row[name]] for row in rows]
+    own = zip(rows, told, strict=True)
+    return distinct([" · ".join(form.get(name, "{}").format(row[name]) for name in of) for row, of in own])
 
 
 def rows_of(frame: pd.DataFrame, renamed: Mapping[str, str] | None = None) -> Rows:
@@ -374,5 +373,5 @@ def _said(key: str, chosen: Sequence[str], entries: Sequence[Entry]) -> bool:
     return len(pairs) == len({option for option, _ in pairs})
 
 
-def _rank(key: str) -> int:
-    return list(TITLES).index(key) if key in TITLES else len(TITLES)
+def _rank(key: str) -> tuple[int, str]:
+    return list(TITLES).index(key) if key in TITLES else len(TITLES), key

@@ -225,7 +225,7 @@ def delta_over(
         fig.supxlabel(x)
         if max(known) > 10 * min(known):
             drawn[0].set_xscale("log")
-            plain_ticks(drawn[0].xaxis)
+            plain_ticks(drawn[0].xaxis, lambda value: f"{value:,.10g}")
         told = {line.get_label(): line for panel in drawn for line in panel.lines}
         told |= {name: told.pop(name) for name in ("the paper",) if name in told}  # last
         if len(told) > 1:

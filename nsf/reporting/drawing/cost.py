@@ -61,14 +61,16 @@ def step_over_particles(panels: Mapping[str, Mapping[str, Mapping[int, float]]])
     """
     names = list(dict.fromkeys(name for of in panels.values() for name in of))
     colors = solver_colors([name for name in names if not name.startswith(_FULL)])
+    coarse = [name for name in names if name not in (_FULL, *colors)]
     rows = math.ceil(len(panels) / _ACROSS)
     with styled():
         fig = figure(0.9 + 3.4 * rows)
         drawn = fig.subplots(rows, min(_ACROSS, len(panels)), squeeze=False).ravel()
         for panel, (scene, solvers) in zip(drawn, panels.items(), strict=False):
             for name, times in solvers.items():
-                color, dash = colors.get(name, FULL), "-" if name in (_FULL, *colors) else "--"
-                panel.plot(list(times), list(times.values()), dash, marker="o", ms=5, color=color, label=name)
+                dash = _LINES[coarse.index(name) % len(_LINES)] if name in coarse else "-"
+                style = {"color": colors.get(name, FULL), "ls": dash, "marker": "o", "ms": 5}
+                panel.plot(list(times), list(times.values()), label=name, **style)
             sizes = sorted({size for times in solvers.values() for size in times})
             panel.set(xscale="log", yscale="log", title=scene)
             panel.set(xlabel="particles [–]", ylabel="time for one full-order Δt [ms]")

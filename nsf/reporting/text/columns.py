@@ -1,8 +1,12 @@
 """What each column of `results.csv` is called, its unit, and how its numbers are written."""
 
+import json
 import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+import pandas as pd
 
 from nsf.data.case import with_unit
 
@@ -162,6 +166,20 @@ def brief(text: str) -> str:
         return f"[{values[0]} to {values[-1]}, {len(values)} values]" if len(values) > _LISTED else found[0]
 
     return re.sub(r"\[([^\[\]{}]*)\]", told, text)
+
+
+def distinct(texts: Sequence[str]) -> list[str]:
+    """The texts, each `brief` unless two that differ would be one."""
+    short = [brief(text) for text in texts]
+    return short if len(set(short)) == len(set(texts)) else list(texts)
+
+
+def counted(lists: pd.Series, scenes: pd.Series) -> pd.Series:
+    """Lengths in place of lists `[21,38.5]`; the lists as they are where two of a scene have one length."""
+    lengths = lists.map(lambda text: len(json.loads(text)) if str(text).startswith("[") else text)
+    both = pd.DataFrame({"scene": scenes, "list": lists, "length": lengths})
+    kinds = both.groupby("scene")[["list", "length"]].nunique()
+    return lengths if (kinds["list"] == kinds["length"]).all() else lists
 
 
 def plus_minus(mean: float, deviation: float, scale: float = 1.0) -> str:

@@ -18,11 +18,13 @@ def job(
     scene: str = "sand", delta: float = 0.001, stress: float = 0.02, parameter: float = 26.0, **keys
 ) -> dict:
     """A held-out row: columns of results.csv, and in `keys` the keys of its job."""
+    particles = int(keys.get("scene.bodies.column.particles", 2))
     row = dict.fromkeys(COLUMNS, 1.0) | dict.fromkeys(RIVALS, math.nan) | {
         "scene": scene, "method": keys.get("method", "nsf"), "field": keys.get("field", "basis"),
         "r": int(keys.get("latent_dim", 6)), "sample": keys.get("sampler.size", "150"),
         "parameter": parameter, "split": "test", "delta": delta, "displacement_error": 10 * delta,
-        "stress_error": stress, "precision": "fp64", "device": "NVIDIA H200", "commit": "1f2e3d4c5b6a",
+        "gamma": 3 * particles / int(keys.get("latent_dim", 6)), "stress_error": stress,
+        "precision": "fp64", "device": "NVIDIA H200", "commit": "1f2e3d4c5b6a",
     }  # fmt: skip
     return row | {"keys": {"scene": scene} | keys}
 

@@ -105,7 +105,7 @@ def test_maps_and_errors_over_cost_stand_below_the_main_chart(tmp_path):
     folder = write_report(tmp_path / "forcing", [job()], chart="delta.png")
     told = json.loads((folder / "sources.json").read_text())
     assert "error-map" not in committed.write_list(tmp_path).read_text()
-    for name in ("error-over-cost.png", "error-map.png"):
+    for name in committed.FURTHER:
         told["files"][name] = ""
     (folder / "sources.json").write_text(json.dumps(told))
     text = committed.write_list(tmp_path).read_text()

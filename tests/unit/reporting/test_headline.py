@@ -241,10 +241,20 @@ def test_values_that_jobs_of_several_seeds_name_are_averaged(tmp_path):
     assert "by itself" not in said
 
 
-def test_a_long_list_is_short_in_the_table(tmp_path):
+def test_of_training_runs_their_number_is_told_and_of_other_long_lists_the_ends(tmp_path):
     lists = [f"[{','.join(map(str, range(count)))}]" for count in (8, 12)]
-    rows, _ = told(write_report(tmp_path / "a", [job(**{"scene.design.train": one}) for one in lists]))
-    assert [row[1] for row in rows[1:]] == ["[0 to 7, 8 values]", "[0 to 11, 12 values]"]
+    for key, expected in (
+        ("design.train", ["8", "12"]),
+        ("own", ["[0 to 7, 8 values]", "[0 to 11, 12 values]"]),
+    ):
+        rows, _ = told(write_report(tmp_path / key, [job(**{f"scene.{key}": one}) for one in lists]))
+        assert [row[1] for row in rows[1:]] == expected
+
+
+def test_numbers_of_particles_of_one_scene_are_scenes_of_their_own(tmp_path):
+    jobs = [job(**{"scene.bodies.column.particles": size}) for size in ("1000", "100000")]
+    rows, _ = told(write_report(tmp_path / "a", jobs))
+    assert [row[0] for row in rows] == ["scene", "sand · 1,000 particles", "sand · 100,000 particles"]
 
 
 def test_changes_are_named_by_the_last_part_of_their_keys(tmp_path):

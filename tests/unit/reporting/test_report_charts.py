@@ -10,7 +10,7 @@ from synthetic import TEST, Made, collapse
 from nsf import config
 from nsf.reporting.drawing import charts
 from nsf.reporting.drawing.camera import Camera, View
-from nsf.reporting.drawing.cost import error_over_cost
+from nsf.reporting.drawing.cost import error_over_cost, step_over_particles
 from nsf.reporting.drawing.point import point_chart, point_response
 from nsf.reporting.drawing.shapes import Case, animation, final_shapes, hides_stress, is_cut_open, strip
 from nsf.reporting.drawing.style import save
@@ -288,3 +288,21 @@ def test_an_axis_of_errors_has_ticks_however_many_decades_it_spans(largest):
     shown = [tick for tick in panel.get_yticks() if low <= tick <= high]
     assert 3 <= len(shown) <= 12
     assert len(panel.get_xticks()) <= 7
+
+
+def test_step_over_particles_has_a_line_for_each_solver():
+    times = {"full order": 1.0, "full order, Δx × 2": 0.2, "full order, Δx × 3": 0.1, "modal engine": 0.5}
+    panels = {"sand": {name: {1000: ms, 1_000_000: 10 * ms} for name, ms in times.items()}}
+    fig = step_over_particles(panels)
+    panel = fig.axes[0]
+    assert [line.get_label() for line in panel.lines] == list(times)
+    assert (
+        len(
+            {
+                (line.get_color(), line.get_linestyle(), *map(str, [line._dash_pattern]))
+                for line in panel.lines
+            }
+        )
+        == 4
+    )
+    assert [text.get_text() for text in panel.get_xticklabels()] == ["1,000", "1,000,000"]

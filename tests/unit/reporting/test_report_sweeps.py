@@ -16,7 +16,7 @@ from nsf.reporting.sections.settings import _told as told_of_settings
 from nsf.reporting.sources import Study, open_sources
 from nsf.reporting.study import _name, _settings, _told, interval, over_seeds, swept
 from nsf.reporting.tables import means, merge, rows_of
-from nsf.reporting.text.columns import brief, plus_minus
+from nsf.reporting.text.columns import brief, counted, distinct, plus_minus
 from nsf.reporting.text.formats import latex, latex_table
 
 VALUES = (22.5, 27.5)
@@ -308,7 +308,24 @@ def test_a_long_list_is_told_by_its_ends_and_its_length():
     values = ",".join(map(str, range(25)))
     assert brief(f"design.train=[{values}], seed=0") == "design.train=[0 to 24, 25 values], seed=0"
     assert brief("evaluation.values=[1,2,3,4,5,6]") == "evaluation.values=[1,2,3,4,5,6]"
-    assert _name({"engine": "modal", "design.train": f"[{values}]"}) == "modal · train [0 to 24, 25 values]"
+
+
+def test_lists_that_differ_keep_names_that_differ():
+    lists = ["[0,5,10,15,20,25,28]", "[0,1,2,3,26,27,28]"]
+    assert distinct(lists) == lists
+    assert distinct([*lists[:1], "[1,2]", lists[0]]) == [
+        "[0 to 28, 7 values]",
+        "[1,2]",
+        "[0 to 28, 7 values]",
+    ]
+
+
+def test_training_runs_are_counted_unless_two_lists_have_one_length():
+    scenes = pd.Series(["sand", "sand", "cake"])
+    lists = pd.Series(["[1,2]", "[1,2,3]", "[5,6]"])
+    assert list(counted(lists, scenes)) == [2, 3, 2]
+    assert list(counted(pd.Series(["[1,2]", "[1,3]", "[5,6]"]), scenes)) == ["[1,2]", "[1,3]", "[5,6]"]
+    assert list(counted(pd.Series(["8", "16", np.nan]), scenes))[:2] == ["8", "16"]
 
 
 def test_a_picture_tells_no_key_that_tells_no_more_than_those_before_it():
@@ -333,14 +350,14 @@ def test_over_training_runs_stands_the_error_of_interpolating_them(tmp_path, dra
     }
     settings = {run.id: f"scene.design.train={one}" for run, one in zip(found, lists, strict=True)}
     merged = merge(open_sources(found), settings)
+    merged.frame["displacement_error"] = 20 * merged.frame["delta"]
+    merged.frame.loc[0, ["delta", "displacement_error"]] = np.inf  # a run that diverged
     swept(merged, of(keys), tmp_path)
     ((_, (panels, x, _)),) = drawn
     assert x == "training runs [–]"
     assert {name: tuple(line) for name, line in panels["sand"].items()} == {
-        "mean": (2, 3),
+        "reduced": (2, 3),
         "interpolated latents": (2, 3),
     }
-    rows = merged.frame
-    expected = rows["displacement_interpolated"] / rows["displacement_error"] * rows["delta"]
     shown = sorted(value for values in panels["sand"]["interpolated latents"].values() for value in values)
-    np.testing.assert_allclose(shown, sorted(expected))
+    np.testing.assert_allclose(shown, sorted(merged.frame["displacement_interpolated"] / 20))

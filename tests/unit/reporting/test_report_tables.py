@@ -365,9 +365,9 @@ GAUSS_NEWTON, TAYLOR = ({"_target_": f"nsf.dynamics.{name}"} for name in ("Gauss
         (
             [{"projector": GAUSS_NEWTON | {"iterations": n}} for n in (1, 2)] + [{"projector": TAYLOR}],
             [
-                "projector.iterations=1, projector=gauss_newton",
-                "projector.iterations=2, projector=gauss_newton",
-                "projector.iterations=–, projector=taylor",
+                "projector=gauss_newton, projector.iterations=1",
+                "projector=gauss_newton, projector.iterations=2",
+                "projector=taylor, projector.iterations=–",
             ],
         ),
     ],
