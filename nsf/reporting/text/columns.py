@@ -6,8 +6,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import pandas as pd
-
 from nsf.data.case import with_unit
 
 
@@ -174,12 +172,12 @@ def distinct(texts: Sequence[str]) -> list[str]:
     return short if len(set(short)) == len(set(texts)) else list(texts)
 
 
-def counted(lists: pd.Series, scenes: pd.Series) -> pd.Series:
+def counted(lists: Sequence, scenes: Sequence[str]) -> list:
     """Lengths in place of lists `[21,38.5]`; the lists as they are where two of a scene have one length."""
-    lengths = lists.map(lambda text: len(json.loads(text)) if str(text).startswith("[") else text)
-    both = pd.DataFrame({"scene": scenes, "list": lists, "length": lengths})
-    kinds = both.groupby("scene")[["list", "length"]].nunique()
-    return lengths if (kinds["list"] == kinds["length"]).all() else lists
+    lengths = [len(json.loads(text)) if str(text).startswith("[") else text for text in lists]
+    told = {(scene, str(text)) for scene, text in zip(scenes, lists, strict=True)}
+    kept = {(scene, str(length)) for scene, length in zip(scenes, lengths, strict=True)}
+    return lengths if len(told) == len(kept) else list(lists)
 
 
 def plus_minus(mean: float, deviation: float, scale: float = 1.0) -> str:
