@@ -24,6 +24,7 @@ from nsf.reporting.text.columns import (
     number,
     parameter_text,
     plus_minus,
+    telling,
 )
 from nsf.reporting.text.formats import Rows
 
@@ -114,15 +115,9 @@ class Report:
             "sample",
             *(["parameter"] if _VALUES in keys and alone else []),
         ]
-        found: set[str] = set()
-        for _, rows in self.rows.groupby("scene", sort=False):
-            told: list[str] = []
-            for key in known:
-                beside = [*told, *self.seeds]  # a sample's size may follow from its seed
-                if key in rows and len(rows.drop_duplicates([*beside, key])) > max(1, _kinds(rows, beside)):
-                    told.append(key)
-            found |= set(told)
-        return [key for key in known if key in found]
+        # A sample's size may follow from its seed.
+        beside = ("scene", *self.seeds)
+        return telling(self.rows.to_dict("records"), (key for key in known if key in self.rows), beside)
 
     @cached_property
     def seeds(self) -> list[str]:

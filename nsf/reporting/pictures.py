@@ -18,14 +18,13 @@ from nsf.reporting.sections.levels import lend_stages, levels_section
 from nsf.reporting.sections.settings import settings_section
 from nsf.reporting.sections.variant import ENDS, ROWS, Variant, order
 from nsf.reporting.sources import Study
-from nsf.reporting.study import SEEDS
+from nsf.reporting.study import SEEDS, unseeded
 from nsf.reporting.tables import (
     Merged,
     first_rows,
     mean_rows,
     natural,
     printed_of,
-    setting_without,
     variant_labels,
     variants,
 )
@@ -301,7 +300,7 @@ def _over_seeds(known: list[Variant], study: Study | None) -> list[tuple[str, li
         if len(alike) == 1:
             found.append((alike[0].label, alike))
             continue
-        parts = [[setting_without(part, SEEDS) for part in v.label.split(" · ")] for v in alike]
+        parts = [unseeded(v.label) for v in alike]
         common = [part for part in parts[0] if part and all(part in other for other in parts)]
         found.append((" · ".join([*common, f"{len(alike)} seeds"]), alike))
     return found

@@ -8,14 +8,13 @@ import pandas as pd
 
 from nsf.reporting.drawing.cost import error_over_cost, step_over_particles
 from nsf.reporting.drawing.style import save
-from nsf.reporting.study import SEEDS
+from nsf.reporting.study import unseeded
 from nsf.reporting.tables import (
     VARIANT,
     Merged,
     first_rows,
     mean_rows,
     rows_of,
-    setting_without,
     variant_labels,
     variants,
     without_constants,
@@ -242,7 +241,7 @@ def _common_names(labels: pd.Series, panels: pd.Series) -> pd.Series:
     """Labels without seeds and the parts that some panel lacks, such as its |S|: a colour has one meaning."""
     if panels.nunique() == 1:
         return labels
-    parts = labels.map(lambda label: [setting_without(part, SEEDS) for part in label.split(" · ")])
+    parts = labels.map(unseeded)
     known = [{part for own in of for part in own} for _, of in parts.groupby(panels)]
     common = set.intersection(*known) - {""}
     return parts.map(lambda own: " · ".join(part for part in own if part in common) or "reduced")

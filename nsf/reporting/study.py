@@ -18,10 +18,11 @@ from nsf.reporting.tables import (
     paper_row,
     printed_of,
     rows_of,
+    setting_without,
     variant_labels,
     variants,
 )
-from nsf.reporting.text.columns import COLUMN, axis, counted, distinct, number, plus_minus
+from nsf.reporting.text.columns import COLUMN, axis, counted, distinct, number, plus_minus, telling
 from nsf.reporting.text.formats import Rows
 from nsf.reporting.text.page import Picture, Section, Table
 
@@ -106,10 +107,10 @@ def _over(key: str, frame: pd.DataFrame, merged: Merged, study: Study, folder: P
             source = of_rows.groupby(alike, dropna=False).transform("mean")
     shown = shown.assign(x=pd.to_numeric(pd.Series(source, index=shown.index), errors="coerce"))
     panels, papers, interpolated = {}, {}, False
-    by_scene = list(shown.dropna(subset="x").groupby(_SCENE, sort=False))
+    placed = shown.dropna(subset="x")
     hidden = (key, *SEEDS, *(SIZE if fnmatchcase(key, SIZE[0]) else ()))
-    told = list(dict.fromkeys(name for _, part in by_scene for name in _told(part, hidden)))
-    for scene, part in by_scene:
+    told = _told(placed, hidden, beside=(_SCENE,))
+    for scene, part in placed.groupby(_SCENE, sort=False):
         panels[scene] = {
             name: group.groupby("x")["delta"].apply(list).to_dict()
             for name, group in _settings(part, told, alone="reduced" if key == TRAIN else "mean")
@@ -218,15 +219,15 @@ def _between(ends: tuple[float, float]) -> str:
     return " to ".join(number(end, 100) for end in ends) if np.isfinite(ends).all() else "–"
 
 
-def _told(frame: pd.DataFrame, without: Sequence[str]) -> list[str]:
-    """Keys of the jobs that tell the settings in rows of `_held_out` apart; `without` are no setting."""
-    told: list[str] = []
-    groups = 1
-    for key in frame.columns.drop([_RUN, "delta", _PAPER, "row", "x", *without], errors="ignore"):
-        found = frame.groupby([*told, key], dropna=False).ngroups
-        if found > groups:
-            told, groups = [*told, key], found
-    return told
+def unseeded(label: str) -> list[str]:
+    """The parts of a variant's label, without what they tell of seeds."""
+    return [setting_without(part, SEEDS) for part in label.split(" · ")]
+
+
+def _told(frame: pd.DataFrame, without: Sequence[str], beside: Sequence[str] = ()) -> list[str]:
+    """Keys of the jobs that, beside others, tell rows of `_held_out` apart; `without` are no setting."""
+    keys = frame.columns.drop([_RUN, "delta", _PAPER, "row", "x", *without, *beside], errors="ignore")
+    return telling(frame.to_dict("records"), keys, beside)
 
 
 def _settings(frame: pd.DataFrame, told: Sequence[str], alone: str) -> list[tuple[str, pd.DataFrame]]:

@@ -14,7 +14,7 @@ from nsf.reporting.drawing.style import save
 from nsf.reporting.sections.variant import Variant
 from nsf.reporting.study import SEEDS
 from nsf.reporting.tables import VARIANT, setting_without, variant_labels
-from nsf.reporting.text.columns import SETTING
+from nsf.reporting.text.columns import SETTING, telling
 from nsf.reporting.text.page import Picture, Section
 
 _LOST = f"A run is lost that diverged or is off by more than {LOST:,.0f} %."
@@ -110,10 +110,9 @@ def _cases(errors: Mapping[str, Mapping[Case, float]], variants: _Alike) -> Case
 def _names(bodies: Sequence[Sequence[Variant]]) -> list[list[str]]:
     """Names of solvers, the same in all bodies: the method, and what more tells those of a body apart."""
     rows = [[_settled(v.rows.iloc[0].to_dict()) for v in own] for own in bodies]
-    told = ["method"]
-    for column in ("engine", "field", SETTING, "r", "sample", "precision", "device"):
-        if any(_kinds(own, [*told, column]) > _kinds(own, told) for own in rows):
-            told.append(column)
+    each = [row | {"body": i} for i, own in enumerate(rows) for row in own]
+    columns = ("engine", "field", SETTING, "r", "sample", "precision", "device")
+    told = ["method", *telling(each, columns, beside=("body", "method"))]
     hidden = dict.fromkeys((name for name in VARIANT if name not in told), "")
     labels = iter(variant_labels([row | hidden for own in rows for row in own]))
     return [[next(labels) for _ in own] for own in rows]
@@ -122,7 +121,3 @@ def _names(bodies: Sequence[Sequence[Variant]]) -> list[list[str]]:
 def _settled(row: dict) -> dict:
     """A row whose setting tells neither the seeds nor the body."""
     return row | {SETTING: setting_without(row[SETTING], [*SEEDS, "material"])}
-
-
-def _kinds(rows: Sequence[Mapping], columns: Sequence[str]) -> int:
-    return len({tuple(str(row[name]) for name in columns) for row in rows})

@@ -1,6 +1,6 @@
 """The bodies of a sweep at each of its settings, below each other."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from nsf.reporting.drawing import shapes
@@ -8,7 +8,7 @@ from nsf.reporting.drawing.style import DIFFERENCE_COLORS, STRESS_COLORS, save
 from nsf.reporting.sections.variant import ROWS, Variant, order
 from nsf.reporting.sources import Study
 from nsf.reporting.study import SEEDS
-from nsf.reporting.text.columns import brief
+from nsf.reporting.text.columns import brief, telling
 from nsf.reporting.text.formats import file_name
 from nsf.reporting.text.page import Picture, Section
 from nsf.vectors import spaced
@@ -57,22 +57,9 @@ def _rows(settings: Mapping[Setting, Variant]) -> list[shapes.Case]:
         return []
     (worst, _), *_ = min(settings.values(), key=order).ranked()
     shown = [list(settings.items())[i] for i in spaced(len(settings), ROWS)]
-    told = _told(settings)
+    told = telling([*map(dict, settings)], dict.fromkeys(key for setting in settings for key, _ in setting))
     return [
         case
         for setting, v in shown
         for case in v.case_at(worst, ", ".join(f"{k}={brief(value)}" for k, value in setting if k in told))
     ]
-
-
-def _told(settings: Iterable[Setting]) -> list[str]:
-    """Keys that tell the settings apart, without those that tell no more than the keys before them."""
-    known = [dict(setting) for setting in settings]
-    told: list[str] = []
-    for key in dict.fromkeys(key for setting in known for key in setting):
-        with_it, without = (
-            {tuple(map(setting.get, keys)) for setting in known} for keys in ([*told, key], told)
-        )
-        if len(with_it) > len(without):
-            told.append(key)
-    return told

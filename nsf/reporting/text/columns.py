@@ -3,7 +3,7 @@
 import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from nsf.data.case import with_unit
@@ -170,6 +170,19 @@ def distinct(texts: Sequence[str]) -> list[str]:
     """The texts, each `brief` unless two that differ would be one."""
     short = [brief(text) for text in texts]
     return short if len(set(short)) == len(set(texts)) else list(texts)
+
+
+def telling(rows: Sequence[Mapping], keys: Iterable[str], beside: Sequence[str] = ()) -> list[str]:
+    """Keys that tell rows apart beside others, without those that add nothing to what stands before them."""
+
+    def kinds(names: Sequence[str]) -> int:
+        return len({tuple(str(row.get(name)) for name in names) for row in rows})
+
+    told = list(beside)
+    for key in keys:
+        if kinds([*told, key]) > kinds(told):
+            told.append(key)
+    return told[len(beside) :]
 
 
 def counted(lists: Sequence, scenes: Sequence[str]) -> list:

@@ -6,7 +6,7 @@ import pytest
 from synthetic import Made, write_run
 
 from nsf.reporting import build, build_report, pictures
-from nsf.reporting.drawing import style
+from nsf.reporting.drawing import camera, style
 
 SWEEP = (
     Made(),
@@ -17,9 +17,10 @@ SWEEP = (
 
 @pytest.fixture(scope="session", autouse=True)
 def coarse():
-    """Half the pixels an inch: to write a picture takes longer than to draw it."""
+    """Half the pixels an inch, and one sample a pixel: a picture takes a third of the time."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(style, "PIXELS", style.PIXELS // 2)
+        patch.setattr(camera, "_OVERSAMPLE", 1)
         yield
 
 

@@ -12,11 +12,10 @@ from synthetic import Made, write_run
 from nsf.reporting import build_report
 from nsf.reporting.drawing import charts, shapes
 from nsf.reporting.pictures import draw
-from nsf.reporting.sections.settings import _told as told_of_settings
 from nsf.reporting.sources import Study, open_sources
 from nsf.reporting.study import _name, _settings, _told, interval, over_seeds, swept
 from nsf.reporting.tables import means, merge, rows_of
-from nsf.reporting.text.columns import brief, counted, distinct, plus_minus
+from nsf.reporting.text.columns import brief, counted, distinct, plus_minus, telling
 from nsf.reporting.text.formats import latex, latex_table
 
 VALUES = (22.5, 27.5)
@@ -329,11 +328,12 @@ def test_training_runs_are_counted_unless_two_lists_have_one_length():
 
 
 def test_a_picture_tells_no_key_that_tells_no_more_than_those_before_it():
-    modal = (("engine", "modal"), ("seed", "0"))
-    operators = (("engine", "operators"), ("seed", "0"), ("engine.teacher", "runs"))
-    more = (*operators, ("scene.design.train", "[1,2]"))
-    assert told_of_settings([modal, operators, more]) == ["engine", "scene.design.train"]
-    assert told_of_settings([modal]) == []
+    modal = {"engine": "modal", "seed": "0"}
+    operators = {"engine": "operators", "seed": "0", "engine.teacher": "runs"}
+    more = {**operators, "scene.design.train": "[1,2]"}
+    assert telling([modal, operators, more], more) == ["engine", "scene.design.train"]
+    assert telling([modal, operators, more], more, beside=["engine.teacher"]) == ["scene.design.train"]
+    assert telling([modal], modal) == []
 
 
 def test_over_training_runs_stands_the_error_of_interpolating_them(tmp_path, drawn):
