@@ -133,8 +133,9 @@ class Report:
         alike = ["scene", *self.settings]
         others = [name for name in _COLUMN_OF.values() if name not in alike]
         rows = []
-        known = self.rows.astype(dict.fromkeys(alike, object)).fillna(dict.fromkeys(alike, ABSENT))
-        for values, part in known.groupby(alike, sort=False):
+        # As objects: pandas fills no column of numbers with text.
+        filled = self.rows.astype(dict.fromkeys(alike, object)).fillna(dict.fromkeys(alike, ABSENT))
+        for values, part in filled.groupby(alike, sort=False):
             row = dict(zip(alike, values, strict=True))
             row |= {name: part[name].iloc[0] if part[name].nunique() == 1 else ABSENT for name in others}
             averaged = [name for name in (*_MEASURED, *RIVALS, _PAPER) if name != _WORST]

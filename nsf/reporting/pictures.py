@@ -301,7 +301,7 @@ def _over_seeds(known: list[Variant], study: Study | None) -> list[tuple[str, li
             found.append((alike[0].label, alike))
             continue
         parts = [unseeded(v.label) for v in alike]
-        common = [part for part in parts[0] if part and all(part in other for other in parts)]
+        common = [part for part in parts[0] if all(part in other for other in parts)]
         found.append((" · ".join([*common, f"{len(alike)} seeds"]), alike))
     return found
 

@@ -243,5 +243,5 @@ def _common_names(labels: pd.Series, panels: pd.Series) -> pd.Series:
         return labels
     parts = labels.map(unseeded)
     known = [{part for own in of for part in own} for _, of in parts.groupby(panels)]
-    common = set.intersection(*known) - {""}
+    common = set.intersection(*known)
     return parts.map(lambda own: " · ".join(part for part in own if part in common) or "reduced")

@@ -54,6 +54,12 @@ _FEWEST = 3  # rows of which a rank correlation says anything
 _ESTIMATED = 5  # of runs by operators, whose true error has that of projected runs in it
 
 
+def unseeded(label: str) -> list[str]:
+    """The parts of a variant's label, without what they tell of seeds."""
+    parts = (setting_without(part, SEEDS) for part in label.split(" · "))
+    return [part for part in parts if part]
+
+
 def swept(merged: Merged, study: Study, folder: Path) -> list[Section]:
     """Draw δ over each number that the jobs vary; over the seeds where they vary nothing else.
 
@@ -217,11 +223,6 @@ def interval(values: np.ndarray) -> tuple[float, float]:
 def _between(ends: tuple[float, float]) -> str:
     """Both ends of an interval of shares, in percent."""
     return " to ".join(number(end, 100) for end in ends) if np.isfinite(ends).all() else "–"
-
-
-def unseeded(label: str) -> list[str]:
-    """The parts of a variant's label, without what they tell of seeds."""
-    return [setting_without(part, SEEDS) for part in label.split(" · ")]
 
 
 def _told(frame: pd.DataFrame, without: Sequence[str], beside: Sequence[str] = ()) -> list[str]:

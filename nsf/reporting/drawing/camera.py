@@ -122,9 +122,10 @@ class View:
         for face in sorted(faces, key=lambda face: self.camera.project(face.corners)[:, 2].mean()):
             if face.opacity < 1.0:
                 self._paint(face, canvas, nearest, scale)
-        every = range(_OVERSAMPLE)  # an eighth of the time that `mean` takes over two axes
-        total = sum(canvas[row::_OVERSAMPLE, column::_OVERSAMPLE] for row in every for column in every)
-        return (255 * np.clip(total / _OVERSAMPLE**2, 0, 1)).astype(np.uint8)
+        # Slices are added, since `mean` over two axes takes eight times as long.
+        offsets = [(row, column) for row in range(_OVERSAMPLE) for column in range(_OVERSAMPLE)]
+        mean = sum(canvas[row::_OVERSAMPLE, column::_OVERSAMPLE] for row, column in offsets) / len(offsets)
+        return (255 * np.clip(mean, 0, 1)).astype(np.uint8)
 
     def front(self, x: np.ndarray, radius: float) -> np.ndarray:
         """Rows of the particles x [n, 3] m within three radii [m] of the foremost about them.

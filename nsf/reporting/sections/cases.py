@@ -110,9 +110,9 @@ def _cases(errors: Mapping[str, Mapping[Case, float]], variants: _Alike) -> Case
 def _names(bodies: Sequence[Sequence[Variant]]) -> list[list[str]]:
     """Names of solvers, the same in all bodies: the method, and what more tells those of a body apart."""
     rows = [[_settled(v.rows.iloc[0].to_dict()) for v in own] for own in bodies]
-    each = [row | {"body": i} for i, own in enumerate(rows) for row in own]
+    of_bodies = [row | {"body": i} for i, own in enumerate(rows) for row in own]
     columns = ("engine", "field", SETTING, "r", "sample", "precision", "device")
-    told = ["method", *telling(each, columns, beside=("body", "method"))]
+    told = ["method", *telling(of_bodies, columns, beside=("body", "method"))]
     hidden = dict.fromkeys((name for name in VARIANT if name not in told), "")
     labels = iter(variant_labels([row | hidden for own in rows for row in own]))
     return [[next(labels) for _ in own] for own in rows]

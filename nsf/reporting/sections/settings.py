@@ -57,7 +57,8 @@ def _rows(settings: Mapping[Setting, Variant]) -> list[shapes.Case]:
         return []
     (worst, _), *_ = min(settings.values(), key=order).ranked()
     shown = [list(settings.items())[i] for i in spaced(len(settings), ROWS)]
-    told = telling([*map(dict, settings)], dict.fromkeys(key for setting in settings for key, _ in setting))
+    known = [dict(setting) for setting in settings]
+    told = telling(known, dict.fromkeys(key for setting in known for key in setting))
     return [
         case
         for setting, v in shown

@@ -3,7 +3,7 @@
 import json
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from nsf.data.case import with_unit
@@ -173,7 +173,13 @@ def distinct(texts: Sequence[str]) -> list[str]:
 
 
 def telling(rows: Sequence[Mapping], keys: Iterable[str], beside: Sequence[str] = ()) -> list[str]:
-    """Keys that tell rows apart beside others, without those that add nothing to what stands before them."""
+    """Keys that tell rows apart: each parts rows that `beside` and the keys before it leave together.
+
+    Args:
+        rows: values count as text, so NaN is NaN; a key that a row lacks counts as None.
+        keys: in the order in which they are tried.
+        beside: keys that count as told already; they are not returned.
+    """
 
     def kinds(names: Sequence[str]) -> int:
         return len({tuple(str(row.get(name)) for name in names) for row in rows})
@@ -185,8 +191,8 @@ def telling(rows: Sequence[Mapping], keys: Iterable[str], beside: Sequence[str] 
     return told[len(beside) :]
 
 
-def counted(lists: Sequence, scenes: Sequence[str]) -> list:
-    """Lengths in place of lists `[21,38.5]`; the lists as they are where two of a scene have one length."""
+def counted(lists: Collection, scenes: Collection[str]) -> list:
+    """Lengths in place of texts such as `[21,38.5]`; all as they are where two of a scene have one length."""
     lengths = [len(json.loads(text)) if str(text).startswith("[") else text for text in lists]
     told = {(scene, str(text)) for scene, text in zip(scenes, lists, strict=True)}
     kept = {(scene, str(length)) for scene, length in zip(scenes, lengths, strict=True)}

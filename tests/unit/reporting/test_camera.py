@@ -23,6 +23,17 @@ def test_the_foremost_particles_make_the_same_picture():
     assert (np.abs(whole.astype(int) - fewer) > 8).any(axis=2).mean() > 0.1
 
 
+def test_a_pixel_is_the_mean_of_its_samples(monkeypatch):
+    rng = np.random.default_rng(0)
+    x, colors = rng.uniform(-0.9, 0.9, (400, 3)), rng.random((400, 3))
+    fine = View.around(x, width=80).picture(x, colors, 0.08).astype(float)  # one sample a pixel
+    height = len(fine) // 2
+    view = View.around(x, width=40)
+    monkeypatch.setattr(camera, "_OVERSAMPLE", 2)
+    mean = fine[: 2 * height].reshape(height, 2, 40, 2, 3).mean((1, 3))
+    np.testing.assert_allclose(view.picture(x, colors, 0.08)[:height], mean, atol=1.0)
+
+
 def test_each_pixel_shows_what_is_nearest():
     rng = np.random.default_rng(0)
     index, depth = rng.integers(0, 50, 400), rng.normal(size=400)

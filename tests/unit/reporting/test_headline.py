@@ -251,6 +251,12 @@ def test_of_training_runs_their_number_is_told_and_of_other_long_lists_the_ends(
         assert [row[1] for row in rows[1:]] == expected
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_number_that_one_job_does_not_name_is_left_open(tmp_path):
+    rows, _ = told(write_report(tmp_path / "a", [job(), job(**{"scene.design.train": "[1,2]"})]))
+    assert [row[1] for row in rows[1:]] == ["–", "2"]
+
+
 def test_numbers_of_particles_of_one_scene_are_scenes_of_their_own(tmp_path):
     jobs = [job(**{"scene.bodies.column.particles": size}) for size in ("1000", "100000")]
     rows, _ = told(write_report(tmp_path / "a", jobs))

@@ -1,6 +1,7 @@
 """Errors over the parameters of scenes with several: charts, maps, and what tells bodies apart."""
 
 import json
+from types import SimpleNamespace
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -12,9 +13,10 @@ from nsf.data import Case
 from nsf.reporting import build_report, rivals
 from nsf.reporting.drawing.cases import Cases, Parameter, error_maps, error_over_parameters
 from nsf.reporting.rivals import solvers
+from nsf.reporting.sections.cases import _names
 from nsf.reporting.sources import Study, open_sources
 from nsf.reporting.study import _held_out
-from nsf.reporting.tables import first_rows, merge, told_apart, variant_labels
+from nsf.reporting.tables import VARIANT, first_rows, merge, told_apart, variant_labels
 
 E, DENSITY = Parameter("E", "Pa", True), Parameter("density", "kg/m³", False)
 TRAINED = [{"E": 4000.0, "density": 80.0, "program": 0.0}, {"E": 8000.0, "density": 120.0, "program": 1.0}]
@@ -197,6 +199,17 @@ def test_time_over_particles_is_drawn_where_a_scene_has_several(tmp_path, monkey
     ((scene, solvers_there),) = drawn[0].items()
     assert scene == "sand"
     assert {tuple(times) for times in solvers_there.values()} == {(300, 1200)}
+
+
+def test_what_tells_bodies_apart_names_no_solver():
+    def solver(scene, field):
+        row = dict.fromkeys(VARIANT, "") | {"scene": scene, "method": "nsf", "field": field, "r": 6}
+        return SimpleNamespace(rows=pd.DataFrame([row]))
+
+    assert _names([[solver("a", "basis")], [solver("b", "mlp")]]) == [["nsf"], ["nsf"]]
+    both = [solver("b", "basis"), solver("b", "mlp")]
+    told = [["nsf · basis field"], ["nsf · basis field", "nsf · mlp field"]]
+    assert _names([[solver("a", "basis")], both]) == told
 
 
 def test_a_report_has_a_chart_a_map_and_pictures_of_each_body(tmp_path, few_pictures, monkeypatch):
