@@ -237,14 +237,14 @@ def _settings(frame: pd.DataFrame, told: Sequence[str], alone: str) -> list[tupl
     Args:
         frame: rows of `_held_out`.
         told: these keys.
-        alone: the name of all rows where there are none.
+        alone: the name of all rows where there are none, and of rows that have none of them.
     """
     if not told:
         return [(alone, frame)] if len(frame) else []
     groups = list(frame.groupby(told, dropna=False, sort=False))
     settings = [dict(zip(told, values, strict=True)) for values, _ in groups]
     names = distinct([_name(setting) for setting in settings])
-    return [(name, group) for name, (_, group) in zip(names, groups, strict=True)]
+    return [(name or alone, group) for name, (_, group) in zip(names, groups, strict=True)]
 
 
 def _name(setting: Mapping[str, object]) -> str:

@@ -180,6 +180,8 @@ def test_lines_are_named_by_what_tells_them_apart():
     told = _told(frame, ())
     assert told == ["field"]
     assert [name for name, _ in _settings(frame, told, "mean")] == ["basis", "mlp"]
+    frame["field"] = ["basis", None]
+    assert [name for name, _ in _settings(frame, told, "mean")] == ["basis", "mean"]
 
 
 def test_a_setting_has_one_name_in_every_scene(tmp_path, drawn):
