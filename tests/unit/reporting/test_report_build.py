@@ -10,7 +10,7 @@ from synthetic import TEST, Made, rewrite_manifest, seal, write_run
 
 from nsf.errors import ConfigError, StorageError
 from nsf.reporting import build, build_report, pictures
-from nsf.reporting.drawing import style
+from nsf.reporting.drawing import camera, style
 from nsf.reporting.sections.variant import Variant
 from nsf.reporting.sources import Source, Study, file_hash, open_sources
 from nsf.reporting.study import estimate_note, spearman, trust_note
@@ -71,6 +71,7 @@ def test_training_time_and_scale_are_told_by_field(tmp_path, no_pictures):
 @pytest.mark.slow
 def test_pictures_of_many_variants_are_the_same_from_several_processes(sweep, tmp_path, monkeypatch):
     monkeypatch.setattr(style, "PIXELS", 2 * style.PIXELS)  # as in other processes
+    monkeypatch.setattr(camera, "_OVERSAMPLE", 2 * camera._OVERSAMPLE)
     report = build_report(sweep, tmp_path / "one" / "sand", "Sand & friends").parent
     monkeypatch.setattr(pictures, "_FEW", 1)
     monkeypatch.setattr(pictures.os, "cpu_count", lambda: 2)
