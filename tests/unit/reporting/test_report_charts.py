@@ -296,13 +296,5 @@ def test_step_over_particles_has_a_line_for_each_solver():
     fig = step_over_particles(panels)
     panel = fig.axes[0]
     assert [line.get_label() for line in panel.lines] == list(times)
-    assert (
-        len(
-            {
-                (line.get_color(), line.get_linestyle(), *map(str, [line._dash_pattern]))
-                for line in panel.lines
-            }
-        )
-        == 4
-    )
+    assert len({(line.get_color(), str(line._dash_pattern)) for line in panel.lines}) == 4
     assert [text.get_text() for text in panel.get_xticklabels()] == ["1,000", "1,000,000"]
