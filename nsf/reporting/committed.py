@@ -7,6 +7,7 @@ markers of README.md, so that no result there is typed by hand.
 import json
 import re
 import sys
+from collections import Counter
 from functools import cache
 from math import nan
 from pathlib import Path
@@ -142,6 +143,10 @@ def _changed(report: Path) -> list[str]:
 def _list(folder: Path) -> str:
     sections = {report.name: _section(report, _sources(report)) for report in _reports(folder)}
     sections |= {report.name: _bench_section(report) for report in _benches(folder)}
+    titles = Counter(section["title"] for section in sections.values())
+    for name, section in sections.items():
+        if titles[section["title"]] > 1:
+            section["title"] += f" ({name})"
     chapters: dict[str, list[dict]] = {heading: [] for heading in (*CHAPTERS, _OTHERS)}
     for name in sorted(sections, key=_place):
         chapters[_place(name)[1]].append(sections[name] | {"name": name})

@@ -21,8 +21,8 @@ _COLUMNS = (
     Column("particles_delta", "δ at the particles", *_PERCENT),
     Column("displacement_error", "displacement error at the points", *_PERCENT),
     Column("particles_displacement_error", "displacement error at the particles", *_PERCENT),
-    Column("full_order_difference", "few beside many full-order particles", *_PERCENT),
-    Column("interpolation_error", "interpolation", *_PERCENT),
+    Column("full_order_difference", "displacement error, few beside many full-order particles", *_PERCENT),
+    Column("interpolation_error", "displacement error of interpolation", *_PERCENT),
     Column("smeared", "smeared", *_PERCENT),
     Column("seconds", "query", "s"),
     Column("full_order_seconds", "fine full-order run", "s"),
@@ -36,7 +36,10 @@ _NOTE = (
     "these that interpolation puts more than half a grid cell away in the last frame. The query is of all "
     "these frames together; values are queried together too, and share its time equally."
 )
-_MEANS = ("points", "delta", "particles_delta", "full_order_difference", "interpolation_error", "seconds")
+_MEANS = (
+    "points", "displacement_error", "particles_displacement_error", "full_order_difference",
+    "interpolation_error", "seconds", "full_order_seconds",
+)  # fmt: skip
 _TOLD = ("scene", "method", "field", "r", "engine", "sample")  # of a variant, in results.csv
 
 

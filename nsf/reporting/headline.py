@@ -24,6 +24,7 @@ from nsf.reporting.text.columns import (
     number,
     parameter_text,
     plus_minus,
+    speedups,
     telling,
 )
 from nsf.reporting.text.formats import Rows
@@ -32,6 +33,7 @@ FEW = 15  # rows of a table in which a number is varied; of more, settings and s
 MANY = 24  # rows where none is, as in the paper's Table 1
 _VALUES = "scene.design.test"  # jobs of one scene and seed with this key are about single held-out values
 _PAPER = "paper"
+_BASELINE = "deformation_only"
 _DEVIATION = ", deviation"
 _RUNS, _DIVERGED, _SEEDS = "runs", "diverged", "seeds"  # how many are in a row of `groups`
 _WORST = "displacement_worst"
@@ -40,6 +42,8 @@ _MEASURED = (
     "speedup_step", "speedup_total", "speedup_shown", "break_even_runs", "handed_over",
 )  # fmt: skip
 _SHARE = "integration_share"  # N over all particles
+_TIMES = ("step_ms_full", "step_ms_reduced", "total_ms_full", "total_ms_reduced", "shown_ms")
+_AVERAGED = [name for name in (*_MEASURED, *RIVALS, _PAPER, *_TIMES) if name != _WORST]
 #: Of these the deviation over seeds stands beside the mean.
 _SCATTERED = ("delta", "displacement_error", "stress_error", "speedup_step", "speedup_total", "speedup_shown")
 _SPLITS = ({"train"}, {"validation"})
@@ -77,11 +81,11 @@ class Report:
                 "build the report again with `nsf report`"
             )
         frame = frame.assign(**{name: np.nan for name in LATER if name not in frame})
-        shown = frame["total_ms_full"] / (frame["total_ms_reduced"] + frame["decode_ms"])
+        shown = frame["total_ms_reduced"] + frame["decode_ms"]
         # Nothing moves has a displacement error of 1.
         still = frame["delta"] / frame["displacement_error"]
         share = frame["integration_mean"] / (frame["gamma"] * frame["r"].astype(float) / 3)  # γ = 3 P / r
-        frame = frame.assign(delta_static=still, speedup_shown=shown, integration_share=share)
+        frame = frame.assign(delta_static=still, shown_ms=shown, integration_share=share)
         runs = [self.told["runs"][row["run"]] for row in self.told["rows"]]
         keys = pd.DataFrame([_own(run) for run in runs], index=frame.index).replace("null", np.nan)
         frame = frame.join(keys)
@@ -138,11 +142,7 @@ class Report:
         for values, part in filled.groupby(alike, sort=False):
             row = dict(zip(alike, values, strict=True))
             row |= {name: part[name].iloc[0] if part[name].nunique() == 1 else ABSENT for name in others}
-            averaged = [name for name in (*_MEASURED, *RIVALS, _PAPER) if name != _WORST]
-            row |= {name: part[name].mean(skipna=False) for name in averaged}
-            row["delta_static"] = part["delta_static"].mean()  # not of runs that diverged
-            row[_SHARE] = part[_SHARE].mean()
-            row[_WORST] = part["displacement_error"].max()
+            row |= _means(part) | {_WORST: part["displacement_error"].max()}
             row |= {f"{name}{_DEVIATION}": value for name, value in self._deviations(part).items()}
             row |= {_RUNS: len(part), _DIVERGED: int(np.isinf(part["delta"]).sum())}
             rows.append(row | {_SEEDS: len(part[self.seeds].drop_duplicates()) if self.seeds else 1})
@@ -154,7 +154,7 @@ class Report:
         """Standard deviation over seeds of the mean over held-out values; none without several seeds."""
         if not self.seeds:
             return {}
-        means = part.groupby(self.seeds, dropna=False)[list(_SCATTERED)].agg(lambda v: v.mean(skipna=False))
+        means = pd.DataFrame([_means(of_one) for _, of_one in part.groupby(self.seeds, dropna=False)])
         return {name: means[name].std(skipna=False) for name in _SCATTERED}
 
     @property
@@ -186,7 +186,7 @@ def headline(report: Report) -> tuple[Rows, str]:
         # The paper's figure stands in each row.
         return _over_seeds(report), f"{said}{_rivals(report)}{_diverged(report)}"
     if len(report.groups) <= (FEW if varied else MANY):
-        table, said = _flat(report), f"Shown: {_averaged(report)}."
+        table, said = _flat(report), f"Shown: {_averaged(report)}.{_defaults(report)}"
     else:
         table = _pivot(report, varied)
         share = ", and N in % of all particles" if _SHARE in _bracketed(report) else ""
@@ -309,17 +309,25 @@ def _best(report: Report) -> str:
 
 
 def _beside_paper(report: Report) -> str:
-    """How often δ is below the paper's; of small runs only that they are not comparable."""
-    known = report.groups.dropna(subset=_PAPER)
+    """How often δ is below the paper's, not of the baseline; of small runs that they are not comparable."""
+    known = report.groups.dropna(subset=_PAPER).query("method != @_BASELINE")
     if not len(known):
         return ""
     if report.small:
         return f" The paper's δ is of its full size, these runs are of {min(report.small)} scale."
-    told = []
+    told, still = [], known[known["delta_static"] < known[_PAPER]]
     for (method, field), part in known.groupby(["method", "field"], sort=False):
         below = int((part["delta"] < part[_PAPER]).sum())
         told.append(f"{below} of {len(part)} ({method}, {field})")
-    return f" δ is below the paper's in {', '.join(told)}, of the cases in which the paper prints one."
+    lazy = ", ".join(dict.fromkeys(still["scene"]))
+    also = f" On {lazy} that of a body that never moves is below it, too." if lazy else ""
+    return f" δ is below the paper's in {', '.join(told)}, of the rows of which the paper prints one.{also}"
+
+
+def _defaults(report: Report) -> str:
+    """What – stands for under configuration keys that some jobs do not set, or set to null."""
+    bare = [_title(key) for key in report.settings if "." in key and (report.groups[key] == ABSENT).any()]
+    return f" – under {', '.join(bare)}: the default, or none." if bare else ""
 
 
 def _rivals(report: Report) -> str:
@@ -330,6 +338,13 @@ def _rivals(report: Report) -> str:
 def _diverged(report: Report) -> str:
     count = int(np.isinf(report.rows["delta"]).sum())
     return f" ∞: {count} of the {len(report.rows)} reduced runs diverged." if count else ""
+
+
+def _means(part: pd.DataFrame) -> dict[str, float]:
+    """Means over some rows; one that is missing leaves a mean empty, but for what no run changes."""
+    means = part.reindex(columns=_AVERAGED).mean(skipna=False).to_dict()
+    still = part["delta_static"].mean()  # not of runs that diverged
+    return means | {"delta_static": still, _SHARE: part[_SHARE].mean()} | speedups(means)
 
 
 def _own(run: Mapping) -> dict[str, str]:

@@ -27,6 +27,7 @@ from nsf.reporting.text.columns import (
     device_type,
     distinct,
     number,
+    speedups,
     split_rank,
 )
 from nsf.reporting.text.formats import Rows, terminal_table
@@ -205,6 +206,7 @@ def mean_rows(merged: Merged, members: list[int]) -> list[dict]:
         row = {name: chosen[name].iloc[0] for name in VARIANT} | {"split": split, VALUES: len(chosen)}
         averaged = dict.fromkeys((*_SHOWN, *MEASURED))
         row |= {name: pd.to_numeric(chosen[name]).mean(skipna=False) for name in averaged}
+        row |= speedups(row)
         rows.append(row | {TRAINING: seconds, PLACE: ABSENT})
     return rows
 

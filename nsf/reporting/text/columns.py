@@ -132,6 +132,11 @@ COSTS = (
 """Columns measured once a variant."""
 MEASURED = ("delta", "displacement_error", "stress_error", *RIVALS, "handed_over", *COSTS)
 """Columns that are averaged over parameter values."""
+_TIMES = {
+    "speedup_step": ("step_ms_full", "step_ms_reduced"),
+    "speedup_total": ("total_ms_full", "total_ms_reduced"),
+    "speedup_shown": ("total_ms_full", "shown_ms"),
+}
 
 ABSENT = "–"
 _LISTED = 6  # entries of a list that is shown whole
@@ -197,6 +202,12 @@ def counted(lists: Collection, scenes: Collection[str]) -> list:
     told = {(scene, str(text)) for scene, text in zip(scenes, lists, strict=True)}
     kept = {(scene, str(length)) for scene, length in zip(scenes, lengths, strict=True)}
     return lengths if len(told) == len(kept) else list(lists)
+
+
+def speedups(means: Mapping[str, float]) -> dict[str, float]:
+    """Speedups of mean times, where these were measured: a mean of ratios would hide runs that are slow."""
+    known = {name: [means.get(time, math.nan) for time in times] for name, times in _TIMES.items()}
+    return {name: full / reduced for name, (full, reduced) in known.items() if full / reduced > 0}
 
 
 def plus_minus(mean: float, deviation: float, scale: float = 1.0) -> str:

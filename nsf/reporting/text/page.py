@@ -23,9 +23,14 @@ DEFINITIONS = (
         "history: particles carry both, as at full order.",
     ),
     (
+        "engine",
+        "what takes the steps: reference any field, as it is written; modal those of modes, compiled; closed "
+        "adds a correction that was learned; operators are a learned recurrence of the latent vector.",
+    ),
+    (
         "speedup",
-        "full-order over reduced wall time, of one step, of the whole simulation, and of the simulation with "
-        "the positions of all particles decoded at every frame, as a full-order run has them. Times of "
+        "full-order over reduced mean wall time, of one step, of the whole simulation, and of the simulation "
+        "with the positions of all particles decoded at every frame, as a full-order run has them. Times of "
         "operators do not hold the checks that tell the estimate.",
     ),
     (

@@ -90,6 +90,15 @@ def test_figures_of_the_paper_are_sought_in_reports_that_have_a_place():
     assert [picture for picture in sorted(sought) if not committed_ones.joinpath(*picture).is_file()] == []
 
 
+def test_equal_titles_are_told_apart_by_the_names_of_the_reports(tmp_path):
+    for name, title in (("a", "One"), ("b", "One"), ("c", "Two")):
+        write_report(tmp_path / name, [job()])
+        sources = json.loads((tmp_path / name / "sources.json").read_text())
+        (tmp_path / name / "sources.json").write_text(json.dumps(sources | {"title": title}))
+    text = committed.write_list(tmp_path).read_text()
+    assert re.findall("^### (.*)$", text, re.MULTILINE) == ["One (a)", "One (b)", "Two"]
+
+
 def test_the_paper_the_chart_and_what_is_missing(tmp_path):
     jobs = [job(**{"sampler.size": "50"}), job(**{"sampler.size": "20"}) | {"delta": float("inf")}]
     told = {"paper": "Section 6.3: 0.2 %.", "missing": ["a: not run", "b: not run"]}
@@ -154,7 +163,7 @@ def test_points_beyond_the_particles_have_their_means(tmp_path):
         folder / "superresolution.csv", index=False
     )
     text = committed.write_list(tmp_path).read_text()
-    assert "| field | points | δ at the points [%] |" in text
+    assert "| field | points | displacement error at the points [%] |" in text
     assert "| basis | 0.0200 | 2 |" in text
     assert "| mlp | 0.500 | 50 |" in text
 

@@ -35,8 +35,7 @@ def test_means_over_values_and_seeds_a_row_a_scene_and_setting(tmp_path):
     ]  # fmt: skip
     assert said == (
         "Shown: means over held-out values and, where several were run, seeds (± their standard deviation). "
-        "δ is below the paper's in 1 of 1 (nsf, basis), 1 of 1 (deformation_only, basis), of the "
-        "cases in which the paper prints one."
+        "δ is below the paper's in 1 of 1 (nsf, basis), of the rows of which the paper prints one."
     )
 
 
@@ -253,8 +252,27 @@ def test_of_training_runs_their_number_is_told_and_of_other_long_lists_the_ends(
 
 @pytest.mark.filterwarnings("error")
 def test_a_number_that_one_job_does_not_name_is_left_open(tmp_path):
-    rows, _ = told(write_report(tmp_path / "a", [job(), job(**{"scene.design.train": "[1,2]"})]))
+    rows, said = told(write_report(tmp_path / "a", [job(), job(**{"scene.design.train": "[1,2]"})]))
     assert [row[1] for row in rows[1:]] == ["–", "2"]
+    assert f" – under {rows[0][1]}: the default, or none." in said
+    _, said = told(write_report(tmp_path / "b", [job(), job("bread")]))
+    assert "default" not in said
+
+
+def test_speedups_are_of_mean_times(tmp_path):
+    """Of two runs, one a hundred times and one twice as fast, the mean run is 3.9 times as fast."""
+    slow, fast = ({"step_ms_full": 1.0, "step_ms_reduced": ms, "speedup_step": 1 / ms} for ms in (0.5, 0.01))
+    jobs = [job(parameter=1.0) | slow, job(parameter=2.0) | fast]
+    rows, _ = told(write_report(tmp_path / "a", jobs))
+    shown = dict(zip(*rows, strict=True))
+    assert float(shown["speedup, step [×]"]) == pytest.approx(2 / 0.51, rel=1e-2)
+
+
+def test_a_still_body_that_is_nearer_than_the_paper_is_named(tmp_path):
+    """δ of one that never moves is δ over the displacement error; the paper prints 0.4 % of sand."""
+    for off, named in ((0.5, True), (0.2, False)):
+        _, said = told(write_report(tmp_path / str(off), [job(delta=0.001) | {"displacement_error": off}]))
+        assert ("On sand that of a body that never moves is below it, too." in said) == named
 
 
 def test_numbers_of_particles_of_one_scene_are_scenes_of_their_own(tmp_path):
