@@ -91,7 +91,7 @@ _ENGINE, _BESIDE = "operators", "modal"
 _PROJECTED = "projected_delta"
 _OF_SEEDS = (SETTING, "sample")  # columns in which seeds may differ
 _ERRORS = ("delta", "displacement_error", "stress_error")
-_COSTS = ("speedup_step", "memory_full_mib", "memory_reduced_mib")
+_STEPS, _MEMORY = ("step_ms_full", "step_ms_reduced"), ("memory_full_mib", "memory_reduced_mib")
 _PAPER = "paper_delta"
 _PENDING = (
     f"`{REPORT}` holds no report yet: `nsf run +experiment={EXPERIMENT}` writes one, "
@@ -279,13 +279,14 @@ def figures(report: Path) -> str:
     frame = frame.assign(**{name: nan for name in RIVALS if name not in frame})
     frame = frame.fillna(dict.fromkeys(alike, ""))
     variants = frame.groupby(alike, sort=False, as_index=False)
-    means = variants[[*_ERRORS, *_COSTS, *RIVALS]].agg(_mean)
+    means = variants[[*_ERRORS, *_STEPS, *_MEMORY, *RIVALS]].agg(_mean)
+    means["speedup_step"] = means["step_ms_full"] / means["step_ms_reduced"]
     sizes = variants["sample"].agg(lambda values: values.iloc[0] if values.nunique() == 1 else ABSENT)
     means["sample"] = sizes["sample"]
     means[_PAPER] = [_printed(row["scene"], row["method"]) for row in means.to_dict("records")]
     means[_PROJECTED] = [100 * projected.get(scene, nan) for scene in means["scene"]]
     titles = {_PAPER: "paper's δ [%]", _PROJECTED: "δ, projected steps [%]", "delta": own}
-    columns = [*alike, "sample", _PAPER, _PROJECTED, *_ERRORS, *_COSTS]
+    columns = [*alike, "sample", _PAPER, _PROJECTED, *_ERRORS, "speedup_step", *_MEMORY]
     table, same = without_constants(means[columns], keep=("scene",))
     return (
         f"Means over held-out parameter values and seeds ({markdown(same)}).\n\n"

@@ -309,25 +309,32 @@ def _best(report: Report) -> str:
 
 
 def _beside_paper(report: Report) -> str:
-    """How often δ is below the paper's, not of the baseline; of small runs that they are not comparable."""
-    known = report.groups.dropna(subset=_PAPER).query("method != @_BASELINE")
+    """In how many rows δ is below the paper's, and on which scenes that of a still body is in all of them.
+
+    The baseline does not count. Small runs cannot be compared, and that is said.
+    """
+    known = report.groups.dropna(subset=_PAPER)
     if not len(known):
         return ""
     if report.small:
         return f" The paper's δ is of its full size, these runs are of {min(report.small)} scale."
-    told, still = [], known[known["delta_static"] < known[_PAPER]]
+    known, told = known[known["method"] != _BASELINE], []
+    if not len(known):
+        return ""
     for (method, field), part in known.groupby(["method", "field"], sort=False):
         below = int((part["delta"] < part[_PAPER]).sum())
         told.append(f"{below} of {len(part)} ({method}, {field})")
-    lazy = ", ".join(dict.fromkeys(still["scene"]))
-    also = f" On {lazy} that of a body that never moves is below it, too." if lazy else ""
-    return f" δ is below the paper's in {', '.join(told)}, of the rows of which the paper prints one.{also}"
+    still = (known["delta_static"] < known[_PAPER]).groupby(known["scene"], sort=False).all()
+    scenes = ", ".join(still.index[still])
+    also = f" A body that never moves has a smaller δ than the paper's on {scenes}." if scenes else ""
+    return f" δ is below the paper's in {', '.join(told)} of the rows for which the paper prints one.{also}"
 
 
 def _defaults(report: Report) -> str:
-    """What – stands for under configuration keys that some jobs do not set, or set to null."""
-    bare = [_title(key) for key in report.settings if "." in key and (report.groups[key] == ABSENT).any()]
-    return f" – under {', '.join(bare)}: the default, or none." if bare else ""
+    """Under which configuration keys cells are empty, since a job does not set them or sets null."""
+    keys = {key for run in report.told["runs"].values() for key in _own(run)}
+    bare = [_title(key) for key in report.settings if key in keys and (report.groups[key] == ABSENT).any()]
+    return f" Where a job does not set {', '.join(bare)}, or sets null, a cell has –." if bare else ""
 
 
 def _rivals(report: Report) -> str:
@@ -341,10 +348,13 @@ def _diverged(report: Report) -> str:
 
 
 def _means(part: pd.DataFrame) -> dict[str, float]:
-    """Means over some rows; one that is missing leaves a mean empty, but for what no run changes."""
+    """Means over some rows and speedups of mean times; a value that is missing leaves its mean empty.
+
+    δ of a still body and the share of N are means over the rows that have them.
+    """
     means = part.reindex(columns=_AVERAGED).mean(skipna=False).to_dict()
-    still = part["delta_static"].mean()  # not of runs that diverged
-    return means | {"delta_static": still, _SHARE: part[_SHARE].mean()} | speedups(means)
+    known = {name: part[name].mean() for name in ("delta_static", _SHARE)}
+    return means | known | speedups(means)
 
 
 def _own(run: Mapping) -> dict[str, str]:

@@ -197,7 +197,7 @@ def means(merged: Merged, study: Study | None = None) -> pd.DataFrame:
 
 
 def mean_rows(merged: Merged, members: list[int]) -> list[dict]:
-    """The means of one variant, a dict a split, held-out ones first."""
+    """The means of one variant and speedups of its mean times, a dict a split, held-out ones first."""
     part = merged.frame.iloc[members]
     seconds = merged.source[members[0]].training_seconds
     rows = []

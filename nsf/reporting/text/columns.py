@@ -131,7 +131,7 @@ COSTS = (
 )  # fmt: skip
 """Columns measured once a variant."""
 MEASURED = ("delta", "displacement_error", "stress_error", *RIVALS, "handed_over", *COSTS)
-"""Columns that are averaged over parameter values."""
+"""Columns that are averaged over parameter values; speedups are then of mean times (`speedups`)."""
 _TIMES = {
     "speedup_step": ("step_ms_full", "step_ms_reduced"),
     "speedup_total": ("total_ms_full", "total_ms_reduced"),
@@ -207,7 +207,7 @@ def counted(lists: Collection, scenes: Collection[str]) -> list:
 def speedups(means: Mapping[str, float]) -> dict[str, float]:
     """Speedups of mean times, where these were measured: a mean of ratios would hide runs that are slow."""
     known = {name: [means.get(time, math.nan) for time in times] for name, times in _TIMES.items()}
-    return {name: full / reduced for name, (full, reduced) in known.items() if full / reduced > 0}
+    return {name: full / reduced for name, (full, reduced) in known.items() if full > 0 and reduced > 0}
 
 
 def plus_minus(mean: float, deviation: float, scale: float = 1.0) -> str:

@@ -24,8 +24,9 @@ DEFINITIONS = (
     ),
     (
         "engine",
-        "what takes the steps: reference any field, as it is written; modal those of modes, compiled; closed "
-        "adds a correction that was learned; operators are a learned recurrence of the latent vector.",
+        "what takes the steps. reference takes projected steps with any field and is not compiled. modal "
+        "takes them with fields of modes and is compiled. closed adds a learned correction to them. "
+        "operators step the latent vector alone, by a learned recurrence.",
     ),
     (
         "speedup",

@@ -35,7 +35,7 @@ def test_means_over_values_and_seeds_a_row_a_scene_and_setting(tmp_path):
     ]  # fmt: skip
     assert said == (
         "Shown: means over held-out values and, where several were run, seeds (± their standard deviation). "
-        "δ is below the paper's in 1 of 1 (nsf, basis), of the rows of which the paper prints one."
+        "δ is below the paper's in 1 of 1 (nsf, basis) of the rows for which the paper prints one."
     )
 
 
@@ -254,9 +254,13 @@ def test_of_training_runs_their_number_is_told_and_of_other_long_lists_the_ends(
 def test_a_number_that_one_job_does_not_name_is_left_open(tmp_path):
     rows, said = told(write_report(tmp_path / "a", [job(), job(**{"scene.design.train": "[1,2]"})]))
     assert [row[1] for row in rows[1:]] == ["–", "2"]
-    assert f" – under {rows[0][1]}: the default, or none." in said
-    _, said = told(write_report(tmp_path / "b", [job(), job("bread")]))
-    assert "default" not in said
+    assert f" Where a job does not set {rows[0][1]}, or sets null, a cell has –." in said
+    rows, said = told(write_report(tmp_path / "b", [job(sampler="random"), job()]))
+    assert rows[0][1] == "sampler"
+    assert " Where a job does not set sampler, or sets null, a cell has –." in said
+    rows, said = told(write_report(tmp_path / "c", [job(sampler="random"), job(sampler="cells")]))
+    assert rows[0][1] == "sampler"
+    assert "does not set" not in said
 
 
 def test_speedups_are_of_mean_times(tmp_path):
@@ -270,9 +274,10 @@ def test_speedups_are_of_mean_times(tmp_path):
 
 def test_a_still_body_that_is_nearer_than_the_paper_is_named(tmp_path):
     """δ of one that never moves is δ over the displacement error; the paper prints 0.4 % of sand."""
-    for off, named in ((0.5, True), (0.2, False)):
-        _, said = told(write_report(tmp_path / str(off), [job(delta=0.001) | {"displacement_error": off}]))
-        assert ("On sand that of a body that never moves is below it, too." in said) == named
+    for name, errors, named in (("a", (0.5, 0.4), True), ("b", (0.5, 0.2), False)):
+        jobs = [job(delta=0.001, sampler=str(off)) | {"displacement_error": off} for off in errors]
+        _, said = told(write_report(tmp_path / name, jobs))
+        assert ("A body that never moves has a smaller δ than the paper's on sand." in said) == named
 
 
 def test_numbers_of_particles_of_one_scene_are_scenes_of_their_own(tmp_path):

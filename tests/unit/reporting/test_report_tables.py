@@ -24,7 +24,7 @@ from nsf.reporting.tables import (
     variant_labels,
     without_constants,
 )
-from nsf.reporting.text.columns import COLUMN, COSTS, RIVALS, number, parameter_text
+from nsf.reporting.text.columns import COLUMN, COSTS, RIVALS, number, parameter_text, speedups
 from nsf.reporting.text.formats import HTML, markdown_table
 
 EARLIER, LATER = "2024-05-01T10:00:00+00:00", "2024-06-01T10:00:00+00:00"
@@ -109,6 +109,25 @@ def test_the_papers_figure_stands_beside_the_papers_method_only(sweep):
     table = means(merge(open_sources(sweep)))
     assert list(table.loc[table["field"] == PAPER, "method"]) == ["nsf"]
     assert set(table["method"]) == {"nsf", "deformation_only"}
+
+
+def test_speedups_are_of_mean_times(tmp_path):
+    """Of four runs one is slow. Of reports that do not have the time of a run the mean of ratios stays."""
+    run = write_run(tmp_path, Made())
+    rows = pd.read_csv(run.path / "results.csv")
+    rows["step_ms_reduced"] = rows["step_ms_full"] / [100, 100, 100, 1]
+    rows["speedup_step"] = rows["step_ms_full"] / rows["step_ms_reduced"]
+    rows.to_csv(run.path / "results.csv", index=False)
+    seal(run)
+    row = means(merge(open_sources([run]))).iloc[0]
+    assert row["speedup_step"] == pytest.approx(4 / 1.03)
+    assert pd.isna(rows.get("total_ms_full", pd.Series([np.nan]))).all()
+    assert row["speedup_total"] == pytest.approx(rows["speedup_total"].mean())
+
+
+@pytest.mark.parametrize("reduced", [0.0, float("nan")])
+def test_a_time_that_is_none_makes_no_speedup(reduced):
+    assert speedups({"step_ms_full": 1.0, "step_ms_reduced": reduced}) == {}
 
 
 def test_a_diverged_value_is_not_averaged_around(tmp_path):
@@ -388,5 +407,5 @@ def test_console_table_of_many_variants_fits_a_terminal():
     lines = stream.getvalue().splitlines()
     assert max(map(len, lines)) <= 100
     words = {word for line in lines for word in line.split()}
-    assert {"jelly_cube", "deformation_only", "δ", "displacement", "speedup,", "[×]"} <= words
+    assert {"jelly_cube", "deformation_only", "reference", "δ", "speedup,", "[×]"} <= words
     assert set(map(number, frame["speedup_step"])) <= words
