@@ -18,9 +18,10 @@ from omegaconf import DictConfig
 from nsf.errors import ConfigError, SchemaError
 from nsf.reporting.build import commit_text
 from nsf.reporting.finer import fine_means
-from nsf.reporting.headline import Report, headline
+from nsf.reporting.headline import headline
 from nsf.reporting.rivals import where_rivals_win
 from nsf.reporting.sources import file_hash
+from nsf.reporting.summary import Report
 from nsf.reporting.swap import MARK
 from nsf.reporting.tables import VARIANT, rows_of, without_constants
 from nsf.reporting.text.columns import ABSENT, RIVALS, SETTING

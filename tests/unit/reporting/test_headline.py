@@ -7,8 +7,9 @@ from finished import job, write_report
 from nsf.errors import SchemaError
 from nsf.reporting import headline as module
 from nsf.reporting.committed import _sources
-from nsf.reporting.headline import Report, headline
+from nsf.reporting.headline import headline
 from nsf.reporting.sources import printed_delta
+from nsf.reporting.summary import Report
 from nsf.reporting.text.columns import LATER, RIVALS
 
 
