@@ -1,5 +1,6 @@
 """Charts of errors, latent coordinates and costs: data in, figure out, units on every axis."""
 
+import itertools
 import math
 import re
 import textwrap
@@ -13,6 +14,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from nsf.reporting.drawing.style import (
     FULL,
     INK,
+    LETTER,
     MUTED,
     PAPER,
     REDUCED,
@@ -270,14 +272,28 @@ def error_scale(panel, values) -> None:
 def plain_ticks(axis_line, text: Callable[[float], str] = "{:g}".format) -> None:
     """Give a logarithmic axis ticks as plain numbers, or as `text` says: at 1, 2 and 5 of a decade.
 
-    At more of it where the axis spans less than a factor of 4, at 1 alone from three decades on.
+    At more of it where the axis spans less than a factor of 4, at 1 alone from three decades on, and at fewer
+    below an axis that has no room for their numbers.
     """
     low, high = axis_line.get_view_interval()
     few = (1, 2, 5) if high < 1e3 * low else (1,)
     subs = (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8) if high < 4 * low else few
+    if axis_line.axis_name == "x":
+        subs = next((some for some in (subs, few, (1, 3)) if _have_room(axis_line, some, text)), (1,))
     axis_line.set_major_locator(LogLocator(subs=subs))
     axis_line.set_major_formatter(FuncFormatter(lambda v, _: text(v)))
     axis_line.set_minor_formatter(NullFormatter())
+
+
+def _have_room(axis_line, subs: Sequence[float], text: Callable[[float], str]) -> bool:
+    """Whether numbers below a logarithmic axis stand apart, with ticks at `subs` of a decade."""
+    low, high = axis_line.get_view_interval()
+    ticks = [v for v in LogLocator(subs=subs).tick_values(low, high) if low <= v <= high]
+    letter = LETTER * axis_line.axes.figure.dpi / 72 / axis_line.axes.bbox.width * math.log(high / low)
+    return all(
+        math.log(after / before) > letter * (1 + (len(text(before)) + len(text(after))) / 2)
+        for before, after in itertools.pairwise(ticks)
+    )
 
 
 def _legend_above(fig: Figure, panel, title: str | None) -> None:
@@ -320,7 +336,9 @@ def rings(rows: Sequence[Mapping[str, Mapping[str, float]]]) -> Figure:
 def _wrapped(variants: list[dict]) -> list[str]:
     """Labels in lines that leave room for the chart beside them; lists break between their entries."""
     spaced = (re.sub(r",\s*(?=[^\[\]]*\])", ", ", v["label"]) for v in variants)
-    return ["\n".join(textwrap.wrap(label, _LINE, break_on_hyphens=False)) for label in spaced]
+    # "r 6" and "|S| 50" stay on one line: what follows their space is not broken off.
+    joined = (re.sub(r"(\br|\|S\|) (?=\d)", "\\1\N{NO-BREAK SPACE}", label) for label in spaced)
+    return ["\n".join(textwrap.wrap(label, _LINE, break_on_hyphens=False)) for label in joined]
 
 
 def speedup_and_memory(variants: list[dict]) -> Figure:
@@ -343,6 +361,9 @@ def speedup_and_memory(variants: list[dict]) -> Figure:
         right.set_xlabel("peak memory [MiB]")
         left.set_yticks(np.arange(len(variants)), _wrapped(variants))
         left.set_ylim(len(variants) - 0.4, -0.6)
+        fig.get_layout_engine().execute(fig)  # the labels of variants take much of the width
+        for panel in (left, right):
+            plain_ticks(panel.xaxis, "{:,g}".format)
     return fig
 
 
@@ -393,7 +414,6 @@ def _pairs(panel, variants: list[dict], columns: Mapping[str, tuple[str, str]]) 
                 )
     low, high = panel.get_xlim()
     panel.set_xlim(low, high * (high / low) ** 0.16)  # room for the last numbers
-    plain_ticks(panel.xaxis, "{:,g}".format)
     panel.grid(axis="x")
     panel.tick_params(axis="y", length=0)
     panel.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2, columnspacing=1.2, handlelength=1.2)

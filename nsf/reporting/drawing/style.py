@@ -84,7 +84,8 @@ _COLORS = 256
 _RAMP = 64  # colours kept of each colour scale: its bar shows no steps
 # Of text, and of floors and their shadows, whose soft edges would else become contours.
 _GREYS = (*range(34, 195, 17), *range(195, 256, 4))
-_LETTER, _ENTRY = 5.5, 40.0  # [pt] width of a letter of a legend at most, and of what is about an entry
+LETTER = 5.5  # [pt] width of a letter of a legend or beside an axis, at most
+_ENTRY = 40.0  # [pt] width of what is about a legend's entry
 _CELL = 4  # levels of a channel that Pillow does not tell apart when it looks up a colour
 
 
@@ -105,7 +106,7 @@ def line_style(i: int) -> dict:
 
 def legend_above(fig: Figure, handles: Collection, labels: Collection[str], most: int, **options) -> None:
     """A legend over the panels, in as many columns as fit, `most` at most; options as of `Figure.legend`."""
-    columns = int(72.0 * fig.get_figwidth() / (_LETTER * max(map(len, labels), default=0) + _ENTRY))
+    columns = int(72.0 * fig.get_figwidth() / (LETTER * max(map(len, labels), default=0) + _ENTRY))
     columns = max(1, min(len(labels), most, columns))
     legend = fig.legend(handles, labels, loc="outside upper left", ncols=columns, handlelength=2.2, **options)
     legend.get_title().set_fontsize(9)

@@ -1,5 +1,6 @@
 """Charts and pictures: they show the data they are given, name their units, and see what lies in front."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -133,7 +134,7 @@ def test_a_legend_and_labels_of_long_settings_leave_the_chart_its_room(tmp_path)
     figure.savefig(tmp_path / "delta.png")
     (panel,) = figure.axes
     (shown,) = (text.get_text() for text in panel.get_yticklabels())
-    assert shown.replace("\n", " ").replace(", ", ",") == label
+    assert shown.replace("\n", " ").replace("\N{NO-BREAK SPACE}", " ").replace(", ", ",") == label
     assert not any(line.startswith(",") for line in shown.splitlines())
     assert panel.get_window_extent().width > 0.4 * figure.bbox.width
 
@@ -180,6 +181,33 @@ def test_reconstruction_and_rollout_are_rms_over_frames(series):
     panel = charts.reconstruction_and_rollout(series).axes[0]
     expected = [100 * np.sqrt((part["delta"] ** 2).mean()) for _, part in series.groupby("parameter")]
     np.testing.assert_allclose(panel.lines[1].get_ydata(), expected)
+
+
+def test_numbers_below_logarithmic_axes_stand_apart(tmp_path):
+    label = "bread · deformation_only · basis field · r 6 · modal engine · |S| 450"
+    memory = {"memory_full_mib": 7.0, "memory_reduced_mib": 889.0}
+    variants = [{"label": label, "speedup_step": 0.02, "speedup_total": 2.0} | memory] * 3
+    spans = {"bread": (0.0026, 0.14), "cake": (0.024, 0.24), "metal": (0.0025, 0.13)}
+    panels = {
+        scene: [{"solver": "nsf", "kind": "reduced", "span_ms": ms, "displacement_error": 0.1} for ms in span]
+        for scene, span in spans.items()
+    }
+    for figure in (charts.speedup_and_memory(variants), error_over_cost(panels, {})):
+        save(figure, tmp_path, "chart")
+        for panel in figure.axes:
+            low, high = panel.get_xlim()
+            at = zip(panel.get_xticks(), panel.get_xticklabels(), strict=True)
+            boxes = [text.get_window_extent() for tick, text in at if low <= tick <= high]
+            assert len(boxes) >= 2
+            assert all(left.x1 + 3 < right.x0 for left, right in itertools.pairwise(boxes))
+
+
+def test_a_label_beside_a_chart_keeps_a_letter_with_its_number():
+    label = "jelly_cube · nsf · basis field of a long name · modal engine · |S| 50 · r 6"
+    entry = {"label": label, "speedup_step": 4.0, "speedup_total": 1.0}
+    entry |= {"memory_full_mib": 900.0, "memory_reduced_mib": 400.0}
+    (shown,) = (text.get_text() for text in charts.speedup_and_memory([entry]).axes[0].get_yticklabels())
+    assert {"|S|\N{NO-BREAK SPACE}50", "r\N{NO-BREAK SPACE}6"} <= set(shown.replace("\n", " ").split(" "))
 
 
 def test_runtime_rings_say_the_sum():
