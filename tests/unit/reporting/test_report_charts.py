@@ -14,7 +14,7 @@ from nsf.reporting.drawing.camera import Camera, View
 from nsf.reporting.drawing.cost import error_over_cost, step_over_particles
 from nsf.reporting.drawing.point import point_chart, point_response
 from nsf.reporting.drawing.shapes import Case, animation, final_shapes, hides_stress, is_cut_open, strip
-from nsf.reporting.drawing.style import save
+from nsf.reporting.drawing.style import LETTER, save
 from nsf.reporting.sources import Motion
 
 RED, BLUE = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
@@ -199,7 +199,8 @@ def test_numbers_below_logarithmic_axes_stand_apart(tmp_path):
             at = zip(panel.get_xticks(), panel.get_xticklabels(), strict=True)
             boxes = [text.get_window_extent() for tick, text in at if low <= tick <= high]
             assert len(boxes) >= 2
-            assert all(left.x1 + 3 < right.x0 for left, right in itertools.pairwise(boxes))
+            letters = 2 * LETTER * figure.dpi / 72
+            assert all(left.x1 + letters < right.x0 for left, right in itertools.pairwise(boxes))
 
 
 def test_a_label_beside_a_chart_keeps_a_letter_with_its_number():
