@@ -10,7 +10,8 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from nsf.bench.rows import OTHER_SAMPLER, size_name
-from nsf.reporting.drawing.charts import plain_ticks, rings
+from nsf.reporting.drawing.charts import rings
+from nsf.reporting.drawing.scales import plain_ticks
 from nsf.reporting.drawing.style import INK, figure, line_style, save, stage_colors, styled
 from nsf.reporting.text.columns import number
 from nsf.reporting.text.formats import Rows, markdown_document, terminal_table

@@ -152,7 +152,7 @@ class Levels:
         if self.tolerance is not None and estimate > _WELL * self.tolerance:
             return False
         if not self.on_distrust:
-            return self.tolerance is not None  # else only a run that is not finite was handed on
+            return self.tolerance is not None  # else only a run whose estimate overflowed
         return again.doubt[0] <= 1.0 and _ratios(solver, n - 1, n, trust)[-1] <= _WELL
 
     def _ahead(

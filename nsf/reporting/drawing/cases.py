@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.transforms import offset_copy
 
-from nsf.reporting.drawing.charts import LOST, error_scale, plain_ticks
 from nsf.reporting.drawing.cost import solver_colors
+from nsf.reporting.drawing.scales import LOST, error_scale, plain_ticks
 from nsf.reporting.drawing.style import FULL, INK, WARNING, WIDTH, figure, legend_above, styled
 from nsf.reporting.text.columns import axis, number
 from nsf.reporting.text.formats import plain

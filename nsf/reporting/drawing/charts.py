@@ -1,25 +1,25 @@
 """Charts of errors, latent coordinates and costs: data in, figure out, units on every axis."""
 
-import itertools
 import math
 import re
 import textwrap
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import MaxNLocator
 
+from nsf.reporting.drawing.scales import LOST, error_scale, plain_ticks
 from nsf.reporting.drawing.style import (
     FULL,
     INK,
-    LETTER,
     MUTED,
     PAPER,
     REDUCED,
     STAGE_TITLES,
     figure,
+    laid_out,
     legend_above,
     line_style,
     stage_colors,
@@ -36,7 +36,6 @@ OVER_TIME = {
 }
 _ACROSS = 4  # panels of scenes in a row
 _LINE = 60  # letters of a label beside a chart, in a line
-LOST = 1000.0  # [%] error from which a run is lost, by how much tells nothing: axes end there
 
 
 def error_over_time(
@@ -165,7 +164,6 @@ def delta_per_variant(variants: list[dict], dots: str = "one parameter value") -
         logarithmic = len(shown) > 0 and shown.min() > 0 and shown.max() > 30 * shown.min()
         if logarithmic:
             panel.set_xscale("log")
-            plain_ticks(panel.xaxis)
         average = 100 * _finite([v["mean"] for v in variants])
         for y in np.flatnonzero(~(average <= LOST)):
             told = "diverged" if np.isnan(average[y]) else f"off by more than {LOST:,.0f} %"
@@ -183,6 +181,9 @@ def delta_per_variant(variants: list[dict], dots: str = "one parameter value") -
         panel.grid(axis="x")
         panel.tick_params(axis="y", length=0)
         _legend_above(fig, panel, None)
+        if logarithmic:
+            laid_out(fig)
+            plain_ticks(panel.xaxis)
     return fig
 
 
@@ -256,46 +257,6 @@ def _rms(values) -> float:
     return float(np.sqrt(np.nanmean(values**2)))
 
 
-def error_scale(panel, values) -> None:
-    """Logarithmic once the errors span more than a factor of 30, else linear from zero; to `LOST` at most."""
-    values = np.asarray(values, float)
-    values = np.minimum(values[np.isfinite(values) & (values > 0)], LOST)
-    panel.grid(axis="y")
-    if len(values) and np.max(values) > 30 * np.quantile(values, 0.05):
-        panel.set_yscale("log")
-        panel.set_ylim(np.quantile(values, 0.02) / 1.6, np.max(values) * 1.6)
-        plain_ticks(panel.yaxis)
-    else:
-        panel.set_ylim(0, 1.08 * np.max(values, initial=1e-12))
-
-
-def plain_ticks(axis_line, text: Callable[[float], str] = "{:g}".format) -> None:
-    """Give a logarithmic axis ticks as plain numbers, or as `text` says: at 1, 2 and 5 of a decade.
-
-    At more of it where the axis spans less than a factor of 4, at 1 alone from three decades on, and at fewer
-    below an axis that has no room for their numbers.
-    """
-    low, high = axis_line.get_view_interval()
-    few = (1, 2, 5) if high < 1e3 * low else (1,)
-    subs = (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8) if high < 4 * low else few
-    if axis_line.axis_name == "x":
-        subs = next((some for some in (subs, few, (1, 3)) if _have_room(axis_line, some, text)), (1,))
-    axis_line.set_major_locator(LogLocator(subs=subs))
-    axis_line.set_major_formatter(FuncFormatter(lambda v, _: text(v)))
-    axis_line.set_minor_formatter(NullFormatter())
-
-
-def _have_room(axis_line, subs: Sequence[float], text: Callable[[float], str]) -> bool:
-    """Whether numbers below a logarithmic axis stand apart, with ticks at `subs` of a decade."""
-    low, high = axis_line.get_view_interval()
-    ticks = [v for v in LogLocator(subs=subs).tick_values(low, high) if low <= v <= high]
-    letter = LETTER * axis_line.axes.figure.dpi / 72 / axis_line.axes.bbox.width * math.log(high / low)
-    return all(
-        math.log(after / before) > letter * (1 + (len(text(before)) + len(text(after))) / 2)
-        for before, after in itertools.pairwise(ticks)
-    )
-
-
 def _legend_above(fig: Figure, panel, title: str | None) -> None:
     handles, labels = panel.get_legend_handles_labels()
     order = sorted(range(len(labels)), key=lambda i: labels[i] != "mean")
@@ -361,7 +322,7 @@ def speedup_and_memory(variants: list[dict]) -> Figure:
         right.set_xlabel("peak memory [MiB]")
         left.set_yticks(np.arange(len(variants)), _wrapped(variants))
         left.set_ylim(len(variants) - 0.4, -0.6)
-        fig.get_layout_engine().execute(fig)  # the labels of variants take much of the width
+        laid_out(fig)
         for panel in (left, right):
             plain_ticks(panel.xaxis, "{:,g}".format)
     return fig

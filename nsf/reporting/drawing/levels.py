@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from nsf.reporting.drawing.charts import LOST, plain_ticks
+from nsf.reporting.drawing.scales import LOST, plain_ticks
 from nsf.reporting.drawing.style import FULL, INK, PALETTE, figure, line_style, styled
 
 #: Title and colour of each level, in the order of `by`.

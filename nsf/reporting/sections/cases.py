@@ -9,7 +9,7 @@ import pandas as pd
 from nsf.data.case import Case
 from nsf.errors import ConfigError
 from nsf.reporting.drawing.cases import COLORS, Cases, Parameter, error_maps, error_over_parameters
-from nsf.reporting.drawing.charts import LOST
+from nsf.reporting.drawing.scales import LOST
 from nsf.reporting.drawing.style import save
 from nsf.reporting.sections.variant import Variant
 from nsf.reporting.study import SEEDS

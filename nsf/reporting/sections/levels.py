@@ -50,7 +50,7 @@ def levels_section(known: Sequence[Variant], folder: Path) -> list[Section]:
         caption = (
             f"The displacement error over time at {name} {parameter_text(mixed[0], '', unit)}, and who took "
             "each step: the operators; the projected step, where the estimated error passed its tolerance or "
-            "the run was not to be believed; and the operators again, where they are well."
+            "overflowed, or the run was not to be believed; and the operators again, where they are well."
         )
         alone = len({variant.body for variant in known}) == 1
         stem = "levels" if alone else file_name(f"{body}-levels")
