@@ -10,7 +10,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from nsf.reporting.drawing.scales import LOST, error_scale, plain_ticks
+from nsf.reporting.drawing.scales import LOST, error_scale, plain_ticks, set_apart
 from nsf.reporting.drawing.style import (
     FULL,
     INK,
@@ -19,7 +19,6 @@ from nsf.reporting.drawing.style import (
     REDUCED,
     STAGE_TITLES,
     figure,
-    laid_out,
     legend_above,
     line_style,
     stage_colors,
@@ -164,6 +163,7 @@ def delta_per_variant(variants: list[dict], dots: str = "one parameter value") -
         logarithmic = len(shown) > 0 and shown.min() > 0 and shown.max() > 30 * shown.min()
         if logarithmic:
             panel.set_xscale("log")
+            plain_ticks(panel.xaxis)
         average = 100 * _finite([v["mean"] for v in variants])
         for y in np.flatnonzero(~(average <= LOST)):
             told = "diverged" if np.isnan(average[y]) else f"off by more than {LOST:,.0f} %"
@@ -181,9 +181,7 @@ def delta_per_variant(variants: list[dict], dots: str = "one parameter value") -
         panel.grid(axis="x")
         panel.tick_params(axis="y", length=0)
         _legend_above(fig, panel, None)
-        if logarithmic:
-            laid_out(fig)
-            plain_ticks(panel.xaxis)
+        set_apart(fig)
     return fig
 
 
@@ -322,9 +320,7 @@ def speedup_and_memory(variants: list[dict]) -> Figure:
         right.set_xlabel("peak memory [MiB]")
         left.set_yticks(np.arange(len(variants)), _wrapped(variants))
         left.set_ylim(len(variants) - 0.4, -0.6)
-        laid_out(fig)
-        for panel in (left, right):
-            plain_ticks(panel.xaxis, "{:,g}".format)
+        set_apart(fig)
     return fig
 
 
@@ -375,6 +371,7 @@ def _pairs(panel, variants: list[dict], columns: Mapping[str, tuple[str, str]]) 
                 )
     low, high = panel.get_xlim()
     panel.set_xlim(low, high * (high / low) ** 0.16)  # room for the last numbers
+    plain_ticks(panel.xaxis, "{:,g}".format)
     panel.grid(axis="x")
     panel.tick_params(axis="y", length=0)
     panel.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2, columnspacing=1.2, handlelength=1.2)

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from matplotlib.figure import Figure
 
 from nsf.reporting.drawing.levels import LEVELS
-from nsf.reporting.drawing.scales import LOST, plain_ticks
-from nsf.reporting.drawing.style import FULL, INK, MUTED, PALETTE, figure, laid_out, legend_above, styled
+from nsf.reporting.drawing.scales import LOST, plain_ticks, set_apart
+from nsf.reporting.drawing.style import FULL, INK, MUTED, PALETTE, figure, legend_above, styled
 
 _FULL = "full order"  # begins the names of full-order solvers
 _ACROSS = 3  # panels in a row
@@ -44,14 +44,13 @@ def error_over_cost(
             panel.margins(0.12)
             panel.set_ylim(top=min(panel.get_ylim()[1], LOST))
             panel.grid()
+            for line in (panel.xaxis, panel.yaxis):
+                plain_ticks(line)
         for panel in drawn[len(panels) :]:
             panel.axis("off")
         told = {line.get_label(): line for panel in drawn for line in panel.lines}
         legend_above(fig, told.values(), told.keys(), 4)
-        laid_out(fig)
-        for panel in drawn[: len(panels)]:
-            for line in (panel.xaxis, panel.yaxis):
-                plain_ticks(line)
+        set_apart(fig)
     return fig
 
 

@@ -5,6 +5,8 @@ import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from nsf.reporting.drawing.style import LETTER
@@ -28,30 +30,45 @@ def error_scale(panel, values) -> None:
 def plain_ticks(axis_line, text: Callable[[float], str] = "{:g}".format) -> None:
     """Give a logarithmic axis ticks as plain numbers, or as `text` says: at 1, 2 and 5 of a decade.
 
-    At more of it where the axis spans less than a factor of 4, at 1 alone from three decades on, and at fewer
-    below an axis that has no room for their numbers. For once its limits stand, and its place (`laid_out`).
+    At more of it where the axis spans less than a factor of 4, at 1 alone from three decades on.
     """
     low, high = axis_line.get_view_interval()
     few = (1, 2, 5) if high < 1e3 * low else (1,)
     subs = (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8) if high < 4 * low else few
-    if axis_line.axis_name == "x":
-        sparser = [some for some in (subs, few, (1, 3), (1,)) if len(_ticks(axis_line, some)) > 1]
-        subs = next((some for some in sparser if _have_room(axis_line, some, text)), (sparser or [subs])[-1])
     axis_line.set_major_locator(LogLocator(subs=subs))
     axis_line.set_major_formatter(FuncFormatter(lambda v, _: text(v)))
     axis_line.set_minor_formatter(NullFormatter())
 
 
-def _have_room(axis_line, subs: Sequence[float], text: Callable[[float], str]) -> bool:
-    """Whether numbers below an axis are two letters apart, with ticks at `subs` of a decade."""
-    low, high = axis_line.get_view_interval()
-    letter = LETTER * axis_line.axes.figure.dpi / 72 / axis_line.axes.bbox.width * math.log(high / low)
+def set_apart(fig: Figure) -> None:
+    """Leave fewer plain ticks below logarithmic axes where their numbers would touch, but two at least.
+
+    For last: it lays the figure out, since labels beside a panel take of its width.
+    """
+    fig.get_layout_engine().execute(fig)
+    for panel in fig.axes:
+        line = panel.xaxis
+        if isinstance(line.get_major_locator(), LogLocator):
+            sparser = (LogLocator(subs=subs) for subs in ((1, 2, 5), (1, 3), (1,)))
+            for locator in itertools.chain([line.get_major_locator()], sparser):
+                if len(ticks := _ticks(panel, locator)) < 2:
+                    break
+                line.set_major_locator(locator)
+                if _have_room(panel, ticks):
+                    break
+
+
+def _have_room(panel: Axes, ticks: Sequence[float]) -> bool:
+    """Whether the numbers of ticks below a panel are two letters apart."""
+    low, high = panel.get_xlim()
+    letter = LETTER * panel.figure.dpi / 72 / panel.bbox.width * math.log(high / low)
+    lengths = [len(panel.xaxis.get_major_formatter()(tick)) for tick in ticks]
     return all(
-        math.log(after / before) > letter * (2 + (len(text(before)) + len(text(after))) / 2)
-        for before, after in itertools.pairwise(_ticks(axis_line, subs))
+        math.log(after / before) > letter * (2 + (a + b) / 2)
+        for (before, a), (after, b) in itertools.pairwise(zip(ticks, lengths, strict=True))
     )
 
 
-def _ticks(axis_line, subs: Sequence[float]) -> list[float]:
-    low, high = axis_line.get_view_interval()
-    return [v for v in LogLocator(subs=subs).tick_values(low, high) if low <= v <= high]
+def _ticks(panel: Axes, locator: LogLocator) -> list[float]:
+    low, high = panel.get_xlim()
+    return [v for v in locator.tick_values(low, high) if low <= v <= high]

@@ -112,11 +112,6 @@ def legend_above(fig: Figure, handles: Collection, labels: Collection[str], most
     legend.get_title().set_fontsize(9)
 
 
-def laid_out(fig: Figure) -> None:
-    """Give panels the places that their labels leave them, for what depends on their size."""
-    fig.get_layout_engine().execute(fig)
-
-
 def stage_colors(stages) -> list[str]:
     """A stage has one colour in every chart; stages not listed take greys."""
     greys = itertools.cycle(("#bbbbbb", "#555555", "#dddddd", "#333333"))

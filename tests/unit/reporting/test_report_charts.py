@@ -14,7 +14,7 @@ from nsf.reporting.drawing import charts
 from nsf.reporting.drawing.camera import Camera, View
 from nsf.reporting.drawing.cost import error_over_cost, step_over_particles
 from nsf.reporting.drawing.point import point_chart, point_response
-from nsf.reporting.drawing.scales import plain_ticks
+from nsf.reporting.drawing.scales import plain_ticks, set_apart
 from nsf.reporting.drawing.shapes import Case, animation, final_shapes, hides_stress, is_cut_open, strip
 from nsf.reporting.drawing.style import LETTER, save, styled
 from nsf.reporting.sources import Motion
@@ -214,10 +214,23 @@ def test_numbers_below_logarithmic_axes_stand_apart(tmp_path):
 @pytest.mark.parametrize("span", [(2.1, 4.9), (0.2, 0.9), (3.0, 30.0), (0.7, 7e3)])
 def test_a_narrow_logarithmic_axis_has_numbers(span):
     with styled():
-        panel = Figure(figsize=(1.0, 1.0)).subplots()
-    panel.set(xscale="log", xlim=span)
-    plain_ticks(panel.xaxis)
+        fig = Figure(figsize=(1.0, 1.0))
+        panel = fig.subplots()
+        panel.set(xscale="log", xlim=span)
+        plain_ticks(panel.xaxis)
+        set_apart(fig)
     assert sum(span[0] <= tick <= span[1] for tick in panel.get_xticks()) >= 2
+
+
+def test_a_wide_logarithmic_axis_keeps_its_numbers():
+    spans = {"bread": (0.5, 7.0), "cake": (4.5, 16.0), "sand": (0.5, 7.0)}
+    panels = {
+        scene: [{"solver": "nsf", "kind": "reduced", "span_ms": ms, "displacement_error": 0.1} for ms in span]
+        for scene, span in spans.items()
+    }
+    bread = error_over_cost(panels, {}).axes[0]
+    low, high = bread.get_xlim()
+    assert [tick for tick in bread.get_xticks() if low <= tick <= high] == [0.5, 1.0, 2.0, 5.0]
 
 
 def test_a_label_beside_a_chart_keeps_a_letter_with_its_number():
