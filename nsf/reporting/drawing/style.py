@@ -84,7 +84,7 @@ _COLORS = 256
 _RAMP = 64  # colours kept of each colour scale: its bar shows no steps
 # Of text, and of floors and their shadows, whose soft edges would else become contours.
 _GREYS = (*range(34, 195, 17), *range(195, 256, 4))
-LETTER = 5.5  # [pt] width of a letter of a legend or beside an axis, at most
+LETTER = 5.5  # [pt] width of a letter of a legend, or of a number below an axis, about
 _ENTRY = 40.0  # [pt] width of what is about a legend's entry
 _CELL = 4  # levels of a channel that Pillow does not tell apart when it looks up a colour
 
