@@ -1,6 +1,7 @@
 """A reduced run beside its full-order truth, frame by frame."""
 
 import copy
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,6 +86,7 @@ def compare(
     split: str,
     pictures: tuple[int, int],
     continuation: Trajectory | None = None,
+    advance: Callable[[int], object] = int,
 ) -> Comparison:
     """Errors of a rollout against the trajectory of the same case.
 
@@ -97,6 +99,7 @@ def compare(
         split: `test`, `validation` or `train`.
         pictures: numbers of particles and of frames kept for pictures.
         continuation: the full-order frames of a rollout that was handed over, from the hand-over on.
+        advance: told how many frames more are compared.
 
     Raises:
         SchemaError: the trajectory is of other particles, or a continuation is missing or too short.
@@ -184,6 +187,7 @@ def compare(
             kept[name].append(shown.float().cpu().numpy())
         roles = [_roles(setup, x_rom[n], samples[start + n])[shown_particles] for n in inside]
         kept["role"].append(np.array(roles, np.int8).reshape(len(inside), len(shown_particles)))
+        advance(block.stop - block.start)
 
     column = {name: torch.cat(values) for name, values in rows.items()}
 

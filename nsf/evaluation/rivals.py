@@ -4,7 +4,7 @@ On a family with few parameters and a fixed forcing, interpolating the training 
 truth as a reduced run, and costs nothing. Whoever reads an error should see these beside it.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -194,7 +194,11 @@ class Rivals:
 
 
 def rivals(
-    solver: ReducedMPM, trajectory: Trajectory, factors: Sequence[int] = (), known: Sequence[Scene] = ()
+    solver: ReducedMPM,
+    trajectory: Trajectory,
+    factors: Sequence[int] = (),
+    known: Sequence[Scene] = (),
+    advance: Callable[[int], object] = int,
 ) -> Rivals:
     """Hold the rivals of a reduced run to its full-order trajectory, at all particles and frames.
 
@@ -203,6 +207,7 @@ def rivals(
         trajectory: the full-order run; its frames are those of the training runs.
         factors: of Δx of coarse full-order runs.
         known: the scene in each training case, in order; asked for where programs force the runs.
+        advance: told how many frames more are compared.
     """
     scene, setup = solver.scene, solver.setup
     forcing = [forcing_of(one) for one in known] if scene.forcing else []
@@ -231,6 +236,7 @@ def rivals(
         found |= {factor: tensor(run.x[block]) - x for factor, run in ran.items()}
         for name, apart in found.items():
             squares.setdefault(name, []).append(metrics.frame_squares(apart))
+        advance(len(x))
     norm = torch.cat(squares.pop("norm"))
     errors = {name: metrics.relative(torch.cat(of), norm) for name, of in squares.items()}
     told = {

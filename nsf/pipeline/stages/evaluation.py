@@ -21,6 +21,7 @@ from nsf.evaluation import (
 )
 from nsf.kinematics.manifold import Manifold
 from nsf.pipeline.stages import results
+from nsf.progress import Progress
 from nsf.runs import Run
 from nsf.vectors import spaced
 
@@ -45,10 +46,12 @@ def evaluate(pipeline, run: Run) -> None:
     truths, manifold = _truths(pipeline), pipeline.manifold().to(pipeline.device)  # as in deployment
     with run.record(device=pipeline.device, precision=pipeline.config.precision) as record:
         rollouts = _rollouts(pipeline, manifold)
-        found = [
-            _compare(pipeline, manifold, rollout, truth, index)
-            for index, (rollout, truth) in enumerate(zip(rollouts, truths, strict=True))
-        ]
+        frames = len(rollouts) * (2 * pipeline.deployed.steps + 1)  # the rivals' without the first
+        with Progress("evaluate", frames, "frames") as progress:
+            found = [
+                _compare(pipeline, manifold, rollout, truth, index, progress)
+                for index, (rollout, truth) in enumerate(zip(rollouts, truths, strict=True))
+            ]
         comparisons, beside = zip(*found, strict=True)
         cost = _cost(pipeline, manifold, rollouts, beside[0].factors)
         engine = str(pipeline.deployment.manifest["metrics"].get("engine", ""))
@@ -117,9 +120,10 @@ def _took(pipeline, rollout: Rollout) -> str | None:
 
 
 def _compare(
-    pipeline, manifold: Manifold, rollout: Rollout, truth: Path, index: int
+    pipeline, manifold: Manifold, rollout: Rollout, truth: Path, index: int, progress: Progress
 ) -> tuple[Comparison, Rivals]:
     asked = pipeline.config.evaluation
+    progress.describe(rollout.case.named)
     with contextlib.ExitStack() as files:
         trajectory = files.enter_context(Trajectory.open(truth))
         rest = None
@@ -127,10 +131,11 @@ def _compare(
             rest = files.enter_context(Trajectory.open(pipeline.deployment.file(continuation_file(index))))
         solver = pipeline.solver_at(manifold, rollout.case, engine=_took(pipeline, rollout))
         shown = (asked.picture_particles, asked.picture_frames)
-        found = compare(solver, trajectory, rollout, pipeline.config.deploy.split, shown, rest)
+        split = pipeline.config.deploy.split
+        found = compare(solver, trajectory, rollout, split, shown, rest, progress.advance)
         forced = pipeline.split.train if pipeline.scene.forcing else ()
         known = list(map(pipeline.scene.with_parameters, forced))
-        return found, rivals(solver, trajectory, pipeline.coarse, known)
+        return found, rivals(solver, trajectory, pipeline.coarse, known, progress.advance)
 
 
 def _cost(pipeline, manifold: Manifold, rollouts: Sequence[Rollout], factors: Sequence[int]) -> dict:

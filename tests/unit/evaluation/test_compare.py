@@ -30,7 +30,10 @@ def rollout_of(t, xhat, diverged=-1):
 def comparison_of(chain, tiny_manifold, truth):
     def build(rollout, split="test", pictures=(50, 4), **options):
         solver = chain.scene.reduced(tiny_manifold, {"friction_angle": 26.0}, 20, device="cpu", **options)
-        return compare(solver, truth, rollout, split, pictures)
+        told = []
+        found = compare(solver, truth, rollout, split, pictures, advance=told.append)
+        assert sum(told) == truth.frames
+        return found
 
     return build
 

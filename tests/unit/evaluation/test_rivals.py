@@ -45,8 +45,10 @@ def test_interpolation_over_two_parameters_keeps_training_runs():
 
 def test_rivals_are_held_to_every_particle_and_frame(chain, tiny_manifold, truth, runs):
     solver = chain.pipeline.solver_at(tiny_manifold, angle(26.0))
-    found = rivals(solver, truth, [2])
+    told = []
+    found = rivals(solver, truth, [2], advance=told.append)
     x, X = truth.read("x")[1:], truth.X
+    assert sum(told) == len(x)
     norm = np.linalg.norm(x - X)
     assert found.static == pytest.approx(1.0)
     for error, xhat in (
