@@ -9,7 +9,8 @@ from pathlib import Path
 import pandas as pd
 from joblib.externals.loky import ProcessPoolExecutor
 
-from nsf.reporting.drawing import charts, shapes
+from nsf.reporting.bodies import shapes
+from nsf.reporting.drawing import charts
 from nsf.reporting.drawing.style import DIFFERENCE_COLORS, STRESS_COLORS, save
 from nsf.reporting.keeping import Kept
 from nsf.reporting.rivals import over_cost

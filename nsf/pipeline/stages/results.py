@@ -263,7 +263,7 @@ def write_superresolution(
     record: Record, scene: Scene, cases: Sequence[Case], fine: Sequence[SuperResolution]
 ) -> pd.DataFrame:
     """Write `superresolution.csv` and `superresolution.png` into a run's folder; gives the table."""
-    from nsf.reporting.drawing.shapes import fine_shapes
+    from nsf.reporting.bodies.shapes import fine_shapes
     from nsf.reporting.drawing.style import PIXELS, STRESS_COLORS, write_png
 
     table = pd.DataFrame([f.row for f in fine])

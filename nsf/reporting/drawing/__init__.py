@@ -1,1 +1,1 @@
-"""Charts and pictures: data in, figures out."""
+"""Charts: data in, figures out."""

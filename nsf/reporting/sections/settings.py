@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from nsf.reporting.drawing import shapes
+from nsf.reporting.bodies import shapes
 from nsf.reporting.drawing.style import DIFFERENCE_COLORS, STRESS_COLORS, save
 from nsf.reporting.sections.variant import ROWS, Variant, order
 from nsf.reporting.sources import Study

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from nsf.reporting.drawing import shapes
+from nsf.reporting.bodies import shapes
 from nsf.reporting.keeping import code, key_of
 from nsf.reporting.sources import Motion, same_parameter
 from nsf.reporting.tables import Merged, natural

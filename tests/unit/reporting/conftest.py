@@ -6,7 +6,8 @@ import pytest
 from synthetic import Made, write_run
 
 from nsf.reporting import build, build_report, pictures
-from nsf.reporting.drawing import camera, style
+from nsf.reporting.bodies import camera
+from nsf.reporting.drawing import style
 
 SWEEP = (
     Made(),

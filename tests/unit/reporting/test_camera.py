@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from nsf.reporting.drawing import camera
-from nsf.reporting.drawing.camera import View
+from nsf.reporting.bodies import camera
+from nsf.reporting.bodies.camera import View
 from nsf.scenes import Box
 
 

@@ -10,7 +10,8 @@ from synthetic import TEST, Made, rewrite_manifest, seal, write_run
 
 from nsf.errors import ConfigError, StorageError
 from nsf.reporting import build, build_report, pictures
-from nsf.reporting.drawing import camera, style
+from nsf.reporting.bodies import camera
+from nsf.reporting.drawing import style
 from nsf.reporting.sections.variant import Variant
 from nsf.reporting.sources import Source, Study, file_hash, open_sources
 from nsf.reporting.study import estimate_note, spearman, trust_note

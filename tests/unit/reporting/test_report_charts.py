@@ -10,12 +10,12 @@ from matplotlib.figure import Figure
 from synthetic import TEST, Made, collapse
 
 from nsf import config
+from nsf.reporting.bodies.camera import Camera, View
+from nsf.reporting.bodies.shapes import Case, animation, final_shapes, hides_stress, is_cut_open, strip
 from nsf.reporting.drawing import charts
-from nsf.reporting.drawing.camera import Camera, View
 from nsf.reporting.drawing.cost import error_over_cost, step_over_particles
 from nsf.reporting.drawing.point import point_chart, point_response
 from nsf.reporting.drawing.scales import plain_ticks, set_apart
-from nsf.reporting.drawing.shapes import Case, animation, final_shapes, hides_stress, is_cut_open, strip
 from nsf.reporting.drawing.style import LETTER, save, styled
 from nsf.reporting.sources import Motion
 

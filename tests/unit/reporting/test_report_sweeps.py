@@ -10,7 +10,8 @@ import pytest
 from synthetic import Made, write_run
 
 from nsf.reporting import build_report
-from nsf.reporting.drawing import charts, shapes
+from nsf.reporting.bodies import shapes
+from nsf.reporting.drawing import charts
 from nsf.reporting.pictures import draw
 from nsf.reporting.sources import Study, open_sources
 from nsf.reporting.study import _name, _settings, _told, interval, over_seeds, swept

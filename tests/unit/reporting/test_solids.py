@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from synthetic import Made, collapse
 
-from nsf.reporting.drawing.camera import Camera, View
-from nsf.reporting.drawing.shapes import Case, Stage
-from nsf.reporting.drawing.solids import faces, reaches, upright
+from nsf.reporting.bodies.camera import Camera, View
+from nsf.reporting.bodies.shapes import Case, Stage
+from nsf.reporting.bodies.solids import faces, reaches, upright
 from nsf.reporting.sources import Motion
 
 RED = np.array([1.0, 0.0, 0.0])

@@ -7,7 +7,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFilter
 from scipy.ndimage import uniform_filter
 
-from nsf.reporting.drawing.solids import Face
+from nsf.reporting.bodies.solids import Face
 
 _LIGHT = np.array([-0.45, 0.65, 0.62])  # in camera axes: from the upper left, in front
 _AMBIENT = 0.62  # share of a surface's colour that light does not model: keeps the colour map readable

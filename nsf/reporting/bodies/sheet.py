@@ -9,7 +9,7 @@ from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 from PIL import Image
 
-from nsf.reporting.drawing.camera import View
+from nsf.reporting.bodies.camera import View
 from nsf.reporting.drawing.style import INK, MUTED, WARNING, WIDTH, ColorScale
 
 

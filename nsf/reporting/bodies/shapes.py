@@ -10,10 +10,10 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from scipy.spatial import cKDTree
 
-from nsf.reporting.drawing.camera import Camera, View
-from nsf.reporting.drawing.gif import gif
-from nsf.reporting.drawing.sheet import Sheet
-from nsf.reporting.drawing.solids import Face, faces, reaches, upright
+from nsf.reporting.bodies.camera import Camera, View
+from nsf.reporting.bodies.gif import gif
+from nsf.reporting.bodies.sheet import Sheet
+from nsf.reporting.bodies.solids import Face, faces, reaches, upright
 from nsf.reporting.drawing.style import (
     CLIP,
     DIFFERENCE_COLORS,

@@ -1,0 +1,1 @@
+"""Pictures of bodies: particles, solids and a camera in, strips and animations out."""
