@@ -78,8 +78,9 @@ def train(
 
     Returns:
         The manifold on the host, and for each phase its steps, last loss (mean squared error over the
-        variance of the field, and what a field adds) and seconds; `training_seconds` adds those and the
-        preparation's. Time before an interrupt counts, work that an interrupt undid does not.
+        variance of the field, and what a field adds) and seconds; `training_seconds` adds those, the
+        preparation's and the building's. Time before an interrupt counts, work that an interrupt undid does
+        not.
 
     Raises:
         ConfigError: a value is out of range.
@@ -100,7 +101,10 @@ def train(
     with refusals(folder), _determinism(deterministic):
         whole, schedule, own_seed = snapshots.whole, trainer.share(), rank.seed(seed)
         prepared, total = _timed(folder / "prepared.pt", lambda: field.prepare(whole, latent_dim), rank)
+        began = time.perf_counter()  # of a large scene, building reads all data once more
         manifold = field.build(whole, prepared, latent_dim, seeded("cpu", seed, WEIGHTS_STREAM)).to(device)
+        took = time.perf_counter() - began
+        total += _once(folder / "built.pt", lambda: {"seconds": took}, rank)["seconds"]
         metrics: dict[str, float] = {}
         for fit in field.fits(manifold, snapshots, prepared):
             descent = Descent(

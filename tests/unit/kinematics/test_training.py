@@ -94,6 +94,14 @@ def test_seconds_before_an_interrupt_count(monkeypatch, train, tmp_path):
     assert metrics["deformation_seconds"] > 0.4  # two whole blocks of five steps came before
 
 
+def test_seconds_of_building_count(monkeypatch, train, tmp_path):
+    true_build = BasisField.build
+    monkeypatch.setattr(BasisField, "build", lambda *given: time.sleep(0.3) or true_build(*given))
+    _, metrics = train("basis", tmp_path)
+    parts = sum(metrics[f"{phase}_seconds"] for phase in PHASES)
+    assert metrics["training_seconds"] > parts + 0.3
+
+
 @pytest.mark.parametrize("field", FIELDS)
 def test_seed_decides(train, tmp_path, field):
     torch.manual_seed(5)  # must not matter
