@@ -35,7 +35,7 @@ VALUES = "scene.design.test"  # jobs of one scene and seed with this key are abo
 _TIMES = ("step_ms_full", "step_ms_reduced", "total_ms_full", "total_ms_reduced", "shown_ms")
 _AVERAGED = [name for name in (*MEASURED, *RIVALS, PAPER, *_TIMES) if name != WORST]
 #: Of these the deviation over seeds stands beside the mean.
-_SCATTERED = ("delta", "displacement_error", "stress_error", "speedup_step", "speedup_total", "speedup_shown")
+_SCATTERED = ("delta", "displacement_error", "stress_error")
 _COLUMN_OF = {
     "scene": "scene",
     "method": "method",

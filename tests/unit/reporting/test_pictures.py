@@ -3,9 +3,13 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
+import pytest
+from synthetic import Made, seal, write_run
 
 from nsf.reporting import pictures
-from nsf.reporting.sources import Study
+from nsf.reporting.sources import Study, open_sources
+from nsf.reporting.tables import merge
 
 
 def variant(delta, scene="sand", method="nsf", changes="", ended="", label="", run="evaluate/sand/1"):
@@ -51,3 +55,21 @@ def test_what_is_varied_beside_the_seed_is_told_in_charts():
     keys = {str(i): {"noise": f"{i // 2}", "seed": f"{i % 2}"} for i in range(4)}
     named = [name for name, _ in pictures._over_seeds(known, Study("?", "", {}, keys, []))]
     assert named == ["nsf · noise=0 · 2 seeds", "nsf · noise=1 · 2 seeds"]
+
+
+def test_speedups_over_seeds_are_of_mean_times(tmp_path, monkeypatch):
+    """A seed whose run is a hundred times as slow as the other's is not hidden by it."""
+    found = [write_run(tmp_path / "runs", Made(seed=seed)) for seed in (0, 1)]
+    for run, times in zip(found, (0.01, 1.0), strict=True):
+        rows = pd.read_csv(run.path / "results.csv")
+        rows["step_ms_full"], rows["step_ms_reduced"], rows["speedup_step"] = 1.0, times, 1 / times
+        rows.to_csv(run.path / "results.csv", index=False)
+        seal(run)
+    keys = {run.id: {"scene": "sand", "seed": str(seed)} for seed, run in enumerate(found)}
+    drawn = []
+    monkeypatch.setattr(pictures.charts, "speedup_and_memory", lambda entries: drawn.extend(entries))
+    monkeypatch.setattr(pictures, "save", lambda *given: [])
+    merged = merge(open_sources(found), {run.id: f"seed={seed}" for seed, run in enumerate(found)})
+    pictures.draw(merged, tmp_path, sweep=True, study=Study("?", "", {}, keys, []))
+    (entry,) = drawn
+    assert entry["speedup_step"] == pytest.approx(2 / 1.01)
