@@ -279,7 +279,8 @@ def _comparison(known: list[Variant], folder: Path, study: Study | None) -> list
         ("delta", charts.delta_per_variant,
          f"Mean δ over the {splits} values, and each of them (dots){printed}."),
         ("speedup-memory", charts.speedup_and_memory,
-         "Speedup of the reduced over the full-order model, of mean times (line: 1×), and the peak memory of both."),
+         "Speedup of the reduced over the full-order model, of mean times (line: 1×), and the peak memory of "
+         "both."),
     )  # fmt: skip
     if all(pd.isna(entry["step_ms_full"]) for entry in entries):
         drawings = drawings[:1]  # evaluation.trials=0
