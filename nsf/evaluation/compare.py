@@ -86,7 +86,7 @@ def compare(
     split: str,
     pictures: tuple[int, int],
     continuation: Trajectory | None = None,
-    advance: Callable[[int], object] = int,
+    advance: Callable[[int], object] = lambda frames: None,
 ) -> Comparison:
     """Errors of a rollout against the trajectory of the same case.
 

@@ -132,7 +132,13 @@ def coarse_scene(scene: Scene, parameters: Mapping[str, float], factor: int) -> 
 
 
 def coarse_run(
-    scene: Scene, parameters: Mapping[str, float], X: np.ndarray, factor: int, precision: str, device: str
+    scene: Scene,
+    parameters: Mapping[str, float],
+    X: np.ndarray,
+    factor: int,
+    precision: str,
+    device: str,
+    advance: Callable[[int], object] = lambda frames: None,
 ) -> CoarseRun | str:
     """Run a scene on a coarser grid, and carry its displacements to the scene's own particles.
 
@@ -143,10 +149,12 @@ def coarse_run(
         factor: of Δx; particles become fewer by its third power.
         precision: `fp64` or `fp32`.
         device: `cpu`, `cuda` or `cuda:N`.
+        advance: told how many frames more there are; of all of them where there is no run.
 
     Returns:
         The run; or the reason why there is none, such as a solid that the coarse grid does not resolve.
     """
+    left = scene.steps + 1
     try:
         coarse = coarse_scene(scene, parameters, factor)
         solver = coarse.full_order(precision=precision, device=device)
@@ -164,7 +172,10 @@ def coarse_run(
                 solver.step(1)
                 last, ahead, taken = ahead, moved(), taken + 1
             x[frame] = X + (1.0 - share) * last + share * ahead
+            left -= 1
+            advance(1)
     except NSFError as error:
+        advance(left)
         return str(error)
     return CoarseRun(x=x, steps=coarse.steps, dx=coarse.dx, particles=len(own))
 
@@ -198,7 +209,7 @@ def rivals(
     trajectory: Trajectory,
     factors: Sequence[int] = (),
     known: Sequence[Scene] = (),
-    advance: Callable[[int], object] = int,
+    advance: Callable[[int], object] = lambda frames: None,
 ) -> Rivals:
     """Hold the rivals of a reduced run to its full-order trajectory, at all particles and frames.
 
@@ -207,7 +218,7 @@ def rivals(
         trajectory: the full-order run; its frames are those of the training runs.
         factors: of Δx of coarse full-order runs.
         known: the scene in each training case, in order; asked for where programs force the runs.
-        advance: told how many frames more are compared.
+        advance: told how many frames more there are of a coarse run, or are compared.
     """
     scene, setup = solver.scene, solver.setup
     forcing = [forcing_of(one) for one in known] if scene.forcing else []
@@ -221,10 +232,8 @@ def rivals(
 
     latents = {"nearest": tensor(runs.nearest(parameters))}
     latents["interpolated"] = tensor(runs.interpolated(parameters))
-    coarse = {
-        factor: coarse_run(scene, setup.given, trajectory.X, factor, setup.precision.name, setup.device)
-        for factor in factors
-    }
+    how = setup.precision.name, setup.device, advance
+    coarse = {factor: coarse_run(scene, setup.given, trajectory.X, factor, *how) for factor in factors}
     ran = {factor: run for factor, run in coarse.items() if not isinstance(run, str)}
     X, squares = tensor(trajectory.X), {}
     rows = max(1, _CHUNK // (3 * trajectory.particles))

@@ -39,13 +39,14 @@ class Interpolation:
 
     @cached_property
     def _used(self) -> tuple[Tensor, Tensor]:
-        """Particles that are a neighbour of some point [m], and each neighbour's place among them [n, k]."""
-        return self.neighbours.unique(return_inverse=True)  # sorts them all, which takes longer than a sum
+        """Indices [used] of the particles that are a neighbour of some point, and each neighbour's place
+        among them [n, k]. To sort all neighbours takes longer than a sum."""
+        return self.neighbours.unique(return_inverse=True)
 
     def value(self, field: Tensor) -> Tensor:
         """Field [P, ...] at the points [n, ...], in float64 on the field's device."""
         # Sums rows as it reads them: to hold every point's neighbours first takes six times as long on a CPU.
-        near, rows, weights = (a.to(field.device) for a in (*self._used, self.weights))
+        near, rows, weights = (given.to(field.device) for given in (*self._used, self.weights))
         values = field[near].double().reshape(len(near), -1)
         found = F.embedding_bag(rows, values, mode="sum", per_sample_weights=weights)
         return found.reshape(len(rows), *field.shape[1:])

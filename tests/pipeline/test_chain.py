@@ -22,6 +22,7 @@ from nsf.errors import ConfigError, InstabilityError, MissingRunError, NSFError
 from nsf.evaluation import superresolution
 from nsf.kinematics.manifold import Manifold
 from nsf.mpm import FullOrderMPM
+from nsf.pipeline.stages import evaluation
 from nsf.reporting.overview.tables import texts
 from nsf.runs import Run
 from nsf.runs.listing import entries
@@ -199,7 +200,7 @@ def test_another_test_value_simulates_only_that_one(copied, pipeline_at):
     assert results["parameter"].tolist() == [26.0, 34.0]
 
 
-def test_values_deployed_together_are_as_one_by_one(copied, pipeline_at):
+def test_values_deployed_together_are_as_one_by_one(copied, pipeline_at, monkeypatch):
     root, keys = copied("simulate", "train"), ("scene.design.test=[26,34,36]", "evaluation.trials=1")
     said_by(pipeline_at, root, *keys, stages=("simulate",))
     found = {}
@@ -216,7 +217,17 @@ def test_values_deployed_together_are_as_one_by_one(copied, pipeline_at):
         assert (one.case, one.stops, one.diverged) == (other.case, other.stops, other.diverged)
         assert (one.sample, one.integration_mean) == (other.sample, other.integration_mean)
         np.testing.assert_allclose(one.xhat, other.xhat, rtol=0, atol=1e-10)
+    counted = []
+
+    class Counted(evaluation.Progress):
+        def __exit__(self, *exception):
+            counted.append((self._done, self._total))
+            super().__exit__(*exception)
+
+    monkeypatch.setattr(evaluation, "Progress", Counted)
     assert pipeline.evaluate().complete
+    ((done, total),) = counted
+    assert done == total > 0
 
 
 def test_an_engine_that_is_asked_for(copied, pipeline_at):

@@ -104,7 +104,7 @@ def train(
         began = time.perf_counter()  # of a large scene, building reads all data once more
         manifold = field.build(whole, prepared, latent_dim, seeded("cpu", seed, WEIGHTS_STREAM)).to(device)
         took = time.perf_counter() - began
-        total += _once(folder / "built.pt", lambda: {"seconds": took}, rank)["seconds"]
+        total += _once(folder / "built.pt", lambda: took, rank)  # of the first call, as all seconds are
         metrics: dict[str, float] = {}
         for fit in field.fits(manifold, snapshots, prepared):
             descent = Descent(

@@ -46,8 +46,9 @@ def evaluate(pipeline, run: Run) -> None:
     truths, manifold = _truths(pipeline), pipeline.manifold().to(pipeline.device)  # as in deployment
     with run.record(device=pipeline.device, precision=pipeline.config.precision) as record:
         rollouts = _rollouts(pipeline, manifold)
-        frames = len(rollouts) * (2 * pipeline.deployed.steps + 1)  # the rivals' without the first
-        with Progress("evaluate", frames, "frames") as progress:
+        frames, coarse = pipeline.deployed.steps + 1, len(pipeline.coarse)
+        total = len(rollouts) * ((2 + coarse) * frames - 1)  # rivals are not compared in the first
+        with Progress("evaluate", total, "frames") as progress:
             found = [
                 _compare(pipeline, manifold, rollout, truth, index, progress)
                 for index, (rollout, truth) in enumerate(zip(rollouts, truths, strict=True))

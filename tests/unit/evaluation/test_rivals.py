@@ -48,7 +48,7 @@ def test_rivals_are_held_to_every_particle_and_frame(chain, tiny_manifold, truth
     told = []
     found = rivals(solver, truth, [2], advance=told.append)
     x, X = truth.read("x")[1:], truth.X
-    assert sum(told) == len(x)
+    assert sum(told) == len(x) + truth.frames  # compared, and of the coarse run
     norm = np.linalg.norm(x - X)
     assert found.static == pytest.approx(1.0)
     for error, xhat in (
@@ -119,8 +119,10 @@ def test_a_scene_that_no_coarse_grid_resolves_says_why(chain):
         "friction": 0.0,
     }
     scene = type(chain.scene).from_config(config)
-    reason = coarse_run(scene, {"friction_angle": 26.0}, scene.particles().X, 2, "fp64", "cpu")
+    told = []
+    reason = coarse_run(scene, {"friction_angle": 26.0}, scene.particles().X, 2, "fp64", "cpu", told.append)
     assert "needs dx of at most" in reason
+    assert told == [scene.steps + 1]
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,19 @@ def test_linear_fields(particles, shift):
     torch.testing.assert_close(slope, coefficients.T.expand(len(X), 2, -1), rtol=1e-5, atol=1e-5)
 
 
+def test_neighbours_are_sorted_once(monkeypatch):
+    X, particles = cloud(40, 1), cloud(200)
+    one, other = particles.sin(), (3 * particles).sum(1)
+    fresh = [interpolation(X, particles).value(field) for field in (one, other)]
+    local, sort, sorted_ = interpolation(X, particles), torch.Tensor.unique, []
+    monkeypatch.setattr(
+        torch.Tensor, "unique", lambda self, **given: sorted_.append(1) or sort(self, **given)
+    )
+    for field, expected in zip((one, other), fresh, strict=True):
+        assert torch.equal(local.value(field), expected)
+    assert len(sorted_) == 1
+
+
 def test_interpolates():
     particles = cloud(200)
     values = torch.sin(7 * particles)

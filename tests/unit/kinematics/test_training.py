@@ -97,6 +97,11 @@ def test_seconds_before_an_interrupt_count(monkeypatch, train, tmp_path):
 def test_seconds_of_building_count(monkeypatch, train, tmp_path):
     true_build = BasisField.build
     monkeypatch.setattr(BasisField, "build", lambda *given: time.sleep(0.3) or true_build(*given))
+    restore = interrupt_at(monkeypatch, "deformation", 7)
+    with pytest.raises(KeyboardInterrupt):
+        train("basis", tmp_path)
+    restore()
+    monkeypatch.setattr(BasisField, "build", true_build)  # the second time is not counted
     _, metrics = train("basis", tmp_path)
     parts = sum(metrics[f"{phase}_seconds"] for phase in PHASES)
     assert metrics["training_seconds"] > parts + 0.3
