@@ -154,7 +154,7 @@ def coarse_run(
     Returns:
         The run; or the reason why there is none, such as a solid that the coarse grid does not resolve.
     """
-    left = scene.steps + 1
+    left = scene.steps + 1  # frames
     try:
         coarse = coarse_scene(scene, parameters, factor)
         solver = coarse.full_order(precision=precision, device=device)
