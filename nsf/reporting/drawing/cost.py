@@ -13,6 +13,7 @@ from nsf.reporting.drawing.style import FULL, INK, MUTED, PALETTE, figure, legen
 _FULL = "full order"  # begins the names of full-order solvers
 _ACROSS = 3  # panels in a row
 _COARSE = {"ls": "", "marker": "s", "ms": 7, "mfc": "white", "mec": FULL, "mew": 1.6}
+_MARKERS = "o^vD"  # of solvers that share a colour
 _LINES = ((0, (6, 2)), (0, (2, 1.5)), (0, (1, 3)))
 
 
@@ -109,7 +110,9 @@ def _point(panel, solver: Mapping, colors: Mapping[str, str]) -> None:
                 name.rpartition(" ")[2] + "Δx", (x, 100 * y), (5, 4), textcoords="offset points", color=INK
             )
         else:
-            panel.plot(x, 100 * y, "o", ms=7, color=colors[name], label=name)
+            same = [other for other, color in colors.items() if color == colors[name]]
+            marker = _MARKERS[same.index(name) % len(_MARKERS)]
+            panel.plot(x, 100 * y, marker, ms=7, color=colors[name], label=name)
 
 
 def _drawable(value) -> bool:

@@ -2,6 +2,7 @@
 
 import io
 import itertools
+import math
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
@@ -86,6 +87,7 @@ _RAMP = 64  # colours kept of each colour scale: its bar shows no steps
 _GREYS = (*range(34, 195, 17), *range(195, 256, 4))
 LETTER = 5.5  # [pt] width of a letter of a legend, or of a number below an axis, about
 _ENTRY = 40.0  # [pt] width of what is about a legend's entry
+_ROW = 16.5  # [pt] height of a legend's row, about
 _CELL = 4  # levels of a channel that Pillow does not tell apart when it looks up a colour
 
 
@@ -105,9 +107,14 @@ def line_style(i: int) -> dict:
 
 
 def legend_above(fig: Figure, handles: Collection, labels: Collection[str], most: int, **options) -> None:
-    """A legend over the panels, in as many columns as fit, `most` at most; options as of `Figure.legend`."""
+    """A legend over the panels, in as many columns as fit, `most` at most; options as of `Figure.legend`.
+
+    A legend of more than three rows makes the figure higher, so that panels keep their room.
+    """
     columns = int(72.0 * fig.get_figwidth() / (LETTER * max(map(len, labels), default=0) + _ENTRY))
     columns = max(1, min(len(labels), most, columns))
+    more = math.ceil(len(labels) / columns) - 3
+    fig.set_figheight(fig.get_figheight() + max(more, 0) * _ROW / 72.0)
     legend = fig.legend(handles, labels, loc="outside upper left", ncols=columns, handlelength=2.2, **options)
     legend.get_title().set_fontsize(9)
 
