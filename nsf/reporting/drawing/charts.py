@@ -118,22 +118,23 @@ def reconstruction_and_rollout(series: pd.DataFrame, name: str = "parameter", un
     """
     groups = _by_parameter(series)
     with styled():
-        fig = figure(3.9, 7.2)
+        fig = figure(1.5 + 0.34 * max(len(groups), 3), 7.2)
         panel = fig.subplots()
         low, high = (
             _finite([100 * _rms(part[column]) for _, part in groups])
             for column in ("reconstruction_delta", "delta")
         )
         at = np.arange(len(groups))
-        panel.vlines(at, low, high, color=REDUCED, lw=3, alpha=0.3)
+        panel.hlines(at, low, high, color=REDUCED, lw=3, alpha=0.3)
         panel.plot(
-            at, low, "o", ms=8, mfc="white", mec=REDUCED, mew=1.6, label="reconstruction: decode(encode(x))"
+            low, at, "o", ms=8, mfc="white", mec=REDUCED, mew=1.6, label="reconstruction: decode(encode(x))"
         )
-        panel.plot(at, high, "o", ms=8, color=REDUCED, label="rollout: reduced dynamics")
-        panel.set_xticks(at, [f"{parameter_text(value)}\n{part['split'].iloc[0]}" for value, part in groups])
-        panel.set(xlabel=axis(name, unit), ylabel="RMS over frames of δ [%]", xlim=(-0.5, len(groups) - 0.5))
-        error_scale(panel, np.concatenate([low, high]))
+        panel.plot(high, at, "o", ms=8, color=REDUCED, label="rollout: reduced dynamics")
+        panel.set_yticks(at, [f"{parameter_text(value)}, {part['split'].iloc[0]}" for value, part in groups])
+        panel.set(ylabel=axis(name, unit), xlabel="RMS over frames of δ [%]", ylim=(len(groups) - 0.5, -0.5))
+        error_scale(panel, np.concatenate([low, high]), "x")
         _legend_above(fig, panel, None)
+        set_apart(fig)
     return fig
 
 

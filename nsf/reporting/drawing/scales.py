@@ -14,17 +14,19 @@ from nsf.reporting.drawing.style import LETTER
 LOST = 1000.0  # [%] error from which a run is lost, by how much tells nothing: axes end there
 
 
-def error_scale(panel, values) -> None:
+def error_scale(panel, values, along: str = "y") -> None:
     """Logarithmic once the errors span more than a factor of 30, else linear from zero; to `LOST` at most."""
     values = np.asarray(values, float)
     values = np.minimum(values[np.isfinite(values) & (values > 0)], LOST)
-    panel.grid(axis="y")
-    if len(values) and np.max(values) > 30 * np.quantile(values, 0.05):
-        panel.set_yscale("log")
-        panel.set_ylim(np.quantile(values, 0.02) / 1.6, np.max(values) * 1.6)
-        plain_ticks(panel.yaxis)
-    else:
-        panel.set_ylim(0, 1.08 * np.max(values, initial=1e-12))
+    panel.grid(axis=along)
+    limits = (0, 1.08 * np.max(values, initial=1e-12))
+    logarithmic = len(values) > 0 and np.max(values) > 30 * np.quantile(values, 0.05)
+    if logarithmic:
+        panel.set(**{f"{along}scale": "log"})
+        limits = (np.quantile(values, 0.02) / 1.6, np.max(values) * 1.6)
+    panel.set(**{f"{along}lim": limits})
+    if logarithmic:
+        plain_ticks(getattr(panel, f"{along}axis"))
 
 
 def plain_ticks(axis_line, text: Callable[[float], str] = "{:g}".format) -> None:

@@ -182,7 +182,7 @@ def test_errors_over_decades_are_drawn_on_a_log_axis():
 def test_reconstruction_and_rollout_are_rms_over_frames(series):
     panel = charts.reconstruction_and_rollout(series).axes[0]
     expected = [100 * np.sqrt((part["delta"] ** 2).mean()) for _, part in series.groupby("parameter")]
-    np.testing.assert_allclose(panel.lines[1].get_ydata(), expected)
+    np.testing.assert_allclose(panel.lines[1].get_xdata(), expected)
 
 
 def test_numbers_below_logarithmic_axes_stand_apart(tmp_path):
