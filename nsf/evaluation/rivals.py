@@ -187,8 +187,9 @@ class Rivals:
     Where programs force the runs, these count among the parameters.
 
     Attributes:
-        static: nothing moves, which is 1 by definition; nearest: the training run of the nearest parameters;
-            interpolated: the latent vectors of training runs, interpolated over the parameters.
+        static: nothing moves, which is 1 by definition; nearest: the training run of the nearest parameters,
+            by its latent vectors; interpolated: the latent vectors of training runs, interpolated over the
+            parameters.
         coarse: of the full-order solver by factor of Δx: `displacement_error`, `dx` [m], `particles` and
             `steps`; or `why` there is none.
     """

@@ -112,7 +112,8 @@ def _page(title: str, merged: Merged, sections, study: Study | None, more, fine,
     per_value, same_there = without_constants(merged.frame.drop(columns=[*COSTS, *RIVALS]))
     alike = merged.frame[["scene"] if sweep else ["scene", "method"]].drop_duplicates()
     chosen = (
-        f"Of each {alike.columns[-1]}, the pictures show the variant with the smallest mean held-out δ. "
+        f"Of each {alike.columns[-1]}, the pictures show the variant with the smallest mean held-out δ; one "
+        "whose runs another solver took over stands last. "
         if len(variants(merged)) > len(alike)
         else ""
     )

@@ -169,7 +169,7 @@ def _stills(v: Variant, folder: Path, prefix: str, brief: bool, beside: Variant 
     whole = "Bodies over time, cut open" if shapes.hides_stress(cases[0].motion) else "Whole bodies over time"
     told = (
         f"{whole}, at {_told(cases, name, unit)}: of each full-order above, reduced below."
-        f"{_beside(cases)}{continued}"
+        f"{_beside(cases)}{_drawn(v, cases)}{continued}"
     )
     pictures = [Picture(strip, told, v.runs)]
     if brief:
@@ -186,6 +186,12 @@ def _stills(v: Variant, folder: Path, prefix: str, brief: bool, beside: Variant 
         f"full-order one puts it.{continued}"
     )
     return [*pictures, Picture(final, told, v.runs), *_sets(v, folder, prefix)]
+
+
+def _drawn(v: Variant, cases: Sequence[shapes.Case]) -> str:
+    """How many particles are drawn, as a sentence; empty where all are."""
+    drawn, known = cases[0].motion.x_full.shape[1], v.sources[0].particles
+    return f" {drawn:,} of {known:,} particles are drawn." if drawn < known else ""
 
 
 def _sets(v: Variant, folder: Path, prefix: str) -> list[Picture]:

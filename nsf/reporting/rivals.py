@@ -30,13 +30,14 @@ _NOTE = (
     "Errors are means over held-out values, and the full-order run is what they are measured from. A run is "
     "all steps from t = 0. A reduced run ends with latent vectors: the last time is that of the run and of "
     "decoding the positions of all particles at every frame, which stay on the device. A coarse solver may "
-    "take longer steps, so its run has fewer of them."
+    "take longer steps, so its run has fewer of them; its time does not hold what carries its frames to the "
+    "particles of the full-order run. Memory is the peak of the steps, without decoding."
 )
 _BESIDE = (
     "Displacement errors, means over held-out values. Nothing moves is 100 % by definition; the nearest "
-    "training run is that of the nearest parameters and program; the latent vectors of training runs are "
-    "interpolated over both; the coarse full order is the full-order solver on a coarser grid, with as many "
-    "particles a cell. The first three take no step."
+    "training run is that of the nearest parameters and program, its latent vectors decoded by the same "
+    "fields; latent vectors of training runs are interpolated over both; the coarse full order is the "
+    "full-order solver on a coarser grid, with as many particles a cell. The first three take no step."
 )
 
 

@@ -168,11 +168,10 @@ class Report:
 def _means(part: pd.DataFrame) -> dict[str, float]:
     """Means over some rows and speedups of mean times; a value that is missing leaves its mean empty.
 
-    δ of a still body and the share of N are means over the rows that have them.
+    The share of N is the mean over the rows that have it.
     """
     means = part.reindex(columns=_AVERAGED).mean(skipna=False).to_dict()
-    known = {name: part[name].mean() for name in ("delta_static", SHARE)}
-    return means | known | speedups(means)
+    return means | {SHARE: part[SHARE].mean()} | speedups(means)
 
 
 def own_keys(run: Mapping) -> dict[str, str]:

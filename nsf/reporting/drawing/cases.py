@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.transforms import offset_copy
 
-from nsf.reporting.drawing.cost import solver_colors
+from nsf.reporting.drawing.cost import solver_styles
 from nsf.reporting.drawing.scales import LOST, error_scale, plain_ticks
 from nsf.reporting.drawing.style import FULL, INK, WARNING, WIDTH, figure, legend_above, styled
 from nsf.reporting.text.columns import axis, number
@@ -68,7 +68,7 @@ def error_over_parameters(bodies: Sequence[Cases]) -> Figure:
     of which a band goes. Lost runs are crosses above the panel.
     """
     panels = [(cases, k) for cases in bodies for k in range(len(cases.parameters))]
-    colors = solver_colors(list(dict.fromkeys(name for cases in bodies for name in cases.errors)))
+    styles = solver_styles(list(dict.fromkeys(name for cases in bodies for name in cases.errors)))
     rows = math.ceil(len(panels) / _ACROSS)
     with styled():
         fig = figure(0.8 + 3.0 * rows)
@@ -76,9 +76,9 @@ def error_over_parameters(bodies: Sequence[Cases]) -> Figure:
         for panel, (cases, k) in zip(drawn, panels, strict=False):
             lost = [name for name in cases.errors if _lost(cases.errors[name][1]).any()]
             for name, (points, errors) in cases.errors.items():
-                _over(panel, points[:, k], 100 * errors, colors[name], cases.parameters[k].log)
+                _over(panel, points[:, k], 100 * errors, styles[name], cases.parameters[k].log)
                 if name in lost:
-                    _off(panel, points[_lost(errors), k], colors[name], lost.index(name))
+                    _off(panel, points[_lost(errors), k], styles[name]["color"], lost.index(name))
             panel.set_title(cases.body if len(bodies) > 1 else "", pad=6 + _STEP * len(lost))
             panel.set(ylabel=_BAR)
             _scaled(panel, cases, x=k)
@@ -86,7 +86,7 @@ def error_over_parameters(bodies: Sequence[Cases]) -> Figure:
             error_scale(panel, 100 * (every[~_lost(every)] if not _lost(every).all() else np.ones(1)))
         for panel in drawn[len(panels) :]:
             panel.axis("off")
-        known = [Line2D([], [], ls="-", marker="o", ms=5, color=c, label=name) for name, c in colors.items()]
+        known = [Line2D([], [], ls="-", ms=5, label=name, **style) for name, style in styles.items()]
         if any(_lost(errors).any() for cases in bodies for _, errors in cases.errors.values()):
             known.append(Line2D([], [], **_LOST | {"color": FULL}, label="lost"))
         legend_above(fig, known, [line.get_label() for line in known], 4)
@@ -124,11 +124,12 @@ def error_maps(bodies: Sequence[Cases]) -> Figure:
     return fig
 
 
-def _over(panel, x: np.ndarray, error: np.ndarray, color: str, log: bool) -> None:
+def _over(panel, x: np.ndarray, error: np.ndarray, style: Mapping[str, str], log: bool) -> None:
     """Dots of one solver [%], and their means over neighbours where they are enough."""
     order = np.argsort(x, kind="stable")
     x, error = x[order], np.where(_lost(error / 100), np.nan, error)[order]
-    panel.plot(x, error, "o", ms=4.5, mfc="white", mec=color, mew=1.1, alpha=0.9)
+    color = style["color"]
+    panel.plot(x, error, style["marker"], ms=4.5, mfc="white", mec=color, mew=1.1, alpha=0.9)
     shown = error[~np.isnan(error)]
     panel.update_datalim([(at, shown[0] if len(shown) else 100.0) for at in x])  # of lost ones too
     if len(x) < _FEWEST:

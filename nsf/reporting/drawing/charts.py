@@ -199,6 +199,7 @@ def delta_over(
         papers: by scene, each x and δ (a fraction) that the paper prints.
     """
     names = list(dict.fromkeys(name for lines in panels.values() for name in lines))
+    names.sort(key=lambda name: "operators" not in name)  # which are blue in every chart
     known = {x for lines in panels.values() for line in lines.values() for x in line}
     with styled():
         rows = math.ceil(len(panels) / _ACROSS)

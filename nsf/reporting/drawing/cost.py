@@ -12,7 +12,7 @@ from nsf.reporting.drawing.style import FULL, INK, MUTED, PALETTE, figure, legen
 
 _FULL = "full order"  # begins the names of full-order solvers
 _ACROSS = 3  # panels in a row
-_COARSE = {"ls": "", "marker": "s", "ms": 7, "mfc": "white", "mec": FULL, "mew": 1.6}
+_COARSE_POINT = {"color": FULL, "marker": "s", "mfc": "white", "mew": 1.6}
 _MARKERS = "o^vD"  # of solvers that share a colour
 _LINES = ((0, (6, 2)), (0, (2, 1.5)), (0, (1, 3)))
 
@@ -28,7 +28,7 @@ def error_over_cost(
         free: by scene, the errors (fractions) of what costs nothing, by name: horizontal lines.
     """
     reduced = dict.fromkeys(s["solver"] for of in panels.values() for s in of if s["kind"] == "reduced")
-    colors = solver_colors(list(reduced))
+    styles = solver_styles(list(reduced))
     names = list(dict.fromkeys(name for of in free.values() for name in of))
     rows = math.ceil(len(panels) / _ACROSS)
     with styled():
@@ -36,7 +36,7 @@ def error_over_cost(
         drawn = fig.subplots(rows, min(_ACROSS, len(panels)), squeeze=False).ravel()
         for panel, (scene, solvers) in zip(drawn, panels.items(), strict=False):
             for solver in solvers:
-                _point(panel, solver, colors)
+                _point(panel, solver, styles)
             for i, name in enumerate(names):
                 if _drawable(error := free.get(scene, {}).get(name)):
                     panel.axhline(100 * error, color=MUTED, ls=_LINES[i % len(_LINES)], lw=1.2, label=name)
@@ -62,17 +62,18 @@ def step_over_particles(panels: Mapping[str, Mapping[str, Mapping[int, float]]])
         panels: by scene, then by solver, the time [ms] at each number of particles; NaN where not measured.
     """
     names = list(dict.fromkeys(name for of in panels.values() for name in of))
-    colors = solver_colors([name for name in names if not name.startswith(_FULL)])
-    coarse = [name for name in names if name not in (_FULL, *colors)]
+    styles = solver_styles([name for name in names if not name.startswith(_FULL)])
+    coarse = [name for name in names if name not in (_FULL, *styles)]
     rows = math.ceil(len(panels) / _ACROSS)
     with styled():
         fig = figure(0.9 + 3.4 * rows)
         drawn = fig.subplots(rows, min(_ACROSS, len(panels)), squeeze=False).ravel()
         for panel, (scene, solvers) in zip(drawn, panels.items(), strict=False):
             for name, times in solvers.items():
-                dash = _LINES[coarse.index(name) % len(_LINES)] if name in coarse else "-"
-                style = {"color": colors.get(name, FULL), "ls": dash, "marker": "o", "ms": 5}
-                panel.plot(list(times), list(times.values()), label=name, **style)
+                style = {"color": FULL, "marker": "o"} | styles.get(name, {})
+                if name in coarse:
+                    style = {"ls": _LINES[coarse.index(name) % len(_LINES)]} | _COARSE_POINT
+                panel.plot(list(times), list(times.values()), ms=5, label=name, **style)
             sizes = sorted({size for times in solvers.values() for size in times})
             panel.set(xscale="log", yscale="log", title=scene)
             panel.set(xlabel="particles [–]", ylabel="time for one full-order Δt [ms]")
@@ -87,17 +88,22 @@ def step_over_particles(panels: Mapping[str, Mapping[str, Mapping[int, float]]])
     return fig
 
 
-def solver_colors(names: Sequence[str]) -> dict[str, str]:
-    """A colour for each reduced solver: operators and projected steps have those of the charts of levels."""
+def solver_styles(names: Sequence[str]) -> dict[str, dict]:
+    """Colour and marker of each reduced solver; operators and projected steps have the colours of levels.
+
+    Once the colours are used up, markers change.
+    """
     known = {
         next((n for n in names if "operators" in n), None): LEVELS["operators"],
         next((n for n in names if "operators" not in n), None): LEVELS["projected step"],
     }
     others = itertools.cycle(color for color in PALETTE if color not in known.values())
-    return {n: known.get(n) or next(others) for n in names}
+    colors = [known.get(n) or next(others) for n in names]
+    marks = [_MARKERS[colors[:i].count(color) % len(_MARKERS)] for i, color in enumerate(colors)]
+    return {n: {"color": c, "marker": m} for n, c, m in zip(names, colors, marks, strict=True)}
 
 
-def _point(panel, solver: Mapping, colors: Mapping[str, str]) -> None:
+def _point(panel, solver: Mapping, styles: Mapping[str, dict]) -> None:
     """One solver, where its time and error are known."""
     name, x, y = solver["solver"], solver["span_ms"], solver["displacement_error"]
     if solver["kind"] == "full":
@@ -105,14 +111,12 @@ def _point(panel, solver: Mapping, colors: Mapping[str, str]) -> None:
             panel.axvline(x, color=FULL, lw=1.6, label=name)
     elif _drawable(x) and _drawable(y):
         if solver["kind"] == "coarse":
-            panel.plot(x, 100 * y, label="full order on coarser grids", **_COARSE)
+            panel.plot(x, 100 * y, label="full order on coarser grids", ls="", ms=7, **_COARSE_POINT)
             panel.annotate(
                 name.rpartition(" ")[2] + "Δx", (x, 100 * y), (5, 4), textcoords="offset points", color=INK
             )
         else:
-            same = [other for other, color in colors.items() if color == colors[name]]
-            marker = _MARKERS[same.index(name) % len(_MARKERS)]
-            panel.plot(x, 100 * y, marker, ms=7, color=colors[name], label=name)
+            panel.plot(x, 100 * y, ls="", ms=7, label=name, **styles[name])
 
 
 def _drawable(value) -> bool:

@@ -70,13 +70,19 @@ class Variant:
         return pd.concat(parts, ignore_index=True)
 
     def continued(self) -> str:
-        """Which held-out runs go on at full order, as a sentence for captions; empty where none does."""
+        """Who took held-out runs over from the engine, as a sentence for captions; empty if none."""
         told, unit = [], self.parameter[1]
         for value, source in zip(self.rows["parameter"], self.sources, strict=True):
             at = (source.trust(value) or {}).get("handed_over_at")
             if at is not None and value in self.values:
                 told.append(f"at {parameter_text(value, '', unit)} from {at:.3g} s on")
-        return f" The full-order solver goes on {', '.join(told)}." if told else ""
+        return f" The full-order solver goes on {', '.join(told)}." if told else self.left()
+
+    def left(self) -> str:
+        """That projected steps took every held-out run in place of operators, as a sentence; else empty."""
+        shown = self.rows[self.rows["split"] == self.held_out]
+        left = (shown["engine"] == "operators") & (shown["handed_over"] == 1.0)
+        return " Projected steps took these runs, from the first step on." if left.all() else ""
 
     def ranked(self) -> list[tuple]:
         """Held-out values and their δ, the worst first; a run that diverged is the worst."""
@@ -123,5 +129,5 @@ class Variant:
 
 
 def order(v: Variant) -> tuple[bool, float]:
-    """Sort key by mean δ, the smallest first; a variant that the full-order solver ends comes last."""
+    """Sort key by mean δ, the smallest first; a variant whose runs another solver took over comes last."""
     return bool(v.continued()), v.delta if np.isfinite(v.delta) else np.inf

@@ -36,9 +36,9 @@ DEFINITIONS = (
     ),
     (
         "rivals",
-        "without a reduced step: nothing moves; the training run of the nearest parameters; latent vectors "
-        "of the same fields, interpolated over the parameters between training runs. Coarse full order is "
-        "the full-order solver on a coarser grid.",
+        "without a reduced step: nothing moves; the training run of the nearest parameters, its latent "
+        "vectors decoded by the same fields; latent vectors interpolated over the parameters between "
+        "training runs. Coarse full order is the full-order solver on a coarser grid.",
     ),
     (
         "runs until it pays",

@@ -12,7 +12,7 @@ from nsf.errors import ConfigError, StorageError
 from nsf.reporting import build, build_report, pictures
 from nsf.reporting.bodies import camera
 from nsf.reporting.drawing import style
-from nsf.reporting.sections.variant import Variant
+from nsf.reporting.sections.variant import Variant, order
 from nsf.reporting.sources import Source, Study, file_hash, open_sources
 from nsf.reporting.study import estimate_note, spearman, trust_note
 from nsf.reporting.tables import merge
@@ -343,3 +343,12 @@ def test_captions_say_where_the_full_order_solver_goes_on(tmp_path):
     (run.path / "summary.json").write_text(json.dumps(summary))
     seal(run)
     assert said() == " The full-order solver goes on at 27.5° from 0.15 s on."
+
+
+@pytest.mark.parametrize(("share", "told"), [(1.0, True), (0.5, False)])
+def test_captions_say_that_projected_steps_took_the_runs_of_operators(tmp_path, share, told):
+    merged = merge(open_sources([write_run(tmp_path / "runs", TINY)]))
+    merged.frame["engine"], merged.frame["handed_over"] = "operators", share
+    taken = Variant(merged, [0, 1], "nsf")
+    assert ("Projected steps took these runs" in taken.continued()) == told
+    assert order(taken)[0] == told  # pictures are of a variant that took its own steps, if there is one
