@@ -275,6 +275,7 @@ def _comparison(known: list[Variant], folder: Path, study: Study | None) -> list
         printed = printed_of(alike[0].merged, alike[0].members, study)
         paper = None if pd.isna(printed) else printed
         mean = pd.DataFrame(rows)[["delta", *MEASURED]].mean(skipna=False).to_dict()
+        mean["shown_ms"] = mean["total_ms_reduced"] + mean["decode_ms"]
         mean |= speedups(mean)
         entries.append(mean | {"label": label, "mean": mean["delta"], "values": list(values), "paper": paper})
     runs = sorted({run for v in known for run in v.runs})
@@ -286,7 +287,7 @@ def _comparison(known: list[Variant], folder: Path, study: Study | None) -> list
          f"Mean δ over the {splits} values, and each of them (dots){printed}."),
         ("speedup-memory", charts.speedup_and_memory,
          "Speedup of the reduced over the full-order model, of mean times (line: 1×), and the peak memory of "
-         "both."),
+         "the steps of both."),
     )  # fmt: skip
     if all(pd.isna(entry["step_ms_full"]) for entry in entries):
         drawings = drawings[:1]  # evaluation.trials=0

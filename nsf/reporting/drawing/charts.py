@@ -306,16 +306,20 @@ def speedup_and_memory(variants: list[dict]) -> Figure:
     """Speedup [×] and peak memory [MiB] of each variant, both logarithmic: engines differ a thousandfold.
 
     Args:
-        variants: per variant `label, speedup_step, speedup_total, memory_full_mib, memory_reduced_mib`;
-            what was not measured is NaN and is said so.
+        variants: per variant `label, speedup_step, speedup_total, speedup_shown, memory_full_mib,
+            memory_reduced_mib`; what was not measured is NaN and is said so.
     """
     with styled():
-        fig = figure(1.7 + 0.46 * len(variants))
+        fig = figure(1.7 + 0.56 * len(variants))
         left, right = fig.subplots(1, 2, sharey=True)
-        speedups = {"speedup_step": ("one step", "#009E73"), "speedup_total": ("whole simulation", "#CC79A7")}
+        speedups = {
+            "speedup_step": ("one step", "#009E73"),
+            "speedup_total": ("run", "#CC79A7"),
+            "speedup_shown": ("run, frames decoded", "#E69F00"),
+        }
         memory = {"memory_full_mib": ("full-order", FULL), "memory_reduced_mib": ("reduced", REDUCED)}
-        _pairs(left, variants, speedups)
-        _pairs(right, variants, memory)
+        _dots(left, variants, speedups)
+        _dots(right, variants, memory)
         left.axvline(1, color=INK, lw=1)
         left.set_xlim(left=min(left.get_xlim()[0], 0.8))
         left.set_xlabel("speedup over full-order [×]")
@@ -349,12 +353,12 @@ def _ring(pie, key, stages: Mapping[str, float], title: str) -> None:
     )
 
 
-def _pairs(panel, variants: list[dict], columns: Mapping[str, tuple[str, str]]) -> None:
-    """Two dots a variant, by column with their label and colour, each with its number beside it."""
+def _dots(panel, variants: list[dict], columns: Mapping[str, tuple[str, str]]) -> None:
+    """Dots of each variant, by column with their label and colour, each with its number beside it."""
     panel.set_xscale("log")
     for k, (column, (label, color)) in enumerate(columns.items()):
-        values = np.array([v[column] for v in variants], float)
-        at = np.arange(len(variants)) + (0.36 * k - 0.18)
+        values = np.array([v.get(column, math.nan) for v in variants], float)
+        at = np.arange(len(variants)) + 0.72 * ((k + 0.5) / len(columns) - 0.5)
         panel.plot(values, at, "o", ms=6, color=color, label=label)
         for x, y in zip(values, at, strict=True):
             if np.isfinite(x):
@@ -376,4 +380,6 @@ def _pairs(panel, variants: list[dict], columns: Mapping[str, tuple[str, str]]) 
     plain_ticks(panel.xaxis, "{:,g}".format)
     panel.grid(axis="x")
     panel.tick_params(axis="y", length=0)
-    panel.legend(loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=2, columnspacing=1.2, handlelength=1.2)
+    panel.legend(
+        loc="lower left", bbox_to_anchor=(-0.02, 1.0), ncols=len(columns), columnspacing=1.2, handlelength=1.2
+    )

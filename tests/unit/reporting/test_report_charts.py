@@ -188,7 +188,9 @@ def test_reconstruction_and_rollout_are_rms_over_frames(series):
 def test_numbers_below_logarithmic_axes_stand_apart(tmp_path):
     label = "bread · deformation_only · basis field · r 6 · modal engine · |S| 450"
     memory = {"memory_full_mib": 7.0, "memory_reduced_mib": 889.0}
-    variants = [{"label": label, "speedup_step": 0.02, "speedup_total": 2.0} | memory] * 3
+    variants = [
+        {"label": label, "speedup_step": 0.02, "speedup_total": 2.0, "speedup_shown": 1.0} | memory
+    ] * 3
     deltas = [{"label": label, "mean": 0.002, "values": [4e-4, 0.04], "paper": None}]
     spans = {"bread": (0.0026, 0.14), "cake": (0.024, 0.24), "metal": (0.0025, 0.13)}
     panels = {
@@ -235,7 +237,7 @@ def test_a_wide_logarithmic_axis_keeps_its_numbers():
 
 def test_a_label_beside_a_chart_keeps_a_letter_with_its_number():
     label = "jelly_cube · nsf · mlp field · r 5 · reference engine · |S| 50"
-    entry = {"label": label, "speedup_step": 4.0, "speedup_total": 1.0}
+    entry = {"label": label, "speedup_step": 4.0, "speedup_total": 1.0, "speedup_shown": 0.5}
     entry |= {"memory_full_mib": 900.0, "memory_reduced_mib": 400.0}
     (shown,) = (text.get_text() for text in charts.speedup_and_memory([entry]).axes[0].get_yticklabels())
     assert len(shown.splitlines()) == 2
@@ -250,7 +252,7 @@ def test_runtime_rings_say_the_sum():
 
 
 def test_bars_say_what_was_not_measured():
-    entry = {"label": "nsf", "speedup_step": 4.0, "speedup_total": float("nan")}
+    entry = {"label": "nsf", "speedup_step": 4.0, "speedup_total": float("nan"), "speedup_shown": 2.0}
     entry |= {"memory_full_mib": 900.0, "memory_reduced_mib": 400.0}
     told = [text.get_text() for panel in charts.speedup_and_memory([entry]).axes for text in panel.texts]
     assert "not measured" in told
