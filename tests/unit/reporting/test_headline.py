@@ -67,6 +67,11 @@ def test_what_a_mean_hides_stands_beside_it(tmp_path):
     assert "means over validation values" in said
     shown = dict(zip(*rows, strict=True))
     assert (shown["runs until it pays"], shown["δ if nothing moves [%]"]) == ("∞", "10")
+    lost = {"parameter": 2.0, "displacement_error": np.inf}
+    jobs = [job("bread"), job("bread", parameter=2.0), job(parameter=1.0), job(delta=np.inf) | lost]
+    rows, _ = told(write_report(tmp_path / "d", jobs))
+    still = rows[0].index("δ if nothing moves [%]")
+    assert [row[still] for row in rows[1:3]] == ["10", "–"]  # not that of the run that is not lost
     jobs = [job(delta=np.inf)]  # one run a row, and it diverged
     rows, _ = told(write_report(tmp_path / "c", jobs))
     assert "its largest [%]" not in rows[0]

@@ -90,6 +90,7 @@ def test_pictures_are_of_the_best_sample_of_each_method(report):
         assert drawn == {f"nsf-{stem}.png", f"deformation_only-{stem}.png"}
     assert "smallest mean held-out δ" in (report / "index.md").read_text()
     assert "nsf · |S| 150" in (report / "index.html").read_text()
+    assert "300 of 71,363 particles are drawn." in (report / "index.md").read_text()
 
 
 def test_sources_lead_from_each_row_to_its_run(report, sweep):

@@ -13,10 +13,10 @@ from nsf import config
 from nsf.reporting.bodies.camera import Camera, View
 from nsf.reporting.bodies.shapes import Case, animation, final_shapes, hides_stress, is_cut_open, strip
 from nsf.reporting.drawing import charts
-from nsf.reporting.drawing.cost import error_over_cost, step_over_particles
+from nsf.reporting.drawing.cost import error_over_cost, solver_styles, step_over_particles
 from nsf.reporting.drawing.point import point_chart, point_response
 from nsf.reporting.drawing.scales import plain_ticks, set_apart
-from nsf.reporting.drawing.style import LETTER, save, styled
+from nsf.reporting.drawing.style import LETTER, legend_above, save, styled
 from nsf.reporting.sources import Motion
 
 RED, BLUE = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
@@ -46,6 +46,23 @@ def test_error_over_time_spans_the_run_where_one_diverged_early(series):
     lost.loc[lost["t"] > 0.1, ["delta", "displacement_error"]] = np.inf
     for panel in charts.error_over_time(lost).axes:
         assert panel.get_xlim()[1] >= series["t"].max()
+
+
+def test_no_two_solvers_look_alike():
+    styles = solver_styles(["nsf · operators engine", *(f"nsf · steps={k}" for k in range(15))])
+    assert len({(style["color"], style["marker"]) for style in styles.values()}) == 16
+
+
+@pytest.mark.parametrize("entries", [1, 3, 13])
+def test_panels_keep_their_room_below_a_long_legend(entries):
+    with styled():
+        fig = Figure(figsize=(9.6, 4.0), dpi=100)
+        panel = fig.subplots()
+        names = [f"nsf · mlp field · reference engine · trainer.steps={k:05}" for k in range(entries)]
+        lines = [panel.plot([0, 1])[0] for _ in names]
+        legend_above(fig, lines, names, 4)
+        fig.draw_without_rendering()
+    assert panel.get_window_extent().height > 250
 
 
 def test_error_over_cost_has_a_point_for_each_solver_that_was_timed():
