@@ -7,15 +7,16 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from nsf.reporting.drawing.scales import LOST, plain_ticks
-from nsf.reporting.drawing.style import FULL, INK, PALETTE, figure, line_style, styled
+from nsf.reporting.drawing.style import DASHES, FULL, INK, PALETTE, figure, styled
 
 #: Title and colour of each level, in the order of `by`.
 LEVELS = {"operators": PALETTE[0], "projected step": PALETTE[1], "full-order solver": FULL}
 
 
-def name_of(series: pd.DataFrame) -> str:
-    """What a run is called by those who took its steps."""
+def name_of(series: pd.DataFrame, closed: bool = False) -> str:
+    """What a run is called by those who took its steps; `closed`: its projected steps have a closure."""
     names = [title for i, title in enumerate(LEVELS) if (series["by"] == i).any()]
+    names = [name + " with a closure" * (closed and name == "projected step") for name in names]
     return f"{names[0]} alone" if len(names) == 1 else " and ".join(names)
 
 
@@ -26,14 +27,14 @@ def levels_over_time(runs: Mapping[str, pd.DataFrame]) -> Figure:
         runs: by name, rows of `series.csv` of one run, `by` among them.
     """
     with styled():
-        mixed: list = []
         fig = figure(3.6 + 0.3 * len(runs))
         error, strips = fig.subplots(2, 1, sharex=True, height_ratios=[3.0, 0.36 * len(runs)])
         for i, (name, series) in enumerate(runs.items()):
             alone = [color for k, color in enumerate(LEVELS.values()) if (series["by"].dropna() == k).all()]
-            style = {"color": alone[0]} if alone else line_style(i) | {"color": INK}
-            line = error.plot(series["t"], 100 * series["displacement_error"], label=name, **style)
-            mixed += [] if alone else line
+            color = alone[0] if alone else INK
+            like = [line.get_color() for line in error.lines].count(color)
+            style = {"color": color, "linestyle": DASHES[like % len(DASHES)]}
+            error.plot(series["t"], 100 * series["displacement_error"], label=name, **style)
             taken = series["by"].notna().to_numpy()
             ends, by = series["t"].to_numpy()[taken], series["by"].to_numpy()[taken].astype(int)
             starts = np.append(series["t"].iloc[0], ends[:-1])
@@ -52,5 +53,7 @@ def levels_over_time(runs: Mapping[str, pd.DataFrame]) -> Figure:
         known = [(title, color) for i, (title, color) in enumerate(LEVELS.items()) if i in shown]
         patches = [strips.fill_between([], [], color=color, label=title) for title, color in known]
         # Lines have a legend where colours do not say whose they are: above, where no line strikes it.
-        fig.legend(handles=[*patches, *mixed], loc="outside upper left", ncols=3)
+        colors = [line.get_color() for line in error.lines]
+        lines = [line for line, c in zip(error.lines, colors, strict=True) if c == INK or colors.count(c) > 1]
+        fig.legend(handles=[*patches, *lines], loc="outside upper left", ncols=3)
     return fig

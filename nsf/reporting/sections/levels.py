@@ -43,7 +43,7 @@ def levels_section(known: Sequence[Variant], folder: Path) -> list[Section]:
             if _seeds(variant) != seed:
                 continue
             if len(part) and "by" in part:
-                name = name_of(part)
+                name = name_of(part, closed=variant.rows["engine"].iloc[0] == "closed")
                 shown[f"{name}, {variant.label}" if name in shown else name] = part
                 runs |= set(variant.runs)
         name, unit = own[0].parameter

@@ -9,6 +9,7 @@ from matplotlib.colors import to_hex
 
 from nsf.deployment.levels import LEVELS as BY
 from nsf.reporting.drawing.levels import LEVELS, levels_over_time, name_of
+from nsf.reporting.sections import levels
 from nsf.reporting.sections.levels import lend_stages, levels_section
 
 
@@ -20,9 +21,10 @@ def series_of(*by: int, parameter: float = 0.6) -> pd.DataFrame:
     )  # fmt: skip
 
 
-def variant(label, *series, scene="jelly_cube"):
+def variant(label, *series, scene="jelly_cube", engine="levels"):
     rows = pd.concat(series)
     return SimpleNamespace(
+        rows=pd.DataFrame({"engine": [engine]}),
         scene=scene, body=scene, label=label, parameter=("speed", "m/s"), runs=[f"evaluate/{label}"],
         series=lambda held_out_only: rows,
     )  # fmt: skip
@@ -58,6 +60,28 @@ def test_a_strip_has_a_span_for_each_step():
     expected = [(operators, 0.0), (operators, 0.3), (projected, 0.1), (projected, 0.2)]
     assert [(color, pytest.approx(t)) for color, t, row in drawn if row == 0] == expected
     assert {color for color, _, row in drawn if row == 1} == {projected}
+
+
+def test_a_closure_is_told_from_the_projected_step():
+    assert name_of(series_of(1, 1), closed=True) == "projected step with a closure alone"
+    assert name_of(series_of(0, 0), closed=True) == "operators alone"
+    figure = levels_over_time({"one": series_of(0, 1), "two": series_of(1, 1), "three": series_of(1, 1)})
+    two, three = figure.axes[0].lines[1:]
+    assert two.get_color() == three.get_color()
+    assert two.get_linestyle() != three.get_linestyle()
+    legend = {text.get_text() for text in figure.legends[0].get_texts()}
+    assert {"one", "two", "three"} <= legend
+
+
+def test_a_picture_names_a_closure(tmp_path, monkeypatch):
+    told = []
+    monkeypatch.setattr(levels, "levels_over_time", lambda runs: told.extend(runs) or levels_over_time(runs))
+    closed = variant("closed", series_of(1, 1, 1), engine="closed")
+    alone = variant("auto", series_of(1, 1, 1))
+    levels_section([closed, alone, variant("levels", series_of(0, 1, 0))], tmp_path)
+    assert told == [
+        "projected step with a closure alone", "projected step alone", "operators and projected step",
+    ]  # fmt: skip
 
 
 def test_a_picture_where_a_run_has_more_than_one_level(tmp_path):
