@@ -79,6 +79,16 @@ def test_figures_are_of_operators_over_seeds_and_the_projected_error_stands_besi
     assert "engine operators" in text
 
 
+@pytest.mark.parametrize(("projected", "operators", "beside"), [(0.04, 0.09, "4 %"), (0.09, 0.05, "5 %")])
+def test_rivals_are_held_to_the_best_reduced_run_of_both_engines(tmp_path, projected, operators, beside):
+    whole = pd.read_csv(results(tmp_path, {"nsf": 0.002}) / "results.csv")
+    whole = whole.assign(displacement_interpolated=0.01)
+    errors = {"modal": projected, "operators": operators}
+    parts = [whole.assign(engine=engine, displacement_error=error) for engine, error in errors.items()]
+    pd.concat(parts).to_csv(tmp_path / "results.csv", index=False)
+    assert f"on sand interpolated latents (1 %) beside {beside}" in figures(tmp_path)
+
+
 def test_figures_do_not_hide_divergence(tmp_path):
     assert "| sand | 0.400 | ∞ |" in figures(results(tmp_path, {"nsf": float("inf")}))
 

@@ -16,7 +16,8 @@ LEVELS = {"operators": PALETTE[0], "projected step": PALETTE[1], "full-order sol
 def name_of(series: pd.DataFrame, closed: bool = False) -> str:
     """What a run is called by those who took its steps; `closed`: its projected steps have a closure."""
     names = [title for i, title in enumerate(LEVELS) if (series["by"] == i).any()]
-    names = [name + " with a closure" * (closed and name == "projected step") for name in names]
+    if closed:
+        names = [name.replace("projected step", "projected step with a closure") for name in names]
     return f"{names[0]} alone" if len(names) == 1 else " and ".join(names)
 
 
@@ -31,16 +32,16 @@ def levels_over_time(runs: Mapping[str, pd.DataFrame]) -> Figure:
         error, strips = fig.subplots(2, 1, sharex=True, height_ratios=[3.0, 0.36 * len(runs)])
         for i, (name, series) in enumerate(runs.items()):
             alone = [color for k, color in enumerate(LEVELS.values()) if (series["by"].dropna() == k).all()]
-            color = alone[0] if alone else INK
-            like = [line.get_color() for line in error.lines].count(color)
-            style = {"color": color, "linestyle": DASHES[like % len(DASHES)]}
+            own = alone[0] if alone else INK
+            alike = [line.get_color() for line in error.lines].count(own)
+            style = {"color": own, "linestyle": DASHES[alike % len(DASHES)]}
             error.plot(series["t"], 100 * series["displacement_error"], label=name, **style)
             taken = series["by"].notna().to_numpy()
             ends, by = series["t"].to_numpy()[taken], series["by"].to_numpy()[taken].astype(int)
             starts = np.append(series["t"].iloc[0], ends[:-1])
             for level, color in enumerate(LEVELS.values()):
-                own = by == level
-                spans = list(zip(starts[own], (ends - starts)[own], strict=True))
+                here = by == level
+                spans = list(zip(starts[here], (ends - starts)[here], strict=True))
                 strips.broken_barh(spans, (i - 0.36, 0.72), color=color, lw=0)
         error.set(ylabel="displacement error [%]", yscale="log")
         error.set_ylim(top=min(error.get_ylim()[1], LOST))
