@@ -111,7 +111,6 @@ class FullOrderMPM:
         names: of the colliders, for `forcing`.
 
     Attributes:
-        forcing: gravity and colliders, which may be set between steps.
         beyond_law: particles whose stress `resume` had to scale down.
 
     Raises:
@@ -143,6 +142,7 @@ class FullOrderMPM:
         if check_every < 1:
             raise ConfigError(f"check_every={check_every} must be at least 1 step")
         self.constants, self.material, self.dt = constants, material, float(dt)
+        self._names = tuple(names)
         self.precision = precision_of(precision)
         self.device = warp_device(device)
         self.check_every = check_every
@@ -169,7 +169,6 @@ class FullOrderMPM:
         boundaries = BoundaryArrays(colliders, walls, self.precision, self.device)
         acting = Forcing([gravity], boundaries, self.precision, self.device)
         self.grid_step = GridStep(self.grid, acting, transfer, dt, self.precision, self.device)
-        self.forcing = Hand(acting, lambda: self.time, names=names)
         law = material.functions(self.precision)
         self._stress_update = make_stress_update(law, self.precision, material.history_size)
         self._g2p_stress = make_g2p_stress(self.precision, transfer.shape, law, material.history_size)
@@ -183,6 +182,12 @@ class FullOrderMPM:
     def time(self) -> float:
         """Simulated time [s]."""
         return self.steps_taken * self.dt
+
+    @property
+    def forcing(self) -> Hand:
+        """Gravity and colliders, which may be set between steps."""
+        # Made when asked for: were it kept, the solver would hold itself, and keep its memory for a while.
+        return Hand(self.grid_step.forcing, lambda: self.time, names=self._names)
 
     @property
     def nbytes(self) -> int:

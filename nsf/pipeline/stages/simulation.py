@@ -7,13 +7,14 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from nsf.data import Case, TrajectoryWriter
 from nsf.data.schema import TRAJECTORY
 from nsf.errors import InstabilityError
-from nsf.mpm import FullOrderMPM, Precision, diagnosed
+from nsf.mpm import FullOrderMPM, ParticleConstants, Precision, diagnosed
 from nsf.mpm.recording import HostMemory, blocks
 from nsf.progress import Progress
 from nsf.runs import Run
@@ -58,6 +59,13 @@ class Shared:
     stored: Precision
     device: str
     precision: str
+
+
+class Cost(NamedTuple):
+    """What a trajectory took, under the names of its file: wall time [s], and memory of the device [byte]."""
+
+    seconds: float
+    bytes: int
 
 
 def simulate(jobs: Sequence[Job], shared: Shared, say: Callable[[str], object]) -> int:
@@ -108,14 +116,15 @@ def _start(
     """Compute one trajectory while its writer, which takes the claim over, and those of earlier ones work."""
     solver, frames = job.build(), queue.Queue(_BLOCKS)
     try:
-        stored_by = pool.submit(_store, job, frames, claim.pop_all(), solver, shared)
+        # Not the solver: who drops it last frees memory of a GPU, and no graph may be captured meanwhile.
+        stored_by = pool.submit(_store, job, frames, claim.pop_all(), solver.constants, solver.dt, shared)
         started = time.perf_counter()
         try:
             for block in blocks(solver, shared.steps, shared.stored, progress.advance, memory):
                 _hand_over(frames, block, stored_by)
         except InstabilityError as error:
             raise diagnosed(error, job.build, solver.steps_taken) from error
-        _hand_over(frames, time.perf_counter() - started, stored_by)
+        _hand_over(frames, Cost(time.perf_counter() - started, solver.nbytes), stored_by)
     except BaseException as error:
         # The writer leaves no half-written file, and its manifest says what happened.
         _stop(frames, error)
@@ -143,9 +152,13 @@ def _stop(frames: queue.Queue, error: BaseException) -> None:
 
 
 def _store(
-    job: Job, frames: queue.Queue, claim: contextlib.ExitStack, solver: FullOrderMPM, shared: Shared
+    job: Job,
+    frames: queue.Queue,
+    claim: contextlib.ExitStack,
+    constants: ParticleConstants,
+    dt: float,
+    shared: Shared,
 ) -> None:
-    constants = solver.constants
     about = {"device": shared.device, "precision": shared.precision, "warnings": job.warnings}
     with claim, job.run.record(**about) as record:
         writer = TrajectoryWriter(
@@ -154,7 +167,7 @@ def _store(
             mass=constants.mass,
             volume0=constants.volume0,
             parameters=job.case.parameters,
-            dt=solver.dt,
+            dt=dt,
             dx=shared.dx,
             frames=shared.steps + 1,
             dtype=np.dtype(shared.stored.numpy).name,
@@ -162,13 +175,13 @@ def _store(
         )
         n = 0
         with writer:
-            while not isinstance(item := frames.get(), float):
+            while not isinstance(item := frames.get(), Cost):
                 if isinstance(item, BaseException):
                     raise item
                 for frame in item:
-                    writer.append(n * solver.dt, **frame)
+                    writer.append(n * dt, **frame)
                     n += 1
                 item.done()
-            writer.cost.update(seconds=item, bytes=solver.nbytes)
-        record.metrics["seconds"] = item
+            writer.cost.update(item._asdict())
+        record.metrics["seconds"] = item.seconds
         record.output(TRAJECTORY)
