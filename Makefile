@@ -67,7 +67,7 @@ test-browser: develop  ## the pages in Chromium, their modules under node and ts
 	$(PYTEST) -rs tests/unit/live tests/unit/export/test_export_page.py
 
 test-slow: develop  ## the tests marked slow
-	$(PYTEST) -m slow
+	$(PYTEST) -m slow -n $(WORKERS) --dist worksteal
 
 test-gpu: develop  ## the tests marked gpu, on a machine with a GPU
 	$(PYTEST) -m gpu -rs

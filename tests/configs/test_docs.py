@@ -92,6 +92,7 @@ def deploy(scene: str) -> None:
         pipeline.run(stage)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES)
 def test_page(page, project, monkeypatch, capsys):
     text = (DOCS / page).read_text(encoding="utf-8")

@@ -87,6 +87,7 @@ def test_the_papers_networks_are_trained_once(name):
     assert found <= trained("mlp")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("overrides", _jobs(), ids=" ".join)
 def test_every_kind_of_job_builds(overrides):
     Pipeline(config.load([*overrides, "device=cpu"]))

@@ -635,6 +635,7 @@ def test_the_full_order_solver_goes_on(far):
 # -- the command ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_nsf_run_in_a_process_of_its_own(copied, tiny, tmp_path):
     """The real command once, report and pictures included, on runs that are there already."""
     root = copied(*STAGES)

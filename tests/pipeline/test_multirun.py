@@ -82,6 +82,7 @@ def test_points_of_several_materials(tmp_path):
     assert len(list((tmp_path / "work/reports/point").glob("*.csv"))) == 4
 
 
+@pytest.mark.slow
 def test_an_experiment_runs_its_jobs_and_reports_them(nsf, copied, tmp_path):
     """experiments/sand.yaml, made tiny and of one field: two of its three jobs are then the same."""
     root = copied("simulate")

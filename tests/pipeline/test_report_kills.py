@@ -37,6 +37,7 @@ def undisturbed(chain, tiny, tmp_path_factory):
     return folder.name, files(folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moment", MOMENTS)
 def test_a_report_that_was_killed(chain, nsf, tmp_path, undisturbed, moment):
     name, expected = undisturbed

@@ -161,6 +161,7 @@ def of_runs(copied, pipeline_at):
     return pipeline_at(copied("simulate", "train"), *keys)
 
 
+@pytest.mark.slow
 def test_full_order_runs_teach_without_a_step_of_an_engine(of_runs, monkeypatch):
     monkeypatch.setattr("nsf.engines.operators.Teacher.step_from", None)
     said = []
@@ -197,6 +198,7 @@ def drawn(copied, pipeline_at):
     return build
 
 
+@pytest.mark.slow
 def test_projected_runs_in_drawn_cases_teach_too(drawn):
     pipeline = drawn()
     known, between, _ = pipeline.lessons
@@ -222,6 +224,7 @@ def test_projected_runs_in_drawn_cases_teach_too(drawn):
     assert anew["stress_error"] == pytest.approx(carried)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", ["history", "nsf"])
 def test_operators_too_far_off_at_validation_runs_take_no_step(drawn, method):
     said = []
@@ -254,6 +257,7 @@ def test_operators_too_far_off_at_validation_runs_take_no_step(drawn, method):
             assert (taken.estimate.max(), taken.projected_share) == (0.0, 1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("held_back", "lost", "ratio"),
     [("[24]", True, "1e-3"), ("[24]", False, "null"), ("[]", False, "1e-3")],
@@ -298,6 +302,7 @@ def test_projected_runs_that_are_lost_teach_nothing(drawn, monkeypatch):
     assert teaching.drawn(pipeline, pipeline.manifold(), lambda steps: None) == []
 
 
+@pytest.mark.slow
 def test_projected_runs_in_drawn_cases_are_the_same_by_several_processes(drawn, monkeypatch):
     pipeline, told = drawn(), []
     alone = teaching.drawn(pipeline, pipeline.manifold(), lambda steps: None)

@@ -34,6 +34,7 @@ KERNELS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(ARCH not in wp.get_cuda_supported_archs(), reason="Warp was built without CUDA")
 @pytest.mark.parametrize("several", [False, True], ids=["one", "several"])
 @pytest.mark.parametrize("precision", ["fp32", "fp64"])

@@ -120,6 +120,7 @@ def graphs(request, deployed, tmp_path_factory):
     return shown, onnx.write(shown, tmp_path_factory.mktemp("graphs"))
 
 
+@pytest.mark.slow
 def test_onnx_round_trip(graphs):
     onnxruntime = pytest.importorskip("onnxruntime")
     shown, folder = graphs

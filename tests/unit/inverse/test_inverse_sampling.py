@@ -102,6 +102,7 @@ def test_sensitivities_of_a_known_function(model):
         sensitivities(prior, 100, linear, ["sum"])
 
 
+@pytest.mark.slow
 def test_a_posterior_is_the_estimate_where_the_prior_is_wide(model, monkeypatch):
     pytest.importorskip("emcee", reason="emcee is not installed; pip install 'nsf[inverse]'")
     t, points = np.array([0.06, 0.12]), model.manifold.X[::25].numpy()
@@ -151,6 +152,7 @@ def test_the_command(tmp_path, deployed):
         sample([*words, "program=3"])
 
 
+@pytest.mark.slow
 def test_the_command_with_both_libraries(tmp_path, deployed, model):
     for name in ("SALib", "emcee"):
         pytest.importorskip(name, reason=f"{name} is not installed; pip install 'nsf[inverse]'")

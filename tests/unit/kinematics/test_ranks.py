@@ -95,6 +95,7 @@ def equal(one, other):
     )
 
 
+@pytest.mark.slow
 def test_the_weights_of_all_ranks_agree(together, folder):
     assert alike(folder)
     assert [together[1][f"{phase}_steps"] for phase in PHASES] == [20, 12, 12]

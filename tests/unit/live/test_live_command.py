@@ -85,6 +85,7 @@ def test_a_missing_extra_names_the_command(nsf, monkeypatch, command, package):
     assert "pip install 'nsf[view]'" in err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", LIVE)
 def test_it_serves_until_it_is_interrupted(chain, command, tmp_path):
     pytest.importorskip("viser", reason="viser is not installed")

@@ -257,6 +257,7 @@ def test_a_slider_changes_the_run_and_the_light(opened, page, taught_model):
     assert tab.evaluate("nsf.live.run.latents.slice(0, 11).map((x) => Array.from(x))") == latents
 
 
+@pytest.mark.slow
 def test_a_drag_tilts_gravity_and_the_body_follows(opened, tilting_page):
     tab = opened(tilting_page)
     paused(tab, 0)

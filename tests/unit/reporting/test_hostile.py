@@ -148,6 +148,7 @@ def test_a_lone_surrogate_is_no_traceback(tmp_path, no_pictures):
     assert json.loads((folder / "sources.json").read_text())["title"] == "a\ud800b"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("texts", [(SCRIPT, "$\\frac{$"), ("a\x00b\x1bc", "../../escaped")], ids=range(2))
 def test_pictures_of_such_names_stay_in_the_folder_and_are_drawings(texts, tmp_path):
     runs = [hostile(tmp_path / "runs", text, seed, values=1) for seed, text in enumerate(texts)]

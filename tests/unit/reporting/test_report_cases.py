@@ -212,6 +212,7 @@ def test_what_tells_bodies_apart_names_no_solver():
     assert _names([[solver("a", "basis")], both]) == told
 
 
+@pytest.mark.slow
 def test_a_report_has_a_chart_a_map_and_pictures_of_each_body(tmp_path, few_pictures, monkeypatch):
     shown = []
     from nsf.reporting.sections import cases as section
