@@ -20,7 +20,7 @@ SIZES = {"cuda": (1, 4, 16, 64, 256), "cpu": (1, 4)}
 _SHARE = 0.8  # of the free device memory that a batch may be expected to take
 
 
-def run(settings: Settings, say: Callable[[str], object]) -> Result:
+def run(settings: Settings, found: Result, say: Callable[[str], object]) -> None:
     """Each scene: at the paper's size on a GPU, at small scale on a CPU.
 
     Data and training are made, or reused, as by `nsf train`. The first simulation of a batch is that of the
@@ -28,12 +28,11 @@ def run(settings: Settings, say: Callable[[str], object]) -> Result:
     are chosen in the scene's own way, or as the name of a case says.
     """
     kind = "cuda" if settings.device.startswith("cuda") else "cpu"
-    scale, found = {"cuda": "paper", "cpu": "small"}[kind], Result()
+    scale = {"cuda": "paper", "cpu": "small"}[kind]
     for scene in settings.scenes or SCENES:
         for end, own in samplers(scene).items():
             overrides = [f"scene={scene}", f"scale={scale}", f"device={settings.device}", *own]
             measured(Pipeline(config.load(overrides), say=say), SIZES[kind], settings, found, say, end)
-    return found
 
 
 def measured(

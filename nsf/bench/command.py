@@ -8,14 +8,14 @@ from pathlib import Path
 import pandas as pd
 
 from nsf.bench.report import write_report
-from nsf.bench.rows import KernelRow, Row, Settings, StageRow, columns
+from nsf.bench.rows import KernelRow, Result, Row, Settings, StageRow, columns
 from nsf.errors import ConfigError
 from nsf.mpm.device import warp_device
 from nsf.mpm.precision import precision_of
 from nsf.storage import require_folder, writing
 
 BENCHES = ("full_order", "scaling", "reduced", "batch", "operators", "training", "multi_gpu")
-"""Modules of this package that have `run(settings, say) -> Result`."""
+"""Modules of this package that have `run(settings, found, say)`, which adds what it finds to a `Result`."""
 
 _MOST = 10**9  # particles: some hundred GB of them
 _UNITS = {"": 1, "k": 1_000, "m": 1_000_000}
@@ -44,10 +44,13 @@ def bench(folder: str | Path, asked: Mapping[str, str], say: Callable[[str], obj
     settings = _settings(asked)
     require_folder(folder)
     for name in names:
-        found = import_module(f"nsf.bench.{name}").run(settings, say)
-        _merge(folder / "results.csv", Row, found.rows)
-        _merge(folder / "kernels.csv", KernelRow, found.kernels)
-        _merge(folder / "stages.csv", StageRow, found.stages)
+        found = Result()
+        try:
+            import_module(f"nsf.bench.{name}").run(settings, found, say)
+        finally:  # an interrupted or failed one leaves what it has measured
+            _merge(folder / "results.csv", Row, found.rows)
+            _merge(folder / "kernels.csv", KernelRow, found.kernels)
+            _merge(folder / "stages.csv", StageRow, found.stages)
     return write_report(folder)
 
 

@@ -44,9 +44,9 @@ def collapse(particles: int, precision: str, device: str) -> FullOrderMPM:
     )
 
 
-def run(settings: Settings, say: Callable[[str], None]) -> Result:
+def run(settings: Settings, found: Result, say: Callable[[str], None]) -> None:
     """Every size; the precisions of a size turn by turn."""
-    found, device = Result(), settings.device
+    device = settings.device
     speed = bandwidth(device)
     say(f"full_order: a copy on {name_of(device)} moves {speed / 1e9:.0f} GB/s")
     for particles in settings.particles or SIZES["cuda" if device.startswith("cuda") else "cpu"]:
@@ -64,7 +64,6 @@ def run(settings: Settings, say: Callable[[str], None]) -> Result:
             found.rows.append(row)
             say(f"{case} {precision}: {median:.4g} ms a step")
             found.kernels.extend(kernel_rows("full_order", case, precision, solver, speed))
-    return found
 
 
 def kernel_rows(bench: str, case: str, precision: str, solver: FullOrderMPM, speed: float) -> list[KernelRow]:

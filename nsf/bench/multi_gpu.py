@@ -21,22 +21,21 @@ _STEPS = 600  # of each phase
 _FRAMES = 32  # of a batch, at most: as many as can be shared evenly
 
 
-def run(settings: Settings, say: Callable[[str], object]) -> Result:
+def run(settings: Settings, found: Result, say: Callable[[str], object]) -> None:
     """One GPU beside all: the networks of sand at the paper's size, whose steps are timed in blocks.
 
     Where there are no two GPUs this says so, and has no rows.
     """
-    gpus, found = len(visible_gpus()), Result()
+    gpus = len(visible_gpus())
     if gpus < 2:
         say(f"multi_gpu: left out, as it needs two GPUs and this process has {gpus}")
-        return found
+        return
     overrides = (
         "scene=sand", "scale=paper", "field=mlp", f"trainer.steps={_STEPS}",
         f"trainer.frames_per_batch={_FRAMES // gpus * gpus}",
         f"scene.design.train={list(_TRAIN)}", "scene.design.test=[]",
     )  # fmt: skip
     measured(overrides, gpus, settings, found, say)
-    return found
 
 
 def measured(

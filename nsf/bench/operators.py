@@ -34,21 +34,19 @@ PARTICLES = {"cuda": 4_000_000, "cpu": 20_000}
 Decode = Callable[[torch.Tensor], torch.Tensor]
 
 
-def run(settings: Settings, say: Callable[[str], object]) -> Result:
+def run(settings: Settings, found: Result, say: Callable[[str], object]) -> None:
     """Each scene, 1 024 runs of `metal` at once, and the sand column with 4 million particles.
 
     At the paper's size on a GPU; on a CPU at small scale, and with 20 000 particles. Data, training and
     teaching are made, or reused, as by `nsf teach engine=operators`. Where `scenes` or `particles` are given,
     these are all.
     """
-    found = Result()
     for scene in settings.scenes or (() if settings.particles else SCENES):
         measured(_chain(scene, settings, say), settings, found, say, MANY if scene == OF_MANY else 0)
     if settings.particles or not settings.scenes:
         kind = "cuda" if settings.device.startswith("cuda") else "cpu"
         for particles in settings.particles or (PARTICLES[kind],):
             measured_decoded(_chain("sand", settings, say), particles, settings, found, say)
-    return found
 
 
 def _chain(scene: str, settings: Settings, say: Callable[[str], object]) -> Pipeline:

@@ -30,7 +30,7 @@ _CHUNK = 2**26  # positions decoded at once
 _DEPENDENT = 7
 
 
-def run(settings: Settings, say: Callable[[str], object]) -> Result:
+def run(settings: Settings, found: Result, say: Callable[[str], object]) -> None:
     """Each scene: at the paper's size on a GPU, at small scale on a CPU.
 
     Data and training are made, or reused, as by `nsf train`. A step of k Δt stands in the case's name; it
@@ -38,7 +38,6 @@ def run(settings: Settings, say: Callable[[str], object]) -> Result:
     chosen, else in the scene's own way. With field=mlp it names what multiplies the hidden layers of h and
     l: tf32 or bf16 on tensor cores, or nothing where they are in the precision of the step.
     """
-    found = Result()
     for scene in settings.scenes or SCENES:
         scale = scale_of(settings.device)
         overrides = [f"scene={scene}", f"scale={scale}", f"device={settings.device}"]
@@ -48,7 +47,6 @@ def run(settings: Settings, say: Callable[[str], object]) -> Result:
         measured(chains, settings, found, say)
         networks = config.load([*overrides, "field=mlp"])
         measured_networks(Pipeline(networks, say=say), settings, found, say)
-    return found
 
 
 def samplers(scene: str) -> dict[str, tuple[str, ...]]:

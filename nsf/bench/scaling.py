@@ -31,18 +31,17 @@ _SAMPLE = 20  # |S| while P grows
 _FRAMES = 5  # at which δ is taken, evenly spread over the run
 
 
-def run(settings: Settings, say: Callable[[str], object]) -> Result:
+def run(settings: Settings, found: Result, say: Callable[[str], object]) -> None:
     """The sand column: from 10 000 to 4 million particles on a GPU, to 20 000 on a CPU.
 
     The fields are trained once, at the paper's size on a GPU and at small scale on a CPU, and evaluated
     between their particles at all other numbers, where the dynamics run on them with another Δx and Δt: how
     far that goes, δ tells. Data and training are made, or reused, as by `nsf train`.
     """
-    kind, found = "cuda" if settings.device.startswith("cuda") else "cpu", Result()
+    kind = "cuda" if settings.device.startswith("cuda") else "cpu"
     overrides = ["scene=sand", f"scale={scale_of(settings.device)}", f"device={settings.device}"]
     chain = Pipeline(config.load(overrides), say=say)
     measured(chain, settings.particles or SIZES[kind], SAMPLES, settings, found, say)
-    return found
 
 
 def measured(

@@ -20,16 +20,14 @@ from nsf.pipeline import Pipeline
 _MOST = 3  # trainings of a scene; a seed each
 
 
-def run(settings: Settings, say: Callable[[str], object]) -> Result:
+def run(settings: Settings, found: Result, say: Callable[[str], object]) -> None:
     """Both scenes: at the paper's size on a GPU, at small scale on a CPU; the precision of networks is fp32.
 
     Data are made, or reused, as by `nsf simulate`. A training goes from its files to the manifold.
     """
-    found = Result()
     for scene in settings.scenes or SCENES:
         overrides = [f"scene={scene}", f"scale={scale_of(settings.device)}", f"device={settings.device}"]
         measured(Pipeline(config.load(overrides), say=say), settings, found, say)
-    return found
 
 
 def measured(chain: Pipeline, settings: Settings, found: Result, say: Callable[[str], object]) -> None:

@@ -89,6 +89,21 @@ def test_other_rows_are_kept(speed, tmp_path):
     assert re.findall(r"\]\((.*?)\)", page.read_text())[:2] == pictures
 
 
+def test_an_interrupted_benchmark_keeps_what_it_measured(speed, tmp_path, monkeypatch):
+    """And the rows that were there before."""
+    (row,) = pd.read_csv(speed / "results.csv").iloc[:1].to_dict("records")
+
+    def run(settings, found, say):
+        found.rows.append(Row(**row | {"case": "first"}))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("nsf.bench.full_order.run", run)
+    pd.DataFrame([row]).to_csv(tmp_path / "results.csv", index=False)
+    with pytest.raises(KeyboardInterrupt):
+        bench(tmp_path, SMALL, lambda text: None)
+    assert set(pd.read_csv(tmp_path / "results.csv")["case"]) == {row["case"], "first"}
+
+
 def test_bytes_of_a_pass_grow_with_particles_and_precision():
     sizes = {}
     for particles, precision in [(400, "fp32"), (400, "fp64"), (1600, "fp32")]:
@@ -134,8 +149,8 @@ def test_a_copy_has_a_bandwidth():
 
 def test_a_floor_is_bytes_over_that_bandwidth(monkeypatch):
     monkeypatch.setattr("nsf.bench.full_order.bandwidth", lambda device: 1e9)
-    said = []
-    found = full_order(Settings((300,), ("fp64",), "cpu", 1), said.append)
+    found, said = Result(), []
+    full_order(Settings((300,), ("fp64",), "cpu", 1), found, said.append)
     assert [row.bench for row in found.rows] == ["full_order"]
     for row in found.kernels:
         assert row.floor_ms == pytest.approx(row.mib * 2**20 / 1e6)
