@@ -58,7 +58,7 @@ quickstart: install  ## a column of sand in a minute, from simulation to report,
 	@echo '  $(BIN)/nsf run scene=sand                    the same column with all its cases'
 	@echo '  docs/tutorial.md                               what was done, and how to go on'
 
-test: develop  ## the tests, without those marked slow or slurm
+test: develop  ## the tests, without those marked slow or slurm: see test-slow
 	$(PYTEST) -m 'not slow and not slurm' -n $(WORKERS) --dist worksteal
 
 test-browser: develop  ## the pages in Chromium, their modules under node and tsc; apt install chromium nodejs npm
@@ -66,7 +66,7 @@ test-browser: develop  ## the pages in Chromium, their modules under node and ts
 	! command -v npx >/dev/null || npx --yes -p typescript@5 tsc -p tests/unit/web/tsconfig.json
 	$(PYTEST) -rs tests/unit/live tests/unit/export/test_export_page.py
 
-test-slow: develop  ## the tests marked slow
+test-slow: develop  ## the tests marked slow: the pages' commands, a job of every kind, the wheel
 	$(PYTEST) -m slow -n $(WORKERS) --dist worksteal
 
 test-gpu: develop  ## the tests marked gpu, on a machine with a GPU

@@ -47,10 +47,18 @@ def bench(folder: str | Path, asked: Mapping[str, str], say: Callable[[str], obj
         found = Result()
         try:
             import_module(f"nsf.bench.{name}").run(settings, found, say)
-        finally:  # an interrupted or failed one leaves what it has measured
-            _merge(folder / "results.csv", Row, found.rows)
-            _merge(folder / "kernels.csv", KernelRow, found.kernels)
-            _merge(folder / "stages.csv", StageRow, found.stages)
+        except BaseException:
+            if found.rows:  # what was measured stays
+                _report(folder, found)
+            raise
+        page = _report(folder, found)
+    return page
+
+
+def _report(folder: Path, found: Result) -> Path:
+    _merge(folder / "results.csv", Row, found.rows)
+    _merge(folder / "kernels.csv", KernelRow, found.kernels)
+    _merge(folder / "stages.csv", StageRow, found.stages)
     return write_report(folder)
 
 

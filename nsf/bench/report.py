@@ -147,9 +147,10 @@ def _parts(folder: Path, results: pd.DataFrame, kernels: pd.DataFrame, stages: p
 
 
 def with_speed_up(results: pd.DataFrame) -> pd.DataFrame:
-    """Rows of `multi_gpu` of one device, each with the ratio of the time on one GPU to its own."""
+    """Rows of `multi_gpu` of one device, with the ratio of its commit's time on one GPU to that of each."""
     work = results["case"].str.rpartition("_on_")
-    keys = pd.Series(list(zip(work[0], results["precision"], strict=True)), index=results.index)
+    parts = work[0], results["precision"], results["commit"]
+    keys = pd.Series(list(zip(*parts, strict=True)), index=results.index)
     alone = results["ms_median"][work[2] == "1"].groupby(keys).last()
     return results.assign(speed_up=keys.map(alone) / results["ms_median"])
 

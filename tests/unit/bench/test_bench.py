@@ -102,6 +102,17 @@ def test_an_interrupted_benchmark_keeps_what_it_measured(speed, tmp_path, monkey
     with pytest.raises(KeyboardInterrupt):
         bench(tmp_path, SMALL, lambda text: None)
     assert set(pd.read_csv(tmp_path / "results.csv")["case"]) == {row["case"], "first"}
+    assert "| first |" in (tmp_path / "index.md").read_text()
+
+
+def test_a_benchmark_that_fails_at_once_leaves_no_file(tmp_path, monkeypatch):
+    def run(settings, found, say):
+        raise ConfigError("no such thing")
+
+    monkeypatch.setattr("nsf.bench.full_order.run", run)
+    with pytest.raises(ConfigError):
+        bench(tmp_path / "speed", SMALL, lambda text: None)
+    assert not list((tmp_path / "speed").iterdir())
 
 
 def test_bytes_of_a_pass_grow_with_particles_and_precision():
@@ -490,6 +501,14 @@ def test_several_devices_have_rows_beside_one(several, tmp_path):
     assert "| train_mlp_stress_on_2 |" in page
     assert "speed-up" in page
     assert "png" not in page
+
+
+def test_rows_of_two_commits_have_no_ratio():
+    rows = pd.DataFrame({
+        "case": ["train_mlp_stress_on_1", "train_mlp_stress_on_2"] * 2, "precision": "bf16",
+        "ms_median": [4.0, 2.0, 6.0, 2.0], "commit": ["a", "a", "b", "c"],
+    })  # fmt: skip
+    np.testing.assert_array_equal(with_speed_up(rows)["speed_up"], [1, 2, 1, np.nan])
 
 
 def test_several_gpus_are_needed(tmp_path, monkeypatch, capsys):
