@@ -62,6 +62,7 @@ def test_a_report_that_was_killed(chain, nsf, tmp_path, undisturbed, moment):
     assert {path.name for path in reports.iterdir()} == {name, f".{name}.lock"}
 
 
+@pytest.mark.slow
 def test_a_report_that_a_killed_process_had_put_aside_comes_back(chain, nsf, tmp_path, undisturbed):
     """Even where the next report is of something else."""
     name, _ = undisturbed

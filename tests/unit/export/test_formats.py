@@ -163,6 +163,7 @@ def test_onnx_passes_on_no_notes_of_the_exporter(graphs, tmp_path):
     assert notes.empty()
 
 
+@pytest.mark.slow
 def test_onnx_depends_on_the_parameter(graphs):
     onnxruntime = pytest.importorskip("onnxruntime")
     _, folder = graphs

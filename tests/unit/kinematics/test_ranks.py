@@ -101,6 +101,7 @@ def test_the_weights_of_all_ranks_agree(together, folder):
     assert [together[1][f"{phase}_steps"] for phase in PHASES] == [20, 12, 12]
 
 
+@pytest.mark.slow
 def test_a_step_is_that_of_the_mean_gradient(together, files, fields, turned_once):
     """The same training in one process, which adds the gradients of both shards."""
     field, whole, share = fields["mlp"], Snapshots(files), TOGETHER.share()

@@ -289,6 +289,7 @@ def test_a_drag_tilts_gravity_and_the_body_follows(opened, tilting_page):
     tab.get_by_text("distrusted: gravity was").wait_for()
 
 
+@pytest.mark.slow
 def test_a_drag_on_the_picture_turns_it_or_tilts(opened, tilting_page):
     tab = opened(tilting_page)
 

@@ -271,5 +271,6 @@ def test_a_program_is_no_axis_and_one_parameter_has_no_map(tmp_path, few_picture
     assert not list(folder.glob("error-map.*"))
 
 
+@pytest.mark.slow
 def test_a_scene_with_numbers_for_cases_has_neither(report):
     assert not [path for stem in ("error-map", "error-over-parameters") for path in report.glob(f"{stem}*")]
