@@ -108,7 +108,8 @@ def outcome(run: Callable[[], object], altered: bool, folder: Path, limit: float
     if not _hooked:
         sys.addaudithook(_hook)
         _hooked.append(True)
-    watch = Watch(folder)
+    watch, writes_none = Watch(folder), sys.dont_write_bytecode
+    sys.dont_write_bytecode = True  # of a module that the case is the first to import
     _watched.append(watch)
     try:
         with _limited(limit):
@@ -130,6 +131,7 @@ def outcome(run: Callable[[], object], altered: bool, folder: Path, limit: float
         kind, said = "traceback", "".join(traceback.format_exception(error)[-3:])
     finally:
         _watched.remove(watch)
+        sys.dont_write_bytecode = writes_none
     if watch.deeds:
         return "code", "; ".join(watch.deeds[:3])
     return kind, said
