@@ -66,6 +66,18 @@ def one_thread_for_torch():
     torch.set_num_threads(before)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def coarse_pictures():
+    """Half the pixels an inch, and one sample a pixel: a picture takes a third of the time."""
+    from nsf.reporting.bodies import camera
+    from nsf.reporting.drawing import style
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(style, "PIXELS", style.PIXELS // 2)
+        patch.setattr(camera, "_OVERSAMPLE", 1)
+        yield
+
+
 @dataclass(frozen=True)
 class Chain:
     """A chain whose stages up to `evaluate` are on disk.

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
+from matplotlib.ticker import MaxNLocator
 from rich.table import Table
 
 from nsf.reporting.drawing.style import MUTED, PALETTE, figure, save, styled
@@ -70,4 +71,5 @@ def _progress(ax, done: pd.DataFrame, objectives: Sequence[str]) -> None:
     shown = done[name] * OBJECTIVES[name].scale
     ax.scatter(done["trial"], shown, s=22, color=MUTED, label="trials")
     ax.step(done["trial"], shown.cummin(), where="post", color=PALETTE[0], label="best until then")
+    ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     ax.set(xlabel="trial", ylabel=OBJECTIVES[name].heading, title="Trials at the validation values")

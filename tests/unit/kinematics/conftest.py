@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 
 from nsf.data import Snapshots, TrajectoryWriter
 from nsf.kinematics.fields.basis import BasisField
@@ -18,15 +17,6 @@ FIELDS = {
 }
 QUICK = FastTrainer(steps=250, learning_rate=1e-2, frames_per_batch=6, particles_per_batch=40)
 PARTICLES, FRAMES, LATENT = 150, 13, 2
-
-
-@pytest.fixture(scope="session", autouse=True)
-def one_thread():
-    """Small matrices are slower on several threads, and tests run beside each other."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def motion(X, t, speed):

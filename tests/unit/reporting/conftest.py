@@ -6,23 +6,12 @@ import pytest
 from synthetic import Made, write_run
 
 from nsf.reporting import build, build_report, pictures
-from nsf.reporting.bodies import camera
-from nsf.reporting.drawing import style
 
 SWEEP = (
     Made(),
     Made(sample=50, noise=0.007),
     Made(method="deformation_only", noise=0.05, dirty=True),
 )
-
-
-@pytest.fixture(scope="session", autouse=True)
-def coarse():
-    """Half the pixels an inch, and one sample a pixel: a picture takes a third of the time."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(style, "PIXELS", style.PIXELS // 2)
-        patch.setattr(camera, "_OVERSAMPLE", 1)
-        yield
 
 
 @pytest.fixture(scope="session")
