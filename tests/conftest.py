@@ -211,19 +211,27 @@ def seal():
     return rewrite
 
 
-@pytest.fixture
-def browser():
-    """A headless Chromium with software WebGL.
-
-    Of one test: while it is open its thread has a running event loop, which tests with `asyncio.run` refuse.
-    """
-    playwright = pytest.importorskip("playwright.sync_api", reason="the package playwright is not installed")
+@pytest.fixture(scope="session")
+def chromium():
+    """The path of Chromium, where playwright can drive it."""
+    pytest.importorskip("playwright.sync_api", reason="the package playwright is not installed")
     names = ("chromium", "chromium-browser", "google-chrome")
     path = next(filter(None, map(shutil.which, names)), None)
     if path is None:
         pytest.skip("no Chromium is installed; apt install chromium")
+    return path
+
+
+@pytest.fixture
+def browser(chromium):
+    """A headless Chromium with software WebGL.
+
+    Of one test: while it is open its thread has a running event loop, which tests with `asyncio.run` refuse.
+    """
+    from playwright.sync_api import sync_playwright
+
     software = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-    with playwright.sync_playwright() as started:
-        chromium = started.chromium.launch(executable_path=path, args=["--no-sandbox", *software])
-        yield chromium
-        chromium.close()
+    with sync_playwright() as started:
+        opened = started.chromium.launch(executable_path=chromium, args=["--no-sandbox", *software])
+        yield opened
+        opened.close()

@@ -71,6 +71,7 @@ def test_a_chain_whose_results_are_there_imports_nothing_that_computes(started, 
     assert not {"torch", "warp", "pytorch_lightning", "matplotlib"} & {*heavy}
 
 
+@pytest.mark.slow
 def test_no_missing_driver_is_told_of_where_nothing_asks_for_it(started, chain, tiny):
     _, _, err, heavy = started("simulate", *tiny, "scene.steps=2", "deploy.split=train")
     assert "warp" in heavy

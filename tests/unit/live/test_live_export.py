@@ -41,8 +41,8 @@ def page(taught_model, tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def tilting_page(tilting_model, tmp_path_factory):
-    """The page of a tiny block under programs of gravity."""
+def tilting_page(chromium, tilting_model, tmp_path_factory):
+    """The page of a tiny block under programs of gravity, made where a browser can show it."""
     return publish.write(tilting_model.run, tmp_path_factory.mktemp("tilting"), device="cpu")
 
 

@@ -217,6 +217,7 @@ def test_animations_of_a_crowded_page_are_of_one_value_and_fewer_frames(tmp_path
     assert keys["frames"] == 3
 
 
+@pytest.mark.slow
 def test_a_sweep_shows_the_best_variant_of_a_scene_and_does_not_animate_it(tmp_path):
     found, keys = [], {}
     for size, noise, method in ((20, 0.02, "nsf"), (50, 0.004, "nsf"), (50, 0.05, "neural_stress_only")):

@@ -274,6 +274,7 @@ def test_latex_knows_every_sign_of_a_table(sweep):
     assert text.isascii()
 
 
+@pytest.mark.slow
 def test_bodies_at_each_setting_stand_below_each_other(tmp_path, monkeypatch):
     seen = []
     draw_shapes = shapes.final_shapes
@@ -292,12 +293,14 @@ def test_bodies_at_each_setting_stand_below_each_other(tmp_path, monkeypatch):
     assert cases[0].delta > cases[1].delta
 
 
+@pytest.mark.slow
 def test_seeds_are_no_settings(tmp_path):
     found, keys, settings = runs(tmp_path, seeds=("0", "1"))
     sections = draw(merge(open_sources(found), settings), tmp_path, True, of(keys))
     assert "Bodies at each setting" not in [section.heading for section in sections]
 
 
+@pytest.mark.slow
 def test_a_sweep_of_the_baseline_alone_has_no_bodies_of_settings(tmp_path):
     made = [Made(method="deformation_only", sample=size) for size in (20, 150)]
     found = [write_run(tmp_path, one) for one in made]
