@@ -23,7 +23,7 @@ def tried(copied, tiny, tmp_path):
     def call(*words):
         said = []
         chart = search([*base, *words], said.append, root)
-        assert chart.stat().st_size > 3_000
+        assert chart.is_file()
         return pd.read_csv(chart.with_name("trials.csv")), said
 
     call.root = root

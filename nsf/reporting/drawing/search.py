@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
+from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from rich.table import Table
 
@@ -29,14 +30,19 @@ def write_search(table: pd.DataFrame, keys: Sequence[str], objectives: Sequence[
     """
     with writing(folder / "trials.csv") as partial:
         table.map(spreadsheet).to_csv(partial, index=False)
+    save(search_chart(table, objectives), folder, "search")
+    return folder / "search.png"
+
+
+def search_chart(table: pd.DataFrame, objectives: Sequence[str]) -> Figure:
+    """The trials that did not fail: two objectives and their front, or one over the trials."""
     with styled():
         fig = figure(4.2)
         ax = fig.add_subplot()
         (_front if len(objectives) == 2 else _progress)(ax, table.dropna(subset=list(objectives)), objectives)
         ax.grid(True)
         ax.legend()
-    save(fig, folder, "search")
-    return folder / "search.png"
+    return fig
 
 
 def best_table(path: Path) -> Table:

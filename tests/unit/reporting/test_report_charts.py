@@ -16,6 +16,7 @@ from nsf.reporting.drawing import charts
 from nsf.reporting.drawing.cost import error_over_cost, solver_styles, step_over_particles
 from nsf.reporting.drawing.point import point_chart, point_response
 from nsf.reporting.drawing.scales import plain_ticks, set_apart
+from nsf.reporting.drawing.search import search_chart
 from nsf.reporting.drawing.style import LETTER, legend_above, save, styled
 from nsf.reporting.sources import Motion
 
@@ -367,6 +368,13 @@ def test_an_axis_of_errors_has_ticks_however_many_decades_it_spans(largest):
     shown = [tick for tick in panel.get_yticks() if low <= tick <= high]
     assert 3 <= len(shown) <= 12
     assert len(panel.get_xticks()) <= 7
+
+
+def test_a_search_shows_its_trials_by_whole_numbers():
+    table = pd.DataFrame({"trial": [0, 1, 2], "delta": [2e-3, np.nan, 1e-3], "pareto": [False, False, True]})
+    panel = search_chart(table, ["delta"]).axes[0]
+    np.testing.assert_allclose(panel.collections[0].get_offsets(), [[0, 0.2], [2, 0.1]])
+    assert panel.get_xticks().tolist() == np.round(panel.get_xticks()).tolist()
 
 
 def test_step_over_particles_has_a_line_for_each_solver():
