@@ -98,15 +98,16 @@ def _held_out(merged: Merged, study: Study) -> pd.DataFrame:
 def _over(key: str, frame: pd.DataFrame, merged: Merged, study: Study, folder: Path) -> Picture:
     """δ over one key, a panel a scene, a line for each setting of the other keys.
 
-    In place of training steps stands their time, the mean over seeds, where every run tells it. Over training
-    runs there is a line for interpolating them.
+    In place of training steps stands their time, the mean over seeds, where every run tells it; then jobs
+    that set no steps have a place, too. Over training runs there is a line for interpolating them.
     """
     title, unit, column = AXES[key]
     shown = frame[frame[key].notna()]
     source = merged.frame[column].loc[shown["row"]].array if column else shown[key]
     if key == _STEPS:
-        seconds = [merged.source[row].training_seconds for row in shown["row"]]
+        seconds = [merged.source[row].training_seconds for row in frame["row"]]
         if None not in seconds:
+            shown = frame
             alike = shown.columns.drop([*SEEDS, _RUN, "delta", "row"], errors="ignore")
             alike = [shown[name] for name in alike]
             (title, unit), of_rows = _SECONDS, pd.Series(seconds, shown.index)
@@ -254,7 +255,8 @@ def _name(setting: Mapping[str, object]) -> str:
         if pd.isna(value):
             continue
         text = str(value)
-        if text == "null" or text.startswith("[") or not pd.isna(pd.to_numeric(text, errors="coerce")):
+        named = text not in ("null", "paper") and not text.startswith("[")  # "paper" alone: the paper's own
+        if not named or not pd.isna(pd.to_numeric(text, errors="coerce")):
             title = AXES[key][0] if key in AXES else key.rpartition(".")[2].replace("_", " ")
             text = f"{title} {text}"
         parts |= dict.fromkeys(text.split(" · "))

@@ -116,6 +116,11 @@ def test_delta_over_training_has_its_time_where_every_run_tells_it(tmp_path, dra
     assert sorted(drawn[1][1][0]["sand"]["mean"]) == [25, 250]
     for name in keys:
         keys[name] = {"scene": "sand", "trainer.steps": steps[name]}
+    *_, other = keys  # another schedule, which has epochs in place of steps
+    schedule = {"scene": "sand", "trainer": "paper", "trainer.epochs_stress": "2"}
+    swept(merged, of(keys | {other: schedule}), tmp_path)
+    lines = drawn.pop()[1][0]["sand"]
+    assert {name: sorted(line) for name, line in lines.items()} == {"mean": [10, 40], "trainer paper": [250]}
     for source in merged.source:
         source.cost["trials"] = 0  # side by side, whose times tell nothing
     swept(merged, of(keys), tmp_path)
