@@ -121,7 +121,9 @@ def _parts(folder: Path, results: pd.DataFrame, kernels: pd.DataFrame, stages: p
         for name in ("reduced", "training", "batch", "operators", "multi_gpu")
     )
     of_pass = "Time of each pass of a full-order step; the mark is its floor."
-    of_case = "Time of a step of both solvers by scene; a point names δ of its run."
+    of_case = (
+        "Time of a step of both solvers by scene; a point names δ of its run, at the first held-out value."
+    )
     listed = (  # rows, texts, chart and what draws it from which rows; the rows are the table
         (of_scene, [of_case], "reduced", steps_by_scene, [of_scene]),
         (of_stages, [_STAGES], "stages", step_beside_paper, [of_stages]),

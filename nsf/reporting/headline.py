@@ -191,7 +191,10 @@ def _defaults(report: Report) -> str:
 
 
 def _rivals(report: Report) -> str:
-    told = where_rivals_win(report.groups)
+    rows = report.groups
+    if "parameter" in report.settings:  # each value by itself
+        rows = rows.assign(scene=rows["scene"] + " at " + rows["parameter"].map(parameter_text))
+    told = where_rivals_win(rows)
     return f" {told}" if told else ""
 
 

@@ -43,6 +43,7 @@ AXES = {
 TRAIN = "scene.design.train"  # a list, of which the length is shown
 _STEPS, _SECONDS = "trainer.steps", ("training time", "s")  # shown in place of steps where runs tell it
 
+_MUTE = ("null", "paper")  # values that say nothing, or something else, without their key
 _RENAMED = {
     "method": "variant",
     "trust": "distrust ratio",
@@ -113,7 +114,8 @@ def _over(key: str, frame: pd.DataFrame, merged: Merged, study: Study, folder: P
             (title, unit), of_rows = _SECONDS, pd.Series(seconds, shown.index)
             source = of_rows.groupby(alike, dropna=False).transform("mean")
     shown = shown.assign(x=pd.to_numeric(pd.Series(source, index=shown.index), errors="coerce"))
-    panels, papers, interpolated = {}, {}, False
+    panels, papers, interpolated, scheduled = {}, {}, False, bool(shown[key].isna().any())
+    devices = merged.frame["device"].loc[shown["row"]].unique() if title == _SECONDS[0] else ()
     placed = shown.dropna(subset="x")
     hidden = (key, *SEEDS, *(SIZE if fnmatchcase(key, SIZE[0]) else ()))
     told = _told(placed, hidden, beside=(_SCENE,))
@@ -136,6 +138,8 @@ def _over(key: str, frame: pd.DataFrame, merged: Merged, study: Study, folder: P
     caption = (
         f"Mean δ (line) against {title}, and from the smallest to the largest over the held-out values"
         f"{' and seeds' if seeds else ''} (band). Where a run diverged, the line has a gap."
+        + (" A job that sets no steps has a schedule of its own, which the table has." if scheduled else "")
+        + (f" Times are of {' and '.join(devices)}, as the table says." if len(devices) > 1 else "")
         + (" The cross is what the paper prints." if any(papers.values()) else "")
         + (" Interpolating the latent vectors of the training runs takes no step." if interpolated else "")
     )
@@ -255,8 +259,7 @@ def _name(setting: Mapping[str, object]) -> str:
         if pd.isna(value):
             continue
         text = str(value)
-        named = text not in ("null", "paper") and not text.startswith("[")  # "paper" alone: the paper's own
-        if not named or not pd.isna(pd.to_numeric(text, errors="coerce")):
+        if text in _MUTE or text.startswith("[") or not pd.isna(pd.to_numeric(text, errors="coerce")):
             title = AXES[key][0] if key in AXES else key.rpartition(".")[2].replace("_", " ")
             text = f"{title} {text}"
         parts |= dict.fromkeys(text.split(" · "))

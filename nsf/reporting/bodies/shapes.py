@@ -47,7 +47,7 @@ class Case:
 
     Attributes:
         motion: of both models; baseline: of the baseline in the same case.
-        place: which of several it is: "worst" or "best" of its variant's cases, or a setting; or nothing.
+        place: which of several it is: "worst" or "best" of its variant and seed, a setting, or nothing.
         delta: δ as a fraction, where it is to be said.
     """
 

@@ -216,6 +216,8 @@ def delta_over(
                 style = line_style(names.index(name))
                 low, high = (_finite([end(v) for v in values]) for end in (np.min, np.max))
                 panel.fill_between(at, low, high, color=style["color"], alpha=0.18, linewidth=0)
+                if len(at) == 1:  # a band without width
+                    panel.vlines(at, low, high, color=style["color"], alpha=0.36, linewidth=6)
                 panel.plot(at, _finite([v.mean() for v in values]), marker="o", ms=4, label=name, **style)
                 every += [*low, *high]
             for value, delta in papers.get(scene, ()):

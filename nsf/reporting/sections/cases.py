@@ -29,11 +29,13 @@ def cases_section(groups: Sequence[_Alike], folder: Path) -> list[Section]:
         folder: of the report.
 
     Returns:
-        Nothing where each case is the number of one parameter.
+        Nothing where each case is the number of one parameter. Operators that left every run to projected
+        steps are not drawn, since these are runs of the projected steps.
     """
     bodies: dict[tuple, list[tuple[_Alike, dict[Case, float]]]] = {}
+    left = [alike for alike in groups if all(v.left() for v in alike)]
     for alike in groups:
-        if errors := _errors(alike):
+        if alike not in left and (errors := _errors(alike)):
             names = tuple(next(iter(errors)).parameters)
             bodies.setdefault((alike[0].body, names), []).append((alike, errors))
     if not bodies:
@@ -49,6 +51,7 @@ def cases_section(groups: Sequence[_Alike], folder: Path) -> list[Section]:
         f"Displacement error of held-out cases over each parameter, a dot a case{seeds}. A line is the mean "
         "over neighbouring cases, and its band goes from the smallest to the largest of them, which differ "
         f"in whatever else varies. {_LOST} It is a cross above the panel, and leaves a gap in the line."
+        + (" Operators that left every run to projected steps are not shown." if left else "")
     )
     pictures = [Picture(save(error_over_parameters(drawn), folder, "error-over-parameters"), told, runs)]
     if maps := [cases for cases in drawn if len(cases.parameters) == 2]:
@@ -57,6 +60,7 @@ def cases_section(groups: Sequence[_Alike], folder: Path) -> list[Section]:
             f"panel for each method, the best first, and one colour scale for all. {_LOST}"
         )
         told += " Grey crosses are the training cases." if any(len(cases.trained) for cases in maps) else ""
+        told += " Operators that left every run to projected steps are not shown." if left else ""
         files = save(error_maps(maps), folder, "error-map", ramps=[COLORS])
         pictures.append(Picture(files, told, runs))
     return [Section("Over the parameters", pictures)]

@@ -1,13 +1,11 @@
 """Who took the steps of runs by operators: a picture beside the runs of one level alone."""
 
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
 from nsf.reporting.drawing.levels import levels_over_time, name_of
 from nsf.reporting.drawing.style import save
 from nsf.reporting.sections.variant import Variant
-from nsf.reporting.study import SEEDS
 from nsf.reporting.text.columns import parameter_text
 from nsf.reporting.text.formats import file_name
 from nsf.reporting.text.page import Picture, Section
@@ -37,10 +35,10 @@ def levels_section(known: Sequence[Variant], folder: Path) -> list[Section]:
         if not mixed:
             continue
         shown, runs = {}, set()
-        seed = next(_seeds(v) for v, rows in zip(own, series, strict=True) if _is_mixed(rows, mixed[0]))
+        seed = next(v.seeds for v, rows in zip(own, series, strict=True) if _is_mixed(rows, mixed[0]))
         for variant, rows in zip(own, series, strict=True):
             part = rows[rows["parameter"] == mixed[0]]
-            if _seeds(variant) != seed:
+            if variant.seeds != seed:
                 continue
             if len(part) and "by" in part:
                 name = name_of(part, closed=variant.rows["engine"].iloc[0] == "closed")
@@ -56,11 +54,6 @@ def levels_section(known: Sequence[Variant], folder: Path) -> list[Section]:
         stem = "levels" if alone else file_name(f"{body}-levels")
         pictures.append(Picture(save(levels_over_time(shown), folder, stem), caption, sorted(runs)))
     return [Section("Who took the steps", pictures)] if pictures else []
-
-
-def _seeds(variant) -> set[str]:
-    """What a variant's label says of its seeds."""
-    return {part for part in re.split(" · |, ", variant.label) if part.partition("=")[0] in SEEDS}
 
 
 def _is_mixed(rows, value) -> bool:

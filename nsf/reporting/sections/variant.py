@@ -1,5 +1,6 @@
 """One variant of a report: its rows, and of its runs what pictures need."""
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +9,7 @@ import pandas as pd
 from nsf.reporting.bodies import shapes
 from nsf.reporting.keeping import code, key_of
 from nsf.reporting.sources import Motion, same_parameter
+from nsf.reporting.study import SEEDS
 from nsf.reporting.tables import Merged, natural
 from nsf.reporting.text.columns import parameter_text
 from nsf.vectors import spaced
@@ -84,6 +86,11 @@ class Variant:
         left = (shown["engine"] == "operators") & (shown["handed_over"] == 1.0)
         return " Projected steps took these runs, from the first step on." if left.all() else ""
 
+    @property
+    def seeds(self) -> set[str]:
+        """What its label says of seeds."""
+        return {part for part in re.split(" · |, ", self.label) if part.partition("=")[0] in SEEDS}
+
     def ranked(self) -> list[tuple]:
         """Held-out values and their δ, the worst first; a run that diverged is the worst."""
         shown = self.rows["split"] == self.held_out
@@ -101,6 +108,8 @@ class Variant:
         for i, value in zip(chosen, values, strict=True):
             if value in motions:
                 place = {0: "worst", len(ranked) - 1: "best"}.get(i, "") if len(ranked) > 1 else ""
+                if place and self.seeds:  # another seed's may be worse
+                    place += f" of {', '.join(sorted(self.seeds)).replace('=', ' ')}"
                 motion, other = motions[value], beside.get(value)
                 if other is not None and len(other.t) != len(motion.t):
                     other = None  # its run kept other frames

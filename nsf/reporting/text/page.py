@@ -38,7 +38,8 @@ DEFINITIONS = (
         "rivals",
         "without a reduced step: nothing moves; the training run of the nearest parameters, its latent "
         "vectors decoded by the same fields; latent vectors interpolated over the parameters between "
-        "training runs. Coarse full order is the full-order solver on a coarser grid.",
+        "training runs, linearly if there is one parameter, and held constant outside. Coarse full order is "
+        "the full-order solver on a coarser grid.",
     ),
     (
         "runs until it pays",

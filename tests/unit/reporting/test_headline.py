@@ -40,6 +40,18 @@ def test_means_over_values_and_seeds_a_row_a_scene_and_setting(tmp_path):
     )
 
 
+def test_values_that_are_shown_each_are_judged_each(tmp_path):
+    """The mean of the reduced runs is nearer than the rival's, and so is each value but one."""
+    jobs = [
+        job(parameter=value, delta=error / 10, **{"scene.design.test": "[41, 55]"})
+        | {"displacement_coarse": 0.15}
+        for value, error in ((41.0, 0.01), (55.0, 0.25))
+    ]
+    assert (
+        "on sand at 55 coarse full order (15 %) beside 25 %." in told(write_report(tmp_path / "a", jobs))[1]
+    )
+
+
 def test_what_a_mean_hides_stands_beside_it(tmp_path):
     """A still body has a δ of δ over the displacement error; frames are decoded beside a run."""
     costs = {

@@ -13,7 +13,9 @@ from nsf.data import Case
 from nsf.reporting import build_report, rivals
 from nsf.reporting.drawing.cases import Cases, Parameter, error_maps, error_over_parameters
 from nsf.reporting.rivals import solvers
+from nsf.reporting.sections import cases as section
 from nsf.reporting.sections.cases import _names
+from nsf.reporting.sections.variant import Variant
 from nsf.reporting.sources import Study, open_sources
 from nsf.reporting.study import _held_out
 from nsf.reporting.tables import VARIANT, first_rows, merge, told_apart, variant_labels
@@ -201,6 +203,32 @@ def test_time_over_particles_is_drawn_where_a_scene_has_several(tmp_path, monkey
     assert {tuple(times) for times in solvers_there.values()} == {(300, 1200)}
 
 
+def test_operators_that_left_every_run_are_not_drawn(tmp_path, monkeypatch):
+    shown = []
+    monkeypatch.setattr(section, "error_over_parameters", lambda bodies: shown.extend(bodies) or plt.figure())
+    monkeypatch.setattr(section, "error_maps", lambda bodies: plt.figure())
+    runs = [block(tmp_path, None), block(tmp_path, None, seed=1)]
+    merged = merge(open_sources(runs), {run.id: f"seed={i}" for i, run in enumerate(runs)})
+    own = [[i for i, source in enumerate(merged.source) if source.id == run.id] for run in runs]
+    merged.frame.loc[own[1], "engine"] = "operators"
+    for share, engines, notes in ((1.0, 1, 2), (0.5, 2, 0)):
+        merged.frame.loc[own[1], "handed_over"] = share
+        groups = [[Variant(merged, members, "")] for members in own]
+        (told,) = section.cases_section(groups, tmp_path)
+        assert len(shown.pop().errors) == engines
+        assert sum("not shown" in picture.caption for picture in told.pictures) == notes
+
+
+def test_a_picture_says_which_seed_its_worst_case_is_of(tmp_path):
+    runs = [block(tmp_path, None), block(tmp_path, None, seed=1)]
+    merged = merge(open_sources(runs), {run.id: f"seed={i}" for i, run in enumerate(runs)})
+    members = [i for i, source in enumerate(merged.source) if source.id == runs[1].id]
+    places = [
+        [case.place for case in Variant(merged, members, name).cases(2)] for name in ("nsf · seed=1", "nsf")
+    ]
+    assert places == [["worst of seed 1", "best of seed 1"], ["worst", "best"]]
+
+
 def test_what_tells_bodies_apart_names_no_solver():
     def solver(scene, field):
         row = dict.fromkeys(VARIANT, "") | {"scene": scene, "method": "nsf", "field": field, "r": 6}
@@ -215,8 +243,6 @@ def test_what_tells_bodies_apart_names_no_solver():
 @pytest.mark.slow
 def test_a_report_has_a_chart_a_map_and_pictures_of_each_body(tmp_path, few_pictures, monkeypatch):
     shown = []
-    from nsf.reporting.sections import cases as section
-
     for name in ("error_over_parameters", "error_maps"):
         draw = getattr(section, name)
         monkeypatch.setattr(section, name, lambda bodies, draw=draw: shown.append(bodies) or draw(bodies))

@@ -26,7 +26,7 @@ def variant(label, *series, scene="jelly_cube", engine="levels"):
     return SimpleNamespace(
         rows=pd.DataFrame({"engine": [engine]}),
         scene=scene, body=scene, label=label, parameter=("speed", "m/s"), runs=[f"evaluate/{label}"],
-        series=lambda held_out_only: rows,
+        series=lambda held_out_only: rows, seeds=set(),
     )  # fmt: skip
 
 

@@ -118,14 +118,24 @@ def test_delta_over_training_has_its_time_where_every_run_tells_it(tmp_path, dra
         keys[name] = {"scene": "sand", "trainer.steps": steps[name]}
     *_, other = keys  # another schedule, which has epochs in place of steps
     schedule = {"scene": "sand", "trainer": "paper", "trainer.epochs_stress": "2"}
-    swept(merged, of(keys | {other: schedule}), tmp_path)
+    (section,) = swept(merged, of(keys | {other: schedule}), tmp_path)
     lines = drawn.pop()[1][0]["sand"]
     assert {name: sorted(line) for name, line in lines.items()} == {"mean": [10, 40], "trainer paper": [250]}
+    assert "sets no steps" in section.pictures[0].caption
+    assert "Times are of" not in section.pictures[0].caption
+    merged.frame.loc[merged.frame.index[-1], "device"] = "NVIDIA H200"
+    (section,) = swept(merged, of(keys), tmp_path)
+    caption = section.pictures[0].caption
+    assert "sets no steps" not in caption
+    assert "and NVIDIA H200, as the table says" in caption
+    drawn.pop()
     for source in merged.source:
         source.cost["trials"] = 0  # side by side, whose times tell nothing
     swept(merged, of(keys), tmp_path)
     _, (panels, x, _) = drawn[2]
     assert (x, sorted(panels["sand"]["mean"])) == ("training steps of each network [–]", [100, 500, 3000])
+    swept(merged, of(keys | {other: schedule}), tmp_path)
+    assert {name: sorted(line) for name, line in drawn[3][1][0]["sand"].items()} == {"mean": [100, 500]}
 
 
 def test_an_interval_of_equal_values_is_a_point_and_of_lost_runs_none():
@@ -220,6 +230,9 @@ def test_the_band_spans_the_values_and_a_diverged_run_leaves_a_gap():
     corners = panel.collections[0].get_paths()[0].vertices[:, 1]
     assert (corners.min(), corners.max()) == pytest.approx((2.0, 4.0))
     assert (panel.get_xscale(), figure.get_supxlabel(), panel.get_ylabel()) == ("log", "|S| [–]", "δ [%]")
+    (panel,) = charts.delta_over({"sand": {"alone": {10.0: [0.02, 0.04]}}}, "|S| [–]", {}).axes
+    (span,) = panel.collections[1].get_segments()
+    np.testing.assert_allclose(span, [[10, 2], [10, 4]])
 
 
 def test_more_than_four_scenes_take_a_second_row():

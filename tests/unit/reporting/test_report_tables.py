@@ -265,6 +265,9 @@ def test_a_rival_that_wins_is_told_with_its_error_and_the_reduced_runs():
     )
     rows[0]["displacement_error"] = 0.01
     assert where_rivals_win(pd.DataFrame(rows)).startswith("No rival has a smaller")
+    rows[0]["displacement_error"] = 0.0  # the full-order solver's
+    assert where_rivals_win(pd.DataFrame(rows)).endswith("beside 50 %.")
+    rows[0]["displacement_error"] = 0.01
     rows.append({"scene": "bread", "displacement_error": float("inf")} | rivals)
     assert where_rivals_win(pd.DataFrame(rows)).endswith(
         "on bread nothing moves (100 %), nearest training run (4 %) and interpolated latents (2 %) beside ∞."
