@@ -28,7 +28,8 @@ RUNS, DIVERGED, SEED_COUNT = "runs", "diverged", "seeds"  # how many are in a ro
 WORST = "displacement_worst"
 MEASURED = (
     "delta", "displacement_error", WORST, "displacement_interpolated", "delta_static", "stress_error",
-    "speedup_step", "speedup_total", "speedup_shown", "break_even_runs", "handed_over",
+    "speedup_step", "speedup_total", "speedup_shown", "memory_full_mib", "memory_reduced_mib",
+    "break_even_runs", "handed_over",
 )  # fmt: skip
 SHARE = "integration_share"  # N over all particles
 VALUES = "scene.design.test"  # jobs of one scene and seed with this key are about single held-out values
