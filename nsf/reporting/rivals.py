@@ -161,7 +161,8 @@ def where_rivals_win(rows: pd.DataFrame) -> str:
 
     Args:
         rows: with `scene`, `displacement_error` and the columns of rivals (fractions). A row without error is
-            of the full-order solver, to which its runs were handed from the start, and does not count.
+            of the full-order solver, to which its runs were handed from the start, and does not count. A mean
+            that has such runs beside others does.
 
     Returns:
         Nothing where no row was held to a rival.

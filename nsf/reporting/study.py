@@ -138,7 +138,7 @@ def _over(key: str, frame: pd.DataFrame, merged: Merged, study: Study, folder: P
     caption = (
         f"Mean δ (line) against {title}, and from the smallest to the largest over the held-out values"
         f"{' and seeds' if seeds else ''} (band). Where a run diverged, the line has a gap."
-        + (" A job that sets no steps has a schedule of its own, which the table has." if scheduled else "")
+        + (" A job that sets no steps takes those of its trainer." if scheduled else "")
         + (f" Times are of {' and '.join(devices)}, as the table says." if len(devices) > 1 else "")
         + (" The cross is what the paper prints." if any(papers.values()) else "")
         + (" Interpolating the latent vectors of the training runs takes no step." if interpolated else "")

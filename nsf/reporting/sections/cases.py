@@ -33,9 +33,10 @@ def cases_section(groups: Sequence[_Alike], folder: Path) -> list[Section]:
         steps are not drawn, since these are runs of the projected steps.
     """
     bodies: dict[tuple, list[tuple[_Alike, dict[Case, float]]]] = {}
-    left = [alike for alike in groups if all(v.left() for v in alike)]
-    for alike in groups:
-        if alike not in left and (errors := _errors(alike)):
+    shown = [alike for alike in groups if not all(v.left() for v in alike)]
+    left = " Operators that left every run to projected steps are not shown." * (len(shown) < len(groups))
+    for alike in shown:
+        if errors := _errors(alike):
             names = tuple(next(iter(errors)).parameters)
             bodies.setdefault((alike[0].body, names), []).append((alike, errors))
     if not bodies:
@@ -46,12 +47,12 @@ def cases_section(groups: Sequence[_Alike], folder: Path) -> list[Section]:
         for names, variants, own in zip(_names(first), first, bodies.values(), strict=True)
     ]
     runs = sorted({run for own in bodies.values() for alike, _ in own for v in alike for run in v.runs})
-    seeds = ", its mean over seeds" if any(len(alike) > 1 for alike in groups) else ""
+    seeds = ", its mean over seeds" if any(len(alike) > 1 for alike in shown) else ""
     told = (
         f"Displacement error of held-out cases over each parameter, a dot a case{seeds}. A line is the mean "
         "over neighbouring cases, and its band goes from the smallest to the largest of them, which differ "
         f"in whatever else varies. {_LOST} It is a cross above the panel, and leaves a gap in the line."
-        + (" Operators that left every run to projected steps are not shown." if left else "")
+        + left
     )
     pictures = [Picture(save(error_over_parameters(drawn), folder, "error-over-parameters"), told, runs)]
     if maps := [cases for cases in drawn if len(cases.parameters) == 2]:
@@ -60,7 +61,7 @@ def cases_section(groups: Sequence[_Alike], folder: Path) -> list[Section]:
             f"panel for each method, the best first, and one colour scale for all. {_LOST}"
         )
         told += " Grey crosses are the training cases." if any(len(cases.trained) for cases in maps) else ""
-        told += " Operators that left every run to projected steps are not shown." if left else ""
+        told += left
         files = save(error_maps(maps), folder, "error-map", ramps=[COLORS])
         pictures.append(Picture(files, told, runs))
     return [Section("Over the parameters", pictures)]

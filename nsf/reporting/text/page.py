@@ -38,7 +38,7 @@ DEFINITIONS = (
         "rivals",
         "without a reduced step: nothing moves; the training run of the nearest parameters, its latent "
         "vectors decoded by the same fields; latent vectors interpolated over the parameters between "
-        "training runs, linearly if there is one parameter, and held constant outside. Coarse full order is "
+        "training runs, of one parameter linearly, and constant outside. Coarse full order is "
         "the full-order solver on a coarser grid.",
     ),
     (

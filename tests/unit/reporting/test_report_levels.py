@@ -21,12 +21,12 @@ def series_of(*by: int, parameter: float = 0.6) -> pd.DataFrame:
     )  # fmt: skip
 
 
-def variant(label, *series, scene="jelly_cube", engine="levels"):
+def variant(label, *series, scene="jelly_cube", engine="levels", seeds=()):
     rows = pd.concat(series)
     return SimpleNamespace(
         rows=pd.DataFrame({"engine": [engine]}),
         scene=scene, body=scene, label=label, parameter=("speed", "m/s"), runs=[f"evaluate/{label}"],
-        series=lambda held_out_only: rows, seeds=set(),
+        series=lambda held_out_only: rows, seeds=set(seeds),
     )  # fmt: skip
 
 
@@ -95,6 +95,9 @@ def test_a_picture_where_a_run_has_more_than_one_level(tmp_path):
     assert "speed 0.6 m/s" in one.caption
     assert two.runs == ["evaluate/other"]
     assert {path.name for path in tmp_path.glob("*.png")} == {"jelly_cube-levels.png", "sand-levels.png"}
+    seeded = [variant(f"levels {seed}", series_of(0, 1, 0), seeds=[f"seed={seed}"]) for seed in (0, 1)]
+    ((picture,),) = (section.pictures for section in levels_section(seeded, tmp_path))
+    assert picture.runs == ["evaluate/levels 0"]  # of the seed that is shown alone
 
 
 def timed(engine, stages, device="cpu"):
