@@ -150,6 +150,7 @@ FORCED = (
 )
 
 
+@pytest.mark.slow
 def test_programs_through_the_whole_chain(pipeline_at, tmp_path):
     """Simulated, trained on, taught from, evaluated; a program beyond the range is distrusted."""
     taught = ("engine=operators", "engine.teaching.descent=60", "engine.teaching.rounds=0", "engine.check=4")

@@ -431,6 +431,7 @@ def test_a_number_that_is_not_finite_is_refused_or_taken_as_before(pipeline_at, 
         pipeline_at(tmp_path, override)
 
 
+@pytest.mark.slow
 def test_a_run_without_timings_is_reported(copied, pipeline_at, tmp_path, monkeypatch):
     for shapes in ("_stills", "_animation"):  # which tell nothing of timings
         monkeypatch.setattr(f"nsf.reporting.pictures.{shapes}", lambda *_: [])

@@ -118,6 +118,7 @@ def test_an_error_that_is_no_ones_fault_is_told_too(tmp_path, monkeypatch, capsy
     assert "Traceback" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_after_a_kill_only_the_job_in_flight_is_redone(nsf, copied):
     root = copied("simulate")
     # Each job takes 400 steps; the kill comes in the middle of the second one.

@@ -43,6 +43,7 @@ def test_the_front_of_two_objectives(tried):
     assert len([line for line in said if re.match(r"trial \d: latent_dim=\d", line)]) == 3
 
 
+@pytest.mark.slow
 def test_only_validation_values_are_deployed_and_the_search_goes_on(tried):
     words = ("scene.design.validation=[25]", "latent_dim=3..5")
     assert len(tried(*words, "search.trials=1")[0]) == 1

@@ -114,6 +114,7 @@ def test_a_second_call_reuses_what_was_taught(lesson, pipeline_at):
     assert said == [f"deploy: inputs unchanged, reused → {pipeline.deployment.id}"]
 
 
+@pytest.mark.slow
 def test_no_held_out_value_is_a_lesson(pipeline_at, tmp_path):
     for seed in range(20):
         pipeline = pipeline_at(tmp_path, *TAUGHT, f"seed={seed}")

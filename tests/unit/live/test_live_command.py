@@ -115,6 +115,7 @@ def test_it_serves_until_it_is_interrupted(chain, command, tmp_path):
             started.kill()
 
 
+@pytest.mark.slow
 def test_beyond_this_machine_a_token_is_asked_for(chain, tmp_path):
     said = tmp_path / "said"
     with said.open("w") as stream:
