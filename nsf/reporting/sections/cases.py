@@ -34,7 +34,8 @@ def cases_section(groups: Sequence[_Alike], folder: Path) -> list[Section]:
     """
     bodies: dict[tuple, list[tuple[_Alike, dict[Case, float]]]] = {}
     shown = [alike for alike in groups if not all(v.left() for v in alike)]
-    left = " Operators that left every run to projected steps are not shown." * (len(shown) < len(groups))
+    some_left = len(shown) < len(groups)
+    left = " Operators that left every run to projected steps are not shown." if some_left else ""
     for alike in shown:
         if errors := _errors(alike):
             names = tuple(next(iter(errors)).parameters)
