@@ -19,7 +19,7 @@ from nsf.reporting.tables import (
     variants,
     without_constants,
 )
-from nsf.reporting.text.columns import COLUMN, RIVALS, SOLVER, device_type
+from nsf.reporting.text.columns import COLUMN, RIVALS, SOLVER, device_type, parameter_text, split_rank
 from nsf.reporting.text.page import Picture, Table
 
 _FULL = "full order"
@@ -141,9 +141,17 @@ def beside_rivals(merged: Merged) -> list[Table]:
     if not len(frame):
         return []
     shown, same = without_constants(frame.dropna(axis="columns", how="all"))
-    parts = [_BESIDE, where_rivals_win(frame), *_refused(merged)]
+    parts = [_BESIDE, where_rivals_win(frame), *_at_single_values(merged, frame), *_refused(merged)]
     parts += [f"The same in every row: {same}."] if same else []
     return [Table("Beside rivals", rows_of(shown), " ".join(parts))]
+
+
+def _at_single_values(merged: Merged, means: pd.DataFrame) -> list[str]:
+    """At which values a rival is nearer on scenes where none is in the mean, as a sentence."""
+    rows = merged.frame[merged.frame["split"] == min(merged.frame["split"], key=split_rank)]
+    rows = rows[~rows["scene"].isin(list(_wins(means)))]
+    won = _wins(rows.assign(scene=rows["scene"] + " at " + rows["parameter"].map(parameter_text)))
+    return [f"At single values one has: {'; '.join(won.values())}."] if won else []
 
 
 def _refused(merged: Merged) -> list[str]:
@@ -167,16 +175,27 @@ def where_rivals_win(rows: pd.DataFrame) -> str:
     Returns:
         Nothing where no row was held to a rival.
     """
-    known = rows[rows["displacement_error"] > 0.0].dropna(subset=list(RIVALS), how="all")
-    told = []
-    for scene, part in known.groupby("scene", sort=False):
+    if won := _wins(rows):
+        told = "; ".join(won.values())
+        return f"A rival has a smaller displacement error than the best reduced run: {told}."
+    held = len(_held(rows))
+    return "No rival has a smaller displacement error than the best reduced run." if held else ""
+
+
+def _held(rows: pd.DataFrame) -> pd.DataFrame:
+    """The rows of reduced runs that were held to a rival."""
+    return rows[rows["displacement_error"] > 0.0].dropna(subset=list(RIVALS), how="all")
+
+
+def _wins(rows: pd.DataFrame) -> dict[str, str]:
+    """By scene, where a rival is nearer than the best row: which, and both errors."""
+    told = {}
+    for scene, part in _held(rows).groupby("scene", sort=False):
         own = part["displacement_error"].min()
         best = {name: part[name].min() for name in RIVALS}
-        nearer = [f"{COLUMN[name].title} ({_percent(v)})" for name, v in best.items() if v < own]
-        told += [f"on {scene} {_listed(nearer)} beside {_percent(own)}"] if nearer else []
-    if told:
-        return f"A rival has a smaller displacement error than the best reduced run: {'; '.join(told)}."
-    return "No rival has a smaller displacement error than the best reduced run." if len(known) else ""
+        if nearer := [f"{COLUMN[name].title} ({_percent(v)})" for name, v in best.items() if v < own]:
+            told[scene] = f"on {scene} {_listed(nearer)} beside {_percent(own)}"
+    return told
 
 
 def _percent(value: float) -> str:

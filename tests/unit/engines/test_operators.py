@@ -312,19 +312,22 @@ def test_windows_weigh_coordinates_whatever_their_unit():
 def test_captured_steps_of_the_descent_are_those_of_the_host():
     """Graphs replay what eager steps do; warming up leaves neither network nor generator changed.
 
-    Muon multiplies in bfloat16, which rounds otherwise on each device.
+    Muon multiplies in bfloat16, which rounds otherwise on each device: on an H200 weights differ by 0.0011,
+    less than by one step.
     """
-    teaching = Teaching(width=8, rounds=0, steps=90, descent=9, unroll=4)
+    close = 2e-3
 
-    def taught(device):
+    def taught(device, descent=9):
         teacher = Stepper(0.3)
         yardstick = Yardstick(teacher, lambda run: run[:, None], teacher.run()[:, :, None])
+        teaching = Teaching(width=8, rounds=0, steps=90, descent=descent, unroll=4)
         return Course([teacher, Stepper(0.3)], None, yardstick, teaching, 0, device).follow().state_dict()
 
-    there, here = taught("cuda"), taught("cpu")
+    there, here, before = taught("cuda"), taught("cpu"), taught("cpu", 8)
     for name, values in here.items():
         assert values.device == there[name].device
-        np.testing.assert_allclose(there[name], values, rtol=0.0, atol=1e-3, err_msg=name)
+        np.testing.assert_allclose(there[name], values, rtol=0.0, atol=close, err_msg=name)
+    assert float((here["net.4.bias"] - before["net.4.bias"]).abs().max()) > 2.0 * close
     assert float(here["net.4.weight"].abs().max()) > 1e-2  # nine steps have moved it from zero
 
 

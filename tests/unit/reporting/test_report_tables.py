@@ -241,6 +241,23 @@ def test_coarse_runs_stand_with_the_solvers(tmp_path):
     assert "sand has no run at Δx × 3: a wall is too thin." in table.note
 
 
+def test_rivals_that_win_at_single_values_are_told_where_none_wins_in_the_mean(tmp_path):
+    run = write_run(tmp_path, Made(engine="modal", rivals=True))
+    merged = merge(open_sources([run]))
+    test = merged.frame.index[merged.frame["split"] == "test"]
+    assert len(test) > 1
+    assert "At single values" not in beside_rivals(merged)[0].note
+    at = parameter_text(merged.frame.loc[test[1], "parameter"])
+    merged.frame.loc[test[1], "displacement_coarse"] = 0.5 * merged.frame.loc[test[1], "displacement_error"]
+    (table,) = beside_rivals(merged)
+    assert "No rival has" in table.note
+    assert f"At single values one has: on sand at {at} coarse full order (" in table.note
+    merged.frame.loc[test, "displacement_coarse"] = 1e-9
+    (table,) = beside_rivals(merged)
+    assert "A rival has" in table.note
+    assert "At single values" not in table.note  # the mean says it
+
+
 def test_lines_of_rivals_are_means_over_held_out_values(tmp_path, monkeypatch):
     merged = merge(open_sources([write_run(tmp_path, Made(engine="modal", rivals=True))]))
     test = merged.frame["split"] == "test"
