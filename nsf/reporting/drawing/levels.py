@@ -1,5 +1,6 @@
 """Who took the steps of a run, and its error meanwhile."""
 
+import textwrap
 from collections.abc import Mapping
 
 import numpy as np
@@ -8,6 +9,8 @@ from matplotlib.figure import Figure
 
 from nsf.reporting.drawing.scales import LOST, plain_ticks
 from nsf.reporting.drawing.style import DASHES, FULL, INK, PALETTE, figure, styled
+
+_LINE = 34  # letters of a name in a line
 
 #: Title and colour of each level, in the order of `by`.
 LEVELS = {"operators": PALETTE[0], "projected step": PALETTE[1], "full-order solver": FULL}
@@ -27,6 +30,7 @@ def levels_over_time(runs: Mapping[str, pd.DataFrame]) -> Figure:
     Args:
         runs: by name, rows of `series.csv` of one run, `by` among them.
     """
+    runs = {textwrap.fill(name, _LINE, break_on_hyphens=False): series for name, series in runs.items()}
     with styled():
         fig = figure(3.6 + 0.3 * len(runs))
         error, strips = fig.subplots(2, 1, sharex=True, height_ratios=[3.0, 0.36 * len(runs)])

@@ -1,12 +1,15 @@
 """Who took the steps of runs by operators: a picture beside the runs of one level alone."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
 from nsf.reporting.drawing.levels import levels_over_time, name_of
 from nsf.reporting.drawing.style import save
 from nsf.reporting.sections.variant import Variant
-from nsf.reporting.text.columns import parameter_text
+from nsf.reporting.study import SEEDS
+from nsf.reporting.tables import setting_without
+from nsf.reporting.text.columns import SETTING, parameter_text
 from nsf.reporting.text.formats import file_name
 from nsf.reporting.text.page import Picture, Section
 
@@ -34,16 +37,19 @@ def levels_section(known: Sequence[Variant], folder: Path) -> list[Section]:
         ]
         if not mixed:
             continue
-        shown, runs = {}, set()
         seed = next(v.seeds for v, rows in zip(own, series, strict=True) if _is_mixed(rows, mixed[0]))
-        for variant, rows in zip(own, series, strict=True):
-            part = rows[rows["parameter"] == mixed[0]]
-            if variant.seeds != seed:
-                continue
-            if len(part) and "by" in part:
-                name = name_of(part, closed=variant.rows["engine"].iloc[0] == "closed")
-                shown[f"{name}, {variant.label}" if name in shown else name] = part
-                runs |= set(variant.runs)
+        parts = [
+            (variant, part)
+            for variant, rows in zip(own, series, strict=True)
+            if variant.seeds == seed and len(part := rows[rows["parameter"] == mixed[0]]) and "by" in part
+        ]
+        shown, runs = {}, {run for variant, _ in parts for run in variant.runs}
+        several = len({_setting(variant) for variant, part in parts if (part["by"] == 0).any()}) > 1
+        for variant, part in parts:
+            name = name_of(part, closed=variant.rows["engine"].iloc[0] == "closed")
+            if several and _setting(variant):
+                name += f", {_setting(variant)}"
+            shown[f"{name}, {variant.label}" if name in shown else name] = part
         name, unit = own[0].parameter
         caption = (
             f"The displacement error over time at {name} {parameter_text(mixed[0], '', unit)}, and who took "
@@ -54,6 +60,11 @@ def levels_section(known: Sequence[Variant], folder: Path) -> list[Section]:
         stem = "levels" if alone else file_name(f"{body}-levels")
         pictures.append(Picture(save(levels_over_time(shown), folder, stem), caption, sorted(runs)))
     return [Section("Who took the steps", pictures)] if pictures else []
+
+
+def _setting(variant: Variant) -> str:
+    """What its run sets, but for seeds; of each key the last part."""
+    return re.sub(r"[\w.]+\.(?=\w+=)", "", setting_without(variant.rows[SETTING].iloc[0], SEEDS))
 
 
 def _is_mixed(rows, value) -> bool:

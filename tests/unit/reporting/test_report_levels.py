@@ -21,10 +21,10 @@ def series_of(*by: int, parameter: float = 0.6) -> pd.DataFrame:
     )  # fmt: skip
 
 
-def variant(label, *series, scene="jelly_cube", engine="levels", seeds=()):
+def variant(label, *series, scene="jelly_cube", engine="levels", seeds=(), setting=""):
     rows = pd.concat(series)
     return SimpleNamespace(
-        rows=pd.DataFrame({"engine": [engine]}),
+        rows=pd.DataFrame({"engine": [engine], "setting": [setting]}),
         scene=scene, body=scene, label=label, parameter=("speed", "m/s"), runs=[f"evaluate/{label}"],
         series=lambda held_out_only: rows, seeds=set(seeds),
     )  # fmt: skip
@@ -82,6 +82,24 @@ def test_a_picture_names_a_closure(tmp_path, monkeypatch):
     assert told == [
         "projected step with a closure alone", "projected step alone", "operators and projected step",
     ]  # fmt: skip
+
+
+def test_a_picture_names_what_operators_of_one_scene_set(tmp_path, monkeypatch):
+    told = []
+    draw = levels_over_time
+    monkeypatch.setattr(levels, "levels_over_time", lambda runs: told.append(list(runs)) or draw(runs))
+    alone, one = variant("auto", series_of(1, 1, 1)), variant("one", series_of(0, 1, 1), setting="seed=0")
+    teaching = "seed=0, engine.teacher=runs, engine.teaching.unroll=64"
+    other = variant("other", series_of(0, 1, 1), setting=teaching)
+    levels_section([alone, one, other], tmp_path)
+    levels_section([alone, other], tmp_path)
+    mixed = "operators and projected step"
+    named = ["projected step alone", mixed, f"{mixed}, teacher=runs, unroll=64"]
+    assert told == [named, named[:2]]  # without another there is nothing to tell apart
+    figure = levels_over_time({name: series_of(0, 1) for name in named})
+    labels = [label.get_text() for label in figure.axes[1].get_yticklabels()]
+    assert max(len(line) for label in labels for line in label.split("\n")) <= 34
+    assert " ".join(labels[2].split()) == named[2]
 
 
 def test_a_picture_where_a_run_has_more_than_one_level(tmp_path):
