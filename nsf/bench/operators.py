@@ -14,7 +14,8 @@ from nsf.bench.rows import Result, Row, Settings, commit, size_name
 from nsf.bench.scaling import at_size, carried_over, frames_of, positions_after
 from nsf.data import Case
 from nsf.data.schema import TRAJECTORY
-from nsf.dynamics import ReducedMPM
+from nsf.deployment import Levels, Trust
+from nsf.dynamics import ReducedBatch, ReducedMPM
 from nsf.dynamics.latent import LatentRecord
 from nsf.dynamics.setup import first_changes
 from nsf.engines import Operators
@@ -22,6 +23,7 @@ from nsf.engines.operators.recurrence import Recurrence
 from nsf.engines.operators.states import collider_states
 from nsf.evaluation import metrics
 from nsf.pipeline import Pipeline
+from nsf.pipeline.stages.deployment import calibrated, levels_of
 from nsf.pipeline.stages.teaching import OPERATORS
 from nsf.scenes import Scene
 from nsf.timing import synchronizer
@@ -166,6 +168,7 @@ def _compared(
             case=f"operators_{name}", sample=run.sample_size, peak_mib=peak, **own,
             speed_up=ms["ms_median"] / own["ms_median"], delta=error(run, position),
             run_mib=run.nbytes / 2**20, decode_ms=_decode_ms(position, run.xhat, settings),
+            checked_ms=_checked_ms(chain, manifold, run, precision, settings),
             teach_seconds=taught.metric("teach_seconds"), teacher_steps=int(taught.metric("teacher_steps")),
         )
     )  # fmt: skip
@@ -254,6 +257,37 @@ class Many:
     def nbytes(self) -> int:
         """Bytes on the device."""
         return self._recurrence.nbytes + self.record.nbytes
+
+
+class Checked:
+    """Runs by operators, and what `nsf deploy` does to know how far to believe them, for `run_times`.
+
+    Args:
+        run: by operators, alone in its batch.
+        levels: how it is watched.
+        projected: the same run by projected steps, built as well before a clock starts.
+        trust: the estimate of whether to believe it.
+
+    Attributes:
+        total_steps: of the run.
+    """
+
+    def __init__(self, run: ReducedMPM, levels: Levels, projected: ReducedBatch, trust: Trust):
+        self._run, self._looked_at = run, partial(levels.watched, run.together, projected, trust)
+        self.restart, self.total_steps = run.restart, run.total_steps
+
+    def step(self, n: int) -> None:
+        """Take the steps of the whole run and check them."""
+        self._run.step(n)
+        self._looked_at()
+
+
+def _checked_ms(chain: Pipeline, manifold, run: ReducedMPM, precision: str, settings: Settings) -> float:
+    """Median time [ms] of a step of checked runs; where projected steps go on with one, with these."""
+    levels, trust = levels_of(chain, manifold), calibrated(chain, manifold)
+    projected = levels.projected([chain.held_out[0]], precision=precision)
+    checked = Checked(run, levels, projected, trust)
+    return float(np.median(run_times({"own": checked}, settings.trials, settings.device)["own"]))
 
 
 def _times_of(ms: np.ndarray) -> dict[str, float]:

@@ -26,6 +26,7 @@ _HEADINGS = {
     "delta": "δ",
     "run_mib": "of a run [MiB]",
     "decode_ms": "a frame decoded [ms]",
+    "checked_ms": "a step, checked [ms]",
     "teach_seconds": "teaching [s]",
     "teacher_steps": "teacher's steps",
     "sample": "|S|",
@@ -47,7 +48,9 @@ _BATCH = (
 )
 _OPERATORS = (
     "Time of a step by operators: all steps of a run in one launch, over their number; of many runs at once, "
-    "over their number too. Speed-up: over the full-order step of the same call. A run holds no particles "
+    "over their number too. Checked: the same with what `nsf deploy` adds to a run, a projected step for "
+    "every 20 steps, the estimated error and the distrust ratio. Speed-up: over the full-order step of the "
+    "same call, without checks. A run holds no particles "
     "but S; the time of decoding a frame stands apart. The operators of the sand column step as at the "
     "scene's own size, while the full-order step of as many particles as are decoded is on a finer grid, and "
     "shorter."

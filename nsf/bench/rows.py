@@ -47,6 +47,7 @@ class Row:
         speed_up: how many times as fast as the full-order step of the same call.
         run_mib: of a run by operators, all that it holds but for the fields that decode a frame [MiB].
         decode_ms: time of the positions of all particles of one frame [ms].
+        checked_ms: of a step by operators in runs that are checked as `nsf deploy` checks them [ms].
         teach_seconds, teacher_steps: of its operators' teaching.
     """
 
@@ -67,6 +68,7 @@ class Row:
     speed_up: float | None = None
     run_mib: float | None = None
     decode_ms: float | None = None
+    checked_ms: float | None = None
     teach_seconds: float | None = None
     teacher_steps: int | None = None
 

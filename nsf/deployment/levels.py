@@ -28,7 +28,7 @@ LEVELS = ("operators", "projected", "full_order")
 #: Share of the tolerance, and of the distrust ratio that is believed, up to which a run is left to operators
 #: that pass it later, and below which they try again: who goes on starts well.
 _WELL = 0.5
-_ROWS = 256  # steps decoded at once
+_ROWS = 1024  # latent vectors decoded at once
 
 
 @dataclass(frozen=True)
@@ -50,13 +50,13 @@ class Levels:
     near: bool = True
 
     def watched(
-        self, batch: ReducedBatch, cases: Sequence[Case], trust: Trust
+        self, batch: ReducedBatch, projected: ReducedBatch, trust: Trust
     ) -> list[tuple[ReducedMPM, np.ndarray, np.ndarray]]:
         """Look at runs that operators have taken to their end.
 
         Args:
             batch: the runs.
-            cases: problem parameters of each.
+            projected: the same runs by projected steps, of `self.projected`; left in the midst of one.
             trust: the estimate of whether to believe a run.
 
         Returns:
@@ -64,7 +64,6 @@ class Levels:
             is while the projected step goes on and is 0 of a run taken anew, and who took each step [N],
             `OPERATORS` or `PROJECTED`.
         """
-        projected = self.projected(cases)
         estimates = estimated_errors(batch, projected, self.every)
         found = []
         for run, estimate in zip(batch.runs, estimates, strict=True):
@@ -246,12 +245,10 @@ def _carried(
     with torch.no_grad():
         again = batch.span_at(since).pushed(torch.as_tensor(between), since)
         for span, rows in groupby(range(since, until + 1), batch.span_at):
-            for part in torch.tensor(list(rows)).split(_ROWS):
+            for part in torch.tensor(list(rows)).split(_ROWS // 2):
                 for run in range(len(batch)):
-                    one, two = (
-                        span.at_sample.position(latent[run, part].to(span.at_sample.dtype))
-                        for latent in (own, again)
-                    )
+                    both = torch.cat([own[run, part], again[run, part].to(own)])
+                    one, two = span.at_sample.position(both.to(span.at_sample.dtype)).split(len(part))
                     off = (one - two).square().sum(-1).mean(-1).sqrt()
                     found[run, part - since] = off.double().cpu()
     found[~torch.isfinite(defects).all(-1).all(-1)] = torch.inf

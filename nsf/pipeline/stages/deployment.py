@@ -92,6 +92,19 @@ def trust_of(run: Run, manifold: Manifold, particles: np.ndarray, pipeline) -> T
     return Trust(residual, distance, known, CaseDistance(manifold), *forcing)
 
 
+def calibrated(pipeline, manifold: Manifold) -> Trust:
+    """The trust estimate of a pipeline's runs, calibrated on projected, or closed, runs of training."""
+    steps_by = pipeline.projecting if pipeline.closing is None else None
+    projected = partial(pipeline.solver_at, manifold, engine=steps_by)
+
+    def known_at(values: Mapping[str, float], device: str) -> ReducedMPM:
+        """A run in the training case of some parameters, with its own program."""
+        return projected(_case_of(pipeline.split.train, values), device)
+
+    found = calibrate(known_at, manifold, pipeline.device)
+    return replace(found, gravity=_range_of_gravity(pipeline.scene), solids=_range_of_solids(pipeline))
+
+
 def _range_of_gravity(scene) -> tuple[Sequence[float], float] | None:
     """Middle [3] and radius [m/s²] of what a scene's programs of gravity may give; None without any."""
     return (scene.gravity, scene.forcing.reach(scene.gravity)) if scene.forcing.gravity else None
@@ -109,16 +122,7 @@ def _range_of_solids(pipeline) -> SolidsRange | None:
 def _rollouts(pipeline, manifold: Manifold, record: Record) -> list[Rollout]:
     """The reduced runs; how far they may be believed, and who takes their steps, go on record."""
     started, asked = time.perf_counter(), pipeline.config.deploy
-    # Trust is calibrated on closed runs where these are deployed.
-    steps_by = pipeline.projecting if pipeline.closing is None else None
-    projected = partial(pipeline.solver_at, manifold, engine=steps_by)
-
-    def known_at(values: Mapping[str, float], device: str) -> ReducedMPM:
-        """A run in the training case of some parameters, with its own program."""
-        return projected(_case_of(pipeline.split.train, values), device)
-
-    found = calibrate(known_at, manifold, pipeline.device)
-    trust = replace(found, gravity=_range_of_gravity(pipeline.scene), solids=_range_of_solids(pipeline))
+    trust = calibrated(pipeline, manifold)
     record.metrics["trust"] = {
         "residual_m": trust.residual,
         "distance_m": trust.distance,
@@ -132,7 +136,7 @@ def _rollouts(pipeline, manifold: Manifold, record: Record) -> list[Rollout]:
         record.metrics |= {"engine": batch.engine, "engine_why": batch.why}
         return batch
 
-    hand_over, levels = asked.on_distrust == "full_order", _levels(pipeline, manifold)
+    hand_over, levels = asked.on_distrust == "full_order", levels_of(pipeline, manifold)
     rollouts = deploy(batch_at, pipeline.held_out, pipeline.device, trust, hand_over, together, levels)
     engine, why = record.metrics["engine"], record.metrics["engine_why"]
     pipeline.say(f"deploy: engine {engine}" + (f", since {why}" if why else ""))
@@ -148,7 +152,7 @@ def _case_of(cases: Sequence[Case], values: Mapping[str, float]) -> Case:
     )
 
 
-def _levels(pipeline, manifold: Manifold) -> Levels | None:
+def levels_of(pipeline, manifold: Manifold) -> Levels | None:
     """How runs by operators are watched, and who goes on with them."""
     if pipeline.teaching is None:
         return None

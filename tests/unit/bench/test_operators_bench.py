@@ -44,7 +44,9 @@ def test_every_case_has_a_row(taught):
     for name in ("sample", "delta", "speed_up", "run_mib", "teach_seconds", "teacher_steps"):
         assert own[name].notna().all()
         assert full[name].isna().all()
-    assert own["decode_ms"].notna().tolist() == [True, False, True, False, True, True]
+    alone = [True, False, True, False, True, True]
+    assert own["decode_ms"].notna().tolist() == own["checked_ms"].notna().tolist() == alone
+    assert (own["checked_ms"] > own["ms_median"])[alone].all()
     ratios = full["ms_median"].to_numpy()[[0, 0, 1, 1, 2, 3]] / own["ms_median"]
     np.testing.assert_allclose(own["speed_up"], ratios)
     known = pipeline.taught.manifest["metrics"]
