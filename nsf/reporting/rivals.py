@@ -8,18 +8,27 @@ import pandas as pd
 
 from nsf.reporting.drawing.cost import error_over_cost, step_over_particles
 from nsf.reporting.drawing.style import save
-from nsf.reporting.study import unseeded
+from nsf.reporting.study import SEEDS, unseeded
 from nsf.reporting.tables import (
     VARIANT,
     Merged,
     first_rows,
     mean_rows,
     rows_of,
+    setting_without,
     variant_labels,
     variants,
     without_constants,
 )
-from nsf.reporting.text.columns import COLUMN, RIVALS, SOLVER, device_type, parameter_text, split_rank
+from nsf.reporting.text.columns import (
+    COLUMN,
+    RIVALS,
+    SETTING,
+    SOLVER,
+    device_type,
+    parameter_text,
+    split_rank,
+)
 from nsf.reporting.text.page import Picture, Table
 
 _FULL = "full order"
@@ -147,11 +156,17 @@ def beside_rivals(merged: Merged) -> list[Table]:
 
 
 def _at_single_values(merged: Merged, means: pd.DataFrame) -> list[str]:
-    """At which values a rival is nearer on scenes where none is in the mean, as a sentence."""
-    rows = merged.frame[merged.frame["split"] == min(merged.frame["split"], key=split_rank)]
+    """At which values, in the mean of seeds, a rival is nearer on scenes where none is in the mean of all."""
+    values = zip(merged.frame["parameter"], merged.source, strict=True)
+    rows = merged.frame.assign(at=[parameter_text(value, *source.parameter) for value, source in values])
     rows = rows[~rows["scene"].isin(list(_wins(means)))]
-    won = _wins(rows.assign(scene=rows["scene"] + " at " + rows["parameter"].map(parameter_text)))
-    return [f"At single values one has: {'; '.join(won.values())}."] if won else []
+    shown = rows.groupby("scene")["split"].transform(lambda splits: min(splits, key=split_rank))
+    rows = rows[rows["split"] == shown].assign(scene=rows["scene"] + " at " + rows["at"])
+    alike = [rows[name] for name in VARIANT if name not in ("sample", SETTING)]
+    alike += [rows[SETTING].map(lambda setting: setting_without(setting, SEEDS))]
+    rows = rows.groupby(alike, sort=False, dropna=False)[["displacement_error", *RIVALS]].mean()
+    won = _wins(rows.reset_index("scene"))
+    return [f"At single values a rival is nearer: {'; '.join(won.values())}."] if won else []
 
 
 def _refused(merged: Merged) -> list[str]:

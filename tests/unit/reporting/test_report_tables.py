@@ -242,20 +242,34 @@ def test_coarse_runs_stand_with_the_solvers(tmp_path):
 
 
 def test_rivals_that_win_at_single_values_are_told_where_none_wins_in_the_mean(tmp_path):
-    run = write_run(tmp_path, Made(engine="modal", rivals=True))
-    merged = merge(open_sources([run]))
-    test = merged.frame.index[merged.frame["split"] == "test"]
-    assert len(test) > 1
+    splits = ("test",) * (len(TEST) - 1) + ("validation",)
+    made = [Made(engine="modal", rivals=True, scene=scene, splits=splits) for scene in ("sand", "cake")]
+    merged = merge(open_sources([write_run(tmp_path / made.scene, made) for made in made]))
+    frame, test = merged.frame, merged.frame["split"] == "test"
+    sand, cake = (frame.index[test & (frame["scene"] == scene)] for scene in ("sand", "cake"))
+    frame.loc[~test, "displacement_coarse"] = 1e-9  # a validation value is shown nowhere
     assert "At single values" not in beside_rivals(merged)[0].note
-    at = parameter_text(merged.frame.loc[test[1], "parameter"])
-    merged.frame.loc[test[1], "displacement_coarse"] = 0.5 * merged.frame.loc[test[1], "displacement_error"]
+    frame.loc[sand[1], "displacement_coarse"] = 0.5 * frame.loc[sand[1], "displacement_error"]
+    frame.loc[cake, "displacement_coarse"] = 1e-9  # wins in the mean, which says it
     (table,) = beside_rivals(merged)
-    assert "No rival has" in table.note
-    assert f"At single values one has: on sand at {at} coarse full order (" in table.note
-    merged.frame.loc[test, "displacement_coarse"] = 1e-9
-    (table,) = beside_rivals(merged)
-    assert "A rival has" in table.note
-    assert "At single values" not in table.note  # the mean says it
+    told = table.note.partition("At single values a rival is nearer: ")[2]
+    named = parameter_text(frame.loc[sand[1], "parameter"], *merged.source[sand[1]].parameter)
+    assert told.startswith(f"on sand at {named} coarse full order (")
+    assert told.count(" beside ") == 1
+    assert "best reduced run: on cake" in table.note
+
+
+def test_single_values_are_means_over_seeds(tmp_path):
+    runs = [write_run(tmp_path / str(seed), Made(engine="modal", rivals=True, seed=seed)) for seed in (0, 1)]
+    settings = {run.id: f"seed={seed}" for seed, run in enumerate(runs)}
+    merged = merge(open_sources(runs), settings)
+    frame = merged.frame
+    of_seed = [frame.index[frame["setting"] == f"seed={seed}"][0] for seed in (0, 1)]
+    others = frame.index.difference(of_seed)
+    frame.loc[others, "displacement_coarse"] = 1.0
+    frame.loc[of_seed, "displacement_coarse"] = 0.05
+    frame.loc[of_seed, "displacement_error"] = [0.04, 0.08]
+    assert "coarse full order (5 %) beside 6 %" in beside_rivals(merged)[0].note
 
 
 def test_lines_of_rivals_are_means_over_held_out_values(tmp_path, monkeypatch):
