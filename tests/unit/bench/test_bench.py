@@ -37,6 +37,7 @@ from nsf.bench.training import measured as measured_training
 from nsf.cli import main
 from nsf.errors import ConfigError, DeviceError, StorageError
 from nsf.pipeline import Pipeline
+from nsf.usage import TOOLS
 
 SMALL = {
     "benches": "full_order",
@@ -54,6 +55,10 @@ def speed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("speed")
     bench(folder, SMALL, lambda text: None)
     return folder
+
+
+def test_help_names_every_benchmark():
+    assert f"benches={','.join(BENCHES)}]" in TOOLS["bench"][1]
 
 
 def test_every_benchmark_gives_its_rows(speed):
