@@ -247,10 +247,10 @@ def _carried(
         for span, rows in groupby(range(since, until + 1), batch.span_at):
             for part in torch.tensor(list(rows)).split(_ROWS // 2):
                 for run in range(len(batch)):
-                    both = torch.cat([own[run, part], again[run, part].to(own)])
+                    both = torch.cat([own[run, part], again[run, part]])
                     one, two = span.at_sample.position(both.to(span.at_sample.dtype)).split(len(part))
-                    off = (one - two).square().sum(-1).mean(-1).sqrt()
-                    found[run, part - since] = off.double().cpu()
+                    off = (one - two).double().square().sum(-1).mean(-1).sqrt()  # fp32 overflows in squares
+                    found[run, part - since] = off.cpu()
     found[~torch.isfinite(defects).all(-1).all(-1)] = torch.inf
     return found.numpy()
 

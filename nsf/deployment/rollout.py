@@ -226,6 +226,7 @@ def rollouts(
         projected = levels.projected(cases)  # built before the clock starts, as `batch` is
         seconds, started = _timed_run(batch, None), time.perf_counter()
         watched = levels.watched(batch, projected, trust)
+        del projected  # what comes after decodes every particle
         seconds = (seconds + time.perf_counter() - started) / len(batch)
     found = []
     for (run, estimate, by), case, (off, _) in zip(watched, cases, batch.doubts, strict=True):

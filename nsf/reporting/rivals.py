@@ -162,11 +162,14 @@ def _at_single_values(merged: Merged, means: pd.DataFrame) -> list[str]:
     rows = rows[~rows["scene"].isin(list(_wins(means)))]
     shown = rows.groupby("scene")["split"].transform(lambda splits: min(splits, key=split_rank))
     rows = rows[rows["split"] == shown].assign(scene=rows["scene"] + " at " + rows["at"])
-    alike = [rows[name] for name in VARIANT if name not in ("sample", SETTING)]
-    alike += [rows[SETTING].map(lambda setting: setting_without(setting, SEEDS))]
-    rows = rows.groupby(alike, sort=False, dropna=False)[["displacement_error", *RIVALS]].mean()
-    won = _wins(rows.reset_index("scene"))
-    return [f"At single values a rival is nearer: {'; '.join(won.values())}."] if won else []
+    seedless = rows[SETTING].map(lambda setting: setting_without(setting, SEEDS))
+    seeded = seedless != rows[SETTING]
+    rows = rows.assign(setting=seedless, device=rows["device"].map(device_type))
+    rows["sample"] = rows["sample"].mask(seeded, 0)  # seeds may choose samples of other sizes
+    errors = rows.groupby(list(VARIANT), sort=False, dropna=False)[["displacement_error", *RIVALS]]
+    won = _wins(errors.agg(lambda values: values.mean(skipna=False)).reset_index("scene"))
+    over = ", in the mean of seeds," if seeded.any() else ""
+    return [f"At single values{over} a rival is nearer: {'; '.join(won.values())}."] if won else []
 
 
 def _refused(merged: Merged) -> list[str]:

@@ -43,8 +43,8 @@ DEFINITIONS = (
     ),
     (
         "runs until it pays",
-        "reduced runs, without decoding, that save as much time as training and teaching took; training runs "
-        "are not counted.",
+        "reduced runs, without decoding and without checks, that save as much time as training and teaching "
+        "took; training runs are not counted.",
     ),
     ("handed on", "share of steps that operators left to projected ones, or these to the full-order solver."),
 )

@@ -1,11 +1,14 @@
 """Levels of a run, on a motion made up: x̂ goes on as it went, and operators miss some of its steps."""
 
+from importlib import import_module
+
 import numpy as np
 import pytest
 import torch
 from angles import angle
 
 from nsf.deployment import OPERATORS, PROJECTED, Levels, Rollout, rollouts
+from nsf.deployment.levels import _carried
 from nsf.dynamics import History, ReducedBatch
 from nsf.dynamics.span import Span
 
@@ -119,6 +122,25 @@ def test_a_run_that_leaves_comes_home(shared, batch_of, tmp_path):
     kept = Rollout.open(tmp_path / "rollout_0.h5")
     np.testing.assert_array_equal(kept.levels, found.levels)
     assert kept.by_operators == found.by_operators == 21
+
+
+def test_the_solver_that_checks_is_built_before_the_clock_starts(batch_of, tiny_trust, monkeypatch):
+    done, module = [], import_module("nsf.deployment.rollout")  # whose name in the package is a function's
+    timed = module._timed_run
+    monkeypatch.setattr(module, "_timed_run", lambda *given: done.append("timed") or timed(*given))
+    levels = Levels(lambda cases: done.append("built") or batch_of(Line, cases), 1)
+    rollouts(batch_of(Line), [angle(26.0)], tiny_trust, levels=levels)
+    assert done == ["built", "timed"]
+
+
+def test_an_estimate_in_single_precision_overflows_no_earlier_than_positions(batch_of, tiny_manifold):
+    batch, far = batch_of(Line), 1e21  # its square is no float32
+    batch.step(STEPS)
+    particles = batch.batch.shared.samples[0].particles
+    batch.span_at(0).at_sample = tiny_manifold.restrict(particles, dtype=torch.float32)
+    defects = torch.full((1, 1, batch.batch.record.xhat.shape[-1]), far)
+    found = _carried(batch, [STEPS - 1], defects, 0)
+    assert 1e19 < found[0, -1] < np.inf
 
 
 def test_a_run_whose_particles_carry_stress_is_taken_anew(shared, batch_of):

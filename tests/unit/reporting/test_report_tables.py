@@ -260,16 +260,24 @@ def test_rivals_that_win_at_single_values_are_told_where_none_wins_in_the_mean(t
 
 
 def test_single_values_are_means_over_seeds(tmp_path):
-    runs = [write_run(tmp_path / str(seed), Made(engine="modal", rivals=True, seed=seed)) for seed in (0, 1)]
-    settings = {run.id: f"seed={seed}" for seed, run in enumerate(runs)}
-    merged = merge(open_sources(runs), settings)
-    frame = merged.frame
-    of_seed = [frame.index[frame["setting"] == f"seed={seed}"][0] for seed in (0, 1)]
-    others = frame.index.difference(of_seed)
-    frame.loc[others, "displacement_coarse"] = 1.0
-    frame.loc[of_seed, "displacement_coarse"] = 0.05
-    frame.loc[of_seed, "displacement_error"] = [0.04, 0.08]
-    assert "coarse full order (5 %) beside 6 %" in beside_rivals(merged)[0].note
+    made = [Made(engine="modal", rivals=True, seed=seed, sample=100 + seed) for seed in (0, 1)]
+    made += [Made(engine="closed", rivals=True, seed=2)]
+    runs = [write_run(tmp_path / str(one.seed), one) for one in made]
+    merged = merge(open_sources(runs), {run.id: f"seed={run.path.parts[-4]}" for run in runs})
+    frame, value = merged.frame, merged.frame["parameter"].iloc[0]
+    frame.loc[:, "displacement_coarse"] = 1.0
+    of = {
+        one.seed: frame.index[(frame["setting"] == f"seed={one.seed}") & (frame["parameter"] == value)][0]
+        for one in made
+    }
+    frame.loc[of[0], ["displacement_error", "displacement_coarse"]] = [0.04, 0.03]
+    frame.loc[of[1], ["displacement_error", "displacement_coarse"]] = [0.08, 0.05]
+    frame.loc[of[2], ["displacement_error", "displacement_coarse"]] = [0.07, 0.08]
+    told = "At single values, in the mean of seeds, a rival is nearer: "
+    assert told in beside_rivals(merged)[0].note
+    assert "coarse full order (4 %) beside 6 %" in beside_rivals(merged)[0].note
+    frame.loc[of[1], "displacement_coarse"] = float("nan")  # not measured there: no mean
+    assert "4 %" not in beside_rivals(merged)[0].note
 
 
 def test_lines_of_rivals_are_means_over_held_out_values(tmp_path, monkeypatch):
