@@ -55,8 +55,8 @@ quickstart: install  ## a column of sand in a minute, from simulation to report,
 	@echo 'Next, the page above in a browser, and'
 	@echo '  $(BIN)/nsf runs stage=evaluate sort=delta    the runs behind it'
 	@echo '  $(BIN)/nsf plan scene=cake                   what another scene would take'
-	@echo '  $(BIN)/nsf run scene=sand                    the same column with all its cases'
-	@echo '  docs/tutorial.md                               what was done, and how to go on'
+	@echo '  $(BIN)/nsf run scene=sand                    a finer column, with two held-out cases'
+	@echo '  docs/tutorial.md                                what was done, and how to go on'
 
 test: develop  ## the tests, without those marked slow or slurm: see test-slow
 	$(PYTEST) -m 'not slow and not slurm' -n $(WORKERS) --dist worksteal

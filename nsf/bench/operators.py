@@ -309,4 +309,5 @@ def _decode_ms(position: Decode, xhat: torch.Tensor, settings: Settings) -> floa
 
 def _tell(row: Row, what: str, say: Callable[[str], object]) -> None:
     told = f"{row.speed_up:.4g} times the full-order step's speed, δ {100 * row.delta:.3g} %"
-    say(f"{row.case} {row.precision}: {row.ms_median:.4g} ms {what}, {told}, {row.run_mib:.3g} MiB")
+    checked = "" if row.checked_ms is None else f", {row.checked_ms:.4g} ms with checks"
+    say(f"{row.case} {row.precision}: {row.ms_median:.4g} ms {what}{checked}, {told}, {row.run_mib:.3g} MiB")

@@ -236,7 +236,7 @@ def rollouts(
             own.by, own.estimate = by[:steps], estimate[: steps + 1]
             own.stops = ["operators" if b == OPERATORS else s for b, s in zip(own.by, own.stops, strict=True)]
             if off > 1.0:
-                after = np.append(own.by[:1], own.by) == OPERATORS
+                after = np.append(by[:1], own.by) == OPERATORS  # [steps + 1], of none as well
                 own.trust = np.where(after, np.maximum(own.trust, off), own.trust)
         found.append(own)
     return found

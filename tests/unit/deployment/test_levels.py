@@ -124,6 +124,19 @@ def test_a_run_that_leaves_comes_home(shared, batch_of, tmp_path):
     assert kept.by_operators == found.by_operators == 21
 
 
+def test_a_run_that_the_full_order_solver_takes_from_the_start_can_be_read(batch_of, tiny_trust, tmp_path):
+    """As in a case outside of the box: operators are doubted there, and the projected step distrusted."""
+    cases = [angle(60.0)]
+    levels = Levels(lambda cases: batch_of(Line, cases), 2, None, True)
+    batch = batch_of(Line, cases, lambda setup, gravity: (2.5, "outside"))
+    (found,) = rollouts(batch, cases, tiny_trust, until_distrusted=True, levels=levels)
+    assert (found.handed_over, len(found.stops)) == (0, 0)
+    found.save(tmp_path / "rollout_0.h5")
+    kept = Rollout.open(tmp_path / "rollout_0.h5")
+    assert kept.trust.shape == (1,)
+    assert kept.trust[0] > 1.0
+
+
 def test_the_solver_that_checks_is_built_before_the_clock_starts(batch_of, tiny_trust, monkeypatch):
     done, module = [], import_module("nsf.deployment.rollout")  # whose name in the package is a function's
     timed = module._timed_run
