@@ -285,7 +285,8 @@ class Checked:
 def _checked_ms(chain: Pipeline, manifold, run: ReducedMPM, precision: str, settings: Settings) -> float:
     """Median time [ms] of a step of checked runs; where projected steps go on with one, with these."""
     levels, trust = levels_of(chain, manifold), calibrated(chain, manifold)
-    projected = levels.projected([chain.held_out[0]], precision=precision)
+    like = {"precision": precision, "engine": chain.projecting}
+    projected = chain.batch_at(manifold, [chain.held_out[0]], **like)
     checked = Checked(run, levels, projected, trust)
     return float(np.median(run_times({"own": checked}, settings.trials, settings.device)["own"]))
 
