@@ -44,12 +44,11 @@ def pytest_runtest_setup(item):
     """A test marked `gpu` says what it lacks here."""
     import warp as wp
 
-    for marker in item.iter_markers("gpu"):
-        needed = marker.args[0] if marker.args else 1
+    if item.get_closest_marker("gpu"):
         found = {"torch": torch.cuda.device_count(), "Warp": wp.get_cuda_device_count()}
-        if min(found.values()) < needed:
+        if not min(found.values()):
             told = " and ".join(f"{library} sees {count}" for library, count in found.items())
-            pytest.skip(f"GPUs needed: {needed}; {told}")
+            pytest.skip(f"needs a GPU; {told}")
 
 
 def pytest_collection_finish(session):

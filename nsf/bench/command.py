@@ -14,7 +14,7 @@ from nsf.mpm.device import warp_device
 from nsf.mpm.precision import precision_of
 from nsf.storage import require_folder, writing
 
-BENCHES = ("full_order", "scaling", "reduced", "batch", "operators", "training", "multi_gpu")
+BENCHES = ("full_order", "scaling", "reduced", "batch", "operators", "training")
 """Modules of this package that have `run(settings, found, say)`, which adds what it finds to a `Result`."""
 
 _MOST = 10**9  # particles: some hundred GB of them

@@ -86,11 +86,6 @@ _TRAINING = (
     "Training of all networks of a scene with field=basis: the time is that of a whole training, from "
     "opening its files to the manifold, and the trials are seeds."
 )
-_SEVERAL = (
-    "Several GPUs of the host; a case ends with their number. Simulate: the time of a data set, the start of "
-    "processes and the writing of files included, over the steps of all trajectories. Train: the time of an "
-    "optimiser step of field=mlp on as many points as the batch says, in whole. Speed-up: over one GPU."
-)
 
 
 #: A case of one of several numbers of samples.
@@ -119,9 +114,8 @@ def _parts(folder: Path, results: pd.DataFrame, kernels: pd.DataFrame, stages: p
     of_sample, sizes = of_size[by_sample], of_size[~by_sample]
     same = (sizes["bench"] == "scaling") & sizes["particles"].isin(of_sample["particles"])
     of_stages = stages[stages["case"].isin(_PAPER)]
-    of_scene, of_training, of_batch, of_operators, of_several = (
-        results[results["bench"] == name]
-        for name in ("reduced", "training", "batch", "operators", "multi_gpu")
+    of_scene, of_training, of_batch, of_operators = (
+        results[results["bench"] == name] for name in ("reduced", "training", "batch", "operators")
     )
     of_pass = "Time of each pass of a full-order step; the mark is its floor."
     of_case = (
@@ -137,7 +131,6 @@ def _parts(folder: Path, results: pd.DataFrame, kernels: pd.DataFrame, stages: p
         (sizes, [_SIZES], "step", step_over_particles, [sizes, passes]),
         (of_sample, [_SAMPLES], "sample", step_over_sample, [of_sample, sizes[same]]),
         (passes, [of_pass, _KERNELS], "kernels", passes_beside_floor, [passes]),
-        (with_speed_up(of_several) if len(of_several) else of_several, [_SEVERAL], None, None, []),
     )
     parts = []
     for rows, texts, chart, draw, drawn in listed:
@@ -149,15 +142,6 @@ def _parts(folder: Path, results: pd.DataFrame, kernels: pd.DataFrame, stages: p
         table = None if rows is of_stages else _rows(rows)
         parts.append({"chart": chart and f"{chart}-{device}", "texts": texts, "table": table})
     return parts
-
-
-def with_speed_up(results: pd.DataFrame) -> pd.DataFrame:
-    """Rows of `multi_gpu` of one device, with the ratio of its commit's time on one GPU to that of each."""
-    work = results["case"].str.rpartition("_on_")
-    parts = work[0], results["precision"], results["commit"]
-    keys = pd.Series(list(zip(*parts, strict=True)), index=results.index)
-    alone = results["ms_median"][work[2] == "1"].groupby(keys).last()
-    return results.assign(speed_up=keys.map(alone) / results["ms_median"])
 
 
 def step_over_particles(results: pd.DataFrame, kernels: pd.DataFrame) -> Figure:

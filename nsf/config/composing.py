@@ -26,6 +26,7 @@ from yaml import MarkedYAMLError, YAMLError
 
 from nsf.config import targets
 from nsf.config.documents import check_sizes, text_of
+from nsf.config.removed import refuse_keys, refuse_overrides
 from nsf.config.resolvers import resolved
 from nsf.errors import ConfigError, first_line
 from nsf.paths import CONF, groups
@@ -69,8 +70,10 @@ def load(overrides: Sequence[str] = (), config_name: str = "config") -> DictConf
 
     Raises:
         ConfigError: unknown key or option (with the nearest known one), a missing value,
-            a syntax error, a `_target_` that its key does not expect, or an interpolation that is refused.
+            a syntax error, a `_target_` that its key does not expect, an interpolation that is refused,
+            or a key that was removed.
     """
+    refuse_overrides(overrides)
     try:
         return checked(_compose(config_name, overrides))
     except (HydraException, OmegaConfBaseException) as error:
@@ -179,6 +182,7 @@ def _packed(config: DictConfig) -> tuple[bytes, bytes]:
         text = f"{os.environ.get('NSF_REPORTS')}{raw}"
         if (found := _PACKED.get(text)) is None:
             plain = resolved(config)
+            refuse_keys(plain)
             targets.check(plain)
             found = pickle.dumps(OmegaConf.create(raw)), pickle.dumps(OmegaConf.create(plain))
             _PACKED[text] = found

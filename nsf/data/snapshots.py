@@ -5,7 +5,6 @@ import os
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 
@@ -41,13 +40,9 @@ class Snapshots:
         device: where tensors are returned.
         resident: keep x, tau and C on the device; "auto" if they take at most
             60 % of what is free there.
-        shard: (number, count) for the rows number, number + count, … alone, one
-            of count sets that together are all rows. The sets have one size: where
-            rows are short, the last sets have a first row of all once more.
 
     Attributes:
         M: number of rows.
-        rows: [M] int64, their indices among the rows of all shards.
         P: number of particles.
         X: [P,3] undeformed positions [m], float64 (their hash is `x_sha256`).
         x_sha256: identity of the particles.
@@ -69,7 +64,6 @@ class Snapshots:
         trajectories: Sequence[Trajectory | str | Path],
         device: str | torch.device = "cpu",
         resident: bool | str = "auto",
-        shard: tuple[int, int] = (0, 1),
     ) -> None:
         self.trajectories = [t if isinstance(t, Trajectory) else Trajectory.open(t) for t in trajectories]
         if not self.trajectories:
@@ -84,34 +78,22 @@ class Snapshots:
         self.x_sha256 = first.x_sha256
         self.parameter_names = tuple(first.parameters)
         frames = [trajectory.frames for trajectory in self.trajectories]
-        number, self._shards = shard
-        rows = np.arange(number, number + self._shards * -(-sum(frames) // self._shards), self._shards)
-        rows %= sum(frames)
-        self.M = len(rows)
+        self.M = sum(frames)
         values = [list(trajectory.parameters.values()) for trajectory in self.trajectories]
-        index = np.repeat(np.arange(len(frames)), frames)[rows]
-        self._frame = rows - np.cumsum([0, *frames])[index]
-        self._trajectory = index
-        self.rows = torch.tensor(rows, device=self.device)
+        index = np.repeat(np.arange(len(frames)), frames)
+        self._first = np.cumsum([0, *frames])
         self.X = torch.tensor(first.X, device=self.device)
         self.trajectory = torch.tensor(index, device=self.device)
-        self.frame = torch.tensor(self._frame, device=self.device)
+        self.frame = torch.tensor(np.arange(self.M) - self._first[index], device=self.device)
         self.parameters = torch.tensor(
             np.array(values, dtype="f4").reshape(len(frames), -1)[index], device=self.device
         )
         times = np.concatenate([trajectory.t for trajectory in self.trajectories])
-        self.t = torch.tensor(times.astype("f4")[rows], device=self.device)
+        self.t = torch.tensor(times.astype("f4"), device=self.device)
         self.resident = (
             self.nbytes <= _RESIDENT_SHARE * _free(self.device) if resident == "auto" else bool(resident)
         )
         self._data = {field: self._load(field) for field in RESIDENT_FIELDS} if self.resident else {}
-
-    @cached_property
-    def whole(self) -> "Snapshots":
-        """The rows of all shards, which stream from the files; itself where there are no others."""
-        if self._shards == 1:
-            return self
-        return Snapshots(self.trajectories, self.device, resident=False)
 
     @property
     def nbytes(self) -> int:
@@ -133,8 +115,8 @@ class Snapshots:
         columns = _on_host(particles)
         count = len(range(self.P)[columns]) if isinstance(columns, slice) else len(columns)
         out = np.empty((self.M, count, _components(field)), "f4")
-        for rows, trajectory, frames in self._runs():
-            trajectory.read(field, _slice(frames), columns, out=out[rows])
+        for trajectory, (first, end) in self._spans():
+            trajectory.read(field, slice(None), columns, out=out[first:end])
         return torch.from_numpy(out).to(self.device)
 
     def gather(
@@ -161,8 +143,8 @@ class Snapshots:
         wanted = np.arange(self.M)[_on_host(rows)]
         out = np.empty((len(wanted), count, _components(field)), "f4")
         for i, row in enumerate(wanted):
-            trajectory = self.trajectories[self._trajectory[row]]
-            trajectory.read(field, self._frame[row], columns, out=out[i : i + 1])
+            index = np.searchsorted(self._first, row, side="right") - 1
+            self.trajectories[index].read(field, row - self._first[index], columns, out=out[i : i + 1])
         return torch.from_numpy(out).to(self.device)
 
     def close(self) -> None:
@@ -174,9 +156,9 @@ class Snapshots:
         data = torch.empty((self.M, self.P, COMPONENTS[field]), device=self.device)
         together = max(1, _STAGING_BYTES // (4 * self.P * COMPONENTS[field]))
         pieces = [
-            (data[rows][first : first + together], trajectory, _slice(frames[first : first + together]))
-            for rows, trajectory, frames in self._runs()
-            for first in range(0, len(frames), together)
+            (data[begin:end][first : first + together], trajectory, slice(first, first + together))
+            for trajectory, (begin, end) in self._spans()
+            for first in range(0, end - begin, together)
         ]
         staging = threading.local()
 
@@ -196,21 +178,14 @@ class Snapshots:
             collections.deque(pool.map(read, pieces), maxlen=0)  # raises what one of them raised
         return data
 
-    def _runs(self) -> Iterator[tuple[slice, Trajectory, range]]:
-        """Neighbouring rows of one trajectory with its frames there, which are evenly spaced upwards."""
-        ends = np.flatnonzero(np.diff(self._trajectory) | (np.diff(self._frame) < 0)) + 1
-        for first, end in pairwise([0, *ends.tolist(), self.M]):
-            frames = range(int(self._frame[first]), int(self._frame[end - 1]) + 1, self._shards)
-            yield slice(first, end), self.trajectories[self._trajectory[first]], frames
+    def _spans(self) -> Iterator[tuple[Trajectory, tuple[int, int]]]:
+        """Each trajectory with the first of its rows and the one after its last."""
+        yield from zip(self.trajectories, pairwise(self._first.tolist()), strict=True)
 
     def _on_device(self, indices: Indices) -> slice | Tensor:
         if isinstance(indices, slice):
             return indices
         return torch.as_tensor(indices, dtype=torch.int64, device=self.device)
-
-
-def _slice(frames: range) -> slice:
-    return slice(frames.start, frames.stop, frames.step)
 
 
 def _components(field: str) -> int:

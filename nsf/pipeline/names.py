@@ -213,9 +213,6 @@ class Names:
     def training(self) -> Run:
         """The run of the manifold."""
         content = self._content(("field", "trainer", "latent_dim", "seed"))
-        if content["trainer"].get("devices", 1) == 1:
-            # The bits, and so the name, of a training from before there was the key.
-            content["trainer"].pop("devices", None)
         content["field"].pop("arithmetic", None)  # of deployment
         return Run.open("train", self.scene.name, content, self.training_data, root=self.root)
 

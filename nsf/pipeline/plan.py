@@ -1,6 +1,5 @@
 """What a configuration asks for: everything that its stages need, checked, and the run of each stage."""
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -9,10 +8,9 @@ from omegaconf import DictConfig, OmegaConf
 from nsf import config as configuration
 from nsf.data import Case
 from nsf.dynamics import History
-from nsf.errors import ConfigError, DeviceError
+from nsf.errors import ConfigError
 from nsf.kinematics.fields.basis import BasisField
 from nsf.mpm import FP32, FP64, Precision
-from nsf.mpm.device import visible_gpus
 from nsf.mpm.recording import frame_bytes
 from nsf.mpm.stability import check_colliders, check_time_step
 from nsf.pipeline.names import Names
@@ -59,11 +57,6 @@ class Plan(Names):
         self.scene, c = Scene.of(self.scene), self.config
         for name in ("field", "trainer", "method", "sampler", "projector", "integration"):
             setattr(self, name, configuration.build(c[name], name))
-        if self.trainer.devices > 1 and not self.field.shardable:
-            raise ConfigError(
-                f"trainer.devices={self.trainer.devices} is for field=mlp; this field takes all snapshots in "
-                "every step, in seconds: set trainer.devices=1"
-            )
         check_batched(c, self.field, self.integration.strategy)
         if isinstance(self.method, History):
             self._check_history()
@@ -118,29 +111,6 @@ class Plan(Names):
             for multiplier in (1.0, self.config.deploy.dt_multiplier):
                 check_colliders(scene.colliders, grid, multiplier * scene.dt)
         _PASSED.add(asked)
-
-    def check_devices(self) -> None:
-        """Refuse to train on more devices than this machine has; what was trained elsewhere may be used.
-
-        Raises:
-            DeviceError: says how many there are.
-        """
-        asked, on_gpu = self.trainer.devices, self.device.startswith("cuda")
-        if asked == 1 or self.training.complete:
-            return
-        if self.device not in ("cpu", "cuda:0"):
-            raise DeviceError(
-                f"trainer.devices={asked} takes the first GPUs and not device={self.config.device}; "
-                "set device=auto"
-            )
-        there = len(visible_gpus()) if on_gpu else os.cpu_count() or 1
-        if asked > there:
-            most = max(n for n in range(1, there + 1) if self.trainer.frames_per_batch % n == 0)
-            raise DeviceError(
-                f"trainer.devices={asked} is more than this process has: {there} "
-                f"{'GPU' if on_gpu else 'processor core'}{'' if there == 1 else 's'}; "
-                f"set trainer.devices={most}"
-            )
 
     def check_room(self, runs: Mapping[Run, tuple[Case, Scene]]) -> None:
         """Refuse trajectories that fit neither into memory nor, all together, on the disk.

@@ -60,7 +60,6 @@ def plans(jobs: Sequence[Sequence[str]]) -> list[Names]:
             from nsf.pipeline.plan import Plan
 
             names = Plan(config)
-            names.check_devices()
         found.append(names)
     return found
 

@@ -15,7 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.plugins import Plugins
 from hydra.plugins.launcher import Launcher
 from hydra.types import HydraContext
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from nsf import config as configuration
 from nsf.data.schema import TRAJECTORY
@@ -85,7 +85,7 @@ def sweep(
     trajectories of a scene go once each of its jobs has gone well.
 
     Jobs side by side on this machine (`hydra/launcher=joblib`) see one GPU each, where all of them have
-    device=auto and trainer.devices=1: it is cuda:0 to them, so their runs are those of one GPU.
+    device=auto: it is cuda:0 to them, so their runs are those of one GPU.
 
     Args:
         sweeps: overrides whose keys may have several values, without Hydra's own.
@@ -114,7 +114,7 @@ def sweep(
     kept: set[str] = set()  # data.keep of all
 
     def check(one: DictConfig) -> None:
-        movable.append(one.device == "auto" and OmegaConf.select(one, "trainer.devices", default=1) == 1)
+        movable.append(one.device == "auto")
         if "point" not in stages:
             names = Names(one)
             kept.add(names.config.data.keep)

@@ -77,7 +77,6 @@ def says_its_gpu(config, stages, folder, beside, labels=()):
     [
         (["device=auto"], JOBLIB, {"4", "7"}),
         pytest.param(["device=auto,cpu"], JOBLIB, {"all"}, marks=pytest.mark.slow),
-        pytest.param(["field=mlp", "trainer.devices=2"], JOBLIB, {"all"}, marks=pytest.mark.slow),
         (["device=auto"], [], {"all"}),
     ],
 )

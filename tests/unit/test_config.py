@@ -262,3 +262,18 @@ def test_a_launcher_that_is_not_there(overrides, quoted):
 def test_what_follows_an_entry_of_a_list_is_found_however_it_is_named():
     config = OmegaConf.create({"a": [1.0, 2.0], "b": "${a[1]}", "c": "${b}"})
     assert sorted(following(config, "a.1")) == sorted(following(config, "a[1]")) == [("b",), ("c",)]
+
+
+@pytest.mark.parametrize("override", ["trainer.devices=2", "+trainer.devices=1", "~trainer.devices"])
+def test_a_removed_key_names_its_replacement(override):
+    with pytest.raises(ConfigError, match=r"trainer\.devices was removed; .*hydra/launcher=joblib"):
+        config.load([override])
+
+
+def test_a_file_with_a_removed_key_is_refused(tmp_path):
+    whole = config.load([])
+    OmegaConf.update(whole, "trainer.devices", 1, force_add=True)
+    path = tmp_path / "config.yaml"
+    path.write_text(OmegaConf.to_yaml(whole))
+    with pytest.raises(ConfigError, match=r"config\.yaml: trainer\.devices was removed"):
+        config.read(path)

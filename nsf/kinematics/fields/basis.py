@@ -17,7 +17,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -76,8 +76,6 @@ class BasisField:
         rate_noise: deviation of the noise on dx̂/dt in training with `affine=rate`, in units of dx̂/dt's
             deviation. Where xhat tells dx̂/dt to within the noise, as along one path, C is left to b(xhat, μ).
     """
-
-    shardable: ClassVar[bool] = False
 
     modes: int | Sequence[int] = (48, 64, 64)
     beta: int | Sequence[int] = (48, 48, 32)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -56,8 +56,6 @@ class MlpField:
 
     Source: Zong et al. 2023, section 4.5, appendices "Training Details" and "Network architecture", table 1.
     """
-
-    shardable: ClassVar[bool] = True
 
     beta: int | Sequence[int] = (48, 72, 72)
     octaves: int = 4
@@ -118,8 +116,7 @@ class MlpField:
         """Step 1: g and e together; steps 2 and 3: h and l on the latents of the trained encoder.
 
         Every target is standardised, so a loss is the mean squared error over its variance. g's has the
-        tangent's besides, and frames of h and l have weights (`evenness`). Of snapshots shared among n
-        devices, a frame's next one is n frames later.
+        tangent's besides, and frames of h and l have weights (`evenness`).
         """
         standard, decoders, r = manifold.standard, manifold.decoders, manifold.latent_dim
         X, frame, trajectory = manifold.X.float(), snapshots.frame, snapshots.trajectory
@@ -151,7 +148,7 @@ class MlpField:
 
         def decoded(phase, share):
             name = TARGETS[phase][0]
-            latents = manifold.decoder_latents(phase)[snapshots.rows]
+            latents = manifold.decoder_latents(phase)
             noise = (self.noise**2 * share.square() + 1 - share.square()).sqrt().float()
             weights = self._weights(standard[name](snapshots.slab(name, spaced(snapshots.P, _PROBED))))
 
@@ -166,9 +163,9 @@ class MlpField:
 
         both = nn.ModuleList([manifold.encoder, decoders["deformation"]])
         yield Fit("deformation", both, deformation, pointwise=True, fine=True)
-        manifold.encode_training(snapshots.whole)
+        manifold.encode_training(snapshots)
         share = manifold.turn(self.noise_floor)
-        manifold.encode_training(snapshots.whole)
+        manifold.encode_training(snapshots)
         for phase in PHASES[1:]:
             yield Fit(phase, decoders[phase], decoded(phase, share), pointwise=True)
 

@@ -12,9 +12,6 @@ from typing import Any
 import pytorch_lightning as pl
 import torch
 from pytorch_lightning.plugins import TorchCheckpointIO
-from pytorch_lightning.plugins.environments import LightningEnvironment
-from pytorch_lightning.strategies import DDPStrategy
-from torch import Tensor
 from typing_extensions import override
 
 from nsf.errors import InstabilityError
@@ -53,17 +50,15 @@ class FieldTraining(pl.LightningModule):
     @override
     def on_train_start(self) -> None:
         # Lightning's wrapper of the optimizer adds a millisecond to every step.
-        # Through Lightning where it has to exchange gradients, which costs a little.
-        backward = Tensor.backward if self.descent.rank.alone else self.manual_backward
         found = self.optimizers(use_pl_optimizer=False)
         optimizers = found if isinstance(found, list) else [found]
-        self.taker = Steps(self.descent, optimizers, self.steps, backward)
+        self.taker = Steps(self.descent, optimizers, self.steps)
         self.progress.advance(self.step)
 
     @override
     def training_step(self, batch: Any, index: int) -> None:
         first, last, started = self.step, min(self.step + self.block, self.steps), time.perf_counter()
-        self.loss = self.descent.rank.mean(self.taker.take(first, last), self.descent.device)
+        self.loss = self.taker.take(first, last)
         self.step, self.seconds = last, self.seconds + time.perf_counter() - started
         if not self.loss < float("inf"):
             raise InstabilityError(
@@ -116,15 +111,16 @@ def descend(descent: Descent, steps: int, folder: Path, tracking: str | None) ->
     """
     checkpoint = folder / CHECKPOINT
     resumed = checkpoint.is_file()
-    shown = descent.rank.first
-    with quiet_lightning(), Progress(f"train {descent.fit.name}", steps, "steps", shown) as progress:
+    on_gpu = descent.device.type == "cuda"
+    with quiet_lightning(), Progress(f"train {descent.fit.name}", steps, "steps") as progress:
         module = FieldTraining(descent, steps, checkpoint, progress)
         trainer = pl.Trainer(
-            **_placement(descent),
+            accelerator="gpu" if on_gpu else "cpu",
+            devices=[descent.device.index or 0] if on_gpu else 1,
             plugins=_BesideTheLast(),
             max_epochs=-1,
             enable_checkpointing=False,  # ModelCheckpoint counts the steps of Lightning's wrapped optimizer
-            logger=loggers(folder, tracking) if descent.rank.first else False,
+            logger=loggers(folder, tracking),
             log_every_n_steps=1,
             enable_progress_bar=False,
             enable_model_summary=False,
@@ -137,13 +133,3 @@ def descend(descent: Descent, steps: int, folder: Path, tracking: str | None) ->
             # Lightning answers an interrupt with exit code 1; the caller is to see the interrupt.
             raise KeyboardInterrupt from stop
     return module.loss, module.seconds
-
-
-def _placement(descent: Descent) -> dict[str, Any]:
-    """On which devices, and how, Lightning trains."""
-    device, rank = descent.device, descent.rank
-    accelerator = "gpu" if device.type == "cuda" else "cpu"
-    if rank.alone:
-        return {"accelerator": accelerator, "devices": [device.index or 0] if accelerator == "gpu" else 1}
-    together = DDPStrategy(cluster_environment=LightningEnvironment())
-    return {"accelerator": accelerator, "devices": rank.count, "strategy": together}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -12,7 +12,6 @@ from torch import Tensor
 from nsf.gpu import without_collection
 from nsf.kinematics.training.optimisers import muon_and_adam
 from nsf.kinematics.training.phases import PHASES, Fit, seed_of
-from nsf.kinematics.training.rank import ALONE, Rank
 from nsf.kinematics.training.schedules import Trainer
 from nsf.kinematics.training.tensor_cores import tf32
 
@@ -29,7 +28,6 @@ class Descent:
         fit, schedule: the network with its loss, and the batches and rates.
         frames, particles: M and P of the snapshots.
         resident: the snapshots lie on the device.
-        rank: which of several processes this is; `schedule`, `frames` and `seed` are its own.
     """
 
     fit: Fit
@@ -39,12 +37,11 @@ class Descent:
     resident: bool
     seed: int
     device: torch.device
-    rank: Rank = ALONE
 
     @property
     def replayable(self) -> bool:
-        """Whether every step is the same sequence of kernels, with no word from the host or other devices."""
-        local = (self.resident or not self.fit.pointwise) and self.rank.alone
+        """Whether every step is the same sequence of kernels, with no word from the host."""
+        local = self.resident or not self.fit.pointwise
         return self.device.type == "cuda" and self.schedule.stationary and local
 
     def optimizers(self) -> list[torch.optim.Optimizer]:
@@ -72,17 +69,10 @@ class Steps:
         descent: the phase.
         optimizers: of its network, already in the state they start from.
         steps: how many there are in all.
-        backward: fills the gradients of a loss.
     """
 
-    def __init__(
-        self,
-        descent: Descent,
-        optimizers: Sequence[torch.optim.Optimizer],
-        steps: int,
-        backward: Callable[[Tensor], None] = Tensor.backward,
-    ):
-        self.descent, self.optimizers, self.steps, self.backward = descent, optimizers, steps, backward
+    def __init__(self, descent: Descent, optimizers: Sequence[torch.optim.Optimizer], steps: int):
+        self.descent, self.optimizers, self.steps = descent, optimizers, steps
         self._generator = torch.Generator(descent.device)
         self._graph: torch.cuda.CUDAGraph | None = None
         self._eager_left = EAGER_STEPS if descent.replayable else steps
@@ -135,5 +125,5 @@ class Steps:
             with torch.autocast(descent.device.type, torch.bfloat16, enabled=low, cache_enabled=False):
                 loss = fit.loss(rows, particles, self._generator)
             fit.network.zero_grad()
-            self.backward(loss)
+            loss.backward()
         return loss.detach()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
@@ -26,8 +26,7 @@ class Trainer(ABC):
     """A schedule; every choice is a pure function of the step (and seed), so that training can be resumed.
 
     Attributes:
-        frames_per_batch: snapshots that a step sees, of all devices together.
-        devices: GPUs that train together, or processes on a CPU; a batch and the data are shared among them.
+        frames_per_batch: snapshots that a step sees.
         bf16: on a GPU, evaluate a field fitted to points in bfloat16 in training; in tf32 if `fine`.
         stationary: batches have one shape and know the step through the generator alone, so a step can be
             captured once and replayed.
@@ -35,23 +34,9 @@ class Trainer(ABC):
     """
 
     frames_per_batch: int
-    devices: int = 1
     bf16: bool = False
     stationary: ClassVar[bool] = False
     muon: ClassVar[bool] = False
-
-    def share(self) -> Trainer:
-        """The schedule of one of the devices: the same steps, with its part of each batch."""
-        return replace(self, frames_per_batch=self.frames_per_batch // self.devices, devices=1)
-
-    def _check_devices(self) -> None:
-        at_least("devices", self.devices, 1)
-        if self.frames_per_batch % self.devices:
-            even = max(1, self.frames_per_batch // self.devices) * self.devices
-            raise ConfigError(
-                f"frames_per_batch={self.frames_per_batch} cannot be shared evenly among "
-                f"devices={self.devices}; choose a multiple, as frames_per_batch={even}"
-            )
 
     @abstractmethod
     def steps_of(self, phase: str, frames: int) -> int | None:
@@ -81,7 +66,6 @@ class PaperTrainer(Trainer):
         epochs_deformation, epochs_stress, epochs_affine: epochs at each learning rate.
         frames_per_batch: k; a batch holds k whole frames, k·|P| points. The paper takes the largest k that
             fits in memory, at most 32.
-        devices: see `Trainer`; each takes k / devices frames of a batch.
 
     Source: Zong et al. 2023, appendix "Training Details".
     """
@@ -91,7 +75,6 @@ class PaperTrainer(Trainer):
     epochs_stress: int = 600
     epochs_affine: int = 600
     frames_per_batch: int = 32
-    devices: int = 1
 
     def __post_init__(self) -> None:
         if not self.learning_rates or min(self.learning_rates) <= 0:
@@ -100,7 +83,6 @@ class PaperTrainer(Trainer):
             )
         for key in ("epochs_deformation", "epochs_stress", "epochs_affine", "frames_per_batch"):
             at_least(key, getattr(self, key), 1)
-        self._check_devices()
 
     def _batches(self, frames: int) -> int:
         return math.ceil(frames / self.frames_per_batch)
@@ -138,7 +120,6 @@ class FastTrainer(Trainer):
         bf16: on a GPU, evaluate a field fitted to points in bfloat16 in training; in tf32 if `fine`.
         budget_minutes: limit on the training of all three networks [min], or None. The rate is measured once
             at the start of each phase; the steps it allows are recorded, and as `steps` make the same bits.
-        devices: see `Trainer`; each takes frames_per_batch / devices frames of a step.
     """
 
     stationary: ClassVar[bool] = True
@@ -150,7 +131,6 @@ class FastTrainer(Trainer):
     particles_per_batch: int = 8192
     bf16: bool = True
     budget_minutes: float | None = None
-    devices: int = 1
 
     def __post_init__(self) -> None:
         if self.steps is None and self.budget_minutes is None:
@@ -165,7 +145,6 @@ class FastTrainer(Trainer):
                 raise ConfigError(f"{key}={value} must be positive; choose for example {key}=0.002")
         for key in ("frames_per_batch", "particles_per_batch"):
             at_least(key, getattr(self, key), 1)
-        self._check_devices()
 
     @override
     def steps_of(self, phase: str, frames: int) -> int | None:

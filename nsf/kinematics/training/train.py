@@ -7,16 +7,14 @@ import os
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol
 
 import torch
 
 from nsf.data import Snapshots
-from nsf.errors import ConfigError
 from nsf.kinematics.manifold import Manifold
 from nsf.kinematics.training.descent import CHECKPOINT, Descent, Steps
 from nsf.kinematics.training.phases import Fit, at_least, seeded
-from nsf.kinematics.training.rank import ALONE, Rank
 from nsf.kinematics.training.schedules import Trainer
 from nsf.kinematics.training.tracking import check_tracking
 from nsf.storage import refusals, writing
@@ -26,14 +24,7 @@ PROBE_STEPS, PROBE_SECONDS = 5, 1.0  # taken at a time, and the least time over 
 
 
 class Field(Protocol):
-    """What a field of `conf/field/` offers to training.
-
-    Attributes:
-        shardable: it may be fitted by several processes, each with a part of the snapshots; `prepare` and
-            `build` get all of them.
-    """
-
-    shardable: ClassVar[bool]
+    """What a field of `conf/field/` offers to training."""
 
     def prepare(self, snapshots: Snapshots, latent_dim: int) -> dict[str, Any]:
         """What the snapshots determine before any network is trained: plain containers and host tensors."""
@@ -57,7 +48,6 @@ def train(
     device: str | torch.device,
     tracking: str | None = None,
     deterministic: bool = True,
-    rank: Rank = ALONE,
 ) -> tuple[Manifold, dict[str, float]]:
     """Train encoder and fields on the snapshots.
 
@@ -73,8 +63,6 @@ def train(
         device: "cpu", "cuda", "cuda:1".
         tracking: "tensorboard" or "mlflow" for a live page beside the CSV logs.
         deterministic: use torch's deterministic algorithms.
-        rank: which of `trainer.devices` processes this is, with its shard of the snapshots; all of them make
-            the same call (`train_together`).
 
     Returns:
         The manifold on the host, and for each phase its steps, last loss (mean squared error over the
@@ -93,29 +81,22 @@ def train(
     """
     at_least("latent_dim", latent_dim, 1)
     check_tracking(tracking)
-    if trainer.devices != rank.count:
-        raise ConfigError(
-            f"trainer.devices={trainer.devices}, but processes that train: {rank.count}; call train_together"
-        )
     device, folder = torch.device(device), Path(folder)
     with refusals(folder), _determinism(deterministic):
-        whole, schedule, own_seed = snapshots.whole, trainer.share(), rank.seed(seed)
-        prepared, total = _timed(folder / "prepared.pt", lambda: field.prepare(whole, latent_dim), rank)
+        prepared, total = _timed(folder / "prepared.pt", lambda: field.prepare(snapshots, latent_dim))
         began = time.perf_counter()  # of a large scene, building reads all data once more
-        manifold = field.build(whole, prepared, latent_dim, seeded("cpu", seed, WEIGHTS_STREAM)).to(device)
+        weights = seeded("cpu", seed, WEIGHTS_STREAM)
+        manifold = field.build(snapshots, prepared, latent_dim, weights).to(device)
         took = time.perf_counter() - began
-        total += _once(folder / "built.pt", lambda: took, rank)  # of the first call, as all seconds are
+        total += _once(folder / "built.pt", lambda: took)  # of the first call, as all seconds are
         metrics: dict[str, float] = {}
         for fit in field.fits(manifold, snapshots, prepared):
-            descent = Descent(
-                fit, schedule, snapshots.M, snapshots.P, snapshots.resident, own_seed, device, rank
-            )
+            descent = Descent(fit, trainer, snapshots.M, snapshots.P, snapshots.resident, seed, device)
             kept = folder / f"{fit.name}.pt"
-            outcome = _once(kept, lambda: _phase(descent, folder, tracking), rank, together=True)  # noqa: B023
+            outcome = _once(kept, lambda: _phase(descent, folder, tracking))  # noqa: B023
             fit.network.load_state_dict(outcome["state"])
             fit.network.to(device)  # Lightning leaves it on the host
-            if rank.first:
-                (folder / fit.name / CHECKPOINT).unlink(missing_ok=True)
+            (folder / fit.name / CHECKPOINT).unlink(missing_ok=True)
             metrics |= {f"{fit.name}_{key}": outcome[key] for key in ("steps", "loss", "seconds")}
             total += outcome["seconds"]
     metrics["training_seconds"] = total
@@ -126,7 +107,7 @@ def _phase(descent: Descent, folder: Path, tracking: str | None) -> dict[str, An
     from nsf.kinematics.training.blocks import descend
 
     name, own = descent.fit.name, folder / descent.fit.name
-    steps, probing = _timed(folder / f"{name}_steps.pt", lambda: _steps(descent), descent.rank)
+    steps, probing = _timed(folder / f"{name}_steps.pt", lambda: _steps(descent))
     loss, seconds = descend(descent, steps, own, tracking)
     return {
         "state": {key: value.cpu() for key, value in descent.fit.network.state_dict().items()},
@@ -160,28 +141,23 @@ def _seconds_per_step(descent: Descent) -> float:
     return (time.perf_counter() - started) / taken
 
 
-def _timed(path: Path, compute: Callable[[], Any], rank: Rank) -> tuple[Any, float]:
+def _timed(path: Path, compute: Callable[[], Any]) -> tuple[Any, float]:
     """As `_once`, with the seconds that computing took."""
 
     def timed() -> dict[str, Any]:
         started = time.perf_counter()
         return {"value": compute(), "seconds": time.perf_counter() - started}
 
-    kept = _once(path, timed, rank)
+    kept = _once(path, timed)
     return kept["value"], kept["seconds"]
 
 
-def _once(path: Path, compute: Callable[[], Any], rank: Rank, together: bool = False) -> Any:
-    """The value kept in `path`; computed and kept there if this is the first time.
-
-    The first rank does both, while the others wait; they all compute where they have to do so `together`.
-    """
-    if (rank.first or together) and not path.is_file():
+def _once(path: Path, compute: Callable[[], Any]) -> Any:
+    """The value kept in `path`; computed and kept there if this is the first time."""
+    if not path.is_file():
         value = compute()
-        if rank.first:
-            with writing(path) as temporary, temporary.open("wb") as file:
-                torch.save(value, file)
-    rank.wait()
+        with writing(path) as temporary, temporary.open("wb") as file:
+            torch.save(value, file)
     return torch.load(path, map_location="cpu", weights_only=True)
 
 

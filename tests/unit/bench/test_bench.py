@@ -1,9 +1,7 @@
 """`nsf bench`: rows, passes and the report; what a step takes is asserted nowhere."""
 
 import dataclasses
-import os
 import re
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -18,7 +16,6 @@ from nsf.bench.batch import measured as measured_batches
 from nsf.bench.full_order import collapse, pass_times
 from nsf.bench.full_order import run as full_order
 from nsf.bench.measure import bandwidth, run_times, step_times
-from nsf.bench.multi_gpu import measured as measured_on_several
 from nsf.bench.reduced import measured as measured_chain
 from nsf.bench.reduced import measured_networks
 from nsf.bench.report import (
@@ -27,7 +24,6 @@ from nsf.bench.report import (
     step_over_particles,
     step_over_sample,
     steps_by_scene,
-    with_speed_up,
     write_report,
 )
 from nsf.bench.rows import KernelRow, Result, Row, Settings, StageRow, columns, size_name
@@ -494,53 +490,3 @@ def test_a_report_of_scenes(reduced, found, tmp_path):
     assert (tmp_path / "reduced-cpu.png").is_file()
     points = steps_by_scene(reduced).axes[0].collections[0].get_offsets()
     np.testing.assert_array_equal(points[:, 0], reduced["ms_median"])
-
-
-@pytest.fixture(scope="module")
-def several(tiny, tmp_path_factory):
-    """Rows of two devices, for which processes on the CPU stand."""
-    found, said = Result(), []
-    mlp = ("field=mlp", "trainer.steps=150", "trainer.frames_per_batch=8", "trainer.particles_per_batch=4")
-    base = [o for o in tiny if not o.startswith(("field.modes", "field.depth", "trainer.steps", "device"))]
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("NSF_RUNS", str(tmp_path_factory.mktemp("several")))
-        measured_on_several([*base, *mlp], 2, Settings((), ("fp64",), "cpu", 1), found, said.append)
-        assert not list(Path(os.environ["NSF_RUNS"]).iterdir())
-    assert len(said) == 7
-    return pd.DataFrame(found.rows, columns=columns(Row))
-
-
-@pytest.mark.slow
-def test_several_devices_have_rows_beside_one(several, tmp_path):
-    cases = [f"train_mlp_{phase}" for phase in ("deformation", "stress", "affine")]
-    assert several["case"].tolist() == [f"{case}_on_{n}" for n in (1, 2) for case in cases]
-    assert several["batch"].tolist() == [32] * 6
-    assert (several["ms_median"] > 0).all()
-    compared = with_speed_up(several)
-    alone, both = (compared[compared["case"].str.endswith(f"_on_{n}")] for n in (1, 2))
-    assert (alone["speed_up"] == 1).all()
-    np.testing.assert_allclose(both["speed_up"], alone["ms_median"].to_numpy() / both["ms_median"].to_numpy())
-    several.to_csv(tmp_path / "results.csv", index=False)
-    pd.DataFrame(columns=columns(KernelRow)).to_csv(tmp_path / "kernels.csv", index=False)
-    pd.DataFrame(columns=columns(StageRow)).to_csv(tmp_path / "stages.csv", index=False)
-    page = write_report(tmp_path).read_text()
-    assert "| train_mlp_stress_on_2 |" in page
-    assert "speed-up" in page
-    assert "png" not in page
-
-
-def test_rows_of_two_commits_have_no_ratio():
-    rows = pd.DataFrame({
-        "case": ["train_mlp_stress_on_1", "train_mlp_stress_on_2"] * 2, "precision": "bf16",
-        "ms_median": [4.0, 2.0, 6.0, 2.0], "commit": ["a", "a", "b", "c"],
-    })  # fmt: skip
-    np.testing.assert_array_equal(with_speed_up(rows)["speed_up"], [1, 2, 1, np.nan])
-
-
-def test_several_gpus_are_needed(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("nsf.bench.multi_gpu.visible_gpus", lambda: ("0",))
-    with pytest.raises(SystemExit) as end:
-        main(["bench", "benches=multi_gpu", f"folder={tmp_path}", "device=cpu"])
-    assert not end.value.code
-    assert "multi_gpu: left out, as it needs two GPUs and this process has 1" in capsys.readouterr().err
-    assert pd.read_csv(tmp_path / "results.csv").empty

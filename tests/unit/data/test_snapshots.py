@@ -136,35 +136,3 @@ def test_on_a_gpu(paths, whole, resident, monkeypatch):
         assert torch.equal(snaps.slab(field, slice(2, 9)).cpu(), values[:, 2:9])
         assert torch.equal(snaps.gather(field, rows, particles).cpu(), values[rows.cpu()][:, particles.cpu()])
     assert torch.allclose(Standardizer.of(snaps, "tau").mean.cpu(), whole["tau"].mean((0, 1)), rtol=1e-4)
-    shard = Snapshots(paths, device="cuda", resident=resident, shard=(1, 2))
-    assert torch.equal(shard.slab("tau", slice(None)).cpu(), whole["tau"][shard.rows.cpu()])
-
-
-@pytest.mark.parametrize("count", [2, 4, 5])
-@pytest.mark.parametrize("resident", [True, False], ids=["resident", "streamed"])
-def test_shards_are_disjoint_and_cover_all_rows(paths, whole, count, resident):
-    every = Snapshots(paths)
-    shards = [Snapshots(paths, resident=resident, shard=(number, count)) for number in range(count)]
-    size = -(-every.M // count)
-    assert [shard.M for shard in shards] == [size] * count
-    rows = torch.stack([shard.rows for shard in shards], dim=1).flatten()
-    assert rows.tolist() == [row % every.M for row in range(count * size)]  # once each, then the first again
-    for shard in shards:
-        for name in ("parameters", "trajectory", "frame", "t"):
-            assert torch.equal(getattr(shard, name), getattr(every, name)[shard.rows])
-        for field, values in whole.items():
-            assert torch.equal(shard.slab(field, slice(None)), values[shard.rows])
-            assert torch.equal(shard.slab(field, [7, 2]), values[shard.rows][:, [7, 2]])
-            assert torch.equal(shard.gather(field, [size - 1, 0], [3]), values[shard.rows[[-1, 0]]][:, [3]])
-
-
-def test_a_shard_holds_its_rows_and_streams_the_others(paths, whole):
-    every = Snapshots(paths)
-    assert every.whole is every
-    assert every.rows.tolist() == list(range(every.M))
-    shard = Snapshots(paths, shard=(1, 3))
-    assert shard.resident
-    assert 3 * shard.nbytes == every.nbytes
-    assert shard.whole.M == every.M
-    assert not shard.whole.resident
-    assert torch.equal(shard.whole.gather("x", slice(None), slice(None)), whole["x"])
