@@ -253,7 +253,7 @@ def _search(words: list[str]) -> int:
     """Trials until there are enough, and the best of them."""
     _check_words("search", words)
     from nsf.pipeline.search import search
-    from nsf.reporting.drawing.search import best_table
+    from nsf.results.search import best_table
 
     chart = search(words)
     _console().print(best_table(chart.with_name("trials.csv")))

@@ -69,7 +69,7 @@ def one_thread_for_torch():
 def coarse_pictures():
     """Half the pixels an inch, and one sample a pixel: a picture takes a third of the time."""
     from nsf.reporting.bodies import camera
-    from nsf.reporting.drawing import style
+    from nsf.results import style
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(style, "PIXELS", style.PIXELS // 2)

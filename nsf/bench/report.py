@@ -11,10 +11,10 @@ from rich.table import Table
 
 from nsf.bench.rows import OTHER_SAMPLER, size_name
 from nsf.reporting.drawing.charts import rings
-from nsf.reporting.drawing.scales import plain_ticks
-from nsf.reporting.drawing.style import INK, figure, line_style, save, stage_colors, styled
 from nsf.reporting.text.columns import number
-from nsf.reporting.text.formats import Rows, markdown_document, terminal_table
+from nsf.results.formats import Rows, markdown_document, terminal_table
+from nsf.results.scales import plain_ticks
+from nsf.results.style import INK, figure, line_style, save, stage_colors, styled
 from nsf.storage import writing
 
 _HEADINGS = {

@@ -9,7 +9,7 @@ import numpy as np
 from nsf.export.playback import QUANTITIES, Playback
 from nsf.extras import optional
 from nsf.progress import Progress
-from nsf.reporting.drawing.style import STRESS_COLORS
+from nsf.results.style import STRESS_COLORS
 from nsf.storage import require_space, writing
 
 NEEDS = ("pyvista", "imageio.v2", "imageio_ffmpeg")

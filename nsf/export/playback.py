@@ -24,7 +24,7 @@ from nsf.kinematics.manifold import Manifold, Restriction
 from nsf.mpm import Collider, floor_height, precision_of
 from nsf.mpm.device import warp_device
 from nsf.progress import Progress
-from nsf.reporting.drawing.style import CLIP
+from nsf.results.style import CLIP
 from nsf.runs import Run
 from nsf.scenes import Scene
 

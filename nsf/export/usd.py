@@ -6,7 +6,7 @@ import numpy as np
 
 from nsf.export.playback import Block, Playback
 from nsf.extras import optional
-from nsf.reporting.drawing.style import STRESS_COLORS, ColorScale
+from nsf.results.style import STRESS_COLORS, ColorScale
 from nsf.storage import writing
 
 NEEDS = ("pxr.Usd", "pxr.UsdGeom", "pxr.Sdf", "pxr.Vt")

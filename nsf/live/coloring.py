@@ -9,7 +9,7 @@ import torch
 from nsf.evaluation.metrics import pressure, von_mises
 from nsf.live.model import LiveModel, Truth
 from nsf.live.player import Moment
-from nsf.reporting.drawing.style import (
+from nsf.results.style import (
     CLIP,
     DIFFERENCE_COLORS,
     METRES,

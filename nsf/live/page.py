@@ -15,8 +15,8 @@ from matplotlib.colors import to_hex
 from nsf.live.coloring import DISTANCE, SAMPLE, Coloring, Picture
 from nsf.live.guard import Connection, refused
 from nsf.live.player import Moment, Player, every
-from nsf.reporting.drawing.style import ROLES, ColorScale
 from nsf.reporting.text.columns import axis
+from nsf.results.style import ROLES, ColorScale
 
 log = logging.getLogger(__name__)
 

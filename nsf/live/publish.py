@@ -20,8 +20,8 @@ from nsf.export import web
 from nsf.live.model import LiveModel
 from nsf.live.wire import check_field, modal_field, network_arrays, shown
 from nsf.pipeline import Pipeline
-from nsf.reporting.drawing.style import CLIP
-from nsf.reporting.text.formats import file_name
+from nsf.results.formats import file_name
+from nsf.results.style import CLIP
 from nsf.runs import Run
 from nsf.scenes import Scene
 from nsf.storage import writing

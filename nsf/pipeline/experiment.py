@@ -175,7 +175,7 @@ class Experiment:
             ConfigError: something else stands there.
             StorageError: the folder above it cannot be written.
         """
-        from nsf.reporting.swap import check_place
+        from nsf.results.folder import check_place
 
         config = configuration.load(self.jobs[0].overrides)
         check_place(self._folder(config, {config.scale}))

@@ -21,7 +21,7 @@ from nsf.engines.operators.teaching import Teaching, random_cases
 from nsf.errors import ConfigError
 from nsf.gpu import has_driver
 from nsf.pipeline.values import check_batch, check_lessons, check_numbers, check_words, factors
-from nsf.reporting.swap import check_place
+from nsf.results.folder import check_place
 from nsf.runs import Run
 from nsf.scenes.draft import Draft
 from nsf.scenes.identity import NOT_PHYSICS

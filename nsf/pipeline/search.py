@@ -14,7 +14,7 @@ from nsf.errors import ConfigError, MissingRunError, NSFError
 from nsf.extras import optional
 from nsf.pipeline.chain import Pipeline
 from nsf.pipeline.plan import Plan
-from nsf.reporting.drawing.search import OBJECTIVES, write_search
+from nsf.results.search import OBJECTIVES, write_search
 from nsf.runs.canonical import content_hash
 from nsf.storage import locked
 

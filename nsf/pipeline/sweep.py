@@ -49,7 +49,7 @@ def work(config: DictConfig, stages: Sequence[str], say: Callable[[str], object]
         NSFError: of every kind that a stage raises.
     """
     if "point" in stages:
-        from nsf.reporting.drawing.point import plot_point
+        from nsf.results.point import plot_point
 
         return plot_point(config)
     names = Names(config)

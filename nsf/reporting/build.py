@@ -11,7 +11,6 @@ from nsf.reporting.pictures import draw
 from nsf.reporting.rivals import beside_rivals, side_by_side
 from nsf.reporting.sources import Source, Study, file_hash, open_sources
 from nsf.reporting.study import over_seeds, swept, trust_table
-from nsf.reporting.swap import MARK, replaced
 from nsf.reporting.tables import (
     PAPER,
     VARIANT,
@@ -25,8 +24,9 @@ from nsf.reporting.tables import (
     without_constants,
 )
 from nsf.reporting.text.columns import ABSENT, COSTS, RIVALS, axis, parameter_text
-from nsf.reporting.text.formats import Rows, latex_table, spreadsheet
-from nsf.reporting.text.page import Page, Table, html_page, markdown_page
+from nsf.results.folder import MARK, replaced
+from nsf.results.formats import Rows, latex_table, spreadsheet
+from nsf.results.page import Page, Table, html_page, markdown_page
 
 _LEAD = (
     "A reduced-order model of elastoplastic material (Neural Stress Fields) runs beside the full-order "

@@ -22,11 +22,11 @@ from nsf.reporting.headline import headline
 from nsf.reporting.rivals import where_rivals_win
 from nsf.reporting.sources import file_hash
 from nsf.reporting.summary import Report
-from nsf.reporting.swap import MARK
 from nsf.reporting.tables import VARIANT, rows_of, without_constants
 from nsf.reporting.text.columns import ABSENT, RIVALS, SETTING
-from nsf.reporting.text.formats import Rows, markdown, markdown_document, markdown_table, unescaped
-from nsf.reporting.text.page import DEFINITIONS
+from nsf.results.folder import MARK
+from nsf.results.formats import Rows, markdown, markdown_document, markdown_table, unescaped
+from nsf.results.page import DEFINITIONS
 from nsf.runs.provenance import not_ignored
 from nsf.storage import writing
 

@@ -8,8 +8,8 @@ import pandas as pd
 
 from nsf.reporting.sources import Source, checked_hash
 from nsf.reporting.text.columns import Column, parameter_text
-from nsf.reporting.text.formats import Rows, file_name, spreadsheet
-from nsf.reporting.text.page import Picture, Section, Table
+from nsf.results.formats import Rows, file_name, spreadsheet
+from nsf.results.page import Picture, Section, Table
 
 _TABLE, _PICTURE = "superresolution.csv", "superresolution.png"
 _HEADING = "At many more points"

@@ -21,7 +21,7 @@ from nsf.reporting.summary import (
     ranked,
 )
 from nsf.reporting.text.columns import ABSENT, COLUMN, axis, brief, number, parameter_text, plus_minus
-from nsf.reporting.text.formats import Rows
+from nsf.results.formats import Rows
 
 FEW = 15  # rows of a table in which a number is varied; of more, settings and scenes go down and across
 MANY = 24  # rows where none is, as in the paper's Table 1

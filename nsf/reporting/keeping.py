@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from nsf.errors import SchemaError
-from nsf.reporting.swap import MARK
+from nsf.results.folder import MARK
 from nsf.runs.manifest import altered, digest
 
 #: Files of an evaluate run that a report reads.

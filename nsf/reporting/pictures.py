@@ -11,7 +11,6 @@ from joblib.externals.loky import ProcessPoolExecutor
 
 from nsf.reporting.bodies import shapes
 from nsf.reporting.drawing import charts
-from nsf.reporting.drawing.style import DIFFERENCE_COLORS, STRESS_COLORS, save
 from nsf.reporting.keeping import Kept
 from nsf.reporting.rivals import over_cost
 from nsf.reporting.sections.cases import cases_section
@@ -30,8 +29,9 @@ from nsf.reporting.tables import (
     variants,
 )
 from nsf.reporting.text.columns import MEASURED, parameter_text, speedups
-from nsf.reporting.text.formats import file_name
-from nsf.reporting.text.page import Picture, Section
+from nsf.results.formats import file_name
+from nsf.results.page import Picture, Section
+from nsf.results.style import DIFFERENCE_COLORS, STRESS_COLORS, save
 
 FRAMES = 31  # of an animation
 BASELINE = "deformation_only"

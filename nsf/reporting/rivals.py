@@ -7,7 +7,6 @@ from pathlib import Path
 import pandas as pd
 
 from nsf.reporting.drawing.cost import error_over_cost, step_over_particles
-from nsf.reporting.drawing.style import save
 from nsf.reporting.study import SEEDS, unseeded
 from nsf.reporting.tables import (
     VARIANT,
@@ -29,7 +28,8 @@ from nsf.reporting.text.columns import (
     parameter_text,
     split_rank,
 )
-from nsf.reporting.text.page import Picture, Table
+from nsf.results.page import Picture, Table
+from nsf.results.style import save
 
 _FULL = "full order"
 _PLACE = ("scene", "precision", "device")

@@ -9,7 +9,6 @@ import numpy as np
 import pandas as pd
 
 from nsf.reporting.drawing import charts
-from nsf.reporting.drawing.style import save
 from nsf.reporting.sources import Study
 from nsf.reporting.tables import (
     SIZE,
@@ -23,8 +22,9 @@ from nsf.reporting.tables import (
     variants,
 )
 from nsf.reporting.text.columns import COLUMN, axis, counted, distinct, number, plus_minus, telling
-from nsf.reporting.text.formats import Rows
-from nsf.reporting.text.page import Picture, Section, Table
+from nsf.results.formats import Rows
+from nsf.results.page import Picture, Section, Table
+from nsf.results.style import save
 
 _SCENE, _RUN, _PAPER = "scene", "run", "the paper's δ"
 SEEDS = ("seed", "sampler.seed")

@@ -30,7 +30,7 @@ from nsf.reporting.text.columns import (
     speedups,
     split_rank,
 )
-from nsf.reporting.text.formats import Rows, terminal_table
+from nsf.results.formats import Rows, terminal_table
 from nsf.runs.columns import CASE, TITLES, cell, differing
 from nsf.runs.listing import Entry
 

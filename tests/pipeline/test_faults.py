@@ -409,7 +409,7 @@ def test_a_folder_of_runs_that_goes_while_it_is_written(refused, copied, tmp_pat
 def test_a_folder_of_reports_that_goes_while_it_is_written(refused, copied, tmp_path):
     root = copied(*STAGES)
     reports = tmp_path / "work" / "reports"
-    faults = [PlainReport(), GoneAt("nsf.reporting.swap:_take_place", 1, reports)]
+    faults = [PlainReport(), GoneAt("nsf.results.folder:_take_place", 1, reports)]
     line = refused("report", root, faults=faults)
     assert str(reports) in line
     assert "was not written" in line

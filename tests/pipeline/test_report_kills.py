@@ -7,14 +7,14 @@ import pytest
 from forked import BriefReport, PlainReport, SignalAt, run_nsf
 
 from nsf.reporting.keeping import MADE_OF
-from nsf.reporting.swap import MARK
+from nsf.results.folder import MARK
 from nsf.storage import locked
 
 #: In the middle of the pictures, before the page, and between the two renames of the exchange.
 MOMENTS = {
     "drawing": ("nsf.reporting.pictures:save", 3),
     "writing": ("nsf.reporting.build:markdown_page", 1),
-    "exchanging": ("nsf.reporting.swap:Path.rename", 2),
+    "exchanging": ("nsf.results.folder:Path.rename", 2),
 }
 
 

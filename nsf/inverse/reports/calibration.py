@@ -15,10 +15,10 @@ from nsf.inverse.observations import AXES, Observations, View
 from nsf.inverse.reports.charts import points_chart, residuals_chart
 from nsf.inverse.reports.page import Results, write
 from nsf.inverse.space import Space
-from nsf.reporting.drawing.style import save
 from nsf.reporting.text.columns import axis, number
-from nsf.reporting.text.formats import Rows
-from nsf.reporting.text.page import Picture, Section, Table
+from nsf.results.formats import Rows
+from nsf.results.page import Picture, Section, Table
+from nsf.results.style import save
 
 _LEAD = (
     "The parameters under which runs by operators pass what was observed, with the uncertainty that the "

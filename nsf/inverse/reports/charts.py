@@ -6,8 +6,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from nsf.reporting.drawing.style import FULL, INK, MUTED, PALETTE, figure, line_style, styled
 from nsf.reporting.text.columns import axis
+from nsf.results.style import FULL, INK, MUTED, PALETTE, figure, line_style, styled
 
 _BODY = 1500  # particles that show a body
 

@@ -11,7 +11,7 @@ from nsf.evaluation.quantities import QUANTITIES
 from nsf.inverse.model import Model
 from nsf.inverse.observations import Observations, View, is_scalar
 from nsf.inverse.space import Space
-from nsf.reporting.swap import check_place
+from nsf.results.folder import check_place
 from nsf.runs import Run
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"

@@ -12,10 +12,10 @@ from nsf.inverse.error import ModelError
 from nsf.inverse.observations import View
 from nsf.inverse.reports.charts import program_chart, residuals_chart
 from nsf.inverse.reports.page import Results, write
-from nsf.reporting.drawing.style import save
 from nsf.reporting.text.columns import number
-from nsf.reporting.text.formats import Rows
-from nsf.reporting.text.page import Picture, Section, Table
+from nsf.results.formats import Rows
+from nsf.results.page import Picture, Section, Table
+from nsf.results.style import save
 
 #: Tolerances (RMS) beyond which the targets count as missed.
 _MISSED = 3.0

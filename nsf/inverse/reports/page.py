@@ -9,10 +9,10 @@ import pandas as pd
 
 from nsf.reporting.build import commit_text
 from nsf.reporting.sources import file_hash
-from nsf.reporting.swap import MARK, replaced
 from nsf.reporting.text.columns import ABSENT
-from nsf.reporting.text.formats import Rows, spreadsheet
-from nsf.reporting.text.page import Page, Picture, Section, Table, html_page, markdown_page
+from nsf.results.folder import MARK, replaced
+from nsf.results.formats import Rows, spreadsheet
+from nsf.results.page import Page, Picture, Section, Table, html_page, markdown_page
 from nsf.runs import Run
 from nsf.runs.provenance import provenance
 

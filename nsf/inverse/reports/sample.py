@@ -17,10 +17,10 @@ from nsf.inverse.reports.charts import bands_chart, indices_chart, posterior_cha
 from nsf.inverse.reports.page import Results, write
 from nsf.inverse.sampling import LEVELS, Asked, Prior, runs, sensitivities
 from nsf.inverse.space import Space
-from nsf.reporting.drawing.style import save
 from nsf.reporting.text.columns import axis, number
-from nsf.reporting.text.formats import Rows
-from nsf.reporting.text.page import Picture, Section, Table
+from nsf.results.formats import Rows
+from nsf.results.page import Picture, Section, Table
+from nsf.results.style import save
 from nsf.runs import Run
 
 _LEAD = "What runs by operators make of parameters that are drawn from stated distributions."

@@ -11,10 +11,10 @@ from nsf.inverse.model import Model
 from nsf.inverse.reports.charts import trials_chart
 from nsf.inverse.reports.page import Results, write
 from nsf.inverse.trials import Trials, run
-from nsf.reporting.drawing.style import save
 from nsf.reporting.text.columns import axis, number
-from nsf.reporting.text.formats import Rows
-from nsf.reporting.text.page import Picture, Section, Table
+from nsf.results.formats import Rows
+from nsf.results.page import Picture, Section, Table
+from nsf.results.style import save
 
 _HEADINGS = (
     "scene", "parameter", "range", "trials", "median |off|", "largest |off|", "median |off| [% of range]",

@@ -264,7 +264,7 @@ def write_superresolution(
 ) -> pd.DataFrame:
     """Write `superresolution.csv` and `superresolution.png` into a run's folder; gives the table."""
     from nsf.reporting.bodies.shapes import fine_shapes
-    from nsf.reporting.drawing.style import PIXELS, STRESS_COLORS, write_png
+    from nsf.results.style import PIXELS, STRESS_COLORS, write_png
 
     table = pd.DataFrame([f.row for f in fine])
     with writing(record.path / "superresolution.csv") as partial:

@@ -6,7 +6,7 @@ import matplotlib
 import numpy as np
 from PIL import Image
 
-from nsf.reporting.drawing.style import STRESS_COLORS
+from nsf.results.style import STRESS_COLORS
 
 
 def gif(images: list[Image.Image], max_bytes: int) -> bytes:

@@ -14,7 +14,9 @@ from nsf.reporting.bodies.camera import Camera, View
 from nsf.reporting.bodies.gif import gif
 from nsf.reporting.bodies.sheet import Sheet
 from nsf.reporting.bodies.solids import Face, faces, reaches, upright
-from nsf.reporting.drawing.style import (
+from nsf.reporting.sources import Motion
+from nsf.reporting.text.columns import parameter_text
+from nsf.results.style import (
     CLIP,
     DIFFERENCE_COLORS,
     METRES,
@@ -24,8 +26,6 @@ from nsf.reporting.drawing.style import (
     ColorScale,
     styled,
 )
-from nsf.reporting.sources import Motion
-from nsf.reporting.text.columns import parameter_text
 from nsf.vectors import spaced
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from matplotlib.lines import Line2D
 from PIL import Image
 
 from nsf.reporting.bodies.camera import View
-from nsf.reporting.drawing.style import INK, MUTED, WARNING, WIDTH, ColorScale
+from nsf.results.style import INK, MUTED, WARNING, WIDTH, ColorScale
 
 
 class Sheet:

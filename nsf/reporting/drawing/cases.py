@@ -14,10 +14,10 @@ from matplotlib.lines import Line2D
 from matplotlib.transforms import offset_copy
 
 from nsf.reporting.drawing.cost import solver_styles
-from nsf.reporting.drawing.scales import LOST, error_scale, plain_ticks
-from nsf.reporting.drawing.style import FULL, INK, WARNING, WIDTH, figure, legend_above, styled
 from nsf.reporting.text.columns import axis, number
-from nsf.reporting.text.formats import plain
+from nsf.results.formats import plain
+from nsf.results.scales import LOST, error_scale, plain_ticks
+from nsf.results.style import FULL, INK, WARNING, WIDTH, figure, legend_above, styled
 
 _ACROSS, _MAPS = 3, 4  # panels in a row: of one parameter, and of two
 _FEWEST = 6  # cases of which means of neighbours say anything

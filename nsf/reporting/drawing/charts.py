@@ -10,8 +10,9 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from nsf.reporting.drawing.scales import LOST, error_scale, plain_ticks, set_apart
-from nsf.reporting.drawing.style import (
+from nsf.reporting.text.columns import axis, number, parameter_text
+from nsf.results.scales import LOST, error_scale, plain_ticks, set_apart
+from nsf.results.style import (
     FULL,
     INK,
     MUTED,
@@ -24,7 +25,6 @@ from nsf.reporting.drawing.style import (
     stage_colors,
     styled,
 )
-from nsf.reporting.text.columns import axis, number, parameter_text
 
 OVER_TIME = {
     "delta": "relative deformation error δ",

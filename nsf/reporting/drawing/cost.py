@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from matplotlib.figure import Figure
 
 from nsf.reporting.drawing.levels import LEVELS
-from nsf.reporting.drawing.scales import LOST, plain_ticks, set_apart
-from nsf.reporting.drawing.style import FULL, INK, MUTED, PALETTE, figure, legend_above, styled
+from nsf.results.scales import LOST, plain_ticks, set_apart
+from nsf.results.style import FULL, INK, MUTED, PALETTE, figure, legend_above, styled
 
 _FULL = "full order"  # begins the names of full-order solvers
 _ACROSS = 3  # panels in a row

@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from nsf.reporting.drawing.scales import LOST, plain_ticks
-from nsf.reporting.drawing.style import DASHES, FULL, INK, PALETTE, figure, styled
+from nsf.results.scales import LOST, plain_ticks
+from nsf.results.style import DASHES, FULL, INK, PALETTE, figure, styled
 
 _LINE = 34  # letters of a name in a line
 

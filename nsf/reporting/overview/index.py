@@ -13,9 +13,9 @@ from PIL import Image
 from nsf.data import Trajectory
 from nsf.data.schema import TRAJECTORY
 from nsf.deployment import Rollout
-from nsf.reporting.drawing.style import FULL, PALETTE, REDUCED, figure, styled
 from nsf.reporting.overview.tables import texts
-from nsf.reporting.text.formats import HTML
+from nsf.results.formats import HTML
+from nsf.results.style import FULL, PALETTE, REDUCED, figure, styled
 from nsf.runs import Run
 from nsf.runs.listing import FIELDS, Entry, entries, text
 from nsf.storage import writing

@@ -9,13 +9,13 @@ import pandas as pd
 from nsf.data.case import Case
 from nsf.errors import ConfigError
 from nsf.reporting.drawing.cases import COLORS, Cases, Parameter, error_maps, error_over_parameters
-from nsf.reporting.drawing.scales import LOST
-from nsf.reporting.drawing.style import save
 from nsf.reporting.sections.variant import Variant
 from nsf.reporting.study import SEEDS
 from nsf.reporting.tables import VARIANT, setting_without, variant_labels
 from nsf.reporting.text.columns import SETTING, telling
-from nsf.reporting.text.page import Picture, Section
+from nsf.results.page import Picture, Section
+from nsf.results.scales import LOST
+from nsf.results.style import save
 
 _LOST = f"A run is lost that diverged or is off by more than {LOST:,.0f} %."
 _Alike = Sequence[Variant]

@@ -5,13 +5,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from nsf.reporting.drawing.levels import levels_over_time, name_of
-from nsf.reporting.drawing.style import save
 from nsf.reporting.sections.variant import Variant
 from nsf.reporting.study import SEEDS
 from nsf.reporting.tables import setting_without
 from nsf.reporting.text.columns import SETTING, parameter_text
-from nsf.reporting.text.formats import file_name
-from nsf.reporting.text.page import Picture, Section
+from nsf.results.formats import file_name
+from nsf.results.page import Picture, Section
+from nsf.results.style import save
 
 #: Columns that variants have in common whose steps are the same but for the engine.
 _ALIKE = ("method", "field", "r", "precision", "device")

@@ -4,13 +4,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from nsf.reporting.bodies import shapes
-from nsf.reporting.drawing.style import DIFFERENCE_COLORS, STRESS_COLORS, save
 from nsf.reporting.sections.variant import ROWS, Variant, order
 from nsf.reporting.sources import Study
 from nsf.reporting.study import SEEDS
 from nsf.reporting.text.columns import brief, telling
-from nsf.reporting.text.formats import file_name
-from nsf.reporting.text.page import Picture, Section
+from nsf.results.formats import file_name
+from nsf.results.page import Picture, Section
+from nsf.results.style import DIFFERENCE_COLORS, STRESS_COLORS, save
 from nsf.vectors import spaced
 
 _TOLD = (

@@ -6,7 +6,7 @@ import pytest
 from matplotlib.figure import Figure
 from PIL import Image
 
-from nsf.reporting.drawing.style import indexed, write_png
+from nsf.results.style import indexed, write_png
 
 
 @pytest.fixture(scope="module")

@@ -11,12 +11,12 @@ from synthetic import TEST, Made, rewrite_manifest, seal, write_run
 from nsf.errors import ConfigError, StorageError
 from nsf.reporting import build, build_report, pictures
 from nsf.reporting.bodies import camera
-from nsf.reporting.drawing import style
 from nsf.reporting.sections.variant import Variant, order
 from nsf.reporting.sources import Source, Study, file_hash, open_sources
 from nsf.reporting.study import estimate_note, spearman, trust_note
 from nsf.reporting.tables import merge
 from nsf.reporting.text.columns import number
+from nsf.results import style
 from nsf.runs import Run
 
 ERRORS = ("error-over-time.png", "error-over-time.svg")

@@ -14,11 +14,11 @@ from nsf.reporting.bodies.camera import Camera, View
 from nsf.reporting.bodies.shapes import Case, animation, final_shapes, hides_stress, is_cut_open, strip
 from nsf.reporting.drawing import charts
 from nsf.reporting.drawing.cost import error_over_cost, solver_styles, step_over_particles
-from nsf.reporting.drawing.point import point_chart, point_response
-from nsf.reporting.drawing.scales import plain_ticks, set_apart
-from nsf.reporting.drawing.search import search_chart
-from nsf.reporting.drawing.style import LETTER, legend_above, save, styled
 from nsf.reporting.sources import Motion
+from nsf.results.point import point_chart, point_response
+from nsf.results.scales import plain_ticks, set_apart
+from nsf.results.search import search_chart
+from nsf.results.style import LETTER, legend_above, save, styled
 
 RED, BLUE = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
 

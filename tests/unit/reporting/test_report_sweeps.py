@@ -17,7 +17,7 @@ from nsf.reporting.sources import Study, open_sources
 from nsf.reporting.study import _name, _settings, _told, interval, over_seeds, swept
 from nsf.reporting.tables import means, merge, rows_of
 from nsf.reporting.text.columns import brief, counted, distinct, plus_minus, telling
-from nsf.reporting.text.formats import latex, latex_table
+from nsf.results.formats import latex, latex_table
 
 VALUES = (22.5, 27.5)
 

@@ -25,7 +25,7 @@ from nsf.reporting.tables import (
     without_constants,
 )
 from nsf.reporting.text.columns import COLUMN, COSTS, RIVALS, number, parameter_text, speedups
-from nsf.reporting.text.formats import HTML, markdown_table
+from nsf.results.formats import HTML, markdown_table
 
 EARLIER, LATER = "2024-05-01T10:00:00+00:00", "2024-06-01T10:00:00+00:00"
 

@@ -14,7 +14,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from PIL import Image
 
-from nsf.reporting.text.formats import plain
+from nsf.results.formats import plain
 
 INK, MUTED, GRID, WARNING = "#222222", "#666666", "#dddddd", "#B04A00"
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from nsf.reporting.text.formats import HTML, Rows, markdown_document
+from nsf.results.formats import HTML, Rows, markdown_document
 
 DEFINITIONS = (
     (

@@ -8,13 +8,13 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from rich.table import Table
 
-from nsf.reporting.drawing.style import MUTED, PALETTE, figure, save, styled
-from nsf.reporting.text.columns import COLUMN, Column
-from nsf.reporting.text.formats import Rows, spreadsheet, terminal_table
+from nsf.results.columns import COLUMNS, Column
+from nsf.results.formats import Rows, spreadsheet, terminal_table
+from nsf.results.style import MUTED, PALETTE, figure, save, styled
 from nsf.storage import writing
 
 #: What a search can make small, by the name that a user gives it.
-OBJECTIVES: dict[str, Column] = {"delta": COLUMN["delta"], "step_ms": COLUMN["step_ms_reduced"]}
+OBJECTIVES: dict[str, Column] = {"delta": COLUMNS["delta"], "step_ms": COLUMNS["step_ms"]}
 
 
 def write_search(table: pd.DataFrame, keys: Sequence[str], objectives: Sequence[str], folder: Path) -> Path:
@@ -51,7 +51,7 @@ def best_table(path: Path) -> Table:
     best = trials[trials["pareto"]].drop(columns=["pareto", "error"])
     columns = [OBJECTIVES.get(name, Column(name, name)) for name in best]
     body = [
-        [column.text(row[name]) for name, column in zip(best, columns, strict=True)]
+        [column.cell(row[name]) for name, column in zip(best, columns, strict=True)]
         for row in best.to_dict("records")
     ]
     return terminal_table(Rows([column.heading for column in columns], body, [False] * len(columns)))

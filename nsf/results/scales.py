@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from nsf.reporting.drawing.style import LETTER
+from nsf.results.style import LETTER
 
 LOST = 1000.0  # [%] error from which a run is lost, by how much tells nothing: axes end there
 

@@ -110,7 +110,7 @@ def address(path) -> Markup:
 def _environment(write, **signs) -> Environment:
     """Templates of a format, whose values `write` escapes."""
     environment = Environment(
-        loader=PackageLoader("nsf.reporting"), undefined=StrictUndefined, autoescape=True,
+        loader=PackageLoader("nsf.results"), undefined=StrictUndefined, autoescape=True,
         finalize=lambda value: value if hasattr(value, "__html__") else Markup(write(value)),
         trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, **signs,
     )  # fmt: skip

@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 from nsf import config as configuration
 from nsf.errors import ConfigError
 from nsf.mpm.materials import deformation_path, drive
-from nsf.reporting.drawing.style import PALETTE, styled
+from nsf.results.style import PALETTE, styled
 from nsf.storage import writing
 
 _MOST_POINTS = 1_000_000
