@@ -7,6 +7,8 @@ from nsf.errors import ConfigError
 
 #: A dotted key, or `key=option`, and the remedy.
 REMOVED = {
+    "deploy.tolerance": "deploy.on_distrust=projected hands a run by operators on where it is not believed",
+    "engine=closed": "choose engine=operators, or engine=auto",
     "trainer.devices": "a manifold trains on one device; hydra/launcher=joblib spreads jobs over GPUs",
 }
 

@@ -38,7 +38,6 @@ _SHAPE = Kind("nsf.scenes", "nsf.scenes.Shape", ("nsf.scenes.mesh_or_ball",))
 
 #: What each key expects; `*` stands for any name. A new group of conf/ is a line here.
 KINDS = {
-    "engine.closing": Kind("nsf.engines.closed", "nsf.engines.closed.Closing"),
     "engine.teaching": Kind("nsf.engines.operators", "nsf.engines.operators.Teaching"),
     "engine.teaching.symmetry": Kind("nsf.scenes", "nsf.scenes.Symmetry"),
     "field": Kind("nsf.kinematics.fields", "nsf.kinematics.training.train.Field"),

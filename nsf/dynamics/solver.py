@@ -171,7 +171,6 @@ class ReducedBatch:
             self._span = span
         elif span is not self._span:
             self._enter(span)
-        span.refresh()
 
     def _end_of_span(self) -> int:
         """Step with which the next span of time begins, or the scene's end."""

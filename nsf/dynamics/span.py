@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -29,23 +29,6 @@ class Particles(NamedTuple):
     tau: wp.array
     mass: wp.array
     volume0: wp.array
-
-
-class Closure(Protocol):
-    """Adds to the x̂_{n+1} of each run what a projected step lacks."""
-
-    def begin(self, first: bool) -> None:
-        """Go on from the latents of the record; `first`: at t = 0."""
-
-    def refresh(self) -> None:
-        """Take what a hand has changed of the forcing."""
-
-    def add(self) -> None:
-        """Add to the x̂_{n+1} that was recorded last."""
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes on the device."""
 
 
 class Span(ABC):
@@ -77,9 +60,6 @@ class Span(ABC):
     @abstractmethod
     def stages(self) -> Stages:
         """One step, stage by stage, in order."""
-
-    def refresh(self) -> None:  # noqa: B027 — most spans read the forcing of the moment where it lies
-        """Take what a hand has changed of the forcing; before each step, also of a captured one."""
 
     @abstractmethod
     def enter(self, first: bool) -> None:
@@ -125,15 +105,12 @@ class GridSpan(Span):
 
     Attributes:
         order: as given.
-        closure: what is added to x̂ after each projection (`nsf.engines.closed`); None for nothing.
         x, v: [B n, 3] position [m] and velocity [m/s]; G2P moves the first |S| rows of each run.
         C, tau: [B n, 3, 3] affine momentum [1/s] and Kirchhoff stress [Pa].
         mass, volume0, mu, lam: [B n] of the particles [kg, m³, Pa, Pa].
         size: n.
         particles: the rows that P2G reads, as Warp sees them; grid_step: P2G, and G2P of S.
     """
-
-    closure: Closure | None = None
 
     def __init__(self, batch: Batch, sets: ParticleSets, order: np.ndarray, at_sample: Restriction):
         super().__init__(batch, sets, at_sample)
@@ -157,25 +134,6 @@ class GridSpan(Span):
         self.C, self.tau = (self.x.new_zeros(len(self.x), 3, 3) for _ in range(2))
         self.bind(len(self.x))
 
-    @property
-    def closing(self) -> Stages:
-        """The stage that adds what the closure gives, where there is one."""
-        return {} if self.closure is None else {"closure": self.close}
-
-    def close(self) -> None:
-        """Add what the closure gives to the x̂_{n+1} that was projected."""
-        self.closure.add()
-
-    @override
-    def refresh(self) -> None:
-        if self.closure is not None:
-            self.closure.refresh()
-
-    @override
-    def enter(self, first: bool) -> None:
-        if self.closure is not None:
-            self.closure.begin(first)
-
     def bind(self, n: int) -> None:
         """Show the first n rows of the arrays to Warp."""
         precision = self.batch.shared.precision
@@ -190,5 +148,4 @@ class GridSpan(Span):
     def nbytes(self) -> int:
         own = (self.mass, self.volume0, self.mu, self.lam, self.initial_velocity, self.x, self.v)
         own += (self.C, self.tau)
-        closure = 0 if self.closure is None else self.closure.nbytes
-        return super().nbytes + self.grid_step.grid.nbytes + sum(a.nbytes for a in own) + closure
+        return super().nbytes + self.grid_step.grid.nbytes + sum(a.nbytes for a in own)

@@ -54,7 +54,6 @@ class Step(GridSpan):
             "p2g": self.p2g,
             "g2p": self.update_g2p,
             "inversion": self.project,
-            **self.closing,
         }
 
     def infer(self) -> None:
@@ -83,7 +82,6 @@ class Step(GridSpan):
 
     @override
     def enter(self, first: bool) -> None:
-        super().enter(first)
         if first:
             self.inference.begin_moving(self.record.now, self.initial_velocity, self.first_rate()[0])
         else:
@@ -161,7 +159,6 @@ class HistoryStep(Step):
             "grid": self.grid_step.update,
             "g2p": self.g2p_stress,
             "inversion": self.project,
-            **self.closing,
         }
 
     @override

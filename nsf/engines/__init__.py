@@ -11,7 +11,6 @@ if TYPE_CHECKING:
     from nsf.engines.base import Engine
     from nsf.engines.building import reduced, reduced_batch
     from nsf.engines.choice import ENGINES, choose
-    from nsf.engines.closed import Closed
     from nsf.engines.modal import Modal
     from nsf.engines.names import NAMES
     from nsf.engines.operators import Operators
@@ -20,7 +19,6 @@ if TYPE_CHECKING:
 __all__ = [
     "ENGINES",
     "NAMES",
-    "Closed",
     "Engine",
     "Modal",
     "Operators",

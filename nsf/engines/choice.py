@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from nsf.dynamics.setup import Setup
 from nsf.engines.base import Engine
 from nsf.engines.modal import Modal
-from nsf.engines.names import CLOSED, NAMES, OPERATORS
+from nsf.engines.names import NAMES, OPERATORS
 from nsf.engines.reference import Reference
 from nsf.errors import ConfigError
 
@@ -33,10 +33,10 @@ def choose(wanted: str | Engine, setups: Sequence[Setup]) -> tuple[Engine, str]:
         candidates = list(ENGINES)
     elif wanted in known:
         candidates = [known[wanted]]
-    elif wanted in (CLOSED, OPERATORS):
+    elif wanted == OPERATORS:
         raise ConfigError(
-            f"engine={wanted} needs what was taught; give engine=nsf.engines.{wanted.title()}.load(FILE) of "
-            "a teach run"
+            f"engine={wanted} needs what was taught; give engine=nsf.engines.Operators.load(FILE) of a "
+            "teach run"
         )
     else:
         raise ConfigError(f"engine={wanted} is unknown; choose one of {', '.join(NAMES)}")

@@ -14,12 +14,11 @@ from omegaconf import DictConfig
 from nsf import config as configuration
 from nsf.data import Case
 from nsf.dynamics import ParticleSets, ReducedBatch, ReducedMPM
-from nsf.engines import Closed, Engine, Operators
+from nsf.engines import Engine, Operators
 from nsf.kinematics.fields.mlp import MlpField
 from nsf.kinematics.manifold import Manifold
 from nsf.pipeline.plan import Plan
 from nsf.pipeline.reuse import report, reused, simulations
-from nsf.pipeline.stages.closing import close
 from nsf.pipeline.stages.deployment import CONFIGURATION, deploy_held_out
 from nsf.pipeline.stages.evaluation import evaluate, superresolve_held_out
 from nsf.pipeline.stages.simulation import Job, Shared, simulate
@@ -183,22 +182,21 @@ class Pipeline(Plan):
         return batch
 
     def teach(self) -> Run:
-        """The operators of the deployed step, or its closure, as the engine that is asked for needs them.
+        """The operators of the deployed step, where the engine that is asked for needs them.
 
         Raises:
             ConfigError: it does not.
         """
-        return self._made(self.taught, partial(teach if self.closing is None else close, self))
+        return self._made(self.taught, partial(teach, self))
 
     def operators(self) -> Operators:
-        """The operators or closure that were taught; their sample is that of all runs from here on.
+        """The operators that were taught; their sample is that of all runs from here on.
 
         Raises:
             MissingRunError: none were taught.
         """
         if self._taught is None:
-            kind = Operators if self.closing is None else Closed
-            self._taught = kind.load(self.taught.require().file(OPERATORS))
+            self._taught = Operators.load(self.taught.require().file(OPERATORS))
             self._samples = self._taught.samples
         return self._taught
 

@@ -14,9 +14,8 @@ from omegaconf import DictConfig, OmegaConf
 from nsf import config as configuration
 from nsf.config.code import code_of
 from nsf.data.case import Case
-from nsf.engines.closed.closing import Closing
 from nsf.engines.modal.mirrors import edits
-from nsf.engines.names import CLOSED, OPERATORS, RUNS
+from nsf.engines.names import OPERATORS, RUNS
 from nsf.engines.operators.teaching import Teaching, random_cases
 from nsf.errors import ConfigError
 from nsf.gpu import has_driver
@@ -50,8 +49,7 @@ class Names:
 
     Attributes:
         scene: that is trained on; deployed: that of the held-out simulations and of deployment.
-        engine: name of the engine that is asked for; teaching: of operators, None for another engine;
-            closing: of a closure, likewise.
+        engine: name of the engine that is asked for; teaching: of operators, None for another engine.
         coarse: factors of Δx of the full-order runs that a reduced one is held to.
         split: cases by their use.
         device: found once, so that a missing GPU is reported before any work.
@@ -87,16 +85,6 @@ class Names:
         if self.engine == OPERATORS:
             self.teaching = configuration.build(c.engine.teaching, "engine.teaching")
             check_lessons(c, self.teaching, self.of_runs)
-        self.closing: Closing | None = None
-        if self.engine == CLOSED:
-            self.closing = configuration.build(c.engine.closing, "engine.closing")
-            if self.scene.steps < 2:
-                raise ConfigError(f"engine={CLOSED} needs runs of 2 steps or more; raise scene.steps")
-            if c.deploy.dt_multiplier != 1:
-                raise ConfigError(
-                    f"engine={CLOSED} learns from steps of the scene's Δt, and deploy.dt_multiplier is "
-                    f"{c.deploy.dt_multiplier:g}; set it to 1, or engine=auto"
-                )
         self.coarse = factors("evaluation.coarse", OmegaConf.select(c, "evaluation.coarse", default=[]))
         check_words(c, self.engine)
         check_batch(c, self.engine)
@@ -127,13 +115,11 @@ class Names:
     @property
     def is_taught(self) -> bool:
         """Whether the engine that is asked for is of a file that the stage `teach` writes."""
-        return self.teaching is not None or self.closing is not None
+        return self.teaching is not None
 
     @property
     def projecting(self) -> str:
         """The engine of steps that are projected: that which is asked for, or which learned ones build on."""
-        if self.closing is not None:
-            return "auto"
         if self.teaching is None:
             return self.engine
         return "auto" if self.of_runs else self.config.engine.teacher
@@ -236,7 +222,7 @@ class Names:
         if self.engine != "auto":
             content["engine"] = self.engine
         if self.teaching is not None:
-            content |= {"check": self.config.engine.check, "tolerance": self.config.deploy.tolerance}
+            content |= {"check": self.config.engine.check}
             if self.of_runs and self.error_ratio is not None:
                 content["error_ratio"] = self.error_ratio
         if changed := edits():  # an edited step is another run, whose result is not there yet
@@ -260,30 +246,25 @@ class Names:
 
     @property
     def taught(self) -> Run:
-        """The run of the operators, or of a closure.
+        """The run of the operators.
 
         Raises:
             ConfigError: the engine that is asked for learns nothing.
         """
         if not self.is_taught:
-            raise ConfigError(
-                f"engine={self.engine} is not taught; set engine={OPERATORS} or engine={CLOSED}"
-            )
+            raise ConfigError(f"engine={self.engine} is not taught; set engine={OPERATORS}")
         content = (
             self._content(("method", "sampler", "projector", "integration", "precision", "seed"))
             | self._physics(self.scene)
             | {"cases": [list(map(dict, cases)) for cases in self.lessons], "device": self.device}
         )
-        if self.closing is not None:
-            content["closing"] = asdict(self.closing)
-        else:
-            content |= {
-                "teaching": asdict(self.teaching),
-                "teacher": self.config.engine.teacher,
-                "dt_multiplier": self.config.deploy.dt_multiplier,
-            }
-            if not self.teaching.runs:  # as it was named before there was the key
-                content["teaching"].pop("runs")
+        content |= {
+            "teaching": asdict(self.teaching),
+            "teacher": self.config.engine.teacher,
+            "dt_multiplier": self.config.deploy.dt_multiplier,
+        }
+        if not self.teaching.runs:  # as it was named before there was the key
+            content["teaching"].pop("runs")
         if changed := edits():
             content["edited"] = changed
         return Run.open("teach", self.scene.name, content, [self.training], root=self.root)
@@ -298,8 +279,8 @@ class Names:
         """
         known, seed = sorted(self.split.train), int(self.config.seed)
         taken = [*known, *self.split.validation, *self.split.test]
-        if self.of_runs or self.closing is not None:
-            drawn = self.teaching.runs if self.of_runs else 0
+        if self.of_runs:
+            drawn = self.teaching.runs
             between = random_cases(self.split.box, drawn, seed, taken) if drawn else []
             return [known, between, sorted(self.split.validation) or known]
         between = random_cases(self.split.box, len(known), seed, taken)

@@ -73,8 +73,6 @@ class Plan(Names):
         """Refuse what asks for a step that x̂ and its last change determine: particles carry their stress."""
         if self.projecting == "modal":
             raise ConfigError("engine=modal does not know method=history; set engine=auto, or method=nsf")
-        if self.closing is not None:
-            raise ConfigError("engine=closed corrects steps of a stress field; set method=nsf")
         if self.teaching is not None and not self.of_runs:
             raise ConfigError(
                 f"engine.teacher={self.config.engine.teacher} is asked for single steps, which "

@@ -6,8 +6,8 @@ from pathlib import Path
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from nsf import config as configuration
-from nsf.engines.names import CLOSED, OPERATORS, RUNS
 from nsf.engines.names import NAMES as ENGINES
+from nsf.engines.names import OPERATORS, RUNS
 from nsf.engines.operators.teaching import Teaching
 from nsf.errors import ConfigError
 from nsf.kinematics.training.tracking import check_tracking
@@ -16,7 +16,7 @@ from nsf.kinematics.training.tracking import check_tracking
 STORED = ("float32", "float64")
 PRECISIONS = ("fp32", "fp64")
 #: What operators can be taught by: engines, or the full-order runs of training.
-TEACHERS = (*(name for name in ENGINES if name not in (CLOSED, OPERATORS)), RUNS)
+TEACHERS = (*(name for name in ENGINES if name != OPERATORS), RUNS)
 #: Least deployment step in units of the scene's: a thousand reduced steps for one are no reduction.
 _LEAST_STEP = 1e-3
 
@@ -122,15 +122,10 @@ def _check_levels(c: DictConfig, engine: str) -> None:
         raise ConfigError(
             f"deploy.error_ratio={ratio} must be positive, or null to leave all runs to operators"
         )
-    tolerance = OmegaConf.select(c.deploy, "tolerance", default=None)
-    if engine != OPERATORS:
-        if c.deploy.on_distrust == "projected" or tolerance is not None:
-            key = "tolerance" if tolerance is not None else "on_distrust"
-            raise ConfigError(f"deploy.{key}={c.deploy[key]} needs engine=operators; set it, or leave it out")
-        return
-    configuration.number("engine.check", c.engine.check, least=1, whole=True)
-    if tolerance is not None and not configuration.number("deploy.tolerance", tolerance) > 0:
-        raise ConfigError(f"deploy.tolerance={tolerance} m must be positive, or null for none")
+    if engine == OPERATORS:
+        configuration.number("engine.check", c.engine.check, least=1, whole=True)
+    elif c.deploy.on_distrust == "projected":
+        raise ConfigError("deploy.on_distrust=projected needs engine=operators; set it, or leave it out")
 
 
 def _check_paper(stated) -> None:

@@ -282,16 +282,14 @@ def trust_table(merged: Merged, renamed: Mapping[str, str]) -> list[Table]:
         times = {name: _or_nan(told[name]) for name in ("distrusted_at", "handed_over_at")}
         known = {name: row[name] for name in ("parameter", "split")}
         errors = {name: row[name] for name in ("estimated_error", "true_error")}
-        told = {"tolerance": merged.source[i].summary.get("tolerance"), "handed_over": row["handed_over"]}
-        rows.append(
-            {"method": label, **known, "trust": ratio, **times, "delta": row["delta"], **errors, **told}
-        )
+        errors["handed_over"] = row["handed_over"]
+        rows.append({"method": label, **known, "trust": ratio, **times, "delta": row["delta"], **errors})
     if not rows:
         return []
     frame = pd.DataFrame(rows)
     same, estimated = frame["method"].nunique() == 1, frame["estimated_error"].notna().any()
     unseen = [] if estimated else ["estimated_error", "true_error"]
-    shown = frame.drop(columns=[*unseen, "tolerance", "handed_over", *(["method"] if same else [])])
+    shown = frame.drop(columns=[*unseen, "handed_over", *(["method"] if same else [])])
     note = " ".join(filter(None, (trust_note(frame), estimate_note(frame))))
     return [Table("Trust", rows_of(shown, {**renamed, **_RENAMED}), note)]
 
@@ -300,26 +298,19 @@ def estimate_note(rows: pd.DataFrame) -> str:
     """How the estimate of runs by operators agrees with their true error; empty where there are too few.
 
     Args:
-        rows: `estimated_error` and `true_error` [m], `tolerance` [m] or none, and `handed_over`, the share of
-            the steps that operators did not take.
+        rows: `estimated_error` and `true_error` [m], and `handed_over`, the share of the steps that operators
+            did not take.
     """
     known = rows[rows["estimated_error"].notna() & (rows["handed_over"] < 1.0)]
     if len(known) < _ESTIMATED:
         return ""
     agreement = spearman(known["estimated_error"], known["true_error"])
-    said = (
+    return (
         "The estimated error is how far a run by operators goes from one by projected steps, RMS over the "
         "samples, as single projected steps tell. The true one is how far it goes from the full-order run, "
         "RMS over all particles, with the error of the projected steps in it. Both are the largest of a run. "
         f"Spearman's rank correlation of the two over {len(known)} runs is {agreement:.2f}."
     )
-    off = known[known["true_error"] > pd.to_numeric(known["tolerance"])]
-    if known["tolerance"].notna().any():
-        unseen = int((off["handed_over"] == 0.0).sum())
-        said += (
-            f" {len(off)} of them went further than their tolerance; {unseen} of these were not handed on."
-        )
-    return said
 
 
 def trust_note(rows: pd.DataFrame) -> str:

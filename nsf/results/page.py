@@ -25,7 +25,7 @@ DEFINITIONS = (
     (
         "engine",
         "what takes the steps. reference takes projected steps with any field and is not compiled. modal "
-        "takes them with fields of modes and is compiled. closed adds a learned correction to them. "
+        "takes them with fields of modes and is compiled. "
         "operators step the latent vector alone, by a learned recurrence.",
     ),
     (

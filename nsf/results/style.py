@@ -40,7 +40,6 @@ STAGE_COLORS = {
     "g2p": "#009E73",
     "stress": "#CC79A7",
     "transfer": "#999999",
-    "closure": "#000000",
 }
 STAGE_TITLES = {"p2g": "P2G", "g2p": "G2P"}
 

@@ -11,7 +11,7 @@ import torch
 from angles import angle
 
 from nsf.data import Trajectory
-from nsf.deployment import FULL_ORDER, OPERATORS, PROJECTED, Levels, Rollout, rollout, rollouts
+from nsf.deployment import OPERATORS, PROJECTED, Levels, Rollout, rollout, rollouts
 from nsf.deployment.levels import estimated_errors
 from nsf.dynamics import Method, Taylor
 from nsf.engines import Operators
@@ -200,7 +200,7 @@ def drawn(copied, pipeline_at):
 
 
 @pytest.mark.slow
-def test_projected_runs_in_drawn_cases_teach_too(drawn):
+def test_projected_runs_in_drawn_cases_teach_too(drawn, monkeypatch):
     pipeline = drawn()
     known, between, _ = pipeline.lessons
     assert len(between) == 3
@@ -211,7 +211,8 @@ def test_projected_runs_in_drawn_cases_teach_too(drawn):
     row = pd.read_csv(pipeline.evaluation.path / "results.csv").iloc[0]
     assert row["displacement_error"] < 0.06
     assert row["method"] == "history"
-    doubted = drawn(lambda line: None, "deploy.tolerance=1e-9")  # taken anew by projected steps
+    monkeypatch.setattr("nsf.deployment.levels._believed", lambda run, trust: 10)
+    doubted = drawn(lambda line: None, "deploy.on_distrust=projected")  # taken anew by projected steps
     for stage in ("deploy", "evaluate"):
         doubted.run(stage)
     anew = pd.read_csv(doubted.evaluation.path / "results.csv").iloc[0]
@@ -466,42 +467,15 @@ def test_the_estimate_is_how_far_projected_runs_are(reduced, lesson, levels_of):
     assert (batch.batch.record.residuals[:, 1:, -1] > 0).all()
 
 
-def test_projected_steps_that_go_on_keep_their_history(drawn, tiny_trust):
-    """Operators end in NaN after 6 steps; from there on each particle goes through all steps to the end."""
-    pipeline = drawn()
-    manifold = pipeline.manifold()
-    levels = Levels(lambda cases: pipeline.batch_at(manifold, cases, engine="auto"), 4)
-    batch = pipeline.batch_at(manifold, [angle(26.0)], engine="auto")
-    batch.step(24)
-    known = batch.batch.record.xhat[0].clone()
-    operators = levels.projected([angle(26.0)])
-    operators.step(24)
-    operators.batch.record.xhat[0, 7:] = torch.nan
-    by = np.full(24, PROJECTED, np.int8)
-    by[:6] = OPERATORS
-    solver = levels.projected([angle(26.0)]).runs[0]
-    levels._shared(operators.runs[0], solver, np.zeros(25), by, tiny_trust)
-    alone = levels.projected([angle(26.0)]).runs[0]
-    alone.record.xhat[:7] = known[:7]
-    alone.record.now.copy_(known[6])
-    alone.record.before.copy_(known[5])
-    alone.record.row.fill_(6)
-    alone.together.resume(6)
-    alone.step(18)
-    assert torch.equal(solver.record.xhat, alone.record.xhat)
-
-
-def test_beyond_a_tolerance_the_projected_step_goes_on(reduced, levels_of, tiny_trust):
+def test_where_it_is_not_believed_the_projected_step_goes_on(reduced, levels_of, tiny_trust, monkeypatch):
     own = rollouts(reduced().together, [angle(26.0)], tiny_trust, levels=levels_of())[0]
     assert (own.by_operators, own.levels.tolist()) == (24, [OPERATORS] * 24)
     assert own.estimate[0] == 0.0 < own.estimate[-1]
-    tolerance = 0.5 * float(own.estimate.max())
-    found = rollouts(reduced().together, [angle(26.0)], tiny_trust, levels=levels_of(tolerance))[0]
-    n = int(np.argmax(found.levels == PROJECTED))
-    assert 0 < n < 24
-    assert (found.levels[n : n + 4] == PROJECTED).all()
+    n = 10
+    monkeypatch.setattr("nsf.deployment.levels._believed", lambda run, trust: n)
+    found = rollouts(reduced().together, [angle(26.0)], tiny_trust, levels=levels_of(True))[0]
+    assert found.levels.tolist() == [OPERATORS] * n + [PROJECTED] * (24 - n)
     assert [stop == "operators" for stop in found.stops] == (found.levels == OPERATORS).tolist()
-    assert (found.estimate <= tolerance).all()
     np.testing.assert_array_equal(found.xhat[: n + 1], own.xhat[: n + 1])
     projected = reduced(engine="auto")
     for name, values in (("now", own.xhat[n]), ("before", own.xhat[n - 1])):
@@ -509,27 +483,19 @@ def test_beyond_a_tolerance_the_projected_step_goes_on(reduced, levels_of, tiny_
     projected.record.xhat[: n + 1] = torch.as_tensor(own.xhat[: n + 1])
     projected.record.row.fill_(n)
     projected.together.resume(n)
-    projected.step(4)
-    np.testing.assert_allclose(found.xhat[n + 4], projected.state.xhat, rtol=0, atol=1e-12)
+    projected.step(24 - n)
+    np.testing.assert_allclose(found.xhat[-1], projected.state.xhat, rtol=0, atol=1e-12)
 
 
-def test_what_is_doubted_is_projected_and_what_is_off_goes_to_full_order(reduced, levels_of, tiny_trust):
+def test_what_is_doubted_is_projected_where_that_may_go_on(reduced, levels_of, tiny_trust):
     outside = angle(60.0)
     solver = reduced(parameters=outside)
-    found = rollouts(solver.together, [outside], tiny_trust, levels=levels_of(None, True))[0]
+    found = rollouts(solver.together, [outside], tiny_trust, levels=levels_of(True))[0]
     assert (found.by_operators, found.levels.tolist()) == (0, [PROJECTED] * 24)
     assert reduced().doubt[0] <= 1.0
     plain = rollouts(reduced(parameters=outside).together, [outside], tiny_trust, levels=levels_of())[0]
     assert plain.by_operators == 24
     assert (plain.trust > 1.0).all()  # never without saying so
-    mixed = rollouts(reduced(parameters=outside).together, [outside], tiny_trust, levels=levels_of(1e-9))[0]
-    assert mixed.levels[-1] == PROJECTED
-    after = np.append(mixed.levels[:1], mixed.levels) == OPERATORS
-    assert (mixed.trust[after] > 1.0).all()
-    options = tiny_trust, True, levels_of(None, True)
-    handed = rollouts(reduced(parameters=outside).together, [outside], *options)[0]
-    own = len(handed.stops) if handed.handed_over < 0 else handed.handed_over
-    assert handed.levels.tolist() == [PROJECTED] * own + [FULL_ORDER] * (len(handed.stops) - own)
 
 
 def test_a_rollout_keeps_who_took_its_steps(lesson, tmp_path):
@@ -547,10 +513,10 @@ def test_a_rollout_keeps_who_took_its_steps(lesson, tmp_path):
     assert row["break_even_runs"] > offline / (1e-3 * 40 * row["step_ms_full"])
 
 
-def test_a_run_that_is_handed_on_costs_what_its_steps_cost(lesson, pipeline_at):
+def test_a_run_that_is_handed_on_costs_what_its_steps_cost(lesson, pipeline_at, monkeypatch):
     pipeline, _ = lesson
-    tolerance = 0.5 * Rollout.open(pipeline.deployment.path / "rollout_0.h5").estimate.max()
-    handed = pipeline_at(pipeline.root, *TAUGHT, f"deploy.tolerance={tolerance}")
+    monkeypatch.setattr("nsf.deployment.levels._believed", lambda run, trust: 10)
+    handed = pipeline_at(pipeline.root, *TAUGHT, "deploy.on_distrust=projected")
     for stage in ("deploy", "evaluate"):
         handed.run(stage)
     row = pd.read_csv(handed.evaluation.path / "results.csv").iloc[0]
@@ -569,9 +535,7 @@ def test_a_run_that_is_handed_on_costs_what_its_steps_cost(lesson, pipeline_at):
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (("deploy.tolerance=0.001",), "deploy.tolerance=0.001 needs engine=operators"),
         (("deploy.on_distrust=projected",), "deploy.on_distrust=projected needs engine=operators"),
-        ((*TAUGHT, "deploy.tolerance=-1.0"), "deploy.tolerance=-1.0 m must be positive, or null"),
         (("deploy.error_ratio=-3",), "deploy.error_ratio=-3 must be positive"),
         ((*TAUGHT, "deploy.error_ratio=0"), "deploy.error_ratio=0 must be positive, or null to leave"),
         ((*TAUGHT, "engine.check=0"), "engine.check=0 must be a whole number of at least 1"),

@@ -70,11 +70,10 @@ class ModalSpan(GridSpan):
     @override
     def stages(self) -> Stages:
         own = {"inference": self.infer, "p2g": self.p2g, "g2p": self.update_g2p, "inversion": self.project}
-        return own | self.closing
+        return own
 
     @override
     def enter(self, first: bool) -> None:
-        super().enter(first)
         state = self.coefficients
         with on_torch_stream(self._arena.device):
             for side in (_PREPARING, _CLEARING):  # where a step was left in its midst

@@ -46,7 +46,7 @@ class Operators(Engine):
         Raises:
             MissingRunError, SchemaError: see `StepOperators.load`.
         """
-        return cls(*StepOperators.load(path, cls.name))
+        return cls(*StepOperators.load(path))
 
     @override
     def refusal(self, setups: Sequence[Setup]) -> str:
@@ -123,16 +123,13 @@ class OperatorRun:
         """[B, lags] of the recorded runs at a step."""
         return self._model.lags_after(self._record.xhat[:, : step + 1])
 
-    def pushed(self, push: torch.Tensor, since: int = 0) -> torch.Tensor:
-        """[B, N + 1, r] latents of the same runs from a step on, with [B, N, r] added to their changes."""
-        own, steps = self._record.xhat, push.shape[1]
-        record = LatentRecord(own[:, 0], steps, 1)
-        record.row.fill_(since)
-        record.xhat[:, since] = own[:, since]
+    def pushed(self, push: torch.Tensor) -> torch.Tensor:
+        """[B, N + 1, r] latents of the same runs with [B, N, r] added to their changes."""
+        start, steps = self._record.xhat[:, 0], push.shape[1]
+        record = LatentRecord(start, steps, 1)
         again = self._of(self._gravity, self._states, record=record, push=push)
-        now, before = own[:, since].double(), own[:, max(0, since - 1)].double()
-        again.begin(now, now - before if since else self._first, self._lag(since))
-        again.advance(steps - since)
+        again.begin(start.double(), self._first)
+        again.advance(steps)
         return record.xhat
 
 
@@ -168,9 +165,9 @@ class OperatorSpan(Span):
     def take(self, steps: int) -> None:
         self._run.take(steps)
 
-    def pushed(self, push: torch.Tensor, since: int = 0) -> torch.Tensor:
+    def pushed(self, push: torch.Tensor) -> torch.Tensor:
         """As `OperatorRun.pushed`."""
-        return self._run.pushed(push, since)
+        return self._run.pushed(push)
 
     @property
     @override

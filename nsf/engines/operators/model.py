@@ -17,7 +17,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from nsf.engines.names import OPERATORS
 from nsf.engines.operators.taught import Taught
 from nsf.errors import ConfigError, MissingRunError, SchemaError, first_line
 from nsf.runs.manifest import verified
@@ -25,7 +24,7 @@ from nsf.sampling.sampler import SampleSpan
 from nsf.storage import writing
 
 FORMAT = "nsf-operators"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 
 
 @dataclass(frozen=True)
@@ -237,39 +236,26 @@ class StepOperators(nn.Module):
         last = torch.cat([B, f, G])
         return [first, middle, (last[:, :-1], last[:, -1])]
 
-    def save(
-        self, path: Path | str, taught: Taught, samples: Sequence[SampleSpan], engine: str = OPERATORS
-    ) -> None:
-        """Write weights, scales, for which engine and on what they were taught, and the sample.
-
-        Whole or not at all.
-        """
+    def save(self, path: Path | str, taught: Taught, samples: Sequence[SampleSpan]) -> None:
+        """Write weights, scales, on what they were taught, and the sample; whole or not at all."""
         content = {
             "format": FORMAT, "format_version": FORMAT_VERSION, "sizes": vars(self.sizes), "dt": self.dt,
-            "engine": engine, "taught": taught.plain(), "samples": [_plain(sample) for sample in samples],
+            "taught": taught.plain(), "samples": [_plain(sample) for sample in samples],
             "state": dict(self.state_dict()),
         }  # fmt: skip
         with writing(Path(path)) as temporary:
             torch.save(content, temporary)
 
     @classmethod
-    def load(
-        cls, path: Path | str, engine: str = OPERATORS
-    ) -> tuple["StepOperators", Taught, list[SampleSpan]]:
-        """Read operators of an engine, what they were taught on and the sample, onto the host.
+    def load(cls, path: Path | str) -> tuple["StepOperators", Taught, list[SampleSpan]]:
+        """Read operators, what they were taught on and the sample, onto the host.
 
         Raises:
             MissingRunError: there is no such file.
-            SchemaError: the file is truncated, foreign, of a newer format or another engine, or does not fit
-                together.
+            SchemaError: the file is truncated, foreign or of a newer format, or does not fit together.
         """
         path = Path(path)
         content = _read(path)
-        own = content.get("engine", OPERATORS)  # files from before there was another engine say none
-        if own != engine:
-            raise SchemaError(
-                f"{path} was taught for engine={own}, not for engine={engine}; pass another file"
-            )
         try:
             taught, sizes = Taught.read(content["taught"]), Sizes(**content["sizes"])
             samples = [_sample(span) for span in content["samples"]]

@@ -150,9 +150,11 @@ class Recurrence:
     ):
         where, dtype, r = torch_device(device), torch_dtype(precision), model.sizes.latents
         count = len(parameters)
-        self._model = model
         with torch.no_grad():
-            held = folded(model, parameters) | self._acting(gravity, features)
+            held = folded(model, parameters) | {
+                "states": model.collider_state(features).flatten(1),
+                "gravity": ((gravity - model.g_mean) / model.g_scale).flatten(1),
+            }
         held = {name: values.detach().to(where, dtype).contiguous() for name, values in held.items()}
         none = torch.zeros(0, 0, dtype=torch.float64, device=where)
         held["push"] = none if push is None else push.to(where).flatten(1)
@@ -170,18 +172,6 @@ class Recurrence:
         self._kernel = make_recurrence(precision, model.sizes, push is not None)
         self._lanes = block_of(model.sizes.width) if device.is_cuda else 1
         self._count, self._device = count, device
-
-    def _acting(self, gravity: torch.Tensor, features: torch.Tensor) -> dict[str, torch.Tensor]:
-        states = self._model.collider_state(features).flatten(1)
-        return {
-            "states": states,
-            "gravity": ((gravity - self._model.g_mean) / self._model.g_scale).flatten(1),
-        }
-
-    def follow(self, gravity: torch.Tensor, features: torch.Tensor) -> None:
-        """Take other gravity and states of the colliders, of the same shapes, where those of now lie."""
-        for name, values in self._acting(gravity, features).items():
-            self._held[name].copy_(values)
 
     def begin(self, xhat: torch.Tensor, change: torch.Tensor, lag: torch.Tensor | None = None) -> None:
         """Go on from x̂_n and d [B, r], and with a memory from its lags [B, lags]; None at t = 0."""

@@ -93,9 +93,8 @@ def trust_of(run: Run, manifold: Manifold, particles: np.ndarray, pipeline) -> T
 
 
 def calibrated(pipeline, manifold: Manifold) -> Trust:
-    """The trust estimate of a pipeline's runs, calibrated on projected, or closed, runs of training."""
-    steps_by = pipeline.projecting if pipeline.closing is None else None
-    projected = partial(pipeline.solver_at, manifold, engine=steps_by)
+    """The trust estimate of a pipeline's runs, calibrated on projected runs of training."""
+    projected = partial(pipeline.solver_at, manifold, engine=pipeline.projecting)
 
     def known_at(values: Mapping[str, float], device: str) -> ReducedMPM:
         """A run in the training case of some parameters, with its own program."""
@@ -160,8 +159,7 @@ def levels_of(pipeline, manifold: Manifold) -> Levels | None:
     return Levels(
         partial(pipeline.batch_at, manifold, engine=pipeline.projecting),
         pipeline.config.engine.check,
-        asked.tolerance,
-        asked.on_distrust != "report",
+        asked.on_distrust == "projected",
         _near(pipeline),
     )
 

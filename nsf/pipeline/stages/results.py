@@ -214,7 +214,6 @@ def summarise(
         "delta": mean("delta") if math.isfinite(mean("delta")) else None,
         "reconstruction_delta": mean("reconstruction_delta"),
         "reconstruction_stress_error": mean("reconstruction_stress_error"),
-        "tolerance": OmegaConf.select(config, "deploy.tolerance", default=None),
         "trust": [trust_of(rollout) for rollout in rollouts],
         "rivals": [
             {"parameter": rollout.case.column} | asdict(beside)

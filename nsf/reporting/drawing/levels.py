@@ -16,11 +16,9 @@ _LINE = 34  # letters of a name in a line
 LEVELS = {"operators": PALETTE[0], "projected step": PALETTE[1], "full-order solver": FULL}
 
 
-def name_of(series: pd.DataFrame, closed: bool = False) -> str:
-    """What a run is called by those who took its steps; `closed`: its projected steps have a closure."""
+def name_of(series: pd.DataFrame) -> str:
+    """What a run is called by those who took its steps."""
     names = [title for i, title in enumerate(LEVELS) if (series["by"] == i).any()]
-    if closed:
-        names = [name.replace("projected step", "projected step with a closure") for name in names]
     return f"{names[0]} alone" if len(names) == 1 else " and ".join(names)
 
 

@@ -46,15 +46,14 @@ def levels_section(known: Sequence[Variant], folder: Path) -> list[Section]:
         shown, runs = {}, {run for variant, _ in parts for run in variant.runs}
         several = len({_setting(variant) for variant, part in parts if (part["by"] == 0).any()}) > 1
         for variant, part in parts:
-            name = name_of(part, closed=variant.rows["engine"].iloc[0] == "closed")
+            name = name_of(part)
             if several and _setting(variant):
                 name += f", {_setting(variant)}"
             shown[f"{name}, {variant.label}" if name in shown else name] = part
         name, unit = own[0].parameter
         caption = (
             f"The displacement error over time at {name} {parameter_text(mixed[0], '', unit)}, and who took "
-            "each step: the operators; the projected step, where the estimated error passed its tolerance or "
-            "overflowed, or the run was not to be believed; and the operators again, where they are well."
+            "each step: the operators, and who went on where the run was not to be believed."
         )
         alone = len({variant.body for variant in known}) == 1
         stem = "levels" if alone else file_name(f"{body}-levels")
@@ -74,7 +73,7 @@ def _is_mixed(rows, value) -> bool:
 def lend_stages(known) -> None:
     """Show the stages of a projected step beside a run by operators, whose own step has but one.
 
-    That of a variant like it but for the engine, without a closure.
+    That of a variant like it but for the engine.
     """
     for v in known:
         if len(v.breakdown.get("reduced", {})) != 1:
@@ -82,6 +81,6 @@ def lend_stages(known) -> None:
         for other in known:
             stages = other.breakdown.get("reduced", {})
             alike = all(other.rows[key].iloc[0] == v.rows[key].iloc[0] for key in _ALIKE)
-            if len(stages) > 1 and "closure" not in stages and alike and other.alike == v.alike:
+            if len(stages) > 1 and alike and other.alike == v.alike:
                 v.breakdown, v.timed = v.breakdown | {"reduced": stages}, "the projected step's"
                 break

@@ -116,7 +116,6 @@ def test_two_samples_in_one_run_are_refused(chain, tiny_manifold):
     ("keys", "told"),
     [
         (["engine=modal"], "engine=modal does not know method=history; set engine=auto, or method=nsf"),
-        (["engine=closed"], "engine=closed corrects steps of a stress field; set method=nsf"),
         (
             ["engine=operators"],
             "teacher=auto is asked for single steps.*; set engine.teacher=runs, or",

@@ -215,7 +215,7 @@ def test_an_engine_is_asked_for(reduced):
     assert reduced(engine="modal").together.why == ""
     with pytest.raises(ConfigError, match=r"engine=fast is unknown; choose one of auto, .*operators"):
         reduced(engine="fast")
-    assert NAMES == ("auto", "modal", "reference", "closed", "operators")
+    assert NAMES == ("auto", "modal", "reference", "operators")
 
 
 def test_an_engine_of_ones_own(reduced):

@@ -62,26 +62,13 @@ def test_a_strip_has_a_span_for_each_step():
     assert {color for color, _, row in drawn if row == 1} == {projected}
 
 
-def test_a_closure_is_told_from_the_projected_step():
-    assert name_of(series_of(1, 1), closed=True) == "projected step with a closure alone"
-    assert name_of(series_of(0, 0), closed=True) == "operators alone"
+def test_runs_by_one_solver_alone_differ_in_their_dashes():
     figure = levels_over_time({"one": series_of(0, 1), "two": series_of(1, 1), "three": series_of(1, 1)})
     two, three = figure.axes[0].lines[1:]
     assert two.get_color() == three.get_color()
     assert two.get_linestyle() != three.get_linestyle()
     legend = {text.get_text() for text in figure.legends[0].get_texts()}
     assert {"one", "two", "three"} <= legend
-
-
-def test_a_picture_names_a_closure(tmp_path, monkeypatch):
-    told = []
-    monkeypatch.setattr(levels, "levels_over_time", lambda runs: told.extend(runs) or levels_over_time(runs))
-    closed = variant("closed", series_of(1, 1, 1), engine="closed")
-    alone = variant("auto", series_of(1, 1, 1))
-    levels_section([closed, alone, variant("levels", series_of(0, 1, 0))], tmp_path)
-    assert told == [
-        "projected step with a closure alone", "projected step alone", "operators and projected step",
-    ]  # fmt: skip
 
 
 def test_a_picture_names_what_operators_of_one_scene_set(tmp_path, monkeypatch):
@@ -128,12 +115,10 @@ def timed(engine, stages, device="cpu"):
 
 def test_beside_operators_stand_the_stages_of_the_projected_step():
     operators, other = (timed("operators", ["recurrence"], device) for device in ("cpu", "cuda:0"))
-    closed = timed("closed", ["inference", "p2g", "inversion", "closure"])
     modal = timed("modal", ["inference", "p2g", "inversion"])
-    lend_stages([operators, other, closed, modal])
+    lend_stages([operators, other, modal])
     assert list(operators.breakdown["reduced"]) == ["inference", "p2g", "inversion"]
     assert operators.breakdown["full_order"] == {"p2g": 1.0}  # its own
     assert operators.timed == "the projected step's"
     assert list(other.breakdown["reduced"]) == ["recurrence"]  # measured on another device
-    assert list(closed.breakdown["reduced"])[-1] == "closure"
-    assert closed.timed == modal.timed == other.timed == "a step's"
+    assert modal.timed == other.timed == "a step's"

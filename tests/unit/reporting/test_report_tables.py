@@ -261,7 +261,7 @@ def test_rivals_that_win_at_single_values_are_told_where_none_wins_in_the_mean(t
 
 def test_single_values_are_means_over_seeds(tmp_path):
     made = [Made(engine="modal", rivals=True, seed=seed, sample=100 + seed) for seed in (0, 1)]
-    made += [Made(engine="closed", rivals=True, seed=2)]
+    made += [Made(engine="operators", rivals=True, seed=2)]
     runs = [write_run(tmp_path / str(one.seed), one) for one in made]
     merged = merge(open_sources(runs), {run.id: f"seed={run.path.parts[-4]}" for run in runs})
     frame, value = merged.frame, merged.frame["parameter"].iloc[0]
