@@ -100,7 +100,7 @@ check-reports: install  ## whether reports/ is as it was generated
 
 # Every experiment, those of the paper's size first; calibration makes `inverse` and `tilt`.
 REPRODUCED := table1 table1_seeds operators floors operators_seeds width latent_dim ablation sample_size sampler timestep \
-	extrapolation weak_elements super_resolution path_dependent sand forcing small teaching \
+	extrapolation weak_elements super_resolution sand forcing small teaching \
 	noise_floor figures mlp mlp_steps forcing_r training cells cake_noise cake_runs stress \
 	large training_runs
 

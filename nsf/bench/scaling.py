@@ -153,8 +153,8 @@ def _built(
         (f"full_order_{size}", p): build(partial(scene.full_order, precision=p, device=device), device)
         for p in settings.precisions
     }
-    rest = torch.as_tensor(chain.scene.particles().X)[None]
-    xhat = chain.manifold().encode(rest, rest.new_zeros(*rest.shape[:2], 6))[0].numpy()
+    rest = torch.as_tensor(chain.scene.particles().X)
+    xhat = chain.manifold().encode(rest[None])[0].numpy()
     make = partial(
         scene.reduced, fields, chain.held_out[0], method=chain.method, device=device,
         projector=chain.projector, integration=chain.integration, xhat=xhat,

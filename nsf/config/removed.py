@@ -9,6 +9,8 @@ from nsf.errors import ConfigError
 REMOVED = {
     "deploy.tolerance": "deploy.on_distrust=projected hands a run by operators on where it is not believed",
     "engine=closed": "choose engine=operators, or engine=auto",
+    "field=joint": "use field=basis",
+    "sampler=greedy": "use sampler=qdeim or sampler=cubature",
     "trainer.devices": "a manifold trains on one device; hydra/launcher=joblib spreads jobs over GPUs",
 }
 

@@ -345,12 +345,11 @@ def _check_version(file: h5py.File) -> None:
         version = hdf5.attribute(file, "schema_version", int)
     except (KeyError, SchemaError) as error:
         raise SchemaError("is HDF5, but not written by nsf; give a file of `nsf simulate`") from error
-    if version > SCHEMA_VERSION:
+    if version != SCHEMA_VERSION:
         raise SchemaError(
-            f"has schema_version={version}, newer than {SCHEMA_VERSION}; upgrade nsf to read it"
+            f"has schema_version={version}, this nsf reads {SCHEMA_VERSION}; "
+            "simulate again with `nsf simulate`"
         )
-    if version < SCHEMA_VERSION:
-        raise SchemaError(f"has schema_version={version}, older than {SCHEMA_VERSION}")
 
 
 def _selection(wanted: Any, size: int, kind: str) -> range | np.ndarray:

@@ -101,9 +101,9 @@ class Setup:
         # On the host: a span takes the rows that it needs.
         velocity = _shaped("velocity", scene.initial_velocity() if velocity is None else velocity, (P, 3))
         self.initial_velocity = torch.as_tensor(velocity, dtype=self.dtype)
-        if xhat is None:  # a scene begins undeformed and free of stress
-            X = torch.as_tensor(self.constants.X, device=manifold.X.device)[None]
-            xhat = manifold.encode(X, X.new_zeros(*X.shape[:2], 6))[0].cpu()
+        if xhat is None:  # a scene begins undeformed
+            X = torch.as_tensor(self.constants.X, device=manifold.X.device)
+            xhat = manifold.encode(X[None])[0].cpu()
         self.xhat = tensor(_shaped("xhat", xhat, (manifold.latent_dim,)))
         self.sets = self._found_sets() if sets is None else list(sets)
 

@@ -155,7 +155,7 @@ def compare(
         if start == 0:
             v_rom[0] = v[0]
         previous = x_rom[-1]
-        encoded = manifold.encode(x, tau).to(setup.dtype)
+        encoded = manifold.encode(x).to(setup.dtype)
         x_rec, tau_rec = decoder.position(encoded), decoder.at.stress(encoded, parameters)
         note(
             x_error=metrics.frame_squares(x_rom - x),

@@ -25,7 +25,7 @@ from nsf.errors import MissingRunError, SchemaError, first_line
 from nsf.runs.manifest import verified
 
 FORMAT = "nsf-manifold"
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 FIELDS = "nsf.kinematics.fields"  # the package that holds every class a file may name
 
 _CLASS = re.compile(rf"({re.escape(FIELDS)}\.[A-Za-z]\w*)\.([A-Za-z]\w*)", re.ASCII)
@@ -96,12 +96,10 @@ def read(path: Path) -> dict[str, Any]:
         raise SchemaError(
             f"{path} is a torch file but no manifold of nsf; pass the checkpoint of a train run"
         )
-    if content.get("format_version") == 1 and isinstance(field := content.get("field"), str):
-        content |= {"manifold": f"{FIELDS}.{field}.{field.capitalize()}Manifold", "format_version": 2}
     if (version := content.get("format_version")) != FORMAT_VERSION:
         raise SchemaError(
-            f"{path} has format_version {_REPR.repr(version)}, this nsf reads {FORMAT_VERSION}; install the"
-            " nsf that wrote it or train again with `nsf train`"
+            f"{path} has format_version {_REPR.repr(version)}, this nsf reads {FORMAT_VERSION}; train again"
+            " with `nsf train`"
         )
     if missing := _KINDS.keys() - content.keys():
         raise SchemaError(f"{path} lacks {', '.join(sorted(missing))}; delete it and run `nsf train` again")

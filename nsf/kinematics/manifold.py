@@ -147,17 +147,12 @@ class Manifold(nn.Module, ABC):
 
     @property
     def field(self) -> str:
-        """Short name of its family, that of the module which defines it: "basis", "joint", "mlp"."""
+        """Short name of its family, that of the module which defines it: "basis", "mlp"."""
         return type(self).__module__.rpartition(".")[2]
 
     @abstractmethod
-    def encode(self, x: Tensor, tau: Tensor | None = None) -> Tensor:
-        """Latents xhat [F, r] (float64) of whole frames of the training particles.
-
-        Args:
-            x: [F, P, 3] m.
-            tau: Kirchhoff stress [F, P, 6] Pa; read only by a field that encodes it.
-        """
+    def encode(self, x: Tensor) -> Tensor:
+        """Latents xhat [F, r] (float64) of whole frames x [F, P, 3] m of the training particles."""
 
     @abstractmethod
     def restrict(

@@ -10,7 +10,7 @@ from nsf.export import web
 from nsf.live.model import LiveModel
 from nsf.live.player import Moment, Player
 
-FIELDS = ("basis", "joint")  # the fields of linear modes
+FIELDS = ("basis",)  # the fields of linear modes
 
 
 def field_message(model: LiveModel) -> bytes:

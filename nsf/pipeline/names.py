@@ -37,7 +37,7 @@ _SECTIONS = (
 #: Cases between the training ones whose runs decide which round of teaching is kept.
 HELD_BACK = 3
 #: Fields without `arithmetic`, known without importing them.
-_EXACT = ("nsf.kinematics.fields.basis.BasisField", "nsf.kinematics.fields.joint.JointField")
+_EXACT = ("nsf.kinematics.fields.basis.BasisField",)
 
 
 class Names:

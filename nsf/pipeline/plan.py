@@ -143,7 +143,7 @@ def check_batched(c: DictConfig, field, strategy: str) -> None:
         return
     if not isinstance(field, BasisField):
         raise ConfigError(
-            f"deploy.batch={size} needs field=basis or joint, whose steps are taken in coefficients; "
+            f"deploy.batch={size} needs field=basis, whose steps are taken in coefficients; "
             "set deploy.batch=1"
         )
     if strategy != "superset":

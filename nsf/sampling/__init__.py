@@ -3,12 +3,11 @@
 from nsf.sampling.cells import CellSampler
 from nsf.sampling.cubature import CubatureSampler
 from nsf.sampling.qdeim import QdeimSampler
-from nsf.sampling.sampler import GreedySampler, RandomSampler, Sampler, SampleSpan, UnweightedSampler
+from nsf.sampling.sampler import RandomSampler, Sampler, SampleSpan, UnweightedSampler
 
 __all__ = [
     "CellSampler",
     "CubatureSampler",
-    "GreedySampler",
     "QdeimSampler",
     "RandomSampler",
     "SampleSpan",

@@ -6,8 +6,10 @@ import torch
 from typing_extensions import override
 
 from nsf.errors import ConfigError
-from nsf.sampling.sampler import UnweightedSampler, displacement_components
+from nsf.sampling.sampler import UnweightedSampler
 
+_CHUNK = 2**25  # values decoded at once
+_SNAPSHOTS = 256  # latents that displacement modes are taken from
 _RANK = 1e-8  # singular value, of orthonormal modes' rows, below which a direction counts as told
 _NEWTON = 8  # steps; from below, on a convex function of slope -3/4 or less
 
@@ -47,6 +49,26 @@ class QdeimSampler(UnweightedSampler):
         U = orthonormal(components)[torch.as_tensor(candidates, device=components.device)]
         chosen = pivots(U, size)
         return candidates[[*chosen, *oversampled(U, chosen, size)]]
+
+
+@torch.no_grad()
+def displacement_components(manifold, count: int, device: str | torch.device = "cpu") -> torch.Tensor:
+    """Principal components [P, 3, k] [m] of g(X, x̂) over the training latents, k ≤ count, largest first.
+
+    Each is a mode times the standard deviation of its amplitude. A part of the latents, evenly spread
+    over the training, is enough for the leading ones.
+    """
+    M = len(manifold.training_latents)
+    latents = manifold.training_latents[torch.linspace(0, M - 1, min(M, _SNAPSHOTS)).long()].to(device)
+    chunks = torch.arange(len(manifold.X)).split(max(1, _CHUNK // (3 * len(latents))))
+
+    def deviations(particles: torch.Tensor) -> torch.Tensor:
+        x = manifold.restrict(particles, device=device).position(latents)
+        return (x - x.mean(0)).permute(1, 2, 0)
+
+    gram = sum(u.T @ u for u in (deviations(particles).flatten(0, 1) for particles in chunks))
+    directions = torch.linalg.eigh(gram).eigenvectors.flip(1)[:, :count] / len(latents) ** 0.5
+    return torch.cat([deviations(particles) @ directions for particles in chunks])
 
 
 def orthonormal(components: torch.Tensor) -> torch.Tensor:

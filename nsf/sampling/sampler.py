@@ -11,9 +11,6 @@ from typing_extensions import override
 
 from nsf.errors import ConfigError, ProjectionError
 
-_CHUNK = 2**25  # values decoded at once
-_SNAPSHOTS = 256  # latents that displacement modes are taken from
-
 
 class Teacher(Protocol):
     """A reduced solver whose sample is every particle, for a sampler that learns from its steps.
@@ -198,77 +195,6 @@ class RandomSampler(UnweightedSampler):
     def choose(self, manifold, candidates, size, device="cpu"):
         order = np.random.default_rng(self.seed).permutation(len(manifold.X))
         return order[np.isin(order, candidates)][:size]
-
-
-@dataclass(frozen=True)
-class GreedySampler(UnweightedSampler):
-    """Particles whose positions tell most about the whole body's: an answer to the paper's future work.
-
-    The amplitudes of the leading displacement modes are taken as Gaussian with their variances over the
-    training, and positions at S as known up to a noise. Each particle taken is the one that adds most
-    information on the amplitudes, log det(1 + R Σ Rᵀ/σ²), where R [3, k] are its components and Σ is what
-    those before it leave unknown. No random number is drawn.
-
-    Attributes:
-        modes: k, number of displacement modes.
-        noise: σ over the root mean square displacement from the mean.
-
-    Raises:
-        ConfigError: modes is not a positive whole number, or noise not positive.
-
-    Source: Krause, Singh and Guestrin 2008, near-optimal sensor placements in Gaussian processes; here a
-        sensor is a particle, its three coordinates at once.
-    """
-
-    modes: int = 24
-    noise: float = 1e-3
-
-    def __post_init__(self):
-        super().__post_init__()
-        if not isinstance(self.modes, int) or self.modes < 1:
-            raise ConfigError(f"sampler.modes={self.modes} must be a whole number of at least 1")
-        if not self.noise > 0:
-            raise ConfigError(f"sampler.noise={self.noise} must be positive")
-
-    @override
-    def choose(self, manifold, candidates, size, device="cpu"):
-        components = displacement_components(manifold, self.modes, device)
-        # In units of the noise.
-        components /= self.noise * components.square().sum((1, 2)).mean().sqrt()
-        R = components[torch.as_tensor(candidates, device=components.device)]
-        Sigma = torch.eye(R.shape[2], dtype=R.dtype, device=R.device)
-        one = torch.eye(3, dtype=R.dtype, device=R.device)
-        left = torch.ones(len(R), dtype=torch.bool, device=R.device)
-        chosen = []
-        for _ in range(size):
-            known = R @ Sigma
-            information = torch.logdet(one + known @ R.mT)
-            best = int(torch.where(left, information, -1.0).argmax())
-            gain = known[best]
-            Sigma = Sigma - gain.T @ torch.linalg.solve(one + gain @ R[best].T, gain)
-            left[best] = False
-            chosen.append(best)
-        return candidates[chosen]
-
-
-@torch.no_grad()
-def displacement_components(manifold, count: int, device: str | torch.device = "cpu") -> torch.Tensor:
-    """Principal components [P, 3, k] [m] of g(X, x̂) over the training latents, k ≤ count, largest first.
-
-    Each is a mode times the standard deviation of its amplitude. A part of the latents, evenly spread
-    over the training, is enough for the leading ones.
-    """
-    M = len(manifold.training_latents)
-    latents = manifold.training_latents[torch.linspace(0, M - 1, min(M, _SNAPSHOTS)).long()].to(device)
-    chunks = torch.arange(len(manifold.X)).split(max(1, _CHUNK // (3 * len(latents))))
-
-    def deviations(particles: torch.Tensor) -> torch.Tensor:
-        x = manifold.restrict(particles, device=device).position(latents)
-        return (x - x.mean(0)).permute(1, 2, 0)
-
-    gram = sum(u.T @ u for u in (deviations(particles).flatten(0, 1) for particles in chunks))
-    directions = torch.linalg.eigh(gram).eigenvectors.flip(1)[:, :count] / len(latents) ** 0.5
-    return torch.cat([deviations(particles) @ directions for particles in chunks])
 
 
 def check_well_posed(sample: int, latent_dim: int) -> None:

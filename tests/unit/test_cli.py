@@ -301,7 +301,7 @@ def chain_module():
 
 @pytest.mark.parametrize(
     ("override", "message"),
-    [("field=mlp", "field=basis or joint"), ("integration=search", "integration=superset; set it")],
+    [("field=mlp", "field=basis"), ("integration=search", "integration=superset; set it")],
 )
 def test_what_is_not_deployed_together_is_refused_before_any_work(nsf, override, message):
     code, _, err = nsf("run", "scene=sand", "device=cpu", "deploy.batch=2", override, tiny_scene=False)

@@ -16,11 +16,10 @@ from nsf.engines.modal.mirrors import edits
 from nsf.engines.modal.projection import projection_fits
 from nsf.engines.modal.span import ModalSpan
 from nsf.kinematics.fields.basis import BasisManifold
-from nsf.kinematics.fields.joint import JointManifold
 
 #: The classes whose code the kernels mirror; one derived from them may do anything.
 _KNOWN = {
-    "manifold": (BasisManifold, JointManifold),
+    "manifold": (BasisManifold,),
     "projector": (GaussNewton, Taylor),
     "method": (Method,),
     "integration": (Integration,),

@@ -26,7 +26,7 @@ _HEADS, _PREPARING, _CLEARING = range(3)  # what of a step runs beside the rest
 
 
 class ModalSpan(GridSpan):
-    """Fields of `field=basis` and `joint`, of one run or of several.
+    """Fields of `field=basis`, of one run or of several.
 
     The networks run once a step, on x̂ alone; modes and coefficients are contracted at those particles of N
     that the step needs, which are found at each step among the sets'; and the projection works on

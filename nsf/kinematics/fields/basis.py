@@ -70,7 +70,7 @@ class BasisField:
             Jacobian and the heads regular beside the training trajectories.
         noise_floor: ε; with σ the deviations of the coordinates, the noise on coordinate k has the deviation
             √(noise² + (ε max σ / σ_k)²), in units of σ_k. Not in the paper; for errors of the sample's
-            positions, which are large in units of a weak σ_k. With `joint` σ is that of joint coefficients.
+            positions, which are large in units of a weak σ_k.
         head_parameters: the heads see the (standardised) problem parameters beside xhat.
         affine: `latent`: C follows from xhat, as in the paper; `rate`: from xhat and dx̂/dt.
         rate_noise: deviation of the noise on dx̂/dt in training with `affine=rate`, in units of dx̂/dt's
@@ -235,7 +235,7 @@ class BasisManifold(Manifold):
 
     def __init__(self, latent_dim, x_sha256, parameter_names, hyperparameters):
         super().__init__(latent_dim, x_sha256, parameter_names, hyperparameters)
-        self.takes_rate = hyperparameters.get("affine") == "rate"  # files from before say nothing of it
+        self.takes_rate = hyperparameters["affine"] == "rate"
         if self.takes_rate:
             shape = hyperparameters["frames"], latent_dim
             self.register_buffer("training_rates", torch.zeros(shape, dtype=torch.float64))
@@ -253,7 +253,7 @@ class BasisManifold(Manifold):
                 inputs,
                 beta * d,
                 hyperparameters["depth"],
-                hyperparameters.get("members", 1),  # files from before there were members
+                hyperparameters["members"],
                 latent_dim if phase == "affine" and self.takes_rate else 0,
             )
 
@@ -261,8 +261,7 @@ class BasisManifold(Manifold):
     def floor(self) -> Tensor:
         """ε max σ / σ_k [r], dimensionless (`noise_floor`)."""
         leading = self.fields["deformation"].leading
-        least = self.hyperparameters.get("noise_floor", 0.0)  # files from before there was one
-        return least * leading.max() / leading
+        return self.hyperparameters["noise_floor"] * leading.max() / leading
 
     @property
     def spread(self) -> Tensor:
@@ -271,9 +270,8 @@ class BasisManifold(Manifold):
 
     @property
     def rest_latent(self) -> Tensor:
-        """xhat [r] of the particles at X, free of stress."""
-        X = self.X[None]
-        return self.encode(X, X.new_zeros(*X.shape[:2], 6))[0]
+        """xhat [r] of the particles at X."""
+        return self.encode(self.X[None])[0]
 
     @property
     def layered(self) -> bool:
@@ -282,7 +280,7 @@ class BasisManifold(Manifold):
 
     def frees(self, phase: str) -> bool:
         """Whether the phase's coefficients are made zero at rest (`zero_at_rest`)."""
-        asked = phase == "stress" and self.hyperparameters.get("free_at_rest", False)
+        asked = phase == "stress" and self.hyperparameters["free_at_rest"]
         return asked and _layered(self.fields[phase].network)
 
     def takes_parameters(self, phase: str) -> bool:
@@ -291,7 +289,7 @@ class BasisManifold(Manifold):
 
     @override
     @torch.no_grad()
-    def encode(self, x: Tensor, tau: Tensor | None = None) -> Tensor:
+    def encode(self, x: Tensor) -> Tensor:
         self.check_frames(x)
         field = self.fields["deformation"]
         modes = field.modes[..., : self.latent_dim].double() / field.leading
@@ -342,7 +340,7 @@ class BasisManifold(Manifold):
             base = points if name == "deformation" else 0
             mean, table = field.mean, field.modes
         network, scale = self._deployed(phase, like), float(field.scale)
-        members = self.hyperparameters.get("members", 1) * (2 if self.frees(phase) else 1)
+        members = self.hyperparameters["members"] * (2 if self.frees(phase) else 1)
         mean = (base + mean[rows]).to(like)
         return ModalFactors(mean, table, rows, field.leading, scale, network, members, field.rates)
 
@@ -373,6 +371,6 @@ class BasisManifold(Manifold):
         if self.frees(phase):
             noise = max(self.hyperparameters["noise"], _LEAST_NOISE)
             reach = _REACH * (noise**2 + self.floor.square()).sqrt()
-            members = self.hyperparameters.get("members", 1)
+            members = self.hyperparameters["members"]
             network = zero_at_rest(network, members, self.rest_latent, reach)
         return network.to(like)

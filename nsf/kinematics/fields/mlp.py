@@ -75,7 +75,7 @@ class MlpField:
         if self.affine != "latent":
             raise ConfigError(
                 f"field.affine={self.affine}: C of field=mlp does not depend on the latent vector's rate; "
-                "choose field.affine=latent, or field=basis or joint"
+                "choose field.affine=latent, or field=basis"
             )
         if self.arithmetic not in (None, *ARITHMETIC):
             known = ", ".join(ARITHMETIC)
@@ -284,7 +284,7 @@ class MlpManifold(Manifold):
 
     @override
     @torch.no_grad()
-    def encode(self, x: Tensor, tau: Tensor | None = None) -> Tensor:
+    def encode(self, x: Tensor) -> Tensor:
         self.check_frames(x)
         X = self.X.float()
         frames = (frames.to(X) - X for frames in x.split(self._frames_at_once()))

@@ -8,10 +8,7 @@ import torch
 from torch import Tensor
 
 from nsf.data import Snapshots
-from nsf.errors import ConfigError
 
-#: Snapshots whose Gram matrix [M, M] is formed; more would take hours and gigabytes.
-MOST_SNAPSHOTS = 8192
 #: Snapshots up to which `decompose` finds all its eigenvalues: at 8,000 a quarter of an hour on a core.
 MOST_SOLVED = 6000
 # Of the subspace iteration: turns, and columns beyond the modes that are wanted.
@@ -54,24 +51,16 @@ def decompose(snapshots: Snapshots, name: str, components: int, count: int) -> t
         the energy, 1 − Σ a² / ‖A‖².
     """
     if snapshots.M <= MOST_SOLVED:
-        G = gram(snapshots, name, components)
-        a, total = leading(G, count), float(G.diagonal().sum())
+        G = _gram(snapshots, name, components)
+        energies, vectors = torch.linalg.eigh(G)
+        a, total = _coefficients(energies.flip(0), vectors.flip(1), count), float(G.diagonal().sum())
     else:
         a, total = _iterated(snapshots, name, components, count)
     return a, max(0.0, 1 - float(a.square().sum()) / total) if total > 0 else 0.0
 
 
-def gram(snapshots: Snapshots, name: str, components: int) -> Tensor:
-    """A Aᵀ [M, M] of a field's deviations A [M, P c] from its mean (`slabs`).
-
-    Raises:
-        ConfigError: there are more than `MOST_SNAPSHOTS`.
-    """
-    if snapshots.M > MOST_SNAPSHOTS:
-        raise ConfigError(
-            f"this field compares each of {snapshots.M:,} snapshots with each, and takes {MOST_SNAPSHOTS:,} "
-            "at most; choose field=basis, or fewer training cases"
-        )
+def _gram(snapshots: Snapshots, name: str, components: int) -> Tensor:
+    """A Aᵀ [M, M] of a field's deviations A [M, P c] (`slabs`)."""
     G = torch.zeros(snapshots.M, snapshots.M, dtype=torch.float64, device=snapshots.X.device)
     for _, _, deviations in slabs(snapshots, name, components):
         rows = deviations.flatten(1)
@@ -79,14 +68,8 @@ def gram(snapshots: Snapshots, name: str, components: int) -> Tensor:
     return G
 
 
-def leading(G: Tensor, count: int) -> Tensor:
-    """The first coefficients [M, K ≤ count] of deviations whose Gram matrix [M, M] is given."""
-    energies, vectors = torch.linalg.eigh(G)
-    return _coefficients(energies.flip(0), vectors.flip(1), count)
-
-
 def _iterated(snapshots: Snapshots, name: str, components: int, count: int) -> tuple[Tensor, float]:
-    """As `leading` of the Gram matrix G, which is not formed, and its trace."""
+    """Coefficients as of `decompose` and the energy ‖A‖²; the Gram matrix is not formed."""
     generator = torch.Generator().manual_seed(0)
     shape = snapshots.M, min(count + _MORE, snapshots.M)
     V = torch.randn(shape, generator=generator, dtype=torch.float64).to(snapshots.X.device)

@@ -14,7 +14,7 @@ def latent_rates(manifold: Manifold, snapshots: Snapshots) -> Tensor:
     """dx̂/dt of every training snapshot, [M, r] float64 [1/s], as a reduced step finds it.
 
     The backward difference (x̂_n − x̂_{n−1})/Δt along each trajectory, whose frames are its steps. Before the
-    first frame the body came with its velocity: there x̂_{n−1} is that of x − Δt v, under the same stress.
+    first frame the body came with its velocity: there x̂_{n−1} is that of x − Δt v.
 
     Args:
         manifold: with its training latents.
@@ -29,6 +29,6 @@ def latent_rates(manifold: Manifold, snapshots: Snapshots) -> Tensor:
     rates[1:] /= torch.diff(t)[:, None]
     rows = first.nonzero().flatten()
     dt = snapshots.trajectories[0].dt
-    x, v, tau = (snapshots.gather(name, rows, slice(None)).double() for name in ("x", "v", "tau"))
-    rates[rows] = ((manifold.encode(x, tau) - manifold.encode(x - dt * v, tau)) / dt).to(rates)
+    x, v = (snapshots.gather(name, rows, slice(None)).double() for name in ("x", "v"))
+    rates[rows] = ((manifold.encode(x) - manifold.encode(x - dt * v)) / dt).to(rates)
     return rates

@@ -233,8 +233,7 @@ def swap_particles(file):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (attribute("schema_version", 2), "schema_version=2, newer than 1; upgrade nsf"),
-        (attribute("schema_version", 0), "schema_version=0, older than 1"),
+        (attribute("schema_version", 2), "schema_version=2, this nsf reads 1; simulate again with `nsf sim"),
         (attribute("schema_version", "one"), "not written by nsf"),
         (attribute("complete", False), "not finished"),
         (attribute("tau_order", "xx,yy,zz,xy,xz,yz"), "tau_order=xx,yy"),

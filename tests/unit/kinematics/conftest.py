@@ -5,14 +5,12 @@ import pytest
 
 from nsf.data import Snapshots, TrajectoryWriter
 from nsf.kinematics.fields.basis import BasisField
-from nsf.kinematics.fields.joint import JointField
 from nsf.kinematics.fields.mlp import MlpField
 from nsf.kinematics.training.schedules import FastTrainer
 from nsf.kinematics.training.train import train
 
 FIELDS = {
     "basis": BasisField(modes=[9, 7, 8], beta=4, depth=2),
-    "joint": JointField(modes=[9, 7, 8], beta=4, depth=2, stress_weight=1.0),
     "mlp": MlpField(beta=4, head_parameters=True),
 }
 QUICK = FastTrainer(steps=250, learning_rate=1e-2, frames_per_batch=6, particles_per_batch=40)

@@ -20,10 +20,6 @@ M, P, RANK = 30, 120, 4
 class LowRank(SimpleNamespace):
     """Snapshots of rank 4 in x and 3 in tau, and none in C; the methods of `nsf.data.Snapshots`."""
 
-    @property
-    def whole(self):
-        return self
-
     def slab(self, name, particles):
         return self.data[name][:, particles]
 
@@ -95,19 +91,13 @@ def test_many_snapshots_have_the_same_modes_without_their_gram_matrix(many, monk
     exact, unresolved = pod.decompose(many, "x", 3, 5)
     monkeypatch.setattr(pod, "MOST_SOLVED", M - 1)
     monkeypatch.setattr(pod, "_MORE", 8)
-    monkeypatch.setattr(pod, "gram", None)
+    monkeypatch.setattr(pod, "_gram", None)
     found, left_out = pod.decompose(many, "x", 3, 5)
     assert left_out == pytest.approx(unresolved, rel=1e-3)
     signs = (found * exact).sum(0).sign()
     torch.testing.assert_close(found * signs, exact, rtol=0, atol=1e-3 * float(exact.abs().max()))
     modes = torch.cat([values for *_, values in pod.modes(many, "x", 3, found)]).flatten(0, 1)
     torch.testing.assert_close(modes.T @ modes, torch.eye(5, dtype=torch.float64), rtol=0, atol=1e-9)
-
-
-def test_a_gram_matrix_of_too_many_snapshots_is_refused(low_rank, monkeypatch):
-    monkeypatch.setattr(pod, "MOST_SNAPSHOTS", M - 1)
-    with pytest.raises(ConfigError, match=r"each of 30 snapshots .* choose field=basis"):
-        pod.gram(low_rank, "x", 3)
 
 
 def test_of_many_snapshots_a_step_sees_some(low_rank, monkeypatch, tmp_path):

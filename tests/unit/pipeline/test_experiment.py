@@ -15,7 +15,7 @@ jobs:
   - {scene: sand, scale: small, field: [basis, mlp]}
   - scene: sand
     scale: small
-    sampler: [random, greedy]
+    sampler: [random, qdeim]
     deploy.dt_multiplier: 1.5
     scene.design.test: [[44, 55]]
     field.modes: null
@@ -37,14 +37,14 @@ def test_every_combination_is_a_job(written):
     rest = ("deploy.dt_multiplier=1.5", "scene.design.test=[44,55]", "field.modes=null")
     assert [job.overrides for job in jobs] == [
         *((*first, f"field={field}") for field in ("basis", "mlp")),
-        *((*first, f"sampler={sampler}", *rest) for sampler in ("random", "greedy")),
+        *((*first, f"sampler={sampler}", *rest) for sampler in ("random", "qdeim")),
     ]
 
 
 def test_a_setting_tells_what_columns_do_not(written):
     """results.csv has columns for the scene, the field and |S|, but none for the sampler."""
     settings = [job.setting for job in written(TEXT).jobs]
-    assert settings == ["", "", "sampler=random", "sampler=greedy"]
+    assert settings == ["", "", "sampler=random", "sampler=qdeim"]
 
 
 def test_how_runs_are_measured_is_no_setting(written):
@@ -57,7 +57,7 @@ def test_how_runs_are_measured_is_no_setting(written):
 
 def test_keys_of_a_job(written):
     *_, last = written(TEXT).jobs
-    assert last.keys["sampler"] == "greedy"
+    assert last.keys["sampler"] == "qdeim"
     assert last.keys["scene.design.test"] == "[44,55]"
 
 

@@ -412,7 +412,7 @@ def test_runs_that_no_column_tells_apart_are_told_apart_by_their_keys(tmp_path):
 
 RANDOM = {"_target_": "nsf.sampling.RandomSampler", "size": 50, "seed": 0}
 REGION = RANDOM | {"lower": [0.1] * 3, "upper": [0.9] * 3, "phases": []}
-GREEDY = {"_target_": "nsf.sampling.GreedySampler", "size": 50}
+QDEIM = {"_target_": "nsf.sampling.QdeimSampler", "size": 50}
 OWN = {"_target_": "nsf.sampling.own.OwnSampler", "size": 50}
 GAUSS_NEWTON, TAYLOR = ({"_target_": f"nsf.dynamics.{name}"} for name in ("GaussNewton", "Taylor"))
 
@@ -420,7 +420,7 @@ GAUSS_NEWTON, TAYLOR = ({"_target_": f"nsf.dynamics.{name}"} for name in ("Gauss
 @pytest.mark.parametrize(
     ("configs", "told"),
     [
-        ([{"sampler": RANDOM}, {"sampler": GREEDY}], ["sampler=random", "sampler=greedy"]),
+        ([{"sampler": RANDOM}, {"sampler": QDEIM}], ["sampler=random", "sampler=qdeim"]),
         ([{"sampler": RANDOM}, {"sampler": REGION}], ["sampler=random", "sampler=region"]),
         ([{"sampler": RANDOM}, {"sampler": OWN}], ["sampler=random", "sampler=OwnSampler"]),
         (

@@ -6,8 +6,7 @@ import torch
 
 from nsf.errors import ConfigError
 from nsf.sampling import QdeimSampler
-from nsf.sampling.qdeim import eigenvalue_gain, orthonormal, oversampled, pivots
-from nsf.sampling.sampler import displacement_components
+from nsf.sampling.qdeim import displacement_components, eigenvalue_gain, orthonormal, oversampled, pivots
 
 MODES = 8  # all that the tiny manifold has
 

@@ -8,8 +8,9 @@ import pytest
 import torch
 
 from nsf.errors import ConfigError, ProjectionError
-from nsf.sampling import GreedySampler, RandomSampler
-from nsf.sampling.sampler import check_well_posed, displacement_components
+from nsf.sampling import RandomSampler
+from nsf.sampling.qdeim import displacement_components
+from nsf.sampling.sampler import check_well_posed
 
 
 @pytest.fixture(scope="module")
@@ -130,51 +131,3 @@ def test_displacement_components(tiny_manifold):
     assert len(u.T) <= 256  # so that none is passed over
     assert torch.allclose(components.norm(dim=0), singular[:5], rtol=1e-6)
     assert torch.allclose((left[:, :5] * components).sum(0).abs(), singular[:5], rtol=1e-6)
-
-
-def information(manifold, particles, modes=12, noise=1e-3) -> float:
-    """What positions of the particles tell about the amplitudes, in closed form [nat]."""
-    R = displacement_components(manifold, modes)
-    R = R / (noise * R.square().sum((1, 2)).mean().sqrt())
-    R = R[torch.as_tensor(particles)].flatten(0, 1)
-    return 0.5 * float(torch.logdet(torch.eye(len(R), dtype=R.dtype) + R @ R.T))
-
-
-@pytest.mark.parametrize("size", [1, 2, 8, 30])
-def test_greedy_tells_more_than_any_of_many_random_samples(tiny_manifold, size):
-    chosen = GreedySampler(size, modes=12).spans_of(tiny_manifold)[0].particles
-    draws = [np.random.default_rng(seed).permutation(500)[:size] for seed in range(200)]
-    assert information(tiny_manifold, chosen) > max(information(tiny_manifold, draw) for draw in draws)
-
-
-@pytest.mark.slow
-def test_greedy_takes_the_best_particle_at_each_turn(tiny_manifold):
-    everything = np.arange(500)
-    order = GreedySampler(3, modes=12).choose(tiny_manifold, everything, 3)
-    for taken in (1, 2):
-        before = order[:taken].tolist()
-        rest = [p for p in range(500) if p not in before]
-        told = [information(tiny_manifold, [*before, p]) for p in rest]
-        assert rest[int(np.argmax(told))] == order[taken]
-
-
-def test_a_smaller_greedy_sample_is_a_part_of_a_larger(tiny_manifold):
-    few, many = (GreedySampler(n, modes=6).spans_of(tiny_manifold)[0].particles for n in (5, 40))
-    assert len(set(many)) == 40
-    assert set(few) < set(many)
-
-
-def test_greedy_keeps_to_its_region(tiny_manifold):
-    X = tiny_manifold.X.numpy()
-    middle = float(np.median(X[:, 0]))
-    sampler = GreedySampler(9, lower=[middle, 0.0, 0.0], phases=[{"start": 0.5, "size": 4}])
-    first, later = sampler.spans_of(tiny_manifold)
-    assert (X[first.particles][:, 0] >= middle).all()
-    assert len(later.particles) == 4
-
-
-@pytest.mark.parametrize("settings", [{"modes": 0}, {"modes": 2.5}, {"noise": 0.0}, {"noise": -1.0}], ids=str)
-def test_greedy_refuses(settings):
-    key, value = next(iter(settings.items()))
-    with pytest.raises(ConfigError, match=rf"sampler\.{key}={value}"):
-        GreedySampler(10, **settings)
