@@ -68,7 +68,7 @@ def one_thread_for_torch():
 @pytest.fixture(scope="session", autouse=True)
 def coarse_pictures():
     """Half the pixels an inch, and one sample a pixel: a picture takes a third of the time."""
-    from nsf.reporting.bodies import camera
+    from nsf.bodies import camera
     from nsf.results import style
 
     with pytest.MonkeyPatch.context() as patch:

@@ -1,5 +1,7 @@
 """What stands about the bodies of a run, for its pictures."""
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from nsf.mpm import Collider
@@ -17,11 +19,15 @@ def surroundings(scene: Scene, t: np.ndarray) -> dict[str, np.ndarray]:
         solid_position: [F, c, 3] [m]; solid_orientation: [F, c, 3, 3].
         solid_active: [F, c] whether the collider acts.
     """
-    solids, frames = scene.colliders, len(t)
+    return {"gravity": scene.acting_gravity.at(t).astype(np.float32), **colliders_at(scene.colliders, t)}
+
+
+def colliders_at(solids: Sequence[Collider], t: np.ndarray) -> dict[str, np.ndarray]:
+    """The part of `surroundings` that is of colliders."""
+    frames = len(t)
     poses = [_poses(solid, t) for solid in solids]
     acts = [(solid.since <= t) & (t < solid.until) for solid in solids]
     return {
-        "gravity": scene.acting_gravity.at(t).astype(np.float32),
         "solid_shape": np.array([solid.name for solid in solids], dtype=str),
         "solid_extents": np.array([solid.extents for solid in solids], np.float32).reshape(-1, 3),
         "solid_position": _stacked([position for position, _ in poses], (frames, 0, 3)),
@@ -34,11 +40,9 @@ def _poses(solid: Collider, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Position [F, 3] [m] and orientation [F, 3, 3] of a collider at times t [F] [s]."""
     if solid.motion is None:
         return np.tile(solid.position, (len(t), 1)), np.tile(solid.orientation, (len(t), 1, 1))
-    times, shifts, angles = solid.motion.keyframes()
-    axis, pivot = solid.motion.hinge()
-    turned = np.stack([rotation(axis, np.degrees(angle)) for angle in np.interp(t, times, angles)])
-    shift = np.stack([np.interp(t, times, way) for way in shifts.T], axis=1)
-    return pivot + shift + turned @ (solid.position - pivot), turned @ solid.orientation
+    pose, (axis, pivot) = solid.motion.pose(t), solid.motion.hinge()
+    turned = np.stack([rotation(axis, np.degrees(angle)) for angle in pose[:, 3]])
+    return pivot + pose[:, :3] + turned @ (solid.position - pivot), turned @ solid.orientation
 
 
 def _stacked(of_solids: list[np.ndarray], none: tuple[int, ...]) -> np.ndarray:

@@ -10,6 +10,7 @@ import torch
 from omegaconf import OmegaConf
 
 from nsf import config as configuration
+from nsf.bodies.colors import CLIP
 from nsf.data import Case, Trajectory
 from nsf.data.schema import TAU_COLUMNS, TAU_ROWS
 from nsf.deployment import Rollout, continuation_file, rollout_file
@@ -18,13 +19,13 @@ from nsf.dynamics.interop import torch_device, torch_dtype
 from nsf.errors import ConfigError, MissingRunError, SchemaError
 from nsf.evaluation import metrics
 from nsf.evaluation.superresolution import POINTS
+from nsf.evaluation.surroundings import colliders_at
 from nsf.export import web
 from nsf.kinematics.interpolation import lying_together
 from nsf.kinematics.manifold import Manifold, Restriction
 from nsf.mpm import Collider, floor_height, precision_of
 from nsf.mpm.device import warp_device
 from nsf.progress import Progress
-from nsf.results.style import CLIP
 from nsf.runs import Run
 from nsf.scenes import Scene
 
@@ -226,9 +227,23 @@ class Playback:
 
     @property
     def solids(self) -> list[dict]:
-        """The solids, for a page; without those that a program moves, whose way only the scene knows."""
+        """The solids, for a page."""
+        return [web.solid(name, own) for name, own in self._shown.items()]
+
+    @property
+    def around(self) -> dict[str, np.ndarray]:
+        """Gravity and colliders in the frames, as `nsf.evaluation.surroundings` returns them."""
+        gravity = np.array(self._settings["scene"]["gravity"], np.float32)
+        return {
+            "gravity": np.tile(gravity, (len(self.t), 1)),
+            **colliders_at(list(self._shown.values()), self.t),
+        }
+
+    @cached_property
+    def _shown(self) -> dict[str, Collider]:
+        """The solids without those that a program moves, whose way only the scene knows."""
         programs = (self._settings["scene"].get("forcing") or {}).get("colliders") or {}
-        return [web.solid(name, own) for name, own in self._colliders.items() if name not in programs]
+        return {name: own for name, own in self._colliders.items() if name not in programs}
 
     @cached_property
     def _colliders(self) -> dict[str, Collider]:

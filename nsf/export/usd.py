@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
+from nsf.bodies.colors import STRESS_COLORS, ColorScale
 from nsf.export.playback import Block, Playback
 from nsf.extras import optional
-from nsf.results.style import STRESS_COLORS, ColorScale
 from nsf.storage import writing
 
 NEEDS = ("pxr.Usd", "pxr.UsdGeom", "pxr.Sdf", "pxr.Vt")

@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from markupsafe import Markup
 
+from nsf.bodies.colors import STRESS_COLORS, ColorScale
 from nsf.results.formats import HTML
-from nsf.results.style import STRESS_COLORS, ColorScale
 from nsf.storage import writing
 
 if TYPE_CHECKING:

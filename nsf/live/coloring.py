@@ -6,10 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from nsf.evaluation.metrics import pressure, von_mises
-from nsf.live.model import LiveModel, Truth
-from nsf.live.player import Moment
-from nsf.results.style import (
+from nsf.bodies.colors import (
     CLIP,
     DIFFERENCE_COLORS,
     METRES,
@@ -19,6 +16,9 @@ from nsf.results.style import (
     STRESS_COLORS,
     ColorScale,
 )
+from nsf.evaluation.metrics import pressure, von_mises
+from nsf.live.model import LiveModel, Truth
+from nsf.live.player import Moment
 
 #: End of the scale of the distance to the truth, over the end of the scale of the displacement.
 _DISTANCE = 0.05

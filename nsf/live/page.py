@@ -12,11 +12,11 @@ import viser
 import websockets.asyncio.server as websockets
 from matplotlib.colors import to_hex
 
+from nsf.bodies.colors import ROLES, ColorScale
 from nsf.live.coloring import DISTANCE, SAMPLE, Coloring, Picture
 from nsf.live.guard import Connection, refused
 from nsf.live.player import Moment, Player, every
 from nsf.reporting.text.columns import axis
-from nsf.results.style import ROLES, ColorScale
 
 log = logging.getLogger(__name__)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from nsf.bodies.colors import CLIP
 from nsf.data import Case
 from nsf.data.schema import TRAJECTORY
 from nsf.data.trajectory import Trajectory
@@ -21,7 +22,6 @@ from nsf.live.model import LiveModel
 from nsf.live.wire import check_field, modal_field, network_arrays, shown
 from nsf.pipeline import Pipeline
 from nsf.results.formats import file_name
-from nsf.results.style import CLIP
 from nsf.runs import Run
 from nsf.scenes import Scene
 from nsf.storage import writing

@@ -9,6 +9,7 @@ from pathlib import Path
 import pandas as pd
 from joblib.externals.loky import ProcessPoolExecutor
 
+from nsf.bodies.colors import DIFFERENCE_COLORS, STRESS_COLORS
 from nsf.reporting.bodies import shapes
 from nsf.reporting.drawing import charts
 from nsf.reporting.keeping import Kept
@@ -31,7 +32,7 @@ from nsf.reporting.tables import (
 from nsf.reporting.text.columns import MEASURED, parameter_text, speedups
 from nsf.results.formats import file_name
 from nsf.results.page import Picture, Section
-from nsf.results.style import DIFFERENCE_COLORS, STRESS_COLORS, save
+from nsf.results.style import save
 
 FRAMES = 31  # of an animation
 BASELINE = "deformation_only"

@@ -9,8 +9,6 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from matplotlib import rc_context
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -20,17 +18,9 @@ INK, MUTED, GRID, WARNING = "#222222", "#666666", "#dddddd", "#B04A00"
 
 # Okabe and Ito 2008, without the yellow that vanishes on white; black last.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#000000")
-#: Colours of a particle in neither set, in N only, and in S.
-ROLES = ("#BBBBBB", PALETTE[0], PALETTE[1])
 DASHES = ("-", (0, (5, 2)), (0, (1.5, 1.5)), (0, (5, 2, 1.5, 2)))
 
 FULL, REDUCED, PAPER = "#7f7f7f", "#0072B2", "#000000"
-
-STRESS_COLORS, DIFFERENCE_COLORS, SIGNED_COLORS = "viridis", "magma", "coolwarm"
-CLIP = 93.0  # [%] percentile of the full-order stress at which the colour scale ends
-
-PASCALS = ((1e6, "MPa"), (1e3, "kPa"), (1.0, "Pa"), (1e-3, "mPa"), (1e-6, "µPa"))
-METRES = ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm"))
 
 STAGE_COLORS = {
     "inference": "#0072B2",
@@ -146,40 +136,6 @@ def save(fig: Figure, folder, stem: str, kinds=("svg", "png"), ramps=()) -> list
                 (folder / f"{stem}.{kind}").write_text(text, encoding="utf-8")
             fig.set_layout_engine("none")  # the first file has laid it out; that takes as long as drawing
     return names
-
-
-class ColorScale:
-    """A colour scale from zero, or about it, in the unit that suits its end.
-
-    Args:
-        top: where it ends, in SI.
-        cmap: of matplotlib.
-        factor, unit: of what is written beside it.
-        signed: it begins at −top instead of 0.
-    """
-
-    def __init__(self, top: float, cmap: str, factor: float, unit: str, signed: bool = False):
-        self.factor, self.unit, self.top = factor, unit, top
-        bottom = -top / factor if signed else 0.0
-        self.mappable = ScalarMappable(Normalize(bottom, top / factor), matplotlib.colormaps[cmap])
-
-    @classmethod
-    def up_to(cls, top: float, cmap: str, units, signed: bool = False) -> "ColorScale":
-        """`top` in SI; the largest unit in which it is no less than 0.3 is taken."""
-        top = float(top) if np.isfinite(top) and top > 0 else units[-1][0]
-        factor, unit = next(((f, u) for f, u in units if top >= 0.3 * f), units[-1])
-        return cls(top, cmap, factor, unit, signed)
-
-    def colors(self, values: np.ndarray) -> np.ndarray:
-        """Values in SI as colours [n,3]; what is not finite takes the end of the scale."""
-        return self.mappable.to_rgba(self._clipped(values))[:, :3]
-
-    def pixels(self, values: np.ndarray) -> np.ndarray:
-        """The same as numbers of 8 bits."""
-        return self.mappable.to_rgba(self._clipped(values), bytes=True)[:, :3]
-
-    def _clipped(self, values: np.ndarray) -> np.ndarray:
-        return np.minimum(np.nan_to_num(values, nan=np.inf), self.top) / self.factor
 
 
 def write_png(fig: Figure, path: Path, dpi: float, ramps: Sequence[str] = ()) -> None:

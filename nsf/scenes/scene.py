@@ -93,8 +93,7 @@ class Scene(Draft):
         poses = np.zeros((len(t), len(self.colliders), 4))
         for c, solid in enumerate(self.colliders):
             if solid.motion is not None:
-                times, shifts, angles = solid.motion.keyframes()
-                poses[:, c] = np.stack([np.interp(t, times, way) for way in (*shifts.T, angles)], 1)
+                poses[:, c] = solid.motion.pose(t)
         return {"gravity": self.acting_gravity.at(t), "solids": poses}
 
     @property

@@ -33,8 +33,7 @@ def collider_states(colliders: Sequence[Collider], dt: float, steps: int) -> np.
     for collider in colliders:
         pose = np.zeros((steps + 1, 4))
         if collider.motion is not None:
-            times, shifts, angles = collider.motion.keyframes()
-            pose = np.stack([np.interp(t, times, way) for way in (*shifts.T, angles)], 1)
+            pose = collider.motion.pose(t)
         later = t[:-1] + _SAME_TIME * dt
         active = (later >= collider.since) & (later < collider.until)
         found += [pose[:-1], np.diff(pose, axis=0), active[:, None].astype(float)]

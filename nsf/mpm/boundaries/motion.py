@@ -85,20 +85,22 @@ class Motion:
             return np.array([0.0, 0.0, 1.0]), np.zeros(3)
         return direction("motion.axis", self.axis), np.array(self.pivot, float)
 
+    def pose(self, t: np.ndarray | float) -> np.ndarray:
+        """d [m] and θ [rad] at times t [...] [s]: [..., 4]."""
+        times, translations, angles = self.keyframes()
+        return np.stack([np.interp(t, times, way) for way in (*translations.T, angles)], axis=-1)
+
     def undone(self, x: np.ndarray, t: float) -> np.ndarray:
         """Where points x [n, 3] [m] of the solid at time t [s] lie at rest [m]."""
-        times, translations, angles = self.keyframes()
-        axis, pivot = self.hinge()
-        moved = pivot + [np.interp(t, times, d) for d in translations.T]
-        return (x - moved) @ rotation(axis, np.degrees(np.interp(t, times, angles))) + pivot
+        (*d, angle), (axis, pivot) = self.pose(t), self.hinge()
+        return (x - (pivot + d)) @ rotation(axis, np.degrees(angle)) + pivot
 
     def steered(self, t: float, velocity: np.ndarray, spin: float) -> "Motion":
         """The motion that goes on from time t [s] at a velocity [3] [m/s] and a spin about `axis` [°/s]."""
-        times, translations, angles = self.keyframes()
-        d = np.array([np.interp(t, times, way) for way in translations.T])
-        turned = {}
+        pose, turned = self.pose(t), {}
+        d = pose[:3]
         if len(self.angles):
-            angle = float(np.degrees(np.interp(t, times, angles)))
+            angle = float(np.degrees(pose[3]))
             turned = {"angles": (angle, angle + _STEERED * spin), "axis": self.axis, "pivot": self.pivot}
         elif spin:
             raise ConfigError(

@@ -262,8 +262,9 @@ def write_superresolution(
     record: Record, scene: Scene, cases: Sequence[Case], fine: Sequence[SuperResolution]
 ) -> pd.DataFrame:
     """Write `superresolution.csv` and `superresolution.png` into a run's folder; gives the table."""
+    from nsf.bodies.colors import STRESS_COLORS
     from nsf.reporting.bodies.shapes import fine_shapes
-    from nsf.results.style import PIXELS, STRESS_COLORS, write_png
+    from nsf.results.style import PIXELS, write_png
 
     table = pd.DataFrame([f.row for f in fine])
     with writing(record.path / "superresolution.csv") as partial:

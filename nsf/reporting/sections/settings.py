@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from nsf.bodies.colors import DIFFERENCE_COLORS, STRESS_COLORS
 from nsf.reporting.bodies import shapes
 from nsf.reporting.sections.variant import ROWS, Variant, order
 from nsf.reporting.sources import Study
@@ -10,7 +11,7 @@ from nsf.reporting.study import SEEDS
 from nsf.reporting.text.columns import brief, telling
 from nsf.results.formats import file_name
 from nsf.results.page import Picture, Section
-from nsf.results.style import DIFFERENCE_COLORS, STRESS_COLORS, save
+from nsf.results.style import save
 from nsf.vectors import spaced
 
 _TOLD = (

@@ -192,26 +192,25 @@ def test_onnx_refuses_more_than_a_file_holds(played, tmp_path, monkeypatch):
 
 
 def test_frames_are_pictures_and_a_film(played, tmp_path, monkeypatch):
-    pytest.importorskip("pyvista")
     imageio = pytest.importorskip("imageio")
     pytest.importorskip("imageio_ffmpeg")
-    monkeypatch.setattr(frames, "SIZE", (320, 180))
+    monkeypatch.setattr(frames, "WIDTH", 320)
     film = frames.write(played(every=12, color="displacement", fps=2.0), tmp_path)
     names = sorted(p.name for p in (tmp_path / "friction_angle_26_frames").iterdir())
     assert names == [f"frame_{k:04d}.png" for k in range(3)]
     pictures = [
         np.asarray(Image.open(tmp_path / "friction_angle_26_frames" / n).convert("RGB")) for n in names
     ]
-    assert {p.shape for p in pictures} == {(180, 320, 3)}
+    ((height, width, _),) = {p.shape for p in pictures}
+    assert width == 370
     for one, other in itertools.pairwise(pictures):
         assert (np.abs(one.astype(int) - other).max(2) > 30).mean() > 0.005
-    middle = pictures[-1][60:140, 110:210].reshape(-1, 3).astype(int)
-    assert np.ptp(middle, axis=1).max() > 60  # the points are in colours
+    assert np.ptp(pictures[-1][: height // 2].astype(int), axis=2).max() > 60  # the points are in colours
     reader = imageio.get_reader(film)
     assert reader.get_meta_data()["fps"] == pytest.approx(2.0)
     shot = [frame for frame in reader]
     assert len(shot) == 3
-    assert np.abs(shot[0].astype(int) - pictures[0]).mean() < 8  # compression's loss alone
+    assert np.abs(shot[0].astype(int) - pictures[0][: height // 2 * 2]).mean() < 8  # compression's loss alone
 
 
 # -- all ----------------------------------------------------------------------------------------------------
@@ -223,7 +222,6 @@ def test_frames_are_pictures_and_a_film(played, tmp_path, monkeypatch):
         ("usd", "pxr.Usd"),
         ("onnx", "onnx"),
         ("onnx", "onnxscript"),
-        ("frames", "pyvista"),
         ("frames", "imageio_ffmpeg"),
     ],
 )

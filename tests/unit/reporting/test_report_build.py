@@ -8,9 +8,9 @@ import pytest
 from PIL import Image
 from synthetic import TEST, Made, rewrite_manifest, seal, write_run
 
+from nsf.bodies import camera
 from nsf.errors import ConfigError, StorageError
 from nsf.reporting import build, build_report, pictures
-from nsf.reporting.bodies import camera
 from nsf.reporting.sections.variant import Variant, order
 from nsf.reporting.sources import Source, Study, file_hash, open_sources
 from nsf.reporting.study import estimate_note, spearman, trust_note

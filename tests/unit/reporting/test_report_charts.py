@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from synthetic import TEST, Made, collapse
 
 from nsf import config
-from nsf.reporting.bodies.camera import Camera, View
-from nsf.reporting.bodies.shapes import Case, animation, final_shapes, hides_stress, is_cut_open, strip
+from nsf.bodies.camera import Camera
+from nsf.reporting.bodies.shapes import Case, final_shapes, strip
 from nsf.reporting.drawing import charts
 from nsf.reporting.drawing.cost import error_over_cost, solver_styles, step_over_particles
 from nsf.reporting.sources import Motion
@@ -95,18 +95,6 @@ def test_error_over_cost_has_a_point_for_each_solver_that_was_timed():
     assert sand.lines[2].get_color() == bread.lines[0].get_color()  # one solver, one colour
 
 
-def test_a_strip_shows_both_models_from_the_first_frame_to_the_last():
-    (motion,) = motions(1)
-    figure = strip([Case(motion)])
-    told = [text.get_text() for text in figure.texts]
-    assert "t = 0 s" in told
-    assert "t = 0.6 s" in told
-    assert [text.split(",")[0] for text in told if "," in text] == ["full-order", "reduced"]
-    pictures = [panel.images[0].get_array() for panel in figure.axes if panel.images]
-    assert len(pictures) == 10
-    assert not np.array_equal(pictures[0], pictures[4])
-
-
 def test_a_strip_has_the_worst_and_the_best_and_the_baseline_below():
     worst, best = motions(2, particles=60)
     lost = replace(worst, stopped=0.2)
@@ -120,15 +108,6 @@ def test_a_strip_has_the_worst_and_the_best_and_the_baseline_below():
         f"reduced, friction angle {TEST[1]:g}°, best, δ 1 %",
     ]
     assert "diverged; shown as at t = 0.2 s" in told
-
-
-def test_a_strip_is_cut_open_where_the_surface_carries_no_stress():
-    (motion,) = motions(1, particles=4000, frames=2)
-    motion = replace(motion, x_full=motion.x_full[:1])
-    X = motion.x_full[0]
-    inside = (np.abs(X - X.mean(axis=0)) < 0.3 * np.ptp(X, axis=0)).all(axis=1)
-    assert hides_stress(replace(motion, stress_full=np.where(inside, 10.0, 0.1)[None]))
-    assert not hides_stress(replace(motion, stress_full=np.ones((1, 4000))))
 
 
 def test_pictures_of_a_diverged_run_say_when_it_stopped():
@@ -292,28 +271,6 @@ def test_camera_axes_are_orthonormal_and_z_points_up():
     assert axes[1, 2] > 0
 
 
-def test_the_nearer_particle_hides_the_farther():
-    camera = Camera(azimuth=-90, elevation=0)  # looks along +y
-    view = View(camera, np.array([-1.0, -1.0]), np.array([1.0, 1.0]), width=40)
-    for x in ([[0, -0.5, 0], [0, 0.5, 0]], [[0, 0.5, 0], [0, -0.5, 0]]):
-        colors = np.array([RED, BLUE]) if x[0][1] < 0 else np.array([BLUE, RED])
-        middle = view.picture(np.array(x, float), colors, radius=0.3)[20, 20].astype(int)
-        assert middle[0] > middle[2] + 80
-
-
-def test_particles_right_of_the_middle_are_drawn_right():
-    view = View(Camera(-90, 0), np.array([-1.0, -1.0]), np.array([1.0, 1.0]), width=40)
-    picture = view.picture(np.array([[0.5, 0, 0.5]]), RED[None], radius=0.2).astype(int)
-    rows, columns = np.nonzero(picture[..., 0] > picture[..., 2] + 50)
-    assert rows.mean() == pytest.approx(10, abs=1.5)  # row 0 is the top
-    assert columns.mean() == pytest.approx(30, abs=1.5)
-
-
-def test_particles_that_are_not_finite_are_left_out():
-    view = View(Camera(), np.array([-1.0, -1.0]), np.array([1.0, 1.0]), width=20)
-    assert view.picture(np.full((3, 3), np.nan), np.zeros((3, 3)), 0.2).min() == 255
-
-
 def test_final_shapes_have_a_row_a_value_and_units():
     figure = final_shapes([Case(m) for m in motions(3, particles=50)], "friction angle", "°")
     assert sum(bool(panel.images) for panel in figure.axes) == 3 * 3
@@ -321,29 +278,6 @@ def test_final_shapes_have_a_row_a_value_and_units():
     assert "friction angle 32.5°, t = 0.6 s" in told
     assert any(text.endswith("[mm]") for text in told)
     assert any(text.endswith("Pa]") for text in told)
-
-
-def test_a_thin_body_is_shown_whole():
-    """Particles in front of its middle are seen; those of a deep body are cut away."""
-    flat = (1.0, 0.1, 1.0)
-    for scale, whole in (((1.0, 1.0, 1.0), False), (flat, True)):
-        shown = [replace(m, x_full=m.x_full * scale, x_reduced=m.x_reduced * scale) for m in motions(1)]
-        X = shown[0].x_full[0]
-        assert is_cut_open(X) is not whole
-        front = (X - X.mean(0)) @ (Camera.facing(X).axes[2] * (1.0, 1.0, 0.0)) > 0.0
-        relaxed = [replace(shown[0], stress_full=np.where(front, 0.0, shown[0].stress_full))]
-        one, other = (
-            final_shapes([Case(m) for m in some]).axes[0].images[0].get_array() for some in (shown, relaxed)
-        )
-        assert (one != other).any() == whole
-
-
-def test_animation_gives_way_to_the_limit(tmp_path):
-    shown = [Case(m) for m in motions(1, particles=400, frames=12)]
-    animation(shown, tmp_path / "large.gif", frames=12, width=160)
-    animation(shown, tmp_path / "small.gif", frames=12, width=160, max_bytes=40_000)
-    large, small = ((tmp_path / name).stat().st_size for name in ("large.gif", "small.gif"))
-    assert small < large
 
 
 def test_material_point_shows_no_rounding():

@@ -9,8 +9,11 @@ from matplotlib.image import AxesImage
 from matplotlib.lines import Line2D
 from PIL import Image
 
-from nsf.reporting.bodies.camera import View
-from nsf.results.style import INK, MUTED, WARNING, WIDTH, ColorScale
+from nsf.bodies.camera import View
+from nsf.bodies.colors import ColorScale
+
+INK, MUTED, WARNING = "#222222", "#666666", "#B04A00"
+WIDTH = 9.6  # [inch] 960 px at 100 dpi: the width of a report's column
 
 
 class Sheet:
@@ -21,7 +24,7 @@ class Sheet:
         self.view, self._wide = view, (inches - gap * (columns + 1)) / columns
         self._tall = self._wide * view.height / view.width
         self._size = (inches, self._top + rows * (self._tall + name) + bottom)
-        self.fig = Figure(figsize=self._size, dpi=dpi)
+        self.fig = Figure(figsize=self._size, dpi=dpi, facecolor="white")
         self.fig.set_layout_engine("none")
         self._left = [gap + k * (self._wide + gap) for k in range(columns)]
         self._row = [self._size[1] - self._top - (k + 1) * (self._tall + name) for k in range(rows)]
@@ -47,7 +50,7 @@ class Sheet:
         panel.axis("off")
         self._images[row, column] = panel.imshow(picture, aspect="auto", interpolation="antialiased")
 
-    def color_bar(self, scale: ColorScale, first: int, last: int, title: str) -> None:
+    def color_bar(self, scale: ColorScale, first: int, last: int) -> None:
         """A colour scale below some columns."""
         left, wide = self._left[first], self._left[last] - self._left[first] + self._wide
         panel = self._axes(left + 0.08 * wide, 0.42, 0.84 * wide, 0.11)
@@ -55,8 +58,8 @@ class Sheet:
             scale.mappable, cax=panel, orientation="horizontal", extend="max", extendfrac=0.03
         )
         bar.outline.set_visible(False)
-        bar.ax.tick_params(labelsize=8.5, pad=2)
-        bar.set_label(f"{title} [{scale.unit}]", fontsize=9, labelpad=2)
+        bar.ax.tick_params(labelsize=8.5, pad=2, color=MUTED, labelcolor=INK)
+        bar.set_label(scale.label, fontsize=9, labelpad=2, color=INK, parse_math=False)
 
     def legend(self, colors: Mapping[str, str]) -> None:
         """What colours stand for, below the pictures."""
@@ -96,4 +99,5 @@ class Sheet:
         return self.fig.add_axes((left / width, low / height, wide / width, tall / height))
 
     def _text(self, left: float, low: float, text: str, **style):
+        style = {"color": INK, "fontsize": 10, "parse_math": False, **style}
         return self.fig.text(left / self._size[0], low / self._size[1], text, va="baseline", **style)

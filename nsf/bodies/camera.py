@@ -1,20 +1,26 @@
-"""An orthographic camera that draws particles as a shaded surface into an array of pixels; z is up."""
+"""An orthographic camera that draws points as a lit surface of grains into an array of pixels; z is up.
+
+Written in numpy, since VTK needs the graphics libraries of a system and a report is to be drawn without them.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageFilter
+from PIL import Image, ImageDraw
 from scipy.ndimage import uniform_filter
 
-from nsf.reporting.bodies.solids import Face
+from nsf.bodies.solids import Face
 
-_LIGHT = np.array([-0.45, 0.65, 0.62])  # in camera axes: from the upper left, in front
-_AMBIENT = 0.62  # share of a surface's colour that light does not model: keeps the colour map readable
+_LIGHT = np.array([-0.45, 0.65, 0.62]) / np.linalg.norm([-0.45, 0.65, 0.62])  # in camera axes
+_AMBIENT = 0.66  # share of a surface's colour that light does not model: keeps the colour map readable
 _OCCLUSION = 0.40  # how much nearer surroundings darken what lies behind them
+_OCCLUDED = (2.5, 8.0)  # radii of a point, about which surroundings are compared
 _SHADOW, _EDGE = 0.20, 0.45  # how dark a shadow is, and an edge of a solid
 _GLAZE = 0.06  # white mixed in, so that the dark end of a colour map still shows its shape
-_SMOOTH = 0.9  # of a sphere's radius, over which a surface is made of spheres
+_SMOOTH = 0.9  # radii of a point, over which depth and colour are smooth
+_GRAINS = (3.0, 12.0)  # radii [sample] between which points turn from a surface into balls
+_CASTERS = 60_000  # points that throw a shadow
 _BEYOND = 0.35  # of the body's extent: how far a window opens for the solids beside it
 _OVERSAMPLE = 2
 
@@ -89,10 +95,11 @@ class View:
     def picture(
         self, x: np.ndarray, colors: np.ndarray, radius: float, faces: Sequence[Face] = ()
     ) -> np.ndarray:
-        """Particles x [n,3] m of colors [n,3] in 0..1 as one surface: pixels [height,width,3], 8 bits.
+        """Points x [n,3] m of colors [n,3] in 0..1, lit: pixels [height,width,3], 8 bits.
 
-        Each is a sphere of this radius [m]; shape and colour are smooth over about as much. Particles that
-        are not finite are left out. Of solids, `faces` are what is seen.
+        Each is a ball of this radius [m]. Balls of a few pixels are seen as such; smaller ones melt into one
+        surface, whose shape and colour are smooth over about a radius. Points that are not finite are left
+        out. Of solids, `faces` are what is seen.
         """
         scale = self.width * _OVERSAMPLE / self.metres_across
         shape = (self.height * _OVERSAMPLE, self.width * _OVERSAMPLE)
@@ -105,20 +112,9 @@ class View:
                 self._paint(face, canvas, nearest, scale)
                 if face.ground:
                     self._shade(face, x, canvas, radius, scale)
-        index, depth, owner = _spheres(self._pixels(self.camera.project(x), scale), radius, scale, shape)
-        front = _foremost(index, depth, shape[0] * shape[1])
-        covered = front >= 0
-        depths = np.zeros(shape, np.float32)
-        depths.reshape(-1)[covered] = depth[front[covered]]
-        if covered.any():
-            own = np.zeros((*shape, 3), np.float32)
-            own.reshape(-1, 3)[covered] = colors[owner[front[covered]]]
-            covered = covered.reshape(shape)
-            part = _box_of(np.argwhere(covered), shape)
-            surface = _surface(covered[part], depths[part], own[part], radius, scale)
-            seen = covered[part] & (depths[part] > nearest[part])
-            canvas[part][seen] = surface[seen]
-            nearest[part][seen] = depths[part][seen]
+        if len(x):
+            rows = self.front(x, radius)
+            self._draw(x[rows], colors[rows], radius, scale, canvas, nearest)
         for face in sorted(faces, key=lambda face: self.camera.project(face.corners)[:, 2].mean()):
             if face.opacity < 1.0:
                 self._paint(face, canvas, nearest, scale)
@@ -128,7 +124,7 @@ class View:
         return (255 * np.clip(mean, 0, 1)).astype(np.uint8)
 
     def front(self, x: np.ndarray, radius: float) -> np.ndarray:
-        """Rows of the particles x [n, 3] m within three radii [m] of the foremost about them.
+        """Rows of the points x [n, 3] m within six radii [m] of the foremost about them.
 
         The others are hidden behind these; of millions it leaves those that a picture shows.
         """
@@ -138,7 +134,27 @@ class View:
         cell = ((up - up.min()) / radius).astype(int) * columns + ((right - right.min()) / radius).astype(int)
         foremost = np.full(cell.max() + 1, -np.inf)
         np.maximum.at(foremost, cell, toward)
-        return alive[toward >= foremost[cell] - 3.0 * radius]
+        return alive[toward >= foremost[cell] - 6.0 * radius]
+
+    def _draw(self, x, colors, radius: float, scale: float, canvas: np.ndarray, nearest: np.ndarray) -> None:
+        """Draw points where nothing is nearer."""
+        shape = nearest.shape
+        index, depth, owner, normals = _balls(
+            self._pixels(self.camera.project(x), scale), radius, scale, shape
+        )
+        front = _foremost(index, depth, shape[0] * shape[1])
+        covered = (front >= 0).reshape(shape)
+        if not covered.any():
+            return
+        part = _box_of(np.argwhere(covered), shape)
+        covered, front = covered[part], front.reshape(shape)[part]
+        depths, own, normal = (np.zeros((*covered.shape, *extra), np.float32) for extra in ((), (3,), (3,)))
+        seen = front[covered]
+        depths[covered], own[covered], normal[covered] = depth[seen], colors[owner[seen]], normals(seen)
+        surface = _surface(covered, depths, own, normal, radius, scale)
+        shown = covered & (depths > nearest[part])
+        canvas[part][shown] = surface[shown]
+        nearest[part][shown] = depths[shown]
 
     def _pixels(self, projected: np.ndarray, scale: float) -> np.ndarray:
         """Camera axes [m] to column, row [pixel] and nearness [m]."""
@@ -168,18 +184,18 @@ class View:
             nearest[part][mask] = depth[mask]
 
     def _shade(self, face: Face, x: np.ndarray, canvas: np.ndarray, radius: float, scale: float) -> None:
-        """The shadow of the particles on a face."""
+        """The shadow of the points on a face."""
         light, normal = _LIGHT @ self.camera.axes, face.normal
         if light @ normal < 0.1 or not len(x):
             return
-        above = (x - face.corners[0]) @ normal
-        fallen = x - (above / (light @ normal))[:, None] * light
+        x = x[:: -(-len(x) // _CASTERS)]
+        fallen = x - (((x - face.corners[0]) @ normal) / (light @ normal))[:, None] * light
         shape = canvas.shape[:2]
-        index, *_ = _spheres(self._pixels(self.camera.project(fallen), scale), radius, scale, shape, 0.35)
+        index, *_ = _balls(self._pixels(self.camera.project(fallen), scale), radius, scale, shape, 0.35)
         shadow = np.zeros(shape, np.float32)
         shadow.reshape(-1)[index] = 1.0
         at = self._pixels(self.camera.project(face.corners), scale)
-        shadow = _blurred(shadow, radius * scale) * _outlined(at[:, :2], shape, True)
+        shadow = _blurred(shadow, max(2.0 * radius * scale, 4.0)) * _outlined(at[:, :2], shape, True)
         canvas *= 1 - _SHADOW * shadow[..., None]
 
 
@@ -201,44 +217,40 @@ def _outlined(corners: np.ndarray, shape, fill: bool) -> np.ndarray:
     return np.array(picture)
 
 
-def _surface(
-    covered: np.ndarray, depth: np.ndarray, colors: np.ndarray, radius: float, scale: float
-) -> np.ndarray:
-    """Colours [h, w, 3] of one surface in place of spheres: depth and colour smooth, lit by the smooth one.
+def _surface(covered, depth, colors, normals, radius: float, scale: float) -> np.ndarray:
+    """Colours [h, w, 3] of points, lit: balls where they are large, one smooth surface where they are small.
 
     What lies more than two radii before or behind its surroundings takes no part in them.
 
     Args:
-        covered: [h, w] where there are particles.
+        covered: [h, w] where there are points.
         depth: [h, w] nearness [m] there.
-        colors: [h, w, 3] of the particle that is seen.
-        radius: of a particle [m].
+        colors: [h, w, 3] of the point that is seen.
+        normals: [h, w, 3] of its ball, in camera axes.
+        radius: of a point [m].
         scale: pixels a metre.
     """
-    size = max(3, round(2 * _SMOOTH * radius * scale))
-
-    def smooth(values: np.ndarray) -> np.ndarray:
-        return uniform_filter(uniform_filter(values, size, mode="constant"), size, mode="constant")
-
+    reach = _SMOOTH * radius * scale
     weight = covered.astype(np.float32)
-    rough = smooth(depth * weight) / np.maximum(smooth(weight), 1e-6)
+    rough = _blurred(depth * weight, reach) / np.maximum(_blurred(weight, reach), 1e-6)
     weight *= np.exp(-(((depth - rough) / (2.0 * radius)) ** 2))
-    total = np.maximum(smooth(weight), 1e-6)
-    even = np.where(weight > 0.1, smooth(depth * weight) / total, depth)
-    slope_row, slope_column = np.gradient(even * scale)
-    slope_row[~covered] = slope_column[~covered] = 0.0
-    light = _LIGHT / np.linalg.norm(_LIGHT)
-    facing = (light[2] - slope_column * light[0] + slope_row * light[1]) / np.sqrt(
-        1.0 + slope_row**2 + slope_column**2
-    )
-    tone = _AMBIENT + (1 - _AMBIENT) * np.clip(facing, 0.0, 1.0)
-    tone[covered] *= _occlusion(covered, depth[covered], reach=3 * radius * scale)
-    blended = np.stack([smooth(colors[..., k] * weight) / total for k in range(3)], axis=-1)
-    return (_GLAZE + (1 - _GLAZE) * blended) * tone[..., None]
+    total = np.maximum(_blurred(weight, reach), 1e-6)
+    even = np.where(weight > 0.1, _blurred(depth * weight, reach) / total, depth)
+    down, right = np.gradient(even * scale)
+    down[~covered] = right[~covered] = 0.0
+    melted = np.stack([-right, down, np.ones_like(even)], axis=-1)
+    melted /= np.linalg.norm(melted, axis=-1, keepdims=True)
+    grains = float(np.interp(radius * scale, _GRAINS, (0.0, 1.0)))
+    normal = (1 - grains) * melted + grains * normals
+    facing = normal @ _LIGHT.astype(np.float32) / np.maximum(np.linalg.norm(normal, axis=-1), 1e-6)
+    tone = (_AMBIENT + (1 - _AMBIENT) * np.clip(facing, 0.0, 1.0)) * _occlusion(covered, even, radius, scale)
+    smooth = np.stack([_blurred(colors[..., k] * weight, reach) / total for k in range(3)], axis=-1)
+    mixed = (1 - grains) * smooth + grains * colors
+    return (_GLAZE + (1 - _GLAZE) * mixed) * tone[..., None]
 
 
-def _spheres(centre: np.ndarray, radius: float, scale: float, shape, squash: float = 1.0):
-    """Pixels that spheres cover: flat index, nearness [m], and the particle each belongs to."""
+def _balls(centre: np.ndarray, radius: float, scale: float, shape, squash: float = 1.0):
+    """Pixels that balls cover: flat index, nearness [m], whose each is, and rows → normals [k, 3] there."""
     pixels = max(radius * scale, 0.8)
     reach = int(np.ceil(pixels))
     dx, dy = np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1))
@@ -249,8 +261,9 @@ def _spheres(centre: np.ndarray, radius: float, scale: float, shape, squash: flo
     row = np.round(centre[:, 1]).astype(int)[:, None] + dy
     seen = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
     depth = centre[:, 2:3] + bulge * radius
-    owner = np.broadcast_to(np.arange(len(centre))[:, None], seen.shape)
-    return (row * shape[1] + column)[seen], depth[seen], owner[seen]
+    owner, offset = np.nonzero(seen)
+    directions = np.stack([dx / pixels, -dy / pixels, bulge], axis=1)
+    return (row * shape[1] + column)[seen], depth[seen], owner, lambda rows: directions[offset[rows]]
 
 
 def _foremost(index: np.ndarray, depth: np.ndarray, pixels: int) -> np.ndarray:
@@ -263,19 +276,21 @@ def _foremost(index: np.ndarray, depth: np.ndarray, pixels: int) -> np.ndarray:
     return front
 
 
-def _occlusion(covered: np.ndarray, depth: np.ndarray, reach: float) -> np.ndarray:
-    """Brightness left to each covered pixel: less where it lies behind what is `reach` pixels about.
+def _occlusion(covered: np.ndarray, depth: np.ndarray, radius: float, scale: float) -> np.ndarray:
+    """Brightness left to each pixel: less where it lies behind what is about it, near and far.
 
-    Unsharp masking of the depth buffer (Luft, Colditz, Deussen 2006). The background takes no part.
+    Unsharp masking of the depth buffer (Luft, Colditz, Deussen 2006), at two reaches. The background takes no
+    part.
     """
-    nearness = (depth - depth.min()) / max(np.ptp(depth), 1e-12)
-    buffer = np.zeros(covered.shape, np.float32)
-    buffer[covered] = nearness
-    around = _blurred(buffer, reach)[covered] / np.maximum(_blurred(covered, reach)[covered], 0.02)
-    return 1 - _OCCLUSION * np.clip(6 * (around - nearness), 0, 1)
+    weight, shade = covered.astype(np.float32), np.zeros(covered.shape, np.float32)
+    for radii in _OCCLUDED:
+        reach = radii * radius
+        around = _blurred(depth * weight, reach * scale) / np.maximum(_blurred(weight, reach * scale), 0.02)
+        shade += np.clip((around - depth) / (0.6 * reach), 0, 1) / len(_OCCLUDED)
+    return 1 - _OCCLUSION * shade
 
 
 def _blurred(image: np.ndarray, reach: float) -> np.ndarray:
-    """A picture of values in 0..1 blurred over `reach` pixels, in 8 bits: enough for shading, and fast."""
-    picture = Image.fromarray((255 * image.astype(np.float32)).astype(np.uint8))
-    return np.asarray(picture.filter(ImageFilter.GaussianBlur(float(reach))), np.float32) / 255
+    """An image blurred over about `reach` pixels; nothing lies beyond its edges."""
+    size = max(3, round(2 * reach))
+    return uniform_filter(uniform_filter(image, size, mode="constant"), size, mode="constant")

@@ -1,10 +1,13 @@
 """What the camera sees of many particles."""
 
 import numpy as np
+import pytest
 
-from nsf.reporting.bodies import camera
-from nsf.reporting.bodies.camera import View
+from nsf.bodies import camera
+from nsf.bodies.camera import Camera, View
 from nsf.scenes import Box
+
+RED, BLUE = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
 
 
 def test_the_foremost_particles_make_the_same_picture():
@@ -43,3 +46,25 @@ def test_each_pixel_shows_what_is_nearest():
         expected = there[depth[there].argmax()] if len(there) else -1
         assert front[pixel] == expected
     assert camera._foremost(np.array([3, 3]), np.array([1.0, 1.0]), 4).tolist() == [-1, -1, -1, 1]
+
+
+def test_the_nearer_particle_hides_the_farther():
+    camera = Camera(azimuth=-90, elevation=0)  # looks along +y
+    view = View(camera, np.array([-1.0, -1.0]), np.array([1.0, 1.0]), width=40)
+    for x in ([[0, -0.5, 0], [0, 0.5, 0]], [[0, 0.5, 0], [0, -0.5, 0]]):
+        colors = np.array([RED, BLUE]) if x[0][1] < 0 else np.array([BLUE, RED])
+        middle = view.picture(np.array(x, float), colors, radius=0.3)[20, 20].astype(int)
+        assert middle[0] > middle[2] + 80
+
+
+def test_particles_right_of_the_middle_are_drawn_right():
+    view = View(Camera(-90, 0), np.array([-1.0, -1.0]), np.array([1.0, 1.0]), width=40)
+    picture = view.picture(np.array([[0.5, 0, 0.5]]), RED[None], radius=0.2).astype(int)
+    rows, columns = np.nonzero(picture[..., 0] > picture[..., 2] + 50)
+    assert rows.mean() == pytest.approx(10, abs=1.5)  # row 0 is the top
+    assert columns.mean() == pytest.approx(30, abs=1.5)
+
+
+def test_particles_that_are_not_finite_are_left_out():
+    view = View(Camera(), np.array([-1.0, -1.0]), np.array([1.0, 1.0]), width=20)
+    assert view.picture(np.full((3, 3), np.nan), np.zeros((3, 3)), 0.2).min() == 255
