@@ -71,8 +71,8 @@ examples:
   nsf run scene=sand scene.design.test=[23,30.5]       other held-out cases
   nsf run -m scene=sand latent_dim=4,6 sampler.size=50,150   every combination
   nsf plan scene=cake scale=paper                      what that would take, before it begins
-  nsf run +experiment=table1 scale=small               every job of experiments/table1.yaml, and its report
-  nsf run -m +experiment=sand hydra/launcher=joblib    jobs side by side on this machine
+  nsf run +experiment=table1/scenes scale=small        the jobs of a part of an experiment, and its report
+  nsf run -m +experiment=timestep hydra/launcher=joblib  jobs side by side on this machine
   nsf run -m +experiment=table1 hydra/launcher=slurm   jobs in Slurm's queue (conf/hydra/launcher/slurm.yaml)
   nsf demo                                             a model in the browser, at once
   nsf export --html --frames                           the newest deployed run as a page and a film
@@ -107,7 +107,7 @@ def groups_text() -> str:
     width = max(map(len, groups()))
     lines = [f"  {group:<{width}} {' '.join(options)}" for group, options in groups().items()]
     experiments = " ".join(sorted(path.stem for path in EXPERIMENTS.glob("*.yaml")))
-    lines += ["", "experiments (+experiment=NAME):", f"  {experiments}"]
+    lines += ["", "experiments (+experiment=NAME, or +experiment=NAME/PART):", f"  {experiments}"]
     return "\n".join(["configuration groups (group=option):", *lines])
 
 

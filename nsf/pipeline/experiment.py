@@ -2,6 +2,7 @@
 
 import difflib
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from nsf.vectors import is_finite
 
 _KEYS = {"title", "question", "paper", "jobs"}
 _OPTIONAL = {"stages", "each", "printed"}
+_KEYS_OF_PARTS = {"title", "question", "parts"}
 _MORE_STAGES = ("superresolve",)  # that a job may do after those of `nsf run`
 #: Keys that a column of results.csv tells of.
 _COLUMNS = ("scene", "method", "field", "latent_dim", "engine", "sampler.size", "precision", "device")
@@ -46,10 +48,10 @@ class Job:
 
 @dataclass(frozen=True)
 class Experiment:
-    """A question and its jobs.
+    """A question and its jobs; or, of a file with parts, the questions and jobs of its parts.
 
     Attributes:
-        name: of the file, and of the report's folder.
+        name: of the file, with `/part` of a part; the report's folder has it too.
         title: of the report.
         question: what it is to find out.
         paper: what the paper reports on it, with the place.
@@ -58,6 +60,7 @@ class Experiment:
         printed: δ that the paper prints of single jobs, as `Study` has them; None where it prints one a scene
             and method, which the scene's file has.
         small: whether the file itself asks for scale=small, so that its report's name need not say so.
+        parts: experiments with questions, jobs and reports of their own; none where the file has jobs itself.
     """
 
     name: str
@@ -68,38 +71,56 @@ class Experiment:
     stages: tuple[str, ...] = ()
     printed: tuple[dict, ...] | None = None
     small: bool = False
+    parts: "tuple[Experiment, ...]" = ()
 
     @classmethod
     def load(cls, name: str, overrides: Sequence[str] = (), folder: Path = EXPERIMENTS) -> "Experiment":
-        """The experiment of `folder/name.yaml`; `overrides` take the place of its own.
+        """The experiment of `folder/name.yaml`, or a part of it; `overrides` take the place of its own.
 
         Args:
-            name: of the file, without its ending.
+            name: of the file, without its ending; or of a part, as `table1/seeds`.
             overrides: `key=value`; a key that no grid has is added to each.
             folder: of the files.
 
         Raises:
-            ConfigError: there is no such file (the nearest is named), or a key of it is missing or unknown.
+            ConfigError: there is no such file or part (the nearest is named), or a key of it is missing or
+                unknown.
         """
-        path, known = folder / f"{name}.yaml", sorted(p.stem for p in folder.glob("*.yaml"))
-        if name not in known:
-            near = difflib.get_close_matches(name, known, n=1)
-            hint = f" (did you mean {near[0]}?)" if near else ""
-            raise ConfigError(f"unknown experiment={name}; choose one of {', '.join(known)}{hint}")
+        stem, _, part = name.partition("/")
+        if stem not in (stems := _stems(folder)):
+            raise _unknown(name, stems, _with_parts(folder))
+        path = folder / f"{stem}.yaml"
         content = _read(path)
+        if "parts" not in content:
+            if part:
+                raise ConfigError(f"unknown experiment={name}; {stem} has no parts, leave /{part} out")
+            return cls._of(stem, content, overrides, f"{path}")
+        names = [f"{stem}/{one}" for one in content["parts"]]
+        if part and name not in names:
+            raise _unknown(name, names, names)
+        parts = {
+            f"{stem}/{one}": cls._of(f"{stem}/{one}", of_part, overrides, f"{path}: {one}")
+            for one, of_part in content["parts"].items()
+        }
+        if part:
+            return parts[name]
+        grids = tuple(grid for one in parts.values() for grid in one.grids)
+        texts = _texts(content, ("title", "question"), f"{path}")
+        return cls(name=stem, paper="", grids=grids, parts=tuple(parts.values()), **texts)
+
+    @classmethod
+    def _of(cls, name: str, content: dict, overrides: Sequence[str], where: str) -> "Experiment":
+        """The experiment of a file without parts, or of one part; `where` says which in messages."""
         stages = content.get("stages", [])
         if not isinstance(stages, list) or any(stage not in _MORE_STAGES for stage in stages):
-            raise ConfigError(f"{path}: stages={stages} must be a list of {', '.join(_MORE_STAGES)}")
-        each = _grid(content.get("each", {}), f"{path}: each")
+            raise ConfigError(f"{where}: stages={stages} must be a list of {', '.join(_MORE_STAGES)}")
+        each = _grid(content.get("each", {}), f"{where}: each")
         own = {override.split("=", 1)[0]: override for override in overrides}
-        stated = [each | _grid(grid, f"{path}: jobs[{at}]") for at, grid in enumerate(content["jobs"])]
+        stated = [each | _grid(grid, f"{where}: jobs[{at}]") for at, grid in enumerate(content["jobs"])]
         grids = tuple(grid | own for grid in stated)
         small = all(grid.get("scale") == "scale=small" for grid in stated)
-        texts = {
-            key: " ".join(configuration.text(f"{path}: {key}", content[key]).split())
-            for key in ("title", "question", "paper")
-        }
-        printed = _printed(content.get("printed"), path)
+        texts = _texts(content, ("title", "question", "paper"), where)
+        printed = _printed(content.get("printed"), where)
         return cls(name=name, grids=grids, stages=tuple(stages), printed=printed, small=small, **texts)
 
     @property
@@ -123,14 +144,16 @@ class Experiment:
         return [Job(job, setting(job)) for job in found]
 
     def report(self, say: Callable[[str], None] = print, root: Path | None = None) -> tuple[Path, list[str]]:
-        """Write `reports/<name>` from what the jobs left, whichever device they ran on.
+        """Write `reports/<name>` from what the jobs left, whichever device they ran on; one for each part.
 
         Returns:
-            The page, and what is missing on it.
+            The page, of parts that of the first one, and what is missing on it or on those of all parts.
 
         Raises:
             MissingRunError: no job was evaluated.
         """
+        if self.parts:
+            return self._reports_of_parts(say, root)
         from nsf.reporting.sources import Study
 
         runs: dict[str, Run] = {}
@@ -168,6 +191,22 @@ class Experiment:
         say(f"report: {len(runs)} jobs, {len(missing)} missing → {page}")
         return page, missing
 
+    def _reports_of_parts(self, say: Callable[[str], None], root: Path | None) -> tuple[Path, list[str]]:
+        pages, missing = [], []
+        for part in self.parts:
+            try:
+                page, absent = part.report(say, root)
+            except MissingRunError as error:
+                missing.append(f"{part.name}: {error}")
+                continue
+            pages.append(page)
+            missing += [f"{part.name}: {one}" for one in absent]
+        if not pages:
+            raise MissingRunError(
+                f"no job of {self.name} was evaluated; run `nsf run +experiment={self.name}`"
+            )
+        return pages[0], missing
+
     def check_report_folder(self) -> None:
         """Refuse a place where no report could be written, before the jobs.
 
@@ -177,25 +216,65 @@ class Experiment:
         """
         from nsf.results.folder import check_place
 
-        config = configuration.load(self.jobs[0].overrides)
-        check_place(self._folder(config, {config.scale}))
+        for one in self.parts or (self,):
+            config = configuration.load(one.jobs[0].overrides)
+            check_place(one._folder(config, {config.scale}))
 
     def _folder(self, config: DictConfig, scales: set[str]) -> Path:
         shrunk = scales == {"small"} and not self.small
         return Path(config.report.folder) / (f"{self.name}_small" if shrunk else self.name)
 
 
+def _stems(folder: Path) -> list[str]:
+    """Names of the files of a folder of experiments."""
+    return sorted(path.stem for path in folder.glob("*.yaml"))
+
+
+def _with_parts(folder: Path) -> list[str]:
+    """The same, and names of their parts; a file that cannot be read has none."""
+    names = _stems(folder)
+    for stem in tuple(names):
+        with suppress(ConfigError):
+            names += [f"{stem}/{part}" for part in _read(folder / f"{stem}.yaml").get("parts", ())]
+    return names
+
+
+def _unknown(name: str, choices: Sequence[str], names: Sequence[str]) -> ConfigError:
+    near = difflib.get_close_matches(name, names, n=1)
+    hint = f" (did you mean {near[0]}?)" if near else ""
+    return ConfigError(f"unknown experiment={name}; choose one of {', '.join(choices)}{hint}")
+
+
 def _read(path: Path) -> dict:
-    """The content of an experiment's file, with the keys that it needs."""
+    """The content of an experiment's file, with the keys that it needs, and each part with those it needs."""
     try:
         content = yaml.safe_load(text_of(path))
     except (yaml.YAMLError, ValueError) as error:
         raise ConfigError(f"{path}: {str(error).splitlines()[0]}; correct the yaml") from error
-    found = set(content) if isinstance(content, dict) else set()
-    jobs = content["jobs"] if "jobs" in found else None
-    if found - _OPTIONAL != _KEYS or not isinstance(jobs, list) or not jobs:
-        raise ConfigError(f"{path} must have the keys {', '.join(sorted(_KEYS))}; jobs is a list")
+    if not isinstance(content, dict) or "parts" not in content:
+        _check_keys(content, str(path))
+        return content
+    parts = content["parts"]
+    if set(content) != _KEYS_OF_PARTS or not isinstance(parts, dict) or not parts:
+        raise ConfigError(
+            f"{path} must have the keys {', '.join(sorted(_KEYS_OF_PARTS))} and no other; parts is a mapping"
+        )
+    for name, part in parts.items():
+        _check_keys(part, f"{path}: {name}")
     return content
+
+
+def _check_keys(content, where: str) -> None:
+    """Refuse what is no experiment and no part of one."""
+    names = set(content) if isinstance(content, dict) else set()
+    jobs = content["jobs"] if "jobs" in names else None
+    if names - _OPTIONAL != _KEYS or not isinstance(jobs, list) or not jobs:
+        raise ConfigError(f"{where} must have the keys {', '.join(sorted(_KEYS))}; jobs is a list")
+
+
+def _texts(content: dict, keys: Sequence[str], where: str) -> dict[str, str]:
+    """The texts of a file or part, each on one line."""
+    return {key: " ".join(configuration.text(f"{where}: {key}", content[key]).split()) for key in keys}
 
 
 def _grid(values, where: str) -> dict[str, str]:
@@ -228,7 +307,7 @@ def _ended(run: Run) -> str | None:
     return f"{run.stage} {run.manifest.get('status')}: {error}" if error else None
 
 
-def _printed(entries, path: Path) -> tuple[dict, ...] | None:
+def _printed(entries, where: str) -> tuple[dict, ...] | None:
     """Figures of the paper: δ as a number, all else as the text that keys of jobs have."""
     if entries is None:
         return None
@@ -236,7 +315,7 @@ def _printed(entries, path: Path) -> tuple[dict, ...] | None:
         isinstance(entry, dict) and isinstance(entry.get("delta"), float) and is_finite(entry["delta"])
         for entry in entries
     ):
-        raise ConfigError(f"{path}: printed must be a list of mappings, each with a number delta")
+        raise ConfigError(f"{where}: printed must be a list of mappings, each with a number delta")
     return tuple(
         {str(key): value if key == "delta" else _text(value) for key, value in entry.items()}
         for entry in entries

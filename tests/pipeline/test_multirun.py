@@ -84,17 +84,17 @@ def test_points_of_several_materials(tmp_path):
 
 @pytest.mark.slow
 def test_an_experiment_runs_its_jobs_and_reports_them(nsf, copied, tmp_path):
-    """experiments/sand.yaml, made tiny and of one field: two of its three jobs are then the same."""
+    """A part of experiments/table1.yaml, made tiny and of one scene and field."""
     root = copied("simulate")
-    tiny = ["field=basis", "evaluation.trials=1", "trainer.budget_minutes=null"]
-    arguments = ["+experiment=sand", "scale=small", *tiny]
+    tiny = ["scene=sand", "field=basis", "evaluation.trials=1", "trainer.budget_minutes=null"]
+    arguments = ["+experiment=table1/scenes", "scale=small", "engine=auto", *tiny]
     outcome = nsf("run", root, *arguments, faults=[PlainReport()], multirun=True)
     assert outcome.code == 0, outcome.err
-    report = tmp_path / "work/reports/sand_small"
+    report = tmp_path / "work/reports/table1/scenes_small"
     rows = pd.read_csv(report / "results.csv")
     found = set(zip(rows["method"], rows["field"], strict=True))
     assert found == {("nsf", "basis"), ("deformation_only", "basis")}
-    assert "Does a neural stress field" in (report / "index.md").read_text()
+    assert "How far is the reduced run" in (report / "index.md").read_text()
     assert r"deformation\_only & " in (report / "results.tex").read_text()
     again = nsf("report", root, *arguments, faults=[PlainReport()])
     assert again.code == 0
@@ -129,17 +129,18 @@ def test_an_experiment_may_ask_for_more_points(nsf, copied, tmp_path):
 
 def test_a_report_names_what_is_missing(nsf, copied, tmp_path):
     root = copied("simulate", "train", "deploy", "evaluate")
-    outcome = nsf("report", root, "+experiment=sand", "scale=small", "field=basis", faults=[PlainReport()])
+    keys = ["+experiment=table1/scenes", "scene=sand", "scale=small", "field=basis", "engine=auto"]
+    outcome = nsf("report", root, *keys, faults=[PlainReport()])
     assert outcome.code == 2
-    assert "missing: scene=sand" in outcome.err
+    assert "missing: scale=small" in outcome.err
     assert "method=deformation_only" in outcome.err
-    assert "Missing" in (tmp_path / "work/reports/sand_small/index.md").read_text()
+    assert "Missing" in (tmp_path / "work/reports/table1/scenes_small/index.md").read_text()
 
 
 def test_an_experiment_without_results_says_how_to_get_them(nsf, copied):
-    outcome = nsf("report", copied("simulate"), "+experiment=sand", "scale=small", "field=basis")
+    outcome = nsf("report", copied("simulate"), "+experiment=large", "scale=small")
     assert outcome.code == 2
-    assert "run `nsf run +experiment=sand`" in outcome.err
+    assert "run `nsf run +experiment=large`" in outcome.err
 
 
 @pytest.mark.slow

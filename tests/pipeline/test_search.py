@@ -74,7 +74,7 @@ def test_a_failed_trial_is_kept_and_the_others_go_on(tried, monkeypatch):
         (["latent_dim=4..6"], "no validation cases.*scene.design.validation"),
         (["latent_dim=4..6", "scene.design.validation=[26]"], "26"),  # a test value
         (["latent_dim=4"], "needs a range"),
-        (["latent_dim=4..6", "+experiment=sand"], "has no experiment"),
+        (["latent_dim=4..6", "+experiment=table1"], "has no experiment"),
         (["latent_dim=6..4"], "nothing between"),
         (["latent_dimm=4..6"], "did you mean latent_dim"),
         (["field.noise=0.0..0.1:log"], "reaches zero"),

@@ -284,7 +284,7 @@ def test_bad_input_of_a_later_stage_is_refused_before_any_work(nsf, monkeypatch,
         assert text in err
 
 
-@pytest.mark.parametrize("jobs", [("+experiment=ablation", "scale=small"), ("-m", "latent_dim=4,5")])
+@pytest.mark.parametrize("jobs", [("+experiment=table1/ablation", "scale=small"), ("-m", "latent_dim=4,5")])
 def test_a_place_for_no_report_is_refused_before_the_jobs(nsf, monkeypatch, jobs):
     monkeypatch.setattr(chain_module(), "simulate", lambda *arguments: pytest.fail("simulate began"))
     code, _, err = nsf("run", *jobs, "report.folder=/proc/reports", tiny_scene=jobs[0] == "-m")

@@ -22,6 +22,15 @@ jobs:
 """
 
 
+PARTS = """
+title: A whole
+question: Which of them?
+parts:
+  first: {title: First, question: "Which?", paper: Nothing., jobs: [{scene: sand, seed: [0, 1]}]}
+  second: {title: Second, question: "Why?", paper: Nothing., each: {seed: 2}, jobs: [{scene: [sand, metal]}]}
+"""
+
+
 @pytest.fixture
 def written(tmp_path):
     def write(text, *overrides):
@@ -119,11 +128,42 @@ def test_equal_jobs_are_one(written):
         ("title: a\0b", "control character"),
         ("a: &a [*a]", "holds itself"),
         ("a: 2024-99-99", "month must be in"),
+        (PARTS + "jobs: [{scene: sand}]\n", "and no other; parts is a mapping"),
+        (PARTS[: PARTS.index("parts")] + "parts: {}\n", "parts is a mapping"),
+        (PARTS[: PARTS.index("parts")] + "parts: [1]\n", "parts is a mapping"),
+        (PARTS + "  third: 3\n", r"one\.yaml: third must have the keys jobs"),
+        (PARTS + "  5: {title: a}\n", r"one\.yaml: 5 must have the keys jobs"),
     ],
 )
 def test_a_file_that_is_no_experiment(written, text, told):
     with pytest.raises(ConfigError, match=told):
         written(text)
+
+
+def test_a_part_is_an_experiment(written, tmp_path):
+    whole = written(PARTS, "scale=small")
+    assert [part.name for part in whole.parts] == ["one/first", "one/second"]
+    assert len(whole.jobs) == 4
+    part = Experiment.load("one/second", ["scale=small"], tmp_path)
+    assert (part.title, part.question, part.parts) == ("Second", "Why?", ())
+    assert [job.overrides for job in part.jobs] == [
+        ("seed=2", f"scene={scene}", "scale=small") for scene in ("sand", "metal")
+    ]
+    assert [job.setting for job in whole.parts[0].jobs] == ["seed=0", "seed=1"]
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("one/third", r"choose one of one/first, one/second"),
+        ("second", r"did you mean one/second\?"),
+        ("one/first/x", r"unknown experiment=one/first/x"),
+    ],
+)
+def test_an_unknown_part(written, tmp_path, name, told):
+    written(PARTS)
+    with pytest.raises(ConfigError, match=told):
+        Experiment.load(name, folder=tmp_path)
 
 
 @pytest.mark.parametrize("encoding", ["latin-1", "utf-16"])
