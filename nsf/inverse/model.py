@@ -16,7 +16,7 @@ from nsf.engines import Operators
 from nsf.engines.operators import collider_states
 from nsf.errors import ConfigError, ShapeError
 from nsf.inverse.inputs import Polynomial
-from nsf.inverse.recurrence import Recurrence
+from nsf.inverse.recurrence import differentiable_run
 from nsf.kinematics.manifold import Restriction
 from nsf.pipeline import Pipeline
 from nsf.pipeline.stages.deployment import trust_of
@@ -89,7 +89,7 @@ class Model:
         self.spacing = float(one.constants.volume0.mean() ** (1 / 3))
         self._sample = one.sets[0].sample
         self._every = np.unique(np.concatenate([sets.sample for sets in one.sets]))
-        self._recurrence = Recurrence(self.operators.model.to(self.device))
+        self._network = self.operators.model.to(self.device)
         self._xhat = one.xhat.to(self.device, torch.float64)
         self._given: dict[str, Polynomial] = {}
         self._built: dict[tuple, dict[str, np.ndarray]] = {}
@@ -138,7 +138,8 @@ class Model:
             values.to(self.device).flatten(0, -3).movedim(-2, 0) if values.ndim > 2 else values[:, None]
             for values in (given.gravity, given.solids)
         )
-        found = self._recurrence(self._xhat.repeat(len(rows), 1), first, rows, gravity, solids)
+        xhat = self._xhat.repeat(len(rows), 1)
+        found = differentiable_run(self._network, xhat, first, rows, gravity, solids)
         return found.movedim(0, -2).unflatten(0, mu.shape[:-1]) if mu.ndim > 1 else found[:, 0]
 
     def at(self, points) -> Restriction:

@@ -215,23 +215,37 @@ class StepOperators(nn.Module):
             found.append(xhat)
         return torch.stack(found)
 
-    def raw_layers(self) -> list[tuple[Tensor, Tensor]]:
-        """Weights [out, in] and biases [out] of the same network for raw inputs and outputs.
+    def scaled_layers(self) -> list[tuple[Tensor, Tensor]]:
+        """Weights [out, in] and biases [out] of the same network with the scales in them, as the loop has it.
 
-        Without a memory. Its inputs are x̂, μ and the collider states as `states.collider_states` gives them;
-        its outputs the entries of B [r, r], Δt² f [r] and Δt² G [r, 3], with d' = d + B d + Δt² (f + G g).
+        Its inputs are x̂, μ, c and lags; its outputs the entries of B [r, r], Δt² f [r] and Δt² G [r, 3],
+        with d' = d + B d + Δt² (f + G γ), where γ = (g − ḡ)/s is gravity in units of its scale.
         """
-        (W, b), middle, (V, c) = ((layer.weight, layer.bias) for layer in (self.net[i] for i in (0, 2, 4)))
-        r, n = self.sizes.latents, self.sizes.parameters
-        of_x, of_mu = W[:, :r] / self.x_scale, W[:, r : r + n] / self.mu_scale
-        of_states = W[:, r + n :] @ self.c_matrix.T
-        first = torch.cat([of_x, of_mu, of_states], 1), b - of_x @ self.x_mean - of_mu @ self.mu_mean
-        first = first[0], first[1] - of_states @ self.c_mean
-        B, f, G = torch.cat([V, c[:, None]], 1).tensor_split([r * r, r * r + r])
-        B = (self.a_scale[:, None] / self.d_scale).flatten()[:, None] * B
-        f = self.a_scale[:, None] * f
+        (W, b), middle, (V, v) = ((layer.weight, layer.bias) for layer in (self.net[i] for i in (0, 2, 4)))
+        r, n, C = self.sizes.latents, self.sizes.parameters, self.sizes.states
+        of_x, of_mu, of_c, of_lag = W.split([r, n, C, self.sizes.lags], 1)
+        of_x, of_mu = of_x / self.x_scale, of_mu / self.mu_scale
+        if self.sizes.memory:
+            of_lag = of_lag / self.lag_scale
+        first = torch.cat([of_x, of_mu, of_c, of_lag], 1), b - of_x @ self.x_mean - of_mu @ self.mu_mean
+        unit = [(self.a_scale[:, None] / self.d_scale).flatten(), self.a_scale]
         if self.sizes.gravity:
-            G = self.a_scale.repeat_interleave(3)[:, None] * G / self.g_scale
+            unit.append(self.a_scale.repeat_interleave(3))
+        unit = torch.cat(unit)
+        return [first, middle, (unit[:, None] * V, unit * v)]
+
+    def raw_layers(self) -> list[tuple[Tensor, Tensor]]:
+        """The same for raw inputs and outputs, as a page has it; without a memory.
+
+        In place of c are the collider states as `states.collider_states` gives them, and G takes g itself.
+        """
+        (W, b), middle, (V, v) = self.scaled_layers()
+        r, n = self.sizes.latents, self.sizes.parameters
+        of_states = W[:, r + n :] @ self.c_matrix.T
+        first = torch.cat([W[:, : r + n], of_states], 1), b - of_states @ self.c_mean
+        B, f, G = torch.cat([V, v[:, None]], 1).tensor_split([r * r, r * r + r])
+        if self.sizes.gravity:
+            G = G / self.g_scale
             f = f - (G.unflatten(0, (r, 3)) * self.g_mean[:, None]).sum(1)
         last = torch.cat([B, f, G])
         return [first, middle, (last[:, :-1], last[:, -1])]

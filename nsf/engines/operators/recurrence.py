@@ -99,26 +99,15 @@ def folded(model: StepOperators, parameters: torch.Tensor) -> dict[str, torch.Te
         model: in fp64.
         parameters: μ [B, n] of the runs.
     """
+    (W, b), (middle, middle_bias), (last, last_bias) = model.scaled_layers()
     r, n = model.sizes.latents, model.sizes.parameters
-    W, b = model.net[0].weight, model.net[0].bias
-    of_x, of_mu, rest = W[:, :r] / model.x_scale, W[:, r : r + n], W[:, r + n :]
-    if model.sizes.memory:
-        of_c, of_lag = rest.tensor_split([model.sizes.states], 1)
-        rest = torch.cat([of_c, of_lag / model.lag_scale], 1)
-    mu = (parameters - model.mu_mean) / model.mu_scale
-    last, last_bias = model.net[4].weight, model.net[4].bias
-    # Rows are of B [r, r], which takes d as it is, of f [r] and of G [r, 3], which takes a gravity in units.
-    unit = [(model.a_scale[:, None] / model.d_scale).flatten(), model.a_scale]
-    if model.sizes.gravity:
-        unit.append(model.a_scale.repeat_interleave(3))
-    unit = torch.cat(unit)
     return {
-        "first": torch.cat([of_x, rest], 1).T.flatten(),
-        "bias": b - of_x @ model.x_mean + mu @ of_mu.T,
-        "middle": model.net[2].weight.T.flatten(),
-        "middle_bias": model.net[2].bias,
-        "last": (unit[:, None] * last).T.flatten(),
-        "last_bias": unit * last_bias,
+        "first": torch.cat([W[:, :r], W[:, r + n :]], 1).T.flatten(),
+        "bias": b + parameters @ W[:, r : r + n].T,
+        "middle": middle.T.flatten(),
+        "middle_bias": middle_bias,
+        "last": last.T.flatten(),
+        "last_bias": last_bias,
     }
 
 
