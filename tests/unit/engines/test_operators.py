@@ -103,25 +103,6 @@ def test_untaught_operators_keep_the_change():
     assert torch.equal(model.step(x, d, mu, g, c)[1], d)
 
 
-def test_a_run_is_differentiable_in_all_it_is_given():
-    model = operators()
-    x, d, mu, g, _ = given(model)
-    c = torch.randn(3, 2).double()
-    inputs = [values.requires_grad_() for values in (x, d, mu, g)]
-    assert torch.autograd.gradcheck(lambda *values: model.run(*values, c), inputs)
-    forcing = g.detach().expand(3, 3).clone().requires_grad_()  # of each step
-    assert torch.autograd.gradcheck(lambda values: model.run(x, d, mu, values, c), [forcing])
-    model.run(x, d, mu, g, c)[-1].sum().backward()
-    weight, size = model.net[0].weight, 1e-6
-    ends = []
-    for sign in (1, -1):
-        with torch.no_grad():
-            weight[2, 3] += sign * size
-            ends.append(model.run(x, d, mu, g, c)[-1].sum())
-            weight[2, 3] -= sign * size
-    torch.testing.assert_close(weight.grad[2, 3], (ends[0] - ends[1]) / (2 * size), rtol=1e-5, atol=1e-9)
-
-
 def test_a_body_at_rest_begins_at_rest_and_a_moving_one_moves():
     torch.manual_seed(0)
     J, d = torch.randn(20, 3, 4).double(), torch.randn(4).double()

@@ -1,4 +1,4 @@
-"""One definition of the recurrence, `StepOperators.step`: the loop, the page's script and gradients follow it."""
+"""`StepOperators.step` defines the recurrence; the loop, the page's script and gradients follow it."""
 
 import json
 import shutil

@@ -60,24 +60,6 @@ def test_the_modules_under_node(node):
     assert "# pass 0" not in done.stdout
 
 
-def test_raw_layers_are_the_operators(taught_model):
-    model = taught_model.pipeline.operators().model
-    values = torch.from_numpy(np.random.default_rng(0).normal(size=(5, 64)))
-    r, n, f = model.sizes.latents, model.sizes.parameters, model.sizes.features
-    x, d = model.x_mean + values[:, :r] * model.x_scale, values[:, r : 2 * r] * model.d_scale
-    mu = model.mu_mean + values[:, 20 : 20 + n] * model.mu_scale
-    g, states = values[:, 30:33], values[:, 33 : 33 + f]
-    out = torch.cat([x, mu, states], 1)
-    layers = model.raw_layers()
-    for k, (weight, bias) in enumerate(layers):
-        out = out @ weight.T + bias
-        out = torch.nn.functional.silu(out) if k < len(layers) - 1 else out
-    B, rest = out[:, : r * r].unflatten(1, (r, r)), out[:, r * r + r :].unflatten(1, (r, 3))
-    change = d + (B @ d[..., None])[..., 0] + out[:, r * r : r * r + r] + (rest @ g[..., None])[..., 0]
-    _, wanted = model.step(x, d, mu, g, model.collider_state(states))
-    torch.testing.assert_close(change, wanted, rtol=1e-9, atol=1e-12)
-
-
 def test_a_whole_run_is_pythons(whole, taught_model):
     cases = taught_model.pipeline.held_out
     assert len(cases) == len(whole) == 3
