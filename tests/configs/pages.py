@@ -25,17 +25,12 @@ def blocks(text: str) -> list[tuple[str, str, str]]:
     return _BLOCK.findall(text)
 
 
-def blocks_of(text: str, language: str) -> list[str]:
-    """Contents of the blocks in one language."""
-    return [content for found, _, content in blocks(text) if found == language]
-
-
 def try_command(command: str, folder: Path, monkeypatch, capsys, experiments: Path = EXPERIMENTS) -> None:
     """Call what is quick, in an empty `folder` of runs; compose and build what a stage would run.
 
     `make` and `pytest` are only asked whether the target or the file is there.
     """
-    program, *words = command.split()
+    program, *words = command.split("#")[0].split()
     if program == "make":
         assert re.search(rf"^{words[0]}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
         return

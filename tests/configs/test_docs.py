@@ -1,4 +1,4 @@
-"""Every code block of docs/ does what its page says: files build, commands compose, Python runs."""
+"""Every code block of README.md and docs/ does what it says: files build, commands compose, Python runs."""
 
 import importlib
 import re
@@ -16,7 +16,8 @@ from nsf.pipeline.experiment import Experiment
 
 DOCS = ROOT / "docs"
 #: What is written for readers of the code has signatures, not programs.
-PAGES = sorted(p.relative_to(DOCS).as_posix() for p in DOCS.glob("**/*.md") if p.name != "design.md")
+PAGES = ["../README.md"]
+PAGES += sorted(p.relative_to(DOCS).as_posix() for p in DOCS.glob("**/*.md") if p.name != "design.md")
 
 
 @pytest.fixture

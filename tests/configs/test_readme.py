@@ -1,24 +1,17 @@
-"""README says what is so: its commands compose, its links lead somewhere, its figures are the report's."""
+"""README is short, its links lead somewhere, its figures are the report's; test_docs.py tries its blocks."""
 
 import re
 from pathlib import Path
 
 import pandas as pd
 import pytest
-from pages import ROOT, blocks_of, try_command
+from pages import ROOT
 
 from nsf.errors import ConfigError
 from nsf.reporting import COLUMNS
 from nsf.reporting.committed import BEGIN, END, REPORT, figures, updated
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-
-
-@pytest.mark.parametrize(
-    "command", [line for block in blocks_of(README, "sh") for line in block.splitlines()]
-)
-def test_readme_command(command, tmp_path, monkeypatch, capsys):
-    try_command(command, tmp_path, monkeypatch, capsys)
 
 
 def test_readme_links_lead_somewhere():
@@ -35,9 +28,9 @@ def test_readme_figures_are_those_of_the_report(monkeypatch):
     assert updated(README, REPORT) == README, "run `make readme`"
 
 
-def test_readme_is_short_and_names_no_commit():
-    assert len(README.split()) <= 1200
-    assert not re.findall(r"\b(?=[0-9a-f]*\d)(?=[0-9a-f]*[a-f])[0-9a-f]{7,}\b", README)
+def test_readme_is_short():
+    generated = README[README.index(BEGIN) : README.index(END)]
+    assert len(README.replace(generated, "").split()) <= 560
 
 
 def results(tmp_path: Path, deltas: dict[str, float]) -> Path:
