@@ -9,8 +9,6 @@ from nsf.errors import ConfigError
 
 #: Name, beside those of the parameters, of the number of a run's forcing program.
 PROGRAM = "program"
-# Relative; values equal to this are one value. Wider than a float32 round trip (6e-8).
-TOLERANCE = 1e-6
 _NEXT = re.compile(r", (?=[A-Za-z]\w*=)")  # between two parameters of `Case.named`
 _ONE = re.compile(r"([A-Za-z]\w*)=([-+]?[\d.]+(?:e[-+]?\d+)?)(°| \S.*)?", re.ASCII)
 
@@ -101,13 +99,6 @@ class Case(Mapping[str, float]):
     def column(self) -> float | str:
         """For tables: the number of one parameter, the text of several."""
         return self.text if len(self) > 1 else self.numbers[0]
-
-    def near(self, other: "Case") -> bool:
-        """Whether another case is the same but for round-off."""
-        return self.names == other.names and all(
-            math.isclose(a, b, rel_tol=TOLERANCE, abs_tol=1e-12)
-            for a, b in zip(self.numbers, other.numbers, strict=True)
-        )
 
     @property
     def _valued(self) -> list[str]:

@@ -47,10 +47,10 @@ class Snapshots:
         X: [P,3] undeformed positions [m], float64 (their hash is `x_sha256`).
         x_sha256: identity of the particles.
         parameter_names: sorted.
-        parameters: [M,n_parameters] float32.
+        parameters: [M,n_parameters] float64, the values of the cases.
         trajectory: [M] int64, index into `trajectories`.
         frame: [M] int64, index into the trajectory's frames.
-        t: [M] float32 [s].
+        t: [M] float64 [s].
         resident: whether the data lie on the device.
 
     Raises:
@@ -86,10 +86,10 @@ class Snapshots:
         self.trajectory = torch.tensor(index, device=self.device)
         self.frame = torch.tensor(np.arange(self.M) - self._first[index], device=self.device)
         self.parameters = torch.tensor(
-            np.array(values, dtype="f4").reshape(len(frames), -1)[index], device=self.device
+            np.array(values, dtype="f8").reshape(len(frames), -1)[index], device=self.device
         )
         times = np.concatenate([trajectory.t for trajectory in self.trajectories])
-        self.t = torch.tensor(times.astype("f4"), device=self.device)
+        self.t = torch.tensor(times, device=self.device)
         self.resident = (
             self.nbytes <= _RESIDENT_SHARE * _free(self.device) if resident == "auto" else bool(resident)
         )

@@ -34,7 +34,7 @@ class Split:
                     f"{part} holds {case.named} beside {self.train[0].named}; give each the same parameters"
                 )
         for (part, case), (other, same) in combinations(entries, 2):
-            if case.near(same):
+            if case == same:
                 where = f"twice in {part}" if part == other else f"in both {part} and {other}"
                 raise ConfigError(f"{case} is {where}; a case belongs to one split, once")
 

@@ -125,9 +125,7 @@ class CaseDistance:
 
     def __init__(self, manifold):
         self._names = manifold.parameter_names
-        # Snapshots keep parameters in float32, of which seven digits are the value's own.
-        rows = np.unique(manifold.training_parameters.cpu().numpy(), axis=0).tolist()
-        known = self._values = np.array([[float(f"{value:.7g}") for value in row] for row in rows])
+        known = self._values = np.unique(manifold.training_parameters.cpu().numpy(), axis=0)
         self._deviation = deviation(known)
         between = cdist(known / self._deviation, known / self._deviation)
         self._spacing = float(minimum_spanning_tree(between).max()) or 1.0

@@ -99,4 +99,4 @@ def random_cases(box: np.ndarray, count: int, seed: int, taken: Sequence[Case]) 
     if PROGRAM in taken[0].names:
         rows = np.column_stack([rows, _PROGRAMS * (1 + seed) + np.arange(count)])
     found = [Case(taken[0].names, point, taken[0].units) for point in rows]
-    return [case for case in found if not any(map(case.near, taken))]
+    return [case for case in found if case not in taken]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -21,8 +20,7 @@ def latent_rates(manifold: Manifold, snapshots: Snapshots) -> Tensor:
         snapshots: those of training, all rows.
     """
     latents = manifold.training_latents
-    t = np.concatenate([trajectory.t for trajectory in snapshots.trajectories])
-    t = torch.as_tensor(t, dtype=torch.float64).to(latents)
+    t = snapshots.t.to(latents)
     first = torch.cat([torch.ones_like(t[:1]), torch.diff(t)]) <= 0
     first[0] = True
     rates = torch.diff(latents, dim=0, prepend=latents[:1])

@@ -1,6 +1,5 @@
 """The stage `deploy`: reduced runs of the held-out cases, and the lines that a user is told of them."""
 
-import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -143,12 +142,8 @@ def _rollouts(pipeline, manifold: Manifold, record: Record) -> list[Rollout]:
 
 
 def _case_of(cases: Sequence[Case], values: Mapping[str, float]) -> Case:
-    """The first case with these parameters, which were kept in float32."""
-    return next(
-        case
-        for case in cases
-        if all(math.isclose(case[name], value, rel_tol=1e-6) for name, value in values.items())
-    )
+    """The first case with these parameters."""
+    return next(case for case in cases if case.parameters == dict(values))
 
 
 def levels_of(pipeline, manifold: Manifold) -> Levels | None:

