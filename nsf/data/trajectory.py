@@ -1,7 +1,6 @@
 """One full-order simulation on disk: written once and whole, read in pieces."""
 
 import json
-import os
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
@@ -20,7 +19,6 @@ from nsf.storage import require_space, writing
 
 _EXACT, _STORED = ("<f8",), ("<f4", "<f8")  # types of constants and of frames
 _MOST_SCALARS = 1000
-_READ_BYTES = 2**30  # at once; the system reads no more than 2 GiB
 
 
 class TrajectoryWriter:
@@ -159,7 +157,7 @@ class TrajectoryWriter:
 
 
 class Trajectory:
-    """A whole trajectory, opened for reading; arrays are read when asked for.
+    """A whole trajectory, opened for reading; frames are mapped, and read when asked for.
 
     Attributes:
         path: the file.
@@ -179,7 +177,6 @@ class Trajectory:
 
     def __init__(self, path: Path, file: h5py.File) -> None:
         self.path = path
-        self._file = file
         _check_version(file)
         if not hdf5.attribute(file, "complete", bool):
             raise SchemaError("was not finished by its simulation")
@@ -199,7 +196,7 @@ class Trajectory:
         self.t = hdf5.values(file, "frames/t", _EXACT, (None,), increasing=True)
         self.frames = len(self.t)
         self._frames = {
-            name: hdf5.array(file, f"frames/{name}", _STORED, (self.frames, P, c))
+            name: _mapped(path, hdf5.array(file, f"frames/{name}", _STORED, (self.frames, P, c)))
             for name, c in COMPONENTS.items()
         }
         self.parameters, self.cost = (_read_scalars(file, name) for name in ("parameters", "cost"))
@@ -222,12 +219,11 @@ class Trajectory:
                 unfinished, of a newer schema, incomplete or damaged, has links or
                 storage outside it, or values that no simulation leaves; names the file.
         """
-        with ExitStack() as stack:
-            file = stack.enter_context(hdf5.opened(path, "trajectory", "simulate"))
-            with hdf5.reading(path, "trajectory", "simulate"):
-                trajectory = cls(Path(path), file)
-            stack.pop_all()
-        return trajectory
+        with (
+            hdf5.opened(path, "trajectory", "simulate") as file,
+            hdf5.reading(path, "trajectory", "simulate"),
+        ):
+            return cls(Path(path), file)
 
     def read(
         self, field: str, frames: Any = slice(None), particles: Any = None, out: np.ndarray | None = None
@@ -249,32 +245,27 @@ class Trajectory:
         """
         if field not in COMPONENTS:
             raise ShapeError(f"field={field!r}; choose one of {', '.join(COMPONENTS)}")
-        dataset = self._frames[field]
+        stored = self._frames[field]
         rows = _selection(frames, self.frames, "frame")
         columns = _selection(slice(None) if particles is None else particles, self.particles, "particle")
-        shape = (len(rows), len(columns), COMPONENTS[field])
+        numbers, count = np.arange(self.frames)[rows], len(np.arange(self.particles)[columns])
+        shape = (len(numbers), count, COMPONENTS[field])
         if out is None:
-            out = np.empty(shape, dataset.dtype.newbyteorder("="))
+            out = np.empty(shape, stored.dtype.newbyteorder("="))
         if out.shape != shape:
             raise ShapeError(f"out has shape {list(out.shape)}; give {list(shape)}")
-        if 0 in shape:
-            return out
-        try:
-            if particles is None and isinstance(rows, range) and _in_one_piece(dataset, out):
-                _read_frames(self._file.id.get_vfd_handle(), dataset, rows, out)
-            elif isinstance(rows, range) and isinstance(columns, range):
-                dataset.read_direct(out, np.s_[_hyperslab(rows), _hyperslab(columns)])
+        with np.errstate(over="ignore", invalid="ignore"):
+            if isinstance(rows, slice) and isinstance(columns, slice):
+                out[...] = stored[rows, columns]
             else:
-                for i, row in enumerate(rows):
-                    out[i] = _read_frame(dataset, int(row), columns)
-        except (OSError, OverflowError, RuntimeError) as error:
-            raise SchemaError(f"{self.path} is damaged in {field}; simulate again ({error})") from error
-        self._check_finite(field, rows, out)
+                for i, row in enumerate(numbers):
+                    out[i] = stored[row, columns]
+        self._check_finite(field, numbers, out)
         return out
 
     def close(self) -> None:
         """Close the file; arrays already read stay valid."""
-        self._file.close()
+        self._frames = {}
 
     def __enter__(self) -> "Trajectory":
         return self
@@ -285,7 +276,7 @@ class Trajectory:
     def __reduce__(self) -> tuple[Any, tuple[Path]]:
         return Trajectory.open, (self.path,)  # another process opens the file for itself
 
-    def _check_finite(self, field: str, rows: range | np.ndarray, found: np.ndarray) -> None:
+    def _check_finite(self, field: str, rows: np.ndarray, found: np.ndarray) -> None:
         with np.errstate(over="ignore", invalid="ignore"):
             total = found.sum()  # at the speed of memory, and not finite if one of the values is not
         if np.isfinite(total):
@@ -318,26 +309,12 @@ def _reserved(group: h5py.Group, name: str, shape: tuple[int, ...], dtype: np.dt
     return _Reserved(shape, dtype, created.get_offset())
 
 
-def _in_one_piece(dataset: h5py.Dataset, out: np.ndarray) -> bool:
-    """Whether the bytes of whole frames in the file are those of the array they go to."""
-    return out.dtype == dataset.dtype and out.flags.c_contiguous and dataset.id.get_offset() is not None
+def _mapped(path: Path, dataset: h5py.Dataset) -> np.ndarray:
+    """The values of an array that lies in one piece in its file.
 
-
-def _read_frames(file: int, dataset: h5py.Dataset, rows: range, out: np.ndarray) -> None:
-    """Whole frames straight from the file: under HDF5's lock one thread at a time could read.
-
-    Raises:
-        OSError: the file is shorter than it says.
+    Past HDF5, under whose lock one thread at a time could read, and which picks scattered particles slowly.
     """
-    begin, size = dataset.id.get_offset(), out[0].nbytes
-    together = len(out) if rows.step == 1 else 1  # neighbours lie side by side
-    for i in range(0, len(out), together):
-        rest, offset = memoryview(out[i : i + together]).cast("B"), begin + rows[i] * size
-        while rest:
-            read = os.preadv(file, [rest[:_READ_BYTES]], offset)
-            if not read:
-                raise OSError("it ends before its frames do")
-            rest, offset = rest[read:], offset + read
+    return np.memmap(path, dataset.dtype, "r", dataset.id.get_offset(), dataset.shape)
 
 
 def _check_version(file: h5py.File) -> None:
@@ -352,29 +329,16 @@ def _check_version(file: h5py.File) -> None:
         )
 
 
-def _selection(wanted: Any, size: int, kind: str) -> range | np.ndarray:
-    """Indices as a range where they are evenly spaced upwards, else as an array."""
+def _selection(wanted: Any, size: int, kind: str) -> slice | np.ndarray:
+    """Indices [n] that are in range, or a slice."""
     if isinstance(wanted, slice):
-        indices = range(size)[wanted]
-        return indices if indices.step > 0 else np.array(indices)
+        return wanted
     array = np.atleast_1d(np.asarray(wanted))
     if array.ndim != 1 or not (array.size == 0 or np.issubdtype(array.dtype, np.integer)):
         raise ShapeError(f"{kind}s have shape {list(array.shape)} of {array.dtype}; give integer indices [n]")
     if array.size and not (-size <= array.min() and array.max() < size):
         raise ShapeError(f"{kind}s reach {array.min()}..{array.max()}; there are {size}")
-    return np.where(array < 0, array + size, array).astype(np.int64)
-
-
-def _hyperslab(indices: range) -> slice:
-    return slice(indices.start, indices[-1] + 1, indices.step)
-
-
-def _read_frame(dataset: h5py.Dataset, frame: int, particles: range | np.ndarray) -> np.ndarray:
-    if isinstance(particles, range):
-        return dataset[frame, _hyperslab(particles)]
-    # HDF5 selects scattered points slowly: read the span they lie in, and pick in memory.
-    low = int(particles.min())
-    return dataset[frame, low : int(particles.max()) + 1][particles - low]
+    return array.astype(np.int64)
 
 
 def _write_scalars(group: h5py.Group, values: Mapping[str, float]) -> None:

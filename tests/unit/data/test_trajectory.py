@@ -98,20 +98,6 @@ def test_reads_outside(write, field, frames, particles, message):
         trajectory.read(field, frames, particles)
 
 
-def test_frames_come_in_as_many_pieces_as_the_system_gives(write, monkeypatch):
-    path, values = write()
-    plain = os.preadv
-    monkeypatch.setattr(os, "preadv", lambda file, into, offset: plain(file, [into[0][:100]], offset))
-    with Trajectory.open(path) as trajectory:
-        assert np.array_equal(trajectory.read("tau"), stacked(values, "tau").astype("f4"))
-        assert np.array_equal(
-            trajectory.read("tau", slice(1, None, 2)), stacked(values, "tau").astype("f4")[1::2]
-        )
-        monkeypatch.setattr(os, "preadv", lambda *_: 0)
-        with pytest.raises(SchemaError, match="damaged in tau"):
-            trajectory.read("tau")
-
-
 def test_another_process_gets_its_own_file(write):
     path, _ = write()
     with Trajectory.open(path) as trajectory:
