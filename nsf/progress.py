@@ -32,12 +32,11 @@ class Progress:
         stage: name of the work.
         total: units of work.
         unit: name of the units.
-        shown: whether this process shows anything.
     """
 
-    def __init__(self, stage: str, total: int, unit: str, shown: bool = True):
+    def __init__(self, stage: str, total: int, unit: str):
         self._unit, self._total, self._done, self._what = unit, total, 0, stage
-        self._logged = shown and not sys.stderr.isatty()
+        self._logged = not sys.stderr.isatty()
         self._began = self._told = time.monotonic()
         self._bar = RichProgress(
             TextColumn("{task.description}"),
@@ -47,7 +46,7 @@ class Progress:
             TimeRemainingColumn(),
             TextColumn("left"),
             console=Console(stderr=True),
-            disable=not (shown and sys.stderr.isatty()),
+            disable=not sys.stderr.isatty(),
             transient=True,
         )
         self._stage = stage

@@ -43,7 +43,7 @@ def loggers(folder: Path, tracking: str | None) -> list[Logger]:
 
     # A resumed phase logs into a new version, for CSVLogger deletes what it finds.
     version = str(len(list((folder / "csv").glob("*"))))
-    found: list[Logger] = [CSVLogger(folder, name="csv", version=version)]
+    found: list[Logger] = [CSVLogger(folder, name="csv", version=version, flush_logs_every_n_steps=1)]
     if tracking == "tensorboard":
         from pytorch_lightning.loggers.tensorboard import TensorBoardLogger
 

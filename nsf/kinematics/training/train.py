@@ -104,7 +104,7 @@ def train(
 
 
 def _phase(descent: Descent, folder: Path, tracking: str | None) -> dict[str, Any]:
-    from nsf.kinematics.training.blocks import descend
+    from nsf.kinematics.training.lightning import descend
 
     name, own = descent.fit.name, folder / descent.fit.name
     steps, probing = _timed(folder / f"{name}_steps.pt", lambda: _steps(descent))

@@ -10,7 +10,7 @@ import torch
 from nsf.errors import ConfigError, InstabilityError, MissingExtraError
 from nsf.kinematics.fields.basis import BasisField
 from nsf.kinematics.fields.mlp import MlpField
-from nsf.kinematics.training import blocks, descent
+from nsf.kinematics.training import descent, lightning
 from nsf.kinematics.training import train as training
 from nsf.kinematics.training.phases import PHASES, Fit, per_phase, seeded
 from nsf.kinematics.training.schedules import FastTrainer, PaperTrainer
@@ -23,7 +23,7 @@ SHORT = FastTrainer(steps=[20, 12, 12], frames_per_batch=4, particles_per_batch=
 @pytest.fixture(autouse=True)
 def short_blocks(monkeypatch):
     """Five steps a block, so that a short training has several."""
-    monkeypatch.setattr(blocks, "SHORTEST_BLOCK", 5)
+    monkeypatch.setattr(lightning, "SHORTEST_BLOCK", 5)
 
 
 @pytest.fixture
