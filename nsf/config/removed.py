@@ -11,6 +11,7 @@ REMOVED = {
     "engine=closed": "choose engine=operators, or engine=auto",
     "field=joint": "use field=basis",
     "sampler=greedy": "use sampler=qdeim or sampler=cubature",
+    "trainer.budget_minutes": "set trainer.steps; a training's log says how many it takes a second",
     "trainer.devices": "a manifold trains on one device; hydra/launcher=joblib spreads jobs over GPUs",
 }
 

@@ -87,10 +87,6 @@ class Standardizer(nn.Module):
         """(values - mean) / std, dimensionless."""
         return (values - self.mean) / self.std
 
-    def inverse(self, values: Float[Tensor, "*points component"]) -> Float[Tensor, "*points component"]:
-        """values * std + mean, in the unit of the field."""
-        return values * self.std + self.mean
-
 
 def deviation(rows: Float[np.ndarray, "row component"]) -> Float[np.ndarray, " component"]:
     """Standard deviation over rows, in their unit, to divide by: 1 for a component that never varies."""

@@ -99,7 +99,7 @@ class Manifold(nn.Module, ABC):
         x_sha256: identity of the training particles.
         parameter_names: problem parameters μ, in the order of every parameter tensor.
         hyperparameters: plain containers; enough, with the above, to rebuild the modules. `particles` (P) and
-            `frames` (M) size the buffers here.
+            `frames` (M) size the buffers here; `head_parameters`: h and l see the problem parameters.
 
     Attributes:
         X: rest positions of the training particles [P, 3] m.
@@ -135,6 +135,17 @@ class Manifold(nn.Module, ABC):
         self.training_times.copy_(snapshots.t)
         if self.parameter_names:
             self.standard_parameters = Standardizer.fit([snapshots.parameters])
+
+    def takes_parameters(self, phase: str) -> bool:
+        """Whether the phase's network sees the problem parameters."""
+        return phase != "deformation" and self.hyperparameters["head_parameters"]
+
+    def standardisation(self, phase: str, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and deviation of a network's inputs: those given, and of the parameters that it sees."""
+        if not self.takes_parameters(phase):
+            return mean, std
+        mu = self.standard_parameters
+        return torch.cat([mean, mu.mean.to(mean)]), torch.cat([std, mu.std.to(std)])
 
     @property
     def training_trajectories(self) -> Tensor:

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from typing_extensions import override
 
-from nsf.errors import ConfigError
 from nsf.sampling.cubature import CubatureSampler, Equations, nonnegative_fit
+from nsf.sampling.sampler import check_count
 
 
 @dataclass(frozen=True)
@@ -33,8 +33,7 @@ class CellSampler(CubatureSampler):
 
     def __post_init__(self):
         super().__post_init__()
-        if not isinstance(self.cells, int) or self.cells < 1:
-            raise ConfigError(f"sampler.cells={self.cells} must be a whole number of at least 1")
+        check_count("cells", self.cells)
 
     @override
     def among(self, equations: Equations) -> np.ndarray:

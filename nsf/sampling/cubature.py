@@ -9,7 +9,7 @@ import torch
 from typing_extensions import override
 
 from nsf.errors import ConfigError, ProjectionError
-from nsf.sampling.sampler import Sampler, SampleSpan, Teacher
+from nsf.sampling.sampler import Sampler, SampleSpan, Teacher, check_count
 
 _EXACT = 1e-9  # residual over target at which a cubature counts as exact
 _STILL = 1e-6  # root mean square motion in a step over Δx, below which a body counts as at rest
@@ -42,8 +42,7 @@ class CubatureSampler(Sampler):
 
     def __post_init__(self):
         super().__post_init__()
-        if not isinstance(self.states, int) or self.states < 1:
-            raise ConfigError(f"sampler.states={self.states} must be a whole number of at least 1")
+        check_count("states", self.states)
 
     @override
     def span_of(self, region, end, manifold, device="cpu", whole=None):

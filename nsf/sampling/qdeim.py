@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import torch
 from typing_extensions import override
 
-from nsf.errors import ConfigError
-from nsf.sampling.sampler import UnweightedSampler
+from nsf.sampling.sampler import UnweightedSampler, check_count
 
 _CHUNK = 2**25  # values decoded at once
 _SNAPSHOTS = 256  # latents that displacement modes are taken from
@@ -40,8 +39,7 @@ class QdeimSampler(UnweightedSampler):
 
     def __post_init__(self):
         super().__post_init__()
-        if not isinstance(self.modes, int) or self.modes < 1:
-            raise ConfigError(f"sampler.modes={self.modes} must be a whole number of at least 1")
+        check_count("modes", self.modes)
 
     @override
     def choose(self, manifold, candidates, size, device="cpu"):

@@ -118,8 +118,7 @@ class Sampler(ABC):
                 f"sampler.phases={self.phases}: give size, start, lower, upper ({error})"
             ) from error
         for region in regions:
-            if not isinstance(region.size, int) or region.size < 1:
-                raise ConfigError(f"sampler.size={region.size} must be a whole number of at least 1")
+            check_count("size", region.size)
             for name in ("lower", "upper"):
                 corner = getattr(region, name)
                 if corner is not None and (np.shape(corner) != (3,) or not np.isfinite(corner).all()):
@@ -188,13 +187,22 @@ class RandomSampler(UnweightedSampler):
 
     def __post_init__(self):
         super().__post_init__()
-        if not isinstance(self.seed, int) or self.seed < 0:
-            raise ConfigError(f"sampler.seed={self.seed} must be a whole number of at least 0")
+        check_count("seed", self.seed, 0)
 
     @override
     def choose(self, manifold, candidates, size, device="cpu"):
         order = np.random.default_rng(self.seed).permutation(len(manifold.X))
         return order[np.isin(order, candidates)][:size]
+
+
+def check_count(key: str, value: int, least: int = 1) -> None:
+    """Refuse a value of the configuration that is no whole number, or below its least.
+
+    Raises:
+        ConfigError: names the key.
+    """
+    if not isinstance(value, int) or value < least:
+        raise ConfigError(f"sampler.{key}={value} must be a whole number of at least {least}")
 
 
 def check_well_posed(sample: int, latent_dim: int) -> None:

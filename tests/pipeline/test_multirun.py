@@ -86,7 +86,7 @@ def test_points_of_several_materials(tmp_path):
 def test_an_experiment_runs_its_jobs_and_reports_them(nsf, copied, tmp_path):
     """A part of experiments/table1.yaml, made tiny and of one scene and field."""
     root = copied("simulate")
-    tiny = ["scene=sand", "field=basis", "evaluation.trials=1", "trainer.budget_minutes=null"]
+    tiny = ["scene=sand", "field=basis", "evaluation.trials=1"]
     arguments = ["+experiment=table1/scenes", "scale=small", "engine=auto", *tiny]
     outcome = nsf("run", root, *arguments, faults=[PlainReport()], multirun=True)
     assert outcome.code == 0, outcome.err
@@ -105,7 +105,7 @@ def test_an_experiment_runs_its_jobs_and_reports_them(nsf, copied, tmp_path):
 def test_an_experiment_may_ask_for_more_points(nsf, copied, tmp_path):
     """experiments/super_resolution.yaml, made tiny and of one field."""
     root = copied("simulate", "train")
-    tiny = ["field=basis", "evaluation.trials=1", "trainer.budget_minutes=null", "super_resolution.factor=2"]
+    tiny = ["field=basis", "evaluation.trials=1", "super_resolution.factor=2"]
     arguments = ["+experiment=super_resolution", "scale=small", *tiny]
     outcome = nsf("run", root, *arguments, faults=[PlainReport()])
     assert outcome.code == 0, outcome.err

@@ -46,7 +46,6 @@ from nsf.kinematics.training.phases import (
     at_least,
     per_phase,
 )
-from nsf.kinematics.training.rates import latent_rates
 
 AFFINE = ("latent", "rate")
 ENCODED_ENTRIES = 1 << 26  # values encoded at once
@@ -170,7 +169,7 @@ class BasisField:
         As the modes are orthonormal, such a loss is the mean squared error of the field over its variance.
         """
         if manifold.takes_rate:
-            rates = latent_rates(manifold, snapshots)
+            rates = _latent_rates(manifold, snapshots)
             manifold.training_rates.copy_(rates)
             deviation = rates.square().mean(0).sqrt()
             manifold.fields["affine"].rate.copy_(torch.where(deviation > 0, deviation, 1.0))
@@ -206,6 +205,21 @@ class BasisField:
             return (found - targets[rows]).square().mean() + self.rate_noise**2 * passed_on
 
         return loss
+
+
+def _latent_rates(manifold: Manifold, snapshots: Snapshots) -> Tensor:
+    """dx̂/dt of every training snapshot, [M, r] float64 [1/s], as a reduced step finds it.
+
+    The backward difference (x̂_n − x̂_{n−1})/Δt along each trajectory, whose frames are its steps. Before the
+    first frame the body came with its velocity: there x̂_{n−1} is that of x − Δt v.
+    """
+    latents, t = manifold.training_latents, snapshots.t
+    rates = torch.diff(latents, dim=0, prepend=latents[:1])
+    rates[1:] /= torch.diff(t)[:, None]
+    rows, dt = (snapshots.frame == 0).nonzero().flatten(), snapshots.trajectories[0].dt
+    x, v = (snapshots.gather(name, rows, slice(None)).double() for name in ("x", "v"))
+    rates[rows] = ((manifold.encode(x) - manifold.encode(x - dt * v)) / dt).to(rates)
+    return rates
 
 
 def _layered(network: nn.Module | None) -> bool:
@@ -283,10 +297,6 @@ class BasisManifold(Manifold):
         asked = phase == "stress" and self.hyperparameters["free_at_rest"]
         return asked and _layered(self.fields[phase].network)
 
-    def takes_parameters(self, phase: str) -> bool:
-        """Whether the phase's network sees the problem parameters."""
-        return phase != "deformation" and self.hyperparameters["head_parameters"]
-
     @override
     @torch.no_grad()
     def encode(self, x: Tensor) -> Tensor:
@@ -359,15 +369,12 @@ class BasisManifold(Manifold):
 
     def _deployed(self, phase: str, like: Tensor) -> FullyConnected | None:
         """The phase's network from (xhat, μ) to coefficients in the field's unit."""
-        field, parameters = self.fields[phase], self.standard_parameters
+        field = self.fields[phase]
         if field.network is None:
             return None
-        mean, std = [torch.zeros(self.latent_dim, device=parameters.mean.device)], [self.spread]
-        if self.takes_parameters(phase):
-            mean, std = [*mean, parameters.mean], [*std, parameters.std]
+        inputs = self.standardisation(phase, torch.zeros_like(self.spread), self.spread)
         scale, dtype = field.output_scale, torch.float64 if self.frees(phase) else like.dtype
-        standardisation = torch.cat(mean), torch.cat(std), torch.zeros_like(scale), scale
-        network = field.network.in_raw_units(*standardisation, dtype, self.X.device)
+        network = field.network.in_raw_units(*inputs, torch.zeros_like(scale), scale, dtype, self.X.device)
         if self.frees(phase):
             noise = max(self.hyperparameters["noise"], _LEAST_NOISE)
             reach = _REACH * (noise**2 + self.floor.square()).sqrt()

@@ -200,15 +200,12 @@ class MlpManifold(Manifold):
         self.decoders = nn.ModuleDict()
         for phase, (_, d) in TARGETS.items():
             inputs = 3 + 6 * self._octaves(phase) + latent_dim
-            inputs += len(self.parameter_names) if self._has_parameters(phase) else 0
+            inputs += len(self.parameter_names) if self.takes_parameters(phase) else 0
             widths = (inputs, *[beta[phase] * d] * HIDDEN_LAYERS, d)
             self.decoders[phase] = FullyConnected(widths, "elu")
         self.standard = nn.ModuleDict(
             {"X": identity(3), **{name: identity(d) for name, d in TARGETS.values()}}
         )
-
-    def _has_parameters(self, phase: str) -> bool:
-        return phase != "deformation" and self.hyperparameters["head_parameters"]
 
     def _octaves(self, phase: str) -> int:
         return 0 if phase == "deformation" else self.hyperparameters["octaves"]
@@ -225,7 +222,7 @@ class MlpManifold(Manifold):
     def decoder_latents(self, phase: str) -> Tensor:
         """Training latents as the phase's decoder takes them: with standardised μ if it depends on μ."""
         inputs = [self.training_latents.float()]
-        if self._has_parameters(phase):
+        if self.takes_parameters(phase):
             inputs.append(self.standard_parameters(self.training_parameters.float()))
         return torch.cat(inputs, -1)
 
@@ -305,13 +302,9 @@ class MlpManifold(Manifold):
 
     def _deployed(self, phase: str, dtype: torch.dtype, device: torch.device | str) -> nn.Module:
         """The decoder from (X [m] and its waves, xhat, μ) to displacement, tau or C in their own unit."""
-        X, parameters, values = self.standard["X"], self.standard_parameters, self.standard[TARGETS[phase][0]]
-        plain = torch.zeros(6 * self._octaves(phase) + self.latent_dim, device=X.mean.device)
-        mean, std = [X.mean, plain], [X.std, plain + 1]
-        if self._has_parameters(phase):
-            mean, std = [*mean, parameters.mean], [*std, parameters.std]
-        raw = self.decoders[phase].in_raw_units(
-            torch.cat(mean), torch.cat(std), values.mean, values.std, dtype, device
-        )
+        X, values = self.standard["X"], self.standard[TARGETS[phase][0]]
+        plain = X.mean.new_zeros(6 * self._octaves(phase) + self.latent_dim)
+        inputs = self.standardisation(phase, torch.cat([X.mean, plain]), torch.cat([X.std, plain + 1]))
+        raw = self.decoders[phase].in_raw_units(*inputs, values.mean, values.std, dtype, device)
         exact = phase == "deformation" or self.arithmetic is None or torch.device(device).type != "cuda"
         return raw if exact else TensorCores(raw, self.arithmetic)

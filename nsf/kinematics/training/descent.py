@@ -3,21 +3,45 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.optim import Adam, Muon, Optimizer
 
 from nsf.gpu import without_collection
-from nsf.kinematics.training.optimisers import muon_and_adam
 from nsf.kinematics.training.phases import PHASES, Fit, seed_of
 from nsf.kinematics.training.schedules import Trainer
-from nsf.kinematics.training.tensor_cores import tf32
 
 MUON = 5.0  # times the schedule's rate with Muon, of all weights; 0.002 is a rate for Adam alone
 EAGER_STEPS = 3  # before a capture, as torch asks
 CHECKPOINT = "last.ckpt"  # of a phase, in its folder
+
+
+def muon_and_adam(network: nn.Module, rate: float) -> list[Optimizer]:
+    """Muon for the matrices of a network and Adam for all else; one learning rate is fit for both.
+
+    Source: Jordan et al. 2024, Muon: an optimizer for hidden layers in neural networks.
+    """
+    weights = list(network.parameters())
+    matrices, others = ([w for w in weights if (w.ndim == 2) is flat] for flat in (True, False))
+    return [
+        Muon(matrices, lr=rate, weight_decay=0.0, adjust_lr_fn="match_rms_adamw"),
+        Adam(others, lr=rate),
+    ]
+
+
+@contextlib.contextmanager
+def tf32() -> Iterator[None]:
+    """Multiply matrices of fp32 on a GPU's tensor cores, with 10 bits after the leading one."""
+    matmul = torch.backends.cuda.matmul
+    before = matmul.fp32_precision
+    matmul.fp32_precision = "tf32"
+    try:
+        yield
+    finally:
+        matmul.fp32_precision = before
 
 
 @dataclass(frozen=True)
@@ -44,11 +68,11 @@ class Descent:
         local = self.resident or not self.fit.pointwise
         return self.device.type == "cuda" and self.schedule.stationary and local
 
-    def optimizers(self) -> list[torch.optim.Optimizer]:
+    def optimizers(self) -> list[Optimizer]:
         """Adam, as in the paper, or with Muon, where the schedule has it; `Steps` sets the rate."""
         if self._by_muon:
             return muon_and_adam(self.fit.network, MUON * self.schedule.rate_at(0, 1))
-        return [torch.optim.Adam(self.fit.network.parameters(), fused=True)]
+        return [Adam(self.fit.network.parameters(), fused=True)]
 
     def rate_at(self, step: int, steps: int) -> float:
         """Learning rate at a step, of every optimizer."""
@@ -71,7 +95,7 @@ class Steps:
         steps: how many there are in all.
     """
 
-    def __init__(self, descent: Descent, optimizers: Sequence[torch.optim.Optimizer], steps: int):
+    def __init__(self, descent: Descent, optimizers: Sequence[Optimizer], steps: int):
         self.descent, self.optimizers, self.steps = descent, optimizers, steps
         self._generator = torch.Generator(descent.device)
         self._graph: torch.cuda.CUDAGraph | None = None

@@ -15,8 +15,6 @@ from typing_extensions import override
 from nsf.errors import ConfigError
 from nsf.kinematics.training.phases import MOST_STEPS, PHASES, Fit, at_least, per_phase, seeded
 
-# Budget of g with e, h and l: as the paper's epochs.
-SHARES = {"deformation": 0.2, "stress": 0.4, "affine": 0.4}
 # A field fitted to whole snapshots sees all of them in a step, up to so many; of more, so many drawn anew.
 MOST_AT_ONCE, DRAWN = 6000, 2048
 BATCH_STREAM = 1 << 20  # keeps the epochs' permutations apart from the steps' generators
@@ -39,12 +37,8 @@ class Trainer(ABC):
     muon: ClassVar[bool] = False
 
     @abstractmethod
-    def steps_of(self, phase: str, frames: int) -> int | None:
-        """Optimiser steps of a phase on so many snapshots; None: as many as `seconds_of` allows."""
-
-    def seconds_of(self, phase: str) -> float | None:
-        """Wall-clock limit of a phase [s]; None: no limit."""
-        return None
+    def steps_of(self, phase: str, frames: int) -> int:
+        """Optimiser steps of a phase on so many snapshots."""
 
     @abstractmethod
     def rate_at(self, step: int, steps: int) -> float:
@@ -107,52 +101,39 @@ class PaperTrainer(Trainer):
 
 @dataclass(frozen=True)
 class FastTrainer(Trainer):
-    """Cosine decay to zero, for a number of steps or a time.
+    """Cosine decay to zero.
 
     A field fitted to points (mlp) sees random particles of random frames in a step; one fitted to whole
     snapshots (basis) sees all of them in every step, or 2,048 at random where they are more than 6,000.
 
     Attributes:
-        steps: optimiser steps of g, h and l, one number for all, [g, h=l] or [g, h, l]; None: as many as the
-            budget allows.
+        steps: optimiser steps of g, h and l, one number for all, [g, h=l] or [g, h, l].
         learning_rate: at the first step; a field fitted to points has five times as much (`muon`).
         frames_per_batch, particles_per_batch: points of a step, for a field fitted to points.
         bf16: on a GPU, evaluate a field fitted to points in bfloat16 in training; in tf32 if `fine`.
-        budget_minutes: limit on the training of all three networks [min], or None. The rate is measured once
-            at the start of each phase; the steps it allows are recorded, and as `steps` make the same bits.
     """
 
     stationary: ClassVar[bool] = True
     muon: ClassVar[bool] = True
 
-    steps: int | Sequence[int] | None = None
+    steps: int | Sequence[int]
     learning_rate: float = 2e-3
     frames_per_batch: int = 32
     particles_per_batch: int = 8192
     bf16: bool = True
-    budget_minutes: float | None = None
 
     def __post_init__(self) -> None:
-        if self.steps is None and self.budget_minutes is None:
+        per_phase("steps", self.steps, MOST_STEPS)
+        if not self.learning_rate > 0:
             raise ConfigError(
-                "steps=null and budget_minutes=null leave training without an end; set one of them"
+                f"learning_rate={self.learning_rate} must be positive; choose for example 0.002"
             )
-        if self.steps is not None:
-            per_phase("steps", self.steps, MOST_STEPS)
-        for key in ("learning_rate", "budget_minutes"):
-            value = getattr(self, key)
-            if value is not None and not value > 0:
-                raise ConfigError(f"{key}={value} must be positive; choose for example {key}=0.002")
         for key in ("frames_per_batch", "particles_per_batch"):
             at_least(key, getattr(self, key), 1)
 
     @override
-    def steps_of(self, phase: str, frames: int) -> int | None:
-        return None if self.steps is None else per_phase("steps", self.steps, MOST_STEPS)[PHASES.index(phase)]
-
-    @override
-    def seconds_of(self, phase: str) -> float | None:
-        return None if self.budget_minutes is None else 60 * self.budget_minutes * SHARES[phase]
+    def steps_of(self, phase: str, frames: int) -> int:
+        return per_phase("steps", self.steps, MOST_STEPS)[PHASES.index(phase)]
 
     @override
     def rate_at(self, step: int, steps: int) -> float:

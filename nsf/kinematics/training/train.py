@@ -13,14 +13,13 @@ import torch
 
 from nsf.data import Snapshots
 from nsf.kinematics.manifold import Manifold
-from nsf.kinematics.training.descent import CHECKPOINT, Descent, Steps
+from nsf.kinematics.training.descent import CHECKPOINT, Descent
 from nsf.kinematics.training.phases import Fit, at_least, seeded
 from nsf.kinematics.training.schedules import Trainer
 from nsf.kinematics.training.tracking import check_tracking
 from nsf.storage import refusals, writing
 
 WEIGHTS_STREAM = 1 << 30  # apart from the phases' streams
-PROBE_STEPS, PROBE_SECONDS = 5, 1.0  # taken at a time, and the least time over which a rate is measured
 
 
 class Field(Protocol):
@@ -47,7 +46,6 @@ def train(
     folder: Path,
     device: str | torch.device,
     tracking: str | None = None,
-    deterministic: bool = True,
 ) -> tuple[Manifold, dict[str, float]]:
     """Train encoder and fields on the snapshots.
 
@@ -62,7 +60,6 @@ def train(
         folder: keeps logs, checkpoints and finished phases; one training a folder.
         device: "cpu", "cuda", "cuda:1".
         tracking: "tensorboard" or "mlflow" for a live page beside the CSV logs.
-        deterministic: use torch's deterministic algorithms.
 
     Returns:
         The manifold on the host, and for each phase its steps, last loss (mean squared error over the
@@ -82,18 +79,17 @@ def train(
     at_least("latent_dim", latent_dim, 1)
     check_tracking(tracking)
     device, folder = torch.device(device), Path(folder)
-    with refusals(folder), _determinism(deterministic):
-        prepared, total = _timed(folder / "prepared.pt", lambda: field.prepare(snapshots, latent_dim))
-        began = time.perf_counter()  # of a large scene, building reads all data once more
-        weights = seeded("cpu", seed, WEIGHTS_STREAM)
-        manifold = field.build(snapshots, prepared, latent_dim, weights).to(device)
-        took = time.perf_counter() - began
-        total += _once(folder / "built.pt", lambda: took)  # of the first call, as all seconds are
+    with refusals(folder), _deterministic():
+        begun = _once(folder / "prepared.pt", lambda: _timed(lambda: field.prepare(snapshots, latent_dim)))
+        prepared, weights = begun["value"], seeded("cpu", seed, WEIGHTS_STREAM)
+        built = _timed(lambda: field.build(snapshots, prepared, latent_dim, weights).to(device))
+        manifold = built["value"]
+        # Of a large scene, building reads all data once more; as all seconds, those of the first call count.
+        total = begun["seconds"] + _once(folder / "built.pt", lambda: built["seconds"])
         metrics: dict[str, float] = {}
         for fit in field.fits(manifold, snapshots, prepared):
             descent = Descent(fit, trainer, snapshots.M, snapshots.P, snapshots.resident, seed, device)
-            kept = folder / f"{fit.name}.pt"
-            outcome = _once(kept, lambda: _phase(descent, folder, tracking))  # noqa: B023
+            outcome = _once(folder / f"{fit.name}.pt", lambda: _phase(descent, folder, tracking))  # noqa: B023
             fit.network.load_state_dict(outcome["state"])
             fit.network.to(device)  # Lightning leaves it on the host
             (folder / fit.name / CHECKPOINT).unlink(missing_ok=True)
@@ -106,50 +102,16 @@ def train(
 def _phase(descent: Descent, folder: Path, tracking: str | None) -> dict[str, Any]:
     from nsf.kinematics.training.lightning import descend
 
-    name, own = descent.fit.name, folder / descent.fit.name
-    steps, probing = _timed(folder / f"{name}_steps.pt", lambda: _steps(descent))
-    loss, seconds = descend(descent, steps, own, tracking)
-    return {
-        "state": {key: value.cpu() for key, value in descent.fit.network.state_dict().items()},
-        "steps": steps,
-        "loss": loss,
-        "seconds": probing + seconds,
-    }
+    steps = descent.schedule.steps_of(descent.fit.name, descent.frames)
+    loss, seconds = descend(descent, steps, folder / descent.fit.name, tracking)
+    state = {key: value.cpu() for key, value in descent.fit.network.state_dict().items()}
+    return {"state": state, "steps": steps, "loss": loss, "seconds": seconds}
 
 
-def _steps(descent: Descent) -> int:
-    """Steps of a phase: those asked for, at most those the budget allows at the rate measured now."""
-    name = descent.fit.name
-    steps, budget = descent.schedule.steps_of(name, descent.frames), descent.schedule.seconds_of(name)
-    if budget is None:
-        return steps
-    affordable = max(1, int(budget / _seconds_per_step(descent)))
-    return affordable if steps is None else min(steps, affordable)
-
-
-def _seconds_per_step(descent: Descent) -> float:
-    """Measured on real steps, which are then undone."""
-    network = descent.fit.network
-    state = {key: value.clone() for key, value in network.state_dict().items()}
-    steps = Steps(descent, descent.optimizers(), 1 << 30)
-    steps.take(0, PROBE_STEPS)  # warm-up
-    taken, started = 0, time.perf_counter()
-    while time.perf_counter() - started < PROBE_SECONDS:
-        taken += PROBE_STEPS
-        steps.take(taken, taken + PROBE_STEPS)
-    network.load_state_dict(state)
-    return (time.perf_counter() - started) / taken
-
-
-def _timed(path: Path, compute: Callable[[], Any]) -> tuple[Any, float]:
-    """As `_once`, with the seconds that computing took."""
-
-    def timed() -> dict[str, Any]:
-        started = time.perf_counter()
-        return {"value": compute(), "seconds": time.perf_counter() - started}
-
-    kept = _once(path, timed)
-    return kept["value"], kept["seconds"]
+def _timed(compute: Callable[[], Any]) -> dict[str, Any]:
+    """A value, and the seconds that it took."""
+    started = time.perf_counter()
+    return {"value": compute(), "seconds": time.perf_counter() - started}
 
 
 def _once(path: Path, compute: Callable[[], Any]) -> Any:
@@ -162,15 +124,13 @@ def _once(path: Path, compute: Callable[[], Any]) -> Any:
 
 
 @contextlib.contextmanager
-def _determinism(deterministic: bool) -> Iterator[None]:
+def _deterministic() -> Iterator[None]:
     """torch's deterministic algorithms, for the time of the training only."""
     before = torch.are_deterministic_algorithms_enabled()
     fill = torch.utils.deterministic.fill_uninitialized_memory
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
-    torch.use_deterministic_algorithms(deterministic)
-    torch.utils.deterministic.fill_uninitialized_memory = (
-        False  # a debugging aid that costs a write of everything
-    )
+    torch.use_deterministic_algorithms(True)
+    torch.utils.deterministic.fill_uninitialized_memory = False  # a debugging aid that writes everything once
     try:
         yield
     finally:

@@ -18,7 +18,6 @@ def test_of_snapshots_is_that_of_all_values_at_once(write, monkeypatch):
     assert standard.dtype == torch.float32
     assert torch.allclose(standard.reshape(-1, 6).mean(0), torch.zeros(6), atol=1e-5)
     assert torch.allclose(standard.reshape(-1, 6).std(0, unbiased=False), torch.ones(6), atol=1e-5)
-    assert torch.allclose(scale.inverse(standard), snaps.slab("tau", slice(None)), rtol=1e-5, atol=1)
 
 
 def test_sums_are_float64_and_a_large_mean_does_not_cancel():
@@ -46,16 +45,6 @@ def test_a_constant_component_is_only_centred():
 def test_a_small_component_beside_a_large_one_is_scaled_by_itself():
     values = torch.tensor([[1e-9, 1e9], [3e-9, 3e9]])
     assert torch.allclose(Standardizer.fit([values])(values), torch.tensor([[-1.0, -1.0], [1.0, 1.0]]))
-
-
-def test_it_travels_in_a_state_dict(tmp_path):
-    scale = Standardizer(torch.tensor([1.0, 2.0]), torch.tensor([3.0, 4.0]))
-    torch.save(scale.state_dict(), tmp_path / "a.pt")
-    other = Standardizer(torch.zeros(2), torch.ones(2))
-    other.load_state_dict(torch.load(tmp_path / "a.pt", weights_only=True))
-    values = torch.rand(5, 2)
-    assert torch.equal(other(values), scale(values))
-    assert scale.double()(values).dtype == torch.float64
 
 
 @pytest.mark.parametrize(
