@@ -5,20 +5,17 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import inspect
-import itertools
 import math
 import pickle
 import re
 import reprlib
 import zipfile
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.nn.modules import module as registration
 
 from nsf.data import Standardizer, hash_of_positions
 from nsf.errors import MissingRunError, SchemaError, first_line
@@ -41,6 +38,8 @@ _KINDS = {
 _MOST_LEAVES = 100_000  # of what a file holds beside its tensors
 _REPR = reprlib.Repr()
 _REPR.maxstring = 100
+#: What torch and a class make of contents that are not what they should be.
+FAULTS = (RuntimeError, LookupError, TypeError, AttributeError, ValueError, ArithmeticError)
 _PLAIN = (str, int, float, bool, type(None))
 
 
@@ -85,8 +84,7 @@ def read(path: Path) -> dict[str, Any]:
     except SchemaError:
         raise
     except (
-        RuntimeError, EOFError, OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError,
-        AssertionError, pickle.UnpicklingError, zipfile.BadZipFile, NotImplementedError,
+        *FAULTS, EOFError, OSError, AssertionError, pickle.UnpicklingError, zipfile.BadZipFile,
     ) as error:  # fmt: skip
         raise SchemaError(
             f"{path} is truncated or not a checkpoint ({first_line(error)}); delete it and run `nsf train`"
@@ -142,26 +140,6 @@ def is_finite(tensor: Tensor) -> bool:
     """Whether every value of a tensor is finite."""
     # A sum goes at the speed of memory, and is not finite if one of the values is not.
     return bool(tensor.sum().isfinite()) or bool(tensor.isfinite().all())
-
-
-@contextmanager
-def registering(most: int) -> Iterator[None]:
-    """Refuse to build a module of more tensors than a file can fill.
-
-    Raises:
-        SchemaError: more parameters and buffers than `most` are made in the block.
-    """
-    made = itertools.count(1)
-
-    def count(module: nn.Module, name: str, value: Any) -> None:
-        if next(made) > most:
-            raise SchemaError("asks for more tensors than it has")
-
-    with (
-        registration.register_module_parameter_registration_hook(count),
-        registration.register_module_buffer_registration_hook(count),
-    ):
-        yield
 
 
 def _check_members(path: Path) -> None:

@@ -259,23 +259,14 @@ class Manifold(nn.Module, ABC):
         about = ("latent_dim", "x_sha256", "parameter_names", "hyperparameters")
         try:
             kind = checkpoint.class_of(content.get("manifold"), Manifold)
-            # A tensor may be registered more than once, but no field has many that are not in its file.
-            with torch.device("meta"), checkpoint.registering(8 * len(content["state"]) + 64):
+            with torch.device("meta"):
                 manifold = kind(*(content[key] for key in about))
             checkpoint.fill(manifold, content["state"])
             checkpoint.check_filled(manifold)
         except SchemaError as error:
             remedy = "" if ";" in str(error) else "; train again with `nsf train`"
             raise SchemaError(f"{path} {error}{remedy}") from error
-        except (
-            RuntimeError,
-            LookupError,
-            TypeError,
-            AttributeError,
-            ValueError,
-            ArithmeticError,
-            NSFError,
-        ) as error:
+        except (*checkpoint.FAULTS, NSFError) as error:
             raise SchemaError(
                 f"{path} names {content['manifold']} but its contents do not fit it"
                 f" ({first_line(error)}); train again with `nsf train`"

@@ -249,6 +249,7 @@ class BasisManifold(Manifold):
 
     def __init__(self, latent_dim, x_sha256, parameter_names, hyperparameters):
         super().__init__(latent_dim, x_sha256, parameter_names, hyperparameters)
+        at_least("depth", hyperparameters["depth"], 1, MOST_DEEP)  # before a file has so many layers built
         self.takes_rate = hyperparameters["affine"] == "rate"
         if self.takes_rate:
             shape = hyperparameters["frames"], latent_dim
