@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from scipy.linalg import qr, qr_delete, qr_insert, solve_triangular
 from typing_extensions import override
 
 from nsf.errors import ConfigError, ProjectionError
@@ -13,6 +14,10 @@ from nsf.sampling.sampler import Sampler, SampleSpan, Teacher, check_count
 
 _EXACT = 1e-9  # residual over target at which a cubature counts as exact
 _STILL = 1e-6  # root mean square motion in a step over Δx, below which a body counts as at rest
+
+
+#: Q [m, k] and R [k, k] of columns, as these join and leave: to factorise anew each time would take longest.
+Factors = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -174,7 +179,8 @@ def nonnegative_fit(columns: torch.Tensor, target: torch.Tensor, size: int) -> t
     """
     # A particle that no latent moves is never taken.
     norms = torch.linalg.vector_norm(columns, dim=0).clamp_min(torch.finfo(columns.dtype).tiny)
-    chosen, weights, residual, factors = [], target.new_zeros(0), target, _Factors(target)
+    goal = target.cpu().numpy()
+    chosen, weights, factors, residual = [], np.zeros(0), None, target
     for _ in range(3 * size):  # Lawson and Hanson's bound; columns that left may come back
         # Not the steepest: a few particles whose x̂ moves them far would be taken for their length alone.
         cosine = columns.T @ residual / norms
@@ -183,59 +189,36 @@ def nonnegative_fit(columns: torch.Tensor, target: torch.Tensor, size: int) -> t
         exact = torch.linalg.vector_norm(residual) <= _EXACT * torch.linalg.vector_norm(target)
         if len(chosen) == size or exact or not cosine[best] > 0:
             break
-        before = chosen
-        factors.join(columns[:, best])
-        chosen, weights = _fitted(factors, [*chosen, best], torch.cat([weights, weights.new_zeros(1)]))
+        before, column = chosen, columns[:, best].cpu().numpy()
+        factors = _joined(factors, column)
+        chosen, weights, factors = _fitted(factors, goal, [*chosen, best], np.append(weights, 0.0))
         if chosen == before:
             break  # no column lowers the residual by more than round-off
-        residual = target - columns[:, chosen] @ weights
-    return np.array(chosen), weights.cpu().numpy()
+        residual = target - columns[:, chosen] @ torch.as_tensor(weights, device=columns.device)
+    return np.array(chosen), weights
 
 
-def _fitted(factors: "_Factors", chosen: list[int], weights: torch.Tensor) -> tuple[list[int], torch.Tensor]:
+def _joined(factors: Factors | None, column: np.ndarray) -> Factors:
+    """The factors of the columns there are and of another one [m]."""
+    if factors is None:
+        return qr(column[:, None], mode="economic")
+    return qr_insert(*factors, column, len(factors[1]), which="col")
+
+
+def _fitted(
+    factors: Factors, goal: np.ndarray, chosen: list[int], weights: np.ndarray
+) -> tuple[list[int], np.ndarray, Factors]:
     """Least squares over the chosen columns; from feasible weights, columns leave as theirs reach zero."""
     while True:
-        fit = factors.solution()
+        Q, R = factors
+        fit = solve_triangular(R, Q.T @ goal)
         if (fit > 0).all():
-            return chosen, fit
-        share = torch.where(fit > 0, torch.inf, weights / (weights - fit))
-        keep = share > share.min()
-        weights = (weights + share.min() * (fit - weights))[keep]
-        chosen = [column for column, kept in zip(chosen, keep.tolist(), strict=True) if kept]
-        factors.keep(keep)
-
-
-class _Factors:
-    """Orthonormal rows Q [k, m] and R [k, k] of columns A = Qᵀ R, as these join and leave.
-
-    Each least-squares problem is the one before with a column more or less: a factorisation anew for each
-    took most of a deployment's time.
-
-    Args:
-        target: [m] of the least squares.
-    """
-
-    def __init__(self, target: torch.Tensor):
-        self.target = target
-        self.Q, self.R = target.new_zeros(0, len(target)), target.new_zeros(0, 0)
-
-    def join(self, column: torch.Tensor) -> None:
-        """Another column [m], independent of those there are, as what its residual tells it to be."""
-        k = len(self.Q)
-        along = self.Q @ column
-        rest = column - along @ self.Q
-        again = self.Q @ rest  # once more, without which Q would lose its orthogonality
-        rest = rest - again @ self.Q
-        norm = torch.linalg.vector_norm(rest)
-        R = self.R.new_zeros(k + 1, k + 1)
-        R[:k, :k], R[:k, k], R[k, k] = self.R, along + again, norm
-        self.Q, self.R = torch.cat([self.Q, (rest / norm)[None]]), R
-
-    def keep(self, kept: torch.Tensor) -> None:
-        """Only some of the columns [k]."""
-        turned, self.R = torch.linalg.qr(self.R[:, kept])
-        self.Q = turned.T @ self.Q
-
-    def solution(self) -> torch.Tensor:
-        """Weights [k] of least squares."""
-        return torch.linalg.solve_triangular(self.R, (self.Q @ self.target)[:, None], upper=True)[:, 0]
+            return chosen, fit, factors
+        share = np.full(len(fit), np.inf)
+        leaves = fit <= 0
+        share[leaves] = weights[leaves] / (weights[leaves] - fit[leaves])
+        kept = share > share.min()
+        weights = (weights + share.min() * (fit - weights))[kept]
+        chosen = [column for column, stays in zip(chosen, kept, strict=True) if stays]
+        for at in np.flatnonzero(~kept)[::-1]:
+            factors = qr_delete(*factors, at, which="col")
