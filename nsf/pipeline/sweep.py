@@ -65,8 +65,6 @@ def work(config: DictConfig, stages: Sequence[str], say: Callable[[str], object]
     from nsf.pipeline.chain import Pipeline
 
     pipeline = Pipeline(config, say)
-    if "train" in stages:
-        pipeline.check_devices()
     for at, name in enumerate(stages):
         result = pipeline.simulate(stages[at + 1 :]) if name == "simulate" else pipeline.run(name)
     return result
