@@ -130,3 +130,13 @@ def test_named_paths_are_there(page):
     own = {title for _, title, _ in blocks(text)}
     for path in set(re.findall(r"`((?:nsf|conf|docs|experiments|tests|reports)/[\w/.]+)`", text)) - own:
         assert (ROOT / path).exists() or path.startswith("reports/"), path
+
+
+def test_the_reference_names_what_is_there():
+    pages = sorted((DOCS / "reference").glob("*.md"))
+    named = [name for page in pages for name in re.findall(r"^::: ([\w.]+)$", page.read_text(), re.MULTILINE)]
+    assert named
+    for name in named:
+        path = ROOT / name.replace(".", "/")
+        package = path.parent / "__init__.py"
+        assert path.is_dir() or path.with_suffix(".py").is_file() or path.name in package.read_text(), name
