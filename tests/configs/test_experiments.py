@@ -56,6 +56,14 @@ def test_all_experiments_with_a_report_of_their_own_are_reproduced():
     assert sorted(listed.replace("\\\n", "").split()) == sorted({*NAMES} - {"inverse", "quickstart"})
 
 
+def test_the_list_of_experiments_has_each_with_its_parts():
+    rows = re.findall(r"^\| `(\w+)` \| (.*?) \|", (EXPERIMENTS / "README.md").read_text(), re.MULTILINE)
+    listed = {name: [f"{name}/{part}" for part in re.findall(r"`(\w+)`", parts)] for name, parts in rows}
+    assert {name: listed.get(name) for name in NAMES} == {
+        name: [part.name for part in Experiment.load(name).parts] for name in NAMES
+    }
+
+
 def test_the_ablation_is_every_method_of_the_paper_on_every_scene():
     jobs = [job.keys for job in Experiment.load("table1/ablation").jobs]
     methods = {path.stem for path in (CONF / "method").glob("*.yaml")} - {"history"}
