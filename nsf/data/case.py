@@ -54,10 +54,10 @@ class Case(Mapping[str, float]):
         Raises:
             ConfigError: it tells of none.
         """
-        found = [_ONE.fullmatch(part) for part in _NEXT.split(named)]
-        if not all(found):
+        matches = [_ONE.fullmatch(part) for part in _NEXT.split(named)]
+        if not all(matches):
             raise ConfigError(f"{named!r} names no case, as E=1500 Pa, friction=0.3 does")
-        names, values, units = zip(*(one.groups(default="") for one in found if one), strict=True)
+        names, values, units = zip(*(one.groups(default="") for one in matches if one), strict=True)
         return cls(names, values, [unit.strip() for unit in units])
 
     def __getitem__(self, name: str) -> float:

@@ -63,15 +63,15 @@ def group(file: h5py.Group, name: str) -> h5py.Group:
         KeyError: there is none.
         SchemaError: a link to somewhere else stands in its place.
     """
-    found = file
+    node = file
     for part in name.split("/"):
-        link = found.get(part, getlink=True) if isinstance(found, h5py.Group) else None
+        link = node.get(part, getlink=True) if isinstance(node, h5py.Group) else None
         if link is None:
             raise KeyError(name)
         if not isinstance(link, h5py.HardLink):
             raise SchemaError(f"has a link in the place of {name}")
-        found = found[part]
-    return found
+        node = node[part]
+    return node
 
 
 def array(file: h5py.Group, name: str, types: Sequence[str], shape: Sequence[int | None]) -> h5py.Dataset:
@@ -87,25 +87,26 @@ def array(file: h5py.Group, name: str, types: Sequence[str], shape: Sequence[int
         KeyError: there is none.
         SchemaError: it is of another type or shape, lies elsewhere, or the file ends before it does.
     """
-    found = group(file, name)
-    if not isinstance(found, h5py.Dataset):
+    dataset = group(file, name)
+    if not isinstance(dataset, h5py.Dataset):
         raise SchemaError(f"has {name}, which is no array")
-    has = () if found.shape is None else found.shape
+    has = () if dataset.shape is None else dataset.shape
     if len(has) != len(shape) or any(
         size != asked if asked is not None else not size for size, asked in zip(has, shape, strict=True)
     ):
-        wanted = ", ".join("any" if size is None else str(size) for size in shape)
-        raise SchemaError(f"has {name} of shape {list(has)}, not [{wanted}]")
-    text = h5py.check_string_dtype(found.dtype) is not None
-    if ("text" if text else found.dtype) not in [t if t == "text" else np.dtype(t) for t in types]:
-        raise SchemaError(f"has {name} of {found.dtype.str}, not {' or '.join(types)}")
-    how = found.id.get_create_plist()
-    if how.get_layout() != h5py.h5d.CONTIGUOUS or how.get_external_count():
+        expected = ", ".join("any" if size is None else str(size) for size in shape)
+        raise SchemaError(f"has {name} of shape {list(has)}, not [{expected}]")
+    text = h5py.check_string_dtype(dataset.dtype) is not None
+    if ("text" if text else dataset.dtype) not in [t if t == "text" else np.dtype(t) for t in types]:
+        raise SchemaError(f"has {name} of {dataset.dtype.str}, not {' or '.join(types)}")
+    layout = dataset.id.get_create_plist()
+    if layout.get_layout() != h5py.h5d.CONTIGUOUS or layout.get_external_count():
         raise SchemaError(f"has {name} in chunks or outside the file, and not in one piece")
-    held, needed = found.id.get_storage_size(), found.size * (_TEXT_BYTES if text else found.dtype.itemsize)
-    if held != needed or (needed and found.id.get_offset() + held > file.file.id.get_filesize()):
+    needed = dataset.size * (_TEXT_BYTES if text else dataset.dtype.itemsize)
+    held = dataset.id.get_storage_size()
+    if held != needed or (needed and dataset.id.get_offset() + held > file.file.id.get_filesize()):
         raise SchemaError(f"ends before {name} does, which is of {needed:,} bytes")
-    return found
+    return dataset
 
 
 def values(
@@ -120,22 +121,22 @@ def values(
     Raises:
         KeyError, SchemaError: as of `array`, or the values are outside their limits.
     """
-    found = array(file, name, types, shape)[()]
-    check(name, found, **limits)
-    return found
+    data = array(file, name, types, shape)[()]
+    check(name, data, **limits)
+    return data
 
 
-def check(name: str, found: np.ndarray | float, positive: bool = False, increasing: bool = False) -> None:
+def check(name: str, data: np.ndarray | float, positive: bool = False, increasing: bool = False) -> None:
     """Refuse values that are not finite, or not positive or increasing where they have to be.
 
     Raises:
         SchemaError: names the array.
     """
-    if not np.isfinite(found).all():
+    if not np.isfinite(data).all():
         raise SchemaError(f"has non-finite values of {name}")
-    if positive and not np.all(np.asarray(found) > 0):
+    if positive and not np.all(np.asarray(data) > 0):
         raise SchemaError(f"has values of {name} that are not positive")
-    if increasing and not np.all(np.diff(found) > 0):
+    if increasing and not np.all(np.diff(data) > 0):
         raise SchemaError(f"has {name} that does not increase")
 
 
@@ -145,16 +146,16 @@ def texts(file: h5py.Group, name: str, shape: Sequence[int | None]) -> list[str]
     Raises:
         KeyError, SchemaError: as of `array`, or a text is longer.
     """
-    found = array(file, name, ["text"], shape)
-    if not found.size:
+    dataset = array(file, name, ["text"], shape)
+    if not dataset.size:
         return []
     # HDF5 would give each as long as it claims to be, and a few bytes of a file can claim one text often.
     with open(file.file.filename, "rb") as raw:
-        raw.seek(found.id.get_offset())
-        lengths = np.frombuffer(raw.read(_TEXT_BYTES * found.size), "<u4")[:: _TEXT_BYTES // 4]
+        raw.seek(dataset.id.get_offset())
+        lengths = np.frombuffer(raw.read(_TEXT_BYTES * dataset.size), "<u4")[:: _TEXT_BYTES // 4]
     if lengths.max() > _LONGEST:
         raise SchemaError(f"has {name} with a text of {lengths.max()} bytes")
-    return [text.decode() for text in found[()]]
+    return [text.decode() for text in dataset[()]]
 
 
 def attribute(file: h5py.File, name: str, kind: type) -> Any:
@@ -174,7 +175,7 @@ def attribute(file: h5py.File, name: str, kind: type) -> Any:
     letter = "O" if text else about.dtype.kind
     if about.shape != () or letter not in {bool: "b", int: "iu", float: "fiu", str: "O" * text}[kind]:
         raise SchemaError(f"has attribute {name}, which is no single {kind.__name__}")
-    found = file.attrs[name]
+    value = file.attrs[name]
     if kind is float:
-        check(name, found)
-    return found if kind is str else kind(found)
+        check(name, value)
+    return value if kind is str else kind(value)

@@ -80,7 +80,7 @@ class Standardizer(nn.Module):
         starts = range(0, snapshots.P, width)
         slabs = (slice(start, start + width) for start in starts)
         return cls.fit(
-            snapshots.slab(field, own) - (0 if origin is None else origin[own].float()) for own in slabs
+            snapshots.slab(field, slab) - (0 if origin is None else origin[slab].float()) for slab in slabs
         )
 
     def forward(self, values: Float[Tensor, "*points component"]) -> Float[Tensor, "*points component"]:
@@ -90,5 +90,5 @@ class Standardizer(nn.Module):
 
 def deviation(rows: Float[np.ndarray, "row component"]) -> Float[np.ndarray, " component"]:
     """Standard deviation over rows, in their unit, to divide by: 1 for a component that never varies."""
-    found = rows.std(0)
-    return np.where(found > 0, found, 1.0)
+    std = rows.std(0)
+    return np.where(std > 0, std, 1.0)

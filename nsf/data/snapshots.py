@@ -140,9 +140,9 @@ class Snapshots:
             return data[rows[:, None], particles]
         columns = _on_host(particles)
         count = len(range(self.P)[columns]) if isinstance(columns, slice) else len(columns)
-        wanted = np.arange(self.M)[_on_host(rows)]
-        out = np.empty((len(wanted), count, _components(field)), "f4")
-        for i, row in enumerate(wanted):
+        numbers = np.arange(self.M)[_on_host(rows)]
+        out = np.empty((len(numbers), count, _components(field)), "f4")
+        for i, row in enumerate(numbers):
             index = np.searchsorted(self._first, row, side="right") - 1
             self.trajectories[index].read(field, row - self._first[index], columns, out=out[i : i + 1])
         return torch.from_numpy(out).to(self.device)

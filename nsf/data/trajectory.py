@@ -276,12 +276,12 @@ class Trajectory:
     def __reduce__(self) -> tuple[Any, tuple[Path]]:
         return Trajectory.open, (self.path,)  # another process opens the file for itself
 
-    def _check_finite(self, field: str, rows: np.ndarray, found: np.ndarray) -> None:
+    def _check_finite(self, field: str, rows: np.ndarray, values: np.ndarray) -> None:
         with np.errstate(over="ignore", invalid="ignore"):
-            total = found.sum()  # at the speed of memory, and not finite if one of the values is not
+            total = values.sum()  # at the speed of memory, and not finite if one of the values is not
         if np.isfinite(total):
             return
-        bad = np.flatnonzero(~np.isfinite(found).all((1, 2)))
+        bad = np.flatnonzero(~np.isfinite(values).all((1, 2)))
         if bad.size:
             raise SchemaError(
                 f"{self.path} has non-finite values of {field}, as in frame {rows[bad[0]]}; simulate again"
@@ -329,11 +329,11 @@ def _check_version(file: h5py.File) -> None:
         )
 
 
-def _selection(wanted: Any, size: int, kind: str) -> slice | np.ndarray:
+def _selection(indices: Any, size: int, kind: str) -> slice | np.ndarray:
     """Indices [n] that are in range, or a slice."""
-    if isinstance(wanted, slice):
-        return wanted
-    array = np.atleast_1d(np.asarray(wanted))
+    if isinstance(indices, slice):
+        return indices
+    array = np.atleast_1d(np.asarray(indices))
     if array.ndim != 1 or not (array.size == 0 or np.issubdtype(array.dtype, np.integer)):
         raise ShapeError(f"{kind}s have shape {list(array.shape)} of {array.dtype}; give integer indices [n]")
     if array.size and not (-size <= array.min() and array.max() < size):
@@ -350,4 +350,4 @@ def _read_scalars(file: h5py.File, name: str) -> dict[str, float]:
     group = hdf5.group(file, name)
     if len(group) > _MOST_SCALARS:
         raise SchemaError(f"has {len(group):,} {name}")
-    return {own: float(hdf5.values(group, own, _EXACT, ())) for own in sorted(group)}
+    return {key: float(hdf5.values(group, key, _EXACT, ())) for key in sorted(group)}

@@ -55,11 +55,11 @@ def class_of(name: Any, base: type) -> type:
     Raises:
         SchemaError: it is no such class.
     """
-    found = _CLASS.fullmatch(name) if isinstance(name, str) else None
-    if found and importlib.util.find_spec(found[1]):
-        kind = vars(importlib.import_module(found[1])).get(found[2])
-        own = isinstance(kind, type) and issubclass(kind, base) and kind.__module__ == found[1]
-        if own and not inspect.isabstract(kind):
+    match = _CLASS.fullmatch(name) if isinstance(name, str) else None
+    if match and importlib.util.find_spec(match[1]):
+        kind = vars(importlib.import_module(match[1])).get(match[2])
+        public = isinstance(kind, type) and issubclass(kind, base) and kind.__module__ == match[1]
+        if public and not inspect.isabstract(kind):
             return kind
     raise SchemaError(
         f"names the manifold {_REPR.repr(name)}, which is no {base.__name__} of a module of {FIELDS}; "
@@ -117,10 +117,10 @@ def fill(manifold: nn.Module, state: dict[str, Tensor]) -> None:
         SchemaError: a tensor is missing or unknown, of another type or shape, or not finite; or the
             particles are not those of the manifold's `x_sha256`.
     """
-    wanted = manifold.state_dict()
-    if odd := sorted(wanted.keys() ^ state.keys()):
+    expected = manifold.state_dict()
+    if odd := sorted(expected.keys() ^ state.keys()):
         raise SchemaError(f"has other tensors than its field ({', '.join(odd[:3])})")
-    for name, like in wanted.items():
+    for name, like in expected.items():
         tensor = state[name]
         if (tensor.dtype, tensor.shape) != (like.dtype, like.shape):
             raise SchemaError(

@@ -46,10 +46,10 @@ class Interpolation:
     def value(self, field: Tensor) -> Tensor:
         """Field [P, ...] at the points [n, ...], in float64 on the field's device."""
         # Sums rows as it reads them: to hold every point's neighbours first takes six times as long on a CPU.
-        near, rows, weights = (given.to(field.device) for given in (*self._used, self.weights))
+        near, rows, weights = (part.to(field.device) for part in (*self._used, self.weights))
         values = field[near].double().reshape(len(near), -1)
-        found = F.embedding_bag(rows, values, mode="sum", per_sample_weights=weights)
-        return found.reshape(len(rows), *field.shape[1:])
+        sums = F.embedding_bag(rows, values, mode="sum", per_sample_weights=weights)
+        return sums.reshape(len(rows), *field.shape[1:])
 
     def gradient(self, field: Tensor) -> Tensor:
         """Its derivative [n, ..., 3] in 1/m."""
@@ -74,8 +74,10 @@ def nearest(X: Tensor, particles: Tensor, k: int) -> Tensor:
     from scipy.spatial import cKDTree  # 0.2 s that commands without points of their own need not pay
 
     ranks = range(1, k + 1)
-    _, found = cKDTree(particles.cpu().numpy()).query(X.cpu().numpy(), ranks, workers=torch.get_num_threads())
-    return torch.as_tensor(found, dtype=torch.long, device=X.device)
+    _, indices = cKDTree(particles.cpu().numpy()).query(
+        X.cpu().numpy(), ranks, workers=torch.get_num_threads()
+    )
+    return torch.as_tensor(indices, dtype=torch.long, device=X.device)
 
 
 def lying_together(X: Tensor, count: int) -> tuple[Tensor, ...]:

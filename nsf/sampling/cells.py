@@ -50,6 +50,6 @@ def added_up(columns: torch.Tensor, cell: np.ndarray) -> torch.Tensor:
     sums = columns.new_zeros(len(columns), len(first))
     for turn in range(count.max()):  # one of each cell at a time
         more = count > turn
-        rows, own = (torch.as_tensor(a, device=columns.device) for a in (order[first[more] + turn], more))
-        sums[:, own] += columns[:, rows]
+        rows, cells = (torch.as_tensor(a, device=columns.device) for a in (order[first[more] + turn], more))
+        sums[:, cells] += columns[:, rows]
     return sums

@@ -217,8 +217,8 @@ def _fitted(
         share = np.full(len(fit), np.inf)
         leaves = fit <= 0
         share[leaves] = weights[leaves] / (weights[leaves] - fit[leaves])
-        kept = share > share.min()
-        weights = (weights + share.min() * (fit - weights))[kept]
-        chosen = [column for column, stays in zip(chosen, kept, strict=True) if stays]
-        for at in np.flatnonzero(~kept)[::-1]:
+        staying = share > share.min()
+        weights = (weights + share.min() * (fit - weights))[staying]
+        chosen = [column for column, stays in zip(chosen, staying, strict=True) if stays]
+        for at in np.flatnonzero(~staying)[::-1]:
             factors = qr_delete(*factors, at, which="col")

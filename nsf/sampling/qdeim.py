@@ -72,8 +72,8 @@ def displacement_components(manifold, count: int, device: str | torch.device = "
 def orthonormal(components: torch.Tensor) -> torch.Tensor:
     """The modes [P, 3, m] of norm one of displacement components, without those that are round-off."""
     norms = components.square().sum((0, 1)).sqrt()
-    kept = norms > _RANK * norms.max()
-    return components[..., kept] / norms[kept]
+    above = norms > _RANK * norms.max()
+    return components[..., above] / norms[above]
 
 
 def pivots(U: torch.Tensor, size: int) -> list[int]:
@@ -99,7 +99,7 @@ def oversampled(U: torch.Tensor, chosen: list[int], size: int) -> list[int]:
     """Further particles, up to `size` with those chosen, each of the largest `eigenvalue_gain`."""
     # In axes of its own, the three rows of a particle are orthogonal.
     # On the host: cuSOLVER fails on as many small matrices as there are particles.
-    squares, axes = (found.to(U.device) for found in torch.linalg.eigh((U @ U.mT).cpu()))
+    squares, axes = (part.to(U.device) for part in torch.linalg.eigh((U @ U.mT).cpu()))
     U = axes.mT @ U
     gram = torch.einsum("pim,pin->mn", U[chosen], U[chosen])
     left = torch.ones(len(U), dtype=torch.bool, device=U.device)

@@ -108,14 +108,14 @@ class BasisField:
         Raises:
             ConfigError: latent_dim exceeds the modes asked for, or the rank of the displacements.
         """
-        wanted = per_phase("modes", self.modes)
-        if latent_dim > wanted[0]:
+        counts = per_phase("modes", self.modes)
+        if latent_dim > counts[0]:
             raise ConfigError(
-                f"latent_dim={latent_dim} exceeds the {wanted[0]} displacement modes; choose"
-                f" field.modes > {latent_dim} or latent_dim <= {wanted[0]}"
+                f"latent_dim={latent_dim} exceeds the {counts[0]} displacement modes; choose"
+                f" field.modes > {latent_dim} or latent_dim <= {counts[0]}"
             )
         prepared = {}
-        for count, (name, components) in zip(wanted, TARGETS.values(), strict=True):
+        for count, (name, components) in zip(counts, TARGETS.values(), strict=True):
             coefficients, unresolved = pod.decompose(snapshots, name, components, count)
             prepared[name] = {"coefficients": coefficients.cpu(), "unresolved": unresolved}
         rank = prepared["x"]["coefficients"].shape[1]
@@ -201,8 +201,8 @@ class BasisField:
                 return (outputs - targets[rows]).square().mean()
             # The mean over all noise on dx̂/dt, whose square M passes on: nothing is drawn.
             passed_on = field.rates * outputs[..., targets.shape[1] :].square().mean()
-            found = at_rate(outputs, rates[rows])
-            return (found - targets[rows]).square().mean() + self.rate_noise**2 * passed_on
+            coefficients_at_rate = at_rate(outputs, rates[rows])
+            return (coefficients_at_rate - targets[rows]).square().mean() + self.rate_noise**2 * passed_on
 
         return loss
 
@@ -295,8 +295,8 @@ class BasisManifold(Manifold):
 
     def frees(self, phase: str) -> bool:
         """Whether the phase's coefficients are made zero at rest (`zero_at_rest`)."""
-        asked = phase == "stress" and self.hyperparameters["free_at_rest"]
-        return asked and _layered(self.fields[phase].network)
+        free = phase == "stress" and self.hyperparameters["free_at_rest"]
+        return free and _layered(self.fields[phase].network)
 
     @override
     @torch.no_grad()

@@ -9,7 +9,7 @@ in training and, once g is trained, principal axes.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -78,8 +78,8 @@ class MlpField:
                 "choose field.affine=latent, or field=basis"
             )
         if self.arithmetic not in (None, *ARITHMETIC):
-            known = ", ".join(ARITHMETIC)
-            raise ConfigError(f"field.arithmetic={self.arithmetic} is unknown; choose {known} or null")
+            choices = ", ".join(ARITHMETIC)
+            raise ConfigError(f"field.arithmetic={self.arithmetic} is unknown; choose {choices} or null")
 
     def prepare(self, snapshots: Snapshots, latent_dim: int) -> dict[str, Any]:
         """What the snapshots determine before training: mean and deviation of X, displacements, tau and C."""
@@ -118,68 +118,88 @@ class MlpField:
         Every target is standardised, so a loss is the mean squared error over its variance. g's has the
         tangent's besides, and frames of h and l have weights (`evenness`).
         """
-        standard, decoders, r = manifold.standard, manifold.decoders, manifold.latent_dim
-        X, frame, trajectory = manifold.X.float(), snapshots.frame, snapshots.trajectory
-        places = {phase: manifold.inputs(phase, X) for phase in PHASES}
-        places = {phase: torch.cat([standard["X"](X), at[:, 3:]], 1) for phase, at in places.items()}
-        pace = self._pace(snapshots, standard["x"])
-
-        def displaced(rows):
-            return standard["x"](snapshots.gather("x", rows, slice(None)) - X)
-
-        def decode(phase, particles, latents):
-            return decoders[phase](pair(places[phase][particles], latents)).float()
-
-        def deformation(rows, particles, generator):
-            now = displaced(rows)
-            xhat = manifold.encoder(now)
-            drawn = torch.randn(xhat.shape, generator=generator, device=xhat.device)
-            noisy = xhat + self.noise * xhat.detach().std(0, correction=0) * drawn
-            found = decode("deformation", particles, noisy)
-            loss = (found - now[:, particles]).square().mean()
-            if self.tangent:
-                later = (rows + 1).clamp(max=snapshots.M - 1)
-                goes_on = (trajectory[later] == trajectory[rows]) & (frame[later] > frame[rows])
-                then = displaced(later)
-                moved = decode("deformation", particles, noisy + manifold.encoder(then) - xhat) - found
-                off = (moved - (then - now)[:, particles]).square().mean((1, 2))
-                loss = loss + self.tangent / pace * (goes_on * off).mean()
-            return loss
-
-        def decoded(phase, share):
-            name = TARGETS[phase][0]
-            latents = manifold.decoder_latents(phase)
-            noise = (self.noise**2 * share.square() + 1 - share.square()).sqrt().float()
-            weights = self._weights(standard[name](snapshots.slab(name, spaced(snapshots.P, _PROBED))))
-
-            def loss(rows, particles, generator):
-                values = standard[name](snapshots.gather(name, rows, particles))
-                xhat, mu = latents[rows].tensor_split([r], 1)
-                drawn = noise * torch.randn(xhat.shape, generator=generator, device=xhat.device)
-                found = decode(phase, particles, torch.cat([xhat + drawn, mu], 1))
-                return (weights[rows] * (found - values).square().mean((1, 2))).mean()
-
-            return loss
-
-        both = nn.ModuleList([manifold.encoder, decoders["deformation"]])
-        yield Fit("deformation", both, deformation, pointwise=True, fine=True)
+        losses = _Losses(self, manifold, snapshots)
+        both = nn.ModuleList([manifold.encoder, manifold.decoders["deformation"]])
+        yield Fit("deformation", both, losses.deformation, pointwise=True, fine=True)
         manifold.encode_training(snapshots)
         share = manifold.turn(self.noise_floor)
         manifold.encode_training(snapshots)
         for phase in PHASES[1:]:
-            yield Fit(phase, decoders[phase], decoded(phase, share), pointwise=True)
+            yield Fit(phase, manifold.decoders[phase], losses.head(phase, share), pointwise=True)
+
+
+class _Losses:
+    """What the phases of `field=mlp` minimise.
+
+    Args:
+        field, manifold, snapshots: as of `MlpField.fits`.
+    """
+
+    def __init__(self, field: MlpField, manifold: MlpManifold, snapshots: Snapshots):
+        self.field, self.manifold, self.snapshots = field, manifold, snapshots
+        self.X, self.standard = manifold.X.float(), manifold.standard
+        seen = {phase: manifold.inputs(phase, self.X)[:, 3:] for phase in PHASES}
+        self.places = {phase: torch.cat([self.standard["X"](self.X), at], 1) for phase, at in seen.items()}
+        self.pace = self._pace()
+
+    def deformation(self, rows: Tensor, particles: Tensor, generator: torch.Generator) -> Tensor:
+        """Of displacements, and of those from a frame to the next (`MlpField.tangent`)."""
+        now = self._displaced(rows)
+        xhat = self.manifold.encoder(now)
+        drawn = torch.randn(xhat.shape, generator=generator, device=xhat.device)
+        noisy = xhat + self.field.noise * xhat.detach().std(0, correction=0) * drawn
+        decoded = self._decode("deformation", particles, noisy)
+        loss = (decoded - now[:, particles]).square().mean()
+        if self.field.tangent:
+            frame, trajectory = self.snapshots.frame, self.snapshots.trajectory
+            later = (rows + 1).clamp(max=self.snapshots.M - 1)
+            goes_on = (trajectory[later] == trajectory[rows]) & (frame[later] > frame[rows])
+            then = self._displaced(later)
+            moved = (
+                self._decode("deformation", particles, noisy + self.manifold.encoder(then) - xhat) - decoded
+            )
+            off = (moved - (then - now)[:, particles]).square().mean((1, 2))
+            loss = loss + self.field.tangent / self.pace * (goes_on * off).mean()
+        return loss
+
+    def head(self, phase: str, share: Tensor) -> Callable[..., Tensor]:
+        """Of h or l; `share` as `MlpManifold.turn` gives it."""
+        (name, _), r = TARGETS[phase], self.manifold.latent_dim
+        latents, scale = self.manifold.decoder_latents(phase), self.standard[name]
+        noise = (self.field.noise**2 * share.square() + 1 - share.square()).sqrt().float()
+        weights = self._weights(scale(self._few(name)))
+
+        def loss(rows: Tensor, particles: Tensor, generator: torch.Generator) -> Tensor:
+            values = scale(self.snapshots.gather(name, rows, particles))
+            xhat, mu = latents[rows].tensor_split([r], 1)
+            drawn = noise * torch.randn(xhat.shape, generator=generator, device=xhat.device)
+            decoded = self._decode(phase, particles, torch.cat([xhat + drawn, mu], 1))
+            return (weights[rows] * (decoded - values).square().mean((1, 2))).mean()
+
+        return loss
+
+    def _displaced(self, rows: Tensor) -> Tensor:
+        """Standardised displacements [F, P, 3] of whole frames."""
+        return self.standard["x"](self.snapshots.gather("x", rows, slice(None)) - self.X)
+
+    def _decode(self, phase: str, particles: Tensor | slice, latents: Tensor) -> Tensor:
+        return self.manifold.decoders[phase](pair(self.places[phase][particles], latents)).float()
+
+    def _few(self, name: str) -> Tensor:
+        """A field of the snapshots at some particles, [M, n, d]."""
+        return self.snapshots.slab(name, spaced(self.snapshots.P, _PROBED))
 
     def _weights(self, values: Tensor) -> Tensor:
         """Weight [M] of each frame of standardised values [M, n, d], in the mean 1."""
         squares = values.square().mean((1, 2))
-        weights = 1.0 / (1.0 + self.evenness * squares / squares.mean().clamp(min=_LEAST))
+        weights = 1.0 / (1.0 + self.field.evenness * squares / squares.mean().clamp(min=_LEAST))
         return weights / weights.mean()
 
-    def _pace(self, snapshots: Snapshots, standard: Standardizer) -> float:
-        """Mean square of displacements from a frame to the next, in units of `standard`; 1 if none moves."""
-        few = snapshots.slab("x", spaced(snapshots.P, _PROBED))
-        goes_on = (torch.diff(snapshots.trajectory) == 0) & (torch.diff(snapshots.frame) > 0)
-        steps = torch.diff(few, dim=0)[goes_on] / standard.std
+    def _pace(self) -> float:
+        """Mean square of standardised displacements from a frame to the next; 1 if none moves."""
+        trajectory, frame = self.snapshots.trajectory, self.snapshots.frame
+        goes_on = (torch.diff(trajectory) == 0) & (torch.diff(frame) > 0)
+        steps = torch.diff(self._few("x"), dim=0)[goes_on] / self.standard["x"].std
         return float(steps.square().mean()) or 1.0 if len(steps) else 1.0
 
 
@@ -264,8 +284,8 @@ class MlpManifold(Manifold):
         """Mean of JᵀJ [r, r] m² over particles and training snapshots, positive definite."""
         at = self.restrict(torch.as_tensor(spaced(len(self.X), _PROBED)), device=self.X.device)
         rows = torch.as_tensor(spaced(len(self.training_latents), _PROBED))
-        found = (at.position_and_jacobian(xhat)[1] for xhat in self.training_latents[rows])
-        metric = sum(torch.einsum("ncj,nck->jk", J, J) for J in found) / (at.points * len(rows))
+        jacobians = (at.position_and_jacobian(xhat)[1] for xhat in self.training_latents[rows])
+        metric = sum(torch.einsum("ncj,nck->jk", J, J) for J in jacobians) / (at.points * len(rows))
         least = _LEAST**2 * metric.trace().clamp(min=_LEAST)  # a coordinate may move nothing
         return metric + least * torch.eye(len(metric)).to(metric)
 

@@ -208,14 +208,14 @@ class ModalFactors:
         has the weights of that member's inputs alone.
         """
         layers = [] if self.network is None else list(self.network.layers)
-        found = []
+        pairs = []
         for n, layer in enumerate(layers):
             W = layer.weight
             if 0 < n < len(layers) - 1:
                 blocks = W.unflatten(0, (self.members, -1)).unflatten(2, (self.members, -1))
                 W = blocks.diagonal(dim1=0, dim2=2).permute(2, 0, 1).flatten(0, 1)
-            found.append((W, layer.bias))
-        return found
+            pairs.append((W, layer.bias))
+        return pairs
 
 
 class ModalModule(nn.Module):

@@ -221,9 +221,9 @@ def zero_at_rest(raw: FullyConnected, members: int, rest: Tensor, reach: Tensor)
     """
     layers, networks = [(layer.weight.double(), layer.bias.double()) for layer in raw.layers], []
     for n in range(members):
-        own = _member(layers, members, n)
-        taken = _taken(own, rest, reach)
-        networks += [[_padded(layer, like) for layer, like in zip(own, taken, strict=True)], taken]
+        member = _member(layers, members, n)
+        taken = _taken(member, rest, reach)
+        networks += [[_padded(layer, like) for layer, like in zip(member, taken, strict=True)], taken]
     return beside(networks, [1] * len(networks), raw.kind).requires_grad_(False)
 
 
@@ -232,23 +232,23 @@ def _taken(layers: Sequence[Layer], rest: Tensor, reach: Tensor) -> list[Layer]:
     (first, b_first), *hidden, (W, b) = layers[:-1]
     r, (out, b_out) = len(rest), layers[-1]
     slopes = torch.cat([torch.diag(1 / reach), torch.diag(-1 / reach)])
-    found = [
+    layers_taken = [
         _beside_own(
             first, b_first + first[:, :r] @ rest, F.pad(slopes, (0, first.shape[1] - r)), -slopes @ rest
         )
     ]
-    found[0][0][: len(first), :r] = 0  # x̂ is x̂₀ there
+    layers_taken[0][0][: len(first), :r] = 0  # x̂ is x̂₀ there
     # Weights that give ρ from the layer before: of silu(±t_k), r each, and later of silu(±ρ).
     distance = torch.ones(1, 2 * r).to(rest)
     for V, c in hidden:
         more = F.pad(torch.cat([distance, -distance]), (len(V), 0))
-        found.append(_beside_own(F.pad(V, (0, distance.shape[1])), c, more, c.new_zeros(2)))
+        layers_taken.append(_beside_own(F.pad(V, (0, distance.shape[1])), c, more, c.new_zeros(2)))
         distance = torch.tensor([[1.0, -1.0]]).to(rest)
     faded = torch.cat([W, -_FADING * distance.expand(len(W), -1)], 1)
     bias = F.pad(-_FADING * distance, (W.shape[1], 0))
-    found.append(_beside_own(faded, b, bias, b.new_tensor([_BIAS])))
+    layers_taken.append(_beside_own(faded, b, bias, b.new_tensor([_BIAS])))
     share = -b_out / F.silu(b_out.new_tensor(_BIAS))
-    return [*found, (torch.cat([-out, share[:, None]], 1), torch.zeros_like(b_out))]
+    return [*layers_taken, (torch.cat([-out, share[:, None]], 1), torch.zeros_like(b_out))]
 
 
 def _beside_own(W: Tensor, b: Tensor, more: Tensor, bias: Tensor) -> Layer:
@@ -264,12 +264,12 @@ def _padded(layer: Layer, like: Layer) -> Layer:
 
 def _member(layers: Sequence[Layer], members: int, n: int) -> list[Layer]:
     """Layers of one of the networks that `layers` hold side by side; of the last bias its share."""
-    own = [b.unflatten(0, (members, -1))[n] for _, b in layers[:-1]]
+    biases = [b.unflatten(0, (members, -1))[n] for _, b in layers[:-1]]
     blocks = [layers[0][0].unflatten(0, (members, -1))[n]]
     for W, _ in layers[1:-1]:
         blocks.append(W.unflatten(0, (members, -1)).unflatten(2, (members, -1))[n, :, n])
     blocks.append(layers[-1][0].unflatten(1, (members, -1))[:, n])
-    return list(zip(blocks, [*own, layers[-1][1] / members], strict=True))
+    return list(zip(blocks, [*biases, layers[-1][1] / members], strict=True))
 
 
 @torch.no_grad()

@@ -86,8 +86,8 @@ def _iterated(snapshots: Snapshots, name: str, components: int, count: int) -> t
 def _coefficients(energies: Tensor, vectors: Tensor, count: int) -> Tensor:
     """V √w of the first `count` pairs above round-off, given with the largest first."""
     rank = int((energies > RANK_TOLERANCE * energies[0].clamp_min(torch.finfo(torch.float64).tiny)).sum())
-    kept = min(count, rank)
-    return vectors[:, :kept] * energies[:kept].sqrt()
+    modes = min(count, rank)
+    return vectors[:, :modes] * energies[:modes].sqrt()
 
 
 def modes(

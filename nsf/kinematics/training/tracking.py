@@ -43,14 +43,14 @@ def loggers(folder: Path, tracking: str | None) -> list[Logger]:
 
     # A resumed phase logs into a new version, for CSVLogger deletes what it finds.
     version = str(len(list((folder / "csv").glob("*"))))
-    found: list[Logger] = [CSVLogger(folder, name="csv", version=version, flush_logs_every_n_steps=1)]
+    writers: list[Logger] = [CSVLogger(folder, name="csv", version=version, flush_logs_every_n_steps=1)]
     if tracking == "tensorboard":
         from pytorch_lightning.loggers.tensorboard import TensorBoardLogger
 
-        found.append(TensorBoardLogger(folder, name="tensorboard", version=version))
+        writers.append(TensorBoardLogger(folder, name="tensorboard", version=version))
     if tracking == "mlflow":
-        found.append(_mlflow(folder))
-    return found
+        writers.append(_mlflow(folder))
+    return writers
 
 
 def _mlflow(folder: Path) -> MLFlowLogger:
@@ -58,7 +58,7 @@ def _mlflow(folder: Path) -> MLFlowLogger:
     from pytorch_lightning.loggers.mlflow import MLFlowLogger
 
     os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-    trainings, kept = folder.parent.parent.resolve(), folder / "mlflow_run.txt"
+    trainings, run_file = folder.parent.parent.resolve(), folder / "mlflow_run.txt"
     # Two processes that make the tables of a data base at once would fail.
     with locked(trainings / ".mlflow.lock", waiting=lambda: None):
         logger = MLFlowLogger(
@@ -66,8 +66,8 @@ def _mlflow(folder: Path) -> MLFlowLogger:
             run_name=f"{folder.parent.name}/{folder.name}",
             tracking_uri=os.environ.get("MLFLOW_TRACKING_URI", f"sqlite:///{trainings / 'mlflow.db'}"),
             artifact_location=(trainings / "mlflow").as_uri(),
-            run_id=kept.read_text(encoding="utf-8") if kept.is_file() else None,
+            run_id=run_file.read_text(encoding="utf-8") if run_file.is_file() else None,
         )
-        with writing(kept) as partial:
+        with writing(run_file) as partial:
             partial.write_text(str(logger.run_id), encoding="utf-8")
     return logger
