@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Adam, Muon, Optimizer
 
+from nsf.data import Snapshots
 from nsf.gpu import without_collection
 from nsf.kinematics.training.phases import PHASES, Fit, seed_of
 from nsf.kinematics.training.schedules import Trainer
@@ -50,22 +51,19 @@ class Descent:
 
     Attributes:
         fit, schedule: the network with its loss, and the batches and rates.
-        frames, particles: M and P of the snapshots.
-        resident: the snapshots lie on the device.
+        snapshots: what the loss reads.
     """
 
     fit: Fit
     schedule: Trainer
-    frames: int
-    particles: int
-    resident: bool
+    snapshots: Snapshots
     seed: int
     device: torch.device
 
     @property
     def replayable(self) -> bool:
         """Whether every step is the same sequence of kernels, with no word from the host."""
-        local = self.resident or not self.fit.pointwise
+        local = self.snapshots.resident or not self.fit.pointwise
         return self.device.type == "cuda" and self.schedule.stationary and local
 
     def optimizers(self) -> list[Optimizer]:
@@ -140,7 +138,7 @@ class Steps:
         descent = self.descent
         fit = descent.fit
         rows, particles = descent.schedule.batch(
-            step, fit, descent.frames, descent.particles, descent.seed, self._generator
+            step, fit, descent.snapshots.M, descent.snapshots.P, descent.seed, self._generator
         )
         fast = descent.schedule.bf16 and fit.pointwise and descent.device.type == "cuda"
         low = fast and not fit.fine

@@ -16,6 +16,7 @@ from pytorch_lightning.plugins import TorchCheckpointIO
 from torch.utils.data import DataLoader, Sampler
 from typing_extensions import override
 
+from nsf.data import Snapshots
 from nsf.errors import InstabilityError
 from nsf.kinematics.training.descent import CHECKPOINT, Descent, Steps
 from nsf.kinematics.training.tracking import loggers
@@ -36,11 +37,13 @@ class SnapshotData(pl.LightningDataModule):
     millisecond is longer than a step that is replayed (`Steps`).
 
     Args:
+        snapshots: of the training cases.
         steps: of the phase.
     """
 
-    def __init__(self, steps: int):
+    def __init__(self, snapshots: Snapshots, steps: int):
         super().__init__()
+        self.snapshots = snapshots
         size = min(max(SHORTEST_BLOCK, steps // BLOCKS), LONGEST_BLOCK)
         self.blocks = [(first, min(first + size, steps)) for first in range(0, steps, size)]
 
@@ -166,7 +169,7 @@ def descend(descent: Descent, steps: int, folder: Path, tracking: str | None) ->
     """
     checkpoint = folder / CHECKPOINT
     resumed = checkpoint if checkpoint.is_file() else None
-    data, module = SnapshotData(steps), FieldTraining(descent, steps)
+    data, module = SnapshotData(descent.snapshots, steps), FieldTraining(descent, steps)
     on_gpu = descent.device.type == "cuda"
     with quiet_lightning(), Progress(f"train {descent.fit.name}", steps, "steps") as progress:
         trainer = pl.Trainer(

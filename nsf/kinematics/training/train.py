@@ -88,7 +88,7 @@ def train(
         total = begun["seconds"] + _once(folder / "built.pt", lambda: built["seconds"])
         metrics: dict[str, float] = {}
         for fit in field.fits(manifold, snapshots, prepared):
-            descent = Descent(fit, trainer, snapshots.M, snapshots.P, snapshots.resident, seed, device)
+            descent = Descent(fit, trainer, snapshots, seed, device)
             outcome = _once(folder / f"{fit.name}.pt", lambda: _phase(descent, folder, tracking))  # noqa: B023
             fit.network.load_state_dict(outcome["state"])
             fit.network.to(device)  # Lightning leaves it on the host
@@ -102,7 +102,7 @@ def train(
 def _phase(descent: Descent, folder: Path, tracking: str | None) -> dict[str, Any]:
     from nsf.kinematics.training.lightning import descend
 
-    steps = descent.schedule.steps_of(descent.fit.name, descent.frames)
+    steps = descent.schedule.steps_of(descent.fit.name, descent.snapshots.M)
     loss, seconds = descend(descent, steps, folder / descent.fit.name, tracking)
     state = {key: value.cpu() for key, value in descent.fit.network.state_dict().items()}
     return {"state": state, "steps": steps, "loss": loss, "seconds": seconds}

@@ -191,7 +191,7 @@ def test_muon_moves_the_matrices_but_in_the_paper_s_schedule(snapshots, schedule
     prepared = FIELD.prepare(snapshots, LATENT)
     manifold = FIELD.build(snapshots, prepared, LATENT, seeded("cpu", 0))
     fit = next(FIELD.fits(manifold, snapshots, prepared))
-    descent = Descent(fit, schedule, snapshots.M, snapshots.P, True, 0, torch.device("cpu"))
+    descent = Descent(fit, schedule, snapshots, 0, torch.device("cpu"))
     optimizers = descent.optimizers()
     assert [type(optimizer).__name__ for optimizer in optimizers] == names
     moved = [w for optimizer in optimizers for group in optimizer.param_groups for w in group["params"]]

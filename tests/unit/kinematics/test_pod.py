@@ -107,7 +107,7 @@ def test_of_many_snapshots_a_step_sees_some(low_rank, monkeypatch, tmp_path):
     fit = next(BasisField().fits(*_built(low_rank)))
     loss = fit.loss
     kept = replace(fit, loss=lambda rows, *rest: seen.append(rows) or loss(rows, *rest))
-    descent = Descent(kept, FastTrainer(steps=3), M, P, True, 0, torch.device("cpu"))
+    descent = Descent(kept, FastTrainer(steps=3), low_rank, 0, torch.device("cpu"))
     Steps(descent, descent.optimizers(), 3).take(0, 3)
     assert [len(rows) for rows in seen] == [7, 7, 7]
     assert len({tuple(rows.tolist()) for rows in seen}) == 3
