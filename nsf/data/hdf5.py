@@ -18,7 +18,7 @@ from nsf.runs.manifest import verified
 _LONGEST = 64  # [byte] of a text in an array of texts
 #: On disk each text of an array is its length, and where it lies: 4 and 12 bytes (HDF5's "Global Heap ID").
 _TEXT_BYTES = 16
-#: What HDF5 makes of a file whose bytes are not what they should be.
+#: Errors of HDF5 on a file whose bytes are damaged.
 _FAULTS = (OSError, RuntimeError, TypeError, ValueError, AttributeError, LookupError, ArithmeticError)
 
 

@@ -1,4 +1,4 @@
-"""What a trajectory file holds: the only home of names and units on disk.
+"""The layout of a trajectory file: the only home of names and units on disk.
 
 attributes   schema_version units tau_order x_sha256 dt dx complete
 /particles   X [P,3]  mass [P]  volume0 [P]                           float64
@@ -28,7 +28,7 @@ TAU_MATRIX = [[TAU_ORDER.index("".join(sorted(row + column))) for column in "xyz
 # Particle fields of a frame and their number of components; C is a 3x3 matrix by rows.
 COMPONENTS = {"x": 3, "v": 3, "C": 9, "tau": 6}
 
-# What forces a simulation at each frame, and its shape after the frames.
+# The forcing of a simulation at each frame, and its shape after the frames.
 FORCING = {"gravity": (3,), "solids": (None, 4)}
 
 UNITS = {

@@ -38,7 +38,7 @@ _KINDS = {
 _MOST_LEAVES = 100_000  # of what a file holds beside its tensors
 _REPR = reprlib.Repr()
 _REPR.maxstring = 100
-#: What torch and a class make of contents that are not what they should be.
+#: Errors of torch and of a class on contents that are damaged or foreign.
 FAULTS = (RuntimeError, LookupError, TypeError, AttributeError, ValueError, ArithmeticError)
 _PLAIN = (str, int, float, bool, type(None))
 
@@ -68,7 +68,7 @@ def class_of(name: Any, base: type) -> type:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """What a checkpoint holds, each value of its kind, tensors mapped and not read.
+    """The content of a checkpoint, each value of its kind, tensors mapped and not read.
 
     Raises:
         MissingRunError: there is no such file.

@@ -10,7 +10,7 @@ from scipy.linalg import qr, qr_delete, qr_insert, solve_triangular
 from typing_extensions import override
 
 from nsf.errors import ConfigError, ProjectionError
-from nsf.sampling.sampler import Sampler, SampleSpan, Teacher, check_count
+from nsf.sampling.sampler import Sampler, SampleSpan, WholeSolver, check_count
 
 _EXACT = 1e-9  # residual over target at which a cubature counts as exact
 _STILL = 1e-6  # root mean square motion in a step over Δx, below which a body counts as at rest
@@ -98,7 +98,7 @@ def training_rows(manifold, start: float, end: float, count: int) -> torch.Tenso
 
 @torch.no_grad()
 def normal_equations(
-    manifold, rows: torch.Tensor, candidates: np.ndarray, whole: Callable[[Mapping[str, float]], Teacher]
+    manifold, rows: torch.Tensor, candidates: np.ndarray, whole: Callable[[Mapping[str, float]], WholeSolver]
 ) -> Equations:
     """Each particle's share in the normal equations of one projection step from training states.
 

@@ -12,7 +12,7 @@ from typing_extensions import override
 from nsf.errors import ConfigError, ProjectionError
 
 
-class Teacher(Protocol):
+class WholeSolver(Protocol):
     """A reduced solver whose sample is every particle, for a sampler that learns from its steps.
 
     Attributes:
@@ -136,7 +136,7 @@ class Sampler(ABC):
         self,
         manifold,
         device: str | torch.device = "cpu",
-        whole: Callable[[Mapping[str, float]], Teacher] | None = None,
+        whole: Callable[[Mapping[str, float]], WholeSolver] | None = None,
     ) -> list[SampleSpan]:
         """Choose the sample particles of each span.
 

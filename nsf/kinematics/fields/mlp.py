@@ -82,7 +82,7 @@ class MlpField:
             raise ConfigError(f"field.arithmetic={self.arithmetic} is unknown; choose {choices} or null")
 
     def prepare(self, snapshots: Snapshots, latent_dim: int) -> dict[str, Any]:
-        """What the snapshots determine before training: mean and deviation of X, displacements, tau and C."""
+        """Mean and deviation of X, displacements, tau and C over the snapshots."""
         standard = {name: Standardizer.of(snapshots, name) for name in ("tau", "C")}
         standard["X"] = Standardizer.fit([snapshots.X])
         moved = Standardizer.of(snapshots, "x", origin=snapshots.X)
@@ -129,7 +129,7 @@ class MlpField:
 
 
 class _Losses:
-    """What the phases of `field=mlp` minimise.
+    """The losses of the phases of `field=mlp`.
 
     Args:
         field, manifold, snapshots: as of `MlpField.fits`.

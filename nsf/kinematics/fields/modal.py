@@ -87,7 +87,7 @@ class ModalField(nn.Module):
 
     @property
     def output_scale(self) -> Tensor:
-        """What each output of the network is multiplied with to be in the field's unit, [(1 + r) K]."""
+        """Factors [(1 + r) K] that bring outputs of the network to the field's unit."""
         closed = self.scale.expand(self.modes.shape[2] - len(self.leading))
         if not self.rates:
             return closed

@@ -22,7 +22,7 @@ def _push_elu(tangents: Tensor, z: Tensor) -> Tensor:
 ACTIVATIONS = {"elu": (F.elu, _push_elu), "silu": (F.silu, torch.ops.aten.silu_backward)}
 
 
-# What tensor cores multiply, by the type of the values between layers: 10 and 7 bits after the leading one.
+# Arithmetic of tensor cores, by the type of values between layers: 10 and 7 bits after the leading one.
 ARITHMETIC = {"tf32": torch.float32, "bf16": torch.bfloat16}
 
 
@@ -228,7 +228,7 @@ def zero_at_rest(raw: FullyConnected, members: int, rest: Tensor, reach: Tensor)
 
 
 def _taken(layers: Sequence[Layer], rest: Tensor, reach: Tensor) -> list[Layer]:
-    """What `zero_at_rest` adds to one network; hidden layers have further units beside its own."""
+    """The network that `zero_at_rest` adds to another; hidden layers have further units beside its own."""
     (first, b_first), *hidden, (W, b) = layers[:-1]
     r, (out, b_out) = len(rest), layers[-1]
     slopes = torch.cat([torch.diag(1 / reach), torch.diag(-1 / reach)])

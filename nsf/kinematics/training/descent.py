@@ -47,7 +47,7 @@ def tf32() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Descent:
-    """What one phase minimises, and how; each step is a function of the weights, its number and the seed.
+    """The minimisation of one phase; each step is a function of the weights, its number and the seed.
 
     Attributes:
         fit, schedule: the network with its loss, and the batches and rates.

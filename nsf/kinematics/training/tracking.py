@@ -13,7 +13,7 @@ from nsf.storage import locked, writing
 if TYPE_CHECKING:
     from pytorch_lightning.loggers import Logger, MLFlowLogger
 
-#: What `tracking` may be, with the extra that brings it.
+#: Values of `tracking`, each with the extra that brings it.
 EXTRAS = {"tensorboard": "track", "mlflow": "mlflow"}
 
 

@@ -23,10 +23,10 @@ WEIGHTS_STREAM = 1 << 30  # apart from the phases' streams
 
 
 class Field(Protocol):
-    """What a field of `conf/field/` offers to training."""
+    """A field of `conf/field/`, as training needs it."""
 
     def prepare(self, snapshots: Snapshots, latent_dim: int) -> dict[str, Any]:
-        """What the snapshots determine before any network is trained: plain containers and host tensors."""
+        """Plain containers and host tensors that follow from the snapshots before any network is trained."""
 
     def build(
         self, snapshots: Snapshots, prepared: dict[str, Any], latent_dim: int, generator: torch.Generator
