@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import scipy  # loads a part when it is first asked for
 import torch
-from scipy.linalg import qr, qr_delete, qr_insert, solve_triangular
 from typing_extensions import override
 
 from nsf.errors import ConfigError, ProjectionError
@@ -201,8 +201,8 @@ def nonnegative_fit(columns: torch.Tensor, target: torch.Tensor, size: int) -> t
 def _joined(factors: Factors | None, column: np.ndarray) -> Factors:
     """The factors of the columns there are and of another one [m]."""
     if factors is None:
-        return qr(column[:, None], mode="economic")
-    return qr_insert(*factors, column, len(factors[1]), which="col")
+        return scipy.linalg.qr(column[:, None], mode="economic")
+    return scipy.linalg.qr_insert(*factors, column, len(factors[1]), which="col")
 
 
 def _fitted(
@@ -211,7 +211,7 @@ def _fitted(
     """Least squares over the chosen columns; from feasible weights, columns leave as theirs reach zero."""
     while True:
         Q, R = factors
-        fit = solve_triangular(R, Q.T @ goal)
+        fit = scipy.linalg.solve_triangular(R, Q.T @ goal)
         if (fit > 0).all():
             return chosen, fit, factors
         share = np.full(len(fit), np.inf)
@@ -221,4 +221,4 @@ def _fitted(
         weights = (weights + share.min() * (fit - weights))[staying]
         chosen = [column for column, stays in zip(chosen, staying, strict=True) if stays]
         for at in np.flatnonzero(~staying)[::-1]:
-            factors = qr_delete(*factors, at, which="col")
+            factors = scipy.linalg.qr_delete(*factors, at, which="col")
