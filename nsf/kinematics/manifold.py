@@ -175,18 +175,6 @@ class Manifold(nn.Module, ABC):
     ) -> Restriction:
         """The fields at training particles (indices [n]; all if neither is given) or at points X [n, 3] m."""
 
-    def position(self, X: Tensor, xhat: Tensor) -> Tensor:
-        """g(X, xhat), [n, 3] m, anywhere in Ω₀."""
-        return self.restrict(X=X, device=self.X.device).position(xhat)
-
-    def stress(self, X: Tensor, xhat: Tensor, parameters: Tensor) -> Tensor:
-        """h(X, xhat, μ), [n, 6] Pa, anywhere in Ω₀."""
-        return self.restrict(X=X, device=self.X.device).stress(xhat, parameters)
-
-    def affine(self, X: Tensor, xhat: Tensor, parameters: Tensor, rate: Tensor | None = None) -> Tensor:
-        """l(X, xhat, μ), [n, 3, 3] 1/s, anywhere in Ω₀; `rate` as for `Restriction.affine`."""
-        return self.restrict(X=X, device=self.X.device).affine(xhat, parameters, rate)
-
     def check_particles(self, x_sha256: str) -> None:
         """Refuse particles other than those of training.
 
