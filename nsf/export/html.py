@@ -55,4 +55,4 @@ def write(playback: Playback, folder: Path) -> Path:
         "recordings": {"run": told},
     }
     data = web.packed(header, {f"run.{name}": own for name, own in arrays.items()})
-    return web.saved(folder / f"{playback.name}.html", web.page("recorded", playback.title, data))
+    return web.saved(folder / f"{playback.name}.html", web.page(playback.title, data))

@@ -28,8 +28,9 @@ if TYPE_CHECKING:
 
 #: Arrays begin at multiples of so many bytes, so that a browser views them in place.
 _WORD = 8
+ENTRY = "page"  # the module that the page begins with
 _TYPES = ("f4", "f8", "i1", "i2", "u1", "u2")
-_IMPORT = re.compile(r'^import \{ ([^}]+) \} from "\.{1,2}/(\w+)\.mjs";\n', re.MULTILINE)
+_IMPORT = re.compile(r'^import \{ ([^}]+) \} from "\./(\w+)\.mjs";\n', re.MULTILINE)
 _TOP = re.compile(r"^(export )?(?:async )?(?:function|class|const|let) (\w+)", re.MULTILINE)
 
 
@@ -54,11 +55,11 @@ def packed(header: Mapping, arrays: Mapping[str, np.ndarray]) -> bytes:
 
 
 @cache
-def script(entry: str) -> str:
-    """The modules that a page needs as one, each once and after those that it imports.
+def script(entry: str = ENTRY) -> str:
+    """The modules that the page needs as one, each once and after those that it imports.
 
     Args:
-        entry: of the page, a module in `pages`, without its ending.
+        entry: the module that it begins with, without its ending.
 
     Raises:
         ValueError: a module imports what another does not export, or two have a name in common.
@@ -67,10 +68,10 @@ def script(entry: str) -> str:
     exported: dict[str, set[str]] = {}
     names: dict[str, str] = {}
 
-    def add(module: str, *folder: str) -> None:
+    def add(module: str) -> None:
         if module in texts:
             return
-        text = _text("live", "web", *folder, f"{module}.mjs")
+        text = _text("live", "web", f"{module}.mjs")
         texts[module] = ""  # a circle of imports ends here; functions are called after all are there
         wanted = [(own.split(", "), other) for own, other in _IMPORT.findall(text)]
         for _, other in wanted:
@@ -87,36 +88,35 @@ def script(entry: str) -> str:
         del texts[module]
         texts[module] = re.sub(r"^export ", "", _IMPORT.sub("", text), flags=re.MULTILINE)
 
-    add(entry, "pages")
+    add(entry)
     whole = "\n".join(texts.values())
     if "</script" in whole or re.search(r"^\s*(import|export)\b", whole, re.MULTILINE):
         raise ValueError(f"{entry}.mjs cannot stand in a page: an import or an end of script is left in it")
     return f"\n{whole}"
 
 
-def policy(entry: str, connects: bool = False) -> str:
-    """What a page may do: run its one script, be styled, and where it connects, reach its own server."""
-    hashes = (_hashed(text) for text in (script(entry), _style()))
+def policy(connects: bool = False) -> str:
+    """What the page may do: run its one script, be styled, and where it connects, reach its own server."""
+    hashes = (_hashed(text) for text in (script(), _style()))
     allowed = "script-src 'sha256-{}'; style-src 'sha256-{}'; img-src data: blob:".format(*hashes)
     own = "; connect-src 'self' ws: wss:" if connects else ""
     return f"default-src 'none'; {allowed}{own}; base-uri 'none'; form-action 'none'"
 
 
-def page(entry: str, title: str, data: bytes = b"", connects: bool = False) -> str:
-    """A page.
+def page(title: str, data: bytes = b"", connects: bool = False) -> str:
+    """The page of a run.
 
     Args:
-        entry: module in `pages` that it begins with, without its ending.
         title: until the script gives another.
-        data: what it holds, of `packed`; none where it is loaded.
+        data: what it holds, of `packed`; none where it follows its server.
         connects: whether it reaches its own server.
     """
     deflated = base64.b64encode(zlib.compress(data, 9)).decode() if data else ""
     return HTML.from_string(_text("export", "page.html")).render(
         title=title,
-        policy=policy(entry, connects),
+        policy=policy(connects),
         style=Markup(_style()),
-        script=Markup(script(entry)),
+        script=Markup(script()),
         data=Markup(deflated),
     )
 

@@ -11,10 +11,9 @@ import numpy as np
 import pandas as pd
 from websockets.asyncio.client import connect
 
-from nsf.live.coloring import Coloring
+from nsf.live.feeds import LatentFeed, PointFeed
 from nsf.live.player import Player
 from nsf.live.server import Stream
-from nsf.live.wire import field_message, frame_message
 from nsf.scenes.designs import evenly
 
 #: A rate that no server reaches, so that it sends as fast as it can.
@@ -25,15 +24,14 @@ _SECONDS, _WARM_UP, _STEER = 5.0, 1.0, 0.5
 
 
 def follow(player: Player) -> pd.DataFrame:
-    """How fast `nsf view` can follow its slider, without the time of viser and of the browser.
+    """How fast `nsf view` can follow its slider, without the time of the browser.
 
     Returns:
         One row a shown step. While that step is shown, the parameters move: median and longest time [s] until
         the run of the new case is shown. "of it build [s]" is the share of building the solver. "frames/s"
         counts a step and its picture (with the full-order run's), one after the other.
     """
-    model, coloring = player.model, Coloring(player.model)
-    known = model.truth(model.initial)
+    model, feed = player.model, PointFeed(player.model)
     rows, values = [], _values([p.trained for p in model.parameters])
     with player:
         player.playing = False
@@ -50,7 +48,7 @@ def follow(player: Player) -> pd.DataFrame:
                 builds.append(waits[-1] - moment.run.seconds)
                 steps.append(moment.run.seconds / moment.run.reached)
                 started = time.perf_counter()
-                coloring.picture(moment, known, "von Mises stress")
+                feed.frame(moment)
                 pictures.append(time.perf_counter() - started)
             rows.append(
                 {
@@ -99,19 +97,20 @@ def bench(player: Player, counts: Sequence[int], rate: float) -> pd.DataFrame:
 
 def sizes(player: Player) -> dict[str, int]:
     """Bytes of a frame on the wire, of its positions, of these and their stress, and of the field."""
-    frame, model = len(frame_message(player.tick())), player.model
+    model, feed = player.model, LatentFeed(player.model)
+    frame = len(feed.frame(player.tick()))
     return {
         # A server's WebSocket frame of up to 125 bytes has a header of two.
         "frame": frame + (2 if frame <= 125 else 4),
         "latent": 4 * model.manifold.latent_dim,
         "positions": 12 * model.particles,
         "positions and stress": 36 * model.particles,
-        "field": len(field_message(model)),
+        "field": len(feed.field),
     }
 
 
 async def _measured(player: Player, count: int, rate: float) -> list[float]:
-    stream = Stream(player, "127.0.0.1", rate=rate)
+    stream = Stream(player, LatentFeed(player.model), "127.0.0.1", rate=rate)
     async with await stream.listen(0) as server:
         playing = asyncio.create_task(stream.play())
         port = server.sockets[0].getsockname()[1]

@@ -1,4 +1,4 @@
-"""Colours of particles by several quantities, on scales that do not change with the parameter."""
+"""Quantities by which the page of `nsf view` colours particles, on scales that are the same in every case."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,90 +9,109 @@ import torch
 from nsf.bodies.colors import (
     CLIP,
     DIFFERENCE_COLORS,
-    METRES,
-    PASCALS,
     ROLES,
     SIGNED_COLORS,
     STRESS_COLORS,
+    Categories,
     ColorScale,
 )
 from nsf.evaluation.metrics import pressure, von_mises
 from nsf.live.model import LiveModel, Truth
 from nsf.live.player import Moment
 
-#: End of the scale of the distance to the truth, over the end of the scale of the displacement.
+#: End of the scale of the distance to the full-order run, over the end of the scale of the displacement.
 _DISTANCE = 0.05
-DISTANCE = "distance to the truth"
-_ROLES = np.array([[int(color[i : i + 2], 16) for i in (1, 3, 5)] for color in ROLES], np.uint8)
-SAMPLE = tuple(_ROLES[2].tolist())
+#: Shade of a particle whose value is unknown, which the page draws grey.
+UNKNOWN = -1.0
+STRESS, PRESSURE, DISPLACEMENT, DISTANCE, SETS = (
+    "von_mises", "pressure", "displacement", "distance", "sets",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Picture:
-    """The drawing of a moment.
+class Shades:
+    """Values [n] over the end of their scale, of the reduced run and of the full-order one (or None)."""
 
-    Attributes:
-        x_reduced: [n, 3] m; colors_reduced: [n, 3] of 8 bits.
-        x_full, colors_full: the same of the full-order run; None without such a run.
-    """
-
-    x_reduced: np.ndarray
-    colors_reduced: np.ndarray
-    x_full: np.ndarray | None
-    colors_full: np.ndarray | None
+    reduced: np.ndarray
+    full: np.ndarray | None
 
 
 class Coloring:
-    """Colours of a model's particles.
+    """Values of a model's particles, from 0 to 1 over their scale.
 
     Args:
-        model: the training snapshots of this model set the scales.
+        model: its training snapshots set the scales.
 
     Attributes:
-        scales: colour scale by name of the quantity; None for the particle sets, which have three colours.
+        quantities: by name, as `controls.mjs` reads them: title, unit, `low` and `top` of the scale [SI], its
+            colours [256 × 3], and for categories their names in place of a scale.
     """
 
     def __init__(self, model: LiveModel):
         self._model = model
         x, tau = model.training_frames()
-        moved = float(np.percentile(np.linalg.norm(x - model.X, axis=2), 99.5))
+        moved = float(np.percentile(np.linalg.norm(x - model.X, axis=2), 99.5)) or 1.0
         equivalent, mean = (_of_stress(law, tau) for law in (von_mises, pressure))
-        self.scales: dict[str, ColorScale | None] = {
-            "von Mises stress": ColorScale.up_to(np.percentile(equivalent, CLIP), STRESS_COLORS, PASCALS),
-            "pressure": ColorScale.up_to(np.percentile(abs(mean), CLIP), SIGNED_COLORS, PASCALS, signed=True),
-            "displacement": ColorScale.up_to(moved, STRESS_COLORS, METRES),
-            DISTANCE: ColorScale.up_to(_DISTANCE * moved, DIFFERENCE_COLORS, METRES),
-            "particle sets": None,
-        }
+        stress, mean = (float(np.percentile(abs(v), CLIP)) or 1.0 for v in (equivalent, mean))
+        self.quantities = {
+            STRESS: _scale("von Mises stress", "Pa", stress, STRESS_COLORS),
+            PRESSURE: _scale("pressure", "Pa", mean, SIGNED_COLORS, signed=True),
+            DISPLACEMENT: _scale("displacement", "m", moved, STRESS_COLORS),
+            DISTANCE: _scale("distance to the full-order run", "m", _DISTANCE * moved, DIFFERENCE_COLORS),
+            SETS: {
+                "title": "particle sets", "unit": "", "low": 0.0, "top": 2.0, "colors": _thirds(),
+                "names": ["neither", "integration only", "sample"],
+            },
+        }  # fmt: skip
 
-    def picture(self, moment: Moment, truth: Truth | None, by: str) -> Picture:
-        """Positions and colours of a moment.
+    def shades(self, moment: Moment, truth: Truth | None, by: str) -> Shades:
+        """Values at a moment.
 
         Args:
             moment: the run and the step that are shown.
-            truth: the full-order run at the same value, if there is one.
-            by: a key of `scales`.
+            truth: the full-order run of the same case, if there is one.
+            by: a key of `quantities`.
         """
-        run, step, t = moment.run, moment.step, moment.t
-        x = run.positions(step)
-        x_full = truth.positions(t) if truth else None
-        scale = self.scales[by]
-        if scale is None:
-            colors = _ROLES[self._model.roles(step)]
-            return Picture(x, colors, x_full, colors if truth else None)
+        run, step, t, X = moment.run, moment.step, moment.t, self._model.X
+        if by == SETS:
+            roles = self._model.roles(step)
+            return self._over(by, roles, roles if truth else None)
         if by == DISTANCE:
-            if x_full is None:  # the distance is unknown, which no colour of the scale says
-                return Picture(x, np.broadcast_to(_ROLES[0], x.shape), None, None)
-            reduced, full = np.linalg.norm(x - x_full, axis=1), np.zeros(len(x))
-        elif by == "displacement":
-            reduced, full = (
-                None if a is None else np.linalg.norm(a - self._model.X, axis=1) for a in (x, x_full)
+            if truth is None:
+                return Shades(np.full(len(X), UNKNOWN, np.float32), None)
+            apart = np.linalg.norm(run.positions(step) - truth.positions(t), axis=1)
+            return self._over(by, apart, np.zeros(len(X)))
+        if by == DISPLACEMENT:
+            reduced, full = run.positions(step) - X, truth and truth.positions(t) - X
+            return self._over(
+                by, *(None if d is None else np.linalg.norm(d, axis=1) for d in (reduced, full))
             )
-        else:
-            law = von_mises if by == "von Mises stress" else pressure
-            reduced = _of_stress(law, run.stress(step))
-            full = _of_stress(law, truth.stress(t)) if truth else None
-        return Picture(x, scale.pixels(reduced), x_full, scale.pixels(full) if truth else None)
+        law = von_mises if by == STRESS else pressure
+        return self._over(
+            by, _of_stress(law, run.stress(step)), _of_stress(law, truth.stress(t)) if truth else None
+        )
+
+    def _over(self, by: str, reduced: np.ndarray, full: np.ndarray | None) -> Shades:
+        low, top = self.quantities[by]["low"], self.quantities[by]["top"]
+
+        def shade(values: np.ndarray) -> np.ndarray:
+            return np.clip((np.nan_to_num(values, nan=top) - low) / (top - low), 0.0, 1.0).astype(np.float32)
+
+        return Shades(shade(reduced), None if full is None else shade(full))
+
+
+def _scale(title: str, unit: str, top: float, cmap: str, signed: bool = False) -> dict:
+    colors = ColorScale(1.0, cmap, 1.0, "").pixels(np.linspace(0, 1, 256))
+    return {
+        "title": title, "unit": unit, "low": -top if signed else 0.0, "top": top,
+        "colors": colors.ravel().tolist(),
+    }  # fmt: skip
+
+
+def _thirds() -> list[int]:
+    """[256 × 3] the colours of the particle sets, a third of the scale each."""
+    colors = Categories(dict(enumerate(ROLES))).colors(np.arange(256) * 3 // 256)
+    return (255 * colors).round().astype(int).ravel().tolist()
 
 
 def _of_stress(law: Callable[[torch.Tensor], torch.Tensor], tau: np.ndarray) -> np.ndarray:

@@ -25,7 +25,7 @@ def page(model: str) -> str:
     if model not in MODELS:
         raise ConfigError(f"model={model} is none that is shipped; choose one of {', '.join(MODELS)}")
     data = files("nsf").joinpath("live", "models", f"{model}.bin").read_bytes()
-    return web.page("live", MODELS[model], zlib.decompress(data))
+    return web.page(MODELS[model], zlib.decompress(data))
 
 
 def show(

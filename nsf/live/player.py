@@ -2,9 +2,8 @@
 
 import logging
 import threading
-import time
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -195,11 +194,3 @@ class Player:
                     self._wake.wait_for(
                         lambda: self._closing or self._tilts or self._wanted != self._shown.case
                     )
-
-
-def every(seconds: float, closing: threading.Event, act: Callable[[], None]) -> None:
-    """Call `act` every `seconds` [s] until `closing` is set; a late call does not hasten the next ones."""
-    due = time.perf_counter()
-    while not closing.wait(max(0.0, due - time.perf_counter())):
-        act()
-        due = max(due + seconds, time.perf_counter())

@@ -50,7 +50,7 @@ def write(run: Run, folder: Path, points: int | None = None, device: str = "auto
     """
     _check_engine(run, Pipeline.of_run(run, device).engine)  # a model takes long to build
     title, data = model_data(LiveModel(run, points or POINTS, device, surface=True))
-    page = web.page("live", title, data)
+    page = web.page(title, data)
     if (size := len(page.encode())) > LARGEST:
         raise ConfigError(
             f"the page would have {size / 1e6:.1f} MB, at most {LARGEST / 1e6:.0f}; give fewer --points"

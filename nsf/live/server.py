@@ -1,7 +1,8 @@
-"""The server of `nsf serve`: one reduced run, whose latent vectors many browsers decode."""
+"""The server of `nsf serve` and `nsf view`: one reduced run, which many browsers show and steer."""
 
 import asyncio
 import http
+import json
 import logging
 
 from websockets.asyncio.server import Server, ServerConnection, broadcast, serve
@@ -11,9 +12,9 @@ from websockets.http11 import Request, Response
 
 from nsf.errors import ConfigError
 from nsf.export import web
+from nsf.live.feeds import LatentFeed, obey
 from nsf.live.guard import Connection, check_token, name_of, refused
 from nsf.live.player import Moment, Player
-from nsf.live.wire import field_message, frame_message, obey, state_message
 
 log = logging.getLogger(__name__)
 
@@ -27,39 +28,41 @@ _HEADERS = {
     "Cache-Control": "no-store",
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
-    "Content-Security-Policy": f"{web.policy('stream', connects=True)}; frame-ancestors 'none'",
+    "Content-Security-Policy": f"{web.policy(connects=True)}; frame-ancestors 'none'",
 }
 
 
 class Stream:
-    """Serves a page, the deformation field, and the latent vector of each frame.
+    """Serves a page, its data, and each frame.
 
-    `/` is the page, `/field` what it decodes with (`wire.field_message`), `/stream` a WebSocket: a binary
-    message a frame, and a text message where another case is shown, or it is paused. A client may send what
-    `wire.obey` knows. One that sends anything else, or that does not keep up for `patience`, is closed.
+    `/` is the page, `/field` its data, `/stream` a WebSocket: a binary message a frame, and a text message
+    where another case is shown, or it is paused. A client may send what the feed obeys. One that sends
+    anything else, or that does not keep up for `patience`, is closed.
 
     Args:
         player: what is shown; all clients see the same.
+        feed: makes the messages.
         host: where it is served.
         token: who does not give it as `?token=…` is refused; None asks for none, which only loopback may.
         rate: frames a second.
         patience: seconds that a client may lag.
 
     Raises:
-        ConfigError: the token is short or missing, or the field is none that a browser can decode.
+        ConfigError: the token is short or missing.
     """
 
     def __init__(
-        self, player: Player, host: str, token: str | None = None, rate: float = 30.0, patience: float = 5.0
-    ):
+        self, player: Player, feed: LatentFeed, host: str, token: str | None = None, rate: float = 30.0,
+        patience: float = 5.0,
+    ):  # fmt: skip
         check_token(host, token)
         self._player, self._host, self._token = player, host, token
         self._rate, self._patience = rate, patience
-        self._field = field_message(player.model)
-        self._page = web.page("stream", "nsf serve", connects=True).encode()
+        self._feed = feed
+        self._page = web.page(feed.title, connects=True).encode()
         self._clients: set[ServerConnection] = set()
         moment = player.tick()
-        self._state, self._frame = state_message(moment, player.playing), frame_message(moment)
+        self._state, self._frame = self._messages(moment)
 
     @property
     def clients(self) -> int:
@@ -80,7 +83,7 @@ class Stream:
                 process_request=self._answer,
                 create_connection=Connection,
                 max_size=_LONGEST,
-                compression=None,  # 32 bytes of floating-point numbers do not get smaller
+                compression=None,  # floating-point numbers do not get smaller
                 ping_interval=self._patience / 2,
                 ping_timeout=self._patience / 2,
                 close_timeout=self._patience / 2,
@@ -96,12 +99,15 @@ class Stream:
         clock = asyncio.get_running_loop()
         due = clock.time()
         while True:
-            self._send(self._player.tick())
+            # Decoding takes milliseconds, in which clients are heard.
+            self._send(*await asyncio.to_thread(self._messages, self._player.tick()))
             due = max(due + 1.0 / self._rate, clock.time())
             await asyncio.sleep(due - clock.time())
 
-    def _send(self, moment: Moment) -> None:
-        state, frame = state_message(moment, self._player.playing), frame_message(moment)
+    def _messages(self, moment: Moment) -> tuple[str, bytes]:
+        return json.dumps(self._feed.state(moment, self._player)), self._feed.frame(moment)
+
+    def _send(self, state: str, frame: bytes) -> None:
         # Written without waiting: a client that does not read holds nobody up, and its pongs fail to come.
         if state != self._state:
             broadcast(self._clients, state)
@@ -119,7 +125,7 @@ class Stream:
         if path == "/":
             return _file(self._page, "text/html; charset=utf-8")
         if path == "/field":
-            return _file(self._field, "application/octet-stream")
+            return _file(self._feed.field, "application/octet-stream")
         return connection.respond(http.HTTPStatus.NOT_FOUND, "there are /, /field and /stream\n")
 
     async def _attend(self, connection: ServerConnection) -> None:
@@ -132,7 +138,7 @@ class Stream:
         why = "closed by itself"
         try:
             async for message in connection:
-                obey(self._player, message)
+                obey(self._feed, self._player, message)
                 await asyncio.sleep(_PACE)
         except ConfigError as error:
             why = f"sent rubbish: {error}"

@@ -1,6 +1,4 @@
-"""Messages of `nsf serve`: the deformation field once, then a latent vector a frame."""
-
-import json
+"""What a page is told of a model: the header, and fields of modes as arrays."""
 
 import numpy as np
 import torch
@@ -8,7 +6,6 @@ import torch
 from nsf.errors import ConfigError
 from nsf.export import web
 from nsf.live.model import LiveModel
-from nsf.live.player import Moment, Player
 
 FIELDS = ("basis",)  # the fields of linear modes
 
@@ -88,47 +85,6 @@ def network_arrays(layers, kind: str) -> dict[str, np.ndarray]:
         for index, layer in enumerate(layers)
         for name in ("weight", "bias")
     }
-
-
-def frame_message(moment: Moment) -> bytes:
-    """t [s], the distrust ratio and x̂, [2 + r] float32, little-endian."""
-    return np.concatenate([[moment.t, moment.trust], moment.xhat]).astype("<f4").tobytes()
-
-
-def state_message(moment: Moment, playing: bool) -> str:
-    """The shown values of the parameters, how far they are from training, and whether it diverged or plays.
-
-    As JSON; the second is `LiveRun.away`.
-    """
-    run = moment.run
-    told = {"values": list(run.case.parameters.values()), "away": run.away, "diverged": run.diverged}
-    return json.dumps(told | {"playing": playing})
-
-
-def obey(player: Player, message: str | bytes) -> None:
-    """Do what a client asks for.
-
-    Args:
-        player: of the server.
-        message: `{"values": [31.5]}` steers to values in the parameters' order, `{"playing": false}` pauses.
-
-    Raises:
-        ConfigError: the message is anything else, or a value is out of reach.
-    """
-    try:
-        asked = json.loads(message) if isinstance(message, str) else None
-    except (ValueError, RecursionError):
-        asked = None
-    match asked:
-        case {"playing": bool(playing), **more} if not more:
-            player.playing = playing
-        case {"values": list(values), **more} if not more and all(type(v) in (int, float) for v in values):
-            try:
-                player.steer(list(map(float, values)))
-            except OverflowError as error:
-                raise ConfigError("the value is too large") from error
-        case _:
-            raise ConfigError('a client may only send {"values": [number, …]} or {"playing": true or false}')
 
 
 def check_field(model: LiveModel) -> None:

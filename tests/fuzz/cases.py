@@ -123,6 +123,7 @@ class Workshop:
     @cached_property
     def server(self) -> int:
         """The port of a stream that serves the tiny chain's deployment, as long as this process lives."""
+        from nsf.live.feeds import LatentFeed
         from nsf.live.model import LiveModel
         from nsf.live.player import Player
         from nsf.live.server import Stream
@@ -131,7 +132,7 @@ class Workshop:
         ports, started = [], threading.Event()
 
         async def serve() -> None:
-            stream = Stream(player, "127.0.0.1", token="a-token-of-the-fuzzer")
+            stream = Stream(player, LatentFeed(player.model), "127.0.0.1", token="a-token-of-the-fuzzer")
             async with await stream.listen(0) as server:
                 ports.append(server.sockets[0].getsockname()[1])
                 started.set()
@@ -486,7 +487,7 @@ def requests(shop: Workshop, draw: random.Random) -> Case:
 def messages(shop: Workshop, draw: random.Random) -> Case:
     """What a client of the stream may send, malformed."""
     value = draw.choice((1, [1.5], ["nan"], None, [1, 2], {"a": 1}, [True], [2**2000], [-1e308], True))
-    text = json.dumps({draw.choice(("values", "values", "playing")): value})
+    text = json.dumps({draw.choice(("values", "values", "playing", "step", "tilt", "color")): value})
     message = draw.choice(
         (text, text[:-1], f"[{text}]", "[" * 100_000, "NaN", '{"values": [NaN]}', '{"values": [1e999]}')
     )
@@ -495,9 +496,12 @@ def messages(shop: Workshop, draw: random.Random) -> Case:
         message = message.decode("utf-8", "replace")
 
     def hand_over() -> None:
-        from nsf.live.wire import obey
+        from nsf.live.feeds import PointFeed, obey
 
-        obey(SimpleNamespace(playing=True, steer=lambda values: None), message)
+        ignored = {name: lambda *values: None for name in ("steer", "seek", "tilt")}
+        feed = PointFeed.__new__(PointFeed)
+        feed._coloring, feed._model = SimpleNamespace(quantities={}), SimpleNamespace(tilt=0.3)
+        obey(feed, SimpleNamespace(playing=True, **ignored), message)
 
     return Case(repr(message[:200]), hand_over)
 

@@ -15,8 +15,10 @@ export class Body {
    * @param {Numbers} rest [n, 3] [m]
    * @param {number} radius of a point [m]
    * @param {number[]} offset [3] [m] by which all are drawn aside
+   * @param {number[] | null} tint [3] one colour for all, which then lie over other bodies and cast no shadow
    */
-  constructor(rest, radius, offset) {
+  constructor(rest, radius, offset, tint = null) {
+    this.tint = tint;
     this.count = rest.length / 3;
     this.rest = rest;
     this.radius = radius;

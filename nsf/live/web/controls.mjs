@@ -2,7 +2,7 @@
 
 import { quantity } from "./trust.mjs";
 
-/** @typedef {{ title: string, unit: string, top: number }} Quantity */
+/** @typedef {{ title: string, unit: string, top: number, low?: number, names?: string[] }} Quantity names: of categories, in place of a scale */
 /** @typedef {{ name: string, unit: string, lower: number, upper: number, step: number, trained: number[] }} Parameter */
 
 /**
@@ -89,6 +89,18 @@ export function slider({ name, unit, lower, upper, step, trained }, value, act) 
 }
 
 /**
+ * The sliders of problem parameters.
+ * @param {Parameter[]} parameters
+ * @param {number[]} values
+ * @param {(values: number[]) => void} act with the values of all
+ */
+export function sliders(parameters, values, act) {
+  /** @type {{ made: any, input: any, show: (value: number) => void }[]} */
+  const made = parameters.map((p, i) => slider(p, values[i], () => act(made.map((own) => Number(own.input.value)))));
+  return made;
+}
+
+/**
  * A value with as many digits as the steps of its slider tell apart.
  * @param {number} value
  * @param {string} unit
@@ -123,11 +135,12 @@ export function counted(points, particles) {
  * @param {Quantity} shown
  * @param {number[]} colors [256 × 3]
  */
-export function legend({ title, unit, top }, colors) {
+export function legend({ title, unit, top, low = 0, names }, colors) {
   const stops = Array.from({ length: 16 }, (_, k) => `rgb(${colors.slice(51 * k, 51 * k + 3)})`);
   const bar = element("i");
   bar.style.background = `linear-gradient(to right, ${stops})`;
-  const ends = element("div", { className: "row" }, element("span", {}, "0"), element("span", {}, `≥ ${prefixed(top, unit)}`));
+  const ends = names ? element("div", { className: "row" }, ...names.map((name) => element("span", {}, name)))
+    : element("div", { className: "row" }, element("span", {}, low ? `≤ −${prefixed(-low, unit)}` : "0"), element("span", {}, `≥ ${prefixed(top, unit)}`));
   find("scale").replaceChildren(element("div", { textContent: title }), bar, ends);
 }
 

@@ -19,9 +19,10 @@ const MOST_PIXELS = 2; // of the canvas along one of the page; a telephone's thr
 
 const POINTS = [
   `#version 300 es
-in vec4 point; uniform mat4 view; uniform float pixels; uniform sampler2D colors; flat out vec3 color;
+in vec4 point; uniform mat4 view; uniform float pixels; uniform vec4 tint; uniform sampler2D colors; flat out vec3 color;
 void main() {
-  color = mix(textureLod(colors, vec2(clamp(point.w, 0.0, 1.0) * 0.996 + 0.002, 0.5), 0.0).rgb, vec3(1.0), 0.06);
+  vec3 scaled = point.w < 0.0 ? vec3(0.73) : textureLod(colors, vec2(clamp(point.w, 0.0, 1.0) * 0.996 + 0.002, 0.5), 0.0).rgb;
+  color = mix(mix(scaled, vec3(1.0), 0.06), tint.rgb, tint.a);
   gl_Position = view * vec4(point.xyz, 1.0);
   gl_PointSize = max(1.5, pixels / gl_Position.w);
 }`,
@@ -148,7 +149,8 @@ export class Drawing {
     this.drawn = gl.createBuffer();
     this.corners = this._buffer(new Float32Array([-1, -1, 1, -1, -1, 1, 1, 1]));
     this.shapes = { box: this._shape(box()), ball: this._shape(ball()) };
-    this._colors(told.colors);
+    this.scale = gl.createTexture();
+    this.paint(told.colors);
     gl.enable(gl.DEPTH_TEST);
     gl.depthFunc(gl.LEQUAL);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
@@ -159,9 +161,10 @@ export class Drawing {
    * @param {Numbers} rest [n, 3] [m]
    * @param {number[]} [offset] [3] [m]
    * @param {number} [radius] of its points [m]
+   * @param {number[] | null} [tint] [3] one colour for all of its points
    */
-  body(rest, offset = [0, 0, 0], radius = this.radius) {
-    const made = new Body(rest, radius, offset);
+  body(rest, offset = [0, 0, 0], radius = this.radius, tint = null) {
+    const made = new Body(rest, radius, offset, tint);
     this.bodies.push(made);
     return made;
   }
@@ -217,11 +220,14 @@ export class Drawing {
     if (floor !== null && this.level === 0) {
       gl.uniform1i(points.uniform("shadow"), 1);
       gl.depthMask(false);
-      for (const body of bodies) draw(1.2 * body.radius, body.shadow(floor, cut));
+      for (const body of bodies) if (!body.tint) draw(1.2 * body.radius, body.shadow(floor, cut));
       gl.depthMask(true);
     }
     gl.uniform1i(points.uniform("shadow"), 0);
-    for (const body of bodies) draw(body.radius, body.seen(matrix, canvas.width, canvas.height, pixels, cut));
+    for (const body of bodies) {
+      gl.uniform4fv(points.uniform("tint"), body.tint ? [...body.tint, 1] : [0, 0, 0, 0]);
+      draw(body.radius, body.seen(matrix, canvas.width, canvas.height, pixels, cut));
+    }
   }
 
   /** @param {Float32Array} matrix */
@@ -276,10 +282,10 @@ export class Drawing {
     return { buffer: this._buffer(values), count: values.length / 6 };
   }
 
-  /** @param {number[]} colors [256 × 3] of 8 bits */
-  _colors(colors) {
+  /** Take other colours of the scale. @param {number[]} colors [256 × 3] of 8 bits */
+  paint(colors) {
     const { gl } = this;
-    gl.bindTexture(gl.TEXTURE_2D, gl.createTexture());
+    gl.bindTexture(gl.TEXTURE_2D, this.scale);
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
     const size = /** @type {const} */ ([gl.RGB8, colors.length / 3, 1, 0, gl.RGB, gl.UNSIGNED_BYTE]);
     gl.texImage2D(gl.TEXTURE_2D, 0, ...size, new Uint8Array(colors));

@@ -3,12 +3,12 @@
 // The network is stored for raw inputs and outputs; Δt² is in f and G.
 
 import { Network } from "./field.mjs";
-import { stateOf } from "./solids.mjs";
+import { stateOf, valueAt } from "./solids.mjs";
 
 /** @typedef {import("./data.mjs").Packed} Packed */
 /** @typedef {import("./field.mjs").Vector} Vector */
 /** @typedef {import("./solids.mjs").Solid} Solid */
-/** @typedef {{ times: number[], values: number[][] }} Keyframes */
+/** @typedef {import("./solids.mjs").Keyframes} Keyframes */
 
 /** The recurrence of the latent vector. */
 export class Operators {
@@ -46,22 +46,6 @@ export class Operators {
       xhat[i] += next[i];
     }
   }
-}
-
-/**
- * Values of keyframes at a time: linear between them, constant outside.
- * @param {Keyframes} keyframes
- * @param {number} t [s]
- * @returns {number[]}
- */
-export function valueAt({ times, values }, t) {
-  const last = times.length - 1;
-  if (t <= times[0]) return values[0];
-  if (t >= times[last]) return values[last];
-  let k = 0;
-  while (times[k + 1] < t) k++;
-  const part = (t - times[k]) / (times[k + 1] - times[k]);
-  return values[k].map((value, c) => value + part * (values[k + 1][c] - value));
 }
 
 /** A run: every latent vector since t = 0, under the forcing of the moment. */

@@ -1,5 +1,6 @@
 // Solids that the material meets: where they are, and their state as operators take it.
 
+/** @typedef {{ times: number[], values: number[][] }} Keyframes */
 /** @typedef {{ times: number[], translations: number[][], angles: number[], axis: number[], pivot: number[] }} Motion */
 /**
  * @typedef {object} Solid
@@ -18,18 +19,19 @@
 const SAME_TIME = 1e-6; // of a step
 
 /**
- * Linear interpolation at t, constant outside.
- * @param {number[]} times
- * @param {(k: number) => number} value
- * @param {number} t
+ * Values of keyframes at a time: linear between them, constant outside.
+ * @param {Keyframes} keyframes
+ * @param {number} t [s]
+ * @returns {number[]}
  */
-function between(times, value, t) {
+export function valueAt({ times, values }, t) {
   const last = times.length - 1;
-  if (t <= times[0]) return value(0);
-  if (t >= times[last]) return value(last);
+  if (t <= times[0]) return values[0];
+  if (t >= times[last]) return values[last];
   let k = 0;
   while (times[k + 1] < t) k++;
-  return value(k) + ((t - times[k]) / (times[k + 1] - times[k])) * (value(k + 1) - value(k));
+  const part = (t - times[k]) / (times[k + 1] - times[k]);
+  return values[k].map((value, c) => value + part * (values[k + 1][c] - value));
 }
 
 /**
@@ -40,8 +42,7 @@ function between(times, value, t) {
 export function poseAt(motion, t) {
   if (!motion) return [0, 0, 0, 0];
   const { times, translations, angles } = motion;
-  const shift = [0, 1, 2].map((c) => between(times, (k) => translations[k][c], t));
-  return [...shift, between(times, (k) => angles[k], t)];
+  return valueAt({ times, values: translations.map((shift, k) => [...shift, angles[k]]) }, t);
 }
 
 /**

@@ -127,10 +127,11 @@ export class Trust {
  * @param {number} trust largest distrust ratio so far
  * @param {number} away how far the case is from the training cases
  * @param {boolean} diverged
+ * @param {number} t [s]
  * @returns {Light}
  */
-export function lightOf(trust, away, diverged) {
-  if (diverged) return { level: "bad", text: "diverged", ratio: Infinity };
+export function lightOf(trust, away, diverged, t) {
+  if (diverged) return { level: "bad", text: `diverged at t = ${quantity(t, "s")}`, ratio: Infinity };
   if (trust > 1) return { level: "bad", text: `distrusted: ratio ${trust.toFixed(2)}, above 1`, ratio: trust };
   if (away > 1)
     return { level: "away", text: `away from the training cases: ratio ${away.toPrecision(3)}, above 1`, ratio: away };

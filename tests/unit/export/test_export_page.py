@@ -94,7 +94,7 @@ def opened(browser, page):
         )
         tab.goto(page.as_uri() + part)
         tab.wait_for_selector("body[data-ready=true]", timeout=20000)
-        tab.wait_for_selector("body[data-frame]")
+        tab.wait_for_selector("body[data-cursor]")
         return tab
 
     yield open_page
@@ -116,7 +116,7 @@ def differs(one, other) -> float:
 
 def test_the_browser_unpacks_the_same(opened, page):
     tab = opened()
-    found = tab.evaluate("[Array.from(nsf.run.planes), Array.from(nsf.run.stresses)]")
+    found = tab.evaluate("[Array.from(nsf.player.run.planes), Array.from(nsf.player.run.stresses)]")
     for own, packed in zip(found, planes(page), strict=True):
         np.testing.assert_array_equal(own, packed.ravel())
 
@@ -125,15 +125,15 @@ def test_it_plays(opened):
     tab = opened()
     assert tab.title() == "sand, friction angle=26°"
     assert tab.text_content("#play") == "Pause"
-    begun = tab.evaluate("document.body.dataset.frame")
-    tab.wait_for_selector(f"body:not([data-frame='{begun}'])")
+    begun = tab.evaluate("document.body.dataset.cursor")
+    tab.wait_for_selector(f"body:not([data-cursor='{begun}'])")
     tab.click("#play")
     assert tab.text_content("#play") == "Play"
-    stopped = tab.evaluate("document.body.dataset.frame")
+    stopped = tab.evaluate("document.body.dataset.cursor")
     # What was asked for before the click may reach the screen after it.
     pictures = [drawn(tab) for _ in range(6)]
     assert differs(*pictures[-2:]) == 0
-    assert tab.evaluate("document.body.dataset.frame") == stopped
+    assert tab.evaluate("document.body.dataset.cursor") == stopped
 
 
 def test_the_scrubber_and_the_colours_change_what_is_drawn(opened):
@@ -143,7 +143,7 @@ def test_the_scrubber_and_the_colours_change_what_is_drawn(opened):
     assert len(colored) > 500
     tab.fill("#frame", "12")
     after = drawn(tab)
-    assert tab.evaluate("document.body.dataset.frame") == "12.00"
+    assert tab.evaluate("document.body.dataset.cursor") == "12.00"
     assert "0.120 s" in tab.text_content("#time")
     assert differs(before, after) > 0.01
     tab.select_option("#color", "displacement")
@@ -162,5 +162,5 @@ def test_the_scrubber_and_the_colours_change_what_is_drawn(opened):
 def test_the_address_names_a_frame_and_a_colour(opened):
     tab = opened("#frame=3&color=displacement")
     drawn(tab)
-    assert tab.evaluate("document.body.dataset.frame") == "3.00"
+    assert tab.evaluate("document.body.dataset.cursor") == "3.00"
     assert tab.input_value("#color") == "displacement"

@@ -15,13 +15,11 @@ from packing import unpacked
 from nsf.export import web
 from nsf.mpm import Cuboid, HalfSpace, Motion, Sphere
 
-ENTRIES = ("live", "recorded", "stream")
 MODULES = Path(web.__file__).parents[1] / "live/web"
 
 
-@pytest.mark.parametrize("entry", ENTRIES)
-def test_a_page_has_each_module_once_after_those_that_it_imports(entry, tmp_path):
-    text = web.script(entry)
+def test_the_page_has_each_module_once_after_those_that_it_imports(tmp_path):
+    text = web.script()
     assert not re.search(r"^(import|export)\b", text, re.MULTILINE)
     for module in MODULES.rglob("*.mjs"):
         for name in re.findall(r"^export class (\w+)", module.read_text(), re.MULTILINE):
@@ -67,9 +65,9 @@ def test_modules_that_do_not_fit_are_refused(modules):
         web.script("a")
 
 
-@pytest.mark.parametrize("entry", ENTRIES)
-def test_the_policy_is_of_the_script_and_the_style_alone(entry):
-    page = web.page(entry, "title", connects=entry == "stream")
+@pytest.mark.parametrize("connects", [False, True])
+def test_the_policy_is_of_the_script_and_the_style_alone(connects):
+    page = web.page("title", connects=connects)
     policy = unescape(re.search(r'Content-Security-Policy" content="([^"]*)"', page)[1])
     for kind, pattern in (
         ("script", r'<script type="module">(.*?)</script>'),

@@ -195,27 +195,27 @@ def paused(tab, step=0):
     """Pause, and show a step."""
     if tab.text_content("#play") == "Pause":
         tab.click("#play")
-    tab.evaluate(f"nsf.live.seek({step}); nsf.state.changed = true")
+    tab.evaluate(f"nsf.player.seek({step}); nsf.state.changed = true")
     wait_until(lambda: tab.evaluate("!nsf.state.changed"))
 
 
 def positions(tab) -> np.ndarray:
-    return np.reshape(tab.evaluate("Array.from(nsf.live.deformation.values)"), (-1, 3))
+    return np.reshape(tab.evaluate("Array.from(nsf.player.deformation.values)"), (-1, 3))
 
 
 def test_it_plays_from_disk_without_a_network(opened, page):
     tab = opened(page)
-    begun = tab.evaluate("document.body.dataset.step")
-    tab.wait_for_selector(f"body:not([data-step='{begun}'])")
+    begun = tab.evaluate("document.body.dataset.cursor")
+    tab.wait_for_selector(f"body:not([data-cursor='{begun}'])")
     assert tab.title() == "Sand column"
     tab.click("#play")
     assert tab.text_content("#play") == "Play"
     tab.click("#reset")
     tab.click("#step")
-    assert tab.evaluate("nsf.live.cursor") == 1
+    assert tab.evaluate("nsf.player.cursor") == 1
     tab.locator("#title").click()
     tab.keyboard.press("ArrowRight")
-    assert tab.evaluate("nsf.live.cursor") == 2
+    assert tab.evaluate("nsf.player.cursor") == 2
     tab.keyboard.press(" ")
     assert tab.text_content("#play") == "Pause"
 
@@ -227,16 +227,16 @@ def test_a_slider_changes_the_run_and_the_light(opened, page, taught_model):
     tab.get_by_label("friction angle").fill("36")
     wait_until(lambda: np.abs(positions(tab) - before).max() > 1e-4)
     assert tab.locator("#canvas").screenshot() != picture
-    assert tab.evaluate("nsf.live.run.steps") == 24
+    assert tab.evaluate("nsf.player.run.steps") == 24
     assert "below 1" in tab.text_content("#light")
     tab.get_by_label("friction angle").fill("45")
     tab.get_by_text("distrusted: friction angle is outside of the training values, 22° to 38°").wait_for()
     tab.select_option("#from", "here")
     paused(tab, 10)
-    latents = tab.evaluate("nsf.live.run.latents.slice(0, 11).map((x) => Array.from(x))")
+    latents = tab.evaluate("nsf.player.run.latents.slice(0, 11).map((x) => Array.from(x))")
     tab.get_by_label("friction angle").fill("30")
     tab.click("#step")
-    assert tab.evaluate("nsf.live.run.latents.slice(0, 11).map((x) => Array.from(x))") == latents
+    assert tab.evaluate("nsf.player.run.latents.slice(0, 11).map((x) => Array.from(x))") == latents
 
 
 @pytest.mark.slow
@@ -255,18 +255,18 @@ def test_a_drag_tilts_gravity_and_the_body_follows(opened, tilting_page):
         tab.mouse.move(x + way * box["width"], y, steps=3)
         tab.mouse.up()
         assert tab.text_content("#play") == "Pause"  # a hand sets it going
-        gravity = np.array(tab.evaluate("nsf.live.run.hand"))
+        gravity = np.array(tab.evaluate("nsf.player.run.hand"))
         assert np.linalg.norm(gravity) == pytest.approx(9.81)
         assert np.sign(gravity @ right) == np.sign(way)
         paused(tab, 60)
         aside.append((positions(tab) @ right).mean())
     assert aside[0] - aside[1] > 0.01
     tab.click("#upright")
-    assert tab.evaluate("nsf.live.run.hand") is None
+    assert tab.evaluate("nsf.player.run.hand") is None
     tab.locator("#pad").focus()
     for _ in range(10):
         tab.keyboard.press("ArrowLeft")
-    assert np.array(tab.evaluate("nsf.live.run.hand")) @ right < -1.0
+    assert np.array(tab.evaluate("nsf.player.run.hand")) @ right < -1.0
     tab.click("#step")
     tab.get_by_text("distrusted: gravity was").wait_for()
 
@@ -280,7 +280,7 @@ def test_a_drag_on_the_picture_turns_it_or_tilts(opened, tilting_page):
         tab.mouse.down()
         tab.mouse.move(380, 300, steps=3)
         tab.mouse.up()
-        return tab.evaluate("[nsf.camera.azimuth, nsf.live.run.hand]")
+        return tab.evaluate("[nsf.camera.azimuth, nsf.player.run.hand]")
 
     first = tab.evaluate("nsf.camera.azimuth")
     azimuth, hand = drag()
@@ -298,10 +298,10 @@ def test_a_program_of_each_held_out_case_is_followed(opened, tilting_page, tilti
         tab.select_option("#case", str(index))
         paused(tab, 60)
         kept = Rollout.open(tilting_model.run.file(rollout_file(index))).xhat
-        found = tab.evaluate("Array.from(nsf.live.run.latents[60])")
+        found = tab.evaluate("Array.from(nsf.player.run.latents[60])")
         np.testing.assert_allclose(found, kept[60], atol=1e-4 * np.abs(kept).max())
         scene = tilting_model.pipeline.deployed.with_parameters(case)
-        gravity = tab.evaluate("nsf.live.run.gravities[40]")
+        gravity = tab.evaluate("nsf.player.run.gravities[40]")
         np.testing.assert_allclose(gravity, scene.acting_gravity.at(40 * scene.dt), atol=1e-9)
 
 
@@ -316,7 +316,7 @@ def test_the_full_order_run_stands_beside(opened, page):
     before = tab.locator("#canvas").screenshot()
     tab.get_by_label("full-order run beside it").check()
     wait_until(lambda: tab.locator("#canvas").screenshot() != before)
-    shown = "nsf.live.recordings.get(nsf.live.case.recording)"
+    shown = "nsf.player.recordings.get(nsf.player.case.recording)"
     full = np.reshape(tab.evaluate(f"Array.from({shown}.at({shown}.frameAt(0.12)).x)"), (-1, 3))
     assert np.abs(full - positions(tab)).max() < 0.02
     tab.get_by_label("friction angle").fill("31")
@@ -332,7 +332,7 @@ def test_what_it_keeps_is_the_picture_and_the_run(opened, page):
     assert lines[0].startswith('"t [s]","xhat_0"')
     rows = np.array([list(map(float, line.split(","))) for line in lines[1:]])
     assert rows.shape == (25, 1 + 4 + 3 + 1)
-    np.testing.assert_allclose(rows[-1, 1:5], tab.evaluate("Array.from(nsf.live.run.latents[24])"))
+    np.testing.assert_allclose(rows[-1, 1:5], tab.evaluate("Array.from(nsf.player.run.latents[24])"))
     with tab.expect_download() as kept:
         tab.click("#picture")
     assert Path(kept.value.path()).read_bytes().startswith(b"\x89PNG")
@@ -355,9 +355,9 @@ def test_a_phone_may_tilt_it(opened, tilting_page):
     turn = "(gamma) => dispatchEvent(new DeviceOrientationEvent('deviceorientation', {beta: 40, gamma}))"
     for gamma in (0, 20):
         tab.evaluate(turn, gamma)
-        wait_until(lambda: tab.evaluate("nsf.live.run.hand !== null"))
+        wait_until(lambda: tab.evaluate("nsf.player.run.hand !== null"))
     right = np.array(tab.evaluate("nsf.camera.axes.right"))
-    hand = np.array(tab.evaluate("nsf.live.run.hand"))
+    hand = np.array(tab.evaluate("nsf.player.run.hand"))
     assert hand @ right == pytest.approx(9.81 * np.sin(np.radians(20)), rel=1e-3)
 
 
@@ -388,7 +388,7 @@ def test_titles_units_and_names_are_text(opened, taught_model, tmp_path, monkeyp
     parameters = tuple(replace(p, unit=hostile) for p in taught_model.parameters)
     monkeypatch.setattr(taught_model, "parameters", parameters)
     title, data = publish.model_data(taught_model)
-    path = publish.web.saved(tmp_path / "page.html", publish.web.page("live", title, data))
+    path = publish.web.saved(tmp_path / "page.html", publish.web.page(title, data))
     assert unescape(re.search(r"<title>([^<]*)</title>", path.read_text())[1]) == hostile
     tab = opened(path)
     assert tab.text_content("#title") == tab.title() == hostile

@@ -9,7 +9,7 @@ import pytest
 from angles import angle
 
 from nsf.errors import ConfigError, InstabilityError
-from nsf.live.player import _HOLD, Player, every
+from nsf.live.player import _HOLD, Player
 
 
 def work(player):
@@ -148,18 +148,6 @@ def wait_until(true):
     while not true():
         assert time.monotonic() < end, "nothing happened within 120 s"
         time.sleep(0.01)
-
-
-def test_every_does_not_catch_up():
-    closing, calls = threading.Event(), []
-
-    def act():
-        calls.append(None)
-        if len(calls) == 5:
-            closing.set()
-
-    every(0.0, closing, act)
-    assert len(calls) == 5
 
 
 # -- gravity by hand ----------------------------------------------------------------------------------------

@@ -24,16 +24,17 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from nsf.errors import ConfigError
+from nsf.live.feeds import LatentFeed, PointFeed, obey
 from nsf.live.player import Player
 from nsf.live.server import Stream
-from nsf.live.wire import field_message, frame_message, obey
+from nsf.live.wire import field_message
 
 
 @asynccontextmanager
-async def streaming(model, host="127.0.0.1", **options):
+async def streaming(model, host="127.0.0.1", feed=LatentFeed, **options):
     """A stream under way: (stream, player, port)."""
     with Player(model) as player:
-        stream = Stream(player, host, **{"rate": 200.0, **options})
+        stream = Stream(player, feed(model), host, **{"rate": 200.0, **options})
         async with await stream.listen(0) as server:
             playing = asyncio.create_task(stream.play())
             yield stream, player, server.sockets[0].getsockname()[1]
@@ -108,11 +109,27 @@ RUBBISH = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize("message", RUBBISH, ids=[str(m)[:24] for m in RUBBISH])
-def test_rubbish_is_refused(message, player):
-    with pytest.raises(ConfigError):
-        obey(player, message)
+#: `nsf view` obeys more, and refuses these.
+RUBBISH_OF_VIEW = [
+    *RUBBISH, '{"step": 1.5}', '{"step": true}', '{"step": "1"}', '{"tilt": [1]}', '{"tilt": [1, 1]}',
+    '{"tilt": [NaN, 0]}', '{"color": "red"}', '{"color": 1}', '{"step": 1, "color": "pressure"}',
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("feed", [LatentFeed, PointFeed])
+def test_rubbish_is_refused(feed, player):
+    own = feed(player.model)
+    for message in RUBBISH if feed is LatentFeed else RUBBISH_OF_VIEW:
+        with pytest.raises(ConfigError):
+            obey(own, player, message)
     assert player.case == angle(26.0)
+    assert player.playing
+
+
+def test_who_serves_takes_no_wishes_of_view(player):
+    for message in ('{"step": 3}', '{"tilt": null}', '{"color": "pressure"}'):
+        with pytest.raises(ConfigError, match="a client may only send"):
+            obey(LatentFeed(player.model), player, message)
 
 
 @pytest.mark.parametrize(
@@ -282,14 +299,14 @@ def test_a_token_is_asked_of_every_request(model):
 @pytest.mark.parametrize("token", ["", " ", "secret", "15 letters long"])
 def test_a_token_that_can_be_guessed_is_refused(player, host, token):
     with pytest.raises(ConfigError, match=r"the token (is empty|has \d+ letters); give at least 16"):
-        Stream(player, host, token)
+        Stream(player, LatentFeed(player.model), host, token)
 
 
 def test_beyond_this_machine_no_token_is_refused(player):
     for host in ("0.0.0.0", "192.0.2.1", "", "::"):
         with pytest.raises(ConfigError, match="the token is empty"):
-            Stream(player, host, None)
-    assert Stream(player, "::1", None)
+            Stream(player, LatentFeed(player.model), host, None)
+    assert Stream(player, LatentFeed(player.model), "::1", None)
 
 
 H = b"Host: 127.0.0.1\r\n"
@@ -405,7 +422,7 @@ def test_a_port_that_is_taken_says_so(model):
 def test_the_field_is_smaller_than_its_numbers_and_a_frame_than_particles(model):
     field = model.at.fields["deformation"]
     assert len(field_message(model)) < field.modes.numel() * 2 + 2 * field.mean.nbytes + 20_000
-    frame = frame_message(Player(model).tick())
+    frame = LatentFeed(model).frame(Player(model).tick())
     assert len(frame) == 4 * (2 + model.manifold.latent_dim)
 
 
@@ -418,13 +435,12 @@ def test_a_field_that_is_no_modes_is_refused(model):
 # -- the page -----------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def address(model):
-    """A stream on a thread of its own, since a browser blocks: its port, and its player."""
+def threaded(model, **options):
+    """A stream on a thread of its own, since a browser blocks: yields its address, and its player."""
     ready, loop, found = threading.Event(), asyncio.new_event_loop(), {}
 
     async def run():
-        async with streaming(model, rate=30.0) as (_, player, port):
+        async with streaming(model, **{"rate": 30.0, **options}) as (_, player, port):
             found.update(port=port, player=player, end=asyncio.Event())
             ready.set()
             await found["end"].wait()
@@ -438,6 +454,11 @@ def address(model):
     loop.close()
 
 
+@pytest.fixture
+def address(model):
+    yield from threaded(model)
+
+
 def test_a_browser_decodes_what_the_server_does(browser, address, model):
     url, player = address
     windows, asked, faults = [browser.new_page() for _ in range(2)], [], []
@@ -445,7 +466,11 @@ def test_a_browser_decodes_what_the_server_does(browser, address, model):
         window.on("request", lambda request: asked.append(request.url))
         window.on("pageerror", lambda error: faults.append(str(error)))
         window.goto(url)
-        wait_until(lambda window=window: window.evaluate("window.nsf && nsf.state.drawn > 5"))
+        wait_until(
+            lambda window=window: window.evaluate(
+                "window.nsf && nsf.player.received.frames > 5 && nsf.state.drawn > 5"
+            )
+        )
     one, other = windows
     assert all(u.startswith(url) or u.startswith("data:") for u in asked)
     assert not faults
@@ -455,7 +480,7 @@ def test_a_browser_decodes_what_the_server_does(browser, address, model):
     wait_until(lambda: player.case == angle(34.0))
     for window in windows:
         window.get_by_text("friction angle = 34.00°").wait_for()
-    wait_until(lambda: other.evaluate("nsf.state.values[0] === 34 && nsf.state.t > 0.1"))
+    wait_until(lambda: other.evaluate("nsf.player.state.values[0] === 34 && nsf.player.t > 0.1"))
     assert other.screenshot() != before
 
     one.get_by_role("button", name="Pause").click()
@@ -463,7 +488,7 @@ def test_a_browser_decodes_what_the_server_does(browser, address, model):
     assert not player.playing
     assert re.fullmatch(r"t = 0\.\d{3} s", other.text_content("#time"))
 
-    shown = other.evaluate("({t: nsf.state.t, x: Array.from(nsf.state.x)})")
+    shown = other.evaluate("({t: nsf.player.t, x: Array.from(nsf.player.x)})")
     run = player.tick().run
     x = np.reshape(shown["x"], (-1, 3))
     expected = run.positions(round(shown["t"] / run.dt))
@@ -478,5 +503,5 @@ def test_a_browser_says_when_the_stream_ends(browser, address):
     window = browser.new_page()
     window.goto(url)
     wait_until(lambda: window.evaluate("window.nsf && nsf.state.drawn > 2"))
-    window.evaluate("nsf.socket.send('rubbish')")
+    window.evaluate("nsf.player.socket.send('rubbish')")
     window.get_by_text("closed (1008) a client may only send").wait_for()

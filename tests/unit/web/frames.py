@@ -54,7 +54,7 @@ def page(folder: Path) -> Path:
     for name in ("rest", "deformation.mean"):
         arrays[name] = arrays[name] + aside
     header |= {"points": POINTS, "radius": header["radius"] * (had / POINTS) ** (1 / 3)}
-    return web.saved(folder / "page.html", web.page("live", header["title"], web.packed(header, arrays)))
+    return web.saved(folder / "page.html", web.page(header["title"], web.packed(header, arrays)))
 
 
 def processor_time() -> dict[str, float]:
@@ -83,7 +83,7 @@ def measured(tab) -> None:
     for how, step in (("playing", None), ("standing", 60)):
         if step is not None:
             tab.click("#play")
-            tab.evaluate(f"nsf.live.seek({step})")
+            tab.evaluate(f"nsf.player.seek({step})")
             tab.wait_for_timeout(2000)
         times = []
         for value in np.linspace(22, 38, 9):

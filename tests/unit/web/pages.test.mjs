@@ -9,8 +9,8 @@ import { prefixed, valued } from "../../../nsf/live/web/controls.mjs";
 import { Recording, undifferenced, unpacked } from "../../../nsf/live/web/data.mjs";
 import { Pace } from "../../../nsf/live/web/drawing.mjs";
 import { Field, Network, displacement, vonMises } from "../../../nsf/live/web/field.mjs";
-import { Operators, Run, valueAt } from "../../../nsf/live/web/operators.mjs";
-import { acts, along, moved, placed, poseAt, stateOf } from "../../../nsf/live/web/solids.mjs";
+import { Operators, Run } from "../../../nsf/live/web/operators.mjs";
+import { acts, along, moved, placed, poseAt, stateOf, valueAt } from "../../../nsf/live/web/solids.mjs";
 import { tilted } from "../../../nsf/live/web/tilt.mjs";
 import { Trust, lightOf, quantity } from "../../../nsf/live/web/trust.mjs";
 
@@ -217,8 +217,8 @@ test("the light names its reason", () => {
   assert.equal(why([30], 0, 0, 0.2), "diverged at t = 0.2 s");
   assert.equal(own.light([30], 0.25, 0, null, 1.9).level, "good");
   assert.equal(why([30], 0.25, 0, null, 2.5), "operators may be 2500 mm from the projected run; training runs are 2000 mm from each other");
-  assert.equal(lightOf(0.2, 2, false).level, "away");
-  assert.equal(lightOf(1.2, 2, false).level, "bad");
+  assert.equal(lightOf(0.2, 2, false, 0).level, "away");
+  assert.equal(lightOf(1.2, 2, false, 0).level, "bad");
 });
 
 test("numbers as text", () => {

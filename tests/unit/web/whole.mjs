@@ -3,7 +3,7 @@
 import { readFileSync } from "node:fs";
 
 import { inflated, unpacked } from "../../../nsf/live/web/data.mjs";
-import { Live } from "../../../nsf/live/web/pages/live.mjs";
+import { Live } from "../../../nsf/live/web/live.mjs";
 
 const text = readFileSync(process.argv[2], "utf-8").match(/id="data">([^<]*)</)[1];
 const live = new Live(unpacked(await inflated(text)));
