@@ -5,7 +5,7 @@ from pathlib import Path
 
 from mkdocs.structure.files import File, Files
 
-from nsf.live.demo import MODELS, page
+from nsf.live.demo import MODELS
 
 ROOT = Path(__file__).parents[1]
 #: How a page beside this file shows one, so that the page reads well in the repository too.
@@ -17,7 +17,7 @@ def on_files(files: Files, config) -> Files:
     pages = [Path(page.abs_src_path) for page in files.documentation_pages()]
     shown = {path for page in pages for path in SHOWN.findall(page.read_text(encoding="utf-8"))}
     for model in MODELS:
-        files.append(File.generated(config, f"live/{model}.html", content=page(model)))
+        files.append(File.generated(config, f"live/{model}.html", content=page_of(model)))
     for path in sorted(shown):
         if (ROOT / path).is_file():  # else the strict build names the page and the path
             files.append(File.generated(config, path, abs_src_path=str(ROOT / path)))

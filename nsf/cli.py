@@ -167,16 +167,9 @@ def _doctor(words: list[str]) -> int:
 
 def _export(words: list[str]) -> int:
     """A deployed run in other programs' formats."""
-    from nsf.export.command import Page
     from nsf.export.command import main as export
 
-    def live(*given):
-        from nsf.live.publish import write
-
-        return write(*given)
-
-    told = "the model itself in one page that runs, is steered and mailed; needs engine=operators"
-    return export(words, {"live": Page(told, live)})
+    return export(words)
 
 
 def _demo(words: list[str]) -> int:

@@ -8,7 +8,7 @@ import numpy as np
 
 
 def unpacked(data: bytes) -> tuple[dict, dict[str, np.ndarray]]:
-    """Header and arrays of `nsf.export.web.packed`."""
+    """Header and arrays of `nsf.live.page.packed`."""
     (length,) = struct.unpack_from("<I", data)
     header, at, arrays = json.loads(data[4 : 4 + length]), 4 + length, {}
     for name, own in header["arrays"].items():

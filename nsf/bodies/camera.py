@@ -20,6 +20,7 @@ _SHADOW, _EDGE = 0.20, 0.45  # how dark a shadow is, and an edge of a solid
 _GLAZE = 0.06  # white mixed in, so that the dark end of a colour map still shows its shape
 _SMOOTH = 0.9  # radii of a point, over which depth and colour are smooth
 _GRAINS = (3.0, 12.0)  # radii [sample] between which points turn from a surface into balls
+_LARGE = 16  # radius [sample] above which balls are drawn one by one, which is faster then
 _CASTERS = 60_000  # points that throw a shadow
 _BEYOND = 0.35  # of the body's extent: how far a window opens for the solids beside it
 _OVERSAMPLE = 2
@@ -138,20 +139,16 @@ class View:
 
     def _draw(self, x, colors, radius: float, scale: float, canvas: np.ndarray, nearest: np.ndarray) -> None:
         """Draw points where nothing is nearer."""
-        shape = nearest.shape
-        index, depth, owner, normals = _balls(
-            self._pixels(self.camera.project(x), scale), radius, scale, shape
-        )
-        front = _foremost(index, depth, shape[0] * shape[1])
-        covered = (front >= 0).reshape(shape)
+        centre = self._pixels(self.camera.project(x), scale)
+        depths, owner, normal = _balls(centre, radius, scale, nearest.shape)
+        covered = owner >= 0
         if not covered.any():
             return
-        part = _box_of(np.argwhere(covered), shape)
-        covered, front = covered[part], front.reshape(shape)[part]
-        depths, own, normal = (np.zeros((*covered.shape, *extra), np.float32) for extra in ((), (3,), (3,)))
-        seen = front[covered]
-        depths[covered], own[covered], normal[covered] = depth[seen], colors[owner[seen]], normals(seen)
-        surface = _surface(covered, depths, own, normal, radius, scale)
+        part = _box_of(np.argwhere(covered), nearest.shape)
+        covered, depths, normal = covered[part], depths[part], normal[part]
+        own = np.zeros((*covered.shape, 3), np.float32)
+        own[covered] = colors[owner[part][covered]]
+        surface = _surface(covered, np.where(covered, depths, 0.0), own, normal, radius, scale)
         shown = covered & (depths > nearest[part])
         canvas[part][shown] = surface[shown]
         nearest[part][shown] = depths[shown]
@@ -191,9 +188,8 @@ class View:
         x = x[:: -(-len(x) // _CASTERS)]
         fallen = x - (((x - face.corners[0]) @ normal) / (light @ normal))[:, None] * light
         shape = canvas.shape[:2]
-        index, *_ = _balls(self._pixels(self.camera.project(fallen), scale), radius, scale, shape, 0.35)
-        shadow = np.zeros(shape, np.float32)
-        shadow.reshape(-1)[index] = 1.0
+        _, owner, _ = _balls(self._pixels(self.camera.project(fallen), scale), radius, scale, shape, 0.35)
+        shadow = (owner >= 0).astype(np.float32)
         at = self._pixels(self.camera.project(face.corners), scale)
         shadow = _blurred(shadow, max(2.0 * radius * scale, 4.0)) * _outlined(at[:, :2], shape, True)
         canvas *= 1 - _SHADOW * shadow[..., None]
@@ -250,30 +246,64 @@ def _surface(covered, depth, colors, normals, radius: float, scale: float) -> np
 
 
 def _balls(centre: np.ndarray, radius: float, scale: float, shape, squash: float = 1.0):
-    """Pixels that balls cover: flat index, nearness [m], whose each is, and rows → normals [k, 3] there."""
+    """The nearest of balls in each pixel.
+
+    Args:
+        centre: [n, 3] column, row [pixel] and nearness [m].
+        radius: [m]; scale: pixels a metre.
+        shape: of the picture.
+        squash: height of a ball's outline over its width.
+
+    Returns:
+        nearness [h, w] [m], -inf where there is none; whose it is [h, w], -1 where there is none; the normal
+        of that ball there [h, w, 3].
+    """
     pixels = max(radius * scale, 0.8)
     reach = int(np.ceil(pixels))
     dx, dy = np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1))
-    inside = dx**2 + (dy / squash) ** 2 <= pixels**2
-    dx, dy = dx[inside], dy[inside]
-    bulge = np.sqrt(np.maximum(0.0, 1 - (dx**2 + dy**2) / pixels**2))
-    column = np.round(centre[:, 0]).astype(int)[:, None] + dx
-    row = np.round(centre[:, 1]).astype(int)[:, None] + dy
+    apart = dx**2 + (dy / squash) ** 2
+    bulge = np.sqrt(np.maximum(0.0, 1 - (dx**2 + dy**2) / pixels**2)).astype(np.float32)
+    normals = np.stack([dx / pixels, -dy / pixels, bulge], axis=-1).astype(np.float32)
+    cell = np.where(apart <= pixels**2, radius * bulge, -np.inf).astype(np.float32)
+    drawn = _one_by_one if reach > _LARGE else _at_once
+    depth, owner, place = drawn(centre, cell, reach, shape)
+    return depth, owner, normals.reshape(-1, 3)[place]
+
+
+def _at_once(centre: np.ndarray, cell: np.ndarray, reach: int, shape):
+    """Many small balls: nearness, owner and place in the cell [h, w]; `cell` is a ball's own nearness."""
+    place = np.flatnonzero(np.isfinite(cell))
+    rows, columns = np.divmod(place, len(cell))
+    column = np.round(centre[:, 0]).astype(int)[:, None] + columns - reach
+    row = np.round(centre[:, 1]).astype(int)[:, None] + rows - reach
     seen = (column >= 0) & (column < shape[1]) & (row >= 0) & (row < shape[0])
-    depth = centre[:, 2:3] + bulge * radius
-    owner, offset = np.nonzero(seen)
-    directions = np.stack([dx / pixels, -dy / pixels, bulge], axis=1)
-    return (row * shape[1] + column)[seen], depth[seen], owner, lambda rows: directions[offset[rows]]
+    index, nearness = (row * shape[1] + column)[seen], (centre[:, 2:] + cell.ravel()[place])[seen]
+    nearest = np.full(shape[0] * shape[1], -np.inf, np.float32)
+    nearness = nearness.astype(np.float32)
+    np.maximum.at(nearest, index, nearness)
+    own, offset = np.nonzero(seen)
+    first = np.flatnonzero(nearness == nearest[index])
+    owner, places = np.full(nearest.shape, -1), np.zeros(nearest.shape, int)
+    owner[index[first]], places[index[first]] = own[first], place[offset[first]]
+    return nearest.reshape(shape), owner.reshape(shape), places.reshape(shape)
 
 
-def _foremost(index: np.ndarray, depth: np.ndarray, pixels: int) -> np.ndarray:
-    """Of each pixel the entry nearest to the viewer, the last of equal ones; -1 where there is none."""
-    nearest = np.full(pixels, -np.inf)
-    np.maximum.at(nearest, index, depth)
-    seen = np.flatnonzero(depth == nearest[index])
-    front = np.full(pixels, -1)
-    front[index[seen]] = seen
-    return front
+def _one_by_one(centre: np.ndarray, cell: np.ndarray, reach: int, shape):
+    """Few large balls; as `_at_once`."""
+    size, wide = len(cell), 2 * reach
+    depth = np.full((shape[0] + 2 * wide, shape[1] + 2 * wide), -np.inf, np.float32)
+    owner, places = np.full(depth.shape, -1), np.zeros(depth.shape, int)
+    at = np.arange(size * size).reshape(size, size)
+    for own, (column, row, nearness) in enumerate(centre):
+        left, top = round(column) - reach + wide, round(row) - reach + wide
+        if min(left, top) < 0 or left + size > depth.shape[1] or top + size > depth.shape[0]:
+            continue  # beyond the picture
+        part = slice(top, top + size), slice(left, left + size)
+        nearer = cell + np.float32(nearness) > depth[part]
+        depth[part][nearer] = cell[nearer] + np.float32(nearness)
+        owner[part][nearer], places[part][nearer] = own, at[nearer]
+    inner = slice(wide, wide + shape[0]), slice(wide, wide + shape[1])
+    return depth[inner], owner[inner], places[inner]
 
 
 def _occlusion(covered: np.ndarray, depth: np.ndarray, radius: float, scale: float) -> np.ndarray:

@@ -2,8 +2,7 @@
 
 import argparse
 import os
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,7 +25,8 @@ examples:
 --usd, --onnx and --frames need pip install 'nsf[export]'."""
 
 
-_OF_FORMATS = ("parameter", "color", "every", "fps")  # options that say nothing to a page of several runs
+LIVE = "live"  # the format that holds the model in place of a run
+_OF_PLAYBACKS = ("parameter", "color", "every", "fps")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -34,20 +34,7 @@ class _Parser(argparse.ArgumentParser):
         raise ConfigError(f"{message}; see `nsf export --help`")
 
 
-@dataclass(frozen=True)
-class Page:
-    """A page of a deployment that holds more than one run, which a higher layer writes.
-
-    Attributes:
-        tells: what it is, for the help.
-        write: (deploy run, folder, points or None, device) → the path to open.
-    """
-
-    tells: str
-    write: "Callable[[Run, Path, int | None, str], Path]"
-
-
-def _parser(pages: Mapping[str, Page]) -> argparse.ArgumentParser:
+def _parser() -> argparse.ArgumentParser:
     parser = _Parser(
         prog="nsf export",
         description=_DESCRIPTION,
@@ -59,7 +46,7 @@ def _parser(pages: Mapping[str, Page]) -> argparse.ArgumentParser:
         "run", nargs="?", metavar="RUN",
         help="deploy run: its id, the beginning of it or of its hash, or its folder; the newest by default",
     )  # fmt: skip
-    for name, tells in (FORMATS | {name: page.tells for name, page in pages.items()}).items():
+    for name, tells in FORMATS.items():
         parser.add_argument(f"--{name}", action="store_true", help=tells)
     options = (
         ("parameter", str, None, "held-out case, as 26 or E=1500,friction=0.3; the first by default"),
@@ -76,30 +63,18 @@ def _parser(pages: Mapping[str, Page]) -> argparse.ArgumentParser:
     return parser
 
 
-def main(arguments: Sequence[str], pages: Mapping[str, Page] | None = None) -> int:
+def main(arguments: Sequence[str]) -> int:
     """Write what the arguments ask for and say where it lies.
 
     Args:
         arguments: of the command line.
-        pages: other formats by name.
 
     Raises:
         NSFError: an argument is refused, a run or an extra is missing, or a file cannot be written.
     """
-    pages = pages or {}
-    asked = _parser(pages).parse_args(arguments)
+    asked = _parser().parse_args(arguments)
     formats = [name for name in FORMATS if getattr(asked, name)]
-    wanted = {name: page for name, page in pages.items() if getattr(asked, name)}
-    if not formats and not wanted:
-        known = ", ".join(f"--{name}" for name in (*FORMATS, *pages))
-        raise ConfigError(f"no format; give one or more of {known}")
-    if asked.points is not None and asked.points < 1:
-        raise ConfigError(f"points={asked.points} must be a whole number of at least 1")
-    if not formats and (unused := [f"--{name}" for name in _OF_FORMATS if getattr(asked, name) is not None]):
-        raise ConfigError(
-            f"--{', --'.join(wanted)} holds every held-out case, which the page shows as its reader asks; "
-            f"leave out {', '.join(unused)}"
-        )
+    _check(asked, formats)
     import importlib
 
     from nsf.extras import optional
@@ -110,23 +85,39 @@ def main(arguments: Sequence[str], pages: Mapping[str, Page] | None = None) -> i
         print(f"export: the newest deploy run, {run.id}")
     else:
         run = Run.named(asked.run, "deploy").require()
-    writers = {name: importlib.import_module(f"nsf.export.{name}") for name in formats}
+    writers = {name: importlib.import_module(f"nsf.export.{name}") for name in formats if name != LIVE}
     for needed in (module for writer in writers.values() for module in writer.NEEDS):
         optional(needed, "export")  # before any work
     folder = asked.output or _reports() / "export" / f"{run.scene}-{run.hash}"
-    if formats:
+    if writers:
         playback = _playback(run, asked)
     for name, writer in writers.items():
         _say(name, writer.write(playback, folder))
-    for name, page in wanted.items():
-        _say(name, page.write(run, folder, asked.points, asked.device))
+    if LIVE in formats:
+        from nsf.live.publish import write
+
+        _say(LIVE, write(run, folder, asked.points, asked.device))
     return 0
+
+
+def _check(asked: argparse.Namespace, formats: Sequence[str]) -> None:
+    """Refuse no format, no points, and options that no format takes."""
+    if not formats:
+        raise ConfigError(f"no format; give one or more of {', '.join(f'--{name}' for name in FORMATS)}")
+    if asked.points is not None and asked.points < 1:
+        raise ConfigError(f"points={asked.points} must be a whole number of at least 1")
+    unused = [f"--{name}" for name in _OF_PLAYBACKS if getattr(asked, name) is not None]
+    if formats == [LIVE] and unused:
+        raise ConfigError(
+            f"--{LIVE} holds every held-out case, which the page shows as its reader asks; "
+            f"leave out {', '.join(unused)}"
+        )
 
 
 def _playback(run: "Run", asked: argparse.Namespace) -> "Playback":
     from nsf.export.playback import Playback
 
-    given = {name: value for name in _OF_FORMATS if (value := getattr(asked, name)) is not None}
+    given = {name: value for name in _OF_PLAYBACKS if (value := getattr(asked, name)) is not None}
     playback = Playback(run, points=asked.points, device=asked.device, **given)
     print(f"export: {playback.title}, {len(playback.t)} frames, {len(playback.X):,} points")
     if playback.stopped is not None:

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from nsf.errors import ConfigError
-from nsf.export import web
 from nsf.export.playback import QUANTITIES, Playback
+from nsf.live import page
 
 NEEDS = ()
 POINTS = 20_000  # by default: a page of some MiB that a telephone plays
@@ -35,7 +35,7 @@ def write(playback: Playback, folder: Path) -> Path:
     for block in playback.blocks("html"):
         x[0, block.rows], x[1:, block.rows] = block.X.numpy(), block.x.numpy()
         stress[:, block.rows] = block.von_mises.numpy() / playback.tops["von_mises"]
-    told, arrays = web.recording(x, stress, playback.t)
+    told, arrays = page.recording(x, stress, playback.t)
     header = {
         "title": playback.title,
         "run": playback.run.id,
@@ -50,9 +50,9 @@ def write(playback: Playback, folder: Path) -> Path:
             name: {"title": quantity.title, "unit": quantity.unit, "top": playback.tops[name]}
             for name, quantity in QUANTITIES.items()
         },
-        "colors": web.colors(),
+        "colors": page.colors(),
         "solids": playback.solids,
         "recordings": {"run": told},
     }
-    data = web.packed(header, {f"run.{name}": own for name, own in arrays.items()})
-    return web.saved(folder / f"{playback.name}.html", web.page(playback.title, data))
+    data = page.packed(header, {f"run.{name}": own for name, own in arrays.items()})
+    return page.saved(folder / f"{playback.name}.html", page.html(playback.title, data))

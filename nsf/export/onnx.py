@@ -28,12 +28,13 @@ def write(playback: Playback, folder: Path) -> Path:
     """Write `deformation.onnx`, `stress.onnx`, `affine.onnx` and `inputs.npz` into a folder of their own.
 
     Inputs: `xhat` [frames, r]; `parameters` [n], problem parameters in the order of the metadata's
-    `parameter_names`; and `X` [points, 3] m at rest, if the field is a function of X (`field=mlp`). Other
+    `parameter_names`; `X` [points, 3] m at rest, if the field is a function of X (`field=mlp`); and of the
+    affine field `rate` [frames, r], dx̂/dt [1/s], if it is trained with `field.affine=rate`. Other
     fields (`field=basis`) are fixed to the points of the playback. A graph keeps an input on which its field
     does not depend. Outputs: `x` [frames, points, 3] m; `tau` [frames, points, 6] Pa in the order of the
     metadata's `tau_order`; `C` [frames, points, 3, 3] 1/s.
 
-    `inputs.npz` holds the run's own `xhat`, `parameters`, `X`, and the time `t` [s] of its frames. All three
+    `inputs.npz` holds the run's own inputs, and the time `t` [s] of its frames. All three
     trained fields are written, even if the run's method does not use each of them.
 
     Raises:
@@ -47,6 +48,8 @@ def write(playback: Playback, folder: Path) -> Path:
         "xhat": playback.xhat.astype(np.float32),
         "parameters": np.array(playback.parameters, np.float32),
     }
+    if at.takes_rate:
+        inputs["rate"] = playback.rate.astype(np.float32)
     folder = folder / f"{playback.name}_onnx"
     modules = {phase: at.module(phase).cpu().eval() for phase in PHASES}
     for module in modules.values():
@@ -85,7 +88,7 @@ def _quiet(logger: logging.Logger) -> Iterator[None]:
 def _graph(module: nn.Module, output: str, inputs: dict[str, np.ndarray]):
     """The module's graph, with named axes without the exporter's notes, which hold paths of this machine."""
     names = list(inspect.signature(module.forward).parameters)
-    axes = {"X": {0: "points"}, "xhat": {0: "frames"}, "parameters": {}}
+    axes = {"X": {0: "points"}, "xhat": {0: "frames"}, "parameters": {}, "rate": {0: "frames"}}
     # Example inputs for the trace. The graph does not depend on their numbers of frames and points.
     example = {name: torch.zeros(4 if axes[name] else len(a), *a.shape[1:]) for name, a in inputs.items()}
     with warnings.catch_warnings(), _quiet(logging.getLogger("torch.onnx")):

@@ -20,9 +20,9 @@ from nsf.errors import ConfigError, MissingRunError, SchemaError
 from nsf.evaluation import metrics
 from nsf.evaluation.superresolution import POINTS
 from nsf.evaluation.surroundings import colliders_at
-from nsf.export import web
 from nsf.kinematics.interpolation import lying_together
 from nsf.kinematics.manifold import Manifold, Restriction
+from nsf.live import page
 from nsf.mpm import Collider, floor_height, precision_of
 from nsf.mpm.device import warp_device
 from nsf.progress import Progress
@@ -175,6 +175,10 @@ class Playback:
         self._xhat = torch.as_tensor(
             rollout.xhat[chosen[chosen < own]], dtype=self._dtype, device=self.device
         )
+        changes = np.diff(rollout.xhat[: max(own, 2)], axis=0)
+        self._rate = (np.concatenate([changes[:1], changes]) / (rollout.t[1] - rollout.t[0]))[
+            chosen[chosen < own]
+        ]
         self._later = chosen[chosen >= own] - (own - 1)  # of the continuation, whose first frame is reduced
 
     def _choose_points(self, points: int | None) -> None:
@@ -216,6 +220,11 @@ class Playback:
         return self._xhat.cpu().numpy()
 
     @property
+    def rate(self) -> np.ndarray:
+        """[F, r] dx̂/dt in the frames of `xhat` [1/s], as steps have it: from the step before."""
+        return self._rate
+
+    @property
     def parameters(self) -> list[float]:
         """[n] problem parameters in the order of the manifold's."""
         return [self.case[name] for name in self.manifold.parameter_names]
@@ -228,7 +237,7 @@ class Playback:
     @property
     def solids(self) -> list[dict]:
         """The solids, for a page."""
-        return [web.solid(name, own) for name, own in self._shown.items()]
+        return [page.solid(name, own) for name, own in self._shown.items()]
 
     @property
     def around(self) -> dict[str, np.ndarray]:
@@ -268,12 +277,6 @@ class Playback:
             values = torch.cat([block.magnitude(name).flatten() for block in self._some])
             found[name] = float(np.percentile(values.double().numpy(), quantity.clip)) or 1.0
         return found
-
-    @cached_property
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Corners [3] [m] of the box about some particles at rest and in every frame."""
-        x = torch.cat([torch.cat([block.X[None], block.x]).flatten(0, 1) for block in self._some]).double()
-        return x.amin(0).numpy(), x.amax(0).numpy()
 
     @cached_property
     def _some(self) -> list[Block]:

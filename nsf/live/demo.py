@@ -6,7 +6,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from nsf.errors import ConfigError
-from nsf.export import web
+from nsf.live import page
 
 #: Title of each model that is shipped; the first is shown unless another is asked for.
 MODELS = {
@@ -16,7 +16,7 @@ MODELS = {
 }
 
 
-def page(model: str) -> str:
+def page_of(model: str) -> str:
     """The page of a shipped model.
 
     Raises:
@@ -25,7 +25,7 @@ def page(model: str) -> str:
     if model not in MODELS:
         raise ConfigError(f"model={model} is none that is shipped; choose one of {', '.join(MODELS)}")
     data = files("nsf").joinpath("live", "models", f"{model}.bin").read_bytes()
-    return web.page(MODELS[model], zlib.decompress(data))
+    return page.html(MODELS[model], zlib.decompress(data))
 
 
 def show(
@@ -46,7 +46,7 @@ def show(
     if opened not in ("true", "false"):
         raise ConfigError(f"open={opened} must be true or false")
     model = next(iter(MODELS)) if model is None else model
-    path = web.saved(Path(folder) / f"{model}.html", page(model))
+    path = page.saved(Path(folder) / f"{model}.html", page_of(model))
     if opened == "true":
         webbrowser.open(path.resolve().as_uri())
     return path

@@ -7,7 +7,7 @@ import numpy as np
 
 from nsf.data import Case
 from nsf.errors import ConfigError
-from nsf.export import web
+from nsf.live import page
 from nsf.live.coloring import STRESS, Coloring
 from nsf.live.model import LiveModel, Truth
 from nsf.live.player import Moment, Player
@@ -91,11 +91,11 @@ class PointFeed(LatentFeed):
             ],
             "particle_feed": True,
         }
-        self.field = web.packed(header, {"rest": model.X})
+        self.field = page.packed(header, {"rest": model.X})
 
     def frame(self, moment: Moment) -> bytes:
         """Positions [n, 3] [m] and shades [n] of both runs, the particles' sets, and of the moment t [s], the
-        distrust ratio, the step, and latent steps a second; as `nsf.export.web.packed` has them.
+        distrust ratio, the step, and latent steps a second; as `nsf.live.page.packed` has them.
         """
         run, step = moment.run, moment.step
         key = (run, step, run.finished, self.color)
@@ -111,7 +111,7 @@ class PointFeed(LatentFeed):
         }  # fmt: skip
         if truth is not None:
             arrays |= {"full.x": truth.positions(moment.t), "full.shade": shades.full}
-        self._drawn = key, web.packed({}, arrays)
+        self._drawn = key, page.packed({}, arrays)
         return self._drawn[1]
 
     def truth(self, moment: Moment) -> Truth | None:

@@ -14,7 +14,7 @@ from nsf.deployment import Trust
 from nsf.deployment.rollout import forcing_ratios
 from nsf.dynamics import Decoder, ReducedMPM
 from nsf.errors import ConfigError, InstabilityError
-from nsf.export import web
+from nsf.live import page
 from nsf.mpm import floor_height
 from nsf.mpm.stability import check_time_step
 from nsf.pipeline import Pipeline
@@ -302,7 +302,9 @@ class LiveModel:
     def solids(self, case: Case) -> list[dict]:
         """The solids of a case, for a page."""
         scene = self.pipeline.deployed.with_parameters(case)
-        return [web.solid(name, own) for name, own in zip(scene.collider_names, scene.colliders, strict=True)]
+        return [
+            page.solid(name, own) for name, own in zip(scene.collider_names, scene.colliders, strict=True)
+        ]
 
     def roles(self, step: int) -> np.ndarray:
         """[n] set of each shown particle in the step that starts at `step`: 2 S, 1 N only, 0 neither.

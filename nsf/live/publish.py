@@ -17,7 +17,7 @@ from nsf.dynamics.setup import first_changes
 from nsf.engines import Operators
 from nsf.errors import ConfigError
 from nsf.evaluation.metrics import von_mises
-from nsf.export import web
+from nsf.live import page
 from nsf.live.model import LiveModel
 from nsf.live.wire import check_field, modal_field, network_arrays, shown
 from nsf.pipeline import Pipeline
@@ -50,12 +50,12 @@ def write(run: Run, folder: Path, points: int | None = None, device: str = "auto
     """
     _check_engine(run, Pipeline.of_run(run, device).engine)  # a model takes long to build
     title, data = model_data(LiveModel(run, points or POINTS, device, surface=True))
-    page = web.page(title, data)
-    if (size := len(page.encode())) > LARGEST:
+    text = page.html(title, data)
+    if (size := len(text.encode())) > LARGEST:
         raise ConfigError(
             f"the page would have {size / 1e6:.1f} MB, at most {LARGEST / 1e6:.0f}; give fewer --points"
         )
-    return web.saved(folder / f"{run.scene}-live.html", page)
+    return page.saved(folder / f"{run.scene}-live.html", text)
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,7 @@ def model_data(model: LiveModel, sizes: Sizes = Sizes()) -> tuple[str, bytes]:
         "recordings": {},
     }  # fmt: skip
     header["cases"] = _cases(model, taught.parameters, arrays, header, sizes)
-    return model.title, web.packed(header, arrays)
+    return model.title, page.packed(header, arrays)
 
 
 def ship(run: Run, path: Path, points: int, sizes: Sizes) -> None:
@@ -301,4 +301,4 @@ def _recorded(
         t = frames * trajectory.dt
     top = quantities.get("von_mises", {"top": 1.0})["top"]
     stress = von_mises(torch.as_tensor(tau)).numpy() / top
-    return web.recording(np.concatenate([model.X[None, chosen], x]).astype(np.float32), stress, t)
+    return page.recording(np.concatenate([model.X[None, chosen], x]).astype(np.float32), stress, t)

@@ -11,7 +11,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
 from nsf.errors import ConfigError
-from nsf.export import web
+from nsf.live import page
 from nsf.live.feeds import LatentFeed, obey
 from nsf.live.guard import Connection, check_token, name_of, refused
 from nsf.live.player import Moment, Player
@@ -28,7 +28,7 @@ _HEADERS = {
     "Cache-Control": "no-store",
     "Referrer-Policy": "no-referrer",
     "X-Content-Type-Options": "nosniff",
-    "Content-Security-Policy": f"{web.policy(connects=True)}; frame-ancestors 'none'",
+    "Content-Security-Policy": f"{page.policy(connects=True)}; frame-ancestors 'none'",
 }
 
 
@@ -59,7 +59,7 @@ class Stream:
         self._player, self._host, self._token = player, host, token
         self._rate, self._patience = rate, patience
         self._feed = feed
-        self._page = web.page(feed.title, connects=True).encode()
+        self._page = page.html(feed.title, connects=True).encode()
         self._clients: set[ServerConnection] = set()
         moment = player.tick()
         self._state, self._frame = self._messages(moment)

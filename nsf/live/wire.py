@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from nsf.errors import ConfigError
-from nsf.export import web
+from nsf.live import page
 from nsf.live.model import LiveModel
 
 FIELDS = ("basis",)  # the fields of linear modes
@@ -16,7 +16,7 @@ def field_message(model: LiveModel) -> bytes:
     The message also has the closure's weights. The browser evaluates the closure, so that a frame is x̂ alone.
 
     Returns:
-        As `nsf.export.web.packed` has it: rest [n, 3] float32 [m] and the arrays of `modal_field`.
+        As `nsf.live.page.packed` has it: rest [n, 3] float32 [m] and the arrays of `modal_field`.
 
     Raises:
         ConfigError: the field does not consist of linear modes.
@@ -24,7 +24,7 @@ def field_message(model: LiveModel) -> bytes:
     check_field(model)
     told, arrays = modal_field(model.at.fields["deformation"], np.int16)
     header = shown(model) | {"fields": {"deformation": told | {"parameters": False}}}
-    return web.packed(header, {"rest": model.X} | {f"deformation.{name}": a for name, a in arrays.items()})
+    return page.packed(header, {"rest": model.X} | {f"deformation.{name}": a for name, a in arrays.items()})
 
 
 def shown(model: LiveModel) -> dict:
@@ -40,7 +40,7 @@ def shown(model: LiveModel) -> dict:
         "lower": x.min((0, 1)).tolist(),
         "upper": x.max((0, 1)).tolist(),
         "floor": model.floor,
-        "colors": web.colors(),
+        "colors": page.colors(),
         "quantities": {"displacement": {"title": "displacement", "unit": "m", "top": moved}},
         "parameters": [
             {

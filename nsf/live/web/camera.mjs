@@ -1,5 +1,7 @@
 // A camera that goes round a scene, z up, by pointer, touch, wheel and keys.
 
+const AZIMUTH = -1.08; // [rad] at first
+const GAP = 1.1; // from a body to the one beside it, over the width of the scene
 const TURN = 0.008; // [rad] a pixel
 const KEY_TURN = 0.1; // [rad] a key
 const dot = (/** @type {number[]} */ a, /** @type {number[]} */ b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -24,11 +26,18 @@ export class Camera {
 
   /** Look at the whole scene. */
   reset() {
-    this.azimuth = -1.08;
+    this.azimuth = AZIMUTH;
     this.elevation = 0.3;
     this.distance = 1.05 * this.size;
     this.centre = this.lower.map((v, c) => 0.5 * (v + this.upper[c]));
     this.changed();
+  }
+
+  /** Where a second body stands, to the right as it is looked at first, so that both are as far away [3] [m]. */
+  beside() {
+    const right = [-Math.sin(AZIMUTH), Math.cos(AZIMUTH), 0];
+    const wide = right.reduce((sum, v, c) => sum + Math.abs(v) * (this.upper[c] - this.lower[c]), 0);
+    return right.map((v) => GAP * wide * v);
   }
 
   /** Unit vectors to the right, up and toward the viewer. */

@@ -1,4 +1,4 @@
-// What a page holds: arrays in one piece behind a header, as `nsf.export.web.packed` writes them.
+// What a page holds: arrays in one piece behind a header, as `nsf.live.page.packed` writes them.
 
 /** @typedef {Float32Array | Float64Array | Int8Array | Int16Array | Uint8Array | Uint16Array} Numbers */
 /** @typedef {{ header: any, arrays: Record<string, Numbers> }} Packed */

@@ -230,12 +230,10 @@ export class LivePlayer extends Live {
 
   /** @param {import("./drawing.mjs").Drawing} drawing */
   place(drawing) {
-    const { told } = this, { right } = drawing.camera.axes;
+    const { told } = this;
     this.drawing = drawing;
     this.body = drawing.body(this.rest);
-    // To the right as the camera looks at first, so that both are as far from it.
-    const wide = right.reduce((sum, v, c) => sum + Math.abs(v) * (told.upper[c] - told.lower[c]), 0);
-    this.beside = right.map((v) => 1.1 * wide * v);
+    this.beside = drawing.camera.beside();
     for (const [name, own] of this.recordings)
       this.truths.set(name, drawing.body(own.rest, this.beside, told.radius * Math.cbrt(told.points / own.points)));
   }

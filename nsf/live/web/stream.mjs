@@ -8,7 +8,6 @@ import { lightOf } from "./trust.mjs";
 const FARTHEST = 1.5; // of the tilt, over the largest that was trained
 const SAMPLE = [0.84, 0.37, 0]; // colour of sample particles
 const IN_SAMPLE = 2; // among the roles of particles
-const GAP = 1.25; // from a body to the one beside it, over the width of the scene
 
 /** Follows a server; see `Player` in `page.mjs`. Its query holds the token where there is one. */
 export class StreamPlayer {
@@ -39,6 +38,7 @@ export class StreamPlayer {
     this.rate = { frames: 0, bytes: 0 }; // in the last second
     this.made = 0; // latent steps a second, by the server
     this.trust = 0;
+    this.beside = [0, 0, 0];
     this.x = this.rest;
     /** @type {ArrayBuffer | null} */ this.newest = null;
     this.state = { values: /** @type {number[]} */ ([]), away: 0, diverged: false, playing: true, color: this.color, tilted: false, known: /** @type {number | null} */ (null) };
@@ -103,11 +103,10 @@ export class StreamPlayer {
     this.body = drawing.body(rest);
     drawing.solids = told.solids;
     if (this.field) return;
-    const aside = GAP * (told.upper[0] - told.lower[0]);
-    this.full = drawing.body(rest, [aside, 0, 0]);
+    this.beside = drawing.camera.beside();
+    this.full = drawing.body(rest, this.beside);
     this.sample = drawing.body(rest, [0, 0, 0], 1.4 * told.radius, SAMPLE);
     this.full.visible = this.sample.visible = false;
-    this.aside = aside;
   }
 
   /** Whether a frame has come. */
@@ -185,8 +184,8 @@ export class StreamPlayer {
     const { known } = this.state, choices = document.getElementById("known");
     if (choices) /** @type {HTMLSelectElement} */ (choices).value = known === null ? "" : String(known);
     if (!this.field && (was.known === null) !== (known === null)) {
-      const { upper } = this.told;
-      page.reach(known === null ? upper : [upper[0] + (this.aside ?? 0), upper[1], upper[2]]);
+      const { upper } = this.told, beside = known === null ? [0, 0, 0] : this.beside;
+      page.reach(upper.map((/** @type {number} */ v, /** @type {number} */ c) => v + beside[c]));
     }
     page.change();
   }

@@ -37,15 +37,21 @@ def test_a_pixel_is_the_mean_of_its_samples(monkeypatch):
     np.testing.assert_allclose(view.picture(x, colors, 0.08)[:height], mean, atol=1.0)
 
 
-def test_each_pixel_shows_what_is_nearest():
+def test_large_balls_one_by_one_are_what_small_ones_are_at_once(monkeypatch):
     rng = np.random.default_rng(0)
-    index, depth = rng.integers(0, 50, 400), rng.normal(size=400)
-    front = camera._foremost(index, depth, 60)
-    for pixel in range(60):
-        there = np.flatnonzero(index == pixel)
-        expected = there[depth[there].argmax()] if len(there) else -1
-        assert front[pixel] == expected
-    assert camera._foremost(np.array([3, 3]), np.array([1.0, 1.0]), 4).tolist() == [-1, -1, -1, 1]
+    centre = np.column_stack([rng.uniform(-20, 140, 300), rng.uniform(-20, 100, 300), rng.normal(size=300)])
+    found = []
+    for most in (0, 100):
+        monkeypatch.setattr(camera, "_LARGE", most)
+        found.append(camera._balls(centre, 0.7, 10.0, (80, 120)))
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-6)
+    depth, owner, normal = found[0]
+    row, column = np.argwhere(owner >= 0)[50]
+    near = np.hypot(*(np.round(centre[:, :2]) - (column, row)).T) <= 7.0
+    assert near[owner[row, column]]
+    assert depth[row, column] == pytest.approx(centre[near, 2].max(), abs=0.71)
+    np.testing.assert_allclose(np.linalg.norm(normal[owner >= 0], axis=1), 1.0, atol=1e-6)
 
 
 def test_the_nearer_particle_hides_the_farther():

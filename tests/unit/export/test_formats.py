@@ -6,7 +6,6 @@ import logging.handlers
 import queue
 import re
 from importlib import import_module
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +16,7 @@ from PIL import Image
 from nsf import config
 from nsf.errors import ConfigError, MissingExtraError
 from nsf.evaluation import metrics
-from nsf.export import FORMATS, frames, onnx, playback, usd, vtk
+from nsf.export import frames, onnx, playback, usd, vtk
 from nsf.export.playback import Playback
 from nsf.kinematics.training.phases import PHASES
 from nsf.pipeline import Pipeline
@@ -188,6 +187,21 @@ def test_onnx_refuses_more_than_a_file_holds(played, tmp_path, monkeypatch):
         onnx.write(played(), tmp_path)
 
 
+def test_a_field_of_the_rate_has_it_as_an_input(played):
+    """`field.affine=rate`: C follows from x̂ and dx̂/dt."""
+    pytest.importorskip("onnxscript")
+
+    class OfRate(torch.nn.Module):
+        def forward(self, xhat, parameters, rate):
+            return (xhat + 2.0 * rate) * parameters
+
+    shown = played()
+    assert shown.rate.shape == shown.xhat.shape
+    inputs = {"xhat": shown.xhat, "parameters": np.ones(1), "rate": shown.rate}
+    graph = onnx._graph(OfRate(), "C", {name: a.astype("f4") for name, a in inputs.items()}).graph
+    assert [own.name for own in graph.input] == ["xhat", "parameters", "rate"]
+
+
 # -- frames -------------------------------------------------------------------------------------------------
 
 
@@ -239,12 +253,3 @@ def test_a_missing_extra_names_the_remedy(played, tmp_path, monkeypatch, name, m
     ):
         import_module(f"nsf.export.{name}").write(played(5), tmp_path)
     assert not list(tmp_path.rglob("*"))
-
-
-def test_every_file_is_a_format_or_serves_one():
-    files = {path.stem for path in Path(playback.__file__).parent.glob("*.py")}
-    assert files == {*FORMATS, "__init__", "command", "playback", "web"}
-    for name in FORMATS:
-        module = import_module(f"nsf.export.{name}")
-        assert callable(module.write)
-        assert isinstance(module.NEEDS, tuple)

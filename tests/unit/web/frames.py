@@ -19,7 +19,7 @@ from playwright.sync_api import sync_playwright
 sys.path.insert(0, str(Path(__file__).parents[2]))
 from packing import unpacked
 
-from nsf.export import web
+from nsf.live import page
 
 POINTS, SECONDS, SIZE = 20_000, 8, {"width": 1280, "height": 800}
 SOFTWARE = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
@@ -41,7 +41,7 @@ PLAYED = """async (seconds) => {
 }"""
 
 
-def page(folder: Path) -> Path:
+def sand_page(folder: Path) -> Path:
     """The sand column's page with its points many times over."""
     header, arrays = unpacked(
         zlib.decompress(files("nsf").joinpath("live", "models", "sand.bin").read_bytes())
@@ -54,7 +54,7 @@ def page(folder: Path) -> Path:
     for name in ("rest", "deformation.mean"):
         arrays[name] = arrays[name] + aside
     header |= {"points": POINTS, "radius": header["radius"] * (had / POINTS) ** (1 / 3)}
-    return web.saved(folder / "page.html", web.page(header["title"], web.packed(header, arrays)))
+    return page.saved(folder / "page.html", page.html(header["title"], page.packed(header, arrays)))
 
 
 def processor_time() -> dict[str, float]:
@@ -98,7 +98,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as started:
         chromium = started.chromium.launch(executable_path=shutil.which("chromium"), args=SOFTWARE)
         tab = chromium.new_page(viewport=SIZE)
-        tab.goto(page(Path(folder)).as_uri())
+        tab.goto(sand_page(Path(folder)).as_uri())
         tab.wait_for_selector("body[data-ready=true]", timeout=60_000)
         measured(tab)
         chromium.close()

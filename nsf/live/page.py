@@ -71,7 +71,7 @@ def script(entry: str = ENTRY) -> str:
     def add(module: str) -> None:
         if module in texts:
             return
-        text = _text("live", "web", f"{module}.mjs")
+        text = _text(f"{module}.mjs")
         texts[module] = ""  # a circle of imports ends here; functions are called after all are there
         wanted = [(own.split(", "), other) for own, other in _IMPORT.findall(text)]
         for _, other in wanted:
@@ -103,7 +103,7 @@ def policy(connects: bool = False) -> str:
     return f"default-src 'none'; {allowed}{own}; base-uri 'none'; form-action 'none'"
 
 
-def page(title: str, data: bytes = b"", connects: bool = False) -> str:
+def html(title: str, data: bytes = b"", connects: bool = False) -> str:
     """The page of a run.
 
     Args:
@@ -112,7 +112,7 @@ def page(title: str, data: bytes = b"", connects: bool = False) -> str:
         connects: whether it reaches its own server.
     """
     deflated = base64.b64encode(zlib.compress(data, 9)).decode() if data else ""
-    return HTML.from_string(_text("export", "page.html")).render(
+    return HTML.from_string(_text("page.html")).render(
         title=title,
         policy=policy(connects),
         style=Markup(_style()),
@@ -193,9 +193,9 @@ def _hashed(text: str) -> str:
 
 @cache
 def _style() -> str:
-    return "\n" + _text("export", "page.css")
+    return "\n" + _text("page.css")
 
 
 @cache
-def _text(*path: str) -> str:
-    return files("nsf").joinpath(*path).read_text(encoding="utf-8")
+def _text(name: str) -> str:
+    return files("nsf").joinpath("live", "web", name).read_text(encoding="utf-8")
