@@ -22,17 +22,20 @@ def spaced(count: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
-def number(key: str, value, least: float = -math.inf, whole: bool = False) -> float | int:
-    """A finite number of at least `least`.
+def number(
+    key: str, value, least: float = -math.inf, whole: bool = False, most: float = math.inf
+) -> float | int:
+    """A finite number of at least `least` and at most `most`.
 
     Raises:
         ConfigError: quotes the key and the value.
     """
-    if not (isinstance(value, int if whole else int | float) and is_finite(value) and value >= least):
-        wanted = "a whole number" if whole else "a finite number"
-        raise ConfigError(
-            f"{key}={value} must be {wanted}" + (f" of at least {least:g}" if least > -math.inf else "")
-        )
+    of_kind = isinstance(value, int if whole else int | float) and is_finite(value)
+    if not (of_kind and least <= value <= most):
+        kind = "a whole number" if whole else "a finite number"
+        above = f" of at least {least:g}" if least > -math.inf else ""
+        limits = above if most == math.inf else f" from {least:g} to {most:g}"
+        raise ConfigError(f"{key}={value} must be {kind}{limits}")
     return value
 
 

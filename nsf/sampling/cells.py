@@ -7,7 +7,7 @@ import torch
 from typing_extensions import override
 
 from nsf.sampling.cubature import CubatureSampler, Equations, nonnegative_fit
-from nsf.sampling.sampler import check_count
+from nsf.vectors import number
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class CellSampler(CubatureSampler):
 
     def __post_init__(self):
         super().__post_init__()
-        check_count("cells", self.cells)
+        number("sampler.cells", self.cells, 1, whole=True)
 
     @override
     def among(self, equations: Equations) -> np.ndarray:

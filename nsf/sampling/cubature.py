@@ -10,7 +10,8 @@ import torch
 from typing_extensions import override
 
 from nsf.errors import ConfigError, ProjectionError
-from nsf.sampling.sampler import Sampler, SampleSpan, WholeSolver, check_count
+from nsf.sampling.sampler import Sampler, SampleSpan, WholeSolver
+from nsf.vectors import number
 
 _EXACT = 1e-9  # residual over target at which a cubature counts as exact
 _STILL = 1e-6  # root mean square motion in a step over Δx, below which a body counts as at rest
@@ -47,7 +48,7 @@ class CubatureSampler(Sampler):
 
     def __post_init__(self):
         super().__post_init__()
-        check_count("states", self.states)
+        number("sampler.states", self.states, 1, whole=True)
 
     @override
     def span_of(self, region, end, manifold, device="cpu", whole=None):

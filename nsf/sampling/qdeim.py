@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import torch
 from typing_extensions import override
 
-from nsf.sampling.sampler import UnweightedSampler, check_count
+from nsf.sampling.sampler import UnweightedSampler
+from nsf.vectors import number
 
 _CHUNK = 2**25  # values decoded at once
 _SNAPSHOTS = 256  # latents that displacement modes are taken from
@@ -39,7 +40,7 @@ class QdeimSampler(UnweightedSampler):
 
     def __post_init__(self):
         super().__post_init__()
-        check_count("modes", self.modes)
+        number("sampler.modes", self.modes, 1, whole=True)
 
     @override
     def choose(self, manifold, candidates, size, device="cpu"):

@@ -10,6 +10,7 @@ import torch
 from typing_extensions import override
 
 from nsf.errors import ConfigError, ProjectionError
+from nsf.vectors import number
 
 
 class WholeSolver(Protocol):
@@ -118,7 +119,7 @@ class Sampler(ABC):
                 f"sampler.phases={self.phases}: give size, start, lower, upper ({error})"
             ) from error
         for region in regions:
-            check_count("size", region.size)
+            number("sampler.size", region.size, 1, whole=True)
             for name in ("lower", "upper"):
                 corner = getattr(region, name)
                 if corner is not None and (np.shape(corner) != (3,) or not np.isfinite(corner).all()):
@@ -187,22 +188,12 @@ class RandomSampler(UnweightedSampler):
 
     def __post_init__(self):
         super().__post_init__()
-        check_count("seed", self.seed, 0)
+        number("sampler.seed", self.seed, 0, whole=True)
 
     @override
     def choose(self, manifold, candidates, size, device="cpu"):
         order = np.random.default_rng(self.seed).permutation(len(manifold.X))
         return order[np.isin(order, candidates)][:size]
-
-
-def check_count(key: str, value: int, least: int = 1) -> None:
-    """Refuse a value of the configuration that is no whole number, or below its least.
-
-    Raises:
-        ConfigError: names the key.
-    """
-    if not isinstance(value, int) or value < least:
-        raise ConfigError(f"sampler.{key}={value} must be a whole number of at least {least}")
 
 
 def check_well_posed(sample: int, latent_dim: int) -> None:

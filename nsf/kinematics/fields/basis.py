@@ -37,15 +37,8 @@ from nsf.kinematics.fields.modal import (
 from nsf.kinematics.fields.networks import Committee, FullyConnected, zero_at_rest
 from nsf.kinematics.interpolation import Interpolation, interpolation
 from nsf.kinematics.manifold import Manifold
-from nsf.kinematics.training.phases import (
-    MOST_DEEP,
-    MOST_MEMBERS,
-    PHASES,
-    TARGETS,
-    Fit,
-    at_least,
-    per_phase,
-)
+from nsf.kinematics.training.phases import MOST_DEEP, MOST_MEMBERS, PHASES, TARGETS, Fit, per_phase
+from nsf.vectors import number
 
 AFFINE = ("latent", "rate")
 ENCODED_ENTRIES = 1 << 26  # values encoded at once
@@ -89,13 +82,13 @@ class BasisField:
     def __post_init__(self) -> None:
         if self.affine not in AFFINE:
             raise ConfigError(f"field.affine={self.affine} is unknown; choose {' or '.join(AFFINE)}")
-        at_least("rate_noise", self.rate_noise, 0)
+        number("rate_noise", self.rate_noise, 0)
         per_phase("modes", self.modes)
         per_phase("beta", self.beta)
-        at_least("depth", self.depth, 1, MOST_DEEP)
-        at_least("members", self.members, 1, MOST_MEMBERS)
-        at_least("noise", self.noise, 0)
-        at_least("noise_floor", self.noise_floor, 0)
+        number("depth", self.depth, 1, whole=True, most=MOST_DEEP)
+        number("members", self.members, 1, whole=True, most=MOST_MEMBERS)
+        number("noise", self.noise, 0)
+        number("noise_floor", self.noise_floor, 0)
 
     @property
     def manifold(self) -> type[BasisManifold]:
@@ -237,19 +230,12 @@ def _slope(local: Interpolation, values: Tensor) -> Tensor:
     return local.gradient(values).movedim(-1, 2).flatten(1, 2)
 
 
-def coefficients(values: Tensor, mean: Tensor, modes: Tensor) -> Tensor:
-    """Products [F, r] (float64) of the deviations of frames [F, P, c] from a mean with modes [P, c, r]."""
-    rows = modes.flatten(0, 1).double()
-    blocks = values.split(max(1, ENCODED_ENTRIES // mean.numel()))
-    return torch.cat([(block.to(mean) - mean).flatten(1) @ rows for block in blocks])
-
-
 class BasisManifold(Manifold):
     """Modal fields of x, tau and C."""
 
     def __init__(self, latent_dim, x_sha256, parameter_names, hyperparameters):
         super().__init__(latent_dim, x_sha256, parameter_names, hyperparameters)
-        at_least("depth", hyperparameters["depth"], 1, MOST_DEEP)  # before a file has so many layers built
+        number("depth", hyperparameters["depth"], 1, whole=True, most=MOST_DEEP)  # else a file has many built
         self.takes_rate = hyperparameters["affine"] == "rate"
         if self.takes_rate:
             shape = hyperparameters["frames"], latent_dim
@@ -303,8 +289,10 @@ class BasisManifold(Manifold):
     def encode(self, x: Tensor) -> Tensor:
         self.check_frames(x)
         field = self.fields["deformation"]
-        modes = field.modes[..., : self.latent_dim].double() / field.leading
-        return coefficients(x, self.X + field.mean, modes)
+        origin = self.X + field.mean
+        rows = (field.modes[..., : self.latent_dim].double() / field.leading).flatten(0, 1)
+        blocks = x.split(max(1, ENCODED_ENTRIES // origin.numel()))
+        return torch.cat([(block.to(origin) - origin).flatten(1) @ rows for block in blocks])
 
     @override
     @torch.no_grad()

@@ -23,7 +23,7 @@ from nsf.kinematics.fields.decoders import MlpRestriction, Waves, pair
 from nsf.kinematics.fields.encoder import Encoder
 from nsf.kinematics.fields.networks import ARITHMETIC, FullyConnected, TensorCores
 from nsf.kinematics.manifold import Manifold, identity
-from nsf.kinematics.training.phases import PHASES, TARGETS, Fit, at_least, per_phase
+from nsf.kinematics.training.phases import PHASES, TARGETS, Fit, per_phase
 from nsf.vectors import number, spaced
 
 HIDDEN_LAYERS = 5
@@ -69,9 +69,9 @@ class MlpField:
 
     def __post_init__(self) -> None:
         per_phase("beta", self.beta)
-        at_least("octaves", number("octaves", self.octaves, whole=True), 0, MOST_OCTAVES)
+        number("octaves", self.octaves, 0, whole=True, most=MOST_OCTAVES)
         for key in ("noise", "noise_floor", "tangent", "evenness"):
-            at_least(key, getattr(self, key), 0)
+            number(key, getattr(self, key), 0)
         if self.affine != "latent":
             raise ConfigError(
                 f"field.affine={self.affine}: C of field=mlp does not depend on the latent vector's rate; "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -63,18 +62,6 @@ def per_phase(key: str, value: int | Sequence[int], most: int = MOST_WIDE) -> tu
             "give n, [g, h=l] or [g, h, l]"
         )
     return (*entries, *entries[-1:] * (3 - len(entries)))
-
-
-def at_least(key: str, value: float, least: float, most: float = math.inf) -> None:
-    """Refuse a value below its least or above its most, naming both.
-
-    Raises:
-        ConfigError: value < least, value > most, or not a number.
-    """
-    if not value >= least:
-        raise ConfigError(f"{key}={value} is below its least value; choose {key} >= {least}")
-    if value > most:
-        raise ConfigError(f"{key}={value} is above its largest value; choose {key} <= {most}")
 
 
 def seed_of(*stream: int) -> int:

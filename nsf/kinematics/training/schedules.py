@@ -13,7 +13,8 @@ from torch import Tensor
 from typing_extensions import override
 
 from nsf.errors import ConfigError
-from nsf.kinematics.training.phases import MOST_STEPS, PHASES, Fit, at_least, per_phase, seeded
+from nsf.kinematics.training.phases import MOST_STEPS, PHASES, Fit, per_phase, seeded
+from nsf.vectors import number
 
 # A field fitted to whole snapshots sees all of them in a step, up to so many; of more, so many drawn anew.
 MOST_AT_ONCE, DRAWN = 6000, 2048
@@ -76,7 +77,7 @@ class PaperTrainer(Trainer):
                 f"learning_rates={list(self.learning_rates)} must be positive; the paper has 1e-3 … 5e-5"
             )
         for key in ("epochs_deformation", "epochs_stress", "epochs_affine", "frames_per_batch"):
-            at_least(key, getattr(self, key), 1)
+            number(key, getattr(self, key), 1, whole=True)
 
     def _batches(self, frames: int) -> int:
         return math.ceil(frames / self.frames_per_batch)
@@ -129,7 +130,7 @@ class FastTrainer(Trainer):
                 f"learning_rate={self.learning_rate} must be positive; choose for example 0.002"
             )
         for key in ("frames_per_batch", "particles_per_batch"):
-            at_least(key, getattr(self, key), 1)
+            number(key, getattr(self, key), 1, whole=True)
 
     @override
     def steps_of(self, phase: str, frames: int) -> int:

@@ -14,10 +14,11 @@ import torch
 from nsf.data import Snapshots
 from nsf.kinematics.manifold import Manifold
 from nsf.kinematics.training.descent import CHECKPOINT, Descent
-from nsf.kinematics.training.phases import Fit, at_least, seeded
+from nsf.kinematics.training.phases import Fit, seeded
 from nsf.kinematics.training.schedules import Trainer
 from nsf.kinematics.training.tracking import check_tracking
 from nsf.storage import refusals, writing
+from nsf.vectors import number
 
 WEIGHTS_STREAM = 1 << 30  # apart from the phases' streams
 
@@ -76,7 +77,7 @@ def train(
 
     Source: Zong et al. 2023, section 4.5.
     """
-    at_least("latent_dim", latent_dim, 1)
+    number("latent_dim", latent_dim, 1, whole=True)
     check_tracking(tracking)
     device, folder = torch.device(device), Path(folder)
     with refusals(folder), _deterministic():
