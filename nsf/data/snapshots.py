@@ -1,11 +1,10 @@
 """Every frame of several trajectories as one set of training snapshots."""
 
 import collections
+import itertools
 import os
-import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -84,7 +83,7 @@ class Snapshots:
         self._first = np.cumsum([0, *frames])
         self.X = torch.tensor(first.X, device=self.device)
         self.trajectory = torch.tensor(index, device=self.device)
-        self.frame = torch.tensor(np.arange(self.M) - self._first[index], device=self.device)
+        self.frame = torch.tensor(np.concatenate([np.arange(n) for n in frames]), device=self.device)
         self.parameters = torch.tensor(
             np.array(values, dtype="f8").reshape(len(frames), -1)[index], device=self.device
         )
@@ -110,14 +109,7 @@ class Snapshots:
         Returns:
             [M,n,c] float32; on resident data a slice is a view, not to be written to.
         """
-        if field in self._data:
-            return self._data[field][:, self._on_device(particles)]
-        columns = _on_host(particles)
-        count = len(range(self.P)[columns]) if isinstance(columns, slice) else len(columns)
-        out = np.empty((self.M, count, _components(field)), "f4")
-        for trajectory, (first, end) in self._spans():
-            trajectory.read(field, slice(None), columns, out=out[first:end])
-        return torch.from_numpy(out).to(self.device)
+        return self.gather(field, slice(None), particles)
 
     def gather(
         self, field: str, rows: Indices, particles: Indices
@@ -138,14 +130,12 @@ class Snapshots:
             if isinstance(rows, slice) or isinstance(particles, slice):
                 return data[rows, particles]
             return data[rows[:, None], particles]
-        columns = _on_host(particles)
-        count = len(range(self.P)[columns]) if isinstance(columns, slice) else len(columns)
-        numbers = np.arange(self.M)[_on_host(rows)]
-        out = np.empty((len(numbers), count, _components(field)), "f4")
-        for i, row in enumerate(numbers):
-            index = np.searchsorted(self._first, row, side="right") - 1
-            self.trajectories[index].read(field, row - self._first[index], columns, out=out[i : i + 1])
-        return torch.from_numpy(out).to(self.device)
+        if field not in COMPONENTS:
+            raise ShapeError(f"field={field!r}; choose one of {', '.join(COMPONENTS)}")
+        columns, numbers = _on_host(particles), np.arange(self.M)[_on_host(rows)]
+        out = torch.empty(len(numbers), len(np.arange(self.P)[columns]), COMPONENTS[field])
+        self._read(field, numbers, columns, out)
+        return out.to(self.device)
 
     def close(self) -> None:
         """Close the files; resident data stay readable."""
@@ -153,45 +143,36 @@ class Snapshots:
             trajectory.close()
 
     def _load(self, field: str) -> Tensor:
+        """A field [M,P,c] on the device, block by block."""
         data = torch.empty((self.M, self.P, COMPONENTS[field]), device=self.device)
         together = max(1, _STAGING_BYTES // (4 * self.P * COMPONENTS[field]))
-        pieces = [
-            (data[begin:end][first : first + together], trajectory, slice(first, first + together))
-            for trajectory, (begin, end) in self._spans()
-            for first in range(0, end - begin, together)
-        ]
-        staging = threading.local()
 
-        def read(piece: tuple[Tensor, Trajectory, slice]) -> None:
-            part, trajectory, frames = piece
-            if part.device.type == "cpu":
-                trajectory.read(field, frames, out=part.numpy())
-                return
-            # Pinned memory, taken once a thread, is what a GPU copies from at full speed.
-            if not hasattr(staging, "memory"):
-                staging.memory = torch.empty((together, *data.shape[1:]), pin_memory=True)
-            host = staging.memory[: len(part)]
-            trajectory.read(field, frames, out=host.numpy())
-            part.copy_(host)
+        def read(first: int) -> None:
+            block = data[first : first + together]
+            # Pinned memory is what a GPU copies from at full speed.
+            host = torch.empty(block.shape, pin_memory=True) if data.is_cuda else block
+            self._read(field, np.arange(first, first + len(block)), slice(None), host)
+            if data.is_cuda:
+                block.copy_(host)
 
         with ThreadPoolExecutor(_READERS) as pool:
-            collections.deque(pool.map(read, pieces), maxlen=0)  # raises what one of them raised
+            collections.deque(pool.map(read, range(0, self.M, together)), maxlen=0)  # raises what one raised
         return data
 
-    def _spans(self) -> Iterator[tuple[Trajectory, tuple[int, int]]]:
-        """Each trajectory with the first of its rows and the one after its last."""
-        yield from zip(self.trajectories, pairwise(self._first.tolist()), strict=True)
+    def _read(self, field: str, rows: np.ndarray, columns: slice | np.ndarray, out: Tensor) -> None:
+        """Rows of a field from the files into a tensor on the host, neighbouring frames together."""
+        index = np.searchsorted(self._first, rows, side="right") - 1
+        frames, values = rows - self._first[index], out.numpy()
+        parts = np.flatnonzero((np.diff(rows) != 1) | (np.diff(index) != 0)) + 1
+        for first, end in itertools.pairwise([0, *parts.tolist(), len(rows)]):
+            if first < end:
+                together = slice(frames[first], frames[first] + end - first)
+                self.trajectories[index[first]].read(field, together, columns, out=values[first:end])
 
     def _on_device(self, indices: Indices) -> slice | Tensor:
         if isinstance(indices, slice):
             return indices
         return torch.as_tensor(indices, dtype=torch.int64, device=self.device)
-
-
-def _components(field: str) -> int:
-    if field not in COMPONENTS:
-        raise ShapeError(f"field={field!r}; choose one of {', '.join(COMPONENTS)}")
-    return COMPONENTS[field]
 
 
 def _on_host(indices: Indices) -> slice | np.ndarray:

@@ -248,7 +248,8 @@ class Trajectory:
         stored = self._frames[field]
         rows = _selection(frames, self.frames, "frame")
         columns = _selection(slice(None) if particles is None else particles, self.particles, "particle")
-        numbers, count = np.arange(self.frames)[rows], len(np.arange(self.particles)[columns])
+        numbers = np.arange(self.frames)[rows]
+        count = len(range(self.particles)[columns]) if isinstance(columns, slice) else len(columns)
         shape = (len(numbers), count, COMPONENTS[field])
         if out is None:
             out = np.empty(shape, stored.dtype.newbyteorder("="))
