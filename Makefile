@@ -103,7 +103,7 @@ REPRODUCED := table1 noise sampling latent_dim training timestep generalise supe
 
 reproduce: install  ## every report, from nothing, on one GPU; the same command goes on where it was stopped
 	@echo 'first the jelly cube at the paper'\''s size, whose rates tell how long the others take at most'
-	$(BIN)/nsf run scene=jelly_cube scale=paper engine=operators
+	$(BIN)/nsf run scene=jelly_cube scale=paper model=recurrence
 	@for e in $(REPRODUCED); do $(BIN)/nsf plan +experiment=$$e | sed -n "s/^in all/in all, $$e:/p"; done
 	@failed=; for e in $(REPRODUCED); do $(BIN)/nsf run +experiment=$$e || failed="$$failed $$e"; done; \
 		[ -z "$$failed" ] || { echo "not whole:$$failed; make reproduce goes on" >&2; exit 1; }
@@ -113,7 +113,7 @@ reproduce: install  ## every report, from nothing, on one GPU; the same command 
 	$(BIN)/nsf reports folder=reports check=true
 
 # Two moduli of a pressed frame, as docs/howto/inverse.md has them.
-FRAME := scene=metal scale=small engine=operators device=cpu latent_dim=8 \
+FRAME := scene=metal scale=small model=recurrence device=cpu latent_dim=8 \
 	'+scene.parameters.E={key:material.E,unit:Pa,range:[1.2,1.8]}' '+scene.parameters.hardening.range=[0.0,0.2]' \
 	'scene.design={_target_:nsf.scenes.Grid,train:[4,4],validation:16,test:2}'
 
@@ -127,7 +127,7 @@ calibration: install  ## the reports of calibration, sensitivities and design, o
 		device=cpu folder=reports/sensitivities
 	$(BIN)/nsf design +experiment=inverse/tilt x@0.5:0.5:0.24=0.52 tilt=10 knots=3 friction_angle=30 device=cpu \
 		folder=reports/design
-	for s in simulate train deploy; do $(BIN)/nsf $$s scene=block engine=operators device=cpu || exit; done
+	for s in simulate train deploy; do $(BIN)/nsf $$s scene=block model=recurrence device=cpu || exit; done
 	$(BIN)/nsf design run=block x@0.4:0.4:0.26=0.42 tilt=30 knots=4 E=6000 density=100 device=cpu \
 		folder=reports/design_block
 

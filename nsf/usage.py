@@ -4,7 +4,7 @@ STAGES = {
     "run": "the whole chain: simulate, train, deploy, evaluate, report; unchanged stages are reused",
     "simulate": "full-order trajectories of every case",
     "train": "the manifold: encoder and deformation, stress and affine fields",
-    "teach": "what engine=operators learns of the reduced step; deploy asks for it by itself",
+    "teach": "what model=recurrence learns of the reduced step; deploy asks for it by itself",
     "deploy": "reduced runs of the held-out cases",
     "evaluate": "errors and costs of the reduced runs beside the full-order ones",
     "report": "tables, charts and pictures of every evaluated variant of the scene",
@@ -28,7 +28,7 @@ TOOLS = {
         "key=low..high[:log] … [key=value …] [search.objectives=[delta,step_ms]] [search.trials=20]",
     ),
     "calibrate": (
-        "parameters from observations by runs of engine=operators, how sure they are, a full-order run there",
+        "parameters from observations by runs of model=recurrence, how sure they are, a full-order run there",
         "observations=FILE [run=RUN] [NAME=LOW..HIGH|VALUE …] [program=N] [full_order=true] [starts=64]\n"
         "       [device=auto] [folder=PATH]; or trials=N [run=RUN,RUN | +experiment=NAME] [seed=0]\n"
         "       [folder=PATH]: full-order runs at known parameters, observed with noise",
@@ -67,7 +67,7 @@ TOOLS = {
 _EXAMPLES = """\
 examples:
   nsf run scene=sand scale=small                       the paper's method in a minute or two, on a CPU
-  nsf run scene=sand method=deformation_only           the baseline beside it, in the same report
+  nsf run scene=sand stress=deformation affine=none    the baseline beside it, in the same report
   nsf run scene=sand scene.design.test=[23,30.5]       other held-out cases
   nsf run -m scene=sand latent_dim=4,6 sampler.size=50,150   every combination
   nsf plan scene=cake scale=paper                      what that would take, before it begins

@@ -13,11 +13,11 @@ from types import SimpleNamespace
 import numpy as np
 
 from nsf import Manifold
-from nsf.dynamics import GaussNewton, Method
+from nsf.dynamics import GaussNewton, Sources
 
 FOLDER = Path(__file__).parent / "references"
 MANIFOLD, STEPS = FOLDER / "manifold.pt", FOLDER / "steps.npz"
-METHODS = [Method(f"{a}{b}", a, b) for a in (True, False) for b in (True, False)]
+SOURCES = [Sources(stress, affine) for stress in ("field", "deformation") for affine in ("field", "none")]
 TOLERANCES = (1e-6, 0.1)  # of the projector; with the larger one update is enough in every step
 KEPT = ("xhat", "residuals", "updates", "stops")
 
@@ -27,24 +27,24 @@ def manifold() -> Manifold:
     return Manifold.load(MANIFOLD)
 
 
-def steps(scene, manifold, device: str, method: Method, tolerance: float, **options):
+def steps(scene, manifold, device: str, sources: Sources, tolerance: float, **options):
     """Trajectory of 24 steps of the modal engine with |S| = 60."""
     projector = GaussNewton(tolerance=tolerance)
-    options |= {"method": method, "device": device, "projector": projector}
+    options |= {"sources": sources, "device": device, "projector": projector}
     solver = scene.reduced(manifold, {"friction_angle": 26.0}, 60, **options)
     solver.step(24)
     return solver.trajectory()
 
 
-def steps_of_a_cpu(method: Method, tolerance: float) -> SimpleNamespace:
+def steps_of_a_cpu(sources: Sources, tolerance: float) -> SimpleNamespace:
     """The same, as they were committed: x̂ [25, r], residuals, updates and stops."""
     with np.load(STEPS) as kept:
-        found = {name: kept[_key(method, tolerance, name)] for name in KEPT}
+        found = {name: kept[_key(sources, tolerance, name)] for name in KEPT}
     return SimpleNamespace(**found | {"stops": found["stops"].tolist()})
 
 
-def _key(method: Method, tolerance: float, name: str) -> str:
-    return f"{method.name} {tolerance} {name}"
+def _key(sources: Sources, tolerance: float, name: str) -> str:
+    return f"{sources.stress == 'field'}{sources.affine == 'field'} {tolerance} {name}"
 
 
 def write() -> None:
@@ -59,9 +59,9 @@ def write() -> None:
             pipeline.run("train")
             shutil.copyfile(pipeline.training.path / "manifold.pt", MANIFOLD)
     found = {}
-    for method, tolerance in product(METHODS, TOLERANCES):
-        trajectory = steps(pipeline.scene, manifold(), "cpu", method, tolerance)
-        found |= {_key(method, tolerance, name): getattr(trajectory, name) for name in KEPT}
+    for sources, tolerance in product(SOURCES, TOLERANCES):
+        trajectory = steps(pipeline.scene, manifold(), "cpu", sources, tolerance)
+        found |= {_key(sources, tolerance, name): getattr(trajectory, name) for name in KEPT}
     np.savez_compressed(STEPS, **found)
 
 

@@ -46,7 +46,7 @@ def measured(
     first = chain.solver_at(manifold, chain.held_out[0])
     samples, sets, particles = first.samples, first.sets, len(first.state)
     del first  # its arrays are on the device
-    how = {"method": chain.method, "projector": chain.projector, "integration": chain.integration}
+    how = {"sources": chain.sources, "projector": chain.projector, "integration": chain.integration}
 
     def make(size: int, precision: str):
         options = how | {"sets": sets, "precision": precision, "device": settings.device}

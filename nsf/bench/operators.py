@@ -40,7 +40,7 @@ def run(settings: Settings, found: Result, say: Callable[[str], object]) -> None
     """Each scene, 1 024 runs of `metal` at once, and the sand column with 4 million particles.
 
     At the paper's size on a GPU; on a CPU at small scale, and with 20 000 particles. Data, training and
-    teaching are made, or reused, as by `nsf teach engine=operators`. Where `scenes` or `particles` are given,
+    teaching are made, or reused, as by `nsf teach model=recurrence`. Where `scenes` or `particles` are given,
     these are all.
     """
     for scene in settings.scenes or (() if settings.particles else SCENES):
@@ -53,7 +53,7 @@ def run(settings: Settings, found: Result, say: Callable[[str], object]) -> None
 
 def _chain(scene: str, settings: Settings, say: Callable[[str], object]) -> Pipeline:
     asked = [f"scene={scene}", f"scale={scale_of(settings.device)}", f"device={settings.device}"]
-    return Pipeline(config.load([*asked, "engine=operators"]), say=say)
+    return Pipeline(config.load([*asked, "model=recurrence"]), say=say)
 
 
 def measured(
@@ -62,7 +62,7 @@ def measured(
     """Add the rows of one scene in its first held-out case.
 
     Args:
-        chain: of the scene, with `engine=operators`.
+        chain: of the scene, with `model=recurrence`.
         settings, found, say: as for `run`.
         many: runs at once, in rows of their own; 0 for none.
     """
@@ -92,7 +92,7 @@ def measured_decoded(
     shorter steps (`scaling.at_size`), each of which counts as one by operators.
 
     Args:
-        chain: of the scene, with `engine=operators` and `field=basis`.
+        chain: of the scene, with `model=recurrence` and `field=basis`.
         particles: P.
         settings, found, say: as for `run`.
     """

@@ -84,7 +84,7 @@ def measured(
     def reduced(precision: str, multiplier: float, end: str = ""):
         samples, own = sets[end]
         return scene.reduced(
-            manifold, first, samples, sets=own, method=chain.method, projector=chain.projector,
+            manifold, first, samples, sets=own, sources=chain.sources, projector=chain.projector,
             integration=chain.integration, precision=precision, device=settings.device,
             dt_multiplier=multiplier,
         )  # fmt: skip
@@ -162,7 +162,8 @@ def measured_networks(
     manifold, case, name = chain.manifold(), chain.held_out[0], chain.scene.name
     truth, particles = chain.truth(case).path / TRAJECTORY, len(manifold.X)
     first = chain.solver_at(manifold, case)
-    options = {"sample": first.samples, "sets": first.sets, "device": settings.device, "method": chain.method}
+    options = {"sample": first.samples, "sets": first.sets, "device": settings.device}
+    options["sources"] = chain.sources
     options |= {"projector": chain.projector, "integration": chain.integration}
     del first  # its arrays are on the device
     kind = "cuda" if settings.device.startswith("cuda") else "cpu"

@@ -156,7 +156,7 @@ def _built(
     rest = torch.as_tensor(chain.scene.particles().X)
     xhat = chain.manifold().encode(rest[None])[0].numpy()
     make = partial(
-        scene.reduced, fields, chain.held_out[0], method=chain.method, device=device,
+        scene.reduced, fields, chain.held_out[0], sources=chain.sources, device=device,
         projector=chain.projector, integration=chain.integration, xhat=xhat,
     )  # fmt: skip
     for number in samples:

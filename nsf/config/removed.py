@@ -7,12 +7,25 @@ from nsf.errors import ConfigError
 
 #: A dotted key, or `key=option`, and the remedy.
 REMOVED = {
-    "deploy.tolerance": "deploy.on_distrust=projected hands a run by operators on where it is not believed",
-    "engine=closed": "choose engine=operators, or engine=auto",
     "field=joint": "use field=basis",
     "sampler=greedy": "use sampler=qdeim or sampler=cubature",
     "trainer.budget_minutes": "set trainer.steps; a training's log says how many it takes a second",
+    "deploy.tolerance": "set fallback=projected, which goes on where a run is not believed",
     "trainer.devices": "a manifold trains on one device; hydra/launcher=joblib spreads jobs over GPUs",
+    "deploy.on_distrust": "set fallback=none, projected or full",
+    "deploy.error_ratio": "set model.error_ratio, of model=recurrence",
+    "engine=operators": "choose model=recurrence",
+    "engine=closed": "choose model=projected, or model=recurrence",
+    "method=nsf": "leave it out: stress=field affine=field are the paper's, and the default",
+    "method=deformation_only": "set stress=deformation affine=none, the baseline",
+    "method=neural_stress_only": "set affine=none",
+    "method=neural_affine_only": "set stress=deformation",
+    "method=history": "set stress=particles affine=particles",
+    "engine": "choose model=projected, or recurrence in place of engine=operators",
+    "engine.teacher": "set model.teacher=projected or runs, of model=recurrence",
+    "engine.check": "set model.check, of model=recurrence",
+    "engine.teaching": "set model.teaching, of model=recurrence",
+    "method": "set stress=field, deformation or particles, and affine=field, none or particles",
 }
 
 

@@ -34,22 +34,28 @@ class Kind(NamedTuple):
     functions: tuple[str, ...] = ()
 
 
+_MODEL = Kind("nsf.models", "nsf.models.Model")
+_TEACHING = Kind("nsf.engines.operators", "nsf.engines.operators.Teaching")
+_SYMMETRY = Kind("nsf.scenes", "nsf.scenes.Symmetry")
 _SHAPE = Kind("nsf.scenes", "nsf.scenes.Shape", ("nsf.scenes.mesh_or_ball",))
 
 #: What each key expects; `*` stands for any name. A new group of conf/ is a line here.
 KINDS = {
-    "engine.teaching": Kind("nsf.engines.operators", "nsf.engines.operators.Teaching"),
-    "engine.teaching.symmetry": Kind("nsf.scenes", "nsf.scenes.Symmetry"),
     "field": Kind("nsf.kinematics.fields", "nsf.kinematics.training.train.Field"),
     "integration": Kind("nsf.dynamics", "nsf.dynamics.Integration"),
     "material": Kind("nsf.mpm.materials", "nsf.mpm.materials.Material"),
-    "method": Kind("nsf.dynamics", "nsf.dynamics.Method"),
+    "model": _MODEL,
+    "model.teaching": _TEACHING,
+    "model.teaching.symmetry": _SYMMETRY,
+    "model.of.*": _MODEL,
+    "model.of.*.teaching": _TEACHING,
+    "model.of.*.teaching.symmetry": _SYMMETRY,
     "projector": Kind("nsf.dynamics", "nsf.dynamics.projection.Projector"),
     "sampler": Kind("nsf.sampling", "nsf.sampling.Sampler"),
     "trainer": Kind("nsf.kinematics.training", "nsf.kinematics.training.schedules.Trainer"),
     "transfer": Kind("nsf.mpm", "nsf.mpm.Transfer"),
     "scene.design": Kind("nsf.scenes", "nsf.scenes.Design"),
-    "scene.reduced.symmetry": Kind("nsf.scenes", "nsf.scenes.Symmetry"),
+    "scene.reduced.symmetry": _SYMMETRY,
     "scene.walls": Kind("nsf.mpm", "nsf.mpm.DomainWalls"),
     "scene.colliders.*": Kind("nsf.mpm", "nsf.mpm.Collider"),
     "scene.colliders.*.motion": Kind("nsf.mpm", "nsf.mpm.Motion"),

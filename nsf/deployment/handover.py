@@ -16,7 +16,7 @@ from nsf.mpm.recording import blocks
 def hand_over(solver: ReducedMPM, rollout: Rollout) -> FullOrderMPM:
     """The full-order solver at the time and in the state in which the rollout handed over.
 
-    x, C and τ are the fields' at every particle, as the method takes them, and v is the backward difference
+    x, C and τ are the fields' at every particle, as the run takes them, and v is the backward difference
     of x, as in a reduced step. τ determines F_e up to a rotation, which the laws do not see, and history
     variables as far as the law can tell (`FullOrderMPM.resume`). At t = 0 the state is the scene's own.
 
@@ -86,5 +86,5 @@ def go_on(solver: ReducedMPM, rollout: Rollout, path: Path, stored: Precision = 
         raise InstabilityError(
             f"the reduced run at {rollout.case.named} was handed over to the full-order solver at "
             f"t = {rollout.t[rollout.handed_over]:.4g} s, which lost stability: {error}; "
-            "deploy with on_distrust=report, or simulate this case"
+            "deploy with fallback=none, or simulate this case"
         ) from error

@@ -3,7 +3,7 @@
 Every so many steps a projected step is taken from the operators' own state. What the operators missed of it,
 the defect, is added to their changes, from one such step to the next, and they run once more: how far this
 run is from the first estimates how far the first is from the projected one. Where a run leaves what it was
-taught or trained on, the projected step may go on, to the end. With method history particles carry stress
+taught or trained on, the projected step may go on, to the end. With stress=particles these carry stress
 that nobody knows in the midst of a run by operators: there the projected step takes the whole run anew, from
 t = 0. Where operators are too far off at validation runs, they take no step.
 """
@@ -17,7 +17,7 @@ import torch
 
 from nsf.data import Case
 from nsf.deployment.trust import Trust, first_distrusted
-from nsf.dynamics import History, ReducedBatch, ReducedMPM
+from nsf.dynamics import ReducedBatch, ReducedMPM
 
 #: Who takes a step.
 OPERATORS, PROJECTED, FULL_ORDER = range(3)
@@ -31,7 +31,7 @@ class Levels:
 
     Attributes:
         projected: cases → runs of the projected step at t = 0.
-        every: steps from one projected step to the next.
+        every: steps from one projected step to the next; 0: nothing is estimated.
         goes_on: whether the projected step goes on where a run is not to be believed.
         near: whether operators were near enough at validation runs; else the projected step takes all runs.
     """
@@ -41,22 +41,28 @@ class Levels:
     goes_on: bool = False
     near: bool = True
 
+    @property
+    def projects(self) -> bool:
+        """Whether projected steps are taken."""
+        return bool(self.every) or self.goes_on
+
     def watched(
-        self, batch: ReducedBatch, projected: ReducedBatch, trust: Trust
-    ) -> list[tuple[ReducedMPM, np.ndarray, np.ndarray]]:
+        self, batch: ReducedBatch, projected: ReducedBatch | None, trust: Trust
+    ) -> list[tuple[ReducedMPM, np.ndarray | None, np.ndarray]]:
         """Look at runs that operators have taken to their end.
 
         Args:
             batch: the runs.
-            projected: the same runs by projected steps, of `self.projected`; left in the midst of one.
+            projected: the same runs by projected steps, of `self.projected`; left in the midst of one. None
+                where none are taken.
             trust: the estimate of whether to believe a run.
 
         Returns:
             Of each run: the solver that holds all of it, its estimated error [N + 1] [m], which stays as it
-            is while the projected step goes on and is 0 of a run taken anew, and who took each step [N],
-            `OPERATORS` or `PROJECTED`.
+            is while the projected step goes on and is 0 of a run taken anew, None where nothing is estimated,
+            and who took each step [N], `OPERATORS` or `PROJECTED`.
         """
-        estimates = estimated_errors(batch, projected, self.every)
+        estimates = estimated_errors(batch, projected, self.every) if self.every else [None] * len(batch)
         found = []
         for run, estimate in zip(batch.runs, estimates, strict=True):
             believed = _believed(run, trust) if self.goes_on else run.steps_taken
@@ -69,7 +75,7 @@ class Levels:
 
 def _believed(run: ReducedMPM, trust: Trust) -> int:
     """How many of a run's steps are left to the operators: those before the last one that is believed."""
-    if run.doubt[0] > 1.0:
+    if max(run.doubt[0], trust.cases.of(run.setup.given)) > 1.0:
         return 0
     residuals = run.record.residuals[: run.steps_taken, -1].cpu().numpy()
     ratios = trust.ratios(run.record.xhat[: run.steps_taken + 1].cpu().numpy(), residuals)
@@ -78,8 +84,8 @@ def _believed(run: ReducedMPM, trust: Trust) -> int:
 
 
 def _projected_from(
-    step: int, run: ReducedMPM, solver: ReducedMPM, estimate: np.ndarray
-) -> tuple[ReducedMPM, np.ndarray, np.ndarray]:
+    step: int, run: ReducedMPM, solver: ReducedMPM, estimate: np.ndarray | None
+) -> tuple[ReducedMPM, np.ndarray | None, np.ndarray]:
     """Take a run to its end by projected steps.
 
     Args:
@@ -92,7 +98,7 @@ def _projected_from(
         As `Levels.watched`.
     """
     by = np.full(run.steps_taken, PROJECTED, np.int8)
-    if isinstance(solver.setup.method, History):
+    if solver.setup.sources.carried:
         step = 0
     if step:
         by[:step] = OPERATORS
@@ -104,6 +110,8 @@ def _projected_from(
         target.row.fill_(step)
         solver.together.resume(step)
     solver.step(len(by) - step)
+    if estimate is None:
+        return solver, None, by
     held = estimate[step] if step else 0.0  # of a run that is not finite, all is ∞
     return solver, np.where(np.arange(len(estimate)) < step, estimate, held), by
 

@@ -19,7 +19,7 @@ from nsf.errors import SchemaError
 from nsf.storage import writing
 from nsf.timing import synchronizer
 
-_VERSION = 3
+_VERSION = 4
 _SCALARS = {
     "away": float, "sample": int, "integration_mean": float, "needed_outside": int, "seconds": float,
     "diverged": int, "handed_over": int,
@@ -29,6 +29,8 @@ _REAL = ("<f4", "<f8")  # types of the arrays: that of the run
 #: Steps between looks at the trust of a run that is to be handed over: a look reads back, and what was
 #: done since the last one is lost.
 _LOOK = 20
+#: Stands for a stop reason where a step of the latent vector alone ends in no inversion.
+_LATENT = "latent"
 #: Times less than this share of Δt apart are the same.
 _SAME_TIME = 1e-6
 
@@ -51,9 +53,9 @@ class Rollout:
         handed_over: step from whose state the full-order solver goes on, −1 when it does not. The steps then
             end with the first distrusted one.
         estimate: [N + 1] how far a run by operators is from one by projected steps alone, as far as is known
-            [m]; None for a run without operators.
-        by: [N] who took each step: 0 operators, 1 the projected step, 2 the full-order solver, from
-            `handed_over` on; None for a run without operators, whose steps are projected.
+            [m]; None where nothing is estimated.
+        by: [N] who took each step: 0 a model of latent vectors alone, 1 the projected step, 2 the full-order
+            solver, from `handed_over` on; None for a run whose steps are projected.
     """
 
     case: Case
@@ -81,12 +83,12 @@ class Rollout:
 
     @property
     def projected_share(self) -> float:
-        """Share of steps, in a run with operators, that the projected step took; 0 of any other run."""
+        """Share of steps, in a run of another model, that the projected step took; 0 of any other run."""
         return 0.0 if self.by is None else float((self.levels == PROJECTED).mean())
 
     @property
     def by_operators(self) -> int:
-        """How many steps operators took."""
+        """How many steps a model of latent vectors alone took."""
         return int((self.levels == OPERATORS).sum())
 
     @property
@@ -102,8 +104,10 @@ class Rollout:
             file.attrs.update({"nsf_rollout": _VERSION} | {name: getattr(self, name) for name in _SCALARS})
             for name in _ARRAYS:
                 file[name] = getattr(self, name)
+            if self.by is not None:
+                file["by"] = self.levels
             if self.estimate is not None:
-                file["by"], file["estimate"] = self.levels, self.estimate
+                file["estimate"] = self.estimate
             file["stops"] = np.array(self.stops, dtype=h5py.string_dtype())
             file["case"] = self.case.numbers
             for name in ("names", "units"):
@@ -138,8 +142,9 @@ class Rollout:
             stops = hdf5.texts(file, "stops", (len(t) - 1,))
             numbers = hdf5.values(file, "case", ("<f8",), (None,))
             names, units = (hdf5.texts(file, f"case_{name}", numbers.shape) for name in ("names", "units"))
-            if "estimate" in file:  # of a run by operators
+            if "by" in file:
                 arrays["by"] = hdf5.array(file, "by", ("|i1",), (len(t) - 1,))[()]
+            if "estimate" in file:
                 arrays["estimate"] = hdf5.array(file, "estimate", _REAL, (len(t),))[()]
             found = cls(Case(names, numbers, units), **scalars, t=t, **arrays, stops=stops)
             found._check()
@@ -171,8 +176,7 @@ class Rollout:
                 raise SchemaError(f"has values of {name} that are negative or no numbers")
         if self.by is not None and not np.isin(self.by, range(len(LEVELS))).all():
             raise SchemaError("has steps by none of " + ", ".join(LEVELS))
-        # A step by operators ends in no inversion.
-        if unknown := set(self.stops) - {*STOP_REASONS, "operators"}:
+        if unknown := set(self.stops) - {*STOP_REASONS, _LATENT}:
             raise SchemaError(f"has stops={sorted(unknown)[0]!r}, which is no reason to stop")
 
 
@@ -223,7 +227,8 @@ def rollouts(
             by, estimate = np.full(taken.total_steps, PROJECTED, np.int8), np.zeros(taken.total_steps + 1)
         watched = [(run, estimate, by) for run in taken.runs]
     else:
-        projected = levels.projected(cases)  # built before the clock starts, as `batch` is
+        # Built before the clock starts, as `batch` is.
+        projected = levels.projected(cases) if levels.projects else None
         seconds, started = _timed_run(batch, None), time.perf_counter()
         watched = levels.watched(batch, projected, trust)
         del projected  # what comes after decodes every particle
@@ -233,8 +238,8 @@ def rollouts(
         own = _rollout_of(run, case, trust, until_distrusted, seconds)
         if by is not None:
             steps = len(own.stops)
-            own.by, own.estimate = by[:steps], estimate[: steps + 1]
-            own.stops = ["operators" if b == OPERATORS else s for b, s in zip(own.by, own.stops, strict=True)]
+            own.by, own.estimate = by[:steps], None if estimate is None else estimate[: steps + 1]
+            own.stops = [_LATENT if b == OPERATORS else s for b, s in zip(own.by, own.stops, strict=True)]
             if off > 1.0:
                 after = np.append(by[:1], own.by) == OPERATORS  # [steps + 1], of none as well
                 own.trust = np.where(after, np.maximum(own.trust, off), own.trust)

@@ -246,7 +246,8 @@ class Trust:
         Args:
             latent_distance: distance from the training latents.
             cases: distance from the training cases.
-            runs: x̂ [N + 1, r] and residuals [N] [m] of each run, as for `ratios`, as far as it went well.
+            runs: x̂ [N + 1, r] and residuals [N] [m] of each run, as for `ratios`, as far as it went well;
+                none where no run takes projected steps, so that distances alone count.
         """
         between = latent_distance.between_trajectories()
         apart = float(np.quantile(between, QUANTILE)) if len(between) else 0.0
@@ -325,5 +326,8 @@ def _nearest(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 
 def _largest(runs: list[np.ndarray]) -> float:
     """Largest value of all runs, at most `STRAY` medians of their own largest; never 0, since it divides."""
-    largest = [float(np.max(values, initial=np.finfo(float).tiny)) for values in runs]
+    tiny = float(np.finfo(float).tiny)
+    if not runs:
+        return tiny
+    largest = [float(np.max(values, initial=tiny)) for values in runs]
     return min(max(largest), STRAY * float(np.median(largest)))

@@ -4,28 +4,26 @@ from nsf.dynamics.batch import Batch
 from nsf.dynamics.inference import Decoder
 from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
 from nsf.dynamics.latent import LatentState, LatentTrajectory
-from nsf.dynamics.methods import History, Method
 from nsf.dynamics.projection import STOP_REASONS, GaussNewton, ProjectionResult, Taylor, stop_reasons
-from nsf.dynamics.setup import NSF, Setup
+from nsf.dynamics.setup import Setup
 from nsf.dynamics.solver import ReducedBatch, ReducedMPM
+from nsf.dynamics.sources import Sources
 
 __all__ = [
-    "NSF",
     "STOP_REASONS",
     "Batch",
     "Decoder",
     "GaussNewton",
-    "History",
     "Integration",
     "LatentState",
     "LatentTrajectory",
-    "Method",
     "NeighbourSearch",
     "ParticleSets",
     "ProjectionResult",
     "ReducedBatch",
     "ReducedMPM",
     "Setup",
+    "Sources",
     "Taylor",
     "stop_reasons",
 ]

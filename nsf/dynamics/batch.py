@@ -68,7 +68,7 @@ def _check_alike(first: Setup, other: Setup) -> None:
 
     shared = {
         "the manifold": first.manifold is other.manifold,
-        "the method": same(lambda setup: setup.method),
+        "where τ and C come from": same(lambda setup: setup.sources),
         "the projector": same(lambda setup: setup.projector),
         "the precision": same(lambda setup: setup.precision.name),
         "the device": same(lambda setup: str(setup.device)),
@@ -78,7 +78,7 @@ def _check_alike(first: Setup, other: Setup) -> None:
         "the number of colliders": same(lambda setup: len(setup.scene.colliders)),
         "Δt or the number of steps": same(lambda setup: (setup.dt, setup.total_steps)),
         "the sample": _same_sample(first, other),
-        "the law": first.method.neural_stress
+        "the law": first.sources.neural_stress
         or same(lambda setup: setup.scene.material.functions(setup.precision)),
     }
     differing = [name for name, alike in shared.items() if not alike]

@@ -14,12 +14,12 @@ AffineSource = Callable[[torch.Tensor, torch.Tensor], torch.Tensor | None]
 class Inference:
     """x, v, τ and C at the integration particles N.
 
-    x = g(X, x̂_n), v = (g(X, x̂_n) − g(X, x̂_{n−1})) / Δt, and τ and C as the method takes them, C with
+    x = g(X, x̂_n), v = (g(X, x̂_n) − g(X, x̂_{n−1})) / Δt, and τ and C from their sources, C with
     dx̂/dt = (x̂_n − x̂_{n−1}) / Δt.
 
     Args:
         at: the fields restricted to N.
-        stress, affine: sources of τ and C (`Method.stress_of`, `Method.affine_of`).
+        stress, affine: sources of τ and C (`Sources.stress_of`, `Sources.affine_of`).
         dt: step [s].
 
     Source: paper section 5.1.
@@ -63,7 +63,7 @@ class Inference:
 
 
 class Decoder:
-    """x, τ and C at the points of a restriction, as a method takes them.
+    """x, τ and C at the points of a restriction, from their sources.
 
     Without a stress field τ comes from ∂g/∂X, without an affine field C is 0: what the run used, not what
     the manifold could have given.

@@ -118,7 +118,7 @@ class LatentState:
     def numpy(self) -> dict[str, np.ndarray]:
         """Every particle's x, v [P, 3], C, tau [P, 3, 3], as of the full-order state, and xhat [r].
 
-        C and tau are the fields', also where particles carry others (`History`).
+        C and tau are the fields', also where particles carry others (`Sources`).
         """
         run = self._run
         decoder, now = run.decoder(), run.xhat[None]

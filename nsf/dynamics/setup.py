@@ -9,15 +9,14 @@ from nsf.data import hash_of_positions
 from nsf.dynamics.inference import AffineSource, Decoder, StressSource
 from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
 from nsf.dynamics.interop import torch_device, torch_dtype
-from nsf.dynamics.methods import History, Method
 from nsf.dynamics.projection import GaussNewton, Taylor, check_projector
+from nsf.dynamics.sources import Sources
 from nsf.errors import ConfigError, ShapeError
 from nsf.kinematics.manifold import Restriction
 from nsf.mpm import precision_of
 from nsf.mpm.device import warp_device
 from nsf.sampling.sampler import SampleSpan, check_well_posed
 
-NSF = Method("nsf", neural_stress=True, neural_affine=True)
 #: Positions decoded at once when every particle is asked for [values].
 _CHUNK = 2**25
 
@@ -30,7 +29,7 @@ class Setup:
         scene: the scene at its problem parameters.
         samples: sample particles by span of time.
         parameters: problem parameters by name.
-        method: which of τ and C come from fields.
+        sources: where τ and C come from; the paper's fields by default.
         projector: `GaussNewton` or `Taylor`, or one's own.
         integration: how N is found.
         precision: `fp64` or `fp32`.
@@ -61,7 +60,7 @@ class Setup:
         scene,
         samples: Sequence[SampleSpan],
         parameters: Mapping[str, float],
-        method: Method = NSF,
+        sources: Sources = Sources(),
         projector: GaussNewton | Taylor = GaussNewton(),
         integration: Integration = Integration(),
         precision: str = "fp64",
@@ -76,7 +75,7 @@ class Setup:
         check_projector(projector)
         for sample in samples:
             check_well_posed(len(sample.particles), manifold.latent_dim)
-        self.manifold, self.scene, self.method, self.projector = manifold, scene, method, projector
+        self.manifold, self.scene, self.sources, self.projector = manifold, scene, sources, projector
         self.integration, self.samples, self.given = integration, samples, dict(parameters)
         self.precision, self.device = precision_of(precision), warp_device(device)
         self.dtype, self.torch_device = torch_dtype(self.precision), torch_device(self.device)
@@ -110,7 +109,7 @@ class Setup:
     def _found_sets(self) -> list[ParticleSets]:
         """Particle sets of each span; supersets go over the training trajectories, decoded from latents."""
         P = len(self.constants)
-        if self.integration.strategy == "search" or isinstance(self.method, History):
+        if self.integration.strategy == "search" or self.sources.carried:
             return [
                 ParticleSets(s.particles, np.append(s.particles, np.delete(np.arange(P), s.particles)), None)
                 for s in self.samples
@@ -128,17 +127,17 @@ class Setup:
             found.append(self.search.superset(frames, sample.particles, self.integration.margin))
         return found
 
-    def sources(self, at: Restriction, particles: np.ndarray) -> tuple[StressSource, AffineSource]:
-        """The method's sources of τ and C at particles [n], to which the fields are restricted."""
+    def sources_at(self, at: Restriction, particles: np.ndarray) -> tuple[StressSource, AffineSource]:
+        """The sources of τ and C at particles [n], to which the fields are restricted."""
         mu, lam = (
             torch.as_tensor(values[particles], dtype=self.dtype, device=self.torch_device)
             for values in (self.constants.mu, self.constants.lam)
         )
         law = self.scene.material, mu, lam, self.precision, self.device
-        return self.method.stress_of(at, self.parameters, *law), self.method.affine_of(at, self.parameters)
+        return self.sources.stress_of(at, self.parameters, *law), self.sources.affine_of(at, self.parameters)
 
     def decoder(self, particles: np.ndarray | None = None, at: Restriction | None = None) -> Decoder:
-        """The fields at particles, as the method takes them.
+        """The fields at particles, as the run takes them.
 
         Args:
             particles: [n] their indices; every particle by default.
@@ -148,7 +147,7 @@ class Setup:
             particles = np.arange(len(self.constants))
         if at is None:
             at = self.manifold.restrict(particles, dtype=self.dtype, device=self.torch_device)
-        return Decoder(at, *self.sources(at, particles))
+        return Decoder(at, *self.sources_at(at, particles))
 
 
 def first_change(jacobian: torch.Tensor, velocity: torch.Tensor, dt: float) -> torch.Tensor:

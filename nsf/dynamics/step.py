@@ -15,7 +15,6 @@ from nsf.dynamics.batch import Batch
 from nsf.dynamics.inference import Inference
 from nsf.dynamics.integration import ParticleSets
 from nsf.dynamics.interop import as_scalars
-from nsf.dynamics.methods import History
 from nsf.dynamics.span import GridSpan, Stages
 from nsf.mpm import stressed
 from nsf.mpm.transfer import make_g2p_stress
@@ -38,7 +37,7 @@ class Step(GridSpan):
         at = one.manifold.restrict(particles=sets.integration, dtype=one.dtype, device=one.torch_device)
         super().__init__(batch, sets, sets.integration, at.subset(slice(0, len(sets.sample))))
         self.record, self.projector = batch.record.of(0), one.projector
-        self.inference = Inference(at, *one.sources(at, sets.integration), one.dt)
+        self.inference = Inference(at, *one.sources_at(at, sets.integration), one.dt)
         self.weights = None
         if sample.weights is not None:
             self.weights = torch.as_tensor(
@@ -130,7 +129,7 @@ class SearchingStep(Step):
 
 
 class HistoryStep(Step):
-    """τ and C of each particle come from the grid and from what the particle went through (`History`).
+    """τ and C of each particle come from the grid and from what the particle went through (`Sources`).
 
     x and v are inferred from x̂ as in any step. Then every particle takes the full-order step, in which F_e,
     the history variables, τ and C go on; what it does to x and v is kept at S alone, to find x̂_{n+1}.
@@ -208,5 +207,5 @@ def steps_of(batch: Batch) -> Sequence[Step]:
     """The reference's step for each span of time of a batch of one run."""
     one = batch.shared
     kind = SearchingStep if one.integration.strategy == "search" else Step
-    kind = HistoryStep if isinstance(one.method, History) else kind
+    kind = HistoryStep if one.sources.carried else kind
     return [kind(batch, sample, sets) for sample, sets in zip(one.samples, one.sets, strict=True)]

@@ -14,10 +14,12 @@ class Engine(ABC):
     """Computes the steps of reduced runs; equal to the reference but for round-off, unless it is learned.
 
     Attributes:
-        name: as `engine=` takes it.
+        name: for the record.
+        moves_particles: whether a step moves sample particles, and not the latent vector alone.
     """
 
     name: ClassVar[str]
+    moves_particles: ClassVar[bool] = True
 
     @abstractmethod
     def refusal(self, setups: Sequence[Setup]) -> str:

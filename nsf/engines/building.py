@@ -8,7 +8,6 @@ from nsf.dynamics import ParticleSets, ReducedBatch, ReducedMPM, Setup
 from nsf.dynamics.interop import torch_device
 from nsf.engines.base import Engine
 from nsf.engines.choice import choose
-from nsf.engines.operators import Operators
 from nsf.errors import ConfigError, ShapeError
 from nsf.mpm.device import warp_device
 from nsf.sampling.sampler import RandomSampler, Sampler, SampleSpan, check_well_posed
@@ -88,8 +87,7 @@ def _setup(scene, manifold, parameters, sample: Sample, engine: str | Engine, op
     parameters = scene.case(parameters or {})
     scene = scene.with_parameters(parameters)
     if sample is None:
-        known = isinstance(engine, Operators)
-        sample = engine.samples if known else int(scene.config.scene.reduced.sample)
+        sample = getattr(engine, "samples", None) or int(scene.config.scene.reduced.sample)
     if isinstance(sample, int | np.integer):
         check_well_posed(int(sample), manifold.latent_dim)
         sample = RandomSampler(size=int(sample))
@@ -104,11 +102,11 @@ def _setup(scene, manifold, parameters, sample: Sample, engine: str | Engine, op
 
 def _sampled(scene, manifold, sampler: Sampler, engine: str | Engine, options: dict) -> list[SampleSpan]:
     """What a sampler chooses; one that learns from steps is given a solver whose sample is every particle."""
-    if isinstance(engine, Operators):  # which know one sample, and move no particle
+    if isinstance(engine, Engine) and not engine.moves_particles:
         engine = "auto"
     everyone = np.arange(len(manifold.X))
     whole = {"sample": everyone, "sets": [ParticleSets(everyone, everyone, None)], "engine": engine}
-    whole |= {k: options[k] for k in ("method", "precision", "device") if k in options}
+    whole |= {k: options[k] for k in ("sources", "precision", "device") if k in options}
     device = torch_device(warp_device(options.get("device", "auto")))
     return sampler.spans_of(
         manifold, device, lambda parameters: reduced(scene, manifold, parameters, **whole)

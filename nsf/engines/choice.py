@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from nsf.dynamics.setup import Setup
 from nsf.engines.base import Engine
 from nsf.engines.modal import Modal
-from nsf.engines.names import NAMES, OPERATORS
+from nsf.engines.names import NAMES
 from nsf.engines.reference import Reference
 from nsf.errors import ConfigError
 
@@ -33,13 +33,11 @@ def choose(wanted: str | Engine, setups: Sequence[Setup]) -> tuple[Engine, str]:
         candidates = list(ENGINES)
     elif wanted in known:
         candidates = [known[wanted]]
-    elif wanted == OPERATORS:
-        raise ConfigError(
-            f"engine={wanted} needs what was taught; give engine=nsf.engines.Operators.load(FILE) of a "
-            "teach run"
-        )
     else:
-        raise ConfigError(f"engine={wanted} is unknown; choose one of {', '.join(NAMES)}")
+        raise ConfigError(
+            f"engine={wanted} is unknown; choose one of {', '.join(NAMES)}, or give "
+            "nsf.engines.Operators.load(FILE) of a teach run"
+        )
     refusals = []
     for engine in candidates:
         refusal = engine.refusal(setups)

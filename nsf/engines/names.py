@@ -1,8 +1,4 @@
-"""Names of the engines, for checks that need none of them."""
+"""Names of the engines of projected steps, for checks that need none of them."""
 
-#: The engine of a file that `nsf teach` writes.
-OPERATORS = "operators"
-#: What `engine=` may be: from the fastest to the one that steps whatever can be stepped.
-NAMES = ("auto", "modal", "reference", OPERATORS)
-#: What `engine.teacher=` may be beside those: the full-order runs of training.
-RUNS = "runs"
+#: What `engine=` may be in Python: from the fastest to the one that steps whatever can be stepped.
+NAMES = ("auto", "modal", "reference")

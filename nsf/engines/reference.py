@@ -6,7 +6,6 @@ from typing import ClassVar
 from typing_extensions import override
 
 from nsf.dynamics.batch import Batch
-from nsf.dynamics.methods import History
 from nsf.dynamics.setup import Setup
 from nsf.dynamics.span import Span
 from nsf.dynamics.step import steps_of
@@ -22,8 +21,8 @@ class Reference(Engine):
     def refusal(self, setups: Sequence[Setup]) -> str:
         if len(setups) > 1:
             return f"it evaluates fields for one run at a time, not {len(setups)}: set deploy.batch=1"
-        if isinstance(setups[0].method, History) and len(setups[0].samples) > 1:
-            return "method=history takes one sample in a run: set sampler.phases=[]"
+        if setups[0].sources.carried and len(setups[0].samples) > 1:
+            return "stress=particles takes one sample in a run: set sampler.phases=[]"
         return ""
 
     @override

@@ -10,7 +10,7 @@ import torch
 
 from nsf.data import Trajectory
 from nsf.deployment import FULL_ORDER, Rollout
-from nsf.dynamics import Decoder, History, ReducedMPM
+from nsf.dynamics import Decoder, ReducedMPM
 from nsf.dynamics.setup import Setup
 from nsf.errors import SchemaError
 from nsf.evaluation import metrics
@@ -91,7 +91,7 @@ def compare(
     """Errors of a rollout against the trajectory of the same case.
 
     Args:
-        solver: the reduced solver of the rollout: it says what the method takes τ and C from. Where particles
+        solver: the reduced solver of the rollout: it says where τ and C come from. Where particles
             carried them, in a run of its own steps at the scene's Δt to the end, it takes the run once more;
             else the fields count.
         trajectory: the full-order run.
@@ -313,7 +313,7 @@ def _reduced_fields(
 def _carries(solver: ReducedMPM, rollout: Rollout, trajectory: Trajectory) -> bool:
     """Whether the solver takes the steps of the rollout itself, and its particles carry their stress."""
     own = not solver.span.latent_only and rollout.handed_over < 0 and rollout.diverged < 0
-    return isinstance(solver.setup.method, History) and own and solver.dt == trajectory.dt
+    return solver.setup.sources.carried and own and solver.dt == trajectory.dt
 
 
 class _Carried:

@@ -11,77 +11,16 @@ import numpy as np
 import torch
 
 from nsf.data import Trajectory
-from nsf.data.normalize import deviation
 from nsf.dynamics import ReducedMPM
 from nsf.errors import InstabilityError, NSFError
 from nsf.evaluation import metrics
 from nsf.evaluation.cost import Subject
 from nsf.kinematics.interpolation import interpolation
-from nsf.kinematics.manifold import Manifold
+from nsf.models import TrainingRuns
 from nsf.mpm.stability import largest_stable_dt
 from nsf.scenes import Scene
 
 _CHUNK = 2**24  # positions decoded at once
-
-
-@dataclass(frozen=True)
-class TrainingRuns:
-    """The latent vectors of the training trajectories, run by run.
-
-    Attributes:
-        parameters: [K, n] of each run, standardised over the runs; a parameter that never varies is 0. Where
-            programs force the runs, what these do in the course of a run stands beside.
-        latents: [K, F, r] of each frame.
-    """
-
-    parameters: np.ndarray
-    latents: np.ndarray
-    _mean: np.ndarray
-    _deviation: np.ndarray
-
-    @classmethod
-    def of(cls, manifold: Manifold, forcing: Sequence[np.ndarray] = ()) -> "TrainingRuns":
-        """Those that a manifold was trained on; all have the same frames.
-
-        Args:
-            manifold: trained fields.
-            forcing: [D] of each run, as `forcing_of` gives it; none where no program forces the runs.
-        """
-        run = manifold.training_trajectories.cpu().numpy()
-        count = int(run[-1]) + 1
-        latents = manifold.training_latents.cpu().double().numpy().reshape(count, -1, manifold.latent_dim)
-        values = manifold.training_parameters.cpu().double().numpy()
-        values = values.reshape(count, -1, values.shape[1])[:, 0]
-        mean, spread = values.mean(0), deviation(values)
-        if len(forcing):
-            # A whole program weighs as much as one parameter.
-            whole = np.stack(forcing)
-            weight = np.linalg.norm(whole.std(0)) or 1.0
-            values = np.hstack([values, whole])
-            mean = np.concatenate([mean, whole.mean(0)])
-            spread = np.concatenate([spread, np.full(whole.shape[1], weight)])
-        return cls((values - mean) / spread, latents, mean, spread)
-
-    def standardised(self, parameters: np.ndarray) -> np.ndarray:
-        """Parameters [n] in the units of `self.parameters`."""
-        return (np.asarray(parameters, float) - self._mean) / self._deviation
-
-    def nearest(self, parameters: np.ndarray) -> np.ndarray:
-        """[F, r] latent vectors of the training run whose parameters [n] are nearest; the first of equals."""
-        distance = np.linalg.norm(self.parameters - self.standardised(parameters), axis=1)
-        return self.latents[int(distance.argmin())]
-
-    def interpolated(self, parameters: np.ndarray) -> np.ndarray:
-        """[F, r] latent vectors, frame by frame interpolated over the training parameters.
-
-        The radial basis function |p − q| makes it piecewise linear in one parameter, constant beyond the
-        training values.
-        """
-        from scipy.interpolate import RBFInterpolator  # SciPy takes 0.2 s to load
-
-        values = self.latents.reshape(len(self.latents), -1)
-        fit = RBFInterpolator(self.parameters, values, kernel="linear", degree=0)
-        return fit(self.standardised(parameters)[None]).reshape(self.latents.shape[1:])
 
 
 def forcing_of(scene: Scene) -> np.ndarray:

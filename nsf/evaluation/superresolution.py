@@ -168,7 +168,7 @@ def _check_own(rollout: Rollout) -> None:
         raise ConfigError(
             f"the reduced run at {rollout.case.named} was handed over to the full-order solver at "
             f"t = {rollout.t[rollout.handed_over]:.4g} s and has no fields beyond; "
-            "deploy with deploy.on_distrust=report"
+            "deploy with fallback=none"
         )
 
 

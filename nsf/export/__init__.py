@@ -6,7 +6,7 @@ The module has `write(playback, folder)`, which gives the path to open, and `NEE
 
 FORMATS = {
     "html": "one self-contained page that plays in a browser, without a network",
-    "live": "the model itself in one page that runs, is steered and mailed; needs engine=operators",
+    "live": "the model itself in one page that runs, is steered and mailed; needs model=recurrence",
     "usd": "points with time samples for usdview, Omniverse, Blender or Houdini (.usdc)",
     "vtk": "points with stress and displacement for ParaView 5.12 or newer (.vtkhdf)",
     "onnx": "the three fields as graphs, and the run's latent vectors to feed them",

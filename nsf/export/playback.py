@@ -14,7 +14,7 @@ from nsf.bodies.colors import CLIP
 from nsf.data import Case, Trajectory
 from nsf.data.schema import TAU_COLUMNS, TAU_ROWS
 from nsf.deployment import Rollout, continuation_file, rollout_file
-from nsf.dynamics import Decoder
+from nsf.dynamics import Decoder, Sources
 from nsf.dynamics.interop import torch_device, torch_dtype
 from nsf.errors import ConfigError, MissingRunError, SchemaError
 from nsf.evaluation import metrics
@@ -147,7 +147,7 @@ class Playback:
         self.device = torch_device(self._warp_device)
         self._precision = precision_of(self._settings["precision"])
         self._dtype = torch_dtype(self._precision)
-        self._method = configuration.build(self._settings["method"], "method")
+        self._sources = Sources(self._settings["stress"], self._settings["affine"])
         self.manifold = Manifold.load(self._training.file("manifold.pt")).to(self.device)
         self._rollout = Rollout.open(run.file(rollout_file(index)), self.manifold.latent_dim)
         self.case, self._rest = self._rollout.case, continuation_file(index)
@@ -190,7 +190,7 @@ class Playback:
                 raise ConfigError(
                     f"points={points}: the full-order solver went on with this run at "
                     f"t = {self._rollout.t[self._rollout.handed_over]:.4g} s, and has its {len(X)} particles "
-                    "alone; leave points out, or deploy with deploy.on_distrust=report"
+                    "alone; leave points out, or deploy with fallback=none"
                 )
             constants = self._scene.resampled(points).particles()
             X = constants.X
@@ -200,7 +200,7 @@ class Playback:
             rows = np.sort(np.random.default_rng(0).permutation(len(X))[:points])
         self.X, self._rows = X[rows], rows
         self._moduli = None
-        if not self._method.neural_stress:
+        if not self._sources.neural_stress:
             constants = constants or self._scene.particles()
             self._moduli = constants.mu[rows], constants.lam[rows]
 
@@ -315,7 +315,7 @@ class Playback:
             yield Block(rows, torch.as_tensor(self.X[rows]).to(x), x, tau)
 
     def _decoder(self, rows: slice) -> Decoder:
-        """The fields at some of the points, combined as in the run's method."""
+        """The fields at some of the points, combined as in the run."""
         at = self.restricted(rows)
 
         def tensor(values: Sequence[float]) -> torch.Tensor:
@@ -325,8 +325,8 @@ class Playback:
         law = None, None, None
         if self._moduli is not None:
             law = self._scene.material, *(tensor(values[rows]) for values in self._moduli)
-        stress = self._method.stress_of(at, parameters, *law, self._precision, self._warp_device)
-        return Decoder(at, stress, self._method.affine_of(at, parameters))
+        stress = self._sources.stress_of(at, parameters, *law, self._precision, self._warp_device)
+        return Decoder(at, stress, self._sources.affine_of(at, parameters))
 
     def _read(self, rows: slice) -> tuple[torch.Tensor, torch.Tensor]:
         """x and τ of some of the points, in the frames of the full-order solver."""

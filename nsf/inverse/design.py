@@ -99,7 +99,7 @@ class Tilt(Program):
         if not 0.0 < self.angle <= most + 1e-9:
             raise ConfigError(
                 f"tilt={self.angle:g}° must lie above 0° and within the {most:.3g}° that was taught; or "
-                "teach with a larger engine.teaching.gravity"
+                "teach with a larger model.teaching.gravity"
             )
 
     @property

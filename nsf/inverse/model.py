@@ -45,7 +45,7 @@ class Model:
     """Runs by operators as a function of their problem parameters: batched, and differentiable by torch.
 
     Args:
-        run: complete deploy run with engine=operators.
+        run: complete deploy run with model=recurrence.
         device: `cpu`, `cuda`, `cuda:N` or `auto`.
 
     Attributes:
@@ -57,17 +57,17 @@ class Model:
 
     Raises:
         MissingRunError: the run, or its teaching, is not whole.
-        ConfigError: the run has another engine, or its operators do not fit it.
+        ConfigError: the run has another model, or its operators do not fit it.
         DeviceError: the device does not exist.
     """
 
     def __init__(self, run: Run, device: str = "auto"):
         self.run = run.require()
         self.pipeline = Pipeline.of_run(run, device, say=lambda line: None)
-        if self.pipeline.engine != Operators.name:
+        if self.pipeline.teaching is None:
             raise ConfigError(
-                f"{run.id} has engine={self.pipeline.engine}, whose steps know no gradient; deploy it with "
-                "engine=operators, which teaches them first"
+                f"{run.id} has model={self.pipeline.model.name}, whose steps know no gradient; deploy it "
+                "with model=recurrence, which is taught first"
             )
         self.manifold = self.pipeline.manifold()
         taught = next(parent for parent in run.parent_runs if parent.stage == "teach")
@@ -75,7 +75,7 @@ class Model:
         if self.operators.model.sizes.memory:
             raise ConfigError(
                 f"{run.id} has operators with a memory, whose steps know no gradient here; deploy it with "
-                "engine.teaching.memory=[]"
+                "model.teaching.memory=[]"
             )
         self.scene = self.pipeline.deployed
         one = self.pipeline.batch_at(

@@ -20,6 +20,7 @@ from nsf.evaluation.metrics import von_mises
 from nsf.live import page
 from nsf.live.model import LiveModel
 from nsf.live.wire import check_field, modal_field, network_arrays, shown
+from nsf.models import Model, Recurrence
 from nsf.pipeline import Pipeline
 from nsf.results.formats import file_name
 from nsf.runs import Run
@@ -48,7 +49,7 @@ def write(run: Run, folder: Path, points: int | None = None, device: str = "auto
     Raises:
         ConfigError: see `model_data`; the page would be too large to be mailed.
     """
-    _check_engine(run, Pipeline.of_run(run, device).engine)  # a model takes long to build
+    _check_model(run, Pipeline.of_run(run, device).model)  # a model takes long to build
     title, data = model_data(LiveModel(run, points or POINTS, device, surface=True))
     text = page.html(title, data)
     if (size := len(text.encode())) > LARGEST:
@@ -88,13 +89,13 @@ def model_data(model: LiveModel, sizes: Sizes = Sizes()) -> tuple[str, bytes]:
     """
     check_field(model)
     pipeline = model.pipeline
-    _check_engine(model.run, pipeline.engine)
+    _check_model(model.run, pipeline.model)
     operators = pipeline.operators()
     taught, network = operators.taught, operators.model
     if network.sizes.memory:
         raise ConfigError(
             f"{model.run.id} has operators with a memory, which a page has not; deploy it with "
-            "engine.teaching.memory=[]"
+            "model.teaching.memory=[]"
         )
     header, order = shown(model), {p.name: i for i, p in enumerate(model.parameters)}
     header["parameters"] = [header["parameters"][order[name]] for name in taught.parameters]
@@ -134,11 +135,11 @@ def ship(run: Run, path: Path, points: int, sizes: Sizes) -> None:
         partial.write_bytes(zlib.compress(data, 9))
 
 
-def _check_engine(run: Run, engine: str) -> None:
-    if engine != Operators.name:
+def _check_model(run: Run, model: Model) -> None:
+    if not isinstance(model, Recurrence):
         raise ConfigError(
-            f"{run.id} has engine={engine}, whose steps take more than a page can; deploy it with "
-            "engine=operators, which teaches them first"
+            f"{run.id} has model={model.name}, whose steps a page does not take; deploy it with "
+            "model=recurrence, which is taught first"
         )
 
 
@@ -153,7 +154,7 @@ def _fields(model: LiveModel, arrays: dict, header: dict, sizes: Sizes) -> dict:
     """Put the fields of x and, where the method takes τ from one, of τ into a page."""
     found = {}
     kinds: dict[str, tuple[type, int | None]] = {"deformation": (np.int16, sizes.modes)}
-    if model.pipeline.method.neural_stress:
+    if model.pipeline.sources.neural_stress:
         kinds["stress"] = np.int8, max(1, sizes.stress // (6 * len(model.X)))
         _, tau = model.training_frames()
         top = float(np.percentile(von_mises(torch.as_tensor(tau)).numpy(), CLIP)) or 1.0

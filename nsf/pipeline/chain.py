@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from omegaconf import DictConfig
@@ -17,10 +18,13 @@ from nsf.dynamics import ParticleSets, ReducedBatch, ReducedMPM
 from nsf.engines import Engine, Operators
 from nsf.kinematics.fields.mlp import MlpField
 from nsf.kinematics.manifold import Manifold
+from nsf.models import Auto
 from nsf.pipeline.plan import Plan
 from nsf.pipeline.reuse import report, reused, simulations
+from nsf.pipeline.stages.choosing import measure_candidates
 from nsf.pipeline.stages.deployment import CONFIGURATION, deploy_held_out
 from nsf.pipeline.stages.evaluation import evaluate, superresolve_held_out
+from nsf.pipeline.stages.fitting import fit, fitted, loaded
 from nsf.pipeline.stages.simulation import Job, Shared, simulate
 from nsf.pipeline.stages.teaching import OPERATORS, teach
 from nsf.pipeline.stages.training import train
@@ -43,6 +47,7 @@ class Pipeline(Plan):
         self._samples: Sequence[SampleSpan] | None = None
         self._sets: Sequence[ParticleSets] | None = None
         self._taught: Operators | None = None
+        self._fitted: Any = None
 
     @classmethod
     def of_run(cls, run: Run, device: str = "auto", say: Callable[[str], None] = print) -> "Pipeline":
@@ -144,7 +149,7 @@ class Pipeline(Plan):
         precision: str | None = None,
         engine: str | Engine | None = None,
     ) -> ReducedMPM:
-        """The reduced solver of a case, at t = 0; device, precision and engine as configured."""
+        """The reduced solver of a case, at t = 0; device, precision and model as configured."""
         return self.batch_at(manifold, [case], device, precision, engine).runs[0]
 
     def batch_at(
@@ -158,18 +163,18 @@ class Pipeline(Plan):
     ) -> ReducedBatch:
         """Reduced runs of several cases that take their steps together, likewise.
 
-        By the engine that is asked for, of the scene that is deployed, unless others are given.
+        By the configured model, of the scene that is deployed, unless an engine or a scene is given.
         """
-        if self.is_taught and self.taught.complete:
+        if self.teaching is not None and self.taught.complete:
             self.operators()  # which bring the sample, whoever takes the steps
         if engine is None:
-            engine = self.operators() if self.is_taught else self.engine
+            engine = self.model.engine(self, manifold)
         batch = (scene or self.deployed).reduced_batch(
             manifold,
             cases,
             self._samples or self.sampler,
             engine=engine,
-            method=self.method,
+            sources=self.sources,
             projector=self.projector,
             integration=self.integration,
             precision=precision or self.config.precision,
@@ -182,12 +187,13 @@ class Pipeline(Plan):
         return batch
 
     def teach(self) -> Run:
-        """The operators of the deployed step, where the engine that is asked for needs them.
+        """What the configured model learns, once, that all its runs use.
 
         Raises:
-            ConfigError: it does not.
+            ConfigError: it learns nothing.
         """
-        return self._made(self.taught, partial(teach, self))
+        taught = self.taught
+        return self._made(taught, partial(fit if self.teaching is None else teach, self))
 
     def operators(self) -> Operators:
         """The operators that were taught; their sample is that of all runs from here on.
@@ -200,11 +206,25 @@ class Pipeline(Plan):
             self._samples = self._taught.samples
         return self._taught
 
+    def fitted(self, manifold: Manifold) -> Any:
+        """What a model of latent vectors was fitted to, from its file where it learns.
+
+        Raises:
+            MissingRunError: it was not taught.
+        """
+        if self._fitted is None:
+            self._fitted = loaded(self.taught) if self.model.learns else fitted(self, manifold)
+        return self._fitted
+
     def deploy(self) -> Run:
         """Reduced trajectories of the held-out cases, through Lightning's `Trainer.predict`."""
         if self.is_taught and not self.taught.complete:
             self.teach()
-        return self._made(self.deployment, partial(deploy_held_out, self))
+        return self._made(self.deployment, self._deploy)
+
+    def _deploy(self, run: Run) -> None:
+        measured = measure_candidates(self) if isinstance(self.configured, Auto) else []
+        deploy_held_out(self, run, measured)
 
     def evaluate(self) -> Run:
         """Errors and costs of the reduced trajectories."""

@@ -23,7 +23,9 @@ _OPTIONAL = {"stages", "each", "printed"}
 _KEYS_OF_PARTS = {"title", "question", "parts"}
 _MORE_STAGES = ("superresolve",)  # that a job may do after those of `nsf run`
 #: Keys that a column of results.csv tells of.
-_COLUMNS = ("scene", "method", "field", "latent_dim", "engine", "sampler.size", "precision", "device")
+_COLUMNS = (
+    *("scene", "model", "stress", "affine", "field", "latent_dim", "sampler.size", "precision", "device"),
+)
 _MEASURING = "evaluation."  # keys of how runs are measured, which tell no two models apart
 
 

@@ -5,7 +5,6 @@ Neither torch nor Warp is imported, so that a mistake, or a chain whose results 
 
 from collections.abc import Sequence
 from copy import copy, deepcopy
-from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 
@@ -15,11 +14,12 @@ from nsf import config as configuration
 from nsf.config.code import code_of
 from nsf.data.case import Case
 from nsf.engines.modal.mirrors import edits
-from nsf.engines.names import OPERATORS, RUNS
 from nsf.engines.operators.teaching import Teaching, random_cases
 from nsf.errors import ConfigError
 from nsf.gpu import has_driver
-from nsf.pipeline.values import check_batch, check_lessons, check_numbers, check_words, factors
+from nsf.models import Auto, Model, Recurrence
+from nsf.paths import CONF, groups
+from nsf.pipeline.values import check_numbers, check_words, factors
 from nsf.results.folder import check_place
 from nsf.runs import Run
 from nsf.scenes.draft import Draft
@@ -31,7 +31,7 @@ STAGES = ("simulate", "train", "teach", "deploy", "evaluate", "report")
 _SCENE_KEYS = ("scale", "material", "transfer")
 #: Keys that hold others, none of which is left out.
 _SECTIONS = (
-    *("material", "transfer", "field", "trainer", "method", "sampler", "projector", "integration"),
+    *("material", "transfer", "field", "trainer", "model", "sampler", "projector", "integration"),
     *("data", "deploy", "evaluation", "super_resolution", "report"),
 )
 #: Cases between the training ones whose runs decide which round of teaching is kept.
@@ -49,7 +49,7 @@ class Names:
 
     Attributes:
         scene: that is trained on; deployed: that of the held-out simulations and of deployment.
-        engine: name of the engine that is asked for; teaching: of operators, None for another engine.
+        configured: the model that the configuration names, which may be `auto`.
         coarse: factors of Δx of the full-order runs that a reduced one is held to.
         split: cases by their use.
         device: found once, so that a missing GPU is reported before any work.
@@ -71,7 +71,7 @@ class Names:
         for key in _SECTIONS:
             configuration.section(config, key)
         check_numbers(config)
-        self.scene = Draft.from_config(config)
+        self.scene = Draft.from_config(with_candidates(config))
         c = self.config = self.scene.config
         self.split = self.scene.split
         if len(self.split.train) <= len(self.split.names):
@@ -79,15 +79,11 @@ class Names:
                 f"scene.design has {len(self.split.train)} training cases, and {', '.join(self.split.names)} "
                 f"need{'s' * (len(self.split.names) == 1)} at least {len(self.split.names) + 1}; add some"
             )
-        # A configuration from before there were engines has no such key.
-        self.engine = OmegaConf.select(c, "engine.name", default="auto")
-        self.teaching: Teaching | None = None
-        if self.engine == OPERATORS:
-            self.teaching = configuration.build(c.engine.teaching, "engine.teaching")
-            check_lessons(c, self.teaching, self.of_runs)
+        self.configured: Model = configuration.build(c.model, "model")
+        self._chosen: Model | None = None
         self.coarse = factors("evaluation.coarse", OmegaConf.select(c, "evaluation.coarse", default=[]))
-        check_words(c, self.engine)
-        check_batch(c, self.engine)
+        check_words(c)
+        self.configured.refuse(self)
         self.deployed = self._changed(c.deploy.changes)
         self.device = _device(c.device)
 
@@ -108,32 +104,51 @@ class Names:
         return self.scene.changed(changes)
 
     @property
+    def model(self) -> Model:
+        """The model that takes the steps; of `model=auto` the one that its deployment chose.
+
+        Raises:
+            MissingRunError: it has not chosen yet.
+        """
+        if not isinstance(self.configured, Auto):
+            return self.configured
+        if self._chosen is None:
+            self.choose(self.deployment.require().manifest["metrics"]["model"])
+        return self._chosen
+
+    def choose(self, name: str) -> None:
+        """Take one of the candidates of `model=auto`."""
+        self._chosen = self.configured.of[name]
+
+    def alone(self, name: str) -> DictConfig:
+        """The configuration of a candidate of `model=auto` by itself, deployed at the validation cases."""
+        config = self.scene.template.copy()
+        config.model = config.model.of[name]
+        config.deploy.split, config.fallback = "validation", "none"
+        return config
+
+    @property
     def stages(self) -> tuple[str, ...]:
-        """The stages of the chain, `teach` only where the engine that is asked for is taught."""
+        """The stages of the chain, `teach` only where the model learns by itself."""
         return tuple(name for name in STAGES if name != "teach" or self.is_taught)
 
     @property
     def is_taught(self) -> bool:
-        """Whether the engine that is asked for is of a file that the stage `teach` writes."""
-        return self.teaching is not None
+        """Whether the configured model is of a file that the stage `teach` writes."""
+        return self.configured.learns
 
     @property
-    def projecting(self) -> str:
-        """The engine of steps that are projected: that which is asked for, or which learned ones build on."""
-        if self.teaching is None:
-            return self.engine
-        return "auto" if self.of_runs else self.config.engine.teacher
+    def teaching(self) -> Teaching | None:
+        """How the recurrence is taught; None for another model."""
+        return self.model.teaching if isinstance(self.model, Recurrence) else None
+
+    #: The engine of projected steps: the compiled one where it can, else the reference.
+    projecting = "auto"
 
     @property
     def of_runs(self) -> bool:
-        """Whether operators learn from the full-order runs of training, not from the steps of an engine."""
-        return self.teaching is not None and self.config.engine.teacher == RUNS
-
-    @property
-    def error_ratio(self) -> float | None:
-        """Times the projected step's error at validation runs, that operators' may be; None for any."""
-        # A configuration from before there was the key has none.
-        return OmegaConf.select(self.config, "deploy.error_ratio", default=None)
+        """Whether a recurrence learns from the full-order runs of training, not from projected steps."""
+        return isinstance(self.model, Recurrence) and self.model.of_runs
 
     @property
     def held_out(self) -> tuple[Case, ...]:
@@ -205,7 +220,7 @@ class Names:
     @property
     def deployment(self) -> Run:
         """The run of the reduced trajectories."""
-        keys = ("method", "sampler", "projector", "integration", "precision")
+        keys = ("model", "stress", "affine", "fallback", "sampler", "projector", "integration", "precision")
         content = (
             self._content(keys)
             | self._physics(self.deployed)
@@ -213,18 +228,11 @@ class Names:
                 "cases": list(map(dict, self.held_out)),
                 "split": self.config.deploy.split,
                 "dt_multiplier": self.config.deploy.dt_multiplier,
-                "on_distrust": self.config.deploy.on_distrust,
                 "device": self.device,
             }
         )
         if self._of_networks:
             content["arithmetic"] = self.field.arithmetic
-        if self.engine != "auto":
-            content["engine"] = self.engine
-        if self.teaching is not None:
-            content |= {"check": self.config.engine.check}
-            if self.of_runs and self.error_ratio is not None:
-                content["error_ratio"] = self.error_ratio
         if changed := edits():  # an edited step is another run, whose result is not there yet
             content["edited"] = changed
         parents = [self.training, self.taught] if self.is_taught else [self.training]
@@ -246,25 +254,20 @@ class Names:
 
     @property
     def taught(self) -> Run:
-        """The run of the operators.
+        """The run of what the model learns.
 
         Raises:
-            ConfigError: the engine that is asked for learns nothing.
+            ConfigError: the model learns nothing.
         """
-        if not self.is_taught:
-            raise ConfigError(f"engine={self.engine} is not taught; set engine={OPERATORS}")
+        if not self.model.learns:
+            raise ConfigError(f"model={self.model.name} is not taught; set model=recurrence")
+        keys = ("stress", "affine", "sampler", "projector", "integration", "precision", "seed")
         content = (
-            self._content(("method", "sampler", "projector", "integration", "precision", "seed"))
+            self._content(keys)
             | self._physics(self.scene)
             | {"cases": [list(map(dict, cases)) for cases in self.lessons], "device": self.device}
+            | {"model": self.model.lesson, "dt_multiplier": self.config.deploy.dt_multiplier}
         )
-        content |= {
-            "teaching": asdict(self.teaching),
-            "teacher": self.config.engine.teacher,
-            "dt_multiplier": self.config.deploy.dt_multiplier,
-        }
-        if not self.teaching.runs:  # as it was named before there was the key
-            content["teaching"].pop("runs")
         if changed := edits():
             content["edited"] = changed
         return Run.open("teach", self.scene.name, content, [self.training], root=self.root)
@@ -275,10 +278,12 @@ class Names:
 
         Runs in those held back decide which round of teaching is kept. None is a validation or test case.
         Where runs are the teacher there is one round; how far its runs at validation values are off, or, if
-        there are none, at training, is what `deploy.error_ratio` is held to. Between are as many as asked.
+        there are none, at training, is what `model.error_ratio` is held to. Between are as many as asked.
         """
         known, seed = sorted(self.split.train), int(self.config.seed)
         taken = [*known, *self.split.validation, *self.split.test]
+        if self.teaching is None:
+            return [known]
         if self.of_runs:
             drawn = self.teaching.runs
             between = random_cases(self.split.box, drawn, seed, taken) if drawn else []
@@ -292,8 +297,6 @@ class Names:
         """The run of errors and costs."""
         content = self._content(("evaluation",))
         content["paper"] = self._content(("scene",))["scene"].get("paper")
-        if self.teaching is not None and self.config.evaluation.trials:
-            content["charged"] = "with projected steps"  # before, a run was timed by operators alone
         parents = [self.deployment, *map(self.truth, self.held_out)]
         return Run.open("evaluate", self.scene.name, content, parents, root=self.root)
 
@@ -360,6 +363,19 @@ class Names:
         content = {key: deepcopy(self.scene.plain[key]) for key in keys}
         code = code_of(content)
         return content | {"code": code} if code else content
+
+
+def with_candidates(config: DictConfig) -> DictConfig:
+    """A configuration with the candidates of `model=auto`, as their files have them; others as they are."""
+    model = config.model
+    if model.get("name") != "auto":
+        return config
+    config = config.copy()
+    names = model.get("candidates") or [name for name in groups()["model"] if name not in ("auto", "full")]
+    files = {name: OmegaConf.load(CONF / "model" / f"{name}.yaml") for name in names}
+    config.model.candidates = list(names)
+    config.model.of = OmegaConf.merge(files, model.get("of") or {})
+    return config
 
 
 def _device(asked) -> str:

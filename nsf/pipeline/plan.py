@@ -7,9 +7,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from nsf import config as configuration
 from nsf.data import Case
-from nsf.dynamics import History
+from nsf.dynamics import Sources
 from nsf.errors import ConfigError
 from nsf.kinematics.fields.basis import BasisField
+from nsf.models import Recurrence
 from nsf.mpm import FP32, FP64, Precision
 from nsf.mpm.recording import frame_bytes
 from nsf.mpm.stability import check_colliders, check_time_step
@@ -24,7 +25,7 @@ from nsf.storage import require_folder, require_space
 #: Precision of stored frames by the name of their type.
 _STORED = {"float32": FP32, "float64": FP64}
 #: Keys that no scene is built from, without their values.
-_REST = dict.fromkeys(("field", "trainer", "method", "sampler", "evaluation", "report", "latent_dim"))
+_REST = dict.fromkeys(("field", "trainer", "model", "sampler", "evaluation", "report", "latent_dim"))
 #: What this process has checked; the jobs of a sweep ask the same thing again and again, for seconds.
 _PASSED: set[str] = set()
 
@@ -37,7 +38,8 @@ class Plan(Names):
 
     Attributes:
         scene, deployed: as whole scenes.
-        field, trainer, method, sampler, projector, integration: as the configuration has them.
+        field, trainer, sampler, projector, integration: as the configuration has them.
+        sources: where a projected step takes τ and C from.
 
     Raises:
         ConfigError: a value is missing or refused; names it.
@@ -55,13 +57,15 @@ class Plan(Names):
     def _build(self) -> None:
         """Build and check everything, so that a bad value is refused before any work."""
         self.scene, c = Scene.of(self.scene), self.config
-        for name in ("field", "trainer", "method", "sampler", "projector", "integration"):
+        for name in ("field", "trainer", "sampler", "projector", "integration"):
             setattr(self, name, configuration.build(c[name], name))
+        self.sources = Sources(c.stress, c.affine)
         check_batched(c, self.field, self.integration.strategy)
-        if isinstance(self.method, History):
-            self._check_history()
-        if self.of_runs and self.teaching.symmetry:
-            self.teaching.symmetry.images(self.scene)  # refuses planes that the scene has not
+        if self.sources.carried:
+            self._check_carried()
+        for model in [self.configured, *(getattr(self.configured, "of", None) or {}).values()]:
+            if isinstance(model, Recurrence) and model.of_runs and model.teaching.symmetry:
+                model.teaching.symmetry.images(self.scene)  # refuses planes that the scene has not
         self.deployed = self._changed(c.deploy.changes)
         X = self.scene.particles().X
         for region in self.sampler.regions:
@@ -69,24 +73,16 @@ class Plan(Names):
             region.candidates(X)
         self._check_cases()
 
-    def _check_history(self) -> None:
+    def _check_carried(self) -> None:
         """Refuse what asks for a step that x̂ and its last change determine: particles carry their stress."""
-        if self.projecting == "modal":
-            raise ConfigError("engine=modal does not know method=history; set engine=auto, or method=nsf")
-        if self.teaching is not None and not self.of_runs:
-            raise ConfigError(
-                f"engine.teacher={self.config.engine.teacher} is asked for single steps, which "
-                "depend on what particles went through with method=history; set engine.teacher=runs, "
-                "or method=nsf"
-            )
         if (size := self.config.deploy.batch) != 1:
             raise ConfigError(
-                f"deploy.batch={size} needs the compiled engine, and method=history the reference; "
-                "set deploy.batch=1, or method=nsf"
+                f"deploy.batch={size} needs compiled steps, and those with stress=particles are not; "
+                "set deploy.batch=1, or stress=field affine=field"
             )
         if len(self.sampler.regions) > 1:
             raise ConfigError(
-                f"the sampler has {len(self.sampler.regions)} samples in a run, and method=history takes "
+                f"the sampler has {len(self.sampler.regions)} samples in a run, and stress=particles takes "
                 "one; set sampler.phases=[], or another sampler"
             )
 

@@ -17,7 +17,7 @@ from nsf.runs.pruning import bytes_text
 _RUNS = {"train": "training", "teach": "taught", "deploy": "deployment", "evaluate": "evaluation"}
 STAGES = ("simulate", *_RUNS)
 #: Key whose value runs of a stage must share for their times to be compared.
-_ALIKE = {"train": "field", "deploy": "engine"}
+_ALIKE = {"train": "field", "deploy": "model"}
 
 
 @dataclass
@@ -155,7 +155,7 @@ def scene_table(names: Names) -> Table:
     for part in ("train", "validation", "test"):
         cases = getattr(names.split, part)
         rows[part] = f"{len(cases)}: " + "; ".join(case.text for case in cases) if cases else "none"
-    rows["deployed"] = f"on {names.device}, engine {names.engine}, r {names.config.latent_dim}"
+    rows["deployed"] = f"on {names.device}, model {names.configured.name}, r {names.config.latent_dim}"
     for key, told in rows.items():
         table.add_row(key, escape(told))
     return table

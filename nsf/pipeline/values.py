@@ -6,17 +6,13 @@ from pathlib import Path
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from nsf import config as configuration
-from nsf.engines.names import NAMES as ENGINES
-from nsf.engines.names import OPERATORS, RUNS
-from nsf.engines.operators.teaching import Teaching
 from nsf.errors import ConfigError
 from nsf.kinematics.training.tracking import check_tracking
+from nsf.models.base import FALLBACKS
 
 #: Types of stored frames.
 STORED = ("float32", "float64")
 PRECISIONS = ("fp32", "fp64")
-#: What operators can be taught by: engines, or the full-order runs of training.
-TEACHERS = (*(name for name in ENGINES if name != OPERATORS), RUNS)
 #: Least deployment step in units of the scene's: a thousand reduced steps for one are no reduction.
 _LEAST_STEP = 1e-3
 
@@ -30,19 +26,13 @@ def check_numbers(c: DictConfig) -> None:
     for key, least in (("factor", 2), ("substeps", 1), ("frames", 1)):
         configuration.number(f"super_resolution.{key}", c.super_resolution[key], least=least, whole=True)
     configuration.number("deploy.dt_multiplier", c.deploy.dt_multiplier, least=_LEAST_STEP)
+    configuration.number("deploy.batch", c.deploy.batch, least=1, whole=True)
 
 
-def check_words(c: DictConfig, engine: str) -> None:
-    """Raises ConfigError where a value is not one of the few that it may be, or the report's name is none.
-
-    Args:
-        c: the configuration.
-        engine: name of the engine that is asked for.
-    """
-    one_of("engine.name", engine, ENGINES)
+def check_words(c: DictConfig) -> None:
+    """Raises ConfigError where a value is not one of the few that it may be, or the report's name is none."""
     one_of("deploy.split", c.deploy.split, ("test", "validation", "train"))
-    one_of("deploy.on_distrust", c.deploy.on_distrust, ("report", "projected", "full_order"))
-    _check_levels(c, engine)
+    one_of("fallback", c.fallback, FALLBACKS)
     check_tracking(c.tracking)
     one_of("data.resident", c.data.resident, (True, False, "auto"))
     one_of("data.keep", c.data.keep, ("all", "held_out"))
@@ -54,44 +44,6 @@ def check_words(c: DictConfig, engine: str) -> None:
     if c.precision not in PRECISIONS:
         raise ConfigError(f"precision={c.precision!r} is unknown; choose one of {', '.join(PRECISIONS)}")
     _check_paper(c.scene.get("paper"))
-
-
-def check_batch(c: DictConfig, engine: str) -> None:
-    """Raises ConfigError where a batch is asked for that the engine cannot step.
-
-    Args:
-        c: the configuration.
-        engine: name of the engine that is asked for.
-    """
-    size = configuration.number("deploy.batch", c.deploy.batch, least=1, whole=True)
-    if size > 1 and engine == "reference":
-        raise ConfigError(f"deploy.batch={size} needs engine=modal, or auto; set it, or deploy.batch=1")
-
-
-def check_lessons(c: DictConfig, teaching: Teaching, of_runs: bool) -> None:
-    """Raises ConfigError where the teacher is unknown, or a value does not go with it.
-
-    Args:
-        c: the configuration.
-        teaching: of operators.
-        of_runs: whether they learn from full-order runs, and not from the steps of an engine.
-    """
-    one_of("engine.teacher", c.engine.teacher, TEACHERS)
-    if teaching.memory and not of_runs:
-        raise ConfigError(
-            f"engine.teaching.memory={list(teaching.memory)} is learned from runs "
-            f"alone; set engine.teacher={RUNS}, or engine.teaching.memory=[]"
-        )
-    if teaching.runs and not of_runs:
-        raise ConfigError(
-            f"engine.teaching.runs={teaching.runs} stand beside full-order runs; set "
-            f"engine.teacher={RUNS}, or engine.teaching.runs=0"
-        )
-    if of_runs and c.deploy.dt_multiplier != 1:
-        raise ConfigError(
-            f"engine.teacher={RUNS} teaches steps of the scene's Δt, and deploy.dt_multiplier is "
-            f"{c.deploy.dt_multiplier:g}; set it to 1, or engine.teacher=auto"
-        )
 
 
 def factors(key: str, asked) -> list[int]:
@@ -113,19 +65,6 @@ def one_of(key: str, value, options: Sequence) -> None:
     if not any(value == option and type(value) is type(option) for option in options):
         shown = [str(o).lower() if isinstance(o, bool) else "null" if o is None else o for o in options]
         raise ConfigError(f"{key}={value} is unknown; choose {', '.join(shown[:-1])} or {shown[-1]}")
-
-
-def _check_levels(c: DictConfig, engine: str) -> None:
-    """Who goes on with a run by operators; no other engine has an estimate, or a level below."""
-    ratio = OmegaConf.select(c.deploy, "error_ratio", default=None)
-    if ratio is not None and not configuration.number("deploy.error_ratio", ratio) > 0:
-        raise ConfigError(
-            f"deploy.error_ratio={ratio} must be positive, or null to leave all runs to operators"
-        )
-    if engine == OPERATORS:
-        configuration.number("engine.check", c.engine.check, least=1, whole=True)
-    elif c.deploy.on_distrust == "projected":
-        raise ConfigError("deploy.on_distrust=projected needs engine=operators; set it, or leave it out")
 
 
 def _check_paper(stated) -> None:

@@ -15,10 +15,11 @@ TITLES = {
     CASE: CASE,
     "latent_dim": "r",
     "sampler.size": "|S|",
-    "method": "method",
+    "model": "model",
+    "stress": "stress",
+    "affine": "affine",
     "field": "field",
     "sampler": "sampler",
-    "engine": "engine",
     "seed": "seed",
     "scale": "scale",
     "precision": "precision",
@@ -27,7 +28,7 @@ TITLES = {
 _MOST = 6  # further keys that differ and have a column
 _WIDEST = 28  # characters of a cell
 #: Keys that say the same as another, or that no reader looks for.
-_SAID = re.compile(r"_target_$|^(parameters|cases|validation|teaching_cases|files|method\.name|paper)\b")
+_SAID = re.compile(r"_target_$|^(parameters|cases|validation|teaching_cases|files|model\.name|paper)\b")
 #: Units of metrics by the end of their name; δ and other errors are shown in per cent.
 _METRICS = {"seconds": "s", "ms": "ms", "mib": "MiB", "bytes": "B"}
 _PERCENT = re.compile(r"(^|_)(delta|error)$")

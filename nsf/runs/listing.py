@@ -131,9 +131,7 @@ def _settings(run: Run, known: dict[Run, dict[str, Any]], generations: int) -> d
 def _with_options(settings: dict[str, Any]) -> dict[str, Any]:
     """Settings with the option of each group that they come from."""
     found = {group: _option(group, settings) for group in _GROUPS}
-    found["method"] = settings.get("method.name")
-    if found["method"] is not None:  # of a deployment, or of what was made from one
-        found["engine"] = settings.get("engine", "auto")
+    found["model"] = settings.get("model.name")
     return settings | {group: option for group, option in found.items() if option is not None}
 
 

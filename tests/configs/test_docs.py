@@ -80,8 +80,8 @@ def train(scene: str) -> None:
 
 #: The same for runs by operators, which few lessons will do for.
 TAUGHT = [
-    "engine=operators", "scene.design.validation=[24,36]", "scene.design.test=[27]",
-    *(f"engine.teaching.{key}" for key in ("steps=300", "descent=100", "rounds=1", "width=16")),
+    "model=recurrence", "scene.design.validation=[24,36]", "scene.design.test=[27]",
+    *(f"model.teaching.{key}" for key in ("steps=300", "descent=100", "rounds=1", "width=16")),
 ]  # fmt: skip
 
 

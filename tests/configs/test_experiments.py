@@ -66,15 +66,14 @@ def test_the_list_of_experiments_has_each_with_its_parts():
 
 def test_the_ablation_is_every_method_of_the_paper_on_every_scene():
     jobs = [job.keys for job in Experiment.load("table1/ablation").jobs]
-    methods = {path.stem for path in (CONF / "method").glob("*.yaml")} - {"history"}
     of_the_paper = {
         path.stem
         for path in (CONF / "scene").glob("*.yaml")
         if "paper" in yaml.safe_load(path.read_text())["scene"]
     }
-    assert sorted((job["scene"], job["method"]) for job in jobs) == sorted(
-        itertools.product(of_the_paper, methods)
-    )
+    assert sorted(
+        (job["scene"], job.get("stress", "field"), job.get("affine", "field")) for job in jobs
+    ) == sorted(itertools.product(of_the_paper, ("field", "deformation"), ("field", "none")))
 
 
 def _ids(name, stage, keys):
@@ -87,8 +86,10 @@ def _ids(name, stage, keys):
 @pytest.mark.slow
 def test_parts_of_table1_share_runs():
     """Hours of work are done once: a run has one identity in all of them."""
-    ablation = _ids("table1/ablation", "evaluation", {"method": "nsf", "scene": "sand"})
-    assert ablation <= _ids("table1/scenes", "evaluation", {"method": "nsf", "scene": "sand"})
+    ablation = _ids("table1/ablation", "evaluation", {"stress": "field", "affine": "field", "scene": "sand"})
+    assert ablation <= _ids(
+        "table1/scenes", "evaluation", {"stress": "field", "affine": "field", "scene": "sand"}
+    )
     networks = _ids("table1/networks", "training", {"field": "mlp", "scene": "metal"})
     assert _ids("table1/scenes", "training", {"field": "mlp", "scene": "metal"}) == networks
     assert networks < _ids("training/networks", "training", {"field": "mlp", "scene": "metal"})
@@ -112,7 +113,7 @@ def test_what_the_paper_prints_is_of_a_job(experiment):
 def test_table1_has_the_papers_seven_scenes():
     jobs = [set(job.overrides) for job in Experiment.load("table1/scenes").jobs]
     scenes = {"bread", "cake", "sand", "metal", "toothpaste", "jelly_cube", "squishy_ball"}
-    for kind in ({"method=nsf"}, {"method=deformation_only"}, {"field=mlp"}):
+    for kind in ({"stress=field", "affine=field"}, {"stress=deformation", "affine=none"}, {"field=mlp"}):
         assert {f"scene={scene}" for scene in scenes} == {
             next(o for o in job if o.startswith("scene=")) for job in jobs if kind <= job
         }

@@ -113,7 +113,7 @@ def test_both_parameters_are_steered(made):
 
 
 def test_lessons_fill_the_box_of_training(pipeline_at, tmp_path):
-    pipeline = pipeline_at(tmp_path, *TWO, "engine=operators")
+    pipeline = pipeline_at(tmp_path, *TWO, "model=recurrence")
     known, between, back = pipeline.lessons
     assert known == sorted(pipeline.split.train)
     low, high = pipeline.split.box.T
@@ -153,7 +153,7 @@ FORCED = (
 @pytest.mark.slow
 def test_programs_through_the_whole_chain(pipeline_at, tmp_path):
     """Simulated, trained on, taught from, evaluated; a program beyond the range is distrusted."""
-    taught = ("engine=operators", "engine.teaching.descent=60", "engine.teaching.rounds=0", "engine.check=4")
+    taught = ("model=recurrence", "model.teaching.descent=60", "model.teaching.rounds=0", "model.check=4")
     pipeline = pipeline_at(tmp_path, *FORCED, *taught)
     for stage in ("simulate", "train", "teach", "deploy", "evaluate"):
         pipeline.run(stage)

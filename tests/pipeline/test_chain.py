@@ -29,7 +29,8 @@ from nsf.runs.listing import entries
 
 #: Issue 2, "Done when".
 COLUMNS = [
-    "scene", "method", "field", "r", "engine", "sample", "integration_mean", "parameter", "split",
+    "scene", "model", "stress", "affine", "field", "method", "engine", "r", "sample", "integration_mean",
+    "parameter", "split",
     "delta", "displacement_error", "stress_error", "displacement_static", "displacement_nearest",
     "displacement_interpolated", "displacement_coarse", "gamma", "step_ms_full", "step_ms_reduced",
     "step_ms_coarse", "total_ms_full", "total_ms_reduced", "total_ms_coarse", "decode_ms", "speedup_step",
@@ -60,8 +61,8 @@ def test_what_is_said(chain):
     assert [line.split(":")[0] for line in said] == ["simulate", "train", "deploy", "deploy", "evaluate"]
     assert "4 trajectories in" in said[0]
     assert "field=basis, r=4" in said[1]
-    assert said[2] == "deploy: engine modal"
-    assert "method=nsf, |S|=20, 1 cases" in said[3]
+    assert said[2] == "deploy: steps by modal"
+    assert "model=projected, |S|=20, 1 cases" in said[3]
     assert "mean δ" in said[4]
 
 
@@ -96,9 +97,9 @@ def test_results_have_the_columns_of_a_report(chain):
     assert len(results) == 1
     assert set(results.columns[results.isna().any()]) == {"estimated_error"}  # which operators have
     row = results.iloc[0]
-    assert (row["scene"], row["method"], row["field"], row["split"]) == ("sand", "nsf", "basis", "test")
+    assert (row["scene"], row["model"], row["field"], row["split"]) == ("sand", "projected", "basis", "test")
     assert (row["r"], row["sample"], row["parameter"], row["precision"]) == (4, 20, 26.0, "fp64")
-    assert row["engine"] == "modal"
+    assert (row["stress"], row["affine"]) == ("field", "field")
     assert (row["teach_seconds"], row["handed_over"]) == (0.0, 0.0)
     assert row["break_even_runs"] > 0  # ∞ where a reduced run saves nothing
     assert row["gamma"] == 3 * 500 / 4
@@ -140,7 +141,8 @@ def test_files_of_an_evaluation(chain):
     assert cost["trials"] == 2
     summary = json.loads((path / "summary.json").read_text())
     assert summary["reconstruction_delta"] < summary["delta"]
-    assert summary["variant"] == {"method": "nsf", "field": "basis", "r": 4, "sample": 20}
+    sources = {"stress": "field", "affine": "field", "method": "nsf"}
+    assert summary["variant"] == sources | {"model": "projected", "field": "basis", "r": 4, "sample": 20}
 
 
 def test_manifests(chain):
@@ -176,14 +178,14 @@ def test_a_second_run_reuses_every_stage(chain, pipeline_at):
 def test_another_method_deploys_and_evaluates_again(copied, pipeline_at):
     root = copied(*STAGES)
     before = stamps(root)
-    pipeline, said = said_by(pipeline_at, root, "method=deformation_only")
+    pipeline, said = said_by(pipeline_at, root, "stress=deformation", "affine=none")
     assert "4 of 4 trajectories are there, reused" in said[0]
     assert "train: inputs unchanged, reused" in said[1]
-    assert "method=deformation_only" in said[-2]
+    assert "model=projected" in said[-2]
     assert said[-1].startswith("evaluate: mean δ")
     assert {p: t for p, t in stamps(root).items() if p in before} == before
     results = pd.read_csv(pipeline.evaluation.path / "results.csv")
-    assert results["method"].tolist() == ["deformation_only"]
+    assert results["stress"].tolist() == ["deformation"]
     assert list(results) == COLUMNS
 
 
@@ -230,18 +232,6 @@ def test_values_deployed_together_are_as_one_by_one(copied, pipeline_at, monkeyp
     assert done == total > 0
 
 
-def test_an_engine_that_is_asked_for(copied, pipeline_at):
-    root = copied("simulate", "train")
-    pipeline, said = said_by(pipeline_at, root, "engine=reference", "evaluation.trials=1")
-    assert said[-3] == "deploy: engine reference, since it was asked for"
-    assert pd.read_csv(pipeline.evaluation.path / "results.csv")["engine"].tolist() == ["reference"]
-    assert pipeline_at(root, "engine=auto").deployment == pipeline_at(root).deployment
-    with pytest.raises(ConfigError, match=r"engine\.name=fast is unknown"):
-        pipeline_at(root, "engine.name=fast")
-    with pytest.raises(ConfigError, match=r"deploy\.batch=2 needs engine=modal, or auto"):
-        pipeline_at(root, "engine=reference", "deploy.batch=2")
-
-
 def test_an_edited_step_is_deployed_anew_and_runs(copied, pipeline_at, monkeypatch):
     """What a reader changes in the reference takes effect in a run that was made before."""
     root = copied(*STAGES)
@@ -255,7 +245,7 @@ def test_an_edited_step_is_deployed_anew_and_runs(copied, pipeline_at, monkeypat
     monkeypatch.setattr(GaussNewton, "solve", damped)
     pipeline, said = said_by(pipeline_at, root, stages=("deploy",))
     assert pipeline.deployment != before
-    assert "deploy: engine reference, since nsf.dynamics." in said[-2]
+    assert "deploy: steps by reference, since nsf.dynamics." in said[-2]
     assert "nsf.dynamics.projection.GaussNewton.solve" in said[-2]
     one, other = (Rollout.open(run.path / "rollout_0.h5").xhat for run in (before, pipeline.deployment))
     assert np.abs(one - other).max() > 1e-3
@@ -323,10 +313,12 @@ def test_a_changed_training_value_is_another_simulation(chain, pipeline_at):
 HASHES = {
     # override → stages that it makes anew
     "scene.design.test=[26,34]": {"deployment", "evaluation"},
-    "method=deformation_only": {"deployment", "evaluation"},
+    "affine=none": {"deployment", "evaluation"},
     "sampler.size=30": {"deployment", "evaluation"},
     "projector=taylor": {"deployment", "evaluation"},
-    "engine=reference": {"deployment", "evaluation"},
+    "model=projected": set(),
+    "model=interpolate": {"deployment", "evaluation"},
+    "fallback=full": {"deployment", "evaluation"},
     "integration=search": {"deployment", "evaluation"},
     "deploy.dt_multiplier=1.5": {"deployment", "evaluation"},
     "deploy.changes={material.E:1900}": {"deployment", "evaluation"},
@@ -581,8 +573,8 @@ def far(chain, pipeline_at, tmp_path_factory):
     for stage in ("simulate", "train"):
         shutil.copytree(chain.root / stage, root / stage)
     keys = ("scene.design.test=[8]", "evaluation.trials=1")
-    answers = ("report", "full_order")
-    found = {a: pipeline_at(root, *keys, f"deploy.on_distrust={a}", say=said.append) for a in answers}
+    answers = ("none", "full")
+    found = {a: pipeline_at(root, *keys, f"fallback={a}", say=said.append) for a in answers}
     for pipeline in found.values():
         for stage in STAGES:
             pipeline.run(stage)
@@ -596,7 +588,7 @@ def evaluated(pipeline):
 
 
 def test_a_run_far_from_training_says_so(far, chain):
-    pipeline, said = far[0]["report"], far[1]
+    pipeline, said = far[0]["none"], far[1]
     told, _, series = evaluated(pipeline)
     assert (told["parameter"], told["distrusted"], told["handed_over_at"]) == (8.0, True, None)
     assert told["trust"] > max(2.0, evaluated(chain.pipeline)[0]["trust"])

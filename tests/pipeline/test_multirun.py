@@ -54,7 +54,7 @@ def test_a_value_out_of_range_shows_before_the_first_job(nsf, copied):
     ("override", "quoted"),
     [
         ("latent_dimm=4,6", "'latent_dimm'"),
-        ("method=nsf,baseline", "method=baseline"),
+        ("model=projected,baseline", "model=baseline"),
         ("latent_dim=[", "latent_dim=["),
         ("latent_dim", "latent_dim"),
         ("field._target_=os.system,os.remove", "os.system is refused"),
@@ -87,7 +87,7 @@ def test_an_experiment_runs_its_jobs_and_reports_them(nsf, copied, tmp_path):
     """A part of experiments/table1.yaml, made tiny and of one scene and field."""
     root = copied("simulate")
     tiny = ["scene=sand", "field=basis", "evaluation.trials=1"]
-    arguments = ["+experiment=table1/scenes", "scale=small", "engine=auto", *tiny]
+    arguments = ["+experiment=table1/scenes", "scale=small", "model=projected", *tiny]
     outcome = nsf("run", root, *arguments, faults=[PlainReport()], multirun=True)
     assert outcome.code == 0, outcome.err
     report = tmp_path / "work/reports/table1/scenes_small"
@@ -129,11 +129,11 @@ def test_an_experiment_may_ask_for_more_points(nsf, copied, tmp_path):
 
 def test_a_report_names_what_is_missing(nsf, copied, tmp_path):
     root = copied("simulate", "train", "deploy", "evaluate")
-    keys = ["+experiment=table1/scenes", "scene=sand", "scale=small", "field=basis", "engine=auto"]
+    keys = ["+experiment=table1/scenes", "scene=sand", "scale=small", "field=basis", "model=projected"]
     outcome = nsf("report", root, *keys, faults=[PlainReport()])
     assert outcome.code == 2
     assert "missing: scale=small" in outcome.err
-    assert "method=deformation_only" in outcome.err
+    assert "stress=deformation affine=none" in outcome.err
     assert "Missing" in (tmp_path / "work/reports/table1/scenes_small/index.md").read_text()
 
 

@@ -13,7 +13,7 @@ from angles import angle
 from nsf.data import Trajectory
 from nsf.deployment import OPERATORS, PROJECTED, Levels, Rollout, rollout, rollouts
 from nsf.deployment.levels import estimated_errors
-from nsf.dynamics import Method, Taylor
+from nsf.dynamics import Sources, Taylor
 from nsf.engines import Operators
 from nsf.engines.operators import Course, Teacher
 from nsf.errors import ConfigError, MissingRunError
@@ -23,11 +23,11 @@ from nsf.sampling import RandomSampler, SampleSpan
 
 ANGLE = {"friction_angle": 26.0}
 TAUGHT = (
-    "engine=operators",
-    "engine.teaching.steps=400",
-    "engine.teaching.descent=300",
-    "engine.teaching.rounds=1",
-    "engine.teaching.width=32",
+    "model=recurrence",
+    "model.teaching.steps=400",
+    "model.teaching.descent=300",
+    "model.teaching.rounds=1",
+    "model.teaching.width=32",
 )
 
 
@@ -86,7 +86,6 @@ def test_the_chain(lesson, chain):
     assert [line.split(":")[0] for line in said if "warning" not in line] == [
         "teach",
         "deploy",
-        "deploy",
         "evaluate",
     ]
     run = pipeline.taught
@@ -100,7 +99,7 @@ def test_the_chain(lesson, chain):
     assert found["teach_seconds"] > 0
     assert [path.name for path in run.path.glob("*.pt")] == ["operators.pt"]
     row = pd.read_csv(pipeline.evaluation.path / "results.csv").iloc[0]
-    assert (row["engine"], row["integration_mean"]) == ("operators", 0)
+    assert (row["model"], row["integration_mean"]) == ("recurrence", 0)
     projected = pd.read_csv(chain.pipeline.evaluation.path / "results.csv").iloc[0]
     # Of 0.4 thousand steps of the teacher; a run that does not move is off by 1.
     assert projected["displacement_error"] < 0.03
@@ -158,7 +157,7 @@ def test_a_teaching_that_was_broken_off_goes_on(lesson, copied, pipeline_at, mon
 @pytest.fixture
 def of_runs(copied, pipeline_at):
     """A chain whose operators learn from full-order runs, as far as training."""
-    keys = (*TAUGHT, "engine.teacher=runs", "engine.teaching.unroll=16", "engine.teaching.descent=600")
+    keys = (*TAUGHT, "model.teacher=runs", "model.teaching.unroll=16", "model.teaching.descent=600")
     return pipeline_at(copied("simulate", "train"), *keys)
 
 
@@ -182,7 +181,7 @@ def test_full_order_runs_teach_without_a_step_of_an_engine(of_runs, monkeypatch)
 def test_what_full_order_runs_taught_is_held_to_those_of_validation(of_runs, pipeline_at, tmp_path):
     known, between, back = of_runs.lessons
     assert (known, between, back) == (list(map(angle, (22.0, 30.0, 38.0))), [], known)
-    held_back = pipeline_at(tmp_path, *TAUGHT, "engine.teacher=runs", "scene.design.validation=[24]")
+    held_back = pipeline_at(tmp_path, *TAUGHT, "model.teacher=runs", "scene.design.validation=[24]")
     assert held_back.lessons[2] == [angle(24.0)]
 
 
@@ -192,8 +191,14 @@ def drawn(copied, pipeline_at):
     root = copied("simulate", "train")
 
     def build(say=lambda line: None, *more):
-        keys = ("engine.teacher=runs", "engine.teaching.unroll=16", "engine.teaching.descent=600")
-        keys += "engine.teaching.runs=3", "method=history", "deploy.error_ratio=null", *more
+        keys = ("model.teacher=runs", "model.teaching.unroll=16", "model.teaching.descent=600")
+        keys += (
+            "model.teaching.runs=3",
+            "stress=particles",
+            "affine=particles",
+            "model.error_ratio=null",
+            *more,
+        )
         return pipeline_at(root, *TAUGHT, *keys, say=say)
 
     return build
@@ -210,9 +215,9 @@ def test_projected_runs_in_drawn_cases_teach_too(drawn, monkeypatch):
     assert pipeline.taught.manifest["metrics"]["teacher_steps"] == 3 * pipeline.scene.steps
     row = pd.read_csv(pipeline.evaluation.path / "results.csv").iloc[0]
     assert row["displacement_error"] < 0.06
-    assert row["method"] == "history"
+    assert row["stress"] == row["affine"] == "particles"
     monkeypatch.setattr("nsf.deployment.levels._believed", lambda run, trust: 10)
-    doubted = drawn(lambda line: None, "deploy.on_distrust=projected")  # taken anew by projected steps
+    doubted = drawn(lambda line: None, "fallback=projected")  # taken anew by projected steps
     for stage in ("deploy", "evaluate"):
         doubted.run(stage)
     anew = pd.read_csv(doubted.evaluation.path / "results.csv").iloc[0]
@@ -227,10 +232,10 @@ def test_projected_runs_in_drawn_cases_teach_too(drawn, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["history", "nsf"])
-def test_operators_too_far_off_at_validation_runs_take_no_step(drawn, method):
+@pytest.mark.parametrize("sources", [("particles", "particles"), ("field", "field")])
+def test_operators_too_far_off_at_validation_runs_take_no_step(drawn, sources):
     said = []
-    held_back = f"method={method}", "scene.design.validation=[24]"
+    held_back = f"stress={sources[0]}", f"affine={sources[1]}", "scene.design.validation=[24]"
     first = drawn(said.append, *held_back)
     for stage in ("simulate", "teach"):
         first.run(stage)
@@ -245,7 +250,7 @@ def test_operators_too_far_off_at_validation_runs_take_no_step(drawn, method):
     ratio = told["errors"][0] / off
     for error_ratio, by_operators in ((0.99 * ratio, 0), (1.01 * ratio, 24)):
         said.clear()
-        pipeline = drawn(said.append, *held_back, f"deploy.error_ratio={error_ratio}")
+        pipeline = drawn(said.append, *held_back, f"model.error_ratio={error_ratio}")
         pipeline.run("deploy")
         taken = Rollout.open(pipeline.deployment.path / "rollout_0.h5")
         assert taken.by_operators == by_operators
@@ -268,7 +273,7 @@ def test_operators_too_far_off_at_validation_runs_take_no_step(drawn, method):
 def test_operators_keep_their_runs_where_nothing_tells_that_they_are_off(
     drawn, monkeypatch, held_back, lost, ratio
 ):
-    keys = f"scene.design.validation={held_back}", f"deploy.error_ratio={ratio}"
+    keys = f"scene.design.validation={held_back}", f"model.error_ratio={ratio}"
     pipeline = drawn(lambda line: None, *keys)
     monkeypatch.setattr(Teacher, "left_grid", lambda teacher: [lost] * len(teacher))
     monkeypatch.setattr(teaching, "drawn", lambda *args: [])
@@ -279,10 +284,10 @@ def test_operators_keep_their_runs_where_nothing_tells_that_they_are_off(
 
 
 def test_drawn_runs_stand_beside_full_order_ones(pipeline_at, tmp_path):
-    with pytest.raises(ConfigError, match=r"runs=3 stand beside full-order runs; set engine\.teacher=runs"):
-        pipeline_at(tmp_path, *TAUGHT, "engine.teaching.runs=3")
+    with pytest.raises(ConfigError, match=r"runs=3 stand beside full-order runs; set model\.teacher=runs"):
+        pipeline_at(tmp_path, *TAUGHT, "model.teaching.runs=3")
     with pytest.raises(ConfigError, match="runs=-1 must be at least 0"):
-        pipeline_at(tmp_path, *TAUGHT, "engine.teacher=runs", "engine.teaching.runs=-1")
+        pipeline_at(tmp_path, *TAUGHT, "model.teacher=runs", "model.teaching.runs=-1")
 
 
 def test_projected_runs_that_are_lost_teach_nothing(drawn, monkeypatch):
@@ -318,11 +323,11 @@ def test_projected_runs_in_drawn_cases_are_the_same_by_several_processes(drawn, 
 
 def test_full_order_runs_teach_their_own_step_alone(pipeline_at, tmp_path):
     with pytest.raises(ConfigError, match=r"the scene's Δt.*dt_multiplier is 1.5; set it to 1"):
-        pipeline_at(tmp_path, *TAUGHT, "engine.teacher=runs", "deploy.dt_multiplier=1.5")
+        pipeline_at(tmp_path, *TAUGHT, "model.teacher=runs", "deploy.dt_multiplier=1.5")
 
 
 def test_an_engine_that_learns_nothing_is_not_taught(pipeline_at, tmp_path):
-    with pytest.raises(ConfigError, match="engine=auto is not taught; set engine=operators"):
+    with pytest.raises(ConfigError, match="model=projected is not taught; set model=recurrence"):
         pipeline_at(tmp_path).teach()
     with pytest.raises(MissingRunError, match="run `nsf train"):
         pipeline_at(tmp_path, *TAUGHT).teach()
@@ -338,8 +343,8 @@ def test_a_run_is_a_solver_as_others(reduced, lesson):
     for n in (1, 10, 13):
         other.step(n)
     assert torch.equal(solver.record.xhat, other.record.xhat)
-    assert solver.engine == "operators"
-    assert solver.trajectory().stops == ["operators"] * 24
+    assert solver.engine == "recurrence"
+    assert solver.trajectory().stops == ["recurrence"] * 24
     assert (solver.left_grid(), solver.needed_outside(), solver.integration_mean) == (-1, 0, 0.0)
     projected = reduced(engine="auto")
     projected.step(24)
@@ -417,7 +422,7 @@ def test_what_operators_were_not_taught_on_is_refused(reduced, lesson, tiny_mani
         ({"manifold": other}, "another manifold"),
         ({"sample": 21}, "another sample"),
         ({"dt_multiplier": 1.5}, "another Δt"),
-        ({"method": Method("deformation_only", False, False)}, "another method"),
+        ({"sources": Sources("deformation", "none")}, "another sources"),
         ({"projector": Taylor()}, "another projector"),
         ({"scene": pipeline.scene.with_changes({"material.nu": 0.25})}, "another scene"),
     ]
@@ -430,7 +435,7 @@ def test_what_operators_were_not_taught_on_is_refused(reduced, lesson, tiny_mani
 
 
 def test_a_name_is_not_enough(chain, tiny_manifold):
-    with pytest.raises(ConfigError, match=re.escape("give engine=nsf.engines.Operators.load(FILE)")):
+    with pytest.raises(ConfigError, match=re.escape("give nsf.engines.Operators.load(FILE)")):
         chain.scene.reduced(tiny_manifold, ANGLE, 20, engine="operators", device="cpu")
 
 
@@ -475,7 +480,7 @@ def test_where_it_is_not_believed_the_projected_step_goes_on(reduced, levels_of,
     monkeypatch.setattr("nsf.deployment.levels._believed", lambda run, trust: n)
     found = rollouts(reduced().together, [angle(26.0)], tiny_trust, levels=levels_of(True))[0]
     assert found.levels.tolist() == [OPERATORS] * n + [PROJECTED] * (24 - n)
-    assert [stop == "operators" for stop in found.stops] == (found.levels == OPERATORS).tolist()
+    assert [stop == "latent" for stop in found.stops] == (found.levels == OPERATORS).tolist()
     np.testing.assert_array_equal(found.xhat[: n + 1], own.xhat[: n + 1])
     projected = reduced(engine="auto")
     for name, values in (("now", own.xhat[n]), ("before", own.xhat[n - 1])):
@@ -516,7 +521,7 @@ def test_a_rollout_keeps_who_took_its_steps(lesson, tmp_path):
 def test_a_run_that_is_handed_on_costs_what_its_steps_cost(lesson, pipeline_at, monkeypatch):
     pipeline, _ = lesson
     monkeypatch.setattr("nsf.deployment.levels._believed", lambda run, trust: 10)
-    handed = pipeline_at(pipeline.root, *TAUGHT, "deploy.on_distrust=projected")
+    handed = pipeline_at(pipeline.root, *TAUGHT, "fallback=projected")
     for stage in ("deploy", "evaluate"):
         handed.run(stage)
     row = pd.read_csv(handed.evaluation.path / "results.csv").iloc[0]
@@ -535,12 +540,10 @@ def test_a_run_that_is_handed_on_costs_what_its_steps_cost(lesson, pipeline_at, 
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (("deploy.on_distrust=projected",), "deploy.on_distrust=projected needs engine=operators"),
-        (("deploy.error_ratio=-3",), "deploy.error_ratio=-3 must be positive"),
-        ((*TAUGHT, "deploy.error_ratio=0"), "deploy.error_ratio=0 must be positive, or null to leave"),
-        ((*TAUGHT, "engine.check=0"), "engine.check=0 must be a whole number of at least 1"),
-        ((*TAUGHT, "engine.teacher=operators"), "engine.teacher=operators is unknown"),
-        ((*TAUGHT, "engine.teaching.width=0"), "engine.teaching: width=0 must be at least 1"),
+        ((*TAUGHT, "model.error_ratio=0"), "model: error_ratio=0 must be positive, or null to leave"),
+        ((*TAUGHT, "model.check=0"), "model: check=0 must be a whole number of at least 1"),
+        ((*TAUGHT, "model.teacher=operators"), "model: teacher=operators is unknown"),
+        ((*TAUGHT, "model.teaching.width=0"), "model.teaching: width=0 must be at least 1"),
     ],
 )
 def test_what_cannot_be_asked_for(pipeline_at, tmp_path, overrides, message):

@@ -75,7 +75,7 @@ def test_version(capsys):
 REFUSED = [
     ("run", "scene.dtt=1", ["scene.dtt", "did you mean scene.dt"]),
     ("run", "lantent_dim=4", ["'lantent_dim'", "did you mean latent_dim"]),
-    ("run", "method=baseline", ["method=baseline", "choose one of deformation_only"]),
+    ("run", "model=baseline", ["model=baseline", "choose one of auto"]),
     ("run", "field=bassis", ["field=bassis", "did you mean basis?"]),
     ("run", "latent_dim", ["'latent_dim' is not key=value"]),
     ("run", "--fast", ["'--fast' is not key=value"]),
@@ -104,7 +104,7 @@ REFUSED = [
     ("run", "device=gpu", ["device=gpu"]),
     ("run", "data.dtype=float16", ["data.dtype=float16", "float32 or float64"]),
     ("run", "deploy.split=foo", ["deploy.split=foo", "test, validation or train"]),
-    ("run", "deploy.on_distrust=stop", ["deploy.on_distrust=stop", "projected or full_order"]),
+    ("run", "fallback=stop", ["fallback=stop", "projected or full"]),
     ("run", "field._target_=os.system", ["os.system is refused"]),
     ("run", "~latent_dim", ["latent_dim"]),
     ("run", "~scene.dx", ["scene.dx"]),
@@ -270,7 +270,7 @@ BEFORE_ANY_WORK = [
     ("report.folder=/proc/reports", ["no report can be written to /proc/reports", "set report.folder"]),
     ("tracking=wandb", ["tracking=wandb", "tensorboard"]),
     ("data.resident=maybe", ["resident=maybe"]),
-    ("method.neural_stress=maybe", ["neural_stress=maybe"]),
+    ("projector.iterations=maybe", ["iterations=maybe"]),
 ]
 
 
@@ -311,10 +311,10 @@ def test_what_is_not_deployed_together_is_refused_before_any_work(nsf, override,
 
 
 def test_a_memory_is_learned_from_full_order_runs_alone(nsf):
-    code, _, err = nsf("run", "engine=operators", "engine.teaching.memory=[0.1]")
+    code, _, err = nsf("run", "model=recurrence", "model.teaching.memory=[0.1]")
     assert code == 2
-    assert "engine.teaching.memory=[0.1] is learned from runs alone" in err
-    assert "engine.teacher=runs" in err
+    assert "model.teaching.memory=[0.1] is learned from runs alone" in err
+    assert "model.teacher=runs" in err
 
 
 def test_the_example_of_the_style_guide(nsf, monkeypatch):

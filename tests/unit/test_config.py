@@ -71,19 +71,19 @@ def test_a_reference_to_nothing_is_refused():
 def test_a_group_option_replaces_the_whole_group():
     found = config.load(["projector=taylor"])
     assert found.projector == {"_target_": "nsf.dynamics.Taylor"}
-    assert config.load(["method=deformation_only"]).method.neural_stress is False
+    assert config.load(["model=interpolate"]).model.name == "interpolate"
 
 
 def test_one_load_leaves_no_trace_in_the_next():
     before = config.load()
-    config.load(["scale=paper", "latent_dim=3", "method=deformation_only"])
+    config.load(["scale=paper", "latent_dim=3", "stress=deformation", "affine=none"])
     with pytest.raises(ConfigError):
         config.load(["nonsense=1"])
     assert config.load() == before
 
 
 @pytest.mark.parametrize(
-    "group", ["method", "projector", "integration", "sampler", "field", "trainer", "transfer"]
+    "group", ["model", "projector", "integration", "sampler", "field", "trainer", "transfer"]
 )
 def test_every_option_builds(group):
     """A new yaml is tested without being registered here."""
@@ -101,8 +101,8 @@ def test_every_yaml_is_in_a_group_or_primary():
         ("lantent_dim=4", "unknown key 'lantent_dim'; did you mean latent_dim"),
         ("sampler.sise=4", "unknown key 'sampler.sise'; did you mean sampler.size"),
         ("foo=1", "unknown key 'foo'"),
-        ("methd=nsf", "did you mean method"),
-        ("method=nfs", "unknown method=nfs; choose one of deformation_only"),
+        ("modl=full", "did you mean model"),
+        ("model=projecte", "unknown model=projecte; choose one of auto, full"),
         ("scene=snad", "(did you mean sand?)"),
         ("scale=big", "scale=big is unknown"),
         ("scene.design.test=[1", "'scene.design.test=[1'"),
@@ -150,7 +150,7 @@ def test_foreign_targets_behind_an_added_key(tmp_path):
         ("projector.iterations=2.5", "projector.iterations=2.5"),
         ("projector.tolerance=abc", "projector.tolerance=abc"),
         ("integration.margin=abc", "integration.margin=abc"),
-        ("method.neural_stress=maybe", "method.neural_stress=maybe"),
+        ("projector.iterations=maybe", "projector.iterations=maybe"),
         ("trainer.learning_rate=abc", "trainer.learning_rate=abc"),
         ("field.depth=abc", "field.depth=abc"),
         ("field.noise=abc", "field.noise=abc"),
@@ -213,10 +213,10 @@ def test_an_experiment_takes_a_plus():
 
 def test_broken_yaml_names_file_and_line(tmp_path, monkeypatch):
     shutil.copytree(CONF, tmp_path / "conf")
-    (tmp_path / "conf/method/broken.yaml").write_text("_target_: nsf.dynamics.Method\nname: [\n")
+    (tmp_path / "conf/model/broken.yaml").write_text("_target_: nsf.models.Projected\nname: [\n")
     monkeypatch.setattr(config.composing, "CONF", tmp_path / "conf")
     with pytest.raises(ConfigError, match=r"broken\.yaml.*line [23].*correct the yaml"):
-        config.load(["method=broken"])
+        config.load(["model=broken"])
 
 
 def test_a_yaml_that_is_edited_is_read_again(tmp_path, monkeypatch):

@@ -22,7 +22,7 @@ def root(tmp_path, monkeypatch):
     monkeypatch.setenv("NSF_RUNS", str(root))
     data = [made("simulate", {"parameters": {"mu": {"key": "material.mu", "value": v}}}) for v in (1.0, 2.0)]
     four, _ = (made("train", {"latent_dim": r, "seed": r - 4}, data) for r in (4, 6))
-    deployed = made("deploy", {"method": {"name": "nsf"}, "cases": [{"mu": 1.5}]}, [four])
+    deployed = made("deploy", {"model": {"name": "projected"}, "cases": [{"mu": 1.5}]}, [four])
     made("evaluate", {"evaluation": {"trials": 2}}, [deployed], delta=0.02, step_ms=1.5)
     with (
         pytest.raises(ValueError, match="lost"),
@@ -70,9 +70,9 @@ def test_columns_are_what_differs_among_the_runs_shown(root, nsf):
 
 
 def test_a_filtered_key_is_shown_although_all_have_it(root, nsf):
-    _, out, _ = nsf("stage=evaluate", "evaluation.trials=*", "method=nsf")
-    assert rows(out)[0][-2:] == ["evaluation.trials", "method"]
-    assert rows(out)[1][-2:] == ["2", "nsf"]
+    _, out, _ = nsf("stage=evaluate", "evaluation.trials=*", "model=projected")
+    assert rows(out)[0][-2:] == ["evaluation.trials", "model"]
+    assert rows(out)[1][-2:] == ["2", "projected"]
 
 
 def test_keys_that_only_some_runs_have_are_no_difference(root):

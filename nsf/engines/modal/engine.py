@@ -7,9 +7,9 @@ from typing_extensions import override
 
 from nsf.dynamics.batch import Batch
 from nsf.dynamics.integration import Integration
-from nsf.dynamics.methods import Method
 from nsf.dynamics.projection import GaussNewton, Taylor
 from nsf.dynamics.setup import Setup
+from nsf.dynamics.sources import Sources
 from nsf.dynamics.span import Span
 from nsf.engines.base import Engine
 from nsf.engines.modal.mirrors import edits
@@ -21,7 +21,7 @@ from nsf.kinematics.fields.basis import BasisManifold
 _KNOWN = {
     "manifold": (BasisManifold,),
     "projector": (GaussNewton, Taylor),
-    "method": (Method,),
+    "sources": (Sources,),
     "integration": (Integration,),
 }
 _NAMED = 3  # edited functions that a refusal names
@@ -42,6 +42,8 @@ class Modal(Engine):
             found = type(getattr(one, role))
             if found not in known:
                 return f"{role} {found.__name__} is not known to modal"
+        if one.sources.carried:
+            return "stress=particles is not known to modal"
         if not one.manifold.layered:
             return "a network of the field is not one of layers, as modal needs it"
         if len(setups) > 1 and one.integration.strategy != "superset":

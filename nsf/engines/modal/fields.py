@@ -37,8 +37,8 @@ def field_launches(
     options = {"particles": span.order, "dtype": arena.real, "device": one.torch_device}
     heads = []
     for name, neural, found in (
-        ("stress", one.method.neural_stress, span.tau),
-        ("affine", one.method.neural_affine, span.C),
+        ("stress", one.sources.neural_stress, span.tau),
+        ("affine", one.sources.neural_affine, span.C),
     ):
         if neural:
             factors = one.manifold.factors(name, **options)
@@ -62,7 +62,7 @@ def field_launches(
         for (factors, found), modes, own in zip(heads, stored, coefficients, strict=True)
     ]
     launches = [_contraction(arena, fields, needed, tiles)] if fields else []
-    if not one.method.neural_stress:
+    if not one.sources.neural_stress:
         F = arena.zeros(len(span.x), 3, 3, dtype=arena.real)
         factors = one.manifold.factors("gradient", **options)
         whole = arena.modes(factors.table, factors.rows), arena.zeros(1, dtype=arena.real)  # over no lengths

@@ -34,7 +34,8 @@ class Operators(Engine):
             adds in any order, may choose another one each time.
     """
 
-    name: ClassVar[str] = "operators"
+    name: ClassVar[str] = "recurrence"
+    moves_particles: ClassVar[bool] = False
 
     def __init__(self, model: StepOperators, taught: Taught, samples: Sequence[SampleSpan]):
         self.model, self.taught, self.samples = model, taught, samples

@@ -25,7 +25,7 @@ class Taught:
     Attributes:
         manifold, scene, sample: hashes; the sample's is of particles, weights and first steps of all spans.
         dt: step [s].
-        method, projector: as text.
+        sources, projector: as text.
         parameters: names of the problem parameters.
         ranges: [n, 2] smallest and largest training value of each.
         gravity: [3] about which gravity was varied [m/s²]; reach: how far, at most [m/s²].
@@ -35,7 +35,7 @@ class Taught:
     scene: str
     sample: str
     dt: float
-    method: str
+    sources: str
     projector: str
     parameters: tuple[str, ...]
     ranges: tuple[tuple[float, float], ...]
@@ -51,7 +51,7 @@ class Taught:
             scene=physics_hash(setup.scene),
             sample=_sample_hash(setup),
             dt=setup.dt,
-            method=str(setup.method),
+            sources=str(setup.sources),
             projector=str(setup.projector),
             parameters=tuple(setup.manifold.parameter_names),
             ranges=tuple(zip(known.amin(0).tolist(), known.amax(0).tolist(), strict=True)),
@@ -84,7 +84,7 @@ class Taught:
 
     def differing(self, other: "Taught") -> str:
         """The first thing in which another identity differs; empty where none does."""
-        for name in ("manifold", "scene", "sample", "dt", "method", "projector", "parameters"):
+        for name in ("manifold", "scene", "sample", "dt", "sources", "projector", "parameters"):
             one, asked = getattr(self, name), getattr(other, name)
             if one != asked:
                 shown = "Δt [s]" if name == "dt" else name

@@ -110,8 +110,8 @@ class Course:
             self._say(f"round {number}: {100 * kept['error']:.3g} % off")
         if best is None:
             raise InstabilityError(
-                "no round of teaching gave operators whose runs stay finite; raise engine.teaching.steps or "
-                "engine.teaching.descent, or deploy with engine=auto"
+                "no round of teaching gave operators whose runs stay finite; raise model.teaching.steps or "
+                "model.teaching.descent, or deploy with model=projected"
             )
         self.model.load_state_dict(best)
         return self.model.double().requires_grad_(False).eval()

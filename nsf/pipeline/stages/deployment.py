@@ -1,5 +1,6 @@
 """The stage `deploy`: reduced runs of the held-out cases, and the lines that a user is told of them."""
 
+import shutil
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -9,6 +10,7 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from nsf.data import Case
+from nsf.data.schema import TRAJECTORY
 from nsf.deployment import (
     PROJECTED,
     Levels,
@@ -24,6 +26,8 @@ from nsf.deployment.trust import CaseDistance, LatentDistance, SolidsRange
 from nsf.dynamics import ReducedBatch, ReducedMPM
 from nsf.engines.operators import collider_states
 from nsf.kinematics.manifold import Manifold
+from nsf.models import FullOrder, Projected, Recurrence
+from nsf.models.auto import Measured
 from nsf.runs import Record, Run
 from nsf.storage import writing
 
@@ -31,22 +35,29 @@ from nsf.storage import writing
 CONFIGURATION = "configuration.yaml"
 
 
-def deploy_held_out(pipeline, run: Run) -> None:
+def deploy_held_out(pipeline, run: Run, measured: Sequence[Measured] = ()) -> None:
     """Deploy a pipeline's held-out cases; rollouts and the configuration of its chain go into the run.
 
     Args:
         pipeline: a `nsf.pipeline.Pipeline`.
         run: its deploy run.
+        measured: the candidates of `model=auto`, of which the pipeline has chosen.
     """
     manifold = pipeline.manifold().to(pipeline.device)  # many solvers take their rows from it
     with run.record(device=pipeline.device, precision=pipeline.config.precision) as record:
-        rollouts = _rollouts(pipeline, manifold, record)
+        record.metrics |= {"model": pipeline.model.name, "candidates": [one.plain for one in measured]}
+        full = isinstance(pipeline.model, FullOrder)
+        rollouts = _full_order(pipeline, manifold, record) if full else _rollouts(pipeline, manifold, record)
         for index, rollout in enumerate(rollouts):
             rollout.save(record.path / rollout_file(index))
             record.output(rollout_file(index))
             for line in _told(rollout):
                 pipeline.say(f"deploy: {line}")
-            if rollout.handed_over >= 0:
+            if full:
+                truth = pipeline.truth(rollout.case).file(TRAJECTORY)
+                shutil.copyfile(truth, record.path / continuation_file(index))
+                record.output(continuation_file(index))
+            elif rollout.handed_over >= 0:
                 solver = pipeline.solver_at(manifold, rollout.case)
                 if beyond := go_on(solver, rollout, record.path / continuation_file(index), pipeline.stored):
                     pipeline.say(
@@ -63,7 +74,7 @@ def deploy_held_out(pipeline, run: Run) -> None:
     together = record.metrics["batch"]
     at_once = f", {together} together" if together > 1 else ""
     pipeline.say(
-        f"deploy: method={pipeline.config.method.name}, |S|={rollouts[0].sample}, "
+        f"deploy: model={pipeline.model.name}, |S|={rollouts[0].sample}, "
         f"{len(rollouts)} cases{at_once} → {run.id}"
     )
 
@@ -92,14 +103,20 @@ def trust_of(run: Run, manifold: Manifold, particles: np.ndarray, pipeline) -> T
 
 
 def calibrated(pipeline, manifold: Manifold) -> Trust:
-    """The trust estimate of a pipeline's runs, calibrated on projected runs of training."""
+    """The trust estimate of a pipeline's runs, calibrated on projected runs of training if it takes any."""
     projected = partial(pipeline.solver_at, manifold, engine=pipeline.projecting)
 
     def known_at(values: Mapping[str, float], device: str) -> ReducedMPM:
         """A run in the training case of some parameters, with its own program."""
         return projected(_case_of(pipeline.split.train, values), device)
 
-    found = calibrate(known_at, manifold, pipeline.device)
+    if pipeline.model.projects or pipeline.config.fallback == "projected":
+        found = calibrate(known_at, manifold, pipeline.device)
+    else:
+        solver = known_at(CaseDistance(manifold).extremes()[0], pipeline.device)
+        particles = np.unique(np.concatenate([span.particles for span in solver.samples]))
+        distance = LatentDistance(manifold, particles, pipeline.device)
+        found = Trust.calibrated(distance, CaseDistance(manifold), [])
     return replace(found, gravity=_range_of_gravity(pipeline.scene), solids=_range_of_solids(pipeline))
 
 
@@ -134,10 +151,38 @@ def _rollouts(pipeline, manifold: Manifold, record: Record) -> list[Rollout]:
         record.metrics |= {"engine": batch.engine, "engine_why": batch.why}
         return batch
 
-    hand_over, levels = asked.on_distrust == "full_order", levels_of(pipeline, manifold)
+    hand_over, levels = pipeline.config.fallback == "full", levels_of(pipeline, manifold)
     rollouts = deploy(batch_at, pipeline.held_out, pipeline.device, trust, hand_over, together, levels)
     engine, why = record.metrics["engine"], record.metrics["engine_why"]
-    pipeline.say(f"deploy: engine {engine}" + (f", since {why}" if why else ""))
+    if isinstance(pipeline.model, Projected):
+        pipeline.say(f"deploy: steps by {engine}" + (f", since {why}" if why else ""))
+    return rollouts
+
+
+def _full_order(pipeline, manifold: Manifold, record: Record) -> list[Rollout]:
+    """Runs that the full-order solver takes from t = 0; their trajectories are those of `simulate`."""
+    runs, rollouts = pipeline.full_order(pipeline.held_out), []
+    record.metrics |= {"engine": "full", "engine_why": "", "batch": 1}
+    record.metrics["trust"] = {"residual_m": 0.0, "distance_m": 0.0, "seconds": 0.0}
+    for case, run in zip(pipeline.held_out, runs, strict=True):
+        solver = pipeline.solver_at(manifold, case)
+        rollouts.append(
+            Rollout(
+                case=case,
+                t=np.zeros(1),
+                xhat=solver.trajectory().xhat,
+                residuals=np.zeros((0, solver.setup.projector.iterations + 1)),
+                stops=[],
+                trust=np.zeros(1),
+                away=0.0,
+                sample=solver.sample_size,
+                integration_mean=solver.integration_mean,
+                needed_outside=0,
+                seconds=run.metric("seconds"),
+                diverged=-1,
+                handed_over=0,
+            )
+        )
     return rollouts
 
 
@@ -147,14 +192,14 @@ def _case_of(cases: Sequence[Case], values: Mapping[str, float]) -> Case:
 
 
 def levels_of(pipeline, manifold: Manifold) -> Levels | None:
-    """How runs by operators are watched, and who goes on with them."""
-    if pipeline.teaching is None:
+    """How runs of another model than the projected one are watched, and who goes on with them."""
+    model = pipeline.model
+    if isinstance(model, Projected):
         return None
-    asked = pipeline.config.deploy
     return Levels(
         partial(pipeline.batch_at, manifold, engine=pipeline.projecting),
-        pipeline.config.engine.check,
-        asked.on_distrust == "projected",
+        model.check if isinstance(model, Recurrence) else 0,
+        pipeline.config.fallback == "projected",
         _near(pipeline),
     )
 
@@ -164,19 +209,19 @@ def _near(pipeline) -> bool:
 
     True as well where there are no such runs, or the projected step loses one of them.
     """
-    if pipeline.error_ratio is None or not pipeline.of_runs or not pipeline.split.validation:
+    if not pipeline.of_runs or pipeline.model.error_ratio is None or not pipeline.split.validation:
         return True
     taught = pipeline.taught
     told = taught.manifest["metrics"]
     if "projected_error" in told and told["projected_error"] is None:  # not finite
         return True
     own, projected = min(told["errors"]), taught.metric("projected_error")
-    if own <= pipeline.error_ratio * projected:
+    if own <= pipeline.model.error_ratio * projected:
         return True
     pipeline.say(
-        f"deploy: warning: operators are {100 * own:.2g} % off at validation runs and the projected step "
-        f"{100 * projected:.2g} %, so that the projected step takes all runs; deploy.error_ratio=null leaves "
-        "them to operators"
+        f"deploy: warning: the recurrence is {100 * own:.2g} % off at validation runs and the projected step "
+        f"{100 * projected:.2g} %, so that the projected step takes all runs; model.error_ratio=null leaves "
+        "them to the recurrence"
     )
     return False
 

@@ -57,8 +57,8 @@ def evaluate(pipeline, run: Run) -> None:
         cost = _cost(pipeline, manifold, rollouts, beside[0].factors)
         engine = str(pipeline.deployment.manifest["metrics"].get("engine", ""))
         seconds = pipeline.training.metric("training_seconds")
-        offline = seconds, pipeline.taught.metric("teach_seconds") if pipeline.is_taught else 0.0
-        own = cost, pipeline.device, run.manifest, engine, offline
+        offline = seconds, pipeline.taught.metric("teach_seconds") if pipeline.model.learns else 0.0
+        own = cost, pipeline.device, run.manifest, pipeline.model.name, engine, offline
         table = results.rows(pipeline.config, manifold, rollouts, comparisons, beside, *own)
         held = comparisons, beside, rollouts
         summary = results.summarise(pipeline.deployed, manifold, table, *held, seconds)
@@ -116,7 +116,7 @@ def _rollouts(pipeline, manifold: Manifold) -> list[Rollout]:
 
 
 def _took(pipeline, rollout: Rollout) -> str | None:
-    """The engine of a run that operators began and none of whose steps are theirs; None: as configured."""
+    """The engine of a run that another model began and took no step of; None: as configured."""
     return None if rollout.by is None or rollout.by_operators else pipeline.projecting
 
 

@@ -15,11 +15,19 @@ from nsf.dynamics.setup import reduced_steps
 from nsf.evaluation import Comparison, Rivals, SolverCost, SuperResolution, reduction_ratio
 from nsf.evaluation.quantities import QUANTITIES
 from nsf.evaluation.surroundings import surroundings
+from nsf.models import describe
 from nsf.runs import Record
 from nsf.scenes import Scene
 from nsf.storage import write_json, writing
 
 _COARSE = "coarse_"
+_METHODS = {
+    ("field", "field"): "nsf",
+    ("deformation", "none"): "deformation_only",
+    ("field", "none"): "neural_stress_only",
+    ("deformation", "field"): "neural_affine_only",
+    ("particles", "particles"): "history",
+}
 
 
 def costs(measured: Mapping[str, SolverCost], decode_ms: float = math.nan) -> dict:
@@ -58,21 +66,24 @@ def rows(
     cost: dict,
     device: str,
     manifest: dict,
+    model: str = "",
     engine: str = "",
     offline: tuple[float, float] = (math.nan, 0.0),
 ) -> pd.DataFrame:
     """Content of `results.csv`, one row a case; errors are fractions, ∞ where a run diverged.
 
-    `engine` took the steps of the rollouts; empty where their run does not say. `offline` are the times of
-    training and of teaching [s]. A run costs what its steps cost, those by operators and projected ones.
+    `model` took the steps of the rollouts, where `model=auto` chose it. `offline` are the times of training
+    and of teaching [s]. A run costs what its steps cost, those by operators and projected ones.
     """
     commit = str(manifest.get("commit") or "unknown")[:12] + ("-dirty" if manifest.get("dirty") else "")
     variant = {
         "scene": config.scene.name,
-        "method": config.method.name,
+        **describe(config, model),
+        # Until reports read the three columns above.
+        "method": _METHODS.get((config.stress, config.affine), ""),
+        "engine": engine,
         "field": manifold.field,
         "r": manifold.latent_dim,
-        "engine": engine,
     }
     # What a step costs whose particles have left the grid is no one's speedup, nor is half a reduced run's.
     costly = (
@@ -165,7 +176,7 @@ def _handed_over(rollout: Rollout, config: DictConfig) -> float:
     """Share of the steps that were not taken by the first level: operators, or else the projected step."""
     steps = reduced_steps(config.scene.steps, config.deploy.dt_multiplier)
     own = steps if rollout.handed_over < 0 else rollout.handed_over
-    if rollout.estimate is not None:
+    if rollout.by is not None:
         own = min(own, rollout.by_operators)
     return 1.0 - own / steps
 
@@ -219,7 +230,10 @@ def summarise(
             {"parameter": rollout.case.column} | asdict(beside)
             for rollout, beside in zip(rollouts, rivals, strict=True)
         ],
-        "variant": {name: results[name].tolist()[0] for name in ("method", "field", "r", "sample")},
+        "variant": {
+            name: results[name].tolist()[0]
+            for name in ("method", "model", "stress", "affine", "field", "r", "sample")
+        },
     }
     if config.scene.get("paper"):
         summary["paper"] = OmegaConf.to_container(config.scene.paper)

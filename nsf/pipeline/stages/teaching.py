@@ -1,4 +1,4 @@
-"""The stage `teach`: operators of the deployed step, taught by another engine."""
+"""The stage `teach` of `model=recurrence`: operators of the deployed step."""
 
 import math
 import time

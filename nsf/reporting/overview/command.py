@@ -22,7 +22,7 @@ keys:
   a field      {", ".join(FIELDS[:-1])}
   a metric     delta, deformation_loss, training_seconds … as `nsf runs show ID` lists them
   a key of the configuration, of the run or those that it was made from, by its dotted name:
-               latent_dim, seed, sampler.size, deploy …; field=, method=, sampler= and engine= take an option
+               latent_dim, seed, sampler.size, deploy …; field=, sampler= and model= take an option
 Several values are parted by commas, * stands for anything, and a key that is filtered has a column.
 
 An ID is stage/scene/hash, or as much of the beginning of it, of scene/hash or of the hash as is unique.

@@ -22,7 +22,7 @@ from nsf.storage import writing
 
 #: What tells variants apart, beside the fields: keys of the configuration, by the heading they get.
 _SETTINGS = {
-    "method": "method.name",
+    "model": "model.name",
     "r": "latent_dim",
     "|S|": "sampler.size",
 }

@@ -17,8 +17,8 @@ from nsf.engines import Operators
 from nsf.pipeline.stages.deployment import calibrated, levels_of
 
 TAUGHT = (
-    "engine=operators", "engine.teaching.steps=400", "engine.teaching.descent=100",
-    "engine.teaching.rounds=0", "engine.teaching.width=16",
+    "model=recurrence", "model.teaching.steps=400", "model.teaching.descent=100",
+    "model.teaching.rounds=0", "model.teaching.width=16",
 )  # fmt: skip
 SETTINGS = Settings((), ("fp32", "fp64"), "cpu", 2)
 

@@ -137,12 +137,12 @@ def test_missing(tmp_path):
 
 
 def test_foreign(tmp_path, chain):
-    with pytest.raises(SchemaError, match="is not a rollout of version 3"):
+    with pytest.raises(SchemaError, match="is not a rollout of version 4"):
         Rollout.open(chain.trajectory(26.0))
     other = tmp_path / "other.h5"
     with h5py.File(other, "w") as file:
         file["x"] = np.zeros(3)
-    with pytest.raises(SchemaError, match="is not a rollout of version 3"):
+    with pytest.raises(SchemaError, match="is not a rollout of version 4"):
         Rollout.open(other)
     (tmp_path / "text.h5").write_text("not HDF5")
     with pytest.raises(SchemaError, match="not HDF5"):
@@ -153,8 +153,8 @@ def test_newer(made, tmp_path):
     path = tmp_path / "rollout.h5"
     made.save(path)
     with h5py.File(path, "a") as file:
-        file.attrs["nsf_rollout"] = 4
-    with pytest.raises(SchemaError, match=r"found 4"):
+        file.attrs["nsf_rollout"] = 5
+    with pytest.raises(SchemaError, match=r"found 5"):
         Rollout.open(path)
 
 
@@ -219,8 +219,8 @@ ODD = [
     (attribute("needed_outside", -1), "needed_outside=-1"),
     (attribute("diverged", 25), "diverged=25, in 24 steps"),
     (attribute("handed_over", -2), "handed_over=-2"),
-    (attribute("nsf_rollout", "2"), "not a rollout of version 3"),
-    (attribute("nsf_rollout", [2, 2]), "not a rollout of version 3"),
+    (attribute("nsf_rollout", "2"), "not a rollout of version 4"),
+    (attribute("nsf_rollout", [2, 2]), "not a rollout of version 4"),
     (lambda file: file.attrs.__delitem__("sample"), "lacks a part of a rollout"),
     (replaced("xhat", np.zeros((24, 4))), r"xhat of shape \[24, 4\], not \[25, 4\]"),
     (replaced("xhat", np.zeros((25, 5))), r"xhat of shape \[25, 5\], not \[25, 4\]"),

@@ -9,7 +9,7 @@ from angles import angle
 
 from nsf.deployment import FULL_ORDER, OPERATORS, PROJECTED, Levels, Rollout, rollouts
 from nsf.deployment.levels import _carried
-from nsf.dynamics import History, ReducedBatch
+from nsf.dynamics import ReducedBatch, Sources
 from nsf.dynamics.span import Span
 
 STEPS, CHANGE = 24, 1e-3
@@ -76,7 +76,7 @@ def batch_of(chain, tiny_manifold):
             at = tiny_manifold.restrict(batch.shared.samples[0].particles, dtype=torch.float64)
             return [span(batch, batch.shared.sets[0], at)]
 
-        return ReducedBatch(runs, spans, engine="operators", **({"doubt": doubt} if doubt else {}))
+        return ReducedBatch(runs, spans, engine="latent", **({"doubt": doubt} if doubt else {}))
 
     return build
 
@@ -169,14 +169,14 @@ def test_an_estimate_in_single_precision_overflows_no_earlier_than_positions(bat
 
 def test_a_run_whose_particles_carry_stress_is_taken_anew(shared, batch_of):
     """From t = 0: in its midst the stress that they would carry is not known."""
-    method = History("history", neural_stress=True, neural_affine=True)
-    (found,) = shared(Straying, Line, 2, True, method=method)
+    sources = Sources("particles", "particles")
+    (found,) = shared(Straying, Line, 2, True, sources=sources)
     assert (found.levels == PROJECTED).all()
     assert (found.estimate == 0.0).all()
     straight = batch_of(Line).runs[0]
     straight.step(STEPS)
     np.testing.assert_array_equal(found.xhat, straight.record.xhat.numpy())
-    (kept,) = shared(Line, Line, 2, True, method=method)
+    (kept,) = shared(Line, Line, 2, True, sources=sources)
     assert (kept.levels == OPERATORS).all()
 
 

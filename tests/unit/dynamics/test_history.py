@@ -1,18 +1,17 @@
-"""`method=history`: stress and C that particles carry, beside full-order steps put onto the manifold."""
+"""`stress=particles`: stress and C that particles carry, beside full-order steps put onto the manifold."""
 
 import numpy as np
 import pytest
 import torch
 
 import nsf.scenes
-from nsf import config
-from nsf.dynamics import GaussNewton, History, Setup
+from nsf.dynamics import GaussNewton, Setup, Sources
 from nsf.engines.choice import choose
 from nsf.errors import ConfigError
 from nsf.sampling import SampleSpan
 
 ANGLE = {"friction_angle": 26.0}
-HISTORY = History("history", neural_stress=True, neural_affine=True)
+CARRIED = Sources("particles", "particles")
 #: Never converged, so that each step takes all its iterations.
 EXACT = GaussNewton(tolerance=1e-14)
 
@@ -22,14 +21,10 @@ def solver_of(chain, tiny_manifold):
     """(scene, **options) → the reduced solver at 26°."""
 
     def build(scene=None, sample=60, **options):
-        options = {"method": HISTORY, "device": "cpu", "projector": EXACT} | options
+        options = {"sources": CARRIED, "device": "cpu", "projector": EXACT} | options
         return (scene or chain.scene).reduced(tiny_manifold, ANGLE, sample, **options)
 
     return build
-
-
-def test_it_is_the_configured_method(tiny):
-    assert config.build(config.load([*tiny, "method=history"]).method, "method") == HISTORY
 
 
 def test_a_step_is_the_full_order_step_put_onto_the_manifold(solver_of, chain, tiny_manifold):
@@ -107,36 +102,35 @@ def test_the_way_to_a_state_counts(solver_of):
 
 def test_two_samples_in_one_run_are_refused(chain, tiny_manifold):
     spans = [SampleSpan(0.0, np.arange(30)), SampleSpan(0.5, np.arange(40))]
-    setup = Setup(tiny_manifold, chain.scene, spans, ANGLE, method=HISTORY, device="cpu")
-    with pytest.raises(ConfigError, match="history takes one sample in a run"):
+    setup = Setup(tiny_manifold, chain.scene, spans, ANGLE, sources=CARRIED, device="cpu")
+    with pytest.raises(ConfigError, match="particles takes one sample in a run"):
         choose("auto", [setup])
 
 
 @pytest.mark.parametrize(
     ("keys", "told"),
     [
-        (["engine=modal"], "engine=modal does not know method=history; set engine=auto, or method=nsf"),
         (
-            ["engine=operators"],
-            "teacher=auto is asked for single steps.*; set engine.teacher=runs, or",
+            ["model=recurrence"],
+            "teacher=projected is asked for single steps.*; set model.teacher=runs, or",
         ),
-        (["deploy.batch=2"], "deploy.batch=2 needs the compiled engine.*; set deploy.batch=1, or method=nsf"),
+        (["deploy.batch=2"], "deploy.batch=2 needs compiled steps.*; set deploy.batch=1, or stress=field"),
         (
             ["sampler=region", "sampler.phases=[{start: 0.5, size: 30}]"],
-            r"2 samples in a run, and method=history takes one; set sampler.phases=\[\]",
+            r"2 samples in a run, and stress=particles takes one; set sampler.phases=\[\]",
         ),
     ],
     ids=lambda value: value if isinstance(value, str) else value[0],
 )
 def test_what_asks_for_steps_without_a_history_is_refused(pipeline_at, tmp_path, keys, told):
     with pytest.raises(ConfigError, match=told):
-        pipeline_at(tmp_path, "method=history", *keys)
+        pipeline_at(tmp_path, "stress=particles", "affine=particles", *keys)
 
 
 def test_the_compiled_engine_leaves_it_to_the_reference(solver_of):
     solver = solver_of()
     assert solver.engine == "reference"
-    assert "History is not known to modal" in solver.together.why
+    assert "stress=particles is not known to modal" in solver.together.why
 
 
 @pytest.mark.gpu
@@ -144,7 +138,7 @@ def test_a_gpu_takes_the_same_steps(tiny, reference_manifold):
     scene = nsf.scenes.load("sand", tiny[1:])
     found = []
     for device in ("cpu", "cuda"):
-        solver = scene.reduced(reference_manifold, ANGLE, 60, method=HISTORY, device=device)
+        solver = scene.reduced(reference_manifold, ANGLE, 60, sources=CARRIED, device=device)
         solver.step(12)
         found.append(solver.xhat.cpu())
     np.testing.assert_allclose(*found, atol=1e-6)

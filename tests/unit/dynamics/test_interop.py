@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import warp as wp
-from gpu_references import METHODS
+from gpu_references import SOURCES
 
 from nsf.dynamics.interop import captured, on_torch_stream
 
@@ -46,13 +46,13 @@ def test_torchs_stream_is_entered_once(entered):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
-def test_captured_steps_are_the_steps_themselves(method, tiny_scene, reference_manifold):
+@pytest.mark.parametrize("sources", SOURCES, ids=str)
+def test_captured_steps_are_the_steps_themselves(sources, tiny_scene, reference_manifold):
     """Every replay clears the grid and takes the stress anew."""
     found = []
     for capturable in (True, False):
         solver = tiny_scene.reduced(
-            reference_manifold, {"friction_angle": 26.0}, 60, method=method, device="cuda"
+            reference_manifold, {"friction_angle": 26.0}, 60, sources=sources, device="cuda"
         )
         solver.span.capturable = capturable
         solver.step(8)

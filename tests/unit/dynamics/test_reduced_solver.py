@@ -11,15 +11,14 @@ import nsf
 import nsf.scenes
 from nsf.deployment import rollout
 from nsf.dynamics import (
-    NSF,
     GaussNewton,
     Integration,
-    Method,
     NeighbourSearch,
     ParticleSets,
     ProjectionResult,
     ReducedMPM,
     Setup,
+    Sources,
     Taylor,
 )
 from nsf.errors import ConfigError, NSFError, ProjectionError, SchemaError, ShapeError
@@ -209,9 +208,9 @@ def test_every_particle_takes_its_own_mass_and_volume_along(solver_of, corner, m
 
     even = solver_of(corner)
     monkeypatch.setattr(Scene, "particles", uneven)
-    for method in (NSF, Method("deformation_only", False, False)):
-        fixed = solver_of(corner, method=method)
-        searching = solver_of(corner, method=method, integration=SEARCH)
+    for sources in (Sources(), Sources("deformation", "none")):
+        fixed = solver_of(corner, sources=sources)
+        searching = solver_of(corner, sources=sources, integration=SEARCH)
         run(fixed, 8), run(searching, 8)
         x = fixed.state.numpy()["x"]
         assert np.abs(x - searching.state.numpy()["x"]).max() < 1e-10

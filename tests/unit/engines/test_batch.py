@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import nsf.scenes
-from nsf.dynamics import NSF, GaussNewton, Integration, Method, ReducedBatch, Setup, Taylor
+from nsf.dynamics import GaussNewton, Integration, ReducedBatch, Setup, Sources, Taylor
 from nsf.engines import Modal
 from nsf.errors import ConfigError, ShapeError
 from nsf.kinematics.fields.basis import BasisManifold
@@ -18,7 +18,7 @@ from nsf.timing import StageTimer
 
 ANGLE = "friction_angle"
 ANGLES = (26.0, 22.0, 37.5)
-METHODS = [Method(f"{a}{b}", a, b) for a in (True, False) for b in (True, False)]
+SOURCES = [Sources(stress, affine) for stress in ("field", "deformation") for affine in ("field", "none")]
 #: A plate that comes down on the column within the first steps.
 PLATE = [
     "+scene.colliders.plate._target_=nsf.mpm.Cuboid",
@@ -60,9 +60,9 @@ def with_law(chain, tiny_manifold, setup_of):
     """(law, method) → the setup of a run of the tiny scene with that law."""
     first = setup_of(chain.scene)
 
-    def build(law, method):
+    def build(law, sources):
         scene = replace(chain.scene, material=law)
-        options = {"method": method, "device": "cpu", "sets": first.sets}
+        options = {"sources": sources, "device": "cpu", "sets": first.sets}
         return Setup(tiny_manifold, scene, first.samples, {ANGLE: 26.0}, **options)
 
     return build
@@ -87,15 +87,15 @@ def assert_each_as_alone(batch, singles, steps, tolerance=1e-10):
         same(run, single, tolerance)
 
 
-@pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
-def test_every_method(chain, tiny_manifold, parameters, method):
-    options = {"method": method, "device": "cpu"}
+@pytest.mark.parametrize("sources", SOURCES, ids=str)
+def test_every_method(chain, tiny_manifold, parameters, sources):
+    options = {"sources": sources, "device": "cpu"}
     batch = chain.scene.reduced_batch(tiny_manifold, parameters, 20, **options)
     singles = [chain.scene.reduced(tiny_manifold, own, 20, **options) for own in parameters]
     assert_each_as_alone(batch, singles, 24)
     ends = batch.xhat.numpy()
     # The friction angle enters by the heads; without it the test would show nothing.
-    assert (np.abs(ends[0] - ends[1]).max() > 1e-3) == (method.neural_stress or method.neural_affine)
+    assert (np.abs(ends[0] - ends[1]).max() > 1e-3) == (sources.neural_stress or sources.neural_affine)
 
 
 @pytest.mark.parametrize("count", [1, 8, 9, 19])
@@ -172,23 +172,23 @@ PROGRAMS = (
 
 
 @pytest.mark.parametrize("what", CHANGES)
-@pytest.mark.parametrize("method", [NSF, Method("deformation", False, False)], ids=lambda m: m.name)
-def test_what_a_parameter_changes_is_each_ones_own(tiny, setup_of, what, method):
+@pytest.mark.parametrize("sources", [Sources(), Sources("deformation", "none")], ids=str)
+def test_what_a_parameter_changes_is_each_ones_own(tiny, setup_of, what, sources):
     added = {"plate": PLATE, "program": PROGRAMS}.get(what, ())
     scene = nsf.scenes.load("sand", [*tiny[1:], *added])
     scenes = [scene.with_changes(changes) if changes else scene for changes in CHANGES[what]]
-    setups = [setup_of(scene, method=method) for scene in scenes]
+    setups = [setup_of(scene, sources=sources) for scene in scenes]
     batch, singles = together(*setups), [together(setup).runs[0] for setup in setups]
     assert_each_as_alone(batch, singles, 24)
     moved = np.abs(batch.xhat.numpy()[1:] - batch.xhat.numpy()[0]).max(1)
     # With τ from its field, the moduli have no part in a step.
-    assert (moved > 1e-3).all() if what != "stiffness" or not method.neural_stress else (moved == 0.0).all()
+    assert (moved > 1e-3).all() if what != "stiffness" or not sources.neural_stress else (moved == 0.0).all()
 
 
 def test_the_history_at_rest_is_each_ones_own(with_law):
     """Without flow it decides a stress where it is zero: such a particle is damaged."""
     laws = [VonMises(E=2000.0, nu=0.2, yield_stress=value) for value in (20.0, 30.0)]
-    span = together(*(with_law(law, METHODS[3]) for law in laws)).span
+    span = together(*(with_law(law, SOURCES[3]) for law in laws)).span
     held = [a for a in span._arena._held if a.shape == (2 * span.size, 1)]
     assert [a.flatten().tolist() for a in held] == [[20.0] * span.size + [30.0] * span.size]
 
@@ -293,7 +293,7 @@ def test_what_cannot_be_stepped_together(chain, tiny_manifold, parameters, optio
         (["scene.walls.padding=4"], {}, "share the domain's walls"),
         (["scene.dx=0.025"], {"sets": None}, "share the grid"),
         (PLATE, {}, "share the number of colliders, which differs between friction_angle=26 and"),
-        ([], {"method": METHODS[1]}, "share the method"),
+        ([], {"sources": SOURCES[1]}, "share where τ and C come from"),
         ([], {"precision": "fp32"}, "share the precision"),
         ([], {"projector": Taylor()}, "share the projector"),
         (["transfer=pic"], {}, "share the transfer"),
@@ -309,9 +309,9 @@ def test_what_must_be_the_same(tiny, setup_of, overrides, options, message):
 
 def test_another_law_is_refused_where_it_is_asked(with_law):
     laws = [Hencky(E=2000.0, nu=0.2), FixedCorotated(E=2000.0, nu=0.2)]
-    together(*(with_law(law, NSF) for law in laws))  # with neural stress nobody asks it
+    together(*(with_law(law, Sources()) for law in laws))  # with neural stress nobody asks it
     with pytest.raises(ConfigError, match="share the law"):
-        together(*(with_law(law, METHODS[3]) for law in laws))
+        together(*(with_law(law, SOURCES[3]) for law in laws))
 
 
 def test_other_samples_are_refused(chain, tiny_manifold):
@@ -341,12 +341,12 @@ def test_bad_states(setup_of, chain, options, message):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
+@pytest.mark.parametrize("sources", SOURCES, ids=str)
 @pytest.mark.parametrize("count", [3, 19])
 @pytest.mark.parametrize("precision", ["fp64", "fp32"])
-def test_on_a_gpu(tiny_scene, reference_manifold, method, count, precision):
+def test_on_a_gpu(tiny_scene, reference_manifold, sources, count, precision):
     parameters = [{ANGLE: angle} for angle in np.linspace(22.0, 38.0, count)]
-    options = {"method": method, "device": "cuda", "precision": precision}
+    options = {"sources": sources, "device": "cuda", "precision": precision}
     batch = tiny_scene.reduced_batch(reference_manifold, parameters, 60, **options)
     batch.step(24)
     for index in {0, 1, count - 1}:

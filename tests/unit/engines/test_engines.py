@@ -11,7 +11,7 @@ import torch
 from typing_extensions import override
 
 from nsf import config, engines
-from nsf.dynamics import NSF, GaussNewton, Integration, Method, ReducedBatch, Taylor
+from nsf.dynamics import GaussNewton, Integration, ReducedBatch, Sources, Taylor
 from nsf.dynamics.latent import LatentRecord
 from nsf.dynamics.projection import Latents
 from nsf.dynamics.step import Step, steps_of
@@ -34,9 +34,9 @@ SCENES = {
     "squishy_ball": "[20.0,30.0]",
     "toothpaste": "[5.0,25.0]",
 }
-METHODS = [Method(f"{a}{b}", a, b) for a in (True, False) for b in (True, False)]
+SOURCES = [Sources(stress, affine) for stress in ("field", "deformation") for affine in ("field", "none")]
 WAYS = [
-    *({"method": method} for method in METHODS),
+    *({"sources": sources} for sources in SOURCES),
     {"projector": Taylor()},
     {"projector": GaussNewton(iterations=2, tolerance=1e-9)},
     {"integration": Integration("search", 0)},
@@ -213,9 +213,9 @@ def test_an_engine_is_asked_for(reduced):
     solver = reduced(engine="reference")
     assert (solver.engine, solver.together.why) == ("reference", "it was asked for")
     assert reduced(engine="modal").together.why == ""
-    with pytest.raises(ConfigError, match=r"engine=fast is unknown; choose one of auto, .*operators"):
+    with pytest.raises(ConfigError, match=r"engine=fast is unknown; choose one of auto, modal, reference"):
         reduced(engine="fast")
-    assert NAMES == ("auto", "modal", "reference", "operators")
+    assert NAMES == ("auto", "modal", "reference")
 
 
 def test_an_engine_of_ones_own(reduced):
@@ -224,15 +224,15 @@ def test_an_engine_of_ones_own(reduced):
 
         @override
         def refusal(self, setups):
-            return "" if setups[0].method == NSF else "it knows one method"
+            return "" if setups[0].sources == Sources() else "it knows one sources"
 
         @override
         def spans(self, batch):
             return steps_of(batch)
 
     assert reduced(engine=Own()).engine == "own"
-    with pytest.raises(ConfigError, match=re.escape("engine own: it knows one method")):
-        reduced(engine=Own(), method=METHODS[3])
+    with pytest.raises(ConfigError, match=re.escape("engine own: it knows one sources")):
+        reduced(engine=Own(), sources=SOURCES[3])
 
 
 def test_the_reference_steps_one_run_at_a_time(chain, tiny_manifold):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from gpu_references import METHODS, TOLERANCES, steps, steps_of_a_cpu
+from gpu_references import SOURCES, TOLERANCES, steps, steps_of_a_cpu
 
 import nsf.scenes
 from nsf.dynamics import GaussNewton, Integration, Taylor
@@ -47,10 +47,10 @@ def same(one, other, tolerance=2e-7):
     assert one.stops == other.stops
 
 
-@pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
-def test_every_method(pair, method):
+@pytest.mark.parametrize("sources", SOURCES, ids=str)
+def test_every_method(pair, sources):
     # The modes of ∂g/∂X are rounded to fp32, as the others are from the start.
-    same(*runs(pair(method=method)), tolerance=2e-7 if method.neural_stress else 5e-6)
+    same(*runs(pair(sources=sources)), tolerance=2e-7 if sources.neural_stress else 5e-6)
 
 
 @pytest.mark.parametrize("strategy", ["superset", "search"])
@@ -215,19 +215,19 @@ def test_the_particles_taken_are_those_of_the_search(pair, chain):
     assert fixed.integration_mean == modal.integration_mean
 
 
-@pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
+@pytest.mark.parametrize("sources", SOURCES, ids=str)
 @pytest.mark.parametrize("tolerance", TOLERANCES)
-def test_references_are_what_a_cpu_computes(tiny_scene, reference_manifold, method, tolerance):
+def test_references_are_what_a_cpu_computes(tiny_scene, reference_manifold, sources, tolerance):
     """Else what a GPU is compared with is of older code: `make gpu-references` writes it anew."""
-    found = steps(tiny_scene, reference_manifold, "cpu", method, tolerance)
-    same(found, steps_of_a_cpu(method, tolerance), tolerance=1e-9)
+    found = steps(tiny_scene, reference_manifold, "cpu", sources, tolerance)
+    same(found, steps_of_a_cpu(sources, tolerance), tolerance=1e-9)
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
+@pytest.mark.parametrize("sources", SOURCES, ids=str)
 @pytest.mark.parametrize("half", [False, True])
 @pytest.mark.parametrize("tolerance", TOLERANCES)
-def test_the_gpu_takes_the_same_steps(tiny_scene, reference_manifold, method, half, tolerance, monkeypatch):
+def test_the_gpu_takes_the_same_steps(tiny_scene, reference_manifold, sources, half, tolerance, monkeypatch):
     if not half:
         monkeypatch.setattr(
             Arena,
@@ -237,8 +237,8 @@ def test_the_gpu_takes_the_same_steps(tiny_scene, reference_manifold, method, ha
                 arena.hold(torch.ones(table.shape[2]), arena.real),
             ),
         )
-    found = steps(tiny_scene, reference_manifold, "cuda", method, tolerance)
-    expected = steps_of_a_cpu(method, tolerance)
+    found = steps(tiny_scene, reference_manifold, "cuda", sources, tolerance)
+    expected = steps_of_a_cpu(sources, tolerance)
     if half:
         # Late in the run x̂ grows by a tenth a step, and with it what eleven bits of a mode leave out.
         np.testing.assert_allclose(found.xhat, expected.xhat, rtol=3e-3, atol=1e-3 * np.ptp(expected.xhat))
@@ -247,16 +247,16 @@ def test_the_gpu_takes_the_same_steps(tiny_scene, reference_manifold, method, ha
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("method", METHODS, ids=lambda m: m.name)
+@pytest.mark.parametrize("sources", SOURCES, ids=str)
 @pytest.mark.parametrize(
     ("options", "tolerance"),
     [({"precision": "fp32"}, 1e-3), ({"engine": "reference"}, 1e-6)],
     ids=["single precision", "the reference"],
 )
-def test_the_gpu_takes_nearly_the_same_steps(tiny_scene, reference_manifold, method, options, tolerance):
+def test_the_gpu_takes_nearly_the_same_steps(tiny_scene, reference_manifold, sources, options, tolerance):
     """In single precision as near as modes in half precision leave them."""
-    found = steps(tiny_scene, reference_manifold, "cuda", method, 1e-6, **options).xhat
-    expected = steps_of_a_cpu(method, 1e-6).xhat
+    found = steps(tiny_scene, reference_manifold, "cuda", sources, 1e-6, **options).xhat
+    expected = steps_of_a_cpu(sources, 1e-6).xhat
     # Modes are in half precision here too.
     np.testing.assert_allclose(found, expected, rtol=3e-3, atol=tolerance * np.ptp(expected))
 

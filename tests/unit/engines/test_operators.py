@@ -33,7 +33,7 @@ from nsf.sampling import SampleSpan
 
 SAMPLES = (SampleSpan(0.0, np.arange(3)), SampleSpan(0.5, np.array([1, 7]), np.array([0.5, 1.5])))
 TAUGHT = Taught(
-    manifold="aa", scene="bb", sample="cc", dt=0.01, method="nsf", projector="gn", parameters=("angle",),
+    manifold="aa", scene="bb", sample="cc", dt=0.01, sources="fields", projector="gn", parameters=("angle",),
     ranges=((20.0, 40.0),), gravity=(0.0, 0.0, -10.0), reach=1.0,
 )  # fmt: skip
 RUNS, STEPS = 3, 12
@@ -339,7 +339,7 @@ class Evil:
     ("spoil", "message"),
     [
         (lambda content: content | {"format": "other"}, "holds no operators"),
-        (lambda content: content | {"format_version": 9}, "has format_version 9, this nsf reads 2"),
+        (lambda content: content | {"format_version": 9}, "has format_version 9, this nsf reads 3"),
         (lambda content: content | {"samples": [{"start": 0.0}]}, "do not fit each other"),
         (
             lambda content: content | {"samples": [content["samples"][1] | {"weights": torch.zeros(2)}]},
@@ -381,7 +381,7 @@ def test_a_file_that_is_cut_short_or_missing(tmp_path):
         ({"scene": "dd"}, "another scene: bb, not dd"),
         ({"sample": "dd"}, "another sample: cc, not dd"),
         ({"dt": 0.02}, "another Δt [s]: 0.01, not 0.02"),
-        ({"method": "pic"}, "another method: nsf, not pic"),
+        ({"sources": "pic"}, "another sources: fields, not pic"),
         ({"projector": "taylor"}, "another projector: gn, not taylor"),
         ({"ranges": ((20.0, 50.0),)}, "other ranges: ((20.0, 40.0),), not ((20.0, 50.0),)"),
         ({}, ""),

@@ -11,7 +11,7 @@ from angles import angle
 import nsf.scenes
 from nsf.data import Trajectory
 from nsf.deployment import FULL_ORDER, OPERATORS, PROJECTED, Rollout, go_on
-from nsf.dynamics import History, Method
+from nsf.dynamics import Sources
 from nsf.errors import InstabilityError, SchemaError
 from nsf.evaluation import at_frames, compare, metrics
 from nsf.evaluation.compare import _shown, levels_at_frames, trust_at_frames
@@ -253,7 +253,7 @@ def test_a_method_is_held_to_the_stress_and_affine_momentum_it_used(
 ):
     """Without a stress field τ is that of ∂g/∂X, without an affine field C = 0 (spin is lost)."""
     neural = comparison_of(made)
-    baseline = comparison_of(made, method=Method("deformation_only", False, False))
+    baseline = comparison_of(made, sources=Sources("deformation", "none"))
     law = chain.scene.material
     at, F = tiny_manifold.restrict(), []
     for row in torch.tensor(made.xhat):
@@ -272,11 +272,11 @@ def test_a_method_is_held_to_the_stress_and_affine_momentum_it_used(
 
 
 def test_stress_that_particles_carried_is_what_counts(chain, tiny_manifold, truth):
-    """With `method=history`, in chunks of any length, though the fields say otherwise."""
-    method = History("history", neural_stress=True, neural_affine=True)
+    """With `stress=particles affine=particles`, in chunks of any length, though the fields say otherwise."""
+    sources = Sources("particles", "particles")
 
     def solver():
-        options = {"method": method, "device": "cpu"}
+        options = {"sources": sources, "device": "cpu"}
         return chain.scene.reduced(tiny_manifold, {"friction_angle": 26.0}, 20, **options)
 
     run, carried = solver(), []

@@ -38,8 +38,8 @@ def test_blocks_are_what_the_solver_decodes(played, solver, deployed, monkeypatc
 
 
 def test_stress_from_the_deformation(pipeline_at, own_root, tiny_manifold):
-    """method=deformation_only: the law's stress, at the particles and in between."""
-    pipeline = pipeline_at(own_root, "method=deformation_only")
+    """stress=deformation affine=none: the law's stress, at the particles and in between."""
+    pipeline = pipeline_at(own_root, "stress=deformation", "affine=none")
     run = pipeline.deploy()
     xhat = torch.tensor(Rollout.open(run.path / "rollout_0.h5").xhat[[0, 20, 24]])
     decoder = pipeline.solver_at(tiny_manifold, angle(26.0)).decoder()
@@ -108,7 +108,7 @@ def test_a_run_handed_over_goes_on_at_full_order(deployed, tmp_path, solver, sea
     torch.testing.assert_close(x[:2], solver.decoder().position(torch.tensor(rollout.xhat[[0, 5]])))
     assert (x[2:, :, 2].mean(1).diff() < 0).all()  # the column goes on falling
     assert torch.isfinite(tau).all()
-    with pytest.raises(ConfigError, match=r"full-order solver went on with .* deploy\.on_distrust=report"):
+    with pytest.raises(ConfigError, match=r"full-order solver went on with .* fallback=none"):
         Playback(run, points=501, device="cpu")
 
 

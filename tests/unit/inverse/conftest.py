@@ -6,8 +6,8 @@ from nsf.inverse import Model
 
 #: The friction angle, and the speed at which the column starts, which only the scene's configuration knows.
 TWO = (
-    "engine=operators",
-    *(f"engine.teaching.{key}" for key in ("steps=2500", "descent=500", "rounds=1", "width=32")),
+    "model=recurrence",
+    *(f"model.teaching.{key}" for key in ("steps=2500", "descent=500", "rounds=1", "width=32")),
     "+scene.speed=0.1",
     "scene.bodies.column.velocity=['${scene.speed}',0,0]",
     "+scene.parameters.friction_angle.range=[22,38]",

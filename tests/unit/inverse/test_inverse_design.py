@@ -156,8 +156,8 @@ def pushed(pipeline_at, tmp_path_factory):
     """A column that a plate pushes along programs."""
     pipeline = pipeline_at(
         tmp_path_factory.mktemp("pushed") / "runs",
-        "engine=operators",
-        *(f"engine.teaching.{key}" for key in ("steps=1500", "descent=300", "rounds=1", "width=24")),
+        "model=recurrence",
+        *(f"model.teaching.{key}" for key in ("steps=1500", "descent=300", "rounds=1", "width=24")),
         "+scene.program=0",
         "+scene.forcing={gravity:{},colliders:{plate:{_target_:nsf.scenes.RandomPush,direction:[1,0,0],"
         "reach:[-0.005,0.02],knots:3}}}",

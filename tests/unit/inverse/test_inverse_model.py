@@ -103,7 +103,9 @@ def test_bad_input(model, chain):
         model(ONE | {"cohesion": 1.0})
     with pytest.raises(ShapeError, match=r"shape \[3\]; give \[..., 2\], as friction_angle, speed"):
         model([1.0, 2.0, 3.0])
-    with pytest.raises(ConfigError, match=r"engine=auto, whose steps know no gradient; .* engine=operators"):
+    with pytest.raises(
+        ConfigError, match=r"model=projected, whose steps know no gradient; .* model=recurrence"
+    ):
         nsf.Model.load(chain.pipeline.deployment, "cpu")
 
 

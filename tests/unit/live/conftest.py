@@ -24,8 +24,8 @@ def player(model):
 def taught_model(chain, pipeline_at, tmp_path_factory):
     """The live model of the tiny chain by operators that were hardly taught, at three held-out values."""
     root = shutil.copytree(chain.root, tmp_path_factory.mktemp("taught") / "runs")
-    taught = [f"engine.teaching.{key}" for key in ("steps=400", "descent=300", "rounds=1", "width=32")]
-    pipeline = pipeline_at(root, "engine=operators", *taught, "scene.design.test=[24,26,34]")
+    taught = [f"model.teaching.{key}" for key in ("steps=400", "descent=300", "rounds=1", "width=32")]
+    pipeline = pipeline_at(root, "model=recurrence", *taught, "scene.design.test=[24,26,34]")
     pipeline.simulate()
     pipeline.deploy()
     return LiveModel(pipeline.deployment, device="cpu", surface=True)
@@ -37,9 +37,9 @@ def tilting_model(tmp_path_factory):
     from nsf import config
     from nsf.pipeline import Pipeline
 
-    taught = [f"engine.teaching.{key}" for key in ("steps=1200", "descent=300", "rounds=1", "width=32")]
+    taught = [f"model.teaching.{key}" for key in ("steps=1200", "descent=300", "rounds=1", "width=32")]
     keys = [
-        "scene=block", "scale=small", "device=cpu", "engine=operators", *taught,
+        "scene=block", "scale=small", "device=cpu", "model=recurrence", *taught,
         "scene.dx=0.03", "scene.dt=0.002", "scene.steps=80", "scene.bodies.block.particles=400",
         "scene.design.train=6", "scene.design.validation=0", "scene.design.test=2",
         "field.modes=[12,12,12]", "field.beta=4", "field.depth=1", "trainer.steps=200", "latent_dim=4",

@@ -100,17 +100,17 @@ def test_most_of_few_points_lie_at_the_surface(chain):
 
 
 def test_a_run_that_no_operators_step_is_refused(model, tmp_path, monkeypatch):
-    with pytest.raises(ConfigError, match=r"engine=auto, whose steps take more .* engine=operators"):
+    with pytest.raises(ConfigError, match=r"model=projected, whose steps a page does not take.* model=recurrence"):
         publish.model_data(model)
     monkeypatch.setattr(publish, "LiveModel", None)  # which takes minutes of a large run
-    with pytest.raises(ConfigError, match=r"engine=auto, whose steps take more .* engine=operators"):
+    with pytest.raises(ConfigError, match=r"model=projected, whose steps a page does not take.* model=recurrence"):
         publish.write(model.run, tmp_path, device="cpu")
 
 
 def test_operators_with_a_memory_are_refused(taught_model, monkeypatch):
     model = taught_model.pipeline.operators().model
     monkeypatch.setattr(model, "sizes", replace(model.sizes, memory=1))
-    with pytest.raises(ConfigError, match=r"memory, which a page has not; .* engine.teaching.memory=\[\]"):
+    with pytest.raises(ConfigError, match=r"memory, which a page has not; .* model.teaching.memory=\[\]"):
         publish.model_data(taught_model)
 
 

@@ -43,7 +43,7 @@ def test_keys_still_follow_the_parameter(pipeline_at, tmp_path):
 @pytest.mark.parametrize(
     ("key", "value", "told"),
     [
-        ("method._target_", "nsf.workers.Worker", r"method: _target_: nsf\.workers\.Worker is refused"),
+        ("model._target_", "nsf.workers.Worker", r"model: _target_: nsf\.workers\.Worker is refused"),
         ("scene.colliders.floor._target_", "nsf.storage.write_json", "write_json is refused"),
         ("sampler._target_", "os.system", r"sampler: _target_: os\.system is refused"),
         ("scene.title", "${oc.env:HOME}", "scene.title: .*oc.env.* is refused"),

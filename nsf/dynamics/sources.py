@@ -1,4 +1,4 @@
-"""Where the reduced step takes τ and C from: the paper's methods (section 6.1), and `History`."""
+"""Where the reduced step takes τ and C from: fields, ∂g/∂X (paper section 6.1), or particles."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,25 +8,64 @@ import warp as wp
 
 from nsf.data import TAU_MATRIX
 from nsf.dynamics.interop import as_matrices, as_scalars, on_torch_stream
+from nsf.errors import ConfigError
 from nsf.mpm import Precision
 from nsf.mpm.materials import Material, make_elastic_stress
 
+STRESS = ("field", "deformation", "particles")
+AFFINE = ("field", "none", "particles")
+
 
 @dataclass(frozen=True)
-class Method:
-    """What the reduced model takes from fields.
+class Sources:
+    """Where a reduced step takes τ and C from.
+
+    With `particles` both follow the grid at every particle, as at full order, and x and v are the manifold's.
+    Each particle keeps F_e, the law's history variables and C: under forcing that no training run had, the
+    stress of a plastic body depends on the way to a state, which no field of x̂ can tell. Such a step needs
+    every particle, so it costs what a full-order step costs. The fields h and l say where a run begins in its
+    midst, and what a latent vector is decoded to. Not in the paper; internal variables at the points of
+    integration, with reduced kinematics, are those of Ryckelynck 2009 (Hyper-reduction of mechanical models
+    involving internal variables).
 
     Attributes:
-        name: of the method.
-        neural_stress: τ from the stress field h; otherwise from ∂g/∂X through the elastic law.
-        neural_affine: C from the affine field l; otherwise C = 0.
+        stress: of τ: the stress field h (`field`), ∂g/∂X through the elastic law (`deformation`), or
+            `particles`.
+        affine: of C: the affine field l (`field`), C = 0 (`none`), or `particles`.
 
-    Source: paper sections 4.3 and 4.4; without both fields it is Chen et al. 2023a.
+    Raises:
+        ConfigError: another word, or particles carry one of both alone.
+
+    Source: paper sections 4.3 and 4.4; deformation and none are Chen et al. 2023a.
     """
 
-    name: str
-    neural_stress: bool
-    neural_affine: bool
+    stress: str = "field"
+    affine: str = "field"
+
+    def __post_init__(self):
+        for name, options in (("stress", STRESS), ("affine", AFFINE)):
+            if (value := getattr(self, name)) not in options:
+                raise ConfigError(f"{name}={value} is unknown; choose one of {', '.join(options)}")
+        if (self.stress == "particles") != (self.affine == "particles"):
+            raise ConfigError(
+                f"stress={self.stress} does not go with affine={self.affine}: particles carry both; set "
+                "stress=particles affine=particles, or neither"
+            )
+
+    @property
+    def carried(self) -> bool:
+        """Whether particles carry τ and C."""
+        return self.stress == "particles"
+
+    @property
+    def neural_stress(self) -> bool:
+        """Whether τ of a latent vector comes from the stress field."""
+        return self.stress != "deformation"
+
+    @property
+    def neural_affine(self) -> bool:
+        """Whether C of a latent vector comes from the affine field."""
+        return self.affine != "none"
 
     def stress_of(
         self,
@@ -57,20 +96,6 @@ class Method:
         if self.neural_affine:
             return lambda xhat, rate: at.affine(xhat, parameters, rate)
         return lambda xhat, rate: None
-
-
-@dataclass(frozen=True)
-class History(Method):
-    """τ and C follow the grid at every particle, as at full order; x and v are the manifold's.
-
-    Each particle keeps F_e, the law's history variables and C. Under forcing that no training run had, the
-    stress of a plastic body depends on the way to a state, which no field of x̂ can tell. Such a step needs
-    every particle, so it costs what a full-order step costs. The fields h and l say where a run begins
-    in its midst, and what a latent vector is decoded to.
-
-    Not in the paper. Internal variables at the points of integration, with reduced kinematics, are those of
-    Ryckelynck 2009 (Hyper-reduction of mechanical models involving internal variables).
-    """
 
 
 class StressNeural:

@@ -6,29 +6,25 @@ import numpy as np
 import pytest
 import torch
 
-from nsf import config
-from nsf.dynamics import Method
-from nsf.dynamics.methods import StressFromDeformation
+from nsf.dynamics import Sources
+from nsf.dynamics.sources import StressFromDeformation
+from nsf.errors import ConfigError
 from nsf.mpm import precision_of
 from nsf.mpm.device import warp_device
 from nsf.mpm.materials import VonMisesSoftening
 
 ANGLE = {"friction_angle": 26.0}
-METHODS = ("nsf", "deformation_only", "neural_stress_only", "neural_affine_only")
+SOURCES = [Sources(stress, affine) for stress in ("field", "deformation") for affine in ("field", "none")]
 
 
-def configured(name, tiny) -> Method:
-    return config.build(config.load([*tiny, f"method={name}"]).method, "method")
-
-
-@pytest.fixture(params=METHODS)
-def method(request, tiny):
-    return configured(request.param, tiny)
+@pytest.fixture(params=SOURCES, ids=str)
+def sources(request):
+    return request.param
 
 
 @pytest.fixture
-def solver(chain, tiny_manifold, method):
-    return chain.scene.reduced(tiny_manifold, ANGLE, 20, method=method, device="cpu")
+def solver(chain, tiny_manifold, sources):
+    return chain.scene.reduced(tiny_manifold, ANGLE, 20, sources=sources, device="cpu")
 
 
 def hencky(F, mu, lam):
@@ -39,14 +35,13 @@ def hencky(F, mu, lam):
     return np.einsum("pij,pj,pkj->pik", U, principal, U)
 
 
-def test_the_four_are_all_there(tiny):
-    found = {(m.neural_stress, m.neural_affine): m.name for m in (configured(n, tiny) for n in METHODS)}
-    assert found == {
-        (True, True): "nsf",
-        (False, False): "deformation_only",
-        (True, False): "neural_stress_only",
-        (False, True): "neural_affine_only",
-    }
+@pytest.mark.parametrize(
+    ("stress", "affine", "said"),
+    [("none", "field", "stress=none is unknown"), ("field", "particles", "particles carry both")],
+)
+def test_what_is_no_source(stress, affine, said):
+    with pytest.raises(ConfigError, match=said):
+        Sources(stress, affine)
 
 
 def test_runs_to_the_end(solver):
@@ -55,7 +50,7 @@ def test_runs_to_the_end(solver):
     assert solver.state.numpy()["x"][:, 2].mean() < solver.setup.constants.X[:, 2].mean() - 1e-3
 
 
-def test_stress_and_affine_on_the_particles(solver, method, tiny_manifold):
+def test_stress_and_affine_on_the_particles(solver, sources, tiny_manifold):
     """What P2G gets in mid-run, against the fields and against Hencky's law of ∂g/∂X by hand."""
     solver.step(12)
     xhat = solver.xhat.clone()
@@ -64,20 +59,20 @@ def test_stress_and_affine_on_the_particles(solver, method, tiny_manifold):
     taken = phase.needed[0].bool()  # the others are not evaluated
     assert taken[: phase.s].all()
     fields = tiny_manifold.restrict(particles=torch.as_tensor(phase.order)[taken])
-    if method.neural_stress:
+    if sources.neural_stress:
         tau = fields.stress(xhat, torch.tensor([26.0], dtype=torch.float64)).numpy()
         tau = tau[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
     else:
         material = solver.scene.material
         tau = hencky(fields.deformation_gradient(xhat).numpy(), material.mu, material.lam)
     C = np.zeros((len(tau), 3, 3))
-    if method.neural_affine:
+    if sources.neural_affine:
         C = fields.affine(xhat, torch.tensor([26.0], dtype=torch.float64)).numpy()
     scale = np.abs(tau).max()
     assert scale > 1.0
     np.testing.assert_allclose(phase.tau[taken].numpy(), tau, atol=1e-6 * scale)
     np.testing.assert_allclose(phase.C[taken].numpy(), C, atol=1e-10)
-    assert (np.abs(C).max() > 1e-3) == method.neural_affine
+    assert (np.abs(C).max() > 1e-3) == sources.neural_affine
 
 
 def test_a_law_with_history_gives_its_stress_at_rest():
@@ -92,10 +87,10 @@ def test_a_law_with_history_gives_its_stress_at_rest():
     np.testing.assert_allclose(tau.numpy(), hencky(F.numpy(), material.mu, material.lam), atol=1e-8)
 
 
-def test_methods_differ(chain, tiny_manifold, tiny):
+def test_sources_differ(chain, tiny_manifold):
     ends = []
-    for name in METHODS:
-        solver = chain.scene.reduced(tiny_manifold, ANGLE, 20, method=configured(name, tiny), device="cpu")
+    for sources in SOURCES:
+        solver = chain.scene.reduced(tiny_manifold, ANGLE, 20, sources=sources, device="cpu")
         solver.step(solver.total_steps)
         ends.append(solver.state.xhat)
     for i, one in enumerate(ends):
@@ -103,7 +98,7 @@ def test_methods_differ(chain, tiny_manifold, tiny):
             assert np.abs(one - other).max() > 1e-6
 
 
-def test_the_search_gives_every_method_the_same_run(chain, tiny_manifold, method):
+def test_the_search_gives_every_method_the_same_run(chain, tiny_manifold, sources):
     from nsf.dynamics import Integration
 
     X = chain.scene.particles().X
@@ -111,7 +106,7 @@ def test_the_search_gives_every_method_the_same_run(chain, tiny_manifold, method
     runs = []
     for integration in (Integration(), Integration("search", 0)):
         solver = chain.scene.reduced(
-            tiny_manifold, ANGLE, corner, method=method, integration=integration, device="cpu"
+            tiny_manifold, ANGLE, corner, sources=sources, integration=integration, device="cpu"
         )
         solver.step(12)
         runs.append(solver.state.numpy()["x"])

@@ -1,0 +1,69 @@
+"""The interface of a model: what it can run, what it learns, and what takes its steps."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar
+
+#: Who goes on with a run that is not to be believed.
+FALLBACKS = ("none", "projected", "full")
+
+
+@dataclass(frozen=True)
+class Model(ABC):
+    """How runs of a scene are computed from cases.
+
+    A model is one class, and a file of `conf/model` that names it; docs/howto/model.md has an example.
+
+    Attributes:
+        name: as `model=` takes it, and as tables call it.
+        learns: whether the stage `teach` makes something of it, once, that all its runs use.
+        projects: whether its runs, or the error of these, take projected steps, on which trust is calibrated.
+    """
+
+    name: str
+    learns: ClassVar[bool] = False
+    projects: ClassVar[bool] = False
+
+    def refuse(self, names) -> None:  # noqa: B027 — most models run whatever there is
+        """Refuse a configuration that the model cannot run.
+
+        Args:
+            names: the stages of the configuration, a `nsf.pipeline.names.Names`.
+
+        Raises:
+            ConfigError: names the key and the remedy.
+        """
+
+    @abstractmethod
+    def engine(self, pipeline, manifold):
+        """What takes the steps of its runs: an `nsf.engines.Engine`, or `auto` for projected steps.
+
+        Args:
+            pipeline: a `nsf.pipeline.Pipeline`.
+            manifold: trained fields.
+
+        Raises:
+            MissingRunError: it was not taught.
+        """
+
+    @property
+    def lesson(self) -> dict[str, Any]:
+        """What its teaching depends on, beside scene, manifold and sample; a part of the name of its run."""
+        return asdict(self)
+
+
+def describe(config: Mapping, chosen: str = "") -> dict[str, str]:
+    """What a resolved configuration takes its steps with: `model`, `stress`, `affine` and `field`.
+
+    Args:
+        config: with these keys, as of a run's `configuration.yaml`.
+        chosen: the model that `model=auto` took.
+    """
+    field = str(config["field"]["_target_"]).rpartition(".")[2].removesuffix("Field").lower()
+    return {
+        "model": chosen or str(config["model"]["name"]),
+        "stress": str(config["stress"]),
+        "affine": str(config["affine"]),
+        "field": field,
+    }

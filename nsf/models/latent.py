@@ -1,0 +1,64 @@
+"""Models that give the latent vectors of whole runs at once."""
+
+from abc import abstractmethod
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from typing_extensions import override
+
+from nsf.errors import ConfigError
+from nsf.models.base import Model
+from nsf.models.inputs import Inputs
+
+
+@dataclass(frozen=True)
+class LatentModel(Model):
+    """A model of latent vectors alone: runs of a scene in, latent vectors out, no particle moved.
+
+    Steps are the scene's, as the training frames are.
+
+    Attributes:
+        knows_forcing: whether `run` sees gravity and solids; else a run under a hand is not believed.
+    """
+
+    knows_forcing: ClassVar[bool] = True
+
+    @abstractmethod
+    def fit(self, manifold, known: Inputs, seed: int) -> Any:
+        """What is learned from the training runs.
+
+        Args:
+            manifold: trained fields, whose `training_latents` [K (N + 1), r] are x̂ of the runs of `known`,
+                one run after the other.
+            known: the training runs.
+            seed: of all randomness.
+
+        Returns:
+            Passed to `run`. With `learns` it is kept in a file of `nsf teach`: tensors, numbers and texts, in
+            dicts and lists.
+        """
+
+    @abstractmethod
+    def run(self, fitted: Any, asked: Inputs) -> np.ndarray:
+        """x̂ [B, N + 1, r] of runs."""
+
+    @override
+    def refuse(self, names) -> None:
+        c = names.config
+        if c.deploy.dt_multiplier != 1:
+            raise ConfigError(
+                f"model={self.name} gives frames of the scene's Δt, and deploy.dt_multiplier is "
+                f"{c.deploy.dt_multiplier:g}; set it to 1, or model=projected"
+            )
+        if c.deploy.changes:
+            raise ConfigError(
+                f"model={self.name} knows the scene of training alone, and deploy.changes deploys another; "
+                "set model=projected"
+            )
+
+    @override
+    def engine(self, pipeline, manifold):
+        from nsf.models.lookup import LatentEngine
+
+        return LatentEngine(self, pipeline.fitted(manifold))

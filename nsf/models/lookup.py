@@ -1,0 +1,125 @@
+"""What takes the steps of models that give latent vectors of whole runs: a step looks one up."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from typing_extensions import override
+
+from nsf.data import Case
+from nsf.dynamics.batch import Batch
+from nsf.dynamics.setup import Setup
+from nsf.dynamics.span import Span, Stages
+from nsf.engines.base import Engine
+from nsf.engines.operators.states import collider_states
+from nsf.models.base import Model
+from nsf.models.inputs import Inputs
+from nsf.mpm import Gravity
+
+
+def inputs_of(batch: Batch) -> Inputs:
+    """What determines the runs of a batch, as far as is known now: a hand may change it."""
+    one, forcing = batch.shared, batch.forcing
+    t, runs = one.dt * np.arange(one.total_steps), range(len(batch))
+    states = [collider_states(forcing.colliders_of(run), one.dt, one.total_steps) for run in runs]
+    return Inputs(
+        names=tuple(one.manifold.parameter_names),
+        parameters=torch.stack([setup.parameters for setup in batch.setups]).double().cpu().numpy(),
+        start=torch.stack([setup.xhat for setup in batch.setups]).double().cpu().numpy(),
+        gravity=np.asarray(forcing.gravity_at(t)),
+        solids=np.stack(states),
+        dt=one.dt,
+    )
+
+
+def training_inputs(manifold, scene, cases: Sequence[Case]) -> Inputs:
+    """What determined the training runs of a manifold, in their order.
+
+    Args:
+        manifold: trained fields.
+        scene: of training; cases: those of training.
+    """
+    at = [scene.with_parameters(case) for case in cases]
+    names, t = tuple(manifold.parameter_names), scene.dt * np.arange(scene.steps)
+    latents = manifold.training_latents.double().cpu().numpy()
+    return Inputs(
+        names=names,
+        parameters=np.array([[case[name] for name in names] for case in cases]),
+        start=latents.reshape(len(cases), -1, latents.shape[1])[:, 0],
+        gravity=np.stack([one.acting_gravity.at(t) for one in at]),
+        solids=np.stack([collider_states(one.colliders, scene.dt, scene.steps) for one in at]),
+        dt=scene.dt,
+    )
+
+
+class LatentEngine(Engine):
+    """Takes the steps of runs whose latent vectors a model gives all at once.
+
+    Args:
+        model: the model.
+        fitted: as its `fit` gave it.
+    """
+
+    moves_particles = False
+
+    def __init__(self, model: Model, fitted):
+        self.model, self._fitted, self.name = model, fitted, model.name
+
+    @override
+    def refusal(self, setups: Sequence[Setup]) -> str:
+        return ""
+
+    @override
+    def spans(self, batch: Batch) -> Sequence[Span]:
+        one, table = batch.shared, _Table(self.model, self._fitted, batch)
+        like = {"dtype": one.dtype, "device": one.torch_device}
+        at = [one.manifold.restrict(sets.sample, **like) for sets in one.sets]
+        return [LatentSpan(batch, sets, sample, table) for sets, sample in zip(one.sets, at, strict=True)]
+
+    @override
+    def doubt(self, setup: Setup, gravity: Gravity) -> tuple[float, str]:
+        if self.model.knows_forcing or np.array_equal(gravity.values, setup.gravity.values):
+            return 0.0, ""
+        return np.inf, f"gravity is another than in training, and model={self.name} knows no forcing"
+
+
+class _Table:
+    """x̂ [B, N + 1, r] of the runs of a batch; made again where a hand has changed the forcing."""
+
+    def __init__(self, model: Model, fitted, batch: Batch):
+        self._model, self._fitted, self._batch = model, fitted, batch
+        self._version, self._xhat = -1, None
+
+    def rows(self) -> torch.Tensor:
+        if self._xhat is None or (self._model.knows_forcing and self._batch.forcing.version != self._version):
+            self._version = self._batch.forcing.version
+            found = np.asarray(self._model.run(self._fitted, inputs_of(self._batch)))
+            self._xhat = torch.as_tensor(found).to(self._batch.record.xhat)
+        return self._xhat
+
+
+class LatentSpan(Span):
+    """A span of time of such runs; S is kept for whoever asks where the sample particles are."""
+
+    latent_only = True
+
+    def __init__(self, batch: Batch, sets, at_sample, table: _Table):
+        super().__init__(batch, sets, at_sample)
+        self._table = table
+
+    @property
+    @override
+    def stages(self) -> Stages:
+        return {"latent": lambda: self.take(1)}
+
+    @override
+    def enter(self, first: bool) -> None:
+        """Nothing is carried from one step to the next."""
+
+    @override
+    def take(self, steps: int) -> None:
+        record, n = self.record, int(self.record.row.max())
+        record.xhat[:, n + 1 : n + steps + 1] = self._table.rows()[:, n + 1 : n + steps + 1]
+        record.before.copy_(record.xhat[:, n + steps - 1])
+        record.now.copy_(record.xhat[:, n + steps])
+        record.row.fill_(n + steps)

@@ -1,0 +1,44 @@
+"""The stage `teach` of models of latent vectors: what they learn from the training runs."""
+
+import time
+from typing import Any
+
+import torch
+
+from nsf.kinematics.manifold import Manifold
+from nsf.models.lookup import training_inputs
+from nsf.runs import Run
+
+#: File of a teach run with what was learned.
+FITTED = "model.pt"
+
+
+def fit(pipeline, run: Run) -> None:
+    """Fit the model of a pipeline's configuration.
+
+    Args:
+        pipeline: a `nsf.pipeline.Pipeline`.
+        run: its teach run.
+    """
+    manifold, c = pipeline.manifold().to(pipeline.device), pipeline.config
+    with run.record(device=pipeline.device, seed=c.seed, precision=c.precision) as record:
+        started = time.perf_counter()
+        torch.save(fitted(pipeline, manifold), record.path / FITTED)
+        record.output(FITTED)
+        record.metrics["teach_seconds"] = seconds = time.perf_counter() - started
+    pipeline.say(f"teach: model={pipeline.model.name} in {seconds:.1f} s → {run.id}")
+
+
+def fitted(pipeline, manifold: Manifold) -> Any:
+    """What the model of a pipeline learns from the training runs."""
+    known = training_inputs(manifold, pipeline.scene, pipeline.split.train)
+    return pipeline.model.fit(manifold, known, int(pipeline.config.seed))
+
+
+def loaded(run: Run) -> Any:
+    """What a teach run left.
+
+    Raises:
+        MissingRunError: it has not run.
+    """
+    return torch.load(run.require().file(FITTED), map_location="cpu", weights_only=True)

@@ -1,0 +1,227 @@
+"""Models by name, from the configuration to the errors of their runs on the tiny chain."""
+
+import shutil
+import sys
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from angles import angle
+
+import nsf.models
+from nsf import config
+from nsf.data import Trajectory
+from nsf.deployment import Rollout
+from nsf.errors import ConfigError
+from nsf.models import describe
+from nsf.models.auto import Auto, Measured
+from nsf.paths import CONF
+from nsf.pipeline import Pipeline
+
+#: A recurrent network from parameters and forcing to latent vectors; docs/howto/model.md has the same.
+GRU = '''
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import torch
+
+from nsf.models import LatentModel
+
+
+@dataclass(frozen=True)
+class GRU(LatentModel):
+    """A gated recurrent network from gravity and parameters to latent vectors."""
+
+    width: int = 16
+    descent: int = 200
+    learns: ClassVar[bool] = True
+
+    def fit(self, manifold, known, seed):
+        torch.manual_seed(seed)
+        runs = manifold.training_latents.float().cpu().unflatten(0, (len(known.start), -1))
+        net = self._net(inputs(known).shape[-1], runs.shape[-1])
+        optimiser = torch.optim.Adam(net.parameters(), 1e-2)
+        for _ in range(self.descent):
+            loss = (self._changes(net, known) - (runs[:, 1:] - runs[:, :1])).square().mean()
+            optimiser.zero_grad()
+            loss.backward()
+            optimiser.step()
+        return net.state_dict()
+
+    def run(self, fitted, asked):
+        net = self._net(inputs(asked).shape[-1], asked.start.shape[-1])
+        net.load_state_dict(fitted)
+        with torch.no_grad():
+            changes = self._changes(net, asked).double().numpy()
+        return np.concatenate([asked.start[:, None], asked.start[:, None] + changes], axis=1)
+
+    def _net(self, inputs, latents):
+        return torch.nn.ModuleList([torch.nn.GRU(inputs, self.width, batch_first=True),
+                                    torch.nn.Linear(self.width, latents)])
+
+    def _changes(self, net, of):
+        hidden, _ = net[0](torch.as_tensor(inputs(of)).float())
+        return net[1](hidden)
+
+
+def inputs(of):
+    """[B, N, n + 3] parameters and gravity at each step, of the order of one."""
+    parameters = np.repeat(of.parameters[:, None] / 30.0, of.gravity.shape[1], axis=1)
+    return np.concatenate([parameters, of.gravity / 10.0], axis=2)
+'''
+
+
+def run_of(pipeline_at, root, *overrides):
+    """A pipeline that was taken to its evaluation, its rows, and what it said."""
+    said = []
+    pipeline = pipeline_at(root, *overrides, say=said.append)
+    for stage in ("simulate", "train", "deploy", "evaluate"):
+        pipeline.run(stage)
+    return pipeline, pd.read_csv(pipeline.evaluation.path / "results.csv"), said
+
+
+def test_interpolated_latents_are_a_model(copied, pipeline_at):
+    pipeline, rows, _ = run_of(pipeline_at, copied("simulate", "train"), "model=interpolate")
+    (row,) = rows.to_dict("records")
+    assert (row["model"], row["handed_over"]) == ("interpolate", 0.0)
+    assert row["displacement_error"] == pytest.approx(row["displacement_interpolated"], rel=1e-9)
+    kept = Rollout.open(pipeline.deployment.file("rollout_0.h5"))
+    assert set(kept.stops) == {"latent"}
+    assert kept.estimate is None
+    again = Pipeline.of_run(pipeline.deployment, say=lambda line: None)
+    solver = again.solver_at(again.manifold(), angle(26.0))
+    solver.step(solver.total_steps)
+    np.testing.assert_array_equal(solver.trajectory().xhat, kept.xhat)
+
+
+def test_beyond_its_training_an_interpolated_run_may_be_projected(copied, pipeline_at):
+    root, keys = copied("simulate", "train"), ("model=interpolate", "scene.design.test=[60]")
+    pipeline, _, said = run_of(pipeline_at, root, *keys, "fallback=projected")
+    kept = Rollout.open(pipeline.deployment.file("rollout_0.h5"))
+    assert kept.by_operators == 0 or kept.trust[: kept.by_operators].max() <= 1.0
+    assert any("is none of the cases that the model was trained for" in line for line in said)
+    handed, rows, _ = run_of(pipeline_at, root, *keys, "fallback=full")
+    assert Rollout.open(handed.deployment.file("rollout_0.h5")).handed_over == 0
+    assert rows["delta"][0] < 1e-6
+
+
+def test_the_full_order_run_is_a_model(copied, pipeline_at):
+    pipeline, rows, _ = run_of(pipeline_at, copied("simulate", "train"), "model=full")
+    (row,) = rows.to_dict("records")
+    assert (row["model"], row["delta"], row["handed_over"]) == ("full", 0.0, 1.0)
+    files = pipeline.deployment.file("continuation_0.h5"), pipeline.truth(angle(26.0)).file("trajectory.h5")
+    with Trajectory.open(files[0]) as own, Trajectory.open(files[1]) as truth:
+        np.testing.assert_array_equal(own.read("x"), truth.read("x"))
+
+
+def test_auto_takes_the_cheapest_that_is_near_enough(copied, pipeline_at):
+    root, validated = copied("simulate", "train"), "scene.design.validation=[24]"
+    keys = ("model=auto", validated, "model.candidates=[projected,interpolate]")
+    pipeline, rows, said = run_of(pipeline_at, root, *keys, "model.slack=1e6")
+    assert rows["model"].tolist() == ["interpolate"]
+    kept = pipeline.deployment.manifest["metrics"]
+    assert [one["model"] for one in kept["candidates"]] == ["projected", "interpolate"]
+    assert all(one["error"] > 0 and one["seconds"] > 0 for one in kept["candidates"])
+    assert any(line.startswith("deploy: model=auto takes interpolate, the cheapest within") for line in said)
+    best = min(kept["candidates"], key=lambda one: one["error"])["model"]
+    _, rows, _ = run_of(pipeline_at, root, *keys, "model.slack=1.0")
+    assert rows["model"].tolist() == [best]
+    again = Pipeline.of_run(pipeline.deployment, say=lambda line: None)
+    assert again.deployment == pipeline.deployment
+    assert again.model.name == "interpolate"
+
+
+def test_auto_takes_projected_without_validation_cases(copied, pipeline_at):
+    _, rows, said = run_of(pipeline_at, copied("simulate", "train"), "model=auto")
+    assert rows["model"].tolist() == ["projected"]
+    assert any("no validation cases" in line for line in said)
+
+
+def test_the_choice_of_auto():
+    auto = Auto("auto", slack=1.25)
+    measured = [Measured("a", 0.10, 3.0), Measured("b", 0.12, 1.0), Measured("c", 0.13, 0.1)]
+    assert auto.choose([*measured, Measured("d", refused="it knows no forcing")]) == "b"
+    assert auto.choose([Measured("a", np.inf, 1.0), Measured("b", 0.1, 9.0)]) == "b"
+    with pytest.raises(ConfigError, match="no candidate that can run: a: it knows no forcing"):
+        auto.choose([Measured("a", refused="it knows no forcing")])
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (
+            ("fallback=projected",),
+            "fallback=projected goes on for another model.*; set fallback=full, or none",
+        ),
+        (("model=full", "fallback=full"), "fallback=full has no use with model=full; set fallback=none"),
+        (("model=interpolate", "deploy.dt_multiplier=1.5"), "set it to 1, or model=projected"),
+        (("model=interpolate", "deploy.changes={scene.friction:0.2}"), "set model=projected"),
+        (
+            ("model=interpolate", "scene=block"),
+            "knows no forcing.*; set model=projected, or model=recurrence",
+        ),
+        (("model=auto", "model.slack=0.5"), "slack=0.5 must be at least 1"),
+        (("fallback=report",), "fallback=report is unknown; choose none, projected or full"),
+        (("stress=particles",), "particles carry both"),
+    ],
+)
+def test_what_cannot_be_asked_for(tmp_path, tiny, overrides, message):
+    base = [] if "scene=block" in overrides else tiny
+    with pytest.raises(ConfigError, match=message):
+        Pipeline(config.load([*base, *overrides]), root=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("engine=operators", "engine=operators was removed; choose model=recurrence"),
+        ("engine.teaching.width=8", "engine.teaching was removed; set model.teaching"),
+        (
+            "method=deformation_only",
+            "method=deformation_only was removed; set stress=deformation",
+        ),
+        ("deploy.on_distrust=report", "deploy.on_distrust was removed; set fallback"),
+    ],
+)
+def test_keys_of_before_name_those_of_now(override, message):
+    with pytest.raises(ConfigError, match=message):
+        config.load([override])
+
+
+def test_a_model_is_described(tiny):
+    described = describe(config.resolve(config.load([*tiny, "model=recurrence", "affine=none"])))
+    assert described == {"model": "recurrence", "stress": "field", "affine": "none", "field": "basis"}
+    assert describe(config.resolve(config.load([*tiny, "model=auto"])), "full")["model"] == "full"
+
+
+@pytest.fixture
+def own_model(tmp_path, monkeypatch):
+    """A model of one's own, in one file of Python and one yaml."""
+    monkeypatch.setattr(nsf.models, "__path__", [*nsf.models.__path__, str(tmp_path)])
+    (tmp_path / "gru.py").write_text(GRU)
+    shutil.copytree(CONF, tmp_path / "conf")
+    yaml = "_target_: nsf.models.gru.GRU\nname: gru\nwidth: 8\ndescent: 200\n"
+    (tmp_path / "conf/model/gru.yaml").write_text(yaml)
+    for module in ("nsf.config.composing", "nsf.paths", "nsf.pipeline.names"):
+        monkeypatch.setattr(sys.modules[module], "CONF", tmp_path / "conf")
+    yield "gru"
+    sys.modules.pop("nsf.models.gru", None)
+
+
+def test_a_model_of_ones_own_is_taught_run_and_chosen(own_model, copied, pipeline_at):
+    root = copied("simulate", "train")
+    pipeline, rows, said = run_of(pipeline_at, root, f"model={own_model}", "model.descent=300")
+    assert rows["model"].tolist() == ["gru"]
+    assert rows["displacement_error"][0] < 0.5
+    assert pipeline.taught.complete
+    assert any(line.startswith("teach: model=gru in") for line in said)
+    fitted = torch.load(pipeline.taught.file("model.pt"), weights_only=True)
+    assert fitted["0.weight_ih_l0"].shape == (24, 4)
+    keys = ("model=auto", "scene.design.validation=[24]", "model.candidates=[gru,projected]")
+    chosen, _, _ = run_of(pipeline_at, root, *keys, "+model.of.gru.descent=300", "model.slack=1e6")
+    assert {one["model"] for one in chosen.deployment.manifest["metrics"]["candidates"]} == {
+        "gru",
+        "projected",
+    }
