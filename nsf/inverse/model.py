@@ -95,13 +95,15 @@ class Model:
         self._built: dict[tuple, dict[str, np.ndarray]] = {}
 
     @classmethod
-    def load(cls, run: Run | Path | str, device: str = "auto") -> "Model":
+    def load(cls, run: Run | Path | str | None = None, device: str = "auto") -> "Model":
         """The model of a deploy run.
 
         Args:
-            run: the run, its folder, or the beginning of its id or hash.
+            run: the run, its folder, or the beginning of its id or hash; None for the newest.
             device: as for `Model`.
         """
+        if run is None:
+            return cls(Run.newest("deploy"), device)
         return cls(run if isinstance(run, Run) else Run.named(str(run), "deploy"), device)
 
     def tensor(self, parameters: Tensor | Mapping[str, float] | Sequence) -> Tensor:

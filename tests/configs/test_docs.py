@@ -111,8 +111,8 @@ def test_page(page, project, monkeypatch, capsys):
             elif language == "python":
                 for scene in re.findall(r'Run\.find\("train", "(\w+)"\)', content):
                     train(scene)
-                for scene in re.findall(r'Model\.load\("(\w+)"\)', content):
-                    deploy(scene)
+                for scene in re.findall(r'Model\.load\(("\w+")?\)', content):
+                    deploy(scene.strip('"') or "sand")
                 exec(compile(content, page, "exec"), names)
             else:
                 assert language == "sh", f"a {language} block without a title"
@@ -123,7 +123,7 @@ def test_page(page, project, monkeypatch, capsys):
             raise
 
 
-@pytest.mark.parametrize("page", PAGES)
+@pytest.mark.parametrize("page", [*PAGES, "design.md"])
 def test_named_paths_are_there(page):
     """A path of the repository that a page names, unless the page adds it or a command makes it."""
     text = (DOCS / page).read_text(encoding="utf-8")
