@@ -131,7 +131,7 @@ calibration: install  ## the reports of calibration, sensitivities and design, o
 	$(BIN)/nsf design run=block x@0.4:0.4:0.26=0.42 tilt=30 knots=4 E=6000 density=100 device=cpu \
 		folder=reports/design_block
 
-# Runs by operators at small scale, as table1/small and forcing have them.
+# Runs by recurrence at small scale, as table1/small and forcing have them.
 models: install  ## write the models of nsf demo: make models block=DEPLOY_ID sand=DEPLOY_ID metal=DEPLOY_ID
 	@[ -n "$(block)$(sand)$(metal)" ] || { echo 'name a run: make models block=ID' >&2; exit 2; }
 	for m in block sand metal; do case $$m in block) id='$(block)';; sand) id='$(sand)';; metal) id='$(metal)';; esac; \

@@ -20,6 +20,10 @@ PAGES = ["../README.md"]
 PAGES += sorted(p.relative_to(DOCS).as_posix() for p in DOCS.glob("**/*.md") if p.name != "design.md")
 
 
+#: Packages to which a page may add a module.
+EXTENDED = ("nsf.mpm.materials", "nsf.kinematics.fields", "nsf.dynamics", "nsf.sampling", "nsf.models")
+
+
 @pytest.fixture
 def project(page, tmp_path, monkeypatch):
     """A checkout to which a page adds its files: `conf`, `experiments` and what extends the package."""
@@ -31,7 +35,7 @@ def project(page, tmp_path, monkeypatch):
     monkeypatch.setenv("NSF_RUNS", str(tmp_path / "runs"))
     monkeypatch.setenv("NSF_REPORTS", str(tmp_path / "reports"))
     before = set(sys.modules)
-    for package in ("nsf.mpm.materials", "nsf.kinematics.fields", "nsf.dynamics", "nsf.sampling"):
+    for package in EXTENDED:
         folder = tmp_path / package.replace(".", "/")
         folder.mkdir(parents=True)
         path = importlib.import_module(package).__path__
@@ -59,7 +63,7 @@ def add(file: str, content: str, project: Path) -> None:
     elif group == "conf/material":
         config.build(config.load([f"material={name}"], "point").material, "material")
     else:
-        assert group in ("conf/scene", "conf/field", "conf/projector", "conf/sampler"), file
+        assert group in ("conf/scene", "conf/field", "conf/projector", "conf/sampler", "conf/model"), file
         option = f"{group.removeprefix('conf/')}={name}"
         Pipeline(config.load([option, "scale=small", "device=cpu"]))
 

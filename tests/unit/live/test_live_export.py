@@ -100,10 +100,14 @@ def test_most_of_few_points_lie_at_the_surface(chain):
 
 
 def test_a_run_that_no_operators_step_is_refused(model, tmp_path, monkeypatch):
-    with pytest.raises(ConfigError, match=r"model=projected, whose steps a page does not take.* model=recurrence"):
+    with pytest.raises(
+        ConfigError, match=r"model=projected, whose steps a page does not take.* model=recurrence"
+    ):
         publish.model_data(model)
     monkeypatch.setattr(publish, "LiveModel", None)  # which takes minutes of a large run
-    with pytest.raises(ConfigError, match=r"model=projected, whose steps a page does not take.* model=recurrence"):
+    with pytest.raises(
+        ConfigError, match=r"model=projected, whose steps a page does not take.* model=recurrence"
+    ):
         publish.write(model.run, tmp_path, device="cpu")
 
 
