@@ -134,7 +134,7 @@ def _bench(words: list[str]) -> int:
 
     folder = asked.pop("folder", os.path.join(os.environ.get("NSF_REPORTS", "reports"), "speed"))
     page = bench(folder, asked, lambda text: print(text, file=sys.stderr))
-    _console().print(table(page.with_name("results.csv")))
+    _console().print(table(page.with_name("bench.csv")))
     print(f"open {page.resolve()}")
     return 0
 

@@ -71,7 +71,6 @@ class StageTimer:
 
     def __init__(self, device: Any = "cpu", synchronize: Synchronize | None = None) -> None:
         self.milliseconds: dict[str, float] = {}
-        self.calls: dict[str, int] = {}
         self._device = device
         self._synchronize = synchronize or synchronizer(device)
         self._marks: list[tuple[str, Any]] = []
@@ -115,14 +114,8 @@ class StageTimer:
         """Mean time [ms] a step of every stage, in the order they first ran."""
         return {stage: total / steps for stage, total in self.milliseconds.items()}
 
-    def reset(self) -> None:
-        """Forget all measurements, such as those of a warm-up."""
-        self.milliseconds.clear()
-        self.calls.clear()
-
     def _add(self, stage: str, ms: float) -> None:
         self.milliseconds[stage] = self.milliseconds.get(stage, 0.0) + ms
-        self.calls[stage] = self.calls.get(stage, 0) + 1
 
     def _mark(self) -> Any:
         torch = _loaded("torch", lambda torch: torch.cuda.is_available())

@@ -1,12 +1,11 @@
 """A full-order step: a block of dry sand that collapses, at several sizes."""
 
-from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 
-from nsf.bench.measure import bandwidth, build, name_of, pass_time, step_times
-from nsf.bench.rows import KernelRow, Result, Row, Settings, commit, size_name
+from nsf.bench.measure import WARM_UP, WINDOW, bandwidth, build, pass_time, window_times
+from nsf.bench.rows import Case, Measurements, name_of, size_name
 from nsf.mpm import DomainWalls, FullOrderMPM, GridGeometry, HalfSpace, ParticleConstants
 from nsf.mpm.grid.nodes import BLOCK
 from nsf.mpm.materials import DruckerPrager
@@ -44,38 +43,35 @@ def collapse(particles: int, precision: str, device: str) -> FullOrderMPM:
     )
 
 
-def run(settings: Settings, found: Result, say: Callable[[str], None]) -> None:
+def run(found: Measurements) -> None:
     """Every size; the precisions of a size turn by turn."""
-    device = settings.device
+    settings, device = found.settings, found.settings.device
     speed = bandwidth(device)
-    say(f"full_order: a copy on {name_of(device)} moves {speed / 1e9:.0f} GB/s")
-    for particles in settings.particles or SIZES["cuda" if device.startswith("cuda") else "cpu"]:
+    found.say(f"full_order: a copy on {name_of(device)} moves {speed / 1e9:.0f} GB/s")
+    for particles in settings.particles or SIZES["cuda" if settings.on_gpu else "cpu"]:
         built = {p: build(partial(collapse, particles, p, device), device) for p in settings.precisions}
         solvers = {precision: solver for precision, (solver, _) in built.items()}
-        times = step_times(solvers, settings.trials, device)
-        for precision, (solver, peak_mib) in built.items():
-            case = f"full_order_{size_name(particles)}"
-            p10, median, p90 = np.percentile(times[precision], [10, 50, 90]).tolist()
-            row = Row(
-                bench="full_order", case=case, particles=particles, precision=precision,
-                device=name_of(device), commit=commit(), sample=None, integration=None, batch=1, delta=None,
-                ms_median=median, ms_p10=p10, ms_p90=p90, peak_mib=peak_mib,
-            )  # fmt: skip
-            found.rows.append(row)
-            say(f"{case} {precision}: {median:.4g} ms a step")
-            found.kernels.extend(kernel_rows("full_order", case, precision, solver, speed))
+        times = window_times(solvers, WARM_UP + WINDOW * settings.trials, settings.trials, device)
+        for precision, (solver, peak) in built.items():
+            name = f"full_order_{size_name(particles)}"
+            case = Case(bench="full_order", name=name, particles=particles, precision=precision)
+            ms = found.add(case, "step", times[precision])
+            found.add(case, "peak memory", peak, "MiB")
+            found.say(f"{name} {precision}: {ms:.4g} ms a step")
+            add_passes(found, case, solver, speed)
 
 
-def kernel_rows(bench: str, case: str, precision: str, solver: FullOrderMPM, speed: float) -> list[KernelRow]:
-    """The passes of a solver's step, beside what a copy of `speed` [B/s] takes; ends the solver's use."""
-    return [
-        KernelRow(
-            bench=bench, case=case, particles=len(solver.state), precision=precision, kernel=kernel, ms=ms,
-            device=name_of(str(solver.device)), mib=size / 2**20, gb_per_s=size / ms / 1e6,
-            floor_ms=1e3 * size / speed, commit=commit(),
-        )
-        for kernel, (ms, size) in pass_times(solver).items()
-    ]  # fmt: skip
+def add_passes(found: Measurements, case: Case, solver: FullOrderMPM, speed: float) -> None:
+    """Add the passes of a solver's step, beside what a copy of `speed` [B/s] takes; ends the solver's use."""
+    for part, (ms, size) in pass_times(solver).items():
+        add_pass(found, case, part, ms, size, 1e3 * size / speed)
+
+
+def add_pass(found: Measurements, case: Case, part: str, ms: float, size: float, floor: float) -> None:
+    """Add a pass's time [ms], the bytes it reads and writes, and the time that these take a copy [ms]."""
+    found.add(case, "time", ms, part=part)
+    found.add(case, "moved", size / 2**20, "MiB", part)
+    found.add(case, "floor", floor, part=part)
 
 
 def pass_times(solver: FullOrderMPM) -> dict[str, tuple[float, int]]:

@@ -11,9 +11,8 @@ import warp as wp
 from nsf.gpu import without_collection
 from nsf.timing import MemoryProbe, synchronizer
 
-_TRIAL_SECONDS = 0.05  # of a trial, at least: the clock and the last synchronisation are lost in it
-_MOST_STEPS = 100
-_WARM_UP = 3  # steps that compile, load and capture
+WINDOW = 100  # steps of a trial at most, so that the clock and the last synchronisation are lost in it
+WARM_UP = 3  # steps that compile, load and capture
 _COPY_BYTES = {"cuda": 2**30, "cpu": 2**27}  # larger than any cache
 _REPEATS = 10  # of a pass in one graph, so that launching it costs nothing
 
@@ -25,7 +24,7 @@ def build(make: Callable[[], object], device: str) -> tuple[object, float]:
     def begin() -> None:
         nonlocal solver
         solver = make()
-        solver.step(_WARM_UP)
+        solver.step(WARM_UP)
 
     peak = peak_mib(begin, device, lambda: solver.nbytes)
     return solver, peak
@@ -40,33 +39,9 @@ def peak_mib(call: Callable[[], object], device: str, nbytes: int | Callable[[],
         nbytes: what it left behind [byte]; stands for the peak where the device's allocators do not tell.
     """
     gc.collect()
-    with MemoryProbe(device) as before:
-        pass
     with MemoryProbe(device, nbytes=nbytes) as probe:
         call()
-    return probe.peak_mib - before.peak_mib
-
-
-def step_times(solvers: Mapping[str, object], trials: int, device: str) -> dict[str, np.ndarray]:
-    """[trials] mean time of a step [ms] of each solver, turn by turn, so that what slows one slows all."""
-    wait = synchronizer(device)
-
-    def trial(solver, steps: int) -> float:
-        wait()
-        begun = time.perf_counter()
-        solver.step(steps)
-        wait()
-        return 1e3 * (time.perf_counter() - begun) / steps
-
-    steps = {}
-    for name, solver in solvers.items():
-        once = min(trial(solver, 1) for _ in range(2))
-        steps[name] = int(np.clip(np.ceil(1e3 * _TRIAL_SECONDS / once), 1, _MOST_STEPS))
-    found = {name: [] for name in solvers}
-    for _ in range(trials):
-        for name, solver in solvers.items():
-            found[name].append(trial(solver, steps[name]))
-    return {name: np.array(times) for name, times in found.items()}
+    return probe.grown_mib
 
 
 def window_times(
@@ -84,9 +59,9 @@ def window_times(
     wait, found = synchronizer(device), {name: [] for name in (*solvers, *whole)}
     for solver in whole.values():
         _whole_run(solver, wait)
-    edges = np.unique(np.linspace(_WARM_UP, total, trials + 1).round().astype(int)).tolist()
+    edges = np.unique(np.linspace(WARM_UP, total, trials + 1).round().astype(int)).tolist()
     for start, end in itertools.pairwise(edges):
-        steps = min(end - start, _MOST_STEPS)
+        steps = min(end - start, WINDOW)
         for name, solver in solvers.items():
             solver.step(start - solver.steps_taken)
             wait()
@@ -160,12 +135,6 @@ def launch_time(device: str, count: int) -> float:
 @wp.kernel(module="unique")
 def _nothing():
     pass
-
-
-def name_of(device: str) -> str:
-    """What a figure names as its device: the product for a GPU, else `cpu`."""
-    found = wp.get_device(device)
-    return found.name if found.is_cuda else "cpu"
 
 
 def bandwidth(device: str) -> float:

@@ -2,17 +2,20 @@
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import torch
 
 from nsf import config
-from nsf.bench.measure import build, name_of, run_times, window_times
-from nsf.bench.reduced import SCENES, deformation_error, error_of_latents, scale_of
-from nsf.bench.rows import Result, Row, Settings, commit, size_name
-from nsf.bench.scaling import at_size, carried_over, frames_of, positions_after
-from nsf.data import Case
+from nsf.bench.command import SCENES
+from nsf.bench.measure import build, run_times, window_times
+from nsf.bench.reduced import Frames, deformation_error, error_of_latents
+from nsf.bench.rows import Case, Measurements, Settings, size_name
+from nsf.bench.scaling import at_size, carried_over, frames_after
+from nsf.data import Case as Parameters
 from nsf.data.schema import TRAJECTORY
 from nsf.deployment import Levels, Trust
 from nsf.dynamics import ReducedBatch, ReducedMPM
@@ -21,7 +24,6 @@ from nsf.dynamics.setup import first_changes
 from nsf.engines import Operators
 from nsf.engines.operators.recurrence import Recurrence
 from nsf.engines.operators.states import collider_states
-from nsf.evaluation import metrics
 from nsf.pipeline import Pipeline
 from nsf.pipeline.stages.deployment import calibrated, levels_of
 from nsf.pipeline.stages.teaching import OPERATORS
@@ -36,55 +38,45 @@ PARTICLES = {"cuda": 4_000_000, "cpu": 20_000}
 Decode = Callable[[torch.Tensor], torch.Tensor]
 
 
-def run(settings: Settings, found: Result, say: Callable[[str], object]) -> None:
+def run(found: Measurements) -> None:
     """Each scene, 1 024 runs of `metal` at once, and the sand column with 4 million particles.
 
     At the paper's size on a GPU; on a CPU at small scale, and with 20 000 particles. Data, training and
     teaching are made, or reused, as by `nsf teach model=recurrence`. Where `scenes` or `particles` are given,
     these are all.
     """
+    settings = found.settings
     for scene in settings.scenes or (() if settings.particles else SCENES):
-        measured(_chain(scene, settings, say), settings, found, say, MANY if scene == OF_MANY else 0)
+        measured(_chain(scene, found), found, MANY if scene == OF_MANY else 0)
     if settings.particles or not settings.scenes:
-        kind = "cuda" if settings.device.startswith("cuda") else "cpu"
-        for particles in settings.particles or (PARTICLES[kind],):
-            measured_decoded(_chain("sand", settings, say), particles, settings, found, say)
+        for particles in settings.particles or (PARTICLES["cuda" if settings.on_gpu else "cpu"],):
+            measured_decoded(_chain("sand", found), particles, found)
 
 
-def _chain(scene: str, settings: Settings, say: Callable[[str], object]) -> Pipeline:
-    asked = [f"scene={scene}", f"scale={scale_of(settings.device)}", f"device={settings.device}"]
-    return Pipeline(config.load([*asked, "model=recurrence"]), say=say)
+def _chain(scene: str, found: Measurements) -> Pipeline:
+    asked = [f"scene={scene}", f"scale={found.settings.scale}", f"device={found.settings.device}"]
+    return Pipeline(config.load([*asked, "model=recurrence"]), say=found.say)
 
 
-def measured(
-    chain: Pipeline, settings: Settings, found: Result, say: Callable[[str], object], many: int = 0
-) -> None:
+def measured(chain: Pipeline, found: Measurements, many: int = 0) -> None:
     """Add the rows of one scene in its first held-out case.
 
     Args:
         chain: of the scene, with `model=recurrence`.
-        settings, found, say: as for `run`.
+        found: as for `run`.
         many: runs at once, in rows of their own; 0 for none.
     """
     _taught(chain)
     manifold, truth = chain.manifold(), chain.truth(chain.held_out[0]).path / TRAJECTORY
-
-    def decode(run: ReducedMPM) -> Decode:
-        return run.decoder().position
-
-    def error(run: ReducedMPM, position: Decode) -> float:
-        return deformation_error(run, truth)
-
-    for precision in settings.precisions:
-        of = chain, manifold, chain.scene, chain.scene.name, precision
-        run = _compared(*of, decode, error, settings, found, say)
+    for precision in found.settings.precisions:
+        full_ms, case, run = _compared(
+            chain, manifold, chain.scene, chain.scene.name, precision, truth, found
+        )
         if many:
-            _together(run, chain, many, found.rows[-2:], truth, settings, found, say)
+            _together(run, chain, many, full_ms, case, truth, found)
 
 
-def measured_decoded(
-    chain: Pipeline, particles: int, settings: Settings, found: Result, say: Callable[[str], object]
-) -> None:
+def measured_decoded(chain: Pipeline, particles: int, found: Measurements) -> None:
     """Add the rows of one scene with another number of particles, in its first held-out case.
 
     A step by operators does not depend on the particles. So the run is that of the chain's own scene, and
@@ -94,31 +86,20 @@ def measured_decoded(
     Args:
         chain: of the scene, with `model=recurrence` and `field=basis`.
         particles: P.
-        settings, found, say: as for `run`.
+        found: as for `run`.
     """
     _taught(chain)
+    settings = found.settings
     scene, manifold, case = at_size(chain.scene, particles), chain.manifold(), chain.held_out[0]
-    fields, steps = carried_over(chain.manifold(), scene, settings.device), frames_of(scene.steps)
-    full = scene.full_order(case, max(settings.precisions), settings.device)
-    truth = positions_after(full, steps)
-    del full  # its arrays are on the device
+    fields = carried_over(chain.manifold(), scene, settings.device)
+    truth = frames_after(scene.full_order(case, max(settings.precisions), settings.device), scene)
 
     def decode(run: ReducedMPM) -> Decode:
         like = {"dtype": run.setup.dtype, "device": run.setup.torch_device}
         return fields.restrict(np.arange(particles), **like).position
 
-    def error(run: ReducedMPM, position: Decode) -> float:
-        latent, errors, norms = run.trajectory(), [], []
-        between = [np.interp(scene.dt * steps, latent.t, column) for column in latent.xhat.T]
-        for xhat, x in zip(torch.as_tensor(np.stack(between, 1)).to(run.xhat), truth, strict=True):
-            found = position(xhat)
-            errors.append(metrics.frame_squares((found - x.to(found))[None]))
-            norms.append(metrics.frame_squares(x.to(found)[None]))
-        return metrics.relative(torch.cat(errors), torch.cat(norms))
-
     for precision in settings.precisions:
-        of = chain, manifold, scene, size_name(particles), precision
-        _compared(*of, decode, error, settings, found, say)
+        _compared(chain, manifold, scene, size_name(particles), precision, truth, found, decode)
 
 
 def _taught(chain: Pipeline) -> None:
@@ -135,85 +116,83 @@ def _compared(
     scene: Scene,
     name: str,
     precision: str,
-    decode: Callable[[ReducedMPM], Decode],
-    error: Callable[[ReducedMPM, Decode], float],
-    settings: Settings,
-    found: Result,
-    say: Callable[[str], object],
-) -> ReducedMPM:
-    """Add a row of either solver in one precision, turn by turn; gives the run by operators, at its end.
+    truth: Path | Frames,
+    found: Measurements,
+    decode: Callable[[ReducedMPM], Decode] = lambda run: run.decoder().position,
+) -> tuple[float, Case, ReducedMPM]:
+    """Add the rows of either solver in one precision, turn by turn.
 
     Args:
-        chain: whose operators are run.
-        manifold: theirs.
+        chain, manifold: whose operators are run.
         scene: of the full-order step.
         name: the end of both cases.
+        precision, truth, found: of the rows.
         decode: run → positions of all particles.
-        error: run and these → δ.
+
+    Returns:
+        Time of a full-order step [ms], the case of the run by operators, and that run at its end.
     """
-    device, case = settings.device, chain.held_out[0]
-    taught = chain.taught
-    full, full_peak = build(partial(scene.full_order, case, precision, device), device)
-    run, peak = build(partial(chain.solver_at, manifold, case, precision=precision), device)
+    settings, device, held_out, teaching = (
+        found.settings,
+        found.settings.device,
+        chain.held_out[0],
+        chain.taught,
+    )
+    full, full_peak = build(partial(scene.full_order, held_out, precision, device), device)
+    run, peak = build(partial(chain.solver_at, manifold, held_out, precision=precision), device)
     times = window_times({"full": full}, scene.steps, settings.trials, device, whole={"own": run})
-    ms, own = _times_of(times["full"]), _times_of(times["own"])
     position = decode(run)
-    row = partial(
-        Row, bench="operators", particles=scene.particle_count, precision=precision, device=name_of(device),
-        commit=commit(),
-    )  # fmt: skip
-    found.rows.append(row(case=f"full_order_{name}", peak_mib=full_peak, **ms))
-    found.rows.append(
-        row(
-            case=f"operators_{name}", sample=run.sample_size, peak_mib=peak, **own,
-            speed_up=ms["ms_median"] / own["ms_median"], delta=error(run, position),
-            run_mib=run.nbytes / 2**20, decode_ms=_decode_ms(position, run.xhat, settings),
-            checked_ms=_checked_ms(chain, manifold, run, precision, settings),
-            teach_seconds=taught.metric("teach_seconds"), teacher_steps=int(taught.metric("teacher_steps")),
-        )
-    )  # fmt: skip
-    _tell(found.rows[-1], "a step", say)
-    return run
+    of = partial(Case, bench="operators", particles=scene.particle_count, precision=precision)
+    case = of(name=f"full_order_{name}")
+    full_ms = found.add(case, "step", times["full"])
+    found.add(case, "peak memory", full_peak, "MiB")
+    case = of(name=f"operators_{name}", sample=run.sample_size)
+    delta = deformation_error(run, truth, position)
+    _add_run(found, case, times["own"], full_ms, delta, run.nbytes, peak, teaching)
+    found.add(case, "decoding of a frame", _decode_ms(position, run.xhat, settings))
+    checked = found.add(case, "checked step", _checked_ms(chain, manifold, run, precision, settings))
+    found.say(f"{case.name} {precision}: {checked:.4g} ms a step with checks")
+    return full_ms, case, run
+
+
+def _add_run(found: Measurements, case: Case, ms, full_ms: float, delta: float, nbytes: int, peak, teaching):
+    """Add the figures of runs by operators, alone or many at once."""
+    own = found.add(case, "step", ms)
+    found.add(case, "peak memory", peak, "MiB")
+    found.add(case, "δ", delta, "1")
+    ratio = found.add(case, "speed-up", full_ms / own, "1")
+    memory = found.add(case, "memory of a run", nbytes / 2**20, "MiB")
+    found.add(case, "teaching", teaching.metric("teach_seconds"), "s")
+    found.add(case, "steps of the teacher", teaching.metric("teacher_steps"), "1")
+    found.say(
+        f"{case.name} {case.precision}: {own:.4g} ms a {'simulation-' * (case.batch > 1)}step, {ratio:.4g} "
+        f"times the full-order step's speed, δ {100 * delta:.3g} %, {memory:.3g} MiB"
+    )
 
 
 def _together(
-    run: ReducedMPM,
-    chain: Pipeline,
-    count: int,
-    beside: list[Row],
-    truth,
-    settings: Settings,
-    found: Result,
-    say: Callable[[str], object],
+    run: ReducedMPM, chain: Pipeline, count: int, full_ms: float, case: Case, truth: Path, found: Measurements
 ) -> None:
-    """Add the row of many runs at once, the first of which is one that has been timed alone.
+    """Add the rows of many runs at once, the first of which is one that has been timed alone.
 
     Args:
-        run: that one.
+        run, case: that one.
         chain: whose operators are run.
         count: how many.
-        beside: rows of the full-order step and of the run alone.
+        full_ms: time of a full-order step [ms].
         truth: trajectory file of the first run.
+        found: gets the rows.
     """
-    full, alone = beside
     low, high = chain.split.box.T
     drawn = np.random.default_rng(0).uniform(low, high, (count - 1, len(low)))
     model = Operators.load(chain.taught.file(OPERATORS)).model
-    many, peak = build(
-        partial(Many, model, run, [chain.held_out[0], *map(chain.scene.case, drawn)]), settings.device
-    )
-    (ms,) = run_times({count: many}, settings.trials, settings.device).values()
-    delta = error_of_latents(run.trajectory().t, many.record.xhat[0], run.decoder(), truth)
-    own = _times_of(ms / count)
-    found.rows.append(
-        Row(
-            bench="operators", case=f"operators_batch{count}", particles=alone.particles, sample=alone.sample,
-            precision=alone.precision, device=alone.device, commit=alone.commit, batch=count, peak_mib=peak,
-            **own, delta=delta, speed_up=full.ms_median / own["ms_median"], run_mib=many.nbytes / 2**20,
-            teach_seconds=alone.teach_seconds, teacher_steps=alone.teacher_steps,
-        )
-    )  # fmt: skip
-    _tell(found.rows[-1], "a simulation-step", say)
+    cases = [chain.held_out[0], *map(chain.scene.case, drawn)]
+    many, peak = build(partial(Many, model, run, cases), found.settings.device)
+    (ms,) = run_times({count: many}, found.settings.trials, found.settings.device).values()
+    latents = run.trajectory().t, many.record.xhat[0], run.decoder().position
+    delta = error_of_latents(*latents, truth, run.xhat)
+    case = replace(case, name=f"operators_batch{count}", batch=count)
+    _add_run(found, case, ms / count, full_ms, delta, many.nbytes, peak, chain.taught)
 
 
 class Many:
@@ -231,7 +210,7 @@ class Many:
         record: of the runs, on the device; total_steps: of each.
     """
 
-    def __init__(self, model, run: ReducedMPM, cases: Sequence[Case]):
+    def __init__(self, model, run: ReducedMPM, cases: Sequence[Parameters]):
         setup, span, self.total_steps = run.setup, run.together.span_at(0), run.total_steps
         self.record = LatentRecord(setup.xhat.expand(len(cases), -1), self.total_steps, 1)
         names = setup.manifold.parameter_names
@@ -291,11 +270,6 @@ def _checked_ms(chain: Pipeline, manifold, run: ReducedMPM, precision: str, sett
     return float(np.median(run_times({"own": checked}, settings.trials, settings.device)["own"]))
 
 
-def _times_of(ms: np.ndarray) -> dict[str, float]:
-    p10, median, p90 = np.percentile(ms, [10, 50, 90]).tolist()
-    return {"ms_median": median, "ms_p10": p10, "ms_p90": p90}
-
-
 def _decode_ms(position: Decode, xhat: torch.Tensor, settings: Settings) -> float:
     """Median time [ms] of the positions of one frame."""
     wait, times = synchronizer(settings.device), []
@@ -306,9 +280,3 @@ def _decode_ms(position: Decode, xhat: torch.Tensor, settings: Settings) -> floa
         wait()
         times.append(1e3 * (time.perf_counter() - begun))
     return float(np.median(times[1:]))
-
-
-def _tell(row: Row, what: str, say: Callable[[str], object]) -> None:
-    told = f"{row.speed_up:.4g} times the full-order step's speed, δ {100 * row.delta:.3g} %"
-    checked = "" if row.checked_ms is None else f", {row.checked_ms:.4g} ms with checks"
-    say(f"{row.case} {row.precision}: {row.ms_median:.4g} ms {what}{checked}, {told}, {row.run_mib:.3g} MiB")

@@ -1,6 +1,8 @@
 """The report of all benchmarks: tables, and charts beside the floor that the memory sets."""
 
 import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -9,42 +11,33 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from nsf.bench.rows import OTHER_SAMPLER, size_name
-from nsf.reporting.drawing.charts import rings
-from nsf.reporting.text.columns import number
+from nsf.bench.rows import FILE, read, size_name
+from nsf.results.columns import axis, number
 from nsf.results.formats import Rows, markdown_document, terminal_table
 from nsf.results.scales import plain_ticks
-from nsf.results.style import INK, figure, line_style, save, stage_colors, styled
+from nsf.results.style import INK, PALETTE, figure, line_style, save, stage_colors, styled
 from nsf.storage import writing
 
-_HEADINGS = {
-    "ms_median": "step, median [ms]",
-    "ms_p10": "10 % [ms]",
-    "ms_p90": "90 % [ms]",
-    "peak_mib": "peak memory [MiB]",
-    "speed_up": "speed-up",
-    "delta": "δ",
-    "run_mib": "of a run [MiB]",
-    "decode_ms": "a frame decoded [ms]",
-    "checked_ms": "a step, checked [ms]",
-    "teach_seconds": "teaching [s]",
-    "teacher_steps": "teacher's steps",
-    "sample": "|S|",
-    "integration": "|N|",
-    "ms": "time [ms]",
-    "mib": "moved [MiB]",
-    "gb_per_s": "bandwidth [GB/s]",
-    "floor_ms": "floor [ms]",
-}
-_TEXT = ("bench", "case", "precision", "device", "kernel", "stage", "commit")
 _LEAD = (
     "Time of a step, both sides of a ratio measured in one process turn by turn, after a warm-up, around a "
-    "synchronised device: the median over the trials, each the mean of many steps. Memory is the peak of "
-    "every allocator beyond what was held before the solver was built. `nsf bench` writes this report."
+    "synchronised device: the median over the trials, each the mean of many steps, with 10 and 90 % of them. "
+    "Memory is the peak of every allocator beyond what was held before the solver was built. "
+    f"`nsf bench` writes this report from {FILE}."
 )
-_BATCH = (
-    "Time of a simulation-step, which is the step of a batch over the simulations that take it together, by "
-    "their number; the band is from 10 % to 90 % of the trials. Dotted: half the time for twice as many."
+_REDUCED = "Time of a step of both solvers by scene; a point names δ of its run, at the first held-out value."
+_STAGES = (
+    "Where the time of a reduced step goes, by events within the captured step, which take a little time of "
+    "their own; what of the inversion is prepared on another stream counts where the step waits for it. "
+    "Beside it a frame of the paper's reduced solver on a Quadro P6000 (its appendix, Runtime analysis)."
+)
+_FLOORS = (
+    "Passes of a reduced step within the captured step, beside the time that a copy takes for the modes and "
+    "the state of the particles that a step needs, each value once, which bounds what does not fit into a "
+    "cache, and that of empty launches, as many as a step has passes that wait for each other."
+)
+_TRAINING = (
+    "Training of all networks of a scene with field=basis: the time is that of a whole training, from "
+    "opening its files to the manifold, and the trials are seeds."
 )
 _OPERATORS = (
     "Time of a step by operators: all steps of a run in one launch, over their number; of many runs at once, "
@@ -55,6 +48,10 @@ _OPERATORS = (
     "scene's own size, while the full-order step of as many particles as are decoded is on a finer grid, and "
     "shorter."
 )
+_BATCH = (
+    "Time of a simulation-step, which is the step of a batch over the simulations that take it together, by "
+    "their number; the band is from 10 % to 90 % of the trials. Dotted: half the time for twice as many."
+)
 _SIZES = (
     "Time of a step over the number of particles; dashed: the floor that the bandwidth sets a full-order "
     "step. `full_order`: a block of sand on the paper's grid. `scaling`: the sand column, whose reduced runs "
@@ -64,271 +61,310 @@ _SAMPLES = (
     "Time of a reduced step of the sand column over the number of sample particles, beside the full-order "
     "step of the same scene; a mark names δ of its run."
 )
-_KERNELS = (
-    "Each pass of a full-order step on its own. Moved: what it has to read and write, each value once. "
-    "Floor: the time that these bytes take a copy measured in the same run; a step cannot be faster than "
-    "the floors of its passes together as long as its state does not fit into a cache."
-)
-_FLOORS = (
-    "Passes of a reduced step within the captured step, beside the time that a copy takes for the modes and "
-    "the state of the particles that a step needs, each value once, which bounds what does not fit into a "
-    "cache, and that of empty launches, as many as a step has passes that wait for each other."
+_PASSES = (
+    "Each pass of a full-order step on its own; the mark is its floor. Moved: the bytes it has to read and "
+    "write, each value once. Floor: the time that these bytes take a copy measured in the same run; a step "
+    "cannot be faster than the floors of its passes together as long as its state does not fit into a cache."
 )
 #: Of a reduced frame [ms]: the networks, the projection and copies between Warp and torch, and all of it
 #: (appendix of the paper, Runtime analysis; double precision, one Quadro P6000).
 _PAPER = {"reduced_cake": (1.95, 4.69), "reduced_metal": (1.78, 2.09)}
-_STAGES = (
-    "Where the time of a reduced step goes, by events within the captured step, which take a little time of "
-    "their own; what of the inversion is prepared on another stream counts where the step waits for it. "
-    "Beside it a frame of the paper's reduced solver on a Quadro P6000 (its appendix, Runtime analysis)."
-)
-_TRAINING = (
-    "Training of all networks of a scene with field=basis: the time is that of a whole training, from "
-    "opening its files to the manifold, and the trials are seeds."
-)
+_KEY = ["bench", "case", "particles", "sample", "integration", "batch", "precision", "part", "commit"]
+_HEADINGS = {"sample": "|S|", "integration": "|N|", "part": "pass"}
+_OF_SAMPLE = r"_s\d+$"  # a case of one of several numbers of samples
 
 
-#: A case of one of several numbers of samples.
-_OF_SAMPLE = r"_s\d+$"
+@dataclass(frozen=True)
+class Section:
+    """A part of the page.
+
+    Attributes:
+        text: over the table.
+        chosen: of a device's rows, those of the table.
+        chart: stem of the picture; draw: device's rows → figure.
+        listed: whether there is a table.
+    """
+
+    text: str
+    chosen: Callable[[pd.DataFrame], pd.Series]
+    chart: str = ""
+    draw: Callable[[pd.DataFrame], Figure] | None = None
+    listed: bool = True
 
 
 def write_report(folder: Path) -> Path:
-    """Charts and index.md from results.csv, kernels.csv and stages.csv of a folder."""
-    frames = [pd.read_csv(folder / name) for name in ("results.csv", "kernels.csv", "stages.csv")]
-    devices = {
-        device: _parts(folder, *(frame[frame["device"] == device] for frame in frames))
-        for device in frames[0]["device"].unique()
-    }
+    """Charts and index.md from the table of a folder."""
+    frame = read(folder / FILE)
+    devices = {device: _parts(folder, rows) for device, rows in frame.groupby("device", sort=False)}
     page = folder / "index.md"
     with writing(page) as partial:
         partial.write_text(markdown_document("speed.md", lead=_LEAD, devices=devices), encoding="utf-8")
     return page
 
 
-def _parts(folder: Path, results: pd.DataFrame, kernels: pd.DataFrame, stages: pd.DataFrame) -> list[dict]:
-    """What the page says of one device: charts, what they show, and tables, each where it has rows."""
-    of_reduced = kernels["bench"] == "reduced"
-    passes, floors = kernels[~of_reduced], kernels[of_reduced]
-    of_size = results[results["bench"].isin(["full_order", "scaling"])]
-    by_sample = of_size["case"].str.contains(_OF_SAMPLE)
-    of_sample, sizes = of_size[by_sample], of_size[~by_sample]
-    same = (sizes["bench"] == "scaling") & sizes["particles"].isin(of_sample["particles"])
-    of_stages = stages[stages["case"].isin(_PAPER)]
-    of_scene, of_training, of_batch, of_operators = (
-        results[results["bench"] == name] for name in ("reduced", "training", "batch", "operators")
-    )
-    of_pass = "Time of each pass of a full-order step; the mark is its floor."
-    of_case = (
-        "Time of a step of both solvers by scene; a point names δ of its run, at the first held-out value."
-    )
-    listed = (  # rows, texts, chart and what draws it from which rows; the rows are the table
-        (of_scene, [of_case], "reduced", steps_by_scene, [of_scene]),
-        (of_stages, [_STAGES], "stages", step_beside_paper, [of_stages]),
-        (floors, [_FLOORS], None, None, []),
-        (of_training, [_TRAINING], None, None, []),
-        (of_operators, [_OPERATORS], None, None, []),
-        (of_batch, [_BATCH], "batch", step_over_batch, [of_batch]),
-        (sizes, [_SIZES], "step", step_over_particles, [sizes, passes]),
-        (of_sample, [_SAMPLES], "sample", step_over_sample, [of_sample, sizes[same]]),
-        (passes, [of_pass, _KERNELS], "kernels", passes_beside_floor, [passes]),
-    )
-    parts = []
-    for rows, texts, chart, draw, drawn in listed:
-        if not len(rows):
+def _parts(folder: Path, rows: pd.DataFrame) -> list[dict]:
+    """The page's parts on one device: charts, their captions, and tables, each where it has rows."""
+    device, parts = re.sub("[^a-z0-9]+", "-", rows["device"].iloc[0].lower()), []
+    for section in SECTIONS:
+        own = rows[section.chosen(rows)]
+        if not len(own):
             continue
-        device = re.sub("[^a-z0-9]+", "-", str(rows["device"].iloc[0]).lower())
-        if chart:
-            save(draw(*drawn), folder, f"{chart}-{device}")
-        table = None if rows is of_stages else _rows(rows)
-        parts.append({"chart": chart and f"{chart}-{device}", "texts": texts, "table": table})
+        chart = section.chart and f"{section.chart}-{device}"
+        if section.draw:
+            save(section.draw(rows), folder, chart, kinds=("png",))
+        constant, table = _rows(own)
+        texts = [section.text, constant] if section.listed and constant else [section.text]
+        parts.append({"chart": chart, "texts": texts, "table": table if section.listed else None})
     return parts
 
 
-def step_over_particles(results: pd.DataFrame, kernels: pd.DataFrame) -> Figure:
-    """Time of a step [ms] over P, both axes logarithmic: a line for each kind of solver and precision.
+def wide(rows: pd.DataFrame) -> pd.DataFrame:
+    """A row a subject and part, a column a figure with its unit, quantiles after it where there are any."""
+    body = []
+    for key, part in rows.groupby(_KEY, sort=False, dropna=False):
+        row = dict(zip(_KEY, key, strict=True))
+        for what, unit, *values in part[["what", "unit", "median", "p10", "p90"]].itertuples(index=False):
+            named = dict(zip(("", ", 10 %", ", 90 %"), values, strict=True))
+            row |= {axis(what + end, unit.replace("1", "")): v for end, v in named.items() if not pd.isna(v)}
+        if row.get("moved [MiB]"):
+            row["bandwidth [GB/s]"] = row["moved [MiB]"] * 2**20 / row["time [ms]"] / 1e6
+        body.append(row)
+    return pd.DataFrame(body)
+
+
+def table(path: Path) -> Table:
+    """The whole steps of a table for a terminal."""
+    rows = read(path)
+    constant, whole = _rows(rows[rows["part"] == ""].assign(commit=""))
+    return terminal_table(whole, constant)
+
+
+def _rows(rows: pd.DataFrame) -> tuple[str, Rows]:
+    """Columns that do not vary in a sentence, and the others as a table."""
+    frame = wide(rows).replace("", np.nan).dropna(axis=1, how="all")
+    same = [name for name in frame.columns[: len(_KEY)] if name in _KEY and frame[name].nunique() == 1]
+    same = [name for name in same if name != "case" and frame[name].notna().all()]
+    said = ", ".join(f"{_HEADINGS.get(name, name)} {number(frame[name].iloc[0])}" for name in same)
+    frame = frame.drop(columns=same)
+    body = [[number(value) for value in row] for row in frame.itertuples(index=False, name=None)]
+    headings = [_HEADINGS.get(name, name) for name in frame]
+    return f"All: {said}." if said else "", Rows(headings, body, [_is_number(frame[c]) for c in frame])
+
+
+def _is_number(values: pd.Series) -> bool:
+    return pd.api.types.is_numeric_dtype(values)
+
+
+# -- charts ---------------------------------------------------------------------------------------------
+
+
+def steps_over(
+    rows: pd.DataFrame, x: str, label: str, by: Iterable[tuple[str, pd.DataFrame]], y: str = "a step"
+) -> tuple[Figure, Axes]:
+    """Time [ms] over a size, both axes logarithmic: a line a group with a band of 10 to 90 % of the trials.
 
     Args:
-        results: rows of one device.
-        kernels: passes of its full-order steps, whose floors add up to that of a step.
+        rows: all that are drawn, whose sizes are ticks where there are few.
+        x: column of the size; label: of its axis.
+        by: label and rows of each line.
+        y: what takes the time.
     """
-    of_block = results["bench"].eq("full_order").map({True: " of a block", False: ""})
-    series = results.assign(solver=[_solver(case) for case in results["case"]] + of_block)
-    with styled():
-        fig, panel = _over("particles P [–]")
-        colors = {}
-        for (solver, precision), part in series.groupby(["solver", "precision"], sort=False):
-            color = _line(panel, part, "particles", f"{solver}, {precision}")
-            if solver.startswith("full-order"):
-                colors[precision] = color
-        for precision, part in kernels.groupby("precision", sort=True):
-            floor = part.groupby(["bench", "particles"])["floor_ms"].sum().groupby("particles").mean()
-            panel.plot(
-                floor.index, floor, ls=(0, (5, 2)), lw=1.2, label=f"full-order floor, {precision}",
-                color=colors[precision],
-            )  # fmt: skip
+    fig = figure(4.4)
+    panel = fig.subplots()
+    panel.set(xscale="log", yscale="log", xlabel=label, ylabel=f"time of {y} [ms]")
+    for i, (name, part) in enumerate(by):
+        part, style = part.sort_values(x), line_style(i)
+        panel.fill_between(part[x], part["p10"], part["p90"], color=style["color"], alpha=0.18, lw=0)
+        panel.plot(part[x], part["median"], marker="o", ms=4.5, label=name, **style)
+    plain_ticks(panel.yaxis)
+    sizes = sorted(rows[x].unique())
+    if len(sizes) < 8:
+        panel.set_xticks(sizes, [size_name(round(size)) for size in sizes])
+        panel.minorticks_off()
+    else:
         plain_ticks(panel.xaxis, lambda count: size_name(round(count)))
+    panel.grid(which="major")
+    return fig, panel
+
+
+def step_over_particles(rows: pd.DataFrame) -> Figure:
+    """A line for each kind of solver and precision, and the floors of a full-order step's passes."""
+    steps = rows[_sizes(rows) & (rows["what"] == "step")]
+    kind = steps["case"].str.rpartition("_")[0].str.replace("_", "-")
+    kind += steps["bench"].eq("full_order").map({True: " of a block", False: ""})
+    groups = steps.groupby([kind, "precision"], sort=False)
+    floors = rows[_passes(rows) & (rows["what"] == "floor")]
+    with styled():
+        fig, panel = steps_over(
+            steps, "particles", "particles P [–]", ((f"{k}, {p}", part) for (k, p), part in groups)
+        )
+        for i, (precision, part) in enumerate(floors.groupby("precision")):
+            floor = part.groupby(["bench", "particles"])["median"].sum().groupby("particles").mean()
+            name, dashes = f"full-order floor, {precision}", (0, (5, 2))
+            panel.plot(floor.index, floor, ls=dashes, lw=1.2, label=name, color=(INK, "#888888")[i])
         fig.legend(loc="outside upper left", ncols=3, handlelength=2.6)
     return fig
 
 
-def step_beside_paper(stages: pd.DataFrame) -> Figure:
-    """Rings of the stages of a reduced step [ms], a scene a row, and of the paper's.
-
-    Args:
-        stages: of one device, of cases of the paper; where there are two precisions, fp64 counts.
-    """
-    rows = []
-    for case, own in stages.groupby("case", sort=True):
-        precision, scene = own["precision"].max(), case.partition("_")[2]
-        own, (networks, whole) = own[own["precision"] == precision], _PAPER[case]
-        told = {"networks, projection, copies": networks, "MPM": whole - networks}
-        rows.append(
-            {
-                f"{scene}, reduced step, {precision}": dict(zip(own["stage"], own["ms"], strict=True)),
-                f"{scene}, the paper's frame": told,
-            }
-        )
-    return rings(rows)
-
-
-def step_over_sample(results: pd.DataFrame, full_order: pd.DataFrame) -> Figure:
-    """Time of a reduced step [ms] over |S|, both axes logarithmic, a line for each precision.
-
-    Args:
-        results: rows of one device and one number of particles.
-        full_order: rows of as many particles.
-    """
+def step_over_sample(rows: pd.DataFrame) -> Figure:
+    """A line a precision over |S|, δ at each point, and the full-order step of as many particles."""
+    own = rows[_samples(rows)]
+    steps, deltas = own[own["what"] == "step"], own[own["what"] == "δ"]
+    full = rows[(rows["bench"] == "scaling") & rows["case"].str.startswith("full_order")]
+    full = full[(full["what"] == "step") & full["particles"].isin(own["particles"])]
+    groups = steps.groupby("precision")
     with styled():
-        fig, panel = _over("sample particles |S| [–]", results["sample"].astype(int))
-        for i, (precision, part) in enumerate(results.groupby("precision")):
-            part = part.sort_values("sample")
-            color = _line(panel, part, "sample", f"reduced, {precision}")
-            for at, ms, delta in zip(
-                part["sample"], part["ms_median"], part["delta"].astype(float), strict=True
-            ):
+        fig, panel = steps_over(
+            steps, "sample", "sample particles |S| [–]", ((f"reduced, {p}", part) for p, part in groups)
+        )
+        for i, (precision, part) in enumerate(groups):
+            color = line_style(i)["color"]
+            both = part.merge(deltas, on=["case", "precision"])
+            for at, ms, delta in zip(both["sample_x"], both["median_x"], both["median_y"], strict=True):
                 panel.annotate(
                     f"{number(100 * delta)} %", (at, ms), (0, 6 - 18 * (i == 0)), ha="center",
                     textcoords="offset points", fontsize=8.5, color=color,
                 )  # fmt: skip
-            for ms in full_order.loc[full_order["precision"] == precision, "ms_median"]:
+            for ms in full.loc[full["precision"] == precision, "median"]:
                 panel.axhline(ms, ls=":", lw=1.4, color=color, label=f"full-order, {precision}")
         fig.legend(loc="outside upper left", ncols=2, handlelength=2.6)
     return fig
 
 
-def step_over_batch(results: pd.DataFrame) -> Figure:
-    """Time of a simulation-step [ms] over the size of the batch, both axes logarithmic.
-
-    Args:
-        results: rows of `batch` of one device; a line for each number of particles, end of the case and
-            precision.
-    """
-    ends = results["case"].str.extract(r"\d+(.*)$")[0].rename("end")
+def step_over_batch(rows: pd.DataFrame) -> Figure:
+    """A line for each body, end of the case and precision; dotted, half the time for twice as many."""
+    steps = rows[(rows["bench"] == "batch") & (rows["what"] == "step")]
+    ends = steps["case"].str.extract(r"\d+(.*)$")[0].str.replace("_", ", ")
+    groups = list(steps.groupby(["particles", ends, "precision"]))
+    named = ((f"{size_name(count)} particles{end}, {p}", part) for (count, end, p), part in groups)
     with styled():
-        fig, panel = _over("simulations B [–]", results["batch"], "time of a simulation-step [ms]")
-        for (particles, end, precision), part in results.groupby(["particles", ends, "precision"]):
-            name = f"{size_name(particles)} particles{end.replace('_', ', ')}, {precision}"
+        fig, panel = steps_over(steps, "batch", "simulations B [–]", named, "a simulation-step")
+        for i, (_, part) in enumerate(groups):
             part = part.sort_values("batch")
-            color = _line(panel, part, "batch", name)
-            shared = part["ms_median"].iloc[0] * part["batch"].iloc[0] / part["batch"]
-            panel.plot(part["batch"], shared, ls=":", lw=1.2, color=color)
+            shared = part["median"].iloc[0] * part["batch"].iloc[0] / part["batch"]
+            panel.plot(part["batch"], shared, ls=":", lw=1.2, color=line_style(i)["color"])
         fig.legend(loc="outside upper left", ncols=2, handlelength=2.6)
     return fig
 
 
-def _over(x: str, at: pd.Series | None = None, y: str = "time of a step [ms]") -> tuple[Figure, Axes]:
-    """An empty chart with logarithmic axes; x has ticks at the values `at`."""
-    fig = figure(4.4)
-    panel = fig.subplots()
-    panel.set(xscale="log", yscale="log", xlabel=x, ylabel=y)
-    if at is not None:
-        sizes = sorted(at.unique())
-        panel.set_xticks(sizes, [str(size) for size in sizes])
-        panel.minorticks_off()
-    panel.grid(which="major")
-    return fig, panel
-
-
-def _line(panel: Axes, rows: pd.DataFrame, x: str, label: str) -> str:
-    """The median over a column, and a band from 10 % to 90 % of the trials; gives the colour."""
-    rows, style = rows.sort_values(x), line_style(len(panel.collections))
-    panel.fill_between(rows[x], rows["ms_p10"], rows["ms_p90"], color=style["color"], alpha=0.18, lw=0)
-    panel.plot(rows[x], rows["ms_median"], marker="o", ms=4.5, label=label, **style)
-    plain_ticks(panel.yaxis)
-    return style["color"]
-
-
-def steps_by_scene(results: pd.DataFrame) -> Figure:
-    """Time of a step [ms] of the full-order and of the reduced solver, a point each, a panel a scene.
-
-    Args:
-        results: rows of `reduced` of one device.
-    """
-    ends = "|".join([r"[\d.]+dt", r"mlp\w*", *OTHER_SAMPLER.values()])
-    scene = results["case"].str.extract(rf"^(?:full_order|reduced)_(.+?)(?:_(?:{ends}))?$")[0]
-    panels_of = list(results.groupby(scene, sort=False))
+def steps_by_scene(rows: pd.DataFrame) -> Figure:
+    """Time of a step [ms] of either solver, a point each with its δ, a panel a scene."""
+    own = rows[(rows["bench"] == "reduced") & (rows["part"] == "")]
+    steps = own[own["what"] == "step"]
+    deltas = own[own["what"] == "δ"].set_index(["case", "precision"])["median"]
+    scene = steps["case"].str.extract(r"^(?:full_order|reduced)_([^_]+(?:_cube)?)")[0]
+    panels_of = list(steps.groupby(scene, sort=False))
     with styled():
         fig = figure(1.2 + 0.3 * max(len(part) for _, part in panels_of))
-        panels = fig.subplots(1, len(panels_of), squeeze=False)[0]
-        for panel, (name, part) in zip(panels, panels_of, strict=True):
-            at = np.arange(len(part))
-            full = part["case"].str.startswith("full_order").to_numpy()
-            median = part["ms_median"].to_numpy()
-            colors = [line_style(0)["color"] if whole else line_style(1)["color"] for whole in full]
-            panel.scatter(median, at, s=42, color=colors)
-            for ms, delta, y in zip(median, part["delta"].astype(float), at, strict=True):
-                text = number(ms) if np.isnan(delta) else f"{number(ms)}, δ {number(100 * delta)} %"
+        for panel, (name, part) in zip(
+            fig.subplots(1, len(panels_of), squeeze=False)[0], panels_of, strict=True
+        ):
+            at, median = np.arange(len(part)), part["median"].to_numpy()
+            full = part["case"].str.startswith("full_order")
+            panel.scatter(median, at, s=42, color=[PALETTE[0] if whole else PALETTE[1] for whole in full])
+            for y, (case, precision, ms) in enumerate(part[["case", "precision", "median"]].to_numpy()):
+                delta = deltas.get((case, precision))
+                text = number(ms) if delta is None else f"{number(ms)}, δ {number(100 * delta)} %"
                 place = {"xytext": (9, 0), "textcoords": "offset points", "va": "center_baseline"}
                 panel.annotate(text, (ms, y), fontsize=8.5, color=INK, **place)
             kinds = part["case"].str.replace(f"_{name}", "").str.replace("_", " ")
-            panel.set_yticks(at, [f"{kind}, {p}" for kind, p in zip(kinds, part["precision"], strict=True)])
+            panel.set_yticks(at, kinds + ", " + part["precision"])
             panel.set_ylim(len(part) - 0.5, -0.5)
             low, high = median.min(), median.max()
             panel.set(xscale="log", title=name, xlabel="time of a step [ms]")
             panel.set_xlim(low / (high / low) ** 0.1, high * (high / low) ** 0.75 * 1.5)
             panel.xaxis.set_major_formatter("{x:g}")
             panel.grid()
-            panel.tick_params(axis="y", length=0)
     return fig
 
 
-def passes_beside_floor(kernels: pd.DataFrame) -> Figure:
-    """Time [ms] of the passes of a full-order step, a bar each, and its floor as a mark; the largest case."""
-    largest = kernels[kernels["particles"] == kernels["particles"].max()].drop_duplicates(
-        ["precision", "kernel"], keep="last"
-    )
-    names = list(dict.fromkeys(largest["kernel"]))
+def bars(panels: dict[str, pd.Series], floors: dict[str, pd.Series], colors: list[str]) -> Figure:
+    """Times [ms] of passes or stages, a bar each, with a floor as a mark; a panel each title."""
+    names = list(dict.fromkeys(name for times in panels.values() for name in times.index))
     with styled():
         fig = figure(1.5 + 0.42 * len(names))
-        panels = fig.subplots(1, largest["precision"].nunique(), sharey=True, squeeze=False)[0]
-        at = np.arange(len(names))
-        for panel, (precision, part) in zip(panels, largest.groupby("precision", sort=True), strict=True):
-            part = part.set_index("kernel").loc[names]
-            bars = panel.barh(at, part["ms"], height=0.6, color=stage_colors(["p2g"]), label="time")
-            panel.bar_label(bars, [number(ms) for ms in part["ms"]], padding=4, fontsize=8.5, color=INK)
-            panel.plot(part["floor_ms"], at, "|", ms=17, mew=2.4, color=INK, label="floor")
-            panel.set(title=f"{part['case'].iloc[0]}, {precision}", xlabel="time [ms]")
-            panel.set_yticks(at, names)
+        for panel, (title, times) in zip(
+            fig.subplots(1, len(panels), sharey=True, squeeze=False)[0], panels.items(), strict=True
+        ):
+            at = [names.index(name) for name in times.index]
+            drawn = panel.barh(
+                at, times, height=0.6, color=[colors[k % len(colors)] for k in at], label="time"
+            )
+            panel.bar_label(drawn, [number(ms) for ms in times], padding=4, fontsize=8.5, color=INK)
+            if title in floors:
+                panel.plot(floors[title], at, "|", ms=17, mew=2.4, color=INK, label="floor")
+            panel.set(title=title, xlabel="time [ms]", xlim=(0, 1.2 * times.max()))
+            panel.set_yticks(range(len(names)), names)
             panel.set_ylim(len(names) - 0.5, -0.5)
-            panel.set_xlim(0, 1.16 * part["ms"].max())
             panel.grid(axis="x")
             panel.tick_params(axis="y", length=0)
-        handles, texts = panels[0].get_legend_handles_labels()
-        fig.legend(handles, texts, loc="outside upper left", ncols=2)
+        if floors:
+            handles, texts = panel.get_legend_handles_labels()
+            fig.legend(handles, texts, loc="outside upper left", ncols=2)
     return fig
 
 
-def table(path: Path) -> Table:
-    """Rows of results.csv for a terminal."""
-    return terminal_table(_rows(pd.read_csv(path).drop(columns="commit")))
+def passes_beside_floor(rows: pd.DataFrame) -> Figure:
+    """The passes of a full-order step of the largest case."""
+    own = rows[_passes(rows)]
+    own = own[own["particles"] == own["particles"].max()]
+    times, floors = {}, {}
+    for (case, precision), part in own.groupby(["case", "precision"]):
+        for chosen, what in ((times, "time"), (floors, "floor")):
+            values = part[part["what"] == what].set_index("part")["median"]
+            chosen[f"{case}, {precision}"] = values[~values.index.duplicated(keep="last")]
+    return bars(times, floors, stage_colors(["p2g"]))
 
 
-def _solver(case: str) -> str:
-    """The kind of solver that a case times: its name without the size."""
-    return case.rpartition("_")[0].replace("_", "-")
+def step_beside_paper(rows: pd.DataFrame) -> Figure:
+    """The stages of a reduced step and those of the paper's frame, a scene each; in fp64 if measured."""
+    panels = {}
+    for case, own in rows[_paper(rows)].groupby("case"):
+        precision, (networks, whole) = own["precision"].max(), _PAPER[case]
+        own, scene = own[own["precision"] == precision], case.partition("_")[2]
+        panels[f"{scene}, {precision}"] = own.set_index("part")["median"]
+        paper = {"networks, projection, copies": networks, "MPM": whole - networks}
+        panels[f"{scene}, the paper"] = pd.Series(paper)
+    stages = [name for times in panels.values() for name in times.index]
+    return bars(panels, {}, stage_colors(list(dict.fromkeys(stages))))
 
 
-def _rows(frame: pd.DataFrame) -> Rows:
-    frame = frame.dropna(axis=1, how="all")
-    body = [[number(value) for value in row] for row in frame.itertuples(index=False, name=None)]
-    return Rows([_HEADINGS.get(name, name) for name in frame], body, [name not in _TEXT for name in frame])
+# -- parts of the page ----------------------------------------------------------------------------------
+
+
+def _of_bench(name: str) -> Callable[[pd.DataFrame], pd.Series]:
+    return lambda rows: (rows["bench"] == name) & (rows["part"] == "")
+
+
+def _paper(rows: pd.DataFrame) -> pd.Series:
+    return rows["case"].isin(_PAPER) & (rows["what"] == "stage")
+
+
+def _floors(rows: pd.DataFrame) -> pd.Series:
+    return (rows["bench"] == "reduced") & rows["what"].isin(["time", "moved", "floor"])
+
+
+def _passes(rows: pd.DataFrame) -> pd.Series:
+    return rows["bench"].isin(["full_order", "scaling"]) & (rows["part"] != "")
+
+
+def _samples(rows: pd.DataFrame) -> pd.Series:
+    return _of_bench("scaling")(rows) & rows["case"].str.contains(_OF_SAMPLE)
+
+
+def _sizes(rows: pd.DataFrame) -> pd.Series:
+    whole = rows["bench"].isin(["full_order", "scaling"]) & (rows["part"] == "")
+    return whole & ~rows["case"].str.contains(_OF_SAMPLE)
+
+
+SECTIONS = (
+    Section(_REDUCED, _of_bench("reduced"), "reduced", steps_by_scene),
+    Section(_STAGES, _paper, "stages", step_beside_paper, listed=False),
+    Section(_FLOORS, _floors),
+    Section(_TRAINING, _of_bench("training")),
+    Section(_OPERATORS, _of_bench("operators")),
+    Section(_BATCH, _of_bench("batch"), "batch", step_over_batch),
+    Section(_SIZES, _sizes, "step", step_over_particles),
+    Section(_SAMPLES, _samples, "sample", step_over_sample),
+    Section(_PASSES, _passes, "kernels", passes_beside_floor),
+)

@@ -1,13 +1,26 @@
-"""What a benchmark is asked for, and what it gives."""
+"""The long table of measurements: a row a figure, which carries its unit, precision, device and commit."""
 
-from dataclasses import dataclass, field, fields
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import warp as wp
 
 from nsf.runs.provenance import provenance
+from nsf.storage import writing
+
+#: What is measured: the benchmark, its case, and sizes P, |S|, |N| and simulations that step together.
+SUBJECT = ("bench", "case", "particles", "sample", "integration", "batch", "precision", "device")
+#: Pass or stage of a step, empty of the whole; then which figure, its median over the trials and quantiles.
+COLUMNS = (*SUBJECT, "part", "what", "median", "p10", "p90", "unit", "commit")
+FILE = "bench.csv"
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What to measure.
+    """Sizes and devices to measure.
 
     Attributes:
         particles: numbers of particles; empty for those that suit the benchmark and the device.
@@ -23,114 +36,92 @@ class Settings:
     trials: int
     scenes: tuple[str, ...] = ()
 
+    @property
+    def on_gpu(self) -> bool:
+        """Whether the device is a GPU."""
+        return self.device.startswith("cuda")
 
-#: How sample particles are chosen in another case of a scene, beside the scene's own way.
-OTHER_SAMPLER = {"cake": "region", "metal": "cells"}
+    @property
+    def scale(self) -> str:
+        """Size of the scenes that the device can be asked for: the paper's, or small."""
+        return "paper" if self.on_gpu else "small"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Row:
-    """One side of a benchmark: a row of results.csv.
+class Case:
+    """One side of a benchmark; None where it has no such size.
 
     Attributes:
-        bench, case: the benchmark, and what of it.
-        particles, sample, integration: P, |S| and |N|; None where there is none.
-        batch: simulations that are stepped together, or points (particles of frames) of a training step.
-        precision, device: of the solver.
-        ms_median, ms_p10, ms_p90: over the trials, of the mean time of a step in one [ms]; that of one
-            simulation, so the step of a batch over its size.
-        peak_mib: what every allocator holds at most beyond what was held before the solver was built [MiB];
-            None where several processes work.
-        delta: δ of the run that is timed, or begun for the time of its first steps, a fraction; None for a
-            full-order run.
-        commit: of the code.
-        speed_up: how many times as fast as the full-order step of the same call.
-        run_mib: of a run by operators, all that it holds but for the fields that decode a frame [MiB].
-        decode_ms: time of the positions of all particles of one frame [ms].
-        checked_ms: of a step by operators in runs that are checked as `nsf deploy` checks them [ms].
-        teach_seconds, teacher_steps: of its operators' teaching.
+        bench, name: the benchmark, and its case.
+        particles, sample, integration: P, |S| and |N|.
+        batch: simulations that are stepped together.
+        precision: of the solver.
     """
 
     bench: str
-    case: str
+    name: str
     particles: int
+    precision: str
     sample: int | None = None
     integration: int | None = None
     batch: int = 1
-    precision: str
-    device: str
-    ms_median: float
-    ms_p10: float
-    ms_p90: float
-    peak_mib: float | None
-    delta: float | None = None
-    commit: str
-    speed_up: float | None = None
-    run_mib: float | None = None
-    decode_ms: float | None = None
-    checked_ms: float | None = None
-    teach_seconds: float | None = None
-    teacher_steps: int | None = None
 
 
-@dataclass(frozen=True)
-class KernelRow:
-    """One pass of a step: a row of kernels.csv.
+@dataclass
+class Measurements:
+    """Where a benchmark puts its figures.
 
     Attributes:
-        bench, case, particles, precision, device, commit: as in `Row`.
-        kernel: the pass, or how many launches of nothing.
-        ms: median time [ms].
-        mib: what it has to read and write, each value once [MiB].
-        gb_per_s: their ratio [GB/s].
-        floor_ms: the time that these bytes take a copy of this run; of empty launches their own [ms].
+        settings: of the measurement; say: told of every result; rows: dicts of `COLUMNS`.
     """
 
-    bench: str
-    case: str
-    particles: int
-    precision: str
-    device: str
-    kernel: str
-    ms: float
-    mib: float
-    gb_per_s: float
-    floor_ms: float
-    commit: str
+    settings: Settings
+    say: Callable[[str], object]
+    rows: list[dict] = field(default_factory=list)
+
+    def add(
+        self, case: Case, what: str, values, unit: str = "ms", part: str = "", quantiles: Sequence = ()
+    ) -> float:
+        """Add a figure, with 10 % and 90 % of its trials where there are several; gives the median."""
+        median = float(np.median(values))
+        if np.ndim(values):
+            quantiles = np.percentile(values, [10, 90]).tolist()
+        subject = asdict(case) | {"case": case.name, "device": name_of(self.settings.device)}
+        own = [*(subject[name] for name in SUBJECT), part, what, median]
+        own += [*(quantiles or (None, None)), unit, commit()]
+        self.rows.append(dict(zip(COLUMNS, own, strict=True)))
+        return median
+
+    @property
+    def frame(self) -> pd.DataFrame:
+        """The table."""
+        return pd.DataFrame(self.rows, columns=list(COLUMNS))
 
 
-@dataclass(frozen=True)
-class StageRow:
-    """One stage of a step, on a GPU within the captured one: a row of stages.csv.
-
-    Attributes:
-        bench, case, particles, precision, device, commit: as in `Row`.
-        stage: of the step.
-        ms: median time over steps spread through a run [ms].
-    """
-
-    bench: str
-    case: str
-    particles: int
-    precision: str
-    device: str
-    stage: str
-    ms: float
-    commit: str
+def read(path: Path) -> pd.DataFrame:
+    """The table of a file, to the last digit; an empty one where there is none."""
+    if not path.is_file():
+        return pd.DataFrame(columns=list(COLUMNS))
+    frame = pd.read_csv(path, dtype={"part": str, "unit": str})
+    return frame.fillna({"part": "", "unit": ""})
 
 
-@dataclass(frozen=True)
-class Result:
-    """What a benchmark found."""
+def merge(path: Path, fresh: pd.DataFrame) -> None:
+    """Put rows in place of those of the same benchmark, case, size, precision and device; keep the others."""
+    key = ["bench", "case", "particles", "precision", "device"]
+    old = read(path)
+    replaced = pd.MultiIndex.from_frame(old[key]).isin(pd.MultiIndex.from_frame(fresh[key]))
+    frames = [frame for frame in (old[~replaced], fresh) if len(frame)]
+    frame = pd.concat(frames, ignore_index=True) if frames else fresh
+    frame = frame.sort_values(["device", "bench", "precision", "particles"], kind="stable")
+    with writing(path) as partial:
+        frame.astype(dict.fromkeys(("sample", "integration"), "Int64")).to_csv(partial, index=False)
 
-    rows: list[Row] = field(default_factory=list)
-    kernels: list[KernelRow] = field(default_factory=list)
-    stages: list[StageRow] = field(default_factory=list)
 
-
-def columns(kind: type) -> list[str]:
-    """Names of a row's columns, in order."""
-    return [f.name for f in fields(kind)]
+def name_of(device: str) -> str:
+    """The name of a figure's device: the product of a GPU, else `cpu`."""
+    found = wp.get_device(device)
+    return found.name if found.is_cuda else "cpu"
 
 
 def commit() -> str:

@@ -3,17 +3,15 @@
 from collections.abc import Callable, Sequence
 from functools import partial
 
-import numpy as np
 import torch
 
 from nsf import config
-from nsf.bench.full_order import kernel_rows
-from nsf.bench.measure import bandwidth, build, name_of, window_times
-from nsf.bench.reduced import scale_of
-from nsf.bench.rows import Result, Row, Settings, commit, size_name
+from nsf.bench.full_order import add_passes
+from nsf.bench.measure import bandwidth, build, window_times
+from nsf.bench.reduced import deformation_error
+from nsf.bench.rows import Case, Measurements, size_name
 from nsf.data import hash_of_positions
 from nsf.dynamics import ReducedMPM
-from nsf.evaluation import metrics
 from nsf.evaluation.superresolution import POINTS
 from nsf.kinematics.fields.basis import BasisManifold
 from nsf.kinematics.interpolation import interpolation, lying_together
@@ -31,42 +29,38 @@ _SAMPLE = 20  # |S| while P grows
 _FRAMES = 5  # at which δ is taken, evenly spread over the run
 
 
-def run(settings: Settings, found: Result, say: Callable[[str], object]) -> None:
+def run(found: Measurements) -> None:
     """The sand column: from 10 000 to 4 million particles on a GPU, to 20 000 on a CPU.
 
     The fields are trained once, at the paper's size on a GPU and at small scale on a CPU, and evaluated
     between their particles at all other numbers, where the dynamics run on them with another Δx and Δt: how
     far that goes, δ tells. Data and training are made, or reused, as by `nsf train`.
     """
-    kind = "cuda" if settings.device.startswith("cuda") else "cpu"
-    overrides = ["scene=sand", f"scale={scale_of(settings.device)}", f"device={settings.device}"]
-    chain = Pipeline(config.load(overrides), say=say)
-    measured(chain, settings.particles or SIZES[kind], SAMPLES, settings, found, say)
+    settings = found.settings
+    overrides = ["scene=sand", f"scale={settings.scale}", f"device={settings.device}"]
+    chain = Pipeline(config.load(overrides), say=found.say)
+    measured(chain, settings.particles or SIZES["cuda" if settings.on_gpu else "cpu"], SAMPLES, found)
 
 
-def measured(
-    chain: Pipeline, sizes: Sequence[int], samples: Sequence[int], settings: Settings, found: Result, say
-) -> None:
+def measured(chain: Pipeline, sizes: Sequence[int], samples: Sequence[int], found: Measurements) -> None:
     """Add the rows of one scene with `field=basis`, in its first held-out case.
 
     Args:
         chain: of the scene.
         sizes: numbers of particles P, all at one |S|.
         samples: numbers of samples |S|, all at the scene's own P.
-        settings: precisions, device and trials.
-        found: gets the rows.
-        say: told of every result.
+        found: see `run`.
     """
     if not chain.training.complete:
         chain.simulate(("train",))
     chain.train()
-    manifold, speed = chain.manifold(), bandwidth(settings.device)
+    manifold, speed = chain.manifold(), bandwidth(found.settings.device)
     for particles in sizes:
         if particles != len(manifold.X):  # measured below
             scene = at_size(chain.scene, particles)
-            fields = partial(carried_over, manifold, scene, settings.device)
-            _compared(chain, scene, fields, (_SAMPLE,), settings, speed, found, say)
-    _compared(chain, chain.scene, lambda: manifold, samples, settings, speed, found, say)
+            fields = partial(carried_over, manifold, scene, found.settings.device)
+            _compared(chain, scene, fields, (_SAMPLE,), speed, found)
+    _compared(chain, chain.scene, lambda: manifold, samples, speed, found)
 
 
 def at_size(scene: Scene, particles: int) -> Scene:
@@ -115,84 +109,60 @@ def _compared(
     scene: Scene,
     fields: Callable[[], BasisManifold],
     samples: Sequence[int],
-    settings: Settings,
     speed: float,
-    found: Result,
-    say: Callable[[str], object],
+    found: Measurements,
 ) -> None:
     """Add both solvers of a scene in every precision, all in turns; nothing of them stays on the device."""
-    device, scene = settings.device, scene.with_parameters(chain.held_out[0])
-    built = _built(chain, scene, fields(), samples, settings)
-    times = window_times(
-        {of: solver for of, (solver, _) in built.items()}, scene.steps, settings.trials, device
-    )
-    steps = frames_of(scene.steps)
-    truth = positions_after(scene.full_order(precision=max(settings.precisions), device=device), steps)
-    for (case, precision), (solver, peak_mib) in built.items():
-        reduced = isinstance(solver, ReducedMPM)
-        delta = _error(solver, steps, truth) if reduced else None
-        p10, median, p90 = np.percentile(times[case, precision], [10, 50, 90]).tolist()
-        row = Row(
-            bench="scaling", case=case, particles=len(truth[0]), batch=1, precision=precision, delta=delta,
-            sample=solver.sample_size if reduced else None, device=name_of(device), ms_median=median,
-            integration=round(solver.integration_mean) if reduced else None, ms_p10=p10, ms_p90=p90,
-            peak_mib=peak_mib, commit=commit(),
-        )  # fmt: skip
-        found.rows.append(row)
-        say(f"{case} {precision}: {median:.4g} ms a step" + (f", δ {100 * delta:.3g} %" if reduced else ""))
-        if not reduced:
-            found.kernels.extend(kernel_rows("scaling", case, precision, solver, speed))
+    settings, scene = found.settings, scene.with_parameters(chain.held_out[0])
+    device = settings.device
+    built = _built(chain, scene, fields(), samples, found)
+    solvers = {of: solver for of, (solver, _) in built.items()}
+    times = window_times(solvers, scene.steps, settings.trials, device)
+    full = scene.full_order(precision=max(settings.precisions), device=device)
+    truth = frames_after(full, scene)
+    for case, (solver, peak) in built.items():
+        ms = found.add(case, "step", times[case])
+        found.add(case, "peak memory", peak, "MiB")
+        if case.sample is None:
+            found.say(f"{case.name} {case.precision}: {ms:.4g} ms a step")
+            add_passes(found, case, solver, speed)
+            continue
+        solver.restart()
+        solver.step(solver.total_steps)
+        delta = found.add(case, "δ", deformation_error(solver, truth), "1")
+        found.say(f"{case.name} {case.precision}: {ms:.4g} ms a step, δ {100 * delta:.3g} %")
 
 
 def _built(
-    chain: Pipeline, scene: Scene, fields: BasisManifold, samples: Sequence[int], settings: Settings
-) -> dict[tuple[str, str], tuple[FullOrderMPM | ReducedMPM, float]]:
-    """By case and precision, each solver after its warm-up and the most memory it took [MiB]."""
-    device, size = settings.device, size_name(len(fields.X))
-    found = {
-        (f"full_order_{size}", p): build(partial(scene.full_order, precision=p, device=device), device)
-        for p in settings.precisions
-    }
-    rest = torch.as_tensor(chain.scene.particles().X)
-    xhat = chain.manifold().encode(rest[None])[0].numpy()
+    chain: Pipeline, scene: Scene, fields: BasisManifold, samples: Sequence[int], found: Measurements
+) -> dict[Case, tuple[FullOrderMPM | ReducedMPM, float]]:
+    """Each solver after its warm-up, and the most memory it took [MiB]."""
+    device, size, built = found.settings.device, size_name(len(fields.X)), {}
+    of = partial(Case, bench="scaling", particles=len(fields.X))
+    for p in found.settings.precisions:
+        case = of(name=f"full_order_{size}", precision=p)
+        built[case] = build(partial(scene.full_order, precision=p, device=device), device)
+    rest = torch.as_tensor(chain.scene.particles().X)[None]
+    xhat = chain.manifold().encode(rest)[0].numpy()
     make = partial(
         scene.reduced, fields, chain.held_out[0], sources=chain.sources, device=device,
         projector=chain.projector, integration=chain.integration, xhat=xhat,
     )  # fmt: skip
     for number in samples:
-        case = f"reduced_{size}" if len(samples) == 1 else f"reduced_{size}_s{number}"
+        name = f"reduced_{size}" if len(samples) == 1 else f"reduced_{size}_s{number}"
         first = make(sample=number)
         how = {"sample": first.samples, "sets": first.sets}
+        sizes = {"sample": first.sample_size, "integration": round(first.integration_mean)}
         del first  # its arrays are on the device
-        for p in settings.precisions:
-            found[case, p] = build(partial(make, **how, precision=p), device)
-    return found
+        for p in found.settings.precisions:
+            built[of(name=name, precision=p, **sizes)] = build(partial(make, **how, precision=p), device)
+    return built
 
 
-def frames_of(steps: int) -> np.ndarray:
-    """Steps after which δ is taken, of a run of so many."""
-    return spaced(steps + 1, _FRAMES + 1)[1:]
-
-
-def positions_after(solver: FullOrderMPM, steps: Sequence[int]) -> list[torch.Tensor]:
-    """[P, 3] positions [m] after some numbers of steps, on the host."""
+def frames_after(solver: FullOrderMPM, scene: Scene) -> list[tuple[float, torch.Tensor]]:
+    """Times [s] and positions [P, 3] [m], on the host, of a few frames that are spread over a run."""
     found = []
-    for step in steps:
-        solver.step(int(step) - solver.steps_taken)
-        found.append(torch.as_tensor(solver.state.x.numpy()))
+    for step in spaced(scene.steps + 1, _FRAMES + 1)[1:].tolist():
+        solver.step(step - solver.steps_taken)
+        found.append((scene.dt * step, torch.as_tensor(solver.state.x.numpy())))
     return found
-
-
-@torch.no_grad()
-def _error(solver: ReducedMPM, steps: Sequence[int], truth: Sequence[torch.Tensor]) -> float:
-    """δ of a whole run against positions after some of its steps; ∞ if it diverged."""
-    solver.restart()
-    solver.step(solver.total_steps)
-    if solver.left_grid() >= 0:
-        return float("inf")
-    decoder, errors, norms = solver.decoder(), [], []
-    for step, x in zip(steps, truth, strict=True):
-        x = x.to(decoder.at.device, decoder.at.dtype)[None]
-        errors.append(metrics.frame_squares(decoder.position(solver.record.xhat[step])[None] - x))
-        norms.append(metrics.frame_squares(x))
-    return metrics.relative(torch.cat(errors), torch.cat(norms))

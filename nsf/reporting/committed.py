@@ -252,7 +252,7 @@ def _reports(folder: Path) -> list[Path]:
 
 def _benches(folder: Path) -> list[Path]:
     """The same of what `nsf bench` wrote."""
-    marks = not_ignored(sorted(folder.glob("*/kernels.csv")))
+    marks = not_ignored(sorted(folder.glob("*/bench.csv")))
     return [mark.parent for mark in marks]
 
 

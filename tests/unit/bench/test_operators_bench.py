@@ -1,6 +1,5 @@
 """`nsf bench benches=operators` on the tiny chain; what a step takes is asserted nowhere."""
 
-import re
 import shutil
 
 import numpy as np
@@ -10,8 +9,8 @@ import torch
 from angles import angle
 
 from nsf.bench.operators import Checked, Many, measured, measured_decoded
-from nsf.bench.report import write_report
-from nsf.bench.rows import KernelRow, Result, Row, Settings, StageRow, columns
+from nsf.bench.report import wide
+from nsf.bench.rows import Measurements, Settings
 from nsf.deployment import Levels, Rollout, rollout_file
 from nsf.engines import Operators
 from nsf.pipeline.stages.deployment import calibrated, levels_of
@@ -20,39 +19,38 @@ TAUGHT = (
     "model=recurrence", "model.teaching.steps=400", "model.teaching.descent=100",
     "model.teaching.rounds=0", "model.teaching.width=16",
 )  # fmt: skip
-SETTINGS = Settings((), ("fp32", "fp64"), "cpu", 2)
 
 
 @pytest.fixture(scope="module")
 def taught(chain, pipeline_at, tmp_path_factory):
     """The tiny chain by operators, its rows, and what was said of them."""
-    root, found, said = tmp_path_factory.mktemp("taught") / "runs", Result(), []
+    root, said = tmp_path_factory.mktemp("taught") / "runs", []
+    found = Measurements(Settings((), ("fp32", "fp64"), "cpu", 2), said.append)
     for stage in ("simulate", "train"):
         shutil.copytree(chain.root / stage, root / stage)
     pipeline = pipeline_at(root, *TAUGHT)
-    measured(pipeline, SETTINGS, found, said.append, many=3)
-    measured_decoded(pipeline, 1200, SETTINGS, found, said.append)
-    return pipeline, pd.DataFrame(found.rows, columns=columns(Row)), said
+    measured(pipeline, found, many=3)
+    measured_decoded(pipeline, 1200, found)
+    return pipeline, wide(found.frame), said
 
 
 def test_every_case_has_a_row(taught):
-    pipeline, rows, said = taught
+    pipeline, rows, _ = taught
     cases = ["full_order_sand", "operators_sand", "operators_batch3"]
     assert rows["case"].tolist() == 2 * cases + 2 * ["full_order_1k", "operators_1k"]
     assert rows["precision"].tolist() == 3 * ["fp32"] + 3 * ["fp64"] + 2 * ["fp32"] + 2 * ["fp64"]
     assert rows["particles"].tolist() == 6 * [500] + 4 * [1200]
     own, full = (rows[rows["case"].str.startswith(kind)] for kind in ("operators", "full_order"))
     assert own["batch"].tolist() == [1, 3, 1, 3, 1, 1]
-    for name in ("sample", "delta", "speed_up", "run_mib", "teach_seconds", "teacher_steps"):
+    for name in ("sample", "δ", "speed-up", "memory of a run [MiB]", "teaching [s]"):
         assert own[name].notna().all()
         assert full[name].isna().all()
     alone = [True, False, True, False, True, True]
-    assert own["decode_ms"].notna().tolist() == own["checked_ms"].notna().tolist() == alone
-    ratios = full["ms_median"].to_numpy()[[0, 0, 1, 1, 2, 3]] / own["ms_median"]
-    np.testing.assert_allclose(own["speed_up"], ratios)
-    known = pipeline.taught.manifest["metrics"]
-    assert (own["teacher_steps"] == known["teacher_steps"]).all()
-    assert len(said) == len(own)
+    for name in ("decoding of a frame [ms]", "checked step [ms]"):
+        assert own[name].notna().tolist() == alone
+    ratios = full["step [ms]"].to_numpy()[[0, 0, 1, 1, 2, 3]] / own["step [ms]"]
+    np.testing.assert_allclose(own["speed-up"], ratios)
+    assert (own["steps of the teacher"] == pipeline.taught.manifest["metrics"]["teacher_steps"]).all()
 
 
 def test_a_checked_run_is_looked_at_as_a_deployed_one_is(taught, monkeypatch):
@@ -79,7 +77,7 @@ def test_delta_is_that_of_the_evaluation(taught):
     pipeline.deploy()
     pipeline.evaluate()
     evaluated = pd.read_csv(pipeline.evaluation.path / "results.csv")["delta"][0]
-    double = rows[rows["precision"] == "fp64"].set_index("case")["delta"]
+    double = rows[rows["precision"] == "fp64"].set_index("case")["δ"]
     assert double["operators_sand"] == pytest.approx(evaluated, rel=1e-6)
     assert double["operators_batch3"] == pytest.approx(evaluated, rel=1e-6)
     # Another body, by its grid; see the same bound in test_bench.
@@ -90,10 +88,10 @@ def test_a_run_holds_little(taught):
     pipeline, rows, _ = taught
     run = pipeline.solver_at(pipeline.manifold(), angle(26.0))
     own = rows[(rows["case"] == "operators_sand") & (rows["precision"] == "fp64")].iloc[0]
-    assert own["run_mib"] == run.nbytes / 2**20
+    assert own["memory of a run [MiB]"] == run.nbytes / 2**20
     assert run.nbytes < 0.2 * run.decoder().at.nbytes
     more = rows[(rows["case"] == "operators_batch3") & (rows["precision"] == "fp64")].iloc[0]
-    assert more["run_mib"] < 3 * own["run_mib"]
+    assert more["memory of a run [MiB]"] < 3 * own["memory of a run [MiB]"]
 
 
 def test_many_runs_are_those_of_a_batch(taught):
@@ -109,21 +107,3 @@ def test_many_runs_are_those_of_a_batch(taught):
         many.step(14)
         torch.testing.assert_close(many.record.xhat, batch.batch.record.xhat, rtol=0, atol=1e-13)
     assert (many.record.xhat[0] - many.record.xhat[2]).abs().max() > 1e-3
-
-
-def test_a_report_of_operators(taught, tmp_path):
-    _, rows, _ = taught
-    rows.to_csv(tmp_path / "results.csv", index=False)
-    for kind, name in ((KernelRow, "kernels"), (StageRow, "stages")):
-        pd.DataFrame(columns=columns(kind)).to_csv(tmp_path / f"{name}.csv", index=False)
-    page = write_report(tmp_path).read_text()
-    assert not re.findall(r"\\.png", page)
-    assert page.count("| operators_batch3 |") == 2
-    for heading in (
-        "speed-up",
-        "of a run [MiB]",
-        "a frame decoded [ms]",
-        "a step, checked [ms]",
-        "teaching [s]",
-    ):
-        assert heading in page
