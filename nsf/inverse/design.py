@@ -237,35 +237,33 @@ class Moves(Program):
             k += len(axes)
         return found
 
-    def _shifts(self, name: str) -> list[np.ndarray]:
-        """[N + 1, 3] of a solid in each training run [m]."""
-        c, found = self.model.scene.collider_names.index(name), []
-        for case in self.model.pipeline.split.train:
-            scene = self.model.pipeline.scene.with_parameters(case)
-            found.append(scene.forcing_at(self.model.t)["solids"][:, c, :3])
-        return found
+    @cached_property
+    def _shifts(self) -> dict[str, np.ndarray]:
+        """[R, N + 1, 3] of each solid in the training runs [m]."""
+        model, there = self.model, self.model.scene.collider_names
+        scenes = [model.pipeline.scene.with_parameters(case) for case in model.pipeline.split.train]
+        solids = np.stack([scene.forcing_at(model.t)["solids"] for scene in scenes])
+        return {name: solids[:, :, there.index(name), :3] for name in self.solids}
 
     @cached_property
     def _axes(self) -> dict[str, np.ndarray]:
         """[ways, 3] of each solid: the axes along which training runs moved it."""
         axes = {}
         for name in self.solids:
-            if name not in self.model.scene.collider_names:
-                continue
             _, sizes, own = np.linalg.svd(self._changes(name), full_matrices=False)
             axes[name] = own[sizes > _HARDLY]
         return axes
 
     def _begun(self, name: str) -> np.ndarray:
         """[3] where a solid is at t = 0, on average over training runs [m]."""
-        return np.mean([run[0] for run in self._shifts(name)], 0)
+        return self._shifts[name][:, 0].mean(0)
 
     def _changes(self, name: str) -> np.ndarray:
         """[n, 3] of a solid's shift in each step of all training runs [m]."""
-        return np.concatenate([np.diff(run, axis=0) for run in self._shifts(name)])
+        return np.diff(self._shifts[name], axis=1).reshape(-1, 3)
 
     def _bounds_of(self, name: str) -> np.ndarray:
-        along = np.concatenate(self._shifts(name)) @ self._axes[name].T
+        along = self._shifts[name].reshape(-1, 3) @ self._axes[name].T
         return np.stack([along.min(0), along.max(0)], 1)
 
 
@@ -309,51 +307,61 @@ def design(
     target, tolerance = (torch.as_tensor(v, device=model.device) for v in (own.values, own.deviations))
     mu, shape = model.tensor(parameters), (program.knots, len(program.names))
 
-    def cost(knots: Tensor) -> tuple[Tensor, Tensor, Forcing]:
+    def run(knots: Tensor) -> tuple[Tensor, Forcing]:
         forcing = program.forcing(program.values(knots))
-        xhat = model(mu.expand(len(knots), -1), forcing)
-        off = (view.of_runs(xhat) - target) / tolerance
-        return (off**2).sum(1), xhat, forcing
+        return model(mu.expand(len(knots), -1), forcing), forcing
 
-    found = torch.as_tensor(np.random.default_rng(seed).random((_STARTS, *shape)), device=model.device)
-    found[0] = 0.5
-    best, least = found[0].clone(), np.inf
-    adam = torch.optim.Adam([found.requires_grad_()], lr=_RATE, betas=(0.9, 0.99))
-    slower = torch.optim.lr_scheduler.LinearLR(adam, 1.0, 1.0 / _LOOKS, _LOOKS)
-    for _ in range(_LOOKS):
-        costs, _, _ = cost(found)
-        now = torch.where(torch.isfinite(costs), costs, torch.inf).detach()
-        if float(now.min()) < least:
-            least, best = float(now.min()), found[now.argmin()].detach().clone()
-        (slope,) = torch.autograd.grad(torch.log1p(costs).sum(), found)
-        found.grad = torch.nan_to_num(slope)
-        adam.step()
-        slower.step()
-        with torch.no_grad():
-            found.clamp_(0.0, 1.0)
+    def costs(knots: Tensor) -> Tensor:
+        return (((view.of_runs(run(knots)[0]) - target) / tolerance) ** 2).sum(1)
+
+    starts = torch.as_tensor(np.random.default_rng(seed).random((_STARTS, *shape)), device=model.device)
+    starts[0] = 0.5
+    best, least = _best_of(costs, starts)
     if not np.isfinite(least):
         raise InstabilityError("no program gives a run that stays finite; choose narrower bounds")
     say(f"design: the best of {_STARTS} programs is {np.sqrt(least / len(own)):.3g} tolerances off (RMS)")
-
-    def value(flat: np.ndarray) -> tuple[float, np.ndarray]:
-        knots = torch.as_tensor(flat.reshape(1, *shape), device=model.device).requires_grad_()
-        total = cost(knots)[0].sum()
-        (slope,) = torch.autograd.grad(total, knots)
-        return float(torch.nan_to_num(total.detach(), 1e30, 1e30)), torch.nan_to_num(
-            slope
-        ).cpu().numpy().ravel()
-
-    box = [(0.0, 1.0)] * best.numel()
-    end = minimize(
-        value, best.cpu().numpy().ravel(), jac=True, method="L-BFGS-B", bounds=box, options={"maxiter": _MOST}
-    )
+    end = _followed(costs, best)
     knots = torch.as_tensor(end.x.reshape(1, *shape), device=model.device)
     with torch.no_grad():
-        _, xhat, forcing = cost(knots)
+        xhat, forcing = run(knots)
         seen = view.of_runs(xhat)[0].cpu().numpy()
         values = program.values(knots)[0].cpu().numpy()
         distrust = float(model.distrust(xhat, mu.expand(1, -1), forcing)[0])
     return Designed(values, xhat[0].cpu().numpy(), seen, float(end.fun), str(end.message), distrust)
+
+
+def _best_of(costs: Callable[[Tensor], Tensor], knots: Tensor) -> tuple[Tensor, float]:
+    """The best [1, knots, ways] that programs [B, knots, ways] meet as they descend together (Adam)."""
+    best, least = knots[:1].clone(), np.inf
+    adam = torch.optim.Adam([knots.requires_grad_()], lr=_RATE, betas=(0.9, 0.99))
+    slower = torch.optim.lr_scheduler.LinearLR(adam, 1.0, 1.0 / _LOOKS, _LOOKS)
+    for _ in range(_LOOKS):
+        now = costs(knots)
+        finite = torch.where(torch.isfinite(now), now, torch.inf).detach()
+        if float(finite.min()) < least:
+            least, best = float(finite.min()), knots[finite.argmin()][None].detach().clone()
+        (slope,) = torch.autograd.grad(torch.log1p(now).sum(), knots)
+        knots.grad = torch.nan_to_num(slope)
+        adam.step()
+        slower.step()
+        with torch.no_grad():
+            knots.clamp_(0.0, 1.0)
+    return best, least
+
+
+def _followed(costs: Callable[[Tensor], Tensor], best: Tensor):
+    """scipy's L-BFGS-B from a program [1, knots, ways], within the bounds."""
+
+    def value(flat: np.ndarray) -> tuple[float, np.ndarray]:
+        knots = torch.as_tensor(flat.reshape(best.shape), device=best.device).requires_grad_()
+        total = costs(knots).sum()
+        (slope,) = torch.autograd.grad(total, knots)
+        total, slope = torch.nan_to_num(total.detach(), 1e30, 1e30), torch.nan_to_num(slope)
+        return float(total), slope.cpu().numpy().ravel()
+
+    box = [(0.0, 1.0)] * best.numel()
+    flat = best.cpu().numpy().ravel()
+    return minimize(value, flat, jac=True, method="L-BFGS-B", bounds=box, options={"maxiter": _MOST})
 
 
 class Held:

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.optimize import brentq
 
 from nsf.data import PROGRAM, Trajectory
 from nsf.data.schema import TRAJECTORY
@@ -131,11 +132,13 @@ class Offsets:
 
 
 def _weights(squares: np.ndarray, count: float) -> np.ndarray:
-    """Gaussian weights [V] of squared distances [V] that `count` cases share, by bisection over the width."""
-    low, high = -20.0, 20.0
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        w = np.exp(-0.5 * (squares - squares.min()) / np.exp(middle))
-        w /= w.sum()
-        low, high = (middle, high) if 1.0 / np.sum(w**2) < count else (low, middle)
-    return w
+    """Gaussian weights [V] of squared distances [V] that `count` cases share."""
+
+    def weights(log_width: float) -> np.ndarray:
+        w = np.exp(-0.5 * (squares - squares.min()) / np.exp(log_width))
+        return w / w.sum()
+
+    ends = [1.0 / np.sum(weights(end) ** 2) - count for end in (-20.0, 20.0)]
+    if ends[0] * ends[1] >= 0.0:  # as where all are equally near
+        return weights(20.0)
+    return weights(brentq(lambda width: 1.0 / np.sum(weights(width) ** 2) - count, -20.0, 20.0))

@@ -15,6 +15,7 @@ Student's, with the degrees of freedom of Welch and Satterthwaite.
 
 import time
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -209,21 +210,16 @@ def _best_starts(seen, values: np.ndarray, s: np.ndarray, n: int, starts: int, d
 
 def _followed(residuals, u: np.ndarray):
     """scipy's least squares from a start, within the ranges."""
-    known: dict[bytes, tuple[np.ndarray, np.ndarray]] = {}
 
-    def both(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        if at.tobytes() not in known:
-            known.clear()
-            known[at.tobytes()] = residuals(at)
-        return known[at.tobytes()]
-
-    # A step that leaves what is finite is no step down: it gets residuals that are too large to take.
-    def finite(at: np.ndarray) -> np.ndarray:
-        return np.nan_to_num(both(at)[0], nan=1e6, posinf=1e6, neginf=-1e6)
+    @lru_cache(maxsize=1)  # of values and slopes, which scipy asks for one after the other
+    def both(at: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
+        values, slopes = residuals(np.array(at))
+        # A step that leaves what is finite is no step down: it gets residuals that are too large to take.
+        return np.nan_to_num(values, nan=1e6, posinf=1e6, neginf=-1e6), np.nan_to_num(slopes)
 
     return least_squares(
-        finite, u, jac=lambda at: np.nan_to_num(both(at)[1]), bounds=(0.0, 1.0), x_scale=1.0, max_nfev=40,
-        xtol=1e-7, ftol=1e-7, gtol=1e-7,
+        lambda at: both(tuple(at))[0], u, jac=lambda at: both(tuple(at))[1], bounds=(0.0, 1.0), x_scale=1.0,
+        max_nfev=40, xtol=1e-7, ftol=1e-7, gtol=1e-7,
     )  # fmt: skip
 
 

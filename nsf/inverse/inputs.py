@@ -11,6 +11,8 @@ from typing import NoReturn
 
 import numpy as np
 import torch
+from numpy.polynomial import chebyshev
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from nsf.errors import ConfigError
@@ -22,7 +24,7 @@ _COMPARED = (0.137, 0.529, 0.871)  # where it is compared, in units of the range
 
 
 class Polynomial:
-    """An array as a polynomial of the problem parameters, in Chebyshev's basis.
+    """An array as a polynomial of the problem parameters.
 
     Each parameter that changes the array has the degree that it takes by itself. Parameters whose changes
     add up have terms apart, so that the scenes that are built grow with their number and no faster; only
@@ -43,27 +45,26 @@ class Polynomial:
     def __init__(
         self, of: Callable[[np.ndarray], np.ndarray], ranges: np.ndarray, names: tuple[Sequence[str], str]
     ):
-        self._low, self._high = torch.as_tensor(np.asarray(ranges, float)).unbind(1)
-        self._of, self._names, self._middle = of, names, np.mean(ranges, axis=1)
-        self._shape = np.shape(of(self._middle))
-        self._base = self._values([{}])[0]
-        one = {p: self._values([{p: _COMPARED[0]}])[0] for p in range(len(ranges))}
-        along = [p for p in one if not torch.equal(one[p], self._base)]
-        self.varies = bool(along)
-        compared = [dict.fromkeys(along, u) for u in _COMPARED] if along else []
-        truth = self._values(compared) if along else self._base[None]
-        self._slack = (
-            _SAME * float(truth.abs().max().maximum(self._base.abs().max())) if truth.numel() else 0.0
-        )
+        self._ranges, self._of, self._names = np.asarray(ranges, float), of, names
+        base = np.asarray(of(self._ranges.mean(1)), float)
+        self._shape, self._base = base.shape, torch.as_tensor(base.ravel())
+        one = {p: self._change({p: _COMPARED[0]}) for p in range(len(ranges))}
+        along = [p for p, change in one.items() if change.any()]
+        self.varies, self._terms = bool(along), []
+        if not along:
+            return
+        compared = [dict.fromkeys(along, u) for u in _COMPARED]
+        truth = torch.stack([self._change(place) for place in compared])
+        largest = max(float((truth + self._base).abs().max()), float(self._base.abs().max()))
+        self._slack = _SAME * largest
         degrees = {p: self._degree(p) for p in along}
         self._terms = [self._term(group, degrees) for group in self._groups(along, one)]
-        if along and (self._at(compared) - truth).abs().max() > self._slack:
+        if (self._sum(self._units(compared)) - truth).abs().max() > self._slack:
             self._refuse(along)
 
     def to(self, device: torch.device) -> "Polynomial":
-        """Itself, with what it holds on a device."""
-        for name in ("_low", "_high", "_base"):
-            setattr(self, name, getattr(self, name).to(device))
+        """Itself, with all it holds on a device."""
+        self._base = self._base.to(device)
         self._terms = [(degrees, coefficients.to(device)) for degrees, coefficients in self._terms]
         return self
 
@@ -71,68 +72,51 @@ class Polynomial:
         """The array [..., *shape] at parameters [..., n]; [*shape] where none changes it."""
         if not self.varies:
             return self._base.view(self._shape)
-        return self._sum((parameters - self._low) / (self._high - self._low)).unflatten(-1, self._shape)
+        low, high = torch.as_tensor(self._ranges.T).to(parameters)
+        return (self._base + self._sum((parameters - low) / (high - low))).unflatten(-1, self._shape)
 
     def _sum(self, u: Tensor) -> Tensor:
-        """[..., size] at parameters u [..., n] in units of their ranges."""
-        found = self._base
-        for degrees, coefficients in self._terms:
-            found = found + _rows(u, degrees) @ coefficients
-        return found
-
-    def _at(self, places: Sequence[dict[int, float]]) -> Tensor:
-        return self._sum(self._units(places))
+        """Change [..., size] from the middle at parameters u [..., n] in units of their ranges."""
+        return sum(_products(u, degrees) @ coefficients for degrees, coefficients in self._terms)
 
     def _units(self, places: Sequence[dict[int, float]]) -> Tensor:
         """u [places, n]: the middle of the ranges, but for some parameters."""
-        u = torch.full((len(places), len(self._low)), 0.5, dtype=torch.float64)
-        for row, place in zip(u, places, strict=True):
-            for p, value in place.items():
-                row[p] = value
-        return u
+        rows = [[place.get(p, 0.5) for p in range(len(self._ranges))] for place in places]
+        return torch.tensor(rows, dtype=torch.float64)
 
-    def _values(self, places: Sequence[dict[int, float]]) -> Tensor:
-        """[places, size] of the array itself."""
-        found = []
-        for place in places:
-            mu = self._middle.copy()
-            for p, u in place.items():
-                mu[p] = float(self._low[p]) + u * float(self._high[p] - self._low[p])
-            found.append(np.ravel(np.asarray(self._of(mu), float)))
-        return torch.as_tensor(np.stack(found))
+    def _change(self, place: dict[int, float]) -> Tensor:
+        """[size] of the array itself at a place, less that in the middle."""
+        low, high = self._ranges.T
+        mu = low + self._units([place])[0].numpy() * (high - low)
+        return torch.as_tensor(np.ravel(np.asarray(self._of(mu), float))) - self._base
 
     def _degree(self, p: int) -> int:
         """The least degree that follows a parameter by itself."""
         compared = [{p: u} for u in _COMPARED]
-        truth = self._values(compared) - self._base
+        truth = torch.stack([self._change(place) for place in compared])
         for degree in _DEGREES:
             degrees, coefficients = self._term([p], {p: degree})
-            if (
-                float((_rows(self._units(compared), degrees) @ coefficients - truth).abs().max())
-                <= self._slack
-            ):
+            off = _products(self._units(compared), degrees) @ coefficients - truth
+            if float(off.abs().max()) <= self._slack:
                 return degree
         self._refuse([p])
 
     def _term(self, group: Sequence[int], degrees: dict[int, int]) -> tuple[dict[int, int], Tensor]:
         """Degrees of some parameters, and coefficients [products, size] of what they change together."""
         own = {p: degrees[p] for p in group}
-        nodes = [0.5 - 0.5 * np.cos(np.pi * (np.arange(d + 1) + 0.5) / (d + 1)) for d in own.values()]
+        nodes = [0.5 + 0.5 * chebyshev.chebpts1(degree + 1) for degree in own.values()]
         places = [dict(zip(own, us, strict=True)) for us in itertools.product(*nodes)]
-        change = self._values(places) - self._base
-        return own, torch.linalg.solve(_rows(self._units(places), own), change)
+        change = torch.stack([self._change(place) for place in places])
+        return own, torch.linalg.solve(_products(self._units(places), own), change)
 
     def _groups(self, along: Sequence[int], one: dict[int, Tensor]) -> list[list[int]]:
         """Parameters that act together: what two change at once is not what each changes by itself."""
-        groups = [[p] for p in along]
-        for p, other in itertools.combinations(along, 2):
-            both = self._values([{p: _COMPARED[0], other: _COMPARED[0]}])[0]
-            if float((both - one[p] - one[other] + self._base).abs().max()) > self._slack:
-                mine, theirs = (next(g for g in groups if k in g) for k in (p, other))
-                if mine is not theirs:
-                    mine += theirs
-                    groups.remove(theirs)
-        return groups
+        together = np.eye(len(along), dtype=bool)
+        for (i, p), (j, other) in itertools.combinations(enumerate(along), 2):
+            both = self._change({p: _COMPARED[0], other: _COMPARED[0]})
+            together[i, j] = float((both - one[p] - one[other]).abs().max()) > self._slack
+        count, label = connected_components(together, directed=False)
+        return [[p for p, own in zip(along, label, strict=True) if own == k] for k in range(count)]
 
     def _refuse(self, along: Sequence[int]) -> NoReturn:
         which = " and ".join(self._names[0][p] for p in along)
@@ -142,13 +126,10 @@ class Polynomial:
         )
 
 
-def _rows(u: Tensor, degrees: dict[int, int]) -> Tensor:
-    """Products [..., K] of Chebyshev polynomials of some parameters of u [..., n] in [0, 1]."""
-    rows = torch.ones_like(u[..., :1])
+def _products(u: Tensor, degrees: dict[int, int]) -> Tensor:
+    """Products [..., K] of powers of some parameters of u [..., n] in [0, 1], from the middle."""
+    products = torch.ones_like(u[..., :1])
     for p, degree in degrees.items():
-        x = 2.0 * u[..., p] - 1.0
-        own = [torch.ones_like(x), x]
-        for _ in range(degree - 1):
-            own.append(2.0 * x * own[-1] - own[-2])
-        rows = (rows[..., :, None] * torch.stack(own, -1)[..., None, :]).flatten(-2)
-    return rows
+        powers = (2.0 * u[..., p, None] - 1.0) ** torch.arange(degree + 1, device=u.device)
+        products = (products[..., :, None] * powers[..., None, :]).flatten(-2)
+    return products

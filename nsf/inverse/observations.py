@@ -1,12 +1,13 @@
 """What was measured of one run: points of the body over time, and scalars of its shape."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import torch
 from torch import Tensor
 
@@ -88,28 +89,48 @@ class Observations:
         return cls(np.full(count, t), tuple(what), points, own, np.full(count, deviation))
 
     @classmethod
+    def joined(cls, parts: Sequence["Observations"]) -> "Observations":
+        """Several after one another."""
+        arrays = {
+            name: [getattr(own, name) for own in parts] for name in ("t", "points", "values", "deviations")
+        }
+        what = tuple(name for own in parts for name in own.what)
+        return cls(what=what, **{name: np.concatenate(values) for name, values in arrays.items()})
+
+    @classmethod
     def read(cls, path: Path | str, model: Model) -> "Observations":
         """Those of a CSV or HDF5 file (docs/howto/inverse.md).
 
         Raises:
             ConfigError: a column is missing or unknown, or a value refused; names the row.
         """
-        table = _table(Path(path))
-        if unknown := [name for name in table if name not in _KNOWN]:
+        rows = _table(Path(path))
+        if unknown := [name for name in rows if name not in _KNOWN]:
             raise ConfigError(f"{path} has the column {unknown[0]!r}; it may have {', '.join(_KNOWN)}")
-        if "deviation" not in table:
+        if "deviation" not in rows:
             raise ConfigError(f"{path} has no column deviation; give the standard deviation [m] of each row")
-        rows = len(next(iter(table.values())))
-        column = {name: _numbers(path, name, table, rows) for name in _KNOWN if name != "quantity"}
-        names = [str(name) if isinstance(name, str) else "" for name in table.get("quantity", [""] * rows)]
-        found: list[tuple[float, str, np.ndarray, float, float, str]] = []
-        for row in range(rows):
-            at, where = {name: values[row] for name, values in column.items()}, f"{path}, row {row + 1}"
-            found += [(*seen, where) for seen in _row(where, at, names[row], model)]
+        rows = rows.reindex(columns=list(_KNOWN))
+        for name in _KNOWN:
+            if name == "quantity":
+                rows[name] = rows[name].astype(object).where(rows[name].notna(), "").astype(str)
+                continue
+            try:
+                rows[name] = rows[name].astype(float)
+            except (TypeError, ValueError):
+                raise ConfigError(f"{path}: the column {name} must hold numbers") from None
+        found = [one for k, row in rows.iterrows() for one in _row(f"{path}, row {k + 1}", row, model)]
         if not found:
             raise ConfigError(f"{path} observes nothing; give x, y, z of points, or value of a quantity")
         t, what, points, values, deviations, places = zip(*found, strict=True)
         return cls(np.array(t), what, np.array(points), np.array(values), np.array(deviations), places)
+
+    @property
+    def frame(self) -> pd.DataFrame:
+        """A row an observation: when, what, where at rest, the value and its deviation."""
+        X = dict(zip(_POINT, self.points.T, strict=True))
+        return pd.DataFrame(
+            {"t": self.t, "what": self.what, **X, "value": self.values, "deviation": self.deviations}
+        )
 
     def _at(self, k: int) -> str:
         """Where an observation is from, before what is wrong with it."""
@@ -127,32 +148,29 @@ class Observations:
                 or a value not finite.
         """
         end, slack = float(model.t[-1]), _SAME_TIME * model.dt
-        for wrong, told in (
-            (
-                (self.t < -slack) | (self.t > end + slack),
-                lambda k: (
-                    f"t={self.t[k]:g} s is outside of the run, 0 … {end:g} s; leave the observation "
-                    "out, or train with more scene.steps"
-                ),
-            ),
-            (
-                ~(np.isfinite(self.deviations) & (self.deviations > 0.0)),
-                lambda k: (
-                    f"deviation={self.deviations[k]:g} m must be positive and finite; give the standard "
-                    "deviation of the measurement"
-                ),
-            ),
-            (
-                ~np.isfinite(self.values),
-                lambda k: f"an observed value is {self.values[k]:g} m; give finite positions",
-            ),
-        ):
-            if wrong.any():
-                raise ConfigError(self._at(k := int(wrong.argmax())) + told(k))
+        t, deviation, value = self.t, self.deviations, self.values
+        outside, positive = (t < -slack) | (t > end + slack), np.isfinite(deviation) & (deviation > 0.0)
+        self._refuse(
+            outside,
+            t,
+            f"t={{:g}} s is outside of the run, 0 … {end:g} s; leave the observation out, or "
+            "train with more scene.steps",
+        )
+        self._refuse(
+            ~positive,
+            deviation,
+            "deviation={:g} m must be positive and finite; give the standard deviation of the measurement",
+        )
+        self._refuse(~np.isfinite(value), value, "an observed value is {:g} m; give finite positions")
         of_points = np.flatnonzero(~np.isnan(self.points[:, 0]))
         if len(of_points):
             model.check_points(self.points[of_points], lambda k: self._at(int(of_points[k])))
         return self
+
+    def _refuse(self, wrong: np.ndarray, values: np.ndarray, message: str) -> None:
+        if wrong.any():
+            k = int(wrong.argmax())
+            raise ConfigError(self._at(k) + message.format(values[k]))
 
 
 class View:
@@ -161,9 +179,10 @@ class View:
     Args:
         observations: checked.
         model: of the runs.
+        looks: frames at which quantities of a whole run are taken; every frame by default.
     """
 
-    def __init__(self, observations: Observations, model: Model):
+    def __init__(self, observations: Observations, model: Model, looks: np.ndarray | None = None):
         self.observations, self._model = observations.check(model), model
         own = observations
         self._of_points = np.flatnonzero([what in AXES for what in own.what])
@@ -172,38 +191,56 @@ class View:
         rows = own.points[self._of_points]
         self._points, self._row = np.unique(rows, axis=0, return_inverse=True)
         self._axis = np.array([AXES.index(own.what[i]) for i in self._of_points], int)
-        self._quantities = [i for i, what in enumerate(own.what) if what in QUANTITIES]
+        self._of_shape = np.flatnonzero([what in QUANTITIES for what in own.what])
+        self._frames = np.round(own.t[self._of_shape] / model.dt).astype(int)
+        self._looks = np.arange(len(model.t)) if looks is None else looks
+        self._order = np.argsort([*self._of_points, *self._of_shape])
         X = model.manifold.X
-        if self._quantities:
-            kept = np.sort(np.random.default_rng(0).permutation(len(X))[:BODY])
-            self._body, self._X = kept, X[torch.as_tensor(kept)].to(model.device)
+        self._body = np.sort(np.random.default_rng(0).permutation(len(X))[:BODY])
+        self._X = X[torch.as_tensor(self._body)].to(model.device)
 
     def of_runs(self, xhat: Tensor) -> Tensor:
         """[B, m] of runs [B, N + 1, r], differentiable."""
-        found = torch.zeros(len(xhat), len(self.observations), dtype=xhat.dtype, device=xhat.device)
+
+        def body(frames: np.ndarray) -> Tensor:
+            return self._model.positions(xhat[:, frames], self._at_body)
+
         parts = [self._positions(xhat)] if len(self._of_points) else []
-        parts += [self._quantity(i, xhat)[:, None] for i in self._quantities]
-        order = np.argsort([*self._of_points, *self._quantities])
-        return torch.cat(parts, 1)[:, torch.as_tensor(order, device=found.device)]
+        parts += [values[:, None] for values in self._quantities(body)]
+        return torch.cat(parts, 1)[:, torch.as_tensor(self._order, device=xhat.device)]
 
     def of_truth(self, trajectory: Trajectory) -> np.ndarray:
         """[m] of a full-order run."""
-        found = np.zeros(len(self.observations))
+
+        def body(frames: np.ndarray) -> Tensor:
+            x = trajectory.read("x", frames=frames.tolist(), particles=self._body)
+            return torch.as_tensor(x.astype(float))[None].to(self._X)
+
+        seen = np.zeros(0)
         if len(self._of_points):
             frames, at = np.unique([self._steps, self._steps + 1], return_inverse=True)
-            last = trajectory.frames - 1
-            x = trajectory.read("x", frames=np.minimum(frames, last)).astype(float)
-            seen = self._interpolation.value(torch.as_tensor(x.swapaxes(0, 1))).numpy()
-            one, two = (seen[self._row, rows.reshape(-1), self._axis] for rows in at.reshape(2, -1))
+            x = trajectory.read("x", frames=np.minimum(frames, trajectory.frames - 1)).astype(float)
+            every = self._interpolation.value(torch.as_tensor(x.swapaxes(0, 1))).numpy()
+            one, two = (every[self._row, rows.reshape(-1), self._axis] for rows in at.reshape(2, -1))
             shares = self._shares.cpu().numpy()
-            found[self._of_points] = (1.0 - shares) * one + shares * two
-        for i in self._quantities:
-            quantity = QUANTITIES[self.observations.what[i]]
-            frame = round(self.observations.t[i] / self._model.dt)
-            frames = slice(0, frame + 1) if quantity.whole else [frame]
-            x = torch.as_tensor(trajectory.read("x", frames=frames, particles=self._body).astype(float))
-            found[i] = float(quantity.of(x if quantity.whole else x[0], self._X.cpu()))
-        return found
+            seen = (1.0 - shares) * one + shares * two
+        scalars = [float(value) for value in self._quantities(body)]
+        return np.concatenate([seen, scalars])[self._order]
+
+    def _quantities(self, body: Callable[[np.ndarray], Tensor]) -> list[Tensor]:
+        """[B] of each scalar of the shape; `body` gives positions [B, frame, particle, 3] at some frames."""
+        seen: dict[int, Tensor] = {}
+        names = [self.observations.what[i] for i in self._of_shape]
+        for frame in np.unique(self._frames):  # one at a time, as bodies are large
+            x = body(np.array([frame]))[:, 0]
+            for k in np.flatnonzero(self._frames == frame):
+                if not (quantity := QUANTITIES[names[k]]).whole:
+                    seen[k] = quantity.of(x, self._X)
+        if len(seen) < len(names):
+            x = body(self._looks)
+            for k in set(range(len(names))) - set(seen):
+                seen[k] = QUANTITIES[names[k]].of(x[:, self._looks <= self._frames[k]], self._X)
+        return [seen[k] for k in range(len(names))]
 
     def _positions(self, xhat: Tensor) -> Tensor:
         """[B, …] of the observations of points."""
@@ -216,13 +253,6 @@ class View:
         between = xhat[:, steps] * (1.0 - shares) + xhat[:, after] * shares
         x = self._model.positions(between, self._at)
         return x[:, at.reshape(-1), self._row, self._axis]
-
-    def _quantity(self, i: int, xhat: Tensor) -> Tensor:
-        """[B] of a scalar of the shape."""
-        quantity = QUANTITIES[self.observations.what[i]]
-        frame = round(self.observations.t[i] / self._model.dt)
-        rows = xhat[:, : frame + 1] if quantity.whole else xhat[:, frame]
-        return quantity.of(self._model.positions(rows, self._at_body), self._X)
 
     @cached_property
     def _at(self):
@@ -247,69 +277,57 @@ def _between(t: np.ndarray, model: Model) -> tuple[np.ndarray, np.ndarray]:
     return steps, at - steps
 
 
-def _table(path: Path) -> Mapping[str, Sequence]:
-    """Columns of a file by name."""
+def _table(path: Path) -> pd.DataFrame:
+    """The rows of a file."""
     if not path.is_file():
         raise ConfigError(f"{path} is no file; name a CSV or HDF5 file of observations")
-    if path.suffix in (".h5", ".hdf5"):
-        import h5py
-
-        try:
-            with h5py.File(path, "r") as file:
-                own = {name: file[name] for name in file if isinstance(file[name], h5py.Dataset)}
-                if any(values.ndim != 1 or len(values) > _MOST for values in own.values()):
-                    raise ConfigError(f"{path} must hold arrays of one axis, a column each")
-                found = {
-                    name: values.asstr()[()] if h5py.check_string_dtype(values.dtype) else values[()]
-                    for name, values in own.items()
-                }
-        except OSError as error:
-            raise ConfigError(f"{path} is no HDF5 file ({first_line(error)})") from error
-    else:
-        import pandas as pd
-
-        try:
-            frame = pd.read_csv(path, nrows=_MOST, skipinitialspace=True)
-        except (ValueError, UnicodeDecodeError) as error:
-            raise ConfigError(f"{path} is no CSV file ({first_line(error)})") from error
-        found = {name: frame[name].tolist() for name in frame}
-    if (
-        not found
-        or len({len(values) for values in found.values()}) > 1
-        or not len(next(iter(found.values())))
-    ):
-        raise ConfigError(f"{path} has no rows, or columns of different length; give a row an observation")
-    return found
-
-
-def _numbers(path, name: str, table: Mapping[str, Sequence], rows: int) -> np.ndarray:
     try:
-        return np.asarray(table.get(name, np.full(rows, np.nan)), float)
-    except (TypeError, ValueError):
-        raise ConfigError(f"{path}: the column {name} must hold numbers") from None
+        if path.suffix in (".h5", ".hdf5"):
+            rows = _hdf5(path)
+        else:
+            rows = pd.read_csv(path, nrows=_MOST, skipinitialspace=True)
+    except (OSError, ValueError) as error:
+        kind = "HDF5" if path.suffix in (".h5", ".hdf5") else "CSV"
+        raise ConfigError(f"{path} is no {kind} file of columns ({first_line(error)})") from error
+    if not len(rows):
+        raise ConfigError(f"{path} has no rows; give a row an observation")
+    return rows
 
 
-def _row(where: str, at: Mapping[str, float], quantity: str, model: Model) -> list[tuple]:
+def _hdf5(path: Path) -> pd.DataFrame:
+    """Data sets of one axis, a column each."""
+    import h5py
+
+    with h5py.File(path, "r") as file:
+        own = {name: file[name] for name in file if isinstance(file[name], h5py.Dataset)}
+        if any(values.ndim != 1 or len(values) > _MOST for values in own.values()):
+            raise ConfigError(f"{path} must hold arrays of one axis, a column each")
+        text = {name: h5py.check_string_dtype(values.dtype) for name, values in own.items()}
+        return pd.DataFrame(
+            {name: values.asstr()[()] if text[name] else values[()] for name, values in own.items()}
+        )
+
+
+def _row(where: str, row: pd.Series, model: Model) -> list[tuple]:
     """The observations of one row of a file."""
-    end, none = float(model.t[-1]), np.full(3, np.nan)
-    if quantity:
+    if quantity := row["quantity"]:
         if quantity not in QUANTITIES:
             raise ConfigError(
                 f"{where}: unknown quantity {quantity!r}; choose one of {', '.join(QUANTITIES)}"
             )
-        if not np.isfinite(at["value"]):
+        if not np.isfinite(row["value"]):
             raise ConfigError(f"{where}: {quantity} has no value; give it [m]")
-        t = end if np.isnan(at["t"]) else at["t"]
-        return [(t, quantity, none, at["value"], at["deviation"])]
-    if not np.isfinite(at["t"]):
+        t = float(model.t[-1]) if np.isnan(row["t"]) else row["t"]
+        return [(t, quantity, np.full(3, np.nan), row["value"], row["deviation"], where)]
+    if not np.isfinite(row["t"]):
         raise ConfigError(f"{where} has no t; give the time [s] of a point's position")
-    point = np.array([at[name] for name in _POINT])
-    if np.isfinite(at["particle"]):
+    point, particle = row[list(_POINT)].to_numpy(float), row["particle"]
+    if np.isfinite(particle):
         X = model.manifold.X.cpu().numpy()
-        if not (at["particle"] % 1 == 0 and 0 <= at["particle"] < len(X)):
-            raise ConfigError(f"{where}: particle={at['particle']:g} must be a whole number below {len(X)}")
-        point = X[int(at["particle"])]
+        if not (particle % 1 == 0 and 0 <= particle < len(X)):
+            raise ConfigError(f"{where}: particle={particle:g} must be a whole number below {len(X)}")
+        point = X[int(particle)]
     if not np.isfinite(point).all():
         raise ConfigError(f"{where} names no point; give X, Y, Z at rest [m], or particle")
-    seen = [axis for axis in AXES if not np.isnan(at[axis])]
-    return [(at["t"], axis, point, at[axis], at["deviation"]) for axis in seen]
+    seen = [axis for axis in AXES if not np.isnan(row[axis])]
+    return [(row["t"], axis, point, row[axis], row["deviation"], where) for axis in seen]

@@ -2,9 +2,9 @@
 
 import ast
 import re
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import pandas as pd
@@ -17,9 +17,8 @@ from nsf.errors import ConfigError, InstabilityError
 from nsf.evaluation.quantities import QUANTITIES
 from nsf.extras import optional
 from nsf.inverse.model import Forcing, Model
-from nsf.inverse.observations import AXES, BODY, component
+from nsf.inverse.observations import Observations, View, is_scalar
 from nsf.inverse.space import Space
-from nsf.kinematics.interpolation import interpolation
 from nsf.vectors import spaced
 
 #: Runs that are taken together.
@@ -128,87 +127,37 @@ class Prior:
 
 
 class Asked:
-    """What is asked of each run over time: quantities of the shape, or a component of a point's position.
+    """Scalars of runs at a few times: quantities of the shape, and components of points, as `z@X:Y:Z`.
 
     Args:
-        texts: names of quantities, or `z@X:Y:Z` with a point at rest [m].
+        names: of the scalars.
         model: of the runs.
 
+    Attributes:
+        names: of the scalars; t: [F] times [s], the end among them.
+
     Raises:
-        ConfigError: a text is neither, or the point lies outside of the body.
+        ConfigError: a name is neither, or a point lies outside of the body.
     """
 
-    def __init__(self, texts: Sequence[str], model: Model):
-        self.names, self._model = tuple(texts), model
-        self._points: dict[str, tuple[int, np.ndarray]] = {}
-        for text in texts:
-            if text in QUANTITIES:
-                continue
-            if not (found := component(text)):
-                raise ConfigError(
-                    f"of={text} is none of {', '.join(QUANTITIES)}, nor a component of a point at rest, as "
-                    "z@0.5:0.5:0.2"
-                )
-            point = found[1][None]
-            model.check_points(point)
-            self._points[text] = AXES.index(found[0]), point
-        self.steps = spaced(len(model.t), _TIMES)
-        self.t = model.t[self.steps]
-        kept = np.sort(np.random.default_rng(0).permutation(len(model.manifold.X))[:BODY])
-        self._body, self._X = kept, model.manifold.X[torch.as_tensor(kept)].to(model.device)
+    def __init__(self, names: Sequence[str], model: Model):
+        if wrong := [name for name in names if not is_scalar(name)]:
+            raise ConfigError(
+                f"of={wrong[0]} is none of {', '.join(QUANTITIES)}, nor a component of a point at rest, as "
+                "z@0.5:0.5:0.2"
+            )
+        self.names, looks = tuple(names), spaced(len(model.t), _TIMES)
+        self.t = model.t[looks]
+        every = [Observations.of_scalars(dict.fromkeys(names, 0.0), t) for t in self.t]
+        self._view = View(Observations.joined(every), model, looks)
 
     def of(self, xhat: Tensor) -> Tensor:
         """[B, asked, F] of runs [B, N + 1, r], differentiable [m]."""
-        rows = xhat[:, torch.as_tensor(self.steps, device=xhat.device)]
-        found = []
-        shapes = self._shapes(rows) if any(name in QUANTITIES for name in self.names) else None
-        for name in self.names:
-            if name in self._points:
-                axis, _ = self._points[name]
-                found.append(self._model.positions(rows, self._at[name])[..., 0, axis])
-            else:
-                found.append(shapes[name])
-        return torch.stack(found, 1)
+        return self._view.of_runs(xhat).unflatten(1, (len(self.t), -1)).transpose(1, 2)
 
     def of_truth(self, truth: Trajectory) -> np.ndarray:
         """[asked] of a full-order run at its end."""
-        last = truth.frames - 1
-        found = []
-        for name in self.names:
-            if name in self._points:
-                k, point = self._points[name]
-                x = torch.as_tensor(truth.read("x", frames=[last])[0].astype(float))
-                at = interpolation(torch.as_tensor(point), self._model.manifold.X.cpu())
-                found.append(float(at.value(x[:, None])[0, 0, k]))
-                continue
-            whole = QUANTITIES[name].whole
-            x = truth.read("x", frames=self.steps.tolist() if whole else [last], particles=self._body)
-            x = torch.as_tensor(x.astype(float))
-            found.append(float(QUANTITIES[name].of(x if whole else x[0], self._X.cpu())))
-        return np.array(found)
-
-    def _shapes(self, rows: Tensor) -> dict[str, Tensor]:
-        """[B, F] of each quantity that is asked for; one frame of all runs at a time, as bodies are large."""
-        wanted = [name for name in self.names if name in QUANTITIES]
-        each: dict[str, list[Tensor]] = {name: [] for name in (*wanted, "height")}
-        for frame in rows.unbind(1):
-            x = self._model.positions(frame, self._at_body)
-            for name in each:
-                if not QUANTITIES[name].whole:
-                    each[name].append(QUANTITIES[name].of(x, self._X))
-        heights = torch.stack(each["height"], 1)
-        found = {name: torch.stack(values, 1) for name, values in each.items() if values}
-        if "springback" in wanted:
-            found["springback"] = heights - heights.cummin(1).values
-        return found
-
-    @cached_property
-    def _at_body(self):
-        return self._model.at(self._body)
-
-    @cached_property
-    def _at(self) -> dict:
-        return {name: self._model.at(point) for name, (_, point) in self._points.items()}
+        return self._view.of_truth(truth)[-len(self.names) :]
 
 
 @dataclass(frozen=True)
@@ -246,8 +195,6 @@ class Runs:
 
 def runs(model: Model, parameters: np.ndarray, asked: Asked, forcing: Forcing | None = None) -> Runs:
     """Runs at parameters [B, n], in batches."""
-    import time
-
     began, values, distrust = time.perf_counter(), [], []
     with torch.no_grad():
         for part in np.array_split(parameters, max(1, -(-len(parameters) // _BATCH))):

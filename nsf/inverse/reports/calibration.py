@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import torch
+from matplotlib.figure import Figure
 
 from nsf.data import PROGRAM, Trajectory
 from nsf.data.schema import TRAJECTORY
@@ -13,12 +14,9 @@ from nsf.inverse.fit import CONFIDENCE, Fit, fit
 from nsf.inverse.model import Model
 from nsf.inverse.observations import AXES, Observations, View
 from nsf.inverse.reports.charts import points_chart, residuals_chart
-from nsf.inverse.reports.page import Results, write
+from nsf.inverse.reports.page import Chart, Results, frame_table, named, rms, title_of, write
 from nsf.inverse.space import Space
-from nsf.reporting.text.columns import axis, number
-from nsf.results.formats import Rows
-from nsf.results.page import Picture, Section, Table
-from nsf.results.style import save
+from nsf.results.columns import number
 
 _LEAD = (
     "The parameters under which runs by operators pass what was observed, with the uncertainty that the "
@@ -37,6 +35,8 @@ _TERMS = (
     ),
     ("distrust", "how far the fitted run is from what was taught; above 1 it is not to be believed."),
 )
+_POINTS = "Observed and fitted points at the last time that was observed."
+_RESIDUALS = "What the runs leave of the observations over time; the full-order run is at the estimate."
 
 
 def report(
@@ -50,7 +50,7 @@ def report(
     starts: int = 64,
     say: Callable[[str], object] = print,
 ) -> tuple[Path, Fit]:
-    """Calibrate, run the full-order solver at the estimate, and write what came out.
+    """Calibrate, run the full-order solver at the estimate, and write the results.
 
     Args:
         view: of the observations.
@@ -62,42 +62,44 @@ def report(
         say: told what is done.
     """
     forcing = None if program is None else model.forcing(program=program)
-    found = fit(view, model, space, starts=starts, forcing=forcing)
-    say(f"calibrate: {_told(found, model)} in {found.seconds:.2f} s")
-    rows, warnings = _residuals(view, found), warnings_of(found, view.observations)
-    runs = [model.run, *model.run.parent_runs]
+    best = fit(view, model, space, starts=starts, forcing=forcing)
+    estimate = _estimate(best, model)
+    values = zip(best.estimate, best.standard_error, strict=True)
+    words = [f"{named(model, n)} {v:.4g} ± {e:.2g}" for n, (v, e) in zip(space.free, values, strict=True)]
+    say(f"calibrate: {', '.join(words)} in {best.seconds:.2f} s")
+    rows = view.observations.frame.assign(fitted=best.seen, s=best.scale, residual=-best.residuals)
+    runs = []
     if full_order:
-        values = dict(zip(space.free, found.estimate.tolist(), strict=True)) | dict(space.fixed)
-        case = model.scene.case(values if program is None else values | {PROGRAM: program})
-        (run,) = model.pipeline.full_order([case])
-        with Trajectory.open(run.file(TRAJECTORY)) as truth:
+        known = dict(zip(space.free, best.estimate.tolist(), strict=True)) | dict(space.fixed)
+        case = model.scene.case(known if program is None else known | {PROGRAM: program})
+        runs = model.pipeline.full_order([case])
+        with Trajectory.open(runs[0].file(TRAJECTORY)) as truth:
             rows["full_order"] = view.of_truth(truth)
-        runs.append(run)
-        rms = 1e3 * float(np.sqrt(np.mean((rows["value"] - rows["full_order"]) ** 2)))
-        say(f"calibrate: a full-order run at the estimate leaves {rms:.3g} mm (RMS) → {run.id}")
-    estimate = _estimate(found, model)
-    correlation = pd.DataFrame(found.correlation, columns=list(space.free))
+        off = 1e3 * rms(rows["value"] - rows["full_order"])
+        say(f"calibrate: a full-order run at the estimate leaves {off:.3g} mm (RMS) → {runs[0].id}")
+    warnings = warnings_of(best, view.observations)
+    for warning in warnings:
+        say(f"calibrate: warning: {warning}")
+    correlation = pd.DataFrame(best.correlation, columns=list(space.free))
     correlation.insert(0, "parameter", space.free)
-
-    def draw(fresh: Path) -> list[Section]:
-        return [Section("Observed and fitted", _pictures(view, model, found, rows, fresh))]
-
-    tables = [Table("Estimate", _rows(found, model), f"{len(rows)} observations; {_stops(found)}")]
+    stops = f"the best of {best.starts} starts were followed to their ends: {'; '.join(best.stops)}."
+    tables = [frame_table("Estimate", _shown(estimate, model), f"{len(rows)} observations; {stops}")]
     if len(space.free) > 1:
-        body = [[n, *map(number, row)] for n, row in zip(space.free, found.correlation.tolist(), strict=True)]
-        heads = ["", *space.free]
-        own = Rows(heads, body, [False] + [True] * len(space.free))
-        tables.append(Table("Correlation of the errors", own, ""))
-    tables.append(Table("What is left", _left(rows, found), "Root mean squares over the observations."))
-    title = model.scene.config.scene.get("title") or model.scene.name
+        tables.append(frame_table("Correlation of the errors", correlation.rename(columns={"parameter": ""})))
+    tables.append(frame_table("What is left", _left(rows), "Root mean squares over the observations."))
+    charts = [Chart("Observed and fitted", "residuals", _RESIDUALS, lambda: residuals_chart(rows))]
+    if rows["what"].isin(AXES).any():
+        chart = Chart("Observed and fitted", "points", _POINTS, lambda: _points(model, best, rows))
+        charts.insert(0, chart)
     results = Results(
-        title=f"{title}: calibration",
+        title=f"{title_of(model)}: calibration",
         lead=_LEAD,
+        models=[model],
+        beside=runs,
         tables=tables,
         files={"estimate.csv": estimate, "correlation.csv": correlation, "residuals.csv": rows},
-        runs=runs,
-        draw=draw,
-        facts=[("Distrust of the fitted run", number(found.distrust)), ("Seconds", number(found.seconds))],
+        charts=charts,
+        facts=[("Distrust of the fitted run", number(best.distrust)), ("Seconds", number(best.seconds))],
         definitions=_TERMS,
         warnings=warnings,
         asked={
@@ -105,116 +107,79 @@ def report(
             "fixed": dict(space.fixed),
         },
     )
-    for warning in warnings:
-        say(f"calibrate: warning: {warning}")
-    return write(results, folder), found
+    return write(results, folder), best
 
 
-def _told(found: Fit, model: Model) -> str:
-    units = dict(zip(model.names, model.units, strict=True))
-    parts = zip(found.space.free, found.estimate, found.standard_error, strict=True)
-    return ", ".join(f"{axis(n, units[n])} {value:.4g} ± {error:.2g}" for n, value, error in parts)
-
-
-def warnings_of(found: Fit, own: Observations) -> list[str]:
+def warnings_of(best: Fit, own: Observations) -> list[str]:
     """What a reader must know of an estimate before they use it."""
-    told = [
+    warnings = [
         f"{name} ends at an end of its range, and the truth may lie beyond; train with a wider range"
-        for name in found.at_end
+        for name in best.at_end
     ]
-    if found.misfit > _MISFIT:
-        k = int(np.abs(found.residuals).argmax())
-        told.append(
-            f"no run passes the observations: the best misses them by {found.misfit:.3g} deviations (RMS), "
-            f"the model's own error among these, {own.place(k)} by {abs(found.residuals[k]):.3g}; look for "
+    if best.misfit > _MISFIT:
+        k = int(np.abs(best.residuals).argmax())
+        warnings.append(
+            f"no run passes the observations: the best misses them by {best.misfit:.3g} deviations (RMS), "
+            f"the model's own error among these, {own.place(k)} by {abs(best.residuals[k]):.3g}; look for "
             "a wrong unit, point or time"
         )
-    if found.distrust > 1.0:
-        told.append(
-            f"the fitted run is {found.distrust:.3g} times as far from what was taught as may be believed"
+    if best.distrust > 1.0:
+        warnings.append(
+            f"the fitted run is {best.distrust:.3g} times as far from what was taught as may be believed"
         )
-    return told
+    return warnings
 
 
-def _estimate(found: Fit, model: Model) -> pd.DataFrame:
+def _estimate(best: Fit, model: Model) -> pd.DataFrame:
     units = dict(zip(model.names, model.units, strict=True))
     return pd.DataFrame(
         {
-            "parameter": found.space.free,
-            "unit": [units[name] for name in found.space.free],
-            "estimate": found.estimate,
-            "standard_error": found.standard_error,
-            "lower_90": found.lower,
-            "upper_90": found.upper,
-            "fitted": found.fitted,
-            "share_of_model": found.share,
-            "degrees_of_freedom": found.freedom,
-            "distrust": found.distrust,
+            "parameter": best.space.free,
+            "unit": [units[name] for name in best.space.free],
+            "estimate": best.estimate,
+            "standard_error": best.standard_error,
+            "lower_90": best.lower,
+            "upper_90": best.upper,
+            "fitted": best.fitted,
+            "share_of_model": best.share,
+            "degrees_of_freedom": best.freedom,
+            "distrust": best.distrust,
         }
     )
 
 
-def _rows(found: Fit, model: Model) -> Rows:
-    heads = ["parameter", "estimate", "standard error", "90 % interval", "the model's own [%]", "fits best"]
-    body = [
-        [
-            axis(row["parameter"].replace("_", " "), row["unit"]),
-            f"{row['estimate']:.5g}",
-            number(row["standard_error"]),
-            f"{row['lower_90']:.5g} … {row['upper_90']:.5g}",
-            number(100 * row["share_of_model"]),
-            f"{row['fitted']:.5g}",
-        ]
-        for row in _estimate(found, model).to_dict("records")
-    ]
-    return Rows(heads, body, [False] + [True] * (len(heads) - 1))
-
-
-def _stops(found: Fit) -> str:
-    ends = "; ".join(found.stops)
-    return f"the best of {found.starts} starts were followed to their ends: {ends}."
-
-
-def _residuals(view: View, found: Fit) -> pd.DataFrame:
-    """A row an observation: what, where, when, the value, its deviation, what the fitted run has [m]."""
-    own = view.observations
-    X = dict(zip(("X", "Y", "Z"), own.points.T, strict=True))
-    values = {"value": own.values, "deviation": own.deviations, "fitted": found.seen}
+def _shown(estimate: pd.DataFrame, model: Model) -> pd.DataFrame:
+    lower, upper = (estimate[f"{end}_90"].map("{:.5g}".format) for end in ("lower", "upper"))
     return pd.DataFrame(
-        {"t": own.t, "what": own.what, **X, **values, "s": found.scale, "residual": -found.residuals}
+        {
+            "parameter": [named(model, name) for name in estimate["parameter"]],
+            "estimate": estimate["estimate"].map("{:.5g}".format),
+            "standard error": estimate["standard_error"],
+            "90 % interval": lower + " … " + upper,
+            "the model's own [%]": 100 * estimate["share_of_model"],
+            "fits best": estimate["fitted"].map("{:.5g}".format),
+        }
     )
 
 
-def _left(rows: pd.DataFrame, found: Fit) -> Rows:
-    def rms(values) -> str:
-        return number(1e3 * float(np.sqrt(np.mean(np.square(values)))))
-
-    body = [["deviation of the measurement", rms(rows["deviation"])], ["the model's own error, expected", ""]]
-    body[1][1] = rms(np.sqrt(np.maximum(rows["s"] ** 2 - rows["deviation"] ** 2, 0.0)))
-    body.append(["observed less the fitted run", rms(rows["value"] - rows["fitted"])])
+def _left(rows: pd.DataFrame) -> pd.DataFrame:
+    own = np.sqrt(np.maximum(rows["s"] ** 2 - rows["deviation"] ** 2, 0.0))
+    left = {
+        "deviation of the measurement": rows["deviation"],
+        "the model's own error, expected": own,
+        "observed less the fitted run": rows["value"] - rows["fitted"],
+    }
     if "full_order" in rows:
-        body.append(
-            ["observed less the full-order run at the estimate", rms(rows["value"] - rows["full_order"])]
-        )
-    return Rows(["", "RMS [mm]"], body, [False, True])
+        left["observed less the full-order run at the estimate"] = rows["value"] - rows["full_order"]
+    return pd.DataFrame({"": list(left), "RMS [mm]": [1e3 * rms(values) for values in left.values()]})
 
 
-def _pictures(view: View, model: Model, found: Fit, rows: pd.DataFrame, folder: Path) -> list[Picture]:
-    ids = [model.run.id]
-    pictures = []
-    of_points = rows[rows["what"].isin(AXES)]
-    if len(of_points):
-        last = of_points[of_points["t"] == of_points["t"].max()]
-        wide = last.pivot_table(index=["X", "Y", "Z"], columns="what", values=["value", "fitted"])
-        empty = pd.Series(np.nan, wide.index)
-        observed, fitted = (
-            np.stack([wide.get((kind, axis), empty) for axis in AXES], 1) for kind in ("value", "fitted")
-        )
-        t = float(last["t"].iloc[0])
-        frame = torch.as_tensor(found.xhat[round(t / model.dt)], device=model.device)
-        body = model.positions(frame, np.arange(len(model.manifold.X))).cpu().numpy()
-        files = save(points_chart(body, observed, fitted, t), folder, "points")
-        pictures.append(Picture(files, "Observed and fitted points at the last time that was observed.", ids))
-    files = save(residuals_chart(rows), folder, "residuals")
-    told = "What the runs leave of the observations over time; the full-order run is at the estimate."
-    return [*pictures, Picture(files, told, ids)]
+def _points(model: Model, best: Fit, rows: pd.DataFrame) -> Figure:
+    """Points at the last time that was observed, in the body of the fitted run."""
+    rows = rows[rows["what"].isin(AXES)]
+    t = float(rows["t"].max())
+    wide = rows[rows["t"] == t].pivot_table(index=["X", "Y", "Z"], columns="what", values=["value", "fitted"])
+    observed, fitted = (wide[kind].reindex(columns=AXES).to_numpy() for kind in ("value", "fitted"))
+    frame = torch.as_tensor(best.xhat[round(t / model.dt)], device=model.device)
+    body = model.positions(frame, np.arange(len(model.manifold.X))).cpu().numpy()
+    return points_chart(body, observed, fitted, t)

@@ -6,40 +6,36 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from nsf.reporting.text.columns import axis
+from nsf.results.columns import axis
 from nsf.results.style import FULL, INK, MUTED, PALETTE, figure, line_style, styled
 
 _BODY = 1500  # particles that show a body
 
 
-def trials_chart(table: pd.DataFrame, reach: np.ndarray, units: Mapping[tuple[str, str], str]) -> Figure:
-    """What each estimate is off, with its 90 % interval, over the truth: a panel a scene and parameter.
+def trials_chart(table: pd.DataFrame, units: Mapping[tuple[str, str], str]) -> Figure:
+    """Estimate less truth, with its 90 % interval, over the truth: a panel a scene and parameter.
 
     Args:
-        table: rows of results.csv.
-        reach: [rows, 2] of the interval below and above the estimate.
+        table: rows of results.csv, and `lower` and `upper` of their intervals.
         units: of the parameters, by scene and name.
     """
     groups = list(table.groupby(["scene", "parameter"], sort=False))
+    rows = (len(groups) + 1) // 2
     with styled():
-        fig = figure(3.4 * ((len(groups) + 1) // 2))
-        panels = np.ravel(fig.subplots((len(groups) + 1) // 2, min(2, len(groups)), squeeze=False))
+        fig = figure(3.4 * rows)
+        panels = np.ravel(fig.subplots(rows, min(2, len(groups)), squeeze=False))
         for panel, ((scene, name), part) in zip(panels, groups, strict=False):
-            off = part["estimate"] - part["truth"]
-            held = part["inside_90"] == 1
-            for chosen, color, told in ((held, PALETTE[0], "holds"), (~held, PALETTE[1], "misses")):
-                if not chosen.any():
-                    continue
-                bars = reach[part.index[chosen]].T
+            for holds, own in part.groupby("inside_90", sort=False):
+                bars = [own["estimate"] - own["lower"], own["upper"] - own["estimate"]]
                 panel.errorbar(
-                    part["truth"][chosen], off[chosen], bars, fmt="o", ms=3.5, lw=1.1, color=color,
-                    label=f"interval {told} the truth: {chosen.sum()}",
+                    own["truth"], own["estimate"] - own["truth"], bars, fmt="o", ms=3.5, lw=1.1,
+                    color=PALETTE[1 - holds],
+                    label=f"interval {'holds' if holds else 'misses'} the truth: {len(own)}",
                 )  # fmt: skip
             panel.axhline(0.0, color=INK, lw=0.8)
             unit = units[scene, name]
-            shown = name.replace("_", " ")
             panel.set(
-                xlabel=axis(shown, unit), ylabel=axis("estimate − truth", unit), title=scene.replace("_", " ")
+                xlabel=axis(_words(name), unit), ylabel=axis("estimate − truth", unit), title=_words(scene)
             )
             panel.grid()
             low, high = panel.get_ylim()
@@ -60,13 +56,9 @@ def points_chart(body: np.ndarray, observed: np.ndarray, fitted: np.ndarray, t: 
     with styled():
         fig = figure(4.4)
         for panel, (i, j) in zip(fig.subplots(1, 2), ((0, 2), (0, 1)), strict=True):
-            panel.scatter(shown[:, i], shown[:, j], s=3, color=FULL, alpha=0.35, lw=0, label="fitted run")
-            panel.scatter(
-                fitted[:, i], fitted[:, j], s=34, facecolor="none", edgecolor=PALETTE[0], label="fitted"
-            )
-            panel.scatter(
-                observed[:, i], observed[:, j], s=18, marker="x", color=PALETTE[1], label="observed"
-            )
+            panel.plot(*shown[:, [i, j]].T, ".", ms=3, color=FULL, alpha=0.35, mew=0, label="fitted run")
+            panel.plot(*fitted[:, [i, j]].T, "o", mfc="none", color=PALETTE[0], label="fitted")
+            panel.plot(*observed[:, [i, j]].T, "x", ms=4, color=PALETTE[1], label="observed")
             panel.set(xlabel=f"{'xyz'[i]} [m]", ylabel=f"{'xyz'[j]} [m]", title=f"t = {t:.4g} s")
             panel.set_aspect("equal", adjustable="datalim")
             panel.grid()
@@ -80,45 +72,41 @@ def residuals_chart(rows: pd.DataFrame, less: str = "observed") -> Figure:
     Args:
         rows: of residuals.csv; less: what `value` is.
     """
+    end = float(rows["t"].max())
     with styled():
         fig = figure(3.4)
         panel = fig.subplots()
-        for k, (column, told) in enumerate(
-            (("fitted", "run by operators"), ("full_order", "full-order run"))
+        for k, (column, name) in enumerate(
+            {"fitted": "run by operators", "full_order": "full-order run"}.items()
         ):
             if column in rows:
-                off = 1e3 * (rows["value"] - rows[column])
-                jitter = (k - 0.5) * 0.006 * float(rows["t"].max())
-                panel.plot(rows["t"] + jitter, off, "o", ms=3, alpha=0.5, label=told, color=PALETTE[k])
+                t, off = rows["t"] + (k - 0.5) * 0.006 * end, 1e3 * (rows["value"] - rows[column])
+                panel.plot(t, off, "o", ms=3, alpha=0.5, label=name, color=PALETTE[k])
         panel.axhline(0.0, color=MUTED, lw=0.8)
         panel.set(xlabel="time t [s]", ylabel=f"{less} − run [mm]")
-        panel.set_xlim(0.0, 1.05 * float(rows["t"].max()) or None)
+        panel.set_xlim(0.0, 1.05 * end or None)
         panel.grid()
         panel.legend()
     return fig
 
 
-def bands_chart(
-    t: np.ndarray, bands: Mapping[str, np.ndarray], levels: Sequence[float], units: str
-) -> Figure:
-    """Quantiles over time, a panel each.
+def bands_chart(t: np.ndarray, bands: Mapping[str, np.ndarray], levels: Sequence[float]) -> Figure:
+    """Quantiles over time [m], a panel each.
 
     Args:
         t: [F] s.
         bands: by name [Q, F]; levels: [Q] ascending, of which the middle one is drawn as a line.
-        units: of the values.
     """
+    middle = len(levels) // 2
     with styled():
         fig = figure(3.2 * len(bands))
         for panel, (name, values) in zip(np.ravel(fig.subplots(len(bands), 1)), bands.items(), strict=True):
-            middle = len(levels) // 2
             for k in range(middle):
-                told = f"{100 * levels[k]:g} to {100 * levels[-1 - k]:g} %"
-                panel.fill_between(
-                    t, values[k], values[-1 - k], color=PALETTE[0], alpha=0.18 + 0.2 * k, lw=0, label=told
-                )
+                label = f"{100 * levels[k]:g} to {100 * levels[-1 - k]:g} %"
+                shade = {"color": PALETTE[0], "alpha": 0.18 + 0.2 * k, "lw": 0}
+                panel.fill_between(t, values[k], values[-1 - k], label=label, **shade)
             panel.plot(t, values[middle], color=PALETTE[0], label="median")
-            panel.set(xlabel="time t [s]", ylabel=axis(name.replace("_", " "), units))
+            panel.set(xlabel="time t [s]", ylabel=axis(_words(name), "m"))
             panel.grid()
             panel.legend(fontsize=8)
     return fig
@@ -131,58 +119,48 @@ def indices_chart(table: pd.DataFrame) -> Figure:
         table: quantity, parameter, first, first_95, total, total_95; and first_full_order, first_same_design
             and the same of total, of a smaller design, where there were full-order runs.
     """
-    beside = (("same_design", "x", "operators, smaller design"), ("full_order", "o", "full order, the same"))
+    beside = {"same_design": ("x", "operators, smaller design"), "full_order": ("o", "full order, the same")}
     groups = list(table.groupby("quantity", sort=False))
     with styled():
         fig = figure(3.2)
         for panel, (name, part) in zip(np.ravel(fig.subplots(1, len(groups))), groups, strict=True):
             at = np.arange(len(part))
-            for k, (column, told) in enumerate((("first", "first order"), ("total", "total"))):
-                panel.bar(
-                    at + 0.36 * (k - 0.5), part[column], 0.34, yerr=part[f"{column}_95"], label=told,
-                    color=PALETTE[k],
-                )  # fmt: skip
-                for kind, mark, who in beside:
-                    if f"{column}_{kind}" in part:
-                        panel.plot(
-                            at + 0.36 * (k - 0.5) + 0.08, part[f"{column}_{kind}"], mark, ms=6, mfc="none",
-                            color=INK, label=who if k else None,
-                        )  # fmt: skip
-            panel.set_xticks(at, [p.replace("_", " ") for p in part["parameter"]])
-            panel.set(ylabel="share of the variance [–]", title=name.replace("_", " "))
+            for k, (order, label) in enumerate({"first": "first order", "total": "total"}.items()):
+                place, errors = at + 0.36 * (k - 0.5), part[f"{order}_95"]
+                panel.bar(place, part[order], 0.34, yerr=errors, label=label, color=PALETTE[k])
+                for kind, (mark, who) in beside.items():
+                    if f"{order}_{kind}" in part:
+                        style = {"ms": 6, "mfc": "none", "color": INK, "label": who if k else None}
+                        panel.plot(place + 0.08, part[f"{order}_{kind}"], mark, **style)
+            panel.set_xticks(at, part["parameter"].map(_words))
+            panel.set(ylabel="share of the variance [–]", title=_words(name))
             panel.grid(axis="y")
         fig.legend(*panel.get_legend_handles_labels(), loc="outside upper left", ncols=4)
     return fig
 
 
-def posterior_chart(draws: np.ndarray, names: Sequence[str], units: Sequence[str]) -> Figure:
+def posterior_chart(draws: np.ndarray, names: Sequence[str]) -> Figure:
     """Draws of the posterior: each parameter's histogram, and each pair in a plane.
 
     Args:
-        draws: [n, p]; names, units: [p].
+        draws: [n, p]; names: [p] with units.
     """
     p = len(names)
     with styled():
         fig = figure(2.6 * p + 0.8)
         panels = fig.subplots(p, p, squeeze=False)
-        for i in range(p):
-            for j in range(p):
-                panel = panels[i, j]
-                if j > i:
-                    panel.set_visible(False)
-                    continue
-                if i == j:
-                    panel.hist(draws[:, i], 50, color=PALETTE[0], alpha=0.8, density=True)
-                    panel.set_ylabel(axis("density", f"1/{units[i]}" if units[i] else ""))
-                else:
-                    panel.plot(draws[::5, j], draws[::5, i], ".", ms=1.2, alpha=0.3, color=PALETTE[0])
-                    panel.set_ylabel(axis(names[i].replace("_", " "), units[i]))
-                panel.set_xlabel(axis(names[j].replace("_", " "), units[j]))
+        for i, j in np.ndindex(p, p):
+            panel = panels[i, j]
+            panel.set(xlabel=names[j], ylabel="density" if i == j else names[i], visible=j <= i)
+            if i == j:
+                panel.hist(draws[:, i], 50, color=PALETTE[0], alpha=0.8, density=True)
+            elif j < i:
+                panel.plot(draws[::5, j], draws[::5, i], ".", ms=1.2, alpha=0.3, color=PALETTE[0])
     return fig
 
 
 def program_chart(t: np.ndarray, ways: Mapping[str, np.ndarray], unit: str) -> Figure:
-    """What was designed over time.
+    """A designed program over time.
 
     Args:
         t: [N] s; ways: by name [N]; unit: theirs.
@@ -196,3 +174,7 @@ def program_chart(t: np.ndarray, ways: Mapping[str, np.ndarray], unit: str) -> F
         panel.grid()
         panel.legend()
     return fig
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")

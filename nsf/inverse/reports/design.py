@@ -1,9 +1,9 @@
 """A designed program, its run by operators, and the full-order run beside it."""
 
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
 
 from nsf.errors import ConfigError
@@ -11,11 +11,8 @@ from nsf.inverse.design import Designed, Program, Tilt, design, full_order
 from nsf.inverse.error import ModelError
 from nsf.inverse.observations import View
 from nsf.inverse.reports.charts import program_chart, residuals_chart
-from nsf.inverse.reports.page import Results, write
-from nsf.reporting.text.columns import number
-from nsf.results.formats import Rows
-from nsf.results.page import Picture, Section, Table
-from nsf.results.style import save
+from nsf.inverse.reports.page import Chart, Results, frame_table, rms, title_of, write
+from nsf.results.columns import number
 
 #: Tolerances (RMS) beyond which the targets count as missed.
 _MISSED = 3.0
@@ -46,72 +43,60 @@ def report(
         seed: of the random programs.
         say: told what is done.
     """
-    model, own = program.model, view.observations
-    found = design(program, view, parameters, seed, say)
-    rows = pd.DataFrame(
-        {
-            "t": own.t, "what": own.what, **dict(zip(("X", "Y", "Z"), own.points.T, strict=True)),
-            "value": own.values, "tolerance": own.deviations, "fitted": found.seen,
-        }
-    )  # fmt: skip
-    body = [["run by operators", number(1e3 * _rms(rows["value"] - rows["fitted"]))]]
+    model = program.model
+    designed = design(program, view, parameters, seed, say)
+    rows = view.observations.frame.rename(columns={"deviation": "tolerance"}).assign(fitted=designed.seen)
+    off = {"run by operators": rms(rows["value"] - rows["fitted"])}
     if run_full_order:
-        rows["full_order"] = view.of_truth(full_order(program, found, parameters))
-        body.append(["full-order run", number(1e3 * _rms(rows["value"] - rows["full_order"]))])
-    try:
-        error = _rms(ModelError.of(view, model).deviations)
-        body.append(["the model's own error", number(1e3 * error)])
-    except ConfigError:  # no validation runs: nothing is known of it
-        error = float("nan")
-    told = ", ".join(f"{what} {value} mm" for what, value in body)
-    say(f"design: off by: {told}")
-    ways = dict(zip(program.names, found.values.T, strict=True))
-    missed = (rows["value"] - rows["fitted"]) / rows["tolerance"]
-    warnings = _warnings(program, found, _rms(missed))
+        rows["full_order"] = view.of_truth(full_order(program, designed, parameters))
+        off["full-order run"] = rms(rows["value"] - rows["full_order"])
+    with suppress(ConfigError):  # without validation runs nothing is known of it
+        off["the model's own error"] = rms(ModelError.of(view, model).deviations)
+    say("design: off by: " + ", ".join(f"{what} {number(1e3 * value)} mm" for what, value in off.items()))
+    warnings = _warnings(program, designed, rms((rows["value"] - rows["fitted"]) / rows["tolerance"]))
     for warning in warnings:
         say(f"design: warning: {warning}")
-
-    def draw(fresh: Path) -> list[Section]:
-        ids = [model.run.id]
-        files = save(program_chart(model.t, ways, program.unit), fresh, "program")
-        pictures = [Picture(files, "The program over time.", ids)]
-        files = save(residuals_chart(rows, "target"), fresh, "targets")
-        return [Section("Program", [*pictures, Picture(files, "Targets less what the runs have.", ids)])]
-
-    title = model.scene.config.scene.get("title") or model.scene.name
-    count = f"{len(rows)} target{'s' * (len(rows) != 1)}."
+    ways = dict(zip(program.names, designed.values.T, strict=True))
+    table = pd.DataFrame({"": list(off), "off [mm]": [1e3 * value for value in off.values()]})
     results = Results(
-        title=f"{title}: design",
+        title=f"{title_of(model)}: design",
         lead=_LEAD,
-        tables=[Table("How far off", Rows(["", "off [mm]"], body, [False, True]), count)],
+        models=[model],
+        tables=[frame_table("How far off", table, f"{len(rows)} target{'s' * (len(rows) != 1)}.")],
         files={"program.csv": pd.DataFrame({"t": model.t} | ways), "targets.csv": rows},
-        runs=[model.run, *model.run.parent_runs],
-        draw=draw,
-        facts=[("Search", found.stopped), ("Distrust", number(found.distrust))],
+        charts=[
+            Chart(
+                "Program", "program", "The program over time.",
+                lambda: program_chart(model.t, ways, program.unit),
+            ),
+            Chart(
+                "Program", "targets", "Targets less what the runs have.",
+                lambda: residuals_chart(rows, "target"),
+            ),
+        ],
+        facts=[("Search", designed.stopped), ("Distrust", number(designed.distrust))],
         definitions=_TERMS,
         warnings=warnings,
         asked={"seed": seed, "knots": program.knots, "bounds": program.bounds.tolist()},
-    )
-    return write(results, folder), found
+    )  # fmt: skip
+    return write(results, folder), designed
 
 
-def _warnings(program: Program, found: Designed, missed: float) -> list[str]:
+def _warnings(program: Program, designed: Designed, missed: float) -> list[str]:
     """What a reader must know of a program whose run misses its targets by so many tolerances (RMS)."""
-    told = []
+    warnings = []
     if missed > _MISSED:
-        told.append(
+        warnings.append(
             f"no program was found that reaches the targets; the best misses them by {missed:.3g} "
             "tolerances; allow wider bounds or more knots, or choose targets nearer by"
         )
-    if found.distrust > 1.0:
-        told.append(f"the run is {found.distrust:.3g} times as far from what was taught as may be believed")
+    if designed.distrust > 1.0:
+        warnings.append(
+            f"the run is {designed.distrust:.3g} times as far from what was taught as may be believed"
+        )
     if isinstance(program, Tilt) and not program.model.scene.forcing.gravity:
-        told.append(
+        warnings.append(
             "gravity was the same in all training runs, so the fields know no shape that a tilt makes; train "
             "with scene.forcing.gravity"
         )
-    return told
-
-
-def _rms(values) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
+    return warnings

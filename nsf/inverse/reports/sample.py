@@ -1,4 +1,4 @@
-"""What drawn parameters bring about: quantiles over time, sensitivities, and a posterior."""
+"""Runs at drawn parameters: quantiles over time, sensitivities, and a posterior."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -14,13 +14,9 @@ from nsf.inverse.observations import View
 from nsf.inverse.posterior import posterior
 from nsf.inverse.reports.calibration import warnings_of
 from nsf.inverse.reports.charts import bands_chart, indices_chart, posterior_chart
-from nsf.inverse.reports.page import Results, write
+from nsf.inverse.reports.page import Chart, Results, frame_table, named, title_of, write
 from nsf.inverse.sampling import LEVELS, Asked, Prior, runs, sensitivities
 from nsf.inverse.space import Space
-from nsf.reporting.text.columns import axis, number
-from nsf.results.formats import Rows
-from nsf.results.page import Picture, Section, Table
-from nsf.results.style import save
 from nsf.runs import Run
 
 _LEAD = "What runs by operators make of parameters that are drawn from stated distributions."
@@ -28,6 +24,10 @@ _TERMS = (
     ("distrusted", "runs that are not to be believed; no quantile counts them (docs/method.md, Trust)."),
     ("first order, total", "share of the variance that a parameter makes alone, and with all others."),
     ("posterior", "the parameters given the observations, the reduced model's own error included."),
+)
+_INDICES = (
+    "Shares of the variance at the end that each parameter makes over its stated distribution, "
+    "whatever was observed, distrusted runs among them, with 95 % intervals."
 )
 _DRAWS = 4000
 
@@ -59,152 +59,125 @@ def report(
         seed: of everything that is drawn.
         say: told what is done.
     """
-    ids, warnings = [model.run.id], []
     forcing = None if program is None else model.forcing(program=program)
+    files, tables, charts, warnings, hidden = {}, [], [], [], []
     if view is None:
         drawn = prior.draw(count, seed)
     else:
-        found = fit(view, model, Space.of(model), forcing=forcing)
-        given = posterior(prior, view, found, _DRAWS, forcing, seed)
-        warnings += warnings_of(found, view.observations) + ([given.warning] if given.warning else [])
+        best = fit(view, model, Space.of(model), forcing=forcing)
+        given = posterior(prior, view, best, _DRAWS, forcing, seed)
+        warnings = warnings_of(best, view.observations) + ([given.warning] if given.warning else [])
         say(f"sample: posterior given {len(view.observations)} observations: {given.told}")
         drawn = given.values[np.random.default_rng(seed).integers(0, len(given.values), count)]
+        names = [named(model, name) for name in model.names]
+        files["posterior.csv"] = pd.DataFrame(given.values, columns=list(model.names))
+        tables.append(frame_table("Posterior", _moments(files["posterior.csv"], names), f"{given.told}."))
+        draw = posterior_chart, given.values, names
+        charts.append(Chart("Posterior", "posterior", "Draws of the posterior.", lambda: draw[0](*draw[1:])))
     made = runs(model, drawn, asked, forcing)
     lost = int((~made.trusted).sum())
     say(f"sample: {count:,} runs in {made.seconds:.2f} s, {lost:,} of them distrusted")
     bands = made.quantiles()
-    rows = pd.DataFrame(drawn, columns=list(model.names))
-    for k, name in enumerate(asked.names):
-        rows[name] = made.values[:, k, -1]
-    rows["distrust"] = made.distrust
-    rows = rows.map(lambda value: float(f"{value:.6g}"))
-    files = {"quantiles.csv": _quantiles(asked, bands), "runs.csv.gz": rows}
-    tables = [Table("At the end", _ends(bands), f"{count:,} runs, {lost:,} of them distrusted and left out.")]
-    sections = {
-        "Quantiles over time": (
-            "quantiles",
-            "Quantiles of trusted runs over time.",
-            lambda: bands_chart(asked.t, bands, LEVELS, "m"),
-        )
-    }
-    beside: list[Run] = []
+    files = {"quantiles.csv": _quantiles(asked, bands), "runs.csv.gz": _each(model, made)} | files
+    note = f"{count:,} runs, {lost:,} of them distrusted and left out."
+    tables.insert(0, frame_table("At the end", _ends(bands), note))
+    heading, caption = "Quantiles over time", "Quantiles of trusted runs over time."
+    charts.insert(0, Chart(heading, "quantiles", caption, lambda: bands_chart(asked.t, bands, LEVELS)))
     if indices:
-        table, own = _indices(model, prior, asked, indices, full_order, program, seed, say)
-        files["sensitivities.csv"], beside = table, own
-        tables.insert(
-            0, Table("Sensitivities at the end", _index_rows(table), _designs(indices, full_order, prior))
-        )
-        told = (
-            "Shares of the variance at the end that each parameter makes over its stated distribution, "
-            "whatever was observed, distrusted runs among them, with 95 % intervals."
-        )
-        sections = {"Sensitivities": ("sensitivities", told, lambda: indices_chart(table))} | sections
-    if view is not None:
-        files["posterior.csv"] = pd.DataFrame(given.values, columns=list(model.names))
-        tables.append(Table("Posterior", _moments(model, given.values), f"{given.told}."))
-        sections["Posterior"] = (
-            "posterior",
-            "Draws of the posterior.",
-            lambda: posterior_chart(given.values, model.names, model.units),
-        )
-
-    def draw(fresh: Path) -> list[Section]:
-        return [
-            Section(heading, [Picture(save(chart(), fresh, stem), told, ids)])
-            for heading, (stem, told, chart) in sections.items()
-        ]
-
-    title = model.scene.config.scene.get("title") or model.scene.name
+        table, hidden = _indices(model, prior, asked, indices, full_order, program, seed, say)
+        files["sensitivities.csv"] = table
+        shown = table.rename(columns=lambda name: name.replace("_", " "))
+        shown[shown.columns[2:]] = shown[shown.columns[2:]].map("{:.3f}".format)
+        note = _designs(indices, full_order, prior)
+        tables.insert(0, frame_table("Sensitivities at the end", shown, note, text=2))
+        charts.insert(0, Chart("Sensitivities", "sensitivities", _INDICES, lambda: indices_chart(table)))
+    for warning in warnings:
+        say(f"sample: warning: {warning}")
     results = Results(
-        title=f"{title}: sampling",
+        title=f"{title_of(model)}: sampling",
         lead=_LEAD,
+        models=[model],
+        hidden=hidden,
         tables=tables,
         files=files,
-        runs=[model.run, *model.run.parent_runs],
-        beside=beside,
-        draw=draw,
+        charts=charts,
         facts=[("Runs", f"{count:,} in {made.seconds:.2f} s"), ("Distrusted", f"{lost:,}")],
         definitions=_TERMS,
         warnings=warnings,
         asked={"count": count, "of": asked.names, "seed": seed, "sensitivities": indices}
         | ({} if program is None else {"program": program}),
     )
-    for warning in warnings:
-        say(f"sample: warning: {warning}")
     return write(results, folder)
 
 
-def _indices(model, prior, asked, count, full_order, program, seed, say) -> tuple[pd.DataFrame, list[Run]]:
+def _indices(
+    model: Model, prior: Prior, asked: Asked, count: int, full_order: int, program: int | None, seed: int, say
+) -> tuple[pd.DataFrame, list[Run]]:
     """Indices at the last time by operators, and by full-order runs of a smaller design of the same kind."""
-
     forcing = None if program is None else model.forcing(program=program)
-    own = {} if program is None else {PROGRAM: program}
+    more = {} if program is None else {PROGRAM: program}
+    made: list[Run] = []
 
     def by_operators(values: np.ndarray) -> np.ndarray:
         return runs(model, values, asked, forcing).values[..., -1]
 
+    def by_full_order(values: np.ndarray) -> np.ndarray:
+        rows = [dict(zip(model.names, row, strict=True)) for row in values.tolist()]
+        made.extend(model.pipeline.full_order([model.scene.case(row | more) for row in rows]))
+        seen = []
+        for run in made:
+            with Trajectory.open(run.file(TRAJECTORY)) as truth:
+                seen.append(asked.of_truth(truth))
+        return np.array(seen)
+
     table = sensitivities(prior, count, by_operators, asked.names, seed)
     if not full_order:
         return table, []
-    made: list[Run] = []
-
-    def by_full_order(values: np.ndarray) -> np.ndarray:
-        named = [dict(zip(model.names, row, strict=True)) for row in values.tolist()]
-        cases = [model.scene.case(values | own) for values in named]
-        made.extend(model.pipeline.full_order(cases))
-        found = []
-        for run in made:
-            with Trajectory.open(run.file(TRAJECTORY)) as truth:
-                found.append(asked.of_truth(truth))
-        return np.array(found)
-
-    beside = sensitivities(prior, full_order, by_full_order, asked.names, seed)
-    same = sensitivities(prior, full_order, by_operators, asked.names, seed)
+    for kind, evaluate in (("same_design", by_operators), ("full_order", by_full_order)):
+        smaller = sensitivities(prior, full_order, evaluate, asked.names, seed)
+        table = table.assign(**{f"{order}_{kind}": smaller[order] for order in ("first", "total")})
     say(f"sample: sensitivities beside {len(made)} full-order runs")
-    return table.assign(
-        first_same_design=same["first"],
-        first_full_order=beside["first"],
-        total_same_design=same["total"],
-        total_full_order=beside["total"],
-    ), made
+    orders = [f"{order}_{kind}" for order in ("first", "total") for kind in ("same_design", "full_order")]
+    return table[[*table.columns[:6], *orders]], made
 
 
 def _designs(count: int, full_order: int, prior: Prior) -> str:
     of = max(2, len(prior.each)) + 2
-    told = f"Saltelli's design of {count * of:,} runs"
-    if full_order:
-        told += f"; beside it {full_order * of:,} full-order runs, and runs by operators of the same design"
-    return f"{told}."
+    beside = f"; beside it {full_order * of:,} full-order runs, and runs by operators of the same design"
+    return f"Saltelli's design of {count * of:,} runs{beside if full_order else ''}."
 
 
-def _index_rows(table: pd.DataFrame) -> Rows:
-    heads = [name.replace("_", " ") for name in table]
-    body = [
-        [str(value) if isinstance(value, str) else f"{value:.3f}" for value in row]
-        for row in table.to_numpy().tolist()
-    ]
-    return Rows(heads, body, [name not in ("quantity", "parameter") for name in table])
+def _each(model: Model, made) -> pd.DataFrame:
+    """A row a run: its parameters, values at the end and distrust, with six digits."""
+    rows = pd.DataFrame(made.parameters, columns=list(model.names))
+    for k, name in enumerate(made.names):
+        rows[name] = made.values[:, k, -1]
+    return rows.assign(distrust=made.distrust).map(lambda value: float(f"{value:.6g}"))
 
 
-def _quantiles(asked: Asked, bands) -> pd.DataFrame:
-    parts = []
-    for name, values in bands.items():
-        columns = {f"q{100 * level:g}": row for level, row in zip(LEVELS, values, strict=True)}
-        parts.append(pd.DataFrame({"quantity": name, "t": asked.t, **columns}))
-    return pd.concat(parts, ignore_index=True)
+def _quantiles(asked: Asked, bands: dict[str, np.ndarray]) -> pd.DataFrame:
+    columns = [f"q{100 * level:g}" for level in LEVELS]
+    parts = {name: pd.DataFrame(values.T, columns=columns) for name, values in bands.items()}
+    for name, part in parts.items():
+        part.insert(0, "quantity", name)
+        part.insert(1, "t", asked.t)
+    return pd.concat(parts.values(), ignore_index=True)
 
 
-def _ends(bands) -> Rows:
-    heads = ["quantity", *(f"{100 * level:g} % [mm]" for level in LEVELS)]
-    body = [[name, *(number(1e3 * row[-1]) for row in values)] for name, values in bands.items()]
-    return Rows(heads, body, [False] + [True] * len(LEVELS))
+def _ends(bands: dict[str, np.ndarray]) -> pd.DataFrame:
+    heads = [f"{100 * level:g} % [mm]" for level in LEVELS]
+    rows = [[name, *(1e3 * values[:, -1])] for name, values in bands.items()]
+    return pd.DataFrame(rows, columns=["quantity", *heads])
 
 
-def _moments(model: Model, draws: np.ndarray) -> Rows:
-    heads = ["parameter", "mean", "deviation", "5 %", "95 %"]
-    body = []
-    for name, unit, own in zip(model.names, model.units, draws.T, strict=True):
-        low, high = np.quantile(own, [0.05, 0.95])
-        told = [f"{own.mean():.5g}", number(float(own.std())), f"{low:.5g}", f"{high:.5g}"]
-        body.append([axis(name.replace("_", " "), unit), *told])
-    return Rows(heads, body, [False, True, True, True, True])
+def _moments(draws: pd.DataFrame, names: list[str]) -> pd.DataFrame:
+    ends = draws.quantile([0.05, 0.95]).map("{:.5g}".format)
+    return pd.DataFrame(
+        {
+            "parameter": names,
+            "mean": draws.mean().map("{:.5g}".format).to_numpy(),
+            "deviation": draws.std(ddof=0).to_numpy(),
+            "5 %": ends.iloc[0].to_numpy(),
+            "95 %": ends.iloc[1].to_numpy(),
+        }
+    )

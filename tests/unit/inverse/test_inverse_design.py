@@ -188,13 +188,13 @@ def test_a_solid_moves_as_in_training(pushed):
 
 def test_a_solid_moves_no_faster_than_in_training(pushed):
     program = Moves(pushed, ("plate",), 24)
-    trained = np.abs(np.concatenate([np.diff(run, axis=0) for run in program._shifts("plate")])).max()
+    trained = np.abs(np.concatenate([np.diff(run, axis=0) for run in program._shifts["plate"]])).max()
     generator = torch.Generator().manual_seed(0)
     knots = torch.rand(20, 24, 1, dtype=torch.float64, generator=generator).round()
     forcing = program.forcing(program.values(knots))
     assert np.abs(np.diff(forcing.solids[..., 9:12].numpy(), axis=1)).max() <= trained * (1 + 1e-9)
     shifts = forcing.solids[..., 9:12]
-    assert shifts[..., 0].max() <= max(run[:, 0].max() for run in program._shifts("plate")) + 1e-12
+    assert shifts[..., 0].max() <= max(run[:, 0].max() for run in program._shifts["plate"]) + 1e-12
     # The gradient passes on from a knot to those after it.
     again = knots.mul(0.5).add(0.25).requires_grad_()
     (slope,) = torch.autograd.grad(program.values(again)[:, -1].sum(), again)

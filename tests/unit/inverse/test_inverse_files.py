@@ -113,7 +113,7 @@ def test_calibrate(tmp_path, deployed, seen, capsys):
     residuals = pd.read_csv(folder / "residuals.csv")
     assert len(residuals) == 60
     assert (residuals["value"] - residuals["full_order"]).abs().max() < 0.02
-    assert {"points.png", "residuals.svg", "correlation.csv"} <= {p.name for p in folder.iterdir()}
+    assert {"points.png", "residuals.png", "correlation.csv"} <= {p.name for p in folder.iterdir()}
     told = json.loads((folder / "sources.json").read_text())
     assert deployed.deployment.id in told["runs"]
     assert any(run.startswith("simulate/") for run in told["runs"])

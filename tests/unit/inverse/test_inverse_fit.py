@@ -92,19 +92,6 @@ def test_the_models_own_error_moves_and_widens(model, seen, no_error):
     assert found.share[1] > 0.5
 
 
-def test_the_jacobian_is_that_of_differences(model, seen):
-    view, space = View(seen, model), Space.of(model)
-    at = torch.tensor([[0.3, 0.6]], dtype=torch.float64)
-    _, slopes = with_jacobian(lambda u: view.of_runs(model(space.parameters(u))), at)
-    assert slopes.shape == (1, len(seen), 2)
-    for k in range(2):
-        step = torch.zeros_like(at)
-        step[0, k] = 1e-5
-        ends = [view.of_runs(model(space.parameters(at + way * step)))[0] for way in (1, -1)]
-        torch.testing.assert_close(slopes[0, :, k], (ends[0] - ends[1]) / 2e-5, atol=1e-7, rtol=1e-4)
-    assert (slopes.abs().amax((0, 1)) > 1e-4).all()
-
-
 def test_validation_runs_tell_the_error(model, seen):
     own = ModelError.of(View(seen, model), model)
     assert own.vectors.shape == (4, len(seen))
