@@ -1,5 +1,6 @@
 """A reduced step beside the full-order one, on the paper's cake and metal, and what a longer Δt costs."""
 
+import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
@@ -51,7 +52,7 @@ def run(found: Measurements) -> None:
 def pipelines(found: Measurements, samplers: bool = False) -> Iterator[tuple[str, Pipeline]]:
     """The configuration of each scene, after the end of its cases; with another sampler too where asked."""
     for scene in found.settings.scenes or SCENES:
-        yield from list(_by_sampler(scene, found))[: 1 + samplers]
+        yield from itertools.islice(_by_sampler(scene, found), 1 + samplers)
 
 
 def _by_sampler(scene: str, found: Measurements) -> Iterator[tuple[str, Pipeline]]:
