@@ -126,7 +126,7 @@ class Prior:
         return np.where(inside, found, -np.inf)
 
 
-class Asked:
+class Scalars:
     """Scalars of runs at a few times: quantities of the shape, and components of points, as `z@X:Y:Z`.
 
     Args:
@@ -146,17 +146,17 @@ class Asked:
                 f"of={wrong[0]} is none of {', '.join(QUANTITIES)}, nor a component of a point at rest, as "
                 "z@0.5:0.5:0.2"
             )
-        self.names, looks = tuple(names), spaced(len(model.t), _TIMES)
+        self.names, looks = tuple(dict.fromkeys(names)), spaced(len(model.t), _TIMES)
         self.t = model.t[looks]
-        every = [Observations.of_scalars(dict.fromkeys(names, 0.0), t) for t in self.t]
+        every = [Observations.of_scalars(dict.fromkeys(self.names, 0.0), t) for t in self.t]
         self._view = View(Observations.joined(every), model, looks)
 
     def of(self, xhat: Tensor) -> Tensor:
-        """[B, asked, F] of runs [B, N + 1, r], differentiable [m]."""
+        """[B, scalars, F] of runs [B, N + 1, r], differentiable [m]."""
         return self._view.of_runs(xhat).unflatten(1, (len(self.t), -1)).transpose(1, 2)
 
     def of_truth(self, truth: Trajectory) -> np.ndarray:
-        """[asked] of a full-order run at its end."""
+        """[scalars] of a full-order run at its end."""
         return self._view.of_truth(truth)[-len(self.names) :]
 
 
@@ -165,7 +165,7 @@ class Runs:
     """Runs at many parameters.
 
     Attributes:
-        parameters: [B, n]; values: [B, asked, F] [m]; distrust: [B]; t: [F] [s]; names: of what was asked.
+        parameters: [B, n]; values: [B, scalars, F] [m]; distrust: [B]; t: [F] [s]; names: of the scalars.
         seconds: wall time.
     """
 
@@ -193,17 +193,17 @@ class Runs:
         return {name: found[:, k] for k, name in enumerate(self.names)}
 
 
-def runs(model: Model, parameters: np.ndarray, asked: Asked, forcing: Forcing | None = None) -> Runs:
+def runs(model: Model, parameters: np.ndarray, scalars: Scalars, forcing: Forcing | None = None) -> Runs:
     """Runs at parameters [B, n], in batches."""
     began, values, distrust = time.perf_counter(), [], []
     with torch.no_grad():
         for part in np.array_split(parameters, max(1, -(-len(parameters) // _BATCH))):
             mu = model.tensor(part)
             xhat = model(mu, forcing)
-            values.append(asked.of(xhat).cpu().numpy())
+            values.append(scalars.of(xhat).cpu().numpy())
             distrust.append(model.distrust(xhat, mu, forcing).cpu().numpy())
     every = np.concatenate(values), np.concatenate(distrust)
-    return Runs(parameters, *every, asked.t, asked.names, time.perf_counter() - began)
+    return Runs(parameters, *every, scalars.t, scalars.names, time.perf_counter() - began)
 
 
 def sensitivities(
@@ -218,8 +218,8 @@ def sensitivities(
     Args:
         prior: of the parameters.
         count: a power of two; the design has count × (parameters + 2) rows.
-        evaluate: parameters [rows, n] → values [rows, asked].
-        names: of what is asked.
+        evaluate: parameters [rows, n] → values [rows, scalars].
+        names: of the scalars.
         seed: of the design and of the bootstrap.
 
     Returns:

@@ -65,7 +65,7 @@ def calibrate(words: Sequence[str], say: Callable[[str], object] = print) -> Pat
         NSFError: a word is refused, a run is missing, or the observations do not tell.
     """
     keys = {"observations": _text, "trials": _whole(most=_MOST_TRIALS), "starts": _whole()}
-    asked = Asked.of("calibrate", words, **keys, full_order=_flag, program=_whole(0))
+    asked = Words.of("calibrate", words, **keys, full_order=_flag, program=_whole(0))
     values, named = asked.values, asked.named
     if ("trials" in values) == ("observations" in values):
         raise ConfigError(
@@ -107,11 +107,10 @@ def sample(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
         NSFError: a word is refused, or a run or an extra is missing.
     """
     keys = {"of": _text, "runs": _whole(), "observations": _text, "sensitivities": _base, "full_order": _base}
-    asked = Asked.of("sample", words, **keys, program=_whole(0))
+    asked = Words.of("sample", words, **keys, program=_whole(0))
     from nsf.extras import optional
     from nsf.inverse.reports.sample import report
-    from nsf.inverse.sampling import Asked as Seen
-    from nsf.inverse.sampling import Prior
+    from nsf.inverse.sampling import Prior, Scalars
 
     values, view = asked.values, None
     indices, full_order = values.get("sensitivities", 0), values.get("full_order", 0)
@@ -125,7 +124,7 @@ def sample(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
     return report(
         model,
         Prior.of(model, asked.named),
-        Seen(values.get("of", "height").split(","), model),
+        Scalars(values.get("of", "height").split(","), model),
         asked.folder(f"sample_{model.scene.name}"),
         count=values.get("runs", 10_000),
         indices=indices,
@@ -149,7 +148,7 @@ def design(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
     """
     scalars = {key: _number for word in words if is_scalar(key := word.split("=")[0])}
     keys = {"target": _text, "tilt": _number, "move": _text, "knots": _whole(most=1000)}
-    asked = Asked.of("design", words, **keys, **scalars, full_order=_flag)
+    asked = Words.of("design", words, **keys, **scalars, full_order=_flag)
     from nsf.inverse.design import Moves, Tilt
     from nsf.inverse.reports.design import report
     from nsf.inverse.space import check_taught
@@ -205,7 +204,7 @@ def ranges_of(named: dict[str, str]) -> dict[str, list[float] | float]:
 
 
 @dataclass(frozen=True)
-class Asked:
+class Words:
     """The words of a command.
 
     Attributes:
@@ -218,7 +217,7 @@ class Asked:
     named: dict[str, str]
 
     @classmethod
-    def of(cls, command: str, words: Sequence[str], **keys: Callable) -> "Asked":
+    def of(cls, command: str, words: Sequence[str], **keys: Callable) -> "Words":
         """From `key=value`, with how to read each key of the command.
 
         Raises:

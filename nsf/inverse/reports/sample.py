@@ -15,7 +15,7 @@ from nsf.inverse.posterior import posterior
 from nsf.inverse.reports.calibration import warnings_of
 from nsf.inverse.reports.charts import bands_chart, indices_chart, posterior_chart
 from nsf.inverse.reports.page import Chart, Results, frame_table, named, title_of, write
-from nsf.inverse.sampling import LEVELS, Asked, Prior, runs, sensitivities
+from nsf.inverse.sampling import LEVELS, Prior, Scalars, runs, sensitivities
 from nsf.inverse.space import Space
 from nsf.runs import Run
 
@@ -35,7 +35,7 @@ _DRAWS = 4000
 def report(
     model: Model,
     prior: Prior,
-    asked: Asked,
+    scalars: Scalars,
     folder: Path,
     *,
     count: int = 10_000,
@@ -49,7 +49,7 @@ def report(
     """Draw, run, and write `quantiles.csv`, `runs.csv.gz`, and what else is asked for.
 
     Args:
-        model, prior, asked: of the runs.
+        model, prior, scalars: of the runs.
         folder: of the page.
         count: runs.
         indices: base of the design of sensitivities, a power of two; 0 for none.
@@ -74,17 +74,17 @@ def report(
         tables.append(frame_table("Posterior", _moments(files["posterior.csv"], names), f"{given.told}."))
         draw = posterior_chart, given.values, names
         charts.append(Chart("Posterior", "posterior", "Draws of the posterior.", lambda: draw[0](*draw[1:])))
-    made = runs(model, drawn, asked, forcing)
+    made = runs(model, drawn, scalars, forcing)
     lost = int((~made.trusted).sum())
     say(f"sample: {count:,} runs in {made.seconds:.2f} s, {lost:,} of them distrusted")
     bands = made.quantiles()
-    files = {"quantiles.csv": _quantiles(asked, bands), "runs.csv.gz": _each(model, made)} | files
+    files = {"quantiles.csv": _quantiles(scalars, bands), "runs.csv.gz": _each(model, made)} | files
     note = f"{count:,} runs, {lost:,} of them distrusted and left out."
     tables.insert(0, frame_table("At the end", _ends(bands), note))
     heading, caption = "Quantiles over time", "Quantiles of trusted runs over time."
-    charts.insert(0, Chart(heading, "quantiles", caption, lambda: bands_chart(asked.t, bands, LEVELS)))
+    charts.insert(0, Chart(heading, "quantiles", caption, lambda: bands_chart(scalars.t, bands, LEVELS)))
     if indices:
-        table, hidden = _indices(model, prior, asked, indices, full_order, program, seed, say)
+        table, hidden = _indices(model, prior, scalars, indices, full_order, program, seed, say)
         files["sensitivities.csv"] = table
         shown = table.rename(columns=lambda name: name.replace("_", " "))
         shown[shown.columns[2:]] = shown[shown.columns[2:]].map("{:.3f}".format)
@@ -104,14 +104,21 @@ def report(
         facts=[("Runs", f"{count:,} in {made.seconds:.2f} s"), ("Distrusted", f"{lost:,}")],
         definitions=_TERMS,
         warnings=warnings,
-        asked={"count": count, "of": asked.names, "seed": seed, "sensitivities": indices}
+        asked={"count": count, "of": scalars.names, "seed": seed, "sensitivities": indices}
         | ({} if program is None else {"program": program}),
     )
     return write(results, folder)
 
 
 def _indices(
-    model: Model, prior: Prior, asked: Asked, count: int, full_order: int, program: int | None, seed: int, say
+    model: Model,
+    prior: Prior,
+    scalars: Scalars,
+    count: int,
+    full_order: int,
+    program: int | None,
+    seed: int,
+    say,
 ) -> tuple[pd.DataFrame, list[Run]]:
     """Indices at the last time by operators, and by full-order runs of a smaller design of the same kind."""
     forcing = None if program is None else model.forcing(program=program)
@@ -119,7 +126,7 @@ def _indices(
     made: list[Run] = []
 
     def by_operators(values: np.ndarray) -> np.ndarray:
-        return runs(model, values, asked, forcing).values[..., -1]
+        return runs(model, values, scalars, forcing).values[..., -1]
 
     def by_full_order(values: np.ndarray) -> np.ndarray:
         rows = [dict(zip(model.names, row, strict=True)) for row in values.tolist()]
@@ -127,14 +134,14 @@ def _indices(
         seen = []
         for run in made:
             with Trajectory.open(run.file(TRAJECTORY)) as truth:
-                seen.append(asked.of_truth(truth))
+                seen.append(scalars.of_truth(truth))
         return np.array(seen)
 
-    table = sensitivities(prior, count, by_operators, asked.names, seed)
+    table = sensitivities(prior, count, by_operators, scalars.names, seed)
     if not full_order:
         return table, []
     for kind, evaluate in (("same_design", by_operators), ("full_order", by_full_order)):
-        smaller = sensitivities(prior, full_order, evaluate, asked.names, seed)
+        smaller = sensitivities(prior, full_order, evaluate, scalars.names, seed)
         table = table.assign(**{f"{order}_{kind}": smaller[order] for order in ("first", "total")})
     say(f"sample: sensitivities beside {len(made)} full-order runs")
     orders = [f"{order}_{kind}" for order in ("first", "total") for kind in ("same_design", "full_order")]
@@ -155,12 +162,12 @@ def _each(model: Model, made) -> pd.DataFrame:
     return rows.assign(distrust=made.distrust).map(lambda value: float(f"{value:.6g}"))
 
 
-def _quantiles(asked: Asked, bands: dict[str, np.ndarray]) -> pd.DataFrame:
+def _quantiles(scalars: Scalars, bands: dict[str, np.ndarray]) -> pd.DataFrame:
     columns = [f"q{100 * level:g}" for level in LEVELS]
     parts = {name: pd.DataFrame(values.T, columns=columns) for name, values in bands.items()}
     for name, part in parts.items():
         part.insert(0, "quantity", name)
-        part.insert(1, "t", asked.t)
+        part.insert(1, "t", scalars.t)
     return pd.concat(parts.values(), ignore_index=True)
 
 

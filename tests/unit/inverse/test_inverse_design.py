@@ -15,7 +15,7 @@ from nsf.inverse.error import ModelError
 from nsf.inverse.observations import Observations, View
 from nsf.inverse.reports.command import calibrate, sample
 from nsf.inverse.reports.command import design as command
-from nsf.inverse.sampling import Asked, runs
+from nsf.inverse.sampling import Scalars, runs
 from nsf.inverse.space import Space
 from nsf.mpm import Motion
 
@@ -229,7 +229,7 @@ def test_runs_of_programs_ask_for_the_program(pushed, tmp_path):
     with pytest.raises(ConfigError, match="give the number of one, as program=3"):
         calibrate([*words, "observations=none.csv"])
     sample([*words, "runs=20", "program=1"])
-    asked, first = Asked(["height"], pushed), pd.read_csv(tmp_path / "a" / "runs.csv.gz").iloc[0]
+    asked, first = Scalars(["height"], pushed), pd.read_csv(tmp_path / "a" / "runs.csv.gz").iloc[0]
     one = runs(pushed, np.array([[first["friction_angle"]]]), asked, pushed.forcing(program=1))
     assert first["height"] == pytest.approx(one.values[0, 0, -1], rel=1e-5)
 

@@ -13,7 +13,7 @@ from nsf.inverse.fit import fit
 from nsf.inverse.observations import Observations, View
 from nsf.inverse.posterior import Posterior, posterior
 from nsf.inverse.reports.command import sample
-from nsf.inverse.sampling import Asked, Prior, distribution, runs, sensitivities
+from nsf.inverse.sampling import Prior, Scalars, distribution, runs, sensitivities
 
 
 def test_distributions_are_those_of_scipy():
@@ -54,7 +54,7 @@ def test_priors(model):
 
 
 def test_what_is_asked(model):
-    asked = Asked(["height", "springback", "z@0.5:0.5:0.2"], model)
+    asked = Scalars(["height", "springback", "z@0.5:0.5:0.2"], model)
     found = runs(model, np.array([[24.0, 0.1], [36.0, 0.3]]), asked)
     assert found.values.shape == (2, 3, len(asked.t))
     frame = model(model.tensor([24.0, 0.1]))[-1]
@@ -62,13 +62,13 @@ def test_what_is_asked(model):
     assert found.values[0, 2, -1] == pytest.approx(float(z))
     assert (found.values[:, 1] >= 0.0).all()
     with pytest.raises(ConfigError, match="of=width is none of height"):
-        Asked(["width"], model)
+        Scalars(["width"], model)
     with pytest.raises(ConfigError, match="outside of the body"):
-        Asked(["x@3:0:0"], model)
+        Scalars(["x@3:0:0"], model)
 
 
 def test_distrusted_runs_are_counted_apart(model):
-    asked = Asked(["height"], model)
+    asked = Scalars(["height"], model)
     within = np.array([[27.0, 0.2], [29.0, 0.2]])
     mixed = runs(model, np.concatenate([within, [[80.0, 0.2]]]), asked)
     assert mixed.trusted.tolist() == [True, True, False]
@@ -82,7 +82,7 @@ def test_distrusted_runs_are_counted_apart(model):
 def test_full_order_quantities_beside(model, deployed):
     from nsf.data import Trajectory
 
-    asked, case = Asked(["height", "run_out", "z@0.5:0.5:0.2"], model), deployed.split.test[0]
+    asked, case = Scalars(["height", "run_out", "z@0.5:0.5:0.2"], model), deployed.split.test[0]
     found = runs(model, np.array([list(case.parameters.values())]), asked).values[0, :, -1]
     with Trajectory.open(deployed.simulation(case).file("trajectory.h5")) as truth:
         np.testing.assert_allclose(asked.of_truth(truth), found, atol=0.01)
