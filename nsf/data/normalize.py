@@ -12,7 +12,6 @@ from nsf.errors import ShapeError
 
 # Relative to a component's mean: less spread than this is float32 round-off of a constant.
 _CONSTANT = 1e-6
-_BLOCK_BYTES = 256 * 2**20
 
 
 class Standardizer(nn.Module):
@@ -76,11 +75,9 @@ class Standardizer(nn.Module):
         cls, snapshots: Snapshots, field: str, origin: Float[Tensor, "particle component"] | None = None
     ) -> "Standardizer":
         """Of every frame and particle of a field less an origin, read a slab of particles at a time."""
-        width = max(1, _BLOCK_BYTES // (8 * 9 * snapshots.M))
-        starts = range(0, snapshots.P, width)
-        slabs = (slice(start, start + width) for start in starts)
         return cls.fit(
-            snapshots.slab(field, slab) - (0 if origin is None else origin[slab].float()) for slab in slabs
+            values - (0 if origin is None else origin[particles].float())
+            for particles, values in snapshots.slabs(field)
         )
 
     def forward(self, values: Float[Tensor, "*points component"]) -> Float[Tensor, "*points component"]:

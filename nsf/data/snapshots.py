@@ -3,7 +3,7 @@
 import collections
 import itertools
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -24,6 +24,7 @@ _RESIDENT_SHARE = 0.6
 # Threads that read side by side, and what each holds between the file and the device.
 _READERS = min(4, os.cpu_count() or 1)
 _STAGING_BYTES = 64 * 2**20
+SLAB_ENTRIES = 2**26  # values of a slab: 0.5 GiB in float64
 
 Indices = slice | Sequence[int] | np.ndarray | Tensor
 
@@ -110,6 +111,13 @@ class Snapshots:
             [M,n,c] float32; on resident data a slice is a view, not to be written to.
         """
         return self.gather(field, slice(None), particles)
+
+    def slabs(self, field: str) -> Iterator[tuple[slice, Float[Tensor, "row particle component"]]]:
+        """All frames of all particles, some particles at a time; arguments and result as of `slab`."""
+        width = max(1, SLAB_ENTRIES // (self.M * COMPONENTS[field]))
+        for start in range(0, self.P, width):
+            particles = slice(start, min(start + width, self.P))
+            yield particles, self.slab(field, particles)
 
     def gather(
         self, field: str, rows: Indices, particles: Indices

@@ -108,8 +108,8 @@ class BasisField:
                 f" field.modes > {latent_dim} or latent_dim <= {counts[0]}"
             )
         prepared = {}
-        for count, (name, components) in zip(counts, TARGETS.values(), strict=True):
-            coefficients, unresolved = pod.decompose(snapshots, name, components, count)
+        for count, (name, _) in zip(counts, TARGETS.values(), strict=True):
+            coefficients, unresolved = pod.decompose(snapshots, name, count)
             prepared[name] = {"coefficients": coefficients.cpu(), "unresolved": unresolved}
         rank = prepared["x"]["coefficients"].shape[1]
         if latent_dim > rank:
@@ -141,12 +141,10 @@ class BasisField:
             latent_dim, snapshots.x_sha256, list(snapshots.parameter_names), hyperparameters
         )
         manifold.describe(snapshots)
-        for phase, (name, components) in TARGETS.items():
-            field, coefficients = (
-                manifold.fields[phase],
-                prepared[name]["coefficients"].to(snapshots.X.device),
-            )
-            for particles, mean, modes in pod.modes(snapshots, name, components, coefficients):
+        for phase, (name, _) in TARGETS.items():
+            field = manifold.fields[phase]
+            coefficients = prepared[name]["coefficients"].to(snapshots.X.device)
+            for particles, mean, modes in pod.modes(snapshots, name, coefficients):
                 origin = manifold.X[particles].to(mean) if phase == "deformation" else 0
                 field.mean[particles], field.modes[particles] = mean - origin, modes.float()
             if field.network is not None:

@@ -13,27 +13,24 @@ from nsf.data import Snapshots
 MOST_SOLVED = 6000
 # Of the subspace iteration: turns, and columns beyond the modes that are wanted.
 _TURNS, _MORE = 6, 20
-SLAB_ENTRIES = 1 << 26  # float64 values of a slab: 0.5 GiB
 # Eigenvalues below this share of the largest are round-off: snapshots are float32, six digits of amplitude.
 RANK_TOLERANCE = 1e-12
 #: Fields whose modes are those of deviations from zero, their value at rest, in place of the mean.
 FROM_ZERO = ("tau",)
 
 
-def slabs(snapshots: Snapshots, name: str, components: int) -> Iterator[tuple[slice, Tensor, Tensor]]:
+def slabs(snapshots: Snapshots, name: str) -> Iterator[tuple[slice, Tensor, Tensor]]:
     """Particle slabs of a field: (particles, mean [n, c], deviations from it [M, n, c]) in float64.
 
     Of a field in `FROM_ZERO` the mean is given as zero.
     """
-    width = max(1, SLAB_ENTRIES // (snapshots.M * components))
-    for start in range(0, snapshots.P, width):
-        particles = slice(start, min(start + width, snapshots.P))
-        values = snapshots.slab(name, particles).double()
+    for particles, values in snapshots.slabs(name):
+        values = values.double()
         mean = torch.zeros_like(values[0]) if name in FROM_ZERO else values.mean(0)
         yield particles, mean, values - mean
 
 
-def decompose(snapshots: Snapshots, name: str, components: int, count: int) -> tuple[Tensor, float]:
+def decompose(snapshots: Snapshots, name: str, count: int) -> tuple[Tensor, float]:
     """Coefficients of the snapshots in their leading modes.
 
     With deviations A [M, P c] (`slabs`): A Aᵀ = V diag(w) Vᵀ, coefficients a = V √w, and the modes are
@@ -43,7 +40,7 @@ def decompose(snapshots: Snapshots, name: str, components: int, count: int) -> t
 
     Args:
         snapshots: of every training frame.
-        name, components: field of the snapshots.
+        name: field of the snapshots.
         count: modes wanted; fewer come back if the snapshots have a lower numerical rank.
 
     Returns:
@@ -51,31 +48,31 @@ def decompose(snapshots: Snapshots, name: str, components: int, count: int) -> t
         the energy, 1 − Σ a² / ‖A‖².
     """
     if snapshots.M <= MOST_SOLVED:
-        G = _gram(snapshots, name, components)
+        G = _gram(snapshots, name)
         energies, vectors = torch.linalg.eigh(G)
         a, total = _coefficients(energies.flip(0), vectors.flip(1), count), float(G.diagonal().sum())
     else:
-        a, total = _iterated(snapshots, name, components, count)
+        a, total = _iterated(snapshots, name, count)
     return a, max(0.0, 1 - float(a.square().sum()) / total) if total > 0 else 0.0
 
 
-def _gram(snapshots: Snapshots, name: str, components: int) -> Tensor:
+def _gram(snapshots: Snapshots, name: str) -> Tensor:
     """A Aᵀ [M, M] of a field's deviations A [M, P c] (`slabs`)."""
     G = torch.zeros(snapshots.M, snapshots.M, dtype=torch.float64, device=snapshots.X.device)
-    for _, _, deviations in slabs(snapshots, name, components):
+    for _, _, deviations in slabs(snapshots, name):
         rows = deviations.flatten(1)
         G.addmm_(rows, rows.T)
     return G
 
 
-def _iterated(snapshots: Snapshots, name: str, components: int, count: int) -> tuple[Tensor, float]:
+def _iterated(snapshots: Snapshots, name: str, count: int) -> tuple[Tensor, float]:
     """Coefficients as of `decompose` and the energy ‖A‖²; the Gram matrix is not formed."""
     generator = torch.Generator().manual_seed(0)
     shape = snapshots.M, min(count + _MORE, snapshots.M)
     V = torch.randn(shape, generator=generator, dtype=torch.float64).to(snapshots.X.device)
     for _ in range(_TURNS):
         Q, V, total = torch.linalg.qr(V).Q, torch.zeros_like(V), 0.0
-        for _, _, deviations in slabs(snapshots, name, components):
+        for _, _, deviations in slabs(snapshots, name):
             rows = deviations.flatten(1)
             V.addmm_(rows, rows.T @ Q)
             total += float(rows.square().sum())
@@ -90,10 +87,8 @@ def _coefficients(energies: Tensor, vectors: Tensor, count: int) -> Tensor:
     return vectors[:, :modes] * energies[:modes].sqrt()
 
 
-def modes(
-    snapshots: Snapshots, name: str, components: int, coefficients: Tensor
-) -> Iterator[tuple[slice, Tensor, Tensor]]:
+def modes(snapshots: Snapshots, name: str, coefficients: Tensor) -> Iterator[tuple[slice, Tensor, Tensor]]:
     """Slab by slab: (particles, mean [n, c], modes [n, c, K]) in float64, for coefficients [M, K]."""
     projection = coefficients / coefficients.square().sum(0)
-    for particles, mean, deviations in slabs(snapshots, name, components):
+    for particles, mean, deviations in slabs(snapshots, name):
         yield particles, mean, torch.einsum("mnc,mk->nck", deviations, projection)

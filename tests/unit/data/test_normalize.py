@@ -3,14 +3,14 @@
 import pytest
 import torch
 
-from nsf.data import Snapshots, Standardizer, normalize
+from nsf.data import Snapshots, Standardizer, snapshots
 from nsf.errors import ShapeError
 
 
 def test_of_snapshots_is_that_of_all_values_at_once(write, monkeypatch):
     snaps = Snapshots([write("a.h5")[0], write("b.h5", seed=50)[0]], resident=False)
     values = snaps.slab("tau", slice(None)).double().reshape(-1, 6)
-    monkeypatch.setattr(normalize, "_BLOCK_BYTES", 8 * 9 * snaps.M * 2)  # two particles a block
+    monkeypatch.setattr(snapshots, "SLAB_ENTRIES", 6 * snaps.M * 2)  # two particles a block
     scale = Standardizer.of(snaps, "tau")
     assert torch.allclose(scale.mean.double(), values.mean(0), rtol=1e-6)
     assert torch.allclose(scale.std.double(), values.std(0, unbiased=False), rtol=1e-6)

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from nsf.data import Snapshots, snapshots
 from nsf.errors import ConfigError
 from nsf.kinematics.fields import pod
 from nsf.kinematics.fields.basis import BasisField
@@ -19,6 +20,8 @@ M, P, RANK = 30, 120, 4
 
 class LowRank(SimpleNamespace):
     """Snapshots of rank 4 in x and 3 in tau, and none in C; the methods of `nsf.data.Snapshots`."""
+
+    slabs = Snapshots.slabs
 
     def slab(self, name, particles):
         return self.data[name][:, particles]
@@ -54,11 +57,11 @@ def low_rank():
 
 
 def test_exact_and_orthonormal(low_rank, monkeypatch):
-    monkeypatch.setattr(pod, "SLAB_ENTRIES", 7 * 3 * M)  # several slabs, the last one shorter
-    coefficients, unresolved = pod.decompose(low_rank, "x", 3, 20)
+    monkeypatch.setattr(snapshots, "SLAB_ENTRIES", 7 * 3 * M)  # several slabs, the last one shorter
+    coefficients, unresolved = pod.decompose(low_rank, "x", 20)
     assert coefficients.shape == (M, RANK)
     assert unresolved < 1e-10
-    _, mean, modes = zip(*pod.modes(low_rank, "x", 3, coefficients), strict=True)
+    _, mean, modes = zip(*pod.modes(low_rank, "x", coefficients), strict=True)
     mean, modes = torch.cat(mean), torch.cat(modes)
     x = mean + torch.einsum("mk,nck->mnc", coefficients, modes)
     torch.testing.assert_close(x, low_rank.data["x"].double(), rtol=0, atol=1e-5)
@@ -67,7 +70,7 @@ def test_exact_and_orthonormal(low_rank, monkeypatch):
 
 
 def test_unresolved_energy(low_rank):
-    coefficients, unresolved = pod.decompose(low_rank, "x", 3, 2)
+    coefficients, unresolved = pod.decompose(low_rank, "x", 2)
     deviations = (low_rank.data["x"] - low_rank.data["x"].mean(0)).double()
     assert unresolved == pytest.approx(
         1 - float(coefficients.square().sum() / deviations.square().sum()), abs=1e-6
@@ -88,15 +91,15 @@ def many(low_rank):
 
 
 def test_many_snapshots_have_the_same_modes_without_their_gram_matrix(many, monkeypatch):
-    exact, unresolved = pod.decompose(many, "x", 3, 5)
+    exact, unresolved = pod.decompose(many, "x", 5)
     monkeypatch.setattr(pod, "MOST_SOLVED", M - 1)
     monkeypatch.setattr(pod, "_MORE", 8)
     monkeypatch.setattr(pod, "_gram", None)
-    found, left_out = pod.decompose(many, "x", 3, 5)
+    found, left_out = pod.decompose(many, "x", 5)
     assert left_out == pytest.approx(unresolved, rel=1e-3)
     signs = (found * exact).sum(0).sign()
     torch.testing.assert_close(found * signs, exact, rtol=0, atol=1e-3 * float(exact.abs().max()))
-    modes = torch.cat([values for *_, values in pod.modes(many, "x", 3, found)]).flatten(0, 1)
+    modes = torch.cat([values for *_, values in pod.modes(many, "x", found)]).flatten(0, 1)
     torch.testing.assert_close(modes.T @ modes, torch.eye(5, dtype=torch.float64), rtol=0, atol=1e-9)
 
 
