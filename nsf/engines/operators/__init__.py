@@ -10,7 +10,7 @@ from nsf.extras import on_first_use
 if TYPE_CHECKING:
     from nsf.engines.operators.engine import Operators
     from nsf.engines.operators.lessons import Yardstick
-    from nsf.engines.operators.model import Sizes, StepOperators, Terms
+    from nsf.engines.operators.model import Sizes, StepOperators
     from nsf.engines.operators.states import collider_states, mirrored_states, principal
     from nsf.engines.operators.taught import Taught
     from nsf.engines.operators.teach import Course
@@ -27,7 +27,6 @@ __all__ = [
     "Taught",
     "Teacher",
     "Teaching",
-    "Terms",
     "Yardstick",
     "collider_states",
     "mirrored_states",

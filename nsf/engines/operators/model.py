@@ -62,15 +62,6 @@ class Sizes:
         return self.latents * (self.latents + 1 + 3 * self.gravity)
 
 
-@dataclass(frozen=True)
-class Terms:
-    """B [..., r, r], f [..., r] [1/s²] and G [..., r, 3] [1/m], None without gravity."""
-
-    B: Tensor
-    f: Tensor
-    G: Tensor | None
-
-
 class StepOperators(nn.Module):
     """A network of two hidden SiLU layers that gives B, f and G.
 
@@ -134,32 +125,6 @@ class StepOperators(nn.Module):
         """The lags [B, lags] at the end of runs [B, n + 1, r] from t = 0 on."""
         return self.lags_along(torch.diff(runs.detach().to(self.x_mean), dim=1).transpose(0, 1))[-1]
 
-    def _outputs(
-        self, xhat: Tensor, parameters: Tensor, c: Tensor, lag: Tensor | None
-    ) -> tuple[Tensor, Tensor, Tensor | None]:
-        """B, f and G in units of the scales, f at the mean gravity."""
-        r, lead = self.sizes.latents, xhat.shape[:-1]
-        given = [(xhat - self.x_mean) / self.x_scale, (parameters - self.mu_mean) / self.mu_scale, c]
-        if self.sizes.memory:
-            given.append(lag / self.lag_scale)
-        out = self.net(torch.cat([values.expand(*lead, values.shape[-1]) for values in given], -1))
-        B, f = out[..., : r * r].unflatten(-1, (r, r)), out[..., r * r : r * r + r]
-        return B, f, out[..., r * r + r :].unflatten(-1, (r, 3)) if self.sizes.gravity else None
-
-    def terms(self, xhat: Tensor, parameters: Tensor, c: Tensor, lag: Tensor | None = None) -> Terms:
-        """B, f and G at latent vectors.
-
-        Args:
-            xhat: [..., r]; parameters: μ [..., n] or [n]; c: [..., C] or [C].
-            lag: [..., lags], asked for with a memory.
-        """
-        B, f, G = self._outputs(xhat, parameters, c, lag)
-        B = self.a_scale[:, None] * B / self.d_scale
-        if G is not None:
-            f = f - G @ (self.g_mean / self.g_scale)
-            G = self.a_scale[:, None] * G / (self.g_scale * self.dt**2)
-        return Terms(B, self.a_scale * f / self.dt**2, G)
-
     def acceleration(
         self,
         xhat: Tensor,
@@ -170,9 +135,15 @@ class StepOperators(nn.Module):
         lag: Tensor | None = None,
     ) -> Tensor:
         """d' − d [..., r]; arguments as for `step`."""
-        B, f, G = self._outputs(xhat, parameters, c, lag)
+        r, lead = self.sizes.latents, xhat.shape[:-1]
+        given = [(xhat - self.x_mean) / self.x_scale, (parameters - self.mu_mean) / self.mu_scale, c]
+        if self.sizes.memory:
+            given.append(lag / self.lag_scale)
+        out = self.net(torch.cat([values.expand(*lead, values.shape[-1]) for values in given], -1))
+        B, f = out[..., : r * r].unflatten(-1, (r, r)), out[..., r * r : r * r + r]
         found = (B @ (change / self.d_scale)[..., None])[..., 0] + f
-        if G is not None:
+        if self.sizes.gravity:
+            G = out[..., r * r + r :].unflatten(-1, (r, 3))
             found = found + (G @ ((gravity - self.g_mean) / self.g_scale)[..., None])[..., 0]
         return self.a_scale * found
 
@@ -194,26 +165,6 @@ class StepOperators(nn.Module):
         """
         change = change + self.acceleration(xhat, change, parameters, gravity, c, lag)
         return xhat + change, change
-
-    def run(self, xhat: Tensor, change: Tensor, parameters: Tensor, gravity: Tensor, c: Tensor) -> Tensor:
-        """A run, differentiable in all that it is given and in the weights.
-
-        Args:
-            xhat, change: [..., r] x̂_0 and what stands for d at t = 0 (`first_change`).
-            parameters: μ [..., n].
-            gravity: [N, ..., 3] [m/s²] of each step, or [3] of all.
-            c: [N, ..., C] of each step, or [N, C].
-
-        Returns:
-            [N + 1, ..., r] latent vectors.
-        """
-        found, lag = [xhat], xhat.new_zeros(*xhat.shape[:-1], self.sizes.lags)
-        for n, state in enumerate(c):
-            g = gravity if gravity.ndim == 1 else gravity[n]
-            xhat, change = self.step(xhat, change, parameters, g, state, lag)
-            lag = self.next_lag(lag, change)
-            found.append(xhat)
-        return torch.stack(found)
 
     def scaled_layers(self) -> list[tuple[Tensor, Tensor]]:
         """Weights [out, in] and biases [out] of the same network with the scales in them, as the loop has it.
