@@ -49,7 +49,7 @@ $(DEVELOPED): $(INSTALLED)
 	$(BIN)/python -m pip install $(CPU_TORCH) $(TORCH) -e '.[dev]'
 	@touch $@
 
-quickstart: install  ## a column of sand in a minute, from simulation to report, by two engines
+quickstart: install  ## a column of sand in a minute, from simulation to report, by two models
 	$(BIN)/nsf run +experiment=quickstart
 	@echo
 	@echo 'Next, the page above in a browser, and'
