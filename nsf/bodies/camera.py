@@ -20,8 +20,8 @@ _SHADOW, _EDGE = 0.20, 0.45  # how dark a shadow is, and an edge of a solid
 _GLAZE = 0.06  # white mixed in, so that the dark end of a colour map still shows its shape
 _SMOOTH = 0.9  # radii of a point, over which depth and colour are smooth
 _GRAINS = (3.0, 12.0)  # radii [sample] between which points turn from a surface into balls
-_LARGE = 16  # radius [sample] above which balls are drawn one by one, which is faster then
-_CASTERS = 60_000  # points that throw a shadow
+_LARGE = 6  # radius [sample] above which balls are drawn one by one, which is faster then
+_CASTERS = 20_000  # points that throw a shadow
 _BEYOND = 0.35  # of the body's extent: how far a window opens for the solids beside it
 _OVERSAMPLE = 2
 
@@ -183,10 +183,12 @@ class View:
     def _shade(self, face: Face, x: np.ndarray, canvas: np.ndarray, radius: float, scale: float) -> None:
         """The shadow of the points on a face."""
         light, normal = _LIGHT @ self.camera.axes, face.normal
-        if light @ normal < 0.1 or not len(x):
+        above = (x - face.corners[0]) @ normal
+        rows = np.flatnonzero(above > -radius)
+        if light @ normal < 0.1 or not len(rows):
             return
-        x = x[:: -(-len(x) // _CASTERS)]
-        fallen = x - (((x - face.corners[0]) @ normal) / (light @ normal))[:, None] * light
+        rows = rows[:: -(-len(rows) // _CASTERS)]
+        fallen = x[rows] - (above[rows] / (light @ normal))[:, None] * light
         shape = canvas.shape[:2]
         _, owner, _ = _balls(self._pixels(self.camera.project(fallen), scale), radius, scale, shape, 0.35)
         shadow = (owner >= 0).astype(np.float32)
@@ -240,9 +242,10 @@ def _surface(covered, depth, colors, normals, radius: float, scale: float) -> np
     normal = (1 - grains) * melted + grains * normals
     facing = normal @ _LIGHT.astype(np.float32) / np.maximum(np.linalg.norm(normal, axis=-1), 1e-6)
     tone = (_AMBIENT + (1 - _AMBIENT) * np.clip(facing, 0.0, 1.0)) * _occlusion(covered, even, radius, scale)
-    smooth = np.stack([_blurred(colors[..., k] * weight, reach) / total for k in range(3)], axis=-1)
-    mixed = (1 - grains) * smooth + grains * colors
-    return (_GLAZE + (1 - _GLAZE) * mixed) * tone[..., None]
+    if grains < 1.0:
+        smooth = np.stack([_blurred(colors[..., k] * weight, reach) / total for k in range(3)], axis=-1)
+        colors = (1 - grains) * smooth + grains * colors
+    return (_GLAZE + (1 - _GLAZE) * colors) * tone[..., None]
 
 
 def _balls(centre: np.ndarray, radius: float, scale: float, shape, squash: float = 1.0):
