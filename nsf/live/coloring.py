@@ -1,7 +1,6 @@
 """Quantities by which the page of `nsf view` colours particles, on scales that are the same in every case."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -28,12 +27,8 @@ STRESS, PRESSURE, DISPLACEMENT, DISTANCE, SETS = (
 )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Shades:
-    """Values [n] over the end of their scale, of the reduced run and of the full-order one (or None)."""
-
-    reduced: np.ndarray
-    full: np.ndarray | None
+#: Values [n] over the end of their scale, of the reduced run and of the full-order one where there is one.
+Shades = tuple[np.ndarray, np.ndarray | None]
 
 
 class Coloring:
@@ -78,7 +73,7 @@ class Coloring:
             return self._over(by, roles, roles if truth else None)
         if by == DISTANCE:
             if truth is None:
-                return Shades(np.full(len(X), UNKNOWN, np.float32), None)
+                return np.full(len(X), UNKNOWN, np.float32), None
             apart = np.linalg.norm(run.positions(step) - truth.positions(t), axis=1)
             return self._over(by, apart, np.zeros(len(X)))
         if by == DISPLACEMENT:
@@ -97,7 +92,7 @@ class Coloring:
         def shade(values: np.ndarray) -> np.ndarray:
             return np.clip((np.nan_to_num(values, nan=top) - low) / (top - low), 0.0, 1.0).astype(np.float32)
 
-        return Shades(shade(reduced), None if full is None else shade(full))
+        return shade(reduced), None if full is None else shade(full)
 
 
 def _scale(title: str, unit: str, top: float, cmap: str, signed: bool = False) -> dict:

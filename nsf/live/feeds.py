@@ -102,15 +102,15 @@ class PointFeed(LatentFeed):
         if key == self._drawn[0]:
             return self._drawn[1]
         truth = self.truth(moment)
-        shades = self._coloring.shades(moment, truth, self.color)
+        shade, full = self._coloring.shades(moment, truth, self.color)
         rate = run.reached / run.seconds if run.seconds else 0.0
         arrays = {
             "moment": np.array([moment.t, moment.trust, step, rate], np.float32),
-            "x": run.positions(step), "shade": shades.reduced,
+            "x": run.positions(step), "shade": shade,
             "roles": self._model.roles(step).astype(np.uint8),
         }  # fmt: skip
         if truth is not None:
-            arrays |= {"full.x": truth.positions(moment.t), "full.shade": shades.full}
+            arrays |= {"full.x": truth.positions(moment.t), "full.shade": full}
         self._drawn = key, page.packed({}, arrays)
         return self._drawn[1]
 

@@ -187,7 +187,6 @@ export class LivePlayer extends Live {
     const { told } = this, first = (told.dt * told.steps) / SHOWN_IN, off = (/** @type {number} */ v) => Math.abs(Math.log(v / first));
     this.about = `a reduced model that runs in this page: ${counted(told.points, told.particles)}, ${told.latents} latent coordinates, ${told.run}`;
     this.color = this.stress ? "von_mises" : "displacement";
-    this.remote = false;
     this.pace = 1 / told.dt;
     this.speeds = SPEEDS.map((v) => /** @type {[string, string]} */ ([String(v), `${v} ×`]));
     this.speed = String(SPEEDS.reduce((best, own) => (off(own) < off(best) ? own : best)));
@@ -208,14 +207,6 @@ export class LivePlayer extends Live {
 
   get length() {
     return Math.max(this.told.steps, this.byHand ? this.run.steps : 0);
-  }
-
-  play() {}
-
-  paint() {}
-
-  fresh() {
-    return false;
   }
 
   reset() {

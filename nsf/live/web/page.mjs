@@ -19,21 +19,21 @@ import { StreamPlayer } from "./stream.mjs";
  * @property {number} end the last value of the cursor
  * @property {number} length of the slider of the cursor
  * @property {number} t [s]
- * @property {boolean} remote whether a server says what plays
- * @property {boolean} stuck whether it cannot go on
+ * @property {boolean} [remote] whether a server says what plays
+ * @property {boolean} [stuck] whether it cannot go on
  * @property {number} pace by which the cursor goes on in a second
  * @property {[string, string][]} speeds factors of the pace that can be chosen; none where a server has the pace
  * @property {string} speed
  * @property {(cursor: number) => void} seek
- * @property {(on: boolean) => void} play
- * @property {(color: string) => void} paint
- * @property {(page: Page) => Node[]} controls of its own, between those of time and of the picture
+ * @property {(on: boolean) => void} [play] asks a server to
+ * @property {(color: string) => void} [paint] asks a server to
+ * @property {(page: Page) => Node[]} [controls] of its own, between those of time and of the picture
  * @property {(drawing: Drawing) => void} place makes its bodies
  * @property {(color: string) => void} draw puts the moment into its bodies
- * @property {() => { light: Light | null, note: string }} tell
- * @property {(() => void) | null} reset
+ * @property {() => { light: Light, note: string }} [tell]
+ * @property {() => void} [reset]
  * @property {(dx: number, dy: number) => boolean} [drag] whether a drag on the picture is not the camera's
- * @property {() => boolean} fresh whether a server has sent anything new
+ * @property {() => boolean} [fresh] whether a server has sent anything new
  */
 
 const HOLD = 0.7; // [s] for which the end stands before the run begins again
@@ -62,7 +62,7 @@ export class Page {
   /** Play or pause. @param {boolean} on */
   set(on) {
     const { player, state } = this;
-    player.play(on);
+    player.play?.(on);
     if (player.remote) return;
     if (on && player.cursor >= player.end) player.seek(0);
     this.playing(on);
@@ -86,7 +86,7 @@ export class Page {
   paint(color) {
     const { told } = this.player, quantity = told.quantities[color];
     this.state.color = find("color").value = color;
-    this.player.paint(color);
+    this.player.paint?.(color);
     this.drawing.paint(quantity.colors ?? told.colors);
     legend(quantity, quantity.colors ?? told.colors);
     this.change();
@@ -110,7 +110,7 @@ export class Page {
   next(now) {
     const { player, state } = this, passed = Math.max(0, Math.min(0.2, (now - this.last) / 1000));
     this.last = now;
-    if (player.remote) state.changed ||= player.fresh();
+    if (player.remote) state.changed ||= player.fresh?.() ?? false;
     else if (state.playing) this._goOn(passed);
     if (this.pace.draws(now, state.changed)) {
       state.changed = false;
@@ -132,10 +132,10 @@ export class Page {
     const slider = find("frame");
     slider.max = String(player.length);
     if (!slider.matches(":active")) slider.value = String(Math.round(player.cursor));
-    const { light, note } = player.tell();
-    find("light").hidden = light === null;
-    if (light) lit(light);
-    find("note").textContent = note;
+    const said = player.tell?.();
+    find("light").hidden = !said;
+    if (said) lit(said.light);
+    find("note").textContent = said?.note ?? "";
     document.body.dataset.cursor = player.cursor.toFixed(2);
   }
 
@@ -174,7 +174,7 @@ export class Page {
       element("div", { className: "row" }, element("output", { id: "time" }),
         ...(player.speeds.length ? [choice("speed", "speed", player.speeds, player.speed, () => {})] : [])),
       element("div", { id: "light", role: "status" }),
-      ...player.controls(this),
+      ...(player.controls?.(this) ?? []),
       choice("color", "colour", colors, player.color, (color) => this.paint(color)),
       cut,
       element("small", { id: "note" }),

@@ -16,11 +16,9 @@ export class RecordedPlayer {
     /** @type {string} */ this.color = told.color;
     this.cursor = 0;
     this.end = this.length = run.frames - 1;
-    this.remote = this.stuck = false;
     /** @type {number} */ this.pace = told.fps;
     this.speeds = ["0.25", "0.5", "1", "2"].map((v) => /** @type {[string, string]} */ ([v, `${v} ×`]));
     this.speed = "1";
-    this.reset = null;
   }
 
   get t() {
@@ -33,14 +31,6 @@ export class RecordedPlayer {
     this.cursor = cursor;
   }
 
-  play() {}
-
-  paint() {}
-
-  controls() {
-    return [];
-  }
-
   /** @param {import("./drawing.mjs").Drawing} drawing */
   place(drawing) {
     this.body = drawing.body(this.run.rest);
@@ -51,13 +41,5 @@ export class RecordedPlayer {
   draw(color) {
     const { x, stressOf } = this.run.at(this.cursor), { top } = this.told.quantities.displacement;
     this.body?.show(x, color === "von_mises" ? stressOf : (rows) => displacement(x, this.run.rest, top, rows));
-  }
-
-  tell() {
-    return { light: null, note: "" };
-  }
-
-  fresh() {
-    return false;
   }
 }

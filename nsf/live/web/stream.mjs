@@ -27,12 +27,10 @@ export class StreamPlayer {
     this.field = told.fields ? new Field(packed, "deformation") : null;
     this.color = told.color ?? "displacement";
     this.remote = true;
-    this.stuck = false;
     this.cursor = this.t = this.pace = 0;
     this.end = this.length = told.steps ?? 0;
     /** @type {[string, string][]} */ this.speeds = [];
     this.speed = "1";
-    this.reset = null;
     this.once = buffer.byteLength;
     this.received = { frames: 0, bytes: 0 };
     this.rate = { frames: 0, bytes: 0 }; // in the last second

@@ -79,7 +79,7 @@ def test_the_newest_run_is_named(export, deployed):
     [
         (["--html", "zzz"], ["no deploy run is, or begins with, 'zzz'", "deploy/sand/"]),
         (["--gltf"], ["unrecognized arguments: --gltf", "nsf export --help"]),
-        ([], ["no format; give one or more of --html, --usd, --vtk, --onnx, --frames"]),
+        ([], ["no format; give one or more of --html, --live, --usd, --vtk, --onnx, --frames"]),
         (["--vtk", "--points", "0"], ["points=0", "at least 1"]),
         (["--vtk", "--points", "-3"], ["points=-3", "at least 1"]),
         (["--vtk", "--points", "many"], ["--points", "many"]),

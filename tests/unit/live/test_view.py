@@ -34,20 +34,20 @@ def test_every_colouring_of_every_moment(model, coloring, run):
     for by in coloring.quantities:
         for step in (0, run.steps):
             for beside in (truth, None):
-                shades = coloring.shades(Moment(run, step), beside, by)
-                assert shades.reduced.shape == (200,)
-                assert shades.reduced.dtype == np.float32
-                assert (shades.full is None) == (beside is None)
-                assert shades.reduced.max() <= 1.0
+                reduced, full = coloring.shades(Moment(run, step), beside, by)
+                assert reduced.shape == (200,)
+                assert reduced.dtype == np.float32
+                assert (full is None) == (beside is None)
+                assert reduced.max() <= 1.0
 
 
 def test_shades_say_what_they_are_of(model, coloring, run):
     truth, end = model.truth(angle(26.0)), Moment(run, run.steps)
-    assert coloring.shades(Moment(run, 0), truth, "displacement").reduced.max() < 5e-3
-    assert np.ptp(coloring.shades(end, truth, "displacement").reduced) > 0.3
-    assert not coloring.shades(end, truth, DISTANCE).full.any()
-    assert (coloring.shades(end, None, DISTANCE).reduced == UNKNOWN).all()  # grey, not small
-    sets = coloring.shades(end, truth, SETS).reduced
+    assert coloring.shades(Moment(run, 0), truth, "displacement")[0].max() < 5e-3
+    assert np.ptp(coloring.shades(end, truth, "displacement")[0]) > 0.3
+    assert not coloring.shades(end, truth, DISTANCE)[1].any()
+    assert (coloring.shades(end, None, DISTANCE)[0] == UNKNOWN).all()  # grey, not small
+    sets = coloring.shades(end, truth, SETS)[0]
     np.testing.assert_array_equal(sets, model.roles(run.steps) / 2)
     low, top = (coloring.quantities[PRESSURE][end] for end in ("low", "top"))
     assert low == -top

@@ -19,7 +19,7 @@ const near = (found, wanted, off = 1e-12) => {
   wanted.forEach((value, i) => assert.ok(Math.abs(found[i] - value) <= off, `${found} is not ${wanted}`));
 };
 
-/** A buffer as `nsf.export.web.packed` makes it. */
+/** A buffer as `nsf.live.page.packed` makes it. */
 function packed(header, arrays) {
   const kinds = new Map([[Float32Array, "f4"], [Float64Array, "f8"], [Int16Array, "i2"], [Uint8Array, "u1"]]);
   const told = Object.fromEntries(Object.entries(arrays).map(([k, a]) => [k, { shape: [a.length], type: kinds.get(a.constructor) }]));
