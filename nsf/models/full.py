@@ -1,6 +1,7 @@
 """The full-order solver as a model, to stand in a table beside the others."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 from typing_extensions import override
 
@@ -11,6 +12,8 @@ from nsf.models.base import Model
 @dataclass(frozen=True)
 class FullOrder(Model):
     """The full-order run itself, so that δ is 0."""
+
+    projects: ClassVar[bool] = True  # under one's hands, in `nsf view`
 
     @override
     def refuse(self, names) -> None:

@@ -68,7 +68,10 @@ class Pipeline(Plan):
         if isinstance(scene := config.get("scene"), DictConfig) and "design" not in scene:
             raise run.of_earlier()
         config.device = device
-        return cls(config, say, run.root)
+        pipeline = cls(config, say, run.root)
+        if isinstance(pipeline.configured, Auto):
+            pipeline.choose(run.manifest["metrics"]["model"])
+        return pipeline
 
     def run(self, stage: str) -> Run | Path:
         """One stage by name; what it reads must be there, except that `simulate` needs nothing.

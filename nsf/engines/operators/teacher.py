@@ -46,15 +46,6 @@ class Teacher:
     def __len__(self) -> int:
         return len(self.parameters)
 
-    @property
-    def known_gravity(self) -> tuple[list[float], float]:
-        """The middle [3] of the runs' gravity, and how far from it any is, keyframes included [m/s²]."""
-        setups = [setup for batch in self._batches for setup in batch.batch.setups]
-        keyframes = np.concatenate([np.atleast_2d(setup.gravity.values) for setup in setups])
-        known = np.concatenate([self.gravity.flatten(0, 1).numpy(), keyframes])
-        middle = self.gravity.flatten(0, 1).mean(0).numpy()
-        return middle.tolist(), float(np.linalg.norm(known - middle, axis=1).max())
-
     def first_change(self) -> torch.Tensor:
         """[R, r] what stands for d at t = 0."""
         spans = [(batch.span_at(0), batch.batch.setups) for batch in self._batches]

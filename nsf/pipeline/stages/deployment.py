@@ -134,15 +134,21 @@ def _range_of_solids(pipeline) -> SolidsRange | None:
     return SolidsRange(np.stack([collider_states(run, scene.dt, scene.steps) for run in runs]), scene.dt)
 
 
-def _rollouts(pipeline, manifold: Manifold, record: Record) -> list[Rollout]:
-    """The reduced runs; how far they may be believed, and who takes their steps, go on record."""
-    started, asked = time.perf_counter(), pipeline.config.deploy
+def _calibrated(pipeline, manifold: Manifold, record: Record) -> Trust:
+    """The trust estimate, whose scales go on record."""
+    started = time.perf_counter()
     trust = calibrated(pipeline, manifold)
     record.metrics["trust"] = {
         "residual_m": trust.residual,
         "distance_m": trust.distance,
         "seconds": time.perf_counter() - started,
     }
+    return trust
+
+
+def _rollouts(pipeline, manifold: Manifold, record: Record) -> list[Rollout]:
+    """The reduced runs; how far they may be believed, and who takes their steps, go on record."""
+    asked, trust = pipeline.config.deploy, _calibrated(pipeline, manifold, record)
     # Runs that take their steps together share the time of these equally.
     together = record.metrics["batch"] = min(asked.batch, len(pipeline.held_out))
 
@@ -163,7 +169,7 @@ def _full_order(pipeline, manifold: Manifold, record: Record) -> list[Rollout]:
     """Runs that the full-order solver takes from t = 0; their trajectories are those of `simulate`."""
     runs, rollouts = pipeline.full_order(pipeline.held_out), []
     record.metrics |= {"engine": "full", "engine_why": "", "batch": 1}
-    record.metrics["trust"] = {"residual_m": 0.0, "distance_m": 0.0, "seconds": 0.0}
+    _calibrated(pipeline, manifold, record)
     for case, run in zip(pipeline.held_out, runs, strict=True):
         solver = pipeline.solver_at(manifold, case)
         rollouts.append(
