@@ -10,9 +10,8 @@ from nsf.extras import on_first_use
 if TYPE_CHECKING:
     from nsf.engines.base import Engine
     from nsf.engines.building import reduced, reduced_batch
-    from nsf.engines.choice import ENGINES, choose
+    from nsf.engines.choice import ENGINES, NAMES, choose
     from nsf.engines.modal import Modal
-    from nsf.engines.names import NAMES
     from nsf.engines.operators import Operators
     from nsf.engines.reference import Reference
 

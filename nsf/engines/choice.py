@@ -5,12 +5,12 @@ from collections.abc import Sequence
 from nsf.dynamics.setup import Setup
 from nsf.engines.base import Engine
 from nsf.engines.modal import Modal
-from nsf.engines.names import NAMES
 from nsf.engines.reference import Reference
 from nsf.errors import ConfigError
 
 #: From the fastest to the one that steps whatever can be stepped.
 ENGINES: tuple[Engine, ...] = (Modal(), Reference())
+NAMES = ("auto", *(engine.name for engine in ENGINES))
 
 
 def choose(wanted: str | Engine, setups: Sequence[Setup]) -> tuple[Engine, str]:

@@ -175,10 +175,7 @@ class Playback:
         self._xhat = torch.as_tensor(
             rollout.xhat[chosen[chosen < own]], dtype=self._dtype, device=self.device
         )
-        changes = np.diff(rollout.xhat[: max(own, 2)], axis=0)
-        self._rate = (np.concatenate([changes[:1], changes]) / (rollout.t[1] - rollout.t[0]))[
-            chosen[chosen < own]
-        ]
+        self._rate = _rates(rollout, max(own, 2))[chosen[chosen < own]]
         self._later = chosen[chosen >= own] - (own - 1)  # of the continuation, whose first frame is reduced
 
     def _choose_points(self, points: int | None) -> None:
@@ -352,6 +349,15 @@ class Playback:
         design = {"_target_": "nsf.scenes.Values", "train": [dict(self.case)], "test": []}
         content["scene"] = content["scene"] | {"parameters": parameters, "design": design}
         return Scene.from_config(OmegaConf.create(content)).with_parameters(self.case)
+
+
+def _rates(rollout: Rollout, frames: int) -> np.ndarray:
+    """[n, r] dx̂/dt [1/s] of the first frames; 0 of a run that was handed over before its first step."""
+    xhat = rollout.xhat[:frames]
+    if len(xhat) < 2:
+        return np.zeros_like(xhat)
+    changes = np.diff(xhat, axis=0)
+    return np.concatenate([changes[:1], changes]) / (rollout.t[1] - rollout.t[0])
 
 
 def _parent(run: Run) -> Run:
