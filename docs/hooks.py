@@ -5,7 +5,7 @@ from pathlib import Path
 
 from mkdocs.structure.files import File, Files
 
-from nsf.live.demo import MODELS
+from nsf.live.demo import MODELS, page_of
 
 ROOT = Path(__file__).parents[1]
 #: How a page beside this file shows one, so that the page reads well in the repository too.
