@@ -4,6 +4,7 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from nsf import usage
 from nsf.errors import ConfigError, NSFError
@@ -116,13 +117,26 @@ def _tool(name: str, words: list[str]) -> int:
         from nsf.live.command import main as live
 
         return live(name, text, words)
+    if name in ("calibrate", "design", "sample"):
+        from nsf.inverse.reports import command
+
+        return _open(getattr(command, name)(words))
     tools = {
-        "bench": _bench, "calibrate": _calibrate, "demo": _demo, "design": _design, "doctor": _doctor,
-        "export": _export,
-        "index": _index, "plan": _plan, "reports": _reports, "runs": _runs, "sample": _sample,
-        "search": _search,
+        "bench": _bench, "demo": _demo, "doctor": _doctor, "export": _export, "index": _index, "plan": _plan,
+        "reports": _reports, "runs": _runs, "search": _search,
     }  # fmt: skip
     return tools[name](words)
+
+
+def _open(page: Path) -> int:
+    """Say where a page is."""
+    print(f"open {page.resolve()}")
+    return 0
+
+
+def _reports_folder(*parts: str) -> Path:
+    """The folder of reports, or one in it."""
+    return Path(os.environ.get("NSF_REPORTS", "reports"), *parts)
 
 
 def _bench(words: list[str]) -> int:
@@ -132,27 +146,10 @@ def _bench(words: list[str]) -> int:
     )
     from nsf.bench import bench, table
 
-    folder = asked.pop("folder", os.path.join(os.environ.get("NSF_REPORTS", "reports"), "speed"))
+    folder = asked.pop("folder", _reports_folder("speed"))
     page = bench(folder, asked, lambda text: print(text, file=sys.stderr))
     _console().print(table(page.with_name("bench.csv")))
-    print(f"open {page.resolve()}")
-    return 0
-
-
-def _calibrate(words: list[str]) -> int:
-    """Parameters from observations."""
-    from nsf.inverse.reports.command import calibrate
-
-    print(f"open {calibrate(words).resolve()}")
-    return 0
-
-
-def _design(words: list[str]) -> int:
-    """A program of forcing that brings a target about."""
-    from nsf.inverse.reports.command import design
-
-    print(f"open {design(words).resolve()}")
-    return 0
+    return _open(page)
 
 
 def _doctor(words: list[str]) -> int:
@@ -177,21 +174,17 @@ def _demo(words: list[str]) -> int:
     asked = _asked("demo", words, "model", "folder", "open")
     from nsf.live.demo import show
 
-    folder = asked.get("folder", os.path.join(os.environ.get("NSF_REPORTS", "reports"), "demo"))
-    print(f"open {show(asked.get('model'), folder, asked.get('open', 'true')).resolve()}")
-    return 0
+    folder = asked.get("folder", _reports_folder("demo"))
+    return _open(show(asked.get("model"), folder, asked.get("open", "true")))
 
 
 def _index(words: list[str]) -> int:
     """The page of all runs."""
     asked = _asked("index", words, "folder")
-    folder = asked.get("folder", os.path.join(os.environ.get("NSF_REPORTS", "reports"), "runs"))
-    from pathlib import Path
-
+    folder = asked.get("folder", _reports_folder("runs"))
     from nsf.reporting.overview.index import write_index
 
-    print(f"open {write_index(Path(folder)).resolve()}")
-    return 0
+    return _open(write_index(Path(folder)))
 
 
 def _plan(words: list[str]) -> int:
@@ -226,11 +219,9 @@ def _reports(words: list[str]) -> int:
     asked = _asked("reports", words, "folder", "check")
     if asked.get("check", "true") not in ("true", "false"):
         raise ConfigError(f"check={asked['check']} must be true or false")
-    from pathlib import Path
-
     from nsf.reporting.committed import faults, write_list
 
-    folder = Path(asked.get("folder", os.environ.get("NSF_REPORTS", "reports")))
+    folder = Path(asked.get("folder", _reports_folder()))
     if not folder.is_dir():
         raise ConfigError(f"folder={folder} is no folder; name one that holds reports, or make one")
     if asked.get("check") != "true":
@@ -250,8 +241,7 @@ def _search(words: list[str]) -> int:
 
     chart = search(words)
     _console().print(best_table(chart.with_name("trials.csv")))
-    print(f"open {chart.resolve()}")
-    return 0
+    return _open(chart)
 
 
 def _runs(words: list[str]) -> int:
@@ -259,14 +249,6 @@ def _runs(words: list[str]) -> int:
     from nsf.reporting.overview.command import main as runs
 
     return runs(words, lambda table: _console().print(table))
-
-
-def _sample(words: list[str]) -> int:
-    """What drawn parameters bring about."""
-    from nsf.inverse.reports.command import sample
-
-    print(f"open {sample(words).resolve()}")
-    return 0
 
 
 def _stages(stage: str) -> tuple[str, ...]:

@@ -116,7 +116,7 @@ class Playback:
     Raises:
         ConfigError: the case was not deployed; a number is not positive; or points between the particles are
             asked of a run that the full-order solver went on with, a part that has no fields.
-        MissingRunError: the train run is not whole, or an earlier nsf made the run.
+        MissingRunError: the train run is not whole.
         SchemaError: the reduced run has other parameters than its manifold.
         DeviceError: there is no such device.
     """
@@ -139,8 +139,6 @@ class Playback:
         if not (fps > 0 and math.isfinite(fps)):
             raise ConfigError(f"fps={fps} must be positive and finite")
         self.run, self.color, self.every, self.fps, self._settings = run, color, every, fps, run.config
-        if "cases" not in self._settings:
-            raise run.of_earlier()
         index = _chosen(self._settings["cases"], parameter)
         self._training = _parent(run).require()
         self._warp_device = warp_device(device)

@@ -59,14 +59,9 @@ class Pipeline(Plan):
             say: as for `Pipeline`.
 
         Raises:
-            MissingRunError: the run was made by an earlier nsf, whose configuration says less.
+            SchemaError: the configuration is not there, or was changed after the run.
         """
-        path = run.path / CONFIGURATION
-        if not path.exists():
-            raise run.of_earlier()
         config = configuration.read(run.file(CONFIGURATION))
-        if isinstance(scene := config.get("scene"), DictConfig) and "design" not in scene:
-            raise run.of_earlier()
         config.device = device
         pipeline = cls(config, say, run.root)
         if isinstance(pipeline.configured, Auto):

@@ -81,7 +81,7 @@ class Names:
             )
         self.configured: Model = configuration.build(c.model, "model")
         self._chosen: Model | None = None
-        self.coarse = factors("evaluation.coarse", OmegaConf.select(c, "evaluation.coarse", default=[]))
+        self.coarse = factors("evaluation.coarse", c.evaluation.coarse)
         check_words(c)
         self.configured.refuse(self)
         self.deployed = self._changed(c.deploy.changes)

@@ -15,7 +15,7 @@ from nsf.runs.provenance import provenance
 from nsf.runs.record import Record
 from nsf.storage import clear_partial, in_use, locked, writing
 
-FORMAT = 1  # of the folder's layout; a new value gives every run a new hash
+FORMAT = 2  # of a folder and the keys of its configuration; a new value gives every run a new hash
 _LOCK = ".lock"
 _LISTED = 8  # runs that an error names
 
@@ -184,7 +184,7 @@ class Run:
             if not manifest:
                 return None
             if manifest["format"] != FORMAT:
-                return f"{MANIFEST} has format={manifest['format']}, and this nsf reads {FORMAT}"
+                return f"{MANIFEST} has format={manifest['format']}, of another nsf; this one reads {FORMAT}"
             if (manifest["stage"], manifest["scene"], manifest["hash"]) != (
                 self.stage,
                 self.scene,
@@ -303,13 +303,6 @@ class Run:
         told = f"{self.stage}: waiting for another process, which is making {self.id}"
         with locked(self.path / _LOCK, None if say is None else lambda: say(told)) as claimed:
             yield claimed
-
-    def of_earlier(self) -> MissingRunError:
-        """The error of a run that an earlier nsf made, in a form that is no longer read."""
-        return MissingRunError(
-            f"{self.path} was made by an earlier nsf; "
-            f"delete the folder and run `nsf {self.stage} scene={self.scene}` with the same keys"
-        )
 
     @contextmanager
     def record(

@@ -1,20 +1,15 @@
 """A scene of two parameters through every stage, whose cases a design draws."""
 
 import json
-import shutil
-from functools import partial
 
 import numpy as np
 import pandas as pd
 import pytest
-import yaml
 
 from nsf.data import Trajectory
 from nsf.deployment import Rollout, rollout_file
-from nsf.errors import ConfigError, MissingRunError
+from nsf.errors import ConfigError
 from nsf.export.playback import Playback
-from nsf.pipeline import Pipeline
-from nsf.runs import Run
 
 TWO = (
     "+scene.parameters.friction_angle.range=[22,38]",
@@ -119,21 +114,6 @@ def test_lessons_fill_the_box_of_training(pipeline_at, tmp_path):
     low, high = pipeline.split.box.T
     for case in (*between, *back):
         assert ((low <= case.numbers) & (case.numbers <= high)).all()
-
-
-def test_a_run_of_the_old_form_is_refused(made, seal, tmp_path):
-    """As an earlier nsf left it: one parameter with its values, and a deployment of numbers."""
-    pipeline, _ = made
-    shutil.copytree(pipeline.root, tmp_path / "runs")
-    run = Run.load(pipeline.deployment.id, tmp_path / "runs")
-    for name, keys in (("configuration.yaml", ("scene", "design")), ("config.yaml", ("cases",))):
-        content = yaml.safe_load((run.path / name).read_text())
-        del (content["scene"] if len(keys) > 1 else content)[keys[-1]]
-        (run.path / name).write_text(yaml.safe_dump(content))
-    seal(run)
-    for use in (Pipeline.of_run, partial(Playback, device="cpu")):
-        with pytest.raises(MissingRunError, match=r"was made by an earlier nsf; .*nsf deploy scene=sand"):
-            use(run)
 
 
 def test_too_few_training_cases_are_refused(pipeline_at, tmp_path):

@@ -107,7 +107,7 @@ DAMAGES = [
     rewritten("outputs-mapping", outputs={"path": "data.bin"}),
     rewritten("outputs-odd", outputs=[{"path": 5, "bytes": "x", "sha256": None}]),
     rewritten("outputs-outside", outputs=[{"path": "../data.bin", "bytes": 7, "sha256": "0" * 64}]),
-    rewritten("format", format=2),
+    rewritten("format", format=1),
     rewritten("hash", hash="0" * 12),
     rewritten("surrogate", error="\ud800"),
     replaced("manifest-list", "manifest.json", "[1, 2]"),
@@ -194,7 +194,7 @@ def test_runs_that_go_back_to_themselves_end(tmp_path):
         folder = tmp_path / own
         folder.mkdir(parents=True)
         (folder / "config.yaml").write_text("a: 1\n")
-        about = {"format": 1, "stage": "train", "scene": "sand", "hash": folder.name, "status": "complete"}
+        about = {"format": 2, "stage": "train", "scene": "sand", "hash": folder.name, "status": "complete"}
         above = [parents[i - 1]] * 2 + [own]
         (folder / "manifest.json").write_text(json.dumps(about | {"parents": above, "outputs": []}))
     with pytest.MonkeyPatch.context() as patch:

@@ -36,7 +36,7 @@ def recorded(run, text="payload", **metrics):
 
 
 def test_the_hash_is_that_of_the_documented_content(run):
-    content = '{"config":{"mu":5},"format":1,"parents":[],"scene":"sand","stage":"simulate"}'
+    content = '{"config":{"mu":5},"format":2,"parents":[],"scene":"sand","stage":"simulate"}'
     expected = hashlib.sha256(content.encode()).hexdigest()[:12]
     assert Run.open("simulate", "sand", {"mu": 5}, root=run.root).hash == expected
 
@@ -61,7 +61,7 @@ def test_everything_that_determines_the_content_changes_the_hash(tmp_path, monke
         Run.open("train", "sand", {"r": 5}, parents=[other]),
         Run.open("train", "sand", {"r": 5}, parents=[parent, other]),
     ]
-    monkeypatch.setattr(nsf.runs.run, "FORMAT", 2)
+    monkeypatch.setattr(nsf.runs.run, "FORMAT", 3)
     runs.append(Run.open("train", "sand", {"r": 5}))
     assert len({run.hash for run in runs}) == len(runs)
 
