@@ -185,6 +185,7 @@ def test_rm_says_what_was_made_from_a_run_and_takes_no_silence_for_yes(root, nsf
         (["rm", "yes=perhaps", "abc"], "must be true or false"),
         (["prune", "yes=perhaps"], "must be true or false"),
         (["prune", "stgae=train"], "did you mean stage"),
+        (["prune", "method=nsf"], "method was removed; set stress="),
         (["show"], "takes one run"),
     ],
 )

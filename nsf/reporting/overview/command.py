@@ -73,7 +73,7 @@ def main(words: Sequence[str], print_table: Callable[[object], object]) -> int:
         return _prune(words[1:])
     asked = _asked(words)
     sort = asked.pop("sort", "-created")
-    found = entries(asked, sort)
+    found = _matching(asked, sort)
     sorted_by = [sort.removeprefix("-")] if len(words) > len(asked) else []
     print_table(runs_table(found, [*asked, *sorted_by]))
     _tell(f"broken: {entry.run.path}: {entry.fault}" for entry in found if entry.fault)
@@ -88,6 +88,17 @@ def _asked(words: Sequence[str]) -> dict[str, str]:
     return dict(word.split("=", 1) for word in words)
 
 
+def _matching(asked: dict[str, str], sort: str = "-created") -> list[Entry]:
+    """The runs that pass all filters; a key that was removed is refused by naming its replacement."""
+    try:
+        return entries(asked, sort)
+    except ConfigError:
+        from nsf.config.removed import refuse_overrides  # with all of Hydra, for a mistake alone
+
+        refuse_overrides([*asked, sort.removeprefix("-")])
+        raise
+
+
 def _named(command: str, words: Sequence[str], count: int) -> list[Run]:
     if len(words) != count:
         wanted = "two runs" if count == 2 else "one run"
@@ -97,7 +108,7 @@ def _named(command: str, words: Sequence[str], count: int) -> list[Run]:
 
 def _verify(words: Sequence[str]) -> int:
     asked = _asked(words)
-    found = entries(asked, asked.pop("sort", "-created"))
+    found = _matching(asked, asked.pop("sort", "-created"))
     faults = [fault for entry in found for fault in entry.run.verify()]
     _tell(faults)
     _tell([f"{len(found)} runs, {len(faults)} faults"])
@@ -124,7 +135,7 @@ def _prune(words: Sequence[str]) -> int:
     results = asked.pop("results", "false") == "true"
     age = asked.pop("older", None)
     asked.pop("yes", None)
-    found: list[Entry] = entries(asked)
+    found = _matching(asked)
     if age is not None:
         found = older(found, age)
     return _delete(prunable(found, Run.find(), results), sure)

@@ -23,6 +23,7 @@ from nsf.storage import writing
 #: What tells variants apart, beside the fields: keys of the configuration, by the heading they get.
 _SETTINGS = {
     "model": "model.name",
+    "stress": "stress",
     "r": "latent_dim",
     "|S|": "sampler.size",
 }
