@@ -31,8 +31,6 @@ _KINDS = {
     "x_sha256": str,
     "parameter_names": list,
     "hyperparameters": dict,
-    "datasets": list,
-    "split": dict,
     "state": dict,
 }
 _MOST_LEAVES = 100_000  # of what a file holds beside its tensors

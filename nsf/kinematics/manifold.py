@@ -105,7 +105,6 @@ class Manifold(nn.Module, ABC):
         X: rest positions of the training particles [P, 3] m.
         training_latents: xhat of every training snapshot [M, r].
         training_parameters, training_times: their μ [M, n] and t [M] s.
-        datasets, split: provenance of the snapshots, plain containers.
     """
 
     def __init__(
@@ -116,8 +115,6 @@ class Manifold(nn.Module, ABC):
         self.x_sha256 = x_sha256
         self.parameter_names = tuple(parameter_names)
         self.hyperparameters = dict(hyperparameters)
-        self.datasets: list = []
-        self.split: dict = {}
         P, M, n = hyperparameters["particles"], hyperparameters["frames"], len(self.parameter_names)
         for name, shape in {
             "X": (P, 3),
@@ -224,8 +221,6 @@ class Manifold(nn.Module, ABC):
             "x_sha256": self.x_sha256,
             "parameter_names": list(self.parameter_names),
             "hyperparameters": self.hyperparameters,
-            "datasets": self.datasets,
-            "split": self.split,
             "state": dict(self.state_dict()),
         }
         with writing(Path(path)) as temporary, temporary.open("wb") as file:
@@ -259,7 +254,6 @@ class Manifold(nn.Module, ABC):
                 f"{path} names {content['manifold']} but its contents do not fit it"
                 f" ({first_line(error)}); train again with `nsf train`"
             ) from error
-        manifold.datasets, manifold.split = content["datasets"], content["split"]
         return manifold.requires_grad_(False).eval()
 
 

@@ -96,7 +96,7 @@ class BasisField:
         return BasisManifold
 
     def prepare(self, snapshots: Snapshots, latent_dim: int) -> dict[str, Any]:
-        """POD coefficients [M, K] of x, tau and C and the energy the modes leave out.
+        """POD coefficients [M, K] of x, tau and C.
 
         Raises:
             ConfigError: latent_dim exceeds the modes asked for, or the rank of the displacements.
@@ -107,11 +107,11 @@ class BasisField:
                 f"latent_dim={latent_dim} exceeds the {counts[0]} displacement modes; choose"
                 f" field.modes > {latent_dim} or latent_dim <= {counts[0]}"
             )
-        prepared = {}
-        for count, (name, _) in zip(counts, TARGETS.values(), strict=True):
-            coefficients, unresolved = pod.decompose(snapshots, name, count)
-            prepared[name] = {"coefficients": coefficients.cpu(), "unresolved": unresolved}
-        rank = prepared["x"]["coefficients"].shape[1]
+        prepared = {
+            name: pod.decompose(snapshots, name, count).cpu()
+            for count, (name, _) in zip(counts, TARGETS.values(), strict=True)
+        }
+        rank = prepared["x"].shape[1]
         if latent_dim > rank:
             raise ConfigError(
                 f"latent_dim={latent_dim} exceeds the rank {rank} of {snapshots.M} displacement snapshots;"
@@ -126,7 +126,7 @@ class BasisField:
         hyperparameters = {
             "particles": snapshots.P,
             "frames": snapshots.M,
-            "modes": [prepared[name]["coefficients"].shape[1] for name, _ in TARGETS.values()],
+            "modes": [prepared[name].shape[1] for name, _ in TARGETS.values()],
             "beta": list(per_phase("beta", self.beta)),
             "depth": self.depth,
             "members": self.members,
@@ -135,7 +135,6 @@ class BasisField:
             "head_parameters": self.head_parameters,
             "affine": self.affine,
             "free_at_rest": self.depth > 1 and _begin_free(snapshots),
-            "unresolved": [prepared[name]["unresolved"] for name, _ in TARGETS.values()],
         }
         manifold = self.manifold(
             latent_dim, snapshots.x_sha256, list(snapshots.parameter_names), hyperparameters
@@ -143,14 +142,14 @@ class BasisField:
         manifold.describe(snapshots)
         for phase, (name, _) in TARGETS.items():
             field = manifold.fields[phase]
-            coefficients = prepared[name]["coefficients"].to(snapshots.X.device)
+            coefficients = prepared[name].to(snapshots.X.device)
             for particles, mean, modes in pod.modes(snapshots, name, coefficients):
                 origin = manifold.X[particles].to(mean) if phase == "deformation" else 0
                 field.mean[particles], field.modes[particles] = mean - origin, modes.float()
             if field.network is not None:
                 field.network.initialise(generator)
             field.calibrate(coefficients)
-        coefficients = prepared["x"]["coefficients"][:, :latent_dim]
+        coefficients = prepared["x"][:, :latent_dim]
         manifold.training_latents.copy_(coefficients / manifold.fields["deformation"].leading)
         return manifold
 
@@ -167,9 +166,7 @@ class BasisField:
         for phase, (name, _) in TARGETS.items():
             field = manifold.fields[phase]
             if field.network is not None:
-                targets = (
-                    prepared[name]["coefficients"].to(field.scale)[:, field.leading.numel() :] / field.scale
-                )
+                targets = prepared[name].to(field.scale)[:, field.leading.numel() :] / field.scale
                 yield Fit(phase, field.network, self._loss(manifold, phase, targets.float()), pointwise=False)
 
     def _loss(self, manifold: BasisManifold, phase: str, targets: Tensor) -> Callable[..., Tensor]:

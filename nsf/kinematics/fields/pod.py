@@ -30,7 +30,7 @@ def slabs(snapshots: Snapshots, name: str) -> Iterator[tuple[slice, Tensor, Tens
         yield particles, mean, values - mean
 
 
-def decompose(snapshots: Snapshots, name: str, count: int) -> tuple[Tensor, float]:
+def decompose(snapshots: Snapshots, name: str, count: int) -> Tensor:
     """Coefficients of the snapshots in their leading modes.
 
     With deviations A [M, P c] (`slabs`): A Aᵀ = V diag(w) Vᵀ, coefficients a = V √w, and the modes are
@@ -44,16 +44,16 @@ def decompose(snapshots: Snapshots, name: str, count: int) -> tuple[Tensor, floa
         count: modes wanted; fewer come back if the snapshots have a lower numerical rank.
 
     Returns:
-        a [M, K] float64, largest mode first, in the field's unit times √(P c); and the unresolved share of
-        the energy, 1 − Σ a² / ‖A‖².
+        a [M, K] float64, largest mode first, in the field's unit times √(P c).
     """
     if snapshots.M <= MOST_SOLVED:
-        G = _gram(snapshots, name)
-        energies, vectors = torch.linalg.eigh(G)
-        a, total = _coefficients(energies.flip(0), vectors.flip(1), count), float(G.diagonal().sum())
+        energies, vectors = torch.linalg.eigh(_gram(snapshots, name))
     else:
-        a, total = _iterated(snapshots, name, count)
-    return a, max(0.0, 1 - float(a.square().sum()) / total) if total > 0 else 0.0
+        energies, vectors = _iterated(snapshots, name, count)
+    energies, vectors = energies.flip(0), vectors.flip(1)
+    rank = int((energies > RANK_TOLERANCE * energies[0].clamp_min(torch.finfo(torch.float64).tiny)).sum())
+    modes = min(count, rank)
+    return vectors[:, :modes] * energies[:modes].sqrt()
 
 
 def _gram(snapshots: Snapshots, name: str) -> Tensor:
@@ -65,26 +65,18 @@ def _gram(snapshots: Snapshots, name: str) -> Tensor:
     return G
 
 
-def _iterated(snapshots: Snapshots, name: str, count: int) -> tuple[Tensor, float]:
-    """Coefficients as of `decompose` and the energy ‖A‖²; the Gram matrix is not formed."""
+def _iterated(snapshots: Snapshots, name: str, count: int) -> tuple[Tensor, Tensor]:
+    """Leading w, the largest last, and V of the Gram matrix, which is not formed."""
     generator = torch.Generator().manual_seed(0)
     shape = snapshots.M, min(count + _MORE, snapshots.M)
     V = torch.randn(shape, generator=generator, dtype=torch.float64).to(snapshots.X.device)
     for _ in range(_TURNS):
-        Q, V, total = torch.linalg.qr(V).Q, torch.zeros_like(V), 0.0
+        Q, V = torch.linalg.qr(V).Q, torch.zeros_like(V)
         for _, _, deviations in slabs(snapshots, name):
             rows = deviations.flatten(1)
             V.addmm_(rows, rows.T @ Q)
-            total += float(rows.square().sum())
     energies, turn = torch.linalg.eigh(Q.T @ V)
-    return _coefficients(energies.flip(0), Q @ turn.flip(1), count), total
-
-
-def _coefficients(energies: Tensor, vectors: Tensor, count: int) -> Tensor:
-    """V √w of the first `count` pairs above round-off, given with the largest first."""
-    rank = int((energies > RANK_TOLERANCE * energies[0].clamp_min(torch.finfo(torch.float64).tiny)).sum())
-    modes = min(count, rank)
-    return vectors[:, :modes] * energies[:modes].sqrt()
+    return energies, Q @ turn
 
 
 def modes(snapshots: Snapshots, name: str, coefficients: Tensor) -> Iterator[tuple[slice, Tensor, Tensor]]:

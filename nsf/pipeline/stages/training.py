@@ -23,10 +23,6 @@ def train(pipeline, run: Run) -> None:
             manifold, metrics = train_field(
                 snapshots, field, trainer, c.latent_dim, c.seed, run.path, device, c.tracking
             )
-        manifold.datasets = [data.id for data in pipeline.training_data]
-        manifold.split = {
-            part: [list(case.numbers) for case in getattr(pipeline.split, part)] for part in ("train", "test")
-        }
         manifold.save(run.path / "manifold.pt")
         record.output("manifold.pt")
         record.metrics.update(metrics)

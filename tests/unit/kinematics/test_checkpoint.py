@@ -20,7 +20,6 @@ from nsf.runs import Run
 
 @pytest.fixture
 def path(manifold, tmp_path):
-    manifold.datasets, manifold.split = ["simulate/wave/0a"], {"train": [0.8, 1.1], "test": []}
     manifold.save(tmp_path / "manifold.pt")
     return tmp_path / "manifold.pt"
 
@@ -33,8 +32,6 @@ def test_round_trip(manifold, path):
         "x_sha256",
         "parameter_names",
         "hyperparameters",
-        "datasets",
-        "split",
         "field",
     ):
         assert getattr(loaded, name) == getattr(manifold, name)
@@ -74,9 +71,8 @@ def test_truncated(path, share):
         ({"x_sha256": "0" * 64}, "has an X of other particles"),
         ({"parameter_names": [1]}, "parameter_names that are no texts"),
         ({"parameter_names": "speed"}, "parameter_names='speed', which is no list"),
-        ({"datasets": None}, "datasets=None, which is no list"),
-        ({"split": {"train": [float("nan")]}}, "holds nan beside its tensors"),
-        ({"split": {"train": [torch.zeros(1)]}}, r"holds tensor\(\[0\.\]\) beside its tensors"),
+        ({"hyperparameters": {"noise": float("nan")}}, "holds nan beside its tensors"),
+        ({"hyperparameters": {"noise": torch.zeros(1)}}, r"holds tensor\(\[0\.\]\) beside its tensors"),
     ],
 )
 def test_foreign(path, change, message):
@@ -208,7 +204,7 @@ def test_a_list_that_is_endless_to_go_through(path):
     bomb = [0.0]
     for _ in range(30):
         bomb = [bomb] * 10
-    torch.save(torch.load(path, weights_only=True) | {"split": {"train": bomb}}, path)
+    torch.save(torch.load(path, weights_only=True) | {"hyperparameters": {"modes": bomb}}, path)
     assert path.stat().st_size < 10**6
     with pytest.raises(SchemaError, match="more than plain data"):
         Manifold.load(path)
@@ -258,9 +254,9 @@ def test_a_pipe_is_no_checkpoint(tmp_path):
 
 def test_missing_key(path):
     content = torch.load(path, weights_only=True)
-    del content["split"]
+    del content["state"]
     torch.save(content, path)
-    with pytest.raises(SchemaError, match="lacks split"):
+    with pytest.raises(SchemaError, match="lacks state"):
         Manifold.load(path)
 
 
