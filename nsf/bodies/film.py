@@ -58,6 +58,9 @@ def _encoded(images: list[Image.Image], fps: float) -> bytes:
     sample = images[:: max(1, len(images) // 6)]
     montage = Image.fromarray(np.concatenate([np.asarray(image) for image in sample]))
     palette = montage.quantize(_COLORS, method=Image.Quantize.MEDIANCUT)
+    table = np.array(palette.getpalette()).reshape(-1, 3)
+    table[table.sum(axis=1).argmax()] = 255  # the background, which a mean of colours is not
+    palette.putpalette(table.ravel().tolist())
     drawn = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     durations = [round(1000 / fps)] * (len(drawn) - 1) + [_LAST]
     stream = io.BytesIO()

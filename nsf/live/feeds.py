@@ -79,17 +79,16 @@ class PointFeed(LatentFeed):
         self._truth: tuple[Case | None, Truth | None] = (None, None)
         self._drawn: tuple[tuple, bytes] = ((), b"")
         self.color = STRESS
-        solver_steps = model.start(model.initial).steps
+        self._most = BEYOND * float(np.degrees(model.tilt or 0.0))  # [°]
         header = shown(model) | {
             "quantities": self._coloring.quantities,
             "color": self.color,
-            "steps": solver_steps,
-            "tilt": None if model.tilt is None else float(np.degrees(model.tilt)),
+            "steps": model.start(model.initial).steps,
+            "tilt": None if model.tilt is None else {"trained": self._most / BEYOND, "most": self._most},
             "known": [
                 {"label": str(case).replace("_", " "), "values": list(case.parameters.values())}
                 for case in model.known
             ],
-            "particle_feed": True,
         }
         self.field = page.packed(header, {"rest": model.X})
 
@@ -152,10 +151,8 @@ class PointFeed(LatentFeed):
         Raises:
             ConfigError: the model has no programs of gravity, or the tilt is out of reach.
         """
-        trained = self._model.tilt
-        most = 0.0 if trained is None else BEYOND * float(np.degrees(trained))
-        if not all(abs(degrees) <= most for degrees in tilt):
-            raise ConfigError(f"tilt={list(tilt)} must lie in [-{most:.3g}, {most:.3g}] °")
+        if not all(abs(degrees) <= self._most for degrees in tilt):
+            raise ConfigError(f"tilt={list(tilt)} must lie in [-{self._most:.3g}, {self._most:.3g}] °")
         return np.radians(tilt).tolist()
 
 

@@ -500,7 +500,7 @@ def messages(shop: Workshop, draw: random.Random) -> Case:
 
         ignored = {name: lambda *values: None for name in ("steer", "seek", "tilt")}
         feed = PointFeed.__new__(PointFeed)
-        feed._coloring, feed._model = SimpleNamespace(quantities={}), SimpleNamespace(tilt=0.3)
+        feed._coloring, feed._most = SimpleNamespace(quantities={}), 20.0
         obey(feed, SimpleNamespace(playing=True, **ignored), message)
 
     return Case(repr(message[:200]), hand_over)

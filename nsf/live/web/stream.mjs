@@ -5,7 +5,6 @@ import { unpacked } from "./data.mjs";
 import { Field, displacement } from "./field.mjs";
 import { lightOf } from "./trust.mjs";
 
-const FARTHEST = 1.5; // of the tilt, over the largest that was trained
 const SAMPLE = [0.84, 0.37, 0]; // colour of sample particles
 const IN_SAMPLE = 2; // among the roles of particles
 
@@ -73,9 +72,9 @@ export class StreamPlayer {
       this.send({ values });
       this.tilts.forEach((own) => own.show(0));
     });
-    const most = FARTHEST * (told.tilt ?? 0);
-    const tilted = { unit: "°", lower: -most, upper: most, step: 0.1, trained: [-(told.tilt ?? 0), told.tilt ?? 0] };
-    this.tilts = !told.tilt ? [] : ["x", "y"].map((way) => slider({ ...tilted, name: `tilt along ${way}` }, 0, () => {
+    const { trained = 0, most = 0 } = told.tilt ?? {};
+    const tilted = { unit: "°", lower: -most, upper: most, step: 0.1, trained: [-trained, trained] };
+    this.tilts = (most ? ["x", "y"] : []).map((way) => slider({ ...tilted, name: `tilt along ${way}` }, 0, () => {
       const degrees = this.tilts.map((own) => Number(own.input.value));
       this.send({ tilt: degrees.some(Boolean) ? degrees : null });
     }));

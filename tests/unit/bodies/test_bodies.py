@@ -95,6 +95,7 @@ def test_a_film_is_no_larger_than_it_may_be(tmp_path):
     assert small.stat().st_size <= 8000 < large.stat().st_size
     with Image.open(large) as film:
         assert film.n_frames == 3
+        assert film.convert("RGB").getpixel((2, 2)) == (255, 255, 255)
 
 
 def test_a_film_of_odd_sides_is_an_mp4(tmp_path):
