@@ -383,7 +383,7 @@ def _chosen(cases: Sequence[Mapping[str, float]], asked: Mapping[str, float] | f
         off, spread = abs(known - list(wanted.values())), np.ptp(known, axis=0)
         if len(names) > 1:
             return int((off / np.where(spread > 0, spread, 1.0)).max(1).argmin())
-        if (same := off[:, 0] <= 1e-9 * abs(known[:, 0])).any():
+        if (same := off[:, 0] == 0.0).any():
             return int(same.argmax())
     listed = [Case.of(case) for case in cases]
     held_out = "; ".join(map(str, listed)) if len(names) > 1 else ", ".join(map(str, listed))
