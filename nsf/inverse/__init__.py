@@ -1,6 +1,6 @@
 """Inverse problems by a taught recurrence: calibration, uncertainty and design.
 
-A run by operators takes a fraction of a millisecond and is differentiable, so that thousands can be asked
+A run by recurrence takes a fraction of a millisecond and is differentiable, so that thousands can be asked
 for. Names are imported on first use, so that a command's help does not wait for torch.
 """
 

@@ -273,7 +273,7 @@ class Designed:
 
     Attributes:
         values: [N + 1, ways] of the program at the steps.
-        xhat: [N + 1, r] of the run by operators; seen: [m] the targets in it [m].
+        xhat: [N + 1, r] of the run by recurrence; seen: [m] the targets in it [m].
         cost: sum of squares of (seen − target)/tolerance; stopped: why the search ended.
         distrust: of the run.
     """

@@ -1,4 +1,4 @@
-"""How far runs by operators are from full-order runs at what was observed, as validation runs show it."""
+"""How far runs by recurrence are from full-order runs at what was observed, as validation runs show it."""
 
 from dataclasses import dataclass
 
@@ -22,7 +22,7 @@ _FREEDOM = 2.0  # degrees that a plane has to leave
 
 @dataclass(frozen=True)
 class ModelError:
-    """What full-order runs of the validation cases have that runs by operators lack.
+    """What full-order runs of the validation cases have that runs by recurrence lack.
 
     Attributes:
         parameters: [V, n] of the cases.

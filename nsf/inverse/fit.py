@@ -1,4 +1,4 @@
-"""Least squares: the parameters under which runs by operators pass the observations, and how sure they are.
+"""Least squares: the parameters under which runs by recurrence pass the observations, and how sure they are.
 
 Residuals are (y − m(θ))/s with s² = σ² + s_b²: σ of the measurement, and s_b the reduced model's own error
 at the same points and times, as validation runs show it. In validation run v that error, b_v [m], alone

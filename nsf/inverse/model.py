@@ -42,7 +42,7 @@ class Forcing:
 
 
 class Model:
-    """Runs by operators as a function of their problem parameters: batched, and differentiable by torch.
+    """Runs by recurrence as a function of their problem parameters: batched, and differentiable by torch.
 
     Args:
         run: complete deploy run with model=recurrence.

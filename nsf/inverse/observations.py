@@ -118,7 +118,8 @@ class Observations:
                 rows[name] = rows[name].astype(float)
             except (TypeError, ValueError):
                 raise ConfigError(f"{path}: the column {name} must hold numbers") from None
-        found = [one for k, row in rows.iterrows() for one in _row(f"{path}, row {k + 1}", row, model)]
+        records = enumerate(rows.to_dict("records"), 1)
+        found = [one for k, row in records for one in _row(f"{path}, row {k}", row, model)]
         if not found:
             raise ConfigError(f"{path} observes nothing; give x, y, z of points, or value of a quantity")
         t, what, points, values, deviations, places = zip(*found, strict=True)
@@ -308,7 +309,7 @@ def _hdf5(path: Path) -> pd.DataFrame:
         )
 
 
-def _row(where: str, row: pd.Series, model: Model) -> list[tuple]:
+def _row(where: str, row: Mapping, model: Model) -> list[tuple]:
     """The observations of one row of a file."""
     if quantity := row["quantity"]:
         if quantity not in QUANTITIES:
@@ -321,7 +322,7 @@ def _row(where: str, row: pd.Series, model: Model) -> list[tuple]:
         return [(t, quantity, np.full(3, np.nan), row["value"], row["deviation"], where)]
     if not np.isfinite(row["t"]):
         raise ConfigError(f"{where} has no t; give the time [s] of a point's position")
-    point, particle = row[list(_POINT)].to_numpy(float), row["particle"]
+    point, particle = np.array([row[name] for name in _POINT]), row["particle"]
     if np.isfinite(particle):
         X = model.manifold.X.cpu().numpy()
         if not (particle % 1 == 0 and 0 <= particle < len(X)):

@@ -1,4 +1,4 @@
-"""Uncertainty: parameters drawn from stated distributions, and what runs by operators make of them."""
+"""Uncertainty: parameters drawn from stated distributions, and what runs by recurrence make of them."""
 
 import ast
 import re

@@ -19,7 +19,7 @@ from nsf.inverse.space import Space
 from nsf.results.columns import number
 
 _LEAD = (
-    "The parameters under which runs by operators pass what was observed, with the uncertainty that the "
+    "The parameters under which runs by recurrence pass what was observed, with the uncertainty that the "
     "measurement and the reduced model's own error leave."
 )
 #: Deviations (RMS) beyond which the observations count as missed.
@@ -36,7 +36,7 @@ _TERMS = (
     ("distrust", "how far the fitted run is from what was taught; above 1 it is not to be believed."),
 )
 _POINTS = "Observed and fitted points at the last time that was observed."
-_RESIDUALS = "What the runs leave of the observations over time; the full-order run is at the estimate."
+_RESIDUALS = "Observations less runs over time; the full-order run is at the estimate."
 
 
 def report(

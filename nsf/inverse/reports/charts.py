@@ -67,7 +67,7 @@ def points_chart(body: np.ndarray, observed: np.ndarray, fitted: np.ndarray, t: 
 
 
 def residuals_chart(rows: pd.DataFrame, less: str = "observed") -> Figure:
-    """Residuals over time [mm], of the run by operators and of the full-order run.
+    """Residuals over time [mm], of the run by recurrence and of the full-order run.
 
     Args:
         rows: of residuals.csv; less: what `value` is.
@@ -77,7 +77,7 @@ def residuals_chart(rows: pd.DataFrame, less: str = "observed") -> Figure:
         fig = figure(3.4)
         panel = fig.subplots()
         for k, (column, name) in enumerate(
-            {"fitted": "run by operators", "full_order": "full-order run"}.items()
+            {"fitted": "run by recurrence", "full_order": "full-order run"}.items()
         ):
             if column in rows:
                 t, off = rows["t"] + (k - 0.5) * 0.006 * end, 1e3 * (rows["value"] - rows[column])
@@ -119,7 +119,7 @@ def indices_chart(table: pd.DataFrame) -> Figure:
         table: quantity, parameter, first, first_95, total, total_95; and first_full_order, first_same_design
             and the same of total, of a smaller design, where there were full-order runs.
     """
-    beside = {"same_design": ("x", "operators, smaller design"), "full_order": ("o", "full order, the same")}
+    beside = {"same_design": ("x", "recurrence, smaller design"), "full_order": ("o", "full order, the same")}
     groups = list(table.groupby("quantity", sort=False))
     with styled():
         fig = figure(3.2)

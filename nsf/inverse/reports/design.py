@@ -1,4 +1,4 @@
-"""A designed program, its run by operators, and the full-order run beside it."""
+"""A designed program, its run by recurrence, and the full-order run beside it."""
 
 from collections.abc import Callable
 from contextlib import suppress
@@ -16,10 +16,10 @@ from nsf.results.columns import number
 
 #: Tolerances (RMS) beyond which the targets count as missed.
 _MISSED = 3.0
-_LEAD = "A program of forcing that is to bring a target about, found by gradients through runs by operators."
+_LEAD = "A program of forcing that is to bring a target about, found by gradients through runs by recurrence."
 _TERMS = (
     ("off", "root mean square, over the targets, of the target less what a run has."),
-    ("the model's own error", "the same of runs by operators less full-order runs, in validation cases."),
+    ("the model's own error", "the same of runs by recurrence less full-order runs, in validation cases."),
     ("distrust", "how far the run is from what was taught; above 1 it is not to be believed."),
 )
 
@@ -46,7 +46,7 @@ def report(
     model = program.model
     designed = design(program, view, parameters, seed, say)
     rows = view.observations.frame.rename(columns={"deviation": "tolerance"}).assign(fitted=designed.seen)
-    off = {"run by operators": rms(rows["value"] - rows["fitted"])}
+    off = {"run by recurrence": rms(rows["value"] - rows["fitted"])}
     if run_full_order:
         rows["full_order"] = view.of_truth(full_order(program, designed, parameters))
         off["full-order run"] = rms(rows["value"] - rows["full_order"])

@@ -19,7 +19,7 @@ from nsf.inverse.sampling import LEVELS, Prior, Scalars, runs, sensitivities
 from nsf.inverse.space import Space
 from nsf.runs import Run
 
-_LEAD = "What runs by operators make of parameters that are drawn from stated distributions."
+_LEAD = "Runs by recurrence at parameters that are drawn from stated distributions."
 _TERMS = (
     ("distrusted", "runs that are not to be believed; no quantile counts them (docs/method.md, Trust)."),
     ("first order, total", "share of the variance that a parameter makes alone, and with all others."),
@@ -120,12 +120,12 @@ def _indices(
     seed: int,
     say,
 ) -> tuple[pd.DataFrame, list[Run]]:
-    """Indices at the last time by operators, and by full-order runs of a smaller design of the same kind."""
+    """Indices at the last time by recurrence, and by full-order runs of a smaller design of the same kind."""
     forcing = None if program is None else model.forcing(program=program)
     more = {} if program is None else {PROGRAM: program}
     made: list[Run] = []
 
-    def by_operators(values: np.ndarray) -> np.ndarray:
+    def by_recurrence(values: np.ndarray) -> np.ndarray:
         return runs(model, values, scalars, forcing).values[..., -1]
 
     def by_full_order(values: np.ndarray) -> np.ndarray:
@@ -137,10 +137,10 @@ def _indices(
                 seen.append(scalars.of_truth(truth))
         return np.array(seen)
 
-    table = sensitivities(prior, count, by_operators, scalars.names, seed)
+    table = sensitivities(prior, count, by_recurrence, scalars.names, seed)
     if not full_order:
         return table, []
-    for kind, evaluate in (("same_design", by_operators), ("full_order", by_full_order)):
+    for kind, evaluate in (("same_design", by_recurrence), ("full_order", by_full_order)):
         smaller = sensitivities(prior, full_order, evaluate, scalars.names, seed)
         table = table.assign(**{f"{order}_{kind}": smaller[order] for order in ("first", "total")})
     say(f"sample: sensitivities beside {len(made)} full-order runs")
@@ -150,7 +150,7 @@ def _indices(
 
 def _designs(count: int, full_order: int, prior: Prior) -> str:
     of = max(2, len(prior.each)) + 2
-    beside = f"; beside it {full_order * of:,} full-order runs, and runs by operators of the same design"
+    beside = f"; beside it {full_order * of:,} full-order runs, and runs by recurrence of the same design"
     return f"Saltelli's design of {count * of:,} runs{beside if full_order else ''}."
 
 
