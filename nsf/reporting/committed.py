@@ -234,7 +234,7 @@ def _bench_section(folder: Path) -> dict:
     title, lead = map(unescaped, page.split("\n\n")[:2])
     charts = re.findall(r"^!\[(.*)\]\(([\w-]+\.png)\)$", page, re.MULTILINE)
     shown = [{"alt": unescaped(alt), "file": file, "caption": unescaped(alt)} for alt, file in charts[:1]]
-    rows = pd.read_csv(folder / "results.csv")
+    rows = pd.read_csv(folder / "bench.csv")
     devices, commits = (", ".join(sorted(rows[name].astype(str).unique())) for name in ("device", "commit"))
     return {
         "title": title.removeprefix("# "),

@@ -139,8 +139,7 @@ def test_benchmarks_are_listed_by_their_first_lines(tmp_path):
     folder = tmp_path / "speed"
     folder.mkdir()
     (folder / "index.md").write_text("# Speed\n\nTime of a step.\n\n## On X\n\n![Over P.](step.png)\n")
-    (folder / "results.csv").write_text("bench,device,commit\nscaling,X,1f2e\nbatch,X,3d4c+\n")
-    (folder / "bench.csv").touch()
+    (folder / "bench.csv").write_text("bench,device,commit\nscaling,X,1f2e\nbatch,X,3d4c+\n")
     text = committed.write_list(tmp_path).read_text()
     assert "### Speed\n\nTime of a step.\n\n![Over P.](speed/step.png)\n\nOver P.\n\n2 rows on X" in text
     assert "1f2e, 3d4c+. [The whole report](speed/index.md)." in text

@@ -189,8 +189,7 @@ def test_the_lines_of_a_page_of_benchmarks_are_text(tmp_path):
     folder.mkdir()
     lead = "Time of `nsf bench`. <img src=x onerror=y> \\|S\\|"
     (folder / "index.md").write_text(f"# <b>Speed\n\n{lead}\n\n![a](javascript:b)\n\n![Over P.](step.png)\n")
-    (folder / "results.csv").write_text("bench,device,commit\nscaling,<i>,1f2e\n")
-    (folder / "bench.csv").touch()
+    (folder / "bench.csv").write_text("bench,device,commit\nscaling,<i>,1f2e\n")
     text = write_list(tmp_path).read_text()
     assert "html_inline" not in markdown_kinds(text.replace('<a id="speed"></a>', ""))
     assert "Time of `nsf bench`." in text
