@@ -149,13 +149,6 @@ def test_a_log_tells_of_work_that_has_not_begun(monkeypatch, capsys):
     assert capsys.readouterr().err == "train, 0 of 10 steps, 0.0/s\n"
 
 
-def test_who_shows_nothing_logs_nothing(monkeypatch, capsys):
-    monkeypatch.setattr(progress, "EVERY", 0.0)
-    with Progress("train", 10, "steps", shown=False) as bar:
-        bar.advance()
-    assert capsys.readouterr().err == ""
-
-
 def test_a_sweep_ends_with_a_table_over_what_it_varied(chain, tiny, monkeypatch):
     monkeypatch.setenv("NSF_RUNS", str(chain.root))
     words = [word for word in tiny if not word.startswith("latent_dim")]
