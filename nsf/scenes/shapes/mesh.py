@@ -7,8 +7,6 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 
 from nsf.errors import ConfigError
 from nsf.scenes.shapes.formats import MeshFileError, read_polygons
@@ -130,7 +128,7 @@ def signed_volume(triangles: np.ndarray) -> float:
 
 def _read(path: str) -> bytes:
     """The file's bytes, if it can be a mesh."""
-    file = Path(path)
+    file = Path(path).expanduser()
     if file.suffix.lower() not in EXTENSIONS:
         raise ConfigError(
             f"mesh={path}: extension {file.suffix!r} is not supported; export it as {', '.join(EXTENSIONS)}"
@@ -161,11 +159,14 @@ def _surface(path: str, digest: str, up: str) -> WindingNumber:
     if not len(faces):
         raise ConfigError(f"mesh={path} has no face with an area; export a solid")
     _check_closed(path, faces)
-    return _oriented(path, vertices[faces], _bodies(faces))
+    return _oriented(path, vertices, faces)
 
 
 def _bodies(faces: np.ndarray) -> np.ndarray:
     """[F] number of the connected surface that each face belongs to, from 0, by their first faces."""
+    from scipy.sparse import coo_matrix  # takes 0.2 s to load
+    from scipy.sparse.csgraph import connected_components
+
     edges = np.stack([faces, np.roll(faces, -1, axis=1)], 2).reshape(-1, 2)
     links = coo_matrix((np.ones(len(edges)), edges.T), shape=(faces.max() + 1,) * 2)
     of_face = connected_components(links, directed=False)[1][faces[:, 0]]
@@ -226,14 +227,15 @@ def _check_closed(path: str, faces: np.ndarray) -> None:
         )
 
 
-def _oriented(path: str, triangles: np.ndarray, body: np.ndarray) -> WindingNumber:
+def _oriented(path: str, vertices: np.ndarray, faces: np.ndarray) -> WindingNumber:
     """The surface with its faces pointing outwards, if it bounds a solid.
 
     Args:
         path: of the file, for messages.
-        triangles: [F, 3, 3] corners in the file's unit.
-        body: [F] number of the closed surface that each belongs to.
+        vertices: [V, 3] in the file's unit.
+        faces: [F, 3] of closed surfaces.
     """
+    triangles = vertices[faces]
     volume = signed_volume(triangles)
     lower, upper = triangles.min((0, 1)), triangles.max((0, 1))
     # Rounding of a flat mesh's volume stays below this.
@@ -243,6 +245,7 @@ def _oriented(path: str, triangles: np.ndarray, body: np.ndarray) -> WindingNumb
     _, inner, outer = _sides(surface, surface)
     wrong = (inner != 1) | (outer != 0)
     if wrong.any():
+        body = _bodies(faces)
         _check_bodies(path, surface.triangles, body)
         raise ConfigError(
             f"mesh={path} overlaps itself: {wrong.sum()} of its {len(triangles)} faces lie inside another "
@@ -254,7 +257,7 @@ def _oriented(path: str, triangles: np.ndarray, body: np.ndarray) -> WindingNumb
         share = ((number < 0) | (number > 1)).mean()
         raise ConfigError(
             f"mesh={path} overlaps itself in {100 * share:.2g} % of its bounding box; "
-            f"{_advice(surface.triangles, body)}"
+            f"{_advice(surface.triangles, _bodies(faces))}"
         )
     return surface
 
