@@ -105,6 +105,11 @@ class Forcing:
     def __len__(self) -> int:
         return len(self._programs)
 
+    @property
+    def steady(self) -> bool:
+        """Whether it is the same at all times, so that it does no work on the whole of a closed path."""
+        return not (self._varies or self.boundaries.changes or self.version)
+
     def start_from(self, steps: int) -> None:
         """Let the next step be the one that starts `steps` steps after t = 0."""
         self.boundaries.start_from(steps)

@@ -17,14 +17,13 @@ from nsf.mpm.grid import Grid, GridGeometry
 from nsf.mpm.grid.shape import stencil_offset
 from nsf.mpm.materials import Material, make_elastic_stress, make_stress_update
 from nsf.mpm.precision import Precision, precision_of
-from nsf.mpm.stability import MAX_ELASTIC_CFL, check_time_step, make_particle_check, wave_speed_at
+from nsf.mpm.stability import MAX_ELASTIC_CFL, check_time_step, wave_speed_at
 from nsf.mpm.state import ParticleConstants, ParticleState, cell_order
 from nsf.mpm.step import GridStep
 from nsf.mpm.stressed import stressed
 from nsf.mpm.transfer import Transfer, make_g2p_stress
+from nsf.mpm.watch import Watch
 from nsf.timing import StageTimer
-
-_NEVER = 2**31 - 1
 
 
 class State(Protocol):
@@ -107,7 +106,7 @@ class FullOrderMPM:
         x, v: [P, 3] initial position [m] (default X) and velocity [m/s] (default 0).
         precision: `fp64` or `fp32`.
         device: `cpu`, `cuda`, `cuda:N` or `auto`.
-        check_every: steps between checks of finiteness and bounds.
+        check_every: steps between looks at the particles.
         names: of the colliders, for `forcing`.
 
     Attributes:
@@ -173,8 +172,8 @@ class FullOrderMPM:
         self._stress_update = make_stress_update(law, self.precision, material.history_size)
         self._g2p_stress = make_g2p_stress(self.precision, transfer.shape, law, material.history_size)
         self._params = material.params(self.precision)
-        self._check = make_particle_check(self.precision, transfer.shape)
-        self._first_bad = wp.full(2, _NEVER, dtype=wp.int32, device=self.device)
+        stiffness = float((constants.volume0 * (constants.lam + 2.0 * constants.mu)).sum())
+        self._watch = Watch(self.precision, transfer.shape, self.device, stiffness)
         self._graph = None
         self.check()
 
@@ -192,8 +191,13 @@ class FullOrderMPM:
     @property
     def nbytes(self) -> int:
         """Bytes that the solver's arrays take on the device."""
-        own = (self.mass, self.volume0, self.mu, self.lam, self._first_bad)
-        return self.state.nbytes + self.grid.nbytes + sum(a.capacity for a in own)
+        own = (self.mass, self.volume0, self.mu, self.lam)
+        return self.state.nbytes + self.grid.nbytes + self._watch.nbytes + sum(a.capacity for a in own)
+
+    @property
+    def warnings(self) -> list[str]:
+        """What was odd at a look since t = 0, though law and step held: a line each, at its worst."""
+        return self._watch.warnings
 
     def restart(self) -> None:
         """Go back to t = 0; captured graphs stay good."""
@@ -203,6 +207,7 @@ class FullOrderMPM:
         self.forcing.release()
         self.grid_step.forcing.start_from(0)
         self.steps_taken = self.beyond_law = 0
+        self._watch.restart()
 
     def resume(self, steps: int, x: np.ndarray, v: np.ndarray, C: np.ndarray, tau: np.ndarray) -> None:
         """Continue from a state that is known by its positions, velocities and stresses alone.
@@ -231,14 +236,15 @@ class FullOrderMPM:
             getattr(self.state, name).assign(values)
         self.grid_step.forcing.start_from(steps)
         self.steps_taken = steps
+        self._watch.restart(unstressed=False)
         self.check()
 
     def step(self, n: int = 1) -> None:
         """Advance by n steps of Δt.
 
         Raises:
-            InstabilityError: a particle became non-finite or left the grid (checked every
-                `check_every` steps); the message names particle, step and time.
+            InstabilityError: law or step no longer hold, see `check`, at a look every `check_every` steps;
+                the message names particle, step and time.
         """
         for _ in range(n):
             self._advance()
@@ -336,38 +342,32 @@ class FullOrderMPM:
         return speed * self.dt / self.grid.geometry.dx
 
     def check(self) -> None:
-        """Raise if a particle is non-finite or off the grid.
+        """Look at all particles, raise if law or step no longer hold, and keep what is odd for `warnings`.
 
         Raises:
-            InstabilityError: names the particle, the step and the time.
+            InstabilityError: a particle is non-finite, off the grid, inside out or faster than a cell a step,
+                most are collapsed, or energy came from nowhere; names the particle, the step and the time.
         """
-        s = self.state
-        self._first_bad.fill_(_NEVER)
-        inputs = [
-            s.x.rows,
-            s.v.rows,
-            s.tau.rows,
-            s.order,
-            self.grid.shape,
-            self.grid_step.dx,
-            self._first_bad[0:1],
-            self._first_bad[1:2],
-        ]
-        wp.launch(self._check, dim=len(s), inputs=inputs, device=self.device)
-        non_finite, outside = (int(p) for p in self._first_bad.numpy())
+        s, forcing, dx = self.state, self.grid_step.forcing, self.grid.geometry.dx
+        look = self._watch.look(s, self.mass, self.grid, forcing, self.dt)
         when = f"at step {self.steps_taken}, t = {self.time:.6g} s"
-        if non_finite != _NEVER:
+        if look.non_finite is not None:
             raise InstabilityError(
-                f"particle {non_finite} became non-finite {when} or in the {self.check_every} steps before; "
-                f"reduce dt={self.dt:g} s"
+                f"particle {look.non_finite} became non-finite {when} or in the {self.check_every} steps "
+                f"before; reduce dt={self.dt:g} s"
             )
-        if outside != _NEVER:
-            where = np.array2string(s.x.numpy()[outside], precision=4)
+        if look.outside is not None:
+            where = np.array2string(s.x.numpy()[look.outside], precision=4)
             raise InstabilityError(
-                f"particle {outside} left the grid {when}: x = {where} m, "
+                f"particle {look.outside} left the grid {when}: x = {where} m, "
                 f"domain [0, {self.grid.geometry.upper}] m; "
                 f"enlarge the domain, add a boundary or reduce dt={self.dt:g} s"
             )
+
+        def J_of(p: int) -> float:
+            return float(np.linalg.det(s.F_e.numpy()[p].astype(float)))
+
+        self._watch.judge(look, forcing.steady, self.dt, dx, when, J_of)
 
 
 def diagnosed(

@@ -1,16 +1,12 @@
 """Is the time step stable, and has the simulation gone wrong?"""
 
 from collections.abc import Callable, Sequence
-from functools import cache
 
 import numpy as np
-import warp as wp
 
 from nsf.errors import ConfigError, InstabilityError
 from nsf.mpm.boundaries.colliders import Collider
-from nsf.mpm.grid.nodes import GridGeometry, inside
-from nsf.mpm.grid.shape import shape_functions
-from nsf.mpm.precision import Precision
+from nsf.mpm.grid.nodes import GridGeometry
 from nsf.mpm.state import ParticleConstants
 
 # c Δt/Δx = 1 is the limit of one quadrature point in the middle of each cell, the worst regular
@@ -18,6 +14,8 @@ from nsf.mpm.state import ParticleConstants
 MAX_ELASTIC_CFL = 1.0
 # A particle or a collider must not cross more than a cell in a step.
 MAX_ADVECTIVE_CFL = 1.0
+# c Δt/Δx above which no arrangement of particles is stable: quadratic B-splines with exact quadrature.
+_NEVER_STABLE_CFL = 1.63
 _ROUND_OFF = 1e-9
 _STRETCHED = 1e-3  # by which a principal stretch grows for the tangent stiffness: a round-off of fp32 is 1e-7
 
@@ -111,30 +109,19 @@ def _rounded_down(value: float) -> str:
     return f"{(1.0 - 5e-6) * value:.6g}"
 
 
-@cache
-def make_particle_check(precision: Precision, shape_name: str):
-    """Kernel that records the lowest index of a particle that is non-finite or off the grid."""
-    real, vec3, mat33 = precision.real, precision.vec3, precision.mat33
-    shape = shape_functions(precision, shape_name)
-    base_node, width = shape.base_node, shape.degree + 1
+def multiplied_step_warning(multiplier: float, dt: float, stable: float) -> str | None:
+    """A line where a reduced step of `multiplier` Δt is unstable however the particles lie; else None.
 
-    @wp.kernel(enable_backward=False, module="unique")
-    def check(
-        x: wp.array(dtype=vec3),
-        v: wp.array(dtype=vec3),
-        tau: wp.array(dtype=mat33),
-        order: wp.array(dtype=wp.int32),
-        grid_shape: wp.vec3i,
-        dx: real,
-        first_non_finite: wp.array(dtype=wp.int32),
-        first_outside: wp.array(dtype=wp.int32),
-    ):
-        p = wp.tid()
-        # The sum of squares is finite only if every entry is.
-        size = wp.length_sq(x[p]) + wp.length_sq(v[p]) + wp.ddot(tau[p], tau[p])
-        if not wp.isfinite(size):
-            wp.atomic_min(first_non_finite, 0, order[p])
-        elif not inside(base_node(x[p], real(1.0) / dx), width, grid_shape):
-            wp.atomic_min(first_outside, 0, order[p])
-
-    return check
+    Args:
+        multiplier: `deploy.dt_multiplier`.
+        dt: full-order step [s].
+        stable: largest stable full-order step [s].
+    """
+    cfl = multiplier * dt / stable * MAX_ELASTIC_CFL
+    if cfl <= _NEVER_STABLE_CFL:
+        return None
+    most = 0.99 * _NEVER_STABLE_CFL * stable / (MAX_ELASTIC_CFL * dt)
+    return (
+        f"deploy.dt_multiplier={multiplier:g}: in a reduced step c dt/dx is {cfl:.3g}, and above "
+        f"{_NEVER_STABLE_CFL:g} it may diverge wherever particles lie; choose at most {most:.2g}"
+    )

@@ -19,6 +19,7 @@ from nsf.engines import Engine, Operators
 from nsf.kinematics.fields.mlp import MlpField
 from nsf.kinematics.manifold import Manifold
 from nsf.models import Auto
+from nsf.mpm.stability import largest_stable_dt, multiplied_step_warning
 from nsf.pipeline.plan import Plan
 from nsf.pipeline.reuse import report, reused, simulations
 from nsf.pipeline.stages.choosing import measure_candidates
@@ -218,11 +219,19 @@ class Pipeline(Plan):
         """Reduced trajectories of the held-out cases, through Lightning's `Trainer.predict`."""
         if self.is_taught and not self.taught.complete:
             self.teach()
+        if not self.deployment.complete and (line := self._step_warning()):
+            self.say(f"deploy: warning: {line}")
         return self._made(self.deployment, self._deploy)
 
     def _deploy(self, run: Run) -> None:
         measured = measure_candidates(self) if isinstance(self.configured, Auto) else []
         deploy_held_out(self, run, measured)
+
+    def _step_warning(self) -> str | None:
+        """Whether the reduced step is far too long for a case."""
+        scenes = map(self.deployed.with_parameters, getattr(self.split, self.config.deploy.split))
+        stable = min(largest_stable_dt(at.particles(), at.initial_velocity(), at.dx) for at in scenes)
+        return multiplied_step_warning(self.config.deploy.dt_multiplier, self.deployed.dt, stable)
 
     def evaluate(self) -> Run:
         """Errors and costs of the reduced trajectories."""

@@ -129,7 +129,7 @@ def expected(stage: str, runs: dict[Run, Names]) -> Expected:
 
 def scene_table(names: Names) -> Table:
     """Particles, grid, resolution and step of a scene, and its cases."""
-    from nsf.mpm.stability import largest_stable_dt
+    from nsf.mpm.stability import largest_stable_dt, multiplied_step_warning
     from nsf.scenes import Scene
     from nsf.scenes.resolution import thinnest
 
@@ -156,6 +156,8 @@ def scene_table(names: Names) -> Table:
         cases = getattr(names.split, part)
         rows[part] = f"{len(cases)}: " + "; ".join(case.text for case in cases) if cases else "none"
     rows["deployed"] = f"on {names.device}, model {names.configured.name}, r {names.config.latent_dim}"
+    if line := multiplied_step_warning(names.config.deploy.dt_multiplier, scene.dt, stable):
+        rows["warning"] = line
     for key, told in rows.items():
         table.add_row(key, escape(told))
     return table

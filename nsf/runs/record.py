@@ -1,7 +1,7 @@
 """The manifest of a run while its stage works: what the stage tells of itself, and how it ended."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
@@ -55,6 +55,11 @@ class Record:
             name = file.resolve().relative_to(self.path.resolve()).as_posix()
             self.outputs[name] = {"path": name, "bytes": file.stat().st_size, "sha256": digest(file)}
         return path
+
+    def warn(self, lines: Sequence[str]) -> None:
+        """Add lines for whoever uses the run's results to `warnings` of the manifest."""
+        if lines:
+            self._manifest["warnings"] = [*self._manifest.get("warnings", ()), *lines]
 
     def plain_metrics(self) -> dict[str, Any]:
         """The metrics as JSON holds them; a value that is not finite becomes null.

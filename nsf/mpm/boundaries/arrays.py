@@ -83,6 +83,7 @@ class BoundaryArrays:
         gradient: [c, 3, 3] gradient of this velocity in space [1/s].
         kind: [c] code of the contact; friction: [c].
         steps: [c] steps taken.
+        changes: whether a collider moves, or acts at some times only.
         solids: the struct of these arrays and of the walls that the kernels take.
     """
 
@@ -111,8 +112,8 @@ class BoundaryArrays:
             setattr(self.solids, name, getattr(self, name))
         self.solids.kind, self.solids.friction = self.kind, self.friction
         self.solids.wall_kind, self.solids.wall_padding = KINDS[walls.kind], walls.padding
-        self._changes = any(c.changes for c in self.colliders)
-        if not self._changes:
+        self.changes = any(c.changes for c in self.colliders)
+        if not self.changes:
             return
         self._follow = make_follow(precision)
         motions = [c.motion or _AT_REST for c in self.colliders]
@@ -171,7 +172,7 @@ class BoundaryArrays:
 
     def advance(self, dt: float) -> None:
         """Set pose and velocity of every collider for the next step of dt [s], if any of them changes."""
-        if not self._changes:
+        if not self.changes:
             return
         found = [self.active, self.position, self.orientation, self.velocity, self.gradient]
         inputs = [*self._prescribed, dt, self.steps, *found]

@@ -68,6 +68,13 @@ class Cost(NamedTuple):
     bytes: int
 
 
+class Ending(NamedTuple):
+    """What follows the last frame of a trajectory: its cost, and lines about what was odd in it."""
+
+    cost: Cost
+    warnings: Sequence[str]
+
+
 def simulate(jobs: Sequence[Job], shared: Shared, say: Callable[[str], object]) -> int:
     """Run and store every job; each file appears when it is whole.
 
@@ -77,13 +84,13 @@ def simulate(jobs: Sequence[Job], shared: Shared, say: Callable[[str], object]) 
     Args:
         jobs: trajectories to be made.
         shared: what they have in common.
-        say: told which trajectory is waited for.
+        say: told which trajectory is waited for, and what was odd in one.
 
     Returns:
         How many were made here.
 
     Raises:
-        InstabilityError: a particle became non-finite or left the grid.
+        InstabilityError: law or step of a run no longer hold, see `FullOrderMPM.check`.
         StorageError: the disk refused a file.
         KeyboardInterrupt: passed on; what is whole stays, what is not is removed.
     """
@@ -98,7 +105,7 @@ def simulate(jobs: Sequence[Job], shared: Shared, say: Callable[[str], object]) 
                         left.append(job)
                     elif not job.run.complete:
                         progress.describe(job.case.named)
-                        writing.append(_start(job, claim, pool, shared, progress, memory))
+                        writing.append(_start(job, claim, pool, shared, progress, memory, say))
             jobs = left
         for future in writing:
             future.result()
@@ -112,6 +119,7 @@ def _start(
     shared: Shared,
     progress: Progress,
     memory: HostMemory,
+    say: Callable[[str], object],
 ) -> Future:
     """Compute one trajectory while its writer, which takes the claim over, and those of earlier ones work."""
     solver, frames = job.build(), queue.Queue(_BLOCKS)
@@ -124,7 +132,10 @@ def _start(
                 _hand_over(frames, block, stored_by)
         except InstabilityError as error:
             raise diagnosed(error, job.build, solver.steps_taken) from error
-        _hand_over(frames, Cost(time.perf_counter() - started, solver.nbytes), stored_by)
+        cost = Cost(time.perf_counter() - started, solver.nbytes)
+        _hand_over(frames, Ending(cost, solver.warnings), stored_by)
+        for line in solver.warnings:
+            say(f"simulate: warning: {job.case.named}: {line}")
     except BaseException as error:
         # The writer leaves no half-written file, and its manifest says what happened.
         _stop(frames, error)
@@ -175,13 +186,14 @@ def _store(
         )
         n = 0
         with writer:
-            while not isinstance(item := frames.get(), Cost):
+            while not isinstance(item := frames.get(), Ending):
                 if isinstance(item, BaseException):
                     raise item
                 for frame in item:
                     writer.append(n * dt, **frame)
                     n += 1
                 item.done()
-            writer.cost.update(item._asdict())
-        record.metrics["seconds"] = item.seconds
+            writer.cost.update(item.cost._asdict())
+        record.warn(item.warnings)
+        record.metrics["seconds"] = item.cost.seconds
         record.output(TRAJECTORY)
