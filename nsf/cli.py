@@ -7,13 +7,15 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from nsf import usage
-from nsf.errors import ConfigError, NSFError
+from nsf.errors import ConfigError, NSFError, first_line, out_of_memory
+from nsf.terminal import replace_what_cannot_be_shown
 from nsf.usage import STAGES, TOOLS
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `nsf`; exits with 0, 2 (a fault the user can mend), 130 (interrupted) or 1."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    replace_what_cannot_be_shown()
     # Threads that spin for long while they wait made training ten times slower on cores that others
     # use too; those that spin for some microseconds lose next to nothing on free ones.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -29,6 +31,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(1)
     except NSFError as error:
         print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except Exception as error:
+        if not out_of_memory(error):
+            raise
+        remedy = "free some, raise `ulimit -v` or take a smaller scene"
+        print(f"error: memory ran out ({first_line(error)}); {remedy}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print("interrupted; the same command goes on from the last whole file", file=sys.stderr)

@@ -65,3 +65,15 @@ class LaunchError(NSFError):
 def first_line(error: BaseException) -> str:
     """The first line of what an error says; its kind where it says nothing."""
     return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+# How libraries say that memory ran out, or that a limit on it, as `ulimit -v`, was met.
+_OUT_OF_MEMORY = ("failed to map segment", "cannot allocate memory", "can't allocate memory", "out of memory")
+
+
+def out_of_memory(error: BaseException | None) -> bool:
+    """Whether an error, or one that it came from, is of memory that was not there."""
+    if error is None or isinstance(error, MemoryError):
+        return error is not None
+    text = str(error).lower()
+    return any(words in text for words in _OUT_OF_MEMORY) or out_of_memory(error.__cause__)

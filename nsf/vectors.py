@@ -22,15 +22,21 @@ def spaced(count: int, most: int) -> np.ndarray:
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
 
 
+#: Steps, particles and the like are counted in 32 bits on a device.
+MOST_WHOLE = 2**31 - 1
+
+
 def number(
     key: str, value, least: float = -math.inf, whole: bool = False, most: float = math.inf
 ) -> float | int:
-    """A finite number of at least `least` and at most `most`.
+    """A finite number of at least `least` and at most `most`; a whole one fits into 32 bits, but for a seed.
 
     Raises:
         ConfigError: quotes the key and the value.
     """
     of_kind = isinstance(value, int if whole else int | float) and is_finite(value)
+    if whole and of_kind and value > MOST_WHOLE and not key.endswith("seed"):
+        raise ConfigError(f"{key}={value} must be a whole number of at most {MOST_WHOLE}")
     if not (of_kind and least <= value <= most):
         kind = "a whole number" if whole else "a finite number"
         above = f" of at least {least:g}" if least > -math.inf else ""

@@ -268,6 +268,14 @@ def _keys(node, prefix: str = "") -> list[str]:
     ]
 
 
+def _unparsed(override: str, first: str) -> str:
+    """Why Hydra does not read an override, and how to write it; a shell takes one pair of quotes away."""
+    key, _, value = override.partition("=")
+    if re.fullmatch(r"[+~\w.@/]+", key) and value and not re.search(r"['\"{}\[\]$\\]", value):
+        return f"{override!r} needs quotes of Hydra's inside those of the shell; write '{key}=\"{value}\"'"
+    return f"{override!r} is not Hydra's key=value ({first}); quote brackets, commas and spaces"
+
+
 def explained(error: Exception, config_name: str, overrides: Sequence[str]) -> str:
     """Hydra's message in one line, with the nearest known key."""
     text = str(error)
@@ -286,7 +294,7 @@ def explained(error: Exception, config_name: str, overrides: Sequence[str]) -> s
         hint = f"; did you mean {' or '.join(near)}?" if near else "; see `nsf --help` for the groups"
         return f"unknown key {key!r}{hint}"
     if isinstance(error, OverrideParseException):
-        return f"{error.override!r} is not Hydra's key=value ({first}); quote brackets, commas and spaces"
+        return _unparsed(str(error.override), first)
     if first.startswith("Ambiguous value"):
         return f"{first}; several values of a key need -m"
     nameless = [o for o in overrides if o.startswith("=")]

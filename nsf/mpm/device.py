@@ -1,10 +1,11 @@
 """Devices by name, and the GPUs of a host."""
 
 import os
+from functools import cache
 
 import warp as wp
 
-from nsf.errors import DeviceError
+from nsf.errors import DeviceError, StorageError
 
 
 def warp_device(name: str):
@@ -12,7 +13,9 @@ def warp_device(name: str):
 
     Raises:
         DeviceError: the device does not exist.
+        StorageError: Warp cannot write its kernels.
     """
+    _check_kernel_cache()
     name = str(name)
     if name == "auto":
         return wp.get_device("cuda:0" if wp.is_cuda_available() else "cpu")
@@ -24,6 +27,25 @@ def warp_device(name: str):
     if name not in known:
         raise DeviceError(f"device={name} is unknown; this machine has {', '.join(sorted(known - {'cuda'}))}")
     return wp.get_device(name)
+
+
+@cache
+def _check_kernel_cache() -> None:
+    """Refuse a folder of compiled kernels that cannot be written, before Warp does."""
+    reason = "it is read-only"
+    try:
+        # Known, unless a GPU is there, from an earlier try to start Warp.
+        if wp.config.kernel_cache_dir is None:
+            wp.init()
+        os.makedirs(wp.config.kernel_cache_dir, exist_ok=True)
+        if os.access(wp.config.kernel_cache_dir, os.W_OK | os.X_OK):
+            return
+    except OSError as error:
+        reason = error.strerror
+    raise StorageError(
+        f"compiled kernels cannot be kept in {wp.config.kernel_cache_dir}: {reason}; "
+        "set WARP_CACHE_PATH to a folder that can be written"
+    )
 
 
 def visible_gpus() -> tuple[str, ...]:
