@@ -61,7 +61,7 @@ def momenta(solver, shape):
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("scheme", ["pic", "apic", "rpic"])
 def test_mass_and_linear_momentum(scheme, shape, free_body):
-    solver = free_body(Transfer(scheme, shape))
+    solver = free_body(Transfer(scheme, shape, 0.5 if scheme == "rpic" else 0.0))
     before, _, size, _ = momenta(solver, shape)
     for _ in range(20):
         solver.step()
@@ -73,7 +73,7 @@ def test_mass_and_linear_momentum(scheme, shape, free_body):
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize(("scheme", "damping"), [("apic", 0.0), ("rpic", 0.0), ("rpic", 0.4), ("rpic", 1.0)])
+@pytest.mark.parametrize(("scheme", "damping"), [("apic", 0.0), ("rpic", 0.4), ("rpic", 1.0)])
 def test_angular_momentum_is_kept(scheme, damping, shape, free_body):
     """Σ x × m v + m D Δx² axial(C) to round-off with free boundaries."""
     solver = free_body(Transfer(scheme, shape, damping))
@@ -128,7 +128,6 @@ def test_virial_of_the_internal_force(shape, free_body, rng):
     [
         ("pic", 0.0, (0.0, 0.0)),
         ("apic", 0.0, (1.0, 1.0)),
-        ("rpic", 0.0, (1.0, 1.0)),
         ("rpic", 0.4, (0.6, 1.0)),
         ("rpic", 1.0, (0.0, 1.0)),
     ],

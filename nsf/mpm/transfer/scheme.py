@@ -16,12 +16,12 @@ class Transfer:
         scheme: `pic` carries no affine momentum; `apic` carries all of it; `rpic` carries its
             rotation, and the share `1 − damping` of its symmetric part.
         shape: B-spline, `quadratic` or `cubic`.
-        damping: RPIC damping in [0, 1], dimensionless; 1 keeps rotation only.
+        damping: RPIC damping in (0, 1], dimensionless; 1 keeps rotation only. 0 would be APIC.
         deterministic: on a GPU, sum P2G's contributions in a fixed order, so that the same run gives
             the same bits (slower). A CPU always does.
 
     Raises:
-        ConfigError: unknown scheme or shape; damping outside [0, 1] or not with RPIC.
+        ConfigError: unknown scheme or shape; damping outside [0, 1], not with RPIC, or RPIC without.
 
     Source: Jiang et al. 2015 (APIC); Fang et al. 2019 (RPIC damping).
     """
@@ -43,6 +43,11 @@ class Transfer:
         if self.damping and self.scheme != "rpic":
             raise ConfigError(
                 f"transfer.damping={self.damping} needs transfer.scheme=rpic, not {self.scheme}"
+            )
+
+        if self.scheme == "rpic" and not self.damping:
+            raise ConfigError(
+                "transfer.damping=0 makes rpic the same as apic; set transfer=apic, or a damping up to 1"
             )
 
     @property

@@ -65,6 +65,7 @@ REFUSED = [
     (lambda: Transfer(shape="linear"), "transfer.shape='linear'"),
     (lambda: Transfer("rpic", damping=1.5), "transfer.damping=1.5"),
     (lambda: Transfer("rpic", damping=NAN), "transfer.damping=nan"),
+    (lambda: Transfer("rpic"), "transfer.damping=0 makes rpic the same as apic; set transfer=apic"),
     (lambda: Transfer("apic", damping=0.5), "transfer.damping=0.5 needs transfer.scheme=rpic"),
     (lambda: HalfSpace(ORIGIN, UP, "glue"), "half-space.kind='glue'"),
     (lambda: HalfSpace(ORIGIN, ORIGIN), "normal=(0.0, 0.0, 0.0)"),
