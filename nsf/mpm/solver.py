@@ -346,7 +346,7 @@ class FullOrderMPM:
 
         Raises:
             InstabilityError: a particle is non-finite, off the grid, inside out or faster than a cell a step,
-                most are collapsed, or energy came from nowhere; names the particle, the step and the time.
+                or most are collapsed; names the particle, the step and the time.
         """
         s, forcing, dx = self.state, self.grid_step.forcing, self.grid.geometry.dx
         look = self._watch.look(s, self.mass, self.grid, forcing, self.dt)

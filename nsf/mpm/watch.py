@@ -24,8 +24,9 @@ _ROUNDED = 16.0
 # A run warns above the first value and stops above the second.
 _COLLAPSED_SHARES = 0.01, 0.5
 _ADVECTIVE_CFLS = 0.8, MAX_ADVECTIVE_CFL
-_ENERGY_RISES = 0.05, 0.5
+# These only warn: a caller may set velocities between steps.
 _INSIDE_SHARE = 0.01
+_ENERGY_RISE = 0.05
 # Motion with less energy than this strain² in all particles is round-off.
 _STILL = 1e-9
 _NEVER = 2**31 - 1
@@ -257,15 +258,10 @@ class Watch:
         rise = 0.0
         if self._unstressed and self._kinetic > self._still:
             rise = (look.kinetic + look.potential - self._energy) / self._kinetic
-        if rise > _ENERGY_RISES[1]:
-            raise InstabilityError(
-                f"energy came from nowhere {when}: kinetic and potential energy rose by {100 * rise:.3g} % "
-                f"of the largest kinetic energy, and nothing did work; reduce dt={dt:g} s"
-            )
         self._remember("collapsed", look.collapsed_share, _COLLAPSED_SHARES[0], when)
         self._remember("cfl", cfl, _ADVECTIVE_CFLS[0], when)
         self._remember("inside", look.inside_share - self._inside, _INSIDE_SHARE, when)
-        self._remember("energy", rise, _ENERGY_RISES[0], when)
+        self._remember("energy", rise, _ENERGY_RISE, when)
 
     def _remember(self, what: str, value: float, limit: float, when: str) -> None:
         if value > max(limit, self._worst.get(what, (limit, ""))[0]):
