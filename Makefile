@@ -92,7 +92,7 @@ mirrors: install  ## the text of the reference that the modal engine mirrors; on
 	$(BIN)/python -c 'from nsf.engines.modal import mirrors; mirrors.write()'
 
 readme: install  ## the figures in README.md, from a report, and the list of reports
-	$(BIN)/python -m nsf.reporting.committed README.md
+	$(BIN)/python -m nsf.results.readme README.md
 	$(BIN)/nsf reports folder=reports
 
 check-reports: install  ## whether reports/ is as it was generated

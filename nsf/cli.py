@@ -190,7 +190,7 @@ def _index(words: list[str]) -> int:
     """The page of all runs."""
     asked = _asked("index", words, "folder")
     folder = asked.get("folder", _reports_folder("runs"))
-    from nsf.reporting.overview.index import write_index
+    from nsf.results.overview.index import write_index
 
     return _open(write_index(Path(folder)))
 
@@ -223,19 +223,21 @@ def _plan(words: list[str]) -> int:
 
 
 def _reports(words: list[str]) -> int:
-    """The list of reports, or what is wrong with them; 2 if something is."""
-    asked = _asked("reports", words, "folder", "check")
-    if asked.get("check", "true") not in ("true", "false"):
-        raise ConfigError(f"check={asked['check']} must be true or false")
-    from nsf.reporting.committed import faults, write_list
+    """The page of all reports and their charts, or what is wrong with them; 2 if something is."""
+    asked = _asked("reports", words, "folder", "check", "html")
+    for key in ("check", "html"):
+        if asked.get(key, "true") not in ("true", "false"):
+            raise ConfigError(f"{key}={asked[key]} must be true or false")
+    from nsf.pipeline.experiment import questions
+    from nsf.results.committed import faults, write_list
 
     folder = Path(asked.get("folder", _reports_folder()))
     if not folder.is_dir():
         raise ConfigError(f"folder={folder} is no folder; name one that holds reports, or make one")
     if asked.get("check") != "true":
-        print(f"open {write_list(folder).resolve()}")
+        print(f"open {write_list(folder, asked.get('html') == 'true', questions()).resolve()}")
         return 0
-    found = faults(folder)
+    found = faults(folder, questions())
     told = found or [f"every report in {folder} is as it was generated"]
     print(*told, sep="\n", file=sys.stderr if found else sys.stdout)
     return 2 if found else 0
@@ -254,7 +256,7 @@ def _search(words: list[str]) -> int:
 
 def _runs(words: list[str]) -> int:
     """Runs listed, shown, compared, verified or deleted."""
-    from nsf.reporting.overview.command import main as runs
+    from nsf.results.overview.command import main as runs
 
     return runs(words, lambda table: _console().print(table))
 
@@ -319,11 +321,9 @@ def _sweep(stage: str, sweeps: Sequence[list[str]], launcher: list[str], more: S
 def _show(page, table: bool = True) -> None:
     """The result table of a report, on the terminal, and where its page is."""
     if table:
-        import pandas as pd
+        from nsf.results.averages import console_table
 
-        from nsf.reporting import console_table
-
-        _console().print(console_table(pd.read_csv(page.parent / "results.csv")))
+        _console().print(console_table(page.parent / "results.csv"))
     print(f"open {page.resolve()}")
 
 

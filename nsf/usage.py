@@ -53,8 +53,8 @@ TOOLS = {
         "[folder=PATH]; reports/runs by default",
     ),
     "reports": (
-        "the list of all reports, reports/index.md; check=true: whether one of them was changed since",
-        "[folder=PATH] [check=true]; reports by default",
+        "table, page and charts of all reports; html=true: a page each; check=true: whether they changed",
+        "[folder=PATH] [html=true] [check=true]; reports by default",
     ),
     "bench": (
         "time and memory of a step, kernel by kernel; writes reports/speed",

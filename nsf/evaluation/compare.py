@@ -33,7 +33,8 @@ class Comparison:
         delta, displacement_error, stress_error: totals over frames 1..N, fractions; ∞ when the run diverged.
             `stress_error` is also ∞ where the run's stress is not finite in some frame.
             Of a run that was handed over, the frames of its continuation count like the reduced ones.
-        true_error: largest distance of a frame from the full-order one, RMS over particles [m]; ∞ likewise.
+        distance: from the full-order run, RMS over particles and frames 1..N [m]; distance_max: largest of a
+            frame, RMS over particles [m]; ∞ likewise.
         quantities: by name, a scalar of the shape at the end less the full-order run's [m]; ∞ likewise.
         reconstruction_delta, reconstruction_stress_error: of the full-order frames encoded and decoded.
         series: one row a frame (design.md).
@@ -43,7 +44,8 @@ class Comparison:
     delta: float
     displacement_error: float
     stress_error: float
-    true_error: float
+    distance: float
+    distance_max: float
     quantities: dict[str, float]
     reconstruction_delta: float
     reconstruction_stress_error: float
@@ -210,13 +212,14 @@ def compare(
         lost.add("stress_error")
     errors |= {name: total(*columns) for name, columns in reduced.items() if name not in lost}
     if not diverged:
-        errors["true_error"] = float((column["x_error"].max() / len(X)).sqrt())
+        errors["distance"] = float((column["x_error"][1:].mean() / len(X)).sqrt())
+        errors["distance_max"] = float((column["x_error"].max() / len(X)).sqrt())
     metrics.require_finite(errors, rollout.case.named)
     ends = [at_end(column[f"height_{of}"], shape[-1], X) for of, shape in (("rom", x_rom), ("fom", x))]
     off = {name: np.inf if diverged else ends[0][name] - ends[1][name] for name in QUANTITIES}
     xhat[own:] = torch.nan  # full-order frames are no latent vectors
     return Comparison(
-        **dict.fromkeys((*reduced, "true_error"), np.inf) | errors,
+        **dict.fromkeys((*reduced, "distance", "distance_max"), np.inf) | errors,
         quantities=off,
         series=_series(column, rollout, trajectory.t, split, xhat.cpu(), good),
         pictures={name: np.concatenate(blocks) for name, blocks in kept.items()}
@@ -260,7 +263,7 @@ def _series(
 
     return pd.DataFrame(
         {
-            "parameter": rollout.case.column,
+            "case": rollout.case.named,
             "split": split,
             "frame": np.arange(len(t)),
             "t": t,

@@ -28,7 +28,7 @@ class SuperResolution:
 
     Attributes:
         row: of `superresolution.csv`:
-            parameter, factor, points (factor × particles);
+            case, factor, points (factor × particles);
             delta, displacement_error: of the fields at the points, against a full-order run of as many
             particles on the same grid;
             particles_delta, particles_displacement_error: the same at the training particles, which are
@@ -147,7 +147,7 @@ def superresolve(
     found = []
     of_each = zip(x.split(len(frames)), at_particles.split(len(frames)), x_full, strict=True)
     for k, (x_k, at_particles_k, x_full_k) in enumerate(of_each):
-        own = {"parameter": rollouts[k].case.column, "factor": factor, "points": len(X)}
+        own = {"case": rollouts[k].case.named, "factor": factor, "points": len(X)}
         errors = _errors(rollouts[k], trajectories[k], frames, x_k, x_full_k, X, shared)
         interpolation_error, smeared = interpolation_errors[k]
         rest = {

@@ -14,18 +14,14 @@ from nsf.config.documents import text_of
 from nsf.errors import ConfigError, MissingRunError
 from nsf.paths import EXPERIMENTS
 from nsf.pipeline.names import Names
-from nsf.reporting.keeping import unchanged
+from nsf.results.question import Question, unchanged
 from nsf.runs import Run
 from nsf.vectors import is_finite
 
 _KEYS = {"title", "question", "paper", "jobs"}
-_OPTIONAL = {"stages", "each", "printed"}
+_OPTIONAL = {"stages", "each", "printed", "plots"}
 _KEYS_OF_PARTS = {"title", "question", "parts"}
 _MORE_STAGES = ("superresolve",)  # that a job may do after those of `nsf run`
-#: Keys that a column of results.csv tells of.
-_COLUMNS = (
-    *("scene", "model", "stress", "affine", "field", "latent_dim", "sampler.size", "precision", "device"),
-)
 _MEASURING = "evaluation."  # keys of how runs are measured, which tell no two models apart
 
 
@@ -35,12 +31,9 @@ class Job:
 
     Attributes:
         overrides: `key=value` in Hydra's grammar.
-        setting: those of them that tell the job from others alike in all columns of results.csv, but for how
-            runs are measured.
     """
 
     overrides: tuple[str, ...]
-    setting: str
 
     @property
     def keys(self) -> dict[str, str]:
@@ -59,8 +52,9 @@ class Experiment:
         paper: what the paper reports on it, with the place.
         grids: each a mapping from a key to its override with all values; every combination is a job.
         stages: what each job does after `evaluate`.
-        printed: δ that the paper prints of single jobs, as `Study` has them; None where it prints one a scene
-            and method, which the scene's file has.
+        plots: names of the charts of its report; None for all.
+        printed: δ that the paper prints of single jobs, as `Question` has them; None where it prints one a
+            scene and method, which the scene's file has.
         small: whether the file itself asks for scale=small, so that its report's name need not say so.
         parts: experiments with questions, jobs and reports of their own; none where the file has jobs itself.
     """
@@ -72,6 +66,7 @@ class Experiment:
     grids: tuple[dict[str, str], ...]
     stages: tuple[str, ...] = ()
     printed: tuple[dict, ...] | None = None
+    plots: tuple[str, ...] | None = None
     small: bool = False
     parts: "tuple[Experiment, ...]" = ()
 
@@ -122,8 +117,13 @@ class Experiment:
         grids = tuple(grid | own for grid in stated)
         small = all(grid.get("scale") == "scale=small" for grid in stated)
         texts = _texts(content, ("title", "question", "paper"), where)
-        printed = _printed(content.get("printed"), where)
-        return cls(name=name, grids=grids, stages=tuple(stages), printed=printed, small=small, **texts)
+        printed, plots = _printed(content.get("printed"), where), content.get("plots")
+        if plots is not None and not (isinstance(plots, list) and all(isinstance(p, str) for p in plots)):
+            raise ConfigError(f"{where}: plots={plots} must be a list of names of charts")
+        return cls(
+            name=name, grids=grids, stages=tuple(stages), printed=printed, small=small,
+            plots=None if plots is None else tuple(plots), **texts,
+        )  # fmt: skip
 
     @property
     def sweeps(self) -> list[list[str]]:
@@ -133,17 +133,7 @@ class Experiment:
     @property
     def jobs(self) -> list[Job]:
         """Every job, each once."""
-        found = configuration.jobs(self.sweeps)
-
-        def told(job: tuple[str, ...]) -> set[str]:
-            return {override for override in job if override.split("=")[0] in _COLUMNS}
-
-        def setting(job: tuple[str, ...]) -> str:
-            alike = [set(other) for other in found if told(other) == told(job)]
-            apart = (override for override in job if override not in set.intersection(*alike))
-            return ", ".join(override for override in apart if not override.startswith(_MEASURING))
-
-        return [Job(job, setting(job)) for job in found]
+        return [Job(job) for job in configuration.jobs(self.sweeps)]
 
     def report(self, say: Callable[[str], None] = print, root: Path | None = None) -> tuple[Path, list[str]]:
         """Write `reports/<name>` from what the jobs left, whichever device they ran on; one for each part.
@@ -156,11 +146,9 @@ class Experiment:
         """
         if self.parts:
             return self._reports_of_parts(say, root)
-        from nsf.reporting.sources import Study
-
         runs: dict[str, Run] = {}
         fine: dict[str, Run] = {}
-        settings, keys, missing, scales = {}, {}, [], set()
+        keys, missing, scales = {}, [], set()
         for job in self.jobs:
             config = configuration.load(job.overrides)
             plan = Names(config, root)
@@ -169,7 +157,7 @@ class Experiment:
             except MissingRunError:
                 missing.append(f"{' '.join(job.overrides)}: {_why(plan)}")
                 continue
-            runs[run.id], settings[run.id], keys[run.id] = run, job.setting, job.keys
+            runs[run.id], keys[run.id] = run, job.keys
             scales.add(config.scale)
             if "superresolve" in self.stages:
                 try:
@@ -183,14 +171,19 @@ class Experiment:
                 f"no job of {self.name} was evaluated; run `nsf run +experiment={self.name}`"
             )
         folder = self._folder(config, scales)
-        study = Study(self.question, self.paper, settings, keys, missing, self.printed, fine)
-        if page := unchanged(folder, runs.values(), self.title, study=study):
-            say(f"report: {len(runs)} jobs, {len(missing)} missing, unchanged, reused → {page}")
+        question = Question(
+            folder.relative_to(config.report.folder).as_posix(), self.title, self.question, self.paper,
+            keys, self.printed, missing, fine, self.plots,
+        )  # fmt: skip
+        said = f"report: {len(runs)} jobs, {len(missing)} missing"
+        if page := unchanged(folder, runs.values(), question):
+            say(f"{said}, unchanged, reused → {page}")
             return page, missing
-        from nsf.reporting.build import build_report
+        from nsf.results.report import build_report
 
-        page = build_report(list(runs.values()), folder, self.title, study=study)
-        say(f"report: {len(runs)} jobs, {len(missing)} missing → {page}")
+        films = not question.settings or not any(map(len, question.settings.values()))
+        page = build_report(runs.values(), folder, question, films=films)
+        say(f"{said} → {page}")
         return page, missing
 
     def _reports_of_parts(self, say: Callable[[str], None], root: Path | None) -> tuple[Path, list[str]]:
@@ -225,6 +218,16 @@ class Experiment:
     def _folder(self, config: DictConfig, scales: set[str]) -> Path:
         shrunk = scales == {"small"} and not self.small
         return Path(config.report.folder) / (f"{self.name}_small" if shrunk else self.name)
+
+
+def questions(folder: Path = EXPERIMENTS) -> dict[str, dict[str, str]]:
+    """Title, question and what the paper says, of each experiment and part that has a report."""
+    loaded = [Experiment.load(stem, folder=folder) for stem in _stems(folder)]
+    return {
+        one.name: {"title": one.title, "question": one.question, "paper": one.paper}
+        for experiment in loaded
+        for one in experiment.parts or (experiment,)
+    }
 
 
 def _stems(folder: Path) -> list[str]:

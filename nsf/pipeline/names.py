@@ -295,7 +295,7 @@ class Names:
     @property
     def evaluation(self) -> Run:
         """The run of errors and costs."""
-        content = self._content(("evaluation",))
+        content = self._content(("evaluation",)) | {"columns": "one table"}  # before, a table had others
         content["paper"] = self._content(("scene",))["scene"].get("paper")
         parents = [self.deployment, *map(self.truth, self.held_out)]
         return Run.open("evaluate", self.scene.name, content, parents, root=self.root)

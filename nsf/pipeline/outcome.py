@@ -9,11 +9,11 @@ from rich.table import Table
 from nsf import config as configuration
 from nsf.errors import MissingRunError
 from nsf.pipeline.names import Names
-from nsf.reporting.text.columns import COLUMN
+from nsf.results.columns import COLUMNS
 from nsf.runs import Run
 
 #: Columns of `results.csv` of which a job's mean is shown.
-_SHOWN = ("delta", "displacement_error", "stress_error", "step_ms_full", "step_ms_reduced")
+_SHOWN = ("delta", "displacement_error", "stress_error", "step_ms_full", "step_ms")
 
 
 def outcome_table(sweeps: Sequence[Sequence[str]], failed: Mapping[str, str]) -> Table | None:
@@ -33,7 +33,7 @@ def outcome_table(sweeps: Sequence[Sequence[str]], failed: Mapping[str, str]) ->
     for key, leaf in zip(varied, leaves, strict=True):
         table.add_column(escape(leaf if leaves.count(leaf) == 1 else key), overflow="fold")
     for name in _SHOWN:
-        table.add_column(escape(COLUMN[name].heading), justify="right")
+        table.add_column(escape(COLUMNS[name].heading), justify="right")
     table.add_column("run", no_wrap=True)
     for job in jobs:
         told = " ".join(f"{key}={job[key]}" for key in keys if key in varied and key in job)
@@ -52,5 +52,5 @@ def _means(run: Run) -> list[str]:
     means = []
     for name in _SHOWN:
         values = [float(row.get(name) or "nan") for row in rows]
-        means.append(COLUMN[name].text(sum(values) / len(values)))
+        means.append(COLUMNS[name].cell(sum(values) / len(values)))
     return means

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from nsf.errors import MissingRunError
 from nsf.pipeline.names import Names
-from nsf.reporting.keeping import unchanged
+from nsf.results.question import Question, unchanged
 from nsf.runs import Run
 
 Say = Callable[[str], object]
@@ -79,7 +79,12 @@ def reused(run: Run, say: Say) -> Run:
 def kept_report(names: Names) -> Path | None:
     """The page of the report, if nothing that it shows has changed since it was written."""
     runs = names.reported()
-    return unchanged(names.report_folder, runs, names.config.scene.title, names.evaluation) if runs else None
+    return unchanged(names.report_folder, runs, question(names), names.evaluation) if runs else None
+
+
+def question(names: Names) -> Question:
+    """What the report of a scene is about."""
+    return Question(names.config.report.name, names.config.scene.title)
 
 
 def report(names: Names, say: Say) -> Path:
@@ -93,12 +98,12 @@ def report(names: Names, say: Say) -> Path:
         raise MissingRunError(
             "no evaluate run of these held-out cases is there; run `nsf run` with the same keys"
         )
-    title, folder = names.config.scene.title, names.report_folder
-    if page := unchanged(folder, runs, title, names.evaluation):
+    folder = names.report_folder
+    if page := unchanged(folder, runs, question(names), names.evaluation):
         say(f"report: evaluated runs: {len(runs)}, unchanged, reused → {page}")
         return page
-    from nsf.reporting.build import build_report
+    from nsf.results.report import build_report
 
-    page = build_report(runs, folder, title, first=names.evaluation)
+    page = build_report(runs, folder, question(names), first=names.evaluation)
     say(f"report: evaluated runs: {len(runs)} → {page}")
     return page

@@ -201,6 +201,8 @@ _COSTS = (
         "",
         "How far the run went from the training data; above 1 it is not to be believed.",
     ),
+    _measured("distrusted_at", "first distrusted", "s", "Time of the first step that was not believed."),
+    _measured("fallback_at", "fallback from", "s", "Time from which the fallback went on to the end."),
 )
 _ORIGIN = (
     _text("precision", "precision", "fp32 or fp64."),
@@ -225,6 +227,7 @@ DERIVED = {
     for column in (
         _text("body", "scene", "The scene, with its material or size where a report has several."),
         _text("variant", "variant", "What tells rows of a scene apart."),
+        _text("delta_interval", "mean δ, 95 % [%]", "Middle 95 % of means of seeds and cases drawn anew."),
         Column("cases", "cases", meaning="How many cases, and seeds of each, a mean is over."),
         Column("diverged", "diverged", meaning="How many of them diverged."),
         Column("speedup_step", "speedup, step", "×", meaning="Full-order over own mean time of a step."),
@@ -238,6 +241,14 @@ DERIVED = {
         ),
         _percent("displacement_worst", "its largest", "Largest displacement error of a case."),
         _percent("integration_share", "N", "Integration particles over all particles."),
+        Column("points", "points", meaning="Points at which the fields are queried."),
+        _percent("particles_delta", "δ at the particles", "δ at the training particles alone."),
+        _percent("particles_displacement_error", "displacement error at them", "The same of displacement."),
+        _percent("full_order_difference", "few and many particles", "Between both full-order runs."),
+        _percent("interpolation_error", "interpolating the fine run", "From its own training particles."),
+        _percent("smeared", "smeared", "Points that interpolation puts more than half a cell away."),
+        Column("seconds", "query", "s", meaning="Time to query the fields at all points."),
+        Column("full_order_seconds", "fine full-order run", "s", meaning="Its time, set-up included."),
         Column("sampler.size", "sample particles |S|"),
         Column("sampler.cells", "cells with sample particles"),
         Column("field.beta", "hidden width β over d"),

@@ -5,51 +5,6 @@ from dataclasses import dataclass, field
 
 from nsf.results.formats import HTML, Rows, markdown_document
 
-DEFINITIONS = (
-    (
-        "δ",
-        "‖x_rom − x_fom‖ / ‖x_fom‖ over frames and particles: the paper's error; it depends on the origin.",
-    ),
-    (
-        "displacement error",
-        "‖x_rom − x_fom‖ / ‖x_fom − X‖: the same distance beside how far the particles moved.",
-    ),
-    ("stress error", "‖τ_rom − τ_fom‖ / ‖τ_fom‖ of the Kirchhoff stress."),
-    ("r, |S|, |N|, γ", "latent dimension, sample and integration particles, and γ = 3·particles / r."),
-    (
-        "method",
-        "nsf takes stress and affine momentum from their fields, neural_stress_only the stress alone "
-        "(C = 0), neural_affine_only the affine momentum alone (τ from ∂g/∂X), deformation_only neither; "
-        "history: particles carry both, as at full order.",
-    ),
-    (
-        "engine",
-        "what takes the steps. reference takes projected steps with any field and is not compiled. modal "
-        "takes them with fields of modes and is compiled. "
-        "operators step the latent vector alone, by a learned recurrence.",
-    ),
-    (
-        "speedup",
-        "full-order over reduced mean wall time, of one step, of the whole simulation, and of the simulation "
-        "with the positions of all particles decoded at every frame, as a full-order run has them. Times of "
-        "operators do not hold the checks that tell the estimate; `nsf bench benches=operators` times "
-        "checked steps.",
-    ),
-    (
-        "rivals",
-        "without a reduced step: nothing moves; the training run of the nearest parameters, its latent "
-        "vectors decoded by the same fields; latent vectors interpolated over the parameters between "
-        "training runs, of one parameter linearly, and constant outside. Coarse full order is "
-        "the full-order solver on a coarser grid.",
-    ),
-    (
-        "runs until it pays",
-        "reduced runs, without decoding and without checks, that save as much time as training and teaching "
-        "took; training runs are not counted.",
-    ),
-    ("handed on", "share of steps that operators left to projected ones, or these to the full-order solver."),
-)
-
 
 @dataclass(frozen=True)
 class Picture:
@@ -62,11 +17,10 @@ class Picture:
 
 @dataclass(frozen=True)
 class Section:
-    """Pictures under one heading; `key` says what they are made of, empty where they are always drawn."""
+    """Pictures under one heading."""
 
     heading: str
     pictures: list[Picture] = field(default_factory=list)
-    key: str = ""
 
 
 @dataclass(frozen=True)
@@ -89,7 +43,7 @@ class Page:
     tables: Sequence[Table]
     sections: Sequence[Section]
     provenance: Table
-    definitions: Sequence[tuple[str, str]] = DEFINITIONS
+    definitions: Sequence[tuple[str, str]] = ()
 
 
 def html_page(page: Page) -> str:

@@ -46,9 +46,9 @@ COLUMNS = {
     "run-out error": "run_out_error",
     "sample": "sample",
     "gamma": "gamma",
-    "handed over": "handed_over",
+    "handed over": "fallback_share",
     "estimated error": "estimated_error",
-    "true error": "true_error",
+    "true error": "distance_max",
 }
 
 
@@ -173,6 +173,8 @@ def results(chains: Chains, experiment: str) -> list[dict]:
         pipeline = chains.deployed(scene, model, *further)
         pipeline.run("evaluate")
         table = pd.read_csv(pipeline.evaluation.path / "results.csv")
+        cases = table["value"].astype(object).where(table["value"].notna(), table["case"])
+        table = table.assign(parameter=cases, gamma=3.0 * table["particles"] / table["r"])
         for _, row in table.iterrows():
             values = {name: row[column] for name, column in COLUMNS.items()}
             rows.append({"scene": scene, "model": model, "keys": " ".join(further)} | values)

@@ -24,7 +24,7 @@ CONTEXT.set_forkserver_preload(
     + [
         "nsf.pipeline.sweep",
         "nsf.pipeline.experiment",
-        "nsf.reporting.build",
+        "nsf.results.report",
         "matplotlib.backends.backend_svg",
     ]
     + [f"nsf.pipeline.stages.{module.name}" for module in pkgutil.iter_modules(stages.__path__)]
@@ -87,8 +87,8 @@ class PlainReport:
     """Reports that draw nothing: pictures have tests of their own, and take seconds."""
 
     def __call__(self):
-        module = importlib.import_module("nsf.reporting.build")
-        module.draw = lambda merged, folder, **_: []
+        importlib.import_module("nsf.results.report").draw = lambda *_: []
+        importlib.import_module("nsf.results.pictures").sections = lambda *_: []
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class BriefReport:
     """Of each variant the two pictures that a page of many has: the others are drawn by the same code."""
 
     def __call__(self):
-        importlib.import_module("nsf.reporting.pictures").MANY = 0
+        importlib.import_module("nsf.results.pictures")._MANY = 0
 
 
 def _at(where, call, act):

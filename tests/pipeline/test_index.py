@@ -4,7 +4,7 @@ import shutil
 
 import pytest
 
-from nsf.reporting.overview.index import write_index
+from nsf.results.overview.index import write_index
 from nsf.runs import Run
 
 

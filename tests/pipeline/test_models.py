@@ -85,7 +85,7 @@ def run_of(pipeline_at, root, *overrides):
 def test_interpolated_latents_are_a_model(copied, pipeline_at):
     pipeline, rows, _ = run_of(pipeline_at, copied("simulate", "train"), "model=interpolate")
     (row,) = rows.to_dict("records")
-    assert (row["model"], row["handed_over"]) == ("interpolate", 0.0)
+    assert (row["model"], row["fallback_share"]) == ("interpolate", 0.0)
     assert row["displacement_error"] == pytest.approx(row["displacement_interpolated"], rel=1e-9)
     kept = Rollout.open(pipeline.deployment.file("rollout_0.h5"))
     assert set(kept.stops) == {"latent"}
@@ -110,7 +110,7 @@ def test_beyond_its_training_an_interpolated_run_may_be_projected(copied, pipeli
 def test_the_full_order_run_is_a_model(copied, pipeline_at):
     pipeline, rows, _ = run_of(pipeline_at, copied("simulate", "train"), "model=full")
     (row,) = rows.to_dict("records")
-    assert (row["model"], row["delta"], row["handed_over"]) == ("full", 0.0, 1.0)
+    assert (row["model"], row["delta"], row["fallback_share"]) == ("full", 0.0, 1.0)
     files = pipeline.deployment.file("continuation_0.h5"), pipeline.truth(angle(26.0)).file("trajectory.h5")
     with Trajectory.open(files[0]) as own, Trajectory.open(files[1]) as truth:
         np.testing.assert_array_equal(own.read("x"), truth.read("x"))

@@ -92,10 +92,10 @@ def test_an_experiment_runs_its_jobs_and_reports_them(nsf, copied, tmp_path):
     assert outcome.code == 0, outcome.err
     report = tmp_path / "work/reports/table1/scenes_small"
     rows = pd.read_csv(report / "results.csv")
-    found = set(zip(rows["method"], rows["field"], strict=True))
-    assert found == {("nsf", "basis"), ("deformation_only", "basis")}
+    found = set(zip(rows["stress"], rows["field"], strict=True))
+    assert found == {("field", "basis"), ("deformation", "basis")}
     assert "How far is the reduced run" in (report / "index.md").read_text()
-    assert r"deformation\_only & " in (report / "results.tex").read_text()
+    assert "deformation only (baseline) & " in (report / "results.tex").read_text()
     again = nsf("report", root, *arguments, faults=[PlainReport()])
     assert again.code == 0
     assert "2 jobs, 0 missing" in again.out

@@ -6,14 +6,13 @@ import signal
 import pytest
 from forked import BriefReport, PlainReport, SignalAt, run_nsf
 
-from nsf.reporting.keeping import MADE_OF
 from nsf.results.folder import MARK
 from nsf.storage import locked
 
 #: In the middle of the pictures, before the page, and between the two renames of the exchange.
 MOMENTS = {
-    "drawing": ("nsf.reporting.pictures:save", 3),
-    "writing": ("nsf.reporting.build:markdown_page", 1),
+    "drawing": ("nsf.results.report:save", 2),
+    "writing": ("nsf.results.report:markdown_page", 1),
     "exchanging": ("nsf.results.folder:Path.rename", 2),
 }
 
@@ -25,7 +24,7 @@ def files(folder):
 def out_of_date(folder):
     """Let a report be drawn anew, as where its runs have changed."""
     told = json.loads((folder / MARK).read_text())
-    (folder / MARK).write_text(json.dumps(told | {MADE_OF: "something else", "drawn": {}}))
+    (folder / MARK).write_text(json.dumps(told | {"made_of": "something else"}))
 
 
 @pytest.fixture(scope="module")

@@ -14,8 +14,8 @@ from rich.console import Console
 import nsf.runs.manifest
 from nsf.cli import main
 from nsf.errors import ConfigError, MissingRunError, NSFError, SchemaError, StorageError
-from nsf.reporting.overview.index import write_index
-from nsf.reporting.overview.tables import difference_table, runs_table
+from nsf.results.overview.index import write_index
+from nsf.results.overview.tables import difference_table, runs_table
 from nsf.runs import Run
 from nsf.runs.listing import entries
 

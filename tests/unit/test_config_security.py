@@ -31,7 +31,7 @@ CALLABLES = [
     "nsf.scenes.shapes.mesh._read",
     "nsf.dynamics.ReducedMPM",
     "nsf.sampling.sampler.np.save",
-    "nsf.reporting.build.build_report",
+    "nsf.results.report.build_report",
     "nsf.live.bench",
     "nsf.__main__.main",
     "nsf",

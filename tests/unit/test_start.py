@@ -60,7 +60,8 @@ def test_a_refused_configuration_imports_nothing_heavy(started, words, told):
 
 def test_a_chain_whose_results_are_there_imports_nothing_that_computes(started, chain, tiny, monkeypatch):
     monkeypatch.setenv("NSF_RUNS", str(chain.root))
-    monkeypatch.setattr("nsf.reporting.build.draw", lambda merged, folder, **_: [])
+    monkeypatch.setattr("nsf.results.report.draw", lambda *_: [])
+    monkeypatch.setattr("nsf.results.pictures.sections", lambda *_: [])
     with pytest.raises(SystemExit) as ended:
         main(["report", *tiny])
     assert not ended.value.code

@@ -10,12 +10,12 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from nsf.inverse.model import Model
-from nsf.reporting.build import commit_text
-from nsf.reporting.sources import file_hash
 from nsf.results.columns import ABSENT, axis, number
 from nsf.results.folder import MARK, replaced
 from nsf.results.formats import Rows, spreadsheet
 from nsf.results.page import Page, Picture, Section, Table, html_page, markdown_page
+from nsf.results.report import commit_text
+from nsf.results.sources import file_hash
 from nsf.results.style import save
 from nsf.runs import Run
 from nsf.runs.provenance import provenance

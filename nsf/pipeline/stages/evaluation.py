@@ -55,13 +55,11 @@ def evaluate(pipeline, run: Run) -> None:
             ]
         comparisons, beside = zip(*found, strict=True)
         cost = _cost(pipeline, manifold, rollouts, beside[0].factors)
-        engine = str(pipeline.deployment.manifest["metrics"].get("engine", ""))
         seconds = pipeline.training.metric("training_seconds")
         offline = seconds, pipeline.taught.metric("teach_seconds") if pipeline.model.learns else 0.0
-        own = cost, pipeline.device, run.manifest, pipeline.model.name, engine, offline
-        table = results.rows(pipeline.config, manifold, rollouts, comparisons, beside, *own)
-        held = comparisons, beside, rollouts
-        summary = results.summarise(pipeline.deployed, manifold, table, *held, seconds)
+        own = cost, pipeline.device, run.manifest, pipeline.model.name, offline
+        table = results.rows(pipeline.deployed, manifold, rollouts, comparisons, beside, *own)
+        summary = results.summarise(pipeline.deployed, comparisons, beside, rollouts, seconds)
         results.write(record, table, comparisons, cost, summary)
     pipeline.say(f"evaluate: mean δ {100 * table['delta'].mean():.3g} % over {len(table)} cases → {run.id}")
 

@@ -1,6 +1,7 @@
 """The files of an evaluate run: one place that knows what reporting reads (docs/design.md)."""
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 
@@ -12,22 +13,19 @@ from omegaconf import DictConfig, OmegaConf
 from nsf.data import Case
 from nsf.deployment import Rollout
 from nsf.dynamics.setup import reduced_steps
-from nsf.evaluation import Comparison, Rivals, SolverCost, SuperResolution, reduction_ratio
+from nsf.evaluation import Comparison, Rivals, SolverCost, SuperResolution
 from nsf.evaluation.quantities import QUANTITIES
 from nsf.evaluation.surroundings import surroundings
 from nsf.models import describe
+from nsf.results.columns import EVALUATED
 from nsf.runs import Record
 from nsf.scenes import Scene
 from nsf.storage import write_json, writing
 
 _COARSE = "coarse_"
-_METHODS = {
-    ("field", "field"): "nsf",
-    ("deformation", "none"): "deformation_only",
-    ("field", "none"): "neural_stress_only",
-    ("deformation", "field"): "neural_affine_only",
-    ("particles", "particles"): "history",
-}
+_OF_WHOLE_RUNS = (
+    *("step_ms", "step_ms_p10", "step_ms_p90", "total_ms", "decode_ms", "memory_mib", "break_even_runs"),
+)
 
 
 def costs(measured: Mapping[str, SolverCost], decode_ms: float = math.nan) -> dict:
@@ -58,7 +56,7 @@ def costs(measured: Mapping[str, SolverCost], decode_ms: float = math.nan) -> di
 
 
 def rows(
-    config: DictConfig,
+    scene: Scene,
     manifold,
     rollouts: Sequence[Rollout],
     comparisons: Sequence[Comparison],
@@ -67,58 +65,81 @@ def rows(
     device: str,
     manifest: dict,
     model: str = "",
-    engine: str = "",
     offline: tuple[float, float] = (math.nan, 0.0),
 ) -> pd.DataFrame:
-    """Content of `results.csv`, one row a case; errors are fractions, ∞ where a run diverged.
+    """Content of `results.csv`, a row a case with the columns `EVALUATED`; ∞ where a run diverged.
 
-    `model` took the steps of the rollouts, where `model=auto` chose it. `offline` are the times of training
-    and of teaching [s]. A run costs what its steps cost, those by operators and projected ones.
+    Args:
+        scene: that was deployed on.
+        manifold: the fields.
+        rollouts, comparisons, rivals: of each case.
+        cost: content of `cost.json`. A run costs what its steps cost, those of the model and of its fallback.
+        device, manifest: where, and from what code, the rows are made.
+        model: that took the steps, where `model=auto` chose it.
+        offline: times of training and of teaching [s].
     """
+    config = scene.config
     commit = str(manifest.get("commit") or "unknown")[:12] + ("-dirty" if manifest.get("dirty") else "")
-    variant = {
+    shared = model_columns(config, model) | {
         "scene": config.scene.name,
-        **describe(config, model),
-        # Until reports read the three columns above.
-        "method": _METHODS.get((config.stress, config.affine), ""),
-        "engine": engine,
+        "material": _material(config),
         "field": manifold.field,
         "r": manifold.latent_dim,
+        "particles": len(manifold.X),
+        "seed": int(config.seed),
+        "split": config.deploy.split,
+        "train_seconds": offline[0] if cost.get("trials") else math.nan,
+        "teach_seconds": offline[1],
+        "precision": config.precision,
+        "device": torch.cuda.get_device_name(device) if device.startswith("cuda") else "cpu",
+        "commit": commit,
     }
-    # What a step costs whose particles have left the grid is no one's speedup, nor is half a reduced run's.
-    costly = (
-        "step_ms_reduced", "total_ms_reduced", "decode_ms", "speedup_step", "speedup_total",
-        "memory_reduced_mib", "break_even_runs",
-    )  # fmt: skip
-    device_name = torch.cuda.get_device_name(device) if device.startswith("cuda") else "cpu"
     found = []
     for rollout, comparison, beside in zip(rollouts, comparisons, rivals, strict=True):
+        as_run = _cost_of_share(cost, rollout.projected_share)
+        times = _costs_in_a_row(as_run, next(iter(rivals[0].coarse), None))
+        times |= {"break_even_runs": _break_even(as_run, sum(offline))}
+        if rollout.diverged >= 0 or rollout.handed_over >= 0:
+            # A step whose particles have left the grid costs no one's speedup, nor does half a run.
+            times |= dict.fromkeys(_OF_WHOLE_RUNS, math.nan)
+        numbers = list(rollout.case.values())
         own = {
+            "case": rollout.case.named,
+            "value": numbers[0] if len(numbers) == 1 else math.nan,
             "sample": rollout.sample,
-            "integration_mean": rollout.integration_mean,
-            "parameter": rollout.case.column,
-            "split": config.deploy.split,
+            "integration": rollout.integration_mean,
             "delta": comparison.delta,
             "displacement_error": comparison.displacement_error,
             "stress_error": comparison.stress_error,
-            **_beside(beside),
-        }
-        as_run = _cost_of_share(cost, rollout.projected_share)
-        times = _costs_in_a_row(as_run, next(iter(rivals[0].coarse), None))
-        times |= {"teach_seconds": offline[1], "break_even_runs": _break_even(as_run, sum(offline))}
-        if rollout.diverged >= 0 or rollout.handed_over >= 0:
-            times |= dict.fromkeys(costly, math.nan)
-        off = {
-            "handed_over": _handed_over(rollout, config),
+            "distance": comparison.distance,
+            "distance_max": comparison.distance_max,
+            "fallback_share": _handed_over(rollout, config),
             "estimated_error": math.nan if rollout.estimate is None else rollout.estimate.max(),
-            "true_error": comparison.true_error,
-            **{f"{name}_error": math.nan for name in QUANTITIES},
-            **{f"{name}_error": off for name, off in comparison.quantities.items()},
+            "distrust": float(rollout.trust.max()),
+            "distrusted_at": _time(rollout, rollout.distrusted),
+            "fallback_at": _time(rollout, rollout.handed_over),
         }
-        gamma = {"gamma": reduction_ratio(len(manifold.X), manifold.latent_dim)}
-        place = {"precision": config.precision, "device": device_name, "commit": commit}
-        found.append(variant | own | gamma | times | off | place)
-    return pd.DataFrame(found)
+        off = {f"{name}_error": comparison.quantities.get(name, math.nan) for name in QUANTITIES}
+        found.append(shared | own | _beside(beside) | times | off)
+    return pd.DataFrame(found).reindex(columns=list(EVALUATED))
+
+
+def model_columns(config: DictConfig, chosen: str = "") -> dict[str, str]:
+    """Which model took the steps, what it learned from, and where a projected step takes τ and C from."""
+    found = describe(config, chosen)
+    teacher = str(OmegaConf.select(config, "model.teacher", default=""))
+    return found | {"teacher": teacher if found["model"] == "recurrence" else ""}
+
+
+def _material(config: DictConfig) -> str:
+    """The name of the law, as `von_mises`."""
+    name = str(config.material.get("_target_", "")).rpartition(".")[2]
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name).lower()
+
+
+def _time(rollout: Rollout, step: int) -> float:
+    """Time [s] of a step; NaN of none."""
+    return float(rollout.t[step]) if step >= 0 else math.nan
 
 
 def _beside(rivals: Rivals) -> dict[str, float]:
@@ -145,23 +166,20 @@ def _cost_of_share(cost: dict, share: float) -> dict:
 def _costs_in_a_row(cost: dict, factor: int | None) -> dict[str, float]:
     """Columns of `results.csv`, of the coarse run at a factor of Δx; NaN where nothing was measured."""
 
-    def pair(key: str) -> tuple[float, float]:
-        return tuple(cost.get(solver, {}).get(key, math.nan) for solver in ("full_order", "reduced"))
-
+    full, own = cost.get("full_order", {}), cost.get("reduced", {})
     coarse = cost.get("coarse", {}).get(str(factor), {})
-    step, total, memory = pair("step_ms"), pair("total_ms"), pair("memory_mib")
     return {
-        "step_ms_full": step[0],
-        "step_ms_reduced": step[1],
+        "step_ms_full": full.get("step_ms", math.nan),
+        "step_ms": own.get("step_ms", math.nan),
+        "step_ms_p10": own.get("step_ms_p10", math.nan),
+        "step_ms_p90": own.get("step_ms_p90", math.nan),
         "step_ms_coarse": coarse.get("step_ms", math.nan),
-        "total_ms_full": total[0],
-        "total_ms_reduced": total[1],
+        "total_ms_full": full.get("total_ms", math.nan),
+        "total_ms": own.get("total_ms", math.nan),
         "total_ms_coarse": coarse.get("total_ms", math.nan),
         "decode_ms": cost.get("decode_ms", math.nan),
-        "speedup_step": step[0] / step[1],
-        "speedup_total": total[0] / total[1],
-        "memory_full_mib": memory[0],
-        "memory_reduced_mib": memory[1],
+        "memory_full_mib": full.get("memory_mib", math.nan),
+        "memory_mib": own.get("memory_mib", math.nan),
     }
 
 
@@ -189,7 +207,7 @@ def trust_of(rollout: Rollout) -> dict:
         return float(rollout.t[step]) if step >= 0 else None
 
     return {
-        "parameter": rollout.case.column,
+        "case": rollout.case.named,
         "away": rollout.away if math.isfinite(rollout.away) else None,
         "trust": largest if math.isfinite(largest) else None,
         "distrusted": rollout.distrusted >= 0,
@@ -200,8 +218,6 @@ def trust_of(rollout: Rollout) -> dict:
 
 def summarise(
     scene: Scene,
-    manifold,
-    results: pd.DataFrame,
     comparisons: Sequence[Comparison],
     rivals: Sequence[Rivals],
     rollouts: Sequence[Rollout],
@@ -216,10 +232,7 @@ def summarise(
     summary = {
         "title": config.scene.title,
         "scale": scene.scale,
-        "parameter_name": _parameter(scene)[0],
-        "parameter_unit": _parameter(scene)[1],
         "cases": [dict(rollout.case) for rollout in rollouts],
-        "particles": len(manifold.X),
         "training_seconds": seconds,
         "changes": OmegaConf.to_container(config.deploy).get("changes") or {},
         "delta": mean("delta") if math.isfinite(mean("delta")) else None,
@@ -227,23 +240,13 @@ def summarise(
         "reconstruction_stress_error": mean("reconstruction_stress_error"),
         "trust": [trust_of(rollout) for rollout in rollouts],
         "rivals": [
-            {"parameter": rollout.case.column} | asdict(beside)
+            {"case": rollout.case.named} | asdict(beside)
             for rollout, beside in zip(rollouts, rivals, strict=True)
         ],
-        "variant": {
-            name: results[name].tolist()[0]
-            for name in ("method", "model", "stress", "affine", "field", "r", "sample")
-        },
     }
     if config.scene.get("paper"):
         summary["paper"] = OmegaConf.to_container(config.scene.paper)
     return summary
-
-
-def _parameter(scene: Scene) -> tuple[str, str]:
-    """Name and unit of what tells the cases of a scene apart, for headings."""
-    (name, one), *more = scene.varied.items()
-    return ("case", "") if more else (name, one.unit)
 
 
 def write(
@@ -259,8 +262,7 @@ def write(
     with writing(path / "frames.npz") as partial:
         np.savez_compressed(
             partial,
-            parameters=np.array(results["parameter"].tolist()),
-            splits=results["split"].to_numpy(dtype=str),
+            cases=results["case"].to_numpy(dtype=str),
             t=pictures[0]["t"],
             **{name: np.stack([p[name] for p in pictures]) for name in pictures[0] if name != "t"},
         )
@@ -269,7 +271,7 @@ def write(
     for name in (*tables, "frames.npz", "cost.json", "summary.json"):
         record.output(name)
     record.metrics.update({name: summary[name] for name in ("delta", "reconstruction_delta")})
-    record.metrics["diverged"] = results.loc[np.isinf(results["delta"]), "parameter"].tolist()
+    record.metrics["diverged"] = results.loc[np.isinf(results["delta"]), "case"].tolist()
 
 
 def write_superresolution(
@@ -277,19 +279,18 @@ def write_superresolution(
 ) -> pd.DataFrame:
     """Write `superresolution.csv` and `superresolution.png` into a run's folder; gives the table."""
     from nsf.bodies.colors import STRESS_COLORS
-    from nsf.reporting.bodies.shapes import fine_shapes
+    from nsf.results.pictures import fine_shapes
     from nsf.results.style import PIXELS, write_png
 
     table = pd.DataFrame([f.row for f in fine])
     with writing(record.path / "superresolution.csv") as partial:
         table.to_csv(partial, index=False)
-    name, unit = _parameter(scene)
     end = np.array([scene.dt * scene.steps])
     around = [surroundings(scene.with_parameters(case), end) for case in cases]
-    picture = fine_shapes(fine, around, name.replace("_", " "), unit)
+    picture = fine_shapes(fine, around)
     with writing(record.path / "superresolution.png") as partial:
         write_png(picture, partial, PIXELS, [STRESS_COLORS])
     for name in ("superresolution.csv", "superresolution.png"):
         record.output(name)
-    record.metrics.update(table.drop(columns="parameter").mean().to_dict())
+    record.metrics.update(table.drop(columns="case").mean().to_dict())
     return table

@@ -417,7 +417,7 @@ def test_batches_have_rows_by_their_size(batches, chain):
     evaluated = pd.read_csv(chain.pipeline.evaluation.path / "results.csv").iloc[0]
     double = of(batches, "δ")[of(batches, "δ")["precision"] == "fp64"]
     np.testing.assert_allclose(double["median"], evaluated["delta"], rtol=1e-6)
-    assert (double["integration"] == round(evaluated["integration_mean"])).all()
+    assert (double["integration"] == round(evaluated["integration"])).all()
 
 
 def test_the_cases_of_a_batch(chain):

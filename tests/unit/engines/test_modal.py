@@ -276,5 +276,5 @@ def test_steps_timed_on_the_gpu_are_steps(tiny_scene, reference_manifold, phases
         for _ in range(2):
             timed.timed_step(timer)
     np.testing.assert_allclose(timed.xhat.cpu(), plain.xhat.cpu(), rtol=0, atol=1e-6)
-    assert list(timer.calls.items()) == [(n, 4) for n in ("inference", "p2g", "g2p", "inversion")]
+    assert list(timer.milliseconds) == ["inference", "p2g", "g2p", "inversion"]
     assert min(timer.milliseconds.values()) > 0

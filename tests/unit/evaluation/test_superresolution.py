@@ -57,7 +57,7 @@ def test_row_against_a_fine_run_of_its_own(fine, chain, tiny_manifold, made, tru
     x_full, X = torch.tensor(np.stack(x_full)), torch.tensor(scene.particles().X)
     x = tiny_manifold.restrict(X=X).position(torch.tensor(made.xhat[FRAMES]))
     row = fine.row
-    assert (row["parameter"], row["factor"], row["points"]) == (26.0, 3, 1500)
+    assert (row["case"], row["factor"], row["points"]) == ("friction_angle=26°", 3, 1500)
     assert row["delta"] == pytest.approx(metrics.deformation_error(x, x_full), rel=1e-9)
     assert row["displacement_error"] == pytest.approx(metrics.displacement_error(x, x_full, X), rel=1e-9)
     few = slice(0, 500)
@@ -82,7 +82,7 @@ def test_runs_together_are_those_alone(fine, chain, tiny_manifold, truth, made):
     )
     (alone,) = superresolve(tiny_manifold, chain.scene, [truth], [other], 3, FRAMES, device="cpu")
     for found, expected in zip(both, (alone, fine), strict=True):
-        measured = {name for name in found.row if not name.endswith("seconds")}
+        measured = {name for name in found.row if not name.endswith("seconds")} - {"case"}
         for name in measured:
             assert found.row[name] == pytest.approx(expected.row[name], rel=1e-9, abs=1e-13)
         np.testing.assert_allclose(found.x_full, expected.x_full)

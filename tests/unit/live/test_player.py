@@ -192,7 +192,7 @@ def test_a_run_by_operators_is_what_is_shown(taught_model):
     work(player)
     run = player.tick().run
     solver = taught_model.pipeline.solver_at(taught_model.manifold, run.case)
-    assert solver.engine == "operators"
+    assert solver.engine == "recurrence"
     solver.step(run.steps)
     np.testing.assert_allclose(run.xhat(run.steps), solver.state.xhat, atol=1e-4)
     assert taught_model.tilt is None

@@ -50,16 +50,9 @@ def test_every_combination_is_a_job(written):
     ]
 
 
-def test_a_setting_tells_what_columns_do_not(written):
-    """results.csv has columns for the scene, the field and |S|, but none for the sampler."""
-    settings = [job.setting for job in written(TEXT).jobs]
-    assert settings == ["", "", "sampler=random", "sampler=qdeim"]
-
-
 def test_how_runs_are_measured_is_no_setting(written):
     jobs = "jobs: [{scene: sand, seed: 0}, {scene: sand, seed: 1, evaluation.trials: 0}]"
     found = written(TEXT[: TEXT.index("jobs:")] + jobs).jobs
-    assert [job.setting for job in found] == ["seed=0", "seed=1"]
     assert "evaluation.trials=0" in found[1].overrides
     assert [set(job.keys) for job in found] == [set(found[0].keys)] * 2
 
@@ -86,7 +79,6 @@ def test_overrides_take_the_place_of_the_files(written):
         ("scene=sand", "scale=small", "field=mlp", "seed=1"),
         ("scene=sand", "scale=small", "field=mlp", "seed=2"),
     ]
-    assert [job.setting for job in experiment.jobs][:2] == ["seed=1", "seed=2"]
 
 
 def test_equal_jobs_are_one(written):
@@ -149,7 +141,6 @@ def test_a_part_is_an_experiment(written, tmp_path):
     assert [job.overrides for job in part.jobs] == [
         ("seed=2", f"scene={scene}", "scale=small") for scene in ("sand", "metal")
     ]
-    assert [job.setting for job in whole.parts[0].jobs] == ["seed=0", "seed=1"]
 
 
 @pytest.mark.parametrize(

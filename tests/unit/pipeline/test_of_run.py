@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 from omegaconf import OmegaConf
 
-from nsf.errors import ConfigError, MissingRunError, SchemaError
+from nsf.errors import ConfigError, SchemaError
 from nsf.pipeline import Pipeline
 from nsf.pipeline.stages.deployment import CONFIGURATION, write_configuration
 
@@ -79,5 +79,5 @@ def test_a_run_without_its_configuration_says_what_to_do(chain, tmp_path):
     shutil.copytree(chain.root / "deploy", tmp_path / "deploy")
     run = replace(chain.pipeline.deployment, root=tmp_path)
     (run.path / CONFIGURATION).unlink()
-    with pytest.raises(MissingRunError, match="delete the folder and run `nsf deploy scene=sand`"):
+    with pytest.raises(SchemaError, match="delete the run's folder and run `nsf deploy` again"):
         Pipeline.of_run(run)

@@ -7,7 +7,7 @@ from nsf.runs import Run
 
 
 def test_the_disk_must_hold_all_trajectories(pipeline_at, tmp_path):
-    pipeline = pipeline_at(tmp_path, "scene.steps=100000000000")
+    pipeline = pipeline_at(tmp_path, "scene.steps=2000000000")
     with pytest.raises(StorageError, match=r"4 trajectories: it needs \d+\.\d MiB and the disk has"):
         pipeline.simulate()
     assert not Run.find("simulate", root=tmp_path)

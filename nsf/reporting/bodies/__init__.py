@@ -1,1 +1,0 @@
-"""Pictures of bodies: particles, solids and a camera in, strips and animations out."""

@@ -1,1 +1,0 @@
-"""Charts: data in, figures out."""

@@ -1,1 +1,0 @@
-"""Sections of a report that set variants beside each other, and what a variant is."""

@@ -1,1 +1,0 @@
-"""What a report says in words and numbers, and how each format writes it."""

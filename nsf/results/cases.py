@@ -1,0 +1,177 @@
+"""Charts of scenes whose cases have several parameters, or forcing programs."""
+
+import math
+import textwrap
+from collections.abc import Iterator
+
+import matplotlib
+import numpy as np
+import pandas as pd
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from nsf.data.case import PROGRAM, Case
+from nsf.errors import ConfigError
+from nsf.results.charts import Figures, View, _legend, _panels, chart
+from nsf.results.columns import COLUMNS, axis, number
+from nsf.results.scales import LOST, error_scale, plain_ticks
+from nsf.results.style import FULL, INK, WARNING, WIDTH, figure, line_style, styled
+
+COLORS = "viridis"  # of the maps
+_FEWEST = 6  # cases of which means of neighbours say anything
+_CROSS = {"ls": "", "marker": "x", "ms": 4, "mew": 0.9, "color": "#aaaaaa"}
+_LOST = {"ls": "", "marker": "X", "ms": 8, "mec": "white", "mew": 0.8}
+_MAPS = 4  # in a row
+_WIDEST = 28  # letters of a line above a map
+_ERROR = COLUMNS["displacement_error"].heading
+
+
+@chart(
+    "Displacement error of held-out cases over each parameter, a dot a case, its mean over seeds; a line is "
+    "the mean over neighbouring cases, its band from the smallest to the largest. Crosses above are lost: "
+    "they diverged or are off by more than 1,000 %."
+)
+def error_over_parameters(view: View) -> Figures:
+    """Errors over each parameter of each body, a panel each."""
+    panels = [(body, part, name) for body, part, names in _several(view) for name in names]
+    if not panels:
+        return {}
+    models = list(dict.fromkeys(view.frame["variant"]))
+    with styled():
+        fig, drawn = _panels(len(panels), 3.0, 3)
+        for panel, (body, part, name) in zip(drawn, panels, strict=True):
+            for variant, own in part.groupby("variant", sort=False):
+                style = line_style(models.index(variant)) | {"label": variant}
+                _over(panel, own.groupby(name)["error"].mean(), style, name in view.logarithmic)
+            panel.set_title(body, pad=14)
+            panel.set(ylabel=_ERROR)
+            _scaled(panel, "x", part, name, name in view.logarithmic)
+            error_scale(panel, 100 * part["error"][part["error"] <= LOST / 100])
+            panel.plot([], [], **_LOST, color=FULL, label="lost")
+        _legend(fig, drawn)
+    return {"error-over-parameters": fig}
+
+
+@chart(
+    "Displacement error of held-out cases in the plane of both parameters, a dot a case, its mean over "
+    "seeds: a panel a model, the best first, and one colour scale. Grey crosses are training cases."
+)
+def error_map(view: View) -> Figures:
+    """Errors in the plane of two parameters, a panel a variant."""
+    planes = [(body, part, names) for body, part, names in _several(view) if len(names) == 2]
+    return {"error-map": _maps(view, planes)} if planes else {}
+
+
+def _maps(view: View, planes: list) -> Figure:
+    rows = []
+    for body, part, names in planes:
+        ranked = sorted(part.groupby("variant", sort=False), key=lambda one: _rank(one[1]["error"]))
+        rows += [(body, names, ranked[i : i + _MAPS]) for i in range(0, len(ranked), _MAPS)]
+    columns = max(len(ranked) for *_, ranked in rows)
+    scale = _colors(100 * pd.concat([part["error"] for _, part, _ in planes]))
+    with styled():
+        fig = figure(0.9 + 2.45 * len(rows), min(WIDTH, 2.0 + 2.4 * columns))
+        grid = fig.subplots(len(rows), columns, squeeze=False)
+        for across, (body, names, ranked) in zip(grid, rows, strict=True):
+            for panel, (variant, own) in zip(across, ranked, strict=False):
+                _map(panel, view, own, names, scale)
+                title = [body, *textwrap.wrap(variant, _WIDEST), _summary(own["error"])]
+                panel.set_title("\n".join(title), fontsize=9, fontweight="normal")
+            for panel in across[len(ranked) :]:
+                panel.axis("off")
+        bar = fig.colorbar(scale, ax=grid, label=_ERROR, aspect=16 * len(rows))
+        plain_ticks(bar.ax.yaxis)
+        bar.outline.set_visible(False)
+        marks = [Line2D([], [], ls="", marker="o", ms=7, mfc="white", mec=INK, label="held-out case")]
+        marks += [Line2D([], [], **_LOST, color=WARNING, label="lost")]
+        marks += [Line2D([], [], **_CROSS, label="training case")] if view.trained else []
+        fig.legend(handles=marks, loc="outside upper left", ncols=3)
+    return fig
+
+
+def _several(view: View) -> Iterator[tuple[str, pd.DataFrame, list[str]]]:
+    """Bodies whose cases have several values: their rows with a column a parameter, and these names.
+
+    Errors are means over seeds, a row a case and variant, but for variants that the fallback took whole.
+    """
+    share = view.frame["fallback_share"].fillna(0).groupby([view.frame["body"], view.frame["variant"]])
+    shown = view.frame[share.transform("min") < 1]
+    for body, part in shown.groupby("body", sort=False):
+        try:
+            cases = {text: Case.read(text) for text in part["case"].unique()}
+        except ConfigError:
+            continue
+        names = [name for name in next(iter(cases.values())) if name != PROGRAM]
+        if all(len(case) < 2 for case in cases.values()) or not names:
+            continue
+        errors = part.groupby(["scene", "variant", "case"], sort=False)["displacement_error"]
+        rows = errors.agg(lambda values: values.mean(skipna=False)).rename("error").reset_index()
+        rows = rows.dropna(subset="error")
+        yield body, rows.assign(**{n: [cases[text][n] for text in rows["case"]] for n in names}), names
+
+
+def _over(panel, errors: pd.Series, style: dict, log: bool) -> None:
+    """Dots of one variant [%], and their means over neighbours where they are enough."""
+    at, values = errors.index.to_numpy(float), 100 * errors.to_numpy(float)
+    lost = ~(values <= LOST)
+    color = style["color"]
+    panel.plot(at[~lost], values[~lost], "o", ms=4.5, mfc="white", mec=color, mew=1.1, alpha=0.9)
+    panel.plot(at[lost], np.full(lost.sum(), 1.03), transform=panel.get_xaxis_transform(), clip_on=False,
+               color=color, **_LOST)  # fmt: skip
+    if len(at) < _FEWEST:
+        panel.plot([], [], "o", **{k: v for k, v in style.items() if k != "linestyle"})
+        return
+    values[lost] = np.nan  # a lost run leaves a gap: it is never averaged around
+    windows = [
+        np.lib.stride_tricks.sliding_window_view(v, math.ceil(math.sqrt(len(at))) + 1) for v in (at, values)
+    ]
+    middle = np.exp(np.log(windows[0]).mean(1)) if log else windows[0].mean(1)
+    panel.fill_between(middle, windows[1].min(1), windows[1].max(1), color=color, alpha=0.18, linewidth=0)
+    panel.plot(middle, windows[1].mean(1), **style)
+
+
+def _map(panel, view: View, own: pd.DataFrame, names: list[str], scale: ScalarMappable) -> None:
+    lost = ~(100 * own["error"] <= LOST)
+    trained = view.trained.get(own["scene"].iloc[0], ())
+    crosses = np.array([[case[name] for name in names] for case in trained if case.keys() >= {*names}])
+    panel.plot(*crosses.reshape(-1, 2).T, zorder=1, **_CROSS)
+    colors = scale.to_rgba(100 * own["error"][~lost])
+    at = [own[name] for name in names]
+    panel.scatter(*(v[~lost] for v in at), s=52, c=colors, edgecolors=INK, linewidths=0.8, zorder=2)
+    panel.plot(*(v[lost] for v in at), zorder=3, color=WARNING, **_LOST)
+    for which, name in zip("xy", names, strict=True):
+        _scaled(panel, which, own, name, name in view.logarithmic)
+    panel.margins(0.06)
+    panel.grid()
+
+
+def _scaled(panel, which: str, rows: pd.DataFrame, name: str, log: bool) -> None:
+    """Name an axis by a parameter with its unit; that of a logarithmic design is logarithmic."""
+    case = Case.read(rows["case"].iloc[0])
+    unit = dict(zip(case.names, case.units, strict=True))[name]
+    panel.set(**{f"{which}label": axis(name.replace("_", " "), unit)})
+    if log:
+        panel.set(**{f"{which}scale": "log"})
+        plain_ticks(getattr(panel, f"{which}axis"))
+    else:
+        panel.locator_params(axis=which, nbins=4)
+
+
+def _colors(errors: pd.Series) -> ScalarMappable:
+    """One logarithmic scale [%] for all errors that are not lost."""
+    shown = errors[(errors <= LOST) & (errors > 0)]
+    low, high = (shown.min(), shown.max()) if len(shown) else (1.0, LOST)
+    return ScalarMappable(LogNorm(low, max(high, 1.1 * low), clip=True), matplotlib.colormaps[COLORS])
+
+
+def _summary(errors: pd.Series) -> str:
+    """The mean, or how many are lost."""
+    lost = int((~(100 * errors <= LOST)).sum())
+    return f"{lost} of {len(errors)} lost" if lost else f"mean {number(errors.mean(), 100)} %"
+
+
+def _rank(errors: pd.Series) -> tuple[int, float]:
+    lost = ~(100 * errors <= LOST)
+    return int(lost.sum()), float(errors[~lost].mean()) if not lost.all() else math.inf

@@ -1,0 +1,342 @@
+"""Pictures of the bodies of a report, by `nsf.bodies`: strips, final shapes, particle sets and films.
+
+Shown is the best variant of each body and model, at its worst and its best held-out case, in rows of the
+full-order run, the model and the baseline.
+"""
+
+import math
+import re
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from nsf import bodies
+from nsf.bodies import Body, Categories, ColorScale
+from nsf.bodies.colors import CLIP, DIFFERENCE_COLORS, METRES, PASCALS, ROLES, STRESS_COLORS
+from nsf.bodies.film import GIF_BYTES
+from nsf.results.charts import best
+from nsf.results.columns import BASELINE, model_name
+from nsf.results.page import Picture, Section
+from nsf.results.sources import Motion, Source, checked_hash
+from nsf.results.style import save
+from nsf.results.table import natural
+from nsf.vectors import spaced
+
+if TYPE_CHECKING:
+    from nsf.evaluation import SuperResolution
+    from nsf.results.question import Question
+
+_ROWS, _ENDS = 6, 2  # cases of final shapes, and of strips and films
+_FILMS = 6 * 2**20  # [bytes] of all on a page
+_MANY = 16  # bodies and models beyond which each has only its strip
+_FINE = "superresolution.png"
+_STRESS = "von Mises equivalent of the Kirchhoff stress"
+_SETS = dict(zip(("in neither", "integration particles N", "sample particles S"), ROLES, strict=True))
+#: Opacity of particles in N alone and in S: S stands out, and both are seen through the body.
+_THROUGH = {1: 0.5, 2: 1.0}
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A case in pictures.
+
+    Attributes:
+        motion: of the full-order run and of the model.
+        model: the model's name.
+        place: "worst" or "best" of several cases, a setting, or nothing.
+        delta: δ as a fraction.
+        baseline: the same case by the baseline, where it is shown beside.
+    """
+
+    motion: Motion
+    model: str
+    place: str = ""
+    delta: float = math.nan
+    baseline: Motion | None = None
+
+    @property
+    def name(self) -> str:
+        """The case, its place and its δ."""
+        delta = [f"δ {100 * self.delta:.2g} %"] if math.isfinite(self.delta) else []
+        return ", ".join(filter(None, (self.motion.case.replace("_", " "), self.place, *delta)))
+
+    def rows(self, scale: ColorScale) -> Iterator[tuple[str, Body]]:
+        """Each model's name and body."""
+        m, b = self.motion, self.baseline
+
+        def body(model: str, x, stress, stopped: float | None = None) -> Body:
+            return Body(x, stress, scale, m.surroundings, f"{model}, {self.name}", _warning(stopped))
+
+        yield "full order", body("full order", m.x_full, m.stress_full)
+        yield self.model, body(self.model, m.x_reduced, m.stress_reduced, m.stopped)
+        if b is not None:
+            text = f"{BASELINE}, {m.case.replace('_', ' ')}"
+            yield (
+                BASELINE,
+                Body(b.x_reduced, b.stress_reduced, scale, m.surroundings, text, _warning(b.stopped)),
+            )
+
+
+def sections(
+    frame: pd.DataFrame, sources: Sequence[Source], folder: Path, question: "Question", films: bool
+) -> list[Section]:
+    """Draw the bodies of a report into a folder.
+
+    Args:
+        frame: its rows, as `nsf.results.table.labelled` gives them.
+        sources: its runs.
+        folder: of the report.
+        question: what it is about; its superresolve runs are shown, too.
+        films: whether bodies are drawn in motion.
+    """
+    opened = {source.id: source for source in sources}
+    chosen = list(best(frame))
+    films = films and len(chosen) <= _MANY
+    found = []
+    for stem, body, variant in chosen:
+        rows = frame[(frame["body"] == body) & (frame["variant"] == variant)]
+        heading = body if body == variant or len(chosen) == 1 else f"{body} · {variant}"
+        bytes_of_one = min(GIF_BYTES, _FILMS // len(chosen)) if films else 0
+        baseline = frame[(frame["body"] == body) & (frame["model_name"] == BASELINE)]
+        pictures = _of_variant(rows, baseline, opened, folder, stem, bytes_of_one, len(chosen) <= _MANY)
+        found.append(Section(heading, pictures))
+    found += [Section("At each setting", shown)] if (shown := _settings(frame, opened, folder)) else []
+    fine = [_fine(of, run, frame, folder) for of, run in question.fine.items() if of in opened]
+    return [*found, *([Section("At many more points", fine)] if fine else [])]
+
+
+def _of_variant(
+    rows: pd.DataFrame,
+    baseline: pd.DataFrame,
+    sources: Mapping[str, Source],
+    folder: Path,
+    stem: str,
+    film_bytes: int,
+    whole: bool,
+) -> list[Picture]:
+    """A strip; and where `whole`, final shapes, particle sets and a film of at most so many bytes."""
+    own = rows[rows["run"] == rows["run"].iloc[0]]
+    beside = baseline[baseline["run"] == baseline["run"].iloc[0]] if len(baseline) else baseline
+    ends = cases(own, beside, sources, _ENDS)
+    if not ends:
+        return []
+    runs = sorted({own["run"].iloc[0], *beside["run"]})
+    over = "cut open" if hides_stress(ends[0].motion) else "whole"
+    told = f"Bodies over time, {over}: full order, {ends[0].model}"
+    told += f", {BASELINE}." if ends[0].baseline is not None else "."
+    pictures = [Picture(save(strip(ends), folder, f"{stem}strip", ("png",), [STRESS_COLORS]), told, runs)]
+    if not whole:
+        return pictures
+    every = sorted(cases(own, beside, sources, _ROWS), key=lambda case: natural(case.motion.case))
+    ramps = [STRESS_COLORS, DIFFERENCE_COLORS]
+    final = save(final_shapes(every), folder, f"{stem}final-shapes", ("png",), ramps)
+    told = "The last frame of each case, and how far each particle lies from the full-order run's."
+    pictures.append(Picture(final, told, runs))
+    if ends[-1].motion.role is not None:
+        sets = save(particle_sets(ends[-1]), folder, f"{stem}particle-sets", ("png",))
+        told = "Sample particles S, and integration particles N that a projected step needs for them."
+        pictures.append(Picture(sets, told, runs))
+    if film_bytes:
+        animation(ends, folder / f"{stem}animation.gif", max_bytes=film_bytes)
+        told = f"Full order beside {ends[0].model}."
+        pictures.append(Picture([f"{stem}animation.gif"], told, runs))
+    return pictures
+
+
+def _settings(frame: pd.DataFrame, sources: Mapping[str, Source], folder: Path) -> list[Picture]:
+    """The last frame of one case of each body at the settings of its model, at most six of them."""
+    pictures = []
+    for body, rows in frame[frame["model_name"] != BASELINE].groupby("body", sort=False):
+        settings = [own for _, own in rows.groupby("variant", sort=False)]
+        if len(settings) < 2 or rows["model_name"].nunique() > 1:
+            continue
+        worst = settings[0].loc[settings[0]["delta"].fillna(math.inf).idxmax(), "case"]
+        chosen = [settings[i] for i in spaced(len(settings), _ROWS)]
+        shown = []
+        for own in (own[own["case"] == worst].head(1) for own in chosen):
+            place = own["variant"].iloc[0] if len(own) else ""
+            motions = _motions(own, [worst], sources) if len(own) else {}
+            shown += [
+                Shown(m, model_name(own.iloc[0]), place, own["delta"].iloc[0]) for m in motions.values()
+            ]
+        if len(shown) > 1:
+            stem = f"{re.sub(r'[^0-9A-Za-z_-]+', '-', str(body))}-settings"
+            drawn = save(final_shapes(shown), folder, stem, ("png",), [STRESS_COLORS, DIFFERENCE_COLORS])
+            told = "The last frame of one held-out case at several settings."
+            pictures.append(Picture(drawn, told, sorted(set(rows["run"]))))
+    return pictures
+
+
+def cases(
+    rows: pd.DataFrame, baseline: pd.DataFrame, sources: Mapping[str, Source], limit: int
+) -> list[Shown]:
+    """At most `limit` cases of a run, from the worst to the best, which are always among them."""
+    ranked = rows.assign(rank=-rows["delta"].fillna(math.inf)).sort_values("rank", kind="stable")
+    chosen = ranked.iloc[spaced(len(ranked), limit)]
+    other = _motions(baseline, chosen["case"], sources)
+    found = []
+    for case, motion in _motions(chosen, chosen["case"], sources).items():
+        row = chosen[chosen["case"] == case].iloc[0]
+        place = "worst" if case == ranked["case"].iloc[0] else ""
+        place = "best" if case == ranked["case"].iloc[-1] else place
+        beside = other.get(case)
+        if beside is not None and (len(beside.t) != len(motion.t) or row["model_name"] == BASELINE):
+            beside = None
+        place = place if len(ranked) > 1 else ""
+        found.append(Shown(motion, model_name(row), place, row["delta"], beside))
+    return found
+
+
+def _motions(rows: pd.DataFrame, wanted: Sequence[str], sources: Mapping[str, Source]) -> dict[str, Motion]:
+    """Motions of some cases of one run, by case."""
+    if not len(rows):
+        return {}
+    return {motion.case: motion for motion in sources[rows["run"].iloc[0]].motions(list(wanted))}
+
+
+def _fine(of: str, run, frame: pd.DataFrame, folder: Path) -> Picture:
+    """The picture that a superresolve run drew."""
+    checked_hash(run, _FINE)
+    row = frame[frame["run"] == of].iloc[0]
+    name = f"{row['scene']}-{row['field']}-{_FINE}"
+    shutil.copyfile(Path(run.path) / _FINE, folder / name)
+    told = "The last frame at the particles, at many more points, and of a full-order run of as many."
+    return Picture([name], told, [run.id])
+
+
+def final_shapes(cases: Sequence[Shown]) -> Figure:
+    """Last frame of each case: full order, the model, and the distance between the two.
+
+    The front half is cut away (`is_cut_open`): a free surface carries little stress, the inside does.
+
+    Args:
+        cases: one a row; positions in metres.
+    """
+    motions, ends = [case.motion for case in cases], [0, -1]
+    stress = _stress_scale([m.stress_full[-1] for m in motions])
+    apart = [np.linalg.norm(m.x_reduced - m.x_full, axis=-1)[ends] for m in motions]
+    finite = np.concatenate([d[-1][np.isfinite(d[-1])] for d in apart])
+    top = np.percentile(finite, 99.5) if len(finite) else 0.0
+    distance = ColorScale.up_to(top, DIFFERENCE_COLORS, METRES, title="distance ‖x_rom − x_fom‖")
+    rows = []
+    for case, m, d in zip(cases, motions, apart, strict=True):
+        told = f"{case.name}, t = {m.t[-1]:.3g} s"
+        around, warning = _at(m.surroundings, ends), _warning(m.stopped)
+        rows.append(
+            [
+                Body(x[ends], values, scale, around, told, warning)
+                for x, values, scale in (
+                    (m.x_full, m.stress_full[ends], stress),
+                    (m.x_reduced, m.stress_reduced[ends], stress),
+                    (m.x_reduced, d, distance),
+                )
+            ]
+        )
+    return bodies.grid(rows, ("full order", cases[0].model, "distance apart"), cut=True)
+
+
+def fine_shapes(fine: list["SuperResolution"], around: Sequence[Mapping]) -> Figure:
+    """Last frame of the reduced run at its particles and at many more points, and the fine full-order run.
+
+    Whole bodies, coloured by ‖x − X‖: a picture of many points shows the surface, which carries no stress.
+
+    Args:
+        fine: one a row.
+        around: the surroundings of each at its last frame alone.
+    """
+    distances = np.linalg.norm(fine[0].x_full - fine[0].X, axis=1)
+    moved = ColorScale.up_to(
+        np.percentile(distances[np.isfinite(distances)], 99.5), STRESS_COLORS, METRES,
+        title="displacement ‖x − X‖",
+    )  # fmt: skip
+    rows = []
+    for f, by in zip(fine, around, strict=True):
+        told, twice = str(f.row["case"]).replace("_", " "), _at(by, [-1, -1])
+        shown = ((f.x_reduced, f.particles), (f.x_reduced, ...), (f.x_full, ...))
+        rows.append(
+            [
+                Body(
+                    np.stack([f.X[which], x[which]]),
+                    np.linalg.norm(np.stack([np.zeros_like(x), x - f.X])[:, which], axis=-1),
+                    moved, twice, told,
+                )
+                for x, which in shown
+            ]
+        )  # fmt: skip
+    count, more = len(fine[0].particles), len(fine[0].X)
+    titles = f"{count:,} particles", f"the same at {more:,} points", f"full order, {more:,} particles"
+    return bodies.grid(rows, titles)
+
+
+def particle_sets(case: Shown, count: int = 4) -> Figure:
+    """S and N in `count` frames of a reduced run, as seen through the body.
+
+    Args:
+        case: whose motion has `role`; positions in metres.
+        count: of frames; all where there are fewer.
+    """
+    m = case.motion
+    scale, warning = Categories(_SETS), _warning(m.stopped)
+    body = Body(m.x_reduced, m.role, scale, m.surroundings, case.name, warning, _THROUGH)
+    return bodies.strip([body], m.t, count)
+
+
+def strip(cases: Sequence[Shown], count: int = 5) -> Figure:
+    """The motion of each case in `count` pictures, a row a model.
+
+    Whole bodies, but cut open where the surface carries little of the stress.
+
+    Args:
+        cases: positions in metres.
+        count: of pictures a row.
+    """
+    stress = _stress_scale([case.motion.stress_full for case in cases])
+    rows = [body for case in cases for _, body in case.rows(stress)]
+    return bodies.strip(rows, cases[0].motion.t, count, hides_stress(cases[0].motion))
+
+
+def animation(
+    cases: Sequence[Shown], path: Path, frames: int = 31, width: int = 380, max_bytes: int = GIF_BYTES
+) -> None:
+    """Write a film: the models side by side, cut open, coloured by stress, with the time.
+
+    Args:
+        cases: one or two, a row each.
+        path: of the film.
+        frames: at most this many, evenly spread over the simulated time.
+        width: of one picture of two [pixel].
+        max_bytes: of a GIF at most.
+    """
+    stress = _stress_scale([case.motion.stress_full for case in cases])
+    models = [list(case.rows(stress)) for case in cases]
+    titles = [model for model, _ in max(models, key=len)]
+    rows = [[body for _, body in row] for row in models]
+    images = bodies.frames(rows, cases[0].motion.t, titles, frames, 2 * width, cut=True)
+    bodies.film(images, path, most=max_bytes)
+
+
+def hides_stress(motion: Motion) -> bool:
+    """Whether the stress lies within the body: its surface carries little of it."""
+    return bodies.hides_inside(motion.x_full[0], motion.x_full[-1], motion.stress_full[-1])
+
+
+def _warning(stopped: float | None) -> str:
+    """Over a run that diverged, that its last good state stands there."""
+    return "" if stopped is None else f"diverged; shown as at t = {stopped:.3g} s"
+
+
+def _at(around: Mapping[str, np.ndarray], frames: list[int]) -> dict[str, np.ndarray]:
+    """Surroundings in some of their frames."""
+    still = ("solid_shape", "solid_extents")
+    return {name: values if name in still else values[frames] for name, values in around.items()}
+
+
+def _stress_scale(values: Sequence[np.ndarray]) -> ColorScale:
+    top = np.percentile(np.concatenate([own.ravel() for own in values]), CLIP)
+    return ColorScale.up_to(top, STRESS_COLORS, PASCALS, title=_STRESS)

@@ -1,0 +1,379 @@
+"""A report: the table of some runs, a question, charts and pictures, on one page.
+
+A report is a folder with `index.html`, `index.md`, `results.csv` (the table), `results.tex` (means, with
+booktabs), charts and pictures, and `sources.json`: the origin of each run, and the sha256 of each file.
+"""
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from nsf.errors import ConfigError
+from nsf.results import table
+from nsf.results.averages import SAID_ONCE, averaged
+from nsf.results.cases import COLORS
+from nsf.results.charts import CHARTS, View
+from nsf.results.columns import (
+    ABSENT,
+    COLUMNS,
+    DERIVED,
+    QUANTITIES,
+    RIVALS,
+    SEEDS,
+)
+from nsf.results.folder import MARK, replaced
+from nsf.results.formats import Rows, latex_table, spreadsheet
+from nsf.results.page import Page, Picture, Section, Table, html_page, markdown_page
+from nsf.results.question import Question, made_of, plain
+from nsf.results.sources import KEPT, Source, checked_hash, file_hash, open_sources
+from nsf.results.style import save
+from nsf.runs import Run
+from nsf.runs.columns import differing
+from nsf.runs.listing import Entry
+
+_IDENTITY = (
+    *("scene", "material", "model", "teacher", "stress", "affine", "field", "r", "particles", "case"),
+    *("seed", "setting", "split", "precision", "device"),
+)
+_MEANS = (
+    *("body", "variant", "case", "cases", "diverged", "paper_delta", "delta", "delta_interval"),
+    *("displacement_error", "displacement_worst", "stress_error", *RIVALS, "delta_static"),
+    *("sample", "integration_share", "step_ms_full", "step_ms", "total_ms", "decode_ms"),
+    *("speedup_step", "speedup_total", "speedup_decoded", "memory_full_mib", "memory_mib"),
+    *("train_seconds", "teach_seconds", "break_even_runs", "fallback_share"),
+)
+_EACH = (
+    *("body", "variant", "seed", "sampler.seed", "case", "delta", "displacement_error", "stress_error"),
+    *(
+        "distance",
+        "distance_max",
+        "estimated_error",
+        "distrust",
+        "distrusted_at",
+        "fallback_at",
+        "fallback_share",
+        *QUANTITIES,
+    ),
+)
+_PASSING = ("evaluation.", "data.", "super_resolution.", "report.")  # keys that tell no models apart
+_OF_COLUMNS = ("case", "latent_dim", "model", "stress", "affine", "field", "seed", "precision", "device")
+_MOST = 3  # keys by which runs without an experiment are told apart
+_FEW = 5  # rows from which a rank correlation says anything
+_FINE = "superresolution.csv"
+_NOTE = (
+    "results.csv holds every row in full precision with its run; sources.json names the origin of "
+    "each run and the hash of each file; results.tex is the first table."
+)
+
+
+def build_report(
+    runs: Iterable[Run], folder: Path, question: Question, first: Run | None = None, films: bool = True
+) -> Path:
+    """Write a report of evaluate runs to a folder, in place of a report that is there, and give its page.
+
+    Equal runs give equal files, byte for byte. The folder changes only once everything is written.
+
+    Args:
+        runs: evaluate runs; those not complete are passed over.
+        folder: where the report goes.
+        question: what it is about.
+        first: the run that stands for its row where several are of one; else the newest.
+        films: whether bodies are drawn in motion, too.
+
+    Raises:
+        MissingRunError: no run is complete.
+        SchemaError: a run's file is missing, altered since the run, or lacks a column.
+        ConfigError: folder holds something that is not a report.
+        StorageError: the disk refused a file.
+    """
+    from nsf.results import pictures
+
+    if unknown := [name for name in question.plots or () if name not in CHARTS]:
+        raise ConfigError(f"plots={unknown[0]} is no chart; choose of {', '.join(CHARTS)}")
+    runs = list(runs)
+    sources = open_sources(runs, first)
+    frame = rows_of_runs(sources, question)
+    with replaced(Path(folder)) as fresh:
+        table.write(frame, fresh / "results.csv")
+        view = view_of(frame, sources)
+        sections = [
+            Section("Charts", draw(view, fresh, question.plots, ("svg", "png"))),
+            *pictures.sections(view.frame, sources, fresh, question, films),
+        ]
+        fine = _fine_tables(view.frame, question, fresh)
+        write_pages(frame, question, fresh, sections, origins(sources), view, fine, _warnings(sources))
+        shown = [picture for section in sections for picture in section.pictures]
+        content = {
+            "name": question.name,
+            "made_of": made_of(runs, question, first),
+            **texts(question),
+            "runs": origins(sources),
+            "trained": view.trained,
+            "logarithmic": sorted(view.logarithmic),
+            "pictures": {p.files[-1]: {"caption": p.caption, "runs": list(p.runs)} for p in shown},
+            "files": {path.name: file_hash(path) for path in sorted(fresh.iterdir())},
+        }
+        text = json.dumps(content, indent=1, ensure_ascii=False, default=plain) + "\n"
+        (fresh / MARK).write_text(text, encoding="utf-8", errors="backslashreplace")
+    return Path(folder) / "index.html"
+
+
+def texts(question: Question) -> dict:
+    """What a report says beside its table, for files."""
+    return {
+        "title": question.title,
+        "question": question.text,
+        "paper": question.paper,
+        "missing": list(question.missing),
+        "plots": None if question.plots is None else list(question.plots),
+    }
+
+
+def rows_of_runs(sources: Sequence[Source], question: Question) -> pd.DataFrame:
+    """The table of some runs, newest first; of a row that several runs have, the first one's.
+
+    Args:
+        sources: the runs.
+        question: names the report, what the paper prints, and what tells its runs apart.
+    """
+    settings = question.settings or told_apart(sources)
+    jobs = {source.id: question.keys.get(source.id, {}) for source in sources}
+    parts = [
+        source.rows.assign(
+            report=question.name,
+            run=source.id,
+            setting=table.setting(settings.get(source.id, {})),
+            paper_delta=[
+                printed(row, source, question, jobs[source.id]) for row in source.rows.to_dict("records")
+            ],
+        )
+        for source in sources
+    ]
+    frame = pd.concat(parts, ignore_index=True)
+    frame = frame[~frame[list(_IDENTITY)].astype(str).duplicated()].reset_index(drop=True)
+    order = table.labelled(frame).index
+    return frame.loc[[*order, *frame.index.difference(order)]].reset_index(drop=True)
+
+
+def printed(row: Mapping, source: Source, question: Question, job: Mapping[str, str]) -> float:
+    """δ that the paper prints of a row, a fraction; NaN where it prints none.
+
+    Without entries of the question's own, what the scene's file says holds at its r, and at its number of
+    sample particles where the job sets one.
+    """
+    if question.printed is not None:
+        known = {name: str(value) for name, value in {**row, **job}.items()}
+        known["parameter"] = f"{row['value']:g}"
+        fits = [e for e in question.printed if all(known.get(k, "null") == e[k] for k in e if k != "delta")]
+        return fits[0]["delta"] if fits else math.nan
+    name = {("field", "field"): "nsf", ("deformation", "none"): "deformation_only"}
+    paper = source.summary.get("paper") or {}
+    stated = paper.get(name.get((row["stress"], row["affine"]), ""), {})
+    same, asked = stated.get("r", row["r"]) == row["r"], job.get("sampler.size", "null")
+    same &= asked in ("null", str(stated.get("sample", asked)))
+    return stated.get("delta", math.nan) if same else math.nan
+
+
+def told_apart(sources: Sequence[Source]) -> dict[str, dict[str, str]]:
+    """By run id, the keys in which runs without an experiment differ, but for those that columns say."""
+    known: dict = {}
+    entries = [Entry(source.run, known) for source in sources]
+    differ = differing(entries)
+    keys = [key for key in (*differ.keys, *differ.more) if key not in _OF_COLUMNS]
+    keys = [key for key in keys if not key.startswith(_PASSING)][:_MOST]
+    return {
+        entry.run.id: {key: str(value) for key in keys if (value := entry.settings.get(key)) is not None}
+        for entry in entries
+    }
+
+
+def view_of(frame: pd.DataFrame, sources: Sequence[Source] = ()) -> View:
+    """What charts see of a table, and of its runs where these are there."""
+    frame = table.labelled(frame)
+    opened = {source.id: source for source in sources}
+    parts, stages, trained = [], {}, {}
+    for run, own in frame.groupby("run", sort=False):
+        if run not in opened:
+            continue
+        source = opened[run]
+        names = own.drop_duplicates("case").set_index("case")[["run", "body", "variant", "model_name"]]
+        parts.append(source.series.join(names, on="case", how="inner"))
+        measured, row = source.cost.get("breakdown", {}), own.iloc[0]
+        stages[f"{row['body']} · {row['variant']}"] = measured.get("reduced", {})
+        stages["full order"] = measured.get("full_order", {})
+        trained.setdefault(row["scene"], source.training_cases)
+    logarithmic = frozenset().union(*(source.logarithmic for source in sources))
+    series = pd.concat(parts, ignore_index=True) if parts else None
+    return View(frame, series, stages, trained, logarithmic)
+
+
+def draw(view: View, folder: Path, plots: Sequence[str] | None, kinds: Sequence[str]) -> list[Picture]:
+    """Draw charts into a folder, the ones named or all, and give them with their captions."""
+    pictures, runs = [], sorted(set(view.frame["run"]) - {""})
+    for name, chart in CHARTS.items():
+        if plots is None or name in plots:
+            for stem, figure in chart.draw(view).items():
+                pictures.append(Picture(save(figure, folder, stem, kinds, [COLORS]), chart.caption, runs))
+    return pictures
+
+
+def write_pages(
+    frame: pd.DataFrame,
+    question: Question,
+    folder: Path,
+    sections: Sequence[Section],
+    runs: Mapping[str, Mapping],
+    view: View,
+    more: Sequence[Table] = (),
+    warnings: Sequence[str] = (),
+) -> None:
+    """Write `index.html`, `index.md` and `results.tex` of a report.
+
+    Args:
+        frame: its table.
+        question, sections: what it is about, and its pictures.
+        runs: the origin of each run, by id.
+        view: of the table.
+        more: tables after the first.
+        warnings: of its simulations.
+    """
+    averages = averaged(view.frame)
+    names = [name for name in _MEANS if name not in ("variant", "body") or averages[name].nunique() > 1]
+    shown = table.rows_of(averages, [name for name in names if name != "case" or "case" in averages])
+    once = table.constants(view.frame, (*SAID_ONCE, "body"))
+    said = ", ".join(f"{title} {text}" for title, text in once.items())
+    first = Table("Results", shown, " ".join([_averages_of(view.frame), *findings(view.frame)]))
+    each = table.rows_of(view.frame, _EACH)
+    headings = {*shown.headings, *each.headings, *(one for own in more for one in own.content.headings)}
+    used = [name for name, column in {**COLUMNS, **DERIVED}.items() if column.heading in headings]
+    page = Page(
+        title=question.title,
+        lead=question.text,
+        facts=[
+            *([("The paper", question.paper)] if question.paper else []),
+            *(("Missing", missing) for missing in question.missing),
+            *([("The same in every row", said)] if said else []),
+            *_facts(view.frame),
+        ],
+        warnings=list(warnings),
+        tables=[first, *more, Table("Each case", each, _correlations(view.frame))],
+        sections=[section for section in sections if section.pictures],
+        provenance=Table("Where the numbers come from", provenance_rows(runs), _NOTE),
+        definitions=definitions(used),
+    )
+    (folder / "index.html").write_text(html_page(page), encoding="utf-8")
+    (folder / "index.md").write_text(markdown_page(page), encoding="utf-8")
+    tex = latex_table(shown, question.title, first.note)
+    (folder / "results.tex").write_text(tex, encoding="utf-8")
+
+
+def _fine_tables(frame: pd.DataFrame, question: Question, folder: Path) -> list[Table]:
+    """The table of superresolve runs, in full in `superresolution.csv`; none without such runs."""
+    parts = []
+    for of, run in question.fine.items():
+        own = frame[frame["run"] == of]
+        if len(own):
+            checked_hash(run, _FINE)
+            head = {name: own[name].iloc[0] for name in ("body", "variant")} | {"run": run.id}
+            parts.append(pd.read_csv(Path(run.path) / _FINE).assign(**head))
+    if not parts:
+        return []
+    fine = pd.concat(parts, ignore_index=True)
+    fine = fine[["body", "variant", *(name for name in fine if name not in ("body", "variant"))]]
+    fine.map(spreadsheet).to_csv(folder / _FINE, index=False)
+    shown = [name for name in fine if name in COLUMNS or name in DERIVED]
+    note = "The fields at the points, beside a full-order run of as many particles on the same grid."
+    return [Table("At many more points", table.rows_of(fine, [n for n in shown if n != "run"]), note)]
+
+
+def findings(frame: pd.DataFrame) -> list[str]:
+    """Sentences: where δ is below the paper's, where rivals win, and what diverged."""
+    averages, sentences = table.means(frame), []
+    beside = averages.dropna(subset="paper_delta")
+    beside = beside[beside["stress"].ne("deformation")]
+    if len(beside):
+        below = int((beside["delta"] < beside["paper_delta"]).sum())
+        sentences.append(f"δ is below the paper's in {below} of {len(beside)} rows that it prints.")
+    if won := table.where_rivals_win(averages):
+        sentences.append(won)
+    if lost := int(np.isinf(frame["delta"]).sum()):
+        sentences.append(f"∞: {lost} of {len(frame)} runs diverged.")
+    return sentences
+
+
+def definitions(names: Iterable[str]) -> list[tuple[str, str]]:
+    """Title and meaning of columns."""
+    known = {**COLUMNS, **DERIVED}
+    return [(known[name].title, known[name].meaning) for name in dict.fromkeys(names) if known[name].meaning]
+
+
+def origins(sources: Iterable[Source]) -> dict[str, dict]:
+    """By run id, where and from what code each run was made, and the hashes of its files."""
+    ordered = sorted(sources, key=lambda source: (source.created, source.id), reverse=True)
+    return {
+        source.id: {key: source.manifest.get(key) for key in KEPT}
+        | {"scale": source.summary.get("scale"), "files": source.hashes}
+        for source in ordered
+    }
+
+
+def provenance_rows(runs: Mapping[str, Mapping]) -> Rows:
+    """A row a run: commit, device, precision, seed, time and versions."""
+    body = []
+    for run, origin in runs.items():
+        versions = ", ".join(f"{name} {of}" for name, of in (origin.get("versions") or {}).items() if of)
+        cells = [origin.get(key) for key in ("device", "precision", "seed", "created")]
+        cells = [ABSENT if cell is None else str(cell) for cell in cells]
+        body.append([run, commit_text(origin), *cells, versions or ABSENT])
+    headings = ["run", "commit", "device", "precision", "seed", "made", "versions"]
+    return Rows(headings, body, [False] * len(headings))
+
+
+def commit_text(origin: Mapping) -> str:
+    """The commit a run was made at; says so where the tree had uncommitted changes."""
+    commit = str(origin.get("commit") or "no commit")[:12]
+    if origin.get("dirty") is None:
+        return f"{commit} (state of the tree unknown)"
+    return f"{commit} + uncommitted changes" if origin["dirty"] else commit
+
+
+def _facts(frame: pd.DataFrame) -> list[tuple[str, str]]:
+    """The cases of each body, and its particles."""
+    facts = []
+    for body, rows in frame.groupby("body", sort=False):
+        cases = list(dict.fromkeys(rows["case"]))
+        listed = "; ".join(cases[:8]) + (f"; … {len(cases)} in all" if len(cases) > 8 else "")
+        particles = ", ".join(f"{count:,.0f}" for count in sorted(rows["particles"].dropna().unique()))
+        facts.append((str(body), f"{' and '.join(rows['split'].unique())} {listed}; {particles} particles"))
+    return facts
+
+
+def _averages_of(frame: pd.DataFrame) -> str:
+    """What the rows of the first table are means over."""
+    seeds = any(name in frame and frame[name].nunique() > 1 for name in SEEDS)
+    splits = " and ".join(frame["split"].unique())
+    return (
+        f"Means over {splits} cases{' and seeds (± their standard deviation)' if seeds else ', of one seed'}."
+    )
+
+
+def _correlations(frame: pd.DataFrame) -> str:
+    """How ranks of the distrust ratio and of the estimated error agree with the errors."""
+    said, own = [], frame[frame["fallback_share"].fillna(0) == 0]
+    for name, error in (("distrust", "delta"), ("estimated_error", "distance_max")):
+        rows = own.dropna(subset=[name, error])
+        if len(rows) >= _FEW and rows[name].nunique() > 1:
+            agreement = rows[name].rank().corr(rows[error].rank())
+            said.append(
+                f"Spearman's rank correlation of the {COLUMNS[name].title} with the {COLUMNS[error].title} "
+                f"over {len(rows)} runs is {agreement:.2f}."
+            )
+    return " ".join(said)
+
+
+def _warnings(sources: Sequence[Source]) -> list[str]:
+    return list(dict.fromkeys(line for source in sources for line in source.warnings))

@@ -1,0 +1,216 @@
+"""The evaluate runs behind a report: each file is checked against its manifest before a number is used.
+
+`summary.json` holds `title` and `scale` of the scene, and `paper`: the `place` where the paper speaks of it,
+and by method the figures that it prints.
+"""
+
+import hashlib
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from nsf.errors import MissingRunError, NSFError, SchemaError
+from nsf.results import table
+from nsf.results.question import FILES
+from nsf.runs import Run
+from nsf.runs.manifest import altered
+
+KEPT = ("commit", "dirty", "device", "precision", "seed", "created", "versions")
+"""What a report says of the origin of a run."""
+_FRAMES = ("cases", "t", "x_full", "x_reduced", "stress_full", "stress_reduced")
+_AROUND = (
+    "gravity",
+    *(f"solid_{name}" for name in ("shape", "extents", "position", "orientation", "active")),
+)
+_SERIES = ("case", "split", "frame", "t", "delta", "displacement_error", "stress_error")
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The particles of one case for pictures.
+
+    Attributes:
+        case: its text.
+        t: [F] [s].
+        x_full, x_reduced: [F, n, 3] [m] of the full-order run and of the model.
+        stress_full, stress_reduced: [F, n] von Mises equivalents of τ [Pa].
+        stopped: time [s] up to which a run that diverged was good; None of one that reached the end.
+        surroundings: gravity and colliders, as `nsf.evaluation.surroundings` names them.
+        role: [F, n] 2 of a sample particle, 1 of an integration particle alone, 0 of others.
+    """
+
+    case: str
+    t: np.ndarray
+    x_full: np.ndarray
+    x_reduced: np.ndarray
+    stress_full: np.ndarray
+    stress_reduced: np.ndarray
+    stopped: float | None = None
+    surroundings: Mapping[str, np.ndarray] = field(default_factory=dict)
+    role: np.ndarray | None = None
+
+
+class Source:
+    """One complete evaluate run whose files are whole.
+
+    Raises:
+        SchemaError: a file is missing, differs from its manifest, or lacks a column.
+    """
+
+    def __init__(self, run: Run):
+        self.run, self.id, self.manifest = run, run.id, run.manifest
+        self.hashes = {name: checked_hash(run, name) for name in FILES}
+        self.rows = table.complete(self._csv("results.csv", ("case",)), self._path("results.csv"))
+        self.summary = json.loads(self._path("summary.json").read_text())
+        self.cost = json.loads(self._path("cost.json").read_text())
+
+    @property
+    def created(self) -> str:
+        """When the run was made (ISO)."""
+        return str(self.manifest.get("created", ""))
+
+    @cached_property
+    def series(self) -> pd.DataFrame:
+        """Errors and latent coordinates, one row a frame and case."""
+        return self._csv("series.csv", _SERIES)
+
+    @cached_property
+    def logarithmic(self) -> set[str]:
+        """Names of the parameters that the design draws evenly in their logarithm, as far as it is known."""
+        from nsf import config  # 0.3 s that most reports need not pay
+
+        try:
+            whole = config.read(self._deployed.file("configuration.yaml")) if self._deployed else {}
+        except NSFError:  # of another version
+            return set()
+        scene = whole.get("scene")
+        parameters = scene.get("parameters") if isinstance(scene, Mapping) else None
+        items = parameters.items() if isinstance(parameters, Mapping) else ()
+        return {str(name) for name, one in items if isinstance(one, Mapping) and one.get("log") is True}
+
+    @cached_property
+    def training_cases(self) -> list[dict[str, float]]:
+        """The parameter values of each training case, as far as the runs are there."""
+        trained = _whole(self._deployed, "train") if self._deployed else []
+        found = [run.config.get("parameters") for train in trained for run in _whole(train, "simulate")]
+        cases = [
+            {name: one.get("value") for name, one in parameters.items() if isinstance(one, Mapping)}
+            for parameters in found
+            if isinstance(parameters, Mapping)
+        ]
+        return [case for case in cases if all(isinstance(value, int | float) for value in case.values())]
+
+    @property
+    def warnings(self) -> list[str]:
+        """What the simulations behind the run warned of."""
+        waiting, lines = list(self.run.parent_runs), {}
+        for run in waiting:
+            waiting += [parent for parent in run.parent_runs if parent not in waiting]
+            if run.stage == "simulate":
+                lines |= dict.fromkeys(map(str, run.manifest.get("warnings", [])))
+        return list(lines)
+
+    def motions(self, cases: Sequence[str]) -> list[Motion]:
+        """The particles of some cases; those that were not stored are left out."""
+        with np.load(self._path("frames.npz"), allow_pickle=False) as stored:
+            if absent := [key for key in _FRAMES if key not in stored]:
+                raise SchemaError(f"{self._path('frames.npz')} lacks {absent}; run `nsf evaluate` again")
+            arrays = {key: stored[key] for key in (*_FRAMES, *_AROUND, "role") if key in stored}
+        rows = {str(case): row for row, case in enumerate(arrays["cases"])}
+        return [
+            Motion(
+                case,
+                arrays["t"],
+                *(arrays[key][rows[case]] for key in _FRAMES[2:]),
+                stopped=self._stopped(case),
+                surroundings={key: arrays[key][rows[case]] for key in _AROUND if key in arrays},
+                role=arrays["role"][rows[case]] if "role" in arrays else None,
+            )
+            for case in cases
+            if case in rows
+        ]
+
+    def _stopped(self, case: str) -> float | None:
+        own = self.series[self.series["case"] == case]
+        lost = np.isinf(own["delta"])
+        return float(max(own.loc[~lost, "t"], default=0.0)) if lost.any() else None
+
+    @cached_property
+    def _deployed(self) -> Run | None:
+        return next(iter(_whole(self.run, "deploy")), None)
+
+    def _path(self, name: str) -> Path:
+        return Path(self.run.path) / name
+
+    def _csv(self, name: str, columns: Sequence[str]) -> pd.DataFrame:
+        frame = pd.read_csv(self._path(name), dtype=dict.fromkeys(("case", *table.TEXT), str))
+        if absent := [column for column in columns if column not in frame]:
+            raise SchemaError(
+                f"{self._path(name)} lacks the columns {absent}: another version wrote it; "
+                "delete the run folder and run `nsf evaluate` again"
+            )
+        return frame
+
+
+def open_sources(runs: Iterable[Run], first: Run | None = None) -> list[Source]:
+    """The complete ones among evaluate runs: `first`, then the newest first.
+
+    Raises:
+        MissingRunError: none is complete.
+        SchemaError: one of them has a missing or altered file.
+    """
+    runs = list(runs)
+    # Not `run.complete`: a finished run whose file is gone must be named, not passed over.
+    sources = [Source(run) for run in runs if run.manifest.get("status") == "complete"]
+    if not sources:
+        scene = runs[0].scene if runs else "sand"
+        raise MissingRunError(
+            f"none of the {len(runs)} evaluate runs is complete; run `nsf evaluate scene={scene}` first"
+        )
+    chosen = first.id if first else None
+    return sorted(sources, key=lambda s: (s.id == chosen, s.created, s.id), reverse=True)
+
+
+def checked_hash(run: Run, name: str) -> str:
+    """sha256 of a file of a run.
+
+    Raises:
+        SchemaError: the file is missing, or is not what the run's manifest records.
+    """
+    path = Path(run.path) / name
+    if not path.is_file():
+        raise SchemaError(
+            f"{path} is missing from {run.stage} run {run.id}; run `nsf {run.stage}` for it again"
+        )
+    recorded = {output["path"]: output for output in run.manifest.get("outputs", ())}.get(name)
+    if recorded is None or altered(Path(run.path), recorded):
+        raise SchemaError(
+            f"{path} is not the file that the manifest of {run.id} records: it was changed after the run; "
+            f"delete the run folder and run `nsf {run.stage}` again"
+        )
+    return recorded["sha256"]
+
+
+def file_hash(path: Path) -> str:
+    """sha256 of a file, in hex."""
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def material_of(config: Mapping) -> str:
+    """The name of the law in a run's configuration: `von_mises`; empty where it has none."""
+    material = config.get("material")
+    target = str(material.get("_target_", "")) if isinstance(material, Mapping) else ""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", target.rpartition(".")[2]).lower()
+
+
+def _whole(run: Run, stage: str) -> list[Run]:
+    """The runs of a stage that a run was made from, those that are there and whole."""
+    found = [parent for parent in run.parent_runs if parent.stage == stage]
+    return [parent for parent in found if parent.manifest and not parent.fault]

@@ -1,0 +1,331 @@
+"""The table of results: read, asked, named, and averaged.
+
+A row is a (run, case, seed, model), with the columns of `nsf.results.columns`. The functions take and give
+pandas data frames; those that `labelled` gives also have `body`, `variant` and a column a setting.
+"""
+
+import json
+import math
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import pandas as pd
+
+from nsf.data.case import Case
+from nsf.errors import ConfigError, MissingRunError, SchemaError
+from nsf.results.columns import (
+    ABSENT,
+    COLUMNS,
+    MEASURED,
+    RIVALS,
+    SEEDS,
+    TEXT,
+    brief,
+    column,
+    model_name,
+    number,
+    plus_minus,
+)
+from nsf.results.formats import Rows, spreadsheet
+from nsf.storage import writing
+
+_TRAIN = "scene.design.train"  # a list, whose length is shown
+_SCATTERED = ("delta", "displacement_error", "stress_error")
+_SETTING = re.compile(r"; (?=[\w.@]+=)")
+_TIMES = {
+    "speedup_step": ("step_ms_full", "step_ms"),
+    "speedup_total": ("total_ms_full", "total_ms"),
+    "speedup_decoded": ("total_ms_full", "decoded_ms"),
+}
+_ORDER = ("test", "validation", "extrapolation")
+_COMPUTED = (
+    *("body", "variant", "model_name", "delta_static", "delta_interpolated", "integration_share"),
+    *("decoded_ms", "line", "rank"),
+)
+DEVIATION = ", deviation"
+"""Ends the names of columns of `means` that have the deviation over seeds."""
+
+
+def read(path: Path | str) -> pd.DataFrame:
+    """The table of a file, such as `reports/results.csv`; columns that it lacks are empty.
+
+    Raises:
+        MissingRunError: there is no such file.
+        SchemaError: it is no table of results.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MissingRunError(f"{path} is not there; `nsf report` and `nsf reports` write tables of results")
+    try:
+        frame = pd.read_csv(path, dtype=dict.fromkeys(TEXT, str))
+    except (ValueError, UnicodeDecodeError) as error:
+        raise SchemaError(f"{path} is no table of results: {error}; write it again") from error
+    return complete(frame, path)
+
+
+def complete(frame: pd.DataFrame, source: Path | str) -> pd.DataFrame:
+    """A frame with all columns of the table, in order; those that it lacks are empty.
+
+    Raises:
+        SchemaError: it lacks what every row has, or a number is text.
+    """
+    absent = [name for name in ("scene", "model", "case", "split", "delta") if name not in frame]
+    if absent:
+        raise SchemaError(f"{source} lacks the columns {', '.join(absent)}; run `nsf evaluate` again")
+    frame = frame.reindex(columns=list(COLUMNS))
+    frame[list(TEXT)] = frame[list(TEXT)].astype(object).where(frame[list(TEXT)].notna(), "").astype(str)
+    for name in frame.columns.difference(TEXT):
+        try:
+            frame[name] = pd.to_numeric(frame[name])
+        except (ValueError, TypeError) as error:
+            raise SchemaError(f"{source}: {name} holds text: {error}; run `nsf evaluate` again") from error
+    return frame
+
+
+def write(frame: pd.DataFrame, path: Path) -> None:
+    """Write a table, without columns that are empty.
+
+    Raises:
+        StorageError: the disk refused the file.
+    """
+    shown = [name for name in frame if not (frame[name].isna() | frame[name].eq("")).all()]
+    with writing(path) as partial:
+        frame[shown].map(spreadsheet).to_csv(partial, index=False)
+
+
+def query(frame: pd.DataFrame, **wanted) -> pd.DataFrame:
+    """The rows whose columns have some values; a list is any of them, `held_out=True` no training case.
+
+    Raises:
+        ConfigError: there is no such column, or no such row; names the values that there are.
+    """
+    held_out = wanted.pop("held_out", False)
+    if unknown := [name for name in wanted if name not in frame]:
+        raise ConfigError(f"no column {unknown[0]}; there are {', '.join(frame)}")
+    found = frame
+    for name, values in wanted.items():
+        values = [values] if isinstance(values, str | int | float) else list(values)
+        kept = found[found[name].isin(values)]
+        if kept.empty:
+            there = ", ".join(sorted(map(str, found[name].unique()))[:20])
+            raise ConfigError(f"no row has {name}={', '.join(map(str, values))}; there are {there}")
+        found = kept
+    if held_out and (found["split"] != "train").any():
+        found = found[found["split"] != "train"]
+    return found
+
+
+def settings(text: str) -> dict[str, str]:
+    """The keys and values of a row's `setting`."""
+    parts = _SETTING.split(text) if text else []
+    return dict(part.split("=", 1) for part in parts)
+
+
+def setting(keys: Mapping[str, object]) -> str:
+    """The text of keys and values, for the column `setting`."""
+    return "; ".join(f"{key}={value}" for key, value in keys.items())
+
+
+def labelled(frame: pd.DataFrame) -> pd.DataFrame:
+    """The held-out rows of a report, sorted, with `body`, `variant`, and a column for each setting.
+
+    `body` is the scene, with the material or the number of particles where a scene has several. `variant`
+    says what tells rows of a body apart but for seeds and cases; `delta_static` and `delta_interpolated`
+    are rivals' errors as δ.
+    """
+    frame = query(frame, held_out=True).reset_index(drop=True)
+    expanded = pd.DataFrame([settings(text) for text in frame["setting"]], index=frame.index)
+    expanded = expanded.drop(columns=[name for name in expanded if name in frame])
+    if _TRAIN in expanded:
+        expanded["training_runs"] = expanded[_TRAIN].map(_length)
+    frame = pd.concat([frame, expanded.apply(_numeric)], axis=1)
+    frame["body"] = _bodies(frame)
+    frame["model_name"] = [model_name(row) for row in frame.to_dict("records")]
+    frame["variant"] = variants(frame)
+    # Both errors of a run divide one distance, so that their ratio is of the full-order run alone.
+    ratio = (frame["delta"] / frame["displacement_error"]).groupby([frame["body"], frame["case"]])
+    ratio = ratio.transform("median")
+    frame["delta_static"], frame["delta_interpolated"] = ratio, frame["displacement_interpolated"] * ratio
+    frame["integration_share"] = frame["integration"] / frame["particles"]
+    frame["decoded_ms"] = frame["total_ms"] + frame["decode_ms"]
+    keys = [frame[name].map(natural) for name in ("body", "variant", "split", "seed", "case")]
+    return frame.loc[pd.concat(keys, axis=1).apply(tuple, axis=1).sort_values(kind="stable").index]
+
+
+def variants(frame: pd.DataFrame, without: Iterable[str] = ()) -> list[str]:
+    """What tells the rows of a body apart, in words, but for seeds, cases and the columns of `without`."""
+    known = [name for name in frame if name not in COLUMNS and name not in _COMPUTED]
+    known = ["model_name", "field", *known, "r", "precision", "device", "material"]
+    hidden = {*SEEDS, _TRAIN if "training_runs" in known else "", *without}
+    keys = telling(frame, [name for name in known if name in frame and name not in hidden])
+    shown = frame[keys].drop(columns="model_name", errors="ignore")
+    names = frame["model_name"] if "model_name" in keys or shown.empty else pd.Series("", frame.index)
+    parts = [
+        [name, *(_named(key, value) for key, value in row.items() if not _is_empty(value))]
+        for name, row in zip(names, shown.to_dict("records"), strict=True)
+    ]
+    default = "default" if keys else frame["model_name"].iloc[0]
+    return [" · ".join(filter(None, part)) or default for part in parts]
+
+
+def telling(frame: pd.DataFrame, keys: Sequence[str]) -> list[str]:
+    """Keys, each of which parts rows of a body that those before it leave together, seeds and cases alike."""
+    found: list[str] = []
+    beside = ["body", *(seed for seed in SEEDS if seed in frame)]
+    texts = frame[[*beside, *keys]].astype(object).where(frame[[*beside, *keys]].notna(), "").astype(str)
+    kinds = len(texts[beside].drop_duplicates())
+    for key in keys:
+        more = len(texts[[*beside, *found, key]].drop_duplicates())
+        if more > kinds:
+            found.append(key)
+            kinds = more
+    return found
+
+
+def means(frame: pd.DataFrame, by: Sequence[str] = ("body", "variant")) -> pd.DataFrame:
+    """A row a group of a labelled frame, with means over cases and seeds, and speedups of mean times.
+
+    A value that is missing leaves its mean empty, and a run that diverged makes it ∞: neither is averaged
+    around. Beside stand how many cases and runs that diverged there are, the largest displacement error,
+    and of errors the deviation over seeds.
+    """
+    averaged = [*MEASURED, "delta_static", "delta_interpolated", "decoded_ms", "paper_delta"]
+    rows = []
+    for values, part in frame.groupby(list(by), sort=False, dropna=False):
+        row = dict(zip(by, values, strict=True)) | part[averaged].mean(skipna=False).to_dict()
+        row |= {"cases": len(part), "diverged": int(part["delta"].map(math.isinf).sum())}
+        row |= {"displacement_worst": part["displacement_error"].max()}
+        row |= {name: _only(part[name]) for name in (*_KEPT, "body") if name not in row}
+        row |= {"integration_share": part["integration_share"].mean()}
+        row |= speedups(row) | _deviations(part)
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+_KEPT = (
+    *("scene", "material", "model", "model_name", "stress", "affine", "teacher", "field", "r", "sample"),
+    *("particles", "precision", "device"),
+)
+
+
+def speedups(times: Mapping[str, float]) -> dict[str, float]:
+    """Speedups of mean times, NaN where they were not measured: a mean of ratios would hide slow runs."""
+    pairs = {name: [times.get(time, math.nan) for time in of] for name, of in _TIMES.items()}
+    return {n: full / own if full > 0 and own > 0 else math.nan for n, (full, own) in pairs.items()}
+
+
+def _deviations(part: pd.DataFrame) -> dict[str, float]:
+    """Standard deviation over seeds of the mean over cases, NaN of one seed."""
+    seeds = [part[name].fillna(-1) for name in SEEDS if name in part and part[name].nunique() > 1]
+    if not seeds:
+        return {f"{name}{DEVIATION}": math.nan for name in _SCATTERED}
+    of_each = part[list(_SCATTERED)].groupby(seeds).agg(lambda values: values.mean(skipna=False))
+    return {f"{name}{DEVIATION}": of_each[name].std(skipna=False) for name in _SCATTERED}
+
+
+def constants(frame: pd.DataFrame, names: Iterable[str]) -> dict[str, str]:
+    """Of some columns those that say one thing in all rows, as heading and text."""
+    found = {}
+    for name in names:
+        values = frame[name].dropna().astype(str).replace("", None).dropna().unique() if name in frame else ()
+        if len(values) == 1:
+            first = frame[name].dropna().iloc[0]
+            found[column(name).title] = f"{column(name).cell(first)} {column(name).unit}".strip()
+    return found
+
+
+def rows_of(frame: pd.DataFrame, names: Sequence[str]) -> Rows:
+    """Columns of a frame as text with units in the headings, those with nothing in them left out."""
+    shown = [name for name in names if name in frame and not frame[name].map(_is_empty).all()]
+    body = [[_cell(name, row) for name in shown] for row in frame.to_dict("records")]
+    headings = [column(name).heading for name in shown]
+    return Rows(headings, body, [not column(name).text for name in shown])
+
+
+def where_rivals_win(averages: pd.DataFrame) -> str:
+    """A sentence: on which bodies a rival is nearer than the best row of `means`, and by how much."""
+    held = averages[averages["displacement_error"] > 0].dropna(subset=list(RIVALS), how="all")
+    won = []
+    for body, part in held.groupby("body", sort=False):
+        own = part["displacement_error"].min()
+        nearer = [f"{COLUMNS[n].title} ({_percent(part[n].min())})" for n in RIVALS if part[n].min() < own]
+        if nearer:
+            won.append(f"on {body} {' and '.join(nearer)} beside {_percent(own)}")
+    if won:
+        return f"A rival has a smaller displacement error than the best model: {'; '.join(won)}."
+    return "No rival has a smaller displacement error than the best model." if len(held) else ""
+
+
+def parameter(case: str) -> tuple[str, str]:
+    """Name and unit of what tells cases apart: of one parameter its own, of several `case`."""
+    try:
+        read_case = Case.read(case)
+    except ConfigError:
+        return "case", ""
+    if len(read_case) > 1:
+        return "case", ""
+    return read_case.names[0].replace("_", " "), read_case.units[0]
+
+
+def natural(value) -> tuple:
+    """Sort key: numbers by size, then text with the numbers in it by size; held-out splits first."""
+    if _is_empty(value):
+        return (0, 0.0, "")
+    if isinstance(value, int | float):
+        return (1, float(value), "")
+    if value in (*_ORDER, "train"):
+        return (2, float((*_ORDER, "train").index(value)), "")
+    return (3, 0.0, re.sub(r"\d[\d,]*(\.\d+)?", _padded, str(value)))
+
+
+def _padded(digits: re.Match) -> str:
+    return f"{float(digits[0].replace(',', '')):024.9f}"
+
+
+def _bodies(frame: pd.DataFrame) -> pd.Series:
+    names = frame["scene"].copy()
+    for name, form in (("material", " · {}"), ("particles", " · {:,.0f} particles")):
+        several = frame.groupby("scene")[name].transform("nunique") > 1
+        names = names.where(~several, names + frame[name].map(form.format))
+    return names
+
+
+def _length(text) -> float:
+    return len(json.loads(text)) if isinstance(text, str) and text.startswith("[") else math.nan
+
+
+def _numeric(values: pd.Series) -> pd.Series:
+    """Numbers where all values that are there are numbers."""
+    numbers = pd.to_numeric(values, errors="coerce")
+    return numbers if numbers.notna().eq(values.notna()).all() else values
+
+
+def _named(key: str, value) -> str:
+    """A setting away from its heading: numbers and bare words need their title."""
+    text = f"{value:,.10g}" if isinstance(value, int | float) else brief(str(value))
+    if text.startswith("{"):
+        entries = (entry.partition(":") for entry in text.strip("{}").split(","))
+        return ", ".join(f"{name.rpartition('.')[2]} {changed}" for name, _, changed in entries)
+    bare = text in ("null", "paper") or text.startswith("[") or isinstance(value, int | float)
+    title = {"field": "", "sampler": "", "device": "", "precision": ""}.get(key, column(key).title)
+    return f"{title} {text}".strip() if bare or (key not in COLUMNS and key != "sampler") else text
+
+
+def _cell(name: str, row: Mapping) -> str:
+    if f"{name}{DEVIATION}" in row:
+        return plus_minus(row[name], row[f"{name}{DEVIATION}"], column(name).scale)
+    return ABSENT if _is_empty(row[name]) else column(name).cell(row[name])
+
+
+def _only(values: pd.Series):
+    """The one value of a group, or what stands for several."""
+    return values.iloc[0] if values.astype(str).nunique() == 1 else None
+
+
+def _percent(value: float) -> str:
+    return f"{number(value, 100)} %" if math.isfinite(value) else "∞"
+
+
+def _is_empty(value) -> bool:
+    return value is None or value == "" or (isinstance(value, float) and math.isnan(value))

@@ -1,0 +1,86 @@
+"""Every chart draws what its table has, with a unit on each axis, and nothing where it has none of it."""
+
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+from made import STAGES, Made, frame
+
+from nsf.results import cases, charts, table
+from nsf.results.charts import CHARTS, View
+
+PLANE = tuple(
+    f"E={e} Pa, density={d} kg/m³, program={p}" for p, (e, d) in enumerate(((5, 1), (6, 2), (7, 3)))
+)
+#: What each chart needs to have something to draw.
+NEEDS = {
+    "delta_over": {"setting": ["sampler.size=12", "sampler.size=12", "sampler.size=50", "sampler.size=50"]},
+    "step_over_particles": {"particles": [1000, 1000, 9000, 9000]},
+    "error_over_parameters": {"case": [*PLANE, PLANE[0].replace("program=0", "program=9")]},
+    "error_map": {"case": [*PLANE, PLANE[0].replace("program=0", "program=9")]},
+}
+
+
+def view(**columns) -> View:
+    rows = table.labelled(table.complete(frame(Made(), Made(r=8)).assign(**columns), "here"))
+    rows["run"] = "evaluate/sand/1"
+    series = []
+    for row in rows.to_dict("records"):
+        t = np.linspace(0, 0.2, 5)
+        errors = dict.fromkeys(("delta", "displacement_error", "stress_error"), 0.01 * t)
+        kept = {name: row[name] for name in ("run", "body", "variant", "model_name", "case")}
+        series.append(pd.DataFrame(kept | errors | {"t": t, "xhat_1": t, "encoded_1": t}))
+    stages = {f"{body} · {kind}": STAGES for body, kind in zip(rows["body"], rows["variant"], strict=True)}
+    trained = {"sand": [{"E": 5.0, "density": 2.0}]}
+    return View(rows, pd.concat(series), stages | {"full order": STAGES}, trained)
+
+
+@pytest.mark.parametrize("name", CHARTS)
+def test_a_chart_draws_something_with_units(name):
+    figures = CHARTS[name].draw(view(**NEEDS.get(name, {})))
+    assert figures
+    for figure in figures.values():
+        panels = [panel for panel in figure.axes if panel.has_data() and panel.axison]
+        assert panels
+        labels = [text for panel in panels for text in (panel.get_xlabel(), panel.get_ylabel()) if text]
+        shared = figure.get_supxlabel()
+        counts = ("sample particles |S|", "particles", "r")  # numbers have no unit
+        for label in (*labels, *([shared] if shared else [])):
+            assert re.search(r"\[[^\]]+\]$", label) or label in counts, label
+
+
+@pytest.mark.parametrize("name", sorted(set(CHARTS) - {"delta"}))
+def test_a_chart_is_left_out_where_there_is_nothing_of_its_kind(name):
+    rows = table.labelled(table.complete(frame(Made(timed=False)), "here"))
+    assert CHARTS[name].draw(View(rows)) == {}
+
+
+def test_a_run_that_diverged_leaves_a_gap_and_is_said():
+    rows = table.labelled(table.complete(frame(Made((0.01, np.inf)), Made(model="recurrence")), "here"))
+    panel = charts.delta(View(rows))["delta"].axes[0]
+    assert [text.get_text() for text in panel.texts] == ["diverged"]
+
+
+def test_the_baseline_has_one_name_in_charts():
+    rows = [Made(), Made(stress="deformation", affine="none")]
+    shown = View(table.labelled(table.complete(frame(*rows), "here")))
+    panel = charts.delta(shown)["delta"].axes[0]
+    names = [text.get_text() for text in panel.get_yticklabels()]
+    assert names == ["deformation only (baseline)", "projected"]
+
+
+def test_a_chart_is_added_by_one_function(monkeypatch):
+    monkeypatch.setattr(charts, "CHARTS", {})
+
+    @charts.chart("Nothing.")
+    def mine(view):
+        return {"mine": None}
+
+    assert charts.CHARTS["mine"].draw(None) == {"mine": None}
+    assert charts.CHARTS["mine"].caption == "Nothing."
+
+
+def test_lost_runs_are_no_colour_of_a_map():
+    assert cases._summary(pd.Series([0.1, np.inf])) == "1 of 2 lost"
+    assert cases._summary(pd.Series([0.1, 0.3])) == "mean 20 %"

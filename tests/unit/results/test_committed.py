@@ -1,0 +1,124 @@
+"""A folder of reports as one: its table, page and charts, and what is noticed of a change."""
+
+import json
+
+import pytest
+from made import Made, write_run
+from PIL import Image
+
+from nsf.cli import main
+from nsf.errors import SchemaError
+from nsf.results import committed, pictures, table
+from nsf.results.page import Picture, Section
+from nsf.results.question import Question
+from nsf.results.report import build_report
+
+
+def body(frame, sources, folder, question, films):
+    """A stand-in for pictures of bodies."""
+    Image.new("RGB", (8, 8), "white").save(folder / "strip.png")
+    return [Section("Bodies", [Picture(["strip.png"], "A body.", sorted(set(frame["run"])))])]
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setattr(pictures, "sections", body)
+    for name, delta in (("table1/seeds", 0.01), ("noise/weak", 0.02)):
+        run = write_run(tmp_path / "runs", Made((delta, delta)))
+        build_report([run], tmp_path / "reports" / name, Question(name, f"Title of {name}"))
+    committed.write_list(tmp_path / "reports")
+    return tmp_path / "reports"
+
+
+def faults(folder) -> list[str]:
+    return [fault.replace(f"{folder}/", "") for fault in committed.faults(folder)]
+
+
+def test_rows_of_all_reports_are_one_table(folder):
+    frame = table.read(folder / "results.csv")
+    assert frame.groupby("report")["delta"].mean().to_dict() == {"noise/weak": 0.02, "table1/seeds": 0.01}
+    content = json.loads((folder / "provenance.json").read_text())
+    assert set(content["runs"]) == set(frame["run"])
+    assert set(content["pictures"]) == {"noise/weak/strip.png", "table1/seeds/strip.png"}
+
+
+def test_the_page_has_each_report_in_its_chapter(folder):
+    text = (folder / "index.md").read_text()
+    marks = (
+        *(
+            "\n## Main results",
+            "### Title of table1/seeds",
+            "|sand|0.400|1|10|5|3|5|",
+            "![table1/seeds]",
+        ),
+        *("1 run, small scale, cpu, 1f2e3d4c5b6a", "## Choices of the method", "### Title of noise/weak"),
+    )
+    places = [text.index(mark) for mark in marks]
+    assert places == sorted(places)
+    assert "|Table 1|seven scenes|[1](table1/seeds/delta.png)|" in text
+
+
+def test_a_report_that_is_made_anew_takes_the_place_of_its_rows(folder, tmp_path):
+    run = write_run(tmp_path / "runs", Made((0.05, 0.07)))
+    build_report([run], folder / "noise/weak", Question("noise/weak", "New"))
+    committed.write_list(folder)
+    frame = table.read(folder / "results.csv")
+    assert frame.groupby("report")["delta"].mean().to_dict() == pytest.approx(
+        {"noise/weak": 0.06, "table1/seeds": 0.01}
+    )
+
+
+def test_the_table_and_pictures_suffice(folder):
+    """As in a clone, which has neither the runs nor the pages of the reports."""
+    for path in folder.rglob("*"):
+        if path.parent != folder and path.is_file() and path.name != "strip.png":
+            path.unlink()
+    committed.write_list(folder, pages=True)
+    assert faults(folder) == []
+    assert (folder / "noise/weak/index.html").is_file()
+    assert (folder / "noise/weak/delta.svg").is_file()
+
+
+def test_what_was_changed_is_named_with_its_remedy(folder, capsys):
+    assert faults(folder) == []
+    Image.new("RGB", (8, 8), "black").save(folder / "noise/weak/strip.png")
+    (folder / "table1/seeds/strip.png").unlink()
+    with Image.open(folder / "noise/weak/delta.png") as image:
+        Image.new("RGB", image.size, "black").save(folder / "noise/weak/delta.png")
+    (folder / "index.md").write_text("other")
+    again = f"write it with `nsf reports folder={folder}`".replace(f"{folder}/", "")
+    assert faults(folder) == [
+        "noise/weak/strip.png was changed; build it again with `nsf report`",
+        "table1/seeds/strip.png is missing; build it again with `nsf report`",
+        f"noise/weak/delta.png is not the chart of results.csv; {again}",
+        f"index.md does not list the reports as they are; {again}",
+    ]
+    with pytest.raises(SystemExit) as ended:
+        main(["reports", f"folder={folder}", "check=true"])
+    assert ended.value.code == 2
+    assert "strip.png was changed" in capsys.readouterr().err
+
+
+def test_a_row_that_was_changed_is_noticed_by_its_charts_and_page(folder):
+    frame = table.read(folder / "results.csv")
+    table.write(frame.assign(delta=0.5 * frame["delta"]), folder / "results.csv")
+    assert any("index.md does not list" in fault for fault in faults(folder))
+
+
+def test_a_half_written_provenance_is_refused(folder):
+    (folder / "provenance.json").write_text('{"runs": {}}')
+    with pytest.raises(SchemaError, match="lacks pictures, reports; take it from version control"):
+        committed.faults(folder)
+
+
+def test_a_report_with_files_of_its_own_is_listed_and_checked(folder):
+    own = folder / "calibration"
+    own.mkdir()
+    (own / "index.md").write_text("# Calibration")
+    listed = {"headings": ["", "off"], "body": [["a", "1"]], "numeric": [False, True], "made": "1 run."}
+    (own / "sources.json").write_text(json.dumps({"title": "Calibration", "listed": listed, "files": {}}))
+    committed.write_list(folder)
+    assert "### Calibration" in (folder / "index.md").read_text()
+    content = json.loads((own / "sources.json").read_text()) | {"files": {"index.md": "0", "page.html": "0"}}
+    (own / "sources.json").write_text(json.dumps(content))
+    assert "calibration/index.md was changed; build it again with `nsf report`" in faults(folder)

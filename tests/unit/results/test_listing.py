@@ -1,0 +1,136 @@
+"""Runs listed, filtered, sorted and compared, from manifests and configurations alone."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+from rich.console import Console
+
+from nsf.errors import ConfigError
+from nsf.results.overview.tables import difference_table, runs_table
+from nsf.runs import Run
+from nsf.runs.listing import entries
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    """Two data sets, three manifolds of the first, one of which failed, and two evaluations."""
+    root = tmp_path_factory.mktemp("runs")
+    data = [
+        made(root, "simulate", {"parameters": {"mu": {"key": "material.mu", "value": v}}}, seconds=v)
+        for v in (1.0, 2.0)
+    ]
+    trained = [made(root, "train", {"latent_dim": r}, data, deformation_loss=0.1 / r) for r in (4, 6)]
+    with pytest.raises(ValueError, match="lost"), failing(root, data).record():
+        raise ValueError("lost")
+    for run, delta in zip(trained, (0.02, 0.001), strict=True):
+        made(root, "evaluate", {"evaluation": {"trials": 2}}, [run, data[0]], delta=delta)
+    made(root, "simulate", {"parameters": {"E": {"key": "material.E", "value": 3.0}}}, scene="jelly")
+    return root
+
+
+def failing(root, data):
+    return Run.open("train", "sand", {"latent_dim": 8}, data, root=root)
+
+
+def made(root, stage, config, parents=(), scene="sand", **metrics):
+    run = Run.open(stage, scene, config, parents, root=root)
+    with run.record(device="cpu", seed=0) as record:
+        record.metrics.update(metrics)
+    return run
+
+
+def shown(table):
+    console = Console(width=160, color_system=None)
+    with console.capture() as capture:
+        console.print(table)
+    return capture.get()
+
+
+def test_all_newest_first(root):
+    found = entries(root=root)
+    assert [entry.run for entry in found] == Run.find(root=root)
+    assert len(found) == 8
+
+
+@pytest.mark.parametrize(
+    ("filters", "count"),
+    [
+        ({"stage": "evaluate"}, 2),
+        ({"stage": "evaluate", "latent_dim": "6"}, 1),  # a key of a run that it goes back to
+        ({"stage": "train", "latent_dim": "4,8"}, 2),
+        ({"status": "failed"}, 1),
+        ({"scene": "j*"}, 1),
+        ({"parameters.E.value": "3"}, 1),
+        ({"parameters.mu.value": "2", "stage": "train"}, 3),  # of one of the data that it was made from
+        ({"stage": "deploy"}, 0),
+    ],
+)
+def test_filters(root, filters, count):
+    assert len(entries(filters, root=root)) == count
+
+
+def test_sorted_by_a_field_a_metric_and_a_key(root):
+    assert [e.values["delta"] for e in entries({"stage": "evaluate"}, "delta", root)] == [0.001, 0.02]
+    assert [e.values["metric"] for e in entries({"stage": "evaluate"}, "-metric", root)] == [0.02, 0.001]
+    latent = [e.settings["latent_dim"] for e in entries({"stage": "train"}, "-latent_dim", root)]
+    assert latent == [8, 6, 4]
+    assert [e.values.get("delta") for e in entries(sort="delta", root=root)][:3] == [0.001, 0.02, None]
+
+
+def test_an_unknown_key_names_the_nearest(root):
+    with pytest.raises(ConfigError, match="'latent_dimm'; did you mean latent_dim"):
+        entries({"latent_dimm": "4"}, root=root)
+    with pytest.raises(ConfigError, match="'secnds'; did you mean seconds"):
+        entries(sort="secnds", root=root)
+
+
+def test_the_table(root):
+    text = shown(runs_table(entries({"scene": "sand"}, "created", root)))
+    assert text.splitlines()[0].split() == [
+        "stage",
+        "scene",
+        "id",
+        "created",
+        "status",
+        "time",
+        "[s]",
+        "metric",
+        "case",
+        "r",
+    ]
+    assert "δ 2 %" in text
+    assert "loss of g 0.0167" in text
+    assert "failed" in text
+
+
+def test_no_runs_at_all(tmp_path):
+    assert entries(root=tmp_path) == []
+
+
+def test_what_differs(root):
+    two, one = entries({"stage": "evaluate"}, root=root)
+    text = shown(difference_table(one.run, two.run))
+    rows = [line.split() for line in text.splitlines()]
+    assert ["configuration", "latent_dim", "4", "6", "+50", "%"] in rows
+    assert ["origin", "the", "same"] in rows
+    assert any(row[-4:] == ["2", "0.100", "-95", "%"] and "delta" in row for row in rows)
+    assert "trials" not in text
+    assert "the same" in shown(difference_table(one.run, one.run))
+
+
+def test_listing_does_not_wait_for_pandas(root):
+    code = """
+import sys
+from nsf.cli import main
+try:
+    main(["runs"])
+except SystemExit as end:
+    assert not end.code
+assert not {"torch", "warp", "hydra", "matplotlib", "pandas"} & set(sys.modules)
+"""
+    environment = os.environ | {"NSF_RUNS": str(root)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "8 runs" in done.stderr

@@ -1,0 +1,153 @@
+"""A report of runs: its page and table, what it refuses, and when it stands as it is."""
+
+import json
+
+import pandas as pd
+import pytest
+from made import Made, rewrite, seal, write_run
+
+from nsf.errors import ConfigError, MissingRunError, SchemaError
+from nsf.results import pictures, table
+from nsf.results.averages import interval
+from nsf.results.question import Question, unchanged
+from nsf.results.report import build_report
+
+ASKED = Question("trial", "Sand & <friends>", "How far?", "Table 1: 0.4 %.", missing=["seed=2: not run"])
+SCRIPT = "</title><script>alert(1)</script> | [x](javascript:alert(1)) $x^2$ \\input{/etc/passwd}"
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    root = tmp_path_factory.mktemp("runs")
+    models = (Made(), Made((0.02, 0.04), seed=1), Made((0.1, 0.2), stress="deformation", affine="none"))
+    return [write_run(root, made) for made in models]
+
+
+@pytest.fixture(scope="module")
+def report(runs, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("reports") / "trial"
+    build_report(runs, folder, ASKED)
+    return folder
+
+
+@pytest.fixture
+def no_pictures(monkeypatch):
+    """Bodies take seconds to draw, and some tests are about the rest."""
+    monkeypatch.setattr(pictures, "sections", lambda *_: [])
+
+
+def test_the_page_has_question_results_cases_and_origin(report):
+    text = (report / "index.md").read_text()
+    marks = [
+        "How far?", "Table 1: 0.4 %.", "seed=2: not run", "## Results",
+        "deformation only (baseline) | 2", "projected | 4", "## Each case", "## Charts",
+        "strip.png)", "## Where the numbers come from", "1f2e3d4c5b6a",
+    ]  # fmt: skip
+    places = [text.find(mark) for mark in marks]
+    assert -1 not in places, dict(zip(marks, places, strict=True))
+    assert places == sorted(places)
+    assert "&lt;friends&gt;" in (report / "index.html").read_text()
+    assert "\\begin{tabular}" in (report / "results.tex").read_text()
+
+
+def test_the_table_names_the_run_of_each_row(report, runs):
+    frame = table.read(report / "results.csv")
+    assert set(frame["run"]) == {run.id for run in runs}
+    assert frame["report"].unique().tolist() == ["trial"]
+    assert frame[frame["stress"] == "field"]["paper_delta"].tolist() == [0.004] * 4
+    assert frame[frame["stress"] == "deformation"]["paper_delta"].isna().all()
+
+
+def test_files_and_pictures_have_their_hashes_and_runs(report, runs):
+    content = json.loads((report / "sources.json").read_text())
+    assert set(content["files"]) == {path.name for path in report.iterdir()} - {"sources.json"}
+    assert set(content["runs"]) == {run.id for run in runs}
+    assert content["pictures"]["projected-strip.png"]["runs"] == sorted({runs[0].id, runs[2].id})
+
+
+def test_a_report_stands_as_it_is_until_something_changes(runs, report, tmp_path, no_pictures):
+    assert unchanged(report, runs, ASKED) == report / "index.html"
+    assert unchanged(report, runs[:2], ASKED) is None
+    build_report(runs, tmp_path / "trial", ASKED)
+    assert unchanged(tmp_path / "trial", runs, ASKED) is not None
+    (tmp_path / "trial/index.md").write_text("other")
+    assert unchanged(tmp_path / "trial", runs, ASKED) is None
+
+
+def test_the_newest_run_counts(tmp_path, no_pictures):
+    old = write_run(tmp_path, Made((0.5, 0.5)), code=1)
+    new = write_run(tmp_path, Made((0.1, 0.1), created="2026-11-02T10:00:00+00:00"), code=2)
+    question = Question("trial", "T", keys={old.id: {}, new.id: {}})
+    build_report([old, new], tmp_path / "r", question)
+    assert table.read(tmp_path / "r/results.csv")["delta"].tolist() == [0.1, 0.1]
+    build_report([old, new], tmp_path / "r", question, first=old)
+    assert table.read(tmp_path / "r/results.csv")["delta"].tolist() == [0.5, 0.5]
+
+
+def test_what_jobs_vary_is_their_setting(tmp_path, no_pictures):
+    some = [write_run(tmp_path, Made((0.1 * k, 0.2)), code=k) for k in (1, 2)]
+    keys = {
+        run.id: {"scene": "sand", "sampler": "random", "sampler.size": f"{k}2"} for k, run in enumerate(some)
+    }
+    build_report(some, tmp_path / "r", Question("trial", "T", keys=keys))
+    assert set(table.read(tmp_path / "r/results.csv")["setting"]) == {"sampler.size=02", "sampler.size=12"}
+
+
+def test_the_papers_figure_of_single_jobs(tmp_path, no_pictures):
+    run = write_run(tmp_path, Made())
+    printed = [{"scene": "sand", "parameter": "30", "delta": 0.018}]
+    build_report([run], tmp_path / "r", Question("trial", "T", keys={run.id: {}}, printed=printed))
+    assert table.read(tmp_path / "r/results.csv")["paper_delta"].fillna(0).tolist() == [0.0, 0.018]
+
+
+def test_an_altered_file_is_refused(tmp_path, no_pictures):
+    run = write_run(tmp_path, Made())
+    rows = pd.read_csv(run.path / "results.csv")
+    rows.assign(delta=0.0).to_csv(run.path / "results.csv", index=False)
+    with pytest.raises(
+        SchemaError, match="changed after the run; delete the run folder and run `nsf evaluate`"
+    ):
+        build_report([run], tmp_path / "r", ASKED)
+    assert not (tmp_path / "r").exists()
+    (run.path / "results.csv").unlink()
+    with pytest.raises(SchemaError, match="is missing from evaluate run"):
+        build_report([run], tmp_path / "r", ASKED)
+
+
+def test_a_run_of_another_version_is_refused(tmp_path, no_pictures):
+    run = write_run(tmp_path, Made())
+    rows = pd.read_csv(run.path / "results.csv")
+    rows.drop(columns=["case", "model"]).to_csv(run.path / "results.csv", index=False)
+    seal(run)
+    with pytest.raises(SchemaError, match="another version wrote it; delete the run folder"):
+        build_report([run], tmp_path / "r", ASKED)
+
+
+def test_no_complete_run_is_refused(tmp_path):
+    run = write_run(tmp_path, Made())
+    rewrite(run, status="failed")
+    with pytest.raises(MissingRunError, match="none of the 1 evaluate runs is complete; run `nsf evaluate"):
+        build_report([run], tmp_path / "r", ASKED)
+
+
+def test_an_unknown_chart_and_a_foreign_folder_are_refused(runs, tmp_path):
+    with pytest.raises(ConfigError, match="plots=pie is no chart; choose of delta"):
+        build_report(runs, tmp_path / "r", Question("trial", "T", plots=["pie"]))
+    (tmp_path / "r").mkdir()
+    (tmp_path / "r/thesis.tex").write_text("mine")
+    with pytest.raises(ConfigError, match="is not a report"):
+        build_report(runs, tmp_path / "r", ASKED)
+
+
+def test_titles_are_no_markup(tmp_path, no_pictures):
+    run = write_run(tmp_path, Made())
+    build_report([run], tmp_path / "r", Question("trial", SCRIPT, SCRIPT))
+    page, text = ((tmp_path / "r" / name).read_text() for name in ("index.html", "index.md"))
+    assert "<script>alert(1)" not in page + text
+    assert "[x](javascript" not in text
+    assert "\\input{/etc" not in (tmp_path / "r/results.tex").read_text()
+
+
+def test_an_interval_is_of_seeds_and_cases_drawn_anew():
+    assert interval(pd.DataFrame([[0.01, 0.01], [0.01, 0.01]]).to_numpy()) == "1 to 1"
+    assert interval(pd.DataFrame([[0.01, 0.02]]).to_numpy()) == ""
