@@ -240,6 +240,9 @@ DERIVED = {
             "δ of latents interpolated over the parameters.",
         ),
         _percent("displacement_worst", "its largest", "Largest displacement error of a case."),
+        Column(
+            "gamma", "γ", meaning="3 |P| / r: coordinates of the full-order over those of the latent state."
+        ),
         _percent("integration_share", "N", "Integration particles over all particles."),
         Column("points", "points", meaning="Points at which the fields are queried."),
         _percent("particles_delta", "δ at the particles", "δ at the training particles alone."),

@@ -42,7 +42,7 @@ _IDENTITY = (
 _MEANS = (
     *("body", "variant", "case", "cases", "diverged", "paper_delta", "delta", "delta_interval"),
     *("displacement_error", "displacement_worst", "stress_error", *RIVALS, "delta_static"),
-    *("sample", "integration_share", "step_ms_full", "step_ms", "total_ms", "decode_ms"),
+    *("gamma", "sample", "integration_share", "step_ms_full", "step_ms", "total_ms", "decode_ms"),
     *("speedup_step", "speedup_total", "speedup_decoded", "memory_full_mib", "memory_mib"),
     *("train_seconds", "teach_seconds", "break_even_runs", "fallback_share"),
 )

@@ -40,7 +40,7 @@ _TIMES = {
 }
 _ORDER = ("test", "validation", "extrapolation")
 _COMPUTED = (
-    *("body", "variant", "model_name", "delta_static", "delta_interpolated", "integration_share"),
+    *("body", "variant", "model_name", "delta_static", "delta_interpolated", "integration_share", "gamma"),
     *("decoded_ms", "line", "rank"),
 )
 DEVIATION = ", deviation"
@@ -148,6 +148,7 @@ def labelled(frame: pd.DataFrame) -> pd.DataFrame:
     ratio = ratio.transform("median")
     frame["delta_static"], frame["delta_interpolated"] = ratio, frame["displacement_interpolated"] * ratio
     frame["integration_share"] = frame["integration"] / frame["particles"]
+    frame["gamma"] = 3 * frame["particles"] / frame["r"]  # paper, section 6
     frame["decoded_ms"] = frame["total_ms"] + frame["decode_ms"]
     keys = [frame[name].map(natural) for name in ("body", "variant", "split", "seed", "case")]
     return frame.loc[pd.concat(keys, axis=1).apply(tuple, axis=1).sort_values(kind="stable").index]
@@ -197,7 +198,7 @@ def means(frame: pd.DataFrame, by: Sequence[str] = ("body", "variant")) -> pd.Da
         row |= {"cases": len(part), "diverged": int(part["delta"].map(math.isinf).sum())}
         row |= {"displacement_worst": part["displacement_error"].max()}
         row |= {name: _only(part[name]) for name in (*_KEPT, "body") if name not in row}
-        row |= {"integration_share": part["integration_share"].mean()}
+        row |= part[["integration_share", "gamma"]].mean().to_dict()
         row |= speedups(row) | _deviations(part)
         rows.append(row)
     return pd.DataFrame(rows)

@@ -24,6 +24,11 @@ def test_a_mean_is_over_cases_and_a_deviation_over_seeds():
     assert (row["cases"], row["displacement_worst"]) == (4, 0.5)
 
 
+def test_gamma_is_the_papers():
+    cake = table.means(rows(Made((0.01,), cases=("angle=14°",)), particles=200_000, r=6)).iloc[0]
+    assert cake["gamma"] == 1e5  # 3 · 200,000 / 6, where the paper prints 1e6
+
+
 def test_speedups_are_of_mean_times_and_decoding_counts():
     slow = frame(Made((0.01,), cases=("friction_angle=26°",))).assign(step_ms=12.0, case="friction_angle=28°")
     both = pd.concat([frame(Made((0.01,), cases=("friction_angle=26°",))), slow])
