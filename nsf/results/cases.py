@@ -17,7 +17,7 @@ from nsf.errors import ConfigError
 from nsf.results.charts import Figures, View, _legend, _panels, chart
 from nsf.results.columns import COLUMNS, axis, number
 from nsf.results.scales import LOST, error_scale, plain_ticks
-from nsf.results.style import FULL, INK, WARNING, WIDTH, figure, line_style, styled
+from nsf.results.style import INK, WARNING, WIDTH, figure, line_style, styled
 
 COLORS = "viridis"  # of the maps
 _FEWEST = 6  # cases of which means of neighbours say anything
@@ -49,7 +49,6 @@ def error_over_parameters(view: View) -> Figures:
             panel.set(ylabel=_ERROR)
             _scaled(panel, "x", part, name, name in view.logarithmic)
             error_scale(panel, 100 * part["error"][part["error"] <= LOST / 100])
-            panel.plot([], [], **_LOST, color=FULL, label="lost")
         _legend(fig, drawn)
     return {"error-over-parameters": fig}
 
@@ -118,8 +117,9 @@ def _over(panel, errors: pd.Series, style: dict, log: bool) -> None:
     lost = ~(values <= LOST)
     color = style["color"]
     panel.plot(at[~lost], values[~lost], "o", ms=4.5, mfc="white", mec=color, mew=1.1, alpha=0.9)
-    panel.plot(at[lost], np.full(lost.sum(), 1.03), transform=panel.get_xaxis_transform(), clip_on=False,
-               color=color, **_LOST)  # fmt: skip
+    if lost.any():  # an empty line outside the axes would upset the layout
+        above = {"transform": panel.get_xaxis_transform(), "clip_on": False, "label": "lost"}
+        panel.plot(at[lost], np.full(lost.sum(), 1.03), color=color, **_LOST, **above)
     if len(at) < _FEWEST:
         panel.plot([], [], "o", **{k: v for k, v in style.items() if k != "linestyle"})
         return

@@ -105,13 +105,14 @@ def build_report(
             *pictures.sections(view.frame, sources, fresh, question, films),
         ]
         fine = _fine_tables(view.frame, question, fresh)
-        write_pages(frame, question, fresh, sections, origins(sources), view, fine, _warnings(sources))
+        runs_of = origins(sources) | _fine_origins(view.frame, question)
+        write_pages(frame, question, fresh, sections, runs_of, view, fine, _warnings(sources))
         shown = [picture for section in sections for picture in section.pictures]
         content = {
             "name": question.name,
             "made_of": made_of(runs, question, first),
             **texts(question),
-            "runs": origins(sources),
+            "runs": runs_of,
             "trained": view.trained,
             "logarithmic": sorted(view.logarithmic),
             "pictures": {p.files[-1]: {"caption": p.caption, "runs": list(p.runs)} for p in shown},
@@ -318,6 +319,15 @@ def origins(sources: Iterable[Source]) -> dict[str, dict]:
         source.id: {key: source.manifest.get(key) for key in KEPT}
         | {"scale": source.summary.get("scale"), "files": source.hashes}
         for source in ordered
+    }
+
+
+def _fine_origins(frame: pd.DataFrame, question: Question) -> dict[str, dict]:
+    """The same of superresolve runs."""
+    shown = [run for of, run in question.fine.items() if of in set(frame["run"])]
+    return {
+        run.id: {key: run.manifest.get(key) for key in KEPT} | {"files": {_FINE: checked_hash(run, _FINE)}}
+        for run in shown
     }
 
 

@@ -113,10 +113,9 @@ def test_an_experiment_may_ask_for_more_points(nsf, copied, tmp_path):
     report = tmp_path / "work/reports/super_resolution_small"
     table, own = (pd.read_csv(f / "superresolution.csv") for f in (report, run.path))
     pd.testing.assert_frame_equal(table[list(own)], own)
-    assert list(table["scene"]) == ["sand"]
+    assert (list(table["body"]), list(table["run"])) == (["sand"], [run.id])
     told = json.loads((report / "sources.json").read_text())
     assert told["runs"][run.id]["files"]["superresolution.csv"]
-    assert told["pictures"]["sand-basis-superresolution.png"] == [run.id]
     page = (report / "index.md").read_text()
     assert "## At many more points" in page
     assert run.id in page
