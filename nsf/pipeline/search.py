@@ -99,7 +99,7 @@ def search(words: Sequence[str], say: Callable[[str], object] = print, root: Pat
             raise
         trial.set_user_attr("run", run)
         columns = [OBJECTIVES[name] for name in objectives]
-        told = [f"{c.title} {c.text(value)} {c.unit}" for c, value in zip(columns, values, strict=True)]
+        told = [f"{c.title} {c.cell(value)} {c.unit}" for c, value in zip(columns, values, strict=True)]
         say(f"trial {trial.number}: {' '.join(tried)}: {', '.join(told)}")
         return values
 
