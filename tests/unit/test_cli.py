@@ -208,7 +208,7 @@ def test_a_malformed_value_is_one_line_that_names_it(nsf, tmp_path, override, to
         ("~path", "path is missing from the configuration"),
         ("~point.folder", "point.folder is missing from the configuration"),
         ("point.folder=5", "point.folder=5 must be text"),
-        ("point.points=99999999999", "point.points=99999999999 is more than"),
+        ("point.points=2000000000", "point.points=2000000000 is more than"),
         ("material._target_=nsf.workers.Worker", "nsf.workers.Worker is refused"),
     ],
 )
