@@ -46,6 +46,11 @@ def refusal(request: Request, host: str, token: str | None = None) -> tuple[HTTP
         host: where it is served.
         token: that the query has to give; None asks for none.
     """
+    if (request.method, request.protocol) != ("GET", "HTTP/1.1"):
+        return (
+            HTTPStatus.BAD_REQUEST,
+            f"{_told(request.method)} of {_told(request.protocol)} is not GET of HTTP/1.1",
+        )
     if not _TARGET.fullmatch(request.path):
         return HTTPStatus.BAD_REQUEST, f"{_told(request.path)} is no path of this server"
     named, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
