@@ -1,9 +1,11 @@
 """Files that appear whole or not at all, and a full disk that says so."""
 
 import errno
+import hashlib
 import json
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -32,10 +34,14 @@ _REMEDIES = {
 _FULL_BYTES = 64 * 1024
 _PARTIAL = ".partial-"  # of hidden folders in which files are written
 _LOCK_SECONDS = 0.2  # between two looks at a lock that another process has
+# Ends a sealed file, with the sha256 of all before it in hex; readers of archives pass over what follows one.
+_SEAL = b"\nsha256 "
+_SEAL_BYTES = len(_SEAL) + 64
+_PIECE = 2**20  # [byte] read at once
 
 
 @contextmanager
-def writing(path: str | Path) -> Iterator[Path]:
+def writing(path: str | Path, sealed: bool = False) -> Iterator[Path]:
     """Yield a temporary path that becomes `path` only if the block succeeds.
 
     The temporary file keeps the name (savers choose a format by the suffix)
@@ -45,6 +51,8 @@ def writing(path: str | Path) -> Iterator[Path]:
 
     Args:
         path: where the file shall be; missing folders are made.
+        sealed: end it with its own sha256, for `intact`: an archive (of torch, of NumPy) that a run reads
+            which goes on after an interrupt, before any manifest records the file.
 
     Raises:
         StorageError: no space, no permission or no writable file system, or the folder was deleted meanwhile.
@@ -58,6 +66,9 @@ def writing(path: str | Path) -> Iterator[Path]:
     try:
         partial = folder / path.name
         yield partial
+        if sealed:
+            with partial.open("ab") as file:
+                file.write(_SEAL + _sum(partial, partial.stat().st_size))
         _flush(partial)
         os.replace(partial, path)
     except (OSError, RuntimeError) as error:
@@ -69,6 +80,42 @@ def writing(path: str | Path) -> Iterator[Path]:
         raise _storage_error(path, os.strerror(fault), _REMEDIES[fault]) from error
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def intact(path: Path, say: Callable[[str], object]) -> bool:
+    """Whether a file is there that `writing(path, sealed=True)` left whole; a damaged one is removed.
+
+    Args:
+        path: of the file.
+        say: called with a line where a file is removed.
+    """
+    try:
+        status = path.lstat()
+    except (FileNotFoundError, NotADirectoryError):
+        return False
+    size = status.st_size - _SEAL_BYTES
+    if stat.S_ISREG(status.st_mode) and size >= 0 and _tail(path, size) == _SEAL + _sum(path, size):
+        return True
+    if not stat.S_ISDIR(status.st_mode):
+        path.unlink()
+    say(f"warning: {path} was damaged after it was written: left out, and its part of the work is done again")
+    return False
+
+
+def _tail(path: Path, start: int) -> bytes:
+    with path.open("rb") as file:
+        file.seek(start)
+        return file.read()
+
+
+def _sum(path: Path, size: int) -> bytes:
+    """The sha256 in hex of the first `size` bytes of a file."""
+    found, left = hashlib.sha256(), size
+    with path.open("rb") as file:
+        while left and (piece := file.read(min(_PIECE, left))):
+            found.update(piece)
+            left -= len(piece)
+    return found.hexdigest().encode()
 
 
 @contextmanager

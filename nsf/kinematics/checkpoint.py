@@ -6,20 +6,15 @@ import importlib
 import importlib.util
 import inspect
 import math
-import pickle
 import re
 import reprlib
-import zipfile
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor, nn
 
-from nsf.data import Standardizer, hash_of_positions
-from nsf.errors import MissingRunError, SchemaError, first_line
-from nsf.runs.manifest import verified
+from nsf.data import Standardizer, archives, hash_of_positions
+from nsf.errors import SchemaError
 
 FORMAT = "nsf-manifold"
 FORMAT_VERSION = 3
@@ -33,12 +28,8 @@ _KINDS = {
     "hyperparameters": dict,
     "state": dict,
 }
-_MOST_LEAVES = 100_000  # of what a file holds beside its tensors
 _REPR = reprlib.Repr()
 _REPR.maxstring = 100
-#: Errors of torch and of a class on contents that are damaged or foreign.
-FAULTS = (RuntimeError, LookupError, TypeError, AttributeError, ValueError, ArithmeticError)
-_PLAIN = (str, int, float, bool, type(None))
 
 
 def class_of(name: Any, base: type) -> type:
@@ -73,34 +64,11 @@ def read(path: Path) -> dict[str, Any]:
         SchemaError: it was changed after its run, is truncated, foreign, of another format, or holds more
             than plain data.
     """
-    try:
-        verified(path)
-        _check_members(path)
-        content = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
-    except FileNotFoundError as error:
-        raise MissingRunError(f"{path} does not exist; run `nsf train` first") from error
-    except SchemaError:
-        raise
-    except (
-        *FAULTS, EOFError, OSError, AssertionError, pickle.UnpicklingError, zipfile.BadZipFile,
-    ) as error:  # fmt: skip
-        raise SchemaError(
-            f"{path} is truncated or not a checkpoint ({first_line(error)}); delete it and run `nsf train`"
-            " again"
-        ) from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise SchemaError(
-            f"{path} is a torch file but no manifold of nsf; pass the checkpoint of a train run"
-        )
-    if (version := content.get("format_version")) != FORMAT_VERSION:
-        raise SchemaError(
-            f"{path} has format_version {_REPR.repr(version)}, this nsf reads {FORMAT_VERSION}; train again"
-            " with `nsf train`"
-        )
+    content = archives.tensors(path, "manifold", "train", (FORMAT, FORMAT_VERSION), mapped=True)
     if missing := _KINDS.keys() - content.keys():
         raise SchemaError(f"{path} lacks {', '.join(sorted(missing))}; delete it and run `nsf train` again")
     try:
-        _check_plain(content, path.stat().st_size)
+        _check_kinds(content, path.stat().st_size)
     except SchemaError as error:
         raise SchemaError(f"{path} {error}; train again with `nsf train`") from error
     return content
@@ -140,53 +108,23 @@ def is_finite(tensor: Tensor) -> bool:
     return bool(tensor.sum().isfinite()) or bool(tensor.isfinite().all())
 
 
-def _check_members(path: Path) -> None:
-    """Raises SchemaError where a part of the file would be larger in memory than it is on disk."""
-    size = path.stat().st_size
-    with zipfile.ZipFile(path) as archive:
-        for member in archive.infolist():
-            if member.compress_type != zipfile.ZIP_STORED or member.file_size > size:
-                raise SchemaError(f"{path} has a part that is compressed; train again with `nsf train`")
-
-
-def _check_plain(content: dict[str, Any], size: int) -> None:
+def _check_kinds(content: dict[str, Any], size: int) -> None:
     """Raises SchemaError without the path where a value is of another kind than a checkpoint's."""
     for key, kind in _KINDS.items():
         if type(content[key]) is not kind and not (kind is dict and isinstance(content[key], dict)):
             raise SchemaError(f"has {key}={_REPR.repr(content[key])}, which is no {kind.__name__}")
     if content["latent_dim"] < 1 or not all(isinstance(name, str) for name in content["parameter_names"]):
         raise SchemaError("has a latent_dim below 1, or parameter_names that are no texts")
-    for leaf in _leaves({key: value for key, value in content.items() if key != "state"}):
-        if not isinstance(leaf, _PLAIN) or (isinstance(leaf, float) and not math.isfinite(leaf)):
+    for leaf in archives.leaves({key: value for key, value in content.items() if key != "state"}):
+        if isinstance(leaf, Tensor) or (isinstance(leaf, float) and not math.isfinite(leaf)):
             raise SchemaError(f"holds {_REPR.repr(leaf)} beside its tensors, which is no plain value")
     # These size what is built, of which each entry takes a byte or more of the file.
-    for leaf in _leaves([content["latent_dim"], content["hyperparameters"]]):
+    for leaf in archives.leaves([content["latent_dim"], content["hyperparameters"]]):
         if isinstance(leaf, int) and abs(leaf) > size:
             raise SchemaError(f"asks for {_REPR.repr(leaf)} entries, with {size:,} bytes")
     for name, tensor in content["state"].items():
-        plain = isinstance(name, str) and type(tensor) in (Tensor, nn.Parameter)
-        if not plain or tensor.layout != torch.strided or tensor.device.type != "cpu":
+        if not isinstance(name, str) or not isinstance(tensor, Tensor):
             raise SchemaError(f"has {_REPR.repr(name)} among its tensors, which is none")
-        if tensor.numel() * tensor.itemsize > size:
-            raise SchemaError(f"has {name} of {list(tensor.shape)}, which is larger than the file")
-
-
-def _leaves(node: Any) -> Iterator[Any]:
-    """Keys and values of a tree of containers.
-
-    Raises:
-        SchemaError: they are many, as where a list holds another one often, which takes no room in a file.
-    """
-    rest = [node]
-    for _ in range(_MOST_LEAVES):
-        if not rest:
-            return
-        node = rest.pop()
-        if isinstance(node, dict | list | tuple):
-            rest += [*node, *node.values()] if isinstance(node, dict) else node
-        else:
-            yield node
-    raise SchemaError("holds more than plain data beside its tensors")
 
 
 def _type(tensor: Tensor) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from nsf.data import Standardizer
+from nsf.data import Standardizer, archives
 from nsf.errors import NSFError, SchemaError, ShapeError, first_line
 from nsf.kinematics import checkpoint
 from nsf.storage import writing
@@ -249,7 +249,7 @@ class Manifold(nn.Module, ABC):
         except SchemaError as error:
             remedy = "" if ";" in str(error) else "; train again with `nsf train`"
             raise SchemaError(f"{path} {error}{remedy}") from error
-        except (*checkpoint.FAULTS, NSFError) as error:
+        except (*archives.FAULTS, NSFError) as error:
             raise SchemaError(
                 f"{path} names {content['manifold']} but its contents do not fit it"
                 f" ({first_line(error)}); train again with `nsf train`"

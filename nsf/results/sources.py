@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from nsf.data import archives
 from nsf.errors import MissingRunError, NSFError, SchemaError
 from nsf.results import table
 from nsf.results.question import FILES
@@ -118,10 +119,9 @@ class Source:
 
     def motions(self, cases: Sequence[str]) -> list[Motion]:
         """The particles of some cases; those that were not stored are left out."""
-        with np.load(self._path("frames.npz"), allow_pickle=False) as stored:
-            if absent := [key for key in _FRAMES if key not in stored]:
-                raise SchemaError(f"{self._path('frames.npz')} lacks {absent}; run `nsf evaluate` again")
-            arrays = {key: stored[key] for key in (*_FRAMES, *_AROUND, "role") if key in stored}
+        arrays = archives.arrays(self._path("frames.npz"), "frames", "evaluate")
+        if absent := [key for key in _FRAMES if key not in arrays]:
+            raise SchemaError(f"{self._path('frames.npz')} lacks {absent}; run `nsf evaluate` again")
         rows = {str(case): row for row, case in enumerate(arrays["cases"])}
         return [
             Motion(

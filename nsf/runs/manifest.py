@@ -6,8 +6,6 @@ for a pipe, reads more than a bound, or takes a value of another kind for what i
 
 import copy
 import hashlib
-import json
-import math
 import os
 import re
 import reprlib
@@ -18,8 +16,10 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+from nsf import schemas
 from nsf.errors import NSFError, SchemaError, first_line
 from nsf.runs.canonical import plain
+from nsf.schemas import Maybe, Number
 
 MANIFEST = "manifest.json"
 CONFIG = "config.yaml"
@@ -28,33 +28,38 @@ NAME = re.compile(r"[A-Za-z0-9][\w.+-]*", re.ASCII)
 STATUSES = ("running", "complete", "failed", "interrupted")
 
 _RUN = re.compile(rf"{NAME.pattern}/{NAME.pattern}/{NAME.pattern}", re.ASCII)
-_SUM = re.compile("[0-9a-f]{64}")
 _MOST_BYTES = {MANIFEST: 2**21, CONFIG: 2**18}  # a configuration takes milliseconds a KiB
 _DEEPEST = 32  # lists and mappings inside each other
-_WIDEST = 2**63  # whole numbers below it
 #: A file changed later than this [s] ago may change once more without another time stamp.
 _SETTLED = 2.0
 
-_TEXT, _WHOLE, _NONE = (str,), (int,), (type(None),)
-_KINDS: dict[str, tuple[type, ...]] = {
-    "format": _WHOLE,
-    "stage": _TEXT,
-    "scene": _TEXT,
-    "hash": _TEXT,
-    "parents": (list,),
-    "commit": _TEXT + _NONE,
-    "dirty": (bool, *_NONE),
-    "versions": (dict,),
-    "device": _TEXT,
-    "seed": _WHOLE + _NONE,
-    "precision": _TEXT + _NONE,
-    "created": _TEXT,
-    "status": _TEXT,
-    "error": _TEXT,
-    "seconds": (int, float),
-    "metrics": (dict,),
-    "outputs": (list,),
-}  # fmt: skip
+_OUTPUT = {
+    "path": re.compile(r"(?!\.{1,2}(/|$))[^/]+(/(?!\.{1,2}(/|$))[^/]+)*"),  # below the folder
+    "bytes": Number(0, whole=True),
+    "sha256": re.compile("[0-9a-f]{64}"),
+}
+_SCHEMA = {
+    Maybe("format"): int,
+    Maybe("stage"): str,
+    Maybe("scene"): str,
+    Maybe("hash"): str,
+    Maybe("parents"): [_RUN],
+    Maybe("commit"): (str, None),
+    Maybe("dirty"): (bool, None),
+    Maybe("versions"): {...: str},
+    Maybe("device"): str,
+    Maybe("seed"): (int, None),
+    Maybe("precision"): (str, None),
+    Maybe("created"): str,
+    "status": re.compile("|".join(STATUSES)),
+    Maybe("error"): str,
+    Maybe("warnings"): [str],
+    Maybe("seconds"): Number(0),
+    Maybe("metrics"): dict,
+    Maybe("outputs"): [_OUTPUT],
+}
+#: Keys that the manifest of a complete run has.
+_OF_COMPLETE = dict.fromkeys(("created", "seconds", "metrics", "outputs"), (str, float, dict, list))
 _KNOWN: dict[tuple, Any] = {}
 
 
@@ -168,27 +173,19 @@ def _regular(path: Path, within: Path | None = None) -> os.stat_result:
     return found
 
 
-def _text(path: Path) -> str:
-    most = _MOST_BYTES[path.name]
-    with path.open("rb") as file:
-        content = file.read(most + 1)
-    if len(content) > most:
-        raise SchemaError(f"{path.name} has more than {most:,} bytes")
-    try:
-        return content.decode()
-    except UnicodeDecodeError as error:
-        raise SchemaError(f"{path.name} is not UTF-8") from error
-
-
 def _json(path: Path) -> dict[str, Any]:
+    manifest = schemas.read(path, _SCHEMA, _MOST_BYTES[MANIFEST])
     try:
-        manifest = json.loads(_text(path), parse_constant=_not_json)
-    except (ValueError, RecursionError) as error:
-        raise SchemaError(f"{path.name} is no JSON: {first_line(error)}") from error
-    if not isinstance(manifest, dict):
-        raise SchemaError(f"{path.name} holds {_shown(manifest)}, not keys with values")
-    if (told := _odd_manifest(manifest)) is not None:
-        raise SchemaError(f"{path.name}: {told}")
+        if manifest["status"] == "complete":
+            schemas.check(manifest, _OF_COMPLETE)
+        if "created" in manifest:
+            datetime.fromisoformat(manifest["created"]).astimezone()
+        if odd := next((o for o in manifest.get("outputs", ()) if not o["path"].isprintable()), None):
+            raise SchemaError(f"outputs has the path {_shown(odd['path'])}")
+    except SchemaError as error:
+        raise SchemaError(f"{path.name}: {error}") from error
+    except (ValueError, OverflowError, OSError) as error:
+        raise SchemaError(f"{path.name}: created={_shown(manifest['created'])} is no time") from error
     return manifest
 
 
@@ -197,7 +194,7 @@ def _yaml(path: Path) -> dict[str, Any]:
     from omegaconf import OmegaConf  # 0.2 s that `nsf --help` need not pay
 
     try:
-        text = _text(path)
+        text = schemas.read_text(path, _MOST_BYTES[CONFIG])
         depth = 0
         for event in yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
             depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
@@ -213,7 +210,7 @@ def _yaml(path: Path) -> dict[str, Any]:
     except Exception as error:  # whatever the parser makes of a text that is no configuration
         told = str(error) if isinstance(error, NSFError) else first_line(error)
         raise SchemaError(f"{path.name} is no configuration: {told}") from error
-    if _strange(config):
+    if schemas.is_strange(config):
         raise SchemaError(f"{path.name} holds a value that no configuration has")
     return config
 
@@ -221,56 +218,6 @@ def _yaml(path: Path) -> dict[str, Any]:
 def _sha256(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def _not_json(name: str) -> None:
-    raise ValueError(f"{name} is no number of JSON")
-
-
-def _odd_manifest(manifest: dict[str, Any]) -> str | None:
-    """What is wrong with the values of a manifest; None where each is of its kind."""
-    for key, kinds in _KINDS.items():
-        if key in manifest and type(manifest[key]) not in kinds:
-            wanted = " or ".join("null" if kind is type(None) else kind.__name__ for kind in kinds)
-            return f"{key}={_shown(manifest[key])} must be {wanted}"
-    if manifest.get("status") not in STATUSES:
-        return f"status={_shown(manifest.get('status'))} must be one of {', '.join(STATUSES)}"
-    if _strange(manifest):
-        return f"it holds a number that is not finite, broken text, or more than {_DEEPEST} levels"
-    for parent in manifest.get("parents", ()):
-        if not (isinstance(parent, str) and _RUN.fullmatch(parent)):
-            return f"parents holds {_shown(parent)}, which is no stage/scene/hash"
-    for output in manifest.get("outputs", ()):
-        if not _is_output(output):
-            return f"outputs holds {_shown(output)}, which is no path, bytes and sha256 of a file"
-    try:
-        if "created" in manifest:
-            datetime.fromisoformat(manifest["created"]).astimezone()
-    except (ValueError, OverflowError, OSError):
-        return f"created={_shown(manifest['created'])} is no time"
-    return None
-
-
-def _is_output(output: Any) -> bool:
-    if not isinstance(output, dict):
-        return False
-    path, size, sha256 = (output.get(key) for key in ("path", "bytes", "sha256"))
-    if not (isinstance(path, str) and type(size) is int and isinstance(sha256, str)):
-        return False
-    inside = path.isprintable() and not {"", ".", ".."} & set(path.split("/"))
-    return inside and size >= 0 and _SUM.fullmatch(sha256) is not None
-
-
-def _strange(value: Any, depth: int = 0) -> bool:
-    """Whether a tree is too deep for its readers, or a leaf cannot be shown or written."""
-    if isinstance(value, dict | list):
-        children = [*value, *value.values()] if isinstance(value, dict) else value
-        return depth == _DEEPEST or any(_strange(child, depth + 1) for child in children)
-    if isinstance(value, str):
-        return not value.isascii() and any("\ud800" <= c <= "\udfff" for c in value)
-    if isinstance(value, float):
-        return not math.isfinite(value)
-    return isinstance(value, int) and abs(value) >= _WIDEST
 
 
 def _shown(value: Any) -> str:

@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from nsf import schemas
 from nsf.errors import ConfigError, MissingRunError, SchemaError, StorageError
 from nsf.runs.canonical import content_hash, plain
 from nsf.runs.manifest import CONFIG, MANIFEST, NAME, altered, read_config, read_manifest
@@ -262,21 +263,27 @@ class Run:
             )
         return self.path / name
 
-    def metric(self, *keys: str) -> float:
-        """A number of the manifest's metrics.
+    def metric(self, *keys: str, kind: Any = float) -> Any:
+        """A value of the manifest's metrics.
+
+        Args:
+            keys: one in the other.
+            kind: of the value, a schema of `nsf.schemas`.
 
         Raises:
-            SchemaError: there is no such number.
+            SchemaError: there is no such value.
         """
         value: Any = self.manifest.get("metrics")
         for key in keys:
             value = value.get(key) if isinstance(value, dict) else None
-        if isinstance(value, bool) or not isinstance(value, int | float):
+        try:
+            schemas.check(value, kind, ".".join(keys))
+        except SchemaError as error:
             raise SchemaError(
-                f"{self.path / MANIFEST} has no number {'.'.join(keys)} among its metrics; "
-                f"delete the run's folder and run `nsf {self.stage}` again"
-            )
-        return float(value)
+                f"{self.path / MANIFEST}: among its metrics {error}; delete the run's folder and run "
+                f"`nsf {self.stage}` again"
+            ) from error
+        return value
 
     def verify(self) -> list[str]:
         """What is wrong with the folder, a line a fault; every recorded file is held to its sha256."""

@@ -8,7 +8,6 @@ With a memory, B, f and G also see lags e_k, by how much x̂ is ahead of its mea
     e_k ← exp(−Δt/T_k) (e_k + d'),    e_k = 0 at t = 0
 """
 
-import pickle
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,9 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from nsf.data import archives
 from nsf.engines.operators.taught import Taught
-from nsf.errors import ConfigError, MissingRunError, SchemaError, first_line
-from nsf.runs.manifest import verified
+from nsf.errors import ConfigError, SchemaError, first_line
 from nsf.sampling.sampler import SampleSpan
 from nsf.storage import writing
 
@@ -220,7 +219,7 @@ class StepOperators(nn.Module):
             SchemaError: the file is truncated, foreign or of a newer format, or does not fit together.
         """
         path = Path(path)
-        content = _read(path)
+        content = archives.tensors(path, "operators", "teach", (FORMAT, FORMAT_VERSION))
         try:
             taught, sizes = Taught.read(content["taught"]), Sizes(**content["sizes"])
             samples = [_sample(span) for span in content["samples"]]
@@ -251,25 +250,3 @@ def _sample(plain: dict) -> SampleSpan:
     return SampleSpan(
         plain["start"], plain["particles"].numpy(), None if weights is None else weights.numpy()
     )
-
-
-def _read(path: Path) -> dict:
-    try:
-        verified(path)
-    except FileNotFoundError as error:
-        raise MissingRunError(f"{path} does not exist; run `nsf teach` first") from error
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, EOFError, OSError, ValueError, KeyError, pickle.UnpicklingError) as error:
-        raise SchemaError(
-            f"{path} is truncated or holds no operators ({first_line(error)}); delete it and run "
-            "`nsf teach` again"
-        ) from error
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise SchemaError(f"{path} is a torch file but holds no operators; pass the file of a teach run")
-    if content.get("format_version") != FORMAT_VERSION:
-        raise SchemaError(
-            f"{path} has format_version {content.get('format_version')!r}, this nsf reads {FORMAT_VERSION}; "
-            "install the nsf that wrote it or teach again with `nsf teach`"
-        )
-    return content

@@ -12,6 +12,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from nsf.data import archives
 from nsf.engines.operators.descent import Descent
 from nsf.engines.operators.lessons import Labels, Yardstick
 from nsf.engines.operators.model import Sizes, StepOperators
@@ -19,7 +20,6 @@ from nsf.engines.operators.states import principal
 from nsf.engines.operators.teacher import Teacher
 from nsf.engines.operators.teaching import Teaching
 from nsf.errors import InstabilityError
-from nsf.storage import writing
 
 _FAR = 4.0  # deviations from the mean of training latents, beyond which a run of one's own is cut off
 #: Of their own deviation, by which the last change of a state of the tube differs from that of its run.
@@ -43,6 +43,7 @@ class Course:
         device: where the network descends.
         folder: where finished rounds are kept, for a teaching that is broken off; None for nowhere.
         say: told of each round.
+        warn: called with a line for each file of a round that was damaged, which is done again.
 
     Attributes:
         errors: of each round by the yardstick; best: the round that is kept.
@@ -59,9 +60,10 @@ class Course:
         device: torch.device | str = "cpu",
         folder: Path | None = None,
         say: Callable[[str], object] = lambda line: None,
+        warn: Callable[[str], object] = print,
     ):
         self.teachers, self.yardstick, self.teaching, self.seed = teachers, yardstick, teaching, seed
-        self._truth, self._device, self._folder, self._say = truth, device, folder, say
+        self._truth, self._device, self._folder, self._say, self._warn = truth, device, folder, say, warn
         self.seconds, self.best = 0.0, 0
         self.errors: list[float] = []
 
@@ -104,7 +106,8 @@ class Course:
                 self._learn(number)
                 kept = self._keep(number, time.perf_counter() - started)
             else:
-                self._take_up(kept)
+                with archives.taken_up(self._folder, "teach"):
+                    self._take_up(kept)
             if kept["error"] < least:
                 best, least, self.best = kept["model"], kept["error"], number
             self._say(f"round {number}: {100 * kept['error']:.3g} % off")
@@ -267,8 +270,7 @@ class Course:
             "steps": [teacher.steps for teacher in (*self.teachers, self.yardstick.teacher)],
         }  # fmt: skip
         if self._folder is not None:
-            with writing(self._file(number)) as partial:
-                torch.save(kept, partial)
+            archives.keep(self._file(number), kept)
         return kept
 
     def _file(self, number: int) -> Path:
@@ -276,9 +278,7 @@ class Course:
 
     def _kept(self, number: int) -> dict | None:
         """What a round left that was finished before."""
-        if self._folder is None or not self._file(number).is_file():
-            return None
-        return torch.load(self._file(number), weights_only=True)
+        return None if self._folder is None else archives.kept(self._file(number), self._warn)
 
     def _take_up(self, kept: dict) -> None:
         """Go on from the end of a round."""

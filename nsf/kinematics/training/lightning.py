@@ -6,7 +6,7 @@ Imported once a phase begins: Lightning takes longer to load than most commands 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,11 @@ from pytorch_lightning.plugins import TorchCheckpointIO
 from torch.utils.data import DataLoader, Sampler
 from typing_extensions import override
 
-from nsf.data import Snapshots
+from nsf.data import Snapshots, archives
 from nsf.errors import InstabilityError
 from nsf.kinematics.training.descent import CHECKPOINT, Descent, Steps
 from nsf.kinematics.training.tracking import loggers
 from nsf.progress import Progress, quiet_lightning
-from nsf.storage import writing
 
 # Steps of a block: enough to hide what Lightning does between two, and about 40 checkpoints a phase.
 SHORTEST_BLOCK, LONGEST_BLOCK, BLOCKS = 50, 500, 40
@@ -153,12 +152,13 @@ class _InItsFolder(TorchCheckpointIO):
 
     @override
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        with writing(path) as partial, partial.open("wb") as file:
-            torch.save(checkpoint, file)
+        archives.keep(path, checkpoint)
 
 
-def descend(descent: Descent, steps: int, folder: Path, tracking: str | None) -> tuple[float, float]:
-    """Train one phase, from the checkpoint in `folder` if there is one.
+def descend(
+    descent: Descent, steps: int, folder: Path, tracking: str | None, say: Callable[[str], object]
+) -> tuple[float, float]:
+    """Train one phase, from the checkpoint in `folder` if there is one, and it is whole.
 
     Returns:
         The last block's mean loss, and the seconds that the steps took, those before an interrupt included.
@@ -168,7 +168,7 @@ def descend(descent: Descent, steps: int, folder: Path, tracking: str | None) ->
         InstabilityError: the loss is not finite.
     """
     checkpoint = folder / CHECKPOINT
-    resumed = checkpoint if checkpoint.is_file() else None
+    resumed = None if archives.kept(checkpoint, say) is None else checkpoint
     data, module = SnapshotData(descent.snapshots, steps), FieldTraining(descent, steps)
     on_gpu = descent.device.type == "cuda"
     with quiet_lightning(), Progress(f"train {descent.fit.name}", steps, "steps") as progress:

@@ -6,18 +6,20 @@ import contextlib
 import os
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
 import torch
 
 from nsf.data import Snapshots
+from nsf.data.archives import keep, kept, taken_up
 from nsf.kinematics.manifold import Manifold
 from nsf.kinematics.training.descent import CHECKPOINT, Descent
 from nsf.kinematics.training.phases import Fit, seeded
 from nsf.kinematics.training.schedules import Trainer
 from nsf.kinematics.training.tracking import check_tracking
-from nsf.storage import refusals, writing
+from nsf.storage import refusals
 from nsf.vectors import number
 
 WEIGHTS_STREAM = 1 << 30  # apart from the phases' streams
@@ -47,6 +49,7 @@ def train(
     folder: Path,
     device: str | torch.device,
     tracking: str | None = None,
+    say: Callable[[str], object] = print,
 ) -> tuple[Manifold, dict[str, float]]:
     """Train encoder and fields on the snapshots.
 
@@ -61,6 +64,8 @@ def train(
         folder: keeps logs, checkpoints and finished phases; one training a folder.
         device: "cpu", "cuda", "cuda:1".
         tracking: "tensorboard" or "mlflow" for a live page beside the CSV logs.
+        say: called with a line for each file of an interrupted training that was damaged, whose part is done
+            again.
 
     Returns:
         The manifold on the host, and for each phase its steps, last loss (mean squared error over the
@@ -72,6 +77,7 @@ def train(
         ConfigError: a value is out of range.
         MissingExtraError: what tracks is not installed.
         InstabilityError: a loss is not finite.
+        SchemaError: somebody made the files of an interrupted training.
         StorageError: the disk refused a file.
         KeyboardInterrupt: on an interrupt, after which a second call goes on.
 
@@ -80,17 +86,21 @@ def train(
     number("latent_dim", latent_dim, 1, whole=True)
     check_tracking(tracking)
     device, folder = torch.device(device), Path(folder)
-    with refusals(folder), _deterministic():
-        begun = _once(folder / "prepared.pt", lambda: _timed(lambda: field.prepare(snapshots, latent_dim)))
+    resumed = any(folder.rglob("*.pt"))
+    fits = taken_up(folder, "train") if resumed else contextlib.nullcontext()
+    with refusals(folder), _deterministic(), fits:
+        prepare = partial(_timed, partial(field.prepare, snapshots, latent_dim))
+        begun = _once(folder / "prepared.pt", say, prepare)
         prepared, weights = begun["value"], seeded("cpu", seed, WEIGHTS_STREAM)
         built = _timed(lambda: field.build(snapshots, prepared, latent_dim, weights).to(device))
         manifold = built["value"]
         # Of a large scene, building reads all data once more; as all seconds, those of the first call count.
-        total = begun["seconds"] + _once(folder / "built.pt", lambda: built["seconds"])
+        total = begun["seconds"] + _once(folder / "built.pt", say, lambda: built["seconds"])
         metrics: dict[str, float] = {}
         for fit in field.fits(manifold, snapshots, prepared):
             descent = Descent(fit, trainer, snapshots, seed, device)
-            outcome = _once(folder / f"{fit.name}.pt", lambda: _phase(descent, folder, tracking))  # noqa: B023
+            phase = partial(_phase, descent, folder, tracking, say)
+            outcome = _once(folder / f"{fit.name}.pt", say, phase)
             fit.network.load_state_dict(outcome["state"])
             fit.network.to(device)  # Lightning leaves it on the host
             (folder / fit.name / CHECKPOINT).unlink(missing_ok=True)
@@ -100,11 +110,13 @@ def train(
     return manifold.cpu().requires_grad_(False).eval(), metrics
 
 
-def _phase(descent: Descent, folder: Path, tracking: str | None) -> dict[str, Any]:
+def _phase(
+    descent: Descent, folder: Path, tracking: str | None, say: Callable[[str], object]
+) -> dict[str, Any]:
     from nsf.kinematics.training.lightning import descend
 
     steps = descent.schedule.steps_of(descent.fit.name, descent.snapshots.M)
-    loss, seconds = descend(descent, steps, folder / descent.fit.name, tracking)
+    loss, seconds = descend(descent, steps, folder / descent.fit.name, tracking, say)
     state = {key: value.cpu() for key, value in descent.fit.network.state_dict().items()}
     return {"state": state, "steps": steps, "loss": loss, "seconds": seconds}
 
@@ -115,13 +127,13 @@ def _timed(compute: Callable[[], Any]) -> dict[str, Any]:
     return {"value": compute(), "seconds": time.perf_counter() - started}
 
 
-def _once(path: Path, compute: Callable[[], Any]) -> Any:
-    """The value kept in `path`; computed and kept there if this is the first time."""
-    if not path.is_file():
-        value = compute()
-        with writing(path) as temporary, temporary.open("wb") as file:
-            torch.save(value, file)
-    return torch.load(path, map_location="cpu", weights_only=True)
+def _once(path: Path, say: Callable[[str], object], compute: Callable[[], Any]) -> Any:
+    """The value kept in `path`; computed and kept there where there is none, or a damaged one."""
+    value = kept(path, say)
+    if value is None:
+        keep(path, compute())
+        value = kept(path, say)
+    return value
 
 
 @contextlib.contextmanager

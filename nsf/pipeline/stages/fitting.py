@@ -5,9 +5,11 @@ from typing import Any
 
 import torch
 
+from nsf.data import archives
 from nsf.kinematics.manifold import Manifold
 from nsf.models.lookup import training_inputs
 from nsf.runs import Run
+from nsf.storage import writing
 
 #: File of a teach run with what was learned.
 FITTED = "model.pt"
@@ -23,7 +25,8 @@ def fit(pipeline, run: Run) -> None:
     manifold, c = pipeline.manifold().to(pipeline.device), pipeline.config
     with run.record(device=pipeline.device, seed=c.seed, precision=c.precision) as record:
         started = time.perf_counter()
-        torch.save(fitted(pipeline, manifold), record.path / FITTED)
+        with writing(record.path / FITTED) as partial:
+            torch.save(fitted(pipeline, manifold), partial)
         record.output(FITTED)
         record.metrics["teach_seconds"] = seconds = time.perf_counter() - started
     pipeline.say(f"teach: model={pipeline.model.name} in {seconds:.1f} s → {run.id}")
@@ -40,5 +43,6 @@ def loaded(run: Run) -> Any:
 
     Raises:
         MissingRunError: it has not run.
+        SchemaError: the file was changed after its run, or holds more than tensors in plain containers.
     """
-    return torch.load(run.require().file(FITTED), map_location="cpu", weights_only=True)
+    return archives.tensors(run.require().file(FITTED), "model", "teach")

@@ -78,7 +78,7 @@ def _follow(pipeline, manifold: Manifold, record: Record) -> None:
             if pipeline.of_runs:
                 progress.advance(1)
 
-        course = Course(lessons, truth, yardstick, teaching, seed, device, record.path, told)
+        course = Course(lessons, truth, yardstick, teaching, seed, device, record.path, told, pipeline.say)
         before = time.perf_counter() - started
         operators, steps = course.follow(), course.steps
         broken = course.broken_affinity()

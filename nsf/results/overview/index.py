@@ -10,7 +10,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from PIL import Image
 
-from nsf.data import Trajectory
+from nsf.data import Trajectory, archives
 from nsf.data.schema import TRAJECTORY
 from nsf.deployment import Rollout
 from nsf.results.formats import HTML
@@ -142,10 +142,10 @@ def _deployed(ax: Axes, run: Run) -> None:
 
 def _evaluated(ax: Axes, run: Run) -> None:
     """The particles at the end, full-order and reduced, of the first value."""
-    with np.load(run.file("frames.npz"), allow_pickle=False) as frames:
-        for name, color in (("x_full", FULL), ("x_reduced", REDUCED)):
-            x = frames[name][0, -1]
-            _scatter(ax, x[:: max(1, len(x) // _POINTS)], color)
+    frames = archives.arrays(run.file("frames.npz"), "frames", "evaluate")
+    for name, color in (("x_full", FULL), ("x_reduced", REDUCED)):
+        x = frames[name][0, -1]
+        _scatter(ax, x[:: max(1, len(x) // _POINTS)], color)
 
 
 def _superresolved(ax: Axes, run: Run) -> None:

@@ -335,7 +335,7 @@ class Evil:
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda content: content | {"format": "other"}, "holds no operators"),
+        (lambda content: content | {"format": "other"}, "no operators of nsf"),
         (lambda content: content | {"format_version": 9}, "has format_version 9, this nsf reads 3"),
         (lambda content: content | {"samples": [{"start": 0.0}]}, "do not fit each other"),
         (
@@ -349,7 +349,7 @@ class Evil:
             lambda content: content | {"state": content["state"] | {"x_mean": torch.full((4,), torch.nan)}},
             "a value is not finite",
         ),
-        (lambda content: content | {"more": Evil()}, "truncated or holds no operators"),
+        (lambda content: content | {"more": Evil()}, "calls "),
     ],
 )  # fmt: skip
 def test_a_bad_file_is_refused(tmp_path, capsys, spoil, message):
@@ -570,3 +570,22 @@ def test_cases_between_fill_a_box_of_two_parameters():
 def test_bad_teaching(options, message):
     with pytest.raises(ConfigError, match=re.escape(message)):
         Teaching(**options)
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda data: data[:900] + b"\0\0\0\0" + data[904:], lambda data: data[:99]]
+)
+def test_a_damaged_round_of_an_interrupted_teaching_is_done_again(tmp_path, damage):
+    def taught(folder, warn=print):
+        teacher = Stepper(0.0)
+        yardstick = Yardstick(teacher, lambda run: run[:, None], teacher.run()[:, :, None])
+        teaching = Teaching(8, rounds=1, steps=90, descent=3, unroll=2)
+        return Course([teacher], None, yardstick, teaching, 0, folder=folder, warn=warn).follow()
+
+    expected, lines = taught(tmp_path).state_dict(), []
+    path = tmp_path / "round_0.pt"
+    path.write_bytes(damage(path.read_bytes()))
+    again = taught(tmp_path, lines.append).state_dict()
+    assert all(torch.equal(again[name], value) for name, value in expected.items())
+    assert len(lines) == 1
+    assert str(path) in lines[0]

@@ -7,7 +7,8 @@ import time
 import pytest
 import torch
 
-from nsf.errors import ConfigError, InstabilityError, MissingExtraError
+from nsf.data import archives
+from nsf.errors import ConfigError, InstabilityError, MissingExtraError, SchemaError
 from nsf.kinematics.fields.basis import BasisField
 from nsf.kinematics.fields.mlp import MlpField
 from nsf.kinematics.training import descent, lightning
@@ -28,8 +29,9 @@ def short_blocks(monkeypatch):
 
 @pytest.fixture
 def train(snapshots, fields):
-    def run(field, folder, schedule=SHORT, seed=0, tracking=None):
-        return training.train(snapshots, fields[field], schedule, LATENT, seed, folder, "cpu", tracking)
+    def run(field, folder, schedule=SHORT, seed=0, tracking=None, say=print):
+        fit = fields[field]
+        return training.train(snapshots, fit, schedule, LATENT, seed, folder, "cpu", tracking, say)
 
     return run
 
@@ -80,6 +82,41 @@ def test_resumed_training_has_the_same_bits(monkeypatch, train, tmp_path, field,
     assert same(again, expected)
     assert not taken
     assert again_metrics["training_seconds"] == total  # what was done before counts, what is read does not
+
+
+def flipped(data: bytes) -> bytes:
+    """One bit of the middle changed."""
+    at = len(data) // 2
+    return data[:at] + bytes([data[at] ^ 4]) + data[at + 1 :]
+
+
+@pytest.mark.parametrize("damage", [flipped, lambda data: data[: len(data) // 2], lambda data: b""])
+@pytest.mark.parametrize(
+    "name", ["prepared.pt", "built.pt", "deformation.pt", "stress/last.ckpt", "stress.pt"]
+)
+def test_a_damaged_file_of_an_interrupted_training_is_dropped(monkeypatch, train, tmp_path, name, damage):
+    expected, _ = train("basis", tmp_path / "whole")
+    restore = interrupt_at(monkeypatch, "affine" if name == "stress.pt" else "stress", 7)
+    with pytest.raises(KeyboardInterrupt):
+        train("basis", tmp_path / "parts")
+    restore()
+    path = tmp_path / "parts" / name
+    path.write_bytes(damage(path.read_bytes()))
+    lines = []
+    resumed, _ = train("basis", tmp_path / "parts", say=lines.append)
+    assert same(resumed, expected)
+    assert len(lines) == 1
+    assert str(path) in lines[0]
+
+
+def test_a_file_of_an_interrupted_training_that_is_forged_is_refused(monkeypatch, train, tmp_path):
+    restore = interrupt_at(monkeypatch, "stress", 7)
+    with pytest.raises(KeyboardInterrupt):
+        train("basis", tmp_path)
+    restore()
+    archives.keep(tmp_path / "deformation.pt", {"state": {"x": torch.zeros(3)}})
+    with pytest.raises(SchemaError, match="delete the folder"):
+        train("basis", tmp_path)
 
 
 def test_seconds_before_an_interrupt_count(monkeypatch, train, tmp_path):
