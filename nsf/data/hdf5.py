@@ -80,7 +80,7 @@ def array(file: h5py.Group, name: str, types: Sequence[str], shape: Sequence[int
     Args:
         file: or a group of it.
         name: within the group.
-        types: which the values may be of, as "<f8"; "text" for text.
+        types: which the values may be of, as "<f8"; "text" for texts of any length.
         shape: None for a size of any number but zero.
 
     Raises:
@@ -96,12 +96,16 @@ def array(file: h5py.Group, name: str, types: Sequence[str], shape: Sequence[int
     ):
         expected = ", ".join("any" if size is None else str(size) for size in shape)
         raise SchemaError(f"has {name} of shape {list(has)}, not [{expected}]")
-    text = h5py.check_string_dtype(dataset.dtype) is not None
+    string = h5py.check_string_dtype(dataset.dtype)
+    text = string is not None and string.length is None
     if ("text" if text else dataset.dtype) not in [t if t == "text" else np.dtype(t) for t in types]:
         raise SchemaError(f"has {name} of {dataset.dtype.str}, not {' or '.join(types)}")
     layout = dataset.id.get_create_plist()
     if layout.get_layout() != h5py.h5d.CONTIGUOUS or layout.get_external_count():
-        raise SchemaError(f"has {name} in chunks or outside the file, and not in one piece")
+        packed = (
+            f"packed by {dataset.compression}" if dataset.compression else "in chunks or outside the file"
+        )
+        raise SchemaError(f"has {name} {packed}, and not in one piece")
     needed = dataset.size * (_TEXT_BYTES if text else dataset.dtype.itemsize)
     held = dataset.id.get_storage_size()
     if held != needed or (needed and dataset.id.get_offset() + held > file.file.id.get_filesize()):

@@ -12,17 +12,16 @@ import torch
 from torch import Tensor
 
 from nsf.data import Trajectory
-from nsf.errors import ConfigError, first_line
+from nsf.errors import ConfigError
 from nsf.evaluation.quantities import QUANTITIES
+from nsf.inverse.columns import COLUMNS, read_columns
 from nsf.inverse.model import Model
 from nsf.kinematics.interpolation import interpolation
 
 AXES = ("x", "y", "z")
 _POINT = ("X", "Y", "Z")
-_KNOWN = ("t", "particle", *_POINT, *AXES, "quantity", "value", "deviation")
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _COMPONENT = re.compile(rf"([xyz])@({_NUMBER}):({_NUMBER}):({_NUMBER})")
-_MOST = 1_000_000  # rows of a file
 #: Particles that a scalar of a shape is taken from.
 BODY = 1000
 #: Of Δt: how far a time may be outside of a run.
@@ -49,7 +48,7 @@ class Observations:
         what: [m] `x`, `y` or `z` of a point, or the name of a quantity.
         points: [m, 3] rest position of each point [m]; NaN of quantities.
         values, deviations: [m] [m].
-        where: [m] the row of a file that each is from, for messages; empty of those from no file.
+        rows: [m] the row of a file that each is from, and source: the file, for messages; none of others.
     """
 
     t: np.ndarray
@@ -57,7 +56,8 @@ class Observations:
     points: np.ndarray
     values: np.ndarray
     deviations: np.ndarray
-    where: tuple[str, ...] = ()
+    rows: np.ndarray | None = None
+    source: str = ""
 
     def __len__(self) -> int:
         return len(self.t)
@@ -103,27 +103,29 @@ class Observations:
 
         Raises:
             ConfigError: a column is missing or unknown, or a value refused; names the row.
+            SchemaError: the file is damaged, or reads others.
         """
-        rows = _table(Path(path))
-        if unknown := [name for name in rows if name not in _KNOWN]:
-            raise ConfigError(f"{path} has the column {unknown[0]!r}; it may have {', '.join(_KNOWN)}")
-        if "deviation" not in rows:
-            raise ConfigError(f"{path} has no column deviation; give the standard deviation [m] of each row")
-        rows = rows.reindex(columns=list(_KNOWN))
-        for name in _KNOWN:
-            if name == "quantity":
-                rows[name] = rows[name].astype(object).where(rows[name].notna(), "").astype(str)
-                continue
-            try:
-                rows[name] = rows[name].astype(float)
-            except (TypeError, ValueError):
-                raise ConfigError(f"{path}: the column {name} must hold numbers") from None
-        records = enumerate(rows.to_dict("records"), 1)
-        found = [one for k, row in records for one in _row(f"{path}, row {k}", row, model)]
-        if not found:
-            raise ConfigError(f"{path} observes nothing; give x, y, z of points, or value of a quantity")
-        t, what, points, values, deviations, places = zip(*found, strict=True)
-        return cls(np.array(t), what, np.array(points), np.array(values), np.array(deviations), places)
+        table = read_columns(path)
+        count = len(table["deviation"])
+        empty = dict.fromkeys(COLUMNS, np.full(count, np.nan)) | {"quantity": np.full(count, "", object)}
+        table = empty | table
+        scalar = table["quantity"] != ""
+        X, x = (np.column_stack([table[name] for name in names]) for names in (_POINT, AXES))
+        rest, particle = model.manifold.X.cpu().numpy(), table["particle"]
+        _check_rows(path, table, len(rest))
+        named = ~np.isnan(particle)
+        X[named] = rest[particle[named].astype(int)]
+        rows, which = np.nonzero(np.column_stack([~np.isnan(x), scalar]))
+        whole = np.where(scalar & np.isnan(table["t"]), float(model.t[-1]), table["t"])
+        return cls(
+            whole[rows],
+            tuple([*AXES, table["quantity"][row]][k] for row, k in zip(rows, which, strict=True)),
+            X[rows],
+            np.column_stack([x, table["value"]])[rows, which],
+            table["deviation"][rows],
+            rows + 1,
+            str(path),
+        )
 
     @property
     def frame(self) -> pd.DataFrame:
@@ -135,7 +137,7 @@ class Observations:
 
     def _at(self, k: int) -> str:
         """Where an observation is from, before what is wrong with it."""
-        return f"{self.where[k]}: " if self.where else ""
+        return "" if self.rows is None else f"{self.source}, row {self.rows[k]}: "
 
     def place(self, k: int) -> str:
         """An observation in words: where it is from, what, and when."""
@@ -278,57 +280,43 @@ def _between(t: np.ndarray, model: Model) -> tuple[np.ndarray, np.ndarray]:
     return steps, at - steps
 
 
-def _table(path: Path) -> pd.DataFrame:
-    """The rows of a file."""
-    if not path.is_file():
-        raise ConfigError(f"{path} is no file; name a CSV or HDF5 file of observations")
-    try:
-        if path.suffix in (".h5", ".hdf5"):
-            rows = _hdf5(path)
-        else:
-            rows = pd.read_csv(path, nrows=_MOST, skipinitialspace=True)
-    except (OSError, ValueError) as error:
-        kind = "HDF5" if path.suffix in (".h5", ".hdf5") else "CSV"
-        raise ConfigError(f"{path} is no {kind} file of columns ({first_line(error)})") from error
-    if not len(rows):
-        raise ConfigError(f"{path} has no rows; give a row an observation")
-    return rows
+def _check_rows(path: Path | str, table: Mapping[str, np.ndarray], particles: int) -> None:
+    """Refuse rows of a file that name no point or quantity, or hold a number that nobody would read.
 
+    Args:
+        path: of the file.
+        table: every column [rows], NaN or "" where it is empty.
+        particles: of the body.
 
-def _hdf5(path: Path) -> pd.DataFrame:
-    """Data sets of one axis, a column each."""
-    import h5py
-
-    with h5py.File(path, "r") as file:
-        own = {name: file[name] for name in file if isinstance(file[name], h5py.Dataset)}
-        if any(values.ndim != 1 or len(values) > _MOST for values in own.values()):
-            raise ConfigError(f"{path} must hold arrays of one axis, a column each")
-        text = {name: h5py.check_string_dtype(values.dtype) for name, values in own.items()}
-        return pd.DataFrame(
-            {name: values.asstr()[()] if text[name] else values[()] for name, values in own.items()}
-        )
-
-
-def _row(where: str, row: Mapping, model: Model) -> list[tuple]:
-    """The observations of one row of a file."""
-    if quantity := row["quantity"]:
-        if quantity not in QUANTITIES:
-            raise ConfigError(
-                f"{where}: unknown quantity {quantity!r}; choose one of {', '.join(QUANTITIES)}"
-            )
-        if not np.isfinite(row["value"]):
-            raise ConfigError(f"{where}: {quantity} has no value; give it [m]")
-        t = float(model.t[-1]) if np.isnan(row["t"]) else row["t"]
-        return [(t, quantity, np.full(3, np.nan), row["value"], row["deviation"], where)]
-    if not np.isfinite(row["t"]):
-        raise ConfigError(f"{where} has no t; give the time [s] of a point's position")
-    point, particle = np.array([row[name] for name in _POINT]), row["particle"]
-    if np.isfinite(particle):
-        X = model.manifold.X.cpu().numpy()
-        if not (particle % 1 == 0 and 0 <= particle < len(X)):
-            raise ConfigError(f"{where}: particle={particle:g} must be a whole number below {len(X)}")
-        point = X[int(particle)]
-    if not np.isfinite(point).all():
-        raise ConfigError(f"{where} names no point; give X, Y, Z at rest [m], or particle")
-    seen = [axis for axis in AXES if not np.isnan(row[axis])]
-    return [(row["t"], axis, point, row[axis], row["deviation"], where) for axis in seen]
+    Raises:
+        ConfigError: names the first such row.
+    """
+    there = {name: ~np.isnan(table[name]) for name in COLUMNS if name != "quantity"}
+    placed, seen = (np.any([there[name] for name in names], axis=0) for names in (_POINT, AXES))
+    scalar, particle = table["quantity"] != "", table["particle"]
+    whole = np.all([np.isfinite(table[name]) for name in _POINT], axis=0) | there["particle"]
+    valid = (np.floor(particle) == particle) & (particle >= 0) & (particle < particles)
+    for wrong, message in (
+        (
+            scalar & ~np.isin(table["quantity"], list(QUANTITIES)),
+            f": unknown quantity {{quantity!r}}; choose one of {', '.join(QUANTITIES)}",
+        ),
+        (scalar & ~np.isfinite(table["value"]), ": {quantity} has no value; give it [m]"),
+        (
+            scalar & (placed | seen | there["particle"]),
+            ": {quantity} stands beside a point (particle, X, Y, Z, x, y, z); give each its own row",
+        ),
+        (
+            ~scalar & there["value"],
+            ": value={value:g} is of no quantity; name it, or give x, y, z of a point",
+        ),
+        (~scalar & ~np.isfinite(table["t"]), " has no t; give the time [s] of a point's position"),
+        (placed & there["particle"], ": particle={particle:g} stands beside X, Y, Z; give one of them"),
+        (there["particle"] & ~valid, f": particle={{particle:g}} must be a whole number below {particles}"),
+        (~scalar & ~whole, " names no point; give X, Y, Z at rest [m], or particle"),
+        (~scalar & ~seen, " observes nothing; give x, y, z of the point [m], or leave the row out"),
+    ):
+        if wrong.any():
+            k = int(wrong.argmax())
+            row = {name: values[k] for name, values in table.items()}
+            raise ConfigError(f"{path}, row {k + 1}{message.format(**row)}")

@@ -49,7 +49,7 @@ def test_hdf5(tmp_path, model):
         ({"particle": np.nan}, "names no point"),
         ({"quantity": "width"}, "unknown quantity 'width'; choose one of height, run_out"),
         ({"quantity": "height"}, "height has no value"),
-        ({"x": "left"}, "the column x must hold numbers"),
+        ({"x": "left"}, "row 1: x=left must be a number"),
         ({"deviation": np.nan}, r"row 1: deviation=nan m must be positive and finite"),
         ({"deviation": 0.0}, r"row 1: deviation=0 m must be positive"),
         ({"z": np.inf}, r"row 1: an observed value is inf m"),

@@ -1,0 +1,190 @@
+"""Columns of a file of observations, CSV or HDF5: sizes are bounded before reading, nothing is lost."""
+
+import csv
+import gzip
+import itertools
+import math
+import os
+import zlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TextIO
+
+import h5py
+import numpy as np
+
+from nsf.data import hdf5
+from nsf.errors import ConfigError, SchemaError, first_line
+
+COLUMNS = ("t", "particle", "X", "Y", "Z", "x", "y", "z", "quantity", "value", "deviation")
+_MOST_ROWS = 1_000_000
+_MOST_BYTES = 2**28  # of a file, and of the text that is packed in it
+_LINE = 4096  # letters of a line of text
+_TEXT_BYTES = 64  # of a quantity's name
+_HDF5 = (".h5", ".hdf5")
+_MISSING = ("", "nan", "na")
+#: First bytes of files that are no text.
+_KINDS = {
+    b"\x1f\x8b": "packed by gzip; name it .csv.gz",
+    b"BZh": "packed by bzip2; unpack it, or give a csv.gz",
+    b"\xfd7zXZ": "packed by xz; unpack it, or give a csv.gz",
+    b"PK": "packed by zip; unpack it, or give a csv.gz",
+    b"\x28\xb5\x2f\xfd": "packed by zstd; unpack it, or give a csv.gz",
+    b"\x89HDF": "HDF5; name it .h5",
+}
+
+
+def read_columns(path: Path | str) -> dict[str, np.ndarray]:
+    """Columns of a file by name, each [rows]: float64 with NaN in empty cells, but `quantity` of text.
+
+    Args:
+        path: HDF5 where it ends in .h5 or .hdf5, else CSV, packed by gzip where it ends in .gz.
+
+    Raises:
+        ConfigError: a column is unknown, or a row does not fit the columns; names it.
+        SchemaError: the file is damaged, or would be read from elsewhere.
+    """
+    path = Path(path)
+    if not os.path.isfile(path):
+        raise ConfigError(f"{path} is no file; name a CSV or HDF5 file of observations")
+    if path.stat().st_size > _MOST_BYTES:
+        raise ConfigError(f"{path} is larger than {_MOST_BYTES >> 20} MiB; observe fewer points or times")
+    columns = _of_hdf5(path) if path.suffix in _HDF5 else _of_csv(path)
+    if not len(columns["deviation"]):
+        raise ConfigError(f"{path} has no rows; give a row an observation")
+    return columns
+
+
+def _check_names(path: Path, names: Sequence[str]) -> None:
+    if not names:
+        raise ConfigError(f"{path} has no rows; give columns of {', '.join(COLUMNS)}")
+    if unknown := [name for name in names if name not in COLUMNS]:
+        remedy = "separate columns by commas" if {";", "\t"} & set(unknown[0]) else "leave it out"
+        raise ConfigError(
+            f"{path} has the column {unknown[0][:80]!r}; {remedy}: it may have {', '.join(COLUMNS)}"
+        )
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ConfigError(f"{path} has the column {twice[0]} twice; leave one of them out")
+    if "deviation" not in names:
+        raise ConfigError(f"{path} has no column deviation; give the standard deviation [m] of each row")
+
+
+def _check_rows(path: Path, count: int) -> None:
+    if count > _MOST_ROWS:
+        raise ConfigError(f"{path} has more than {_MOST_ROWS:,} rows; observe fewer points or times")
+
+
+# -- text -----------------------------------------------------------------------------------------------
+
+
+def _of_csv(path: Path) -> dict[str, np.ndarray]:
+    packed = path.suffix == ".gz"
+    try:
+        with path.open("rb") as raw:
+            head = raw.read(8)
+        if kinds := [kind for first, kind in _KINDS.items() if head.startswith(first) and not packed]:
+            raise ConfigError(f"{path} is {kinds[0]}")
+        opened = gzip.open if packed else open
+        with opened(path, "rt", encoding="utf-8-sig", newline="") as file:
+            return _of_text(path, file)
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path} is no UTF-8 text; save it as CSV in UTF-8") from error
+    except (OSError, EOFError, zlib.error) as error:
+        raise SchemaError(
+            f"{path} is damaged or cannot be read; write it again ({first_line(error)})"
+        ) from error
+
+
+def _of_text(path: Path, file: TextIO) -> dict[str, np.ndarray]:
+    records = _records(path, file)
+    names = [name.strip() for name in next(records, [])]
+    _check_names(path, names)
+    cells: dict[str, list] = {name: [] for name in names}
+    for k, fields in enumerate(records, 1):
+        if len(fields) != len(names):
+            raise ConfigError(
+                f"{path}, row {k} has {len(fields)} fields for {len(names)} columns; give each column one"
+            )
+        for name, text in zip(names, fields, strict=True):
+            try:
+                cells[name].append(_cell(name, text.strip()))
+            except ValueError:
+                raise ConfigError(f"{path}, row {k}: {name}={text[:80]} must be a number") from None
+    return {name: np.array(cells[name], object if name == "quantity" else float) for name in names}
+
+
+def _cell(name: str, text: str) -> float | str:
+    """The value of a cell.
+
+    Raises:
+        ValueError: it is no number, or one as only Python writes it.
+    """
+    missing = text.lower() in _MISSING
+    if name == "quantity":
+        return "" if missing else text
+    if "_" in text or not text.isascii():
+        raise ValueError(text)
+    return math.nan if missing else float(text)
+
+
+def _records(path: Path, file: TextIO) -> Iterator[list[str]]:
+    """Fields of each line that is not blank."""
+    records = csv.reader(_lines(path, file), strict=True, skipinitialspace=True)
+    try:
+        yield from (fields for fields in records if fields not in ([], [""]))
+    except csv.Error as error:
+        raise ConfigError(f"{path}, line {records.line_num} is no line of a CSV file ({error})") from error
+
+
+def _lines(path: Path, file: TextIO) -> Iterator[str]:
+    """Lines of bounded length and number; the first one names the columns."""
+    letters = 0
+    for k in itertools.count():
+        line = file.readline(_LINE + 1)
+        if not line:
+            return
+        _check_rows(path, k)
+        letters += len(line)
+        if len(line) > _LINE:
+            raise ConfigError(f"{path}, line {k + 1} has more than {_LINE:,} letters; give a row a line")
+        if letters > _MOST_BYTES:
+            raise ConfigError(
+                f"{path} holds more than {_MOST_BYTES >> 20} MiB of text; observe fewer points or times"
+            )
+        yield line
+
+
+# -- HDF5 -----------------------------------------------------------------------------------------------
+
+
+def _of_hdf5(path: Path) -> dict[str, np.ndarray]:
+    with hdf5.reading(path, "file of observations", "write it"), h5py.File(path, "r") as file:
+        names = list(itertools.islice(file, len(COLUMNS) + 1))
+        _check_names(path, names)
+        rows = hdf5.array(file, "deviation", [_type(file, "deviation")], [None]).size
+        _check_rows(path, rows)
+        return {name: _column(file, name, rows) for name in names}
+
+
+def _column(file: h5py.File, name: str, rows: int) -> np.ndarray:
+    """The values [rows] of a column."""
+    kind = _type(file, name)
+    if name != "quantity":
+        return hdf5.array(file, name, [kind], [rows])[()].astype(float)
+    texts = (
+        hdf5.texts(file, name, [rows])
+        if kind == "text"
+        else hdf5.array(file, name, [kind], [rows]).asstr("utf-8")
+    )
+    return np.array([text.strip() for text in texts[:]], object)
+
+
+def _type(file: h5py.File, name: str) -> str:
+    """The type of a column's values, as `nsf.data.hdf5.array` has it."""
+    dtype = getattr(hdf5.group(file, name), "dtype", np.dtype("V"))
+    text = h5py.check_string_dtype(dtype)
+    if name != "quantity" and (text or dtype.kind not in "fiu"):
+        raise SchemaError(f"has {name} of {dtype}, and not of numbers")
+    if name == "quantity" and not (text and (text.length or 1) <= _TEXT_BYTES):
+        raise SchemaError(f"has {name} of {dtype}, and not of text of at most {_TEXT_BYTES} bytes")
+    return "text" if text and text.length is None else dtype.str
