@@ -8,6 +8,7 @@ from pathlib import Path
 
 from nsf import usage
 from nsf.errors import ConfigError, NSFError, first_line, out_of_memory
+from nsf.paths import reports_folder
 from nsf.terminal import replace_what_cannot_be_shown
 from nsf.usage import STAGES, TOOLS
 
@@ -142,11 +143,6 @@ def _open(page: Path) -> int:
     return 0
 
 
-def _reports_folder(*parts: str) -> Path:
-    """The folder of reports, or one in it."""
-    return Path(os.environ.get("NSF_REPORTS", "reports"), *parts)
-
-
 def _bench(words: list[str]) -> int:
     """Benchmarks, and the report of all there are."""
     asked = _asked(
@@ -154,7 +150,7 @@ def _bench(words: list[str]) -> int:
     )
     from nsf.bench import bench, table
 
-    folder = asked.pop("folder", _reports_folder("speed"))
+    folder = asked.pop("folder", reports_folder("speed"))
     page = bench(folder, asked, lambda text: print(text, file=sys.stderr))
     _console().print(table(page.with_name("bench.csv")))
     return _open(page)
@@ -182,14 +178,14 @@ def _demo(words: list[str]) -> int:
     asked = _asked("demo", words, "model", "folder", "open")
     from nsf.live.demo import show
 
-    folder = asked.get("folder", _reports_folder("demo"))
+    folder = asked.get("folder", reports_folder("demo"))
     return _open(show(asked.get("model"), folder, asked.get("open", "true")))
 
 
 def _index(words: list[str]) -> int:
     """The page of all runs."""
     asked = _asked("index", words, "folder")
-    folder = asked.get("folder", _reports_folder("runs"))
+    folder = asked.get("folder", reports_folder("runs"))
     from nsf.results.overview.index import write_index
 
     return _open(write_index(Path(folder)))
@@ -231,7 +227,7 @@ def _reports(words: list[str]) -> int:
     from nsf.pipeline.experiment import questions
     from nsf.results.committed import faults, write_list
 
-    folder = Path(asked.get("folder", _reports_folder()))
+    folder = Path(asked.get("folder", reports_folder()))
     if not folder.is_dir():
         raise ConfigError(f"folder={folder} is no folder; name one that holds reports, or make one")
     if asked.get("check") != "true":

@@ -1,5 +1,6 @@
-"""Where the configuration files lie: beside the package in a checkout, inside it in a wheel."""
+"""Where configuration files lie, beside the package in a checkout, inside it in a wheel, and reports."""
 
+import os
 from pathlib import Path
 
 
@@ -10,6 +11,11 @@ def _bundled(name: str) -> Path:
 
 CONF = _bundled("conf")
 EXPERIMENTS = _bundled("experiments")
+
+
+def reports_folder(*parts: str) -> Path:
+    """The folder of reports (`NSF_REPORTS`), or one in it."""
+    return Path(os.environ.get("NSF_REPORTS", "reports"), *parts)
 
 
 def groups() -> dict[str, list[str]]:

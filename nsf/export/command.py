@@ -1,7 +1,6 @@
 """`nsf export`: its options, and the work."""
 
 import argparse
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -88,7 +87,7 @@ def main(arguments: Sequence[str]) -> int:
     writers = {name: importlib.import_module(f"nsf.export.{name}") for name in formats if name != LIVE}
     for needed in (module for writer in writers.values() for module in writer.NEEDS):
         optional(needed, "export")  # before any work
-    folder = asked.output or _reports() / "export" / f"{run.scene}-{run.hash}"
+    folder = asked.output or reports_folder() / "export" / f"{run.scene}-{run.hash}"
     if writers:
         playback = _playback(run, asked)
     for name, writer in writers.items():
@@ -127,10 +126,6 @@ def _playback(run: "Run", asked: argparse.Namespace) -> "Playback":
 
 def _say(name: str, path: Path) -> None:
     print(f"export: {name} → {path} ({_size(path) / 2**20:.1f} MiB)")
-
-
-def _reports() -> Path:
-    return Path(os.environ.get("NSF_REPORTS") or "reports").expanduser()
 
 
 def _size(path: Path) -> int:

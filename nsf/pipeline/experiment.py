@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 from nsf import config as configuration
 from nsf.config.documents import text_of
 from nsf.errors import ConfigError, MissingRunError
-from nsf.paths import EXPERIMENTS
+from nsf.paths import EXPERIMENTS, reports_folder
 from nsf.pipeline.names import Names
 from nsf.results.question import Question, unchanged
 from nsf.runs import Run
@@ -55,6 +55,7 @@ class Experiment:
         plots: names of the charts of its report; None for all.
         printed: δ that the paper prints of single jobs, as `Question` has them; None where it prints one a
             scene and method, which the scene's file has.
+        placed: whether the command line says where the report goes.
         small: whether the file itself asks for scale=small, so that its report's name need not say so.
         parts: experiments with questions, jobs and reports of their own; none where the file has jobs itself.
     """
@@ -68,6 +69,7 @@ class Experiment:
     printed: tuple[dict, ...] | None = None
     plots: tuple[str, ...] | None = None
     small: bool = False
+    placed: bool = False
     parts: "tuple[Experiment, ...]" = ()
 
     @classmethod
@@ -122,7 +124,7 @@ class Experiment:
             raise ConfigError(f"{where}: plots={plots} must be a list of names of charts")
         return cls(
             name=name, grids=grids, stages=tuple(stages), printed=printed, small=small,
-            plots=None if plots is None else tuple(plots), **texts,
+            placed="report.folder" in own, plots=None if plots is None else tuple(plots), **texts,
         )  # fmt: skip
 
     @property
@@ -216,7 +218,11 @@ class Experiment:
             check_place(one._folder(config, {config.scale}))
 
     def _folder(self, config: DictConfig, scales: set[str]) -> Path:
+        from nsf.results.folder import check_inside
+
         shrunk = scales == {"small"} and not self.small
+        if not self.placed:
+            check_inside(config.report.folder, reports_folder())
         return Path(config.report.folder) / (f"{self.name}_small" if shrunk else self.name)
 
 

@@ -1,5 +1,6 @@
 """A folder that is replaced whole or not at all."""
 
+import json
 import re
 import shutil
 import sys
@@ -12,28 +13,65 @@ from nsf.errors import ConfigError, StorageError
 from nsf.storage import in_use, locked
 
 MARK = "sources.json"
-"""The file by which a folder is known as a report and may be replaced."""
+"""The file by which a folder is known as a report: it names every other file of the folder."""
 
-_LEFT = re.compile(r"\.(?P<name>.+)\.(?P<kind>new|old)-\w+")  # beside a folder while it is replaced
+_LEFT = re.compile(r"\.(?P<name>.+)\.(?P<kind>new|old)-\w{8}")  # beside a folder while it is replaced
+_MOST_BYTES = 2**26  # of `MARK`
 
 
 def check_place(folder: Path) -> None:
     """Refuse a place where `replaced` could not put a report; the folder above it is made.
 
     Raises:
-        ConfigError: `folder` holds something that is not a report.
+        ConfigError: `folder` holds a file that no report wrote.
         StorageError: the folder above it cannot be made or written.
     """
     folder = Path(folder).absolute()
-    if folder.exists() and not (folder / MARK).is_file() and (not folder.is_dir() or any(folder.iterdir())):
+    if fault := _of_others(folder):
         raise ConfigError(
-            f"{folder} exists and is not a report (it has no {MARK}); name another folder or remove it"
+            f"{folder} exists and is not a report ({fault}); name another folder or move it away"
         )
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder.parent).close()
     except OSError as error:
         raise _no_place(folder, error) from error
+
+
+def check_inside(folder: Path, reports: Path) -> None:
+    """Refuse a folder that a file from elsewhere names outside of the folder of reports.
+
+    Raises:
+        ConfigError: says how to allow it.
+    """
+    if not Path(folder).resolve().is_relative_to(Path(reports).resolve()):
+        raise ConfigError(
+            f"report.folder={folder} lies outside of the reports folder {reports}, and the experiment's file "
+            f"says so; give report.folder={folder} on the command line if the report is to go there"
+        )
+
+
+def _of_others(folder: Path) -> str:
+    """Why a folder may not be replaced: what is in it that no report wrote; empty where it may."""
+    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+        return ""
+    try:
+        if (folder / MARK).stat().st_size > _MOST_BYTES:
+            return f"its {MARK} is too large"
+        content = json.loads((folder / MARK).read_bytes())
+        files = content["files"]
+        if [type(content[key]) for key in ("title", "runs", "files")] != [str, dict, dict]:
+            return f"its {MARK} is of another program"
+    except NotADirectoryError:
+        return "it is a file"
+    except FileNotFoundError:
+        return f"it has no {MARK}"
+    except (OSError, ValueError, TypeError, LookupError, RecursionError):
+        return f"its {MARK} is of another program"
+    others = [
+        path for path in sorted(folder.iterdir()) if path.name not in {MARK, *files} or not path.is_file()
+    ]
+    return f"no report wrote its {others[0].name}" if others else ""
 
 
 def _no_place(folder: Path, error: OSError) -> StorageError:
@@ -52,7 +90,7 @@ def replaced(folder: Path) -> Iterator[Path]:
     process left beside it is removed.
 
     Raises:
-        ConfigError: `folder` holds something that is not a report.
+        ConfigError: `folder` holds a file that no report wrote.
         StorageError: the disk refused a file.
     """
     folder = Path(folder).absolute()
@@ -82,16 +120,18 @@ def _lock(folder: Path) -> Path:
 
 
 def _clear(reports: Path) -> None:
-    """Remove what killed processes left in a folder of reports; a report that was put aside comes back."""
+    """Remove what killed processes left in a folder of reports; a report that was put aside comes back.
+
+    A folder of such a name beside which there is no lock, or one put aside that is no report, is of others.
+    """
     for left in sorted(reports.iterdir()):
-        found = _LEFT.fullmatch(left.name)
-        if not found:
+        parts = _LEFT.fullmatch(left.name)
+        if not parts or not _lock(folder := reports / parts["name"]).is_file():
             continue
-        folder = reports / found["name"]
         with suppress(OSError, StorageError):  # of someone else
-            if in_use(_lock(folder)):
+            if in_use(_lock(folder)) or (parts["kind"] == "old" and _of_others(left)):
                 continue
-            if found["kind"] == "old" and not folder.exists():
+            if parts["kind"] == "old" and not folder.exists():
                 left.rename(folder)
             shutil.rmtree(left, ignore_errors=True)
 

@@ -79,15 +79,18 @@ def test_a_report_that_a_killed_process_had_put_aside_comes_back(chain, nsf, tmp
 
 def test_what_a_living_process_writes_is_left_alone(chain, nsf, tmp_path):
     reports = tmp_path / "work/reports"
-    for name in (".mine.new-abc", ".dead.new-abc", ".dead.old-abc"):
+    for name in (".mine.new-abcdefgh", ".dead.new-abcdefgh", ".dead.old-abcdefgh"):
         (reports / name).mkdir(parents=True)
         (reports / name / "page").touch()
+    (reports / ".dead.lock").touch()
+    content = {"title": "", "runs": {}, "files": {"page": ""}}
+    (reports / ".dead.old-abcdefgh" / MARK).write_text(json.dumps(content))
     with locked(reports / ".mine.lock"):
         assert nsf("report", chain.root, faults=[PlainReport()]).code == 0
-        assert (reports / ".mine.new-abc/page").exists()
-    assert not (reports / ".dead.new-abc").exists()
+        assert (reports / ".mine.new-abcdefgh/page").exists()
+    assert not (reports / ".dead.new-abcdefgh").exists()
     assert (reports / "dead/page").exists()
     (written,) = (path.parent for path in reports.glob(f"*/{MARK}"))
     out_of_date(written)
     assert nsf("report", chain.root, faults=[PlainReport()]).code == 0
-    assert not (reports / ".mine.new-abc").exists()
+    assert not (reports / ".mine.new-abcdefgh").exists()

@@ -1,6 +1,5 @@
 """`nsf calibrate`, `nsf sample` and `nsf design`: their words, and the work."""
 
-import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -12,6 +11,7 @@ from nsf.evaluation.quantities import QUANTITIES
 from nsf.inverse.model import Model
 from nsf.inverse.observations import Observations, View, is_scalar
 from nsf.inverse.space import Space
+from nsf.paths import reports_folder
 from nsf.results.folder import check_place
 from nsf.runs import Run
 
@@ -79,7 +79,9 @@ def calibrate(words: Sequence[str], say: Callable[[str], object] = print) -> Pat
         from nsf.inverse.trials import Trials
 
         made = Trials(values["trials"], seed=values.get("seed", 0))
-        return trials_report(asked.models, made, asked.folder("calibration"), say)
+        of = asked.values.get("+experiment", "_".join(model.scene.name for model in asked.models))
+        name = f"calibration_{of.replace('/', '_')}_{made.count}_seed{made.seed}"
+        return trials_report(asked.models, made, asked.folder(name), say)
     from nsf.inverse.reports.calibration import report
 
     model, program = asked.model, asked.program
@@ -178,7 +180,7 @@ def design(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
         program,
         View(seen, model),
         dict(zip(model.names, model.ranges.mean(1).tolist(), strict=True)) | given,
-        asked.folder(f"design_{model.scene.name}"),
+        asked.folder(f"design_{model.scene.name}_{values.get('move', 'tilt').replace(',', '_')}"),
         run_full_order=values.get("full_order", True),
         seed=values.get("seed", 0),
         say=say,
@@ -269,8 +271,7 @@ class Words:
 
     def folder(self, name: str) -> Path:
         """Where the page goes, refused at once where none could be written."""
-        reports = Path(os.environ.get("NSF_REPORTS", "reports"))
-        folder = Path(self.values.get("folder") or reports / name)
+        folder = Path(self.values.get("folder") or reports_folder(name))
         check_place(folder)
         return folder
 
