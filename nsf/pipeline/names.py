@@ -187,6 +187,12 @@ class Names:
         needed = [(case, self.scene) for case in plain] + [(case, self.deployed) for case in held_out]
         return sorted(needed, key=lambda pair: pair[0])
 
+    @property
+    def inputs(self) -> list[Run]:
+        """The runs from which the chain makes others: trajectories, the manifold, and the taught model."""
+        simulations = [self.simulation(case, scene) for case, scene in self.needed()]
+        return [*simulations, self.training, *([self.taught] if self.is_taught else [])]
+
     def simulation(self, case: Case, scene: Draft | None = None) -> Run:
         """The run of one full-order trajectory, of the scene of training by default."""
         c = self.config

@@ -26,6 +26,8 @@ from nsf.pipeline.names import Names
 from nsf.pipeline.reuse import done
 from nsf.pipeline.reuse import report as report_of
 from nsf.progress import label, labelled
+from nsf.runs import Run
+from nsf.runs.reserved import reserved, reserving
 from nsf.terminal import replace_what_cannot_be_shown
 
 _SUBMITTED = "*/*_submitted.pkl"  # a file of each job that Slurm took
@@ -66,8 +68,9 @@ def work(config: DictConfig, stages: Sequence[str], say: Callable[[str], object]
     from nsf.pipeline.chain import Pipeline
 
     pipeline = Pipeline(config, say)
-    for at, name in enumerate(stages):
-        result = pipeline.simulate(stages[at + 1 :]) if name == "simulate" else pipeline.run(name)
+    with reserving(names.inputs if len(stages) > 1 else ()):
+        for at, name in enumerate(stages):
+            result = pipeline.simulate(stages[at + 1 :]) if name == "simulate" else pipeline.run(name)
     return result
 
 
@@ -111,12 +114,14 @@ def sweep(
     optional(plugin, "sweep")
     movable: list[bool] = []  # by configuration: whether it may see any one GPU
     kept: set[str] = set()  # data.keep of all
+    needed: set[Run] = set()
 
     def check(one: DictConfig) -> None:
         movable.append(one.device == "auto")
         if "point" not in stages:
             names = Names(one)
             kept.add(names.config.data.keep)
+            needed.update(names.inputs)
             if done(names, _of_chain(names, stages), lambda line: None) is None:
                 from nsf.pipeline.plan import Plan
 
@@ -137,7 +142,7 @@ def sweep(
     started = Plugins.instance().instantiate_launcher(context, task, config)
     dropped = kept == {"held_out"} and {"train", "evaluate"} <= set(stages)
     errors: list[str | None] = []
-    with _own_processes() if len(gpus) > 1 else nullcontext():
+    with reserving(needed), _own_processes() if len(gpus) > 1 else nullcontext():
         for scene in _scenes(jobs) if dropped else [jobs]:
             try:
                 found = _launched(started, [list(job) for job in scene], say, len(errors))
@@ -258,10 +263,13 @@ def _scenes(jobs: Sequence[tuple[str, ...]]) -> list[list[tuple[str, ...]]]:
 def _drop_training(plans: Sequence[Names], say: Callable[[str], object]) -> None:
     """Delete the trajectories that the jobs trained on, but for those that one of them is held to.
 
-    Their manifests stay; `nsf simulate` makes the trajectories again. What another process makes is left.
+    Their manifests stay; `nsf simulate` makes the trajectories again. What another process makes or needs is
+    left.
     """
     truths = {plan.truth(case).id for plan in plans for case in plan.held_out}
     for run in {run for plan in plans for run in plan.training_data if run.id not in truths}:
+        if run.id in reserved(run.root, by_others=True):
+            continue
         try:
             with run.claimed() as claimed:
                 if claimed:

@@ -1,4 +1,4 @@
-"""Runs that can go: what nothing complete was made from, and how much room it takes."""
+"""Runs that can go: those from which nothing complete was made, and which no sweep needs; their size."""
 
 import math
 import os
@@ -11,6 +11,7 @@ from pathlib import Path
 
 from nsf.errors import ConfigError, StorageError
 from nsf.runs.listing import Entry
+from nsf.runs.reserved import reserved
 from nsf.runs.run import Run
 
 #: Stages whose complete runs are results: nothing is made from them, and they are why the rest was made.
@@ -36,17 +37,20 @@ def dependents(runs: Iterable[Run]) -> dict[Run, set[Run]]:
 
 
 def prunable(asked: Sequence[Entry], everything: Sequence[Run], results: bool = False) -> list[Run]:
-    """Of some runs, those that no complete run depends on, unless that one goes as well.
+    """Of some runs, those that no complete run depends on, unless that one goes as well, and no sweep needs.
 
     Args:
         asked: the runs that may go.
         everything: all runs.
         results: complete runs of the last stages may go, too.
     """
+    needed = set().union(*(reserved(root) for root in {run.root for run in everything}))
     candidates = [
         entry.run
         for entry in asked
-        if entry.run.status != "running" and (results or not _is_result(entry.run))
+        if entry.run.status != "running"
+        and entry.run.id not in needed
+        and (results or not _is_result(entry.run))
     ]
     of = dependents(everything)
     while True:
@@ -87,11 +91,13 @@ def remove(run: Run) -> None:
     """Delete a run's folder, and those above it that this leaves empty.
 
     Raises:
-        StorageError: a process is making the run, or the folder cannot be deleted.
+        StorageError: a process is making the run or needs it, or the folder cannot be deleted.
     """
     making = StorageError(f"{run.id} is being made by another process; wait until it has ended")
     if run.status == "running":
         raise making
+    if run.id in reserved(run.root):
+        raise StorageError(f"{run.id} is needed by a sweep that is running; wait until it has ended")
     with run.claimed() as claimed:
         if not claimed:
             raise making

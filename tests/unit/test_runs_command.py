@@ -13,6 +13,7 @@ from nsf.runs import Run
 from nsf.runs.columns import differing, unit_of
 from nsf.runs.listing import entries
 from nsf.runs.pruning import bytes_text, prunable
+from nsf.runs.reserved import reserved, reserving
 
 
 @pytest.fixture
@@ -145,6 +146,43 @@ def test_prune_keeps_results_and_what_they_need_unless_told(root):
     assert len(prunable(asked, everything, results=True)) == len(asked)
     # One that goes is no reason to keep what it was made from; one that stays is.
     assert [run.stage for run in prunable(entries({"stage": "simulate"}), everything)] == ["simulate"]
+
+
+def test_what_a_running_sweep_needs_is_kept(root, nsf):
+    (run,) = Run.find("simulate", "jelly")
+    with reserving([run]):
+        assert run not in prunable(entries({}), Run.find())
+        assert reserved(root, by_others=True) == set()
+        code, _, err = nsf("rm", run.id, "yes=true")
+        assert code == 2
+        assert "needed by a sweep that is running; wait until it has ended" in err
+        assert run.complete
+    assert run in prunable(entries({}), Run.find())
+    assert not (root / ".reserved").exists()
+
+
+def test_a_killed_sweep_needs_nothing(root):
+    (run,) = Run.find("simulate", "jelly")
+    names = root / ".reserved" / "dead.txt"
+    names.parent.mkdir()
+    names.write_text(run.id)
+    assert run in prunable(entries({}), Run.find())
+    assert not names.exists()
+
+
+def test_a_sweep_names_what_it_needs(tmp_path, monkeypatch):
+    from nsf.pipeline import sweep
+
+    monkeypatch.setenv("NSF_RUNS", str(tmp_path))
+    seen: set[str] = set()
+    monkeypatch.setattr(
+        sweep, "_launched", lambda _, jobs, *__: seen.update(reserved(tmp_path)) or [None] * len(jobs)
+    )
+    jobs = ["scene=sand", "scale=small", "device=cpu", "latent_dim=2,3", "scene.design.train=[21,30,38.5]"]
+    assert sweep.sweep([jobs], ("simulate", "train")) == []
+    assert sorted(run.split("/")[0] for run in seen if "train/" in run) == ["train", "train"]
+    assert sum(run.startswith("simulate/sand/") for run in seen) >= 3
+    assert reserved(tmp_path) == set()
 
 
 def test_prune_by_age(root, nsf):
