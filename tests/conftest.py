@@ -182,7 +182,7 @@ def tiny_scene():
     """The scene of the tiny chain, for tests that read nothing that its stages left."""
     import nsf.scenes
 
-    return nsf.scenes.load("sand", TINY[1:])
+    return nsf.load_scene("sand", TINY[1:])
 
 
 @pytest.fixture(scope="session")

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
+import nsf
 from nsf import Manifold
 from nsf.dynamics import GaussNewton, Sources
 
@@ -31,7 +32,7 @@ def steps(scene, manifold, device: str, sources: Sources, tolerance: float, **op
     """Trajectory of 24 steps of the modal engine with |S| = 60."""
     projector = GaussNewton(tolerance=tolerance)
     options |= {"sources": sources, "device": device, "projector": projector}
-    solver = scene.reduced(manifold, {"friction_angle": 26.0}, 60, **options)
+    solver = nsf.reduced(scene, manifold, {"friction_angle": 26.0}, 60, **options)
     solver.step(24)
     return solver.trajectory()
 

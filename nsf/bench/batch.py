@@ -9,6 +9,7 @@ from nsf.bench.measure import build, run_times
 from nsf.bench.reduced import deformation_error, pipelines, prepared
 from nsf.bench.rows import Case, Measurements
 from nsf.data import Case as Parameters
+from nsf.engines import reduced_batch
 from nsf.pipeline import Pipeline
 from nsf.scenes.designs import evenly
 
@@ -36,7 +37,7 @@ def measured(chain: Pipeline, sizes: Sequence[int], found: Measurements, end: st
     def make(size: int, precision: str):
         options = how | {"precision": precision, "device": settings.device}
         samples = options.pop("sample")
-        return scene.reduced_batch(manifold, cases_of(chain, size), samples, **options)
+        return reduced_batch(scene, manifold, cases_of(chain, size), samples, **options)
 
     for precision in settings.precisions:
         built: dict[int, tuple] = {}

@@ -216,7 +216,7 @@ class Many:
         names = setup.manifold.parameter_names
         mu = torch.tensor([[case[name] for name in names] for case in cases], dtype=torch.float64)
         gravity = torch.as_tensor(setup.gravity.at(setup.dt * np.arange(self.total_steps))[None])
-        states = collider_states(setup.scene.colliders, setup.dt, self.total_steps)[None]
+        states = collider_states(setup.scene.solids, setup.dt, self.total_steps)[None]
         given = mu, gravity, torch.as_tensor(states), self.record, setup.precision, setup.device
         self._recurrence = Recurrence(model, *given)
         first = first_changes(span.at_sample, span.sets.sample, [setup])

@@ -93,7 +93,7 @@ def measured(chains: Mapping[str, Pipeline], found: Measurements) -> None:
 
     def reduced(precision: str, multiplier: float, end: str = ""):
         how = ready[end][2] | {"precision": precision, "device": device}
-        return scene.reduced(manifold, first, dt_multiplier=multiplier, **how)
+        return engines.reduced(scene, manifold, first, dt_multiplier=multiplier, **how)
 
     for precision in found.settings.precisions:
         full = Subject(partial(scene.full_order, first, precision, device), scene.steps)
@@ -126,7 +126,7 @@ def measured_networks(chain: Pipeline, found: Measurements) -> None:
     def reduced(arithmetic: str | None, precision: str):
         manifold.arithmetic = arithmetic
         how.update(precision=precision, device=settings.device)
-        return chain.scene.reduced(manifold, chain.held_out[0], **how)
+        return engines.reduced(chain.scene, manifold, chain.held_out[0], **how)
 
     for precision in settings.precisions:
         subjects = {}

@@ -1,6 +1,7 @@
 """How a step of both solvers grows with the number of particles, and the reduced one with that of samples."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 
 import torch
@@ -68,13 +69,11 @@ def at_size(scene: Scene, particles: int) -> Scene:
 
     The floor lies as far from the nodes next to it, in cells: what it holds depends on that.
     """
-    ratio, (floor,) = (particles / len(scene.particles())) ** (1 / 3), scene.colliders
+    ratio, (floor,) = (particles / scene.particle_count) ** (1 / 3), scene.solids
     cells = floor.point[2] / scene.dx
     ratio = 1.0 + round((ratio - 1.0) * cells) / cells
-    template = scene.resampled(particles).template.copy()
-    template.scene.dx, template.scene.dt = scene.dx / ratio, scene.dt / ratio
-    template.scene.steps = round(scene.steps * ratio)
-    return Scene.from_config(template)
+    steps = round(scene.steps * ratio)
+    return replace(scene.resampled(particles), dx=scene.dx / ratio, dt=scene.dt / ratio, steps=steps)
 
 
 @torch.no_grad()
@@ -113,7 +112,7 @@ def _compared(
     found: Measurements,
 ) -> None:
     """Add both solvers of a scene in every precision, all in turns; nothing of them stays on the device."""
-    settings, scene = found.settings, scene.with_parameters(chain.held_out[0])
+    settings, scene = found.settings, scene.at(chain.held_out[0])
     device = settings.device
     built = _built(chain, scene, fields(), samples, found)
     solvers = {of: solver for of, (solver, _) in built.items()}

@@ -8,7 +8,6 @@ from nsf.config.composing import (
     of_launcher,
     read,
     resolve,
-    resolve_again,
 )
 from nsf.config.keys import leaves, naming_the_missing, replaced, section
 from nsf.config.sweeps import check_sweep, jobs, scene_of
@@ -32,7 +31,6 @@ __all__ = [
     "read",
     "replaced",
     "resolve",
-    "resolve_again",
     "scene_of",
     "section",
     "text",

@@ -10,7 +10,7 @@ import pickle
 import re
 import typing
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from functools import cache, lru_cache
 from pathlib import Path
@@ -20,7 +20,7 @@ from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException, OverrideParseException
 from hydra.types import RunMode
-from omegaconf import DictConfig, ListConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import MarkedYAMLError, YAMLError
 
@@ -189,36 +189,6 @@ def _packed(config: DictConfig) -> tuple[bytes, bytes]:
             if len(_PACKED) > 64:
                 _PACKED.pop(next(iter(_PACKED)), None)
         return found
-
-
-def resolve_again(
-    config: DictConfig, values: Mapping[str, float], known: DictConfig, paths: Iterable[tuple[str, ...]]
-) -> DictConfig:
-    """`resolve` in a fraction of its time, where a configuration gets other values of a few keys.
-
-    Args:
-        config: as it was before; it gets the values.
-        values: by dotted key.
-        known: what `resolve` made of it before; it is changed and returned.
-        paths: of the values that follow these keys (`nsf.config.resolvers.following`).
-
-    Raises:
-        ConfigError: see `load`.
-    """
-    for key, value in values.items():
-        OmegaConf.update(config, key, value)
-        OmegaConf.update(known, key, value)
-    try:
-        for path in paths:
-            of, into = config, known
-            for part in path[:-1]:
-                of, into = (node[int(part) if isinstance(node, ListConfig) else part] for node in (of, into))
-            last = int(path[-1]) if isinstance(of, ListConfig) else path[-1]
-            value = of[last]
-            into[last] = resolved(value) if OmegaConf.is_config(value) else value
-    except OmegaConfBaseException:
-        return resolve(config)  # which says what is wrong
-    return known
 
 
 @contextmanager

@@ -56,6 +56,7 @@ KINDS = {
     "transfer": Kind("nsf.mpm", "nsf.mpm.Transfer"),
     "scene.design": Kind("nsf.scenes", "nsf.scenes.Design"),
     "scene.reduced.symmetry": _SYMMETRY,
+    "scene.inclination": Kind("nsf.scenes", "nsf.scenes.Inclination"),
     "scene.walls": Kind("nsf.mpm", "nsf.mpm.DomainWalls"),
     "scene.colliders.*": Kind("nsf.mpm", "nsf.mpm.Collider"),
     "scene.colliders.*.motion": Kind("nsf.mpm", "nsf.mpm.Motion"),

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from nsf.errors import MissingRunError, SchemaError, first_line, out_of_memory
-from nsf.runs.manifest import verified
+from nsf.manifest import verified
 from nsf.storage import intact, writing
 
 #: Errors of torch and of what is built from a file, on contents that are damaged or foreign.

@@ -13,7 +13,7 @@ import h5py
 import numpy as np
 
 from nsf.errors import MissingRunError, SchemaError, ShapeError
-from nsf.runs.manifest import verified
+from nsf.manifest import verified
 
 _LONGEST = 64  # [byte] of a text in an array of texts
 #: On disk each text of an array is its length, and where it lies: 4 and 12 bytes (HDF5's "Global Heap ID").

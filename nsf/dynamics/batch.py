@@ -46,7 +46,7 @@ class Batch:
             _check_alike(first, other)
         starts = torch.stack([setup.xhat for setup in setups])
         record = LatentRecord(starts, first.total_steps, first.projector.iterations)
-        colliders = tuple(chain.from_iterable(setup.scene.colliders for setup in setups))
+        colliders = tuple(chain.from_iterable(setup.scene.solids for setup in setups))
         boundaries = BoundaryArrays(colliders, first.scene.walls, first.precision, first.device)
         gravities = [setup.gravity for setup in setups]
         return cls(tuple(setups), record, Forcing(gravities, boundaries, first.precision, first.device))

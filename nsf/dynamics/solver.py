@@ -74,7 +74,7 @@ class ReducedBatch:
 
     def hand(self, index: int = 0) -> Hand:
         """The forcing of one of the runs, which may be set between steps."""
-        names = self.batch.setups[index].scene.collider_names
+        names = tuple(self.batch.setups[index].scene.colliders)
         return Hand(self.batch.forcing, lambda: self.time, index, names)
 
     def alone(self, index: int) -> "ReducedBatch":

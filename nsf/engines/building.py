@@ -12,6 +12,8 @@ from nsf.errors import ConfigError, ShapeError
 from nsf.mpm.device import warp_device
 from nsf.sampling.sampler import RandomSampler, Sampler, SampleSpan, check_well_posed
 
+#: Sample particles of a solver that is built without a number.
+SAMPLE = 150
 #: What `sample=` may be: particle indices, their number, a sampler, or the `samples` of an earlier solver.
 Sample = int | Sequence[int] | Sampler | Sequence[SampleSpan] | None
 
@@ -31,7 +33,7 @@ def reduced(
         manifold: trained fields.
         parameters: `{name: value}`; those left out are as configured.
         sample: particle indices, a number (drawn at random), a `Sampler`, the `samples` of an earlier
-            solver, or None for the scene's number.
+            solver, or None for `SAMPLE` of them.
         engine: how steps are computed: `auto`, the fastest engine that can; `reference`, `modal`, taught
             operators (`Operators.load`), or an engine of one's own.
         **options: further arguments of `nsf.dynamics.Setup`.
@@ -85,9 +87,9 @@ def _together(setups: Sequence[Setup], wanted: str | Engine) -> ReducedBatch:
 def _setup(scene, manifold, parameters, sample: Sample, engine: str | Engine, options: dict) -> Setup:
     """The setup of one run of a scene."""
     parameters = scene.case(parameters or {})
-    scene = scene.with_parameters(parameters)
+    scene = scene.at(parameters)
     if sample is None:
-        sample = getattr(engine, "samples", None) or int(scene.config.scene.reduced.sample)
+        sample = getattr(engine, "samples", None) or min(SAMPLE, len(manifold.X))
     if isinstance(sample, int | np.integer):
         check_well_posed(int(sample), manifold.latent_dim)
         sample = RandomSampler(size=int(sample))

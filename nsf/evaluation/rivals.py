@@ -30,8 +30,8 @@ def forcing_of(scene: Scene) -> np.ndarray:
     """
     acting, found = scene.forcing_at(scene.dt * np.arange(scene.steps)), []
     if scene.forcing.gravity:
-        found.append(acting["gravity"].ravel() / (scene.forcing.reach(scene.gravity) or 1.0))
-    moved = [name in scene.forcing.colliders for name in scene.collider_names]
+        found.append(acting["gravity"].ravel() / (scene.forcing.reach(scene.base_gravity) or 1.0))
+    moved = [name in scene.forcing.colliders for name in scene.colliders]
     found.append(acting["solids"][:, moved, :3].ravel() / scene.dx)
     return np.concatenate(found)
 
@@ -61,7 +61,7 @@ def coarse_scene(scene: Scene, parameters: Mapping[str, float], factor: int) -> 
         ConfigError: a solid, a collider or the walls do not fit the coarse grid.
         InstabilityError: the scene's Δt is unstable on it.
     """
-    fine = scene.with_parameters(parameters)
+    fine = scene.at(parameters)
     coarse = fine.coarsened(factor)
     stable = largest_stable_dt(coarse.particles(), coarse.initial_velocity(), coarse.dx)
     multiples = [m for m in range(1, factor + 1) if scene.steps % m == 0 and m * scene.dt <= stable]

@@ -256,6 +256,6 @@ def _full_order_frames(build: Callable[[], FullOrderMPM], steps: Sequence[int]) 
 
 def _rows_in(fine, scene) -> np.ndarray:
     """Rows of a scene's particles among those of the scene that `Scene.refined` makes of it."""
-    ends = np.cumsum([body.particles for body in fine.bodies])
-    bodies = zip(ends, fine.bodies, scene.bodies, strict=True)
+    ends = np.cumsum([body.particles for body in fine.bodies.values()])
+    bodies = zip(ends, fine.bodies.values(), scene.bodies.values(), strict=True)
     return np.concatenate([end - more.particles + np.arange(few.particles) for end, more, few in bodies])

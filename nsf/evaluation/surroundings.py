@@ -19,7 +19,7 @@ def surroundings(scene: Scene, t: np.ndarray) -> dict[str, np.ndarray]:
         solid_position: [F, c, 3] [m]; solid_orientation: [F, c, 3, 3].
         solid_active: [F, c] whether the collider acts.
     """
-    return {"gravity": scene.acting_gravity.at(t).astype(np.float32), **colliders_at(scene.colliders, t)}
+    return {"gravity": scene.acting_gravity.at(t).astype(np.float32), **colliders_at(scene.solids, t)}
 
 
 def colliders_at(solids: Sequence[Collider], t: np.ndarray) -> dict[str, np.ndarray]:

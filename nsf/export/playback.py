@@ -7,16 +7,16 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from omegaconf import OmegaConf
 
 from nsf import config as configuration
 from nsf.bodies.colors import CLIP
+from nsf.config.scenes import recorded_scene
 from nsf.data import Case, Trajectory
 from nsf.data.schema import TAU_COLUMNS, TAU_ROWS
 from nsf.deployment import Rollout, continuation_file, rollout_file
 from nsf.dynamics import Decoder, Sources
 from nsf.dynamics.interop import torch_device, torch_dtype
-from nsf.errors import ConfigError, MissingRunError, SchemaError
+from nsf.errors import ConfigError, SchemaError
 from nsf.evaluation import metrics
 from nsf.evaluation.superresolution import POINTS
 from nsf.evaluation.surroundings import colliders_at
@@ -237,9 +237,12 @@ class Playback:
     @property
     def around(self) -> dict[str, np.ndarray]:
         """Gravity and colliders in the frames, as `nsf.evaluation.surroundings` returns them."""
-        gravity = np.array(self._settings["scene"]["gravity"], np.float32)
+        scene = self._settings["scene"]
+        gravity = scene["gravity"]
+        if "inclination" in scene:
+            gravity = configuration.build(scene["inclination"], "scene.inclination").turned(gravity)
         return {
-            "gravity": np.tile(gravity, (len(self.t), 1)),
+            "gravity": np.tile(np.array(gravity, np.float32), (len(self.t), 1)),
             **colliders_at(list(self._shown.values()), self.t),
         }
 
@@ -331,22 +334,8 @@ class Playback:
 
     @cached_property
     def _scene(self) -> Scene:
-        """The scene deployed on, for its shapes and law. Keys that follow a parameter are as configured.
-
-        Raises:
-            MissingRunError: the configuration of the simulation that was trained on is not there.
-        """
-        content = {key: self._settings[key] for key in ("scale", "material", "transfer", "scene")}
-        try:
-            varied = _parent(self._training).config["parameters"]
-        except MissingRunError as error:
-            raise MissingRunError(
-                f"points beside the particles, and stress from the deformation, need the scene: {error}"
-            ) from error
-        parameters = {name: {"key": own["key"], "unit": ""} for name, own in varied.items()}
-        design = {"_target_": "nsf.scenes.Values", "train": [dict(self.case)], "test": []}
-        content["scene"] = content["scene"] | {"parameters": parameters, "design": design}
-        return Scene.from_config(OmegaConf.create(content)).with_parameters(self.case)
+        """The scene deployed on, in the run's case, for its shapes and law."""
+        return recorded_scene(self._settings).at(self.case)
 
 
 def _rates(rollout: Rollout, frames: int) -> np.ndarray:

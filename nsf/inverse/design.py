@@ -92,10 +92,10 @@ class Tilt(Program):
     unit = "°"
 
     def __post_init__(self):
-        if not np.any(self.model.scene.gravity):
+        if not np.any(self.model.scene.base_gravity):
             raise ConfigError(f"{self.model.scene.name} has no gravity to tilt; move a solid, as move=NAME")
         taught = self.model.operators.taught
-        most = _largest_tilt(np.array(self.model.scene.gravity), np.array(taught.gravity), taught.reach)
+        most = _largest_tilt(np.array(self.model.scene.base_gravity), np.array(taught.gravity), taught.reach)
         if not 0.0 < self.angle <= most + 1e-9:
             raise ConfigError(
                 f"tilt={self.angle:g}° must lie above 0° and within the {most:.3g}° that was taught; or "
@@ -114,14 +114,14 @@ class Tilt(Program):
 
     def forcing(self, values: Tensor) -> Forcing:
         """See `Program.forcing`."""
-        gravity = torch.tensor(self.model.scene.gravity, dtype=values.dtype, device=values.device)
+        gravity = torch.tensor(self.model.scene.base_gravity, dtype=values.dtype, device=values.device)
         size, tilt = gravity.norm(), torch.deg2rad(values[:, :-1])
         # At rest the angle has no gradient, but its square has.
         square = (tilt**2).sum(-1, keepdim=True)
         angle = torch.where(square > 0.0, square, torch.ones_like(square)).sqrt()
         sinc = torch.where(square > 1e-12, torch.sin(angle) / angle, 1.0 - square / 6.0)
         cosine = torch.where(square > 1e-12, torch.cos(angle), 1.0 - square / 2.0)
-        aside = torch.as_tensor(across(np.array(self.model.scene.gravity))).to(values)
+        aside = torch.as_tensor(across(np.array(self.model.scene.base_gravity))).to(values)
         found = cosine * gravity + size * sinc * (tilt @ aside)
         return Forcing(found, self._solids.expand(len(values), -1, -1))
 
@@ -166,7 +166,7 @@ class Moves(Program):
     unit = "m"
 
     def __post_init__(self):
-        there = self.model.scene.collider_names
+        there = tuple(self.model.scene.colliders)
         if unknown := [name for name in self.solids if name not in there]:
             raise ConfigError(f"move={unknown[0]} is no solid of the scene; there are {', '.join(there)}")
         programs = self.model.pipeline.scene.forcing.colliders
@@ -175,8 +175,8 @@ class Moves(Program):
                 f"move={still[0]} follows no program in training runs, so operators know no other way of it; "
                 f"train with scene.forcing.colliders.{still[0]}"
             )
-        colliders = dict(zip(there, self.model.scene.colliders, strict=True))
-        if turning := [n for n in self.solids if (m := colliders[n].motion) is not None and len(m.angles)]:
+        colliders = dict(zip(there, self.model.scene.solids, strict=True))
+        if turning := [n for n in self.solids if (m := colliders[n].motion) is not None and m.turns]:
             raise ConfigError(f"move={turning[0]} turns as well; only solids that shift alone are designed")
 
     @property
@@ -220,11 +220,13 @@ class Moves(Program):
 
     def scene(self, scene: Scene, values: np.ndarray) -> Scene:
         """See `Program.scene`."""
-        colliders = list(scene.colliders)
+        colliders, programs = dict(scene.colliders), dict(scene.forcing.colliders)
         for c, shift in self._by_collider(torch.as_tensor(values)[None]):
             motion = Motion(self.model.t.tolist(), shift[0].cpu().numpy().tolist())
-            colliders[c] = replace(colliders[c], motion=motion)
-        return replace(scene, colliders=tuple(colliders))
+            name = tuple(colliders)[c]
+            colliders[name] = replace(colliders[name], motion=motion)
+            programs.pop(name, None)
+        return replace(scene, colliders=colliders, forcing=Programs(scene.forcing.gravity, programs))
 
     def _by_collider(self, values: Tensor) -> list[tuple[int, Tensor]]:
         """Number and shift [B, N + 1, 3] of each solid."""
@@ -233,15 +235,15 @@ class Moves(Program):
             own, begun = self._axes[name], self._begun(name)
             axes, aside = (torch.as_tensor(v).to(values) for v in (own, begun - begun @ own.T @ own))
             shift = aside + values[..., k : k + len(axes)] @ axes
-            found.append((self.model.scene.collider_names.index(name), shift))
+            found.append((tuple(self.model.scene.colliders).index(name), shift))
             k += len(axes)
         return found
 
     @cached_property
     def _shifts(self) -> dict[str, np.ndarray]:
         """[R, N + 1, 3] of each solid in the training runs [m]."""
-        model, there = self.model, self.model.scene.collider_names
-        scenes = [model.pipeline.scene.with_parameters(case) for case in model.pipeline.split.train]
+        model, there = self.model, tuple(self.model.scene.colliders)
+        scenes = [model.pipeline.scene.at(case) for case in model.pipeline.split.train]
         solids = np.stack([scene.forcing_at(model.t)["solids"] for scene in scenes])
         return {name: solids[:, :, there.index(name), :3] for name in self.solids}
 
@@ -384,8 +386,8 @@ def full_order(program: Program, designed: Designed, parameters) -> Held:
     """The full-order run of a designed program."""
     model = program.model
     values = dict(zip(model.names, model.tensor(parameters).tolist(), strict=True))
-    scene = program.scene(model.scene.with_parameters(model.scene.case(values)), designed.values)
-    solver = scene.solver(model.pipeline.config.precision, model.pipeline.device)
+    scene = program.scene(model.scene.at(model.scene.case(values)), designed.values)
+    solver = scene.full_order(None, model.pipeline.config.precision, model.pipeline.device)
     frames = [solver.state.numpy()["x"].astype(np.float32)]
     for _ in range(scene.steps):
         solver.step()

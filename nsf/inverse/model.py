@@ -255,14 +255,14 @@ class Model:
         return self._built[key]
 
     def _inputs_of(self, case: Mapping[str, float]) -> dict[str, np.ndarray]:
-        scene, steps = self.scene.with_parameters(self.scene.case(case)), len(self.t) - 1
+        scene, steps = self.scene.at(self.scene.case(case)), len(self.t) - 1
         rows = torch.as_tensor(self._sample).long()
         velocity = torch.as_tensor(scene.initial_velocity())[rows]
         _, jacobian = self._at_sample.position_and_jacobian(self._xhat)
         return {
             "start": first_change(jacobian.cpu(), velocity.double(), self.dt).numpy(),
             "gravity": scene.acting_gravity.at(self.t[:-1]),
-            "solids": collider_states(scene.colliders, self.dt, steps),
+            "solids": collider_states(scene.solids, self.dt, steps),
         }
 
     @cached_property

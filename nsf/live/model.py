@@ -215,7 +215,7 @@ class LiveModel:
     def __init__(self, run: Run, points: int = 6000, device: str = "auto", surface: bool = False):
         self.run = run
         self.pipeline = Pipeline.of_run(run, device)
-        self.title = self.pipeline.deployed.config.scene.title
+        self.title = self.pipeline.config.scene.title
         self.manifold = self.pipeline.manifold()
         self._truths = _truths(self.pipeline)
         self.known = tuple(sorted(self._truths))
@@ -297,14 +297,12 @@ class LiveModel:
     @property
     def floor(self) -> float | None:
         """Height of a horizontal floor at rest [m]."""
-        return floor_height(list(self.pipeline.deployed.colliders))
+        return floor_height(list(self.pipeline.deployed.solids))
 
     def solids(self, case: Case) -> list[dict]:
         """The solids of a case, for a page."""
-        scene = self.pipeline.deployed.with_parameters(case)
-        return [
-            page.solid(name, own) for name, own in zip(scene.collider_names, scene.colliders, strict=True)
-        ]
+        scene = self.pipeline.deployed.at(case)
+        return [page.solid(name, own) for name, own in zip(scene.colliders, scene.solids, strict=True)]
 
     def roles(self, step: int) -> np.ndarray:
         """[n] set of each shown particle in the step that starts at `step`: 2 S, 1 N only, 0 neither.
@@ -355,7 +353,7 @@ def _parameters(pipeline: Pipeline, known: Sequence[Case]) -> tuple[Parameter, .
 
 def _possible(pipeline: Pipeline, case: Mapping[str, float]) -> bool:
     try:
-        scene = pipeline.deployed.with_parameters(case)
+        scene = pipeline.deployed.at(case)
         check_time_step(scene.particles(), scene.initial_velocity(), scene.dx, scene.dt)
     except (ConfigError, InstabilityError):
         return False

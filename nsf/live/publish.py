@@ -229,7 +229,7 @@ def _cases(model: LiveModel, names, arrays: dict, header: dict, sizes: Sizes) ->
     """The held-out cases: their parameters, forcing, and the full-order runs of some."""
     pipeline, found, movable = model.pipeline, [], _movable(model)
     for index, case in enumerate(pipeline.held_out):
-        scene = pipeline.deployed.with_parameters(case)
+        scene = pipeline.deployed.at(case)
         rollout = Rollout.open(model.run.file(rollout_file(index)), model.manifold.latent_dim)
         own = {
             "label": str(case).replace("_", " "),
@@ -252,10 +252,10 @@ def _cases(model: LiveModel, names, arrays: dict, header: dict, sizes: Sizes) ->
 def _movable(model: LiveModel) -> dict[str, dict]:
     """Direction, reach [m] and speed [m/s] of the solids that programs move, as training runs have them."""
     found = {}
-    scenes = [model.pipeline.scene.with_parameters(case) for case in model.pipeline.split.train]
+    scenes = [model.pipeline.scene.at(case) for case in model.pipeline.split.train]
     for name in model.pipeline.scene.forcing.colliders:
-        index = model.pipeline.scene.collider_names.index(name)
-        motions = [scene.colliders[index].motion.keyframes() for scene in scenes]
+        index = list(model.pipeline.scene.colliders).index(name)
+        motions = [scene.solids[index].motion.keyframes() for scene in scenes]
         shifts = np.concatenate([shift for _, shift, _ in motions])
         axis = np.linalg.svd(np.concatenate([s - s[:1] for _, s, _ in motions]), full_matrices=False)[2][0]
         axis *= np.sign(axis[np.abs(axis).argmax()])
@@ -282,7 +282,7 @@ def _check_forcing(model: LiveModel) -> None:
     """
     deployed, first = model.pipeline.deployed, None
     for case in _corners(model):
-        forcing = _gravity(deployed.with_parameters(case)), model.solids(case)
+        forcing = _gravity(deployed.at(case)), model.solids(case)
         first = first or forcing
         if forcing != first:
             raise ConfigError("a parameter changes gravity or a solid, which a page keeps; use nsf view")

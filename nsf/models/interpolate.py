@@ -85,7 +85,7 @@ class Interpolate(LatentModel):
     @override
     def refuse(self, names) -> None:
         super().refuse(names)
-        if names.scene.config.scene.get("forcing") and any(names.scene.config.scene.forcing.values()):
+        if names.scene.forcing:
             raise ConfigError(
                 f"model=interpolate knows no forcing, and programs force scene={names.scene.name}; set "
                 "model=projected, or model=recurrence"

@@ -39,7 +39,7 @@ def training_inputs(manifold, scene, cases: Sequence[Case]) -> Inputs:
         manifold: trained fields.
         scene: of training; cases: those of training.
     """
-    at = [scene.with_parameters(case) for case in cases]
+    at = [scene.at(case) for case in cases]
     names, t = tuple(manifold.parameter_names), scene.dt * np.arange(scene.steps)
     latents = manifold.training_latents.double().cpu().numpy()
     return Inputs(
@@ -47,7 +47,7 @@ def training_inputs(manifold, scene, cases: Sequence[Case]) -> Inputs:
         parameters=np.array([[case[name] for name in names] for case in cases]),
         start=latents.reshape(len(cases), -1, latents.shape[1])[:, 0],
         gravity=np.stack([one.acting_gravity.at(t) for one in at]),
-        solids=np.stack([collider_states(one.colliders, scene.dt, scene.steps) for one in at]),
+        solids=np.stack([collider_states(one.solids, scene.dt, scene.steps) for one in at]),
         dt=scene.dt,
     )
 

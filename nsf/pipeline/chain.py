@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 from nsf import config as configuration
 from nsf.data import Case
 from nsf.dynamics import ParticleSets, ReducedBatch, ReducedMPM
-from nsf.engines import Engine, Operators
+from nsf.engines import Engine, Operators, reduced_batch
 from nsf.kinematics.fields.mlp import MlpField
 from nsf.kinematics.manifold import Manifold
 from nsf.models import Auto
@@ -103,14 +103,14 @@ class Pipeline(Plan):
         """What a trajectory is too coarse for."""
         from nsf.scenes.resolution import resolution_warnings  # SciPy takes 0.2 s to load
 
-        return resolution_warnings(scene.with_parameters(case))
+        return resolution_warnings(scene.at(case))
 
     def _simulate(self, runs: dict[Run, tuple[Case, Scene]], warnings: dict[Run, list[str]]) -> int:
         c = self.config
 
         def job(run: Run, case: Case, scene: Scene) -> Job:
             build = partial(scene.full_order, case, c.precision, self.device)
-            forcing = scene.with_parameters(case).forcing_at(scene.dt * np.arange(scene.steps + 1))
+            forcing = scene.at(case).forcing_at(scene.dt * np.arange(scene.steps + 1))
             return Job(run, case, build, forcing, warnings[run])
 
         self.check_room(runs)
@@ -168,7 +168,8 @@ class Pipeline(Plan):
             self.operators()  # which bring the sample, whoever takes the steps
         if engine is None:
             engine = self.model.engine(self, manifold)
-        batch = (scene or self.deployed).reduced_batch(
+        batch = reduced_batch(
+            scene or self.deployed,
             manifold,
             cases,
             self._samples or self.sampler,
@@ -229,7 +230,7 @@ class Pipeline(Plan):
 
     def _step_warning(self) -> str | None:
         """Whether the reduced step is far too long for a case."""
-        scenes = map(self.deployed.with_parameters, getattr(self.split, self.config.deploy.split))
+        scenes = map(self.deployed.at, getattr(self.split, self.config.deploy.split))
         stable = min(largest_stable_dt(at.particles(), at.initial_velocity(), at.dx) for at in scenes)
         return multiplied_step_warning(self.config.deploy.dt_multiplier, self.deployed.dt, stable)
 

@@ -1,17 +1,18 @@
 """The run of each stage of a configuration, named before anything of it is built.
 
-Neither torch nor Warp is imported, so that a mistake, or a chain whose results are all there, takes a second.
+Torch is not imported, so that a mistake, or a chain whose results are all there, takes a second or two.
 """
 
 from collections.abc import Sequence
-from copy import copy, deepcopy
+from copy import copy
 from functools import cached_property
 from pathlib import Path
 
 from omegaconf import DictConfig, OmegaConf
 
 from nsf import config as configuration
-from nsf.config.code import code_of
+from nsf.code import code_of
+from nsf.config.scenes import changed_scene, scene_of
 from nsf.data.case import Case
 from nsf.engines.modal.mirrors import edits
 from nsf.engines.operators.teaching import Teaching, random_cases
@@ -22,13 +23,11 @@ from nsf.paths import CONF, groups
 from nsf.pipeline.values import check_numbers, check_words, factors
 from nsf.results.folder import check_place
 from nsf.runs import Run
-from nsf.scenes.draft import Draft
-from nsf.scenes.identity import NOT_PHYSICS
+from nsf.scenes import Scene
+from nsf.scenes.identity import plain_scene
 
 #: Of the chain, in order; each reads the files of the one before it and nothing else.
 STAGES = ("simulate", "train", "teach", "deploy", "evaluate", "report")
-#: Keys of the configuration that a simulation's content depends on.
-_SCENE_KEYS = ("scale", "material", "transfer")
 #: Keys that hold others, none of which is left out.
 _SECTIONS = (
     *("material", "transfer", "field", "trainer", "model", "sampler", "projector", "integration"),
@@ -48,6 +47,7 @@ class Names:
         root: folder of runs; `NSF_RUNS` or `runs` by default.
 
     Attributes:
+        config: resolved; template: the same before its interpolations were resolved.
         scene: that is trained on; deployed: that of the held-out simulations and of deployment.
         configured: the model that the configuration names, which may be `auto`.
         coarse: factors of Δx of the full-order runs that a reduced one is held to.
@@ -59,9 +59,6 @@ class Names:
         DeviceError: the device does not exist.
     """
 
-    scene: Draft
-    deployed: Draft
-
     def __init__(self, config: DictConfig, root: Path | None = None):
         self.root = root
         with configuration.naming_the_missing():
@@ -71,8 +68,9 @@ class Names:
         for key in _SECTIONS:
             configuration.section(config, key)
         check_numbers(config)
-        self.scene = Draft.from_config(with_candidates(config))
-        c = self.config = self.scene.config
+        self.template = configuration.checked(with_candidates(config))
+        c = self.config = configuration.resolve(self.template)
+        self.scene = scene_of(self.template)
         self.split = self.scene.split
         if len(self.split.train) <= len(self.split.names):
             raise ConfigError(
@@ -87,7 +85,7 @@ class Names:
         self.deployed = self._changed(c.deploy.changes)
         self.device = _device(c.device)
 
-    def _changed(self, changes: DictConfig | None) -> Draft:
+    def _changed(self, changes: DictConfig | None) -> Scene:
         """The scene of the held-out simulations and of deployment."""
         if not changes:
             return self.scene
@@ -96,12 +94,9 @@ class Names:
         if wrong := [key for key in changes if not isinstance(key, str)]:
             raise ConfigError(f"deploy.changes has the key {wrong[0]}; give dotted keys, as material.nu")
         try:
-            return self._with_changes(OmegaConf.to_container(changes))
+            return changed_scene(self.template, self.scene, OmegaConf.to_container(changes))
         except ConfigError as error:
             raise ConfigError(f"deploy.changes: {error}") from error
-
-    def _with_changes(self, changes: dict) -> Draft:
-        return self.scene.changed(changes)
 
     @property
     def model(self) -> Model:
@@ -122,7 +117,7 @@ class Names:
 
     def alone(self, name: str) -> DictConfig:
         """The configuration of a candidate of `model=auto` by itself, deployed at the validation cases."""
-        config = self.scene.template.copy()
+        config = self.template.copy()
         config.model = config.model.of[name]
         config.deploy.split, config.fallback = "validation", "none"
         return config
@@ -180,7 +175,7 @@ class Names:
         """
         check_place(self.report_folder)
 
-    def needed(self) -> list[tuple[Case, Draft]]:
+    def needed(self) -> list[tuple[Case, Scene]]:
         """Every case with the scene that is simulated in it: the deployed one where cases are held out."""
         held_out = getattr(self.split, self.config.deploy.split)
         plain = {*self.split.cases}.difference(() if self.config.deploy.split == "train" else held_out)
@@ -193,18 +188,13 @@ class Names:
         simulations = [self.simulation(case, scene) for case, scene in self.needed()]
         return [*simulations, self.training, *([self.taught] if self.is_taught else [])]
 
-    def simulation(self, case: Case, scene: Draft | None = None) -> Run:
+    def simulation(self, case: Case, scene: Scene | None = None) -> Run:
         """The run of one full-order trajectory, of the scene of training by default."""
         c = self.config
-        scene = scene or self.scene
-        content = self._physics(scene)
+        content = self._physics(scene or self.scene, case)
         content |= {"precision": c.precision, "dtype": c.data.dtype}
-        content["parameters"] = {
-            name: {"key": self.scene.varied[name].key, "value": value} for name, value in case.items()
-        }
-        if scene.files:
-            # A changed mesh under the same path is another simulation.
-            content["files"] = scene.files
+        for name, value in case.items():
+            content["parameters"][name]["value"] = value
         return Run.open("simulate", self.scene.name, content, root=self.root)
 
     def truth(self, case: Case) -> Run:
@@ -229,7 +219,7 @@ class Names:
         keys = ("model", "stress", "affine", "fallback", "sampler", "projector", "integration", "precision")
         content = (
             self._content(keys)
-            | self._physics(self.deployed)
+            | self._physics(self.deployed, self.held_out[0])
             | {
                 "cases": list(map(dict, self.held_out)),
                 "split": self.config.deploy.split,
@@ -270,7 +260,7 @@ class Names:
         keys = ("stress", "affine", "sampler", "projector", "integration", "precision", "seed")
         content = (
             self._content(keys)
-            | self._physics(self.scene)
+            | self._physics(self.scene, self.split.train[0])
             | {"cases": [list(map(dict, cases)) for cases in self.lessons], "device": self.device}
             | {"model": self.model.lesson, "dt_multiplier": self.config.deploy.dt_multiplier}
         )
@@ -356,17 +346,15 @@ class Names:
             if run.complete and truths == {p for p in run.parents if p.startswith("simulate/")}
         ]
 
-    @staticmethod
-    def _physics(scene: Draft) -> dict:
-        """What the configuration says of a scene's physics."""
-        plain = scene.plain
-        content = {key: plain[key] for key in _SCENE_KEYS}
-        if law := code_of(content):
-            content["law"] = law
-        return content | {"scene": {k: v for k, v in plain["scene"].items() if k not in NOT_PHYSICS}}
+    def _physics(self, scene: Scene, case: Case) -> dict:
+        """A scene's physics in one of its cases: what it would be without a case changes nothing."""
+        content = plain_scene(scene.at(case))
+        content |= {"law": code_of({key: content[key] for key in ("material", "transfer")})}
+        content |= {"scale": str(self.config.scale), "files": scene.files}
+        return content | {"parameters": {name: {"key": scene.varied[name].key} for name in case}}
 
     def _content(self, keys: Sequence[str]) -> dict:
-        content = {key: deepcopy(self.scene.plain[key]) for key in keys}
+        content = {key: _container(self.config[key]) for key in keys}
         code = code_of(content)
         return content | {"code": code} if code else content
 
@@ -382,6 +370,10 @@ def with_candidates(config: DictConfig) -> DictConfig:
     config.model.candidates = list(names)
     config.model.of = OmegaConf.merge(files, model.get("of") or {})
     return config
+
+
+def _container(value):
+    return OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
 
 
 def _device(asked) -> str:

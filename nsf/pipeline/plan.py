@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from pathlib import Path
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from nsf import config as configuration
 from nsf.data import Case
@@ -19,13 +19,10 @@ from nsf.runs import Run
 from nsf.sampling.sampler import check_well_posed
 from nsf.scenes import Scene
 from nsf.scenes.checks import check_memory, check_physics
-from nsf.scenes.draft import Draft
 from nsf.storage import require_folder, require_space
 
 #: Precision of stored frames by the name of their type.
 _STORED = {"float32": FP32, "float64": FP64}
-#: Keys that no scene is built from, without their values.
-_REST = dict.fromkeys(("field", "trainer", "model", "sampler", "evaluation", "report", "latent_dim"))
 #: What this process has checked; the jobs of a sweep ask the same thing again and again, for seconds.
 _PASSED: set[str] = set()
 
@@ -37,7 +34,6 @@ class Plan(Names):
         config, root: as for `Names`.
 
     Attributes:
-        scene, deployed: as whole scenes.
         field, trainer, sampler, projector, integration: as the configuration has them.
         sources: where a projected step takes τ and C from.
 
@@ -46,9 +42,6 @@ class Plan(Names):
         InstabilityError: Δt is unstable in a case.
     """
 
-    scene: Scene
-    deployed: Scene
-
     def __init__(self, config: DictConfig, root: Path | None = None):
         super().__init__(config, root)
         with configuration.naming_the_missing():
@@ -56,7 +49,7 @@ class Plan(Names):
 
     def _build(self) -> None:
         """Build and check everything, so that a bad value is refused before any work."""
-        self.scene, c = Scene.of(self.scene), self.config
+        c = self.config
         for name in ("field", "trainer", "sampler", "projector", "integration"):
             setattr(self, name, configuration.build(c[name], name))
         self.sources = Sources(c.stress, c.affine)
@@ -66,7 +59,6 @@ class Plan(Names):
         for model in [self.configured, *(getattr(self.configured, "of", None) or {}).values()]:
             if isinstance(model, Recurrence) and model.of_runs and model.teaching.symmetry:
                 model.teaching.symmetry.images(self.scene)  # refuses planes that the scene has not
-        self.deployed = self._changed(c.deploy.changes)
         X = self.scene.particles().X
         for region in self.sampler.regions:
             check_well_posed(region.size, c.latent_dim)
@@ -86,24 +78,18 @@ class Plan(Names):
                 "one; set sampler.phases=[], or another sampler"
             )
 
-    def _with_changes(self, changes: dict) -> Draft:
-        whole = isinstance(self.scene, Scene)
-        return self.scene.with_changes(changes) if whole else super()._with_changes(changes)
-
     def _check_cases(self) -> None:
         """Build the scene in every case: a value out of range fails before any work."""
-        asked = repr(
-            [OmegaConf.to_container(of, resolve=False) | _REST for of in (self.config, self.scene.template)]
-        )
+        asked = repr((self.scene, self.deployed, self.needed(), self.config.deploy.dt_multiplier))
         if asked in _PASSED:
             return
         for case, scene in self.needed():
-            scene = scene.with_parameters(case)
+            scene = scene.at(case)
             grid = scene.grid
             check_physics(scene)
             check_time_step(scene.particles(), scene.initial_velocity(), grid.dx, scene.dt)
             for multiplier in (1.0, self.config.deploy.dt_multiplier):
-                check_colliders(scene.colliders, grid, multiplier * scene.dt)
+                check_colliders(scene.solids, grid, multiplier * scene.dt)
         _PASSED.add(asked)
 
     def check_room(self, runs: Mapping[Run, tuple[Case, Scene]]) -> None:

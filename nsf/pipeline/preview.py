@@ -130,21 +130,20 @@ def expected(stage: str, runs: dict[Run, Names]) -> Expected:
 def scene_table(names: Names) -> Table:
     """Particles, grid, resolution and step of a scene, and its cases."""
     from nsf.mpm.stability import largest_stable_dt, multiplied_step_warning
-    from nsf.scenes import Scene
     from nsf.scenes.resolution import thinnest
 
-    scene = names.scene if isinstance(names.scene, Scene) else Scene.from_config(names.scene.template)
+    scene = names.scene
     case = names.split.cases[0]
-    at = scene.with_parameters(case)
+    at = scene.at(case)
     stable = min(
         largest_stable_dt(one.particles(), one.initial_velocity(), one.dx)
-        for one in map(scene.with_parameters, names.split.cases)
+        for one in map(scene.at, names.split.cases)
     )
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(style="bold")
     table.add_column(overflow="fold")
     rows = {
-        "scene": f"{scene.name}, {scene.scale} scale",
+        "scene": f"{scene.name}, {names.config.scale} scale",
         "particles": f"{scene.particle_count:,}",
         "grid": f"{' × '.join(map(str, scene.grid.nodes))} nodes, Δx = {scene.dx:.4g} m",
         "steps": f"{scene.steps:,} of Δt = {scene.dt:.4g} s; up to {stable:.3g} s is stable",

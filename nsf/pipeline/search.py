@@ -10,12 +10,12 @@ import pandas as pd
 from omegaconf import DictConfig, ListConfig
 
 from nsf import config as configuration
+from nsf.canonical import content_hash
 from nsf.errors import ConfigError, MissingRunError, NSFError
 from nsf.extras import optional
 from nsf.pipeline.chain import Pipeline
 from nsf.pipeline.plan import Plan
 from nsf.results.search import OBJECTIVES, write_search
-from nsf.runs.canonical import content_hash
 from nsf.storage import locked
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"

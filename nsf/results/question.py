@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from nsf.errors import SchemaError
+from nsf.manifest import altered, digest
 from nsf.results.folder import MARK
-from nsf.runs.manifest import altered, digest
 from nsf.runs.run import Run
 
 FILES = ("results.csv", "series.csv", "frames.npz", "cost.json", "summary.json")

@@ -17,10 +17,10 @@ import pandas as pd
 
 from nsf.data import archives
 from nsf.errors import MissingRunError, NSFError, SchemaError
+from nsf.manifest import altered
 from nsf.results import table
 from nsf.results.question import FILES
 from nsf.runs import Run
-from nsf.runs.manifest import altered
 
 KEPT = ("commit", "dirty", "device", "precision", "seed", "created", "versions")
 """What a report says of the origin of a run."""

@@ -7,9 +7,9 @@ from nsf.runs.record import Record
 from nsf.runs.run import Run
 
 if TYPE_CHECKING:
-    from nsf.runs.finding import find, table
+    from nsf.runs.finding import table
 
-__all__ = ["Record", "Run", "find", "table"]
+__all__ = ["Record", "Run", "table"]
 
 # On demand: a stage that records its run lists none.
 __getattr__ = on_first_use(__name__)

@@ -6,9 +6,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+from nsf.canonical import plain
 from nsf.errors import ConfigError, SchemaError, StorageError
-from nsf.runs.canonical import plain
-from nsf.runs.manifest import MANIFEST, digest, read_manifest
+from nsf.manifest import MANIFEST, digest, read_manifest
 from nsf.storage import AGAIN, write_json
 
 

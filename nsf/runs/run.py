@@ -9,15 +9,17 @@ from pathlib import Path
 from typing import Any
 
 from nsf import schemas
+from nsf.canonical import content_hash, plain
 from nsf.errors import ConfigError, MissingRunError, SchemaError, StorageError
-from nsf.runs.canonical import content_hash, plain
-from nsf.runs.manifest import CONFIG, MANIFEST, NAME, altered, read_config, read_manifest
+from nsf.manifest import CONFIG, MANIFEST, NAME, altered, read_config, read_manifest
 from nsf.runs.provenance import provenance
 from nsf.runs.record import Record
 from nsf.storage import clear_partial, in_use, locked, writing
 
-FORMAT = 2  # of a folder and the keys of its configuration; a new value gives every run a new hash
+FORMAT = 3  # of a folder and the keys of its configuration; a new value gives every run a new hash
 _LOCK = ".lock"
+#: Keys of a run's configuration that its values follow from, or that say where they were read.
+_SAID = ("scale", "files")
 _LISTED = 8  # runs that an error names
 
 
@@ -356,10 +358,9 @@ class Run:
                 yield record
 
     def _write_config(self) -> None:
-        from omegaconf import OmegaConf
+        import yaml
 
-        # OmegaConf quotes strings that look like numbers; yaml.safe_dump leaves "1e-5" bare.
-        text = OmegaConf.to_yaml(OmegaConf.create(self.config))
+        text = yaml.safe_dump(self.config, sort_keys=False, allow_unicode=True)
         with writing(self.path / CONFIG) as partial:
             partial.write_text(text, encoding="utf-8")
 
@@ -377,8 +378,29 @@ def _listed(runs: Sequence[Run], stage: str | None) -> str:
 def _hash_of(stage: str, scene: str, config: dict[str, Any], parents: Sequence[str]) -> str:
     """The name of a run: a hash of all that determines its content; parents by their ids."""
     hashes = [parent.split("/")[-1] for parent in parents]
-    content = {"format": FORMAT, "stage": stage, "scene": scene, "config": config, "parents": hashes}
+    content = {
+        "format": FORMAT,
+        "stage": stage,
+        "scene": scene,
+        "config": identity(config),
+        "parents": hashes,
+    }
     return content_hash(content)
+
+
+def identity(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A run's configuration as it names the run: a file by its content, whatever its path."""
+    files = config.get("files")
+    files = files if isinstance(files, dict) else {}
+
+    def by_content(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: by_content(item) for key, item in value.items()}
+        if isinstance(value, list):
+            return [by_content(item) for item in value]
+        return files.get(value, value) if isinstance(value, str) else value
+
+    return {key: by_content(value) for key, value in config.items() if key not in _SAID}
 
 
 def _is_run(names: Sequence[str]) -> bool:

@@ -3,7 +3,6 @@
 Names are imported on first use: shapes and designs can be checked without Warp.
 """
 
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from nsf.extras import on_first_use
@@ -11,11 +10,13 @@ from nsf.extras import on_first_use
 if TYPE_CHECKING:
     from nsf.scenes.body import Body
     from nsf.scenes.designs import Design, Grid, LatinHypercube, Sobol, Values
+    from nsf.scenes.inclination import Inclination
     from nsf.scenes.parameters import Parameter
     from nsf.scenes.programs import (
         GravityProgram,
         Keyframes,
         MotionProgram,
+        Programs,
         RandomPress,
         RandomPush,
         RandomShake,
@@ -35,11 +36,13 @@ __all__ = [
     "Frame",
     "GravityProgram",
     "Grid",
+    "Inclination",
     "Keyframes",
     "LatinHypercube",
     "Mesh",
     "MotionProgram",
     "Parameter",
+    "Programs",
     "RandomPress",
     "RandomPush",
     "RandomShake",
@@ -52,24 +55,7 @@ __all__ = [
     "TentacleBall",
     "Values",
     "Weakness",
-    "load",
     "mesh_or_ball",
 ]
 
 __getattr__ = on_first_use(__name__)
-
-
-def load(name: str, overrides: Sequence[str] = ()) -> "Scene":
-    """Load a scene of `conf/scene` by name.
-
-    Args:
-        name: for example `sand`.
-        overrides: Hydra overrides, for example `["scale=paper", "scene.dt=0.001"]`.
-
-    Raises:
-        ConfigError: unknown scene, key or value.
-    """
-    from nsf import config
-    from nsf.scenes.scene import Scene
-
-    return Scene.from_config(config.load([f"scene={name}", *overrides]))

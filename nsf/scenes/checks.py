@@ -1,10 +1,7 @@
 """Scenes that cannot be computed, refused before any work."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,9 +12,6 @@ from nsf.mpm.device import warp_device
 from nsf.mpm.recording import block_bytes
 from nsf.mpm.solver import bytes_on_device
 from nsf.mpm.stability import wave_speed
-
-if TYPE_CHECKING:
-    from nsf.scenes.scene import Scene
 
 # [byte] a particle that placing it and building a solver take on the host, measured.
 _PLACED = 240
@@ -39,11 +33,11 @@ def check_particles(count: int) -> None:
     require_memory(f"{count} particles", _PLACED * count, host_memory(), "take fewer")
 
 
-def check_memory(scene: Scene, precision: str, device: str, stored: Precision | None = None) -> None:
+def check_memory(scene, precision: str, device: str, stored: Precision | None = None) -> None:
     """Refuse a full-order simulation that fits neither the device nor the host.
 
     Args:
-        scene: what is simulated.
+        scene: a `nsf.scenes.Scene`.
         precision, device: as for `Scene.full_order`.
         stored: precision of the frames, where they are stored.
 
@@ -61,7 +55,7 @@ def check_memory(scene: Scene, precision: str, device: str, stored: Precision | 
     require_memory(what, _PLACED * particles + solver + _WAITING * block, host_memory(), _SMALLER)
 
 
-def check_physics(scene: Scene) -> None:
+def check_physics(scene) -> None:
     """Refuse a scene at t = 0 that cannot be meant.
 
     Raises:
@@ -71,7 +65,7 @@ def check_physics(scene: Scene) -> None:
     check_motion(scene)
 
 
-def check_placement(scene: Scene) -> None:
+def check_placement(scene) -> None:
     """Refuse walls, solids and bodies that cannot be meant to be where they are at t = 0.
 
     A `sticky` solid may hold a part of a body, as a grip or a root does.
@@ -87,7 +81,7 @@ def check_placement(scene: Scene) -> None:
             f"set at most {(min(nodes) - 1) // 4}"
         )
     corners = np.array(list(itertools.product(*((0.0, edge) for edge in scene.size))))
-    for name, solid in zip(scene.config.scene.colliders, scene.colliders, strict=True):
+    for name, solid in zip(scene.colliders, scene.solids, strict=True):
         outside = np.linalg.norm(solid.position - np.clip(solid.position, 0.0, scene.size)) > solid.bound
         if solid.motion is None and (
             outside or (solid.bound == np.inf and solid.distance(corners).min() > 0)
@@ -96,10 +90,9 @@ def check_placement(scene: Scene) -> None:
                 f"scene.colliders.{name} lies outside the domain [0, {scene.size}] m and never moves; "
                 "move it, or leave it out"
             )
-    bodies = dict(zip(scene.config.scene.bodies, scene.bodies, strict=True))
-    for name, body in bodies.items():
+    for name, body in scene.bodies.items():
         _check_solids(scene, name, body.points())
-    for (name, body), (other, second) in itertools.permutations(bodies.items(), 2):
+    for (name, body), (other, second) in itertools.permutations(scene.bodies.items(), 2):
         X = body.points()
         deep = second.shape.contains(X)
         for step in _TOUCHING * scene.dx * np.concatenate([np.eye(3), -np.eye(3)]):
@@ -111,7 +104,7 @@ def check_placement(scene: Scene) -> None:
             )
 
 
-def _check_solids(scene: Scene, name: str, X: np.ndarray) -> None:
+def _check_solids(scene, name: str, X: np.ndarray) -> None:
     """Refuse a body whose particles X [P, 3] [m] are within what they should meet."""
     if (depth_in_walls(scene, X) > 0.0).all():
         raise ConfigError(
@@ -128,20 +121,20 @@ def _check_solids(scene: Scene, name: str, X: np.ndarray) -> None:
             )
 
 
-def depth_in_walls(scene: Scene, X: np.ndarray) -> np.ndarray:
+def depth_in_walls(scene, X: np.ndarray) -> np.ndarray:
     """[P] how deep particles X [P, 3] [m] lie behind the walls' innermost nodes [m], negative before them."""
     padding, upper = (scene.walls.padding - 1) * scene.dx, np.array(scene.grid.upper)
     return np.maximum(padding - X, X - (upper - padding)).max(1)
 
 
-def _solids(scene: Scene, X: np.ndarray) -> Iterator[tuple[str, str, np.ndarray]]:
+def _solids(scene, X: np.ndarray) -> Iterator[tuple[str, str, np.ndarray]]:
     """Name and kind of each solid that acts at t = 0, and the distance [P] of X from it [m]."""
-    for name, solid in zip(scene.config.scene.colliders, scene.colliders, strict=True):
+    for name, solid in zip(scene.colliders, scene.solids, strict=True):
         if solid.since == 0.0:
             yield f"scene.colliders.{name}", solid.kind, solid.distance(X)
 
 
-def check_motion(scene: Scene) -> None:
+def check_motion(scene) -> None:
     """Refuse steps so short, or a material so soft, that a run would show nothing of the material.
 
     Raises:

@@ -1,24 +1,22 @@
-"""Problem parameters of a scene: the keys that they replace (paper section 4.1)."""
+"""Problem parameters of a scene: the values that they replace (paper section 4.1)."""
 
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-
-from nsf import config as configuration
-from nsf.config.resolvers import following, leaves
-from nsf.config.targets import filled
 from nsf.errors import ConfigError
-from nsf.vectors import numbers
+from nsf.scenes.paths import parts_of, value_at
+from nsf.vectors import is_finite, numbers
 
 _NAME = re.compile(r"[A-Za-z]\w{0,39}", re.ASCII)
-#: Keys that the physics is read from; a scene may have others, which these refer to.
-_PHYSICS = re.compile(r"(material|transfer|scene\.(gravity|bodies|colliders|walls))\.")
-#: Keys of the particles at rest, the grid and the steps, which all values of a parameter share.
-_SHARED = re.compile(r"scene\.(dx|dt|steps|size|bodies\.[^.]+\.(shape|particles|particles_per_cell))(\.|$)")
+#: What a parameter may change.
+_PHYSICS = re.compile(
+    r"(material|transfer|gravity|inclination|colliders|walls|bodies\.[^.]+\.(density|velocity|weakness))\b"
+)
+#: The particles at rest, the grid and the steps, which all values of a parameter share.
+_SHARED = re.compile(r"(dx|dt|steps|size|bodies\.[^.]+\.(shape|particles|particles_per_cell))\b")
 
 
 @dataclass(frozen=True)
@@ -26,7 +24,8 @@ class Parameter:
     """One problem parameter μ of a scene (paper section 4.1).
 
     Attributes:
-        key: configuration key that it replaces, for example `material.friction_angle`.
+        key: of the value that it replaces, for example `material.friction_angle`,
+            `scene.bodies.cube.velocity.0`.
         unit: for tables and charts; "" or "-" where it has none.
         range: smallest and largest value that a design may draw; None where `Values` lists them.
         log: whether a design draws evenly in its logarithm.
@@ -36,7 +35,7 @@ class Parameter:
     """
 
     key: str
-    unit: str
+    unit: str = ""
     range: Sequence[float] | None = None
     log: bool = False
 
@@ -52,61 +51,46 @@ class Parameter:
             )
         object.__setattr__(self, "range", (float(low), float(high)))
 
+    @cached_property
+    def path(self) -> tuple[str, ...]:
+        """The key's parts from the scene on."""
+        return parts_of(self.key)
 
-def parameters_of(nodes: Mapping[str, Any]) -> dict[str, Parameter]:
-    """The parameters of `scene.parameters`, by name; null in place of one leaves out that of a scene below.
+
+def check_parameters(scene: Any, parameters: Mapping[str, Parameter]) -> None:
+    """Refuse parameters that a scene cannot take.
 
     Raises:
-        ConfigError: there is none; a name cannot be part of a file's; two have one key; or one is refused.
+        ConfigError: a name cannot be part of a file's, two parameters have one key, or a key names no number
+            or something else than the physics.
     """
-    where, found = "scene.parameters", {}
-    for name, node in ((name, node) for name, node in nodes.items() if node is not None):
-        if not isinstance(node, Mapping):
-            raise ConfigError(
-                f"{where}.{name}={node} must map keys to values, as {{key: material.E, unit: Pa}}"
-            )
+    where, keys = "scene.parameters", {}
+    for name, parameter in parameters.items():
         if not _NAME.fullmatch(str(name)):
             raise ConfigError(
                 f"{where} has the name {name!r}; give up to 40 letters, digits and _, a letter first"
             )
-        found[name] = filled(Parameter, node, f"{where}.{name}")
-        same = next((other for other in found if other != name and found[other].key == node["key"]), None)
-        if same:
-            raise ConfigError(f"{where}: {same} and {name} are both {node['key']}; leave one out")
-    if not found:
-        raise ConfigError(f"{where}={dict(nodes)} leaves nothing to vary; give a name with its key and unit")
-    return found
+        if not isinstance(parameter, Parameter):
+            raise ConfigError(f"{where}.{name}={parameter} must be a parameter, as Parameter('material.E')")
+        if same := keys.get(parameter.path):
+            raise ConfigError(f"{where}: {same} and {name} are both {parameter.key}; leave one out")
+        keys[parameter.path] = name
+        _check_key(scene, f"{where}.{name}.key", parameter)
 
 
-def check_key(name: str, key: str, values: Sequence[float], config: DictConfig, template: DictConfig) -> None:
-    """Refuse a problem parameter that holds no number, or changes something else than the physics.
-
-    Args:
-        name: of the parameter.
-        key: of the configuration.
-        values: that it takes.
-        config: the configuration, resolved.
-        template: the same with its interpolations, as others may refer to the key.
-
-    Raises:
-        ConfigError: says what the key changes.
-    """
-    where, remedy = f"scene.parameters.{name}.key", "name a key of the material, the motion or the boundaries"
-    try:
-        own = OmegaConf.select(config, key) if key else None
-    except OmegaConfBaseException:  # it is no key, as ../name
-        own = None
-    if not isinstance(own, int | float) or isinstance(own, bool):
-        raise ConfigError(f"{where}={key!r} names no key that holds a number; {remedy}")
-    value = float(next(value for value in (*values, own + 1.0) if value != own))
-    paths = following(template, key)
-    other = configuration.resolve_again(template.copy(), {key: value}, config.copy(), paths)
-    before, after = (dict(leaves(OmegaConf.to_container(c))) for c in (config, other))
-    changed = [".".join(path) for path, value in after.items() if before.get(path) != value]
-    if shared := [name for name in changed if _SHARED.match(name)]:
+def _check_key(scene: Any, where: str, parameter: Parameter) -> None:
+    key, path = parameter.key, ".".join(parameter.path)
+    remedy = "name a key of the material, the motion or the boundaries"
+    if _SHARED.match(path):
         raise ConfigError(
-            f"{where}={key} changes {shared[0]}, but all values share the particles at rest, "
+            f"{where}={key} changes scene.{path}, but all values share the particles at rest, "
             f"the grid and the steps; {remedy}"
         )
-    if not any(map(_PHYSICS.match, changed)):
+    try:
+        configured = value_at(scene, parameter.path)
+    except KeyError:
+        configured = None
+    if not is_finite(configured):
+        raise ConfigError(f"{where}={key!r} names no key that holds a number; {remedy}")
+    if not _PHYSICS.match(path):
         raise ConfigError(f"{where}={key} changes no physics; {remedy}")

@@ -26,7 +26,7 @@ _MIDDLES, _DIRECTIONS = 32, 32
 def resolution_warnings(scene: Scene) -> list[str]:
     """What of a scene is too coarse to be trusted, in a line each, with the value that would do."""
     found = []
-    for name, body in zip(scene.config.scene.bodies, scene.bodies, strict=True):
+    for name, body in scene.bodies.items():
         key, volume = f"scene.bodies.{name}", body.shape.volume
         thickness = _thinnest_part(body.placing, scene.dx)
         if thickness < _LENIENT * LEAST_CELLS * scene.dx:
@@ -54,8 +54,7 @@ def resolution_warnings(scene: Scene) -> list[str]:
 
 def thinnest(scene: Scene) -> dict[str, float]:
     """Thickness [m] of the thinnest part of each body, to a few percent; infinite if two cells or more."""
-    names = map(str, scene.config.scene.bodies)
-    return {name: _thinnest_part(b.placing, scene.dx) for name, b in zip(names, scene.bodies, strict=True)}
+    return {name: _thinnest_part(body.placing, scene.dx) for name, body in scene.bodies.items()}
 
 
 @functools.lru_cache(maxsize=8)

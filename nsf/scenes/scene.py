@@ -1,88 +1,114 @@
 """Scenes: what is simulated (paper section 6)."""
 
 import math
-import pickle
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
-from omegaconf import DictConfig, OmegaConf
 
-from nsf import config as configuration
-from nsf.config.resolvers import following
-from nsf.data import PROGRAM, Case
+from nsf.data import PROGRAM, Case, Split
 from nsf.errors import ConfigError
 from nsf.mpm import Collider, DomainWalls, FullOrderMPM, Gravity, GridGeometry, ParticleConstants, Transfer
 from nsf.mpm.materials import Material
+from nsf.scenes.body import Body
 from nsf.scenes.checks import check_memory, check_particles, check_physics
-from nsf.scenes.designs import case_of
-from nsf.scenes.draft import Draft
+from nsf.scenes.designs import Design, case_of
+from nsf.scenes.inclination import Inclination
+from nsf.scenes.parameters import Parameter, check_parameters
+from nsf.scenes.paths import parts_of, value_at, with_value
 from nsf.scenes.programs import Programs
-from nsf.vectors import vector
+from nsf.vectors import length, number, text, vector
 
 
-@dataclass(frozen=True)
-class Scene(Draft):
+@dataclass(frozen=True, kw_only=True)
+class Scene:
     """A full-order problem: bodies, law, boundaries, time span, problem parameters.
 
     Attributes:
-        name, scale: what it is called.
+        name: what it is called; a folder's name.
         dx: grid spacing [m]; dt: step [s]; steps: number of steps, each a frame.
-        size: domain edge lengths [m]; gravity: [3] [m/s²].
-        bodies: what moves; colliders, walls: boundaries.
+        bodies: what moves, by name.
         material: constitutive law; transfer: PIC, APIC or RPIC.
+        size: domain edge lengths [m].
+        gravity: [3] [m/s²]; inclination: of the scene's frame, in which gravity and velocities are turned.
+        colliders: solids by name; walls: of the domain.
         forcing: programs of gravity and colliders, as drawn for the run whose number `program` is.
         parameters: the problem parameters by name; design: draws the cases, the values that they take.
-        config: the configuration that it was built from, resolved.
-        template: the same before its interpolations were resolved.
+
+    Raises:
+        ConfigError: a value is outside its range, a body does not fit into the domain, a program moves no
+            collider, or a parameter replaces no number of the physics.
     """
 
-    gravity: tuple[float, float, float]
-    colliders: tuple[Collider, ...]
-    walls: DomainWalls
+    name: str
+    dx: float
+    dt: float
+    steps: int
+    bodies: Mapping[str, Body]
     material: Material
-    transfer: Transfer
-    forcing: Programs
-    program: int
-    _at: dict[tuple, "Scene"] = field(default_factory=dict, init=False, repr=False, compare=False)
+    transfer: Transfer = field(default_factory=Transfer)
+    size: Sequence[float] = (1.0, 1.0, 1.0)
+    gravity: Sequence[float] = (0.0, 0.0, -9.81)
+    inclination: Inclination | None = None
+    colliders: Mapping[str, Collider] = field(default_factory=dict)
+    walls: DomainWalls = field(default_factory=DomainWalls)
+    forcing: Programs = field(default_factory=Programs)
+    program: int = 0
+    parameters: Mapping[str, Parameter] = field(default_factory=dict)
+    design: Design | None = None
 
-    @classmethod
-    def of(cls, draft: Draft) -> "Scene":
-        """The whole scene of a draft, whose keys were checked when it was made.
+    def __post_init__(self):
+        text("scene.name", self.name)
+        number("scene.dt", self.dt)
+        number("scene.steps", self.steps, least=1, whole=True)
+        number("scene.program", self.program, least=0, whole=True)
+        size = tuple(length("scene.size", edge) for edge in vector("scene.size", self.size, "m"))
+        self._set(dx=float(length("scene.dx", self.dx)), dt=float(self.dt), size=size)
+        self._set(gravity=vector("scene.gravity", self.gravity, "m/s²"))
+        if not self.bodies:
+            raise ConfigError("scene.bodies={} leaves nothing to simulate; give a body")
+        self._set(bodies={name: self._fitted(name, body) for name, body in self.bodies.items()})
+        GridGeometry.of_domain(self.size, self.dx)
+        self.forcing.check(tuple(self.colliders), self.duration, self.dt, self.dx)
+        check_parameters(self, self.parameters)
 
-        Raises:
-            ConfigError: a value is outside its range.
-        """
-        return cls._build(draft.config, draft.template)
+    def _set(self, **values: Any) -> None:
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
 
-    @classmethod
-    def _build(cls, config: DictConfig, template: DictConfig) -> "Scene":
-        s = configuration.section(config, "scene")
-        forcing, program = _programs(s)
-        solids = configuration.build_all(s.colliders, "scene.colliders")
-        own = cls._drafted(config, template)
-        dx, dt, duration = own["dx"], own["dt"], own["dt"] * own["steps"]
-        GridGeometry.of_domain(own["size"], dx)
-        forcing.check(tuple(solids), duration, dt, dx)
-        for name in forcing.colliders:
-            solids[name] = replace(solids[name], motion=forcing.motion_of(name, duration, program))
-        return cls(
-            **own,
-            gravity=vector("scene.gravity", s.gravity, "m/s²"),
-            colliders=tuple(solids.values()),
-            walls=configuration.build(s.walls, "scene.walls"),
-            material=configuration.build(config.material, "material"),
-            transfer=configuration.build(config.transfer, "transfer"),
-            forcing=forcing,
-            program=program,
-        )
+    def _fitted(self, name: str, body: Body) -> Body:
+        """A body that the grid can hold, with its number of particles."""
+        try:
+            body.check_extent(self.size, self.dx)
+            return body.counted(self.dx)
+        except ConfigError as error:
+            raise ConfigError(f"scene.bodies.{name}: {error}") from error
+
+    @property
+    def duration(self) -> float:
+        """Of a run [s]."""
+        return self.dt * self.steps
+
+    @property
+    def base_gravity(self) -> tuple[float, float, float]:
+        """[3] gravity in the scene's frame, before any program changes it [m/s²]."""
+        return self.inclination.turned(self.gravity) if self.inclination else self.gravity
 
     @cached_property
     def acting_gravity(self) -> Gravity:
         """Gravity in the course of the run, as the programs have it [m/s²]."""
-        return self.forcing.gravity_of(self.gravity, self.dt * self.steps, self.program)
+        return self.forcing.gravity_of(self.base_gravity, self.duration, self.program)
+
+    @cached_property
+    def solids(self) -> tuple[Collider, ...]:
+        """The colliders in the course of the run, in order, moved as the programs have it."""
+        moved = {name: self.forcing.motion_of(name, self.duration, self.program) for name in self.colliders}
+        return tuple(
+            solid if moved[name] is None else replace(solid, motion=moved[name])
+            for name, solid in self.colliders.items()
+        )
 
     def forcing_at(self, t: np.ndarray) -> dict[str, np.ndarray]:
         """What forces a run at times t [n] [s].
@@ -90,99 +116,83 @@ class Scene(Draft):
         Returns:
             gravity: [n, 3] [m/s²]; solids: [n, c, 4] shift [m] and angle [rad] of each collider.
         """
-        poses = np.zeros((len(t), len(self.colliders), 4))
-        for c, solid in enumerate(self.colliders):
+        poses = np.zeros((len(t), len(self.solids), 4))
+        for c, solid in enumerate(self.solids):
             if solid.motion is not None:
                 poses[:, c] = solid.motion.pose(t)
         return {"gravity": self.acting_gravity.at(t), "solids": poses}
 
-    @property
-    def collider_names(self) -> tuple[str, ...]:
-        """Of the colliders, in order."""
-        return tuple(map(str, self.config.scene.colliders))
+    @cached_property
+    def varied(self) -> dict[str, Parameter]:
+        """What a case has a value of: the problem parameters, and the program's number if there is any."""
+        return dict(self.parameters) | ({PROGRAM: Parameter(PROGRAM)} if self.forcing else {})
+
+    @cached_property
+    def split(self) -> Split:
+        """The cases that the design draws, by their use.
+
+        Raises:
+            ConfigError: there is no design, or no parameter to vary; and see `Design.split`.
+        """
+        if self.design is None or not self.parameters:
+            raise ConfigError(f"scene {self.name} has no parameters or no design; give it both to draw cases")
+        return self.design.split(self.varied)
 
     def case(self, values: Mapping[str, float] | Sequence[float] | float | None = None) -> Case:
         """A case of the problem parameters.
 
         Args:
-            values: by name, where those that are left out are as configured; or in the parameters' order; or
-                the value of the only one. As configured by default.
+            values: by name, where those that are left out are as the scene has them; or in the parameters'
+                order; or the value of the only one. As the scene has them by default.
 
         Raises:
             ConfigError: a name is no parameter of the scene, or a value no finite number.
         """
         if values is None or isinstance(values, Mapping):
-            configured = {
-                name: OmegaConf.select(self.config, parameter.key) for name, parameter in self.varied.items()
-            }
-            values = configured | dict(values or {})
+            own = {name: value_at(self, parameter.path) for name, parameter in self.varied.items()}
+            values = own | dict(values or {})
         if not isinstance(values, Mapping):
             values = np.atleast_1d(values).tolist()
             if self.forcing and len(values) == len(self.parameters):
                 values.append(self.program)
         return case_of(self.varied, values, self.name)
 
-    def with_parameters(self, parameters: Mapping[str, float]) -> "Scene":
-        """The same scene at given problem parameters, `{name: value}`; keys that refer to them follow.
+    def at(self, case: Mapping[str, float]) -> Self:
+        """The same scene at values of problem parameters, `{name: value}`.
 
         Raises:
             ConfigError: a name is none of the scene's parameters, or a value is refused.
         """
-        if (asked := tuple(parameters.items())) in self._at:
-            return self._at[asked]
         values = {}
-        for name, value in parameters.items():
+        for name, value in case.items():
             if name not in self.varied:
                 raise ConfigError(
                     f"{self.name} has no parameter {name!r}; there are {', '.join(self.varied)}"
                 )
             if not (isinstance(value, int | float | np.number) and math.isfinite(value)):
                 raise ConfigError(f"{name}={value!r} must be a finite number")
-            values[self.varied[name].key] = int(value) if name == PROGRAM else float(value)
-        config, template = pickle.loads(self._packed)
-        paths = (path for name in parameters for path in self._following[name])
-        config = configuration.resolve_again(template, values, config, paths)
-        self._at[asked] = Scene._build(config, template)
-        return self._at[asked]
+            key = self.varied[name].key
+            whole = type(value_at(self, parts_of(key))) is int and value == int(value)
+            values[key] = int(value) if whole else float(value)
+        return self.changed(values)
 
-    @cached_property
-    def _packed(self) -> bytes:
-        """Both configurations: to unpack them takes a third of what copies take."""
-        return pickle.dumps((self.config, self.template))
-
-    @cached_property
-    def _following(self) -> dict[str, list[tuple[str, ...]]]:
-        """Paths of the values that follow each parameter's key."""
-        return {name: following(self.template, parameter.key) for name, parameter in self.varied.items()}
-
-    def with_changes(self, changes: Mapping[str, Any]) -> "Scene":
-        """The scene with other values of some configuration keys, and the same particles at rest and steps.
-
-        A manifold of this scene can be deployed on that one: the fields are functions of the particles'
-        X, and a latent vector steps by Δt on the grid.
-
-        Args:
-            changes: values by dotted key of the scene, its material or its transfer.
+    def changed(self, values: Mapping[str, Any]) -> Self:
+        """The same scene with other values, by key path, as `{"bodies.cube.density": 80.0}`.
 
         Raises:
-            ConfigError: a key is unknown, a problem parameter's, or one that changes X, the grid or the
-                steps; a value is refused.
+            ConfigError: the scene has no such key, or a value is refused.
         """
-        changed = self.changed(changes)
-        kept = {
-            "particles": np.array_equal(changed.particles().X, self.particles().X),
-            "grid nodes": (changed.grid, changed.size) == (self.grid, self.size),
-            "time steps": (changed.dt, changed.steps) == (self.dt, self.steps),
-        }
-        other = [what for what, same in kept.items() if not same]
-        if other:
-            raise ConfigError(
-                f"{', '.join(changes)} gives other {', '.join(other)} than the manifold is trained on; "
-                f"set it for the whole chain, {next(iter(changes))}=…"
-            )
-        return changed
+        found: dict[str, Any] = {}
+        for key, value in values.items():
+            first, *rest = path = parts_of(key)
+            try:
+                value_at(self, path)
+            except KeyError as error:
+                raise ConfigError(f"scene {self.name} has no {key!r}: there is no {error}") from error
+            found[first] = with_value(found.get(first, getattr(self, first)), rest, value, first)
+        return replace(self, **found)
 
-    def refined(self, factor: int, substeps: int = 1) -> "Scene":
+    def refined(self, factor: int, substeps: int = 1) -> Self:
         """The same scene with factor times the particles on the same grid; a body's own come first in it.
 
         Weak elements are drawn anew, as there are others to draw from: their share stays.
@@ -191,11 +201,10 @@ class Scene(Draft):
             factor: particles for each particle.
             substeps: steps for each step.
         """
-        config = self._recounted([factor * body.particles for body in self.bodies])
-        config.scene.dt, config.scene.steps = self.dt / substeps, substeps * self.steps
-        return Scene.from_config(config)
+        bodies = self._recounted([factor * body.particles for body in self.bodies.values()])
+        return replace(self, bodies=bodies, dt=self.dt / substeps, steps=substeps * self.steps)
 
-    def resampled(self, particles: int) -> "Scene":
+    def resampled(self, particles: int) -> Self:
         """The same scene with that many particles, each body with its share of them.
 
         A body's own particles come first in it, if it gets more; weak elements are drawn anew.
@@ -203,10 +212,10 @@ class Scene(Draft):
         Raises:
             ConfigError: a body's share is less than one particle.
         """
-        ends = np.cumsum([0] + [body.particles for body in self.bodies])
-        return Scene.from_config(self._recounted(np.diff(np.rint(particles * (ends / ends[-1])))))
+        ends = np.cumsum([0] + [body.particles for body in self.bodies.values()])
+        return replace(self, bodies=self._recounted(np.diff(np.rint(particles * (ends / ends[-1])))))
 
-    def coarsened(self, factor: int, multiple: int = 1) -> "Scene":
+    def coarsened(self, factor: int, multiple: int = 1) -> Self:
         """The same scene on a grid of factor times the spacing, with as many particles a cell.
 
         Args:
@@ -216,23 +225,34 @@ class Scene(Draft):
         Raises:
             ConfigError: a body, a collider or the walls do not fit the coarse grid.
         """
-        config = self._recounted([max(1, round(body.particles / factor**3)) for body in self.bodies])
-        config.scene.dx, config.scene.dt = factor * self.dx, multiple * self.dt
-        config.scene.steps = self.steps // multiple
-        return Scene.from_config(config)
+        counts = [max(1, round(body.particles / factor**3)) for body in self.bodies.values()]
+        return replace(
+            self,
+            bodies=self._recounted(counts),
+            dx=factor * self.dx,
+            dt=multiple * self.dt,
+            steps=self.steps // multiple,
+        )
 
-    def _recounted(self, counts: Sequence[int]) -> DictConfig:
-        """The configuration with other numbers of particles of the bodies."""
-        config = self.template.copy()
-        for name, count in zip(self.config.scene.bodies, counts, strict=True):
-            node = config.scene.bodies[name]
-            node.particles, node.particles_per_cell = int(count), None
-        return config
+    def _recounted(self, counts: Sequence[float]) -> dict[str, Body]:
+        """The bodies with other numbers of particles."""
+        pairs = zip(self.bodies.items(), counts, strict=True)
+        return {name: replace(body, particles=int(count)) for (name, body), count in pairs}
 
     @property
     def grid(self) -> GridGeometry:
         """The background grid."""
         return GridGeometry.of_domain(self.size, self.dx)
+
+    @property
+    def particle_count(self) -> int:
+        """Particles of all bodies together."""
+        return sum(body.particles for body in self.bodies.values())
+
+    @property
+    def files(self) -> dict[str, str]:
+        """Path and sha256 of every file that the scene is made from."""
+        return {path: digest for body in self.bodies.values() for path, digest in body.files.items()}
 
     def particles(self) -> ParticleConstants:
         """Particles of every body, in order; μ̂ and λ are the material's, times a body's weakness.
@@ -242,7 +262,7 @@ class Scene(Draft):
         """
         check_particles(self.particle_count)
         X, mass, volume0, stiffness = [], [], [], []
-        for body in self.bodies:
+        for body in self.bodies.values():
             volume = body.shape.volume / body.particles
             X.append(body.points())
             volume0.append(np.full(body.particles, volume))
@@ -253,8 +273,11 @@ class Scene(Draft):
         return ParticleConstants(np.concatenate(X), np.concatenate(mass), np.concatenate(volume0), mu, lam)
 
     def initial_velocity(self) -> np.ndarray:
-        """[P, 3] velocity at t = 0 [m/s]."""
-        return np.concatenate([np.tile(np.asarray(b.velocity, float), (b.particles, 1)) for b in self.bodies])
+        """[P, 3] velocity at t = 0, in the scene's frame [m/s]."""
+        turned = self.inclination.turned if self.inclination else lambda upright: upright
+        return np.concatenate(
+            [np.tile(np.asarray(turned(b.velocity), float), (b.particles, 1)) for b in self.bodies.values()]
+        )
 
     def full_order(
         self, parameters: Mapping[str, float] | None = None, precision: str = "fp64", device: str = "auto"
@@ -262,7 +285,7 @@ class Scene(Draft):
         """The full-order solver at t = 0 (paper section 3).
 
         Args:
-            parameters: problem parameters `{name: value}`; those left out are as configured.
+            parameters: problem parameters `{name: value}`; those left out are as the scene has them.
             precision: `fp64` or `fp32`.
             device: `cpu`, `cuda`, `cuda:N` or `auto`.
 
@@ -271,62 +294,20 @@ class Scene(Draft):
                 (`nsf.scenes.checks`); and see `FullOrderMPM`.
             InstabilityError, DeviceError: see `FullOrderMPM`.
         """
-        return self.with_parameters(parameters or {}).solver(precision, device)
-
-    def solver(self, precision: str = "fp64", device: str = "auto") -> FullOrderMPM:
-        """The same of the scene as it stands, though its configuration may say another thing."""
-        check_memory(self, precision, device)
-        check_physics(self)
+        scene = self.at(parameters or {})
+        check_memory(scene, precision, device)
+        check_physics(scene)
         return FullOrderMPM(
-            self.particles(),
-            self.material,
-            self.grid,
-            self.dt,
-            gravity=self.acting_gravity,
-            colliders=self.colliders,
-            walls=self.walls,
-            transfer=self.transfer,
-            v=self.initial_velocity(),
+            scene.particles(),
+            scene.material,
+            scene.grid,
+            scene.dt,
+            gravity=scene.acting_gravity,
+            colliders=scene.solids,
+            walls=scene.walls,
+            transfer=scene.transfer,
+            v=scene.initial_velocity(),
             precision=precision,
             device=device,
-            names=self.collider_names,
+            names=tuple(scene.colliders),
         )
-
-    def reduced(self, manifold, parameters: Mapping[str, float] | None = None, sample=None, **options):
-        """The reduced solver at t = 0 (paper section 5): same `step` and `state` as the full-order one.
-
-        Args:
-            manifold: a trained `nsf.Manifold` of these particles.
-            parameters: problem parameters `{name: value}`.
-            sample: indices of the sample particles S, or their number.
-            **options: see `nsf.engines.reduced`; `engine` says how steps are computed.
-        """
-        from nsf import engines
-
-        return engines.reduced(self, manifold, parameters, sample, **options)
-
-    def reduced_batch(self, manifold, parameters: Sequence[Mapping[str, float]], sample=None, **options):
-        """Reduced runs at t = 0 that take their steps together, one for each `{name: value}`.
-
-        Args:
-            manifold, sample: as for `reduced`.
-            parameters: problem parameters of each.
-            **options: see `nsf.engines.reduced_batch`.
-        """
-        from nsf import engines
-
-        return engines.reduced_batch(self, manifold, parameters, sample, **options)
-
-
-def _programs(s: DictConfig) -> tuple[Programs, int]:
-    """The programs of a scene's configuration, and the number of the one that it follows."""
-    node = s.get("forcing") or {}
-    if not isinstance(node, Mapping) or not set(node) <= {"gravity", "colliders"}:
-        raise ConfigError(
-            f"scene.forcing={node} must have the keys gravity and colliders, each with programs by name"
-        )
-    found = Programs(
-        configuration.build_all(node.get("gravity", {}), "scene.forcing.gravity"),
-        configuration.build_all(node.get("colliders", {}), "scene.forcing.colliders"),
-    )
-    return found, int(configuration.number("scene.program", s.get("program", 0), least=0, whole=True))

@@ -1,6 +1,6 @@
 """Planes in which a scene is its own mirror image, so that the image of a run is a run as well."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol
 
@@ -20,11 +20,11 @@ _EDGE = 0.003  # of the points, which round-off may put outside
 
 
 class Solids(Protocol):
-    """What of a `nsf.scenes.Scene` has to be its own image: the domain's edges [m], bodies and colliders."""
+    """Parts of a `nsf.scenes.Scene` that have to be their own image: edges [m], bodies and solids."""
 
     size: Sequence[float]
-    bodies: "Sequence[Body]"
-    colliders: "Sequence[Collider]"
+    bodies: "Mapping[str, Body]"
+    solids: "Sequence[Collider]"
 
 
 @dataclass(frozen=True)
@@ -92,16 +92,16 @@ class Symmetry:
         domain, near = np.stack([np.zeros(3), size]), _NEAR * float(size.max())
         if not np.allclose(np.sort(self.at(domain, R), axis=0), domain, atol=near):
             raise self._refused("the domain")
-        for number, body in enumerate(scene.bodies):
+        for name, body in scene.bodies.items():
             if not body.shape.contains(self.at(body.shape.sample(_POINTS), R)).mean() > 1.0 - _EDGE:
-                raise self._refused(f"body {number} ({type(body.shape).__name__})")
+                raise self._refused(f"body {name} ({type(body.shape).__name__})")
             if body.weakness is not None or not np.allclose(R @ np.asarray(body.velocity), body.velocity):
-                raise self._refused(f"the velocity or the weakness of body {number}")
+                raise self._refused(f"the velocity or the weakness of body {name}")
         x = size * np.random.default_rng(0).random((_POINTS, 3))
-        return tuple(self._partner(own, scene.colliders, x, R, near) for own in scene.colliders)
+        return tuple(self._partner(own, scene.solids, x, R, near) for own in scene.solids)
 
     def _partner(self, own: "Collider", others, x: np.ndarray, R: np.ndarray, near: float) -> int:
-        if own.motion is not None and np.any(own.motion.angles) and not np.array_equal(R, np.eye(3)):
+        if own.motion is not None and np.any(own.motion.keyframes()[2]) and not np.array_equal(R, np.eye(3)):
             raise self._refused(f"the {own.name}, which turns,")
         far = replace(own, motion=None).distance(x)
         for number, other in enumerate(others):

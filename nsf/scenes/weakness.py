@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nsf.config import number
 from nsf.errors import ConfigError
 from nsf.scenes.shapes.geometry import Shape
+from nsf.vectors import number
 
 
 @dataclass(frozen=True)

@@ -140,7 +140,7 @@ def test_programs_through_the_whole_chain(pipeline_at, tmp_path):
     assert pipeline.manifold().parameter_names == ("friction_angle",)
     case = pipeline.split.test[0]
     with Trajectory.open(pipeline.simulation(case).path / "trajectory.h5") as trajectory:
-        acting = pipeline.scene.with_parameters(case).acting_gravity
+        acting = pipeline.scene.at(case).acting_gravity
         np.testing.assert_allclose(trajectory.forcing["gravity"], acting.at(trajectory.t), atol=1e-12)
         assert list(trajectory.parameters) == ["friction_angle"]
     _, between, back = pipeline.lessons
@@ -152,7 +152,7 @@ def test_programs_through_the_whole_chain(pipeline_at, tmp_path):
     beyond = steep.scene.forcing.reach(steep.scene.gravity)
     for index, held_out in enumerate(steep.held_out):
         rollout = Rollout.open(steep.deployment.file(rollout_file(index)))
-        gravity = steep.deployed.with_parameters(held_out).acting_gravity.at(rollout.t[:-1])
+        gravity = steep.deployed.at(held_out).acting_gravity.at(rollout.t[:-1])
         outside = np.linalg.norm(gravity - steep.scene.gravity, axis=1) > beyond
         assert outside.any()
         assert (rollout.trust[1:][outside] > 1.0).all()

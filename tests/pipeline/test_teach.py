@@ -10,6 +10,7 @@ import pytest
 import torch
 from angles import angle
 
+import nsf
 from nsf.data import Trajectory
 from nsf.deployment import OPERATORS, PROJECTED, Levels, Rollout, rollout, rollouts
 from nsf.deployment.levels import estimated_errors
@@ -73,7 +74,7 @@ def reduced(lesson, taught, tiny_manifold):
 
     def build(scene=pipeline.scene, parameters=ANGLE, sample=known.samples, manifold=manifold, **options):
         options = {"engine": taught, "device": "cpu"} | options
-        return scene.reduced(manifold, parameters, sample, **options)
+        return nsf.reduced(scene, manifold, parameters, sample, **options)
 
     return build
 
@@ -364,7 +365,7 @@ def test_a_batch_is_its_runs(reduced, lesson, taught):
     sample = reduced().setup.samples
     parameters = [{"friction_angle": value} for value in (23.0, 26.0, 37.0)]
     manifold = pipeline.manifold()
-    batch = pipeline.scene.reduced_batch(manifold, parameters, sample, engine=taught, device="cpu")
+    batch = nsf.reduced_batch(pipeline.scene, manifold, parameters, sample, engine=taught, device="cpu")
     batch.step(24)
     for run, own in zip(batch.runs, parameters, strict=True):
         alone = reduced(parameters=own)
@@ -395,7 +396,7 @@ def test_a_run_goes_on_from_where_another_engine_is(reduced):
 )
 def test_gravity_and_the_initial_velocity_may_be_others(reduced, lesson, changes, inside, tiny_trust):
     pipeline, _ = lesson
-    changed = pipeline.scene.with_changes(changes)
+    changed = pipeline.scene.changed(changes)
     plain, own, projected = reduced(), reduced(scene=changed), reduced(scene=changed, engine="auto")
     for run in (plain, own, projected):
         run.step(12)
@@ -424,7 +425,7 @@ def test_what_operators_were_not_taught_on_is_refused(reduced, lesson, tiny_mani
         ({"dt_multiplier": 1.5}, "another Δt"),
         ({"sources": Sources("deformation", "none")}, "another sources"),
         ({"projector": Taylor()}, "another projector"),
-        ({"scene": pipeline.scene.with_changes({"material.nu": 0.25})}, "another scene"),
+        ({"scene": pipeline.scene.changed({"material.nu": 0.25})}, "another scene"),
     ]
     for options, message in refused:
         with pytest.raises(ConfigError, match=re.escape(f"they were taught on {message}")):
@@ -436,7 +437,7 @@ def test_what_operators_were_not_taught_on_is_refused(reduced, lesson, tiny_mani
 
 def test_a_name_is_not_enough(chain, tiny_manifold):
     with pytest.raises(ConfigError, match=re.escape("give nsf.engines.Operators.load(FILE)")):
-        chain.scene.reduced(tiny_manifold, ANGLE, 20, engine="operators", device="cpu")
+        nsf.reduced(chain.scene, tiny_manifold, ANGLE, 20, engine="operators", device="cpu")
 
 
 # -- levels ---------------------------------------------------------------------------------------------

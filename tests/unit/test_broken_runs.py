@@ -11,7 +11,7 @@ import zlib
 import pytest
 from rich.console import Console
 
-import nsf.runs.manifest
+import nsf.manifest
 from nsf.cli import main
 from nsf.errors import ConfigError, MissingRunError, NSFError, SchemaError, StorageError
 from nsf.results.overview.index import write_index
@@ -302,13 +302,13 @@ def test_verify_tells_of_a_broken_run(runs):
 
 
 def test_a_file_is_read_for_its_sum_once_a_process(runs, monkeypatch):
-    monkeypatch.setattr(nsf.runs.manifest, "_SETTLED", -1.0)  # as if the file were older
-    monkeypatch.setattr(nsf.runs.manifest, "_KNOWN", {})
+    monkeypatch.setattr(nsf.manifest, "_SETTLED", -1.0)  # as if the file were older
+    monkeypatch.setattr(nsf.manifest, "_KNOWN", {})
     read = []
     monkeypatch.setattr(
-        nsf.runs.manifest,
+        nsf.manifest,
         "_sha256",
-        lambda path, plain=nsf.runs.manifest._sha256: read.append(path) or plain(path),
+        lambda path, plain=nsf.manifest._sha256: read.append(path) or plain(path),
     )
     for _ in range(3):
         runs[1].file("data.bin")

@@ -2,8 +2,8 @@
 
 import pytest
 
-from nsf.config import code
-from nsf.config.code import code_of
+from nsf import code
+from nsf.code import code_of
 
 FILES = {
     "sampling/__init__.py": "from nsf.sampling.own import Own\n",

@@ -7,12 +7,11 @@ import sys
 import pytest
 from omegaconf import OmegaConf
 
-from nsf import config
+from nsf import config, load_scene
 from nsf.config import targets
 from nsf.errors import ConfigError, NSFError
 from nsf.paths import CONF, groups
 from nsf.pipeline.sweep import sweep
-from nsf.scenes import load
 
 #: Callables of this package, which are no class that a key expects, and what they would need.
 CALLABLES = [
@@ -320,7 +319,7 @@ def test_a_scene_that_runs_code_is_refused(conf, tmp_path, monkeypatch):
     with pytest.raises(
         ConfigError, match=r"scene\.colliders\.floor: _target_: nsf\.workers\.Worker is refused"
     ):
-        load("evil")
+        load_scene("evil")
 
 
 @pytest.mark.parametrize("override", ["projector=$", "sampler=${oc.decode:'1'}"])

@@ -15,9 +15,9 @@ from omegaconf import OmegaConf
 import nsf.runs.provenance
 import nsf.runs.record
 import nsf.runs.run
+from nsf.canonical import content_hash, plain
 from nsf.errors import ConfigError, MissingRunError, StorageError
 from nsf.runs import Run
-from nsf.runs.canonical import content_hash, plain
 
 CONFIG = {"mu": 1e6, "name": "1e-5", "list": [1, 2.5, None, True], "nested": {"b": 1, "a": "x: y"}}
 

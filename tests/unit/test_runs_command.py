@@ -6,7 +6,7 @@ import re
 import pandas as pd
 import pytest
 
-from nsf import runs
+from nsf import find, runs
 from nsf.cli import main
 from nsf.errors import ConfigError, MissingRunError
 from nsf.runs import Run
@@ -267,16 +267,16 @@ def test_the_table_is_a_data_frame_with_the_same_filters(root):
 
 def test_find_gives_the_run_of_exactly_these_keys(chain, tiny):
     words = [word for word in tiny if word.split("=")[0] not in ("scene", "latent_dim")]
-    found = runs.find(*words, scene="sand", latent_dim=4, root=chain.root)
+    found = find(*words, scene="sand", latent_dim=4, root=chain.root)
     assert found == chain.pipeline.training
-    evaluated = runs.find(*words, stage="evaluate", scene="sand", latent_dim=4, root=chain.root)
+    evaluated = find(*words, stage="evaluate", scene="sand", latent_dim=4, root=chain.root)
     assert evaluated == chain.pipeline.evaluation
     with pytest.raises(MissingRunError, match="is not there"):
-        runs.find(*words, scene="sand", latent_dim=5, root=chain.root)
+        find(*words, scene="sand", latent_dim=5, root=chain.root)
     with pytest.raises(ConfigError, match="name a scene"):
-        runs.find(latent_dim=4, root=chain.root)
+        find(latent_dim=4, root=chain.root)
     with pytest.raises(ConfigError, match="stage=report"):
-        runs.find(scene="sand", stage="report")
+        find(scene="sand", stage="report")
 
 
 def test_bytes_are_shown_in_a_unit_of_their_size():

@@ -7,6 +7,7 @@ import pytest
 import torch
 import warp as wp
 
+import nsf
 import nsf.scenes
 from nsf.dynamics import GaussNewton, Integration, NeighbourSearch, Taylor
 from nsf.dynamics.integration import particle_sets
@@ -32,7 +33,7 @@ MOVING = (
 def mid_run(request):
     """A sand column in mid-collapse and its state one full-order step later."""
     overrides = MOVING if request.param == "moving" else [f"transfer={request.param}"]
-    scene = nsf.scenes.load("sand", overrides)
+    scene = nsf.load_scene("sand", overrides)
     solver = scene.full_order({"friction_angle": 30.0}, device="cpu")
     solver.step(STEPS)
     before = {name: torch.tensor(value) for name, value in solver.state.numpy().items()}
@@ -46,7 +47,7 @@ def moved_sample(scene, state, rows, sample, nodes, steps=STEPS, dt=None):
     chosen = {name: state[name][rows].contiguous() for name in ("x", "v", "C", "tau")}
     mass, volume0 = (torch.tensor(getattr(constants, k)[rows]) for k in ("mass", "volume0"))
     device = wp.get_device("cpu")
-    boundaries = BoundaryArrays(scene.colliders, scene.walls, FP64, device)
+    boundaries = BoundaryArrays(scene.solids, scene.walls, FP64, device)
     grid = Grid(scene.grid, FP64, device, nodes=nodes)
     forcing = Forcing([scene.gravity], boundaries, FP64, device)
     step = GridStep(grid, forcing, scene.transfer, dt or scene.dt, FP64, device)
@@ -123,9 +124,10 @@ def test_a_reduced_run_meets_moving_colliders_in_every_span(
     engine, strategy, multiplier, tiny, tiny_manifold
 ):
     """S moves as in a step over every particle, with its Δt, at any time and after a change of sample."""
-    scene = nsf.scenes.load("sand", [*tiny[1:], *MOVING]).with_parameters({"friction_angle": 26.0})
+    scene = nsf.load_scene("sand", [*tiny[1:], *MOVING]).at({"friction_angle": 26.0})
     sampler = RandomSampler(20, phases=[{"start": 0.5, "size": 8}])
-    solver = scene.reduced(
+    solver = nsf.reduced(
+        scene,
         tiny_manifold,
         {"friction_angle": 26.0},
         sampler,
@@ -144,7 +146,7 @@ def test_a_reduced_run_meets_moving_colliders_in_every_span(
             sample, others = span.sets.sample, np.arange(len(solver.state))
             rows = np.concatenate([sample, np.setdiff1d(others, sample)])
             expected = moved_sample(scene, state, rows, sample, None, n, solver.dt)
-            still = replace(scene, colliders=scene.colliders[:1])
+            still = replace(scene, colliders=dict(list(scene.colliders.items())[:1]))
             without = moved_sample(still, state, rows, sample, None, n, solver.dt)
             felt = max(felt, (without - expected).abs().max())
             solver.step()
@@ -161,11 +163,11 @@ def test_a_reduced_run_meets_moving_colliders_in_every_span(
 @pytest.mark.parametrize("strategy", ["superset", "search"])
 def test_a_step_started_from_latents_is_the_one_of_the_run(strategy, tiny, tiny_manifold):
     """At its moment, which moving colliders feel, and with its sample: the same Gauss-Newton step."""
-    scene = nsf.scenes.load("sand", [*tiny[1:], *MOVING]).with_parameters({"friction_angle": 26.0})
+    scene = nsf.load_scene("sand", [*tiny[1:], *MOVING]).at({"friction_angle": 26.0})
     sampler = RandomSampler(20, phases=[{"start": 0.5, "size": 8}])
     options = {"device": "cpu", "integration": Integration(strategy), "projector": Taylor()}
     run, other = (
-        scene.reduced(tiny_manifold, {"friction_angle": 26.0}, sampler, **options) for _ in range(2)
+        nsf.reduced(scene, tiny_manifold, {"friction_angle": 26.0}, sampler, **options) for _ in range(2)
     )
     run.step(20)
     latents = torch.as_tensor(run.trajectory().xhat)

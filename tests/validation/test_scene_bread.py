@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from nsf import scenes
+import nsf
 
 
 def connected(x, start, reach):
@@ -21,14 +21,14 @@ def connected(x, start, reach):
 
 def torn(value, overrides=()):
     """Is no particle of one grip joined to the other's by particles within 2 Δx of each other?"""
-    scene = scenes.load("bread", ["scale=small", *overrides])
+    scene = nsf.load_scene("bread", ["scale=small", *overrides])
     solver = scene.full_order({"E": value}, device="cpu")
     solver.step(scene.steps)
     X, x = scene.particles().X, solver.state.numpy()["x"]
     left, right = X[:, 0] < 0.425, X[:, 0] > 0.575
     joined = connected(x, left, 2.0 * scene.dx)
     # Where it tore, the fracture runs through the weak elements: the rest keeps to its grip.
-    weak = scene.bodies[0].weakness.region.contains(X)
+    weak = next(iter(scene.bodies.values())).weakness.region.contains(X)
     return not (joined & right).any() and np.array_equal(joined[~weak], X[~weak, 0] < 0.5)
 
 

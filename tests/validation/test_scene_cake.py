@@ -3,17 +3,17 @@
 import numpy as np
 import pytest
 
-from nsf import scenes
+import nsf
 from nsf.vectors import direction, rotation
 
 
 def cut(angle, overrides=()):
     """Opening of the halves across the blade, in its thicknesses, and the particles left in its way."""
-    scene = scenes.load("cake", ["scale=small", *overrides])
+    scene = nsf.load_scene("cake", ["scale=small", *overrides])
     solver = scene.full_order({"angle": angle}, device="cpu")
     solver.step(scene.steps)
     X, x = scene.particles().X, solver.state.numpy()["x"]
-    blade = scene.colliders[0]
+    blade = scene.solids[0]
     across = rotation(direction("axis", blade.motion.axis), angle) @ blade.orientation[:, 0]
     side, moved = (X - blade.motion.pivot) @ across, (x - X) @ across
     right, left = (side > 0.0) & (side < 0.1), (side < 0.0) & (side > -0.1)

@@ -2,16 +2,16 @@
 
 import pytest
 
-from nsf import scenes
+import nsf
 
 
 def spring_back(hardening):
     """Height that the frame regains once the plates let go, as a share of what it had lost."""
-    scene = scenes.load("metal", ["scale=small"])
+    scene = nsf.load_scene("metal", ["scale=small"])
     solver = scene.full_order({"hardening": hardening}, device="cpu")
     z = scene.particles().X[:, 2]
     top, bottom = z > z.max() - scene.dx, z < z.min() + scene.dx
-    release = round(scene.colliders[0].until / scene.dt)
+    release = round(scene.solids[0].until / scene.dt)
     heights = [z[top].mean() - z[bottom].mean()]
     for steps in (release, *[10] * ((scene.steps - release) // 10)):
         solver.step(steps)

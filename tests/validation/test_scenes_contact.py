@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 
-from nsf import scenes
+import nsf
 
 SMALL = "scale=small"
 
 
 def run(name, value, *overrides, until=1.0, every=None):
     """The scene, x and v [f, P, 3] after each `every` steps or the last of `until` of them, mass [P, 1]."""
-    scene = scenes.load(name, [SMALL, *overrides])
-    scene = scene.with_parameters(scene.case(value))
+    scene = nsf.load_scene(name, [SMALL, *overrides])
+    scene = scene.at(scene.case(value))
     solver = scene.full_order(device="cpu")
     steps = round(until * scene.steps)
     x, v = [], []
@@ -42,8 +42,8 @@ class TestJellyCube:
     def spin(*overrides):
         """Angular velocity [3] of the cube after the hit, in units of its first speed over its edge."""
         scene, x, v, mass = run("jelly_cube", 0.5, *overrides, until=0.6)
-        n = scene.bodies[0].particles
-        lower, upper = scene.bodies[0].shape.bounds
+        n = next(iter(scene.bodies.values())).particles
+        lower, upper = next(iter(scene.bodies.values())).shape.bounds
         edge = (upper - lower)[0]
         inertia = mass[:n].sum() * edge**2 / 6.0
         return angular_momentum(x[-1, :n], v[-1, :n], mass[:n]) / inertia * edge / 0.5
@@ -105,7 +105,7 @@ class TestSquishyBall:
     def test_tentacles_touch_each_other(self, tilted):
         """Particles of different tentacles share a cell, hence every node about it."""
         scene, x, _, _ = tilted[15.0]
-        shape, X = scene.bodies[0].shape, scene.particles().X
+        shape, X = next(iter(scene.bodies.values())).shape, scene.particles().X
         outer = np.linalg.norm(X - shape.centre, axis=1) > shape.radius + 0.5 * shape.length
         # Farther apart than this at rest, two of them are not of one tentacle.
         widest = np.hypot(0.5 * shape.length, 2.0 * shape.tentacle_radius)
@@ -128,7 +128,7 @@ class TestToothpaste:
     def lay(angle, *overrides):
         """The run, its plane, and the speed [m/s] of its middle down the brush in the last tenth."""
         scene, x, v, mass = run("toothpaste", angle, *overrides, every=10)
-        plane = scene.colliders[0]
+        plane = scene.solids[0]
         down = np.cross([0.0, 1.0, 0.0], plane.extents)
         creep = (mean(x[-1], mass) - mean(x[-2], mass)) @ down / (10 * scene.dt)
         return scene, plane, x, v, mass, creep
@@ -145,7 +145,7 @@ class TestToothpaste:
             height = (x[-1] - plane.position) @ plane.extents
             assert height.min() > -scene.dx
             # Thinner than the ribbon was, as it spreads.
-            assert height.max() < 2.0 * scene.bodies[0].shape.radius
+            assert height.max() < 2.0 * next(iter(scene.bodies.values())).shape.radius
 
     def test_creeps_down_faster_on_a_steeper_brush(self, laid):
         creep = {angle: case[-1] for angle, case in laid.items()}

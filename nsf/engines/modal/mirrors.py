@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 
-from nsf.config.code import text_of, text_sum
+from nsf.code import text_of, text_sum
 
 TABLE = Path(__file__).with_name("mirrors.json")
 #: What the kernels stand for: classes, of which every function counts, and functions.

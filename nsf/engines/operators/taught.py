@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass, fields
 import numpy as np
 import torch
 
+from nsf.canonical import plain
 from nsf.dynamics.setup import Setup
 from nsf.errors import SchemaError
-from nsf.runs.canonical import plain
 from nsf.scenes.identity import physics_hash
 
 _DIGITS = 12

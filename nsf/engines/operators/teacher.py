@@ -40,7 +40,7 @@ class Teacher:
         t = self.dt * np.arange(self.total_steps)
         self.gravity = torch.as_tensor(np.stack([setup.gravity.at(t) for setup in setups], 1))
         self.start = _host(torch.stack([setup.xhat for setup in setups]))
-        states = [collider_states(setup.scene.colliders, self.dt, self.total_steps) for setup in setups]
+        states = [collider_states(setup.scene.solids, self.dt, self.total_steps) for setup in setups]
         self.features = torch.as_tensor(np.stack(states, 1))
 
     def __len__(self) -> int:

@@ -101,7 +101,7 @@ def write(results: Results, folder: Path) -> Path:
 
 def title_of(model: Model) -> str:
     """The scene's title."""
-    return model.scene.config.scene.get("title") or model.scene.name
+    return model.pipeline.config.scene.get("title") or model.scene.name
 
 
 def frame_table(heading: str, frame: pd.DataFrame, note: str = "", text: int = 1) -> Table:

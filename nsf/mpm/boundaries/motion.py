@@ -22,7 +22,8 @@ class Motion:
     """Keyframes of a rigid motion, relative to the pose at rest.
 
     The point X of the solid is at pivot + R(θ)(X − pivot) + d. The translation d and the angle θ are
-    linear between keyframes, constant before the first and after the last.
+    linear between keyframes, constant before the first and after the last. With a tilt, the solid and its
+    way are turned by it as one: θ is larger by it, and d is turned.
 
     Attributes:
         times: [k] times of the keyframes [s], ascending.
@@ -30,11 +31,12 @@ class Motion:
         angles: [k] θ about `axis`, right-handed [°]; none if left out.
         axis: [3] axis of the rotation, any length.
         pivot: [3] a point of the axis, at rest [m]; the translation carries it along.
+        tilt: of the solid and its whole way about `axis` through `pivot` [°]; None for none.
 
     Raises:
         ConfigError: fewer than 2 keyframes, times that do not ascend from 0 s on, lists that differ
-            in length, neither translations nor angles, angles without axis and pivot or the reverse,
-            a value that is not finite.
+            in length, neither translations nor angles, angles or a tilt without axis and pivot or the
+            reverse, a value that is not finite.
     """
 
     times: Sequence[float]
@@ -42,6 +44,7 @@ class Motion:
     angles: Sequence[float] = ()
     axis: Sequence[float] | None = None
     pivot: Sequence[float] | None = None
+    tilt: float | None = None
 
     def __post_init__(self):
         times = numbers("motion.times", self.times, "s")
@@ -63,25 +66,35 @@ class Motion:
         for d in self.translations:
             vector("motion.translations", d, "m")
         numbers("motion.angles", self.angles, "°")
-        if len(self.angles):
+        if self.turns:
             direction("motion.axis", self.axis)
             vector("motion.pivot", self.pivot, "m")
+            numbers("motion.tilt", [self.tilt or 0.0], "°")
         elif self.axis is not None or self.pivot is not None:
             raise ConfigError(
                 f"motion.axis={self.axis} and motion.pivot={self.pivot} have no effect without "
-                "motion.angles; leave them out"
+                "motion.angles or motion.tilt; leave them out"
             )
+
+    @property
+    def turns(self) -> bool:
+        """Whether the solid is turned."""
+        return len(self.angles) > 0 or self.tilt is not None
 
     def keyframes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Times [k] [s], translations [k, 3] [m] and angles [k] [rad]."""
         k = len(self.times)
         translations = np.array(self.translations, float) if len(self.translations) else np.zeros((k, 3))
         angles = np.radians(self.angles) if len(self.angles) else np.zeros(k)
+        if self.tilt is not None:
+            turn = rotation(self.hinge()[0], self.tilt)
+            translations = np.array([turn @ d for d in translations])
+            angles = angles + np.radians(self.tilt)
         return np.array(self.times, float), translations, angles
 
     def hinge(self) -> tuple[np.ndarray, np.ndarray]:
         """Unit axis [3] and pivot [3] [m]; the origin if the motion has no rotation."""
-        if not len(self.angles):
+        if not self.turns:
             return np.array([0.0, 0.0, 1.0]), np.zeros(3)
         return direction("motion.axis", self.axis), np.array(self.pivot, float)
 
@@ -99,7 +112,7 @@ class Motion:
         """The motion that goes on from time t [s] at a velocity [3] [m/s] and a spin about `axis` [°/s]."""
         pose, turned = self.pose(t), {}
         d = pose[:3]
-        if len(self.angles):
+        if self.turns:
             angle = float(np.degrees(pose[3]))
             turned = {"angles": (angle, angle + _STEERED * spin), "axis": self.axis, "pivot": self.pivot}
         elif spin:
@@ -112,7 +125,7 @@ class Motion:
         """Bound on the speed [m/s] of the solid's points within `reach` [m] of the pivot."""
         times, translations, angles = self.keyframes()
         speed = np.linalg.norm(np.diff(translations, axis=0), axis=1)
-        if len(self.angles):
+        if self.turns:
             speed = speed + reach * np.abs(np.diff(angles))
         return float((speed / np.diff(times)).max())
 

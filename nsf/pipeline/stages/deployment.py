@@ -83,7 +83,7 @@ def write_configuration(pipeline, record: Record) -> None:
     """Write the configuration of a pipeline's whole chain into the folder of a run."""
     # config.yaml is resolved, so in it no key follows another value of a problem parameter.
     with writing(record.path / CONFIGURATION) as partial:
-        OmegaConf.save(pipeline.scene.template, partial)
+        OmegaConf.save(pipeline.template, partial)
     record.output(CONFIGURATION)
 
 
@@ -122,7 +122,7 @@ def calibrated(pipeline, manifold: Manifold) -> Trust:
 
 def _range_of_gravity(scene) -> tuple[Sequence[float], float] | None:
     """Middle [3] and radius [m/s²] of what a scene's programs of gravity may give; None without any."""
-    return (scene.gravity, scene.forcing.reach(scene.gravity)) if scene.forcing.gravity else None
+    return (scene.base_gravity, scene.forcing.reach(scene.base_gravity)) if scene.forcing.gravity else None
 
 
 def _range_of_solids(pipeline) -> SolidsRange | None:
@@ -130,7 +130,7 @@ def _range_of_solids(pipeline) -> SolidsRange | None:
     scene = pipeline.scene
     if not scene.forcing.colliders:
         return None
-    runs = [scene.with_parameters(case).colliders for case in pipeline.split.train]
+    runs = [scene.at(case).solids for case in pipeline.split.train]
     return SolidsRange(np.stack([collider_states(run, scene.dt, scene.steps) for run in runs]), scene.dt)
 
 

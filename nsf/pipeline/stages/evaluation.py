@@ -58,8 +58,8 @@ def evaluate(pipeline, run: Run) -> None:
         seconds = pipeline.training.metric("training_seconds")
         offline = seconds, pipeline.taught.metric("teach_seconds") if pipeline.model.learns else 0.0
         own = cost, pipeline.device, run.manifest, pipeline.model.name, offline
-        table = results.rows(pipeline.deployed, manifold, rollouts, comparisons, beside, *own)
-        summary = results.summarise(pipeline.deployed, comparisons, beside, rollouts, seconds)
+        table = results.rows(pipeline.config, manifold, rollouts, comparisons, beside, *own)
+        summary = results.summarise(pipeline.config, comparisons, beside, rollouts, seconds)
         results.write(record, table, comparisons, cost, summary)
     pipeline.say(f"evaluate: mean δ {100 * table['delta'].mean():.3g} % over {len(table)} cases → {run.id}")
 
@@ -133,7 +133,7 @@ def _compare(
         split = pipeline.config.deploy.split
         found = compare(solver, trajectory, rollout, split, shown, rest, progress.advance)
         forced = pipeline.split.train if pipeline.scene.forcing else ()
-        known = list(map(pipeline.scene.with_parameters, forced))
+        known = list(map(pipeline.scene.at, forced))
         return found, rivals(solver, trajectory, pipeline.coarse, known, progress.advance)
 
 

@@ -56,7 +56,7 @@ def costs(measured: Mapping[str, SolverCost], decode_ms: float = math.nan) -> di
 
 
 def rows(
-    scene: Scene,
+    config: DictConfig,
     manifold,
     rollouts: Sequence[Rollout],
     comparisons: Sequence[Comparison],
@@ -70,7 +70,7 @@ def rows(
     """Content of `results.csv`, a row a case with the columns `EVALUATED`; ∞ where a run diverged.
 
     Args:
-        scene: that was deployed on.
+        config: of the whole chain, resolved.
         manifold: the fields.
         rollouts, comparisons, rivals: of each case.
         cost: content of `cost.json`. A run costs what its steps cost, those of the model and of its fallback.
@@ -78,7 +78,6 @@ def rows(
         model: that took the steps, where `model=auto` chose it.
         offline: times of training and of teaching [s].
     """
-    config = scene.config
     commit = str(manifest.get("commit") or "unknown")[:12] + ("-dirty" if manifest.get("dirty") else "")
     shared = model_columns(config, model) | {
         "scene": config.scene.name,
@@ -217,21 +216,20 @@ def trust_of(rollout: Rollout) -> dict:
 
 
 def summarise(
-    scene: Scene,
+    config: DictConfig,
     comparisons: Sequence[Comparison],
     rivals: Sequence[Rivals],
     rollouts: Sequence[Rollout],
     seconds: float,
 ) -> dict:
     """Content of `summary.json`; `seconds` is the training's wall time."""
-    config = scene.config
 
     def mean(name: str) -> float:
         return float(np.mean([getattr(c, name) for c in comparisons]))
 
     summary = {
         "title": config.scene.title,
-        "scale": scene.scale,
+        "scale": config.scale,
         "cases": [dict(rollout.case) for rollout in rollouts],
         "training_seconds": seconds,
         "changes": OmegaConf.to_container(config.deploy).get("changes") or {},
@@ -286,7 +284,7 @@ def write_superresolution(
     with writing(record.path / "superresolution.csv") as partial:
         table.to_csv(partial, index=False)
     end = np.array([scene.dt * scene.steps])
-    around = [surroundings(scene.with_parameters(case), end) for case in cases]
+    around = [surroundings(scene.at(case), end) for case in cases]
     picture = fine_shapes(fine, around)
     with writing(record.path / "superresolution.png") as partial:
         write_png(picture, partial, PIXELS, [STRESS_COLORS])

@@ -166,7 +166,7 @@ def _side_by_side(
 ) -> tuple[torch.Tensor, list[bool]]:
     """x̂ [N + 1, R, r] of projected runs, and whether each left the grid; by several processes."""
     runs, left = [], []
-    one = partial(_alone, type(pipeline), OmegaConf.to_yaml(pipeline.scene.template), pipeline.root)
+    one = partial(_alone, type(pipeline), OmegaConf.to_yaml(pipeline.template), pipeline.root)
     with ProcessPoolExecutor(processes, initializer=torch.set_num_threads, initargs=(1,)) as pool:
         for run, gone in pool.map(one, cases):
             runs.append(run)

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nsf.config import length
 from nsf.errors import ConfigError
-from nsf.vectors import vector
+from nsf.vectors import length, vector
 
 
 @dataclass(frozen=True)

@@ -5,10 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nsf import config as configuration
 from nsf.errors import ConfigError
 from nsf.scenes.shapes.geometry import Ball, Shape
-from nsf.vectors import vector
+from nsf.vectors import length, number, vector
 
 # Each is held to each other, and each point to each.
 _MOST = 2000
@@ -42,11 +41,11 @@ class TentacleBall(Shape):
 
     def __post_init__(self):
         vector("tentacle ball centre", self.centre, "m")
-        configuration.number("tentacles", self.tentacles, least=1, whole=True)
+        number("tentacles", self.tentacles, least=1, whole=True)
         if self.tentacles > _MOST:
             raise ConfigError(f"tentacles={self.tentacles} are more than {_MOST}; take fewer")
         for name in ("radius", "length", "tentacle_radius"):
-            configuration.length(f"tentacle ball {name}", getattr(self, name))
+            length(f"tentacle ball {name}", getattr(self, name))
         if self.length < self.tentacle_radius:
             raise ConfigError(
                 f"tentacle ball length={self.length} m must be at least its "

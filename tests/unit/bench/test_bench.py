@@ -386,7 +386,7 @@ def test_fields_carried_over_are_those_between_the_particles(chain):
 
 def test_a_body_of_another_size_stands_alike_on_its_grid(chain):
     scene = chain.pipeline.scene
-    (floor,) = scene.colliders
+    (floor,) = scene.solids
     for particles in (300, 1200, 40_000):
         other = at_size(scene, particles)
         assert len(other.particles()) == particles

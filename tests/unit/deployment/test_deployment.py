@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from angles import AnyCase, angle
 
+import nsf
 from nsf.deployment import Rollout, deploy, rollout, rollouts
 from nsf.dynamics import Taylor
 from nsf.errors import MissingRunError, SchemaError
@@ -15,7 +16,7 @@ from nsf.errors import MissingRunError, SchemaError
 @pytest.fixture(scope="module")
 def solver_at(chain, tiny_manifold):
     def build(case, device="cpu"):
-        return chain.scene.reduced(tiny_manifold, case, 20, device=device)
+        return nsf.reduced(chain.scene, tiny_manifold, case, 20, device=device)
 
     return build
 
@@ -58,7 +59,7 @@ class Thrown:
 
 
 def test_a_run_that_leaves_the_grid_has_diverged(chain, tiny_manifold, tiny_trust):
-    solver = chain.scene.reduced(tiny_manifold, angle(26.0), 20, device="cpu", projector=Thrown())
+    solver = nsf.reduced(chain.scene, tiny_manifold, angle(26.0), 20, device="cpu", projector=Thrown())
     made = rollout(solver, angle(26.0), tiny_trust)
     assert np.isfinite(made.xhat).all()
     assert made.diverged == 5
@@ -76,7 +77,7 @@ def test_batches_are_cases(made, batch_at, tiny_trust):
 def batch_at(chain, tiny_manifold):
     def build(cases, device="cpu"):
         taken.append(len(cases))
-        return chain.scene.reduced_batch(tiny_manifold, cases, 20, device=device)
+        return nsf.reduced_batch(chain.scene, tiny_manifold, cases, 20, device=device)
 
     taken = build.taken = []
     return build
@@ -117,7 +118,9 @@ def test_round_trip(made, tmp_path):
 
 
 def test_a_single_step_is_a_run(chain, tiny_manifold, tiny_trust):
-    solver = chain.scene.reduced(tiny_manifold, {"friction_angle": 26.0}, 20, device="cpu", dt_multiplier=24)
+    solver = nsf.reduced(
+        chain.scene, tiny_manifold, {"friction_angle": 26.0}, 20, device="cpu", dt_multiplier=24
+    )
     assert rollout(solver, angle(26.0), tiny_trust).xhat.shape == (2, 4)
 
 

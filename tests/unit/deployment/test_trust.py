@@ -9,6 +9,7 @@ import pytest
 import torch
 from angles import AnyCase, angle
 
+import nsf
 from nsf.deployment import Trust, calibrate, rollout
 from nsf.deployment.rollout import _whole_step_before
 from nsf.deployment.trust import QUANTILE, STRAY, CaseDistance, LatentDistance, SolidsRange
@@ -199,7 +200,7 @@ def test_a_diverged_calibration_run_is_cut(chain, tiny_manifold, tiny_trust):
 
     def solver_at(case, device):
         options = {"projector": Thrown(), "sample": 20, "device": device}
-        return chain.scene.reduced(tiny_manifold, case, **options)
+        return nsf.reduced(chain.scene, tiny_manifold, case, **options)
 
     trust = calibrate(solver_at, tiny_manifold, "cpu")
     assert 0.0 < trust.residual < 1.0

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 
+import nsf
 import nsf.scenes
 from nsf.dynamics import GaussNewton, Setup, Sources
 from nsf.engines.choice import choose
@@ -22,7 +23,7 @@ def solver_of(chain, tiny_manifold):
 
     def build(scene=None, sample=60, **options):
         options = {"sources": CARRIED, "device": "cpu", "projector": EXACT} | options
-        return (scene or chain.scene).reduced(tiny_manifold, ANGLE, sample, **options)
+        return nsf.reduced(scene or chain.scene, tiny_manifold, ANGLE, sample, **options)
 
     return build
 
@@ -135,10 +136,10 @@ def test_the_compiled_engine_leaves_it_to_the_reference(solver_of):
 
 @pytest.mark.gpu
 def test_a_gpu_takes_the_same_steps(tiny, reference_manifold):
-    scene = nsf.scenes.load("sand", tiny[1:])
+    scene = nsf.load_scene("sand", tiny[1:])
     found = []
     for device in ("cpu", "cuda"):
-        solver = scene.reduced(reference_manifold, ANGLE, 60, sources=CARRIED, device=device)
+        solver = nsf.reduced(scene, reference_manifold, ANGLE, 60, sources=CARRIED, device=device)
         solver.step(12)
         found.append(solver.xhat.cpu())
     np.testing.assert_allclose(*found, atol=1e-6)

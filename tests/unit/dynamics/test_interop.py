@@ -10,6 +10,7 @@ import torch
 import warp as wp
 from gpu_references import SOURCES
 
+import nsf
 from nsf.dynamics.interop import captured, on_torch_stream
 
 
@@ -51,8 +52,8 @@ def test_captured_steps_are_the_steps_themselves(sources, tiny_scene, reference_
     """Every replay clears the grid and takes the stress anew."""
     found = []
     for capturable in (True, False):
-        solver = tiny_scene.reduced(
-            reference_manifold, {"friction_angle": 26.0}, 60, sources=sources, device="cuda"
+        solver = nsf.reduced(
+            tiny_scene, reference_manifold, {"friction_angle": 26.0}, 60, sources=sources, device="cuda"
         )
         solver.span.capturable = capturable
         solver.step(8)

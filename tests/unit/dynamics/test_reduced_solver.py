@@ -45,7 +45,7 @@ def solver_of(chain, tiny_manifold):
     """(sample, **options) → the reduced solver at 26°."""
 
     def build(sample=20, scene=None, **options):
-        return (scene or chain.scene).reduced(tiny_manifold, ANGLE, sample, device="cpu", **options)
+        return nsf.reduced(scene or chain.scene, tiny_manifold, ANGLE, sample, device="cpu", **options)
 
     return build
 
@@ -60,10 +60,10 @@ def run(solver, steps=None):
 
 def test_names_of_the_python_interface(chain, tiny):
     """`nsf.scenes.load` → `full_order`, `nsf.Manifold.load` → `reduced`; one piece of code steps both."""
-    scene = nsf.scenes.load("sand", [o for o in tiny if o != "scene=sand"])
+    scene = nsf.load_scene("sand", [o for o in tiny if o != "scene=sand"])
     manifold = nsf.Manifold.load(chain.checkpoint)
     full = scene.full_order({"friction_angle": 26.0}, "fp64", "cpu")
-    reduced = scene.reduced(manifold, {"friction_angle": 26.0}, 20)
+    reduced = nsf.reduced(scene, manifold, {"friction_angle": 26.0}, 20)
     assert isinstance(full, FullOrderMPM)
     assert isinstance(reduced, ReducedMPM)
 
@@ -90,9 +90,9 @@ def test_samples_are_indices_a_number_or_a_sampler(solver_of, sample):
 
 
 def test_the_configured_sample_and_value_are_the_defaults(chain, tiny_manifold):
-    solver = chain.scene.reduced(tiny_manifold, device="cpu")
-    assert solver.sample_size == chain.scene.config.scene.reduced.sample == 150
-    assert solver.setup.parameters.tolist() == [chain.scene.config.material.friction_angle]
+    solver = nsf.reduced(chain.scene, tiny_manifold, device="cpu")
+    assert solver.sample_size == 150
+    assert solver.setup.parameters.tolist() == [chain.scene.material.friction_angle]
 
 
 def test_single_precision(solver_of):
@@ -107,7 +107,7 @@ def test_single_precision(solver_of):
 
 def test_the_first_velocity_is_the_initial_one(tiny, solver_of):
     velocity = [0.3, -0.1, 0.2]
-    scene = nsf.scenes.load("sand", [*tiny[1:], f"scene.bodies.column.velocity={velocity}"])
+    scene = nsf.load_scene("sand", [*tiny[1:], f"scene.bodies.column.velocity={velocity}"])
     solver = solver_of(scene=scene)
     np.testing.assert_array_equal(solver.state.numpy()["v"], np.tile(velocity, (500, 1)))
     solver.stages["inference"]()
@@ -118,8 +118,8 @@ def test_the_first_velocity_is_the_initial_one(tiny, solver_of):
 
 def test_the_initial_velocity_moves_the_sample(tiny, solver_of):
     """Two first steps that differ in the initial velocity alone move S apart by Δt v, but for the floor."""
-    still = nsf.scenes.load("sand", [*tiny[1:]])
-    moving = nsf.scenes.load("sand", [*tiny[1:], "scene.bodies.column.velocity=[0,0,0.2]"])
+    still = nsf.load_scene("sand", [*tiny[1:]])
+    moving = nsf.load_scene("sand", [*tiny[1:], "scene.bodies.column.velocity=[0,0,0.2]"])
     sample = np.flatnonzero(still.particles().X[:, 2] > 0.22)
     moved = []
     for scene in (still, moving):
@@ -419,7 +419,7 @@ def test_divergence_names_its_step(solver_of, tiny_trust):
 def test_too_small_a_sample(chain, tiny_manifold):
     for sample in (1, [7], RandomSampler(1)):
         with pytest.raises(ProjectionError) as refusal:
-            chain.scene.reduced(tiny_manifold, ANGLE, sample, device="cpu")
+            nsf.reduced(chain.scene, tiny_manifold, ANGLE, sample, device="cpu")
         assert (
             str(refusal.value)
             == "|S|=1 gives 3 equations for r=4 unknowns; choose sampler.size >= 2 or latent_dim <= 3"
@@ -427,16 +427,16 @@ def test_too_small_a_sample(chain, tiny_manifold):
 
 
 def test_other_particles_are_refused(tiny, tiny_manifold):
-    scene = nsf.scenes.load("sand", [*tiny[1:], "scene.bodies.column.particles=499"])
+    scene = nsf.load_scene("sand", [*tiny[1:], "scene.bodies.column.particles=499"])
     with pytest.raises(SchemaError, match="checkpoint made for other particles"):
-        scene.reduced(tiny_manifold, ANGLE, 20, device="cpu")
+        nsf.reduced(scene, tiny_manifold, ANGLE, 20, device="cpu")
 
 
 def test_a_mask_is_not_taken_for_indices(chain, tiny_manifold):
     """False and True are 0 and 1: as indices they would silently choose particles 0 and 1."""
     mask = np.arange(500) % 25 == 0
     try:
-        solver = chain.scene.reduced(tiny_manifold, ANGLE, mask, device="cpu")
+        solver = nsf.reduced(chain.scene, tiny_manifold, ANGLE, mask, device="cpu")
     except NSFError:
         return
     assert solver.span.sets.sample.tolist() == np.flatnonzero(mask).tolist()
@@ -445,17 +445,17 @@ def test_a_mask_is_not_taken_for_indices(chain, tiny_manifold):
 @pytest.mark.parametrize("sample", [[], [-1], [500], [0.5, 1.0], "many", 0], ids=str)
 def test_samples_out_of_range(chain, tiny_manifold, sample):
     with pytest.raises(NSFError, match=r"sample|\|S\|"):
-        chain.scene.reduced(tiny_manifold, ANGLE, sample, device="cpu")
+        nsf.reduced(chain.scene, tiny_manifold, ANGLE, sample, device="cpu")
 
 
 def test_more_particles_than_there_are(chain, tiny_manifold):
     with pytest.raises(ConfigError, match=re.escape("sampler.size=501, but the scene has 500 particles")):
-        chain.scene.reduced(tiny_manifold, ANGLE, 501, device="cpu")
+        nsf.reduced(chain.scene, tiny_manifold, ANGLE, 501, device="cpu")
 
 
 def test_unknown_parameter(chain, tiny_manifold):
     with pytest.raises(ConfigError, match="no parameter 'angle'"):
-        chain.scene.reduced(tiny_manifold, {"angle": 26.0}, 20, device="cpu")
+        nsf.reduced(chain.scene, tiny_manifold, {"angle": 26.0}, 20, device="cpu")
 
 
 def test_a_parameter_that_the_fields_need_is_missing(chain, tiny_manifold):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+import nsf
 from nsf.dynamics import Sources
 from nsf.dynamics.sources import StressFromDeformation
 from nsf.errors import ConfigError
@@ -24,7 +25,7 @@ def sources(request):
 
 @pytest.fixture
 def solver(chain, tiny_manifold, sources):
-    return chain.scene.reduced(tiny_manifold, ANGLE, 20, sources=sources, device="cpu")
+    return nsf.reduced(chain.scene, tiny_manifold, ANGLE, 20, sources=sources, device="cpu")
 
 
 def hencky(F, mu, lam):
@@ -90,7 +91,7 @@ def test_a_law_with_history_gives_its_stress_at_rest():
 def test_sources_differ(chain, tiny_manifold):
     ends = []
     for sources in SOURCES:
-        solver = chain.scene.reduced(tiny_manifold, ANGLE, 20, sources=sources, device="cpu")
+        solver = nsf.reduced(chain.scene, tiny_manifold, ANGLE, 20, sources=sources, device="cpu")
         solver.step(solver.total_steps)
         ends.append(solver.state.xhat)
     for i, one in enumerate(ends):
@@ -105,8 +106,8 @@ def test_the_search_gives_every_method_the_same_run(chain, tiny_manifold, source
     corner = np.linalg.norm(X - X[np.argmax(X @ [1.0, 1.0, 2.0])], axis=1).argsort()[:10]
     runs = []
     for integration in (Integration(), Integration("search", 0)):
-        solver = chain.scene.reduced(
-            tiny_manifold, ANGLE, corner, sources=sources, integration=integration, device="cpu"
+        solver = nsf.reduced(
+            chain.scene, tiny_manifold, ANGLE, corner, sources=sources, integration=integration, device="cpu"
         )
         solver.step(12)
         runs.append(solver.state.numpy()["x"])

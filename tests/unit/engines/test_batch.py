@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+import nsf
 import nsf.scenes
 from nsf.dynamics import GaussNewton, Integration, ReducedBatch, Setup, Sources, Taylor
 from nsf.engines import Modal
@@ -44,7 +45,7 @@ def setup_of(tiny_manifold):
     def build(scene, angle=26.0, **options):
         first = (kept["samples"], kept["sets"]) if kept else (20, None)
         options = {"device": "cpu", "sets": first[1]} | options
-        found = scene.reduced(tiny_manifold, {ANGLE: angle}, first[0], **options).setup
+        found = nsf.reduced(scene, tiny_manifold, {ANGLE: angle}, first[0], **options).setup
         kept.setdefault("samples", found.samples), kept.setdefault("sets", found.sets)
         return found
 
@@ -90,8 +91,8 @@ def assert_each_as_alone(batch, singles, steps, tolerance=1e-10):
 @pytest.mark.parametrize("sources", SOURCES, ids=str)
 def test_every_method(chain, tiny_manifold, parameters, sources):
     options = {"sources": sources, "device": "cpu"}
-    batch = chain.scene.reduced_batch(tiny_manifold, parameters, 20, **options)
-    singles = [chain.scene.reduced(tiny_manifold, own, 20, **options) for own in parameters]
+    batch = nsf.reduced_batch(chain.scene, tiny_manifold, parameters, 20, **options)
+    singles = [nsf.reduced(chain.scene, tiny_manifold, own, 20, **options) for own in parameters]
     assert_each_as_alone(batch, singles, 24)
     ends = batch.xhat.numpy()
     # The friction angle enters by the heads; without it the test would show nothing.
@@ -101,11 +102,11 @@ def test_every_method(chain, tiny_manifold, parameters, sources):
 @pytest.mark.parametrize("count", [1, 8, 9, 19])
 def test_tiles_that_are_full_and_not(chain, tiny_manifold, count):
     parameters = [{ANGLE: angle} for angle in np.linspace(22.0, 38.0, count)]
-    batch = chain.scene.reduced_batch(tiny_manifold, parameters, 20, device="cpu")
+    batch = nsf.reduced_batch(chain.scene, tiny_manifold, parameters, 20, device="cpu")
     assert len(batch) == count
     batch.step(6)
     for index in {0, count // 2, count - 1}:
-        single = chain.scene.reduced(tiny_manifold, parameters[index], 20, device="cpu")
+        single = nsf.reduced(chain.scene, tiny_manifold, parameters[index], 20, device="cpu")
         single.step(6)
         same(batch.runs[index], single)
 
@@ -122,16 +123,16 @@ def test_tiles_that_are_full_and_not(chain, tiny_manifold, count):
 )
 def test_every_way_of_stepping(chain, tiny_manifold, parameters, options):
     options = {"device": "cpu"} | options
-    batch = chain.scene.reduced_batch(tiny_manifold, parameters, 20, **options)
-    singles = [chain.scene.reduced(tiny_manifold, own, 20, **options) for own in parameters]
+    batch = nsf.reduced_batch(chain.scene, tiny_manifold, parameters, 20, **options)
+    singles = [nsf.reduced(chain.scene, tiny_manifold, own, 20, **options) for own in parameters]
     assert_each_as_alone(batch, singles, 16, 1e-10 if batch.runs[0].setup.precision.name == "fp64" else 1e-4)
 
 
 def test_weights_and_spans_of_time(chain, tiny_manifold, parameters):
     weights = np.random.default_rng(0).uniform(0.1, 3.0, 20)
     phases = [SampleSpan(0.0, np.arange(0, 500, 25), weights), SampleSpan(0.5, np.arange(7, 500, 50), None)]
-    batch = chain.scene.reduced_batch(tiny_manifold, parameters, phases, device="cpu")
-    singles = [chain.scene.reduced(tiny_manifold, own, phases, device="cpu") for own in parameters]
+    batch = nsf.reduced_batch(chain.scene, tiny_manifold, parameters, phases, device="cpu")
+    singles = [nsf.reduced(chain.scene, tiny_manifold, own, phases, device="cpu") for own in parameters]
     assert_each_as_alone(batch, singles, 24)
 
 
@@ -145,8 +146,8 @@ def test_deep_networks_of_several_members(chain, tiny_manifold, parameters):
         field.network.initialise(torch.Generator().manual_seed(seed))
         field.scale.mul_(0.01)
     manifold.requires_grad_(False)
-    batch = chain.scene.reduced_batch(manifold, parameters, 20, device="cpu")
-    singles = [chain.scene.reduced(manifold, own, 20, device="cpu") for own in parameters]
+    batch = nsf.reduced_batch(chain.scene, manifold, parameters, 20, device="cpu")
+    singles = [nsf.reduced(chain.scene, manifold, own, 20, device="cpu") for own in parameters]
     assert_each_as_alone(batch, singles, 3)
 
 
@@ -175,8 +176,8 @@ PROGRAMS = (
 @pytest.mark.parametrize("sources", [Sources(), Sources("deformation", "none")], ids=str)
 def test_what_a_parameter_changes_is_each_ones_own(tiny, setup_of, what, sources):
     added = {"plate": PLATE, "program": PROGRAMS}.get(what, ())
-    scene = nsf.scenes.load("sand", [*tiny[1:], *added])
-    scenes = [scene.with_changes(changes) if changes else scene for changes in CHANGES[what]]
+    scene = nsf.load_scene("sand", [*tiny[1:], *added])
+    scenes = [scene.changed(changes) if changes else scene for changes in CHANGES[what]]
     setups = [setup_of(scene, sources=sources) for scene in scenes]
     batch, singles = together(*setups), [together(setup).runs[0] for setup in setups]
     assert_each_as_alone(batch, singles, 24)
@@ -198,11 +199,11 @@ def test_initial_states_are_each_ones_own(chain, tiny_manifold):
     xhat = [None, *rng.normal(size=(2, 4))]
     velocity = [rng.normal(scale=0.1, size=(500, 3)), None, rng.normal(scale=0.1, size=(500, 3))]
     one = {ANGLE: 26.0}
-    batch = chain.scene.reduced_batch(
-        tiny_manifold, [one] * 3, 20, xhat=xhat, velocity=velocity, device="cpu"
+    batch = nsf.reduced_batch(
+        chain.scene, tiny_manifold, [one] * 3, 20, xhat=xhat, velocity=velocity, device="cpu"
     )
     singles = [
-        chain.scene.reduced(tiny_manifold, one, 20, xhat=x, velocity=v, device="cpu")
+        nsf.reduced(chain.scene, tiny_manifold, one, 20, xhat=x, velocity=v, device="cpu")
         for x, v in zip(xhat, velocity, strict=True)
     ]
     np.testing.assert_array_equal(batch.runs[2].state.numpy()["v"], velocity[2])
@@ -212,8 +213,8 @@ def test_initial_states_are_each_ones_own(chain, tiny_manifold):
 
 def test_one_that_goes_astray_leaves_the_others_alone(chain, tiny_manifold):
     away = np.full(4, 0.0), np.full(4, np.nan), np.array([400.0, 0.0, 0.0, 0.0]), None
-    batch = chain.scene.reduced_batch(tiny_manifold, [{ANGLE: 26.0}] * 4, 60, xhat=away, device="cpu")
-    alone = chain.scene.reduced(tiny_manifold, {ANGLE: 26.0}, 60, device="cpu")
+    batch = nsf.reduced_batch(chain.scene, tiny_manifold, [{ANGLE: 26.0}] * 4, 60, xhat=away, device="cpu")
+    alone = nsf.reduced(chain.scene, tiny_manifold, {ANGLE: 26.0}, 60, device="cpu")
     batch.step(8)
     alone.step(8)
     assert np.array_equal(batch.runs[3].trajectory().xhat, alone.trajectory().xhat)
@@ -223,8 +224,8 @@ def test_one_that_goes_astray_leaves_the_others_alone(chain, tiny_manifold):
 
 
 def test_each_is_asked_as_a_solver_is(chain, tiny_manifold, parameters):
-    batch = chain.scene.reduced_batch(tiny_manifold, parameters, 20, device="cpu")
-    single = chain.scene.reduced(tiny_manifold, parameters[2], 20, device="cpu")
+    batch = nsf.reduced_batch(chain.scene, tiny_manifold, parameters, 20, device="cpu")
+    single = nsf.reduced(chain.scene, tiny_manifold, parameters[2], 20, device="cpu")
     run = batch.runs[2]
     assert run.integration_mean == single.integration_mean > 20
     batch.step(5)
@@ -242,10 +243,10 @@ def test_each_is_asked_as_a_solver_is(chain, tiny_manifold, parameters):
 
 
 def test_a_second_run_is_as_the_first(tiny, tiny_manifold, parameters):
-    scene = nsf.scenes.load("sand", [*tiny[1:], *PLATE])
+    scene = nsf.load_scene("sand", [*tiny[1:], *PLATE])
     sample = [SampleSpan(0.0, np.arange(0, 500, 25)), SampleSpan(0.5, np.arange(7, 500, 50))]
-    batch = scene.reduced_batch(tiny_manifold, parameters, sample, device="cpu")
-    single = scene.reduced(tiny_manifold, parameters[0], sample, device="cpu")
+    batch = nsf.reduced_batch(scene, tiny_manifold, parameters, sample, device="cpu")
+    single = nsf.reduced(scene, tiny_manifold, parameters[0], sample, device="cpu")
     for solver, runs in ((batch, batch.runs), (single, (single,))):
         solver.step(24)
         before = [run.record.xhat.clone() for run in runs]
@@ -257,7 +258,7 @@ def test_a_second_run_is_as_the_first(tiny, tiny_manifold, parameters):
 
 def test_modes_are_held_once(chain, tiny_manifold):
     def nbytes(count):
-        return chain.scene.reduced_batch(tiny_manifold, [{ANGLE: 26.0}] * count, 20, device="cpu").nbytes
+        return nsf.reduced_batch(chain.scene, tiny_manifold, [{ANGLE: 26.0}] * count, 20, device="cpu").nbytes
 
     one, two, three = (nbytes(count) for count in (1, 2, 3))
     assert three - two == two - one < 0.6 * one
@@ -283,7 +284,7 @@ class Own(GaussNewton):
 )
 def test_what_cannot_be_stepped_together(chain, tiny_manifold, parameters, options, message):
     with pytest.raises(ConfigError, match=re.escape(message)):
-        chain.scene.reduced_batch(tiny_manifold, parameters, 20, device="cpu", **options)
+        nsf.reduced_batch(chain.scene, tiny_manifold, parameters, 20, device="cpu", **options)
 
 
 @pytest.mark.parametrize(
@@ -300,7 +301,7 @@ def test_what_cannot_be_stepped_together(chain, tiny_manifold, parameters, optio
     ],
 )  # fmt: skip
 def test_what_must_be_the_same(tiny, setup_of, overrides, options, message):
-    scenes = [nsf.scenes.load("sand", [*tiny[1:], *more]) for more in ([], overrides)]
+    scenes = [nsf.load_scene("sand", [*tiny[1:], *more]) for more in ([], overrides)]
     setups = [setup_of(scenes[0]), setup_of(scenes[1], angle=30.0, **options)]
     with pytest.raises(ConfigError, match=re.escape(message)) as error:
         together(*setups)
@@ -316,7 +317,7 @@ def test_another_law_is_refused_where_it_is_asked(with_law):
 
 def test_other_samples_are_refused(chain, tiny_manifold):
     setups = [
-        chain.scene.reduced(tiny_manifold, {ANGLE: 26.0}, sample, device="cpu").setup
+        nsf.reduced(chain.scene, tiny_manifold, {ANGLE: 26.0}, sample, device="cpu").setup
         for sample in (range(20), range(1, 21))
     ]
     with pytest.raises(ConfigError, match="share the sample"):
@@ -347,10 +348,10 @@ def test_bad_states(setup_of, chain, options, message):
 def test_on_a_gpu(tiny_scene, reference_manifold, sources, count, precision):
     parameters = [{ANGLE: angle} for angle in np.linspace(22.0, 38.0, count)]
     options = {"sources": sources, "device": "cuda", "precision": precision}
-    batch = tiny_scene.reduced_batch(reference_manifold, parameters, 60, **options)
+    batch = nsf.reduced_batch(tiny_scene, reference_manifold, parameters, 60, **options)
     batch.step(24)
     for index in {0, 1, count - 1}:
-        single = tiny_scene.reduced(reference_manifold, parameters[index], 60, **options)
+        single = nsf.reduced(tiny_scene, reference_manifold, parameters[index], 60, **options)
         single.step(24)
         if precision == "fp64":
             same(batch.runs[index], single, 1e-7)  # of a GPU's sums the order is not fixed
@@ -362,8 +363,8 @@ def test_on_a_gpu(tiny_scene, reference_manifold, sources, count, precision):
 @pytest.mark.parametrize("engine", ["reference", "modal"])
 def test_a_hand_is_a_program_known_only_afterwards(tiny, tiny_manifold, engine):
     """Gravity set by hand between steps gives the run whose keyframes had it all along."""
-    scene = nsf.scenes.load("sand", [*tiny[1:], *PROGRAMS])
-    run = scene.reduced(tiny_manifold, sample=20, engine=engine, device="cpu")
+    scene = nsf.load_scene("sand", [*tiny[1:], *PROGRAMS])
+    run = nsf.reduced(scene, tiny_manifold, sample=20, engine=engine, device="cpu")
     run.step(24)
     own = run.trajectory().xhat.copy()
     run.restart()
@@ -374,17 +375,17 @@ def test_a_hand_is_a_program_known_only_afterwards(tiny, tiny_manifold, engine):
     run.restart()
     run.forcing.gravity = (0.0, 0.0, -4.0)
     run.step(24)
-    plain = nsf.scenes.load("sand", tiny[1:]).reduced(tiny_manifold, sample=20, engine=engine, device="cpu")
+    plain = nsf.load_scene("sand", tiny[1:]).reduced(tiny_manifold, sample=20, engine=engine, device="cpu")
     plain.step(24)
     np.testing.assert_allclose(run.trajectory().xhat, plain.trajectory().xhat, rtol=0, atol=1e-10)
     assert np.abs(plain.trajectory().xhat - own).max() > 1e-3
 
 
 def test_the_hand_of_one_run_leaves_the_others(tiny, tiny_manifold):
-    scene = nsf.scenes.load("sand", [*tiny[1:], *PROGRAMS])
+    scene = nsf.load_scene("sand", [*tiny[1:], *PROGRAMS])
     cases = [{"friction_angle": 26.0, "program": program} for program in (3, 4)]
-    batch = scene.reduced_batch(tiny_manifold, cases, 20, engine="modal", device="cpu")
-    alone = [scene.reduced(tiny_manifold, case, 20, engine="modal", device="cpu") for case in cases]
+    batch = nsf.reduced_batch(scene, tiny_manifold, cases, 20, engine="modal", device="cpu")
+    alone = [nsf.reduced(scene, tiny_manifold, case, 20, engine="modal", device="cpu") for case in cases]
     for run in (batch.runs[0], alone[0]):
         run.together.step(8)
         run.forcing.gravity = (1.0, 0.0, -2.0)

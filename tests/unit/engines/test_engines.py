@@ -10,6 +10,7 @@ import pytest
 import torch
 from typing_extensions import override
 
+import nsf
 from nsf import config, engines
 from nsf.dynamics import GaussNewton, Integration, ReducedBatch, Sources, Taylor
 from nsf.dynamics.latent import LatentRecord
@@ -64,14 +65,14 @@ def model(request, tmp_path_factory):
 @pytest.mark.parametrize("engine", OTHERS, ids=lambda engine: engine.name)
 def test_every_engine_is_the_reference(engine, model):
     scene, manifold, parameters = model
-    first = scene.reduced(manifold, parameters, 40, device="cpu")
+    first = nsf.reduced(scene, manifold, parameters, 40, device="cpu")
     kept = {"superset": first.sets}
     taken = 0
     for way in WAYS:
         options = {"projector": GaussNewton(tolerance=1e-9), "device": "cpu"} | way
         options["sets"] = kept.get(options.get("integration", Integration()).strategy)
         one, other = (
-            scene.reduced(manifold, parameters, first.samples, engine=name, **options)
+            nsf.reduced(scene, manifold, parameters, first.samples, engine=name, **options)
             for name in ("auto", "reference")
         )
         if engine.refusal([one.setup]):
@@ -94,8 +95,8 @@ def test_every_engine_is_the_reference(engine, model):
 def test_engines_agree_where_c_depends_on_the_rate(tmp_path):
     scene, manifold, parameters = trained("toothpaste", tmp_path, "field.affine=rate")
     one, other = (
-        scene.reduced(
-            manifold, parameters, 40, projector=GaussNewton(tolerance=1e-9), engine=name, device="cpu"
+        nsf.reduced(
+            scene, manifold, parameters, 40, projector=GaussNewton(tolerance=1e-9), engine=name, device="cpu"
         )
         for name in ("modal", "reference")
     )
@@ -125,8 +126,8 @@ class Quadratic(BasisManifold):
 
 @pytest.fixture
 def reduced(chain, tiny_manifold):
-    return lambda manifold=tiny_manifold, **options: chain.scene.reduced(
-        manifold, ANGLE, 20, device="cpu", **options
+    return lambda manifold=tiny_manifold, **options: nsf.reduced(
+        chain.scene, manifold, ANGLE, 20, device="cpu", **options
     )
 
 
@@ -267,7 +268,7 @@ def test_every_solver_keeps_the_protocol(chain, tiny_manifold, name):
         solver = chain.scene.full_order(ANGLE, device="cpu")
         assert isinstance(solver, FullOrderMPM)
     else:
-        solver = chain.scene.reduced(tiny_manifold, ANGLE, 20, engine=name, device="cpu")
+        solver = nsf.reduced(chain.scene, tiny_manifold, ANGLE, 20, engine=name, device="cpu")
     assert isinstance(solver, Solver)
     begin = solver.state.numpy()
     solver.step(5)

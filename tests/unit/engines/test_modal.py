@@ -5,6 +5,7 @@ import pytest
 import torch
 from gpu_references import SOURCES, TOLERANCES, steps, steps_of_a_cpu
 
+import nsf
 import nsf.scenes
 from nsf.dynamics import GaussNewton, Integration, Taylor
 from nsf.engines.modal.arena import Arena
@@ -21,7 +22,7 @@ def pair(chain, tiny_manifold):
 
     def build(sample=20, manifold=tiny_manifold, scene=chain.scene, **options):
         def one(engine):
-            return scene.reduced(manifold, {"friction_angle": 26.0}, sample, engine=engine, **options)
+            return nsf.reduced(scene, manifold, {"friction_angle": 26.0}, sample, engine=engine, **options)
 
         options.setdefault("device", "cpu")
         # Of the default, a hundred times as much, the two ways of the last update differ visibly.
@@ -167,7 +168,7 @@ def test_more_samples_than_a_block_has_threads(pair):
 
 
 def test_cubic_splines(chain, tiny, pair):
-    scene = nsf.scenes.load("sand", [*tiny[1:], "transfer.shape=cubic"])
+    scene = nsf.load_scene("sand", [*tiny[1:], "transfer.shape=cubic"])
     same(*runs(pair(scene=scene), steps=6))
 
 
@@ -266,7 +267,7 @@ def test_the_gpu_takes_nearly_the_same_steps(tiny_scene, reference_manifold, sou
 def test_steps_timed_on_the_gpu_are_steps(tiny_scene, reference_manifold, phases):
     sampler = RandomSampler(40, phases=phases)
     timed, plain = (
-        tiny_scene.reduced(reference_manifold, {"friction_angle": 26.0}, sampler, device="cuda")
+        nsf.reduced(tiny_scene, reference_manifold, {"friction_angle": 26.0}, sampler, device="cuda")
         for _ in range(2)
     )
     plain.step(16)

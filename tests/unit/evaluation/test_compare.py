@@ -8,6 +8,7 @@ import pytest
 import torch
 from angles import angle
 
+import nsf
 import nsf.scenes
 from nsf.data import Trajectory
 from nsf.deployment import FULL_ORDER, OPERATORS, PROJECTED, Rollout, go_on
@@ -29,7 +30,9 @@ def rollout_of(t, xhat, diverged=-1):
 @pytest.fixture(scope="module")
 def comparison_of(chain, tiny_manifold, truth):
     def build(rollout, split="test", pictures=(50, 4), **options):
-        solver = chain.scene.reduced(tiny_manifold, {"friction_angle": 26.0}, 20, device="cpu", **options)
+        solver = nsf.reduced(
+            chain.scene, tiny_manifold, {"friction_angle": 26.0}, 20, device="cpu", **options
+        )
         told = []
         found = compare(solver, truth, rollout, split, pictures, advance=told.append)
         assert sum(told) == truth.frames
@@ -160,7 +163,7 @@ def test_a_multiplied_step_is_compared_at_the_frames(chain, tiny_manifold, tiny_
     from nsf.deployment import rollout
 
     value = {"friction_angle": 26.0}
-    solver = chain.scene.reduced(tiny_manifold, value, 20, device="cpu", dt_multiplier=1.5)
+    solver = nsf.reduced(chain.scene, tiny_manifold, value, 20, device="cpu", dt_multiplier=1.5)
     run = rollout(solver, angle(26.0), tiny_trust)
     found = comparison_of(run)
     assert len(found.series) == 25
@@ -277,7 +280,7 @@ def test_stress_that_particles_carried_is_what_counts(chain, tiny_manifold, trut
 
     def solver():
         options = {"sources": sources, "device": "cpu"}
-        return chain.scene.reduced(tiny_manifold, {"friction_angle": 26.0}, 20, **options)
+        return nsf.reduced(chain.scene, tiny_manifold, {"friction_angle": 26.0}, 20, **options)
 
     run, carried = solver(), []
     for _ in range(len(truth.t) - 1):
@@ -290,7 +293,7 @@ def test_stress_that_particles_carried_is_what_counts(chain, tiny_manifold, trut
     expected = metrics.stress_error(torch.tensor(np.stack(carried)), torch.tensor(full[1:]))
     found = compare(solver(), truth, rollout, "test", (50, 4))
     assert found.stress_error == pytest.approx(expected, rel=1e-9)
-    plain = chain.scene.reduced(tiny_manifold, {"friction_angle": 26.0}, 20, device="cpu")
+    plain = nsf.reduced(chain.scene, tiny_manifold, {"friction_angle": 26.0}, 20, device="cpu")
     decoded = compare(plain, truth, rollout, "test", (50, 4))
     assert found.stress_error != pytest.approx(decoded.stress_error, rel=1e-2)
     assert found.delta == pytest.approx(decoded.delta, rel=1e-12)
@@ -298,8 +301,8 @@ def test_stress_that_particles_carried_is_what_counts(chain, tiny_manifold, trut
 
 
 def test_other_particles_are_refused(chain, tiny, tiny_manifold, made, tmp_path):
-    solver = chain.scene.reduced(tiny_manifold, {"friction_angle": 26.0}, 20, device="cpu")
-    scene = nsf.scenes.load("sand", [*tiny[1:], "scene.bodies.column.particles=499"])
+    solver = nsf.reduced(chain.scene, tiny_manifold, {"friction_angle": 26.0}, 20, device="cpu")
+    scene = nsf.load_scene("sand", [*tiny[1:], "scene.bodies.column.particles=499"])
     from nsf.data import TrajectoryWriter
 
     constants = scene.particles()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+import nsf
 from nsf.dynamics import Decoder
 from nsf.evaluation import Subject, at_frames, decoding_ms, measure
 
@@ -17,7 +18,7 @@ FULL = ["p2g", "grid", "g2p", "stress"]
 def cost(chain, tiny_manifold):
     scene, angle = chain.scene, {"friction_angle": 26.0}
     full = Subject(lambda: scene.full_order(angle, device="cpu"), 24)
-    reduced = Subject(lambda: scene.reduced(tiny_manifold, angle, 20, device="cpu"), 24)
+    reduced = Subject(lambda: nsf.reduced(scene, tiny_manifold, angle, 20, device="cpu"), 24)
     return measure({"full": full, "reduced": reduced}, 3, "cpu")
 
 
@@ -32,7 +33,7 @@ def reduced(cost):
 
 
 def test_a_run_is_decoded_at_every_frame(chain, tiny_manifold, made, monkeypatch):
-    solver = chain.scene.reduced(tiny_manifold, {"friction_angle": 26.0}, 20, device="cpu")
+    solver = nsf.reduced(chain.scene, tiny_manifold, {"friction_angle": 26.0}, 20, device="cpu")
     decoded = []
     position = Decoder.position
     monkeypatch.setattr(Decoder, "position", lambda self, xhat: decoded.append(xhat) or position(self, xhat))

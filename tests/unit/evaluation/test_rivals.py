@@ -82,7 +82,7 @@ def test_a_coarse_run_is_timed_over_its_own_steps(chain):
 
 def test_a_coarse_run_has_the_frames_and_particles_of_the_fine_one(chain):
     scene = chain.scene
-    fine = scene.with_parameters({"friction_angle": 26.0})
+    fine = scene.at({"friction_angle": 26.0})
     X = fine.particles().X
     coarse = coarse_run(scene, {"friction_angle": 26.0}, X, 2, "fp64", "cpu")
     assert coarse.x.shape == (scene.steps + 1, 500, 3)
@@ -98,11 +98,9 @@ def test_a_coarse_run_has_the_frames_and_particles_of_the_fine_one(chain):
 
 
 def test_a_rigid_fall_is_the_same_on_a_coarse_grid(chain):
-    scene = chain.scene.with_changes({"scene.gravity": [0.0, 0.0, 0.0]})
-    config = scene.template.copy()
-    config.scene.bodies.column.velocity = [0.1, 0.0, 0.2]
-    config.scene.bodies.column.shape.base = [0.5, 0.5, 0.5]  # clear of the sticky floor
-    scene = type(scene).from_config(config)
+    column = {"velocity": (0.1, 0.0, 0.2), "shape.base": (0.5, 0.5, 0.5)}  # clear of the sticky floor
+    column = {f"bodies.column.{key}": value for key, value in column.items()}
+    scene = chain.scene.changed({"gravity": (0.0, 0.0, 0.0)} | column)
     X = scene.particles().X
     coarse = coarse_run(scene, {"friction_angle": 26.0}, X, 2, "fp64", "cpu")
     t = scene.dt * np.arange(scene.steps + 1)[:, None, None]
@@ -110,15 +108,8 @@ def test_a_rigid_fall_is_the_same_on_a_coarse_grid(chain):
 
 
 def test_a_scene_that_no_coarse_grid_resolves_says_why(chain):
-    config = chain.scene.template.copy()
-    config.scene.colliders.blade = {
-        "_target_": "nsf.mpm.Cuboid",
-        "centre": [0.8, 0.8, 0.8],
-        "size": [0.07, 0.07, 0.07],
-        "kind": "separate",
-        "friction": 0.0,
-    }
-    scene = type(chain.scene).from_config(config)
+    blade = Cuboid((0.8, 0.8, 0.8), (0.07, 0.07, 0.07), "separate")
+    scene = replace(chain.scene, colliders={**chain.scene.colliders, "blade": blade})
     told = []
     reason = coarse_run(scene, {"friction_angle": 26.0}, scene.particles().X, 2, "fp64", "cpu", told.append)
     assert "needs dx of at most" in reason

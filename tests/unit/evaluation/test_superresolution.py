@@ -8,9 +8,9 @@ import torch
 from angles import angle
 from test_compare import rollout_of
 
+from nsf import load_scene
 from nsf.errors import ConfigError
 from nsf.evaluation import metrics, query, superresolution, superresolve
-from nsf.scenes import load
 
 FRAMES = [12, 24]
 
@@ -23,7 +23,7 @@ def fine(chain, tiny_manifold, truth, made):
 
 def test_a_refined_scene_begins_with_the_same_particles():
     ball = "{_target_: nsf.scenes.Body, shape: {_target_: nsf.scenes.Ball, centre: [0.5,0.5,0.6], radius: 0.1}, particles_per_cell: 2, density: 1}"  # fmt: skip # noqa: E501
-    scene = load("sand", ["scene.bodies.column.particles=300", f"+scene.bodies.ball={ball}"])
+    scene = load_scene("sand", ["scene.bodies.column.particles=300", f"+scene.bodies.ball={ball}"])
     fine = scene.refined(4)
     assert [b.particles for b in fine.bodies] == [4 * b.particles for b in scene.bodies]
     assert (fine.grid, fine.dt) == (scene.grid, scene.dt)

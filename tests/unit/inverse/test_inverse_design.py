@@ -73,10 +73,10 @@ def test_the_full_order_run_follows_the_program(model):
     program = Tilt(model, 4.0, 2)
     values = program.values(torch.ones(1, 2, 2, dtype=torch.float64))[0].numpy()
     upright = np.zeros_like(values)
-    scenes = [program.scene(model.scene.with_parameters(model.scene.case(ONE)), v) for v in (values, upright)]
+    scenes = [program.scene(model.scene.at(model.scene.case(ONE)), v) for v in (values, upright)]
     gravity = program.forcing(torch.as_tensor(values)[None]).gravity[0].numpy()
     np.testing.assert_allclose(scenes[0].acting_gravity.at(model.t[:-1]), gravity, atol=1e-12)
-    one, other = (scene.solver(device="cpu") for scene in scenes)
+    one, other = (scene.full_order(device="cpu") for scene in scenes)
     one.step(24), other.step(24)
     aside = (one.state.numpy()["x"] - other.state.numpy()["x"]).mean(0)
     assert np.hypot(*aside[:2]) > 1e-4
@@ -178,10 +178,10 @@ def test_a_solid_moves_as_in_training(pushed):
     np.testing.assert_allclose(np.abs(axis), [1, 0, 0], atol=1e-9)
     values = program.values(torch.ones(1, 3, 1, dtype=torch.float64))
     forcing = program.forcing(values)
-    scene = program.scene(pushed.scene.with_parameters(pushed.scene.case()), values[0].numpy())
+    scene = program.scene(pushed.scene.at(pushed.scene.case()), values[0].numpy())
     from nsf.engines.operators import collider_states
 
-    states = collider_states(scene.colliders, pushed.dt, len(pushed.t) - 1)
+    states = collider_states(scene.solids, pushed.dt, len(pushed.t) - 1)
     np.testing.assert_allclose(forcing.solids[0], states, atol=1e-9)
     assert np.abs(states - pushed.forcing().solids.numpy()).max() > 1e-3
 
@@ -235,10 +235,11 @@ def test_runs_of_programs_ask_for_the_program(pushed, tmp_path):
 
 
 def test_a_solid_that_turns_is_refused(pushed, monkeypatch):
-    (plate,) = (c for c in pushed.scene.colliders if c.motion is not None)
+    plate = pushed.scene.colliders["plate"]
     motion = Motion([0.0, 1.0], [[0.0] * 3, [0.01, 0.0, 0.0]], [0.0, 5.0], [0, 0, 1], [0.4, 0.5, 0.2])
-    turning = tuple(replace(c, motion=motion) if c is plate else c for c in pushed.scene.colliders)
-    monkeypatch.setattr(pushed, "scene", replace(pushed.scene, colliders=turning))
+    turning = {**pushed.scene.colliders, "plate": replace(plate, motion=motion)}
+    forcing = replace(pushed.scene.forcing, colliders={})
+    monkeypatch.setattr(pushed, "scene", replace(pushed.scene, colliders=turning, forcing=forcing))
     with pytest.raises(ConfigError, match="move=plate turns as well"):
         Moves(pushed, ("plate",))
 

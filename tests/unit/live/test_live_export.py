@@ -304,7 +304,7 @@ def test_a_program_of_each_held_out_case_is_followed(opened, tilting_page, tilti
         kept = Rollout.open(tilting_model.run.file(rollout_file(index))).xhat
         found = tab.evaluate("Array.from(nsf.player.run.latents[60])")
         np.testing.assert_allclose(found, kept[60], atol=1e-4 * np.abs(kept).max())
-        scene = tilting_model.pipeline.deployed.with_parameters(case)
+        scene = tilting_model.pipeline.deployed.at(case)
         gravity = tab.evaluate("nsf.player.run.gravities[40]")
         np.testing.assert_allclose(gravity, scene.acting_gravity.at(40 * scene.dt), atol=1e-9)
 

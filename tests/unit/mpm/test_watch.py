@@ -5,12 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from nsf import config
+from nsf import config, load_scene
 from nsf.errors import InstabilityError
 from nsf.mpm import HalfSpace, Motion
 from nsf.mpm.stability import multiplied_step_warning
 from nsf.pipeline import Pipeline
-from nsf.scenes import load
 
 #: The scene `drop` with a thousand particles.
 SMALL = ("scale=small", "scene.dx=0.05", "scene.dt=0.004", "scene.steps=100")
@@ -18,7 +17,7 @@ SMALL = ("scale=small", "scene.dx=0.05", "scene.dt=0.004", "scene.steps=100")
 
 def dropped(E, *overrides):
     """The solver of a ball after its fall."""
-    solver = load("drop", [*SMALL, *overrides]).full_order({"E": E}, device="cpu")
+    solver = load_scene("drop", [*SMALL, *overrides]).full_order({"E": E}, device="cpu")
     solver.step(100)
     return solver
 

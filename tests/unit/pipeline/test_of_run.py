@@ -36,7 +36,7 @@ def test_keys_still_follow_the_parameter(pipeline_at, tmp_path):
     run = pipeline.deployment
     with run.record() as record:
         write_configuration(pipeline, record)
-    scenes = [Pipeline.of_run(run, "cpu").scene.with_parameters({"friction_angle": v}) for v in (20.0, 30.0)]
+    scenes = [Pipeline.of_run(run, "cpu").scene.at({"friction_angle": v}) for v in (20.0, 30.0)]
     assert [scene.material.E for scene in scenes] == [20.0, 30.0]
 
 

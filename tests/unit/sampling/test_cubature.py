@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+import nsf
 from nsf.dynamics import ParticleSets
 from nsf.errors import ConfigError, ProjectionError
 from nsf.sampling import CellSampler, CubatureSampler, SampleSpan
@@ -21,8 +22,8 @@ STATES = 9
 def whole(chain, tiny_manifold):
     """Problem parameters → the reduced solver whose sample is every particle."""
     sets = [ParticleSets(EVERYONE, EVERYONE, None)]
-    return lambda parameters: chain.scene.reduced(
-        tiny_manifold, parameters, EVERYONE, device="cpu", sets=sets
+    return lambda parameters: nsf.reduced(
+        chain.scene, tiny_manifold, parameters, EVERYONE, device="cpu", sets=sets
     )
 
 
@@ -189,7 +190,7 @@ def test_a_cubature_out_of_cells_needs_fewer_integration_particles(chain, tiny_m
     assert residual(equations, few[0]) < 0.7 * np.mean(others)
     sizes = []
     for phases in (few, any_cell):
-        solver = chain.scene.reduced(tiny_manifold, ANGLE, phases, device="cpu")
+        solver = nsf.reduced(chain.scene, tiny_manifold, ANGLE, phases, device="cpu")
         solver.step(6)
         sizes.append(solver.integration_mean)
     assert sizes[0] < 0.8 * sizes[1]
@@ -225,7 +226,7 @@ def test_a_scene_is_reduced_with_a_cubature(chain, tiny_manifold, precision):
     """Through the front door, with weights in every span of the run."""
     sampler = CubatureSampler(10, states=6, phases=[{"start": 0.5, "size": 8}])
     options = {"device": "cpu", "precision": precision, "dt_multiplier": 1.5}
-    solver = chain.scene.reduced(tiny_manifold, ANGLE, sampler, **options)
+    solver = nsf.reduced(chain.scene, tiny_manifold, ANGLE, sampler, **options)
     solver.step(solver.total_steps)
     assert solver.left_grid() == -1
     for span, sets in zip(solver.samples, solver.sets, strict=True):

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from nsf import load_scene
 from nsf.errors import ConfigError
 from nsf.mpm import Cuboid, HalfSpace, Motion, Sphere
-from nsf.scenes import load
 from nsf.scenes.checks import check_physics
 from nsf.vectors import rotation
 
@@ -80,7 +80,7 @@ REFUSED = {
 def test_refused(case):
     overrides, quoted = REFUSED[case]
     with pytest.raises(ConfigError, match=quoted):
-        load("sand", [FEW, *overrides]).full_order(device="cpu")
+        load_scene("sand", [FEW, *overrides]).full_order(device="cpu")
 
 
 MEANT = {
@@ -102,7 +102,7 @@ MEANT = {
 
 @pytest.mark.parametrize("case", MEANT)
 def test_meant(case):
-    check_physics(load("sand", [FEW, *MEANT[case]]))
+    check_physics(load_scene("sand", [FEW, *MEANT[case]]))
 
 
 @pytest.mark.parametrize("scale", ["small", "paper"])
@@ -110,9 +110,9 @@ def test_meant(case):
     "name", ["bread", "cake", "drop", "jelly_cube", "metal", "sand", "squishy_ball", "toothpaste"]
 )
 def test_shipped_scenes_are_meant(name, scale):
-    scene = load(name, [f"scale={scale}"])
+    scene = load_scene(name, [f"scale={scale}"])
     for case in (min(scene.split.cases), max(scene.split.cases)):
-        check_physics(scene.with_parameters(case))
+        check_physics(scene.at(case))
 
 
 class TestDistance:

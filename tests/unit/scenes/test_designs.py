@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from nsf import load_scene
 from nsf.data import Case
 from nsf.errors import ConfigError
-from nsf.scenes import Grid, LatinHypercube, Parameter, Sobol, Values, load
+from nsf.scenes import Grid, LatinHypercube, Parameter, Sobol, Values
 from nsf.scenes.designs import evenly
 
 RANGES = {
@@ -131,24 +132,24 @@ def test_a_bad_design_says_what_to_do(make, message):
 )
 def test_a_bad_scene_says_what_to_do(overrides, message):
     with pytest.raises(ConfigError, match=message):
-        load("drop", overrides)
+        load_scene("drop", overrides)
 
 
 def test_a_scene_of_two_parameters():
-    scene = load("drop", [*TWO, "scene.design={_target_:nsf.scenes.Sobol,train:8,validation:0,test:2}"])
+    scene = load_scene("drop", [*TWO, "scene.design={_target_:nsf.scenes.Sobol,train:8,validation:0,test:2}"])
     case = scene.split.test[0]
-    at = scene.with_parameters(case)
+    at = scene.at(case)
     assert (at.material.E, at.material.nu) == case.numbers
     assert scene.case() == Case(("E", "nu"), (4000.0, 0.3))
     assert scene.case({"nu": 0.2}) == Case(("E", "nu"), (4000.0, 0.2))
     assert scene.case([1, 2]).named == "E=1 Pa, nu=2"
-    assert scene.with_parameters({"nu": 0.2}).material.E == 4000.0
+    assert scene.at({"nu": 0.2}).material.E == 4000.0
     with pytest.raises(ConfigError, match="drop has no parameter 'mu'; there are E, nu"):
-        scene.with_parameters({"mu": 1.0})
+        scene.at({"mu": 1.0})
 
 
 def test_null_leaves_out_a_parameter_of_the_scene_below():
-    (name,) = load(
+    (name,) = load_scene(
         "drop",
         ["scene.parameters.E=null", TWO[1], "scene.design.train=[0.2,0.3]", "scene.design.test=[0.25]"],
     ).parameters

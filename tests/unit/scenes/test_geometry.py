@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from nsf import load_scene
 from nsf.errors import ConfigError
-from nsf.scenes import Ball, Box, Cylinder, Frame, Ribbon, TentacleBall, load
+from nsf.scenes import Ball, Box, Cylinder, Frame, Ribbon, TentacleBall
 from nsf.scenes.shapes import geometry
 
 WAVE = [(0.2 + 0.6 * t, 0.5 + 0.06 * np.sin(9.0 * t), 0.4 + 0.1 * t * t) for t in np.linspace(0.0, 1.0, 40)]
@@ -108,7 +109,7 @@ def test_points_that_would_take_minutes_to_find_are_refused(shape):
 
 def test_a_hundred_times_the_particles_of_the_thinnest_scene_are_not():
     """The tries for super-resolution stay within the limit, by far."""
-    ribbon = load("toothpaste", ["scale=paper"]).bodies[0]
+    ribbon = load_scene("toothpaste", ["scale=paper"]).bodies["ribbon"]
     edge = (ribbon.shape.bounds[1] - ribbon.shape.bounds[0]).max()
     assert 100 * ribbon.particles * edge**3 / ribbon.shape.volume < 0.5 * geometry._MOST_DRAWN
 

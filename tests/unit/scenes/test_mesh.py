@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from meshes import FORMATS, cube, joined, sphere, torus, turned, write
 
+from nsf import load_scene
 from nsf.errors import ConfigError
-from nsf.scenes import Ball, Box, Mesh, load, mesh_or_ball
+from nsf.scenes import Ball, Box, Mesh, mesh_or_ball
 from nsf.scenes.shapes import mesh
 from nsf.scenes.shapes.winding import WindingNumber
 
@@ -393,15 +394,15 @@ def test_a_changed_file_is_read_again(tmp_path):
 
 class TestDrop:
     def test_ball_without_a_mesh(self):
-        scene = load("drop")
-        assert scene.bodies[0].shape == Ball((0.5, 0.5, 0.3), 0.15)
+        scene = load_scene("drop")
+        assert next(iter(scene.bodies.values())).shape == Ball((0.5, 0.5, 0.3), 0.15)
         assert scene.files == {}
         np.testing.assert_array_equal(mesh_or_ball(None, 0.3, (0.5, 0.5, 0.15)).bounds[0], (0.35, 0.35, 0.15))
 
     def test_mesh(self, tmp_path):
         path = write(tmp_path, sphere(3))
-        scene = load("drop", [f"scene.geometry.mesh={path}", "scene.geometry.height=0.2"])
-        body, particles = scene.bodies[0], scene.particles()
+        scene = load_scene("drop", [f"scene.geometry.mesh={path}", "scene.geometry.height=0.2"])
+        body, particles = next(iter(scene.bodies.values())), scene.particles()
         assert body.shape == Mesh(path, 0.2, [0.5, 0.5, 0.15])
         assert body.particles == round(8 * body.shape.volume / scene.dx**3) == len(particles)
         assert list(scene.files) == [path]
@@ -410,11 +411,11 @@ class TestDrop:
     def test_outside_the_domain(self, tmp_path):
         path = write(tmp_path, cube())
         with pytest.raises(ConfigError, match=r"reaches outside the domain .*; move it or make it smaller"):
-            load("drop", [f"scene.geometry.mesh={path}", "scene.geometry.height=0.9"])
+            load_scene("drop", [f"scene.geometry.mesh={path}", "scene.geometry.height=0.9"])
 
     def test_missing_mesh(self):
         with pytest.raises(ConfigError, match=r"mesh=bunny\.obj is no file"):
-            load("drop", ["scene.geometry.mesh=bunny.obj"])
+            load_scene("drop", ["scene.geometry.mesh=bunny.obj"])
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import nsf
 import nsf.scenes
 from nsf.errors import ConfigError
 from nsf.mpm import Gravity
@@ -91,7 +92,7 @@ def test_what_is_refused_says_why(make, message):
 
 @pytest.fixture(scope="module")
 def block():
-    return nsf.scenes.load("block", SMALL)
+    return nsf.load_scene("block", SMALL)
 
 
 def test_each_case_has_a_program_of_its_own_and_no_part_shares_one(block):
@@ -100,12 +101,12 @@ def test_each_case_has_a_program_of_its_own_and_no_part_shares_one(block):
     assert len(set(programs)) == len(programs)
     assert split.box.shape == (2, 2)
     assert list(split.train[0].parameters) == ["E", "density"]
-    one, other = (block.with_parameters(case).acting_gravity.at(T) for case in split.test[:2])
+    one, other = (block.at(case).acting_gravity.at(T) for case in split.test[:2])
     assert np.abs(one - other).max() > 0.5
-    more = nsf.scenes.load("block", [*SMALL, "scene.design.test=12"]).split
+    more = nsf.load_scene("block", [*SMALL, "scene.design.test=12"]).split
     assert more.train == split.train
     assert more.test[:8] == split.test
-    seeded = nsf.scenes.load("block", [*SMALL, "scene.design.seed=1"]).split
+    seeded = nsf.load_scene("block", [*SMALL, "scene.design.seed=1"]).split
     assert not {case["program"] for case in seeded.cases} & set(programs)
 
 
@@ -113,8 +114,8 @@ def test_a_case_left_out_is_as_configured(block):
     assert block.case([3000.0, 100.0])["program"] == 0.0
     assert block.case({"E": 3000.0, "program": 7})["program"] == 7.0
     np.testing.assert_array_equal(
-        block.with_parameters({"program": 7}).acting_gravity.at(T),
-        nsf.scenes.load("block", [*SMALL, "scene.program=7"]).acting_gravity.at(T),
+        block.at({"program": 7}).acting_gravity.at(T),
+        nsf.load_scene("block", [*SMALL, "scene.program=7"]).acting_gravity.at(T),
     )
 
 
@@ -132,4 +133,4 @@ def test_a_case_left_out_is_as_configured(block):
 )  # fmt: skip
 def test_a_forcing_that_cannot_be_meant_is_refused(overrides, message):
     with pytest.raises(ConfigError, match=message):
-        nsf.scenes.load("block", [*SMALL, *overrides])
+        nsf.load_scene("block", [*SMALL, *overrides])

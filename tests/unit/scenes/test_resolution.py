@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from meshes import cube, sphere, torus, turned, write
 
-from nsf.scenes import Ball, Box, Cylinder, Frame, Mesh, Ribbon, TentacleBall, load
+from nsf import load_scene
+from nsf.scenes import Ball, Box, Cylinder, Frame, Mesh, Ribbon, TentacleBall
 from nsf.scenes.resolution import resolution_warnings, thinnest_part
 
 ZIGZAG = [(0.2, 0.5, 0.5), (0.5, 0.5, 0.5), (0.5, 0.8, 0.5), (0.5, 0.7, 0.9)]
@@ -93,7 +94,7 @@ def test_a_part_that_no_point_of_the_lattice_hits():
     "name", ["bread", "cake", "drop", "jelly_cube", "metal", "sand", "squishy_ball", "toothpaste"]
 )
 def test_no_shipped_scene_is_warned_of(name, scale):
-    assert resolution_warnings(load(name, [f"scale={scale}"])) == []
+    assert resolution_warnings(load_scene(name, [f"scale={scale}"])) == []
 
 
 def test_thin_legs():
@@ -103,7 +104,7 @@ def test_thin_legs():
     def told(dx, particles):
         body = f"{{_target_: nsf.scenes.Body, shape: {leg}, density: 100, particles: {particles}}}"
         return resolution_warnings(
-            load("sand", ["~scene.bodies.column", f"scene.dx={dx}", f"+scene.bodies.leg={body}"])
+            load_scene("sand", ["~scene.bodies.column", f"scene.dx={dx}", f"+scene.bodies.leg={body}"])
         )
 
     (line,) = told(0.04, 50)
@@ -115,12 +116,12 @@ def test_thin_legs():
 
 
 def test_few_particles():
-    (line,) = resolution_warnings(load("sand", ["scene.bodies.column.particles=300"]))
+    (line,) = resolution_warnings(load_scene("sand", ["scene.bodies.column.particles=300"]))
     assert line.startswith("scene.bodies.column: 300 particles are 0.64 a cell")
     more = re.search(r"set (scene\.bodies\.column\.particles=\d+) or more", line)[1]
-    assert resolution_warnings(load("sand", [more])) == []
+    assert resolution_warnings(load_scene("sand", [more])) == []
 
 
 def test_a_body_that_reaches_into_the_walls():
-    (line,) = resolution_warnings(load("sand", ["scene.walls.padding=12"]))
+    (line,) = resolution_warnings(load_scene("sand", ["scene.walls.padding=12"]))
     assert re.search(r"column: \d+ % of its particles lie in scene\.walls\.padding=12 nodes", line)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from nsf import config, scenes
+import nsf
+from nsf import config
 from nsf.engines.operators import Mirrored, collider_states, mirrored_states
 from nsf.errors import ConfigError
 from nsf.mpm import Motion
@@ -25,7 +26,7 @@ OWN = {
 
 
 def scene(name, *overrides):
-    return scenes.load(name, ["scale=small", *overrides])
+    return nsf.load_scene(name, ["scale=small", *overrides])
 
 
 @pytest.mark.parametrize(
@@ -47,7 +48,7 @@ def test_a_scene_s_own_planes(name):
     """They are those of its yaml, and solids go over into equal ones."""
     centre, mirrors = OWN[name]
     own = scene(name)
-    declared = own.config.scene.reduced.symmetry
+    declared = config.load([f"scene={name}", "scale=small"]).scene.reduced.symmetry
     assert (tuple(declared.centre), [list(n) for n in declared.mirrors]) == (
         centre,
         [list(n) for n in mirrors],
@@ -56,9 +57,9 @@ def test_a_scene_s_own_planes(name):
     assert len(images) == 8
     x = np.random.default_rng(1).random((50, 3)) * np.asarray(own.size)
     for image in images:
-        assert sorted(image.partners) == list(range(len(own.colliders)))
-        for collider, partner in zip(own.colliders, image.partners, strict=True):
-            there = replace(own.colliders[partner], motion=None).distance(
+        assert sorted(image.partners) == list(range(len(own.solids)))
+        for collider, partner in zip(own.solids, image.partners, strict=True):
+            there = replace(own.solids[partner], motion=None).distance(
                 Symmetry(centre, mirrors).at(x, image.R)
             )
             np.testing.assert_allclose(there, replace(collider, motion=None).distance(x), atol=1e-9)
@@ -66,15 +67,15 @@ def test_a_scene_s_own_planes(name):
 
 def test_states_of_an_image_are_those_of_solids_that_move_as_it_does():
     symmetry, own = Symmetry(*OWN["press"]), scene("press", "scene.program=3")
-    states = collider_states(own.colliders, own.dt, own.steps)
+    states = collider_states(own.solids, own.dt, own.steps)
     assert np.ptp(states, axis=0).max() > 0.01
     for image in symmetry.images(own):
         moved = [None, None]
-        for collider, partner in zip(own.colliders, image.partners, strict=True):
+        for collider, partner in zip(own.solids, image.partners, strict=True):
             times, shifts, _ = collider.motion.keyframes()
             turned = Motion(times.tolist(), (shifts @ image.R.T).tolist())
             moved[partner] = replace(
-                own.colliders[partner], motion=turned, since=collider.since, until=collider.until
+                own.solids[partner], motion=turned, since=collider.since, until=collider.until
             )
         expected = collider_states(moved, own.dt, own.steps)
         np.testing.assert_allclose(mirrored_states(states, image), expected, atol=1e-15)
@@ -84,7 +85,13 @@ def test_states_of_an_image_are_those_of_solids_that_move_as_it_does():
     ("name", "centre", "mirrors", "overrides", "told"),
     [
         ("block", (0.4, 0.4, 0.17), [Z], [], "the domain"),
-        ("block", (0.4, 0.4, 0.17), [X], ["scene.bodies.block.shape.lower=[0.33,0.34,0.08]"], "body 0 (Box)"),
+        (
+            "block",
+            (0.4, 0.4, 0.17),
+            [X],
+            ["scene.bodies.block.shape.lower=[0.33,0.34,0.08]"],
+            "body block (Box)",
+        ),
         ("block", (0.4, 0.4, 0.17), [X], ["scene.bodies.block.velocity=[0.1,0.0,0.0]"], "velocity"),
         ("tray", (0.22, 0.22, 0.11), [X], ["scene.colliders.west.point=[0.1,0.0,0.0]"], "half-space"),
         ("tray", (0.22, 0.22, 0.11), [X], ["scene.colliders.west.friction=0.2"], "half-space"),
@@ -99,10 +106,10 @@ def test_what_is_not_its_own_image_is_refused(name, centre, mirrors, overrides, 
 def test_a_solid_that_turns_is_refused():
     own = scene("press")
     motion = Motion([0.0, 1.0], angles=[0.0, 10.0], axis=[0, 1, 0], pivot=[0.5, 0.5, 0.5])
-    turning = [replace(own.colliders[0], motion=motion), own.colliders[1]]
+    turning = [replace(own.solids[0], motion=motion), own.solids[1]]
     with pytest.raises(ConfigError, match="the cuboid, which turns, is not its own mirror image"):
         Symmetry((0.5, 0.5, 0.5), [X]).images(
-            SimpleNamespace(size=own.size, bodies=own.bodies, colliders=turning)
+            SimpleNamespace(size=own.size, bodies=own.bodies, solids=turning)
         )
 
 

@@ -5,8 +5,9 @@ import re
 import numpy as np
 import pytest
 
+from nsf import load_scene
 from nsf.errors import ConfigError
-from nsf.scenes import Box, Weakness, load
+from nsf.scenes import Box, Weakness
 
 LOAF = Box((0.0, 0.0, 0.0), (1.0, 1.0, 1.0))
 MIDDLE = Box((0.4, 0.0, 0.0), (0.6, 1.0, 1.0))
@@ -115,11 +116,14 @@ def test_in_a_scene():
     """μ̂ and λ of the weak particles, and of no other property or body."""
     body = "{_target_: nsf.scenes.Weakness, factor: 0.2, share: 0.5, region: {_target_: nsf.scenes.Box, lower: [0,0,0], upper: [0.5,1,1]}}"  # fmt: skip # noqa: E501
     few = "scene.bodies.column.particles=300"
-    plain, scene = load("sand", [few]), load("sand", [few, f"+scene.bodies.column.weakness={body}"])
+    plain, scene = (
+        load_scene("sand", [few]),
+        load_scene("sand", [few, f"+scene.bodies.column.weakness={body}"]),
+    )
     before, after = plain.particles(), scene.particles()
     for name in ("X", "mass", "volume0"):
         np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
-    factor = scene.bodies[0].weakness.of(before.X)
+    factor = next(iter(scene.bodies.values())).weakness.of(before.X)
     assert (factor == 0.2).sum() == round(0.5 * (before.X[:, 0] <= 0.5).sum()) > 50
     np.testing.assert_array_equal(after.mu, factor * before.mu)
     np.testing.assert_array_equal(after.lam, factor * before.lam)

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from nsf import schemas
+from nsf.canonical import plain
 from nsf.errors import NSFError, SchemaError, first_line
-from nsf.runs.canonical import plain
 from nsf.schemas import Maybe, Number
 
 MANIFEST = "manifest.json"
@@ -191,7 +191,6 @@ def _json(path: Path) -> dict[str, Any]:
 
 def _yaml(path: Path) -> dict[str, Any]:
     import yaml
-    from omegaconf import OmegaConf  # 0.2 s that `nsf --help` need not pay
 
     try:
         text = schemas.read_text(path, _MOST_BYTES[CONFIG])
@@ -201,7 +200,7 @@ def _yaml(path: Path) -> dict[str, Any]:
             # An alias stands for a copy, and a few of them for billions; nesting takes its square in time.
             if isinstance(event, yaml.AliasEvent) or depth > _DEEPEST:
                 raise SchemaError(f"{path.name} has an alias (*), or more than {_DEEPEST} levels")
-        config = OmegaConf.to_container(OmegaConf.create(text))
+        config = yaml.load(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
         if not isinstance(config, dict):
             raise SchemaError(f"{path.name} holds {_shown(config)}, not keys with values")
         config = plain(config)

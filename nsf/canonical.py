@@ -1,4 +1,4 @@
-"""Configurations in one canonical form, and the hash that names their result."""
+"""Values in one canonical form, and the hash of it."""
 
 import hashlib
 import json
@@ -22,15 +22,13 @@ def plain(value: Any, finite: bool = True, key: str = "config") -> Any:
     """The same value in what JSON and YAML can hold.
 
     Args:
-        value: mappings, sequences, scalars, paths; also OmegaConf, NumPy or torch ones.
+        value: mappings, sequences, scalars, paths; also NumPy or torch ones.
         finite: refuse NaN and infinity; else they become None.
         key: name of the value, for messages.
 
     Raises:
-        ConfigError: a value is missing ("???"), of another kind, or not finite.
+        ConfigError: a value is of another kind, or not finite.
     """
-    if type(value).__module__.startswith("omegaconf."):
-        value = _resolved(value, key)
     if isinstance(value, Mapping):
         return {str(name): plain(item, finite, f"{key}.{name}") for name, item in value.items()}
     if isinstance(value, list | tuple):
@@ -48,16 +46,6 @@ def plain(value: Any, finite: bool = True, key: str = "config") -> Any:
     raise ConfigError(
         f"{key}={value!r} is a {type(value).__name__}; use numbers, strings, lists and mappings"
     )
-
-
-def _resolved(value: Any, key: str) -> Any:
-    from omegaconf import OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
-
-    try:
-        return OmegaConf.to_container(value, resolve=True, throw_on_missing=True)
-    except OmegaConfBaseException as error:
-        raise ConfigError(f"{key} is not resolved: {error}; set the missing key") from error
 
 
 def _canonical(value: Any) -> Any:

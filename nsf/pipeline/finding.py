@@ -1,0 +1,49 @@
+"""The run of a stage that a command makes, found by the same keys."""
+
+from pathlib import Path
+from typing import Any
+
+from nsf import config
+from nsf.errors import ConfigError
+from nsf.pipeline.names import Names
+from nsf.runs import Run
+
+_STAGES = {
+    "train": "training", "teach": "taught", "deploy": "deployment", "evaluate": "evaluation",
+    "superresolve": "superresolution",
+}  # fmt: skip
+
+
+def find(*words: str, stage: str = "train", root: str | Path | None = None, **keys: Any) -> Run:
+    """The complete run of a stage that `nsf run` makes with exactly these keys, all others at their defaults.
+
+    Args:
+        words: keys with a dot, in Hydra's grammar, as `"sampler.size=50"`.
+        stage: `train`, `teach`, `deploy`, `evaluate` or `superresolve`.
+        root: folder of all runs; NSF_RUNS, else ./runs.
+        **keys: keys of the configuration, as `scene="sand", latent_dim=6`.
+
+    Raises:
+        ConfigError: a key or value is refused, or the stage is none of those.
+        MissingRunError: there is no such run, or it is not complete; says how far it came.
+    """
+    if stage not in _STAGES:
+        raise ConfigError(f"stage={stage} is none of {', '.join(_STAGES)}")
+    overrides = [*words, *(f"{key}={_hydra(value)}" for key, value in keys.items())]
+    if not any(map(config.names_scene, overrides)):
+        raise ConfigError('name a scene, as scene="sand"')
+    names = Names(config.load(overrides), None if root is None else Path(root))
+    if stage == "evaluate":
+        return names.evaluated()
+    if stage == "superresolve":
+        return names.superresolved()
+    return getattr(names, _STAGES[stage]).require()
+
+
+def _hydra(value: Any) -> str:
+    """A value in Hydra's grammar."""
+    if isinstance(value, list | tuple):
+        return f"[{','.join(map(_hydra, value))}]"
+    if isinstance(value, dict):
+        return "{" + ",".join(f"{key}:{_hydra(one)}" for key, one in value.items()) + "}"
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)

@@ -1,0 +1,61 @@
+"""Key paths into a scene: `material.E`, `bodies.cube.velocity.0`, as configurations write them."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
+
+from nsf.errors import NSFError
+from nsf.vectors import is_list
+
+
+def parts_of(key: str) -> tuple[str, ...]:
+    """The parts of a key; the `scene.` that a configuration writes in front of a scene's own is left out."""
+    parts = key.replace("[", ".").replace("]", "").split(".")
+    return tuple(parts[1:] if parts[0] == "scene" else parts)
+
+
+def value_at(node: Any, parts: Sequence[str]) -> Any:
+    """The value at the end of a path.
+
+    Raises:
+        KeyError: there is nothing.
+    """
+    for part in parts:
+        if is_dataclass(node) and part in {own.name for own in fields(node)}:
+            node = getattr(node, part)
+        elif isinstance(node, Mapping) and part in node:
+            node = node[part]
+        elif is_list(node) and part.isdigit() and int(part) < len(node):
+            node = node[int(part)]
+        else:
+            raise KeyError(part)
+    return node
+
+
+def with_value(node: Any, parts: Sequence[str], value: Any, where: str) -> Any:
+    """A copy with another value at the end of a path that exists; all beside the path is shared.
+
+    Args:
+        node: a frozen dataclass, mapping or sequence.
+        parts: of the path.
+        value: new.
+        where: the path to `node`, for messages.
+
+    Raises:
+        NSFError: a class on the way refuses the value; names its path.
+    """
+    if not parts:
+        return value
+    first, rest = parts[0], parts[1:]
+    path = f"{where}.{first}"
+    if isinstance(node, Mapping):
+        return {**node, first: with_value(node[first], rest, value, path)}
+    if is_list(node):
+        at = int(first)
+        return (*node[:at], with_value(node[at], rest, value, path), *node[at + 1 :])
+    inner = with_value(getattr(node, first), rest, value, path)
+    try:
+        return replace(node, **{first: inner})
+    except NSFError as error:
+        told = str(error)
+        raise type(error)(told if told.startswith(where) else f"{where}: {told}") from error
