@@ -84,9 +84,10 @@ def _dispatch(arguments: list[str]) -> int:
         return _multirun(stage, own, launcher)
     if launcher:
         raise ConfigError(f"{launcher[0]} is about the jobs of a sweep; add -m")
+    loaded = config.load(overrides, usage.primary(stage))  # refused before the import of what would use it
     from nsf.pipeline.sweep import work
 
-    result = work(config.load(overrides, usage.primary(stage)), _stages(stage))
+    result = work(loaded, _stages(stage))
     if stage in ("run", "report"):
         _show(result)
     return 0

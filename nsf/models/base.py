@@ -29,7 +29,7 @@ class Model(ABC):
         """Refuse a configuration that the model cannot run.
 
         Args:
-            names: the stages of the configuration, a `nsf.pipeline.names.Names`.
+            names: the stages of the configuration, a `nsf.pipeline.Pipeline`.
 
         Raises:
             ConfigError: names the key and the remedy.

@@ -3,12 +3,11 @@
 from typing import TYPE_CHECKING
 
 from nsf.extras import on_first_use
-from nsf.pipeline.names import STAGES
 
 if TYPE_CHECKING:
-    from nsf.pipeline.chain import Pipeline
+    from nsf.pipeline.chain import STAGES, Pipeline
 
 __all__ = ["STAGES", "Pipeline"]
 
-# On demand, so that names of runs do not wait for torch.
+# On demand, so that `nsf --help` waits for nothing.
 __getattr__ = on_first_use(__name__)

@@ -1,57 +1,109 @@
-"""The stages in order; each reads the files of the one before it and nothing else.
+"""The stages of one configuration, in order; each reads the files of the one before it and nothing else.
 
 scene → simulate → dataset → train (→ teach) → deploy → evaluate → report
+
+A configuration becomes values here, and values become stages: the run of each, whether it is there, and the
+work that makes it. Torch is imported where a stage works, so that a mistake, or a chain whose results are all
+there, takes a second or two.
 """
 
-import time
 from collections.abc import Callable, Sequence
-from functools import partial
+from copy import copy
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from nsf import config as configuration
-from nsf.data import Case
-from nsf.dynamics import ParticleSets, ReducedBatch, ReducedMPM
-from nsf.engines import Engine, Operators, reduced_batch
-from nsf.kinematics.fields.mlp import MlpField
-from nsf.kinematics.manifold import Manifold
-from nsf.models import Auto
-from nsf.mpm.stability import largest_stable_dt, multiplied_step_warning
-from nsf.pipeline.plan import Plan
-from nsf.pipeline.reuse import report, reused, simulations
-from nsf.pipeline.stages.choosing import measure_candidates
-from nsf.pipeline.stages.deployment import CONFIGURATION, deploy_held_out
-from nsf.pipeline.stages.evaluation import evaluate, superresolve_held_out
-from nsf.pipeline.stages.fitting import fit, fitted, loaded
-from nsf.pipeline.stages.simulation import Job, Shared, simulate
-from nsf.pipeline.stages.teaching import OPERATORS, teach
-from nsf.pipeline.stages.training import train
+from nsf.config.scenes import changed_scene, scene_of
+from nsf.data.case import Case
+from nsf.engines.operators.teaching import Teaching, random_cases
+from nsf.errors import ConfigError
+from nsf.gpu import has_driver
+from nsf.models import Auto, Model, Recurrence
+from nsf.mpm import FP32, FP64, Precision
+from nsf.paths import CONF, groups
+from nsf.pipeline import naming
+from nsf.pipeline.reuse import report, reused
+from nsf.pipeline.values import check_numbers, check_words, factors
+from nsf.results.folder import check_place
 from nsf.runs import Run
-from nsf.sampling import SampleSpan
 from nsf.scenes import Scene
 
+if TYPE_CHECKING:
+    from nsf.dynamics import ReducedBatch, ReducedMPM, Sources
+    from nsf.engines import Engine, Operators
+    from nsf.kinematics.manifold import Manifold
 
-class Pipeline(Plan):
-    """The chain for one configuration.
+#: Of the chain, in order.
+STAGES = ("simulate", "train", "teach", "deploy", "evaluate", "report")
+#: Keys that hold others, none of which is left out.
+_SECTIONS = (
+    *("material", "transfer", "field", "trainer", "model", "sampler", "projector", "integration"),
+    *("data", "deploy", "evaluation", "super_resolution", "report"),
+)
+#: Cases between the training ones whose runs decide which round of teaching is kept.
+HELD_BACK = 3
+#: Precision of stored frames by the name of their type.
+_STORED = {"float32": FP32, "float64": FP64}
+
+
+class Pipeline:
+    """The chain of one configuration.
 
     Args:
-        config, root: as for `Plan`, which checks them.
+        config: as `nsf.config.load` gives it; resolved here.
         say: called with a line for the user.
+        root: folder of runs; `NSF_RUNS` or `runs` by default.
+
+    Attributes:
+        config: resolved; template: the same before its interpolations were resolved.
+        scene: that is trained on; deployed: that of the held-out simulations and of deployment.
+        configured: the model that the configuration names, which may be `auto`.
+        coarse: factors of Δx of the full-order runs that a reduced one is held to.
+        split: cases by their use.
+        device: found once, so that a missing GPU is reported before any work.
+
+    Raises:
+        ConfigError: a value is missing or refused; names it. What only a stage's work needs is built, and
+            refused, by `check`, which every stage begins with.
+        DeviceError: the device does not exist.
     """
 
-    def __init__(self, config: DictConfig, say: Callable[[str], None] = print, root: Path | None = None):
-        super().__init__(config, root)
-        self.say = say
-        self._samples: Sequence[SampleSpan] | None = None
-        self._sets: Sequence[ParticleSets] | None = None
-        self._taught: Operators | None = None
-        self._fitted: Any = None
+    #: The engine of projected steps: the compiled one where it can, else the reference.
+    projecting = "auto"
+
+    def __init__(self, config: DictConfig, say: Callable[[str], object] = print, root: Path | None = None):
+        self.say, self.root = say, root
+        self._chosen: Model | None = None
+        self._samples = self._sets = self._taught = self._fitted = None
+        with configuration.naming_the_missing():
+            self._begin(config)
+
+    def _begin(self, config: DictConfig) -> None:
+        for key in _SECTIONS:
+            configuration.section(config, key)
+        check_numbers(config)
+        self.template = configuration.checked(with_candidates(config))
+        c = self.config = configuration.resolve(self.template)
+        self.scene = scene_of(self.template)
+        self.split = self.scene.split
+        names, count = self.split.names, len(self.split.train)
+        if count <= len(names):
+            raise ConfigError(
+                f"scene.design has {count} training cases, and {', '.join(names)} "
+                f"need{'s' * (len(names) == 1)} at least {len(names) + 1}; add some"
+            )
+        self.configured: Model = configuration.build(c.model, "model")
+        self.coarse = factors("evaluation.coarse", c.evaluation.coarse)
+        check_words(c)
+        self.configured.refuse(self)
+        self.deployed = self._deployed(c.deploy.changes)
+        self.device = _device(c.device)
 
     @classmethod
-    def of_run(cls, run: Run, device: str = "auto", say: Callable[[str], None] = print) -> "Pipeline":
+    def of_run(cls, run: Run, device: str = "auto", say: Callable[[str], object] = print) -> "Pipeline":
         """The chain that a deploy run is part of, for more than the run holds.
 
         Args:
@@ -62,6 +114,8 @@ class Pipeline(Plan):
         Raises:
             SchemaError: the configuration is not there, or was changed after the run.
         """
+        from nsf.pipeline.stages.deployment import CONFIGURATION
+
         config = configuration.read(run.file(CONFIGURATION))
         config.device = device
         pipeline = cls(config, say, run.root)
@@ -69,7 +123,264 @@ class Pipeline(Plan):
             pipeline.choose(run.manifest["metrics"]["model"])
         return pipeline
 
-    def run(self, stage: str) -> Run | Path:
+    def _deployed(self, changes: DictConfig | None) -> Scene:
+        """The scene of the held-out simulations and of deployment."""
+        if not changes:
+            return self.scene
+        if not isinstance(changes, DictConfig):
+            raise ConfigError(f"deploy.changes={changes} must map keys to values, as {{material.nu:0.25}}")
+        if wrong := [key for key in changes if not isinstance(key, str)]:
+            raise ConfigError(f"deploy.changes has the key {wrong[0]}; give dotted keys, as material.nu")
+        try:
+            return changed_scene(self.template, self.scene, OmegaConf.to_container(changes))
+        except ConfigError as error:
+            raise ConfigError(f"deploy.changes: {error}") from error
+
+    # -- what the stages need, built when it is first asked for ------------------------------------------
+
+    @cached_property
+    def field(self):
+        """What is trained."""
+        return configuration.build(self.config.field, "field")
+
+    @cached_property
+    def trainer(self):
+        """How it is trained."""
+        return configuration.build(self.config.trainer, "trainer")
+
+    @cached_property
+    def sampler(self):
+        """What chooses the sample particles."""
+        return configuration.build(self.config.sampler, "sampler")
+
+    @cached_property
+    def projector(self):
+        """What projects a step onto the latent vector."""
+        return configuration.build(self.config.projector, "projector")
+
+    @cached_property
+    def integration(self):
+        """Which particles a step integrates."""
+        return configuration.build(self.config.integration, "integration")
+
+    @cached_property
+    def sources(self) -> "Sources":
+        """Where a projected step takes τ and C from."""
+        from nsf.dynamics import Sources
+
+        return Sources(self.config.stress, self.config.affine)
+
+    @property
+    def stored(self) -> Precision:
+        """Precision of the frames of trajectories."""
+        return _STORED[self.config.data.dtype]
+
+    def check(self) -> "Pipeline":
+        """This pipeline, once everything that its stages need is built and checked.
+
+        Raises:
+            ConfigError: a value is refused; names it.
+            InstabilityError: Δt is unstable in a case.
+        """
+        from nsf.pipeline.checks import check
+
+        check(self)
+        return self
+
+    # -- models and cases --------------------------------------------------------------------------------
+
+    @property
+    def model(self) -> Model:
+        """The model that takes the steps; of `model=auto` the one that its deployment chose.
+
+        Raises:
+            MissingRunError: it has not chosen yet.
+        """
+        if not isinstance(self.configured, Auto):
+            return self.configured
+        if self._chosen is None:
+            self.choose(self.deployment.require().manifest["metrics"]["model"])
+        return self._chosen
+
+    def choose(self, name: str) -> None:
+        """Take one of the candidates of `model=auto`."""
+        self._chosen = self.configured.of[name]
+
+    def alone(self, name: str) -> "Pipeline":
+        """The chain of a candidate of `model=auto` by itself, deployed at the validation cases."""
+        config = self.template.copy()
+        config.model = config.model.of[name]
+        config.deploy.split, config.fallback = "validation", "none"
+        return Pipeline(config, self.say, self.root)
+
+    @property
+    def is_taught(self) -> bool:
+        """Whether the configured model is of a file that the stage `teach` writes."""
+        return self.configured.learns
+
+    @property
+    def teaching(self) -> Teaching | None:
+        """How the recurrence is taught; None for another model."""
+        return self.model.teaching if isinstance(self.model, Recurrence) else None
+
+    @property
+    def of_runs(self) -> bool:
+        """Whether a recurrence learns from the full-order runs of training, not from projected steps."""
+        return isinstance(self.model, Recurrence) and self.model.of_runs
+
+    @property
+    def lessons(self) -> list[list[Case]]:
+        """Cases of three kinds that the teacher is asked in: of training, between them, and held back.
+
+        Runs in those held back decide which round of teaching is kept. None is a validation or test case.
+        Where runs are the teacher there is one round; how far its runs at validation values are off, or, if
+        there are none, at training, is what `model.error_ratio` is held to. Between are as many as asked.
+        """
+        known, seed = sorted(self.split.train), int(self.config.seed)
+        taken = [*known, *self.split.validation, *self.split.test]
+        if self.teaching is None:
+            return [known]
+        if self.of_runs:
+            drawn = self.teaching.runs
+            between = random_cases(self.split.box, drawn, seed, taken) if drawn else []
+            return [known, between, sorted(self.split.validation) or known]
+        between = random_cases(self.split.box, len(known), seed, taken)
+        back = random_cases(self.split.box, HELD_BACK, seed + 1, [*taken, *between])
+        return [known, between, back]
+
+    @property
+    def held_out(self) -> tuple[Case, ...]:
+        """Cases that are deployed and evaluated.
+
+        Raises:
+            ConfigError: the split that is deployed is empty.
+        """
+        split = self.config.deploy.split
+        if not (cases := getattr(self.split, split)):
+            raise ConfigError(f"deploy.split={split} has no cases; set scene.design.{split}")
+        return cases
+
+    def needed(self) -> list[tuple[Case, Scene]]:
+        """Every case with the scene that is simulated in it: the deployed one where cases are held out."""
+        split = self.config.deploy.split
+        held_out = getattr(self.split, split)
+        plain = {*self.split.cases}.difference(() if split == "train" else held_out)
+        needed = [(case, self.scene) for case in plain] + [(case, self.deployed) for case in held_out]
+        return sorted(needed, key=lambda pair: pair[0])
+
+    # -- the run of each stage ---------------------------------------------------------------------------
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """The stages of the chain, `teach` only where the model learns by itself."""
+        return tuple(name for name in STAGES if name != "teach" or self.is_taught)
+
+    def simulation(self, case: Case, scene: Scene | None = None) -> Run:
+        """The run of one full-order trajectory, of the scene of training by default."""
+        return naming.simulation(self, case, scene or self.scene)
+
+    def truth(self, case: Case) -> Run:
+        """The run of the full-order trajectory that a deployed one is held to."""
+        return self.simulation(case, self.deployed)
+
+    @property
+    def training_data(self) -> list[Run]:
+        """The runs of the trajectories that are trained on."""
+        return [self.simulation(case) for case in self.split.train]
+
+    @property
+    def training(self) -> Run:
+        """The run of the manifold."""
+        return naming.training(self)
+
+    @property
+    def taught(self) -> Run:
+        """The run of what the model learns.
+
+        Raises:
+            ConfigError: the model learns nothing.
+        """
+        return naming.taught(self)
+
+    @property
+    def deployment(self) -> Run:
+        """The run of the reduced trajectories."""
+        return naming.deployment(self)
+
+    @property
+    def evaluation(self) -> Run:
+        """The run of errors and costs."""
+        return naming.evaluation(self)
+
+    @property
+    def superresolution(self) -> Run:
+        """The run of the deployed fields at more points."""
+        return naming.superresolution(self)
+
+    def runs_of(self, stage: str) -> list[Run]:
+        """The runs of a stage, each once; none of `teach` where nothing is taught."""
+        if stage == "simulate":
+            return list(dict.fromkeys(self.simulation(*needed) for needed in self.needed()))
+        names = {
+            "train": "training", "teach": "taught", "deploy": "deployment", "evaluate": "evaluation",
+            "superresolve": "superresolution",
+        }  # fmt: skip
+        return [] if stage == "teach" and not self.is_taught else [getattr(self, names[stage])]
+
+    @property
+    def inputs(self) -> list[Run]:
+        """The runs from which the chain makes others: trajectories, the manifold, and the taught model."""
+        return [run for stage in ("simulate", "train", "teach") for run in self.runs_of(stage)]
+
+    def evaluated(self, stage: str = "evaluate") -> Run:
+        """The complete run of a stage, of this device or another: it may have been brought here.
+
+        Raises:
+            MissingRunError: there is none; says how far it came.
+        """
+        for device in (self.device, "cuda:0", "cpu"):
+            there = copy(self)
+            there.device = device
+            (run,) = there.runs_of(stage)
+            if run.complete:
+                return run
+        return self.runs_of(stage)[0].require()
+
+    def spare(self, later: Sequence[str]) -> set[str]:
+        """Trajectories, by id, that later stages need not read, as their results are there."""
+        truths = {self.truth(case).id for case in self.held_out}
+        read = [run for name in ("evaluate", "superresolve") if name in later for run in self.runs_of(name)]
+        over = "evaluate" in later and all(run.complete for run in read)
+        trained = {run.id for run in self.training_data}
+        needed = (set() if over else truths) | (set() if self.training.complete else trained)
+        return (truths | trained) - needed
+
+    def reported(self) -> list[Run]:
+        """Every evaluated variant of this scene at these held-out trajectories."""
+        truths = {self.truth(case).id for case in self.held_out}
+        return [
+            run
+            for run in Run.find("evaluate", self.scene.name, root=self.root)
+            if run.complete and truths == {p for p in run.parents if p.startswith("simulate/")}
+        ]
+
+    @property
+    def report_folder(self) -> Path:
+        """Where the report goes."""
+        return Path(self.config.report.folder) / self.config.report.name
+
+    def check_report_folder(self) -> None:
+        """Refuse a place where no report could be written.
+
+        Raises:
+            ConfigError: something else stands there.
+            StorageError: the folder above it cannot be written.
+        """
+        check_place(self.report_folder)
+
+    # -- the work ----------------------------------------------------------------------------------------
+
+    def run(self, stage: str) -> Run | Path | list[Run]:
         """One stage by name; what it reads must be there, except that `simulate` needs nothing.
 
         Raises:
@@ -84,57 +395,107 @@ class Pipeline(Plan):
             later: the stages that they are for, if no others: trajectories that only read are in these
                 stages' results, where those are there, are not made again.
         """
-        # A changed scene that changes nothing, or trains on what it deploys, names one run twice.
-        runs = {self.simulation(*needed): needed for needed in self.needed()}
-        missing = simulations(self, runs, later, self.say)
-        warnings = {run: self._resolution(*runs[run]) for run in missing}
-        known = {line for run in runs if run.complete for line in run.manifest.get("warnings", ())}
-        for line in dict.fromkeys(line for lines in warnings.values() for line in lines):
-            if line not in known:
-                self.say(f"simulate: warning: {line}")
-        if missing:
-            started = time.perf_counter()
-            made = self._simulate({run: runs[run] for run in missing}, warnings)
-            elsewhere = f", {len(missing) - made} by another process" if made < len(missing) else ""
-            self.say(f"simulate: {made} trajectories in {time.perf_counter() - started:.1f} s{elsewhere}")
-        return list(runs)
+        from nsf.pipeline.stages.simulation import simulate_all
 
-    def _resolution(self, case: Case, scene: Scene) -> list[str]:
-        """What a trajectory is too coarse for."""
-        from nsf.scenes.resolution import resolution_warnings  # SciPy takes 0.2 s to load
-
-        return resolution_warnings(scene.at(case))
-
-    def _simulate(self, runs: dict[Run, tuple[Case, Scene]], warnings: dict[Run, list[str]]) -> int:
-        c = self.config
-
-        def job(run: Run, case: Case, scene: Scene) -> Job:
-            build = partial(scene.full_order, case, c.precision, self.device)
-            forcing = scene.at(case).forcing_at(scene.dt * np.arange(scene.steps + 1))
-            return Job(run, case, build, forcing, warnings[run])
-
-        self.check_room(runs)
-        jobs = [job(run, *needed) for run, needed in runs.items()]
-        shared = Shared(self.scene.steps, self.scene.dx, self.stored, self.device, c.precision)
-        return simulate(jobs, shared, self.say)
+        self.check()
+        return simulate_all(self, later)
 
     def full_order(self, cases: Sequence[Case]) -> list[Run]:
         """Full-order trajectories of any cases of the deployed scene; those that are there are reused."""
+        from nsf.pipeline.stages.simulation import make
+
         runs = {self.truth(case): (case, self.deployed) for case in cases}
         if missing := {run: needed for run, needed in runs.items() if not run.complete}:
-            self._simulate(missing, {run: [] for run in missing})
-        return [self.truth(case) for case in cases]
+            make(self, missing)
+        return list(runs)
 
     def train(self) -> Run:
         """The manifold of the training trajectories."""
-        return self._made(self.training, partial(train, self))
 
-    def manifold(self) -> Manifold:
+        def work(run: Run) -> None:
+            from nsf.pipeline.stages.training import train
+
+            train(self, run)
+
+        return self._made(self.training, work)
+
+    def teach(self) -> Run:
+        """What the configured model learns, once, that all its runs use.
+
+        Raises:
+            ConfigError: it learns nothing.
+        """
+
+        def work(run: Run) -> None:
+            from nsf.pipeline.stages.fitting import fit
+            from nsf.pipeline.stages.teaching import teach
+
+            (fit if self.teaching is None else teach)(self, run)
+
+        return self._made(self.taught, work)
+
+    def deploy(self) -> Run:
+        """Reduced trajectories of the held-out cases, through Lightning's `Trainer.predict`."""
+        if self.is_taught and not self.taught.complete:
+            self.teach()
+
+        def work(run: Run) -> None:
+            from nsf.pipeline.stages.choosing import measure_candidates
+            from nsf.pipeline.stages.deployment import deploy_held_out, warn_of_step
+
+            warn_of_step(self)
+            measured = measure_candidates(self) if isinstance(self.configured, Auto) else []
+            deploy_held_out(self, run, measured)
+
+        return self._made(self.deployment, work)
+
+    def evaluate(self) -> Run:
+        """Errors and costs of the reduced trajectories."""
+
+        def work(run: Run) -> None:
+            from nsf.pipeline.stages.evaluation import evaluate
+
+            evaluate(self, run)
+
+        return self._made(self.evaluation, work)
+
+    def superresolve(self) -> Run:
+        """The reduced trajectories at many more points, beside full-order ones of as many particles."""
+
+        def work(run: Run) -> None:
+            from nsf.pipeline.stages.evaluation import superresolve_held_out
+
+            superresolve_held_out(self, run)
+
+        return self._made(self.superresolution, work)
+
+    def report(self) -> Path:
+        """The report of every evaluated variant of this scene at these held-out trajectories."""
+        return report(self, self.say)
+
+    def _made(self, run: Run, work: Callable[[Run], None]) -> Run:
+        """The run, made here unless it is there or another process makes it meanwhile."""
+        if not run.complete:
+            self.check()
+            for parent in run.parent_runs:
+                parent.require()
+            with run.claimed(self.say):
+                if not run.complete:
+                    work(run)
+                    return run
+        return reused(run, self.say)
+
+    # -- reduced solvers ---------------------------------------------------------------------------------
+
+    def manifold(self) -> "Manifold":
         """The trained manifold.
 
         Raises:
             MissingRunError: it is not trained.
         """
+        from nsf.kinematics.fields.mlp import MlpField
+        from nsf.kinematics.manifold import Manifold
+
         manifold = Manifold.load(self.training.require().file("manifold.pt"))
         if isinstance(self.field, MlpField):
             manifold.arithmetic = self.field.arithmetic
@@ -142,28 +503,30 @@ class Pipeline(Plan):
 
     def solver_at(
         self,
-        manifold: Manifold,
+        manifold: "Manifold",
         case: Case,
         device: str | None = None,
         precision: str | None = None,
-        engine: str | Engine | None = None,
-    ) -> ReducedMPM:
+        engine: "str | Engine | None" = None,
+    ) -> "ReducedMPM":
         """The reduced solver of a case, at t = 0; device, precision and model as configured."""
         return self.batch_at(manifold, [case], device, precision, engine).runs[0]
 
     def batch_at(
         self,
-        manifold: Manifold,
+        manifold: "Manifold",
         cases: Sequence[Case],
         device: str | None = None,
         precision: str | None = None,
-        engine: str | Engine | None = None,
+        engine: "str | Engine | None" = None,
         scene: Scene | None = None,
-    ) -> ReducedBatch:
+    ) -> "ReducedBatch":
         """Reduced runs of several cases that take their steps together, likewise.
 
         By the configured model, of the scene that is deployed, unless an engine or a scene is given.
         """
+        from nsf.engines import reduced_batch
+
         if self.teaching is not None and self.taught.complete:
             self.operators()  # which bring the sample, whoever takes the steps
         if engine is None:
@@ -186,73 +549,51 @@ class Pipeline(Plan):
         self._samples, self._sets = batch.batch.shared.samples, batch.batch.shared.sets
         return batch
 
-    def teach(self) -> Run:
-        """What the configured model learns, once, that all its runs use.
-
-        Raises:
-            ConfigError: it learns nothing.
-        """
-        taught = self.taught
-        return self._made(taught, partial(fit if self.teaching is None else teach, self))
-
-    def operators(self) -> Operators:
+    def operators(self) -> "Operators":
         """The operators that were taught; their sample is that of all runs from here on.
 
         Raises:
             MissingRunError: none were taught.
         """
         if self._taught is None:
+            from nsf.engines import Operators
+            from nsf.pipeline.stages.teaching import OPERATORS
+
             self._taught = Operators.load(self.taught.require().file(OPERATORS))
             self._samples = self._taught.samples
         return self._taught
 
-    def fitted(self, manifold: Manifold) -> Any:
+    def fitted(self, manifold: "Manifold") -> Any:
         """What a model of latent vectors was fitted to, from its file where it learns.
 
         Raises:
             MissingRunError: it was not taught.
         """
         if self._fitted is None:
+            from nsf.pipeline.stages.fitting import fitted, loaded
+
             self._fitted = loaded(self.taught) if self.model.learns else fitted(self, manifold)
         return self._fitted
 
-    def deploy(self) -> Run:
-        """Reduced trajectories of the held-out cases, through Lightning's `Trainer.predict`."""
-        if self.is_taught and not self.taught.complete:
-            self.teach()
-        if not self.deployment.complete and (line := self._step_warning()):
-            self.say(f"deploy: warning: {line}")
-        return self._made(self.deployment, self._deploy)
 
-    def _deploy(self, run: Run) -> None:
-        measured = measure_candidates(self) if isinstance(self.configured, Auto) else []
-        deploy_held_out(self, run, measured)
+def with_candidates(config: DictConfig) -> DictConfig:
+    """A configuration with the candidates of `model=auto`, as their files have them; others as they are."""
+    model = config.model
+    if model.get("name") != "auto":
+        return config
+    config = config.copy()
+    names = model.get("candidates") or [name for name in groups()["model"] if name not in ("auto", "full")]
+    files = {name: OmegaConf.load(CONF / "model" / f"{name}.yaml") for name in names}
+    config.model.candidates = list(names)
+    config.model.of = OmegaConf.merge(files, model.get("of") or {})
+    return config
 
-    def _step_warning(self) -> str | None:
-        """Whether the reduced step is far too long for a case."""
-        scenes = map(self.deployed.at, getattr(self.split, self.config.deploy.split))
-        stable = min(largest_stable_dt(at.particles(), at.initial_velocity(), at.dx) for at in scenes)
-        return multiplied_step_warning(self.config.deploy.dt_multiplier, self.deployed.dt, stable)
 
-    def evaluate(self) -> Run:
-        """Errors and costs of the reduced trajectories."""
-        return self._made(self.evaluation, partial(evaluate, self))
+def _device(asked) -> str:
+    """The name of the device that is asked for."""
+    if str(asked) in ("auto", "cpu") and not has_driver():
+        return "cpu"
+    from nsf.mpm.device import warp_device
 
-    def report(self) -> Path:
-        """The report of every evaluated variant of this scene at these held-out trajectories."""
-        return report(self, self.say)
-
-    def superresolve(self) -> Run:
-        """The reduced trajectories at many more points, beside full-order ones of as many particles."""
-        return self._made(self.superresolution, partial(superresolve_held_out, self))
-
-    def _made(self, run: Run, make: Callable[[Run], None]) -> Run:
-        """The run, made here unless it is there or another process makes it meanwhile."""
-        if not run.complete:
-            for parent in run.parent_runs:
-                parent.require()
-            with run.claimed(self.say):
-                if not run.complete:
-                    make(run)
-                    return run
-        return reused(run, self.say)
+    device = warp_device(asked)
+    return str(device) if device.is_cuda else "cpu"

@@ -13,7 +13,7 @@ from nsf import config as configuration
 from nsf.config.documents import text_of
 from nsf.errors import ConfigError, MissingRunError
 from nsf.paths import EXPERIMENTS, reports_folder
-from nsf.pipeline.names import Names
+from nsf.pipeline.chain import Pipeline
 from nsf.results.question import Question, unchanged
 from nsf.runs import Run
 from nsf.vectors import is_finite
@@ -153,21 +153,20 @@ class Experiment:
         keys, missing, scales = {}, [], set()
         for job in self.jobs:
             config = configuration.load(job.overrides)
-            plan = Names(config, root)
+            pipeline = Pipeline(config, root=root)
             try:
-                run = plan.evaluated()
+                run = pipeline.evaluated()
             except MissingRunError:
-                missing.append(f"{' '.join(job.overrides)}: {_why(plan)}")
+                missing.append(f"{' '.join(job.overrides)}: {_why(pipeline)}")
                 continue
             runs[run.id], keys[run.id] = run, job.keys
             scales.add(config.scale)
             if "superresolve" in self.stages:
                 try:
-                    fine[run.id] = plan.superresolved()
+                    fine[run.id] = pipeline.evaluated("superresolve")
                 except MissingRunError:
-                    missing.append(
-                        f"{' '.join(job.overrides)}: {_ended(plan.superresolution) or 'superresolve not run'}"
-                    )
+                    why = _ended(pipeline.superresolution) or "superresolve not run"
+                    missing.append(f"{' '.join(job.overrides)}: {why}")
         if not runs:
             raise MissingRunError(
                 f"no job of {self.name} was evaluated; run `nsf run +experiment={self.name}`"
@@ -297,13 +296,13 @@ def _grid(values, where: str) -> dict[str, str]:
     return {key: f"{key}={_values(value)}" for key, value in values.items()}
 
 
-def _why(plan: Names) -> str:
+def _why(pipeline: Pipeline) -> str:
     """What became of a job that has no result: the first stage that did not end well."""
     needed = (
-        [plan.simulation(v) for v in plan.split.train],
-        [plan.training],
-        [plan.deployment],
-        [plan.evaluation],
+        pipeline.training_data,
+        [pipeline.training],
+        [pipeline.deployment],
+        [pipeline.evaluation],
     )
     for runs in needed:
         for run in runs:

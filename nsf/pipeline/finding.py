@@ -5,13 +5,10 @@ from typing import Any
 
 from nsf import config
 from nsf.errors import ConfigError
-from nsf.pipeline.names import Names
+from nsf.pipeline.chain import Pipeline
 from nsf.runs import Run
 
-_STAGES = {
-    "train": "training", "teach": "taught", "deploy": "deployment", "evaluate": "evaluation",
-    "superresolve": "superresolution",
-}  # fmt: skip
+_STAGES = ("train", "teach", "deploy", "evaluate", "superresolve")
 
 
 def find(*words: str, stage: str = "train", root: str | Path | None = None, **keys: Any) -> Run:
@@ -32,12 +29,10 @@ def find(*words: str, stage: str = "train", root: str | Path | None = None, **ke
     overrides = [*words, *(f"{key}={_hydra(value)}" for key, value in keys.items())]
     if not any(map(config.names_scene, overrides)):
         raise ConfigError('name a scene, as scene="sand"')
-    names = Names(config.load(overrides), None if root is None else Path(root))
-    if stage == "evaluate":
-        return names.evaluated()
-    if stage == "superresolve":
-        return names.superresolved()
-    return getattr(names, _STAGES[stage]).require()
+    pipeline = Pipeline(config.load(overrides), root=None if root is None else Path(root))
+    if stage in ("evaluate", "superresolve"):
+        return pipeline.evaluated(stage)
+    return (pipeline.runs_of(stage) or [pipeline.taught])[0].require()
 
 
 def _hydra(value: Any) -> str:

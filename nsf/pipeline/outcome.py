@@ -8,7 +8,7 @@ from rich.table import Table
 
 from nsf import config as configuration
 from nsf.errors import MissingRunError
-from nsf.pipeline.names import Names
+from nsf.pipeline.chain import Pipeline
 from nsf.results.columns import COLUMNS
 from nsf.runs import Run
 
@@ -38,7 +38,7 @@ def outcome_table(sweeps: Sequence[Sequence[str]], failed: Mapping[str, str]) ->
     for job in jobs:
         told = " ".join(f"{key}={job[key]}" for key in keys if key in varied and key in job)
         try:
-            run = Names(configuration.load([f"{key}={value}" for key, value in job.items()])).evaluated()
+            run = Pipeline(configuration.load([f"{key}={value}" for key, value in job.items()])).evaluated()
             cells = [*_means(run), run.hash]
         except MissingRunError:
             cells = [""] * len(_SHOWN) + ["failed" if told in failed else "not evaluated"]

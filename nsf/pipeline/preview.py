@@ -10,12 +10,11 @@ from rich.markup import escape
 from rich.table import Table
 
 from nsf import config as configuration
-from nsf.pipeline.names import Names
+from nsf.pipeline.chain import Pipeline
 from nsf.runs import Run
 from nsf.runs.pruning import bytes_text
 
-_RUNS = {"train": "training", "teach": "taught", "deploy": "deployment", "evaluate": "evaluation"}
-STAGES = ("simulate", *_RUNS)
+STAGES = ("simulate", "train", "teach", "deploy", "evaluate")
 #: Key whose value runs of a stage must share for their times to be compared.
 _ALIKE = {"train": "field", "deploy": "model"}
 
@@ -45,7 +44,7 @@ class Expected:
         return "to be made" if self.runs == 1 else f"{self.runs - self.made} of {self.runs} to be made"
 
 
-def plans(jobs: Sequence[Sequence[str]]) -> list[Names]:
+def plans(jobs: Sequence[Sequence[str]]) -> list[Pipeline]:
     """Each job checked as before its work, where it has any.
 
     Raises:
@@ -54,24 +53,15 @@ def plans(jobs: Sequence[Sequence[str]]) -> list[Names]:
     found = []
     for job in jobs:
         config = configuration.load(job)
-        names = Names(config)
-        names.check_held_out()
-        if any(not run.complete for run in runs_of(names, "simulate")) or not names.evaluation.complete:
-            from nsf.pipeline.plan import Plan
-
-            names = Plan(config)
-        found.append(names)
+        pipeline = Pipeline(config)
+        _ = pipeline.held_out
+        if not all(run.complete for stage in ("simulate", "evaluate") for run in pipeline.runs_of(stage)):
+            pipeline.check()
+        found.append(pipeline)
     return found
 
 
-def runs_of(names: Names, stage: str) -> list[Run]:
-    """The runs of a stage, each once; none of `teach` where no operators are taught."""
-    if stage == "simulate":
-        return list(dict.fromkeys(names.simulation(*needed) for needed in names.needed()))
-    return [getattr(names, _RUNS[stage])] if stage in names.stages else []
-
-
-def stages_table(found: Sequence[Names]) -> Table:
+def stages_table(found: Sequence[Pipeline]) -> Table:
     """State, expected time and room of every stage of some jobs, whose common runs count once."""
     table = Table(box=None, header_style="bold", pad_edge=False)
     if len(found) > 1:
@@ -84,7 +74,7 @@ def stages_table(found: Sequence[Names]) -> Table:
         table.add_column(heading, justify=side, no_wrap=heading == "run")
     seconds, size = 0.0, 0.0
     for stage in STAGES:
-        own = {run: names for names in found for run in runs_of(names, stage)}
+        own = {run: pipeline for pipeline in found for run in pipeline.runs_of(stage)}
         if not own:
             continue
         told = expected(stage, own)
@@ -101,22 +91,22 @@ def stages_table(found: Sequence[Names]) -> Table:
     return table
 
 
-def expected(stage: str, runs: dict[Run, Names]) -> Expected:
+def expected(stage: str, runs: dict[Run, Pipeline]) -> Expected:
     """What the runs of a stage will take, by those of its kind that are there, at best of the same scene."""
-    missing = {run: names for run, names in runs.items() if not run.complete}
+    missing = {run: pipeline for run, pipeline in runs.items() if not run.complete}
     told = Expected(len(runs), len(runs) - len(missing))
     if not missing:
         return told
     there = [run for run in Run.find(stage, root=next(iter(runs)).root) if run.complete]
     seconds, size = 0.0, 0.0
-    for run, names in missing.items():
-        alike = [r for r in there if r.manifest.get("device") == names.device and _kind(r) == _kind(run)]
+    for run, pipeline in missing.items():
+        alike = [r for r in there if r.manifest.get("device") == pipeline.device and _kind(r) == _kind(run)]
         near = [r for r in alike if r.scene == run.scene] or alike
         told.known = len(near)
         of = run.scene if near and near[0].scene == run.scene else "other scenes"
         told.like = f"run{'s' * (len(near) > 1)} of {of}"
         if stage == "simulate":
-            stored = trajectory_bytes(names)
+            stored = trajectory_bytes(pipeline)
             rates = [r.manifest["seconds"] / _bytes(r) for r in near if _bytes(r)]
             seconds += statistics.median(rates) * stored if rates else math.nan
             size += stored
@@ -127,23 +117,23 @@ def expected(stage: str, runs: dict[Run, Names]) -> Expected:
     return told
 
 
-def scene_table(names: Names) -> Table:
+def scene_table(pipeline: Pipeline) -> Table:
     """Particles, grid, resolution and step of a scene, and its cases."""
     from nsf.mpm.stability import largest_stable_dt, multiplied_step_warning
     from nsf.scenes.resolution import thinnest
 
-    scene = names.scene
-    case = names.split.cases[0]
+    scene = pipeline.scene
+    case = pipeline.split.cases[0]
     at = scene.at(case)
     stable = min(
         largest_stable_dt(one.particles(), one.initial_velocity(), one.dx)
-        for one in map(scene.at, names.split.cases)
+        for one in map(scene.at, pipeline.split.cases)
     )
     table = Table(box=None, show_header=False, pad_edge=False)
     table.add_column(style="bold")
     table.add_column(overflow="fold")
     rows = {
-        "scene": f"{scene.name}, {names.config.scale} scale",
+        "scene": f"{scene.name}, {pipeline.config.scale} scale",
         "particles": f"{scene.particle_count:,}",
         "grid": f"{' × '.join(map(str, scene.grid.nodes))} nodes, Δx = {scene.dx:.4g} m",
         "steps": f"{scene.steps:,} of Δt = {scene.dt:.4g} s; up to {stable:.3g} s is stable",
@@ -152,35 +142,37 @@ def scene_table(names: Names) -> Table:
         cells = thickness / scene.dx
         rows[f"thinnest of {name}"] = "2 cells or more" if math.isinf(cells) else f"{cells:.2g} cells"
     for part in ("train", "validation", "test"):
-        cases = getattr(names.split, part)
+        cases = getattr(pipeline.split, part)
         rows[part] = f"{len(cases)}: " + "; ".join(case.text for case in cases) if cases else "none"
-    rows["deployed"] = f"on {names.device}, model {names.configured.name}, r {names.config.latent_dim}"
-    if line := multiplied_step_warning(names.config.deploy.dt_multiplier, scene.dt, stable):
+    rows["deployed"] = (
+        f"on {pipeline.device}, model {pipeline.configured.name}, r {pipeline.config.latent_dim}"
+    )
+    if line := multiplied_step_warning(c.deploy.dt_multiplier, scene.dt, stable):
         rows["warning"] = line
     for key, told in rows.items():
         table.add_row(key, escape(told))
     return table
 
 
-def scenes(found: Sequence[Names]) -> list[Names]:
+def scenes(found: Sequence[Pipeline]) -> list[Pipeline]:
     """One job for each scene and size."""
     return list({(n.scene.name, n.scene.particle_count, n.scene.dt): n for n in reversed(found)}.values())[
         ::-1
     ]
 
 
-def composed(names: Names) -> str:
+def composed(pipeline: Pipeline) -> str:
     """The whole configuration, every reference in it resolved, as yaml."""
-    return OmegaConf.to_yaml(names.config, resolve=True)
+    return OmegaConf.to_yaml(pipeline.config, resolve=True)
 
 
-def trajectory_bytes(names: Names) -> float:
+def trajectory_bytes(pipeline: Pipeline) -> float:
     """Of one trajectory on disk."""
     from nsf.mpm import FP32, FP64
     from nsf.mpm.recording import frame_bytes
 
-    stored = FP32 if names.config.data.dtype == "float32" else FP64
-    return (names.scene.steps + 1) * frame_bytes(names.scene.particle_count, stored)
+    stored = FP32 if pipeline.config.data.dtype == "float32" else FP64
+    return (pipeline.scene.steps + 1) * frame_bytes(pipeline.scene.particle_count, stored)
 
 
 def _kind(run: Run) -> str:

@@ -4,53 +4,48 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
 from nsf.errors import MissingRunError
-from nsf.pipeline.names import Names
 from nsf.results.question import Question, unchanged
 from nsf.runs import Run
 
 Say = Callable[[str], object]
 
 
-def done(names: Names, stages: Sequence[str], say: Say) -> list[Run] | Run | Path | None:
+def done(pipeline, stages: Sequence[str], say: Say) -> list[Run] | Run | Path | None:
     """The result of the last of some stages where none has anything to do; None where one has.
 
     Args:
-        names: of the runs.
+        pipeline: a `nsf.pipeline.Pipeline`.
         stages: as of `nsf.pipeline.sweep.work`.
         say: told what is reused, as the stages themselves would.
     """
-    kinds = {
-        "train": "training", "teach": "taught", "deploy": "deployment", "evaluate": "evaluation",
-        "superresolve": "superresolution",
-    }  # fmt: skip
-    trajectories = [names.simulation(*needed) for needed in names.needed()] if "simulate" in stages else []
+    trajectories = pipeline.runs_of("simulate") if "simulate" in stages else []
     later = [stage for stage in stages if stage != "simulate"]
-    spare = names.spare(later) if later and trajectories else set()
+    spare = pipeline.spare(later) if later and trajectories else set()
     if not all(run.complete or run.id in spare for run in trajectories):
         return None
-    runs = {name: getattr(names, kinds[name]) for name in stages if name in kinds}
+    runs = {name: (pipeline.runs_of(name) or [pipeline.taught])[0] for name in later if name != "report"}
     if not all(run.complete for run in runs.values()):
         return None
-    page = kept_report(names) if "report" in stages else None
+    page = kept_report(pipeline) if "report" in stages else None
     if "report" in stages and page is None:
         return None
     result: list[Run] | Run | Path | None = None
     for name in stages:
         if name == "simulate":
-            simulations(names, trajectories, later, say)
+            simulations(pipeline, trajectories, later, say)
             result = list(dict.fromkeys(trajectories))
         elif name == "report":
-            result = report(names, say)
+            result = report(pipeline, say)
         else:
             result = reused(runs[name], say)
     return result
 
 
-def simulations(names: Names, runs: Iterable[Run], later: Sequence[str], say: Say) -> list[Run]:
+def simulations(pipeline, runs: Iterable[Run], later: Sequence[str], say: Say) -> list[Run]:
     """The trajectories that have to be made, once it is said which are there, and what they warn of.
 
     Args:
-        names: of the runs.
+        pipeline: a `nsf.pipeline.Pipeline`.
         runs: the trajectories.
         later: the stages that they are for, if no others: trajectories that only read are in these
             stages' results, where those are there, are not made again.
@@ -59,7 +54,7 @@ def simulations(names: Names, runs: Iterable[Run], later: Sequence[str], say: Sa
     runs = list(dict.fromkeys(runs))
     there = [run for run in runs if run.complete]
     missing = [run for run in runs if run not in there]
-    spare = names.spare(later) if later and missing else set()
+    spare = pipeline.spare(later) if later and missing else set()
     needless = [run for run in missing if run.id in spare]
     if there:
         say(f"simulate: {len(there)} of {len(runs)} trajectories are there, reused")
@@ -76,34 +71,34 @@ def reused(run: Run, say: Say) -> Run:
     return run
 
 
-def kept_report(names: Names) -> Path | None:
+def kept_report(pipeline) -> Path | None:
     """The page of the report, if nothing that it shows has changed since it was written."""
-    runs = names.reported()
-    return unchanged(names.report_folder, runs, question(names), names.evaluation) if runs else None
+    runs = pipeline.reported()
+    return unchanged(pipeline.report_folder, runs, question(pipeline), pipeline.evaluation) if runs else None
 
 
-def question(names: Names) -> Question:
+def question(pipeline) -> Question:
     """What the report of a scene is about."""
-    return Question(names.config.report.name, names.config.scene.title)
+    return Question(pipeline.config.report.name, pipeline.config.scene.title)
 
 
-def report(names: Names, say: Say) -> Path:
+def report(pipeline, say: Say) -> Path:
     """The page of every evaluated variant of a scene, written anew where something has changed.
 
     Raises:
         MissingRunError: there is none.
     """
-    runs = names.reported()
+    runs = pipeline.reported()
     if not runs:
         raise MissingRunError(
             "no evaluate run of these held-out cases is there; run `nsf run` with the same keys"
         )
-    folder = names.report_folder
-    if page := unchanged(folder, runs, question(names), names.evaluation):
+    folder = pipeline.report_folder
+    if page := unchanged(folder, runs, question(pipeline), pipeline.evaluation):
         say(f"report: evaluated runs: {len(runs)}, unchanged, reused → {page}")
         return page
     from nsf.results.report import build_report
 
-    page = build_report(runs, folder, question(names), first=names.evaluation)
+    page = build_report(runs, folder, question(pipeline), first=pipeline.evaluation)
     say(f"report: evaluated runs: {len(runs)} → {page}")
     return page

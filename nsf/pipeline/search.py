@@ -14,7 +14,6 @@ from nsf.canonical import content_hash
 from nsf.errors import ConfigError, MissingRunError, NSFError
 from nsf.extras import optional
 from nsf.pipeline.chain import Pipeline
-from nsf.pipeline.plan import Plan
 from nsf.results.search import OBJECTIVES, write_search
 from nsf.storage import locked
 
@@ -87,7 +86,7 @@ def search(words: Sequence[str], say: Callable[[str], object] = print, root: Pat
     with configuration.naming_the_missing():
         objectives, trials = _asked(config)
     _check(ranges, fixed, root)
-    study = _study(config, ranges, fixed, objectives, Path(Plan(config, root).training.root))
+    study = _study(config, ranges, fixed, objectives, Path(Pipeline(config, root=root).check().training.root))
 
     def objective(trial):
         tried = [r.suggest(trial) for r in ranges]
@@ -142,11 +141,11 @@ def _check(ranges: Sequence[Range], fixed: Sequence[str], root: Path | None) -> 
     """Build both ends of each range, with the test cases still there, so that no case is in two splits."""
     for end in ("low", "high"):
         overrides = [*fixed, *(f"{r.key}={getattr(r, end)}" for r in ranges), "deploy.split=validation"]
-        plan = Plan(configuration.load(overrides), root)
-        if not plan.split.validation:
+        pipeline = Pipeline(configuration.load(overrides), root=root).check()
+        if not pipeline.split.validation:
             raise ConfigError(
-                f"scene={plan.scene.name} has no validation cases, and a search never looks at test cases; "
-                "give some, apart from those of training and test, as scene.design.validation=[27,31]"
+                f"scene={pipeline.scene.name} has no validation cases, and a search never looks at test "
+                "cases; give some, apart from those of training and test, as scene.design.validation=[27,31]"
             )
 
 

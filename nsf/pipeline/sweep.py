@@ -22,7 +22,7 @@ from nsf.data.schema import TRAJECTORY
 from nsf.errors import ConfigError, LaunchError, NSFError
 from nsf.extras import optional
 from nsf.gpu import has_driver
-from nsf.pipeline.names import Names
+from nsf.pipeline.chain import Pipeline
 from nsf.pipeline.reuse import done
 from nsf.pipeline.reuse import report as report_of
 from nsf.progress import label, labelled
@@ -55,20 +55,18 @@ def work(config: DictConfig, stages: Sequence[str], say: Callable[[str], object]
         from nsf.results.point import plot_point
 
         return plot_point(config)
-    names = Names(config)
-    if len(stages) > 1:
-        stages = _of_chain(names, stages)
-        names.check_held_out()  # before hours of simulation and training, not after
-    if "report" in stages:
-        names.check_report_folder()
-    if "report" in stages[:1]:
-        return report_of(names, say)
-    if (there := done(names, stages, say)) is not None:
-        return there
-    from nsf.pipeline.chain import Pipeline
-
     pipeline = Pipeline(config, say)
-    with reserving(names.inputs if len(stages) > 1 else ()):
+    if len(stages) > 1:
+        stages = _of_chain(pipeline, stages)
+        _ = pipeline.held_out  # refused before hours of simulation and training, not after
+    if "report" in stages:
+        pipeline.check_report_folder()
+    if "report" in stages[:1]:
+        return report_of(pipeline, say)
+    if (there := done(pipeline, stages, say)) is not None:
+        return there
+    pipeline.check()
+    with reserving(pipeline.inputs if len(stages) > 1 else ()):
         for at, name in enumerate(stages):
             result = pipeline.simulate(stages[at + 1 :]) if name == "simulate" else pipeline.run(name)
     return result
@@ -119,13 +117,11 @@ def sweep(
     def check(one: DictConfig) -> None:
         movable.append(one.device == "auto")
         if "point" not in stages:
-            names = Names(one)
-            kept.add(names.config.data.keep)
-            needed.update(names.inputs)
-            if done(names, _of_chain(names, stages), lambda line: None) is None:
-                from nsf.pipeline.plan import Plan
-
-                Plan(one)
+            pipeline = Pipeline(one)
+            kept.add(one.data.keep)
+            needed.update(pipeline.inputs)
+            if done(pipeline, _of_chain(pipeline, stages), lambda line: None) is None:
+                pipeline.check()
 
     for overrides in sweeps:
         configuration.check_sweep(overrides, config_name, check)
@@ -155,7 +151,7 @@ def sweep(
                     say(f"not started: the jobs of later scenes, {later}; the same command goes on with them")
                 raise
             if dropped and not any(found):
-                _drop_training([Names(configuration.load(job, config_name)) for job in scene], say)
+                _drop_training([Pipeline(configuration.load(job, config_name)) for job in scene], say)
             errors += found
     return [
         Failure(tuple(override for override in job if override not in common), error)
@@ -170,7 +166,7 @@ def reports(overrides: Sequence[str], say: Callable[[str], object] = print) -> l
     Raises:
         MissingRunError: no job of a scene was evaluated.
     """
-    return [report_of(names, say) for names in _reporting(overrides)]
+    return [report_of(pipeline, say) for pipeline in _reporting(overrides)]
 
 
 def check_report_folders(overrides: Sequence[str]) -> None:
@@ -180,20 +176,20 @@ def check_report_folders(overrides: Sequence[str]) -> None:
         ConfigError: something else stands there.
         StorageError: the folder above it cannot be written.
     """
-    for names in _reporting(overrides):
-        names.check_report_folder()
+    for pipeline in _reporting(overrides):
+        pipeline.check_report_folder()
 
 
-def _reporting(overrides: Sequence[str]) -> list[Names]:
+def _reporting(overrides: Sequence[str]) -> list[Pipeline]:
     """One for each page."""
     configs = [configuration.load(job) for job in configuration.jobs([overrides])]
     last = {(config.report.folder, config.report.name): config for config in configs}
-    return [Names(config) for config in last.values()]
+    return [Pipeline(config) for config in last.values()]
 
 
-def _of_chain(names: Names, stages: Sequence[str]) -> list[str]:
+def _of_chain(pipeline: Pipeline, stages: Sequence[str]) -> list[str]:
     """The stages that a configuration has."""
-    return [name for name in stages if len(stages) == 1 or name != "teach" or name in names.stages]
+    return [name for name in stages if len(stages) == 1 or name != "teach" or name in pipeline.stages]
 
 
 def visible_gpus() -> tuple[str, ...]:
@@ -260,14 +256,14 @@ def _scenes(jobs: Sequence[tuple[str, ...]]) -> list[list[tuple[str, ...]]]:
     return [list(group) for _, group in itertools.groupby(jobs, configuration.scene_of)]
 
 
-def _drop_training(plans: Sequence[Names], say: Callable[[str], object]) -> None:
+def _drop_training(pipelines: Sequence[Pipeline], say: Callable[[str], object]) -> None:
     """Delete the trajectories that the jobs trained on, but for those that one of them is held to.
 
     Their manifests stay; `nsf simulate` makes the trajectories again. What another process makes or needs is
     left.
     """
-    truths = {plan.truth(case).id for plan in plans for case in plan.held_out}
-    for run in {run for plan in plans for run in plan.training_data if run.id not in truths}:
+    truths = {one.truth(case).id for one in pipelines for case in one.held_out}
+    for run in {run for one in pipelines for run in one.training_data if run.id not in truths}:
         if run.id in reserved(run.root, by_others=True):
             continue
         try:

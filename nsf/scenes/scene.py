@@ -61,7 +61,8 @@ class Scene:
 
     def __post_init__(self):
         text("scene.name", self.name)
-        number("scene.dt", self.dt)
+        if not number("scene.dt", self.dt) > 0:
+            raise ConfigError(f"scene.dt={self.dt} s must be positive")
         number("scene.steps", self.steps, least=1, whole=True)
         number("scene.program", self.program, least=0, whole=True)
         size = tuple(length("scene.size", edge) for edge in vector("scene.size", self.size, "m"))

@@ -42,7 +42,7 @@ def try_command(command: str, folder: Path, monkeypatch, capsys, experiments: Pa
     if name == "search":
         ranges = [Range.parse(word) for word in words]
         assert any(ranges)
-        Pipeline(config.load([word for word, found in zip(words, ranges, strict=True) if not found]))
+        Pipeline(config.load([word for word, found in zip(words, ranges, strict=True) if not found])).check()
     elif name in TOOLS:
         if name == "bench":
             words = _quick(words)
@@ -86,4 +86,4 @@ def _build(command: str, experiments: Path) -> None:
             first = Experiment.load(named[-1], own, experiments).jobs[0]
             config.load([*first.overrides, "device=cpu"])
         else:
-            Pipeline(config.load([*own, "device=cpu"]))
+            Pipeline(config.load([*own, "device=cpu"])).check()

@@ -56,7 +56,7 @@ def add(file: str, content: str, project: Path) -> None:
         importlib.import_module(file.removesuffix(".py").replace("/", "."))
     elif group == "experiments":
         for job in Experiment.load(name, folder=project / "experiments").jobs:
-            Pipeline(config.load([*job.overrides, "device=cpu"]))
+            Pipeline(config.load([*job.overrides, "device=cpu"])).check()
     elif group == "conf/hydra/launcher":
         launcher = config.launching([f"hydra/launcher={name}"])[0].hydra.launcher
         assert set(yaml.safe_load(content)) - {"defaults"} <= set(launcher)
@@ -65,7 +65,7 @@ def add(file: str, content: str, project: Path) -> None:
     else:
         assert group in ("conf/scene", "conf/field", "conf/projector", "conf/sampler", "conf/model"), file
         option = f"{group.removeprefix('conf/')}={name}"
-        Pipeline(config.load([option, "scale=small", "device=cpu"]))
+        Pipeline(config.load([option, "scale=small", "device=cpu"])).check()
 
 
 #: A chain as a page tells it, with its particles but few steps, values and iterations.

@@ -10,7 +10,6 @@ from nsf import config
 from nsf.paths import CONF, EXPERIMENTS, groups
 from nsf.pipeline import Pipeline
 from nsf.pipeline.experiment import Experiment
-from nsf.pipeline.plan import Plan
 
 NAMES = sorted(path.stem for path in EXPERIMENTS.glob("*.yaml"))
 #: The same, with a name for each part.
@@ -47,7 +46,7 @@ def _jobs():
 @pytest.mark.slow
 @pytest.mark.parametrize("overrides", _jobs(), ids=" ".join)
 def test_every_kind_of_job_builds(overrides):
-    Pipeline(config.load([*overrides, "device=cpu"]))
+    Pipeline(config.load([*overrides, "device=cpu"])).check()
 
 
 def test_all_experiments_with_a_report_of_their_own_are_reproduced():
@@ -80,7 +79,7 @@ def _ids(name, stage, keys):
     """Names of the runs of a stage, of those jobs that have these values."""
     jobs = [job for job in _small(name) if keys.items() <= job.keys.items()]
     assert jobs
-    return {getattr(Plan(config.load(job.overrides)), stage).id for job in jobs}
+    return {getattr(Pipeline(config.load(job.overrides)), stage).id for job in jobs}
 
 
 @pytest.mark.slow

@@ -25,7 +25,7 @@ OF_SCALE = [
 
 @pytest.mark.parametrize(("group", "option", "scale"), [*CHAIN, *OF_SCALE])
 def test_option_builds(group, option, scale):
-    Pipeline(config.load([f"{group}={option}", f"scale={scale}", "device=cpu"]))
+    Pipeline(config.load([f"{group}={option}", f"scale={scale}", "device=cpu"])).check()
 
 
 @pytest.mark.parametrize("name", GROUPS["hydra/launcher"])
@@ -37,7 +37,7 @@ def test_launcher_composes(name):
 @pytest.mark.parametrize("scale", ["small", "paper"])
 def test_scene_is_runnable(name, scale):
     """It is built in the cases at the ends of each range, with particles in the domain and a stable step."""
-    scene = Pipeline(config.load([f"scene={name}", f"scale={scale}", "device=cpu"])).scene
+    scene = Pipeline(config.load([f"scene={name}", f"scale={scale}", "device=cpu"])).check().scene
     assert scene.name == name
     ends = {end(scene.split.cases, key=itemgetter(of)) for of in scene.varied for end in (min, max)}
     for case in sorted(ends):

@@ -170,7 +170,7 @@ def test_the_choice_of_auto():
 def test_what_cannot_be_asked_for(tmp_path, tiny, overrides, message):
     base = [] if "scene=block" in overrides else tiny
     with pytest.raises(ConfigError, match=message):
-        Pipeline(config.load([*base, *overrides]), root=tmp_path)
+        Pipeline(config.load([*base, *overrides]), root=tmp_path).check()
 
 
 @pytest.mark.parametrize(
@@ -204,7 +204,7 @@ def own_model(tmp_path, monkeypatch):
     shutil.copytree(CONF, tmp_path / "conf")
     yaml = "_target_: nsf.models.gru.GRU\nname: gru\nwidth: 8\ndescent: 200\n"
     (tmp_path / "conf/model/gru.yaml").write_text(yaml)
-    for module in ("nsf.config.composing", "nsf.paths", "nsf.pipeline.names"):
+    for module in ("nsf.config.composing", "nsf.paths", "nsf.pipeline.chain"):
         monkeypatch.setattr(sys.modules[module], "CONF", tmp_path / "conf")
     yield "gru"
     sys.modules.pop("nsf.models.gru", None)

@@ -8,8 +8,7 @@ from omegaconf import OmegaConf
 from nsf import progress
 from nsf.cli import main
 from nsf.config import load
-from nsf.pipeline import preview
-from nsf.pipeline.names import Names
+from nsf.pipeline import Pipeline, preview
 from nsf.pipeline.outcome import outcome_table
 from nsf.progress import Progress, label, labelled
 
@@ -67,9 +66,9 @@ def test_what_is_to_be_made_is_expected_to_take_what_the_like_of_it_took(nsf, ch
     assert {path for path in chain.root.rglob("*")} == before
 
 
-def test_a_scene_whose_parameter_others_refer_to():
-    names = Names(load(["scene=cake", "scale=small", "device=cpu"]))  # as of a chain that is there
-    shown = preview.scene_table(names)
+def test_a_scene_of_a_chain_that_is_there():
+    pipeline = Pipeline(load(["scene=cake", "scale=small", "device=cpu"]))  # as of a chain that is there
+    shown = preview.scene_table(pipeline)
     assert "12,500" in list(shown.columns[1].cells)
 
 
@@ -77,7 +76,7 @@ def test_trajectories_take_what_their_bytes_say(chain, tiny):
     words = [word for word in tiny if not word.startswith("scene.design.train")]
     (names,) = preview.plans([(*words, "scene.design.train=[21,25,35]")])
     names.root = chain.root
-    told = preview.expected("simulate", {run: names for run in preview.runs_of(names, "simulate")})
+    told = preview.expected("simulate", {run: names for run in names.runs_of("simulate")})
     of_one = chain.trajectory(26.0).stat().st_size
     assert (told.runs, told.made) == (4, 1)
     assert told.size == pytest.approx(3 * of_one, rel=0.2)

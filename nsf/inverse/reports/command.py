@@ -283,10 +283,10 @@ def _runs(named: str | None, experiment: str | None) -> list[Run]:
             return [Run.newest("deploy")]
         return [Run.named(name, "deploy").require() for name in named.split(",")]
     from nsf import config
+    from nsf.pipeline import Pipeline
     from nsf.pipeline.experiment import Experiment
-    from nsf.pipeline.names import Names
 
-    runs = [Names(config.load(job.overrides)).deployment for job in Experiment.load(experiment).jobs]
+    runs = [Pipeline(config.load(job.overrides)).deployment for job in Experiment.load(experiment).jobs]
     if missing := [run for run in runs if not run.complete]:
         raise MissingRunError(
             f"no complete deploy run is there of {len(missing)} jobs of {experiment}, as {missing[0].id}; "

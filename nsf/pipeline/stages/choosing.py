@@ -46,7 +46,7 @@ def measure_candidates(pipeline) -> list[Measured]:
 def _measured(pipeline, name: str) -> Measured:
     """A candidate at the validation cases, by a deploy run of its own."""
     try:
-        alone = type(pipeline)(pipeline.alone(name), pipeline.say, pipeline.root)
+        alone = pipeline.alone(name).check()
     except ConfigError as error:
         return Measured(name, refused=str(error))
     run, manifold = alone.deploy(), alone.manifold().to(alone.device)

@@ -28,6 +28,7 @@ from nsf.engines.operators import collider_states
 from nsf.kinematics.manifold import Manifold
 from nsf.models import FullOrder, Projected, Recurrence
 from nsf.models.auto import Measured
+from nsf.mpm.stability import largest_stable_dt, multiplied_step_warning
 from nsf.runs import Record, Run
 from nsf.storage import writing
 
@@ -77,6 +78,14 @@ def deploy_held_out(pipeline, run: Run, measured: Sequence[Measured] = ()) -> No
         f"deploy: model={pipeline.model.name}, |S|={rollouts[0].sample}, "
         f"{len(rollouts)} cases{at_once} → {run.id}"
     )
+
+
+def warn_of_step(pipeline) -> None:
+    """Say so where the reduced step of a pipeline is far too long for a case."""
+    scenes = map(pipeline.deployed.at, pipeline.held_out)
+    stable = min(largest_stable_dt(at.particles(), at.initial_velocity(), at.dx) for at in scenes)
+    if line := multiplied_step_warning(pipeline.config.deploy.dt_multiplier, pipeline.deployed.dt, stable):
+        pipeline.say(f"deploy: warning: {line}")
 
 
 def write_configuration(pipeline, record: Record) -> None:

@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -16,8 +18,12 @@ from nsf.data.schema import TRAJECTORY
 from nsf.errors import InstabilityError
 from nsf.mpm import FullOrderMPM, ParticleConstants, Precision, diagnosed
 from nsf.mpm.recording import HostMemory, blocks
+from nsf.pipeline.checks import check_room
+from nsf.pipeline.reuse import simulations
 from nsf.progress import Progress
 from nsf.runs import Run
+from nsf.scenes import Scene
+from nsf.scenes.resolution import resolution_warnings
 
 # Trajectories that are written at once; each holds about ten blocks of frames (64 MiB) at most.
 _WRITERS = min(8, os.cpu_count() or 1)
@@ -197,3 +203,53 @@ def _store(
         record.warn(item.warnings)
         record.metrics["seconds"] = item.cost.seconds
         record.output(TRAJECTORY)
+
+
+def simulate_all(pipeline, later: Sequence[str] = ()) -> list[Run]:
+    """The trajectories of every case of a pipeline, those that are not there made.
+
+    Args:
+        pipeline: a `nsf.pipeline.Pipeline`.
+        later: as for `Pipeline.simulate`.
+    """
+    # A changed scene that changes nothing, or trains on what it deploys, names one run twice.
+    runs = {pipeline.simulation(*needed): needed for needed in pipeline.needed()}
+    missing = simulations(pipeline, runs, later, pipeline.say)
+    if not missing:
+        return list(runs)
+    pipeline.check()
+    warnings = {run: resolution_warnings(scene.at(case)) for run in missing for case, scene in [runs[run]]}
+    known = {line for run in runs if run.complete for line in run.manifest.get("warnings", ())}
+    for line in dict.fromkeys(line for lines in warnings.values() for line in lines):
+        if line not in known:
+            pipeline.say(f"simulate: warning: {line}")
+    started = time.perf_counter()
+    made = make(pipeline, {run: runs[run] for run in missing}, warnings)
+    elsewhere = f", {len(missing) - made} by another process" if made < len(missing) else ""
+    pipeline.say(f"simulate: {made} trajectories in {time.perf_counter() - started:.1f} s{elsewhere}")
+    return list(runs)
+
+
+def make(
+    pipeline,
+    runs: Mapping[Run, tuple[Case, Scene]],
+    warnings: Mapping[Run, Sequence[str]] = MappingProxyType({}),
+) -> int:
+    """Make trajectories of a pipeline; gives how many were made here.
+
+    Args:
+        pipeline: a `nsf.pipeline.Pipeline`.
+        runs: to be made, at least one, each with its case and scene.
+        warnings: lines of some, for their manifests.
+    """
+    check_room(pipeline, runs)
+    c, device = pipeline.config, pipeline.device
+
+    def job(run: Run, case: Case, scene: Scene) -> Job:
+        build = partial(scene.full_order, case, c.precision, device)
+        forcing = scene.at(case).forcing_at(scene.dt * np.arange(scene.steps + 1))
+        return Job(run, case, build, forcing, warnings.get(run, ()))
+
+    jobs = [job(run, *needed) for run, needed in runs.items()]
+    shared = Shared(pipeline.scene.steps, pipeline.scene.dx, pipeline.stored, device, c.precision)
+    return simulate(jobs, shared, pipeline.say)

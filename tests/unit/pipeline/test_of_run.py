@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 
 from nsf.errors import ConfigError, SchemaError
 from nsf.pipeline import Pipeline
-from nsf.pipeline.stages.deployment import CONFIGURATION, write_configuration
+from nsf.pipeline.stages.deployment import CONFIGURATION
 
 
 def test_the_same_chain_comes_out(chain):
@@ -28,16 +28,6 @@ def test_a_run_on_another_device_has_the_same_training(chain, tmp_path, seal):
         Pipeline.of_run(run, device="cpu")
     seal(run)
     assert Pipeline.of_run(run, device="cpu").training.complete
-
-
-def test_keys_still_follow_the_parameter(pipeline_at, tmp_path):
-    """A resolved configuration would keep E where it was."""
-    pipeline = pipeline_at(tmp_path, "material.E=${material.friction_angle}")
-    run = pipeline.deployment
-    with run.record() as record:
-        write_configuration(pipeline, record)
-    scenes = [Pipeline.of_run(run, "cpu").scene.at({"friction_angle": v}) for v in (20.0, 30.0)]
-    assert [scene.material.E for scene in scenes] == [20.0, 30.0]
 
 
 @pytest.mark.parametrize(

@@ -150,7 +150,7 @@ def test_a_lesson_and_its_images():
 def test_planes_that_the_scene_has_not_are_refused_before_any_work():
     wrong = ["scene=block", "scale=small", "model=recurrence", "scene.reduced.symmetry.mirrors=[[0,0,1]]"]
     with pytest.raises(ConfigError, match="symmetry"):
-        Pipeline(config.load(wrong))
+        Pipeline(config.load(wrong)).check()
 
 
 class Shifts:
