@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nsf import config
+from nsf import config, engines
 from nsf.bench.command import SCENES
 from nsf.bench.full_order import add_pass
 from nsf.bench.measure import bandwidth, launch_time
