@@ -144,9 +144,8 @@ def scene_table(pipeline: Pipeline) -> Table:
     for part in ("train", "validation", "test"):
         cases = getattr(pipeline.split, part)
         rows[part] = f"{len(cases)}: " + "; ".join(case.text for case in cases) if cases else "none"
-    rows["deployed"] = (
-        f"on {pipeline.device}, model {pipeline.configured.name}, r {pipeline.config.latent_dim}"
-    )
+    c = pipeline.config
+    rows["deployed"] = f"on {pipeline.device}, model {pipeline.configured.name}, r {c.latent_dim}"
     if line := multiplied_step_warning(c.deploy.dt_multiplier, scene.dt, stable):
         rows["warning"] = line
     for key, told in rows.items():

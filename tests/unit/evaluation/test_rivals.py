@@ -1,5 +1,7 @@
 """Rivals of a reduced run: the nearest training run, their interpolation, and a coarser full-order run."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -8,6 +10,7 @@ from angles import angle
 from nsf.data import Trajectory
 from nsf.errors import ConfigError
 from nsf.evaluation.rivals import TrainingRuns, coarse_run, coarse_scene, coarse_subjects, rivals
+from nsf.mpm import Cuboid
 
 
 @pytest.fixture
