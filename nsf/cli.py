@@ -9,14 +9,14 @@ from pathlib import Path
 from nsf import usage
 from nsf.errors import ConfigError, NSFError, first_line, out_of_memory
 from nsf.paths import reports_folder
-from nsf.terminal import replace_what_cannot_be_shown
+from nsf.terminal import console, guard
 from nsf.usage import STAGES, TOOLS
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `nsf`; exits with 0, 2 (a fault the user can mend), 130 (interrupted) or 1."""
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    replace_what_cannot_be_shown()
+    guard()
     # Threads that spin for long while they wait made training ten times slower on cores that others
     # use too; those that spin for some microseconds lose next to nothing on free ones.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -325,9 +325,7 @@ def _show(page, table: bool = True) -> None:
 
 
 def _console():
-    from rich.console import Console
-
-    return Console(width=None if sys.stdout.isatty() else 160)
+    return console(sys.stdout, None if sys.stdout.isatty() else 160)
 
 
 if __name__ == "__main__":

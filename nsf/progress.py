@@ -7,10 +7,11 @@ import time
 import warnings
 from collections.abc import Iterator
 
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, ProgressColumn, Task, TextColumn, TimeRemainingColumn
 from rich.progress import Progress as RichProgress
 from rich.text import Text
+
+from nsf.terminal import console
 
 #: Between two lines of a log [s].
 EVERY = 10.0
@@ -45,7 +46,7 @@ class Progress:
             _Rate(unit),
             TimeRemainingColumn(),
             TextColumn("left"),
-            console=Console(stderr=True),
+            console=console(sys.stderr),
             disable=not sys.stderr.isatty(),
             transient=True,
         )

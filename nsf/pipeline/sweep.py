@@ -28,7 +28,7 @@ from nsf.pipeline.reuse import report as report_of
 from nsf.progress import label, labelled
 from nsf.runs import Run
 from nsf.runs.reserved import reserved, reserving
-from nsf.terminal import replace_what_cannot_be_shown
+from nsf.terminal import guard
 
 _SUBMITTED = "*/*_submitted.pkl"  # a file of each job that Slurm took
 _DIED = "its process died (killed, or out of memory or time)"
@@ -233,7 +233,7 @@ def _job(config: DictConfig, stages: Sequence[str], labels: Sequence[str] = ()) 
         stages: as of `work`.
         labels: by the number of a job, what each of its lines begins with; none where jobs come one by one.
     """
-    replace_what_cannot_be_shown()  # in a process of its own as well
+    guard()  # in a process of its own as well
     with labelled(labels[HydraConfig.get().job.num] if labels else ""):
         _say(f"--- {' '.join(HydraConfig.get().overrides.task)}")
         try:

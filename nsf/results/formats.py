@@ -15,11 +15,9 @@ import rich.table
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup, escape
 
-_INVISIBLE = re.compile(
-    "[\x00-\x1f\x7f-\x9f\u2028\u2029\u202a-\u202e\u2066-\u2069\ud800-\udfff\ufffe\uffff]+"
-)
-"""Control characters, line ends, changes of direction, and what no file holds as UTF-8."""
+from nsf.terminal import INVISIBLE
 
+_INVISIBLE = re.compile(f"[{INVISIBLE}]+")
 _MARKDOWN = re.compile(
     r"(?P<code>`[^`]+`)"
     r"|(?P<unit>(?!\A)\[(?:[^\W_]|[ %×°/–.-])+\](?![(\[:]))"  # followed by these it would be a link

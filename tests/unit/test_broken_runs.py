@@ -219,6 +219,21 @@ def test_what_a_terminal_would_obey_is_not_printed(runs, capsys, monkeypatch):
     assert "[bold]" in out
 
 
+@pytest.mark.parametrize("words", [[], ["show", "{}"], ["diff", "{}", "{}"], ["E\x1b[2J=*"], ["verify"]])
+def test_keys_that_a_terminal_would_obey_are_not_printed(tmp_path, capsys, monkeypatch, words):
+    hostile = "E\x1b[2J\x9b31m\u202e"
+    made_of = [made(tmp_path, "simulate", {hostile: {hostile: value}}) for value in (1, 2)]
+    for at, run in enumerate(made_of):
+        manifest = json.loads((run.path / "manifest.json").read_text())
+        manifest |= {"metrics": {hostile: at}, "versions": {hostile: str(at)}, "warnings": [hostile]}
+        (run.path / "manifest.json").write_text(json.dumps(manifest))
+    ids = iter([run.hash for run in made_of] * 2)
+    words = [next(ids) if word == "{}" else word for word in words]
+    _, out, err = said_by(made_of, capsys, monkeypatch, *words)
+    assert not [c for c in out + err if c in hostile[1:] and not c.isprintable()]
+    assert "E?[2J?31m?" in out or words in (["verify"], ["E\x1b[2J=*"])
+
+
 # ---- altered files --------------------------------------------------------------------------------------
 
 

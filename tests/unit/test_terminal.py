@@ -122,3 +122,10 @@ def test_what_plan_refuses(capsys, word, told):
         main(["plan", "scene=drop", word])
     assert end.value.code == 2
     assert told in capsys.readouterr().err
+
+
+def test_a_unit_that_a_terminal_would_obey_is_not_printed(capsys):
+    with pytest.raises(SystemExit):
+        main(["plan", "scene=drop", "scale=small", 'scene.parameters.E.unit="\x1b[2J"'])
+    shown = capsys.readouterr()
+    assert "\x1b" not in shown.out + shown.err
