@@ -1,10 +1,11 @@
 """A full-order step: a block of dry sand that collapses, at several sizes."""
 
+import time
 from functools import partial
 
 import numpy as np
 
-from nsf.bench.measure import WARM_UP, WINDOW, bandwidth, build, pass_time, window_times
+from nsf.bench.measure import WARM_UP, WINDOW, bandwidth, build, pass_time, synchronizer, window_times
 from nsf.bench.rows import Case, Measurements, name_of, size_name
 from nsf.mpm import DomainWalls, FullOrderMPM, GridGeometry, HalfSpace, ParticleConstants
 from nsf.mpm.grid.nodes import BLOCK
@@ -57,8 +58,21 @@ def run(found: Measurements) -> None:
             case = Case(bench="full_order", name=name, particles=particles, precision=precision)
             ms = found.add(case, "step", times[precision])
             found.add(case, "peak memory", peak, "MiB")
-            found.say(f"{name} {precision}: {ms:.4g} ms a step")
+            looks = look_times(solver, settings.trials)
+            share = 100.0 * found.add(case, "watch", looks) / ms
+            found.say(f"{name} {precision}: {ms:.4g} ms a step, {share:.2g} % of it the watch")
             add_passes(found, case, solver, speed)
+
+
+def look_times(solver: FullOrderMPM, trials: int) -> list[float]:
+    """[trials] time of a look at J, |v| Δt/Δx, contact and energy, over the steps between two looks [ms]."""
+    wait, times = synchronizer(solver.device), []
+    for _ in range(trials + 1):  # the first one compiles nothing, but finds cold caches
+        wait()
+        begun = time.perf_counter()
+        solver.check()
+        times.append(1e3 * (time.perf_counter() - begun) / solver.check_every)
+    return times[1:]
 
 
 def add_passes(found: Measurements, case: Case, solver: FullOrderMPM, speed: float) -> None:

@@ -1,6 +1,7 @@
 """Reduced runs from t = 0 to the end of their scene, and what each leaves."""
 
 import io
+import math
 import time
 from collections.abc import Sequence
 from contextlib import suppress
@@ -90,6 +91,11 @@ class Rollout:
     def by_operators(self) -> int:
         """How many steps a model of latent vectors alone took."""
         return int((self.levels == OPERATORS).sum())
+
+    @property
+    def estimated_error(self) -> float:
+        """Largest of `estimate` [m]; NaN where nothing is estimated, or another model took every step."""
+        return math.nan if self.estimate is None or not self.by_operators else float(self.estimate.max())
 
     @property
     def distrusted(self) -> int:

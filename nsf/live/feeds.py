@@ -42,6 +42,9 @@ class LatentFeed:
         values = list(run.case.parameters.values())
         return {"values": values, "away": run.away, "diverged": run.diverged, "playing": player.playing}
 
+    def begin_again(self) -> None:
+        """Forget what clients asked for of the picture."""
+
     def obey(self, player: Player, wish: object) -> str | None:
         """Do what a client asks for, or give back what it may ask for.
 
@@ -127,6 +130,10 @@ class PointFeed(LatentFeed):
         more = {"color": self.color, "tilted": run.by_hand, "known": index}
         return super().state(moment, player) | more
 
+    def begin_again(self) -> None:
+        """Show the first colour again."""
+        self.color = STRESS
+
     def obey(self, player: Player, wish: object) -> str | None:
         """As of `nsf serve`, and `{"step": 12}`, `{"tilt": [x, y]}` [°] or null, `{"color": "pressure"}`."""
         match wish:
@@ -151,7 +158,7 @@ class PointFeed(LatentFeed):
         Raises:
             ConfigError: the model has no programs of gravity, or the tilt is out of reach.
         """
-        if not all(abs(degrees) <= self._most for degrees in tilt):
+        if not self._most or not all(abs(degrees) <= self._most for degrees in tilt):
             raise ConfigError(f"tilt={list(tilt)} must lie in [-{self._most:.3g}, {self._most:.3g}] °")
         return np.radians(tilt).tolist()
 

@@ -146,6 +146,10 @@ class LiveRun:
         if self.diverged or last == self.steps:
             self._solver = None
 
+    def end(self) -> None:
+        """Take no further step, as where one has failed."""
+        self.diverged, self._solver = True, None
+
     def goes_on(self, run: "LiveRun", step: int, gravity: Sequence[float]) -> None:
         """Take over another run of the same case up to a step, and let gravity be another from there on.
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nsf.data import Case
-from nsf.errors import NSFError
+from nsf.errors import first_line
 from nsf.live.model import LiveModel, LiveRun
 
 log = logging.getLogger(__name__)
@@ -122,6 +122,14 @@ class Player:
             self._tilts.append(tilt)
             self._wake.notify()
 
+    def begin_again(self) -> None:
+        """Show the first case from its beginning, whatever was asked for."""
+        with self._wake:
+            self._wanted, self._coming = self.model.initial, None
+            self._tilts.clear()
+            self._shown, self._step, self._held = self._run_at(self._wanted), 0, 0
+            self._wake.notify()
+
     def seek(self, step: int) -> None:
         """Show a step, or the run's last one until the run has come so far."""
         with self._wake:
@@ -183,12 +191,18 @@ class Player:
 
     def _keep_working(self) -> None:
         while not self._closing:
+            wanted = self._wanted
             try:
                 busy = self.work()
-            except NSFError as error:
-                # The scene refuses this case, so the shown run goes on.
-                log.warning("%s: %s", self._wanted.named, error)
-                self._wanted, busy = self._shown.case, True
+            except Exception as error:
+                # The scene refuses this case, or a step of it fails: the shown run goes on.
+                log.warning("%s: %s", wanted.named, first_line(error))
+                with self._wake:
+                    if self._coming is None and wanted == self._shown.case and not self._tilts:
+                        self._shown.end()
+                    if self._wanted == wanted:  # nobody has asked for another meanwhile
+                        self._wanted = self._shown.case
+                    self._coming, busy = None, True
             if not busy:
                 with self._wake:
                     self._wake.wait_for(

@@ -1,6 +1,7 @@
 """A model that runs in a page: what a file of it holds, and what cannot be put into one."""
 
 import itertools
+import math
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -236,7 +237,7 @@ def _cases(model: LiveModel, names, arrays: dict, header: dict, sizes: Sizes) ->
             "values": [case[name] for name in names],
             "gravity": _gravity(scene),
             "solids": [own | {"movable": movable.get(own["name"])} for own in model.solids(case)],
-            "estimate": None if rollout.estimate is None else float(np.nan_to_num(rollout.estimate).max()),
+            "estimate": None if math.isnan(off := rollout.estimated_error) else float(np.nan_to_num(off)),
             "recording": None,
         }  # fmt: skip
         if case in model.known and len(header["recordings"]) < sizes.runs:

@@ -10,7 +10,7 @@ from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 
-from nsf.errors import ConfigError
+from nsf.errors import ConfigError, first_line
 from nsf.live import page
 from nsf.live.feeds import LatentFeed, obey
 from nsf.live.guard import Connection, check_token, name_of, refused
@@ -37,7 +37,7 @@ class Stream:
 
     `/` is the page, `/field` its data, `/stream` a WebSocket: a binary message a frame, and a text message
     where another case is shown, or it is paused. A client may send what the feed obeys. One that sends
-    anything else, or that does not keep up for `patience`, is closed.
+    anything else, or for what cannot be drawn, or that does not keep up for `patience`, is closed.
 
     Args:
         player: what is shown; all clients see the same.
@@ -61,6 +61,7 @@ class Stream:
         self._feed = feed
         self._page = page.html(feed.title, connects=True).encode()
         self._clients: set[ServerConnection] = set()
+        self._asked: ServerConnection | None = None  # who asked last for something
         moment = player.tick()
         self._state, self._frame = self._messages(moment)
 
@@ -99,10 +100,22 @@ class Stream:
         clock = asyncio.get_running_loop()
         due = clock.time()
         while True:
-            # Decoding takes milliseconds, in which clients are heard.
-            self._send(*await asyncio.to_thread(self._messages, self._player.tick()))
+            try:
+                # Decoding takes milliseconds, in which clients are heard.
+                self._send(*await asyncio.to_thread(self._messages, self._player.tick()))
+            except Exception as error:  # of whatever a client asked for: the others see the run go on
+                await self._refuse(f"cannot be drawn: {type(error).__name__}: {first_line(error)}")
             due = max(due + 1.0 / self._rate, clock.time())
             await asyncio.sleep(due - clock.time())
+
+    async def _refuse(self, why: str) -> None:
+        """Begin again, without the client that asked last for something."""
+        log.error("what is shown %s; it begins again", why)
+        self._player.begin_again()
+        self._feed.begin_again()
+        if (client := self._asked) is not None:
+            self._asked = None
+            await client.close(1011, why[:_LONGEST_REASON])
 
     def _messages(self, moment: Moment) -> tuple[str, bytes]:
         return json.dumps(self._feed.state(moment, self._player)), self._feed.frame(moment)
@@ -138,6 +151,7 @@ class Stream:
         why = "closed by itself"
         try:
             async for message in connection:
+                self._asked = connection
                 obey(self._feed, self._player, message)
                 await asyncio.sleep(_PACE)
         except ConfigError as error:

@@ -222,7 +222,8 @@ def test_projected_runs_in_drawn_cases_teach_too(drawn, monkeypatch):
     for stage in ("deploy", "evaluate"):
         doubted.run(stage)
     anew = pd.read_csv(doubted.evaluation.path / "results.csv").iloc[0]
-    assert (anew["fallback_share"], anew["estimated_error"]) == (1.0, 0.0)
+    assert anew["fallback_share"] == 1.0
+    assert np.isnan(anew["estimated_error"])  # of a run that the recurrence took no step of
     taken = Rollout.open(doubted.deployment.path / "rollout_0.h5")
     with Trajectory.open(doubted.truth(angle(26.0)).file("trajectory.h5")) as truth:
         projected = doubted.solver_at(doubted.manifold(), angle(26.0), engine="auto")

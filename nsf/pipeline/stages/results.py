@@ -113,7 +113,7 @@ def rows(
             "distance": comparison.distance,
             "distance_max": comparison.distance_max,
             "fallback_share": _handed_over(rollout, config),
-            "estimated_error": math.nan if rollout.estimate is None else rollout.estimate.max(),
+            "estimated_error": rollout.estimated_error,
             "distrust": float(rollout.trust.max()),
             "distrusted_at": _time(rollout, rollout.distrusted),
             "fallback_at": _time(rollout, rollout.handed_over),

@@ -8,10 +8,9 @@ from nsf.inverse import Model
 TWO = (
     "model=recurrence",
     *(f"model.teaching.{key}" for key in ("steps=2500", "descent=500", "rounds=1", "width=32")),
-    "+scene.speed=0.1",
-    "scene.bodies.column.velocity=['${scene.speed}',0,0]",
+    "scene.bodies.column.velocity=[0.1,0,0]",
     "+scene.parameters.friction_angle.range=[22,38]",
-    "+scene.parameters.speed={key:scene.speed,unit:m/s,range:[0.05,0.3]}",
+    "+scene.parameters.speed={key:scene.bodies.column.velocity.0,unit:m/s,range:[0.05,0.3]}",
     "scene.design={_target_:nsf.scenes.Sobol,train:8,validation:4,test:2}",
 )
 

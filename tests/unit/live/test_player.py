@@ -9,6 +9,7 @@ import pytest
 from angles import angle
 
 from nsf.errors import ConfigError, InstabilityError
+from nsf.live.model import LiveRun
 from nsf.live.player import _HOLD, Player
 
 
@@ -124,6 +125,18 @@ def test_its_thread_survives_a_value_that_the_scene_refuses(model, monkeypatch, 
         player.steer([30.0])
         wait_until(lambda: player.tick().run.case == angle(30.0))
     assert "friction_angle=40°: dt=1 s is unstable" in caplog.text
+
+
+def test_its_thread_survives_a_run_that_fails(model, monkeypatch):
+    def fail(*_):
+        raise RuntimeError("no memory")
+
+    with Player(model) as player:
+        monkeypatch.setattr(LiveRun, "advance", fail)
+        wait_until(lambda: player.tick().run.finished)
+        monkeypatch.undo()
+        player.steer([34.0])
+        wait_until(lambda: player.tick().run.case == angle(34.0))
 
 
 def test_many_may_steer_at_once(model):

@@ -126,6 +126,31 @@ def test_rubbish_is_refused(feed, player):
     assert player.playing
 
 
+def test_what_cannot_be_drawn_ends_one_client(model, monkeypatch):
+    async def run():
+        drawn = PointFeed.frame
+        fails = lambda feed: feed.color == "pressure"  # noqa: E731
+        monkeypatch.setattr(PointFeed, "frame", lambda feed, m: 1 / 0 if fails(feed) else drawn(feed, m))
+        joined = streaming(model, feed=PointFeed)
+        async with joined as (stream, player, port), connected(port) as one, connected(port) as other:
+            await until(lambda: stream.clients == 2)
+            await one.send('{"color": "pressure"}')
+            await until(lambda: stream.clients == 1)
+            with pytest.raises(ConnectionClosed) as closed:
+                await frames(one, 10**6)
+            assert closed.value.rcvd.code == 1011
+            await other.send('{"values": [34]}')
+            await until(lambda: player.tick().run.case == angle(34.0))
+            assert stream.clients == 1
+
+    asyncio.run(run())
+
+
+def test_without_programs_of_gravity_nothing_is_tilted(player):
+    with pytest.raises(ConfigError, match="must lie in"):
+        obey(PointFeed(player.model), player, '{"tilt": [0, 0]}')
+
+
 def test_who_serves_takes_no_wishes_of_view(player):
     for message in ('{"step": 3}', '{"tilt": null}', '{"color": "pressure"}'):
         with pytest.raises(ConfigError, match="a client may only send"):
