@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from nsf import usage
+from nsf import paths, usage
 from nsf.errors import ConfigError, NSFError, first_line, out_of_memory
 from nsf.paths import reports_folder
 from nsf.terminal import console, guard
@@ -44,7 +44,27 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(130)
 
 
+def _without_folders(arguments: Sequence[str]) -> list[str]:
+    """The arguments without `--config-dir DIR`, of which each is put before ours."""
+    rest, folders, left = [], [], iter(arguments)
+    for word in left:
+        flag, _, folder = word.partition("=")
+        if flag.lstrip("+~") == "hydra.searchpath":
+            raise ConfigError(f"hydra.searchpath is refused; {paths.REMEDY}")
+        if flag != "--config-dir":
+            rest.append(word)
+        elif folder := folder or next(left, ""):
+            folders.append(folder)
+        else:
+            raise ConfigError("--config-dir needs a folder, as --config-dir my/conf")
+    for folder in reversed(folders):
+        paths.add_folder(folder)
+    paths.user_folders()
+    return rest
+
+
 def _dispatch(arguments: list[str]) -> int:
+    arguments = _without_folders(arguments)
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(usage.whole())
         return 0
@@ -53,7 +73,7 @@ def _dispatch(arguments: list[str]) -> int:
 
         print(version("nsf"))
         return 0
-    stage, overrides = arguments[0], arguments[1:]
+    stage, *overrides = arguments
     if stage in TOOLS:
         return _tool(stage, overrides)
     if stage not in STAGES:

@@ -4,6 +4,8 @@ Library code raises one of these; only the command line exits (with code 2).
 Each message quotes the offending value and says what to do about it.
 """
 
+import difflib
+from collections.abc import Iterable
 from typing import ClassVar
 
 
@@ -65,6 +67,20 @@ class LaunchError(NSFError):
 def first_line(error: BaseException) -> str:
     """The first line of what an error says; its kind where it says nothing."""
     return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def unknown(key: str, keys: Iterable[str], remedy: str = "see `nsf --help` for the groups") -> str:
+    """A message that names a dotted key that there is not, and the nearest one, or the keys beside it."""
+    parent, _, last = key.rpartition(".")
+    keys = [other for other in keys if not key.startswith(f"{other}.")]
+    beside = {other.rpartition(".")[2]: other for other in keys if other.rpartition(".")[0] == parent}
+    near = [beside[name] for name in difflib.get_close_matches(last, beside, n=1)]
+    same_end = [other for other in keys if other.rpartition(".")[2] == last]
+    near = near or difflib.get_close_matches(key, same_end, n=1, cutoff=0.0)
+    if not near and parent and beside:
+        return f"unknown key {key!r}; {parent} has {', '.join(beside)}"
+    near = near or difflib.get_close_matches(key, keys, n=1)
+    return f"unknown key {key!r}; {f'did you mean {near[0]}?' if near else remedy}"
 
 
 # How libraries say that memory ran out, or that a limit on it, as `ulimit -v`, was met.

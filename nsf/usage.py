@@ -77,13 +77,16 @@ examples:
   nsf demo                                             a model in the browser, at once
   nsf export --html --frames                           the newest deployed run as a page and a film
   nsf point material=drucker_prager path=oedometer     plot a law before trusting it
+  nsf run --config-dir my/conf scene=mine              groups of a folder of yours, before these
   nsf view                                             the newest deployment in the browser
   nsf search scene=sand scene.design.validation=[27,31] latent_dim=4..8   the r of the smallest δ there
   nsf runs stage=evaluate scene=sand latent_dim=4 sort=delta   runs by what made them, the best first
   nsf runs diff 1a2b 3c4d                              what differs between two runs, in keys and in result
   nsf bench particles=10k,40k precision=fp32           what a step costs on this machine, and its floor
 
-Results lie in ./runs (NSF_RUNS) and ./reports (NSF_REPORTS)."""
+Results lie in ./runs (NSF_RUNS) and ./reports (NSF_REPORTS). Every command takes --config-dir DIR, or
+NSF_CONFIG=DIR: a folder with groups of yours, as DIR/scene/mine.yaml, and experiments, as
+DIR/experiments/mine.yaml."""
 
 
 def primary(stage: str) -> str:
@@ -102,12 +105,11 @@ def whole() -> str:
 
 def groups_text() -> str:
     """The options of every group, and the experiments."""
-    from nsf.paths import EXPERIMENTS, groups
+    from nsf.paths import experiments, groups
 
     width = max(map(len, groups()))
     lines = [f"  {group:<{width}} {' '.join(options)}" for group, options in groups().items()]
-    experiments = " ".join(sorted(path.stem for path in EXPERIMENTS.glob("*.yaml")))
-    lines += ["", "experiments (+experiment=NAME, or +experiment=NAME/PART):", f"  {experiments}"]
+    lines += ["", "experiments (+experiment=NAME, or +experiment=NAME/PART):", f"  {' '.join(experiments())}"]
     return "\n".join(["configuration groups (group=option):", *lines])
 
 

@@ -11,11 +11,13 @@ import re
 import typing
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from functools import cache, lru_cache
 from pathlib import Path
 
-from hydra import compose, initialize_config_dir
+from hydra import compose, version
+from hydra._internal.hydra import Hydra
+from hydra._internal.utils import create_config_search_path
 from hydra.core.config_loader import ConfigLoader
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException, OverrideParseException
@@ -28,8 +30,9 @@ from nsf.config import targets
 from nsf.config.documents import check_sizes, text_of
 from nsf.config.removed import refuse_keys, refuse_overrides
 from nsf.config.resolvers import resolved
-from nsf.errors import ConfigError, first_line
-from nsf.paths import CONF, groups
+from nsf.config.schema import refuse_unread
+from nsf.errors import ConfigError, first_line, unknown
+from nsf.paths import CONF, REMEDY, files, groups, user_folders
 
 # conf/hydra/launcher/joblib.yaml takes the place of the launcher's own configuration on purpose.
 warnings.filterwarnings(
@@ -82,7 +85,7 @@ def load(overrides: Sequence[str] = (), config_name: str = "config") -> DictConf
         mark = error.problem_mark
         raise ConfigError(f"{mark.name}, line {mark.line + 1}: {error.problem}; correct the yaml") from error
     except _OF_BROKEN_FILES as error:
-        for path in sorted(CONF.rglob("*.yaml")):
+        for path in files():
             text_of(path)  # tells of the one that cannot be read
         told = explained(error, config_name, overrides)
         raise ConfigError(f"the configuration cannot be composed: {told}") from error
@@ -107,7 +110,7 @@ def read(path: Path) -> DictConfig:
 
 
 def _compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
-    return pickle.loads(_composed(config_name, tuple(overrides), check_sizes(CONF)))
+    return pickle.loads(_composed(config_name, tuple(overrides), check_sizes(files())))
 
 
 @lru_cache(maxsize=64)
@@ -119,6 +122,8 @@ def _composed(
     own = _of_hydra(config)
     if own != _default_hydra():
         changed = [f"hydra.{key}" for key, value in own.items() if value != _default_hydra().get(key)]
+        if "hydra.searchpath" in changed:
+            raise ConfigError(f"hydra.searchpath is refused; {REMEDY}")
         raise ConfigError(
             f"the configuration sets {', '.join(changed)}, by which Hydra could be made to run code; "
             "leave it out: only the command line says how jobs are launched"
@@ -127,10 +132,19 @@ def _composed(
     return pickle.dumps(config)
 
 
-def initialized(**named: str) -> AbstractContextManager:
-    """Hydra over `conf/` while a block works, anew."""
+@contextmanager
+def initialized(job_name: str = "app") -> Iterator[None]:
+    """Hydra over `conf/` and the user's folders before it, while a block works, anew."""
     GlobalHydra.instance().clear()
-    return initialize_config_dir(str(CONF), version_base="1.3", **named)
+    version.setbase("1.3")
+    search_path = create_config_search_path(str(CONF))
+    for folder in user_folders():
+        search_path.prepend("user", str(folder), anchor="main")
+    Hydra.create_main_hydra2(job_name, search_path)
+    try:
+        yield
+    finally:
+        GlobalHydra.instance().clear()
 
 
 def _with_hydra(config_name: str | None, overrides: Sequence[str]) -> DictConfig:
@@ -184,6 +198,7 @@ def _packed(config: DictConfig) -> tuple[bytes, bytes]:
             plain = resolved(config)
             refuse_keys(plain)
             targets.check(plain)
+            refuse_unread(raw, plain)
             found = pickle.dumps(OmegaConf.create(raw)), pickle.dumps(OmegaConf.create(plain))
             _PACKED[text] = found
             if len(_PACKED) > 64:
@@ -259,14 +274,13 @@ def explained(error: Exception, config_name: str, overrides: Sequence[str]) -> s
         known = _known_keys(config_name, others, of_launcher(key))
         if key in known:
             return f"{key!r} takes no keys beyond its own; set them one by one, or write a scene's yaml"
-        same_end = [other for other in known if other.split(".")[-1] == key.split(".")[-1]]
-        near = difflib.get_close_matches(key, same_end or known, n=3, cutoff=0.5)
-        hint = f"; did you mean {' or '.join(near)}?" if near else "; see `nsf --help` for the groups"
-        return f"unknown key {key!r}{hint}"
+        return unknown(key, known)
     if isinstance(error, OverrideParseException):
         return _unparsed(str(error.override), first)
     if first.startswith("Ambiguous value"):
         return f"{first}; several values of a key need -m"
+    if "hydra.searchpath" in text:
+        return f"hydra.searchpath is refused; {REMEDY}"
     nameless = [o for o in overrides if o.startswith("=")]
     if nameless:
         return f"{nameless[0]!r} has no key; give key=value"

@@ -1,6 +1,7 @@
 """Yaml files that someone else may have written: read as text that a parser can take."""
 
 import re
+from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
 
@@ -10,7 +11,7 @@ from nsf.errors import ConfigError
 
 _LONGEST = 2**20  # bytes; the longest file of conf/ and experiments/ has some thousand
 _MOST = 100_000  # values, each as often as it is repeated through an alias
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
 
 def text_of(path: Path) -> str:
@@ -27,8 +28,8 @@ def text_of(path: Path) -> str:
     return _text_of(path, status.st_mtime_ns, status.st_size)
 
 
-def check_sizes(folder: Path) -> tuple[tuple[Path, int, int], ...]:
-    """Refuse yaml files of a folder and those below that no parser would come to the end of.
+def check_sizes(paths: Iterable[Path]) -> tuple[tuple[Path, int, int], ...]:
+    """Refuse yaml files that no parser would come to the end of.
 
     Returns:
         path, time of change [ns] and size [bytes] of each.
@@ -36,10 +37,10 @@ def check_sizes(folder: Path) -> tuple[tuple[Path, int, int], ...]:
     Raises:
         ConfigError: as for `text_of`, of files that are long or have aliases.
     """
-    stats = [(path, path.stat()) for path in sorted(folder.rglob("*.yaml"))]
-    found = tuple((path, status.st_mtime_ns, status.st_size) for path, status in stats)
-    _check_sizes(found)
-    return found
+    stats = [(path, path.stat()) for path in paths]
+    files = tuple((path, status.st_mtime_ns, status.st_size) for path, status in stats)
+    _check_sizes(files)
+    return files
 
 
 @lru_cache(maxsize=8)
@@ -61,7 +62,7 @@ def _text_of(path: Path, _changed: int, size: int) -> str:
         line = text.count("\n", 0, found.start()) + 1
         raise ConfigError(f"{path}, line {line}: control character {found[0]!r}; delete it")
     try:
-        node = yaml.compose(text, _LOADER)
+        node = yaml.compose(text, LOADER)
         if _repeated(node, {}) > _MOST:
             raise ConfigError(f"{path} has more than {_MOST} values, as aliases repeat them; write them out")
     except RecursionError as error:

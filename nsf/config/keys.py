@@ -1,6 +1,5 @@
 """Keys of a composed configuration: found, replaced, or named where one is missing."""
 
-import difflib
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -9,7 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError
 
 from nsf.config import targets
-from nsf.errors import ConfigError
+from nsf.errors import ConfigError, unknown
 
 
 @contextmanager
@@ -51,10 +50,9 @@ def replaced(config: DictConfig, values: Mapping[str, Any], known: Sequence[str]
     config = config.copy()
     for key, value in values.items():
         if key not in known:
-            inner = [k for k in known if k.startswith(f"{key}.")]
-            near = inner or difflib.get_close_matches(key, known, n=3, cutoff=0.5)
-            hint = f"did you mean {' or '.join(near[:3])}?" if near else "give a dotted key, as scene.gravity"
-            raise ConfigError(f"{'several keys in' if inner else 'unknown key'} {key!r}; {hint}")
+            if inner := [k for k in known if k.startswith(f"{key}.")]:
+                raise ConfigError(f"several keys in {key!r}; did you mean {' or '.join(inner[:3])}?")
+            raise ConfigError(unknown(key, known, "give a dotted key, as scene.gravity"))
         OmegaConf.update(config, key, value)
     return config
 

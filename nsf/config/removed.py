@@ -7,6 +7,8 @@ from nsf.errors import ConfigError
 
 #: A dotted key, or `key=option`, and the remedy.
 REMOVED = {
+    "scene.reduced.latent_dim": "set latent_dim",
+    "scene.reduced": "set reduction, whose keys are those of scene.reduced, at the top",
     "field=joint": "use field=basis",
     "sampler=greedy": "use sampler=qdeim or sampler=cubature",
     "trainer.budget_minutes": "set trainer.steps; a training's log says how many it takes a second",

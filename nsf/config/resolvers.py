@@ -111,14 +111,19 @@ def _check(key: str, value: Any) -> None:
             )
 
 
-def following(config: DictConfig, key: str) -> list[tuple[str, ...]]:
-    """Paths of the values of a configuration that may follow a key, directly or through others."""
-    referring = {
-        path: [_target(*found, path) for found in _REFERENCE.findall(value)]
+def references(raw: Any) -> dict[tuple[str, ...], list[tuple[str, ...]]]:
+    """Paths of the keys that each value of a tree refers to, by its path; interpolations were kept."""
+    return {
+        path: [_target(*match, path) for match in _REFERENCE.findall(value)]
         + [("scale",)] * ("scaled" in value)
-        for path, value in leaves(OmegaConf.to_container(config))
+        for path, value in leaves(raw)
         if isinstance(value, str) and "${" in value
     }
+
+
+def following(config: DictConfig, key: str) -> list[tuple[str, ...]]:
+    """Paths of the values of a configuration that may follow a key, directly or through others."""
+    referring = references(OmegaConf.to_container(config))
     found, keys = [], [_target("", key, ())]
     while keys:
         own = keys.pop()

@@ -19,7 +19,7 @@ from nsf.scenes.identity import plain_scene, plain_value
 from nsf.vectors import text
 
 #: Keys of a configuration's scene that say nothing of its physics.
-NOT_PHYSICS = ("name", "title", "parameters", "design", "reduced", "paper")
+NOT_PHYSICS = ("name", "title", "parameters", "design", "paper")
 _NUMBERS = ("name", "dx", "dt", "steps", "size", "gravity", "program")
 _OBJECTS = ("inclination", "walls")
 _PHYSICS = re.compile(
@@ -94,7 +94,6 @@ def config_of(scene: Scene, overrides: Sequence[str] = ()) -> DictConfig:
         "title": scene.name,
         "parameters": {name: asdict(parameter) for name, parameter in scene.parameters.items()},
         "design": plain_value(scene.design),
-        "reduced": config.scene.reduced,
     }
     for key, value in plain.items():
         config[key] = value

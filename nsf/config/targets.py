@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 from omegaconf import DictConfig
 
 from nsf.config.resolvers import resolved
-from nsf.errors import ConfigError, NSFError, first_line
+from nsf.errors import ConfigError, NSFError, first_line, unknown
 from nsf.vectors import is_finite
 
 
@@ -55,8 +55,8 @@ KINDS = {
     "trainer": Kind("nsf.kinematics.training", "nsf.kinematics.training.schedules.Trainer"),
     "transfer": Kind("nsf.mpm", "nsf.mpm.Transfer"),
     "scene.design": Kind("nsf.scenes", "nsf.scenes.Design"),
-    "scene.reduced.symmetry": _SYMMETRY,
     "scene.inclination": Kind("nsf.scenes", "nsf.scenes.Inclination"),
+    "reduction.symmetry": _SYMMETRY,
     "scene.walls": Kind("nsf.mpm", "nsf.mpm.DomainWalls"),
     "scene.colliders.*": Kind("nsf.mpm", "nsf.mpm.Collider"),
     "scene.colliders.*.motion": Kind("nsf.mpm", "nsf.mpm.Motion"),
@@ -117,7 +117,7 @@ def build(node: DictConfig | Mapping, where: str) -> Any:
     plain = resolved(node) if isinstance(node, DictConfig) else node
     check(plain, path)
     if not isinstance(plain, dict) or "_target_" not in plain:
-        kind = next((kind for key, kind in KINDS.items() if _is_at(path, key)), None)
+        kind = kind_at(path)
         raise ConfigError(f"{where} names no class; give it a _target_: {kind.package if kind else 'nsf'}.…")
     return _built(plain, path)
 
@@ -149,8 +149,9 @@ def filled(made_of: Any, values: Mapping[str, Any], where: str) -> Any:
         ConfigError: a key is unknown or missing, or a value refused; names it.
     """
     parameters = inspect.signature(made_of).parameters
-    if unknown := [key for key in values if key not in parameters]:
-        raise ConfigError(f"{where}: unexpected key {unknown[0]!r}; known keys: {', '.join(parameters)}")
+    for key in values:
+        if key not in parameters:
+            raise ConfigError(unknown(f"{where}.{key}", [f"{where}.{name}" for name in parameters]))
     for name, parameter in parameters.items():
         if name not in values and parameter.default is parameter.empty:
             raise ConfigError(f"{where}.{name} is missing; give it a value")
@@ -186,14 +187,18 @@ def _built(node: Any, path: tuple[str, ...]) -> Any:
     return filled(_named(node["_target_"], path), values, ".".join(path)) if "_target_" in node else values
 
 
-def _is_at(path: tuple[str, ...], key: str) -> bool:
-    parts = key.split(".")
-    return len(parts) == len(path) and all(part in ("*", own) for part, own in zip(parts, path, strict=True))
+def kind_at(path: tuple[str, ...]) -> Kind | None:
+    """What a key expects a `_target_` of; None where nothing is built from it."""
+    for key, kind in KINDS.items():
+        parts = key.split(".")
+        if len(parts) == len(path) and all(map(lambda part, name: part in ("*", name), parts, path)):
+            return kind
+    return None
 
 
 def _kind(path: tuple[str, ...], target: Any) -> Kind:
     """What a key expects, if it is where a target could lie."""
-    kind = next((kind for key, kind in KINDS.items() if _is_at(path, key)), None)
+    kind = kind_at(path)
     refused = f"{'.'.join(path) or 'the configuration'}: _target_: {target} is refused; "
     if kind is None:
         raise ConfigError(refused + "nothing is built from this key")

@@ -23,7 +23,7 @@ from nsf.errors import ConfigError
 from nsf.gpu import has_driver
 from nsf.models import Auto, Model, Recurrence
 from nsf.mpm import FP32, FP64, Precision
-from nsf.paths import CONF, groups
+from nsf.paths import groups, option
 from nsf.pipeline import naming
 from nsf.pipeline.reuse import report, reused
 from nsf.pipeline.values import check_numbers, check_words, factors
@@ -583,7 +583,7 @@ def with_candidates(config: DictConfig) -> DictConfig:
         return config
     config = config.copy()
     names = model.get("candidates") or [name for name in groups()["model"] if name not in ("auto", "full")]
-    files = {name: OmegaConf.load(CONF / "model" / f"{name}.yaml") for name in names}
+    files = {name: OmegaConf.load(option("model", name)) for name in names}
     config.model.candidates = list(names)
     config.model.of = OmegaConf.merge(files, model.get("of") or {})
     return config

@@ -1,7 +1,7 @@
 """Experiments: a question, and the jobs that answer it (one file each in `experiments/`)."""
 
 import difflib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 from nsf import config as configuration
 from nsf.config.documents import text_of
 from nsf.errors import ConfigError, MissingRunError
-from nsf.paths import EXPERIMENTS, reports_folder
+from nsf.paths import experiments, reports_folder
 from nsf.pipeline.chain import Pipeline
 from nsf.results.question import Question, unchanged
 from nsf.runs import Run
@@ -73,22 +73,23 @@ class Experiment:
     parts: "tuple[Experiment, ...]" = ()
 
     @classmethod
-    def load(cls, name: str, overrides: Sequence[str] = (), folder: Path = EXPERIMENTS) -> "Experiment":
-        """The experiment of `folder/name.yaml`, or a part of it; `overrides` take the place of its own.
+    def load(cls, name: str, overrides: Sequence[str] = (), folder: Path | None = None) -> "Experiment":
+        """The experiment of a file, or a part of it; `overrides` take the place of its own.
 
         Args:
             name: of the file, without its ending; or of a part, as `table1/seeds`.
             overrides: `key=value`; a key that no grid has is added to each.
-            folder: of the files.
+            folder: of the files; by default the user's, and ours.
 
         Raises:
             ConfigError: there is no such file or part (the nearest is named), or a key of it is missing or
                 unknown.
         """
         stem, _, part = name.partition("/")
-        if stem not in (stems := _stems(folder)):
-            raise _unknown(name, stems, _with_parts(folder))
-        path = folder / f"{stem}.yaml"
+        files = _files(folder)
+        if stem not in files:
+            raise _unknown(name, list(files), _with_parts(files))
+        path = files[stem]
         content = _read(path)
         if "parts" not in content:
             if part:
@@ -225,9 +226,9 @@ class Experiment:
         return Path(config.report.folder) / (f"{self.name}_small" if shrunk else self.name)
 
 
-def questions(folder: Path = EXPERIMENTS) -> dict[str, dict[str, str]]:
+def questions(folder: Path | None = None) -> dict[str, dict[str, str]]:
     """Title, question and what the paper says, of each experiment and part that has a report."""
-    loaded = [Experiment.load(stem, folder=folder) for stem in _stems(folder)]
+    loaded = [Experiment.load(stem, folder=folder) for stem in _files(folder)]
     return {
         one.name: {"title": one.title, "question": one.question, "paper": one.paper}
         for experiment in loaded
@@ -235,17 +236,17 @@ def questions(folder: Path = EXPERIMENTS) -> dict[str, dict[str, str]]:
     }
 
 
-def _stems(folder: Path) -> list[str]:
-    """Names of the files of a folder of experiments."""
-    return sorted(path.stem for path in folder.glob("*.yaml"))
+def _files(folder: Path | None) -> dict[str, Path]:
+    """The files of experiments by name: of a folder, or all that there are."""
+    return experiments() if folder is None else {path.stem: path for path in sorted(folder.glob("*.yaml"))}
 
 
-def _with_parts(folder: Path) -> list[str]:
-    """The same, and names of their parts; a file that cannot be read has none."""
-    names = _stems(folder)
-    for stem in tuple(names):
+def _with_parts(files: Mapping[str, Path]) -> list[str]:
+    """Names of experiments, and of their parts; a file that cannot be read has none."""
+    names = list(files)
+    for stem, path in files.items():
         with suppress(ConfigError):
-            names += [f"{stem}/{part}" for part in _read(folder / f"{stem}.yaml").get("parts", ())]
+            names += [f"{stem}/{part}" for part in _read(path).get("parts", ())]
     return names
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-from nsf.paths import CONF
+from nsf.paths import files
 from nsf.runs.listing import ABSENT, FIELDS, Entry, text, value_of
 
 CASE = "case"
@@ -118,7 +118,7 @@ def scaled(key: str, value: Any) -> Any:
 def _units() -> dict[str, dict[str, str]]:
     """Units by the first and the last part of a key, from the comments of `conf/`: `dx: 0.01  # [m]`."""
     found: dict[str, dict[str, str]] = {}
-    for path in sorted(CONF.glob("*/*.yaml")):
+    for path in reversed(files()):
         group = path.parent.name
         for name, unit in _UNIT.findall(path.read_text(encoding="utf-8")):
             # A scene's file has the keys of its material, too.

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from nsf.errors import ConfigError
-from nsf.paths import CONF
+from nsf.paths import groups, option
 from nsf.runs.run import Run
 
 #: What a user sees of each run first.
@@ -158,7 +158,7 @@ def _option(group: str, settings: dict[str, Any]) -> str | None:
 def _options(group: str) -> dict[str, dict[str, dict[str, str]]]:
     """The options of each class of a group, with their keys and values as they stand."""
     found: dict[str, dict[str, dict[str, str]]] = {}
-    for path in sorted((CONF / group).glob("*.yaml")):
+    for path in (option(group, name) for name in groups().get(group, ())):
         keys = dict(
             re.findall(r"^(\w+):[ \t]*([^\n#]*?)[ \t]*(?:#.*)?$", path.read_text(encoding="utf-8"), re.M)
         )

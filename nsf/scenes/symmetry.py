@@ -115,5 +115,5 @@ class Symmetry:
         planes = [list(normal) for normal in self.mirrors]
         return ConfigError(
             f"symmetry.mirrors={planes} about {list(self.centre)}: {what} is not its own mirror image; "
-            "leave out that plane, or set scene.reduced.symmetry=null"
+            "leave out that plane, or set reduction.symmetry=null"
         )

@@ -146,7 +146,10 @@ MALFORMED = [
     ("scene.bodies.column.velocity=5", "scene.bodies.column.velocity=5 must be a list of numbers"),
     ("scene.bodies.column.particles=true", "particles=True must be a whole number or null"),
     ("~scene.bodies.column.density", "scene.bodies.column.density is missing"),
-    ("+scene.bodies.column.weight=1", "unexpected key 'weight'; known keys: shape, density"),
+    (
+        "+scene.bodies.column.weight=1",
+        "'scene.bodies.column.weight'; scene.bodies.column has density",
+    ),
     ("scene.parameters.friction_angle.key=''", "friction_angle.key='' names no key"),
     ("scene.parameters.friction_angle.key=[a]", "friction_angle.key=['a'] must be text"),
     ("~scene.parameters.friction_angle.key", "scene.parameters.friction_angle.key is missing"),

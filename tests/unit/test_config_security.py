@@ -7,6 +7,7 @@ import sys
 import pytest
 from omegaconf import OmegaConf
 
+import nsf.paths
 from nsf import config, load_scene
 from nsf.config import targets
 from nsf.errors import ConfigError, NSFError
@@ -215,7 +216,8 @@ def test_references_that_multiply_are_refused(kind):
 def conf(tmp_path, monkeypatch):
     """A copy of conf/ to which files may be added."""
     shutil.copytree(CONF, tmp_path / "conf")
-    monkeypatch.setattr(config.composing, "CONF", tmp_path / "conf")
+    for module in (config.composing, nsf.paths):
+        monkeypatch.setattr(module, "CONF", tmp_path / "conf")
     return tmp_path / "conf"
 
 

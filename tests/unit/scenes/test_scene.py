@@ -114,7 +114,7 @@ def test_parameter_key_must_exist():
         ("scene.title", "names no key that holds a number"),
         ("scene..dx", "names no key that holds a number"),
         ("scene.gravity.7", "names no key that holds a number"),
-        ("scene.reduced.sample", "names no key that holds a number"),
+        ("reduction.sample", "names no key that holds a number"),
         ("sampler.size", "names no key that holds a number"),
         ("latent_dim", "names no key that holds a number"),
         ("seed", "names no key that holds a number"),

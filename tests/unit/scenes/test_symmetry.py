@@ -48,7 +48,7 @@ def test_a_scene_s_own_planes(name):
     """They are those of its yaml, and solids go over into equal ones."""
     centre, mirrors = OWN[name]
     own = scene(name)
-    declared = config.load([f"scene={name}", "scale=small"]).scene.reduced.symmetry
+    declared = config.load([f"scene={name}", "scale=small"]).reduction.symmetry
     assert (tuple(declared.centre), [list(n) for n in declared.mirrors]) == (
         centre,
         [list(n) for n in mirrors],
@@ -148,7 +148,7 @@ def test_a_lesson_and_its_images():
 
 
 def test_planes_that_the_scene_has_not_are_refused_before_any_work():
-    wrong = ["scene=block", "scale=small", "model=recurrence", "scene.reduced.symmetry.mirrors=[[0,0,1]]"]
+    wrong = ["scene=block", "scale=small", "model=recurrence", "reduction.symmetry.mirrors=[[0,0,1]]"]
     with pytest.raises(ConfigError, match="symmetry"):
         Pipeline(config.load(wrong)).check()
 
