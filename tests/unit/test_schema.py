@@ -7,8 +7,8 @@ import pytest
 import yaml
 
 from nsf import config
-from nsf.config import targets
 from nsf.code import arguments
+from nsf.config import targets
 from nsf.errors import ConfigError
 from nsf.paths import CONF, groups
 
