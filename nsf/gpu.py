@@ -1,4 +1,4 @@
-"""What concerns a GPU, without a library that would use it."""
+"""The GPU's driver, captures of its launches, and its arithmetic; torch is imported on first use."""
 
 import ctypes
 import gc
@@ -35,3 +35,17 @@ def without_collection() -> Iterator[None]:
     finally:
         if collects:
             gc.enable()
+
+
+@contextmanager
+def tf32() -> Iterator[None]:
+    """Multiply matrices of fp32 on a GPU's tensor cores, with 10 bits after the leading one."""
+    import torch
+
+    matmul = torch.backends.cuda.matmul
+    before = matmul.fp32_precision
+    matmul.fp32_precision = "tf32"
+    try:
+        yield
+    finally:
+        matmul.fp32_precision = before

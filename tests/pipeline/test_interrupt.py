@@ -20,7 +20,7 @@ STAGES = ("simulate", "train", "deploy", "evaluate")
 #: Where the signal comes, and what is there already: in the middle of the stage's own work.
 MOMENTS = {
     "simulate": SignalAt("nsf.mpm:FullOrderMPM.step", 40),
-    "train": SignalAt("nsf.kinematics.training.descent:Steps._take", 330),
+    "train": SignalAt("nsf.kinematics.training.lightning:FieldTraining._step", 330),
     "deploy": SignalAt("nsf.engines.modal.span:ModalSpan.project", 10),
     "evaluate": SignalAt("nsf.evaluation.cost:_stages"),
 }
@@ -82,7 +82,10 @@ def test_a_resumed_training_ends_with_the_same_bits(nsf, copied, pipeline_at, ch
     """In the first block of the first phase, in the second phase, and in the last block of it."""
     root = copied("simulate")
     assert (
-        nsf("train", root, faults=[SignalAt("nsf.kinematics.training.descent:Steps._take", call)]).code == 130
+        nsf(
+            "train", root, faults=[SignalAt("nsf.kinematics.training.lightning:FieldTraining._step", call)]
+        ).code
+        == 130
     )
     pipeline = pipeline_at(root)
     pipeline.run("train")

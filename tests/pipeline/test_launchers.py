@@ -121,7 +121,7 @@ def test_an_error_that_is_no_ones_fault_is_told_too(tmp_path, monkeypatch, capsy
 def test_after_a_kill_only_the_job_in_flight_is_redone(nsf, copied):
     root = copied("simulate")
     # Each job takes 400 steps; the kill comes in the middle of the second one.
-    moment = SignalAt("nsf.kinematics.training.descent:Steps._take", 700, signal.SIGKILL)
+    moment = SignalAt("nsf.kinematics.training.lightning:FieldTraining._step", 700, signal.SIGKILL)
     killed = nsf("train", root, "seed=1,2,3", faults=[moment], multirun=True)
     assert killed.code == -signal.SIGKILL
     assert sorted(run.status for run in Run.find("train", root=root)) == ["complete", "killed"]

@@ -69,7 +69,7 @@ def test_bad_grammar_is_refused_as_in_a_single_run(nsf, copied, override, quoted
 
 def test_control_c_stops_all_jobs(nsf, copied):
     root = copied("simulate")
-    moment = SignalAt("nsf.kinematics.training.descent:Steps._take", 100)
+    moment = SignalAt("nsf.kinematics.training.lightning:FieldTraining._step", 100)
     outcome = nsf("train", root, "latent_dim=3,4", faults=[moment], multirun=True)
     assert outcome.code == 130
     assert [run.manifest["status"] for run in Run.find("train", root=root)] == ["interrupted"]

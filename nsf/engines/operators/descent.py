@@ -13,7 +13,7 @@ from nsf.engines.operators.model import StepOperators
 from nsf.engines.operators.teacher import Teacher
 from nsf.engines.operators.teaching import Teaching
 from nsf.gpu import without_collection
-from nsf.kinematics.training.descent import muon_and_adam
+from nsf.kinematics.training.schedules import muon_and_adam
 
 _BATCH = 1024  # labels of one step of the descent
 _FAR = 8.0  # deviations, to which long windows hold how far x̂ and d are off, so that a lost one stays bounded

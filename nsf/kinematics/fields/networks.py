@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from nsf.kinematics.training.descent import tf32
+from nsf.gpu import tf32
 
 
 def _push_elu(tangents: Tensor, z: Tensor) -> Tensor:

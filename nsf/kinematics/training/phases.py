@@ -14,6 +14,8 @@ from nsf.errors import ConfigError
 TARGETS = {"deformation": ("x", 3), "stress": ("tau", 6), "affine": ("C", 9)}
 PHASES = tuple(TARGETS)
 
+CHECKPOINT = "last.ckpt"  # of a phase, in its folder
+
 
 def joined(xhat: Tensor, parameters: Tensor) -> Tensor:
     """Latents [..., r] each with the problem parameters [n] (or [..., n]): [..., r + n]."""

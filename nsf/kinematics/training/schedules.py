@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.optim import Adam, Muon, Optimizer
 from typing_extensions import override
 
 from nsf.errors import ConfigError
@@ -152,3 +153,16 @@ class FastTrainer(Trainer):
             return slice(None) if frames <= MOST_AT_ONCE else draw(frames, DRAWN), slice(None)
 
         return draw(frames, self.frames_per_batch), draw(particles, self.particles_per_batch)
+
+
+def muon_and_adam(network: nn.Module, rate: float) -> list[Optimizer]:
+    """Muon for the matrices of a network and Adam for all else; one learning rate is fit for both.
+
+    Source: Jordan et al. 2024, Muon: an optimizer for hidden layers in neural networks.
+    """
+    weights = list(network.parameters())
+    matrices, vectors = ([w for w in weights if (w.ndim == 2) is flat] for flat in (True, False))
+    return [
+        Muon(matrices, lr=rate, weight_decay=0.0, adjust_lr_fn="match_rms_adamw"),
+        Adam(vectors, lr=rate),
+    ]

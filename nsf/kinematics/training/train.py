@@ -15,8 +15,7 @@ import torch
 from nsf.data import Snapshots
 from nsf.data.archives import keep, kept, taken_up
 from nsf.kinematics.manifold import Manifold
-from nsf.kinematics.training.descent import CHECKPOINT, Descent
-from nsf.kinematics.training.phases import Fit, seeded
+from nsf.kinematics.training.phases import CHECKPOINT, Fit, seeded
 from nsf.kinematics.training.schedules import Trainer
 from nsf.kinematics.training.tracking import check_tracking
 from nsf.storage import refusals
@@ -98,8 +97,7 @@ def train(
         total = begun["seconds"] + _once(folder / "built.pt", say, lambda: built["seconds"])
         metrics: dict[str, float] = {}
         for fit in field.fits(manifold, snapshots, prepared):
-            descent = Descent(fit, trainer, snapshots, seed, device)
-            phase = partial(_phase, descent, folder, tracking, say)
+            phase = partial(_descend, fit, trainer, snapshots, seed, folder / fit.name, tracking, say)
             outcome = _once(folder / f"{fit.name}.pt", say, phase)
             fit.network.load_state_dict(outcome["state"])
             fit.network.to(device)  # Lightning leaves it on the host
@@ -110,15 +108,10 @@ def train(
     return manifold.cpu().requires_grad_(False).eval(), metrics
 
 
-def _phase(
-    descent: Descent, folder: Path, tracking: str | None, say: Callable[[str], object]
-) -> dict[str, Any]:
+def _descend(*phase: Any) -> dict[str, Any]:
     from nsf.kinematics.training.lightning import descend
 
-    steps = descent.schedule.steps_of(descent.fit.name, descent.snapshots.M)
-    loss, seconds = descend(descent, steps, folder / descent.fit.name, tracking, say)
-    state = {key: value.cpu() for key, value in descent.fit.network.state_dict().items()}
-    return {"state": state, "steps": steps, "loss": loss, "seconds": seconds}
+    return descend(*phase)
 
 
 def _timed(compute: Callable[[], Any]) -> dict[str, Any]:

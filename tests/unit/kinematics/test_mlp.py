@@ -9,7 +9,7 @@ import torch
 from nsf.errors import ConfigError, SchemaError
 from nsf.kinematics.fields.mlp import MlpField
 from nsf.kinematics.manifold import Manifold
-from nsf.kinematics.training.descent import Descent
+from nsf.kinematics.training.lightning import FieldTraining
 from nsf.kinematics.training.phases import seeded
 from nsf.kinematics.training.schedules import FastTrainer, PaperTrainer
 from nsf.kinematics.training.train import train
@@ -191,13 +191,13 @@ def test_muon_moves_the_matrices_but_in_the_paper_s_schedule(snapshots, schedule
     prepared = FIELD.prepare(snapshots, LATENT)
     manifold = FIELD.build(snapshots, prepared, LATENT, seeded("cpu", 0))
     fit = next(FIELD.fits(manifold, snapshots, prepared))
-    descent = Descent(fit, schedule, snapshots, 0, torch.device("cpu"))
-    optimizers = descent.optimizers()
+    module = FieldTraining(fit, schedule, snapshots, 0)
+    optimizers = module.configure_optimizers()
     assert [type(optimizer).__name__ for optimizer in optimizers] == names
     moved = [w for optimizer in optimizers for group in optimizer.param_groups for w in group["params"]]
     assert {id(w) for w in moved} == {id(w) for w in fit.network.parameters()}
     assert len(moved) == len(list(fit.network.parameters()))
-    assert descent.rate_at(0, 10) == (5 if "Muon" in names else 1) * schedule.rate_at(0, 10)
+    assert module.rate_at(0) == (5 if "Muon" in names else 1) * schedule.rate_at(0, 1)
 
 
 def test_a_checkpoint_from_before_is_refused(untrained, tmp_path):

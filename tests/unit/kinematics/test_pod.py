@@ -11,7 +11,7 @@ from nsf.errors import ConfigError
 from nsf.kinematics.fields import pod
 from nsf.kinematics.fields.basis import BasisField
 from nsf.kinematics.training import schedules
-from nsf.kinematics.training.descent import Descent, Steps
+from nsf.kinematics.training.lightning import FieldTraining
 from nsf.kinematics.training.schedules import FastTrainer
 from nsf.kinematics.training.train import train
 
@@ -99,8 +99,9 @@ def test_of_many_snapshots_a_step_sees_some(low_rank, monkeypatch, tmp_path):
     fit = next(BasisField().fits(*_built(low_rank)))
     loss = fit.loss
     kept = replace(fit, loss=lambda rows, *rest: seen.append(rows) or loss(rows, *rest))
-    descent = Descent(kept, FastTrainer(steps=3), low_rank, 0, torch.device("cpu"))
-    Steps(descent, descent.optimizers(), 3).take(0, 3)
+    module = FieldTraining(kept, FastTrainer(steps=3), low_rank, 0)
+    module.begin(module.configure_optimizers())
+    module.take(0, 3)
     assert [len(rows) for rows in seen] == [7, 7, 7]
     assert len({tuple(rows.tolist()) for rows in seen}) == 3
     assert max(int(rows.max()) for rows in seen) < M

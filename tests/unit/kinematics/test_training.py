@@ -11,7 +11,7 @@ from nsf.data import archives
 from nsf.errors import ConfigError, InstabilityError, MissingExtraError, SchemaError
 from nsf.kinematics.fields.basis import BasisField
 from nsf.kinematics.fields.mlp import MlpField
-from nsf.kinematics.training import descent, lightning
+from nsf.kinematics.training import lightning
 from nsf.kinematics.training import train as training
 from nsf.kinematics.training.phases import PHASES, Fit, per_phase, seeded
 from nsf.kinematics.training.schedules import FastTrainer, PaperTrainer
@@ -44,15 +44,15 @@ def same(one, other):
 
 def interrupt_at(monkeypatch, phase, step):
     """Raise once, before that step; returns what restores the code."""
-    true_step = descent.Steps._take
+    true_step = lightning.FieldTraining._step
 
     def interrupted(self, at):
-        if (self.descent.fit.name, at) == (phase, step):
+        if (self.phase.name, at) == (phase, step):
             raise KeyboardInterrupt
         return true_step(self, at)
 
-    monkeypatch.setattr(descent.Steps, "_take", interrupted)
-    return lambda: monkeypatch.setattr(descent.Steps, "_take", true_step)
+    monkeypatch.setattr(lightning.FieldTraining, "_step", interrupted)
+    return lambda: monkeypatch.setattr(lightning.FieldTraining, "_step", true_step)
 
 
 @pytest.mark.parametrize("field", FIELDS)
@@ -66,11 +66,11 @@ def test_resumed_training_has_the_same_bits(monkeypatch, train, tmp_path, field,
     assert signal.getsignal(signal.SIGINT) is before
     restore()
     taken = []
-    true_step = descent.Steps._take
+    true_step = lightning.FieldTraining._step
     monkeypatch.setattr(
-        descent.Steps,
-        "_take",
-        lambda self, at: taken.append((self.descent.fit.name, at)) or true_step(self, at),
+        lightning.FieldTraining,
+        "_step",
+        lambda self, at: taken.append((self.phase.name, at)) or true_step(self, at),
     )
     resumed, resumed_metrics = train(field, tmp_path / "parts")
     assert same(resumed, expected)
@@ -121,12 +121,14 @@ def test_a_file_of_an_interrupted_training_that_is_forged_is_refused(monkeypatch
 
 def test_seconds_before_an_interrupt_count(monkeypatch, train, tmp_path):
     restore = interrupt_at(monkeypatch, "deformation", 12)
-    true_take = descent.Steps.take
-    monkeypatch.setattr(descent.Steps, "take", lambda self, *span: time.sleep(0.2) or true_take(self, *span))
+    true_take = lightning.FieldTraining.take
+    monkeypatch.setattr(
+        lightning.FieldTraining, "take", lambda self, *span: time.sleep(0.2) or true_take(self, *span)
+    )
     with pytest.raises(KeyboardInterrupt):
         train("basis", tmp_path)
     restore()
-    monkeypatch.setattr(descent.Steps, "take", true_take)
+    monkeypatch.setattr(module, "take", true_take)
     _, metrics = train("basis", tmp_path)
     assert metrics["deformation_seconds"] > 0.4  # two whole blocks of five steps came before
 
