@@ -1,6 +1,7 @@
 """Cases of the sand column, whose one problem parameter is its friction angle."""
 
 from nsf.data import Case
+from nsf.deployment import Fallback, rollouts
 
 
 def angle(value: float) -> Case:
@@ -13,3 +14,8 @@ class AnyCase:
 
     def of(self, case):
         return 0.0
+
+
+def rollout(solver, case, trust, to="none"):
+    """The rollout of one reduced solver."""
+    return rollouts(solver.together, [case], trust, Fallback(to))[0]

@@ -17,7 +17,7 @@ from nsf.bench.rows import Case, Measurements, Settings, size_name
 from nsf.bench.scaling import at_size, carried_over, frames_after
 from nsf.data import Case as Parameters
 from nsf.data.schema import TRAJECTORY
-from nsf.deployment import Levels, Trust
+from nsf.deployment import Fallback, Trust
 from nsf.dynamics import ReducedBatch, ReducedMPM
 from nsf.dynamics.latent import LatentRecord
 from nsf.dynamics.setup import first_changes
@@ -25,7 +25,7 @@ from nsf.engines import Operators
 from nsf.engines.operators.recurrence import Recurrence
 from nsf.engines.operators.states import collider_states
 from nsf.pipeline import Pipeline
-from nsf.pipeline.stages.deployment import calibrated, levels_of
+from nsf.pipeline.stages.deployment import calibrated, fallback_of
 from nsf.pipeline.stages.teaching import OPERATORS
 from nsf.scenes import Scene
 from nsf.timing import synchronizer
@@ -243,7 +243,7 @@ class Checked:
 
     Args:
         run: by operators, alone in its batch.
-        levels: how it is watched.
+        fallback: how it is watched, and who goes on with it.
         projected: the same run by projected steps, built as well before a clock starts.
         trust: the estimate of whether to believe it.
 
@@ -251,22 +251,22 @@ class Checked:
         total_steps: of the run.
     """
 
-    def __init__(self, run: ReducedMPM, levels: Levels, projected: ReducedBatch, trust: Trust):
-        self._run, self._looked_at = run, partial(levels.watched, run.together, projected, trust)
+    def __init__(self, run: ReducedMPM, fallback: Fallback, projected: ReducedBatch, trust: Trust):
+        self._run, self._look_at = run, partial(fallback.apply, run.together, projected, trust)
         self.restart, self.total_steps = run.restart, run.total_steps
 
     def step(self, n: int) -> None:
         """Take the steps of the whole run and check them."""
         self._run.step(n)
-        self._looked_at()
+        self._look_at()
 
 
 def _checked_ms(chain: Pipeline, manifold, run: ReducedMPM, precision: str, settings: Settings) -> float:
     """Median time [ms] of a step of checked runs; where projected steps go on with one, with these."""
-    levels, trust = levels_of(chain, manifold), calibrated(chain, manifold)
+    fallback, trust = fallback_of(chain, manifold), calibrated(chain, manifold)
     like = {"precision": precision, "engine": chain.projecting}
     projected = chain.batch_at(manifold, [chain.held_out[0]], **like)
-    checked = Checked(run, levels, projected, trust)
+    checked = Checked(run, fallback, projected, trust)
     return float(np.median(run_times({"own": checked}, settings.trials, settings.device)["own"]))
 
 

@@ -1,27 +1,27 @@
-"""Reduced runs of held-out cases: their rollouts, whether to believe them, who goes on where not."""
+"""Reduced runs of held-out cases: their records, whether to believe them, who goes on where not."""
 
 from typing import TYPE_CHECKING
 
-from nsf.deployment.handover import go_on, hand_over
-from nsf.deployment.levels import FULL_ORDER, OPERATORS, PROJECTED, Levels
+from nsf.deployment.fallback import Fallback, go_on, hand_over
 from nsf.deployment.rollout import (
+    FULL_ORDER,
+    OPERATORS,
+    PROJECTED,
     Rollout,
     continuation_file,
-    rollout,
     rollout_file,
-    rollouts,
 )
 from nsf.deployment.trust import Trust, calibrate
 from nsf.extras import on_first_use
 
 if TYPE_CHECKING:
-    from nsf.deployment.prediction import deploy
+    from nsf.deployment.running import deploy, rollouts
 
 __all__ = [
     "FULL_ORDER",
     "OPERATORS",
     "PROJECTED",
-    "Levels",
+    "Fallback",
     "Rollout",
     "Trust",
     "calibrate",
@@ -29,7 +29,6 @@ __all__ = [
     "deploy",
     "go_on",
     "hand_over",
-    "rollout",
     "rollout_file",
     "rollouts",
 ]

@@ -1,9 +1,7 @@
-"""Reduced runs from t = 0 to the end of their scene, and what each leaves."""
+"""The record of a reduced run, and its file."""
 
 import io
 import math
-import time
-from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,13 +10,16 @@ import h5py
 import numpy as np
 
 from nsf.data import Case, hdf5
-from nsf.deployment.levels import FULL_ORDER, LEVELS, OPERATORS, PROJECTED, Levels
-from nsf.deployment.trust import Trust, first_distrusted
-from nsf.dynamics import STOP_REASONS, ReducedBatch, ReducedMPM
-from nsf.engines.operators.states import collider_states
+from nsf.deployment.trust import first_distrusted
+from nsf.dynamics import STOP_REASONS
 from nsf.errors import SchemaError
 from nsf.storage import writing
-from nsf.timing import synchronizer
+
+#: Who takes a step: a model of latent vectors alone, the projected step, the full-order solver.
+OPERATORS, PROJECTED, FULL_ORDER = range(3)
+LEVELS = ("operators", "projected", "full_order")
+#: Stands for a stop reason where a step of the latent vector alone ends in no inversion.
+LATENT = "latent"
 
 _VERSION = 4
 _SCALARS = {
@@ -27,13 +28,6 @@ _SCALARS = {
 }  # fmt: skip
 _ARRAYS = ("t", "xhat", "residuals", "trust")
 _REAL = ("<f4", "<f8")  # types of the arrays: that of the run
-#: Steps between looks at the trust of a run that is to be handed over: a look reads back, and what was
-#: done since the last one is lost.
-_LOOK = 20
-#: Stands for a stop reason where a step of the latent vector alone ends in no inversion.
-_LATENT = "latent"
-#: Times less than this share of Δt apart are the same.
-_SAME_TIME = 1e-6
 
 
 @dataclass
@@ -48,15 +42,15 @@ class Rollout:
             themselves (`Trust.ratios`, and `away` where that is above 1).
         away: how far the case is from the training cases, in units of their spacing (`CaseDistance`).
         sample: |S| of the first span of time; integration_mean: mean |N| over all steps taken.
-        needed_outside: most particles or nodes a step needed outside the superset.
+        needed_outside: most particles or nodes outside the superset that a step needed.
         seconds: wall time of the steps, without set-up; of a batch, an equal share of it.
         diverged: step at which x̂ ceased to be finite or a sample particle left the grid, −1 when neither did.
         handed_over: step from whose state the full-order solver goes on, −1 when it does not. The steps then
             end with the first distrusted one.
         estimate: [N + 1] how far a run by operators is from one by projected steps alone, as far as is known
             [m]; None where nothing is estimated.
-        by: [N] who took each step: 0 a model of latent vectors alone, 1 the projected step, 2 the full-order
-            solver, from `handed_over` on; None for a run whose steps are projected.
+        by: [N] who took each step (`OPERATORS`, `PROJECTED`; `FULL_ORDER` from `handed_over` on); None for a
+            run whose model projects itself.
     """
 
     case: Case
@@ -117,8 +111,8 @@ class Rollout:
             file["stops"] = np.array(self.stops, dtype=h5py.string_dtype())
             file["case"] = self.case.numbers
             for name in ("names", "units"):
-                of_all = getattr(self.case, name) or ("",) * len(self.case)
-                file[f"case_{name}"] = np.array(of_all, dtype=h5py.string_dtype())
+                texts = getattr(self.case, name) or ("",) * len(self.case)
+                file[f"case_{name}"] = np.array(texts, dtype=h5py.string_dtype())
         with writing(path) as partial:
             partial.write_bytes(memory.getbuffer())
 
@@ -152,9 +146,9 @@ class Rollout:
                 arrays["by"] = hdf5.array(file, "by", ("|i1",), (len(t) - 1,))[()]
             if "estimate" in file:
                 arrays["estimate"] = hdf5.array(file, "estimate", _REAL, (len(t),))[()]
-            found = cls(Case(names, numbers, units), **scalars, t=t, **arrays, stops=stops)
-            found._check()
-        return found
+            rollout = cls(Case(names, numbers, units), **scalars, t=t, **arrays, stops=stops)
+            rollout._check()
+        return rollout
 
     def _check(self) -> None:
         """Raises SchemaError where the values are none that a run leaves."""
@@ -182,7 +176,7 @@ class Rollout:
                 raise SchemaError(f"has values of {name} that are negative or no numbers")
         if self.by is not None and not np.isin(self.by, range(len(LEVELS))).all():
             raise SchemaError("has steps by none of " + ", ".join(LEVELS))
-        if unknown := set(self.stops) - {*STOP_REASONS, _LATENT}:
+        if unknown := set(self.stops) - {*STOP_REASONS, LATENT}:
             raise SchemaError(f"has stops={sorted(unknown)[0]!r}, which is no reason to stop")
 
 
@@ -194,150 +188,3 @@ def rollout_file(index: int) -> str:
 def continuation_file(index: int) -> str:
     """File of a deploy run in which the full-order solver goes on with that reduced run."""
     return f"continuation_{index}.h5"
-
-
-def rollout(solver: ReducedMPM, case: Case, trust: Trust, until_distrusted: bool = False) -> Rollout:
-    """Run a reduced solver to the end of its scene.
-
-    Args:
-        solver: at t = 0; the only one of its batch.
-        case: its problem parameters, for the record.
-        trust: the estimate of whether to believe the run.
-        until_distrusted: stop at the first step that is not to be believed, and name the one before it from
-            whose state a full-order run can go on: the last whose time is a whole number of the scene's Δt.
-    """
-    return rollouts(solver.together, [case], trust, until_distrusted)[0]
-
-
-def rollouts(
-    batch: ReducedBatch,
-    cases: Sequence[Case],
-    trust: Trust,
-    until_distrusted: bool = False,
-    levels: Levels | None = None,
-) -> list[Rollout]:
-    """Run a batch to the end of its scene.
-
-    Args:
-        batch: at t = 0.
-        cases: problem parameters of each run, for the record.
-        trust, until_distrusted: as for `rollout`; steps are taken for as long as any run is to be believed.
-        levels: who goes on with runs by operators, and how these are watched; their time counts too. None
-            where no operators step, or nobody looks.
-    """
-    if levels is None or not levels.near:
-        taken = batch if levels is None else levels.projected(cases)
-        seconds = _timed_run(taken, trust if until_distrusted else None) / len(batch)
-        by = estimate = None
-        if levels is not None:
-            by, estimate = np.full(taken.total_steps, PROJECTED, np.int8), np.zeros(taken.total_steps + 1)
-        watched = [(run, estimate, by) for run in taken.runs]
-    else:
-        # Built before the clock starts, as `batch` is.
-        projected = levels.projected(cases) if levels.projects else None
-        seconds, started = _timed_run(batch, None), time.perf_counter()
-        watched = levels.watched(batch, projected, trust)
-        del projected  # what comes after decodes every particle
-        seconds = (seconds + time.perf_counter() - started) / len(batch)
-    found = []
-    for (run, estimate, by), case, (off, _) in zip(watched, cases, batch.doubts, strict=True):
-        own = _rollout_of(run, case, trust, until_distrusted, seconds)
-        if by is not None:
-            steps = len(own.stops)
-            own.by, own.estimate = by[:steps], None if estimate is None else estimate[: steps + 1]
-            own.stops = [_LATENT if b == OPERATORS else s for b, s in zip(own.by, own.stops, strict=True)]
-            if off > 1.0:
-                after = np.append(by[:1], own.by) == OPERATORS  # [steps + 1], of none as well
-                own.trust = np.where(after, np.maximum(own.trust, off), own.trust)
-        found.append(own)
-    return found
-
-
-def _rollout_of(
-    solver: ReducedMPM, case: Case, trust: Trust, until_distrusted: bool, seconds: float
-) -> Rollout:
-    """What a run that has ended leaves."""
-    taken = solver.steps_taken
-    latent = solver.trajectory()
-    diverged, handed_over, steps = solver.left_grid(), -1, taken
-    ratios = _ratios(solver, trust, diverged)
-    distrusted = first_distrusted(ratios)
-    if until_distrusted and distrusted >= 0:
-        diverged, steps = -1, distrusted
-        handed_over = _whole_step_before(latent.t, distrusted, solver.scene.dt)
-    believed = steps if handed_over < 0 else handed_over
-    outside = solver.needed_outside(believed) if diverged < 0 else 0
-    return Rollout(
-        case=case,
-        t=latent.t[: steps + 1],
-        xhat=latent.xhat[: steps + 1],
-        residuals=latent.residuals[:steps],
-        stops=latent.stops[:steps],
-        trust=ratios[: steps + 1],
-        away=trust.cases.of(case),
-        sample=solver.sample_size,
-        integration_mean=solver.integration_mean,
-        needed_outside=outside,
-        seconds=seconds,
-        diverged=diverged,
-        handed_over=handed_over,
-    )
-
-
-def _timed_run(solver: ReducedBatch, trust: Trust | None) -> float:
-    """Take every step, or with an estimate of trust stop soon after it believes none of the runs any more.
-
-    Returns:
-        Wall time [s] of the steps; the first, which compiles, loads and captures, counts as the others' mean.
-    """
-    solver.step(1)
-    wait = synchronizer(solver.device)
-    wait()
-    believed, looked, started = solver.runs, 0, time.perf_counter()
-    look = solver.total_steps if trust is None else _LOOK
-    while solver.steps_taken < solver.total_steps:
-        solver.step(min(look, solver.total_steps - solver.steps_taken))
-        if trust is not None:
-            believed = [
-                run
-                for run in believed
-                if first_distrusted(_ratios(run, trust, run.left_grid(since=looked + 1))) < 0
-            ]
-            if not believed:
-                break
-            looked = solver.steps_taken
-    wait()
-    taken = solver.steps_taken
-    return (time.perf_counter() - started) * taken / max(1, taken - 1)
-
-
-def _ratios(solver: ReducedMPM, trust: Trust, diverged: int) -> np.ndarray:
-    """Trust of the steps taken [n + 1]; ∞ from the step at which the run diverged."""
-    latent = solver.trajectory()
-    ratios = trust.ratios(latent.xhat, latent.residuals[:, -1])
-    # Not below 1: there the steps themselves tell more.
-    for off in (solver.doubt[0], trust.cases.of(solver.setup.given)):
-        if off > 1.0:
-            ratios = np.maximum(ratios, off)
-    ratios[1:] = np.maximum(ratios[1:], forcing_ratios(solver, trust))
-    if diverged >= 0:
-        ratios[diverged:] = np.inf
-    return ratios
-
-
-def forcing_ratios(solver: ReducedMPM, trust: Trust, first: int = 0) -> np.ndarray:
-    """`Trust.of_forcing` at each step taken from a first one on; a step takes the gravity of its start."""
-    taken, dt = solver.steps_taken, solver.together.dt
-    colliders = solver.together.batch.forcing.colliders_of(solver.index)
-    solids = collider_states(colliders, dt, taken)[first:]
-    return trust.of_forcing(solver.acting_gravity(dt * np.arange(first, taken)), solids, dt)
-
-
-def _whole_step_before(t: np.ndarray, step: int, dt: float) -> int:
-    """Last step before `step` whose time is a whole number of Δt [s]; 0, the start, if there is none.
-
-    Frames and colliders of the full-order solver then stand where they would in a run of its own.
-    """
-    fractions = t[:step] / dt
-    whole = np.flatnonzero(np.abs(fractions - np.round(fractions)) < _SAME_TIME)
-    return int(whole[-1]) if len(whole) else 0

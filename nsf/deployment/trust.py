@@ -1,10 +1,10 @@
 """Whether to believe a reduced run: how far it is from what its fields were trained on.
 
-A reduced run has no truth beside it, but three things tell when it leaves its training data: the sample
-particles move where no latent vector can follow, which leaves a projection residual; the latent vector goes
-where no training snapshot was; and the problem parameters lie where no training case does. All are measured
-in units of what training data themselves show, so that a ratio of 1 means "as far as training data are from
-themselves". Not in the paper.
+Three signals tell when a run leaves its training data: the sample particles move where no latent vector can
+follow, which leaves a projection residual; the latent vector goes where no training snapshot was; and the
+problem parameters, or what forces the run, lie outside of training. Each is measured in units of what
+training data themselves show, so that a ratio of 1 means "as far as training data are from themselves". Not
+in the paper.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from scipy.spatial.distance import cdist
 
 from nsf.data.normalize import deviation
 from nsf.dynamics import ReducedMPM
-from nsf.engines.operators.states import FEATURES
+from nsf.engines.operators.states import FEATURES, collider_states
 from nsf.progress import Progress
 
 #: Of the distances between training trajectories: the largest ones are of single frames.
@@ -48,23 +48,23 @@ class LatentDistance:
     def __init__(self, manifold, particles: np.ndarray, device: str | torch.device = "cpu"):
         self._at = manifold.restrict(particles=torch.as_tensor(particles), device=device)
         self._latents = manifold.training_latents
-        known = self._positions(manifold.training_latents)
-        self._origin = known.mean(0)  # near which distances lose fewer digits
-        self._known = known - self._origin
+        training = self._positions(manifold.training_latents)
+        self._origin = training.mean(0)  # near which distances lose fewer digits
+        self._training = training - self._origin
         self._trajectories = manifold.training_trajectories.to(device)
 
     def of(self, xhat: np.ndarray) -> np.ndarray:
         """Distance [n] [m] of latent vectors [n, r] to the nearest training latent; NaN where x̂ is."""
-        return _nearest(self._positions(torch.as_tensor(xhat)) - self._origin, self._known).cpu().numpy()
+        return _nearest(self._positions(torch.as_tensor(xhat)) - self._origin, self._training).cpu().numpy()
 
     def between_trajectories(self) -> np.ndarray:
         """[M] distance [m] of each training latent to the nearest of another trajectory; [0] if none."""
-        found = [np.zeros(0)]
+        distances = [np.zeros(0)]
         for k in self._trajectories.unique():
-            own = self._trajectories == k
-            if not own.all():
-                found.append(_nearest(self._known[own], self._known[~own]).cpu().numpy())
-        return np.concatenate(found)
+            inside = self._trajectories == k
+            if not inside.all():
+                distances.append(_nearest(self._training[inside], self._training[~inside]).cpu().numpy())
+        return np.concatenate(distances)
 
     def embedded(self, error: float) -> tuple[np.ndarray, np.ndarray]:
         """The same distances between few numbers, where positions are modes times coefficients.
@@ -82,9 +82,9 @@ class LatentDistance:
         R = np.linalg.qr(modes, mode="r")
         y = (a - a.mean(0)) @ R.T
         _, _, axes = np.linalg.svd(y, full_matrices=False)
-        left = y @ axes.T
-        rest = np.sqrt(np.cumsum((left**2)[:, ::-1], axis=1)[:, ::-1]).max(0)  # beyond each axis
-        count = max(1, int((2.0 * rest > error).sum()))
+        squares = (y @ axes.T) ** 2
+        beyond = np.sqrt(np.cumsum(squares[:, ::-1], axis=1)[:, ::-1]).max(0)  # in this and further axes
+        count = max(1, int((2.0 * beyond > error).sum()))
         matrix = axes[:count] @ R
         return matrix, a @ matrix.T
 
@@ -95,8 +95,8 @@ class LatentDistance:
         """
         if not hasattr(self._at, "fields") or not hasattr(self._at.fields["deformation"], "modes"):
             return lambda xhat: torch.as_tensor(self.of(xhat.cpu().numpy())).to(xhat)
-        matrix, known = (torch.as_tensor(values, device=self._at.device) for values in self.embedded(error))
-        return lambda xhat: _nearest(self._coefficients(xhat) @ matrix.T, known)
+        matrix, training = (torch.as_tensor(a, device=self._at.device) for a in self.embedded(error))
+        return lambda xhat: _nearest(self._coefficients(xhat) @ matrix.T, training)
 
     def _coefficients(self, latents: torch.Tensor) -> torch.Tensor:
         """a(x̂) [n, K] in fp64, of a field of modes times coefficients."""
@@ -117,7 +117,7 @@ class CaseDistance:
     """How far a case is from the training cases, in units of their own spacing.
 
     Parameters are standardised over the training cases. Their spacing is the longest edge of their minimum
-    spanning tree: the longest step that it takes to go from any case to any other by way of the rest.
+    spanning tree: the longest step that it takes to go from any case to any other by way of further ones.
 
     Args:
         manifold: trained fields.
@@ -125,10 +125,10 @@ class CaseDistance:
 
     def __init__(self, manifold):
         self._names = manifold.parameter_names
-        known = self._values = np.unique(manifold.training_parameters.cpu().numpy(), axis=0)
-        self._deviation = deviation(known)
-        between = cdist(known / self._deviation, known / self._deviation)
-        self._spacing = float(minimum_spanning_tree(between).max()) or 1.0
+        self._values = np.unique(manifold.training_parameters.cpu().numpy(), axis=0)
+        self._deviation = deviation(self._values)
+        standard = self._values / self._deviation
+        self._spacing = float(minimum_spanning_tree(cdist(standard, standard)).max()) or 1.0
 
     def of(self, case: Mapping[str, float]) -> float:
         """The ratio: the distance to the nearest training case, or 1 and the way into their box from outside.
@@ -183,9 +183,9 @@ class SolidsRange:
         self._round_off = _ROUND_OFF * np.abs(rows).max((0, 1))
         beyond = [1.0]
         for run in range(len(rows)) if len(rows) > 1 else ():
-            others = _range(np.delete(low, run, 0), np.delete(high, run, 0))
-            found = self._of(rows[run], *others)
-            beyond.append(float(found[np.isfinite(found)].max(initial=1.0)))
+            without = _range(np.delete(low, run, 0), np.delete(high, run, 0))
+            ratios = self._of(rows[run], *without)
+            beyond.append(float(ratios[np.isfinite(ratios)].max(initial=1.0)))
         self._leeway = 1.0 + _AGAIN * (max(beyond) - 1.0)
 
     def of(self, states: np.ndarray, dt: float) -> np.ndarray:
@@ -193,8 +193,8 @@ class SolidsRange:
         return self._of(_velocities(states, dt), self._middle, self._half).max(-1, initial=0.0) / self._leeway
 
     def _of(self, rows: np.ndarray, middle: np.ndarray, half: np.ndarray) -> np.ndarray:
-        off = np.maximum(np.abs(rows - middle) - self._round_off, 0.0)
-        return np.divide(off, half, out=np.where(off > 0.0, np.inf, 0.0), where=half > 0.0)
+        distance = np.maximum(np.abs(rows - middle) - self._round_off, 0.0)
+        return np.divide(distance, half, out=np.where(distance > 0.0, np.inf, 0.0), where=half > 0.0)
 
 
 def _range(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -204,9 +204,9 @@ def _range(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _velocities(states: np.ndarray, dt: float) -> np.ndarray:
     """States [..., f] with velocities in place of changes in a step."""
-    own = states.reshape(*states.shape[:-1], -1, FEATURES).copy()
-    own[..., 4:8] /= dt
-    return own.reshape(states.shape)
+    rows = states.reshape(*states.shape[:-1], -1, FEATURES).copy()
+    rows[..., 4:8] /= dt
+    return rows.reshape(states.shape)
 
 
 @dataclass(frozen=True)
@@ -249,10 +249,11 @@ class Trust:
             runs: x̂ [N + 1, r] and residuals [N] [m] of each run, as for `ratios`, as far as it went well;
                 none where no run takes projected steps, so that distances alone count.
         """
-        between = latent_distance.between_trajectories()
-        apart = float(np.quantile(between, QUANTILE)) if len(between) else 0.0
+        distances = latent_distance.between_trajectories()
+        separation = float(np.quantile(distances, QUANTILE)) if len(distances) else 0.0
         drift = _largest([latent_distance.of(xhat) for xhat, _ in runs])
-        return cls(_largest([residuals for _, residuals in runs]), max(apart, drift), latent_distance, cases)
+        residual = _largest([residuals for _, residuals in runs])
+        return cls(residual, max(separation, drift), latent_distance, cases)
 
     def ratios(self, xhat: np.ndarray, residuals: np.ndarray) -> np.ndarray:
         """The larger of residual and distance over its scale, at each step; ∞ where a value is not finite.
@@ -280,16 +281,45 @@ class Trust:
             [...] distance from the middle over the radius or half of the range, where that is above 1; else
             0, since a forcing that is inside tells nothing of where the run goes.
         """
-        found = np.zeros(gravity.shape[:-1])
+        ratios = np.zeros(gravity.shape[:-1])
         if self.gravity is not None:
             middle, radius = self.gravity
-            found = np.linalg.norm(gravity - np.asarray(middle), axis=-1) / radius
+            ratios = np.linalg.norm(gravity - np.asarray(middle), axis=-1) / radius
         if self.solids is not None:
-            found = np.maximum(found, self.solids.of(solids, dt))
-        return np.where(found > 1.0 + _ROUND_OFF, found, 0.0)
+            ratios = np.maximum(ratios, self.solids.of(solids, dt))
+        return np.where(ratios > 1.0 + _ROUND_OFF, ratios, 0.0)
+
+    def of_forcing_in(self, run: ReducedMPM, first: int = 0) -> np.ndarray:
+        """`of_forcing` at the steps of a run from a first one on, each with the forcing of its start."""
+        steps, dt = run.steps_taken, run.together.dt
+        colliders = run.together.batch.forcing.colliders_of(run.index)
+        solids = collider_states(colliders, dt, steps)[first:]
+        return self.of_forcing(run.acting_gravity(dt * np.arange(first, steps)), solids, dt)
+
+    def of_run(self, run: ReducedMPM, diverged: int | None = None) -> np.ndarray:
+        """All signals of a run together, [n + 1] over the steps taken; above 1 a step is not to be believed.
+
+        Args:
+            run: at its end, or in its midst.
+            diverged: step at which it diverged and from which on the ratio is ∞; −1: at none. None: to be
+                found.
+        """
+        latent = run.trajectory()
+        ratios = self.ratios(latent.xhat, latent.residuals[:, -1])
+        # Not below 1: there the steps themselves tell more.
+        for outside in (run.doubt[0], self.cases.of(run.setup.given)):
+            if outside > 1.0:
+                ratios = np.maximum(ratios, outside)
+        ratios[1:] = np.maximum(ratios[1:], self.of_forcing_in(run))
+        diverged = run.left_grid() if diverged is None else diverged
+        if diverged >= 0:
+            ratios[diverged:] = np.inf
+        return ratios
 
 
-def calibrate(solver_at: Callable[[Mapping[str, float], str], ReducedMPM], manifold, device: str) -> Trust:
+def calibrate(
+    solver_at: Callable[[Mapping[str, float], str], ReducedMPM], manifold, device: str, projects: bool = True
+) -> Trust:
     """The estimate of trust, from reduced runs of the first, the middle and the last training cases.
 
     Runs and not the snapshots' own residuals: what a step leaves at S depends on S, the method and Δt.
@@ -298,19 +328,21 @@ def calibrate(solver_at: Callable[[Mapping[str, float], str], ReducedMPM], manif
         solver_at: case and device name → solver at t = 0.
         manifold: trained fields.
         device: `cpu`, `cuda` or `cuda:N`.
+        projects: whether projected steps are taken, so that residuals count; else no run is made.
     """
-    known, runs = CaseDistance(manifold), []
-    cases = known.extremes()
-    with Progress("calibrate", len(cases), "runs") as progress:
-        for case in cases:
+    cases, runs = CaseDistance(manifold), []
+    extremes = cases.extremes() if projects else cases.extremes()[:1]
+    with Progress("calibrate", len(extremes), "runs") as progress:
+        for case in extremes:
             solver = solver_at(case, device)
-            solver.step(solver.total_steps)
-            latent, diverged = solver.trajectory(), solver.left_grid()
-            good = diverged if diverged >= 0 else len(latent.xhat)
-            runs.append((latent.xhat[:good], latent.residuals[: good - 1, -1]))
+            if projects:
+                solver.step(solver.total_steps)
+                latent, diverged = solver.trajectory(), solver.left_grid()
+                good = diverged if diverged >= 0 else len(latent.xhat)
+                runs.append((latent.xhat[:good], latent.residuals[: good - 1, -1]))
             progress.advance()
     particles = np.unique(np.concatenate([span.particles for span in solver.samples]))
-    return Trust.calibrated(LatentDistance(manifold, particles, device), known, runs)
+    return Trust.calibrated(LatentDistance(manifold, particles, device), cases, runs)
 
 
 def first_distrusted(ratios: np.ndarray) -> int:

@@ -11,7 +11,6 @@ import torch
 from nsf.data import Case, Trajectory
 from nsf.data.schema import TRAJECTORY, packed
 from nsf.deployment import Trust
-from nsf.deployment.rollout import forcing_ratios
 from nsf.dynamics import Decoder, ReducedMPM
 from nsf.errors import ConfigError, InstabilityError
 from nsf.live import page
@@ -138,7 +137,7 @@ class LiveRun:
         self._xhat[found] = latent.xhat[found]
         residuals = latent.residuals[first - 1 : last, -1]
         ratios = self._trust.ratios(latent.xhat[first - 1 : last + 1], residuals)[1:]
-        forced = forcing_ratios(solver, self._trust, first - 1)[: last - first + 1]
+        forced = self._trust.of_forcing_in(solver, first - 1)[: last - first + 1]
         self._ratios[found] = np.maximum(ratios, forced)
         self.seconds += time.perf_counter() - started
         self.diverged = lost >= 0

@@ -8,12 +8,12 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from angles import angle
+from angles import angle, rollout
 
 import nsf
 from nsf.data import Trajectory
-from nsf.deployment import OPERATORS, PROJECTED, Levels, Rollout, rollout, rollouts
-from nsf.deployment.levels import estimated_errors
+from nsf.deployment import OPERATORS, PROJECTED, Fallback, Rollout, rollouts
+from nsf.deployment.estimate import estimated_errors
 from nsf.dynamics import Sources, Taylor
 from nsf.engines import Operators
 from nsf.engines.operators import Course, Teacher
@@ -217,7 +217,7 @@ def test_projected_runs_in_drawn_cases_teach_too(drawn, monkeypatch):
     row = pd.read_csv(pipeline.evaluation.path / "results.csv").iloc[0]
     assert row["displacement_error"] < 0.06
     assert row["stress"] == row["affine"] == "particles"
-    monkeypatch.setattr("nsf.deployment.levels._believed", lambda run, trust: 10)
+    monkeypatch.setattr("nsf.deployment.fallback.first_distrusted", lambda ratios: 11)
     doubted = drawn(lambda line: None, "fallback=projected")  # taken anew by projected steps
     for stage in ("deploy", "evaluate"):
         doubted.run(stage)
@@ -441,26 +441,26 @@ def test_a_name_is_not_enough(chain, tiny_manifold):
         nsf.reduced(chain.scene, tiny_manifold, ANGLE, 20, engine="operators", device="cpu")
 
 
-# -- levels ---------------------------------------------------------------------------------------------
+# -- fallback -------------------------------------------------------------------------------------------
 
 
 @pytest.fixture
-def levels_of(lesson):
+def fallback_of(lesson):
     pipeline, _ = lesson
     manifold = pipeline.manifold()
 
-    def build(*how, every=4):
-        return Levels(lambda cases: pipeline.batch_at(manifold, cases, engine="auto"), every, *how)
+    def build(to="none"):
+        return Fallback(to, lambda cases: pipeline.batch_at(manifold, cases, engine="auto"), 4)
 
     return build
 
 
-def test_the_estimate_is_how_far_projected_runs_are(reduced, lesson, levels_of):
+def test_the_estimate_is_how_far_projected_runs_are(reduced, lesson, fallback_of):
     pipeline, _ = lesson
     cases = [angle(23.0), angle(26.0)]
     batch = pipeline.batch_at(pipeline.manifold(), cases)
     batch.step(24)
-    projected = levels_of().projected(cases)
+    projected = fallback_of().projected(cases)
     found = estimated_errors(batch, projected, 1)
     projected.restart()
     projected.step(24)
@@ -474,13 +474,13 @@ def test_the_estimate_is_how_far_projected_runs_are(reduced, lesson, levels_of):
     assert (batch.batch.record.residuals[:, 1:, -1] > 0).all()
 
 
-def test_where_it_is_not_believed_the_projected_step_goes_on(reduced, levels_of, tiny_trust, monkeypatch):
-    own = rollouts(reduced().together, [angle(26.0)], tiny_trust, levels=levels_of())[0]
+def test_where_it_is_not_believed_the_projected_step_goes_on(reduced, fallback_of, tiny_trust, monkeypatch):
+    own = rollouts(reduced().together, [angle(26.0)], tiny_trust, fallback_of())[0]
     assert (own.by_operators, own.levels.tolist()) == (24, [OPERATORS] * 24)
     assert own.estimate[0] == 0.0 < own.estimate[-1]
     n = 10
-    monkeypatch.setattr("nsf.deployment.levels._believed", lambda run, trust: n)
-    found = rollouts(reduced().together, [angle(26.0)], tiny_trust, levels=levels_of(True))[0]
+    monkeypatch.setattr("nsf.deployment.fallback.first_distrusted", lambda ratios: n + 1)
+    found = rollouts(reduced().together, [angle(26.0)], tiny_trust, fallback_of("projected"))[0]
     assert found.levels.tolist() == [OPERATORS] * n + [PROJECTED] * (24 - n)
     assert [stop == "latent" for stop in found.stops] == (found.levels == OPERATORS).tolist()
     np.testing.assert_array_equal(found.xhat[: n + 1], own.xhat[: n + 1])
@@ -494,13 +494,13 @@ def test_where_it_is_not_believed_the_projected_step_goes_on(reduced, levels_of,
     np.testing.assert_allclose(found.xhat[-1], projected.state.xhat, rtol=0, atol=1e-12)
 
 
-def test_what_is_doubted_is_projected_where_that_may_go_on(reduced, levels_of, tiny_trust):
+def test_what_is_doubted_is_projected_where_that_may_go_on(reduced, fallback_of, tiny_trust):
     outside = angle(60.0)
     solver = reduced(parameters=outside)
-    found = rollouts(solver.together, [outside], tiny_trust, levels=levels_of(True))[0]
+    found = rollouts(solver.together, [outside], tiny_trust, fallback_of("projected"))[0]
     assert (found.by_operators, found.levels.tolist()) == (0, [PROJECTED] * 24)
     assert reduced().doubt[0] <= 1.0
-    plain = rollouts(reduced(parameters=outside).together, [outside], tiny_trust, levels=levels_of())[0]
+    plain = rollouts(reduced(parameters=outside).together, [outside], tiny_trust, fallback_of())[0]
     assert plain.by_operators == 24
     assert (plain.trust > 1.0).all()  # never without saying so
 
@@ -522,7 +522,7 @@ def test_a_rollout_keeps_who_took_its_steps(lesson, tmp_path):
 
 def test_a_run_that_is_handed_on_costs_what_its_steps_cost(lesson, pipeline_at, monkeypatch):
     pipeline, _ = lesson
-    monkeypatch.setattr("nsf.deployment.levels._believed", lambda run, trust: 10)
+    monkeypatch.setattr("nsf.deployment.fallback.first_distrusted", lambda ratios: 11)
     handed = pipeline_at(pipeline.root, *TAUGHT, "fallback=projected")
     for stage in ("deploy", "evaluate"):
         handed.run(stage)

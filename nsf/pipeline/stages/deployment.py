@@ -13,7 +13,7 @@ from nsf.data import Case
 from nsf.data.schema import TRAJECTORY
 from nsf.deployment import (
     PROJECTED,
-    Levels,
+    Fallback,
     Rollout,
     Trust,
     calibrate,
@@ -115,18 +115,13 @@ def calibrated(pipeline, manifold: Manifold) -> Trust:
     """The trust estimate of a pipeline's runs, calibrated on projected runs of training if it takes any."""
     projected = partial(pipeline.solver_at, manifold, engine=pipeline.projecting)
 
-    def known_at(values: Mapping[str, float], device: str) -> ReducedMPM:
+    def training_run(values: Mapping[str, float], device: str) -> ReducedMPM:
         """A run in the training case of some parameters, with its own program."""
         return projected(_case_of(pipeline.split.train, values), device)
 
-    if pipeline.model.projects or pipeline.config.fallback == "projected":
-        found = calibrate(known_at, manifold, pipeline.device)
-    else:
-        solver = known_at(CaseDistance(manifold).extremes()[0], pipeline.device)
-        particles = np.unique(np.concatenate([span.particles for span in solver.samples]))
-        distance = LatentDistance(manifold, particles, pipeline.device)
-        found = Trust.calibrated(distance, CaseDistance(manifold), [])
-    return replace(found, gravity=_range_of_gravity(pipeline.scene), solids=_range_of_solids(pipeline))
+    projects = pipeline.model.projects or pipeline.config.fallback == "projected"
+    trust = calibrate(training_run, manifold, pipeline.device, projects)
+    return replace(trust, gravity=_range_of_gravity(pipeline.scene), solids=_range_of_solids(pipeline))
 
 
 def _range_of_gravity(scene) -> tuple[Sequence[float], float] | None:
@@ -166,8 +161,8 @@ def _rollouts(pipeline, manifold: Manifold, record: Record) -> list[Rollout]:
         record.metrics |= {"engine": batch.engine, "engine_why": batch.why}
         return batch
 
-    hand_over, levels = pipeline.config.fallback == "full", levels_of(pipeline, manifold)
-    rollouts = deploy(batch_at, pipeline.held_out, pipeline.device, trust, hand_over, together, levels)
+    fallback = fallback_of(pipeline, manifold)
+    rollouts = deploy(batch_at, pipeline.held_out, pipeline.device, trust, fallback, together)
     engine, why = record.metrics["engine"], record.metrics["engine_why"]
     if isinstance(pipeline.model, Projected):
         pipeline.say(f"deploy: steps by {engine}" + (f", since {why}" if why else ""))
@@ -206,17 +201,13 @@ def _case_of(cases: Sequence[Case], values: Mapping[str, float]) -> Case:
     return next(case for case in cases if case.parameters == dict(values))
 
 
-def levels_of(pipeline, manifold: Manifold) -> Levels | None:
-    """How runs of another model than the projected one are watched, and who goes on with them."""
-    model = pipeline.model
+def fallback_of(pipeline, manifold: Manifold) -> Fallback:
+    """How the pipeline's runs are watched, and who goes on with one that is no longer believed."""
+    model, to = pipeline.model, pipeline.config.fallback
     if isinstance(model, Projected):
-        return None
-    return Levels(
-        partial(pipeline.batch_at, manifold, engine=pipeline.projecting),
-        model.check if isinstance(model, Recurrence) else 0,
-        pipeline.config.fallback == "projected",
-        _near(pipeline),
-    )
+        return Fallback(to)
+    projected = partial(pipeline.batch_at, manifold, engine=pipeline.projecting)
+    return Fallback(to, projected, model.check if isinstance(model, Recurrence) else 0, _near(pipeline))
 
 
 def _near(pipeline) -> bool:

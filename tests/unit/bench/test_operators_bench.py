@@ -11,9 +11,9 @@ from angles import angle
 from nsf.bench.operators import Checked, Many, measured, measured_decoded
 from nsf.bench.report import wide
 from nsf.bench.rows import Measurements, Settings
-from nsf.deployment import Levels, Rollout, rollout_file
+from nsf.deployment import Fallback, Rollout, rollout_file
 from nsf.engines import Operators
-from nsf.pipeline.stages.deployment import calibrated, levels_of
+from nsf.pipeline.stages.deployment import calibrated, fallback_of
 
 TAUGHT = (
     "model=recurrence", "model.teaching.steps=400", "model.teaching.descent=100",
@@ -56,16 +56,16 @@ def test_every_case_has_a_row(taught):
 def test_a_checked_run_is_looked_at_as_a_deployed_one_is(taught, monkeypatch):
     pipeline, _, _ = taught
     manifold, case, looked = pipeline.manifold(), pipeline.held_out[0], []
-    levels, trust = levels_of(pipeline, manifold), calibrated(pipeline, manifold)
-    watched = Levels.watched
-    monkeypatch.setattr(Levels, "watched", lambda *given: looked.append(watched(*given)) or looked[-1])
+    fallback, trust = fallback_of(pipeline, manifold), calibrated(pipeline, manifold)
+    apply = Fallback.apply
+    monkeypatch.setattr(Fallback, "apply", lambda *given: looked.append(apply(*given)) or looked[-1])
     run = pipeline.solver_at(manifold, case)
-    checked = Checked(run, levels, levels.projected([case]), trust)
+    checked = Checked(run, fallback, fallback.projected([case]), trust)
     for _ in range(2):
         checked.restart()
         checked.step(checked.total_steps)
-    (_, estimate, by), again = looked[0][0], looked[1][0]
-    np.testing.assert_array_equal(estimate, again[1])
+    (_, by, estimate), again = looked[0][0], looked[1][0]
+    np.testing.assert_array_equal(estimate, again.estimate)
     pipeline.deploy()
     deployed = Rollout.open(pipeline.deployment.file(rollout_file(0)))
     np.testing.assert_allclose(estimate, deployed.estimate, rtol=1e-5)

@@ -5,10 +5,10 @@ from dataclasses import replace
 import h5py
 import numpy as np
 import pytest
-from angles import AnyCase, angle
+from angles import AnyCase, angle, rollout
 
 import nsf
-from nsf.deployment import Rollout, deploy, rollout, rollouts
+from nsf.deployment import Fallback, Rollout, deploy, rollouts
 from nsf.dynamics import Taylor
 from nsf.errors import MissingRunError, SchemaError
 
@@ -83,23 +83,23 @@ def batch_at(chain, tiny_manifold):
     return build
 
 
-@pytest.mark.parametrize("until_distrusted", [False, True])
-def test_cases_that_take_their_steps_together(solver_at, batch_at, tiny_trust, until_distrusted):
+@pytest.mark.parametrize("to", ["none", "full"])
+def test_cases_that_take_their_steps_together(solver_at, batch_at, tiny_trust, to):
     """One of them is far from training, so that it hands over in mid-run; the last has no other beside it."""
     cases = list(map(angle, (26.0, 8.0, 33.5, 30.0, 22.5)))
     batch_at.taken.clear()
     of_steps = replace(tiny_trust, cases=AnyCase())
-    found = deploy(batch_at, cases, "cpu", of_steps, until_distrusted, 2)
+    found = deploy(batch_at, cases, "cpu", of_steps, Fallback(to), 2)
     assert batch_at.taken == [2, 2, 1]
     assert [run.case for run in found] == cases
     assert found[0].seconds == found[1].seconds > 0
     for run in found:
-        alone = rollout(solver_at(run.case), run.case, of_steps, until_distrusted)
+        alone = rollout(solver_at(run.case), run.case, of_steps, to)
         if run.handed_over >= 0:  # the other one of its batch went on, so that more steps were taken
             run = replace(run, integration_mean=alone.integration_mean)
         assert same(run, alone, timing=False)
     assert found[1].distrusted > 0
-    assert (found[1].handed_over > 0) == until_distrusted
+    assert (found[1].handed_over > 0) == (to == "full")
     assert found[0].handed_over < 0
 
 
@@ -107,7 +107,7 @@ def test_a_batch_ends_when_no_run_is_believed(batch_at, tiny_trust):
     for values, all_steps in (((8.0, 9.0), False), ((26.0, 8.0), True)):
         cases = list(map(angle, values))
         batch = batch_at(cases)
-        rollouts(batch, cases, tiny_trust, until_distrusted=True)
+        rollouts(batch, cases, tiny_trust, Fallback("full"))
         assert (batch.steps_taken == batch.total_steps) == all_steps
 
 

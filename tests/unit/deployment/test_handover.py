@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from angles import angle
+from angles import angle, rollout
 
 from nsf.data import Trajectory
-from nsf.deployment import go_on, hand_over, rollout
+from nsf.deployment import go_on, hand_over
 from nsf.errors import InstabilityError
 from nsf.mpm import FP64, FullOrderMPM
 
@@ -94,7 +94,7 @@ def test_a_run_lost_at_its_end_leaves_no_file(solver, made, tmp_path, monkeypatc
         return full
 
     monkeypatch.setattr(FullOrderMPM, "check", check)
-    monkeypatch.setattr("nsf.deployment.handover.hand_over", seldom_checked)
+    monkeypatch.setattr("nsf.deployment.fallback.hand_over", seldom_checked)
     with pytest.raises(InstabilityError, match="lost stability: off the grid"):
         go_on(solver, replace(made, handed_over=12), tmp_path / "rest.h5")
     assert not list(tmp_path.iterdir())

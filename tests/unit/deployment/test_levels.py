@@ -7,8 +7,8 @@ import pytest
 import torch
 from angles import angle
 
-from nsf.deployment import FULL_ORDER, OPERATORS, PROJECTED, Levels, Rollout, rollouts
-from nsf.deployment.levels import _carried
+from nsf.deployment import FULL_ORDER, OPERATORS, PROJECTED, Fallback, Rollout, rollouts
+from nsf.deployment.estimate import _moved_by
 from nsf.dynamics import ReducedBatch, Sources
 from nsf.dynamics.span import Span
 
@@ -83,18 +83,18 @@ def batch_of(chain, tiny_manifold):
 
 @pytest.fixture
 def shared(batch_of, tiny_trust):
-    """(operators, projected step, how) → the run at 26° that both take."""
+    """(operators, projected step, check, who goes on) → the run at 26° that both take."""
 
-    def run(operators, projected, *how, values=(26.0,), doubt=None, **changed):
+    def run(operators, projected, check, to="none", values=(26.0,), doubt=None, **changed):
         cases = list(map(angle, values))
-        levels = Levels(lambda cases: batch_of(projected, cases, **changed), *how)
-        return rollouts(batch_of(operators, cases, doubt), cases, tiny_trust, levels=levels)
+        fallback = Fallback(to, lambda cases: batch_of(projected, cases, **changed), check)
+        return rollouts(batch_of(operators, cases, doubt), cases, tiny_trust, fallback)
 
     return run
 
 
 def test_a_run_that_is_not_believed_is_taken_to_its_end(shared, batch_of, tmp_path):
-    (found,) = shared(Straying, Line, 2, True)
+    (found,) = shared(Straying, Line, 2, "projected")
     n = found.by_operators
     assert 0 < n < STEPS
     assert found.levels.tolist() == [OPERATORS] * n + [PROJECTED] * (STEPS - n)
@@ -123,16 +123,16 @@ def test_an_estimate_is_how_far_a_kick_takes_a_run(shared, batch_of):
 
 
 def test_a_run_that_is_doubted_is_the_projected_steps_from_the_start(shared):
-    (found,) = shared(Line, Line, 2, True, doubt=lambda setup, gravity: (1.5, "outside"))
+    (found,) = shared(Line, Line, 2, "projected", doubt=lambda setup, gravity: (1.5, "outside"))
     assert (found.levels == PROJECTED).all()
     assert (found.estimate == 0.0).all()
 
 
 def test_a_run_that_the_full_order_solver_takes_from_the_start_can_be_read(batch_of, tiny_trust, tmp_path):
     cases = [angle(60.0)]  # outside of the box
-    levels = Levels(lambda cases: batch_of(Line, cases), 2)
+    fallback = Fallback("full", lambda cases: batch_of(Line, cases), 2)
     batch = batch_of(Line, cases, lambda setup, gravity: (2.5, "outside"))
-    (found,) = rollouts(batch, cases, tiny_trust, until_distrusted=True, levels=levels)
+    (found,) = rollouts(batch, cases, tiny_trust, fallback)
     assert (found.handed_over, len(found.stops)) == (0, 0)
     found.save(tmp_path / "rollout_0.h5")
     kept = Rollout.open(tmp_path / "rollout_0.h5")
@@ -141,19 +141,19 @@ def test_a_run_that_the_full_order_solver_takes_from_the_start_can_be_read(batch
 
 
 def test_the_full_order_solver_goes_on_with_operators(batch_of, tiny_trust):
-    levels, cases = Levels(lambda cases: batch_of(Line, cases), 2), [angle(26.0)]
-    (found,) = rollouts(batch_of(Straying, cases), cases, tiny_trust, until_distrusted=True, levels=levels)
+    fallback, cases = Fallback("full", lambda cases: batch_of(Line, cases), 2), [angle(26.0)]
+    (found,) = rollouts(batch_of(Straying, cases), cases, tiny_trust, fallback)
     assert 0 < found.handed_over < found.distrusted == len(found.stops)
     assert (found.levels[: found.handed_over] == OPERATORS).all()
     assert (found.levels[found.handed_over :] == FULL_ORDER).all()
 
 
 def test_the_solver_that_checks_is_built_before_the_clock_starts(batch_of, tiny_trust, monkeypatch):
-    done, module = [], import_module("nsf.deployment.rollout")  # whose name in the package is a function's
+    done, module = [], import_module("nsf.deployment.running")
     timed = module._timed_run
     monkeypatch.setattr(module, "_timed_run", lambda *given: done.append("timed") or timed(*given))
-    levels = Levels(lambda cases: done.append("built") or batch_of(Line, cases), 1)
-    rollouts(batch_of(Line), [angle(26.0)], tiny_trust, levels=levels)
+    fallback = Fallback("none", lambda cases: done.append("built") or batch_of(Line, cases), 1)
+    rollouts(batch_of(Line), [angle(26.0)], tiny_trust, fallback)
     assert done == ["built", "timed"]
 
 
@@ -163,27 +163,27 @@ def test_an_estimate_in_single_precision_overflows_no_earlier_than_positions(bat
     particles = batch.batch.shared.samples[0].particles
     batch.span_at(0).at_sample = tiny_manifold.restrict(particles, dtype=torch.float32)
     defects = torch.full((1, 1, batch.batch.record.xhat.shape[-1]), far)
-    found = _carried(batch, [STEPS - 1], defects)
+    found = _moved_by(batch, [STEPS - 1], defects)
     assert 1e19 < found[0, -1] < np.inf
 
 
 def test_a_run_whose_particles_carry_stress_is_taken_anew(shared, batch_of):
     """From t = 0: in its midst the stress that they would carry is not known."""
     sources = Sources("particles", "particles")
-    (found,) = shared(Straying, Line, 2, True, sources=sources)
+    (found,) = shared(Straying, Line, 2, "projected", sources=sources)
     assert (found.levels == PROJECTED).all()
     assert (found.estimate == 0.0).all()
     straight = batch_of(Line).runs[0]
     straight.step(STEPS)
     np.testing.assert_array_equal(found.xhat, straight.record.xhat.numpy())
-    (kept,) = shared(Line, Line, 2, True, sources=sources)
+    (kept,) = shared(Line, Line, 2, "projected", sources=sources)
     assert (kept.levels == OPERATORS).all()
 
 
 def test_each_run_of_a_batch_is_handed_on_by_itself(shared):
-    many = shared(Straying, Line, 2, True, values=(23.0, 26.0))
+    many = shared(Straying, Line, 2, "projected", values=(23.0, 26.0))
     for value, run in zip((23.0, 26.0), many, strict=True):
-        (alone,) = shared(Straying, Line, 2, True, values=(value,))
+        (alone,) = shared(Straying, Line, 2, "projected", values=(value,))
         np.testing.assert_array_equal(run.levels, alone.levels)
         np.testing.assert_allclose(run.xhat, alone.xhat, rtol=0, atol=1e-12)
 
@@ -192,7 +192,7 @@ def test_a_run_that_is_not_finite_is_handed_on(shared):
     class Lost(Line):
         kicks, kick = (5,), np.nan
 
-    (found,) = shared(Lost, Line, 4, True)
+    (found,) = shared(Lost, Line, 4, "projected")
     assert found.by_operators < 6
     assert np.isfinite(found.xhat).all()
     (lost,) = shared(Lost, Line, 4)

@@ -7,11 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from angles import AnyCase, angle
+from angles import AnyCase, angle, rollout
 
 import nsf
-from nsf.deployment import Trust, calibrate, rollout
-from nsf.deployment.rollout import _whole_step_before
+from nsf.deployment import Trust, calibrate
+from nsf.deployment.fallback import full_order_step
 from nsf.deployment.trust import QUANTILE, STRAY, CaseDistance, LatentDistance, SolidsRange
 from nsf.dynamics import Taylor
 from nsf.engines.operators import collider_states
@@ -164,7 +164,7 @@ def run_at(build, trust):
 
 
 def test_a_run_far_from_the_training_cases_is_distrusted_from_the_start(build, trust, run_at):
-    far = rollout(build(angle(40.0), "cpu"), angle(40.0), trust, until_distrusted=True)
+    far = rollout(build(angle(40.0), "cpu"), angle(40.0), trust, to="full")
     assert far.away == pytest.approx(1.25)  # the training cases are 8° apart
     assert (far.distrusted, far.handed_over) == (0, 0)
     inside = rollout(build(angle(27.0), "cpu"), angle(27.0), trust)
@@ -208,13 +208,13 @@ def test_a_diverged_calibration_run_is_cut(chain, tiny_manifold, tiny_trust):
 
 
 def test_a_run_to_be_handed_over_stops_at_the_first_distrusted_step(run_at):
-    whole, stopped = run_at(70.0), run_at(70.0, until_distrusted=True)
+    whole, stopped = run_at(70.0), run_at(70.0, to="full")
     n = whole.distrusted
     assert (stopped.distrusted, stopped.handed_over) == (n, n - 1)
     assert len(stopped.residuals) == len(stopped.stops) == n
     for name in ("t", "xhat", "trust"):
         np.testing.assert_array_equal(getattr(stopped, name), getattr(whole, name)[: n + 1])
-    believed = run_at(27.0, until_distrusted=True)
+    believed = run_at(27.0, to="full")
     assert believed.handed_over == -1
     np.testing.assert_array_equal(believed.xhat, run_at(27.0).xhat)
 
@@ -225,7 +225,7 @@ def test_a_run_to_be_handed_over_stops_at_the_first_distrusted_step(run_at):
 )
 def test_the_hand_over_is_at_a_full_order_frame(multiplier, step, expected):
     """The last step n < `step` for which n times the multiplier is whole; else the start."""
-    assert _whole_step_before(0.004 * multiplier * np.arange(20), step, 0.004) == expected
+    assert full_order_step(0.004 * multiplier * np.arange(20), step, 0.004) == expected
 
 
 # -- solids that programs move ---------------------------------------------------------------------------

@@ -5,11 +5,10 @@ import re
 import numpy as np
 import pytest
 import torch
-from angles import angle
+from angles import angle, rollout
 
 import nsf
 import nsf.scenes
-from nsf.deployment import rollout
 from nsf.dynamics import (
     GaussNewton,
     Integration,

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from angles import angle
+from angles import angle, rollout
 
 import nsf
 import nsf.scenes
@@ -160,7 +160,6 @@ def test_who_took_the_step_to_each_frame(made):
 
 
 def test_a_multiplied_step_is_compared_at_the_frames(chain, tiny_manifold, tiny_trust, comparison_of, made):
-    from nsf.deployment import rollout
 
     value = {"friction_angle": 26.0}
     solver = nsf.reduced(chain.scene, tiny_manifold, value, 20, device="cpu", dt_multiplier=1.5)
