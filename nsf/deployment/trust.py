@@ -307,7 +307,7 @@ class Trust:
         latent = run.trajectory()
         ratios = self.ratios(latent.xhat, latent.residuals[:, -1])
         # Not below 1: there the steps themselves tell more.
-        for outside in (run.doubt[0], self.cases.of(run.setup.given)):
+        for outside in (run.doubt[0], self.cases.of(run.setup.values)):
             if outside > 1.0:
                 ratios = np.maximum(ratios, outside)
         ratios[1:] = np.maximum(ratios[1:], self.of_forcing_in(run))

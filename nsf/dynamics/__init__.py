@@ -3,8 +3,14 @@
 from nsf.dynamics.batch import Batch
 from nsf.dynamics.inference import Decoder
 from nsf.dynamics.integration import Integration, NeighbourSearch, ParticleSets
-from nsf.dynamics.latent import LatentState, LatentTrajectory
-from nsf.dynamics.projection import STOP_REASONS, GaussNewton, ProjectionResult, Taylor, stop_reasons
+from nsf.dynamics.latent import (
+    STOP_REASONS,
+    LatentState,
+    LatentTrajectory,
+    ProjectionResult,
+    stop_reasons,
+)
+from nsf.dynamics.projection import GaussNewton, Taylor
 from nsf.dynamics.setup import Setup
 from nsf.dynamics.solver import ReducedBatch, ReducedMPM
 from nsf.dynamics.sources import Sources

@@ -1,10 +1,10 @@
 """Reduced runs that take their steps together; one run is a batch of one."""
 
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain
 
-import numpy as np
 import torch
 
 from nsf.dynamics.latent import LatentRecord
@@ -15,14 +15,14 @@ from nsf.mpm import BoundaryArrays, Forcing
 
 @dataclass(frozen=True)
 class Batch:
-    """What the steps of B runs read and write, whichever engine takes them.
+    """B runs that take their steps together: setups, latent vectors and forcing, for whichever engine.
 
-    The runs are of one manifold, one sample and one grid. What a problem parameter or a start may change is
-    each one's own: μ of the heads, initial velocity and latent vector, mass, elastic moduli, gravity,
-    colliders and, where τ comes from ∂g/∂X, the law's constants.
+    The runs share manifold, sample and grid. They may differ by what a problem parameter or a start changes:
+    μ of the heads, initial velocity and latent vector, mass, elastic moduli, gravity, colliders and, where τ
+    comes from ∂g/∂X, the law's constants.
 
     Attributes:
-        setups: [B] what each run is given.
+        setups: [B] of the runs.
         record: latent vectors of all.
         forcing: gravity, colliders and walls; those of each run, one run after the other.
     """
@@ -83,20 +83,14 @@ def _check_alike(first: Setup, other: Setup) -> None:
     }
     differing = [name for name, alike in shared.items() if not alike]
     if differing:
-        one, two = (", ".join(f"{k}={v:g}" for k, v in setup.given.items()) for setup in (first, other))
+        cases = (", ".join(f"{k}={v:g}" for k, v in setup.values.items()) for setup in (first, other))
         raise ConfigError(
-            f"runs of a batch share {differing[0]}, which differs between {one} and {two}; "
+            f"runs of a batch share {differing[0]}, which differs between {' and '.join(cases)}; "
             "step them one by one, with deploy.batch=1"
         )
 
 
 def _same_sample(first: Setup, other: Setup) -> bool:
-    def arrays(setup: Setup) -> list:
-        found = [[sample.start, sample.particles, sample.weights] for sample in setup.samples]
-        return found + [[sets.integration, sets.nodes] for sets in setup.sets]
-
-    one, two = arrays(first), arrays(other)
-    if [len(part) for part in one] != [len(part) for part in two]:
-        return False
-    pairs = zip(chain(*one), chain(*two), strict=True)
-    return all(a is b or (a is not None and b is not None and np.array_equal(a, b)) for a, b in pairs)
+    """Whether two setups hold the same sample and particle sets, not copies of them."""
+    ours, theirs = ([*setup.samples, *setup.sets] for setup in (first, other))
+    return len(ours) == len(theirs) and all(map(operator.is_, ours, theirs))

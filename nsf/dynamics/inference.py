@@ -1,4 +1,4 @@
-"""Network inference: what the fields say of particles at a latent vector (paper section 5.1)."""
+"""Network inference: x, v, τ and C of particles at a latent vector (paper section 5.1)."""
 
 from collections.abc import Callable
 
@@ -30,17 +30,17 @@ class Inference:
         self.previous = torch.zeros(at.points, 3, dtype=at.dtype, device=at.device)
         self.before = torch.zeros(at.latent_dim, dtype=at.dtype, device=at.device)
 
-    def begin(self, xhat: torch.Tensor) -> None:
-        """Take x̂_{n−1} [r] and the positions there, from which the next rates are found."""
-        self.previous.copy_(self.at.position(xhat))
-        self.before.copy_(xhat)
-
-    def begin_moving(self, xhat: torch.Tensor, velocity: torch.Tensor, rate: torch.Tensor) -> None:
-        """As `begin` at t = 0, where there is nothing to take a difference of.
+    def begin(
+        self,
+        xhat: torch.Tensor,
+        velocity: torch.Tensor | float = 0.0,
+        rate: torch.Tensor | float = 0.0,
+    ) -> None:
+        """Set x̂_{n−1} and the positions there, from which the first difference is taken.
 
         Args:
-            xhat: [r] x̂_0.
-            velocity: [n, 3] initial velocity [m/s]; rate: [r] the dx̂/dt of it [1/s].
+            xhat: [r] x̂_{n−1}; at t = 0, where no step came before, x̂_0.
+            velocity, rate: at t = 0 the initial velocity [n, 3] [m/s] and the dx̂/dt [r] of it [1/s]; else 0.
         """
         self.previous.copy_(self.at.position(xhat) - self.dt * velocity)
         self.before.copy_(xhat - self.dt * rate)
@@ -65,8 +65,8 @@ class Inference:
 class Decoder:
     """x, τ and C at the points of a restriction, from their sources.
 
-    Without a stress field τ comes from ∂g/∂X, without an affine field C is 0: what the run used, not what
-    the manifold could have given.
+    Without a stress field τ comes from ∂g/∂X, without an affine field C is 0: as the run used them, whatever
+    further fields the manifold has.
 
     Args:
         at: fields restricted to n points.
@@ -86,6 +86,6 @@ class Decoder:
 
     def affine(self, xhat: torch.Tensor, rate: torch.Tensor) -> torch.Tensor:
         """C [F, n, 3, 3] of x̂ and dx̂/dt [F, r], in 1/s."""
-        found = [self._affine(*row) for row in zip(xhat, rate, strict=True)]
-        empty = torch.zeros(self.at.points, 3, 3, dtype=self.at.dtype, device=self.at.device)
-        return torch.stack([empty if C is None else C for C in found])
+        frames = [self._affine(*row) for row in zip(xhat, rate, strict=True)]
+        zero = torch.zeros(self.at.points, 3, 3, dtype=self.at.dtype, device=self.at.device)
+        return torch.stack([zero if C is None else C for C in frames])

@@ -24,9 +24,9 @@ class Integration:
     """How the integration particles are found.
 
     Attributes:
-        strategy: `search` finds N anew at each step, exactly as the paper (a, b); `superset` fixes it
-            before the run as the union over the training trajectories. With `field=basis` that union holds
-            the candidates, among which N is found at each step; with `search` every particle is one.
+        strategy: `search` finds N anew at each step, as the paper does (a, b); `superset` fixes it before the
+            run as the union over the training trajectories. With `field=basis` that union holds the
+            candidates, among which N is found at each step; with `search` every particle is one.
         margin: nodes by which the superset's node set is widened, so that values between
             the training values stay inside.
 
@@ -146,7 +146,7 @@ class NeighbourSearch:
         return torch.zeros(self.geometry.count, dtype=torch.uint8, device=device)
 
     def needed(self, x: torch.Tensor, sample: torch.Tensor) -> torch.Tensor:
-        """[P] mask of the integration particles of `sample` [s] when all particles are at x [P, 3]."""
+        """[P] mask of N, the particles that share a node with `sample` [s], with all at x [P, 3]."""
         marked = self.no_nodes(x.device)
         self.mark_nodes(x[sample].contiguous(), marked)
         needed = torch.zeros(len(x), dtype=torch.uint8, device=x.device)
@@ -194,7 +194,7 @@ class NeighbourSearch:
 
 
 def particle_sets(sample: np.ndarray, needed: torch.Tensor, nodes: torch.Tensor) -> ParticleSets:
-    """Sets from masks, S first in N.
+    """Particle sets from masks, S first in N.
 
     Args:
         sample: [s] indices of S.
@@ -203,6 +203,6 @@ def particle_sets(sample: np.ndarray, needed: torch.Tensor, nodes: torch.Tensor)
     """
     needed = needed.clone()
     needed[torch.as_tensor(sample, device=needed.device)] = False
-    others = torch.nonzero(needed).flatten().cpu().numpy()
+    neighbours = torch.nonzero(needed).flatten().cpu().numpy()
     flat = torch.nonzero(nodes).flatten().to(torch.int32).cpu().numpy()
-    return ParticleSets(sample, np.concatenate([sample, others]), flat)
+    return ParticleSets(sample, np.concatenate([sample, neighbours]), flat)

@@ -1,4 +1,4 @@
-"""What a reduced run leaves: latent vectors, and how well each step's inversion went."""
+"""The latent vectors of a reduced run, and how well the inversion of each step went."""
 
 from copy import copy
 from dataclasses import dataclass
@@ -6,12 +6,29 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from nsf.dynamics.projection import ProjectionResult, stop_reasons
+#: Named reasons to stop, in the order of the codes that `stop_reasons` gives.
+STOP_REASONS = ("converged", "max_iterations", "stagnated", "diverged")
+
+
+@dataclass
+class ProjectionResult:
+    """Outcome of one inversion; tensors on the device, nothing read back.
+
+    Attributes:
+        xhat: [r] latent vector.
+        residuals: [k + 1] RMS distance [m] of g(X_S, x̂) to the target, before each iteration and at the end;
+            weighted where the particles are.
+        updates: [k] Euclidean length of each latent update; 0 after the last one that counts.
+    """
+
+    xhat: torch.Tensor
+    residuals: torch.Tensor
+    updates: torch.Tensor
 
 
 @dataclass(frozen=True)
 class LatentTrajectory:
-    """A reduced run: what a user needs to share to share the simulation.
+    """A reduced run on the host: with the manifold, all that it takes to share a simulation.
 
     Attributes:
         t: [N + 1] time [s].
@@ -28,7 +45,7 @@ class LatentTrajectory:
 
 
 class LatentRecord:
-    """Where a run is and what its steps leave, on the device: filled in place and without a read-back.
+    """The latent vectors and residuals of a run on the device, filled in place and without a read-back.
 
     Args:
         xhat: [r] latent vector at t = 0, or [B, r] those of B runs, whose arrays then begin with B.
@@ -51,15 +68,15 @@ class LatentRecord:
         self.row = torch.zeros(runs.numel(), dtype=torch.int64, device=xhat.device)
 
     def of(self, run: int) -> "LatentRecord":
-        """That of one run of a batch, sharing memory."""
-        own = copy(self)
-        own.row = self.row[run : run + 1]
+        """The record of one run of a batch, sharing memory."""
+        record = copy(self)
+        record.row = self.row[run : run + 1]
         for name in ("now", "before", "xhat", "residuals", "updates"):
-            setattr(own, name, getattr(self, name)[run])
-        return own
+            setattr(record, name, getattr(self, name)[run])
+        return record
 
     def restart(self) -> None:
-        """Go back to t = 0; what was recorded stays until it is written over."""
+        """Go back to t = 0; further rows stay until they are written over."""
         for latest in (self.now, self.before):
             latest.copy_(self.xhat[..., 0, :])
         self.row.zero_()
@@ -81,7 +98,7 @@ class LatentRecord:
         return sum(a.nbytes for a in (self.xhat, self.residuals, self.updates))
 
     def add(self, result: ProjectionResult) -> None:
-        """Put down the end of one step."""
+        """Record the end of one step."""
         self.before.copy_(self.now)
         self.now.copy_(result.xhat)
         self.residuals.index_copy_(0, self.row, result.residuals[None])
@@ -129,3 +146,21 @@ class LatentState:
             v = (x - decoder.position(run.record.before)) / run.dt
         fields = {"x": x, "v": v, "C": decoder.affine(now, run.rate[None])[0], "tau": decoder.stress(now)[0]}
         return {name: value.cpu().numpy() for name, value in fields.items()} | {"xhat": self.xhat}
+
+
+def stop_reasons(residuals: torch.Tensor, updates: torch.Tensor, tolerance: float) -> list[str]:
+    """Why each step's inversion stopped.
+
+    Args:
+        residuals: [n, k + 1]; updates: [n, k]; as in `ProjectionResult`, one row a step.
+        tolerance: of the projector.
+
+    Returns:
+        One of `STOP_REASONS` a step: `diverged` (non-finite), `converged` (the square of an update does
+        not exceed the tolerance), `stagnated` (the residual grew), else `max_iterations`.
+    """
+    finite = torch.isfinite(residuals).all(1) & torch.isfinite(updates).all(1)
+    converged = (updates**2 <= tolerance).any(1)
+    grew = residuals[:, -1] > residuals[:, 0]
+    code = torch.where(~finite, 3, torch.where(converged, 0, torch.where(grew, 2, 1)))
+    return [STOP_REASONS[c] for c in code.tolist()]

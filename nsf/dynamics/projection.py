@@ -1,49 +1,16 @@
-"""Network inversion: the latent vector of given sample positions (paper section 5.3)."""
+"""Network inversion: the latent vector that is nearest to positions of S (paper section 5.3)."""
 
 from dataclasses import dataclass
 from typing import ClassVar, Protocol
 
 import torch
 
+from nsf.dynamics.latent import LatentRecord, ProjectionResult
 from nsf.errors import ConfigError
-
-#: Named reasons to stop, in the order of the codes that `stop_reasons` gives.
-STOP_REASONS = ("converged", "max_iterations", "stagnated", "diverged")
-
-
-@dataclass
-class ProjectionResult:
-    """Outcome of one inversion; tensors on the device, nothing read back.
-
-    Attributes:
-        xhat: [r] latent vector.
-        residuals: [k + 1] RMS distance [m] of g(X_S, x̂) to the target, before each iteration and at the end;
-            weighted where the particles are.
-        updates: [k] Euclidean length of each latent update; 0 where none was needed.
-    """
-
-    xhat: torch.Tensor
-    residuals: torch.Tensor
-    updates: torch.Tensor
-
-
-class Latents(Protocol):
-    """What the steps before left, from which an inversion may begin.
-
-    Attributes:
-        now, before: [r] x̂_n and x̂_{n−1}.
-    """
-
-    now: torch.Tensor
-    before: torch.Tensor
-
-    @property
-    def predicted(self) -> torch.Tensor:
-        """[r] x̂_{n+1} on the parabola through the last three."""
 
 
 class Projector(Protocol):
-    """What a reduced run asks of a projector, which may be one's own.
+    """The members that a reduced run uses of a projector, which may be a class of the user.
 
     Attributes:
         iterations: k, the most that `solve` takes; its residuals are k + 1, its updates k.
@@ -53,7 +20,7 @@ class Projector(Protocol):
     iterations: int
     tolerance: float
 
-    def start(self, record: Latents) -> torch.Tensor:
+    def start(self, record: LatentRecord) -> torch.Tensor:
         """[r] x̂ that the iteration starts from; see `GaussNewton.start`."""
 
     def solve(
@@ -63,10 +30,10 @@ class Projector(Protocol):
 
 
 def check_projector(projector) -> None:
-    """Whether a projector, which may be one's own, has all that a reduced run asks of it.
+    """Refuse an object that lacks members of a `Projector`.
 
     Raises:
-        ConfigError: it lacks one of `start`, `solve`, `iterations` and `tolerance` of `GaussNewton`.
+        ConfigError: names them.
     """
     missing = [n for n in ("start", "solve", "iterations", "tolerance") if not hasattr(projector, n)]
     if missing:
@@ -76,7 +43,7 @@ def check_projector(projector) -> None:
         )
 
 
-#: Gauss-Newton that has not ended by then never does.
+#: More iterations never end either.
 _MOST_ITERATIONS = 1000
 
 
@@ -107,8 +74,8 @@ class GaussNewton:
         if not self.tolerance > 0:
             raise ConfigError(f"projector.tolerance={self.tolerance} must be positive")
 
-    def start(self, record: Latents) -> torch.Tensor:
-        """Where the inversion begins, by what the steps before it left."""
+    def start(self, record: LatentRecord) -> torch.Tensor:
+        """The x̂ from which the inversion begins."""
         return record.predicted
 
     def solve(
@@ -147,7 +114,7 @@ class Taylor:
     iterations: ClassVar[int] = 1
     tolerance: ClassVar[float] = 0.0  # it checks nothing, so it never claims convergence
 
-    def start(self, record: Latents) -> torch.Tensor:
+    def start(self, record: LatentRecord) -> torch.Tensor:
         """Where the deformation field is linearised: x̂_n."""
         return record.now
 
@@ -157,9 +124,9 @@ class Taylor:
         """Invert the linearised deformation field; arguments as for `GaussNewton.solve`."""
         error, J = _equations(at, target, xhat, weights)
         update = _normal_equations(J, error)
-        left = _rms(error - J @ update)
+        residual = _rms(error - J @ update)
         return ProjectionResult(
-            xhat + update, torch.stack([_rms(error), left]), torch.linalg.vector_norm(update)[None]
+            xhat + update, torch.stack([_rms(error), residual]), torch.linalg.vector_norm(update)[None]
         )
 
 
@@ -186,21 +153,3 @@ def _normal_equations(J: torch.Tensor, error: torch.Tensor) -> torch.Tensor:
 def _rms(error: torch.Tensor) -> torch.Tensor:
     """Root mean square distance per point of a flat [3 s] error."""
     return torch.linalg.vector_norm(error) * (3.0 / error.numel()) ** 0.5
-
-
-def stop_reasons(residuals: torch.Tensor, updates: torch.Tensor, tolerance: float) -> list[str]:
-    """Why each step's inversion stopped.
-
-    Args:
-        residuals: [n, k + 1]; updates: [n, k]; as in `ProjectionResult`, one row a step.
-        tolerance: of the projector.
-
-    Returns:
-        One of `STOP_REASONS` a step: `diverged` (non-finite), `converged` (the square of an update does
-        not exceed the tolerance), `stagnated` (the residual grew), else `max_iterations`.
-    """
-    finite = torch.isfinite(residuals).all(1) & torch.isfinite(updates).all(1)
-    converged = (updates**2 <= tolerance).any(1)
-    grew = residuals[:, -1] > residuals[:, 0]
-    code = torch.where(~finite, 3, torch.where(converged, 0, torch.where(grew, 2, 1)))
-    return [STOP_REASONS[c] for c in code.tolist()]

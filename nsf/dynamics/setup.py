@@ -1,4 +1,4 @@
-"""A reduced run before its first step: everything that it is given."""
+"""A reduced run before its first step: fields, scene, sample and start, checked and on the device."""
 
 from collections.abc import Mapping, Sequence
 
@@ -22,7 +22,7 @@ _CHUNK = 2**25
 
 
 class Setup:
-    """What a reduced run is given: fields, scene, samples, where it starts, and how steps are taken.
+    """The inputs of a reduced run: fields, scene, sample, start, and how steps are taken.
 
     Args:
         manifold: trained fields.
@@ -30,19 +30,19 @@ class Setup:
         samples: sample particles by span of time.
         parameters: problem parameters by name.
         sources: where τ and C come from; the paper's fields by default.
-        projector: `GaussNewton` or `Taylor`, or one's own.
+        projector: `GaussNewton`, `Taylor`, or a class of the user with the members of `Projector`.
         integration: how N is found.
         precision: `fp64` or `fp32`.
         device: `cpu`, `cuda`, `cuda:N` or `auto`.
         dt_multiplier: deployment step in units of the scene's Δt (paper section 6.1: 1.5).
-        sets: particle sets of each span, as `sets` of an earlier run of the same manifold and samples gives
-            them; searched for when None.
+        sets: particle sets of each span, those of an earlier run of the same manifold and samples; searched
+            for when None.
         xhat: [r] latent vector at t = 0; that of the undeformed body without stress when None.
         velocity: [P, 3] initial velocity [m/s]; the scene's when None.
 
     Attributes:
         dt, total_steps: step [s] and number of steps to the end of the scene.
-        starts: step with which each span begins.
+        starts: step with which each span begins; values: the problem parameters by name.
         constants: every particle of the scene; initial_velocity: [P, 3] theirs [m/s], on the host.
         gravity: over the run, as the scene's programs have it.
         xhat: [r] x̂_0; parameters: [n_parameters] μ; both on the device.
@@ -76,7 +76,7 @@ class Setup:
         for sample in samples:
             check_well_posed(len(sample.particles), manifold.latent_dim)
         self.manifold, self.scene, self.sources, self.projector = manifold, scene, sources, projector
-        self.integration, self.samples, self.given = integration, samples, dict(parameters)
+        self.integration, self.samples, self.values = integration, samples, dict(parameters)
         self.precision, self.device = precision_of(precision), warp_device(device)
         self.dtype, self.torch_device = torch_dtype(self.precision), torch_device(self.device)
         self.dt = scene.dt * dt_multiplier
@@ -104,28 +104,28 @@ class Setup:
             X = torch.as_tensor(self.constants.X, device=manifold.X.device)
             xhat = manifold.encode(X[None])[0].cpu()
         self.xhat = tensor(_shaped("xhat", xhat, (manifold.latent_dim,)))
-        self.sets = self._found_sets() if sets is None else list(sets)
+        self.sets = self._search_sets() if sets is None else list(sets)
 
-    def _found_sets(self) -> list[ParticleSets]:
-        """Particle sets of each span; supersets go over the training trajectories, decoded from latents."""
+    def _search_sets(self) -> list[ParticleSets]:
+        """Particle sets of each span, over the training trajectories decoded from their latents."""
         P = len(self.constants)
         if self.integration.strategy == "search" or self.sources.carried:
             return [
                 ParticleSets(s.particles, np.append(s.particles, np.delete(np.arange(P), s.particles)), None)
                 for s in self.samples
             ]
-        everything = self.decoder()
+        decoder = self.decoder()
         latents = self.manifold.training_latents.to(self.torch_device, self.dtype)
         fraction = self.manifold.training_times.to(self.torch_device) / (self.scene.dt * self.scene.steps)
         rows = max(1, _CHUNK // (3 * P))
         ends = [sample.start for sample in self.samples[1:]] + [1.0]
         slack = 2.0 / self.scene.steps  # a span also meets the frames just before and after it
-        found = []
+        sets = []
         for sample, end in zip(self.samples, ends, strict=True):
             of_span = latents[(fraction >= sample.start - slack) & (fraction <= end + slack)]
-            frames = (everything.position(chunk) for chunk in of_span.split(rows))
-            found.append(self.search.superset(frames, sample.particles, self.integration.margin))
-        return found
+            frames = (decoder.position(chunk) for chunk in of_span.split(rows))
+            sets.append(self.search.superset(frames, sample.particles, self.integration.margin))
+        return sets
 
     def sources_at(self, at: Restriction, particles: np.ndarray) -> tuple[StressSource, AffineSource]:
         """The sources of τ and C at particles [n], to which the fields are restricted."""
@@ -151,7 +151,7 @@ class Setup:
 
 
 def first_change(jacobian: torch.Tensor, velocity: torch.Tensor, dt: float) -> torch.Tensor:
-    """What stands for d = x̂_n − x̂_{n−1} at t = 0: the least squares of (∂g/∂x̂) d = v₀ Δt over S.
+    """The change d = x̂_n − x̂_{n−1} before the first step: the least squares of (∂g/∂x̂) d = v₀ Δt over S.
 
     Args:
         jacobian: ∂g/∂x̂ [..., s, 3, r] [m] at x̂_0.
@@ -166,20 +166,20 @@ def first_change(jacobian: torch.Tensor, velocity: torch.Tensor, dt: float) -> t
 
 
 def first_changes(at_sample: Restriction, sample: np.ndarray, setups: Sequence[Setup]) -> torch.Tensor:
-    """[B, r] what stands for d at t = 0 in some runs, in fp64 on the host.
+    """[B, r] `first_change` of some runs, in fp64 on the host.
 
     Args:
         at_sample: the manifold restricted to S.
         sample: [s] indices of S.
         setups: of the runs.
     """
-    rows, found = torch.as_tensor(sample).long(), []
+    rows, changes = torch.as_tensor(sample).long(), []
     with torch.no_grad():
         for setup in setups:
             _, jacobian = at_sample.position_and_jacobian(setup.xhat)
             velocity = setup.initial_velocity[rows].to("cpu", torch.float64)
-            found.append(first_change(jacobian.to(velocity), velocity, setup.dt))
-    return torch.stack(found)
+            changes.append(first_change(jacobian.to(velocity), velocity, setup.dt))
+    return torch.stack(changes)
 
 
 def reduced_steps(steps: int, dt_multiplier: float) -> int:

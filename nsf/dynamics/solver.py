@@ -1,4 +1,4 @@
-"""The reduced-order solver: what a user holds (paper section 5)."""
+"""The reduced-order solver, of one run or of several that take their steps together (paper section 5)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -29,16 +29,15 @@ class ReducedBatch:
     round-off.
 
     Args:
-        setups: what each run is given; see `Batch` for what they share.
-        spans_of: gives what takes the steps of each span of time, as `Engine.spans`; those of the reference
-            by default.
-        engine, why: name of the engine that gives them, and the reason for its choice; for the record.
+        setups: the inputs of each run; see `Batch` for what they share.
+        spans_of: makes the spans that take the steps, as `Engine.spans`; those of the reference by default.
+        engine, why: name of the engine that makes them, and the reason for its choice; for the record.
         doubt: how far a run's input lies outside of what was learned, as `Engine.doubt`; never by default.
 
     Attributes:
         batch: setups, record of the latent vectors, forcing.
-        engine, why: as given.
-        steps_taken, total_steps: taken, and those to the end of the scene.
+        engine, why: the arguments.
+        steps_taken, total_steps: so far, and to the end of the scene.
         dt: step [s]; device: Warp device.
 
     Raises:
@@ -85,7 +84,7 @@ class ReducedBatch:
     def doubts(self) -> tuple[tuple[float, str], ...]:
         """How far the input of each run lies outside of what its engine learned from; see `Engine.doubt`."""
         pairs = zip(self.batch.setups, self.batch.forcing.gravities, strict=True)
-        return tuple(self._doubt(*own) for own in pairs)
+        return tuple(self._doubt(setup, gravity) for setup, gravity in pairs)
 
     @property
     def xhat(self) -> torch.Tensor:
@@ -104,15 +103,15 @@ class ReducedBatch:
 
     @property
     def span(self) -> Span:
-        """What takes the steps now."""
+        """The span of time that takes the steps now."""
         return self._span
 
     def span_at(self, step: int) -> Span:
-        """What takes the step that starts `step` steps after t = 0."""
+        """The span of time that takes the step which starts `step` steps after t = 0."""
         return self._spans[max(i for i, start in enumerate(self._starts) if start <= step)]
 
     def steps_by_span(self, since: int = 0) -> list[tuple[int, Span]]:
-        """How many of the steps taken, those before `since` left out, each span of time has had."""
+        """Each span of time with how many steps it took, from step `since` on."""
         ends = [*self._starts[1:], self.total_steps]
         parts = zip(self._starts, ends, self._spans, strict=True)
         return [(max(0, min(self.steps_taken, end) - max(start, since)), span) for start, end, span in parts]
@@ -145,12 +144,12 @@ class ReducedBatch:
             while self.steps_taken < last:
                 self._begin_step()
                 if self._span.latent_only:
-                    taken = min(last, self._end_of_span()) - self.steps_taken
-                    self._span.take(taken)
+                    steps = min(last, self._end_of_span()) - self.steps_taken
+                    self._span.take(steps)
                 else:
-                    taken = 1
+                    steps = 1
                     self._advance()
-                self.steps_taken += taken
+                self.steps_taken += steps
 
     def timed_step(self, timer: StageTimer) -> None:
         """One step, stage by stage under a timer; captured anew where steps are captured."""
@@ -212,16 +211,16 @@ class ReducedBatch:
 
 
 class ReducedMPM:
-    """One reduced run: stepped and asked as `FullOrderMPM` is, and for its latent vectors.
+    """One reduced run, with the interface of `FullOrderMPM` and its latent vectors.
 
-    Of a batch every run is stepped with the others.
+    The runs of a batch take their steps together.
 
     Args:
         together: the batch that it is of.
         index: which of its runs.
 
     Attributes:
-        setup: what the run was given; scene, manifold, device, dt, total_steps, samples and sets are the
+        setup: the inputs of the run; scene, manifold, device, dt, total_steps, samples and sets are the
             setup's; dx: grid spacing [m].
         record: latent vectors, residuals and updates, on the device.
     """
@@ -306,10 +305,10 @@ class ReducedMPM:
 
     def trajectory(self) -> LatentTrajectory:
         """Everything recorded up to now, on the host."""
-        found = self.record.trajectory(self.steps_taken, self.dt, self.setup.projector.tolerance)
+        trajectory = self.record.trajectory(self.steps_taken, self.dt, self.setup.projector.tolerance)
         if self.span.latent_only:  # nothing was projected, so nothing stopped
-            found = replace(found, stops=[self.engine] * self.steps_taken)
-        return found
+            trajectory = replace(trajectory, stops=[self.engine] * self.steps_taken)
+        return trajectory
 
     @property
     def sample_size(self) -> int:
@@ -321,12 +320,12 @@ class ReducedMPM:
         """Mean |N| over the steps taken; before them, how many there may be."""
         if not self.steps_taken:
             return float(len(self.sets[0].integration))
-        taken = self.together.steps_by_span()
-        return sum(n * span.mean_sizes[self.index] for n, span in taken) / self.steps_taken
+        spans = self.together.steps_by_span()
+        return sum(n * span.mean_sizes[self.index] for n, span in spans) / self.steps_taken
 
     @property
     def span(self) -> Span:
-        """What takes the steps now: its S, N and arrays."""
+        """The span of time that takes the steps now: its S, N and arrays."""
         return self.together.span
 
     def decoder(self, particles: np.ndarray | None = None, at: Restriction | None = None) -> Decoder:
@@ -338,11 +337,10 @@ class ReducedMPM:
         return self.together.span_at(step).sets
 
     def left_grid(self, since: int = 1) -> int:
-        """First step that ended with a sample particle off the grid, or non-finite; −1 when none did.
+        """First step from `since` on that ended with a particle of S off the grid or not finite; −1: none.
 
-        Only steps from `since` on are looked at.
-        Such a particle no longer takes part in a step, so what follows is no reduced model of anything;
-        the full-order solver stops there. For after a run.
+        Such a particle no longer takes part in a step, so further steps are no reduced model of anything; the
+        full-order solver stops there. Call it after a run: it decodes S at every step.
         """
         first = since
         for count, span in self.together.steps_by_span(since - 1):
@@ -357,26 +355,25 @@ class ReducedMPM:
     def needed_outside(self, steps: int | None = None) -> int:
         """Most particles and nodes that a step needed and the superset lacks, or that were off the grid.
 
-        Looks at the first `steps` steps, or at all that were taken.
-        Decodes every particle at every step; for after a run. The transfers pass over what is off
-        the grid, so it counts here; so does a node of a sample particle that is not stored.
+        The transfers pass over what is off the grid, and over nodes that are not stored, so both count. Call
+        it after a run: it decodes every particle at each of the first `steps` steps, all of them by default.
 
         Source: paper section 5.4, b.
         """
         if self.sets[0].nodes is None or self.span.latent_only:
             return 0
-        everything, search, worst = self.decoder(), self.setup.search, 0
+        decoder, search, worst = self.decoder(), self.setup.search, 0
         for n in range(self.steps_taken if steps is None else steps):
-            x = everything.position(self.record.xhat[n])
+            x = decoder.position(self.record.xhat[n])
             worst = max(worst, search.missing(x, self.sets_at(n)))
         return worst
 
     def equations_at(
         self, step: int, xhat: torch.Tensor, previous: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """What the projection at the end of a step is given, linearised where it starts.
+        """The equations that the projection at the end of a step solves, linearised at x̂_n.
 
-        Leaves the solver in the midst of that step. Of a batch of one.
+        Only of a batch of one, which is left in the midst of that step.
 
         Args:
             step: steps before it, which set its moment.

@@ -22,11 +22,11 @@ class Sources:
 
     With `particles` both follow the grid at every particle, as at full order, and x and v are the manifold's.
     Each particle keeps F_e, the law's history variables and C: under forcing that no training run had, the
-    stress of a plastic body depends on the way to a state, which no field of x̂ can tell. Such a step needs
-    every particle, so it costs what a full-order step costs. The fields h and l say where a run begins in its
-    midst, and what a latent vector is decoded to. Not in the paper; internal variables at the points of
-    integration, with reduced kinematics, are those of Ryckelynck 2009 (Hyper-reduction of mechanical models
-    involving internal variables).
+    stress of a plastic body depends on the way to a state, which no field of x̂ can tell. Such a step moves
+    every particle, so it costs as much as a full-order step. The fields h and l decode latent vectors, and
+    start a run in its midst. Not in the paper; internal variables at the points of integration, with reduced
+    kinematics, are those of Ryckelynck 2009 (Hyper-reduction of mechanical models involving internal
+    variables).
 
     Attributes:
         stress: of τ: the stress field h (`field`), ∂g/∂X through the elastic law (`deformation`), or
@@ -34,7 +34,7 @@ class Sources:
         affine: of C: the affine field l (`field`), C = 0 (`none`), or `particles`.
 
     Raises:
-        ConfigError: another word, or particles carry one of both alone.
+        ConfigError: another value, or particles carry τ alone or C alone.
 
     Source: paper sections 4.3 and 4.4; deformation and none are Chen et al. 2023a.
     """

@@ -1,4 +1,4 @@
-"""A span of time with one sample: the particles that a step moves, and their grid."""
+"""A span of time in which the sample stays the same: the particles that a step moves, and their grid."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -12,11 +12,11 @@ from typing_extensions import override
 from nsf.dynamics.batch import Batch
 from nsf.dynamics.integration import ParticleSets
 from nsf.dynamics.interop import as_matrices, as_scalars, as_vectors
-from nsf.dynamics.setup import first_changes
+from nsf.dynamics.setup import Setup, first_changes
 from nsf.kinematics.manifold import Restriction
 from nsf.mpm import Grid, GridStep
 
-#: The stages of one step in the order of the paper's section 5: name → what it does.
+#: The stages of one step, in the order of the paper's section 5, by name.
 Stages = dict[str, Callable[[], None]]
 
 
@@ -40,10 +40,10 @@ class Span(ABC):
         at_sample: the manifold restricted to S.
 
     Attributes:
-        batch, sets, at_sample: as given; record: the batch's.
+        batch, sets, at_sample: the arguments; record: the batch's.
         s: |S|; size: particles of each run that a step may need.
         latent_only: whether a step goes from x̂ to x̂ without particles. Then `take` takes many at once,
-            nothing is projected, and what is entered stays good from one span to the next.
+            nothing is projected, and `enter` is called once, not for each span.
         capturable: whether a step is the same launches each time; graph: of a step, where it is captured.
     """
 
@@ -66,12 +66,12 @@ class Span(ABC):
         """Begin with the latents of the record; `first`: v is the initial velocity, not a difference."""
 
     def first_rate(self) -> torch.Tensor:
-        """[B, r] dx̂/dt at t = 0 [1/s], of the initial velocities; zero where no field asks for it."""
-        one, latents = self.batch.shared, self.at_sample.latent_dim
+        """[B, r] dx̂/dt at t = 0 [1/s], of the initial velocities; zero where no field depends on it."""
+        setup, latents = self.batch.shared, self.at_sample.latent_dim
         if not self.at_sample.takes_rate:
-            return torch.zeros(len(self.batch), latents, dtype=one.dtype, device=one.torch_device)
+            return torch.zeros(len(self.batch), latents, dtype=setup.dtype, device=setup.torch_device)
         changes = first_changes(self.at_sample, self.sets.sample, self.batch.setups)
-        return (changes / one.dt).to(one.torch_device, one.dtype)
+        return (changes / setup.dt).to(setup.torch_device, setup.dtype)
 
     def take(self, steps: int) -> None:
         """Take steps at once, where they are `latent_only`."""
@@ -96,15 +96,15 @@ class Span(ABC):
 class GridSpan(Span):
     """A span whose steps move particles over a grid.
 
-    Holds what P2G reads and G2P moves: n rows of each run, one run after the other, S first. Where their
-    values come from, and how x̂ follows from S, is left to the engine.
+    It holds the arrays that P2G reads and G2P writes: n rows of each run, one run after the other, S first.
+    The engine fills them, and finds x̂ from S.
 
     Args:
         batch, sets, at_sample: as for `Span`.
         order: [n] the particles of N in the order of the rows, S first.
 
     Attributes:
-        order: as given.
+        order: the argument.
         x, v: [B n, 3] position [m] and velocity [m/s]; G2P moves the first |S| rows of each run.
         C, tau: [B n, 3, 3] affine momentum [1/s] and Kirchhoff stress [Pa].
         mass, volume0, mu, lam: [B n] of the particles [kg, m³, Pa, Pa].
@@ -115,17 +115,15 @@ class GridSpan(Span):
     def __init__(self, batch: Batch, sets: ParticleSets, order: np.ndarray, at_sample: Restriction):
         super().__init__(batch, sets, at_sample)
         self.order = order
-        one = batch.shared
-        grid = Grid(one.geometry, one.precision, one.device, sets.nodes, runs=len(batch))
-        self.grid_step = GridStep(grid, batch.forcing, one.transfer, one.dt, one.precision, one.device)
+        shared = batch.shared
+        grid = Grid(shared.geometry, shared.precision, shared.device, sets.nodes, runs=len(batch))
+        self.grid_step = GridStep(
+            grid, batch.forcing, shared.transfer, shared.dt, shared.precision, shared.device
+        )
 
-        def rows(of) -> torch.Tensor:
-            return torch.cat(
-                [
-                    torch.as_tensor(of(setup)[order], dtype=one.dtype, device=one.torch_device)
-                    for setup in batch.setups
-                ]
-            )
+        def rows(of: Callable[[Setup], np.ndarray | torch.Tensor]) -> torch.Tensor:
+            like = {"dtype": shared.dtype, "device": shared.torch_device}
+            return torch.cat([torch.as_tensor(of(setup)[order], **like) for setup in batch.setups])
 
         self.mass, self.volume0 = rows(lambda s: s.constants.mass), rows(lambda s: s.constants.volume0)
         self.mu, self.lam = rows(lambda s: s.constants.mu), rows(lambda s: s.constants.lam)
@@ -146,6 +144,6 @@ class GridSpan(Span):
     @property
     @override
     def nbytes(self) -> int:
-        own = (self.mass, self.volume0, self.mu, self.lam, self.initial_velocity, self.x, self.v)
-        own += (self.C, self.tau)
-        return super().nbytes + self.grid_step.grid.nbytes + sum(a.nbytes for a in own)
+        arrays = (self.mass, self.volume0, self.mu, self.lam, self.initial_velocity, self.x, self.v)
+        arrays += (self.C, self.tau)
+        return super().nbytes + self.grid_step.grid.nbytes + sum(a.nbytes for a in arrays)

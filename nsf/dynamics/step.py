@@ -1,7 +1,12 @@
 """One step of the reduced model, from x̂_n to x̂_{n+1} (paper section 5).
 
-This is the reference: what is written here is what a step does, for any field and any projector, on a CPU and
-on a GPU. The engines compute the same, and give way to it where they cannot.
+    5.1  inference  x = g(X, x̂_n), v = (x − g(X, x̂_{n−1})) / Δt, τ = h(X, x̂_n, μ), C = l(X, x̂_n, μ) at N
+    5.2  P2G, G2P   N → grid, boundaries, grid → S: positions x_S at the end of the step
+    5.3  inversion  x̂_{n+1} = argmin Σ_S w_p ‖g(X_p, x̂) − x_p‖²
+    5.4  S is the sample, N its integration particles: all that share a grid node with one of S
+
+`Step.stages` has these in order. This text is the reference for any field and any projector, on a CPU and on
+a GPU: the engines compute the same, and leave steps that they cannot compute to it.
 """
 
 from collections.abc import Sequence
@@ -22,27 +27,27 @@ from nsf.sampling.sampler import SampleSpan
 
 
 class Step(GridSpan):
-    """Infers the particles of N from x̂, takes one MPM step of them, and finds x̂ from where S went.
+    """Infers the particles of N from x̂, takes one MPM step of them, and finds the x̂ of where S went.
 
     Args:
         batch: of one run.
         sample: S and its weights.
-        sets: S, N and I; every particle, S first, and no nodes where N is searched at each step.
+        sets: S, N and the nodes I of S; every particle, S first, and no nodes where each step searches N.
 
     Source: paper section 5.
     """
 
     def __init__(self, batch: Batch, sample: SampleSpan, sets: ParticleSets):
-        one = batch.shared
-        at = one.manifold.restrict(particles=sets.integration, dtype=one.dtype, device=one.torch_device)
-        super().__init__(batch, sets, sets.integration, at.subset(slice(0, len(sets.sample))))
-        self.record, self.projector = batch.record.of(0), one.projector
-        self.inference = Inference(at, *one.sources_at(at, sets.integration), one.dt)
+        setup, N = batch.shared, sets.integration
+        at_integration = setup.manifold.restrict(particles=N, dtype=setup.dtype, device=setup.torch_device)
+        at_sample = at_integration.subset(slice(0, len(sets.sample)))
+        super().__init__(batch, sets, N, at_sample)
+        self.record, self.projector = batch.record.of(0), setup.projector
+        self.inference = Inference(at_integration, *setup.sources_at(at_integration, N), setup.dt)
         self.weights = None
         if sample.weights is not None:
-            self.weights = torch.as_tensor(
-                sample.weights / np.mean(sample.weights), dtype=one.dtype, device=one.torch_device
-            )
+            weights = sample.weights / np.mean(sample.weights)
+            self.weights = torch.as_tensor(weights, dtype=setup.dtype, device=setup.torch_device)
 
     @property
     @override
@@ -60,17 +65,17 @@ class Step(GridSpan):
         self.inferred = self.inference(self.record.now)
 
     def load(self) -> None:
-        """Into the arrays that torch and Warp share."""
+        """Copy these into the arrays that torch and Warp share."""
         for array, values in zip((self.x, self.v, self.tau, self.C), self.inferred, strict=True):
             if values is not None:
                 array.copy_(values)
 
     def p2g(self) -> None:
-        """N → grid: mass, momentum and the impulse of the stress (section 5.2)."""
+        """N → grid: mass, momentum and the impulse of the stress (sections 3 and 5.2)."""
         self.grid_step.p2g(*self.particles)
 
     def update_g2p(self) -> None:
-        """Momentum → velocity at the nodes of S, boundaries included; then x and v of S (section 5.2)."""
+        """Momentum → velocity and boundaries at the nodes of S; then x and v of S by G2P (section 5.2)."""
         self.grid_step.follow()
         self.grid_step.update_g2p(self.particles.x, self.particles.v, self.s)
 
@@ -82,7 +87,7 @@ class Step(GridSpan):
     @override
     def enter(self, first: bool) -> None:
         if first:
-            self.inference.begin_moving(self.record.now, self.initial_velocity, self.first_rate()[0])
+            self.inference.begin(self.record.now, self.initial_velocity, self.first_rate()[0])
         else:
             self.inference.begin(self.record.before)
 
@@ -90,14 +95,14 @@ class Step(GridSpan):
     @override
     def nbytes(self) -> int:
         weights = 0 if self.weights is None else self.weights.nbytes
-        shared = self.at_sample.nbytes  # S is a part of N
-        return super().nbytes - shared + self.inference.at.nbytes + self.inference.previous.nbytes + weights
+        fields = self.inference.at.nbytes - self.at_sample.nbytes  # S is a part of N
+        return super().nbytes + fields + self.inference.previous.nbytes + weights
 
 
 class SearchingStep(Step):
     """S fixed, N searched at each step (paper section 5.4, a and b).
 
-    The fields are evaluated at every particle, and those that S needs are moved to the front of the arrays.
+    The fields are evaluated at every particle, and the rows of N are moved to the front of the arrays.
     """
 
     capturable = False
@@ -112,9 +117,9 @@ class SearchingStep(Step):
     @override
     def load(self) -> None:
         x, *_ = self.inferred
-        needed = self._search.needed(x, self._sample_rows)
-        needed[: self.s] = True
-        rows = needed.nonzero().flatten()
+        in_N = self._search.needed(x, self._sample_rows)
+        in_N[: self.s] = True
+        rows = in_N.nonzero().flatten()
         n = len(rows)
         for array, values in zip((self.x, self.v, self.tau, self.C), self.inferred, strict=True):
             array[:n] = 0.0 if values is None else values[rows]
@@ -129,22 +134,22 @@ class SearchingStep(Step):
 
 
 class HistoryStep(Step):
-    """τ and C of each particle come from the grid and from what the particle went through (`Sources`).
+    """Every particle carries τ, C, F_e and history variables, which a full-order step updates (`Sources`).
 
-    x and v are inferred from x̂ as in any step. Then every particle takes the full-order step, in which F_e,
-    the history variables, τ and C go on; what it does to x and v is kept at S alone, to find x̂_{n+1}.
+    x and v are inferred from x̂ as in any step. Then every particle takes the full-order step; of the x and v
+    that it gives, those of S alone are used, to find x̂_{n+1}.
     """
 
     def __init__(self, batch: Batch, sample: SampleSpan, sets: ParticleSets):
         super().__init__(batch, sample, sets)
-        one, n = batch.shared, len(sets.integration)
-        material, precision = one.scene.material, one.precision
+        setup, n = batch.shared, len(sets.integration)
+        material, precision = setup.scene.material, setup.precision
         self._law = make_g2p_stress(
-            precision, one.transfer.shape, material.functions(precision), material.history_size
+            precision, setup.transfer.shape, material.functions(precision), material.history_size
         )
         vecH = wp.types.vector(length=material.history_size, dtype=precision.real)
-        self._F_e = wp.zeros(n, dtype=precision.mat33, device=one.device)
-        self._history = wp.zeros(n, dtype=vecH, device=one.device)
+        self._F_e = wp.zeros(n, dtype=precision.mat33, device=setup.device)
+        self._history = wp.zeros(n, dtype=vecH, device=setup.device)
         self._moduli = as_scalars(self.mu), as_scalars(self.lam)
         self._params = material.params(precision)
 
@@ -171,22 +176,22 @@ class HistoryStep(Step):
 
     def g2p_stress(self) -> None:
         """Grid → particles, F_e ← returnMap(f F_e), τ ← τ(F_e); as `FullOrderMPM.g2p_stress`."""
-        own = self.particles
+        rows = self.particles
         inputs = [*self.grid_step.gathering, *self._moduli, self._params]
-        inputs += [own.x, own.v, own.C, self._F_e, self._history, own.tau]
+        inputs += [rows.x, rows.v, rows.C, self._F_e, self._history, rows.tau]
         wp.launch(self._law, dim=len(self.x), inputs=inputs, device=self.batch.shared.device)
 
     @override
     def enter(self, first: bool) -> None:
         super().enter(first)
-        one, xhat = self.batch.shared, self.record.now
-        material, n = one.scene.material, len(self.x)
+        setup, xhat = self.batch.shared, self.record.now
+        material, n = setup.scene.material, len(self.x)
         if first:
             self.C.zero_()
             tau, F_e = np.zeros((n, 3, 3)), np.tile(np.eye(3), (n, 1, 1))
             carried = {"tau": tau, "F_e": F_e, "history": material.initial_history(n)}
-        else:  # in the midst of a run, of which x̂ alone is known
-            rate = (xhat - self.record.before) / one.dt
+        else:  # in the midst of a run: from x̂ alone
+            rate = (xhat - self.record.before) / setup.dt
             C = self.inference.affine(xhat, rate)
             self.C.copy_(torch.zeros_like(self.C) if C is None else C)
             tau = self.inference.stress(xhat).double().cpu().numpy()
@@ -205,7 +210,7 @@ class HistoryStep(Step):
 
 def steps_of(batch: Batch) -> Sequence[Step]:
     """The reference's step for each span of time of a batch of one run."""
-    one = batch.shared
-    kind = SearchingStep if one.integration.strategy == "search" else Step
-    kind = HistoryStep if one.sources.carried else kind
-    return [kind(batch, sample, sets) for sample, sets in zip(one.samples, one.sets, strict=True)]
+    setup = batch.shared
+    kind = SearchingStep if setup.integration.strategy == "search" else Step
+    kind = HistoryStep if setup.sources.carried else kind
+    return [kind(batch, sample, sets) for sample, sets in zip(setup.samples, setup.sets, strict=True)]

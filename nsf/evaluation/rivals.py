@@ -173,7 +173,7 @@ def rivals(
     latents = {"nearest": tensor(runs.nearest(parameters))}
     latents["interpolated"] = tensor(runs.interpolated(parameters))
     how = setup.precision.name, setup.device, advance
-    coarse = {factor: coarse_run(scene, setup.given, trajectory.X, factor, *how) for factor in factors}
+    coarse = {factor: coarse_run(scene, setup.values, trajectory.X, factor, *how) for factor in factors}
     ran = {factor: run for factor, run in coarse.items() if not isinstance(run, str)}
     X, squares = tensor(trajectory.X), {}
     rows = max(1, _CHUNK // (3 * trajectory.particles))

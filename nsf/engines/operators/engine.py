@@ -70,7 +70,7 @@ class Operators(Engine):
 
     @override
     def doubt(self, setup: Setup, gravity: Gravity) -> tuple[float, str]:
-        return self.taught.outside(setup.given, np.asarray(gravity.values))
+        return self.taught.outside(setup.values, np.asarray(gravity.values))
 
 
 def acting(batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:

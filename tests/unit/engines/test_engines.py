@@ -14,7 +14,6 @@ import nsf
 from nsf import config, engines
 from nsf.dynamics import GaussNewton, Integration, ReducedBatch, Sources, Taylor
 from nsf.dynamics.latent import LatentRecord
-from nsf.dynamics.projection import Latents
 from nsf.dynamics.step import Step, steps_of
 from nsf.engines import ENGINES, NAMES, Engine
 from nsf.engines.modal import mirrors
@@ -195,7 +194,7 @@ def test_words_and_layout_are_no_edit(monkeypatch):
     """A docstring, a comment and a line break more are the same text to the engine."""
 
     def start(
-        self, record: Latents
+        self, record: LatentRecord
     ) -> torch.Tensor:  # fmt: skip
         """In other words."""
         return record.predicted  # as before
@@ -203,7 +202,7 @@ def test_words_and_layout_are_no_edit(monkeypatch):
     monkeypatch.setattr(GaussNewton, "start", start)
     assert mirrors.edits() == {}
 
-    def start(self, record: Latents) -> torch.Tensor:
+    def start(self, record: LatentRecord) -> torch.Tensor:
         return record.now
 
     monkeypatch.setattr(GaussNewton, "start", start)
