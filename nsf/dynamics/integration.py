@@ -88,7 +88,7 @@ def _kernels(precision: Precision, shape_name: str):
         dx: real,
         grid_shape: wp.vec3i,
         marked: wp.array(dtype=wp.uint8),
-        needed: wp.array(dtype=wp.uint8),
+        touching: wp.array(dtype=wp.uint8),
     ):
         p = wp.tid()
         base = base_node(x[p], real(1.0) / dx)
@@ -98,7 +98,7 @@ def _kernels(precision: Precision, shape_name: str):
             for b in range(width):
                 for c in range(width):
                     if marked[flat_index(base[0] + a, base[1] + b, base[2] + c, grid_shape)] != wp.uint8(0):
-                        needed[p] = wp.uint8(1)
+                        touching[p] = wp.uint8(1)
 
     return mark_nodes, flag_particles
 
@@ -133,11 +133,11 @@ class NeighbourSearch:
         with on_torch_stream(self.device):
             wp.launch(self._mark, dim=len(x), inputs=inputs, device=self.device)
 
-    def flag_particles(self, x: torch.Tensor, marked: torch.Tensor, needed: torch.Tensor) -> None:
-        """Set `needed` [P] where a particle at x [P, 3] touches a marked node."""
+    def flag_particles(self, x: torch.Tensor, marked: torch.Tensor, touching: torch.Tensor) -> None:
+        """Set `touching` [P] where a particle at x [P, 3] touches a marked node."""
         g = self.geometry
         inputs = [as_vectors(x, self.precision), self.precision.real(g.dx), wp.vec3i(*g.nodes)]
-        inputs += [wp.from_torch(marked), wp.from_torch(needed)]
+        inputs += [wp.from_torch(marked), wp.from_torch(touching)]
         with on_torch_stream(self.device):
             wp.launch(self._flag, dim=len(x), inputs=inputs, device=self.device)
 
@@ -145,13 +145,13 @@ class NeighbourSearch:
         """An empty node mark [all nodes]."""
         return torch.zeros(self.geometry.count, dtype=torch.uint8, device=device)
 
-    def needed(self, x: torch.Tensor, sample: torch.Tensor) -> torch.Tensor:
+    def integration_mask(self, x: torch.Tensor, sample: torch.Tensor) -> torch.Tensor:
         """[P] mask of N, the particles that share a node with `sample` [s], with all at x [P, 3]."""
         marked = self.no_nodes(x.device)
         self.mark_nodes(x[sample].contiguous(), marked)
-        needed = torch.zeros(len(x), dtype=torch.uint8, device=x.device)
-        self.flag_particles(x.contiguous(), marked, needed)
-        return needed.bool()
+        touching = torch.zeros(len(x), dtype=torch.uint8, device=x.device)
+        self.flag_particles(x.contiguous(), marked, touching)
+        return touching.bool()
 
     def on_grid(self, x: torch.Tensor) -> torch.Tensor:
         """[...] whether stencils of particles at x [..., 3] lie on the grid; False where x is not finite."""
@@ -163,12 +163,12 @@ class NeighbourSearch:
         sample, integration, nodes = (
             torch.as_tensor(of, device=x.device).long() for of in (sets.sample, sets.integration, sets.nodes)
         )
-        needed = self.needed(x, sample)
-        needed[integration] = False
+        outside = self.integration_mask(x, sample)
+        outside[integration] = False
         marked = self.no_nodes(x.device)
         self.mark_nodes(x[sample].contiguous(), marked)
         marked[nodes] = 0
-        return int(needed.sum()) + int(marked.sum()) + int((~self.on_grid(x)).sum())
+        return int(outside.sum()) + int(marked.sum()) + int((~self.on_grid(x)).sum())
 
     def superset(self, frames: Iterable[torch.Tensor], sample: np.ndarray, margin: int) -> ParticleSets:
         """Union of I and of N over many configurations.
@@ -178,31 +178,31 @@ class NeighbourSearch:
             sample: [s] indices of S.
             margin: nodes by which I is widened.
         """
-        needed = nodes = None
+        mask = nodes = None
         for chunk in frames:
-            if needed is None:
+            if mask is None:
                 chosen = torch.as_tensor(sample, device=chunk.device)
                 nodes = self.no_nodes(chunk.device)
-                needed = torch.zeros(chunk.shape[1], dtype=torch.uint8, device=chunk.device)
+                mask = torch.zeros(chunk.shape[1], dtype=torch.uint8, device=chunk.device)
             for x in chunk:
                 # A configuration's own nodes: N is their union, not the neighbours of the union.
                 marked = self.no_nodes(x.device)
                 self.mark_nodes(x[chosen].contiguous(), marked, margin)
-                self.flag_particles(x.contiguous(), marked, needed)
+                self.flag_particles(x.contiguous(), marked, mask)
                 nodes |= marked
-        return particle_sets(sample, needed.bool(), nodes)
+        return particle_sets(sample, mask.bool(), nodes)
 
 
-def particle_sets(sample: np.ndarray, needed: torch.Tensor, nodes: torch.Tensor) -> ParticleSets:
+def particle_sets(sample: np.ndarray, mask: torch.Tensor, nodes: torch.Tensor) -> ParticleSets:
     """Particle sets from masks, S first in N.
 
     Args:
         sample: [s] indices of S.
-        needed: [P] mask of N.
+        mask: [P] mask of N.
         nodes: [all nodes] mark of I.
     """
-    needed = needed.clone()
-    needed[torch.as_tensor(sample, device=needed.device)] = False
-    neighbours = torch.nonzero(needed).flatten().cpu().numpy()
+    mask = mask.clone()
+    mask[torch.as_tensor(sample, device=mask.device)] = False
+    neighbours = torch.nonzero(mask).flatten().cpu().numpy()
     flat = torch.nonzero(nodes).flatten().to(torch.int32).cpu().numpy()
     return ParticleSets(sample, np.concatenate([sample, neighbours]), flat)

@@ -117,7 +117,7 @@ class SearchingStep(Step):
     @override
     def load(self) -> None:
         x, *_ = self.inferred
-        in_N = self._search.needed(x, self._sample_rows)
+        in_N = self._search.integration_mask(x, self._sample_rows)
         in_N[: self.s] = True
         rows = in_N.nonzero().flatten()
         n = len(rows)

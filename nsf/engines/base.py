@@ -1,4 +1,4 @@
-"""What an engine is: one way to compute the steps of reduced runs."""
+"""The interface of an engine: one way to compute the steps of reduced runs."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -27,16 +27,16 @@ class Engine(ABC):
 
     @abstractmethod
     def spans(self, batch: Batch) -> Sequence[Span]:
-        """What takes the steps of each span of time, of runs that are not refused."""
+        """The spans of time that take the steps of runs that are not refused."""
 
     def doubt(self, setup: Setup, gravity: Gravity) -> tuple[float, str]:
         """How far a run's input lies outside of what the engine learned from, in units of its range.
 
         Args:
-            setup: what the run is given.
-            gravity: in its course, as far as is known.
+            setup: of the run.
+            gravity: in its course, which a hand may still change.
 
         Returns:
-            At most 1 where it is inside, as it always is where nothing is learned; and what lies outside.
+            At most 1 where it is inside, and 0 where nothing is learned; and a text of what lies outside.
         """
         return 0.0, ""

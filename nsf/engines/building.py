@@ -35,7 +35,7 @@ def reduced(
         sample: particle indices, a number (drawn at random), a `Sampler`, the `samples` of an earlier
             solver, or None for `SAMPLE` of them.
         engine: how steps are computed: `auto`, the fastest engine that can; `reference`, `modal`, taught
-            operators (`Operators.load`), or an engine of one's own.
+            operators (`Operators.load`), or an engine of the user.
         **options: further arguments of `nsf.dynamics.Setup`.
 
     Raises:
@@ -65,22 +65,22 @@ def reduced_batch(
     Raises:
         ConfigError: no parameters, or another number of xhat or velocity; and as for `reduced`.
     """
-    own: list[dict] = [{} for _ in parameters]
+    starts: list[dict] = [{} for _ in parameters]
     for name, values in (("xhat", xhat), ("velocity", velocity)):
-        if values is not None and len(values) != len(own):
-            raise ConfigError(f"{name} is given for {len(values)} of {len(own)} runs")
-        for start, value in zip(own, values or (), strict=False):
+        if values is not None and len(values) != len(starts):
+            raise ConfigError(f"{name} is given for {len(values)} of {len(starts)} runs")
+        for start, value in zip(starts, values or (), strict=False):
             start[name] = value
     setups: list[Setup] = []
-    for values, start in zip(parameters, own, strict=True):
-        if setups:  # the sample and the sets depend on the manifold alone: found once
+    for values, start in zip(parameters, starts, strict=True):
+        if setups:  # the sample and the sets depend on the manifold alone
             sample, options = setups[0].samples, options | {"sets": setups[0].sets}
         setups.append(_setup(scene, manifold, values, sample, engine, options | start))
     return _together(setups, engine)
 
 
-def _together(setups: Sequence[Setup], wanted: str | Engine) -> ReducedBatch:
-    engine, why = choose(wanted, setups)
+def _together(setups: Sequence[Setup], name: str | Engine) -> ReducedBatch:
+    engine, why = choose(name, setups)
     return ReducedBatch(setups, engine.spans, engine.name, why, engine.doubt)
 
 
@@ -103,15 +103,15 @@ def _setup(scene, manifold, parameters, sample: Sample, engine: str | Engine, op
 
 
 def _sampled(scene, manifold, sampler: Sampler, engine: str | Engine, options: dict) -> list[SampleSpan]:
-    """What a sampler chooses; one that learns from steps is given a solver whose sample is every particle."""
+    """The sample of a sampler; one that learns from steps gets solvers whose sample is every particle."""
     if isinstance(engine, Engine) and not engine.moves_particles:
         engine = "auto"
     everyone = np.arange(len(manifold.X))
-    whole = {"sample": everyone, "sets": [ParticleSets(everyone, everyone, None)], "engine": engine}
-    whole |= {k: options[k] for k in ("sources", "precision", "device") if k in options}
+    options_of_all = {"sample": everyone, "sets": [ParticleSets(everyone, everyone, None)], "engine": engine}
+    options_of_all |= {k: options[k] for k in ("sources", "precision", "device") if k in options}
     device = torch_device(warp_device(options.get("device", "auto")))
     return sampler.spans_of(
-        manifold, device, lambda parameters: reduced(scene, manifold, parameters, **whole)
+        manifold, device, lambda parameters: reduced(scene, manifold, parameters, **options_of_all)
     )
 
 

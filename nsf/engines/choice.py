@@ -13,37 +13,37 @@ ENGINES: tuple[Engine, ...] = (Modal(), Reference())
 NAMES = ("auto", *(engine.name for engine in ENGINES))
 
 
-def choose(wanted: str | Engine, setups: Sequence[Setup]) -> tuple[Engine, str]:
+def choose(name: str | Engine, setups: Sequence[Setup]) -> tuple[Engine, str]:
     """The engine for runs that take their steps together.
 
     Args:
-        wanted: one of `NAMES`, of which `auto` is the fastest that can; or an engine of one's own.
+        name: one of `NAMES`, of which `auto` is the fastest that can; or an engine of the user.
         setups: of the runs.
 
     Returns:
         The engine, and why it is not a faster one; empty where none is faster.
 
     Raises:
-        ConfigError: an unknown name, or no engine that was asked for can take the steps: says why.
+        ConfigError: an unknown name, or the engine cannot take the steps: says why.
     """
-    known = {engine.name: engine for engine in ENGINES}
-    if isinstance(wanted, Engine):
-        candidates = [wanted]
-    elif wanted == "auto":
+    by_name = {engine.name: engine for engine in ENGINES}
+    if isinstance(name, Engine):
+        candidates = [name]
+    elif name == "auto":
         candidates = list(ENGINES)
-    elif wanted in known:
-        candidates = [known[wanted]]
+    elif name in by_name:
+        candidates = [by_name[name]]
     else:
         raise ConfigError(
-            f"engine={wanted} is unknown; choose one of {', '.join(NAMES)}, or give "
+            f"engine={name} is unknown; choose one of {', '.join(NAMES)}, or give "
             "nsf.engines.Operators.load(FILE) of a teach run"
         )
     refusals = []
     for engine in candidates:
         refusal = engine.refusal(setups)
         if not refusal:
-            asked = candidates[0] is not ENGINES[0]
-            return engine, "; ".join(refusals) or ("it was asked for" if asked else "")
+            slower = candidates[0] is not ENGINES[0]
+            return engine, "; ".join(refusals) or ("it was asked for" if slower else "")
         refusals.append(refusal)
     detail = "; ".join(
         f"engine {engine.name}: {why}" for engine, why in zip(candidates, refusals, strict=True)

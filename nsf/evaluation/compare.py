@@ -347,7 +347,12 @@ def _roles(setup: Setup, x: torch.Tensor, sample: np.ndarray) -> np.ndarray:
 
     N is what a projected step from the positions x [P, 3] needs, no superset of it that a span may have.
     """
-    role = setup.search.needed(x, torch.as_tensor(sample, device=x.device)).cpu().numpy().astype(np.int8)
+    role = (
+        setup.search.integration_mask(x, torch.as_tensor(sample, device=x.device))
+        .cpu()
+        .numpy()
+        .astype(np.int8)
+    )
     role[sample] = 2
     return role
 

@@ -63,12 +63,14 @@ class Auto(Model):
         Raises:
             ConfigError: none could run.
         """
-        ran = [one for one in measured if not one.refused and not math.isnan(one.error)]
+        ran = [
+            candidate for candidate in measured if not candidate.refused and not math.isnan(candidate.error)
+        ]
         if not ran:
             raise ConfigError(
                 "model=auto has no candidate that can run: "
-                + "; ".join(f"{one.name}: {one.refused}" for one in measured)
+                + "; ".join(f"{candidate.name}: {candidate.refused}" for candidate in measured)
             )
-        best = min(one.error for one in ran)
-        near = [one for one in ran if one.error <= self.slack * best]
-        return min(near, key=lambda one: one.seconds).name
+        best = min(candidate.error for candidate in ran)
+        near = [candidate for candidate in ran if candidate.error <= self.slack * best]
+        return min(near, key=lambda candidate: candidate.seconds).name

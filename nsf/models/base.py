@@ -1,4 +1,4 @@
-"""The interface of a model: what it can run, what it learns, and what takes its steps."""
+"""The interface of a model: which runs it refuses, whether it learns, and its engine."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ class Model(ABC):
     learns: ClassVar[bool] = False
     projects: ClassVar[bool] = False
 
-    def refuse(self, names) -> None:  # noqa: B027 — most models run whatever there is
+    def refuse(self, names) -> None:  # noqa: B027 — most models run whatever is configured
         """Refuse a configuration that the model cannot run.
 
         Args:
@@ -37,7 +37,7 @@ class Model(ABC):
 
     @abstractmethod
     def engine(self, pipeline, manifold):
-        """What takes the steps of its runs: an `nsf.engines.Engine`, or `auto` for projected steps.
+        """The engine that takes the steps of its runs, or its name; `auto` for projected steps.
 
         Args:
             pipeline: a `nsf.pipeline.Pipeline`.
@@ -49,12 +49,12 @@ class Model(ABC):
 
     @property
     def lesson(self) -> dict[str, Any]:
-        """What its teaching depends on, beside scene, manifold and sample; a part of the name of its run."""
+        """The values on which its teaching depends besides scene, manifold and sample; they name its run."""
         return asdict(self)
 
 
 def describe(config: Mapping, chosen: str = "") -> dict[str, str]:
-    """What a resolved configuration takes its steps with: `model`, `stress`, `affine` and `field`.
+    """The names of a configuration's `model`, `stress`, `affine` and `field`, as tables show them.
 
     Args:
         config: with these keys, as of a run's `configuration.yaml`.

@@ -1,4 +1,4 @@
-"""What determines runs of a scene, for models of latent vectors."""
+"""Parameters, start and forcing of runs, from which a model of latent vectors computes them."""
 
 from dataclasses import dataclass
 
@@ -7,7 +7,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Inputs:
-    """What determines runs of a scene, in fp64.
+    """Parameters, start and forcing of B runs of a scene, in fp64.
 
     Attributes:
         names: of the problem parameters; parameters: [B, n] their values.

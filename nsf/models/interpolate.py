@@ -18,7 +18,7 @@ class TrainingRuns:
 
     Attributes:
         parameters: [K, n] of each run, standardised over the runs; a parameter that never varies is 0. Where
-            programs force the runs, what these do in the course of a run stands beside.
+            programs force the runs, columns of their forcing follow.
         latents: [K, F, r] of each frame.
     """
 
@@ -44,11 +44,11 @@ class TrainingRuns:
         mean, spread = values.mean(0), deviation(values)
         if len(forcing):
             # A whole program weighs as much as one parameter.
-            whole = np.stack(forcing)
-            weight = np.linalg.norm(whole.std(0)) or 1.0
-            values = np.hstack([values, whole])
-            mean = np.concatenate([mean, whole.mean(0)])
-            spread = np.concatenate([spread, np.full(whole.shape[1], weight)])
+            programs = np.stack(forcing)
+            weight = np.linalg.norm(programs.std(0)) or 1.0
+            values = np.hstack([values, programs])
+            mean = np.concatenate([mean, programs.mean(0)])
+            spread = np.concatenate([spread, np.full(programs.shape[1], weight)])
         return cls((values - mean) / spread, latents, mean, spread)
 
     def standardised(self, parameters: np.ndarray) -> np.ndarray:
@@ -92,9 +92,9 @@ class Interpolate(LatentModel):
             )
 
     @override
-    def fit(self, manifold, known: Inputs, seed: int) -> TrainingRuns:
+    def fit(self, manifold, training: Inputs, seed: int) -> TrainingRuns:
         return TrainingRuns.of(manifold)
 
     @override
-    def run(self, fitted: TrainingRuns, asked: Inputs) -> np.ndarray:
-        return np.stack([fitted.interpolated(values) for values in asked.parameters])
+    def run(self, fitted: TrainingRuns, inputs: Inputs) -> np.ndarray:
+        return np.stack([fitted.interpolated(values) for values in inputs.parameters])

@@ -25,22 +25,22 @@ class LatentModel(Model):
     knows_forcing: ClassVar[bool] = True
 
     @abstractmethod
-    def fit(self, manifold, known: Inputs, seed: int) -> Any:
-        """What is learned from the training runs.
+    def fit(self, manifold, training: Inputs, seed: int) -> Any:
+        """Learn from the training runs.
 
         Args:
-            manifold: trained fields, whose `training_latents` [K (N + 1), r] are x̂ of the runs of `known`,
+            manifold: trained fields, whose `training_latents` [K (N + 1), r] are x̂ of the runs of `training`,
                 one run after the other.
-            known: the training runs.
+            training: the training runs.
             seed: of all randomness.
 
         Returns:
-            Passed to `run`. With `learns` it is kept in a file of `nsf teach`: tensors, numbers and texts, in
-            dicts and lists.
+            The first argument of `run`. With `learns` `nsf teach` writes it into a file: tensors, numbers and
+            texts, in dicts and lists.
         """
 
     @abstractmethod
-    def run(self, fitted: Any, asked: Inputs) -> np.ndarray:
+    def run(self, fitted: Any, inputs: Inputs) -> np.ndarray:
         """x̂ [B, N + 1, r] of runs."""
 
     @override

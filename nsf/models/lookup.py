@@ -1,4 +1,4 @@
-"""What takes the steps of models that give latent vectors of whole runs: a step looks one up."""
+"""The engine of models that give the latent vectors of whole runs: a step looks one up."""
 
 from collections.abc import Sequence
 
@@ -18,7 +18,7 @@ from nsf.mpm import Gravity
 
 
 def inputs_of(batch: Batch) -> Inputs:
-    """What determines the runs of a batch, as far as is known now: a hand may change it."""
+    """Parameters, start and forcing of a batch, as they are now: a hand may change them."""
     one, forcing = batch.shared, batch.forcing
     t, runs = one.dt * np.arange(one.total_steps), range(len(batch))
     states = [collider_states(forcing.colliders_of(run), one.dt, one.total_steps) for run in runs]
@@ -33,7 +33,7 @@ def inputs_of(batch: Batch) -> Inputs:
 
 
 def training_inputs(manifold, scene, cases: Sequence[Case]) -> Inputs:
-    """What determined the training runs of a manifold, in their order.
+    """Parameters, start and forcing of the training runs of a manifold, in their order.
 
     Args:
         manifold: trained fields.
@@ -93,13 +93,13 @@ class _Table:
     def rows(self) -> torch.Tensor:
         if self._xhat is None or (self._model.knows_forcing and self._batch.forcing.version != self._version):
             self._version = self._batch.forcing.version
-            found = np.asarray(self._model.run(self._fitted, inputs_of(self._batch)))
-            self._xhat = torch.as_tensor(found).to(self._batch.record.xhat)
+            xhat = np.asarray(self._model.run(self._fitted, inputs_of(self._batch)))
+            self._xhat = torch.as_tensor(xhat).to(self._batch.record.xhat)
         return self._xhat
 
 
 class LatentSpan(Span):
-    """A span of time of such runs; S is kept for whoever asks where the sample particles are."""
+    """A span of time of such runs; S serves those who decode the sample particles."""
 
     latent_only = True
 

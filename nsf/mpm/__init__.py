@@ -13,13 +13,13 @@ wp.config.log_level = wp.LOG_ERROR  # kernels are compiled without a word; error
 def _begin_without_gpu() -> None:
     """Start Warp where no GPU can be, without its warning; `nsf doctor` says what is missing."""
     with suppress(OSError), open(os.devnull, "wb") as nowhere:
-        kept = os.dup(2)  # the warning comes from C++, which knows no sys.stderr
+        stderr = os.dup(2)  # the warning comes from C++, which knows no sys.stderr
         try:
             os.dup2(nowhere.fileno(), 2)
             wp.init()
         finally:
-            os.dup2(kept, 2)
-            os.close(kept)
+            os.dup2(stderr, 2)
+            os.close(stderr)
 
 
 if not has_driver():

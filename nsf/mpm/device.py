@@ -23,9 +23,9 @@ def warp_device(name: str):
         raise DeviceError(
             f"device={name} was asked for, but this machine has no usable GPU; use device=cpu or device=auto"
         )
-    known = {d.alias for d in wp.get_devices()} | {"cuda"}
-    if name not in known:
-        raise DeviceError(f"device={name} is unknown; this machine has {', '.join(sorted(known - {'cuda'}))}")
+    names = {d.alias for d in wp.get_devices()} | {"cuda"}
+    if name not in names:
+        raise DeviceError(f"device={name} is unknown; this machine has {', '.join(sorted(names - {'cuda'}))}")
     return wp.get_device(name)
 
 

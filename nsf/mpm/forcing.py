@@ -58,7 +58,7 @@ class Gravity:
 
 
 class Forcing:
-    """What acts on simulations from outside at the moment, on the device.
+    """Gravity, colliders and walls of simulations at the present step, on the device.
 
     A step reads gravity and the solids' poses from here, whatever brought them about: programs, which are
     keyframes on the device, or a hand between two steps. A captured step stays good. Solvers that take turns
@@ -93,14 +93,14 @@ class Forcing:
             return
         self._follow = make_follow_gravity(precision)
         self._steps = wp.zeros(len(gravities), dtype=wp.int32, device=device)
-        # The first keyframe of each run is a hand's.
+        # The first keyframe of each run is for a hand.
         ends = np.cumsum([1 + len(gravity.times) for gravity in gravities])
-        self._own = begin, last = np.array([0, *ends[:-1]]) + 1, ends - 1
+        self._keyframe_rows = begin, last = np.array([0, *ends[:-1]]) + 1, ends - 1
         times = np.concatenate([[0.0, *gravity.times] for gravity in gravities])
-        self._held = np.concatenate([[np.zeros(3), *gravity.values] for gravity in gravities])
+        self._keyframe_values = np.concatenate([[np.zeros(3), *gravity.values] for gravity in gravities])
         self._times = wp.array(times, dtype=wp.float64, device=device)
-        self._values = wp.array(self._held, dtype=wp.vec3d, device=device)
-        self._from, self._last = (wp.array(own, dtype=wp.int32, device=device) for own in (begin, last))
+        self._values = wp.array(self._keyframe_values, dtype=wp.vec3d, device=device)
+        self._from, self._last = (wp.array(rows, dtype=wp.int32, device=device) for rows in (begin, last))
 
     def __len__(self) -> int:
         return len(self._programs)
@@ -151,10 +151,10 @@ class Forcing:
         if not self._varies:
             return
         by_hand = np.array([a is not b for a, b in zip(self.gravities, self._programs, strict=True)])
-        begin, last = self._own
+        begin, last = self._keyframe_rows
         for run in np.flatnonzero(by_hand):
-            self._held[begin[run] - 1] = self.gravities[run].values[0]
-        self._values.assign(self._held)
+            self._keyframe_values[begin[run] - 1] = self.gravities[run].values[0]
+        self._values.assign(self._keyframe_values)
         self._from.assign(np.where(by_hand, begin - 1, begin).astype(np.int32))
         self._last.assign(np.where(by_hand, begin - 1, last).astype(np.int32))
 
@@ -164,7 +164,7 @@ class Forcing:
         return self.boundaries.colliders[run * each : (run + 1) * each]
 
     def gravity_at(self, t) -> np.ndarray:
-        """[runs, n, 3] gravity [m/s²] at times t [n] [s], as it is now known."""
+        """[runs, n, 3] gravity [m/s²] at times t [n] [s], as programs and hand have it now."""
         return np.stack([gravity.at(t) for gravity in self.gravities])
 
     def _first(self) -> np.ndarray:
@@ -173,8 +173,8 @@ class Forcing:
     @property
     def nbytes(self) -> int:
         """Bytes of the gravity on the device."""
-        own = (self.now,) if not self._varies else (self.now, self._times, self._values, self._steps)
-        return sum(array.capacity for array in own)
+        arrays = (self.now,) if not self._varies else (self.now, self._times, self._values, self._steps)
+        return sum(array.capacity for array in arrays)
 
 
 class Hand:
@@ -211,18 +211,18 @@ class Hand:
             ConfigError: there is no such solid, or it stands still by itself; a value is not finite.
         """
         if collider not in self._names:
-            there = ", ".join(self._names) or "none"
-            raise ConfigError(f"there is no collider {collider!r}; there are: {there}")
+            names = ", ".join(self._names) or "none"
+            raise ConfigError(f"there is no collider {collider!r}; there are: {names}")
         index = self._names.index(collider)
-        own = self._forcing.colliders_of(self._run)[index].motion
-        if own is None:
+        motion = self._forcing.colliders_of(self._run)[index].motion
+        if motion is None:
             raise ConfigError(
                 f"collider {collider!r} stands still in its scene; give it a motion there, or a program in "
                 f"scene.forcing.colliders.{collider}"
             )
         velocity = np.array(vector("velocity", velocity, "m/s"))
         (spin,) = numbers("spin", [spin], "°/s", 1)
-        self._forcing.move(self._run, index, own.steered(self._clock(), velocity, float(spin)))
+        self._forcing.move(self._run, index, motion.steered(self._clock(), velocity, float(spin)))
 
     def release(self) -> None:
         """Give everything back to the programs."""

@@ -38,7 +38,7 @@ class State(Protocol):
 
 @runtime_checkable
 class Solver(Protocol):
-    """What a user holds of a simulation, at full order or reduced, whatever computes its steps.
+    """The interface of a simulation, at full order or reduced, whatever computes its steps.
 
     A step takes no argument: the forcing of its moment, gravity and where colliders are, is on the device.
 
@@ -191,12 +191,12 @@ class FullOrderMPM:
     @property
     def nbytes(self) -> int:
         """Bytes that the solver's arrays take on the device."""
-        own = (self.mass, self.volume0, self.mu, self.lam)
-        return self.state.nbytes + self.grid.nbytes + self._watch.nbytes + sum(a.capacity for a in own)
+        arrays = (self.mass, self.volume0, self.mu, self.lam)
+        return self.state.nbytes + self.grid.nbytes + self._watch.nbytes + sum(a.capacity for a in arrays)
 
     @property
     def warnings(self) -> list[str]:
-        """What was odd at a look since t = 0, though law and step held: a line each, at its worst."""
+        """A line for each warning since t = 0, at its worst: the state was odd, though law and step held."""
         return self._watch.warnings
 
     def restart(self) -> None:
@@ -384,13 +384,13 @@ def diagnosed(
         steps_taken: number of steps up to the check that failed.
     """
     solver = build()
-    rest = solver.elastic_cfl()
+    cfl_at_rest = solver.elastic_cfl()
     solver.step((steps_taken - 1) // solver.check_every * solver.check_every)
     cfl = solver.elastic_cfl()
     advice = ""
     if cfl > MAX_ELASTIC_CFL:
         advice = f", as the material is stretched: try dt={solver.dt * MAX_ELASTIC_CFL / cfl:.2g} s"
     return InstabilityError(
-        f"{error}; elastic CFL c dt/dx = {rest:.3g} at rest, {cfl:.3g} at step {solver.steps_taken} "
+        f"{error}; elastic CFL c dt/dx = {cfl_at_rest:.3g} at rest, {cfl:.3g} at step {solver.steps_taken} "
         f"(limit {MAX_ELASTIC_CFL:g}){advice}"
     )

@@ -97,13 +97,13 @@ class ParticleState:
         real, vec3, mat33 = precision.real, precision.vec3, precision.mat33
         vecH = wp.types.vector(length=history.shape[1], dtype=real)
 
-        def taken(values: np.ndarray, dtype) -> ParticleArray:
+        def array_of(values: np.ndarray, dtype) -> ParticleArray:
             return ParticleArray(wp.array(values[order], dtype=dtype, device=device), order)
 
         def filled(value) -> ParticleArray:
             return ParticleArray(wp.full(len(x), value, dtype=mat33, device=device), order)
 
-        self.x, self.v, self.history = taken(x, vec3), taken(v, vec3), taken(history, vecH)
+        self.x, self.v, self.history = array_of(x, vec3), array_of(v, vec3), array_of(history, vecH)
         # Made on the device: for millions of particles these are gigabytes of one value.
         self.C, self.tau, self.F_e = filled(mat33()), filled(mat33()), filled(mat33(np.eye(3)))
         self.order = wp.array(order, dtype=wp.int32, device=device)

@@ -1,4 +1,4 @@
-"""What particles carry of which the stress alone is known: those of a run that begins in its midst."""
+"""F_e and history variables of particles from their stress, for a run that begins in its midst."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ _TURNS = 1000  # to a share of 4e-5
 def stressed(
     material: Material, tau: np.ndarray, mu: np.ndarray, lam: np.ndarray
 ) -> tuple[dict[str, np.ndarray], int]:
-    """What particles carry of which the stress alone is known.
+    """τ, F_e and history variables of particles from their stress.
 
     A stress beyond yield is kept; the first return map brings it back.
 

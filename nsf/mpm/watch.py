@@ -51,17 +51,17 @@ def make_depth(precision: Precision):
                 # The pose is that at the start of the step.
                 arm = x - solids.position[c] - dt * solids.velocity[c]
                 extents = solids.extents[c]
-                here = real(0.0)
+                distance = real(0.0)
                 if solids.shape[c] == wp.static(CUBOID):
                     local = wp.transpose(solids.orientation[c]) * arm
-                    here = real(wp.inf)
+                    distance = real(wp.inf)
                     for a in range(3):
-                        here = wp.min(here, extents[a] - wp.abs(local[a]))
+                        distance = wp.min(distance, extents[a] - wp.abs(local[a]))
                 elif solids.shape[c] == wp.static(SPHERE):
-                    here = extents[0] - wp.length(arm)
+                    distance = extents[0] - wp.length(arm)
                 else:
-                    here = -wp.dot(arm, solids.orientation[c] * extents)
-                deepest = wp.max(deepest, here)
+                    distance = -wp.dot(arm, solids.orientation[c] * extents)
+                deepest = wp.max(deepest, distance)
         return deepest
 
     return depth
@@ -101,7 +101,7 @@ def make_watch(precision: Precision, shape_name: str):
         fastest: wp.array(dtype=real),
     ):
         p = wp.tid()
-        energy, found = wp.vec3d(), wp.vec3d()
+        energy, counts = wp.vec3d(), wp.vec3d()
         speed = real(0.0)
         while p < x.shape[0]:
             F = F_e[p]
@@ -118,22 +118,22 @@ def make_watch(precision: Precision, shape_name: str):
                     wp.atomic_min(first, 2, order[p])
                 if real(wp.static(COLLAPSED)) > J:
                     wp.atomic_min(first, 3, order[p])
-                    found[0] += wp.float64(1.0)
-                here = wp.length(v[p])
-                if here * dt > real(wp.static(MAX_ADVECTIVE_CFL)) * dx:
+                    counts[0] += wp.float64(1.0)
+                particle_speed = wp.length(v[p])
+                if particle_speed * dt > real(wp.static(MAX_ADVECTIVE_CFL)) * dx:
                     wp.atomic_min(first, 4, order[p])
-                speed = wp.max(speed, here)
+                speed = wp.max(speed, particle_speed)
                 if depth(x[p], dt, dx, solids) > dx:
-                    found[1] += wp.float64(1.0)
+                    counts[1] += wp.float64(1.0)
                 m = wp.float64(mass[p])
-                energy[0] += wp.float64(0.5) * m * wp.float64(here) * wp.float64(here)
+                energy[0] += wp.float64(0.5) * m * wp.float64(particle_speed) * wp.float64(particle_speed)
                 energy[1] -= m * wp.float64(wp.dot(gravity[0], x[p]))
             p += threads
-        energy, found = total(energy, lanes), total(found, lanes)
+        energy, counts = total(energy, lanes), total(counts, lanes)
         if wp.tid() % lanes == 0:
             for i in range(2):
                 wp.atomic_add(sums, i, energy[i])
-                wp.atomic_add(sums, 2 + i, found[i])
+                wp.atomic_add(sums, 2 + i, counts[i])
         if speed > fastest[0]:
             wp.atomic_max(fastest, 0, speed)
 
@@ -141,7 +141,7 @@ def make_watch(precision: Precision, shape_name: str):
 
 
 class Look(NamedTuple):
-    """What one look found.
+    """The sums and extremes of one look.
 
     Attributes:
         non_finite, outside, inverted, collapsed, fast: lowest index of such a particle; None for none.
@@ -263,9 +263,9 @@ class Watch:
         self._remember("inside", look.inside_share - self._inside, _INSIDE_SHARE, when)
         self._remember("energy", rise, _ENERGY_RISE, when)
 
-    def _remember(self, what: str, value: float, limit: float, when: str) -> None:
-        if value > max(limit, self._worst.get(what, (limit, ""))[0]):
-            self._worst[what] = value, when
+    def _remember(self, quantity: str, value: float, limit: float, when: str) -> None:
+        if value > max(limit, self._worst.get(quantity, (limit, ""))[0]):
+            self._worst[quantity] = value, when
 
     @property
     def warnings(self) -> list[str]:
@@ -278,4 +278,4 @@ class Watch:
             "energy": "kinetic and potential energy rose by {:.3g} % of the largest kinetic energy {}, "
             "and nothing did work; reduce dt",
         }
-        return [texts[what].format(100 * value, when) for what, (value, when) in self._worst.items()]
+        return [texts[quantity].format(100 * value, when) for quantity, (value, when) in self._worst.items()]

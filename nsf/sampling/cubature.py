@@ -10,7 +10,7 @@ import torch
 from typing_extensions import override
 
 from nsf.errors import ConfigError, ProjectionError
-from nsf.sampling.sampler import Sampler, SampleSpan, WholeSolver
+from nsf.sampling.sampler import EquationSolver, Sampler, SampleSpan
 from nsf.vectors import number
 
 _EXACT = 1e-9  # residual over target at which a cubature counts as exact
@@ -51,10 +51,10 @@ class CubatureSampler(Sampler):
         number("sampler.states", self.states, 1, whole=True)
 
     @override
-    def span_of(self, region, end, manifold, device="cpu", whole=None):
+    def span_of(self, region, end, manifold, device="cpu", solver_at=None):
         candidates = region.candidates(manifold.X.cpu().numpy())
         rows = training_rows(manifold, region.start, end, self.states)
-        equations = normal_equations(manifold, rows, candidates, whole)
+        equations = normal_equations(manifold, rows, candidates, solver_at)
         among = self.among(equations)
         chosen, weights = nonnegative_fit(equations.columns[:, among], equations.target, region.size)
         order = np.argsort(chosen)
@@ -99,7 +99,10 @@ def training_rows(manifold, start: float, end: float, count: int) -> torch.Tenso
 
 @torch.no_grad()
 def normal_equations(
-    manifold, rows: torch.Tensor, candidates: np.ndarray, whole: Callable[[Mapping[str, float]], WholeSolver]
+    manifold,
+    rows: torch.Tensor,
+    candidates: np.ndarray,
+    solver_at: Callable[[Mapping[str, float]], EquationSolver],
 ) -> Equations:
     """Each particle's share in the normal equations of one projection step from training states.
 
@@ -112,7 +115,7 @@ def normal_equations(
         manifold: trained fields.
         rows: [k] of its training latents.
         candidates: [c] particle indices.
-        whole: problem parameters → reduced solver whose sample is every particle.
+        solver_at: problem parameters → reduced solver whose sample is every particle.
 
     Returns:
         r + r (r + 1)/2 of them for each state that counts.
@@ -125,7 +128,7 @@ def normal_equations(
         if parameters is None or not torch.equal(parameters, manifold.training_parameters[row]):
             parameters = manifold.training_parameters[row]
             values = dict(zip(manifold.parameter_names, parameters.tolist(), strict=True))
-            solver = whole(values)
+            solver = solver_at(values)
         previous, xhat = manifold.training_latents[row - 1 : row + 1]
         step = round(float(manifold.training_times[row]) / solver.dt)
         error, J = solver.equations_at(step, xhat, previous)
@@ -157,8 +160,8 @@ def _shares(error: torch.Tensor, J: torch.Tensor, least: float) -> tuple[torch.T
     right = torch.einsum("pir,pi->pr", J, error)
     row, column = torch.triu_indices(r, r, device=J.device)
     # Twice what is off the diagonal, in squares, so that the norm is that of the whole matrix.
-    both = torch.where(row == column, 1.0, 2.0).to(J).sqrt()
-    matrix = both * torch.einsum("pir,pis->prs", J, J)[:, row, column]
+    factor = torch.where(row == column, 1.0, 2.0).to(J).sqrt()
+    matrix = factor * torch.einsum("pir,pis->prs", J, J)[:, row, column]
     return right / torch.linalg.vector_norm(right.sum(0)).clamp_min(least), matrix / r**0.5
 
 

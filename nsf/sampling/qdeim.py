@@ -82,15 +82,15 @@ def pivots(U: torch.Tensor, size: int) -> list[int]:
 
     Fewer come back where their rows span all that U does.
     """
-    left, chosen, rank = U.clone(), [], 0
+    remaining, chosen, rank = U.clone(), [], 0
     while len(chosen) < size and rank < U.shape[2]:
-        best = int(left.square().sum((1, 2)).argmax())
-        _, singular, rows = torch.linalg.svd(left[best], full_matrices=False)
+        best = int(remaining.square().sum((1, 2)).argmax())
+        _, singular, rows = torch.linalg.svd(remaining[best], full_matrices=False)
         rows = rows[singular > _RANK]
         if not len(rows):
             break
-        left -= (left @ rows.T) @ rows
-        left[best] = 0.0  # its round-off
+        remaining -= (remaining @ rows.T) @ rows
+        remaining[best] = 0.0  # its round-off
         chosen.append(best)
         rank += len(rows)
     return chosen
@@ -103,18 +103,18 @@ def oversampled(U: torch.Tensor, chosen: list[int], size: int) -> list[int]:
     squares, axes = (part.to(U.device) for part in torch.linalg.eigh((U @ U.mT).cpu()))
     U = axes.mT @ U
     gram = torch.einsum("pim,pin->mn", U[chosen], U[chosen])
-    left = torch.ones(len(U), dtype=torch.bool, device=U.device)
-    left[chosen] = False
-    more: list[int] = []
-    while len(chosen) + len(more) < size:
+    remaining = torch.ones(len(U), dtype=torch.bool, device=U.device)
+    remaining[chosen] = False
+    added: list[int] = []
+    while len(chosen) + len(added) < size:
         values, vectors = torch.linalg.eigh(gram)
         gap = values[1] - values[0] if len(values) > 1 else torch.full_like(values[0], torch.inf)
         gain = eigenvalue_gain(U @ vectors[:, 0], squares, gap)
-        best = int(torch.where(left, gain, -1.0).argmax())
+        best = int(torch.where(remaining, gain, -1.0).argmax())
         gram += U[best].T @ U[best]
-        left[best] = False
-        more.append(best)
-    return more
+        remaining[best] = False
+        added.append(best)
+    return added
 
 
 def eigenvalue_gain(along: torch.Tensor, squares: torch.Tensor, gap: torch.Tensor) -> torch.Tensor:

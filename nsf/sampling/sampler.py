@@ -13,7 +13,7 @@ from nsf.errors import ConfigError, ProjectionError
 from nsf.vectors import number
 
 
-class WholeSolver(Protocol):
+class EquationSolver(Protocol):
     """A reduced solver whose sample is every particle, for a sampler that learns from its steps.
 
     Attributes:
@@ -82,11 +82,13 @@ class Region:
         upper = np.inf if self.upper is None else np.asarray(self.upper, float)
         inside = np.flatnonzero(((lower <= X) & (upper >= X)).all(1))
         if len(inside) < self.size:
-            whole = self.lower is None and self.upper is None
-            where, more = ("scene has", "more particles") if whole else ("region holds", "a larger region")
+            everywhere = self.lower is None and self.upper is None
+            where, remedy = (
+                ("scene has", "more particles") if everywhere else ("region holds", "a larger region")
+            )
             raise ConfigError(
                 f"sampler.size={self.size}, but the {where} {len(inside)} particles; "
-                f"choose a smaller size or {more}"
+                f"choose a smaller size or {remedy}"
             )
         return inside
 
@@ -137,14 +139,14 @@ class Sampler(ABC):
         self,
         manifold,
         device: str | torch.device = "cpu",
-        whole: Callable[[Mapping[str, float]], WholeSolver] | None = None,
+        solver_at: Callable[[Mapping[str, float]], EquationSolver] | None = None,
     ) -> list[SampleSpan]:
         """Choose the sample particles of each span.
 
         Args:
             manifold: trained fields of the particles.
             device: where the fields are evaluated, if the choice needs them.
-            whole: problem parameters → the reduced solver whose sample is every particle, if the choice
+            solver_at: problem parameters → the reduced solver whose sample is every particle, if the choice
                 needs steps of it.
 
         Raises:
@@ -152,12 +154,12 @@ class Sampler(ABC):
         """
         ends = [region.start for region in self.regions[1:]] + [1.0]
         return [
-            self.span_of(region, end, manifold, device, whole)
+            self.span_of(region, end, manifold, device, solver_at)
             for region, end in zip(self.regions, ends, strict=True)
         ]
 
     @abstractmethod
-    def span_of(self, region: Region, end: float, manifold, device="cpu", whole=None) -> SampleSpan:
+    def span_of(self, region: Region, end: float, manifold, device="cpu", solver_at=None) -> SampleSpan:
         """The sample particles of one span, which ends at a fraction of T; the rest as for `spans_of`."""
 
 
@@ -165,7 +167,7 @@ class UnweightedSampler(Sampler):
     """A choice of particles that all weigh the same."""
 
     @override
-    def span_of(self, region, end, manifold, device="cpu", whole=None):
+    def span_of(self, region, end, manifold, device="cpu", solver_at=None):
         candidates = region.candidates(manifold.X.cpu().numpy())
         return SampleSpan(region.start, np.sort(self.choose(manifold, candidates, region.size, device)))
 

@@ -64,7 +64,7 @@ def sets_of(scene, x, sample):
     search = NeighbourSearch(scene.grid, scene.transfer.shape, FP64, wp.get_device("cpu"))
     marked = search.no_nodes(x.device)
     search.mark_nodes(x[sample].contiguous(), marked)
-    return particle_sets(sample, search.needed(x, torch.as_tensor(sample)), marked)
+    return particle_sets(sample, search.integration_mask(x, torch.as_tensor(sample)), marked)
 
 
 @pytest.mark.parametrize("sparse", [False, True])

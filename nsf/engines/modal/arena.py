@@ -27,12 +27,12 @@ class Arena:
         self.precision, self.device = precision, device
         self.real, self._torch = torch_dtype(precision), torch_device(device)
         self.mode_bytes = 0
-        self._held: list[torch.Tensor] = []
+        self._buffers: list[torch.Tensor] = []
         self._sides = [wp.Stream(device) for _ in range(3)] if device.is_cuda else []
 
     @contextmanager
-    def beside(self, side: int) -> Iterator[None]:
-        """What is launched inside may run beside what is launched after it, until `meet` of that side."""
+    def concurrently(self, side: int) -> Iterator[None]:
+        """Let launches inside run beside those that come after the block, until `meet` of that side."""
         if not self._sides:
             yield
             return
@@ -48,12 +48,12 @@ class Arena:
     @property
     def nbytes(self) -> int:
         """Bytes of the arrays."""
-        return sum(a.nbytes for a in self._held)
+        return sum(a.nbytes for a in self._buffers)
 
     def hold(self, values, dtype: torch.dtype) -> torch.Tensor:
         """The values as a contiguous array of this device."""
         tensor = torch.as_tensor(values).to(self._torch, dtype).contiguous()
-        self._held.append(tensor)
+        self._buffers.append(tensor)
         return tensor
 
     def zeros(self, *shape: int, dtype: torch.dtype = torch.float64) -> torch.Tensor:
@@ -81,13 +81,13 @@ class Arena:
         n, (c, K) = len(table) if rows is None else len(rows), table.shape[1:]
         four = -(-K // 4)
         shape = (c, four, n, 4) if self.device.is_cuda else (n, c, four, 4)
-        held = self.hold(torch.zeros(shape, dtype=dtype, device=self._torch), dtype)
-        self.mode_bytes += held.nbytes
-        by_particle = held.permute(2, 0, 1, 3) if self.device.is_cuda else held
+        stored = self.hold(torch.zeros(shape, dtype=dtype, device=self._torch), dtype)
+        self.mode_bytes += stored.nbytes
+        by_particle = stored.permute(2, 0, 1, 3) if self.device.is_cuda else stored
         for part in self._parts(table, rows):
             values = _rows(table, rows, part).to(self._torch) / lengths
             by_particle[part] = torch.nn.functional.pad(values, (0, -K % 4)).unflatten(2, (four, 4)).to(dtype)
-        return held.flatten()
+        return stored.flatten()
 
     def halved(
         self, table: torch.Tensor, rows: torch.Tensor | None = None

@@ -23,7 +23,7 @@ def packed_weights(layers: Sequence[tuple[torch.Tensor, torch.Tensor]], is_cuda:
     reads at once lies side by side.
     """
     parts, tile = (PARTS, WARP) if is_cuda else (1, 1)
-    found = []
+    packed = []
     for W, b in layers:
         (out, inputs), across = W.shape, tile // parts
         half, steps = -(-out // 2), -(-inputs // parts)
@@ -31,8 +31,8 @@ def packed_weights(layers: Sequence[tuple[torch.Tensor, torch.Tensor]], is_cuda:
         padded = W.new_zeros(2, tiles * across, steps * parts)
         padded[0, :half, :inputs], padded[1, : out - half, :inputs] = W[:half], W[half:]
         shaped = padded.unflatten(2, (steps, parts)).unflatten(1, (tiles, across))
-        found += [shaped.permute(1, 3, 2, 4, 0).flatten(), torch.nn.functional.pad(b, (0, out % 2))]
-    return torch.cat(found)
+        packed += [shaped.permute(1, 3, 2, 4, 0).flatten(), torch.nn.functional.pad(b, (0, out % 2))]
+    return torch.cat(packed)
 
 
 def inputs_of_widest(widths: tuple[int, ...], latents: int) -> int:

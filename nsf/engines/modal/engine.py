@@ -1,4 +1,4 @@
-"""What the modal engine can run, and why not the rest."""
+"""The modal engine: which runs it can step, and why not others."""
 
 from collections.abc import Sequence
 from typing import ClassVar
@@ -37,18 +37,18 @@ class Modal(Engine):
 
     @override
     def refusal(self, setups: Sequence[Setup]) -> str:
-        one = setups[0]
-        for role, known in _KNOWN.items():
-            found = type(getattr(one, role))
-            if found not in known:
-                return f"{role} {found.__name__} is not known to modal"
-        if one.sources.carried:
+        setup = setups[0]
+        for role, classes in _KNOWN.items():
+            kind = type(getattr(setup, role))
+            if kind not in classes:
+                return f"{role} {kind.__name__} is not known to modal"
+        if setup.sources.carried:
             return "stress=particles is not known to modal"
-        if not one.manifold.layered:
+        if not setup.manifold.layered:
             return "a network of the field is not one of layers, as modal needs it"
-        if len(setups) > 1 and one.integration.strategy != "superset":
-            return f"integration={one.integration.strategy} needs a whole grid for each of {len(setups)} runs"
-        if one.device.is_cuda and not _closure_fits(one):
+        if len(setups) > 1 and setup.integration.strategy != "superset":
+            return f"integration={setup.integration.strategy} needs a whole grid for each of {len(setups)} runs"
+        if setup.device.is_cuda and not _closure_fits(setup):
             return "a block of the GPU does not hold the networks of the field"
         if changed := [name.replace(":", ".") for name in edits()]:
             more = f" and {len(changed) - _NAMED} more" if len(changed) > _NAMED else ""
@@ -57,13 +57,15 @@ class Modal(Engine):
 
     @override
     def spans(self, batch: Batch) -> Sequence[Span]:
-        one = batch.shared
-        return [ModalSpan(batch, sample, sets) for sample, sets in zip(one.samples, one.sets, strict=True)]
+        setup = batch.shared
+        return [
+            ModalSpan(batch, sample, sets) for sample, sets in zip(setup.samples, setup.sets, strict=True)
+        ]
 
 
-def _closure_fits(one: Setup) -> bool:
+def _closure_fits(setup: Setup) -> bool:
     """Whether a block of a GPU holds what the projection needs of the closure."""
-    sizes, r = one.manifold.hyperparameters, one.manifold.latent_dim
+    sizes, r = setup.manifold.hyperparameters, setup.manifold.latent_dim
     K = sizes["modes"][0]
     widths = (r, *[3 * sizes["beta"][0]] * sizes["depth"], K - r)
-    return projection_fits(one.precision, widths if r < K else (), r, K)
+    return projection_fits(setup.precision, widths if r < K else (), r, K)

@@ -22,51 +22,54 @@ def field_launches(
     span: GridSpan,
     a: torch.Tensor,
     rate: torch.Tensor,
-    needed: torch.Tensor,
+    in_N: torch.Tensor,
     tiles: tuple[int, int],
 ) -> tuple[list, list]:
-    """The launches of the networks, and those that then give τ and C at N, as the method takes them.
+    """The launches of the networks, and those that then write τ and C at N, from the run's sources.
 
     Args:
         arena: holds what they need.
         span: whose rows of τ and C are found.
         a, rate: [B, K] coefficients of the displacement and their rate [1/s].
-        needed: [tiles, n] which particles a step needs, as bits; tiles: their number and the runs of one.
+        in_N: [tiles, n] which particles a step needs, as bits; tiles: their number and the runs of one.
     """
-    setups, one, n = span.batch.setups, span.batch.shared, span.size
-    options = {"particles": span.order, "dtype": arena.real, "device": one.torch_device}
+    setups, shared, n = span.batch.setups, span.batch.shared, span.size
+    options = {"particles": span.order, "dtype": arena.real, "device": shared.torch_device}
     heads = []
-    for name, neural, found in (
-        ("stress", one.sources.neural_stress, span.tau),
-        ("affine", one.sources.neural_affine, span.C),
+    for name, neural, values in (
+        ("stress", shared.sources.neural_stress, span.tau),
+        ("affine", shared.sources.neural_affine, span.C),
     ):
         if neural:
-            factors = one.manifold.factors(name, **options)
+            factors = shared.manifold.factors(name, **options)
             if factors.table.shape[2]:
-                heads.append((factors, found))
+                heads.append((factors, values))
             else:  # the same in every snapshot, or none
-                found.unflatten(0, (-1, n)).copy_(_as_matrices(factors.mean))
+                values.unflatten(0, (-1, n)).copy_(_as_matrices(factors.mean))
     stored = [arena.halved(factors.table, factors.rows) for factors, _ in heads]
     parameters = torch.stack([setup.parameters for setup in setups])
     networks, outputs = _networks(arena, [f.layers for f, _ in heads], span.record, parameters)
     coefficients = []
-    for (factors, _), found in zip(heads, outputs, strict=True):
-        coefficients.append(found)
+    for (factors, _), output in zip(heads, outputs, strict=True):
+        coefficients.append(output)
         if factors.rates:
-            coefficients[-1] = arena.zeros(len(found), factors.table.shape[2], dtype=arena.real)
-            sigma = arena.hold(one.manifold.fields["deformation"].leading, torch.float64)
-            own = {"outputs": found, "rate": rate, "sigma": sigma, "a": coefficients[-1]}
-            networks.append(arena.pack(make_at_rate(arena.precision), tuple(coefficients[-1].shape), **own))
+            coefficients[-1] = arena.zeros(len(output), factors.table.shape[2], dtype=arena.real)
+            sigma = arena.hold(shared.manifold.fields["deformation"].leading, torch.float64)
+            arguments = {"outputs": output, "rate": rate, "sigma": sigma, "a": coefficients[-1]}
+            networks.append(
+                arena.pack(make_at_rate(arena.precision), tuple(coefficients[-1].shape), **arguments)
+            )
     fields = [
-        (factors, *modes, own, found)
-        for (factors, found), modes, own in zip(heads, stored, coefficients, strict=True)
+        (factors, *modes, a, values)
+        for (factors, values), modes, a in zip(heads, stored, coefficients, strict=True)
     ]
-    launches = [_contraction(arena, fields, needed, tiles)] if fields else []
-    if not one.sources.neural_stress:
+    launches = [_contraction(arena, fields, in_N, tiles)] if fields else []
+    if not shared.sources.neural_stress:
         F = arena.zeros(len(span.x), 3, 3, dtype=arena.real)
-        factors = one.manifold.factors("gradient", **options)
-        whole = arena.modes(factors.table, factors.rows), arena.zeros(1, dtype=arena.real)  # over no lengths
-        launches.append(_contraction(arena, [(factors, *whole, a, F)], needed, tiles))
+        factors = shared.manifold.factors("gradient", **options)
+        modes = arena.modes(factors.table, factors.rows)
+        lengths = arena.zeros(1, dtype=arena.real)  # modes over no lengths
+        launches.append(_contraction(arena, [(factors, modes, lengths, a, F)], in_N, tiles))
         launches.append(_elastic(arena, span, [setup.scene.material for setup in setups], F))
     return networks, launches
 
@@ -135,23 +138,23 @@ def _sides(weights: list, inputs: list, outputs: list) -> list[dict]:
     return [{"W": W, "b": b, "x": x, "y": y} for (W, b), x, y in layers]
 
 
-def _contraction(arena: Arena, fields: Sequence[tuple], needed: torch.Tensor, tiles: tuple[int, int]):
-    """The launch of one or two fields at the needed particles.
+def _contraction(arena: Arena, fields: Sequence[tuple], in_N: torch.Tensor, tiles: tuple[int, int]):
+    """The launch of one or two fields at N.
 
-    A field is its factors, the arena's modes, their lengths, coefficients a [B, K], and where it goes.
+    A field is its factors, the arena's modes, their lengths, coefficients a [B, K], and the output array.
     """
     number, tile = tiles
     sides = []
-    for factors, modes, lengths, a, found in fields:
+    for factors, modes, lengths, a, values in fields:
         mean = arena.hold(factors.mean, arena.real)
-        sides.append({"mean": mean, "modes": modes, "lengths": lengths, "a": a, "found": found})
+        sides.append({"mean": mean, "modes": modes, "lengths": lengths, "a": a, "values": values})
     threads = [arena.whole_blocks(f.table.shape[1] // 3 * len(f.rows), THREADS) for f, *_ in fields]
     four = [-(-a.shape[1] // 4) for *_, a, _ in fields]
     coefficients, stored = (wp.dtype_from_torch(sides[0][name].dtype) for name in ("a", "modes"))
     kernel = make_contraction(arena.precision, (four[0], four[-1]), coefficients, tile, number > 1, stored)
     # One field alone stands on both sides; the second gets no thread.
     return arena.pack(
-        kernel, number * sum(threads), THREADS, needed=needed, one=sides[0], two=sides[-1],
+        kernel, number * sum(threads), THREADS, in_N=in_N, one=sides[0], two=sides[-1],
         threads=threads[0], tiles=number, lanes=arena.lanes(THREADS),
     )  # fmt: skip
 
@@ -159,7 +162,7 @@ def _contraction(arena: Arena, fields: Sequence[tuple], needed: torch.Tensor, ti
 def _elastic(arena: Arena, span: GridSpan, materials: Sequence[Material], F: torch.Tensor):
     """The launch of τ = τ(F) at N; without flow the history keeps its values at rest."""
     precision, n, material = arena.precision, len(F), materials[0]
-    history = np.concatenate([one.initial_history(span.size) for one in materials])
+    history = np.concatenate([law.initial_history(span.size) for law in materials])
     history = arena.hold(history, arena.real)
     vecH = wp.types.vector(length=material.history_size, dtype=precision.real)
     kernel = make_elastic_stress(material.functions(precision), precision, material.history_size)

@@ -80,7 +80,7 @@ def make_combination(
         stored: type of modes; fp16 on a GPU alone, each over its length (`Arena.halved`).
     """
     real = precision.real
-    found = wp.types.vector(length=3 * sums * tile, dtype=real)
+    values = wp.types.vector(length=3 * sums * tile, dtype=real)
     types = {"real": precision.native, "stored": _NATIVE[stored]}
 
     @wp.func_native(
@@ -97,7 +97,7 @@ def make_combination(
         p: int,
         c: int,
         live: bool,
-    ) -> found: ...
+    ) -> values: ...
 
     return combined
 
@@ -113,7 +113,7 @@ def _make_field_arrays(precision: Precision, coefficients, stored):
         modes: wp.array(dtype=stored)
         lengths: wp.array(dtype=real)
         a: wp.array2d(dtype=coefficients)
-        found: wp.array3d(dtype=real)
+        values: wp.array3d(dtype=real)
 
     return Field
 
@@ -126,8 +126,8 @@ def _make_field(precision: Precision, vectors: int, coefficients, tile: int, sev
     Field = _make_field_arrays(precision, coefficients, stored)
 
     @wp.func
-    def field(needed: wp.array2d(dtype=wp.int32), its: Field, start: int, t: int):
-        n, components = needed.shape[1], its.mean.shape[1]
+    def field(in_N: wp.array2d(dtype=wp.int32), its: Field, start: int, t: int):
+        n, components = in_N.shape[1], its.mean.shape[1]
         groups = components / 3
         if wp.static(several):  # what a warp stores then lies together, which gains more than its loads lose
             group, p = t % groups, t / groups
@@ -136,7 +136,7 @@ def _make_field(precision: Precision, vectors: int, coefficients, tile: int, sev
         c = 3 * group
         bits = 0
         if c < components and p < n:
-            bits = needed[start / wp.static(tile), p]
+            bits = in_N[start / wp.static(tile), p]
         live = bits != 0
         middle = vec3()
         if live:  # loaded before all that is waited for below
@@ -153,20 +153,20 @@ def _make_field(precision: Precision, vectors: int, coefficients, tile: int, sev
                 two = value[3 * s + 1] + middle[1]
                 three = value[3 * s + 2] + middle[2]
                 if components == 9:
-                    its.found[row, group, 0] = one
-                    its.found[row, group, 1] = two
-                    its.found[row, group, 2] = three
+                    its.values[row, group, 0] = one
+                    its.values[row, group, 1] = two
+                    its.values[row, group, 2] = three
                 elif group == 0:
-                    its.found[row, 0, 0] = one
-                    its.found[row, 0, 1] = two
-                    its.found[row, 1, 0] = two
-                    its.found[row, 0, 2] = three
-                    its.found[row, 2, 0] = three
+                    its.values[row, 0, 0] = one
+                    its.values[row, 0, 1] = two
+                    its.values[row, 1, 0] = two
+                    its.values[row, 0, 2] = three
+                    its.values[row, 2, 0] = three
                 else:
-                    its.found[row, 1, 1] = one
-                    its.found[row, 1, 2] = two
-                    its.found[row, 2, 1] = two
-                    its.found[row, 2, 2] = three
+                    its.values[row, 1, 1] = one
+                    its.values[row, 1, 2] = two
+                    its.values[row, 2, 1] = two
+                    its.values[row, 2, 2] = three
 
     return field
 
@@ -184,7 +184,7 @@ def make_contraction(
 
     A thread has three components of a particle, in the runs of a tile; `several` tiles have blocks in
     turn. The first `threads` are those of the first field. The six components of a symmetric field are xx xy
-    xz yy yz zz, the nine of another go row by row. Nothing is found where the bit of a run in `needed`
+    xz yy yz zz, the nine of another go row by row. Nothing is written where the bit of a run in `in_N`
     is not set, see `make_others`. `vectors` are those of four modes of either field, `coefficients` is the
     type of a, `stored` that of modes.
     """
@@ -194,14 +194,14 @@ def make_contraction(
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def contraction(
-        needed: wp.array2d(dtype=wp.int32), one: Field, two: Field, threads: int, tiles: int, lanes: int
+        in_N: wp.array2d(dtype=wp.int32), one: Field, two: Field, threads: int, tiles: int, lanes: int
     ):
         t = within(wp.tid(), tiles, lanes)
         start = tile_of(wp.tid(), tiles, lanes) * wp.static(tile)
         if t < threads:  # whole blocks
-            first(needed, one, start, t)
+            first(in_N, one, start, t)
         else:
-            second(needed, two, start, t - threads)
+            second(in_N, two, start, t - threads)
 
     return contraction
 
@@ -227,7 +227,7 @@ def _make_gathered(precision: Precision):
 
 @cache
 def make_gathering(precision: Precision, several: bool = False):
-    """Kernel of what the projection needs of S, one block a run and mode: b_k = Σ_p w_p B_p,kᵀ Δt v_p.
+    """Kernel of the sums of S for the projection, one block a run and mode: b_k = Σ_p w_p B_p,kᵀ Δt v_p.
 
     The displacement of S in the step is Δt v_p, as its positions before it lie on the manifold. The last
     block of a run gives Σ_p w_p |Δt v_p|².
@@ -236,16 +236,16 @@ def make_gathering(precision: Precision, several: bool = False):
     Gathered = _make_gathered(precision)
 
     @wp.func_native(native_code(__package__, "gathering"))
-    def share(given: Gathered, run: int, k: int, lane: int, lanes: int) -> wp.float64: ...
+    def share(gathered: Gathered, run: int, k: int, lane: int, lanes: int) -> wp.float64: ...
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
-    def gathering(given: Gathered, lanes: int):
+    def gathering(gathered: Gathered, lanes: int):
         t = wp.tid()
-        sums = given.b.shape[1]
+        sums = gathered.b.shape[1]
         run = run_of(t / lanes, sums)
         k, lane = t / lanes - run * sums, t % lanes
-        total = share(given, run, k, lane, lanes)
+        total = share(gathered, run, k, lane, lanes)
         if lane == 0:
-            given.b[run, k] = total
+            gathered.b[run, k] = total
 
     return gathering

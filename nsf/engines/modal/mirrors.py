@@ -1,4 +1,4 @@
-"""The text that the modal engine mirrors: where the reference is edited, the edit is what runs.
+"""The text that the modal engine mirrors: an edit of the reference is what runs.
 
 The kernels compute what the reference said when they were written. `mirrors.json` has the sha256 of each
 function that they stand for, docstrings, comments and white space apart. Where one reads otherwise, in its
@@ -18,7 +18,7 @@ from pathlib import Path
 from nsf.code import text_of, text_sum
 
 TABLE = Path(__file__).with_name("mirrors.json")
-#: What the kernels stand for: classes, of which every function counts, and functions.
+#: The text that the kernels stand for: classes, of which every function counts, and functions.
 MIRRORED = (
     "nsf.dynamics.step:Step",
     "nsf.dynamics.step:SearchingStep",
@@ -30,7 +30,7 @@ MIRRORED = (
     "nsf.dynamics.sources:Sources",
     "nsf.dynamics.sources:StressNeural",
     "nsf.dynamics.sources:StressFromDeformation",
-    "nsf.dynamics.integration:NeighbourSearch.needed",
+    "nsf.dynamics.integration:NeighbourSearch.integration_mask",
     "nsf.dynamics.integration:NeighbourSearch.mark_nodes",
     "nsf.dynamics.integration:NeighbourSearch.flag_particles",
     "nsf.dynamics.integration:_kernels",
@@ -79,15 +79,15 @@ def _digests() -> dict[str, str]:
 @cache
 def _digests_on_disk() -> dict[str, str]:
     """As `_digests`, of the text of the files; nothing is imported."""
-    found = {}
+    digests = {}
     for mirrored in MIRRORED:
         module, _, name = mirrored.partition(":")
         path = Path(__file__).parents[2].joinpath(*module.split(".")[1:]).with_suffix(".py")
         for inner, node in _defined(ast.parse(text_of(path)), name):
             lines = text_of(path).splitlines(keepends=True)
             first = min([node.lineno, *(decorator.lineno for decorator in node.decorator_list)])
-            found[f"{mirrored}.{inner}".rstrip(".")] = text_sum("".join(lines[first - 1 : node.end_lineno]))
-    return found
+            digests[f"{mirrored}.{inner}".rstrip(".")] = text_sum("".join(lines[first - 1 : node.end_lineno]))
+    return digests
 
 
 def _defined(tree: ast.AST, name: str) -> Iterator[tuple[str, ast.FunctionDef]]:
@@ -105,8 +105,8 @@ def _defined(tree: ast.AST, name: str) -> Iterator[tuple[str, ast.FunctionDef]]:
 
 def _functions(mirrored: str) -> Iterator[tuple[str, Callable]]:
     """Names and functions of an entry of `MIRRORED`."""
-    found = pkgutil.resolve_name(mirrored)
-    members = vars(found) if isinstance(found, type) else {"": found}
+    mirror = pkgutil.resolve_name(mirrored)
+    members = vars(mirror) if isinstance(mirror, type) else {"": mirror}
     for name, member in members.items():
         # Of a property, a cached one, or what functools wraps, the function within.
         function = inspect.unwrap(getattr(member, "fget", None) or getattr(member, "func", None) or member)

@@ -26,7 +26,7 @@ def _make_motion(precision: Precision):
     """Warp struct of what tells where particles are, and of what is found.
 
     The coefficients a and their rate are of each run, as are whether its step is the `first`, the
-    number of the `step`, the `stamps` of cells, and `count`: particles needed in all steps, and the steps.
+    number of the `step`, the `stamps` of cells, and `count`: particles of N in all steps, and the steps.
     `mean` and the box of cells, which begins at `lower`, are common to all. x, v and the initial velocity
     have a row for each particle of each run, the `of_sample` of S first.
     """
@@ -72,7 +72,7 @@ def make_sample(precision: Precision, shape_name: str, several: bool = False):
     Motion = _make_motion(precision)
 
     @wp.func_native(native_code(__package__, "sample", real=precision.native))
-    def combined(given: Motion, modes: wp.array(dtype=wp.float32), p: int, run: int, lane: int) -> sums: ...
+    def combined(motion: Motion, modes: wp.array(dtype=wp.float32), p: int, run: int, lane: int) -> sums: ...
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
     def sample(at: Motion, modes: wp.array(dtype=wp.float32), grid_shape: wp.vec3i, lanes: int):
@@ -106,7 +106,7 @@ def make_sample(precision: Precision, shape_name: str, several: bool = False):
 
 
 @cache
-def make_others(
+def make_neighbours(
     precision: Precision,
     shape_name: str,
     vectors: int,
@@ -117,8 +117,8 @@ def make_others(
     """Kernel of x and v at N without S, as `make_sample`, one thread a particle and tile of runs.
 
     It is launched over whole blocks; `several` tiles have blocks in turn. Only particles in the cells that
-    `make_sample` has stamped are needed; it moves the rest off the grid, where the transfers pass over it.
-    Which runs of a tile need a particle are the bits of `needed`. `stored` is the type of the modes.
+    `make_sample` has stamped are of N; it moves all others off the grid, where the transfers pass over them.
+    Which runs of a tile need a particle are the bits of `in_N`. `stored` is the type of the modes.
 
     Source: paper section 5.4, b.
     """
@@ -130,14 +130,14 @@ def make_others(
     combined = make_combination(precision, vectors, 2, tile, several, wp.float64, stored)
 
     @wp.func_native(native_code(__package__, "count"))
-    def add_up(count: wp.array2d(dtype=wp.int64), run: int, taken: int): ...
+    def add_up(count: wp.array2d(dtype=wp.int64), run: int, needs: int): ...
 
     @wp.kernel(enable_backward=False, module="unique", grid_stride=False)
-    def others(
+    def neighbours(
         at: Motion,
         modes: wp.array(dtype=stored),
         lengths: wp.array(dtype=real),
-        needed: wp.array2d(dtype=wp.int32),
+        in_N: wp.array2d(dtype=wp.int32),
         tiles: int,
         lanes: int,
     ):
@@ -149,14 +149,14 @@ def make_others(
         if not live:
             return
         p = of_sample + t
-        mean, taken, beginning = at.mean[p], places(), places()
+        mean, needs, beginning = at.mean[p], places(), places()
         # Before anything is written, so that all loads are under way together.
         for s in range(wp.static(tile)):
             run = wp.min(start + s, at.first.shape[0] - 1)
             x = mean + vec3(moved[6 * s], moved[6 * s + 1], moved[6 * s + 2])
             c = _cell(base_node(x, at.inv_dx), at.lower, at.extent)
             stamp = at.stamps[run, wp.max(c, 0)]
-            taken[s] = wp.where(c >= 0 and stamp == at.step[run], 1, 0)
+            needs[s] = wp.where(c >= 0 and stamp == at.step[run], 1, 0)
             beginning[s] = at.first[run]
         bits = 0
         for s in range(wp.static(tile)):
@@ -164,7 +164,7 @@ def make_others(
             if run < at.first.shape[0]:
                 row = run * n + p
                 x = vec3(real(-1.0), real(-1.0), real(-1.0))  # the grid starts at the origin
-                if taken[s] != 0:
+                if needs[s] != 0:
                     bits += wp.static(1 << s)
                     x = mean + vec3(moved[6 * s], moved[6 * s + 1], moved[6 * s + 2])
                     if beginning[s] != 0:
@@ -172,7 +172,7 @@ def make_others(
                     else:
                         at.v[row] = vec3(moved[6 * s + 3], moved[6 * s + 4], moved[6 * s + 5])
                 at.x[row] = x
-                add_up(at.count, run, taken[s])
-        needed[start / wp.static(tile), p] = bits
+                add_up(at.count, run, needs[s])
+        in_N[start / wp.static(tile), p] = bits
 
-    return others
+    return neighbours

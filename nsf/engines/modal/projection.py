@@ -115,20 +115,21 @@ def make_projection(
     """
     _, run_of = make_runs(several)
     rows = inputs_of_widest(widths, latents)
-    kept = shared_bytes(precision, widths, latents, modes) + 8 * modes**2 <= SHARED - TAKEN
+    in_shared = shared_bytes(precision, widths, latents, modes) + 8 * modes**2 <= SHARED - TAKEN
     Inversion = _make_inversion(precision)
     constants = {
         "R": latents, "K": modes, "WIDTHS": widths or (0,), "LAYERS": max(len(widths) - 1, 0), "ROWS": rows,
-        "MEMBERS": members, "SHARERS": PARTS, "WARP": WARP, "KEPT": kept, "PREPARE": PREPARE, "SOLVE": SOLVE,
+        "MEMBERS": members, "SHARERS": PARTS, "WARP": WARP, "IN_SHARED": in_shared,
+        "PREPARE": PREPARE, "SOLVE": SOLVE,
     }  # fmt: skip
 
     @wp.func_native(native_code(__package__, "projection", real=precision.native, **constants))
-    def invert(given: Inversion, task: int, run: int): ...
+    def invert(inversion: Inversion, task: int, run: int): ...
 
     @wp.kernel(
         enable_backward=False, module="unique", grid_stride=False, launch_bounds=projection_block(widths)
     )
-    def projection(given: Inversion, task: int, threads: int):
-        invert(given, task, run_of(wp.tid(), threads))
+    def projection(inversion: Inversion, task: int, threads: int):
+        invert(inversion, task, run_of(wp.tid(), threads))
 
     return projection

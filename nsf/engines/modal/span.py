@@ -14,7 +14,7 @@ from nsf.engines.modal.arena import Arena
 from nsf.engines.modal.closure import packed_weights, projection_block
 from nsf.engines.modal.fields import field_launches
 from nsf.engines.modal.gathering import THREADS, make_gathering, tiling
-from nsf.engines.modal.placing import make_others, make_sample
+from nsf.engines.modal.placing import make_neighbours, make_sample
 from nsf.engines.modal.projection import EVALUATE, PREPARE, SOLVE, make_projection, prepared_size
 from nsf.kinematics.fields.modal import ModalFactors
 from nsf.mpm.grid.shape import DEGREES, stencil_offset
@@ -41,17 +41,17 @@ class ModalSpan(GridSpan):
 
     Attributes:
         coefficients: where the runs are.
-        needed: see `Placing`.
+        in_N: see `Placing`.
     """
 
     def __init__(self, batch: Batch, sample: SampleSpan, sets: ParticleSets):
-        one = batch.shared
-        manifold, shape = one.manifold, one.transfer.shape
-        like = {"dtype": one.dtype, "device": one.torch_device}
-        order = _by_cell(sets, one.constants.X, one.geometry.dx, shape)
+        shared = batch.shared
+        manifold, shape = shared.manifold, shared.transfer.shape
+        like = {"dtype": shared.dtype, "device": shared.torch_device}
+        order = _by_cell(sets, shared.constants.X, shared.geometry.dx, shape)
         super().__init__(batch, sets, order, manifold.restrict(sets.sample, **like))
         self._clears_ahead = self.grid_step.grid.sparse  # else what is cleared depends on where particles are
-        self._arena = arena = Arena(one.precision, one.device)
+        self._arena = arena = Arena(shared.precision, shared.device)
         deformation = manifold.factors("deformation", order, **like)
         of_sample = arena.modes(deformation.table, deformation.rows[: self.s])
         self.coefficients = state = Coefficients(
@@ -62,15 +62,14 @@ class ModalSpan(GridSpan):
         tiles = tiling(len(batch), arena.real.itemsize * 4 * max(2 * of_x, sum(of_heads)))
         # What is handed on is the span of every engine, which is whole by now.
         self._placing = Placing(arena, state, deformation, of_sample, self, tiles)
-        self.needed = self._placing.needed
-        self._networks, self._fields = field_launches(arena, self, state.a, state.rate, self.needed, tiles)
+        self.in_N = self._placing.in_N
+        self._networks, self._fields = field_launches(arena, self, state.a, state.rate, self.in_N, tiles)
         self._projection = Projection(arena, state, deformation, of_sample, self, sample.weights)
 
     @property
     @override
     def stages(self) -> Stages:
-        own = {"inference": self.infer, "p2g": self.p2g, "g2p": self.update_g2p, "inversion": self.project}
-        return own
+        return {"inference": self.infer, "p2g": self.p2g, "g2p": self.update_g2p, "inversion": self.project}
 
     @override
     def enter(self, first: bool) -> None:
@@ -101,12 +100,12 @@ class ModalSpan(GridSpan):
         Beside them, where the boundaries will be, and what of the inversion is known before the step.
         """
         if self._clears_ahead:
-            with self._arena.beside(_CLEARING):
+            with self._arena.concurrently(_CLEARING):
                 self.grid_step.clear(self.particles.x)
-        with self._arena.beside(_PREPARING):  # what nothing needs before S is moved
+        with self._arena.concurrently(_PREPARING):  # what nothing needs before S is moved
             self.grid_step.follow()
             self._projection.prepare.launch()
-        with self._arena.beside(_HEADS):
+        with self._arena.concurrently(_HEADS):
             for launch in self._networks:
                 launch.launch()
         for launch in self._placing.launches:
@@ -138,7 +137,7 @@ class ModalSpan(GridSpan):
     @override
     def mean_sizes(self) -> list[float]:
         counts = self._placing.count.tolist()
-        return [found / steps if steps else float(self.size) for found, steps in counts]
+        return [particles / steps if steps else float(self.size) for particles, steps in counts]
 
     @property
     @override
@@ -176,11 +175,11 @@ class Placing:
         arena, state: of the batch.
         deformation: factors of g at N; of_sample: its modes at S.
         span: whose rows of x and v are found.
-        tiles: number of tiles, and of runs in a tile; each of these has a bit in `needed`.
+        tiles: number of tiles, and of runs in a tile; each of these has a bit in `in_N`.
 
     Attributes:
-        needed: [tiles, n] in which runs of a tile a particle is, as bits.
-        count: [B, 2] particles needed in all steps taken, and the number of these.
+        in_N: [tiles, n] in which runs of a tile a particle is of N, as bits.
+        count: [B, 2] particles of N in all steps taken, and the number of these.
         launches: in order.
     """
 
@@ -204,8 +203,8 @@ class Placing:
         extent = upper - lower + 1
         B, s, n = len(state), span.s, span.size
         number, tile = tiles
-        whole = [2 ** min(tile, B - tile * before) - 1 for before in range(number)]
-        self.needed = arena.hold(torch.tensor(whole)[:, None].expand(number, n), torch.int32)
+        all_runs = [2 ** min(tile, B - tile * before) - 1 for before in range(number)]
+        self.in_N = arena.hold(torch.tensor(all_runs)[:, None].expand(number, n), torch.int32)
         self.count = arena.zeros(B, 2, dtype=torch.int64)
         stamps = arena.zeros(B, int(extent.prod()), dtype=torch.int32)
         mean = as_vectors(arena.hold(deformation.mean, arena.real), precision)
@@ -217,17 +216,17 @@ class Placing:
             "extent": wp.vec3i(*extent.tolist()), "of_sample": s,
         }  # fmt: skip
         lanes, kernel = arena.lanes(WARP), make_sample(precision, shape, B > 1)
-        own = {"modes": of_sample, "grid_shape": grid.shape, "lanes": lanes}
-        self.launches = [arena.pack(kernel, B * s * lanes, at=motion, **own)]
+        arguments = {"modes": of_sample, "grid_shape": grid.shape, "lanes": lanes}
+        self.launches = [arena.pack(kernel, B * s * lanes, at=motion, **arguments)]
         if n == s:
             return
         modes, lengths = arena.halved(deformation.table, deformation.rows[s:])
         four, kind = -(-state.a.shape[1] // 4), wp.dtype_from_torch(modes.dtype)
-        kernel = make_others(precision, shape, four, tile, number > 1, kind)
+        kernel = make_neighbours(precision, shape, four, tile, number > 1, kind)
         threads = number * arena.whole_blocks(n - s, THREADS)
-        own = {"modes": modes, "lengths": lengths, "needed": self.needed, "tiles": number}
-        own["lanes"] = arena.lanes(THREADS)
-        self.launches.append(arena.pack(kernel, threads, THREADS, at=motion, **own))
+        arguments = {"modes": modes, "lengths": lengths, "in_N": self.in_N, "tiles": number}
+        arguments["lanes"] = arena.lanes(THREADS)
+        self.launches.append(arena.pack(kernel, threads, THREADS, at=motion, **arguments))
 
 
 class Projection:
@@ -241,9 +240,9 @@ class Projection:
     """
 
     def __init__(self, arena, state, deformation, displacement, span: GridSpan, weights: np.ndarray | None):
-        one, s, (count, K) = span.batch.shared, span.s, state.a.shape
-        projector, record, r = one.projector, span.record, state.latent.shape[1]
-        of_sample = deformation.table[deformation.rows[:s]].to(one.torch_device)
+        shared, s, (count, K) = span.batch.shared, span.s, state.a.shape
+        projector, record, r = shared.projector, span.record, state.latent.shape[1]
+        of_sample = deformation.table[deformation.rows[:s]].to(shared.torch_device)
         w = torch.ones(s) if weights is None else torch.as_tensor(weights / np.mean(weights))
         w = arena.hold(w, torch.float64)
         B = of_sample.double().flatten(0, 1)
@@ -255,9 +254,9 @@ class Projection:
         lanes, velocity = arena.lanes(THREADS), as_vectors(span.v, arena.precision)
         self.gather = arena.pack(
             make_gathering(arena.precision, count > 1), count * (K + 1) * lanes, THREADS, lanes=lanes,
-            given={
+            gathered={
                 "displacement": displacement, "v": velocity, "rows": span.size, "weights": w,
-                "dt": one.dt, "b": b,
+                "dt": shared.dt, "b": b,
             },
         )  # fmt: skip
         self.sigma = arena.hold(deformation.leading, torch.float64)
@@ -270,13 +269,13 @@ class Projection:
             "updates": record.updates, "row": record.row, "first": state.first, "step": state.step,
             "prepared": arena.zeros(count, prepared_size(r, K)), "b": b,
         }  # fmt: skip
-        given = {name: values.view(count, -1) for name, values in of_each.items()} | {
-            "weights": weights, "scale": deformation.scale, "G": G, "sample": s, "dt": one.dt,
+        inversion = {name: values.view(count, -1) for name, values in of_each.items()} | {
+            "weights": weights, "scale": deformation.scale, "G": G, "sample": s, "dt": shared.dt,
             "sigma": self.sigma, "iterations": projector.iterations,
             "tolerance": projector.tolerance, "linear": isinstance(projector, Taylor),
         }  # fmt: skip
         self.evaluate, self.prepare, self.solve = (
-            arena.pack(kernel, count * threads, block, given=given, task=task, threads=threads)
+            arena.pack(kernel, count * threads, block, inversion=inversion, task=task, threads=threads)
             for task in (EVALUATE, PREPARE, SOLVE)
         )
 
@@ -290,11 +289,11 @@ def _closure(deformation: ModalFactors, is_cuda: bool) -> tuple[tuple[int, ...],
     widths = (len(deformation.leading), *(len(b) // members for _, b in hidden), len(b_last))
     packed = []
     for member in range(members):
-        own = [tuple(part.unflatten(0, (members, -1))[member] for part in layer) for layer in hidden]
+        layers = [tuple(part.unflatten(0, (members, -1))[member] for part in layer) for layer in hidden]
         # What is in the unit of the coefficients is divided by it, so that fp32 holds it; all share a bias.
         last = W_last.unflatten(1, (members, -1))[:, member], b_last * (member == 0)
-        own.append(tuple(part / deformation.scale for part in last))
-        packed.append(packed_weights(own, is_cuda))
+        layers.append(tuple(part / deformation.scale for part in last))
+        packed.append(packed_weights(layers, is_cuda))
     return widths, torch.cat(packed)
 
 
@@ -303,5 +302,5 @@ def _by_cell(sets: ParticleSets, X: np.ndarray, dx: float, shape: str) -> np.nda
 
     Neighbours are needed together, and P2G adds up those of one cell before they reach the grid.
     """
-    others = sets.integration[len(sets.sample) :]
-    return np.concatenate([sets.sample, others[cell_order(X[others], dx, stencil_offset(shape))]])
+    neighbours = sets.integration[len(sets.sample) :]
+    return np.concatenate([sets.sample, neighbours[cell_order(X[neighbours], dx, stencil_offset(shape))]])

@@ -1,1 +1,1 @@
-"""What a body meets: colliders, the domain's walls, their motion and contact."""
+"""Colliders and the domain's walls: shapes, motion and contact."""

@@ -121,16 +121,16 @@ class BoundaryArrays:
         axes, pivots = zip(*(m.hinge() for m in motions), strict=True)
         # The first two keyframes of each solid are a hand's.
         ends = np.cumsum([_BY_HAND + len(t) for t in times])
-        self._own = np.array([0, *ends[:-1]]) + _BY_HAND, ends - 1
+        self._keyframe_rows = np.array([0, *ends[:-1]]) + _BY_HAND, ends - 1
         self._keyframes = [
-            np.concatenate([part for own in lists for part in (np.zeros_like(own[:_BY_HAND]), own)])
+            np.concatenate([part for keys in lists for part in (np.zeros_like(keys[:_BY_HAND]), keys)])
             for lists in (times, translations, angles)
         ]
         self._prescribed = [
             array(self._keyframes[0], wp.float64),
             array(self._keyframes[1], wp.vec3d, 3),
             array(self._keyframes[2], wp.float64),
-            *(wp.array(which, dtype=wp.int32, device=device) for which in self._own),
+            *(wp.array(which, dtype=wp.int32, device=device) for which in self._keyframe_rows),
             array(axes, wp.vec3d, 3),
             array(pivots, wp.vec3d, 3),
             array(positions, wp.vec3d, 3),
@@ -149,10 +149,10 @@ class BoundaryArrays:
             replace(solid, motion=motion) if c == collider else solid
             for c, solid in enumerate(self.colliders)
         )
-        first = int(self._own[0][collider]) - _BY_HAND
-        for held, values, array in zip(self._keyframes, motion.keyframes(), self._prescribed, strict=False):
-            held[first : first + _BY_HAND] = values
-            array.assign(held)
+        first = int(self._keyframe_rows[0][collider]) - _BY_HAND
+        for keys, values, array in zip(self._keyframes, motion.keyframes(), self._prescribed, strict=False):
+            keys[first : first + _BY_HAND] = values
+            array.assign(keys)
         self._point()
 
     def release(self) -> None:
@@ -162,9 +162,9 @@ class BoundaryArrays:
             self._point()
 
     def _point(self) -> None:
-        """Say to the kernel which keyframes each solid follows."""
+        """Assign to each solid the keyframes that the kernel follows."""
         steered = np.array([a is not b for a, b in zip(self.colliders, self._programs, strict=True)])
-        first, last = self._own
+        first, last = self._keyframe_rows
         begin = np.where(steered, first - _BY_HAND, first)
         end = np.where(steered, begin + _BY_HAND - 1, last)
         for array, values in zip(self._prescribed[3:5], (begin, end), strict=True):
@@ -174,6 +174,6 @@ class BoundaryArrays:
         """Set pose and velocity of every collider for the next step of dt [s], if any of them changes."""
         if not self.changes:
             return
-        found = [self.active, self.position, self.orientation, self.velocity, self.gradient]
-        inputs = [*self._prescribed, dt, self.steps, *found]
+        outputs = [self.active, self.position, self.orientation, self.velocity, self.gradient]
+        inputs = [*self._prescribed, dt, self.steps, *outputs]
         wp.launch(self._follow, dim=len(self.colliders), inputs=inputs, device=self._device)

@@ -54,10 +54,10 @@ class Motion:
                 "leave out the motion of a solid at rest"
             )
         for name in ("translations", "angles"):
-            given = getattr(self, name)
-            if not is_list(given) or len(given) not in (0, len(times)):
+            values = getattr(self, name)
+            if not is_list(values) or len(values) not in (0, len(times)):
                 raise ConfigError(
-                    f"motion.{name}={given} must be a list of {len(times)} keyframes, as motion.times is"
+                    f"motion.{name}={values} must be a list of {len(times)} keyframes, as motion.times is"
                 )
         if not len(self.translations) and not len(self.angles):
             raise ConfigError(

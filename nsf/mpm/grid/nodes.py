@@ -167,8 +167,8 @@ class Grid:
     @property
     def nbytes(self) -> int:
         """Bytes on the device."""
-        own = (self.values, self.nodes, self.slots, self.marks, self.blocks, self.listed)
-        return sum(a.capacity for a in own)
+        arrays = (self.values, self.nodes, self.slots, self.marks, self.blocks, self.listed)
+        return sum(a.capacity for a in arrays)
 
     @property
     def stored(self) -> list:

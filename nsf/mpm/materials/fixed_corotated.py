@@ -64,8 +64,8 @@ def fixed_corotated_stretches(principal: np.ndarray, mu: np.ndarray, lam: np.nda
         unreal = np.isnan(product)
         upper = np.where((product < J) | (unreal & (lam > 0.0)), J, upper)
         lower = np.where((product > J) | (unreal & (lam <= 0.0)), J, lower)
-        kept = (J + step >= lower) & (J + step <= upper)
-        J = np.where(kept, J + step, 0.5 * (lower + upper))
+        inside = (J + step >= lower) & (J + step <= upper)
+        J = np.where(inside, J + step, 0.5 * (lower + upper))
     return np.where(np.abs(step) < _CLOSED, stretches, np.nan)
 
 

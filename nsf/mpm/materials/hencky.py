@@ -90,11 +90,11 @@ def hencky_update(precision: Precision, flow, Params):
     @wp.func
     def update(F_trial: mat33, history: vecH, mu: real, lam: real, params: Params, dt: real):
         U, eps, V = decompose(F_trial)
-        left, h = flow(eps, history, mu, lam, params)
-        tau = stress(U, left, mu, lam)
-        if left == eps:
+        eps_e, h = flow(eps, history, mu, lam, params)
+        tau = stress(U, eps_e, mu, lam)
+        if eps_e == eps:
             return F_trial, h, tau
-        return compose(U, left, V), h, tau
+        return compose(U, eps_e, V), h, tau
 
     return update
 

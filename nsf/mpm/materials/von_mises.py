@@ -44,13 +44,13 @@ def _functions(precision: Precision) -> LawFunctions:
         tau_Y = tau_Y + (real(2.0) * mu * params.hardening - params.softening) * flowed
         return eps - (flowed / size) * deviator, vecH(tau_Y)
 
-    whole = hencky_update(precision, flow, Params)
+    flowing_update = hencky_update(precision, flow, Params)
 
     @wp.func
     def update(F_trial: mat33, history: vecH, mu: real, lam: real, params: Params, dt: real):
         if history[0] <= real(0.0):
             return wp.identity(n=3, dtype=real), history, mat33()
-        F_e, h, tau = whole(F_trial, history, mu, lam, params, dt)
+        F_e, h, tau = flowing_update(F_trial, history, mu, lam, params, dt)
         if h[0] <= real(0.0):
             tau = mat33()
         return F_e, h, tau

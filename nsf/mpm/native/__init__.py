@@ -25,7 +25,7 @@ def native_code(package: str, name: str, **constants: Constant) -> str:
 
     def text(name: str) -> str:
         code = (folder / f"{name}.h").read_text(encoding="utf-8")
-        return re.sub(r'^ *#include "(\w+)\.h"$', lambda found: text(found[1]), code, flags=re.MULTILINE)
+        return re.sub(r'^ *#include "(\w+)\.h"$', lambda match: text(match[1]), code, flags=re.MULTILINE)
 
     return "\n".join([*(_declared(key, value) for key, value in constants.items()), text(name)])
 

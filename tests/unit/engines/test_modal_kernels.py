@@ -13,7 +13,7 @@ from nsf.engines.modal.arena import Arena
 from nsf.engines.modal.closure import packed_weights, projection_block
 from nsf.engines.modal.gathering import THREADS, make_contraction, make_gathering, tiling
 from nsf.engines.modal.networks import make_layer, make_product, product_blocks
-from nsf.engines.modal.placing import make_others, make_sample
+from nsf.engines.modal.placing import make_neighbours, make_sample
 from nsf.engines.modal.projection import (
     EVALUATE,
     PREPARE,
@@ -81,14 +81,14 @@ def test_contraction(arena, rng, n, K, simulations, fields, coefficients, half):
         expected = mean.double() + torch.einsum("nck,bk->bnc", read, a.double())
         found = arena.zeros(simulations * n, 3, 3)
         mean = arena.hold(mean, torch.float64)
-        sides.append({"mean": mean, "modes": stored, "lengths": lengths, "a": a, "found": found})
+        sides.append({"mean": mean, "modes": stored, "lengths": lengths, "a": a, "values": found})
         threads.append(arena.whole_blocks(components // 3 * n, THREADS))
         sizes.append(-(-k // 4))
         results.append((found, expected.cpu().numpy().reshape(simulations * n, components)))
     kind = wp.dtype_from_torch(stored.dtype)
     kernel = make_contraction(arena.precision, (sizes[0], sizes[-1]), of, tile, tiles > 1, kind)
     arena.pack(
-        kernel, tiles * sum(threads), THREADS, needed=bits, one=sides[0], two=sides[-1], threads=threads[0],
+        kernel, tiles * sum(threads), THREADS, in_N=bits, one=sides[0], two=sides[-1], threads=threads[0],
         tiles=tiles, lanes=arena.lanes(THREADS),
     ).launch()  # fmt: skip
     wp.synchronize_device(arena.device)
@@ -156,7 +156,7 @@ def test_where_the_sample_and_its_neighbours_are(arena, rng, n, K, simulations):
         }  # fmt: skip
         sample, others = (
             make_sample(arena.precision, "quadratic", several),
-            make_others(arena.precision, "quadratic", -(-K // 4), tile, tiles > 1, kind),
+            make_neighbours(arena.precision, "quadratic", -(-K // 4), tile, tiles > 1, kind),
         )
         arena.pack(
             sample, simulations * s * warp, at=motion, modes=arena.modes(modes[:s]), grid_shape=shape,
@@ -164,7 +164,7 @@ def test_where_the_sample_and_its_neighbours_are(arena, rng, n, K, simulations):
         ).launch()  # fmt: skip
         arena.pack(
             others, tiles * arena.whole_blocks(n - s, THREADS), THREADS, at=motion, modes=stored,
-            lengths=lengths, needed=needed, tiles=tiles, lanes=lanes,
+            lengths=lengths, in_N=needed, tiles=tiles, lanes=lanes,
         ).launch()  # fmt: skip
         wp.synchronize_device(arena.device)
         places, moved = (torch.einsum("nck,bk->bnc", read, c).cpu().numpy() for c in (a, rate))
@@ -193,7 +193,7 @@ def test_what_the_projection_takes_from_the_sample(arena, rng, n, K, simulations
     velocity = as_vectors(v.flatten(0, 1), arena.precision)
     given = {"displacement": arena.modes(modes), "v": velocity, "rows": n, "weights": w, "dt": dt, "b": b}
     kernel = make_gathering(arena.precision, simulations > 1)
-    arena.pack(kernel, simulations * (K + 1) * lanes, THREADS, given=given, lanes=lanes).launch()
+    arena.pack(kernel, simulations * (K + 1) * lanes, THREADS, gathered=given, lanes=lanes).launch()
     wp.synchronize_device(arena.device)
     moved = dt * v[:, :s]
     expected = torch.einsum("p,pck,bpc->bk", w, modes.double(), moved)
@@ -322,7 +322,7 @@ def test_the_inversion_finds_the_latents_that_moved_the_sample(
     threads = arena.lanes(block)
     tasks = []
     for task in (EVALUATE, PREPARE, SOLVE):
-        arena.pack(kernel, runs * threads, block, given=given, task=task, threads=threads).launch()
+        arena.pack(kernel, runs * threads, block, inversion=given, task=task, threads=threads).launch()
         wp.synchronize_device(arena.device)
         tasks.append({name: held[name].cpu().double().clone() for name in ("a", "rate", "latent")})
     evaluated, _, found = tasks

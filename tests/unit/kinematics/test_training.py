@@ -128,7 +128,7 @@ def test_seconds_before_an_interrupt_count(monkeypatch, train, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         train("basis", tmp_path)
     restore()
-    monkeypatch.setattr(module, "take", true_take)
+    monkeypatch.setattr(lightning.FieldTraining, "take", true_take)
     _, metrics = train("basis", tmp_path)
     assert metrics["deformation_seconds"] > 0.4  # two whole blocks of five steps came before
 

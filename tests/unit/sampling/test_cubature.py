@@ -19,7 +19,7 @@ STATES = 9
 
 
 @pytest.fixture(scope="module")
-def whole(chain, tiny_manifold):
+def solver_at(chain, tiny_manifold):
     """Problem parameters → the reduced solver whose sample is every particle."""
     sets = [ParticleSets(EVERYONE, EVERYONE, None)]
     return lambda parameters: nsf.reduced(
@@ -28,15 +28,17 @@ def whole(chain, tiny_manifold):
 
 
 @pytest.fixture(scope="module")
-def equations(tiny_manifold, whole):
-    return normal_equations(tiny_manifold, training_rows(tiny_manifold, 0.0, 1.0, STATES), EVERYONE, whole)
+def equations(tiny_manifold, solver_at):
+    return normal_equations(
+        tiny_manifold, training_rows(tiny_manifold, 0.0, 1.0, STATES), EVERYONE, solver_at
+    )
 
 
 @pytest.fixture(scope="module")
-def span_of(tiny_manifold, whole):
+def span_of(tiny_manifold, solver_at):
     """Size and settings → the first phase."""
     return lambda size, **settings: CubatureSampler(size, states=STATES, **settings).spans_of(
-        tiny_manifold, whole=whole
+        tiny_manifold, solver_at=solver_at
     )[0]
 
 
@@ -107,11 +109,11 @@ def test_a_step_that_is_not_finite_is_left_out(tiny_manifold):
     rows = training_rows(tiny_manifold, 0.0, 1.0, 3)
     lowest = float(tiny_manifold.training_parameters.min())
 
-    def whole(values):
+    def solver_at(values):
         return Still(np.nan if values["friction_angle"] == lowest else 1e-3)
 
-    columns, target, _ = normal_equations(tiny_manifold, rows, np.arange(40), whole)
-    rest, of_rest, _ = normal_equations(tiny_manifold, rows[1:], np.arange(40), whole)
+    columns, target, _ = normal_equations(tiny_manifold, rows, np.arange(40), solver_at)
+    rest, of_rest, _ = normal_equations(tiny_manifold, rows[1:], np.arange(40), solver_at)
     assert torch.equal(columns, rest)
     assert torch.equal(target, of_rest)
     with pytest.raises(ProjectionError, match="of the steps from 3 training states none is finite"):
@@ -137,7 +139,7 @@ def test_nonnegative_fit_meets_the_conditions_of_an_optimum():
 # -- the choice -----------------------------------------------------------------------------------------
 
 
-def test_a_cubature_of_any_size_takes_the_step_of_every_particle(tiny_manifold, whole, span_of):
+def test_a_cubature_of_any_size_takes_the_step_of_every_particle(tiny_manifold, solver_at, span_of):
     """With as many particles as wanted the sums are exact, and so is the Gauss-Newton step."""
     phase = span_of(500)
     assert 14 <= len(phase.particles) <= STATES * 14
@@ -147,7 +149,7 @@ def test_a_cubature_of_any_size_takes_the_step_of_every_particle(tiny_manifold, 
         parameters = {"friction_angle": float(tiny_manifold.training_parameters[row, 0])}
         latents = tiny_manifold.training_latents
         frame = row % 25
-        error, J = whole(parameters).equations_at(frame, latents[row], latents[row - 1])
+        error, J = solver_at(parameters).equations_at(frame, latents[row], latents[row - 1])
 
         def step(error, J):
             return torch.linalg.lstsq(J.flatten(0, 1), error.flatten()[:, None]).solution[:, 0]
@@ -172,10 +174,12 @@ def test_the_residual_falls_with_size_and_beats_random_samples(equations, span_o
         assert ours < np.mean(fitted)
 
 
-def test_a_cubature_out_of_cells_needs_fewer_integration_particles(chain, tiny_manifold, whole, equations):
+def test_a_cubature_out_of_cells_needs_fewer_integration_particles(
+    chain, tiny_manifold, solver_at, equations
+):
     """All of S is in the cells that are allowed, and weights bring the sums nearer than equal ones there."""
     few, any_cell = (
-        kind(24, states=STATES, **own).spans_of(tiny_manifold, whole=whole)
+        kind(24, states=STATES, **own).spans_of(tiny_manifold, solver_at=solver_at)
         for kind, own in ((CellSampler, {"cells": 3}), (CubatureSampler, {}))
     )
     every, cell = np.unique(np.floor(tiny_manifold.X.numpy() / chain.scene.dx), axis=0, return_inverse=True)
@@ -210,11 +214,11 @@ def test_the_choice_is_bitwise_the_same(span_of):
     assert (np.diff(one.particles) > 0).all()
 
 
-def test_regions_and_spans(tiny_manifold, whole):
+def test_regions_and_spans(tiny_manifold, solver_at):
     X = tiny_manifold.X.numpy()
     middle = float(np.median(X[:, 0]))
     sampler = CubatureSampler(9, lower=[middle, 0, 0], states=6, phases=[{"start": 0.5, "size": 7}])
-    first, later = sampler.spans_of(tiny_manifold, whole=whole)
+    first, later = sampler.spans_of(tiny_manifold, solver_at=solver_at)
     assert (X[first.particles][:, 0] >= middle).all()
     assert (X[later.particles][:, 0] < middle).any()
     assert (first.start, later.start) == (0.0, 0.5)

@@ -4,7 +4,7 @@
 // their round-off times the residual.
 #pragma unroll 1
 for (int member = 0; member < MEMBERS; ++member) {
-    const slope_t* W = given.weights.data + size_t(member) * (given.weights.shape[0] / MEMBERS);
+    const slope_t* W = inversion.weights.data + size_t(member) * (inversion.weights.shape[0] / MEMBERS);
     const bool begun = member > 0;  // a share of another member is there already
     #pragma unroll 1
     for (int e = lane; e < R * R; e += lanes) {
@@ -64,13 +64,13 @@ for (int member = 0; member < MEMBERS; ++member) {
                 const real z = (side == 0 ? v_1 : v_2) + real(bias[k]);
                 const real s = real(1) / (real(1) + exp(-z));
                 const slope_t rise = slope_t(s * (real(1) + z * (real(1) - s)));
-                if (last) at[R + k] = (begun ? at[R + k] : 0.0) + given.scale * z;
+                if (last) at[R + k] = (begun ? at[R + k] : 0.0) + inversion.scale * z;
                 else value[to][k] = z * s;
                 for (int c = 0; c < R; ++c) {
                     const slope_t u = side == 0 ? u_1[c] : u_2[c];
                     if (last) {
                         double& tangent = A[(R + k) * R + c];
-                        tangent = (begun ? tangent : 0.0) + given.scale * u;
+                        tangent = (begun ? tangent : 0.0) + inversion.scale * u;
                     } else {
                         slope[to][k * ROW + c] = rise * u;
                     }

@@ -16,24 +16,24 @@ constexpr int AHEAD = ROWS / SHARERS < 18 ? ROWS / SHARERS : 18;  // weights who
 NSF_SHARED real value[2][ROWS];
 NSF_SHARED alignas(16) slope_t slope[2][ROWS * ROW];
 NSF_SHARED double x[R], at[K], a_n[K], d[K + 1], A[K * R], q[K], M[K * R], g[R], u[R], E[2][2 * R * R];
-NSF_SHARED double error, copied[KEPT ? K * K : 1];
-const double* gram = KEPT ? copied : given.G.data;
+NSF_SHARED double error, copied[IN_SHARED ? K * K : 1];
+const double* gram = IN_SHARED ? copied : inversion.G.data;
 // A run has a row of each array of two dimensions.
 auto own = [&](const auto& values) { return values.data + size_t(run) * values.shape[1]; };
-double *const latent = own(given.latent), *const a = own(given.a);
-const double* b = own(given.b);
-double *const x_0 = own(given.prepared), *const a_0 = x_0 + R, *const q_0 = a_0 + K;
+double *const latent = own(inversion.latent), *const a = own(inversion.a);
+const double* b = own(inversion.b);
+double *const x_0 = own(inversion.prepared), *const a_0 = x_0 + R, *const q_0 = a_0 + K;
 double *const A_0 = q_0 + K, *const M_0 = A_0 + K * R, *const inverse = M_0 + K * R;
-real *const xhat = own(given.xhat), *const xhat_previous = own(given.xhat_previous);
-real *const xhats = own(given.xhats);
-real *const residuals = own(given.residuals), *const updates = own(given.updates);
-const int iterations = given.iterations;
-const bool linear = given.linear;
+real *const xhat = own(inversion.xhat), *const xhat_previous = own(inversion.xhat_previous);
+real *const xhats = own(inversion.xhats);
+real *const residuals = own(inversion.residuals), *const updates = own(inversion.updates);
+const int iterations = inversion.iterations;
+const bool linear = inversion.linear;
 auto evaluate = [&]() {
     #pragma unroll 1
     for (int e = lane; e < R * R; e += lanes) {
-        A[e] = e / R == e % R ? given.sigma.data[e / R] : 0.0;
-        if (e < R) at[e] = given.sigma.data[e] * x[e];
+        A[e] = e / R == e % R ? inversion.sigma.data[e / R] : 0.0;
+        if (e < R) at[e] = inversion.sigma.data[e] * x[e];
     }
     NSF_SYNC;
     if constexpr (LAYERS > 0) {
@@ -46,8 +46,8 @@ auto begin = [&]() {
     for (int e = lane; e < 2 * ROWS; e += lanes) (&value[0][0])[e] = 0;
     #pragma unroll 1
     for (int e = lane; e < 2 * ROWS * ROW; e += lanes) (&slope[0][0])[e] = 0.0f;
-    if constexpr (KEPT)
-        for (int e = lane; e < K * K; e += lanes) copied[e] = given.G.data[e];
+    if constexpr (IN_SHARED)
+        for (int e = lane; e < K * K; e += lanes) copied[e] = inversion.G.data[e];
     NSF_SYNC;
 };
 // q = d - G da, where d holds b, or zeros while b is not known; with them the columns of M = G A.
@@ -105,7 +105,7 @@ auto left = [&]() {
     return least(sum);
 };
 
-const long long n = own(given.row)[0];
+const long long n = own(inversion.row)[0];
 #pragma unroll 1
 for (int k = lane; k < K; k += lanes) a_n[k] = a[k];
 if (task != SOLVE) {
@@ -183,9 +183,9 @@ if (task != SOLVE) {
             length += u[i] * u[i];
             change += u[i] * g[i];
         }
-        going = !(length <= given.tolerance);
+        going = !(length <= inversion.tolerance);
         if (lane == 0) {
-            residuals[n * (iterations + 1) + done] = real(sqrt(error / given.sample));
+            residuals[n * (iterations + 1) + done] = real(sqrt(error / inversion.sample));
             updates[n * iterations + done] = real(sqrt(length));
         }
         #pragma unroll 1
@@ -222,11 +222,11 @@ if (task != SOLVE) {
     if (lane == 0) {
         if (!linear || !going) error = left();
         for (int i = done; i <= iterations; ++i)
-            residuals[n * (iterations + 1) + i] = real(sqrt(error / given.sample));
+            residuals[n * (iterations + 1) + i] = real(sqrt(error / inversion.sample));
         for (int i = done; i < iterations; ++i) updates[n * iterations + i] = real(0);
-        own(given.row)[0] = n + 1;
-        own(given.first)[0] = 0;
-        own(given.step)[0] += 1;
+        own(inversion.row)[0] = n + 1;
+        own(inversion.first)[0] = 0;
+        own(inversion.step)[0] += 1;
     }
     #pragma unroll 1
     for (int i = lane; i < R; i += lanes) {
@@ -238,7 +238,7 @@ if (task != SOLVE) {
 }
 #pragma unroll 1
 for (int k = lane; k < K; k += lanes) {
-    own(given.rate)[k] = (at[k] - a_n[k]) / given.dt;
+    own(inversion.rate)[k] = (at[k] - a_n[k]) / inversion.dt;
     a[k] = at[k];
 }
 #undef NSF_SHARED

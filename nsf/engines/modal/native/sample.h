@@ -1,13 +1,13 @@
 // The displacement and its rate at one particle of S, by all lanes of a warp, or by a CPU's thread.
-const int K = given.a.shape[1], Q = (K + 3) / 4;
-const double *const of_a = given.a.data + run * K, *const of_rate = given.rate.data + run * K;
+const int K = motion.a.shape[1], Q = (K + 3) / 4;
+const double *const of_a = motion.a.data + run * K, *const of_rate = motion.rate.data + run * K;
 wp::vec_t<6, real> sum;
 #if defined(__CUDA_ARCH__)
 const float4* first = (const float4*)modes.data + p;
 for (int q = lane; q < Q; q += 32) {
     #pragma unroll
     for (int c = 0; c < 3; ++c) {
-        const float4 w = __ldg(first + size_t(c * Q + q) * given.of_sample);
+        const float4 w = __ldg(first + size_t(c * Q + q) * motion.of_sample);
         const float each[4] = {w.x, w.y, w.z, w.w};
         #pragma unroll
         for (int j = 0; j < 4; ++j) {
