@@ -115,7 +115,7 @@ class LatentRecord:
 
 
 class LatentState:
-    """The state of a reduced run; particle fields are decoded when they are asked for.
+    """The state of a reduced run; `numpy` decodes its particle fields.
 
     Args:
         run: a `ReducedMPM`.

@@ -17,7 +17,7 @@ from nsf.mpm import precision_of
 from nsf.mpm.device import warp_device
 from nsf.sampling.sampler import SampleSpan, check_well_posed
 
-#: Positions decoded at once when every particle is asked for [values].
+#: Positions of all particles decoded at once [values].
 _CHUNK = 2**25
 
 

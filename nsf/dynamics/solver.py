@@ -68,7 +68,7 @@ class ReducedBatch:
 
     @property
     def runs(self) -> tuple["ReducedMPM", ...]:
-        """Each run, to be asked for its own state and trajectory."""
+        """Each run, with its own state and trajectory."""
         return tuple(ReducedMPM(self, index) for index in range(len(self)))
 
     def hand(self, index: int = 0) -> Hand:

@@ -33,7 +33,7 @@ class Interpolation:
 
     @cached_property
     def gradients(self) -> Tensor:
-        """∂weights/∂X [n, k, 3] 1/m, the exact derivative, the moving support included; made if asked for."""
+        """∂weights/∂X [n, k, 3] 1/m, the exact derivative, the moving support included; made on first use."""
         chunks = _chunks(self.X, self.neighbours)
         return torch.cat([_gradients(x, self.particles[near]) for x, near in chunks])
 

@@ -91,8 +91,8 @@ def _tensors(node: Any) -> Iterator[Tensor]:
 class Manifold(nn.Module, ABC):
     """Fields g, h, l over Ω₀ and the encoder e, for the particles and the latent space they were trained on.
 
-    A manifold lives where `.to(device)` puts it (on the host once loaded); `restrict` moves only what the
-    points asked for need.
+    A manifold lives where `.to(device)` puts it (on the host once loaded); `restrict` moves only the rows of
+    its points.
 
     Args:
         latent_dim: r.
@@ -138,7 +138,7 @@ class Manifold(nn.Module, ABC):
         return phase != "deformation" and self.hyperparameters["head_parameters"]
 
     def standardisation(self, phase: str, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
-        """Mean and deviation of a network's inputs: those given, and of the parameters that it sees."""
+        """Mean and deviation of a network's inputs, followed by those of the parameters that it sees."""
         if not self.takes_parameters(phase):
             return mean, std
         mu = self.standard_parameters
@@ -193,7 +193,7 @@ class Manifold(nn.Module, ABC):
             )
 
     def points(self, particles: Tensor | None, X: Tensor | None) -> tuple[Tensor | slice | None, Tensor]:
-        """The training rows asked for (None: points given by X) and their rest positions [n, 3]."""
+        """Rows of training particles (None: points of X) and their rest positions [n, 3]."""
         if particles is not None and X is not None:
             raise ShapeError("restrict takes particles or X, not both; leave one out")
         if X is not None:
@@ -258,6 +258,6 @@ class Manifold(nn.Module, ABC):
 
 
 def identity(components: int) -> Standardizer:
-    """A standardisation that does nothing yet; its buffers come from a checkpoint or from data."""
+    """The standardisation by 0 and 1, a place for buffers of a checkpoint or of data."""
     # On the host even while a checkpoint is rebuilt on the meta device: Standardizer looks at the values.
     return Standardizer(torch.zeros(components, device="cpu"), torch.ones(components, device="cpu"))

@@ -185,7 +185,7 @@ class FullOrderMPM:
     @property
     def forcing(self) -> Hand:
         """Gravity and colliders, which may be set between steps."""
-        # Made when asked for: were it kept, the solver would hold itself, and keep its memory for a while.
+        # Made on each call: if it were stored, the solver would hold itself, and keep its memory for a while.
         return Hand(self.grid_step.forcing, lambda: self.time, names=self._names)
 
     @property
@@ -210,7 +210,7 @@ class FullOrderMPM:
         self._watch.restart()
 
     def resume(self, steps: int, x: np.ndarray, v: np.ndarray, C: np.ndarray, tau: np.ndarray) -> None:
-        """Continue from a state that is known by its positions, velocities and stresses alone.
+        """Continue from a state that is given by its positions, velocities and stresses alone.
 
         F_e becomes the stretch that carries τ (`Material.stretch_of`), and the history variables those that
         the law assumes for τ (`Material.history_of`). The colliders go to their pose at that time. A stress

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import scipy  # loads a part when it is first asked for
+import scipy  # loads a part on its first use
 import torch
 from typing_extensions import override
 

@@ -10,7 +10,7 @@ from nsf.vectors import number
 
 _CHUNK = 2**25  # values decoded at once
 _SNAPSHOTS = 256  # latents that displacement modes are taken from
-_RANK = 1e-8  # singular value, of orthonormal modes' rows, below which a direction counts as told
+_RANK = 1e-8  # singular value, of orthonormal modes' rows, below which a direction counts as spanned
 _NEWTON = 8  # steps; from below, on a convex function of slope -3/4 or less
 
 

@@ -76,7 +76,7 @@ class Region:
         """Indices of the particles inside, ascending; X [P, 3] are reference positions [m].
 
         Raises:
-            ConfigError: the region holds fewer particles than asked for.
+            ConfigError: the region holds fewer particles than its size.
         """
         lower = -np.inf if self.lower is None else np.asarray(self.lower, float)
         upper = np.inf if self.upper is None else np.asarray(self.upper, float)
@@ -150,7 +150,7 @@ class Sampler(ABC):
                 needs steps of it.
 
         Raises:
-            ConfigError: a region holds fewer particles than asked for.
+            ConfigError: a region holds fewer particles than its size.
         """
         ends = [region.start for region in self.regions[1:]] + [1.0]
         return [

@@ -47,7 +47,9 @@ class Modal(Engine):
         if not setup.manifold.layered:
             return "a network of the field is not one of layers, as modal needs it"
         if len(setups) > 1 and setup.integration.strategy != "superset":
-            return f"integration={setup.integration.strategy} needs a whole grid for each of {len(setups)} runs"
+            return (
+                f"integration={setup.integration.strategy} needs a whole grid for each of {len(setups)} runs"
+            )
         if setup.device.is_cuda and not _closure_fits(setup):
             return "a block of the GPU does not hold the networks of the field"
         if changed := [name.replace(":", ".") for name in edits()]:

@@ -97,7 +97,7 @@ class ModalSpan(GridSpan):
     def infer(self) -> None:
         """x and v, the particles that S needs, and their τ and C (paper sections 5.1 and 5.4).
 
-        Beside them, where the boundaries will be, and what of the inversion is known before the step.
+        On further streams: where the boundaries will be, and parts of the inversion that need no S.
         """
         if self._clears_ahead:
             with self._arena.concurrently(_CLEARING):

@@ -99,7 +99,7 @@ class BasisField:
         """POD coefficients [M, K] of x, tau and C.
 
         Raises:
-            ConfigError: latent_dim exceeds the modes asked for, or the rank of the displacements.
+            ConfigError: latent_dim exceeds `modes`, or the rank of the displacements.
         """
         counts = per_phase("modes", self.modes)
         if latent_dim > counts[0]:
@@ -236,7 +236,7 @@ class BasisManifold(Manifold):
             shape = hyperparameters["frames"], latent_dim
             self.register_buffer("training_rates", torch.zeros(shape, dtype=torch.float64))
         self.fields = nn.ModuleDict()
-        self._kept_slopes: tuple[Tensor, Tensor] | None = None
+        self._particle_slopes: tuple[Tensor, Tensor] | None = None
         layout = zip(TARGETS.items(), hyperparameters["modes"], hyperparameters["beta"], strict=True)
         for (phase, (_, d)), modes, beta in layout:
             inputs = latent_dim + (len(self.parameter_names) if self.takes_parameters(phase) else 0)
@@ -310,8 +310,8 @@ class BasisManifold(Manifold):
                 lambda values: _slope(local(), values), base, networks["deformation"], like
             )
 
-        own = self.latent_dim, self.takes_parameters("stress"), self.takes_rate
-        return ModalRestriction(fields, gradient, *own)
+        takes_parameters = self.takes_parameters("stress")
+        return ModalRestriction(fields, gradient, self.latent_dim, takes_parameters, self.takes_rate)
 
     @torch.no_grad()
     def factors(self, name: str, particles, dtype: torch.dtype, device: torch.device | str) -> ModalFactors:
@@ -341,15 +341,15 @@ class BasisManifold(Manifold):
     def _slopes(self, device: torch.device | str) -> tuple[Tensor, Tensor]:
         """∂/∂X of the deformation's mean [P, 9] and of its modes [P, 9, K], in fp32, at the particles.
 
-        Found on `device`, and once: every solver of the baseline asks for them.
+        Computed on `device`, once: every solver of the baseline takes them.
         """
-        if self._kept_slopes is None:
+        if self._particle_slopes is None:
             field, X = self.fields["deformation"], self.X.to(device)
             local = interpolation(X, X)
             mean, modes = (_slope(local, values.to(device)) for values in (field.mean, field.modes))
-            self._kept_slopes = mean, modes.float()
-        self._kept_slopes = tuple(values.to(self.X.device) for values in self._kept_slopes)
-        return self._kept_slopes
+            self._particle_slopes = mean, modes.float()
+        self._particle_slopes = tuple(values.to(self.X.device) for values in self._particle_slopes)
+        return self._particle_slopes
 
     def _deployed(self, phase: str, like: Tensor) -> FullyConnected | None:
         """The phase's network from (xhat, μ) to coefficients in the field's unit."""

@@ -119,8 +119,8 @@ class MlpField:
         tangent's besides, and frames of h and l have weights (`evenness`).
         """
         losses = _Losses(self, manifold, snapshots)
-        both = nn.ModuleList([manifold.encoder, manifold.decoders["deformation"]])
-        yield Fit("deformation", both, losses.deformation, pointwise=True, fine=True)
+        autoencoder = nn.ModuleList([manifold.encoder, manifold.decoders["deformation"]])
+        yield Fit("deformation", autoencoder, losses.deformation, pointwise=True, fine=True)
         manifold.encode_training(snapshots)
         share = manifold.turn(self.noise_floor)
         manifold.encode_training(snapshots)
@@ -138,8 +138,8 @@ class _Losses:
     def __init__(self, field: MlpField, manifold: MlpManifold, snapshots: Snapshots):
         self.field, self.manifold, self.snapshots = field, manifold, snapshots
         self.X, self.standard = manifold.X.float(), manifold.standard
-        seen = {phase: manifold.inputs(phase, self.X)[:, 3:] for phase in PHASES}
-        self.places = {phase: torch.cat([self.standard["X"](self.X), at], 1) for phase, at in seen.items()}
+        waves = {phase: manifold.inputs(phase, self.X)[:, 3:] for phase in PHASES}
+        self.places = {phase: torch.cat([self.standard["X"](self.X), w], 1) for phase, w in waves.items()}
         self.pace = self._pace()
 
     def deformation(self, rows: Tensor, particles: Tensor, generator: torch.Generator) -> Tensor:
@@ -158,8 +158,8 @@ class _Losses:
             moved = (
                 self._decode("deformation", particles, noisy + self.manifold.encoder(then) - xhat) - decoded
             )
-            off = (moved - (then - now)[:, particles]).square().mean((1, 2))
-            loss = loss + self.field.tangent / self.pace * (goes_on * off).mean()
+            errors = (moved - (then - now)[:, particles]).square().mean((1, 2))
+            loss = loss + self.field.tangent / self.pace * (goes_on * errors).mean()
         return loss
 
     def head(self, phase: str, share: Tensor) -> Callable[..., Tensor]:
@@ -208,7 +208,7 @@ class MlpManifold(Manifold):
 
     Attributes:
         arithmetic: of h and l where they are deployed on a GPU, whose own errors are far larger: a key of
-            `networks.ARITHMETIC`, or None for that of g, which is the type asked for.
+            `networks.ARITHMETIC`, or None for that of g, the `dtype` of the restriction.
     """
 
     arithmetic: str | None = None
@@ -232,7 +232,7 @@ class MlpManifold(Manifold):
 
     @property
     def waves(self) -> Waves:
-        """Those that h and l see."""
+        """The waves of X that h and l see."""
         return Waves(self.standard["X"].mean, self.standard["X"].std, self.hyperparameters["octaves"])
 
     def inputs(self, phase: str, X: Tensor) -> Tensor:
@@ -311,9 +311,9 @@ class MlpManifold(Manifold):
     def restrict(self, particles=None, X=None, dtype=torch.float64, device="cpu") -> MlpRestriction:
         _, points = self.points(particles, X)
         points = points.to(dtype=dtype, device=device)
-        seen = self.waves(points) if self.hyperparameters["octaves"] else points
+        waved = self.waves(points) if self.hyperparameters["octaves"] else points
         return MlpRestriction(
-            {phase: points if phase == "deformation" else seen for phase in PHASES},
+            {phase: points if phase == "deformation" else waved for phase in PHASES},
             {phase: self._deployed(phase, dtype, device) for phase in PHASES},
             self.waves,
             self.hyperparameters["head_parameters"],

@@ -140,13 +140,13 @@ class RestrictedField:
         a = [inputs[..., : self.leading]] if self.leading or self.network is None else []
         if self.network is not None:
             outputs = self.network(inputs)
-            a.append(at_rate(outputs, self._given(rate)) if self.rates else outputs)
+            a.append(at_rate(outputs, self._checked(rate)) if self.rates else outputs)
         coefficients = torch.cat(a, -1) if len(a) > 1 else a[0]
         return F.linear(coefficients, self.modes.flatten(0, 1), self.mean.flatten()).unflatten(
             -1, self.mean.shape
         )
 
-    def _given(self, rate: Tensor | None) -> Tensor:
+    def _checked(self, rate: Tensor | None) -> Tensor:
         if rate is None:
             raise ShapeError(
                 "C of this manifold depends on the rate of the latent vector (field.affine=rate); "
@@ -166,7 +166,7 @@ class RestrictedField:
 
 
 class PlacedFields(dict):
-    """Restricted fields by phase, each made when first asked for: most need that of the deformation alone."""
+    """Restricted fields by phase, each made on first use: most callers use that of the deformation alone."""
 
     def __init__(self, make: Callable[[str], RestrictedField]):
         self._make = make
@@ -303,8 +303,8 @@ class ModalRestriction(Restriction):
     @override
     def subset(self, rows):
         fields = PlacedFields(lambda phase: self.fields[phase].subset(rows))
-        own = self.latent_dim, self._takes_parameters, self.takes_rate
-        return ModalRestriction(fields, lambda: self._gradient.subset(rows), *own)
+        flags = self._takes_parameters, self.takes_rate
+        return ModalRestriction(fields, lambda: self._gradient.subset(rows), self.latent_dim, *flags)
 
     def _inputs(self, xhat: Tensor, parameters: Tensor) -> Tensor:
         xhat = xhat.to(self.dtype)

@@ -34,7 +34,7 @@ def xavier(layer: nn.Linear | nn.Conv1d, generator: torch.Generator) -> None:
 
 Layer = tuple[Tensor, Tensor]  # weights [out, in] and biases [out]
 
-#: Of `zero_at_rest`: how fast what is taken fades, and what the unit that carries the bias has before SiLU.
+#: Of `zero_at_rest`: how fast the value at rest fades, and the input to SiLU of the unit of the bias.
 _FADING, _BIAS = 4.0, 4.0
 
 
@@ -190,8 +190,8 @@ class Committee(nn.Module):
     def mean(self) -> FullyConnected:
         """The members' mean as one network in double precision: side by side, averaged by the last layer."""
         layers = list(zip(self.weights, self.biases, strict=True))
-        each = [[(w[n], b[n, 0]) for w, b in layers] for n in range(len(self.weights[0]))]
-        return beside(each, [1 / len(each)] * len(each), self.activation)
+        networks = [[(w[n], b[n, 0]) for w, b in layers] for n in range(len(self.weights[0]))]
+        return weighted_sum(networks, [1 / len(networks)] * len(networks), self.activation)
 
     def in_raw_units(self, *standardisation, **place) -> FullyConnected:
         """The mean, frozen, for raw inputs and outputs; arguments as for `FullyConnected.in_raw_units`."""
@@ -203,12 +203,12 @@ def zero_at_rest(raw: FullyConnected, members: int, rest: Tensor, reach: Tensor)
     """The network, but zero at x̂₀ whatever μ is, and as before from a few times `reach` on.
 
     Of each member N = W silu(z) + b, with z what its last hidden layer has before SiLU, the value at rest is
-    taken, which fades as x̂ leaves x̂₀:
+    subtracted, which fades as x̂ leaves x̂₀:
 
         N(x̂, μ) − W silu(z(x̂₀, μ) − K ρ) − b silu(c − K ρ)/silu(c),   ρ = Σ_k t_k tanh(t_k/2),
 
     with t = (x̂ − x̂₀)/reach, K = `_FADING` and c = `_BIAS`. This is a network of SiLU layers too, so that
-    whatever evaluates `raw` evaluates it: silu(t) + silu(−t) = t tanh(t/2), and silu(ρ) − silu(−ρ) = ρ.
+    the code that evaluates `raw` evaluates it: silu(t) + silu(−t) = t tanh(t/2), and silu(ρ) − silu(−ρ) = ρ.
 
     Args:
         raw: of inputs (x̂, μ), with two hidden layers or more, each of the members side by side.
@@ -222,38 +222,36 @@ def zero_at_rest(raw: FullyConnected, members: int, rest: Tensor, reach: Tensor)
     layers, networks = [(layer.weight.double(), layer.bias.double()) for layer in raw.layers], []
     for n in range(members):
         member = _member(layers, members, n)
-        taken = _taken(member, rest, reach)
-        networks += [[_padded(layer, like) for layer, like in zip(member, taken, strict=True)], taken]
-    return beside(networks, [1] * len(networks), raw.kind).requires_grad_(False)
+        faded = _value_at_rest(member, rest, reach)
+        networks += [[_padded(layer, like) for layer, like in zip(member, faded, strict=True)], faded]
+    return weighted_sum(networks, [1] * len(networks), raw.kind).requires_grad_(False)
 
 
-def _taken(layers: Sequence[Layer], rest: Tensor, reach: Tensor) -> list[Layer]:
-    """The network that `zero_at_rest` adds to another; hidden layers have further units beside its own."""
+def _value_at_rest(layers: Sequence[Layer], rest: Tensor, reach: Tensor) -> list[Layer]:
+    """The network that `zero_at_rest` adds to a member: minus its value at rest, which fades with ρ."""
     (first, b_first), *hidden, (W, b) = layers[:-1]
     r, (out, b_out) = len(rest), layers[-1]
     slopes = torch.cat([torch.diag(1 / reach), torch.diag(-1 / reach)])
-    layers_taken = [
-        _beside_own(
-            first, b_first + first[:, :r] @ rest, F.pad(slopes, (0, first.shape[1] - r)), -slopes @ rest
-        )
+    added = [
+        _widened(first, b_first + first[:, :r] @ rest, F.pad(slopes, (0, first.shape[1] - r)), -slopes @ rest)
     ]
-    layers_taken[0][0][: len(first), :r] = 0  # x̂ is x̂₀ there
+    added[0][0][: len(first), :r] = 0  # x̂ is x̂₀ there
     # Weights that give ρ from the layer before: of silu(±t_k), r each, and later of silu(±ρ).
     distance = torch.ones(1, 2 * r).to(rest)
     for V, c in hidden:
-        more = F.pad(torch.cat([distance, -distance]), (len(V), 0))
-        layers_taken.append(_beside_own(F.pad(V, (0, distance.shape[1])), c, more, c.new_zeros(2)))
+        units = F.pad(torch.cat([distance, -distance]), (len(V), 0))
+        added.append(_widened(F.pad(V, (0, distance.shape[1])), c, units, c.new_zeros(2)))
         distance = torch.tensor([[1.0, -1.0]]).to(rest)
     faded = torch.cat([W, -_FADING * distance.expand(len(W), -1)], 1)
     bias = F.pad(-_FADING * distance, (W.shape[1], 0))
-    layers_taken.append(_beside_own(faded, b, bias, b.new_tensor([_BIAS])))
+    added.append(_widened(faded, b, bias, b.new_tensor([_BIAS])))
     share = -b_out / F.silu(b_out.new_tensor(_BIAS))
-    return [*layers_taken, (torch.cat([-out, share[:, None]], 1), torch.zeros_like(b_out))]
+    return [*added, (torch.cat([-out, share[:, None]], 1), torch.zeros_like(b_out))]
 
 
-def _beside_own(W: Tensor, b: Tensor, more: Tensor, bias: Tensor) -> Layer:
+def _widened(W: Tensor, b: Tensor, units: Tensor, bias: Tensor) -> Layer:
     """A layer with further units."""
-    return torch.cat([W, more]), torch.cat([b, bias])
+    return torch.cat([W, units]), torch.cat([b, bias])
 
 
 def _padded(layer: Layer, like: Layer) -> Layer:
@@ -273,7 +271,9 @@ def _member(layers: Sequence[Layer], members: int, n: int) -> list[Layer]:
 
 
 @torch.no_grad()
-def beside(networks: Sequence[Sequence[Layer]], shares: Sequence[float], activation: str) -> FullyConnected:
+def weighted_sum(
+    networks: Sequence[Sequence[Layer]], shares: Sequence[float], activation: str
+) -> FullyConnected:
     """Σ_k share_k network_k as one network in double precision, whose hidden layers are side by side.
 
     Args:

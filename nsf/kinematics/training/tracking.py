@@ -1,4 +1,4 @@
-"""Where the losses of a training are written: CSV always, TensorBoard or MLflow beside it if asked for."""
+"""Loggers of a training: CSV always, and TensorBoard or MLflow where `tracking` names it."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def loggers(folder: Path, tracking: str | None) -> list[Logger]:
 
     Args:
         folder: of the phase, in the folder of the training.
-        tracking: "tensorboard" writes into `folder`; "mlflow" into `mlflow.db` (SQLite) beside the trainings,
+        tracking: "tensorboard" writes into `folder`; "mlflow" into `mlflow.db` (SQLite) by the trainings,
             or to MLFLOW_TRACKING_URI. None: the CSV log alone.
     """
     from pytorch_lightning.loggers.csv_logs import CSVLogger

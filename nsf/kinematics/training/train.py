@@ -36,7 +36,7 @@ class Field(Protocol):
         """A manifold with untrained networks."""
 
     def fits(self, manifold: Manifold, snapshots: Snapshots, prepared: dict[str, Any]) -> Iterator[Fit]:
-        """The phases; the next is asked for once the one before is trained."""
+        """The phases, one by one; the next one follows once the one before is trained."""
 
 
 def train(

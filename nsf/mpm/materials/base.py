@@ -141,7 +141,7 @@ class Material(ABC):
             return self.stretches_of(principal, mu, lam)
 
     def history_of(self, tau: np.ndarray) -> np.ndarray:
-        """[P, H] history variables to assume where τ [P, 3, 3] [Pa] alone is known: by default those at rest.
+        """[P, H] history variables to assume from τ [P, 3, 3] [Pa] alone: by default those at rest.
 
         A law that can tell more from τ overrides this.
         """
