@@ -65,7 +65,7 @@ class Step(GridSpan):
         self.inferred = self.inference(self.record.now)
 
     def load(self) -> None:
-        """Copy these into the arrays that torch and Warp share."""
+        """Copy x, v, τ and C into the arrays that torch and Warp share."""
         for array, values in zip((self.x, self.v, self.tau, self.C), self.inferred, strict=True):
             if values is not None:
                 array.copy_(values)

@@ -110,7 +110,7 @@ def test_the_first_velocity_is_the_initial_one(tiny, solver_of):
     solver = solver_of(scene=scene)
     np.testing.assert_array_equal(solver.state.numpy()["v"], np.tile(velocity, (500, 1)))
     solver.stages["inference"]()
-    v = solver.span.v[solver.span.needed[0].bool()].numpy()
+    v = solver.span.v[solver.span.in_N[0].bool()].numpy()
     assert len(v) > len(solver.sets[0].sample)
     np.testing.assert_allclose(v, np.tile(velocity, (len(v), 1)), rtol=1e-12)
 

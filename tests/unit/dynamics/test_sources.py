@@ -57,7 +57,7 @@ def test_stress_and_affine_on_the_particles(solver, sources, tiny_manifold):
     xhat = solver.xhat.clone()
     solver.stages["inference"]()
     phase = solver.span
-    taken = phase.needed[0].bool()  # the others are not evaluated
+    taken = phase.in_N[0].bool()  # the others are not evaluated
     assert taken[: phase.s].all()
     fields = tiny_manifold.restrict(particles=torch.as_tensor(phase.order)[taken])
     if sources.neural_stress:
