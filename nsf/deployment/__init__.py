@@ -1,4 +1,4 @@
-"""Reduced runs of held-out cases: their records, whether to believe them, who goes on where not."""
+"""Reduced runs of held-out cases: records, an estimate of trust, and who goes on where it is lost."""
 
 from typing import TYPE_CHECKING
 

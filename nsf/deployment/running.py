@@ -1,4 +1,4 @@
-"""Reduced runs of several cases to the end of their scene, driven by Lightning's `Trainer.predict`."""
+"""Runs of several cases to the end of their scene, by Lightning's `Trainer.predict`."""
 
 import time
 from collections.abc import Callable, Sequence

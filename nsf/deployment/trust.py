@@ -164,7 +164,7 @@ class CaseDistance:
 
 
 class SolidsRange:
-    """How far solids are from where, and as fast as, programs of training moved them.
+    """How far solids leave the poses and speeds that programs of training gave them.
 
     Each number of a solid's state, shift [m], angle [rad] and both velocities, has its range over all
     training runs; it counts from the middle, in units of the half. A run that is drawn like them may go

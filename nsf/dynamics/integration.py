@@ -21,7 +21,7 @@ STRATEGIES = ("superset", "search")
 
 @dataclass(frozen=True)
 class Integration:
-    """How the integration particles are found.
+    """How a step determines its integration particles N.
 
     Attributes:
         strategy: `search` finds N anew at each step, as the paper does (a, b); `superset` fixes it before the

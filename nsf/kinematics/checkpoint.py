@@ -1,4 +1,4 @@
-"""The file of a manifold: plain data that names a class of this package, and the tensors that it asks for."""
+"""The file of a manifold: plain data that names a class of this package, and its tensors."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from nsf.storage import writing
 
 
 class Restriction(ABC):
-    """The three fields at n fixed material points: what a deployed model evaluates.
+    """The fields g, h and l at n fixed material points, as a deployed model evaluates them.
 
     `xhat` is [r] or a batch [F, r]; every result then gains the leading F. `parameters` is [n_parameters] or
     [F, n_parameters] in the order of `Manifold.parameter_names`. No call synchronises with the host, so all

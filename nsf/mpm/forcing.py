@@ -1,4 +1,4 @@
-"""Forcing: what acts on a simulation from outside at the moment, gravity and where the solids are."""
+"""Forcing: gravity and the poses of solids over time, by programs or by hand."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Is the time step stable, and has the simulation gone wrong?"""
+"""Stability: the largest stable time step, and the checks that end a run which has gone wrong."""
 
 from collections.abc import Callable, Sequence
 

@@ -1,4 +1,4 @@
-"""Has a simulation gone wrong? One pass over the particles, now and then, without a step's cost."""
+"""Checks of a running simulation: one pass over the particles, now and then, for less than a step costs."""
 
 from collections.abc import Callable
 from functools import cache
@@ -163,7 +163,7 @@ class Look(NamedTuple):
 
 
 class Watch:
-    """Looks at a full-order run, and remembers the worst of what is odd but no error.
+    """Looks at a full-order run now and then; errors end it, and the worst of each warning is remembered.
 
     Energy is compared with that at the start: while nothing outside does work, a body that starts free of
     stress never has more kinetic and potential energy than then, whatever is stored elastically.

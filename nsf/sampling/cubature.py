@@ -23,7 +23,7 @@ Factors = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True)
 class CubatureSampler(Sampler):
-    """Few particles with weights under which the projection does what all particles would do.
+    """Few particles, with weights under which their projection approximates that of all particles.
 
     From a state of the training the full-order step moves every particle to x_p, and the projection on all
     of them takes a Gauss-Newton step from the sums Σ J_pᵀ J_p and Σ J_pᵀ (x_p − g(X_p, x̂)), J_p = ∂g/∂x̂.

@@ -13,7 +13,7 @@ _ENTRIES = 2**23  # values of modes taken at once
 
 
 class Arena:
-    """Holds what packed launches point to, and counts it.
+    """Allocates the arrays of packed launches, keeps them alive, and counts their bytes.
 
     Args:
         precision: of the floating-point arrays that are of the model.

@@ -1,4 +1,4 @@
-"""Launches that give τ and C where a step needs them: the heads, then modes times what these find."""
+"""Launches that write τ and C at N: the networks of the heads, then modes times their coefficients."""
 
 from collections.abc import Sequence
 

@@ -185,7 +185,7 @@ def make_contraction(
     A thread has three components of a particle, in the runs of a tile; `several` tiles have blocks in
     turn. The first `threads` are those of the first field. The six components of a symmetric field are xx xy
     xz yy yz zz, the nine of another go row by row. Nothing is written where the bit of a run in `in_N`
-    is not set, see `make_neighbours`. `vectors` are those of four modes of either field, `coefficients` is the
+    is not set, see `make_neighbours`. `vectors` are those of four modes of either field, `coefficients` the
     type of a, `stored` that of modes.
     """
     tile_of, within = make_tiles(several)

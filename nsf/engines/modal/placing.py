@@ -1,4 +1,4 @@
-"""Kernels that give x and v where a reduced step needs them: at S, and at those of N that touch its nodes."""
+"""Kernels that write x and v at S, and at N, the particles that touch its nodes."""
 
 from functools import cache
 

@@ -151,7 +151,7 @@ class ModalSpan(GridSpan):
 
 
 class Coefficients:
-    """Where B runs are, in coefficients, on the device.
+    """Latent vectors and modal coefficients of B runs, on the device.
 
     Attributes:
         latent: [B, r] x̂_n in fp64.
@@ -169,7 +169,7 @@ class Coefficients:
 
 
 class Placing:
-    """Finds x and v at S, and at each step which others its step needs, and theirs.
+    """Launches that write x and v at S, find N in each step, and write x and v there.
 
     Args:
         arena, state: of the batch.

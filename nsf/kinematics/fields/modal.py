@@ -1,4 +1,4 @@
-"""A field of `field=basis`: its mean and modes times coefficients, of which a small network finds most."""
+"""A field of `field=basis`: its mean, and modes times coefficients, most of which a small network gives."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The three networks are trained one after the other: g with e, then h, then l (paper section 4.5)."""
+"""The phases of a training: g with e, then h, then l (paper section 4.5)."""
 
 from __future__ import annotations
 
