@@ -79,7 +79,7 @@ class Rollout:
     @property
     def projected_share(self) -> float:
         """Share of steps, in a run of another model, that the projected step took; 0 of any other run."""
-        return 0.0 if self.by is None else float((self.levels == PROJECTED).mean())
+        return 0.0 if self.by is None else float((self.levels == PROJECTED).sum()) / max(1, len(self.by))
 
     @property
     def by_operators(self) -> int:
