@@ -31,9 +31,10 @@ class Number:
     whole: bool = False
 
     def __str__(self):
-        ends = [f"at least {self.least:g}"] * (self.least > -math.inf)
-        ends += [f"at most {self.most:g}"] * (self.most < math.inf)
-        return " ".join(["a whole number" if self.whole else "a number", *ends])
+        kind = "a whole number" if self.whole else "a number"
+        if self.most < math.inf:
+            return f"{kind} from {self.least:g} to {self.most:g}"
+        return f"{kind} of at least {self.least:g}" if self.least > -math.inf else kind
 
 
 @dataclass(frozen=True)

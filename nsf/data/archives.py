@@ -13,7 +13,7 @@ import re
 import reprlib
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,7 @@ import numpy as np
 
 from nsf.errors import MissingRunError, SchemaError, first_line, out_of_memory
 from nsf.manifest import verified
+from nsf.schemas import Maybe
 from nsf.storage import intact, writing
 
 #: Errors of torch and of what is built from a file, on contents that are damaged or foreign.
@@ -180,11 +181,15 @@ def leaves(node: Any) -> Iterator[Any]:
     raise SchemaError("holds more than plain data beside its tensors")
 
 
-def arrays(path: Path | str, what: str, stage: str) -> dict[str, np.ndarray]:
+def arrays(
+    path: Path | str, what: str, stage: str, layout: Mapping[str | Maybe, str] | None = None
+) -> dict[str, np.ndarray]:
     """The arrays of a file of `numpy.savez`, by name.
 
     Args:
         path: of the file; what: it should be; stage: that makes it.
+        layout: of each array that is read its kind (of NumPy) and axes, as "f frame particle 3": equal names
+            are equal sizes of at least one, or of any with a star.
 
     Raises:
         MissingRunError: there is no such file.
@@ -198,13 +203,37 @@ def arrays(path: Path | str, what: str, stage: str) -> dict[str, np.ndarray]:
             members = archive.infolist()
             if sum(member.file_size for member in members) > most:
                 raise SchemaError(f"{path} takes more than {most:,} bytes; run `nsf {stage}` again")
-            return {m.filename.removesuffix(".npy"): _array(_unpacked(archive, m)) for m in members}
+            found = {m.filename.removesuffix(".npy"): _array(_unpacked(archive, m)) for m in members}
+            _check_layout(found, layout or {})
+            return found
     except FileNotFoundError as error:
         raise MissingRunError(f"no {what} at {path}; run `nsf {stage}` first") from error
     except _UNREADABLE as error:
         raise SchemaError(
             f"{path} is truncated or no {what} ({first_line(error)}); delete it and run `nsf {stage}` again"
         ) from error
+
+
+def _check_layout(found: Mapping[str, np.ndarray], layout: Mapping[str | Maybe, str]) -> None:
+    """Raises ValueError where an array is missing or not as its layout says."""
+    sizes: dict[str, int] = {}
+    for key, form in layout.items():
+        name, (kind, *axes) = key.key if isinstance(key, Maybe) else key, form.split()
+        if name not in found:
+            if isinstance(key, Maybe):
+                continue
+            raise ValueError(f"it lacks {name}")
+        values = found[name]
+        fits = values.dtype.kind == kind and values.ndim == len(axes)
+        for axis, size in zip(axes, values.shape, strict=False):
+            known = int(axis) if axis.isdigit() else sizes.setdefault(axis, size)
+            fits &= size == known and (size > 0 or axis.endswith("*"))
+        if not fits:
+            raise ValueError(
+                f"it has {name} of {values.dtype.str}{list(values.shape)}, not [{', '.join(axes)}]"
+            )
+        if kind == "f" and not np.isfinite(values).all():
+            raise ValueError(f"it has values of {name} that are not finite")
 
 
 def _unpacked(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:

@@ -13,18 +13,20 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from nsf import schemas
 from nsf.data import Standardizer, archives, hash_of_positions
 from nsf.errors import SchemaError
+from nsf.schemas import Number
 
 FORMAT = "nsf-manifold"
 FORMAT_VERSION = 3
 FIELDS = "nsf.kinematics.fields"  # the package that holds every class a file may name
 
 _CLASS = re.compile(rf"({re.escape(FIELDS)}\.[A-Za-z]\w*)\.([A-Za-z]\w*)", re.ASCII)
-_KINDS = {
-    "latent_dim": int,
+_SCHEMA = {
+    "latent_dim": Number(1, whole=True),
     "x_sha256": str,
-    "parameter_names": list,
+    "parameter_names": [str],
     "hyperparameters": dict,
     "state": dict,
 }
@@ -65,10 +67,9 @@ def read(path: Path) -> dict[str, Any]:
             than plain data.
     """
     content = archives.tensors(path, "manifold", "train", (FORMAT, FORMAT_VERSION), mapped=True)
-    if missing := _KINDS.keys() - content.keys():
-        raise SchemaError(f"{path} lacks {', '.join(sorted(missing))}; delete it and run `nsf train` again")
     try:
-        _check_kinds(content, path.stat().st_size)
+        schemas.check(content, _SCHEMA)
+        _check_leaves(content, path.stat().st_size)
     except SchemaError as error:
         raise SchemaError(f"{path} {error}; train again with `nsf train`") from error
     return content
@@ -108,13 +109,8 @@ def is_finite(tensor: Tensor) -> bool:
     return bool(tensor.sum().isfinite()) or bool(tensor.isfinite().all())
 
 
-def _check_kinds(content: dict[str, Any], size: int) -> None:
-    """Raises SchemaError without the path where a value is of another kind than a checkpoint's."""
-    for key, kind in _KINDS.items():
-        if type(content[key]) is not kind and not (kind is dict and isinstance(content[key], dict)):
-            raise SchemaError(f"has {key}={_REPR.repr(content[key])}, which is no {kind.__name__}")
-    if content["latent_dim"] < 1 or not all(isinstance(name, str) for name in content["parameter_names"]):
-        raise SchemaError("has a latent_dim below 1, or parameter_names that are no texts")
+def _check_leaves(content: dict[str, Any], size: int) -> None:
+    """Raises SchemaError where a leaf is of another kind than a checkpoint's."""
     for leaf in archives.leaves({key: value for key, value in content.items() if key != "state"}):
         if isinstance(leaf, Tensor) or (isinstance(leaf, float) and not math.isfinite(leaf)):
             raise SchemaError(f"holds {_REPR.repr(leaf)} beside its tensors, which is no plain value")

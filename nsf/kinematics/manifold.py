@@ -5,16 +5,18 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
+from nsf import schemas
 from nsf.data import Standardizer, archives
 from nsf.errors import NSFError, SchemaError, ShapeError, first_line
 from nsf.kinematics import checkpoint
+from nsf.schemas import Number
 from nsf.storage import writing
 
 
@@ -107,6 +109,14 @@ class Manifold(nn.Module, ABC):
         training_parameters, training_times: their μ [M, n] and t [M] s.
     """
 
+    #: Of which kind each of them is, as a schema of `nsf.schemas`; a class with more adds its own.
+    HYPERPARAMETERS: ClassVar[Mapping] = {
+        "particles": Number(1, whole=True),
+        "frames": Number(1, whole=True),
+        "beta": [Number(1, whole=True)],
+        "head_parameters": bool,
+    }
+
     def __init__(
         self, latent_dim: int, x_sha256: str, parameter_names: list[str], hyperparameters: dict[str, Any]
     ):
@@ -115,6 +125,7 @@ class Manifold(nn.Module, ABC):
         self.x_sha256 = x_sha256
         self.parameter_names = tuple(parameter_names)
         self.hyperparameters = dict(hyperparameters)
+        schemas.check(self.hyperparameters, self.HYPERPARAMETERS, "hyperparameters")
         P, M, n = hyperparameters["particles"], hyperparameters["frames"], len(self.parameter_names)
         for name, shape in {
             "X": (P, 3),

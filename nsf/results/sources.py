@@ -5,7 +5,6 @@ and by method the figures that it prints.
 """
 
 import hashlib
-import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,21 +14,42 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from nsf import schemas
 from nsf.data import archives
 from nsf.errors import MissingRunError, NSFError, SchemaError
 from nsf.manifest import altered
 from nsf.results import table
 from nsf.results.question import FILES
 from nsf.runs import Run
+from nsf.schemas import Maybe, Number
 
 KEPT = ("commit", "dirty", "device", "precision", "seed", "created", "versions")
 """What a report says of the origin of a run."""
-_FRAMES = ("cases", "t", "x_full", "x_reduced", "stress_full", "stress_reduced")
-_AROUND = (
-    "gravity",
-    *(f"solid_{name}" for name in ("shape", "extents", "position", "orientation", "active")),
-)
+_PARTICLES = ("x_full", "x_reduced", "stress_full", "stress_reduced")
+_AROUND = {
+    Maybe("gravity"): "f case frame 3",
+    Maybe("solid_shape"): "U case solid*",
+    Maybe("solid_extents"): "f case solid* 3",
+    Maybe("solid_position"): "f case frame solid* 3",
+    Maybe("solid_orientation"): "f case frame solid* 3 3",
+    Maybe("solid_active"): "b case frame solid*",
+}
+#: Arrays of `frames.npz`.
+FRAMES = {
+    "cases": "U case",
+    "t": "f frame",
+    **{name: "f case frame particle 3" for name in _PARTICLES[:2]},
+    **{name: "f case frame particle" for name in _PARTICLES[2:]},
+    Maybe("role"): "i case frame particle",
+    **_AROUND,
+}
 _SERIES = ("case", "split", "frame", "t", "delta", "displacement_error", "stress_error")
+_STATED = {Maybe("r"): int, Maybe("sample"): int, Maybe("delta"): Number(0)}
+_SUMMARY = {
+    Maybe("scale"): (str, None),
+    Maybe("paper"): ({Maybe("nsf"): _STATED, Maybe("deformation_only"): _STATED}, None),
+}
+_COST = {Maybe("breakdown"): {...: {...: Number(0)}}}
 
 
 @dataclass(frozen=True)
@@ -68,8 +88,8 @@ class Source:
         self.run, self.id, self.manifest = run, run.id, run.manifest
         self.hashes = {name: checked_hash(run, name) for name in FILES}
         self.rows = table.complete(self._csv("results.csv", ("case",)), self._path("results.csv"))
-        self.summary = json.loads(self._path("summary.json").read_text())
-        self.cost = json.loads(self._path("cost.json").read_text())
+        self.summary = self._json("summary.json", _SUMMARY)
+        self.cost = self._json("cost.json", _COST)
 
     @property
     def created(self) -> str:
@@ -79,7 +99,7 @@ class Source:
     @cached_property
     def series(self) -> pd.DataFrame:
         """Errors and latent coordinates, one row a frame and case."""
-        return self._csv("series.csv", _SERIES)
+        return table.numbers(self._csv("series.csv", _SERIES), self._path("series.csv"), ("case", "split"))
 
     @cached_property
     def logarithmic(self) -> set[str]:
@@ -119,17 +139,16 @@ class Source:
 
     def motions(self, cases: Sequence[str]) -> list[Motion]:
         """The particles of some cases; those that were not stored are left out."""
-        arrays = archives.arrays(self._path("frames.npz"), "frames", "evaluate")
-        if absent := [key for key in _FRAMES if key not in arrays]:
-            raise SchemaError(f"{self._path('frames.npz')} lacks {absent}; run `nsf evaluate` again")
+        arrays = archives.arrays(self._path("frames.npz"), "frames", "evaluate", FRAMES)
+        around = [one.key for one in _AROUND if one.key in arrays]
         rows = {str(case): row for row, case in enumerate(arrays["cases"])}
         return [
             Motion(
                 case,
                 arrays["t"],
-                *(arrays[key][rows[case]] for key in _FRAMES[2:]),
+                *(arrays[key][rows[case]] for key in _PARTICLES),
                 stopped=self._stopped(case),
-                surroundings={key: arrays[key][rows[case]] for key in _AROUND if key in arrays},
+                surroundings={key: arrays[key][rows[case]] for key in around},
                 role=arrays["role"][rows[case]] if "role" in arrays else None,
             )
             for case in cases
@@ -148,8 +167,14 @@ class Source:
     def _path(self, name: str) -> Path:
         return Path(self.run.path) / name
 
+    def _json(self, name: str, schema: Mapping) -> dict:
+        try:
+            return schemas.read(self._path(name), schema)
+        except SchemaError as error:
+            raise SchemaError(f"{self.run.path}: {error}; run `nsf evaluate` again") from error
+
     def _csv(self, name: str, columns: Sequence[str]) -> pd.DataFrame:
-        frame = pd.read_csv(self._path(name), dtype=dict.fromkeys(("case", *table.TEXT), str))
+        frame = table.parsed(self._path(name), ("case", *table.TEXT))
         if absent := [column for column in columns if column not in frame]:
             raise SchemaError(
                 f"{self._path(name)} lacks the columns {absent}: another version wrote it; "

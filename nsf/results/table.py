@@ -13,7 +13,7 @@ from pathlib import Path
 import pandas as pd
 
 from nsf.data.case import Case
-from nsf.errors import ConfigError, MissingRunError, SchemaError
+from nsf.errors import ConfigError, MissingRunError, SchemaError, first_line
 from nsf.results.columns import (
     ABSENT,
     COLUMNS,
@@ -57,11 +57,41 @@ def read(path: Path | str) -> pd.DataFrame:
     path = Path(path)
     if not path.is_file():
         raise MissingRunError(f"{path} is not there; `nsf report` and `nsf reports` write tables of results")
+    return complete(parsed(path, TEXT), path)
+
+
+def parsed(path: Path, texts: Iterable[str]) -> pd.DataFrame:
+    """The table of a CSV file, as it stands there.
+
+    Args:
+        path: of the file; texts: columns that hold text, whatever it looks like.
+
+    Raises:
+        SchemaError: it is none.
+    """
     try:
-        frame = pd.read_csv(path, dtype=dict.fromkeys(TEXT, str))
-    except (ValueError, UnicodeDecodeError) as error:
-        raise SchemaError(f"{path} is no table of results: {error}; write it again") from error
-    return complete(frame, path)
+        frame = pd.read_csv(path, dtype=dict.fromkeys(texts, str))
+        if not isinstance(frame.index, pd.RangeIndex):
+            raise ValueError("rows have more cells than there are columns")
+        return frame
+    except (ValueError, OverflowError) as error:
+        raise SchemaError(f"{path} is no table: {first_line(error)}; write it again") from error
+
+
+def numbers(frame: pd.DataFrame, source: Path | str, texts: Iterable[str]) -> pd.DataFrame:
+    """A frame whose columns hold numbers, but those of texts, in which an empty cell is empty text.
+
+    Raises:
+        SchemaError: a number is text.
+    """
+    texts = [name for name in texts if name in frame]
+    frame[texts] = frame[texts].astype(object).where(frame[texts].notna(), "").astype(str)
+    for name in frame.columns.difference(texts):
+        try:
+            frame[name] = pd.to_numeric(frame[name])
+        except (ValueError, TypeError, OverflowError) as error:
+            raise SchemaError(f"{source}: {name} holds text: {error}; run `nsf evaluate` again") from error
+    return frame
 
 
 def complete(frame: pd.DataFrame, source: Path | str) -> pd.DataFrame:
@@ -73,14 +103,7 @@ def complete(frame: pd.DataFrame, source: Path | str) -> pd.DataFrame:
     absent = [name for name in ("scene", "model", "case", "split", "delta") if name not in frame]
     if absent:
         raise SchemaError(f"{source} lacks the columns {', '.join(absent)}; run `nsf evaluate` again")
-    frame = frame.reindex(columns=list(COLUMNS))
-    frame[list(TEXT)] = frame[list(TEXT)].astype(object).where(frame[list(TEXT)].notna(), "").astype(str)
-    for name in frame.columns.difference(TEXT):
-        try:
-            frame[name] = pd.to_numeric(frame[name])
-        except (ValueError, TypeError) as error:
-            raise SchemaError(f"{source}: {name} holds text: {error}; run `nsf evaluate` again") from error
-    return frame
+    return numbers(frame.reindex(columns=list(COLUMNS)), source, TEXT)
 
 
 def write(frame: pd.DataFrame, path: Path) -> None:

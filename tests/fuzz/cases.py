@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import gzip
 import hashlib
 import io
 import json
@@ -19,7 +20,9 @@ from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
 
+import h5py
 import inputs
+import numpy as np
 import torch
 import yaml
 from omegaconf import OmegaConf
@@ -28,6 +31,7 @@ import nsf.config
 import nsf.paths
 from nsf.errors import ConfigError
 from nsf.runs import Run
+from nsf.terminal import visible
 
 CONF = nsf.paths.CONF
 #: Keys of the tiny chain that make a run of it shorter still.
@@ -97,8 +101,11 @@ class Workshop:
             from nsf.cli import main
 
             shown = io.StringIO()
-            with contextlib.redirect_stdout(shown), contextlib.redirect_stderr(shown):
-                main(list(words))
+            try:
+                with contextlib.redirect_stdout(shown), contextlib.redirect_stderr(shown):
+                    main(list(words))
+            finally:
+                assert shown.getvalue() == visible(shown.getvalue()), "a terminal would obey this"
 
         return run
 
@@ -119,6 +126,41 @@ class Workshop:
                     yield from leaves(child, f"{prefix}{name}.")
 
         return [key for key in leaves(config) if not key.startswith("scene.paper")]
+
+    @cached_property
+    def interrupted(self) -> Path:
+        """The folder of a training of the tiny chain that was interrupted in its last phase."""
+        from conftest import tiny_pipeline
+
+        from nsf.kinematics.training.lightning import BlockCheckpoint
+
+        root = self.folder / "interrupted"
+        shutil.copytree(self.root / "simulate", root / "simulate", copy_function=os.link)
+        true_end, ends = BlockCheckpoint.on_train_epoch_end, []
+
+        def interrupted(callback, trainer, module) -> None:
+            true_end(callback, trainer, module)
+            ends.append(callback)
+            if len(ends) == 6:  # of eight blocks in two phases
+                raise KeyboardInterrupt
+
+        BlockCheckpoint.on_train_epoch_end = interrupted
+        try:
+            with contextlib.suppress(KeyboardInterrupt):
+                tiny_pipeline(root).run("train")
+        finally:
+            BlockCheckpoint.on_train_epoch_end = true_end
+        (run,) = Run.find("train", root=root)
+        assert list(run.path.rglob("last.ckpt"))
+        return run.path
+
+    @cached_property
+    def model(self):
+        """As much of the tiny chain's model as observations are held to."""
+        from nsf.kinematics.manifold import Manifold
+
+        manifold = Manifold.load(self.only("train").path / "manifold.pt")
+        return SimpleNamespace(manifold=manifold, t=np.linspace(0.0, 0.12, 25), spacing=0.01)
 
     @cached_property
     def server(self) -> int:
@@ -358,6 +400,110 @@ def checkpoints(shop: Workshop, draw: random.Random) -> Case:
         Manifold.load(path).restrict(torch.arange(5)).position(torch.zeros(4, dtype=torch.float64))
 
     return Case(what, hand_over, altered=True)
+
+
+def intermediates(shop: Workshop, draw: random.Random) -> Case:
+    """A file that an interrupted training left, damaged, or forged with a sum that fits."""
+    from nsf.data import archives
+
+    before = shop.interrupted
+    run = before.parent.parent.name
+    folder = shop.fresh() / "train" / run / before.name
+    shutil.rmtree(folder)
+    shutil.copytree(before, folder)
+    path = draw.choice(sorted([*folder.rglob("*.pt"), *folder.rglob("*.ckpt")]))
+    forged = draw.random() < 0.4
+    if forged:
+        content = inputs.mutated_tensors(torch.load(path, weights_only=True), draw)
+    else:
+        data = inputs.mutated(path.read_bytes(), draw)
+
+    def hand_over() -> None:
+        from conftest import tiny_pipeline
+
+        if forged:
+            archives.keep(path, content)
+        else:
+            path.write_bytes(data)
+        lines: list[str] = []
+        pipeline = tiny_pipeline(shop.runs, say=lines.append)
+        trained = pipeline.run("train").path / "manifold.pt"
+        if not forged:
+            assert any(str(path) in line for line in lines), lines
+            same = torch.load(trained, weights_only=True)["state"]
+            whole = torch.load(shop.root / trained.relative_to(shop.runs), weights_only=True)["state"]
+            assert all(torch.equal(same[name], value) for name, value in whole.items())
+
+    return Case(f"{path.relative_to(folder)} {'forged' if forged else 'damaged'}", hand_over)
+
+
+def evaluations(shop: Workshop, draw: random.Random) -> Case:
+    """A file of an evaluate run that is whole by its hash and cannot be meant, in a report or the index."""
+    run = shop.only("evaluate")
+    name = draw.choice(("results.csv", "series.csv", "summary.json", "cost.json", "frames.npz"))
+    path, what = run.path / name, ""
+    data = path.read_bytes()
+    if name.endswith("npz") and draw.random() < 0.8:
+        shop.rewrite(path, data)
+        what = inputs.spoiled_npz(path, draw)
+    else:
+        if draw.random() < 0.15:
+            changed = draw.choice((b"", b"[]", b"null", b"[" * 100_000, b'{"a": NaN}', b"\xff\xfe", b"{}"))
+        elif name.endswith("json"):
+            tree = inputs.mutated_json(json.loads(data), draw)
+            changed = json.dumps(tree).encode("utf-8", "surrogatepass")
+        elif name.endswith("csv"):
+            changed = inputs.mutated_csv(data.decode(), draw).encode("utf-8", "surrogatepass")
+        else:
+            changed = inputs.mutated(data, draw)
+        shop.rewrite(path, changed)
+        what = repr(changed[:1500])
+    shop.recorded(path)
+    index = draw.random() < 0.2
+
+    def hand_over() -> None:
+        if index:
+            shutil.rmtree(shop.folder / "index", ignore_errors=True)
+            shop.command("index", f"folder={shop.folder / 'index'}")()
+            return
+        from nsf.results.question import Question
+        from nsf.results.report import build_report
+
+        build_report([run], shop.folder / "reports" / "fuzz", Question("fuzz", "Fuzz"), films=False)
+
+    return Case(f"{'index' if index else 'report'} with {name}: {what}", hand_over)
+
+
+def observations(shop: Workshop, draw: random.Random) -> Case:
+    """A file of observations, malformed."""
+    kind = draw.choice(("csv", "csv", "csv.gz", "h5", "npz", "json"))
+    lines = ["t,X,Y,Z,x,deviation"] + [f"{0.01 * i},0.5,0.5,0.{i + 1},0.5,0.001" for i in range(6)]
+    path = shop.folder / f"observed.{kind}"
+    path.unlink(missing_ok=True)
+    if kind == "h5":
+        columns = np.array([row.split(",") for row in lines[1:]], float).T
+        with h5py.File(path, "w") as file:
+            for name, values in zip(lines[0].split(","), columns, strict=True):
+                file[name] = values
+        what = inputs.spoiled_hdf5(path, draw)
+        data = path.read_bytes()
+        if draw.random() < 0.4:
+            data, what = inputs.mutated(data, draw), f"{what}, bytes changed"
+    else:
+        data = inputs.mutated_csv("\n".join(lines), draw).encode("utf-8", "surrogatepass")
+        if kind == "csv.gz":
+            data = gzip.compress(data if draw.random() < 0.8 else b"t,x,deviation\n" + b"1,1,1\n" * 2**24)
+        if draw.random() < 0.4:
+            data = inputs.mutated(data, draw)
+        what = repr(data[:600])
+
+    def hand_over() -> None:
+        from nsf.inverse.observations import Observations
+
+        path.write_bytes(data)
+        Observations.read(path, shop.model)
+
+    return Case(f"{kind}: {what}", hand_over)
 
 
 def manifests(shop: Workshop, draw: random.Random) -> Case:
@@ -637,6 +783,9 @@ KINDS: dict[str, Callable[[Workshop, random.Random], Case]] = {
         damaged,
         hdf5,
         checkpoints,
+        intermediates,
+        evaluations,
+        observations,
         manifests,
         requests,
         messages,

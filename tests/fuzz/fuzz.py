@@ -20,7 +20,7 @@ import cases  # noqa: E402
 import watch  # noqa: E402
 from conftest import TINY, tiny_pipeline  # noqa: E402
 
-VIOLATIONS = ("code", "hang", "traceback", "altered")
+VIOLATIONS = ("code", "hang", "memory", "traceback", "altered")
 
 
 def made(folder: Path) -> cases.Workshop:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import torch
 
 #: Values as a hand types them, or as another program writes them.
 VALUES = (
@@ -148,6 +149,8 @@ HOSTILE = (
     "\u202enoitcerid",
     "a\tb\rc\nd",
     "\x07",
+    "\x1b[2J\x1b]0;nsfcanary\x07",
+    "\x9b31m",
     "x" * 3000,
     "${oc.env:HOME}",
     "%(name)s",
@@ -252,11 +255,91 @@ def mutated_json(tree, draw: random.Random):
     if not path or draw.random() < 0.05:
         return value_like(tree, draw)
     parent, key = path[-1]
-    if draw.random() < 0.15:
+    way = draw.random()
+    if way < 0.15:
         del parent[key]
+    elif way < 0.3 and isinstance(parent, dict):
+        parent[draw.choice(HOSTILE)] = parent.pop(key)
+    elif way < 0.33:
+        for _ in range(draw.choice((40, 2000))):
+            parent[key] = [parent[key]]
     else:
         parent[key] = value_like(parent[key], draw)
     return tree
+
+
+def mutated_tensors(tree, draw: random.Random):
+    """A copy of a tree of containers and tensors with one leaf changed or gone."""
+    if isinstance(tree, dict | list | tuple) and tree and (kept := draw.random() < 0.9):
+        copy = dict(tree) if isinstance(tree, dict) else list(tree)
+        key = draw.choice(list(copy)) if isinstance(copy, dict) else draw.randrange(len(copy))
+        if kept and draw.random() < 0.85:
+            copy[key] = mutated_tensors(copy[key], draw)
+        else:
+            del copy[key]
+        return copy
+    if isinstance(tree, torch.Tensor) and draw.random() < 0.7:
+        nothing = tree.clone().double() * float("nan")
+        return draw.choice((tree[..., :0] if tree.ndim else tree[None], tree[None], tree.to(torch.complex64),
+                            nothing, tree.bool(), tree.flatten()))  # fmt: skip
+    return draw.choice((None, "x", -1, 1e300, [], {}, {"a": 1}, True, float("nan"), 2**40))
+
+
+def mutated_csv(text: str, draw: random.Random) -> str:
+    """A table with a cell, a heading, a column or a row changed."""
+    rows = [line.split(",") for line in text.splitlines()]
+    for _ in range(draw.choice((1, 1, 2, 8))):
+        row, column = draw.randrange(len(rows)), draw.randrange(len(rows[0]))
+        match draw.randrange(8):
+            case 0:
+                rows[0][column] = draw.choice(("x", "", rows[0][0], *HOSTILE))
+            case 1:
+                for cells in rows:
+                    del cells[column : column + 1]
+            case 2:
+                del rows[row:]
+            case 3:
+                rows[row] = rows[row][:column]
+            case 4:
+                rows[row] += ["1"] * draw.choice((1, 5000))
+            case 5 | 6 | 7 if len(rows) > 1:
+                cells = rows[draw.randrange(1, len(rows))]
+                cells[min(column, len(cells) - 1) :][:1] = [draw.choice((*VALUES, *HOSTILE))]
+                if cells:
+                    cells[min(column, len(cells) - 1)] = draw.choice((*VALUES, *HOSTILE))
+        if not rows or not rows[0]:
+            break
+    return "\n".join(map(",".join, rows)) + "\n"
+
+
+def spoiled_npz(path: Path, draw: random.Random) -> str:
+    """Change one array of a file as its author could; says it."""
+    with np.load(path) as stored:
+        arrays = dict(stored)
+    name, kind = draw.choice(sorted(arrays)), draw.randrange(9)
+    values = arrays[name]
+    match kind:
+        case 0:
+            del arrays[name]
+        case 1:
+            arrays[name] = np.array([None, {}], object)
+        case 2:
+            arrays[name] = values.astype(draw.choice(("U8", "c16", "?", "f2", "i8", "M8[s]", "V4")))
+        case 3:
+            arrays[name] = values[..., :1] if values.ndim else values.reshape(1, 1)
+        case 4:
+            arrays[name] = values[:0] if values.ndim else values
+        case 5:
+            arrays[name] = np.full_like(values, np.nan) if values.dtype.kind == "f" else values[..., None]
+        case 6:
+            arrays[name] = np.zeros((draw.choice((4, 2**27)),), draw.choice(("f8", "u1")))
+        case 7:
+            arrays[name] = np.concatenate([values, values]) if values.ndim else values
+        case 8 if values.dtype.kind == "f":
+            arrays[name] = values * draw.choice((1e300, -1e30, 0))
+    with np.errstate(all="ignore"):
+        np.savez_compressed(path, **arrays)
+    return f"{name} changed in the way {kind}"
 
 
 def spoiled_hdf5(path: Path, draw: random.Random) -> str:

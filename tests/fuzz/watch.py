@@ -1,6 +1,7 @@
 """A watch over a case: the files it writes, programs it starts, connections it opens, time it takes."""
 
 import os
+import re
 import signal
 import sys
 import tempfile
@@ -14,6 +15,8 @@ from nsf.errors import NSFError
 
 #: Seconds that a case may take; no valid one takes a tenth of it.
 LIMIT = 20.0
+#: [byte] of memory that a case may take beyond what the process had.
+MOST_MEMORY = 2 * 2**30
 #: Programs that the package itself starts: who made a result is a part of it.
 _PROGRAMS = {"git", "nvidia-smi", "uname", "lscpu"}
 _STARTS = {"subprocess.Popen", "os.system", "os.exec", "os.posix_spawn", "os.spawn", "pty.spawn", "os.fork"}
@@ -90,6 +93,13 @@ def _limited(seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
+def _peak(reset: bool = False) -> int:
+    """The most memory [byte] that this process held since the last reset."""
+    if reset:
+        Path("/proc/self/clear_refs").write_text("5")
+    return 1024 * int(re.search(r"VmHWM:\s+(\d+)", Path("/proc/self/status").read_text())[1])
+
+
 _hooked: list[bool] = []
 
 
@@ -103,13 +113,15 @@ def outcome(run: Callable[[], object], altered: bool, folder: Path, limit: float
         limit: [s] that it may take.
 
     Returns:
-        "accepted", "refused", or a violation ("code", "hang", "traceback", "altered"); and what was said.
+        "accepted", "refused", or a violation ("code", "hang", "memory", "traceback", "altered"); and what was
+        said.
     """
     if not _hooked:
         sys.addaudithook(_hook)
         _hooked.append(True)
     watch, writes_none = Watch(folder), sys.dont_write_bytecode
     sys.dont_write_bytecode = True  # of a module that the case is the first to import
+    before = _peak(reset=True)
     _watched.append(watch)
     try:
         with _limited(limit):
@@ -132,6 +144,8 @@ def outcome(run: Callable[[], object], altered: bool, folder: Path, limit: float
     finally:
         _watched.remove(watch)
         sys.dont_write_bytecode = writes_none
+    if (taken := _peak() - before) > MOST_MEMORY:
+        kind, said = "memory", f"{taken / 2**30:.1f} GiB"
     if watch.deeds:
         return "code", "; ".join(watch.deeds[:3])
     return kind, said

@@ -15,9 +15,10 @@ not in the paper, whose fields are `mlp`; it takes their place in every equation
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator, Sequence
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -38,6 +39,7 @@ from nsf.kinematics.fields.networks import Committee, FullyConnected, zero_at_re
 from nsf.kinematics.interpolation import Interpolation, interpolation
 from nsf.kinematics.manifold import Manifold
 from nsf.kinematics.training.phases import MOST_DEEP, MOST_MEMBERS, PHASES, TARGETS, Fit, per_phase
+from nsf.schemas import Number
 from nsf.vectors import number
 
 AFFINE = ("latent", "rate")
@@ -228,9 +230,19 @@ def _slope(local: Interpolation, values: Tensor) -> Tensor:
 class BasisManifold(Manifold):
     """Modal fields of x, tau and C."""
 
+    HYPERPARAMETERS: ClassVar[Mapping] = {
+        **Manifold.HYPERPARAMETERS,
+        "modes": [Number(0, whole=True)],
+        "depth": Number(1, MOST_DEEP, whole=True),  # else a file has many built
+        "members": Number(1, MOST_MEMBERS, whole=True),
+        "noise": Number(0),
+        "noise_floor": Number(0),
+        "affine": re.compile("|".join(AFFINE)),
+        "free_at_rest": bool,
+    }
+
     def __init__(self, latent_dim, x_sha256, parameter_names, hyperparameters):
         super().__init__(latent_dim, x_sha256, parameter_names, hyperparameters)
-        number("depth", hyperparameters["depth"], 1, whole=True, most=MOST_DEEP)  # else a file has many built
         self.takes_rate = hyperparameters["affine"] == "rate"
         if self.takes_rate:
             shape = hyperparameters["frames"], latent_dim

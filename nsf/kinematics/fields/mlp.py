@@ -9,9 +9,9 @@ in training and, once g is trained, principal axes.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -24,6 +24,7 @@ from nsf.kinematics.fields.encoder import Encoder
 from nsf.kinematics.fields.networks import ARITHMETIC, FullyConnected, TensorCores
 from nsf.kinematics.manifold import Manifold, identity
 from nsf.kinematics.training.phases import PHASES, TARGETS, Fit, per_phase
+from nsf.schemas import Number
 from nsf.vectors import number, spaced
 
 HIDDEN_LAYERS = 5
@@ -210,6 +211,11 @@ class MlpManifold(Manifold):
         arithmetic: of h and l where they are deployed on a GPU, whose own errors are far larger: a key of
             `networks.ARITHMETIC`, or None for that of g, the `dtype` of the restriction.
     """
+
+    HYPERPARAMETERS: ClassVar[Mapping] = {
+        **Manifold.HYPERPARAMETERS,
+        "octaves": Number(0, MOST_OCTAVES, whole=True),
+    }
 
     arithmetic: str | None = None
 

@@ -62,15 +62,15 @@ def test_truncated(path, share):
         ({"format_version": 2}, r"format_version 2, this nsf reads 3; train again with `nsf train`"),
         ({"format": "other"}, "no manifold"),
         ({"state": {}}, "other tensors than its field"),
-        ({"hyperparameters": {}}, "do not fit"),
+        ({"hyperparameters": {}}, "hyperparameters lacks particles"),
         ({"latent_dim": 3}, r"has training_latents of float64\[26, 2\], not float64\[26, 3\]"),
-        ({"latent_dim": "2"}, "latent_dim='2', which is no int"),
-        ({"latent_dim": True}, "latent_dim=True, which is no int"),
-        ({"latent_dim": 0}, "latent_dim below 1"),
-        ({"x_sha256": 5}, "x_sha256=5, which is no str"),
+        ({"latent_dim": "2"}, "latent_dim='2' must be a whole number of at least 1"),
+        ({"latent_dim": True}, "latent_dim=True must be a whole number of at least 1"),
+        ({"latent_dim": 0}, "latent_dim=0 must be a whole number of at least 1"),
+        ({"x_sha256": 5}, "x_sha256=5 must be text"),
         ({"x_sha256": "0" * 64}, "has an X of other particles"),
-        ({"parameter_names": [1]}, "parameter_names that are no texts"),
-        ({"parameter_names": "speed"}, "parameter_names='speed', which is no list"),
+        ({"parameter_names": [1]}, r"parameter_names\[0\]=1 must be text"),
+        ({"parameter_names": "speed"}, "parameter_names='speed' must be a list"),
         ({"hyperparameters": {"noise": float("nan")}}, "holds nan beside its tensors"),
         ({"hyperparameters": {"noise": torch.zeros(1)}}, r"holds tensor\(\[0\.\]\) beside its tensors"),
     ],
@@ -79,6 +79,16 @@ def test_foreign(path, change, message):
     torch.save({**torch.load(path, weights_only=True), **change}, path)
     with pytest.raises(SchemaError, match=rf"manifold\.pt .*{message}"):
         Manifold.load(path)
+
+
+def test_hyperparameters_that_no_field_has(path):
+    content = torch.load(path, weights_only=True)
+    for key in content["hyperparameters"]:
+        for odd in ("abc", None, -1, [{}], {"a": 1}):
+            forged = {**content["hyperparameters"], key: odd}
+            torch.save({**content, "hyperparameters": forged}, path)
+            with pytest.raises(SchemaError, match=rf"manifold\.pt .*hyperparameters\.{key}"):
+                Manifold.load(path)
 
 
 @pytest.mark.parametrize(

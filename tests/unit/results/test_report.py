@@ -1,7 +1,9 @@
 """A report of runs: its page and table, what it refuses, and when it stands as it is."""
 
 import json
+import re
 
+import numpy as np
 import pandas as pd
 import pytest
 from made import Made, rewrite, seal, write_run
@@ -11,6 +13,7 @@ from nsf.results import pictures, table
 from nsf.results.averages import interval
 from nsf.results.question import Question, unchanged
 from nsf.results.report import build_report
+from nsf.results.sources import open_sources
 
 ASKED = Question("trial", "Sand & <friends>", "How far?", "Table 1: 0.4 %.", missing=["seed=2: not run"])
 SCRIPT = "</title><script>alert(1)</script> | [x](javascript:alert(1)) $x^2$ \\input{/etc/passwd}"
@@ -151,3 +154,41 @@ def test_titles_are_no_markup(tmp_path, no_pictures):
 def test_an_interval_is_of_seeds_and_cases_drawn_anew():
     assert interval(pd.DataFrame([[0.01, 0.01], [0.01, 0.01]]).to_numpy()) == "1 to 1"
     assert interval(pd.DataFrame([[0.01, 0.02]]).to_numpy()) == ""
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("summary.json", ""),
+        ("summary.json", "[]"),
+        ("summary.json", "[" * 100_000),
+        ("summary.json", '{"paper": {"nsf": {"delta": "abc"}}}'),
+        ("summary.json", '{"paper": 5}'),
+        ("summary.json", '{"scale": {"a": NaN}}'),
+        ("cost.json", '{"breakdown": {"reduced": {"p2g": "abc"}}}'),
+        ("cost.json", "null"),
+        ("results.csv", ""),
+        ("results.csv", "scene,model,case,split,delta,memory_full_mib\nsand,projected,a=1,test,0.1,abc\n"),
+        ("results.csv", "scene,model,case,split,delta\nsand,projected,a=1,test,0.1,1\n"),
+        ("series.csv", "case,split,frame,t,delta,displacement_error,stress_error\na=1,test,0,abc,0,0,0\n"),
+    ],
+)
+def test_a_forged_file_is_refused(tmp_path, no_pictures, name, content):
+    run = write_run(tmp_path / "runs", Made())
+    (run.path / name).write_bytes(content.encode())
+    seal(run)
+    with pytest.raises(SchemaError, match=rf"{re.escape(name)}.*evaluate.* again|write it again"):
+        build_report([run], tmp_path / "reports", ASKED)
+
+
+@pytest.mark.parametrize(
+    "change", [{"x_full": np.zeros((2, 4, 3))}, {"role": None}, {"t": np.full(4, np.inf)}]
+)
+def test_forged_frames_are_refused(tmp_path, change):
+    run = write_run(tmp_path / "runs", Made())
+    with np.load(run.path / "frames.npz") as stored:
+        arrays = dict(stored) | change
+    np.savez(run.path / "frames.npz", **arrays)
+    seal(run)
+    with pytest.raises(SchemaError, match=r"frames\.npz"):
+        open_sources([run])[0].motions(Made().cases)
