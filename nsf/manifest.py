@@ -46,7 +46,7 @@ _SCHEMA = {
     Maybe("parents"): [_RUN],
     Maybe("commit"): (str, None),
     Maybe("dirty"): (bool, None),
-    Maybe("versions"): {...: str},
+    Maybe("versions"): {...: (str, None)},  # a package may be there without its metadata
     Maybe("device"): str,
     Maybe("seed"): (int, None),
     Maybe("precision"): (str, None),

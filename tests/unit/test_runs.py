@@ -103,6 +103,14 @@ def test_a_recorded_run(run):
     assert sorted(os.listdir(child.path)) == [".lock", "config.yaml", "manifest.json", "nets"]
 
 
+def test_packages_without_metadata_are_recorded_as_such(run, monkeypatch):
+    """As of a package that lies on the path and was not installed."""
+    monkeypatch.setattr(nsf.runs.provenance, "_version", lambda distribution: None)
+    monkeypatch.setattr(nsf.runs.run, "provenance", nsf.runs.provenance.provenance.__wrapped__)
+    recorded(run)
+    assert Run.load(run.id, root=run.root).manifest["versions"]["numpy"] is None
+
+
 def test_the_config_on_disk_is_plain_and_the_same(run):
     recorded(run)
     text = (run.path / "config.yaml").read_text()
