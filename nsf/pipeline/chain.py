@@ -10,6 +10,7 @@ there, takes a second or two.
 from collections.abc import Callable, Sequence
 from copy import copy
 from functools import cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -411,13 +412,7 @@ class Pipeline:
 
     def train(self) -> Run:
         """The manifold of the training trajectories."""
-
-        def work(run: Run) -> None:
-            from nsf.pipeline.stages.training import train
-
-            train(self, run)
-
-        return self._made(self.training, work)
+        return self._made(self.training, "training.train")
 
     def teach(self) -> Run:
         """What the configured model learns, once, that all its runs use.
@@ -425,63 +420,41 @@ class Pipeline:
         Raises:
             ConfigError: it learns nothing.
         """
-
-        def work(run: Run) -> None:
-            from nsf.pipeline.stages.fitting import fit
-            from nsf.pipeline.stages.teaching import teach
-
-            (fit if self.teaching is None else teach)(self, run)
-
-        return self._made(self.taught, work)
+        return self._made(self.taught, "fitting.fit" if self.teaching is None else "teaching.teach")
 
     def deploy(self) -> Run:
         """Reduced trajectories of the held-out cases, through Lightning's `Trainer.predict`."""
         if self.is_taught and not self.taught.complete:
             self.teach()
-
-        def work(run: Run) -> None:
-            from nsf.pipeline.stages.choosing import measure_candidates
-            from nsf.pipeline.stages.deployment import deploy_held_out, warn_of_step
-
-            warn_of_step(self)
-            measured = measure_candidates(self) if isinstance(self.configured, Auto) else []
-            deploy_held_out(self, run, measured)
-
-        return self._made(self.deployment, work)
+        return self._made(self.deployment, "deployment.deploy_held_out")
 
     def evaluate(self) -> Run:
         """Errors and costs of the reduced trajectories."""
-
-        def work(run: Run) -> None:
-            from nsf.pipeline.stages.evaluation import evaluate
-
-            evaluate(self, run)
-
-        return self._made(self.evaluation, work)
+        return self._made(self.evaluation, "evaluation.evaluate")
 
     def superresolve(self) -> Run:
         """The reduced trajectories at many more points, beside full-order ones of as many particles."""
-
-        def work(run: Run) -> None:
-            from nsf.pipeline.stages.evaluation import superresolve_held_out
-
-            superresolve_held_out(self, run)
-
-        return self._made(self.superresolution, work)
+        return self._made(self.superresolution, "evaluation.superresolve_held_out")
 
     def report(self) -> Path:
         """The report of every evaluated variant of this scene at these held-out trajectories."""
         return report(self, self.say)
 
-    def _made(self, run: Run, work: Callable[[Run], None]) -> Run:
-        """The run, made here unless it is there or another process makes it meanwhile."""
+    def _made(self, run: Run, work: str) -> Run:
+        """The run, made here unless it is there or another process makes it meanwhile.
+
+        Args:
+            run: of a stage.
+            work: `module.function` of `nsf.pipeline.stages` that makes it, of the pipeline and the run.
+        """
         if not run.complete:
             self.check()
             for parent in run.parent_runs:
                 parent.require()
             with run.claimed(self.say):
                 if not run.complete:
-                    work(run)
+                    module, _, function = work.partition(".")
+                    getattr(import_module(f"nsf.pipeline.stages.{module}"), function)(self, run)
                     return run
         return reused(run, self.say)
 

@@ -279,7 +279,7 @@ BEFORE_ANY_WORK = [
 
 @pytest.mark.parametrize(("override", "quoted"), BEFORE_ANY_WORK, ids=[o for o, _ in BEFORE_ANY_WORK])
 def test_bad_input_of_a_later_stage_is_refused_before_any_work(nsf, monkeypatch, override, quoted):
-    monkeypatch.setattr(chain_module(), "simulate", lambda *arguments: pytest.fail("simulate began"))
+    monkeypatch.setattr(simulation_stage(), "simulate", lambda *arguments: pytest.fail("simulate began"))
     code, _, err = nsf("run", override)
     assert code == 2
     assert len(err.strip().splitlines()) == 1
@@ -289,17 +289,17 @@ def test_bad_input_of_a_later_stage_is_refused_before_any_work(nsf, monkeypatch,
 
 @pytest.mark.parametrize("jobs", [("+experiment=table1/ablation", "scale=small"), ("-m", "latent_dim=4,5")])
 def test_a_place_for_no_report_is_refused_before_the_jobs(nsf, monkeypatch, jobs):
-    monkeypatch.setattr(chain_module(), "simulate", lambda *arguments: pytest.fail("simulate began"))
+    monkeypatch.setattr(simulation_stage(), "simulate", lambda *arguments: pytest.fail("simulate began"))
     code, _, err = nsf("run", *jobs, "report.folder=/proc/reports", tiny_scene=jobs[0] == "-m")
     assert code == 2
     assert len(err.strip().splitlines()) == 1
     assert "no report can be written to /proc/reports" in err
 
 
-def chain_module():
-    from nsf.pipeline import chain
+def simulation_stage():
+    from nsf.pipeline.stages import simulation
 
-    return chain
+    return simulation
 
 
 @pytest.mark.parametrize(
@@ -322,7 +322,7 @@ def test_a_memory_is_learned_from_full_order_runs_alone(nsf):
 
 def test_the_example_of_the_style_guide(nsf, monkeypatch):
     """|S| = 1 with the paper's r = 6."""
-    monkeypatch.setattr(chain_module(), "simulate", lambda *arguments: pytest.fail("simulate began"))
+    monkeypatch.setattr(simulation_stage(), "simulate", lambda *arguments: pytest.fail("simulate began"))
     code, _, err = nsf("run", "latent_dim=6", "sampler.size=1")
     assert code == 2
     assert "|S|=1 gives 3 equations for r=6 unknowns; choose sampler.size >= 2 or latent_dim <= 3" in err

@@ -26,9 +26,9 @@ from nsf.deployment.trust import CaseDistance, LatentDistance, SolidsRange
 from nsf.dynamics import ReducedBatch, ReducedMPM
 from nsf.engines.operators import collider_states
 from nsf.kinematics.manifold import Manifold
-from nsf.models import FullOrder, Projected, Recurrence
-from nsf.models.auto import Measured
+from nsf.models import Auto, FullOrder, Projected, Recurrence
 from nsf.mpm.stability import largest_stable_dt, multiplied_step_warning
+from nsf.pipeline.stages.choosing import measure_candidates
 from nsf.runs import Record, Run
 from nsf.storage import writing
 
@@ -36,14 +36,15 @@ from nsf.storage import writing
 CONFIGURATION = "configuration.yaml"
 
 
-def deploy_held_out(pipeline, run: Run, measured: Sequence[Measured] = ()) -> None:
+def deploy_held_out(pipeline, run: Run) -> None:
     """Deploy a pipeline's held-out cases; rollouts and the configuration of its chain go into the run.
 
     Args:
         pipeline: a `nsf.pipeline.Pipeline`.
         run: its deploy run.
-        measured: the candidates of `model=auto`, of which the pipeline has chosen.
     """
+    warn_of_step(pipeline)
+    measured = measure_candidates(pipeline) if isinstance(pipeline.configured, Auto) else []
     manifold = pipeline.manifold().to(pipeline.device)  # many solvers take their rows from it
     with run.record(device=pipeline.device, precision=pipeline.config.precision) as record:
         record.metrics |= {"model": pipeline.model.name, "candidates": [one.plain for one in measured]}
