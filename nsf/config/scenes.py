@@ -114,7 +114,7 @@ def recorded_scene(settings: Mapping[str, Any]) -> Scene:
     }
     content = {key: settings[key] for key in ("material", "transfer")}
     content["scene"] = settings["scene"] | {"name": "recorded", "parameters": parameters}
-    return _built(OmegaConf.create(content), None)
+    return _built(resolve(OmegaConf.create(content)), None)
 
 
 def changed_scene(config: DictConfig, scene: Scene, changes: Mapping[str, Any]) -> Scene:
