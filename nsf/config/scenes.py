@@ -20,8 +20,7 @@ from nsf.vectors import text
 
 #: Keys of a configuration's scene that say nothing of its physics.
 NOT_PHYSICS = ("name", "title", "parameters", "design", "paper")
-_NUMBERS = ("name", "dx", "dt", "steps", "size", "gravity", "program")
-_OBJECTS = ("inclination", "walls")
+_REQUIRED, _OPTIONAL = ("name", "dx", "dt", "steps", "bodies"), ("size", "gravity", "program")
 _PHYSICS = re.compile(
     r"(material|transfer|scene\.(dx|dt|steps|size|gravity|inclination|bodies|colliders|walls|forcing))\b"
 )
@@ -63,11 +62,13 @@ def _built(whole: DictConfig, design: Design | None) -> Scene:
     s = section(whole, "scene")
     if "title" in s:
         text("scene.title", s.title)
-    values = {key: _plain(s[key]) for key in _NUMBERS if key in s}
-    values |= {key: build(s[key], f"scene.{key}") for key in _OBJECTS if s.get(key) is not None}
+    values = {key: _plain(s[key]) for key in (*_REQUIRED, *_OPTIONAL) if key in s or key in _REQUIRED}
+    if s.get("inclination") is not None:
+        values["inclination"] = build(s.inclination, "scene.inclination")
+    if "walls" in s:
+        values["walls"] = build(s.walls, "scene.walls")
     return Scene(
-        **values,
-        bodies=build_all(s.bodies, "scene.bodies"),
+        **values | {"bodies": build_all(s.bodies, "scene.bodies")},
         colliders=build_all(s.get("colliders", {}), "scene.colliders"),
         material=build(whole.material, "material"),
         transfer=build(whole.transfer, "transfer"),

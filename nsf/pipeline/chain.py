@@ -20,15 +20,15 @@ from nsf import config as configuration
 from nsf.config.scenes import changed_scene, scene_of
 from nsf.data.case import Case
 from nsf.engines.operators.teaching import Teaching, random_cases
-from nsf.errors import ConfigError
+from nsf.errors import ConfigError, MissingRunError
 from nsf.gpu import has_driver
 from nsf.models import Auto, Model, Recurrence
 from nsf.mpm import FP32, FP64, Precision
 from nsf.paths import groups, option
 from nsf.pipeline import naming
-from nsf.pipeline.reuse import report, reused
 from nsf.pipeline.values import check_numbers, check_words, factors
 from nsf.results.folder import check_place
+from nsf.results.question import Question, unchanged
 from nsf.runs import Run
 from nsf.scenes import Scene
 
@@ -50,6 +50,11 @@ HELD_BACK = 3
 _STORED = {"float32": FP32, "float64": FP64}
 
 
+def _part(key: str) -> cached_property:
+    """What a section of the configuration names, built when it is first asked for."""
+    return cached_property(lambda pipeline: configuration.build(pipeline.config[key], key))
+
+
 class Pipeline:
     """The chain of one configuration.
 
@@ -65,6 +70,8 @@ class Pipeline:
         coarse: factors of Δx of the full-order runs that a reduced one is held to.
         split: cases by their use.
         device: found once, so that a missing GPU is reported before any work.
+        field, trainer, sampler, projector, integration: as the configuration names them.
+        training, taught, deployment, evaluation, superresolution: runs of the stages (`nsf.pipeline.naming`).
 
     Raises:
         ConfigError: a value is missing or refused; names it. What only a stage's work needs is built, and
@@ -139,30 +146,11 @@ class Pipeline:
 
     # -- what the stages need, built when it is first asked for ------------------------------------------
 
-    @cached_property
-    def field(self):
-        """What is trained."""
-        return configuration.build(self.config.field, "field")
-
-    @cached_property
-    def trainer(self):
-        """How it is trained."""
-        return configuration.build(self.config.trainer, "trainer")
-
-    @cached_property
-    def sampler(self):
-        """What chooses the sample particles."""
-        return configuration.build(self.config.sampler, "sampler")
-
-    @cached_property
-    def projector(self):
-        """What projects a step onto the latent vector."""
-        return configuration.build(self.config.projector, "projector")
-
-    @cached_property
-    def integration(self):
-        """Which particles a step integrates."""
-        return configuration.build(self.config.integration, "integration")
+    field = _part("field")
+    trainer = _part("trainer")
+    sampler = _part("sampler")
+    projector = _part("projector")
+    integration = _part("integration")
 
     @cached_property
     def sources(self) -> "Sources":
@@ -289,34 +277,11 @@ class Pipeline:
         """The runs of the trajectories that are trained on."""
         return [self.simulation(case) for case in self.split.train]
 
-    @property
-    def training(self) -> Run:
-        """The run of the manifold."""
-        return naming.training(self)
-
-    @property
-    def taught(self) -> Run:
-        """The run of what the model learns.
-
-        Raises:
-            ConfigError: the model learns nothing.
-        """
-        return naming.taught(self)
-
-    @property
-    def deployment(self) -> Run:
-        """The run of the reduced trajectories."""
-        return naming.deployment(self)
-
-    @property
-    def evaluation(self) -> Run:
-        """The run of errors and costs."""
-        return naming.evaluation(self)
-
-    @property
-    def superresolution(self) -> Run:
-        """The run of the deployed fields at more points."""
-        return naming.superresolution(self)
+    training = property(naming.training)
+    taught = property(naming.taught)
+    deployment = property(naming.deployment)
+    evaluation = property(naming.evaluation)
+    superresolution = property(naming.superresolution)
 
     def runs_of(self, stage: str) -> list[Run]:
         """The runs of a stage, each once; none of `teach` where nothing is taught."""
@@ -346,6 +311,17 @@ class Pipeline:
             if run.complete:
                 return run
         return self.runs_of(stage)[0].require()
+
+    def complete(self, stages: Sequence[str]) -> bool:
+        """Whether some stages have nothing to do."""
+        later = [stage for stage in stages if stage != "simulate"]
+        if "simulate" in stages:
+            spare = self.spare(later) if later else set()
+            if not all(run.complete or run.id in spare for run in self.runs_of("simulate")):
+                return False
+        if not all(run.complete for stage in later if stage != "report" for run in self.runs_of(stage)):
+            return False
+        return "report" not in stages or self._kept_report() is not None
 
     def spare(self, later: Sequence[str]) -> set[str]:
         """Trajectories, by id, that later stages need not read, as their results are there."""
@@ -396,10 +372,25 @@ class Pipeline:
             later: the stages that they are for, if no others: trajectories that only read are in these
                 stages' results, where those are there, are not made again.
         """
-        from nsf.pipeline.stages.simulation import simulate_all
+        runs = self.runs_of("simulate")
+        there = [run for run in runs if run.complete]
+        spare = self.spare(later) if later and len(there) < len(runs) else set()
+        needless = [run for run in runs if run not in there and run.id in spare]
+        if there:
+            self.say(f"simulate: {len(there)} of {len(runs)} trajectories are there, reused")
+        if needless:
+            self.say(
+                f"simulate: {len(needless)} of {len(runs)} trajectories are gone, and nothing needs them"
+            )
+        known = dict.fromkeys(line for run in there for line in run.manifest.get("warnings", ()))
+        for line in known:
+            self.say(f"simulate: warning: {line}")
+        if missing := {run for run in runs if run not in there and run not in needless}:
+            from nsf.pipeline.stages.simulation import simulate_missing
 
-        self.check()
-        return simulate_all(self, later)
+            self.check()
+            simulate_missing(self, missing, known)
+        return runs
 
     def full_order(self, cases: Sequence[Case]) -> list[Run]:
         """Full-order trajectories of any cases of the deployed scene; those that are there are reused."""
@@ -437,8 +428,34 @@ class Pipeline:
         return self._made(self.superresolution, "evaluation.superresolve_held_out")
 
     def report(self) -> Path:
-        """The report of every evaluated variant of this scene at these held-out trajectories."""
-        return report(self, self.say)
+        """The page of every evaluated variant of this scene, written anew where something has changed.
+
+        Raises:
+            MissingRunError: there is none.
+        """
+        runs = self.reported()
+        if not runs:
+            raise MissingRunError(
+                "no evaluate run of these held-out cases is there; run `nsf run` with the same keys"
+            )
+        said = f"report: evaluated runs: {len(runs)}"
+        if page := self._kept_report():
+            self.say(f"{said}, unchanged, reused → {page}")
+            return page
+        from nsf.results.report import build_report
+
+        page = build_report(runs, self.report_folder, self._question, first=self.evaluation)
+        self.say(f"{said} → {page}")
+        return page
+
+    def _kept_report(self) -> Path | None:
+        """The page of the report, if nothing that it shows has changed since it was written."""
+        runs = self.reported()
+        return unchanged(self.report_folder, runs, self._question, self.evaluation) if runs else None
+
+    @property
+    def _question(self) -> Question:
+        return Question(self.config.report.name, self.config.scene.title)
 
     def _made(self, run: Run, work: str) -> Run:
         """The run, made here unless it is there or another process makes it meanwhile.
@@ -456,7 +473,8 @@ class Pipeline:
                     module, _, function = work.partition(".")
                     getattr(import_module(f"nsf.pipeline.stages.{module}"), function)(self, run)
                     return run
-        return reused(run, self.say)
+        self.say(f"{run.stage}: inputs unchanged, reused → {run.id}")
+        return run
 
     # -- reduced solvers ---------------------------------------------------------------------------------
 

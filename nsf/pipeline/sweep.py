@@ -23,8 +23,6 @@ from nsf.errors import ConfigError, LaunchError, NSFError
 from nsf.extras import optional
 from nsf.gpu import has_driver
 from nsf.pipeline.chain import Pipeline
-from nsf.pipeline.reuse import done
-from nsf.pipeline.reuse import report as report_of
 from nsf.progress import label, labelled
 from nsf.runs import Run
 from nsf.runs.reserved import reserved, reserving
@@ -61,12 +59,8 @@ def work(config: DictConfig, stages: Sequence[str], say: Callable[[str], object]
         _ = pipeline.held_out  # refused before hours of simulation and training, not after
     if "report" in stages:
         pipeline.check_report_folder()
-    if "report" in stages[:1]:
-        return report_of(pipeline, say)
-    if (there := done(pipeline, stages, say)) is not None:
-        return there
-    pipeline.check()
-    with reserving(pipeline.inputs if len(stages) > 1 else ()):
+    needs_others = len(stages) > 1 and not pipeline.complete(stages)
+    with reserving(pipeline.inputs if needs_others else ()):
         for at, name in enumerate(stages):
             result = pipeline.simulate(stages[at + 1 :]) if name == "simulate" else pipeline.run(name)
     return result
@@ -120,7 +114,7 @@ def sweep(
             pipeline = Pipeline(one)
             kept.add(one.data.keep)
             needed.update(pipeline.inputs)
-            if done(pipeline, _of_chain(pipeline, stages), lambda line: None) is None:
+            if not pipeline.complete(_of_chain(pipeline, stages)):
                 pipeline.check()
 
     for overrides in sweeps:
@@ -166,7 +160,7 @@ def reports(overrides: Sequence[str], say: Callable[[str], object] = print) -> l
     Raises:
         MissingRunError: no job of a scene was evaluated.
     """
-    return [report_of(pipeline, say) for pipeline in _reporting(overrides)]
+    return [pipeline.report() for pipeline in _reporting(overrides, say)]
 
 
 def check_report_folders(overrides: Sequence[str]) -> None:
@@ -180,11 +174,11 @@ def check_report_folders(overrides: Sequence[str]) -> None:
         pipeline.check_report_folder()
 
 
-def _reporting(overrides: Sequence[str]) -> list[Pipeline]:
+def _reporting(overrides: Sequence[str], say: Callable[[str], object] = print) -> list[Pipeline]:
     """One for each page."""
     configs = [configuration.load(job) for job in configuration.jobs([overrides])]
     last = {(config.report.folder, config.report.name): config for config in configs}
-    return [Pipeline(config) for config in last.values()]
+    return [Pipeline(config, say) for config in last.values()]
 
 
 def _of_chain(pipeline: Pipeline, stages: Sequence[str]) -> list[str]:

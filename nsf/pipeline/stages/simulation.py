@@ -4,7 +4,7 @@ import contextlib
 import os
 import queue
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -19,7 +19,6 @@ from nsf.errors import InstabilityError
 from nsf.mpm import FullOrderMPM, ParticleConstants, Precision, diagnosed
 from nsf.mpm.recording import HostMemory, blocks
 from nsf.pipeline.checks import check_room
-from nsf.pipeline.reuse import simulations
 from nsf.progress import Progress
 from nsf.runs import Run
 from nsf.scenes import Scene
@@ -205,29 +204,25 @@ def _store(
         record.output(TRAJECTORY)
 
 
-def simulate_all(pipeline, later: Sequence[str] = ()) -> list[Run]:
-    """The trajectories of every case of a pipeline, those that are not there made.
+def simulate_missing(pipeline, missing: Collection[Run], known: Collection[str]) -> None:
+    """Make the trajectories of a pipeline that are not there.
 
     Args:
         pipeline: a `nsf.pipeline.Pipeline`.
-        later: as for `Pipeline.simulate`.
+        missing: their runs.
+        known: warnings that were said already.
     """
     # A changed scene that changes nothing, or trains on what it deploys, names one run twice.
     runs = {pipeline.simulation(*needed): needed for needed in pipeline.needed()}
-    missing = simulations(pipeline, runs, later, pipeline.say)
-    if not missing:
-        return list(runs)
-    pipeline.check()
-    warnings = {run: resolution_warnings(scene.at(case)) for run in missing for case, scene in [runs[run]]}
-    known = {line for run in runs if run.complete for line in run.manifest.get("warnings", ())}
+    runs = {run: needed for run, needed in runs.items() if run in missing}
+    warnings = {run: resolution_warnings(scene.at(case)) for run, (case, scene) in runs.items()}
     for line in dict.fromkeys(line for lines in warnings.values() for line in lines):
         if line not in known:
             pipeline.say(f"simulate: warning: {line}")
     started = time.perf_counter()
-    made = make(pipeline, {run: runs[run] for run in missing}, warnings)
-    elsewhere = f", {len(missing) - made} by another process" if made < len(missing) else ""
+    made = make(pipeline, runs, warnings)
+    elsewhere = f", {len(runs) - made} by another process" if made < len(runs) else ""
     pipeline.say(f"simulate: {made} trajectories in {time.perf_counter() - started:.1f} s{elsewhere}")
-    return list(runs)
 
 
 def make(
