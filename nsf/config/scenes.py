@@ -20,7 +20,7 @@ from nsf.vectors import text
 
 #: Keys of a configuration's scene that say nothing of its physics.
 NOT_PHYSICS = ("name", "title", "parameters", "design", "paper")
-_REQUIRED, _OPTIONAL = ("name", "dx", "dt", "steps", "bodies"), ("size", "gravity", "program")
+_REQUIRED, _OPTIONAL = ("name", "dx", "dt", "steps"), ("size", "gravity", "program")
 _PHYSICS = re.compile(
     r"(material|transfer|scene\.(dx|dt|steps|size|gravity|inclination|bodies|colliders|walls|forcing))\b"
 )
@@ -68,7 +68,8 @@ def _built(whole: DictConfig, design: Design | None) -> Scene:
     if "walls" in s:
         values["walls"] = build(s.walls, "scene.walls")
     return Scene(
-        **values | {"bodies": build_all(s.bodies, "scene.bodies")},
+        **values,
+        bodies=build_all(s.bodies, "scene.bodies"),
         colliders=build_all(s.get("colliders", {}), "scene.colliders"),
         material=build(whole.material, "material"),
         transfer=build(whole.transfer, "transfer"),
