@@ -32,6 +32,8 @@ _SAID = re.compile(r"_target_$|^(parameters|cases|validation|teaching_cases|file
 #: Units of metrics by the end of their name; δ and other errors are shown in per cent.
 _METRICS = {"seconds": "s", "ms": "ms", "mib": "MiB", "bytes": "B"}
 _PERCENT = re.compile(r"(^|_)(delta|error)$")
+#: Keys that a case replaces, which the column of cases shows.
+_PARAMETER_KEY = re.compile(r"parameters\.\w+\.key")
 _UNIT = re.compile(r"^\s*(\w+):[^#\n]*#\s*\[([^\]\d][^\]]*)\]", re.M)
 
 
@@ -59,12 +61,15 @@ def differing(found: Sequence[Entry], asked: Iterable[str] = ()) -> Differing:
     for entry in found:
         groups.setdefault((entry.run.stage, entry.run.scene), []).append(entry)
     differ: dict[str, None] = {}
+    replaced = {
+        value for entry in found for key, value in entry.settings.items() if _PARAMETER_KEY.fullmatch(key)
+    }
     for entries in groups.values():
         known = dict.fromkeys(key for entry in entries for key in (*TITLES, *entry.settings))
         for key in known:
             # Some have no such key at all, as those of operators.
             values = {cell(entry, key) for entry in entries} - {ABSENT}
-            if not _SAID.search(key) and len(values) > 1:
+            if not _SAID.search(key) and key not in replaced and len(values) > 1:
                 differ[key] = None
     own = [key for key in dict.fromkeys(asked) if key not in FIELDS]
     first = [key for key in TITLES if key in differ and key not in own]
