@@ -35,7 +35,7 @@ class Parameter:
     """
 
     key: str
-    unit: str = ""
+    unit: str
     range: Sequence[float] | None = None
     log: bool = False
 

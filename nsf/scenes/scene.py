@@ -126,7 +126,7 @@ class Scene:
     @cached_property
     def varied(self) -> dict[str, Parameter]:
         """What a case has a value of: the problem parameters, and the program's number if there is any."""
-        return dict(self.parameters) | ({PROGRAM: Parameter(f"scene.{PROGRAM}")} if self.forcing else {})
+        return dict(self.parameters) | ({PROGRAM: Parameter(f"scene.{PROGRAM}", "")} if self.forcing else {})
 
     @cached_property
     def split(self) -> Split:

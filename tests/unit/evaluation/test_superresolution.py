@@ -25,7 +25,7 @@ def test_a_refined_scene_begins_with_the_same_particles():
     ball = "{_target_: nsf.scenes.Body, shape: {_target_: nsf.scenes.Ball, centre: [0.5,0.5,0.6], radius: 0.1}, particles_per_cell: 2, density: 1}"  # fmt: skip # noqa: E501
     scene = load_scene("sand", ["scene.bodies.column.particles=300", f"+scene.bodies.ball={ball}"])
     fine = scene.refined(4)
-    assert [b.particles for b in fine.bodies] == [4 * b.particles for b in scene.bodies]
+    assert [b.particles for b in fine.bodies.values()] == [4 * b.particles for b in scene.bodies.values()]
     assert (fine.grid, fine.dt) == (scene.grid, scene.dt)
     before, after = scene.particles(), fine.particles()
     rows = superresolution._rows_in(fine, scene)
