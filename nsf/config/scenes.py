@@ -112,7 +112,9 @@ def recorded_scene(settings: Mapping[str, Any]) -> Scene:
         ConfigError: a value is refused, as a mesh that is no longer there.
     """
     parameters = {
-        name: {"key": own["key"]} for name, own in settings["parameters"].items() if name != PROGRAM
+        name: {"key": own["key"], "unit": ""}
+        for name, own in settings["parameters"].items()
+        if name != PROGRAM
     }
     content = {key: settings[key] for key in ("material", "transfer")}
     content["scene"] = settings["scene"] | {"name": "recorded", "parameters": parameters}
