@@ -34,7 +34,7 @@ class Posterior:
     accepted: float
 
     @property
-    def told(self) -> str:
+    def text(self) -> str:
         """How the draws were made."""
         return (
             f"{len(self.values):,} draws from the second half of {self.steps:,} steps, "
@@ -42,15 +42,15 @@ class Posterior:
         )
 
     @property
-    def warning(self) -> str:
-        """What a reader must know of a chain that ran too short or stood still; empty of a good one."""
+    def warnings(self) -> list[str]:
+        """A sentence on a chain that ran too short or stood still; none on a good one."""
         if self.length >= _LENGTH and self.accepted >= _ACCEPTED:
-            return ""
-        return (
+            return []
+        return [
             f"the sampler's chain is {self.length:.3g} autocorrelation times long, of {_LENGTH:g}, and "
             f"accepts {100 * self.accepted:.0f} % of the proposals, of {100 * _ACCEPTED:g} % at least; its "
             "quantiles are rough; give a wider prior, or observations that tell the parameters apart"
-        )
+        ]
 
 
 def posterior(

@@ -1,20 +1,18 @@
-"""One calibration: the estimate, how sure it is, what is left, and a full-order run there."""
+"""One calibration: the estimate, how sure it is, the residuals, and a full-order run at the estimate."""
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import torch
-from matplotlib.figure import Figure
 
-from nsf.data import PROGRAM, Trajectory
+from nsf.data import Trajectory
 from nsf.data.schema import TRAJECTORY
 from nsf.inverse.fit import CONFIDENCE, Fit, fit
 from nsf.inverse.model import Model
 from nsf.inverse.observations import AXES, Observations, View
 from nsf.inverse.reports.charts import points_chart, residuals_chart
-from nsf.inverse.reports.page import Chart, Results, frame_table, named, rms, title_of, write
+from nsf.inverse.reports.page import Chart, Problem, Results, frame_table, named, rms, title_of
 from nsf.inverse.space import Space
 from nsf.results.columns import number
 
@@ -39,79 +37,65 @@ _POINTS = "Observed and fitted points at the last time that was observed."
 _RESIDUALS = "Observations less runs over time; the full-order run is at the estimate."
 
 
-def report(
+def calibration(
+    problem: Problem,
     view: View,
-    model: Model,
     space: Space,
-    folder: Path,
-    *,
-    program: int | None = None,
     full_order: bool = True,
     starts: int = 64,
     say: Callable[[str], object] = print,
-) -> tuple[Path, Fit]:
-    """Calibrate, run the full-order solver at the estimate, and write the results.
+) -> Results:
+    """Calibrate, and run the full-order solver at the estimate.
 
     Args:
+        problem: the model, and the program that the observed run followed.
         view: of the observations.
-        model, space: of the runs, and where to look.
-        folder: of the page, `estimate.csv`, `correlation.csv` and `residuals.csv`.
-        program: number of the program that the observed run followed, where the scene has programs.
+        space: where to look.
         full_order: whether to make that run.
         starts: see `fit`.
         say: told what is done.
+
+    Returns:
+        A page with `estimate.csv`, `correlation.csv` and `residuals.csv`.
     """
-    forcing = None if program is None else model.forcing(program=program)
-    best = fit(view, model, space, starts=starts, forcing=forcing)
-    estimate = _estimate(best, model)
-    values = zip(best.estimate, best.standard_error, strict=True)
-    words = [f"{named(model, n)} {v:.4g} ± {e:.2g}" for n, (v, e) in zip(space.free, values, strict=True)]
+    model, runs = problem.model, []
+    best = fit(view, model, space, starts=starts, forcing=problem.forcing)
+    values = zip(space.free, best.estimate, best.standard_error, strict=True)
+    words = [f"{named(model, name)} {value:.4g} ± {error:.2g}" for name, value, error in values]
     say(f"calibrate: {', '.join(words)} in {best.seconds:.2f} s")
     rows = view.observations.frame.assign(fitted=best.seen, s=best.scale, residual=-best.residuals)
-    runs = []
     if full_order:
-        known = dict(zip(space.free, best.estimate.tolist(), strict=True)) | dict(space.fixed)
-        case = model.scene.case(known if program is None else known | {PROGRAM: program})
-        runs = model.pipeline.full_order([case])
+        estimate = dict(zip(space.free, best.estimate.tolist(), strict=True))
+        runs = problem.full_order([estimate | dict(space.fixed)])
         with Trajectory.open(runs[0].file(TRAJECTORY)) as truth:
             rows["full_order"] = view.of_truth(truth)
         off = 1e3 * rms(rows["value"] - rows["full_order"])
         say(f"calibrate: a full-order run at the estimate leaves {off:.3g} mm (RMS) → {runs[0].id}")
-    warnings = warnings_of(best, view.observations)
-    for warning in warnings:
-        say(f"calibrate: warning: {warning}")
-    correlation = pd.DataFrame(best.correlation, columns=list(space.free))
+    estimate, correlation = _estimate(best, model), pd.DataFrame(best.correlation, columns=list(space.free))
     correlation.insert(0, "parameter", space.free)
-    stops = f"the best of {best.starts} starts were followed to their ends: {'; '.join(best.stops)}."
-    tables = [frame_table("Estimate", _shown(estimate, model), f"{len(rows)} observations; {stops}")]
-    if len(space.free) > 1:
-        tables.append(frame_table("Correlation of the errors", correlation.rename(columns={"parameter": ""})))
-    tables.append(frame_table("What is left", _left(rows), "Root mean squares over the observations."))
-    charts = [Chart("Observed and fitted", "residuals", _RESIDUALS, lambda: residuals_chart(rows))]
-    if rows["what"].isin(AXES).any():
-        chart = Chart("Observed and fitted", "points", _POINTS, lambda: _points(model, best, rows))
-        charts.insert(0, chart)
-    results = Results(
+    return Results(
         title=f"{title_of(model)}: calibration",
         lead=_LEAD,
         models=[model],
-        beside=runs,
-        tables=tables,
+        runs=runs,
+        tables=_tables(best, estimate, correlation, rows),
         files={"estimate.csv": estimate, "correlation.csv": correlation, "residuals.csv": rows},
-        charts=charts,
+        charts=[
+            *([_points(model, best, rows)] if rows["what"].isin(AXES).any() else []),
+            Chart("Observed and fitted", "residuals", _RESIDUALS, residuals_chart(rows)),
+        ],
         facts=[("Distrust of the fitted run", number(best.distrust)), ("Seconds", number(best.seconds))],
         definitions=_TERMS,
-        warnings=warnings,
+        warnings=warnings_of(best, view.observations),
         asked={
             "ranges": dict(zip(space.free, space.ranges.tolist(), strict=True)),
             "fixed": dict(space.fixed),
         },
     )
-    return write(results, folder), best
 
 
-def warnings_of(best: Fit, own: Observations) -> list[str]:
-    """What a reader must know of an estimate before they use it."""
+def warnings_of(best: Fit, observations: Observations) -> list[str]:
+    """Sentences that a reader must know before they use an estimate."""
     warnings = [
         f"{name} ends at an end of its range, and the truth may lie beyond; train with a wider range"
         for name in best.at_end
@@ -120,8 +104,8 @@ def warnings_of(best: Fit, own: Observations) -> list[str]:
         k = int(np.abs(best.residuals).argmax())
         warnings.append(
             f"no run passes the observations: the best misses them by {best.misfit:.3g} deviations (RMS), "
-            f"the model's own error among these, {own.place(k)} by {abs(best.residuals[k]):.3g}; look for "
-            "a wrong unit, point or time"
+            f"the model's own error among these, {observations.place(k)} by {abs(best.residuals[k]):.3g}; "
+            "look for a wrong unit, point or time"
         )
     if best.distrust > 1.0:
         warnings.append(
@@ -131,6 +115,7 @@ def warnings_of(best: Fit, own: Observations) -> list[str]:
 
 
 def _estimate(best: Fit, model: Model) -> pd.DataFrame:
+    """A row a parameter."""
     units = dict(zip(model.names, model.units, strict=True))
     return pd.DataFrame(
         {
@@ -148,33 +133,35 @@ def _estimate(best: Fit, model: Model) -> pd.DataFrame:
     )
 
 
-def _shown(estimate: pd.DataFrame, model: Model) -> pd.DataFrame:
-    lower, upper = (estimate[f"{end}_90"].map("{:.5g}".format) for end in ("lower", "upper"))
-    return pd.DataFrame(
-        {
-            "parameter": [named(model, name) for name in estimate["parameter"]],
-            "estimate": estimate["estimate"].map("{:.5g}".format),
-            "standard error": estimate["standard_error"],
-            "90 % interval": lower + " … " + upper,
-            "the model's own [%]": 100 * estimate["share_of_model"],
-            "fits best": estimate["fitted"].map("{:.5g}".format),
-        }
+def _tables(best: Fit, estimate: pd.DataFrame, correlation: pd.DataFrame, rows: pd.DataFrame) -> list:
+    """Tables of the page: the estimate, the correlation of several parameters, and the residuals."""
+    value, lower, upper, fitted = (
+        estimate[name].map("{:.5g}".format) for name in ("estimate", "lower_90", "upper_90", "fitted")
     )
-
-
-def _left(rows: pd.DataFrame) -> pd.DataFrame:
-    own = np.sqrt(np.maximum(rows["s"] ** 2 - rows["deviation"] ** 2, 0.0))
+    shown = {
+        "parameter": [named(best.space.model, name) for name in estimate["parameter"]],
+        "estimate": value,
+        "standard error": estimate["standard_error"],
+        "90 % interval": lower + " … " + upper,
+        "the model's own [%]": 100 * estimate["share_of_model"],
+        "fits best": fitted,
+    }
     left = {
         "deviation of the measurement": rows["deviation"],
-        "the model's own error, expected": own,
+        "the model's own error, expected": np.sqrt(np.maximum(rows["s"] ** 2 - rows["deviation"] ** 2, 0.0)),
         "observed less the fitted run": rows["value"] - rows["fitted"],
     }
     if "full_order" in rows:
         left["observed less the full-order run at the estimate"] = rows["value"] - rows["full_order"]
-    return pd.DataFrame({"": list(left), "RMS [mm]": [1e3 * rms(values) for values in left.values()]})
+    errors = pd.DataFrame({"": list(left), "RMS [mm]": [1e3 * rms(off) for off in left.values()]})
+    stops = f"the best of {best.starts} starts were followed to their ends: {'; '.join(best.stops)}."
+    tables = [frame_table("Estimate", pd.DataFrame(shown), f"{len(rows)} observations; {stops}")]
+    if len(estimate) > 1:
+        tables.append(frame_table("Correlation of the errors", correlation.rename(columns={"parameter": ""})))
+    return [*tables, frame_table("Residuals", errors, "Root mean squares over the observations.")]
 
 
-def _points(model: Model, best: Fit, rows: pd.DataFrame) -> Figure:
+def _points(model: Model, best: Fit, rows: pd.DataFrame) -> Chart:
     """Points at the last time that was observed, in the body of the fitted run."""
     rows = rows[rows["what"].isin(AXES)]
     t = float(rows["t"].max())
@@ -182,4 +169,4 @@ def _points(model: Model, best: Fit, rows: pd.DataFrame) -> Figure:
     observed, fitted = (wide[kind].reindex(columns=AXES).to_numpy() for kind in ("value", "fitted"))
     frame = torch.as_tensor(best.xhat[round(t / model.dt)], device=model.device)
     body = model.positions(frame, np.arange(len(model.manifold.X))).cpu().numpy()
-    return points_chart(body, observed, fitted, t)
+    return Chart("Observed and fitted", "points", _POINTS, points_chart(body, observed, fitted, t))

@@ -10,7 +10,7 @@ from nsf.errors import ConfigError, MissingRunError
 from nsf.evaluation.quantities import QUANTITIES
 from nsf.inverse.model import Model
 from nsf.inverse.observations import Observations, View, is_scalar
-from nsf.inverse.space import Space
+from nsf.inverse.space import Space, check_taught
 from nsf.paths import reports_folder
 from nsf.results.folder import check_place
 from nsf.runs import Run
@@ -18,7 +18,6 @@ from nsf.runs import Run
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
 _RANGE = re.compile(rf"({_NUMBER})\.\.({_NUMBER})")
 _MOST_TRIALS = 10_000
-_EVERY = ("run", "+experiment", "device", "folder")
 
 
 def _whole(least: int = 1, most: int = 10_000_000) -> Callable[[str, str], int]:
@@ -54,6 +53,22 @@ def _text(key: str, text: str) -> str:
     return text
 
 
+_KEYS: dict[str, dict[str, Callable]] = {
+    "calibrate": {
+        "observations": _text, "trials": _whole(most=_MOST_TRIALS), "starts": _whole(), "full_order": _flag,
+        "program": _whole(0),
+    },
+    "sample": {
+        "of": _text, "runs": _whole(), "observations": _text, "sensitivities": _base, "full_order": _base,
+        "program": _whole(0),
+    },
+    "design": {
+        "target": _text, "tilt": _number, "move": _text, "knots": _whole(most=1000), "full_order": _flag,
+    },
+}  # fmt: skip
+_EVERY = dict.fromkeys(("run", "+experiment", "device", "folder"), _text) | {"seed": _whole(0)}
+
+
 def calibrate(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
     """Parameters from observations, or synthetic trials; gives the page.
 
@@ -64,8 +79,7 @@ def calibrate(words: Sequence[str], say: Callable[[str], object] = print) -> Pat
     Raises:
         NSFError: a word is refused, a run is missing, or the observations do not tell.
     """
-    keys = {"observations": _text, "trials": _whole(most=_MOST_TRIALS), "starts": _whole()}
-    asked = Words.of("calibrate", words, **keys, full_order=_flag, program=_whole(0))
+    asked = Words.of("calibrate", words)
     values, named = asked.values, asked.named
     if ("trials" in values) == ("observations" in values):
         raise ConfigError(
@@ -75,27 +89,20 @@ def calibrate(words: Sequence[str], say: Callable[[str], object] = print) -> Pat
     if "trials" in values:
         if named:
             raise ConfigError(f"trials={values['trials']} takes no {next(iter(named))}=; leave it out")
-        from nsf.inverse.reports.trials import report as trials_report
-        from nsf.inverse.trials import Trials
+        from nsf.inverse.reports.trials import Trials, trying
 
-        made = Trials(values["trials"], seed=values.get("seed", 0))
-        of = asked.values.get("+experiment", "_".join(model.scene.name for model in asked.models))
-        name = f"calibration_{of.replace('/', '_')}_{made.count}_seed{made.seed}"
-        return trials_report(asked.models, made, asked.folder(name), say)
-    from nsf.inverse.reports.calibration import report
+        trials = Trials(values["trials"], seed=values.get("seed", 0))
+        of = values.get("+experiment", "_".join(model.scene.name for model in asked.models))
+        folder = asked.folder(f"calibration_{of.replace('/', '_')}_{trials.count}_seed{trials.seed}")
+        return _written(trying(asked.models, trials, say), folder, "calibrate", say)
+    from nsf.inverse.reports.calibration import calibration
+    from nsf.inverse.reports.page import Problem
 
-    model, program = asked.model, asked.program
-    page, _ = report(
-        View(Observations.read(values["observations"], model), model),
-        model,
-        Space.of(model, ranges_of(named)),
-        asked.folder(f"calibrate_{model.scene.name}"),
-        program=program,
-        full_order=values.get("full_order", True),
-        starts=values.get("starts", 64),
-        say=say,
-    )
-    return page
+    problem, folder = Problem(asked.model, asked.program), asked.folder(f"calibrate_{asked.scene}")
+    view = View(Observations.read(values["observations"], asked.model), asked.model)
+    space = Space.of(asked.model, ranges_of(named))
+    options = {key: values[key] for key in ("full_order", "starts") if key in values}
+    return _written(calibration(problem, view, space, **options, say=say), folder, "calibrate", say)
 
 
 def sample(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
@@ -108,34 +115,31 @@ def sample(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
     Raises:
         NSFError: a word is refused, or a run or an extra is missing.
     """
-    keys = {"of": _text, "runs": _whole(), "observations": _text, "sensitivities": _base, "full_order": _base}
-    asked = Words.of("sample", words, **keys, program=_whole(0))
+    asked = Words.of("sample", words)
     from nsf.extras import optional
-    from nsf.inverse.reports.sample import report
+    from nsf.inverse.reports.page import Problem
+    from nsf.inverse.reports.sample import sampling
     from nsf.inverse.sampling import Prior, Scalars
 
-    values, view = asked.values, None
-    indices, full_order = values.get("sensitivities", 0), values.get("full_order", 0)
-    if full_order and not indices:
+    values, model = asked.values, asked.model
+    if values.get("full_order") and not values.get("sensitivities"):
         raise ConfigError("full_order= are runs beside sensitivities; give sensitivities= too")
-    for needed in ("SALib",) * bool(indices) + ("emcee",) * ("observations" in values):
+    for needed in ("SALib",) * bool(values.get("sensitivities")) + ("emcee",) * ("observations" in values):
         optional(needed, "inverse")  # before any work
-    model, program = asked.model, asked.program
-    if "observations" in values:
-        view = View(Observations.read(values["observations"], model), model)
-    return report(
-        model,
+    problem, folder = Problem(model, asked.program), asked.folder(f"sample_{asked.scene}")
+    observed = "observations" in values
+    results = sampling(
+        problem,
         Prior.of(model, asked.named),
         Scalars(values.get("of", "height").split(","), model),
-        asked.folder(f"sample_{model.scene.name}"),
         count=values.get("runs", 10_000),
-        indices=indices,
-        full_order=full_order,
-        view=view,
-        program=program,
+        indices=values.get("sensitivities", 0),
+        full_order=values.get("full_order", 0),
+        view=View(Observations.read(values["observations"], model), model) if observed else None,
         seed=values.get("seed", 0),
         say=say,
     )
+    return _written(results, folder, "sample", say)
 
 
 def design(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
@@ -148,12 +152,10 @@ def design(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
     Raises:
         NSFError: a word is refused, or a run is missing.
     """
-    scalars = {key: _number for word in words if is_scalar(key := word.split("=")[0])}
-    keys = {"target": _text, "tilt": _number, "move": _text, "knots": _whole(most=1000)}
-    asked = Words.of("design", words, **keys, **scalars, full_order=_flag)
+    scalars = [key for word in words if is_scalar(key := word.split("=")[0])]
+    asked = Words.of("design", words, dict.fromkeys(scalars, _number))
     from nsf.inverse.design import Moves, Tilt
-    from nsf.inverse.reports.design import report
-    from nsf.inverse.space import check_taught
+    from nsf.inverse.reports.design import designing
 
     model, values = asked.model, asked.values
     if ("target" in values) == bool(scalars):
@@ -162,30 +164,22 @@ def design(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
         )
     if ("tilt" in values) == ("move" in values):
         raise ConfigError("nsf design takes tilt=ANGLE [°] or move=SOLID, what may change; give one of them")
-    knots = values.get("knots", 6)
-    if "tilt" in values:
-        program = Tilt(model, values["tilt"], knots)
-    else:
-        program = Moves(model, tuple(values["move"].split(",")), knots)
+    knots, moves = values.get("knots", 6), values.get("move", "").split(",")
+    program = Tilt(model, values["tilt"], knots) if "tilt" in values else Moves(model, tuple(moves), knots)
     if "target" in values:
         seen = Observations.read(values["target"], model)
     else:
         seen = Observations.of_scalars({key: values[key] for key in scalars}, float(model.t[-1]))
-    given = ranges_of(asked.named)
-    if wide := [name for name, value in given.items() if isinstance(value, list)]:
+    ranges = ranges_of(asked.named)
+    if wide := [name for name, value in ranges.items() if isinstance(value, list)]:
         raise ConfigError(f"{wide[0]}={asked.named[wide[0]]} must be one value: the run's own")
-    for name, value in given.items():
+    for name, value in ranges.items():
         check_taught(model, name, value, value)
-    page, _ = report(
-        program,
-        View(seen, model),
-        dict(zip(model.names, model.ranges.mean(1).tolist(), strict=True)) | given,
-        asked.folder(f"design_{model.scene.name}_{values.get('move', 'tilt').replace(',', '_')}"),
-        run_full_order=values.get("full_order", True),
-        seed=values.get("seed", 0),
-        say=say,
-    )
-    return page
+    parameters = dict(zip(model.names, model.ranges.mean(1).tolist(), strict=True)) | ranges
+    folder = asked.folder(f"design_{asked.scene}_{'tilt' if 'tilt' in values else '_'.join(moves)}")
+    run_full_order, seed = values.get("full_order", True), values.get("seed", 0)
+    results = designing(program, View(seen, model), parameters, run_full_order, seed, say)
+    return _written(results, folder, "design", say)
 
 
 def ranges_of(named: dict[str, str]) -> dict[str, list[float] | float]:
@@ -205,6 +199,15 @@ def ranges_of(named: dict[str, str]) -> dict[str, list[float] | float]:
     return ranges
 
 
+def _written(results, folder: Path, command: str, say: Callable[[str], object]) -> Path:
+    """The page of results, once their warnings are said."""
+    from nsf.inverse.reports.page import write
+
+    for warning in results.warnings:
+        say(f"{command}: warning: {warning}")
+    return write(results, folder)
+
+
 @dataclass(frozen=True)
 class Words:
     """The words of a command.
@@ -219,18 +222,18 @@ class Words:
     named: dict[str, str]
 
     @classmethod
-    def of(cls, command: str, words: Sequence[str], **keys: Callable) -> "Words":
-        """From `key=value`, with how to read each key of the command.
+    def of(cls, command: str, words: Sequence[str], more: dict[str, Callable] | None = None) -> "Words":
+        """From `key=value`, with how to read keys that this command has today.
 
         Raises:
             ConfigError: a word is no such pair, or given twice, or its key unknown, or its value refused.
         """
         if wrong := [word for word in words if "=" not in word]:
             raise ConfigError(f"{wrong[0]!r} is not key=value; see `nsf {command} --help`")
-        given = [word.split("=", 1)[0] for word in words]
-        if twice := [key for key in given if given.count(key) > 1]:
+        keys = [word.split("=", 1)[0] for word in words]
+        if twice := [key for key in keys if keys.count(key) > 1]:
             raise ConfigError(f"{twice[0]}= is given twice; give it once")
-        read = dict.fromkeys(_EVERY, _text) | {"seed": _whole(0)} | keys
+        read = _EVERY | _KEYS[command] | (more or {})
         texts = dict(word.split("=", 1) for word in words)
         values = {key: read[key](key, text) for key, text in texts.items() if key in read}
         runs = _runs(values.get("run"), values.get("+experiment"))
@@ -255,16 +258,20 @@ class Words:
         return self.models[0]
 
     @property
+    def scene(self) -> str:
+        """The scene's name."""
+        return self.model.scene.name
+
+    @property
     def program(self) -> int | None:
         """The program that runs follow; None where the scene has no programs."""
-        scene, program = self.model.scene, self.values.get("program")
-        if PROGRAM not in scene.varied:
+        program = self.values.get("program")
+        if PROGRAM not in self.model.scene.varied:
             if program is not None:
-                raise ConfigError(f"program={program}: {scene.name} has no programs; leave it out")
-            return None
-        if program is None:
+                raise ConfigError(f"program={program}: {self.scene} has no programs; leave it out")
+        elif program is None:
             raise ConfigError(
-                f"the runs of {scene.name} follow programs; give the number of one, as program=3, that of "
+                f"the runs of {self.scene} follow programs; give the number of one, as program=3, that of "
                 "the observed run where there are observations"
             )
         return program

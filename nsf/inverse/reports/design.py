@@ -1,8 +1,7 @@
-"""A designed program, its run by recurrence, and the full-order run beside it."""
+"""A designed program, its run by recurrence, and the full-order run along it."""
 
 from collections.abc import Callable
 from contextlib import suppress
-from pathlib import Path
 
 import pandas as pd
 
@@ -11,12 +10,12 @@ from nsf.inverse.design import Designed, Program, Tilt, design, full_order
 from nsf.inverse.error import ModelError
 from nsf.inverse.observations import View
 from nsf.inverse.reports.charts import program_chart, residuals_chart
-from nsf.inverse.reports.page import Chart, Results, frame_table, rms, title_of, write
+from nsf.inverse.reports.page import Chart, Results, frame_table, rms, title_of
 from nsf.results.columns import number
 
 #: Tolerances (RMS) beyond which the targets count as missed.
 _MISSED = 3.0
-_LEAD = "A program of forcing that is to bring a target about, found by gradients through runs by recurrence."
+_LEAD = "A program of forcing that is to bring a target about, from gradients through runs by recurrence."
 _TERMS = (
     ("off", "root mean square, over the targets, of the target less what a run has."),
     ("the model's own error", "the same of runs by recurrence less full-order runs, in validation cases."),
@@ -24,24 +23,24 @@ _TERMS = (
 )
 
 
-def report(
+def designing(
     program: Program,
     view: View,
     parameters,
-    folder: Path,
-    *,
     run_full_order: bool = True,
     seed: int = 0,
     say: Callable[[str], object] = print,
-) -> tuple[Path, Designed]:
-    """Design, run the full-order solver along the program, and write `program.csv` and `targets.csv`.
+) -> Results:
+    """Design, and run the full-order solver along the program.
 
     Args:
         program, view, parameters: as for `design`.
-        folder: of the page.
         run_full_order: whether to make that run.
         seed: of the random programs.
         say: told what is done.
+
+    Returns:
+        A page with `program.csv` and `targets.csv`.
     """
     model = program.model
     designed = design(program, view, parameters, seed, say)
@@ -52,38 +51,27 @@ def report(
         off["full-order run"] = rms(rows["value"] - rows["full_order"])
     with suppress(ConfigError):  # without validation runs nothing is known of it
         off["the model's own error"] = rms(ModelError.of(view, model).deviations)
-    say("design: off by: " + ", ".join(f"{what} {number(1e3 * value)} mm" for what, value in off.items()))
-    warnings = _warnings(program, designed, rms((rows["value"] - rows["fitted"]) / rows["tolerance"]))
-    for warning in warnings:
-        say(f"design: warning: {warning}")
+    say("design: off by: " + ", ".join(f"{name} {number(1e3 * value)} mm" for name, value in off.items()))
     ways = dict(zip(program.names, designed.values.T, strict=True))
     table = pd.DataFrame({"": list(off), "off [mm]": [1e3 * value for value in off.values()]})
-    results = Results(
+    drawn, over = program_chart(model.t, ways, program.unit), "The program over time."
+    left, less = residuals_chart(rows, "target"), "Targets less what the runs have."
+    return Results(
         title=f"{title_of(model)}: design",
         lead=_LEAD,
         models=[model],
         tables=[frame_table("How far off", table, f"{len(rows)} target{'s' * (len(rows) != 1)}.")],
         files={"program.csv": pd.DataFrame({"t": model.t} | ways), "targets.csv": rows},
-        charts=[
-            Chart(
-                "Program", "program", "The program over time.",
-                lambda: program_chart(model.t, ways, program.unit),
-            ),
-            Chart(
-                "Program", "targets", "Targets less what the runs have.",
-                lambda: residuals_chart(rows, "target"),
-            ),
-        ],
+        charts=[Chart("Program", "program", over, drawn), Chart("Program", "targets", less, left)],
         facts=[("Search", designed.stopped), ("Distrust", number(designed.distrust))],
         definitions=_TERMS,
-        warnings=warnings,
+        warnings=_warnings(program, designed, rms((rows["value"] - rows["fitted"]) / rows["tolerance"])),
         asked={"seed": seed, "knots": program.knots, "bounds": program.bounds.tolist()},
-    )  # fmt: skip
-    return write(results, folder), designed
+    )
 
 
 def _warnings(program: Program, designed: Designed, missed: float) -> list[str]:
-    """What a reader must know of a program whose run misses its targets by so many tolerances (RMS)."""
+    """Sentences on a program whose run misses its targets by so many tolerances (RMS)."""
     warnings = []
     if missed > _MISSED:
         warnings.append(

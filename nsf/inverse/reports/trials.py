@@ -1,7 +1,6 @@
 """The report of synthetic trials: how near estimates come, and how often their intervals hold the truth."""
 
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -9,7 +8,7 @@ import pandas as pd
 from nsf.inverse.fit import CONFIDENCE, Fit
 from nsf.inverse.model import Model
 from nsf.inverse.reports.charts import trials_chart
-from nsf.inverse.reports.page import Chart, Results, frame_table, named, write
+from nsf.inverse.reports.page import Chart, Results, frame_table, named
 from nsf.inverse.trials import Trials, run
 
 _TERMS = (
@@ -27,19 +26,16 @@ _LEAD = (
 _CHART = "What each estimate is off over the truth, with its 90 % interval; a panel a scene and parameter."
 
 
-def report(
-    models: Sequence[Model], trials: Trials, folder: Path, say: Callable[[str], object] = print
-) -> Path:
-    """Make trials of each model, and write their report.
+def trying(models: Sequence[Model], trials: Trials, say: Callable[[str], object] = print) -> Results:
+    """Make trials of each model.
 
     Args:
         models: of different scenes.
         trials: how they are made.
-        folder: of the report.
         say: told of each trial.
 
     Returns:
-        The path of `index.html`.
+        A page with `results.csv`.
     """
     made = [run(model, trials, say) for model in models]
     table = pd.concat([rows for rows, _ in made], ignore_index=True)
@@ -52,18 +48,17 @@ def report(
     )
     pairs = zip(models, made, strict=True)
     summary = pd.DataFrame([row for model, own in pairs for row in _rows(model, *own)])
-    results = Results(
+    return Results(
         title="Calibration",
         lead=_LEAD,
         models=models,
         tables=[frame_table("Trials", summary, f"{trials.count} trials a scene: {settings}.", text=3)],
         files={"results.csv": table},
-        charts=[Chart("Trials", "trials", _CHART, lambda: trials_chart(table.assign(**ends), units))],
+        charts=[Chart("Trials", "trials", _CHART, trials_chart(table.assign(**ends), units))],
         facts=[("Observed", settings)],
         definitions=_TERMS,
         asked=vars(trials),
     )
-    return write(results, folder)
 
 
 def _rows(model: Model, table: pd.DataFrame, fits: Sequence[Fit]) -> list[dict]:

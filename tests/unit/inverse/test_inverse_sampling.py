@@ -115,7 +115,7 @@ def test_a_posterior_is_the_estimate_where_the_prior_is_wide(model, monkeypatch)
     drawn = made.values
     assert drawn.shape == (2000, 2)
     assert made.length >= 50.0
-    assert made.warning == ""
+    assert made.warnings == []
     np.testing.assert_allclose(drawn.mean(0), found.estimate, atol=0.3 * found.standard_error.max())
     assert (np.abs(drawn.std(0) / found.standard_error - 1.0) < 0.3).all()
     monkeypatch.setattr(
@@ -133,10 +133,10 @@ def test_a_posterior_is_the_estimate_where_the_prior_is_wide(model, monkeypatch)
 
 def test_a_chain_that_is_too_short_or_stands_still_is_said():
     good = Posterior(np.zeros((3, 1)), 100, 65.0, 0.5)
-    assert good.warning == ""
-    assert "65 autocorrelation times; 50 % of the proposals" in good.told
-    assert "is 3 autocorrelation times long" in replace(good, length=3.0).warning
-    assert "accepts 1 % of the proposals" in replace(good, accepted=0.01).warning
+    assert good.warnings == []
+    assert "65 autocorrelation times; 50 % of the proposals" in good.text
+    assert "is 3 autocorrelation times long" in replace(good, length=3.0).warnings[0]
+    assert "accepts 1 % of the proposals" in replace(good, accepted=0.01).warnings[0]
 
 
 def test_the_command(tmp_path, deployed):
