@@ -36,10 +36,6 @@ CONFIDENCE = 0.9
 #: Entry of a direction's unit vector from which on a parameter is named as part of it.
 _PART = 0.3
 _POLISHED = 3  # starts that are followed to their end
-_STOPS = {
-    0: "evaluations used up", 1: "gradient vanishes", 2: "residuals change no more",
-    3: "parameters change no more", 4: "residuals and parameters change no more",
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -56,7 +52,6 @@ class Fit:
         share: [n] of the variance that is the model's own error.
         freedom: [n] degrees of freedom of the intervals.
         xhat: [N + 1, r] the fitted run; distrust: its ratio.
-        stops: why each start that was followed ended, the best first; starts: how many were looked at.
         project: [n, m] A/s, from observations [m] to u.
         seconds: wall time.
     """
@@ -76,8 +71,6 @@ class Fit:
     freedom: np.ndarray
     xhat: np.ndarray
     distrust: float
-    stops: tuple[str, ...]
-    starts: int
     project: np.ndarray
     seconds: float
 
@@ -139,8 +132,7 @@ def fit(
         return (values[0].cpu().numpy() - own.values) / s, slopes[0].cpu().numpy() / s[:, None]
 
     first = _best_starts(seen, own.values, s, len(space.free), starts, model.device)
-    found = sorted((_followed(residuals, u) for u in first), key=lambda result: result.cost)
-    best = found[0]
+    best = min((_followed(residuals, u) for u in first), key=lambda result: result.cost)
     J = best.jac
     _check_told_apart(J, space)
     A = np.linalg.pinv(J)
@@ -177,8 +169,6 @@ def fit(
         freedom=freedom,
         xhat=xhat.cpu().numpy(),
         distrust=distrust,
-        stops=tuple(_STOPS.get(result.status, "failed") for result in found),
-        starts=starts,
         project=A / s,
         seconds=time.perf_counter() - began,
     )

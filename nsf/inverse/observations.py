@@ -17,7 +17,9 @@ from nsf.evaluation.quantities import QUANTITIES
 from nsf.inverse.columns import COLUMNS, read_columns
 from nsf.inverse.model import Model
 from nsf.kinematics.interpolation import interpolation
+from nsf.kinematics.manifold import Restriction
 
+_Positions = Callable[[np.ndarray], Tensor]
 AXES = ("x", "y", "z")
 _POINT = ("X", "Y", "Z")
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
@@ -77,25 +79,19 @@ class Observations:
         )
 
     @classmethod
-    def of_scalars(cls, values: Mapping[str, float], t: float, deviation: float = 1e-3) -> "Observations":
-        """Quantities and components of points, as `z@X:Y:Z`, by name [m] at a time [s]; one deviation [m]."""
-        count = len(values)
-        points = np.full((count, 3), np.nan)
-        what = list(values)
-        for k, name in enumerate(values):
-            if found := component(name):
-                what[k], points[k] = found
-        own = np.array(list(values.values()), float)
-        return cls(np.full(count, t), tuple(what), points, own, np.full(count, deviation))
-
-    @classmethod
-    def joined(cls, parts: Sequence["Observations"]) -> "Observations":
-        """Several after one another."""
-        arrays = {
-            name: [getattr(own, name) for own in parts] for name in ("t", "points", "values", "deviations")
-        }
-        what = tuple(name for own in parts for name in own.what)
-        return cls(what=what, **{name: np.concatenate(values) for name, values in arrays.items()})
+    def of_scalars(
+        cls, values: Mapping[str, float], times: float | np.ndarray, deviation: float = 1e-3
+    ) -> "Observations":
+        """Quantities and components of points, as `z@X:Y:Z`, by name [m], at each of some times [s]."""
+        times = np.atleast_1d(times)
+        what, points = zip(*(component(name) or (name, np.full(3, np.nan)) for name in values), strict=True)
+        return cls(
+            np.repeat(times, len(values)),
+            what * len(times),
+            np.tile(points, (len(times), 1)),
+            np.tile(np.array(list(values.values()), float), len(times)),
+            np.full(len(times) * len(values), deviation),
+        )
 
     @classmethod
     def read(cls, path: Path | str, model: Model) -> "Observations":
@@ -177,7 +173,7 @@ class Observations:
 
 
 class View:
-    """How observations are seen in runs.
+    """How observations are seen in runs; between two frames linear in time.
 
     Args:
         observations: checked.
@@ -187,51 +183,51 @@ class View:
 
     def __init__(self, observations: Observations, model: Model, looks: np.ndarray | None = None):
         self.observations, self._model = observations.check(model), model
-        own = observations
-        self._of_points = np.flatnonzero([what in AXES for what in own.what])
-        self._steps, shares = _between(own.t[self._of_points], model)
-        self._shares = torch.as_tensor(shares, device=model.device)
-        rows = own.points[self._of_points]
-        self._points, self._row = np.unique(rows, axis=0, return_inverse=True)
-        self._axis = np.array([AXES.index(own.what[i]) for i in self._of_points], int)
-        self._of_shape = np.flatnonzero([what in QUANTITIES for what in own.what])
-        self._frames = np.round(own.t[self._of_shape] / model.dt).astype(int)
+        t, what, X = observations.t, observations.what, model.manifold.X
+        self._of_points = np.flatnonzero([name in AXES for name in what])
+        self._steps, self._shares = _between(t[self._of_points], model)
+        self._points, self._row = np.unique(observations.points[self._of_points], axis=0, return_inverse=True)
+        self._axis = np.array([AXES.index(what[i]) for i in self._of_points], int)
+        self._of_shape = np.flatnonzero([name in QUANTITIES for name in what])
+        self._frames = np.round(t[self._of_shape] / model.dt).astype(int)
         self._looks = np.arange(len(model.t)) if looks is None else looks
         self._order = np.argsort([*self._of_points, *self._of_shape])
-        X = model.manifold.X
         self._body = np.sort(np.random.default_rng(0).permutation(len(X))[:BODY])
         self._X = X[torch.as_tensor(self._body)].to(model.device)
 
     def of_runs(self, xhat: Tensor) -> Tensor:
         """[B, m] of runs [B, N + 1, r], differentiable."""
-
-        def body(frames: np.ndarray) -> Tensor:
-            return self._model.positions(xhat[:, frames], self._at_body)
-
-        parts = [self._positions(xhat)] if len(self._of_points) else []
-        parts += [values[:, None] for values in self._quantities(body)]
-        return torch.cat(parts, 1)[:, torch.as_tensor(self._order, device=xhat.device)]
+        return self._seen(
+            lambda frames: self._model.positions(xhat[:, frames], self._at),
+            lambda frames: self._model.positions(xhat[:, frames], self._at_body),
+        )
 
     def of_truth(self, trajectory: Trajectory) -> np.ndarray:
         """[m] of a full-order run."""
 
-        def body(frames: np.ndarray) -> Tensor:
-            x = trajectory.read("x", frames=frames.tolist(), particles=self._body)
-            return torch.as_tensor(x.astype(float))[None].to(self._X)
+        def read(frames: np.ndarray, particles: np.ndarray | None = None) -> Tensor:
+            x = trajectory.read("x", frames=frames.tolist(), particles=particles)
+            return torch.as_tensor(x.astype(float))
 
-        seen = np.zeros(0)
+        seen = self._seen(
+            lambda frames: self._interpolation.value(read(frames).transpose(0, 1)).transpose(0, 1)[None],
+            lambda frames: read(frames, self._body)[None].to(self._X),
+        )
+        return seen[0].cpu().numpy()
+
+    def _seen(self, points: _Positions, body: _Positions) -> Tensor:
+        """[B, m] of positions [B, frame, n, 3] at some frames, of the observed points and of the body."""
+        parts = [values[:, None] for values in self._quantities(body)]
         if len(self._of_points):
-            frames, at = np.unique([self._steps, self._steps + 1], return_inverse=True)
-            x = trajectory.read("x", frames=np.minimum(frames, trajectory.frames - 1)).astype(float)
-            every = self._interpolation.value(torch.as_tensor(x.swapaxes(0, 1))).numpy()
-            one, two = (every[self._row, rows.reshape(-1), self._axis] for rows in at.reshape(2, -1))
-            shares = self._shares.cpu().numpy()
-            seen = (1.0 - shares) * one + shares * two
-        scalars = [float(value) for value in self._quantities(body)]
-        return np.concatenate([seen, scalars])[self._order]
+            after = self._steps + (self._shares > 0.0)
+            frames, at = np.unique([self._steps, after], return_inverse=True)
+            x = points(frames)
+            begun, ended = (x[:, rows, self._row, self._axis] for rows in at.reshape(2, -1))
+            parts.insert(0, begun + torch.as_tensor(self._shares).to(x) * (ended - begun))
+        return torch.cat(parts, 1)[:, self._order]
 
-    def _quantities(self, body: Callable[[np.ndarray], Tensor]) -> list[Tensor]:
-        """[B] of each scalar of the shape; `body` gives positions [B, frame, particle, 3] at some frames."""
+    def _quantities(self, body: _Positions) -> list[Tensor]:
+        """[B] of each scalar of the shape."""
         seen: dict[int, Tensor] = {}
         names = [self.observations.what[i] for i in self._of_shape]
         for frame in np.unique(self._frames):  # one at a time, as bodies are large
@@ -245,37 +241,23 @@ class View:
                 seen[k] = QUANTITIES[names[k]].of(x[:, self._looks <= self._frames[k]], self._X)
         return [seen[k] for k in range(len(names))]
 
-    def _positions(self, xhat: Tensor) -> Tensor:
-        """[B, …] of the observations of points."""
-        kinds, at = np.unique(
-            np.stack([self._steps, self._shares.cpu().numpy()], 1), axis=0, return_inverse=True
-        )
-        steps = torch.as_tensor(kinds[:, 0].astype(int), device=xhat.device)
-        shares = torch.as_tensor(kinds[:, 1:], device=xhat.device)
-        after = steps.add(1).clamp_max(xhat.shape[1] - 1)
-        between = xhat[:, steps] * (1.0 - shares) + xhat[:, after] * shares
-        x = self._model.positions(between, self._at)
-        return x[:, at.reshape(-1), self._row, self._axis]
-
     @cached_property
-    def _at(self):
+    def _at(self) -> Restriction:
         return self._model.at(self._points)
 
     @cached_property
-    def _at_body(self):
+    def _at_body(self) -> Restriction:
         return self._model.at(self._body)
 
     @cached_property
     def _interpolation(self):
-        X = self._model.manifold.X.cpu()
-        return interpolation(torch.as_tensor(self._points), X)
+        return interpolation(torch.as_tensor(self._points), self._model.manifold.X.cpu())
 
 
 def _between(t: np.ndarray, model: Model) -> tuple[np.ndarray, np.ndarray]:
     """The frame before each time, and the share of the step that has passed since."""
     at = np.clip(t / model.dt, 0.0, len(model.t) - 1.0)
-    whole = np.abs(at - np.round(at)) < _SAME_TIME
-    at = np.where(whole, np.round(at), at)
+    at = np.where(np.abs(at - np.round(at)) < _SAME_TIME, np.round(at), at)
     steps = np.floor(at).astype(int)
     return steps, at - steps
 

@@ -148,8 +148,8 @@ class Scalars:
             )
         self.names, looks = tuple(dict.fromkeys(names)), spaced(len(model.t), _TIMES)
         self.t = model.t[looks]
-        every = [Observations.of_scalars(dict.fromkeys(self.names, 0.0), t) for t in self.t]
-        self._view = View(Observations.joined(every), model, looks)
+        every = Observations.of_scalars(dict.fromkeys(self.names, 0.0), self.t)
+        self._view = View(every, model, looks)
 
     def of(self, xhat: Tensor) -> Tensor:
         """[B, scalars, F] of runs [B, N + 1, r], differentiable [m]."""

@@ -154,8 +154,7 @@ def _tables(best: Fit, estimate: pd.DataFrame, correlation: pd.DataFrame, rows: 
     if "full_order" in rows:
         left["observed less the full-order run at the estimate"] = rows["value"] - rows["full_order"]
     errors = pd.DataFrame({"": list(left), "RMS [mm]": [1e3 * rms(off) for off in left.values()]})
-    stops = f"the best of {best.starts} starts were followed to their ends: {'; '.join(best.stops)}."
-    tables = [frame_table("Estimate", pd.DataFrame(shown), f"{len(rows)} observations; {stops}")]
+    tables = [frame_table("Estimate", pd.DataFrame(shown), f"{len(rows)} observations.")]
     if len(estimate) > 1:
         tables.append(frame_table("Correlation of the errors", correlation.rename(columns={"parameter": ""})))
     return [*tables, frame_table("Residuals", errors, "Root mean squares over the observations.")]
