@@ -152,7 +152,8 @@ def _tool(name: str, words: list[str]) -> int:
 
         return _open(getattr(command, name)(words))
     tools = {
-        "bench": _bench, "demo": _demo, "doctor": _doctor, "export": _export, "index": _index, "plan": _plan,
+        "bench": _bench, "demo": _demo, "doctor": _doctor, "export": _export, "index": _index, "init": _init,
+        "plan": _plan,
         "reports": _reports, "runs": _runs, "search": _search,
     }  # fmt: skip
     return tools[name](words)
@@ -210,6 +211,18 @@ def _index(words: list[str]) -> int:
     from nsf.results.overview.index import write_index
 
     return _open(write_index(Path(folder)))
+
+
+def _init(words: list[str]) -> int:
+    """A project of the user."""
+    if len(words) != 1 or words[0].startswith("-"):
+        raise ConfigError("nsf init needs one folder, as nsf init my_project")
+    from nsf.init import write_project
+
+    folder = Path(words[0])
+    write_project(folder)
+    print(f"wrote {folder}; its README.md has two commands: pip install -e . and nsf run")
+    return 0
 
 
 def _plan(words: list[str]) -> int:

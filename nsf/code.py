@@ -8,6 +8,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from nsf.installed import root_of
+
 _PACKAGE = Path(__file__).parent
 #: Bases of classes that add no argument.
 _WITHOUT_ARGUMENTS = ("ABC", "Generic", "Protocol")
@@ -22,8 +24,9 @@ def text_sum(text: str) -> str:
 def code_of(node: Any) -> dict[str, str]:
     """Sums of the files that define the classes of a plain tree, by `_target_`; nothing is imported.
 
-    A class counts with those of its own package that its file imports, such as its base. What cannot be found
-    is left out; it is refused where it is built.
+    A class of nsf counts with those of the same folder that its file imports, such as its base; one of the
+    user with every file of the user that it imports. What cannot be found is left out, and refused where it
+    is built.
     """
     return {target: _sum_of(target) for target in sorted(set(_targets(node))) if _home(target)}
 
@@ -48,6 +51,8 @@ def arguments(target: str) -> set[str] | None:
 def _arguments(path: Path, name: str) -> set[str] | None:
     """Those of a definition in a file: of `__init__`, or the fields of a dataclass and of its bases."""
     definition = next((node for node in _tree(path).body if getattr(node, "name", None) == name), None)
+    if definition is None and (passed := _imported(path).get(name, path)) != path:
+        return _arguments(passed, name)
     if isinstance(definition, ast.FunctionDef):
         return {one.arg for one in (*definition.args.args, *definition.args.kwonlyargs)}
     if not isinstance(definition, ast.ClassDef):
@@ -82,7 +87,8 @@ def _sum_of(target: str) -> str:
     files, left = {home}, [home]
     while left:
         for imported in _imported(left.pop()).values():
-            if imported.parent == home.parent and imported not in files:
+            near = imported.parent == home.parent or _PACKAGE not in imported.parents
+            if near and imported not in files:
                 files.add(imported)
                 left.append(imported)
     return text_sum("".join(text_of(path) for path in sorted(files)))
@@ -93,22 +99,36 @@ def _home(target: str) -> Path | None:
     """The file that defines a class, behind the packages that only pass it on."""
     module, _, name = target.rpartition(".")
     path = _file(module)
-    while path is not None and path.name == "__init__.py" and (passed := _imported(path).get(name)) != path:
-        path = passed
+    while path is not None and path.name == "__init__.py" and not _defines(path, name):
+        passed = _imported(path).get(name)
+        path = passed if passed != path else None
     return path
+
+
+def _defines(path: Path, name: str) -> bool:
+    return any(getattr(node, "name", None) == name for node in _tree(path).body)
 
 
 @cache
 def _imported(path: Path) -> dict[str, Path]:
-    """Files of this package from which a file takes names, by name."""
+    """Files of nsf and of the user's packages from which a file takes names, by name."""
     files = {}
     for node in ast.walk(_tree(path)):
-        if isinstance(node, ast.ImportFrom) and node.module and not node.level:
+        if isinstance(node, ast.ImportFrom):
             for alias in node.names:
-                file = _file(f"{node.module}.{alias.name}") or _file(node.module)
+                file = _source(path, node, alias.name)
                 if file is not None:
                     files[alias.asname or alias.name] = file
     return files
+
+
+def _source(path: Path, node: ast.ImportFrom, name: str) -> Path | None:
+    """The file from which `from … import name` takes a name: a module of that name, or where it says."""
+    module = node.module or ""
+    if not node.level:
+        return _file(f"{module}.{name}") or _file(module)
+    folder = path.parents[node.level - 1].joinpath(*filter(None, module.split(".")))
+    return _module(folder / name) or _module(folder)
 
 
 @cache
@@ -121,13 +141,17 @@ def _tree(path: Path) -> ast.Module:
 
 def _file(module: str) -> Path | None:
     first, *parts = module.split(".")
-    if first != _PACKAGE.name or not all(map(str.isidentifier, parts)):
+    root = _PACKAGE if first == _PACKAGE.name else root_of(first)
+    if root is None or not all(map(str.isidentifier, parts)):
         return None
-    path = _PACKAGE.joinpath(*parts)
+    return _module(root.joinpath(*parts))
+
+
+def _module(path: Path) -> Path | None:
     return next((p for p in (path.with_suffix(".py"), path / "__init__.py") if p.is_file()), None)
 
 
 @cache
 def text_of(path: Path) -> str:
-    """The text of a file of this package, read once."""
+    """The text of a file of nsf, or of a package of the user, read once."""
     return path.read_text(encoding="utf-8", errors="replace")

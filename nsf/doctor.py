@@ -1,5 +1,6 @@
 """`nsf doctor`: what this installation consists of, where it keeps things, and what it lacks."""
 
+import importlib
 import importlib.metadata
 import os
 import platform
@@ -7,6 +8,8 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+from nsf.errors import first_line
+from nsf.installed import entry_points
 from nsf.runs.provenance import provenance
 
 _DEVELOPMENT = ("dev", "docs")  # extras that a user does not miss
@@ -15,6 +18,7 @@ _DEVELOPMENT = ("dev", "docs")  # extras that a user does not miss
 def report() -> str:
     """Versions, devices, caches and extras, as text; a part that cannot be told says why."""
     parts = {"versions": _versions, "devices": _devices, "folders": _folders, "extras": _extras}
+    parts |= {"packages of yours": _packages} if entry_points() else {}
     return "\n\n".join("\n".join((f"{title}:", *_lines(find))) for title, find in parts.items())
 
 
@@ -104,6 +108,17 @@ def _extras() -> Iterator[str]:
         missing = [r.name for r in own if not _fits(r)]
         state = f"missing {', '.join(missing)}: pip install 'nsf[{extra}]'" if missing else "there"
         yield f"{extra:<10} {state}"
+
+
+def _packages() -> Iterator[str]:
+    """Each entry point of the group `nsf`, and whether its module can be imported."""
+    for point in entry_points():
+        try:
+            importlib.import_module(point.module)
+            state = "there"
+        except Exception as error:
+            state = f"cannot be imported, {type(error).__name__}: {first_line(error)}"
+        yield f"{point.name:<10} {point.module} of {point.dist.name} {point.dist.version}: {state}"
 
 
 def _fits(requirement) -> bool:

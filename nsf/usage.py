@@ -47,6 +47,10 @@ TOOLS = {
         "what nsf run would do: stages and their states, size, time and room; --cfg: the configuration",
         "[-m] [+experiment=NAME] [key=value …] [--cfg]; nsf run … --dry-run is the same",
     ),
+    "init": (
+        "a project of yours: a law, a scene with a mesh, an experiment and a test, outside nsf's tree",
+        "FOLDER; which is new or empty",
+    ),
     "runs": ("every run there is: listed, shown, compared, verified, deleted", None),
     "index": (
         "a page of every run, with a thumbnail each, that sorts and filters in the browser",

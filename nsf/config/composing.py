@@ -26,13 +26,14 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import MarkedYAMLError, YAMLError
 
+from nsf import paths
 from nsf.config import targets
 from nsf.config.documents import check_sizes, text_of
 from nsf.config.removed import refuse_keys, refuse_overrides
 from nsf.config.resolvers import resolved
 from nsf.config.schema import refuse_unread
 from nsf.errors import ConfigError, first_line, unknown
-from nsf.paths import CONF, REMEDY, files, groups, user_folders
+from nsf.paths import REMEDY, files, groups, user_folders
 
 # conf/hydra/launcher/joblib.yaml takes the place of the launcher's own configuration on purpose.
 warnings.filterwarnings(
@@ -137,7 +138,7 @@ def initialized(job_name: str = "app") -> Iterator[None]:
     """Hydra over `conf/` and the user's folders before it, while a block works, anew."""
     GlobalHydra.instance().clear()
     version.setbase("1.3")
-    search_path = create_config_search_path(str(CONF))
+    search_path = create_config_search_path(str(paths.CONF))
     for folder in user_folders():
         search_path.prepend("user", str(folder), anchor="main")
     Hydra.create_main_hydra2(job_name, search_path)

@@ -89,6 +89,8 @@ def resolved(config: DictConfig) -> Any:
     except OmegaConfBaseException as error:
         # OmegaConf wraps what a resolver raises; its own words come first in the text.
         detail = re.sub(r"^\w*Error raised while resolving interpolation: ", "", str(error).splitlines()[0])
+        if detail.startswith("Recursive interpolation"):
+            detail = "it refers to itself, by way of other keys or not; give one of them a value"
         raise ConfigError(f"{error.full_key}: {detail}" if error.full_key else detail) from error
     for path, value in leaves(plain):
         if (

@@ -1,7 +1,8 @@
-"""What the `_target_` of a configuration may name, and the objects that are built from it.
+"""The classes that a `_target_` of a configuration may name, and the objects that are built from it.
 
-A configuration is data, also where someone else wrote it: it chooses among the classes that a key expects and
-gives them their values. All else is refused before it is imported.
+A configuration is data, also where someone else wrote it: it chooses among the classes that a key expects, of
+nsf and of packages that the user installed for it (`nsf.installed`), and gives them their values. All else is
+refused before it is imported.
 """
 
 import dataclasses
@@ -10,6 +11,7 @@ import inspect
 import re
 import typing
 from collections.abc import Mapping, Sequence
+from importlib.metadata import EntryPoint
 from types import NoneType, UnionType
 from typing import Any, NamedTuple
 
@@ -17,6 +19,7 @@ from omegaconf import DictConfig
 
 from nsf.config.resolvers import resolved
 from nsf.errors import ConfigError, NSFError, first_line, unknown
+from nsf.installed import entry_point_of
 from nsf.vectors import is_finite
 
 
@@ -67,7 +70,7 @@ KINDS = {
     "scene.bodies.*.weakness": Kind("nsf.scenes", "nsf.scenes.Weakness"),
     "scene.bodies.*.weakness.region": _SHAPE,
 }
-_NAME = re.compile(r"nsf(\.[A-Za-z]\w*)+", re.ASCII)
+_NAME = re.compile(r"[A-Za-z]\w*(\.[A-Za-z]\w*)+", re.ASCII)
 #: Types in words: one value, and several.
 _WORDS = {
     int: ("a whole number", "whole numbers"),
@@ -202,9 +205,18 @@ def _kind(path: tuple[str, ...], target: Any) -> Kind:
     refused = f"{'.'.join(path) or 'the configuration'}: _target_: {target} is refused; "
     if kind is None:
         raise ConfigError(refused + "nothing is built from this key")
-    if not (_NAME.fullmatch(str(target)) and str(target).startswith(f"{kind.package}.")):
-        raise ConfigError(refused + _wanted(kind))
+    if not (
+        _NAME.fullmatch(str(target)) and (target.startswith(f"{kind.package}.") or _is_installed(target))
+    ):
+        raise ConfigError(
+            f"{refused}{_wanted(kind)}, or of an installed package that declares the entry point group nsf"
+        )
     return kind
+
+
+def _is_installed(target: str) -> bool:
+    """Whether a class is of a package that the user installed for nsf."""
+    return not target.startswith("nsf.") and entry_point_of(target) is not None
 
 
 def _wanted(kind: Kind) -> str:
@@ -214,26 +226,47 @@ def _wanted(kind: Kind) -> str:
 def _named(target: str, path: tuple[str, ...]) -> Any:
     """The class, or the function, that a target names."""
     kind, where = _kind(path, target), ".".join(path)
-    module, _, name = target.rpartition(".")
-    try:
-        found = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        raise ConfigError(f"{where}: _target_: {target} does not exist ({error})") from error
+    named = _imported(target, where)
     if target in kind.functions:
-        return found
+        return named
     module, _, name = kind.base.rpartition(".")
     base = getattr(importlib.import_module(module), name)
-    if not (inspect.isclass(found) and _is_a(found, base)):
-        raise ConfigError(f"{where}: _target_: {target} is refused; {_wanted(kind)}{_lacking(found, base)}")
-    if inspect.isabstract(found):
-        raise ConfigError(f"{where}: _target_: {target} is abstract; name a class derived from it")
-    return found
+    if not (inspect.isclass(named) and _is_a(named, base)):
+        raise ConfigError(f"{where}: _target_: {target} is refused; {_wanted(kind)}{_lacking(named, base)}")
+    if inspect.isabstract(named):
+        missing = ", ".join(sorted(named.__abstractmethods__))
+        raise ConfigError(
+            f"{where}: _target_: {target} is abstract; define {missing}, or name a class that does"
+        )
+    return named
 
 
-def _is_a(found: type, base: type) -> bool:
+def _imported(target: str, where: str) -> Any:
+    """What a dotted name stands for; an error of the user's module is one line that names its entry point."""
+    module, _, name = target.rpartition(".")
+    point = None if target.startswith("nsf.") else entry_point_of(target)
+    try:
+        return getattr(importlib.import_module(module), name)
+    except (ImportError, AttributeError) as error:
+        if point is None or isinstance(error, AttributeError):
+            raise ConfigError(f"{where}: _target_: {target} does not exist ({error})") from error
+        raise _broken(target, where, point, error) from error
+    except Exception as error:
+        raise _broken(target, where, point, error) from error
+
+
+def _broken(target: str, where: str, point: EntryPoint, error: Exception) -> ConfigError:
+    return ConfigError(
+        f"{where}: _target_: {target} cannot be imported, {type(error).__name__}: {first_line(error)}; mend "
+        f"{point.module}, the entry point {point.name!r} of {point.dist.name}"
+    )
+
+
+def _is_a(named: type, base: type) -> bool:
     if not getattr(base, "_is_protocol", False):
-        return issubclass(found, base)
-    return found.__module__.startswith("nsf.") and members(base) <= _members(found)
+        return issubclass(named, base)
+    name = f"{named.__module__}.{named.__name__}"
+    return (name.startswith("nsf.") or _is_installed(name)) and members(base) <= _members(named)
 
 
 def _lacking(found: Any, protocol: type) -> str:

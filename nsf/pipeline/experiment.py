@@ -12,7 +12,7 @@ from omegaconf import DictConfig
 from nsf import config as configuration
 from nsf.config.documents import text_of
 from nsf.errors import ConfigError, MissingRunError
-from nsf.paths import experiments, reports_folder
+from nsf.paths import experiments, groups, option, reports_folder
 from nsf.pipeline.chain import Pipeline
 from nsf.results.question import Question, unchanged
 from nsf.runs import Run
@@ -117,6 +117,8 @@ class Experiment:
         each = _grid(content.get("each", {}), f"{where}: each")
         own = {override.split("=", 1)[0]: override for override in overrides}
         stated = [each | _grid(grid, f"{where}: jobs[{at}]") for at, grid in enumerate(content["jobs"])]
+        for grid in stated:
+            _check_options(grid, own, where)
         grids = tuple(grid | own for grid in stated)
         small = all(grid.get("scale") == "scale=small" for grid in stated)
         texts = _texts(content, ("title", "question", "paper"), where)
@@ -316,6 +318,30 @@ def _ended(run: Run) -> str | None:
     """How a run ended that did not end well; None if it did, or was never begun."""
     error = run.manifest.get("error")
     return f"{run.stage} {run.manifest.get('status')}: {error}" if error else None
+
+
+def _check_options(grid: Mapping[str, str], own: Mapping[str, str], where: str) -> None:
+    """Refuse an option of the command line, as model=interpolate, that lacks a key which a job sets."""
+    for group in own.keys() & groups().keys():
+        keys = [key for key in grid if key.startswith(f"{group}.") and key not in own]
+        for name in own[group].partition("=")[2].split(",") if keys else ():
+            lacking = [key for key in keys if not _has(group, name, key)]
+            if lacking:
+                raise ConfigError(
+                    f"{where} sets {lacking[0]}, which {group}={name} does not have; leave {group}={name} out"
+                )
+
+
+def _has(group: str, name: str, key: str) -> bool:
+    """Whether an option of a group has a key in its file; an option that is unknown is refused elsewhere."""
+    if name not in groups()[group]:
+        return True
+    node = yaml.safe_load(text_of(option(group, name)))
+    for part in key.split(".")[1:]:
+        if not isinstance(node, dict) or part not in node:
+            return False
+        node = node[part]
+    return True
 
 
 def _printed(entries, where: str) -> tuple[dict, ...] | None:

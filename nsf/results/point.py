@@ -79,10 +79,10 @@ def plot_point(config: DictConfig) -> Path:
         response.to_csv(partial, index=False)
     with writing(stem.with_suffix(".png")) as partial:
         point_chart(response, f"{name}, {config.path.replace('_', ' ')}").savefig(partial, dpi=150)
-    last = response.iloc[-1]
+    pressure, deviator = response["pressure"], response["dev_norm"].max()
     print(
-        f"{name} at amplitude {last['amplitude']:g}: "
-        f"pressure {last['pressure']:.6g} Pa, ‖dev τ‖ {last['dev_norm']:.6g} Pa"
+        f"{name} along {config.path}, amplitude {config.point.amplitude:g}: "
+        f"pressure from {pressure.min():.6g} to {pressure.max():.6g} Pa, ‖dev τ‖ up to {deviator:.6g} Pa"
     )
     print(f"wrote {stem.with_suffix('.png')} and {stem.with_suffix('.csv')}")
     return stem.with_suffix(".png")

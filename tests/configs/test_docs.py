@@ -4,13 +4,15 @@ import importlib
 import re
 import shutil
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
 import yaml
 from pages import ROOT, blocks, try_command
 
-from nsf import config
+import nsf
+from nsf import config, find, paths
 from nsf.pipeline import Pipeline
 from nsf.pipeline.experiment import Experiment
 
@@ -30,7 +32,7 @@ def project(page, tmp_path, monkeypatch):
     shutil.copytree(ROOT / "experiments", tmp_path / "experiments")
     if 'title="conf/' in (DOCS / page).read_text(encoding="utf-8"):  # others share what Hydra composed
         shutil.copytree(ROOT / "conf", tmp_path / "conf")
-        monkeypatch.setattr(config.composing, "CONF", tmp_path / "conf")
+        monkeypatch.setattr(paths, "CONF", tmp_path / "conf")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("NSF_RUNS", str(tmp_path / "runs"))
     monkeypatch.setenv("NSF_REPORTS", str(tmp_path / "reports"))
@@ -113,8 +115,9 @@ def test_page(page, project, monkeypatch, capsys):
             if title:
                 add(title, content, project)
             elif language == "python":
-                for scene in re.findall(r'Run\.find\("train", "(\w+)"\)', content):
+                for scene in re.findall(r'nsf\.find\(scene="(\w+)"', content):
                     train(scene)
+                    monkeypatch.setattr(nsf, "find", partial(find, *SHORT[scene], "device=cpu"))
                 for scene in re.findall(r'Model\.load\(("\w+")?\)', content):
                     deploy(scene.strip('"') or "sand")
                 exec(compile(content, page, "exec"), names)

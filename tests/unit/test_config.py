@@ -215,16 +215,14 @@ def test_an_experiment_takes_a_plus():
 def test_broken_yaml_names_file_and_line(tmp_path, monkeypatch):
     shutil.copytree(CONF, tmp_path / "conf")
     (tmp_path / "conf/model/broken.yaml").write_text("_target_: nsf.models.Projected\nname: [\n")
-    for module in (config.composing, nsf.paths):
-        monkeypatch.setattr(module, "CONF", tmp_path / "conf")
+    monkeypatch.setattr(nsf.paths, "CONF", tmp_path / "conf")
     with pytest.raises(ConfigError, match=r"broken\.yaml.*line [23].*correct the yaml"):
         config.load(["model=broken"])
 
 
 def test_a_yaml_that_is_edited_is_read_again(tmp_path, monkeypatch):
     shutil.copytree(CONF, tmp_path / "conf")
-    for module in (config.composing, nsf.paths):
-        monkeypatch.setattr(module, "CONF", tmp_path / "conf")
+    monkeypatch.setattr(nsf.paths, "CONF", tmp_path / "conf")
     before, file = config.load(["scene=sand"]), tmp_path / "conf/scene/sand.yaml"
     assert config.load(["scene=sand"]) == before
     text = file.read_text(encoding="utf-8")

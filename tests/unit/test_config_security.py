@@ -195,6 +195,11 @@ def test_no_interpolation_is_put_together_from_pieces(monkeypatch):
         config.resolve(found)
 
 
+def test_a_cycle_of_interpolations_is_one_line():
+    with pytest.raises(ConfigError, match=r"^scene\.dx: it refers to itself.*; give one of them a value$"):
+        config.load(["scene.dt='${scene.dx}'", "scene.dx='${scene.dt}'"])
+
+
 @pytest.mark.parametrize("kind", ["list", "text", "select", "relative"])
 def test_references_that_multiply_are_refused(kind):
     """Thirty doublings would take hours and all memory."""
@@ -216,8 +221,7 @@ def test_references_that_multiply_are_refused(kind):
 def conf(tmp_path, monkeypatch):
     """A copy of conf/ to which files may be added."""
     shutil.copytree(CONF, tmp_path / "conf")
-    for module in (config.composing, nsf.paths):
-        monkeypatch.setattr(module, "CONF", tmp_path / "conf")
+    monkeypatch.setattr(nsf.paths, "CONF", tmp_path / "conf")
     return tmp_path / "conf"
 
 

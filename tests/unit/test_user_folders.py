@@ -107,7 +107,7 @@ def test_jobs_in_other_processes_have_it_too(folder):
     command = [
         sys.executable,
         "-m",
-        "nsf",
+        "nsf.cli",
         *words,
         "scene.steps=5",
         "scene.bodies.column.particles=300",

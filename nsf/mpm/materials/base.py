@@ -37,6 +37,11 @@ class LawFunctions:
 class Material(ABC):
     """A constitutive law with its parameters.
 
+    A law defines `functions` and `stretches_of`. It inherits one history variable a particle, which is zero
+    at rest (`history_size`, `initial_history`), that at rest where τ alone is known (`history_of`), and
+    constants that are all zero (`params`). A law whose return map reads a history or constants overrides
+    these: with a yield stress of zero everything would flow.
+
     Attributes:
         E: Young's modulus [Pa].
         nu: Poisson's ratio, dimensionless, in (−1, 1/2).

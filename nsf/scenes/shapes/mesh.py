@@ -23,6 +23,8 @@ _UNITE = (
     "trimesh.boolean.union(trimesh.load_mesh(FILE).split()).export(FILE)"
 )
 _REMESH = "mend it where it was made, for instance by Blender's Boolean modifier with Self Intersection"
+#: [m] of one unit of a file, by its name.
+_UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 # Points at which a mesh is tested for overlaps of its own parts.
 _PROBES = 2**15
 # How far off a face's middle its two sides are probed, in units of the mesh's extent.
@@ -40,9 +42,10 @@ class Mesh(Shape):
 
     Attributes:
         path: an .obj, .ply or .stl file; where relative, of the current directory.
-        height: vertical extent to which the mesh is scaled [m]; by default 1 unit of the file is 1 m.
+        height: vertical extent to which the mesh is scaled [m]; by default `unit` says how large it is.
         base: middle of the bottom of its bounding box [m]; where the file has it, by default.
         up: axis of the file that points up, `x`, `y` or `z`.
+        unit: of the file's lengths, `m`, `cm` or `mm`.
 
     Raises:
         ConfigError: the file is missing, too large, of another kind or not whole, or the mesh is not
@@ -57,10 +60,17 @@ class Mesh(Shape):
     height: float | None = None
     base: Sequence[float] | None = None
     up: str = "z"
+    unit: str = "m"
 
     def __post_init__(self):
+        if self.unit not in _UNITS:
+            raise ConfigError(f"mesh unit={self.unit!r} is unknown; choose {', '.join(_UNITS)}")
         if self.height is not None:
             length("mesh height", self.height)
+            if self.unit != "m":
+                raise ConfigError(
+                    f"mesh height={self.height} m and unit={self.unit} both scale the mesh; leave one out"
+                )
         if self.base is not None:
             vector("mesh base", self.base, "m")
         if self.up not in AXES:
@@ -77,7 +87,7 @@ class Mesh(Shape):
         """Scale and shift from the file, and the surface in the file's units, turned upright."""
         surface = _surface(str(self.path), self.files[str(self.path)], self.up)
         lower, upper = surface.corners
-        scale = 1.0 if self.height is None else self.height / (upper[2] - lower[2])
+        scale = _UNITS[self.unit] if self.height is None else self.height / (upper[2] - lower[2])
         foot = np.array([*(0.5 * (lower + upper))[:2], lower[2]])
         shift = np.zeros(3) if self.base is None else np.asarray(self.base, float) - scale * foot
         return scale, shift, surface

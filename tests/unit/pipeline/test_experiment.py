@@ -193,3 +193,14 @@ def test_a_name_leads_nowhere_else(tmp_path):
 def test_the_nearest_name_is_told():
     with pytest.raises(ConfigError, match=r"unknown experiment=tabel1.*did you mean table1"):
         Experiment.load("tabel1")
+
+
+def test_an_option_that_lacks_a_key_of_the_experiment_is_named(written):
+    text = TEXT.replace(
+        "field.modes: null", "field.modes: null\n    model.teaching.steps: 9\n    model: recurrence"
+    )
+    with pytest.raises(
+        ConfigError, match=r"sets model\.teaching\.steps, which model=interpolate does not have"
+    ):
+        written(text, "model=interpolate")
+    assert written(text, "model=recurrence")

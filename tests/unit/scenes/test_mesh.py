@@ -439,3 +439,15 @@ def test_a_face_beyond_the_vertices_is_refused(tmp_path):
     path.write_text(f"{head}0 0 0\n1 0 0\n0 1 0\n3 0 1 66\n")
     with pytest.raises(ConfigError, match="a face names vertex 66 of 3"):
         Mesh(str(path))
+
+
+def test_a_mesh_in_millimetres(tmp_path):
+    path = tmp_path / "box.obj"
+    corners = [f"v {x} {y} {z}\n" for x in (0, 300) for y in (0, 200) for z in (0, 100)]
+    faces = ["f 1 2 4 3\n", "f 5 7 8 6\n", "f 1 5 6 2\n", "f 3 4 8 7\n", "f 1 3 7 5\n", "f 2 6 8 4\n"]
+    path.write_text("".join(corners + faces))
+    assert Mesh(str(path), unit="mm").volume == pytest.approx(0.006)
+    with pytest.raises(ConfigError, match="both scale the mesh; leave one out"):
+        Mesh(str(path), height=0.1, unit="mm")
+    with pytest.raises(ConfigError, match="unit='inch' is unknown; choose m, cm, mm"):
+        Mesh(str(path), unit="inch")
