@@ -1,5 +1,6 @@
 """Who takes the steps of a run, on a motion made up: x̂ goes on as it went, and operators miss some steps."""
 
+from dataclasses import replace
 from importlib import import_module
 
 import numpy as np
@@ -126,6 +127,13 @@ def test_a_run_that_is_doubted_is_the_projected_steps_from_the_start(shared):
     (found,) = shared(Line, Line, 2, "projected", doubt=lambda setup, gravity: (1.5, "outside"))
     assert (found.levels == PROJECTED).all()
     assert (found.estimate == 0.0).all()
+
+
+def test_the_projected_step_goes_on_where_forcing_is_beyond_training(batch_of, tiny_trust):
+    fallback = Fallback("projected", lambda cases: batch_of(Line, cases))
+    weak = replace(tiny_trust, gravity=((0.0, 0.0, 0.0), 1.0))  # m/s², where the scene has 9.81
+    (found,) = rollouts(batch_of(Line), [angle(26.0)], weak, fallback)
+    assert (found.levels == PROJECTED).all()
 
 
 def test_a_run_that_the_full_order_solver_takes_from_the_start_can_be_read(batch_of, tiny_trust, tmp_path):
