@@ -13,10 +13,9 @@ from nsf.dynamics.interop import captured, on_torch_stream
 from nsf.dynamics.latent import LatentState, LatentTrajectory
 from nsf.dynamics.setup import Setup
 from nsf.dynamics.span import Span, Stages
-from nsf.dynamics.step import steps_of
 from nsf.errors import ConfigError
 from nsf.kinematics.manifold import Restriction
-from nsf.mpm import Gravity, Hand
+from nsf.mpm import Hand
 from nsf.timing import StageTimer, untimed
 
 _CHUNK = 2**22  # positions of sample particles decoded at once [values]
@@ -30,13 +29,12 @@ class ReducedBatch:
 
     Args:
         setups: the inputs of each run; see `Batch` for what they share.
-        spans_of: makes the spans that take the steps, as `Engine.spans`; those of the reference by default.
-        engine, why: name of the engine that makes them, and the reason for its choice; for the record.
-        doubt: how far a run's input lies outside of what was learned, as `Engine.doubt`; never by default.
+        engine: takes the steps, an `nsf.engines.Engine`.
+        why: the reason for its choice; for the record.
 
     Attributes:
         batch: setups, record of the latent vectors, forcing.
-        engine, why: the arguments.
+        engine, why: name of the engine, and the reason.
         steps_taken, total_steps: so far, and to the end of the scene.
         dt: step [s]; device: Warp device.
 
@@ -46,21 +44,13 @@ class ReducedBatch:
     Source: paper section 5.
     """
 
-    def __init__(
-        self,
-        setups: Sequence[Setup],
-        spans_of: Callable[[Batch], Sequence[Span]] = steps_of,
-        engine: str = "reference",
-        why: str = "",
-        doubt: Callable[[Setup, Gravity], tuple[float, str]] = lambda setup, gravity: (0.0, ""),
-    ):
+    def __init__(self, setups: Sequence[Setup], engine, why: str = ""):
         self.batch = Batch.of(setups)
-        self.engine, self.why, self._spans_of = engine, why, spans_of
-        self._doubt = doubt
+        self._engine, self.engine, self.why = engine, engine.name, why
         shared = self.batch.shared
         self.dt, self.total_steps, self.device = shared.dt, shared.total_steps, shared.device
         self.steps_taken = 0
-        self._starts, self._spans = shared.starts, spans_of(self.batch)
+        self._starts, self._spans = shared.starts, engine.spans(self.batch)
         self._enter(self._spans[0])
 
     def __len__(self) -> int:
@@ -78,13 +68,13 @@ class ReducedBatch:
 
     def alone(self, index: int) -> "ReducedBatch":
         """One of the runs, at t = 0 and in a batch of its own."""
-        return ReducedBatch([self.batch.setups[index]], self._spans_of, self.engine, self.why, self._doubt)
+        return ReducedBatch([self.batch.setups[index]], self._engine, self.why)
 
     @property
     def doubts(self) -> tuple[tuple[float, str], ...]:
         """How far the input of each run lies outside of what its engine learned from; see `Engine.doubt`."""
         pairs = zip(self.batch.setups, self.batch.forcing.gravities, strict=True)
-        return tuple(self._doubt(setup, gravity) for setup, gravity in pairs)
+        return tuple(self._engine.doubt(setup, gravity) for setup, gravity in pairs)
 
     @property
     def xhat(self) -> torch.Tensor:

@@ -81,7 +81,7 @@ def reduced_batch(
 
 def _together(setups: Sequence[Setup], name: str | Engine) -> ReducedBatch:
     engine, why = choose(name, setups)
-    return ReducedBatch(setups, engine.spans, engine.name, why, engine.doubt)
+    return ReducedBatch(setups, engine, why)
 
 
 def _setup(scene, manifold, parameters, sample: Sample, engine: str | Engine, options: dict) -> Setup:

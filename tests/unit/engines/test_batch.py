@@ -53,7 +53,7 @@ def setup_of(tiny_manifold):
 
 
 def together(*setups):
-    return ReducedBatch(setups, Modal().spans)
+    return ReducedBatch(setups, Modal())
 
 
 @pytest.fixture
@@ -62,7 +62,7 @@ def with_law(chain, tiny_manifold, setup_of):
     first = setup_of(chain.scene)
 
     def build(law, sources):
-        scene = replace(chain.scene, material=law)
+        scene = replace(chain.scene, material=law, parameters={})
         options = {"sources": sources, "device": "cpu", "sets": first.sets}
         return Setup(tiny_manifold, scene, first.samples, {ANGLE: 26.0}, **options)
 
@@ -190,7 +190,7 @@ def test_the_history_at_rest_is_each_ones_own(with_law):
     """Without flow it decides a stress where it is zero: such a particle is damaged."""
     laws = [VonMises(E=2000.0, nu=0.2, yield_stress=value) for value in (20.0, 30.0)]
     span = together(*(with_law(law, SOURCES[3]) for law in laws)).span
-    held = [a for a in span._arena._held if a.shape == (2 * span.size, 1)]
+    held = [a for a in span._arena._buffers if a.shape == (2 * span.size, 1)]
     assert [a.flatten().tolist() for a in held] == [[20.0] * span.size + [30.0] * span.size]
 
 
@@ -375,7 +375,8 @@ def test_a_hand_is_a_program_known_only_afterwards(tiny, tiny_manifold, engine):
     run.restart()
     run.forcing.gravity = (0.0, 0.0, -4.0)
     run.step(24)
-    plain = nsf.load_scene("sand", tiny[1:]).reduced(tiny_manifold, sample=20, engine=engine, device="cpu")
+    still = nsf.load_scene("sand", tiny[1:])
+    plain = nsf.reduced(still, tiny_manifold, sample=20, engine=engine, device="cpu")
     plain.step(24)
     np.testing.assert_allclose(run.trajectory().xhat, plain.trajectory().xhat, rtol=0, atol=1e-10)
     assert np.abs(plain.trajectory().xhat - own).max() > 1e-3

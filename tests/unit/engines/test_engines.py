@@ -76,7 +76,7 @@ def test_every_engine_is_the_reference(engine, model):
         )
         if engine.refusal([one.setup]):
             continue
-        one = ReducedBatch([one.setup], engine.spans).runs[0]
+        one = ReducedBatch([one.setup], engine).runs[0]
         taken += 1
         for solver in (one, other):
             solver.step(6)
