@@ -6,7 +6,7 @@ import signal
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -53,15 +53,16 @@ class Watch:
         elif (
             event == "open" and isinstance(arguments[1], str) and set(arguments[1]) & set("wax+")
         ) or event in _CHANGES:
-            self._changed(arguments[0])
+            self._changed(arguments[0], arguments[1:] if event in ("os.remove", "os.rmdir") else ())
         elif event == "socket.connect" and not isinstance(arguments[1], str | bytes):
             host = arguments[1][0]
             self.deeds += [f"connected to {host}"] * (host not in _LOOPBACK)
 
-    def _changed(self, path) -> None:
+    def _changed(self, path, folders: Sequence[int] = ()) -> None:
         if not isinstance(path, bytes | str | os.PathLike):
             return
-        path = Path(os.path.abspath(os.fsdecode(path)))
+        above = [os.readlink(f"/proc/self/fd/{folder}") for folder in folders if folder >= 0]
+        path = Path(os.path.abspath(os.path.join(*above, os.fsdecode(path))))
         places = (self.folder, Path.home() / ".cache", Path("/dev"), Path("/proc"))
         in_temporary = path.is_relative_to(tempfile.gettempdir()) and not path.is_relative_to(
             self.folder.parent
