@@ -102,7 +102,7 @@ def read(path: Path) -> pd.DataFrame:
     """The table of a file, to the last digit; an empty one where there is none."""
     if not path.is_file():
         return pd.DataFrame(columns=list(COLUMNS))
-    frame = pd.read_csv(path, dtype={"part": str, "unit": str})
+    frame = table.parsed(path, ("part", "unit"))
     return frame.fillna({"part": "", "unit": ""})
 
 

@@ -251,6 +251,8 @@ class Trajectory:
         numbers = np.arange(self.frames)[rows]
         count = len(range(self.particles)[columns]) if isinstance(columns, slice) else len(columns)
         shape = (len(numbers), count, COMPONENTS[field])
+        if stored.base.size() < stored.offset + stored.nbytes:  # of the file, as it is now
+            raise SchemaError(f"{self.path} was cut short while it was open; simulate again")
         if out is None:
             out = np.empty(shape, stored.dtype.newbyteorder("="))
         if out.shape != shape:

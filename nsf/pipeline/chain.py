@@ -128,7 +128,7 @@ class Pipeline:
         config.device = device
         pipeline = cls(config, say, run.root)
         if isinstance(pipeline.configured, Auto):
-            pipeline.choose(run.manifest["metrics"]["model"])
+            pipeline.choose(run.metric("model", kind=str))
         return pipeline
 
     def _deployed(self, changes: DictConfig | None) -> Scene:
@@ -188,7 +188,7 @@ class Pipeline:
         if not isinstance(self.configured, Auto):
             return self.configured
         if self._chosen is None:
-            self.choose(self.deployment.require().manifest["metrics"]["model"])
+            self.choose(self.deployment.require().metric("model", kind=str))
         return self._chosen
 
     def choose(self, name: str) -> None:

@@ -192,7 +192,7 @@ def _tried(overrides: list[str], objectives: Sequence[str], root: Path | None) -
     pipeline.split = replace(pipeline.split, test=())  # which a search never looks at
     for stage in pipeline.stages[:-1]:
         run = pipeline.run(stage)
-    results = pd.read_csv(run.file("results.csv"))
+    results = table.read(run.file("results.csv"))
     if set(results["split"]) != {"validation"}:
         raise ConfigError(f"{run.id} is not of the validation cases alone; leave deploy.split out")
     values = [float(results[OBJECTIVES[name].name].mean()) for name in objectives]

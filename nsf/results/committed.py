@@ -7,7 +7,6 @@ no cases, keep files of their own and are listed.
 """
 
 import html
-import json
 import re
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -18,6 +17,7 @@ import numpy as np
 import pandas as pd
 from PIL import Image
 
+from nsf import schemas
 from nsf.errors import SchemaError
 from nsf.results import report, table
 from nsf.results.averages import averaged
@@ -29,6 +29,7 @@ from nsf.results.page import Picture, Section
 from nsf.results.question import Question
 from nsf.results.sources import file_hash
 from nsf.runs.provenance import not_ignored
+from nsf.schemas import Maybe
 from nsf.storage import write_json, writing
 
 TABLE, PROVENANCE, LIST = "results.csv", "provenance.json", "index.md"
@@ -94,6 +95,22 @@ _SAME = 1.0  # mean difference of pixels, of 255, that another version of a libr
 _REBUILD = "build it again with `nsf report`"
 
 
+_PROVENANCE = {key: {...: dict} for key in ("reports", "runs", "pictures")}
+_MARK = {
+    Maybe("title"): str,
+    Maybe("files"): {...: str},
+    Maybe("chart"): ({"file": str}, None),
+    Maybe("listed"): {"headings": [str], "body": [[str]], "numeric": [bool], "made": str},
+}
+#: Of a report that `nsf report` wrote.
+_WRITTEN = {
+    "name": str,
+    "files": {...: str},
+    "runs": {...: dict},
+    "pictures": {...: {"caption": str, "runs": [str]}},
+}
+
+
 @dataclass(frozen=True)
 class Reports:
     """What a folder of reports holds.
@@ -122,9 +139,7 @@ class Reports:
             SchemaError: the table is none, or `provenance.json` lacks a key.
         """
         path = folder / PROVENANCE
-        content = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
-        if content and (absent := {"reports", "runs", "pictures"} - content.keys()):
-            raise SchemaError(f"{path} lacks {', '.join(sorted(absent))}; take it from version control again")
+        content = _read(path, _PROVENANCE) if path.is_file() else {}
         frame = table.read(folder / TABLE) if (folder / TABLE).is_file() else pd.DataFrame(columns=[*COLUMNS])
         beside = (content.get(key, {}) for key in ("reports", "runs", "pictures"))
         return cls(folder, frame, *beside, questions or {})
@@ -133,9 +148,9 @@ class Reports:
         """With every report that `nsf report` wrote in the folder, each in the place of its older rows."""
         found = self
         for mark in sorted(self.folder.rglob(MARK)):
-            content = json.loads(mark.read_text(encoding="utf-8"))
+            content = _read(mark, _MARK)
             if "made_of" in content and not_ignored([mark.with_name("delta.png")]):
-                found = found._with(mark.parent, content)
+                found = found._with(mark.parent, _read(mark, _WRITTEN))
         return found
 
     def _with(self, place: Path, content: Mapping) -> "Reports":
@@ -144,7 +159,7 @@ class Reports:
         frame = pd.concat([others, rows], ignore_index=True) if len(others) else rows
         prefix = place.relative_to(self.folder).as_posix()
         drawn = {
-            f"{prefix}/{file}": {**picture, "sha256": content["files"][file]}
+            f"{prefix}/{file}": {**picture, "sha256": content["files"].get(file, "")}
             for file, picture in content["pictures"].items()
             if picture["caption"] not in {chart.caption for chart in CHARTS.values()}
         }
@@ -337,16 +352,23 @@ def _place(name: str) -> tuple[int, str, int, str]:
     return len(CHAPTERS) - 1, list(CHAPTERS)[-1], 0, name
 
 
+def _read(path: Path, schema: Mapping) -> dict:
+    try:
+        return schemas.read(path, schema)
+    except SchemaError as error:
+        raise SchemaError(f"{path.parent}: {error}; write the report again, or take it from git") from error
+
+
 def _listed(folder: Path) -> Iterator[Path]:
     """Marks of reports that have files of their own, as of inverse problems."""
     for mark in not_ignored(sorted(folder.rglob(MARK))):
-        if "listed" in json.loads(mark.read_text(encoding="utf-8")):
+        if "listed" in _read(mark, _MARK):
             yield mark
 
 
 def _listed_section(mark: Path) -> dict:
     """What the page says of a report with files of its own: what it says itself."""
-    content = json.loads(mark.read_text(encoding="utf-8"))
+    content = _read(mark, _MARK)
     rows = content["listed"]
     wide = [text[:_WIDE] for text in rows["body"]]
     return {
@@ -362,7 +384,7 @@ def _listed_section(mark: Path) -> dict:
 
 def _changed(folder: Path) -> list[str]:
     """Files of such a report that are not those whose hashes it holds."""
-    known = json.loads((folder / MARK).read_text(encoding="utf-8")).get("files", {})
+    known = _read(folder / MARK, _MARK).get("files", {})
     there = {path.name: file_hash(path) for path in sorted(folder.iterdir()) if path.name != MARK}
     missing = {name for name in known.keys() - there.keys() if not name.endswith(_MADE_ANEW)}
     changed = {name for name in known.keys() & there.keys() if known[name] != there[name]}
@@ -381,7 +403,7 @@ def _bench(folder: Path) -> dict:
     """What the page says of benchmarks: their title and first chart."""
     text = (folder / LIST).read_text(encoding="utf-8")
     chart = re.search(r"^!\[.*\]\(([\w-]+\.png)\)$", text, re.MULTILINE)
-    rows = pd.read_csv(folder / "bench.csv")
+    rows = table.parsed(folder / "bench.csv", ())
     devices, commits = (", ".join(sorted(rows[name].astype(str).unique())) for name in ("device", "commit"))
     return {
         "name": folder.name,

@@ -280,7 +280,7 @@ def _fine_tables(frame: pd.DataFrame, question: Question, folder: Path) -> list[
         if len(own):
             checked_hash(run, _FINE)
             head = {name: own[name].iloc[0] for name in ("body", "variant")} | {"run": run.id}
-            parts.append(pd.read_csv(Path(run.path) / _FINE).assign(**head))
+            parts.append(table.parsed(Path(run.path) / _FINE, ("case",)).assign(**head))
     if not parts:
         return []
     fine = pd.concat(parts, ignore_index=True)

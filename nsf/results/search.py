@@ -47,7 +47,7 @@ def search_chart(table: pd.DataFrame, objectives: Sequence[str]) -> Figure:
 
 def best_table(path: Path) -> Table:
     """The best trials of a `trials.csv`, for the terminal: the Pareto front."""
-    trials = pd.read_csv(path)
+    trials = table.parsed(path, ())
     best = trials[trials["pareto"]].drop(columns=["pareto", "error"])
     columns = [OBJECTIVES.get(name, Column(name, name)) for name in best]
     body = [

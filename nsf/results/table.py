@@ -4,7 +4,7 @@ A row is a (run, case, seed, model), with the columns of `nsf.results.columns`. 
 pandas data frames; those that `labelled` gives also have `body`, `variant` and a column a setting.
 """
 
-import json
+import contextlib
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pandas as pd
 
+from nsf import schemas
 from nsf.data.case import Case
 from nsf.errors import ConfigError, MissingRunError, SchemaError, first_line
 from nsf.results.columns import (
@@ -316,7 +317,9 @@ def _bodies(frame: pd.DataFrame) -> pd.Series:
 
 
 def _length(text) -> float:
-    return len(json.loads(text)) if isinstance(text, str) and text.startswith("[") else math.nan
+    with contextlib.suppress(SchemaError):
+        return len(schemas.parse(text, _TRAIN, list)) if isinstance(text, str) else math.nan
+    return math.nan
 
 
 def _numeric(values: pd.Series) -> pd.Series:

@@ -50,7 +50,7 @@ def reserved(root: Path, by_others: bool = False) -> set[str]:
             continue
         with suppress(OSError, StorageError):  # it has ended meanwhile, or is of someone else
             if in_use(names.with_suffix(".lock")):
-                ids.update(names.read_text(encoding="utf-8").split("\n"))
+                ids.update(names.read_text(encoding="utf-8", errors="replace").split("\n"))
             else:
                 _forget(names)
     return ids

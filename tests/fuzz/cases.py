@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
+from unittest import mock
 
 import h5py
 import inputs
@@ -29,7 +30,12 @@ from omegaconf import OmegaConf
 
 import nsf.config
 import nsf.paths
+from nsf.bodies import camera
 from nsf.errors import ConfigError
+from nsf.results import style
+from nsf.results.charts import CHARTS
+from nsf.results.question import Question
+from nsf.results.report import build_report
 from nsf.runs import Run
 from nsf.terminal import visible
 
@@ -66,6 +72,7 @@ class Workshop:
         self.folder, self.root, self.tiny = folder, root, tiny
         self.runs, self.conf = folder / "runs", folder / "conf"
         shutil.copytree(CONF, self.conf)
+        style.PIXELS, camera._OVERSAMPLE = style.PIXELS // 4, 1  # pictures are not looked at
         os.environ["NSF_RUNS"], os.environ["NSF_REPORTS"] = str(self.runs), str(folder / "reports")
 
     def fresh(self) -> Path:
@@ -459,17 +466,18 @@ def evaluations(shop: Workshop, draw: random.Random) -> Case:
         shop.rewrite(path, changed)
         what = repr(changed[:1500])
     shop.recorded(path)
-    index = draw.random() < 0.2
+    index, charts = draw.random() < 0.2, draw.sample(sorted(CHARTS), draw.choice((0, 0, 0, 1, 2)))
 
     def hand_over() -> None:
         if index:
             shutil.rmtree(shop.folder / "index", ignore_errors=True)
             shop.command("index", f"folder={shop.folder / 'index'}")()
             return
-        from nsf.results.question import Question
-        from nsf.results.report import build_report
-
-        build_report([run], shop.folder / "reports" / "fuzz", Question("fuzz", "Fuzz"), films=False)
+        question = Question("fuzz", "Fuzz", plots=charts)
+        with contextlib.ExitStack() as stack:
+            if draw.random() < (0.3 if name.endswith("npz") else 0.9):  # bodies take seconds to draw
+                stack.enter_context(mock.patch("nsf.results.pictures.sections", return_value=[]))
+            build_report([run], shop.folder / "reports" / "fuzz", question, films=False)
 
     return Case(f"{'index' if index else 'report'} with {name}: {what}", hand_over)
 
@@ -497,11 +505,13 @@ def observations(shop: Workshop, draw: random.Random) -> Case:
             data = inputs.mutated(data, draw)
         what = repr(data[:600])
 
+    model = shop.model
+
     def hand_over() -> None:
         from nsf.inverse.observations import Observations
 
         path.write_bytes(data)
-        Observations.read(path, shop.model)
+        Observations.read(path, model)
 
     return Case(f"{kind}: {what}", hand_over)
 

@@ -58,7 +58,7 @@ def main() -> int:
         for kind in kinds:
             for at in numbers:
                 # A loop that no signal interrupts ends the process, with every thread's place.
-                faulthandler.dump_traceback_later(3 * watch.LIMIT, exit=True)
+                faulthandler.dump_traceback_later(20 * watch.LIMIT, exit=True)
                 ending, said, what = drawn(shop, kind, at, options.seed)
                 faulthandler.cancel_dump_traceback_later()
                 endings[kind][ending] += 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -53,6 +54,12 @@ def loggers(folder: Path, tracking: str | None) -> list[Logger]:
     return writers
 
 
+def _run_id(path: Path) -> str | None:
+    """The id of MLflow in a file; None where there is none, or something else."""
+    found = path.read_bytes() if path.is_file() else b""
+    return found.decode() if re.fullmatch(rb"[0-9a-f]{32}", found) else None
+
+
 def _mlflow(folder: Path) -> MLFlowLogger:
     """One MLflow run a phase, which a resumed phase goes on with."""
     from pytorch_lightning.loggers.mlflow import MLFlowLogger
@@ -66,7 +73,7 @@ def _mlflow(folder: Path) -> MLFlowLogger:
             run_name=f"{folder.parent.name}/{folder.name}",
             tracking_uri=os.environ.get("MLFLOW_TRACKING_URI", f"sqlite:///{trainings / 'mlflow.db'}"),
             artifact_location=(trainings / "mlflow").as_uri(),
-            run_id=run_file.read_text(encoding="utf-8") if run_file.is_file() else None,
+            run_id=_run_id(run_file),
         )
         with writing(run_file) as partial:
             partial.write_text(str(logger.run_id), encoding="utf-8")

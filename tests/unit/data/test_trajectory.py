@@ -522,3 +522,13 @@ def test_a_really_full_disk(tmp_path, constants, monkeypatch, kib):
         assert os.listdir(disk) == []
     finally:
         subprocess.run(["umount", "-l", disk], check=True)
+
+
+def test_a_file_cut_short_while_it_is_open_is_refused(write):
+    path, _ = write()
+    with Trajectory.open(path) as trajectory:
+        with path.open("r+b") as file:
+            file.truncate(0)
+        for field in ("x", "v", "C", "tau"):
+            with pytest.raises(SchemaError, match=r"was cut short while it was open; simulate again"):
+                trajectory.read(field)

@@ -107,7 +107,7 @@ def test_a_row_that_was_changed_is_noticed_by_its_charts_and_page(folder):
 
 def test_a_half_written_provenance_is_refused(folder):
     (folder / "provenance.json").write_text('{"runs": {}}')
-    with pytest.raises(SchemaError, match="lacks pictures, reports; take it from version control"):
+    with pytest.raises(SchemaError, match=r"provenance\.json: it lacks reports; .* take it from git"):
         committed.faults(folder)
 
 
