@@ -10,6 +10,8 @@ from nsf.mpm.materials import PATHS, deformation_path, drive
 from nsf.mpm.stability import check_time_step
 from nsf.paths import CONF, groups
 from nsf.pipeline import Pipeline
+from nsf.scenes.checks import check_physics
+from nsf.scenes.resolution import resolution_warnings
 
 GROUPS = groups()
 #: A scene sets its material's constants, so a law alone is composed with the material point.
@@ -33,10 +35,10 @@ def test_launcher_composes(name):
     assert config.launching([f"hydra/launcher={name}"])[0].hydra.launcher
 
 
+@pytest.mark.parametrize("scale", ["small", pytest.param("paper", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", GROUPS["scene"])
-@pytest.mark.parametrize("scale", ["small", "paper"])
 def test_scene_is_runnable(name, scale):
-    """It is built in the cases at the ends of each range, with particles in the domain and a stable step."""
+    """In the cases at the ends of each range: particles in the domain, a stable step, no body in another."""
     scene = Pipeline(config.load([f"scene={name}", f"scale={scale}", "device=cpu"])).check().scene
     assert scene.name == name
     ends = {end(scene.split.cases, key=itemgetter(of)) for of in scene.varied for end in (min, max)}
@@ -46,7 +48,12 @@ def test_scene_is_runnable(name, scale):
         constants = at.particles()
         assert len(constants) == at.particle_count
         check_time_step(constants, at.initial_velocity(), at.dx, at.dt)
-    scene.full_order(device="cpu")
+        check_physics(at)
+    assert resolution_warnings(scene) == []
+    solver = scene.full_order(device="cpu")
+    if scale == "small":
+        solver.step()
+        solver.check()
 
 
 @pytest.mark.parametrize("name", GROUPS["material"])

@@ -105,16 +105,6 @@ def test_meant(case):
     check_physics(load_scene("sand", [FEW, *MEANT[case]]))
 
 
-@pytest.mark.parametrize("scale", ["small", "paper"])
-@pytest.mark.parametrize(
-    "name", ["bread", "cake", "drop", "jelly_cube", "metal", "sand", "squishy_ball", "toothpaste"]
-)
-def test_shipped_scenes_are_meant(name, scale):
-    scene = load_scene(name, [f"scale={scale}"])
-    for case in (min(scene.split.cases), max(scene.split.cases)):
-        check_physics(scene.at(case))
-
-
 class TestDistance:
     def test_cuboid(self):
         block = Cuboid((1.0, 2.0, 3.0), (2.0, 4.0, 6.0), axis=(0.0, 0.0, 1.0), angle=90.0)

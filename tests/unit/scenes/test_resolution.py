@@ -89,14 +89,6 @@ def test_a_part_that_no_point_of_the_lattice_hits():
     assert 2e-4 < thinnest_part(Ribbon(ends.tolist(), 5e-4), 0.2, points) < 1.2e-3
 
 
-@pytest.mark.parametrize("scale", ["small", "paper"])
-@pytest.mark.parametrize(
-    "name", ["bread", "cake", "drop", "jelly_cube", "metal", "sand", "squishy_ball", "toothpaste"]
-)
-def test_no_shipped_scene_is_warned_of(name, scale):
-    assert resolution_warnings(load_scene(name, [f"scale={scale}"])) == []
-
-
 def test_thin_legs():
     """A chair of such legs fell into loose spheres on this grid; what the line names does."""
     leg = "{_target_: nsf.scenes.Box, lower: [0.4, 0.4, 0.2], upper: [0.427, 0.427, 0.6]}"
