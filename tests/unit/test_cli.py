@@ -48,7 +48,7 @@ def test_help(arguments, capsys):
     assert re.search(r"^  scene .*\bsand\b", out, re.MULTILINE)
 
 
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("stage", ["run", "point"])
 def test_help_of_a_stage(nsf, stage):
     code, out, _ = nsf(stage, "--help", tiny_scene=False)
     assert code == 0
@@ -73,50 +73,20 @@ def test_version(capsys):
 
 
 REFUSED = [
-    ("run", "scene.dtt=1", ["scene.dtt", "did you mean scene.dt"]),
     ("run", "lantent_dim=4", ["'lantent_dim'", "did you mean latent_dim"]),
-    ("run", "model=baseline", ["model=baseline", "choose one of auto"]),
     ("run", "field=bassis", ["field=bassis", "did you mean basis?"]),
     ("run", "latent_dim", ["'latent_dim' is not key=value"]),
     ("run", "--fast", ["'--fast' is not key=value"]),
-    ("run", "scene.design.test=[1", ["scene.design.test=[1"]),
     ("run", "scene.design.test=[22,26]", ["22", "train and test", "one split"]),
-    ("run", "scene.design.train=[30]", ["1 training cases", "friction_angle needs at least 2; add some"]),
-    ("run", "scene.design.train=[22,22,30]", ["22", "twice in train"]),
-    ("run", "scene.design.test=[]", ["scene.design.test"]),
-    ("run", "scene.design.test=26", ["scene.design.test=26"]),
-    ("run", "scene.design.train=abc", ["scene.design.train"]),
-    ("run", "scene.design.test=[95]", ["friction_angle=95", "[0, 90)"]),
     ("run", "scale=big", ["scale=big", "choose one of small, paper"]),
     ("run", "material.nu=0.6", ["material.nu=0.6", "(-1, 0.5)"]),
-    ("run", "material.E=-1", ["material.E=-1", "positive"]),
-    ("run", "material.E=soft", ["material.E=soft"]),
-    ("run", "material.friction_angle=95", ["material.friction_angle=95", "[0, 90)"]),
-    ("run", "scene.dt=0", ["dt=0", "positive"]),
-    ("run", "scene.dt=-0.1", ["dt=-0.1", "positive"]),
-    ("run", "scene.dx=0", ["dx=0", "positive"]),
-    ("run", "scene.gravity=3", ["scene.gravity=3"]),
     ("run", "latent_dim=0", ["latent_dim=0", "at least 1"]),
-    ("run", "latent_dim=abc", ["latent_dim=abc", "at least 1"]),
-    ("run", "latent_dim=2.5", ["latent_dim=2.5"]),
-    ("run", "seed=abc", ["seed=abc"]),
-    ("run", "precision=fp16", ["precision='fp16'", "fp32, fp64"]),
     ("run", "device=gpu", ["device=gpu"]),
-    ("run", "data.dtype=float16", ["data.dtype=float16", "float32 or float64"]),
     ("run", "deploy.split=foo", ["deploy.split=foo", "test, validation or train"]),
-    ("run", "fallback=stop", ["fallback=stop", "projected or full"]),
     ("run", "field._target_=os.system", ["os.system is refused"]),
-    ("run", "~latent_dim", ["latent_dim"]),
-    ("run", "~scene.dx", ["scene.dx"]),
-    ("point", "material=hencki", ["material=hencki", "did you mean hencky?"]),
     ("point", "path=pull", ["path='pull'", "simple_shear"]),
     ("point", "point.amplitude=abc", ["point.amplitude=abc"]),
-    ("point", "point.amplitude=-1", ["point.amplitude=-1"]),
-    ("point", "point.points=1", ["point.points=1"]),
     ("point", "point.rate=0", ["point.rate=0"]),
-    ("point", "material.E=0", ["material.E=0"]),
-    ("point", "precision=fp16", ["precision='fp16'"]),
-    ("run", "scene.size=[-1,1,1]", ["scene.size=-1", "must be positive"]),
 ]
 
 
@@ -133,51 +103,20 @@ def test_bad_input_is_one_clear_line(nsf, tmp_path, stage, override, quoted):
 
 MALFORMED = [
     ("scene.bodies=null", "scene.bodies=null must map names to nodes"),
-    ("scene.colliders=5", "scene.colliders=5 must map names to nodes"),
-    ("scene.colliders=null", "scene.colliders=null must map names to nodes"),
     ("scene.walls=null", "scene.walls names no class; give it a _target_: nsf.mpm."),
-    ("scene.colliders.floor=null", "scene.colliders.floor names no class"),
-    ("+scene.bodies.x=5", "scene.bodies.x names no class"),
     ("scene.bodies.column.density=inf", "scene.bodies.column.density=inf must be finite"),
-    ("scene.bodies.column.density=nan", "scene.bodies.column.density=nan must be finite"),
-    ("scene.bodies.column.shape.base=[a,b,c]", "shape.base=['a', 'b', 'c'] must be a list of numbers"),
-    ("scene.bodies.column.shape.base=[nan,0.5,0.13]", "shape.base=[nan, 0.5, 0.13] must be finite"),
-    ("scene.bodies.column.shape=5", "shape=5 must be built; give it a _target_"),
-    ("scene.bodies.column.velocity=5", "scene.bodies.column.velocity=5 must be a list of numbers"),
     ("scene.bodies.column.particles=true", "particles=True must be a whole number or null"),
     ("~scene.bodies.column.density", "scene.bodies.column.density is missing"),
-    (
-        "+scene.bodies.column.weight=1",
-        "'scene.bodies.column.weight'; scene.bodies.column has density",
-    ),
-    ("scene.parameters.friction_angle.key=''", "friction_angle.key='' names no key"),
-    ("scene.parameters.friction_angle.key=[a]", "friction_angle.key=['a'] must be text"),
-    ("~scene.parameters.friction_angle.key", "scene.parameters.friction_angle.key is missing"),
-    ("~scene.parameters.friction_angle.unit", "scene.parameters.friction_angle.unit is missing"),
-    ("~scene.design.train", "scene.design.train is missing"),
     ("scene.parameters=null", "scene.parameters=null must map keys to values"),
-    ("scene.parameters.friction_angle.unit=5", "friction_angle.unit=5 must be text"),
     ("scene.design.test=null", "scene.design.test=None must be a list, as [None]"),
-    ("scene.design.validation=[[1,2]]", "scene.design.validation: [1, 2] must be a finite number"),
-    ("scene.name=[1]", "scene.name=[1] must be text"),
-    ("scene.name=''", "scene.name='' must be text, and not empty"),
-    ("scene.title=null", "scene.title=None must be text"),
-    ("scene.paper=5", "scene.paper must have place, a text, and figures by method"),
     ("scene.paper={nsf:{delta:a}}", "scene.paper.nsf.delta=a must be a finite number"),
     ("scene=null", "scene=null names no option of its group"),
     ("material=5", "material=5 names no option of its group"),
     ("scene=../../etc/passwd", "unknown scene=../../etc/passwd; choose one of block, bread"),
     ("scene.colliders.floor=[]", "scene.colliders.floor=[]: Cannot merge DictConfig with ListConfig"),
     ("data=null", "data=null must map keys to values"),
-    ("deploy=5", "deploy=5"),
-    ("evaluation=null", "evaluation=null must map keys to values"),
-    ("super_resolution=null", "super_resolution=null must map keys to values"),
-    ("report=null", "report=null must map keys to values"),
-    ("~deploy", "deploy=null must map keys to values"),
     ("~deploy.split", "deploy.split is missing from the configuration"),
-    ("~precision", "precision is missing from the configuration"),
     ("report.folder=5", "report.folder=5 must be text"),
-    ("report.name=null", "report.name=None must be one folder's name"),
     ("seed=1e400", "seed=inf must be a whole number"),
     ("deploy.dt_multiplier=1e-300", "deploy.dt_multiplier=1e-300 must be a finite number of at least 0.001"),
     ("deploy.changes={5:5}", "deploy.changes has the key 5; give dotted keys"),
@@ -186,11 +125,8 @@ MALFORMED = [
         "deploy.changes.material: _target_: os.system is refused",
     ),
     ("+scene.x='${scene.x}'", "scene.x: Recursive interpolation detected"),
-    ("+scene.x='${scene.y}'", "scene.x: Interpolation key 'scene.y' not found"),
     ("+scene.x='${scaled:5}'", "scene.x: ${scaled:5} has no values by scale"),
-    ("+scene.x='${per:0}'", "scene.x: ${per:0} divides by zero"),
     ("+scene.x='${per:1,2}'", "scene.x: per() takes 1 positional argument"),
-    ("scale=[]", "scale=[] is unknown here"),
 ]
 
 
@@ -208,9 +144,6 @@ def test_a_malformed_value_is_one_line_that_names_it(nsf, tmp_path, override, to
     ("override", "told"),
     [
         ("point=null", "point=null must map keys to values"),
-        ("~path", "path is missing from the configuration"),
-        ("~point.folder", "point.folder is missing from the configuration"),
-        ("point.folder=5", "point.folder=5 must be text"),
         ("point.points=2000000000", "point.points=2000000000 is more than"),
         ("material._target_=nsf.workers.Worker", "nsf.workers.Worker is refused"),
     ],
@@ -246,33 +179,22 @@ def test_an_error_steers_no_terminal(nsf, monkeypatch):
 
 # What later stages need is known from the start: minutes of simulating and training must not be spent first.
 BEFORE_ANY_WORK = [
-    ("sampler.size=0", ["sampler.size"]),
     (
         "sampler.size=1",
         ["|S|=1 gives 3 equations for r=4 unknowns; choose sampler.size >= 2 or latent_dim <= 3"],
     ),
-    ("sampler.size=2.5", ["sampler.size=2.5"]),
     ("sampler.size=501", ["sampler.size=501", "500 particles"]),
-    ("sampler.seed=abc", ["sampler.seed=abc"]),
     ("deploy.dt_multiplier=0", ["dt_multiplier=0"]),
-    ("deploy.dt_multiplier=abc", ["dt_multiplier=abc"]),
     ("deploy.batch=0", ["deploy.batch=0"]),
-    ("deploy.batch=1.5", ["deploy.batch=1.5"]),
     ("deploy.changes={scene.gravty:[0,0,-1]}", ["'scene.gravty'", "did you mean scene.gravity"]),
     ("deploy.changes={scene.bodies.column.particles:400}", ["column.particles", "other particles"]),
     ("deploy.changes={material.nu:0.6}", ["deploy.changes", "material.nu=0.6"]),
-    ("deploy.changes=3", ["deploy.changes=3", "{material.nu:0.25}"]),
     ("evaluation.trials=-1", ["evaluation.trials=-1"]),
-    ("evaluation.trials=abc", ["evaluation.trials=abc"]),
     ("super_resolution.factor=1", ["super_resolution.factor=1", "at least 2"]),
-    ("super_resolution.frames=0", ["super_resolution.frames=0"]),
     ("evaluation.picture_particles=0", ["evaluation.picture_particles=0"]),
-    ("evaluation.picture_frames=0", ["evaluation.picture_frames=0"]),
     ("report.name=../elsewhere", ["report.name=../elsewhere", "report.folder"]),
-    ("report.name=..", ["report.name=.."]),
     ("report.folder=/proc/reports", ["no report can be written to /proc/reports", "set report.folder"]),
     ("tracking=wandb", ["tracking=wandb", "tensorboard"]),
-    ("data.resident=maybe", ["resident=maybe"]),
     ("projector.iterations=maybe", ["iterations=maybe"]),
 ]
 
@@ -318,14 +240,6 @@ def test_a_memory_is_learned_from_full_order_runs_alone(nsf):
     assert code == 2
     assert "model.teaching.memory=[0.1] is learned from runs alone" in err
     assert "model.teacher=runs" in err
-
-
-def test_the_example_of_the_style_guide(nsf, monkeypatch):
-    """|S| = 1 with the paper's r = 6."""
-    monkeypatch.setattr(simulation_stage(), "simulate", lambda *arguments: pytest.fail("simulate began"))
-    code, _, err = nsf("run", "latent_dim=6", "sampler.size=1")
-    assert code == 2
-    assert "|S|=1 gives 3 equations for r=6 unknowns; choose sampler.size >= 2 or latent_dim <= 3" in err
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")

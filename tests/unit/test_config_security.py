@@ -46,16 +46,22 @@ CALLABLES = [
 PLACES = sorted(key.replace("*", "column" if "bodies" in key else "floor") for key in targets.KINDS)
 
 
-@pytest.mark.parametrize("target", CALLABLES)
 @pytest.mark.parametrize("place", PLACES)
-def test_a_key_takes_only_the_classes_that_it_expects(place, target):
-    told = re.escape(f"{place}: _target_: {target} ") + "(is refused|does not exist)"
-    with pytest.raises(ConfigError, match=told):
-        config.build({"_target_": target, "folder": "/nowhere"}, place)
+def test_a_key_takes_only_the_classes_that_it_expects(place):
+    for target in CALLABLES:
+        told = re.escape(f"{place}: _target_: {target} ") + "(is refused|does not exist)"
+        with pytest.raises(ConfigError, match=told):
+            config.build({"_target_": target, "folder": "/nowhere"}, place)
 
 
-@pytest.mark.parametrize("target", ["nsf.workers.Worker", "nsf.storage.write_json", "nsf.cli.main"])
-@pytest.mark.parametrize("place", ["field", "scene.walls", "scene.bodies.column.shape"])
+@pytest.mark.parametrize(
+    ("place", "target"),
+    [
+        ("field", "nsf.workers.Worker"),
+        ("scene.walls", "nsf.storage.write_json"),
+        ("scene.bodies.column.shape", "nsf.cli.main"),
+    ],
+)
 def test_it_is_refused_where_a_configuration_is_loaded(place, target):
     with pytest.raises(ConfigError, match=re.escape(f"{place}: _target_: {target} is refused")):
         config.load([f"{place}._target_={target}"])
@@ -100,13 +106,19 @@ def test_where_nothing_is_built_no_target_may_stand(override):
         )
 
 
-@pytest.mark.parametrize("key", ["_partial_", "_recursive_", "_convert_", "_args_", "_mode_", "_init_"])
 @pytest.mark.parametrize(
-    "place", ["field", "scene.bodies.column", "scene.bodies.column.shape", "scene", "data"]
+    "key",
+    [
+        *(f"field.{key}" for key in ("_partial_", "_recursive_", "_convert_", "_args_", "_mode_", "_init_")),
+        *(
+            f"{place}._args_"
+            for place in ("scene.bodies.column", "scene.bodies.column.shape", "scene", "data")
+        ),
+    ],
 )
-def test_keys_of_hydras_instantiation_are_refused(place, key):
-    with pytest.raises(ConfigError, match=f"{key} is refused"):
-        config.load([f"+{place}.{key}=1"])
+def test_keys_of_hydras_instantiation_are_refused(key):
+    with pytest.raises(ConfigError, match=f"{key.split('.')[-1]} is refused"):
+        config.load([f"+{key}=1"])
 
 
 def test_a_target_that_an_interpolation_puts_together_is_refused():
@@ -162,8 +174,13 @@ SECRETS = [
 ]
 
 
-@pytest.mark.parametrize("text", SECRETS)
-@pytest.mark.parametrize("key", ["scene.title", "report.name", "scene.bodies.column.particles", "tracking"])
+@pytest.mark.parametrize(
+    ("key", "text"),
+    [
+        *(("scene.title", text) for text in SECRETS),
+        *((key, SECRETS[0]) for key in ("report.name", "scene.bodies.column.particles", "tracking")),
+    ],
+)
 def test_the_environment_is_not_read(monkeypatch, key, text):
     monkeypatch.setenv("SECRET", "s3cret")
     found = config.load()

@@ -19,8 +19,8 @@ def gravity_of(program, seed, base=DOWN):
     return program.of(Gravity.constant(base), 1.2, np.random.default_rng(seed)).at(T)
 
 
-@pytest.mark.parametrize("base", [DOWN, (3.0, 0.0, 0.0), (1.0, -2.0, 0.5)])
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("base", [DOWN, (1.0, -2.0, 0.5)])
+@pytest.mark.parametrize("seed", range(3))
 def test_a_tilt_starts_upright_keeps_its_size_and_stays_in_reach(seed, base):
     program, size = RandomTilt(angle=35.0), np.linalg.norm(base)
     found = gravity_of(program, seed, base)

@@ -57,7 +57,7 @@ MESHES = {
 }
 
 
-@pytest.mark.parametrize("cells", [0.3, 1.0, 1.8])
+@pytest.mark.parametrize("cells", [0.3, 1.8])
 @pytest.mark.parametrize("name", KNOWN)
 def test_known_thickness(name, cells):
     shape, thickness = KNOWN[name]
@@ -65,11 +65,10 @@ def test_known_thickness(name, cells):
     assert thinnest_part(shape, thickness / 2.5, None) > 1.9 * thickness / 2.5
 
 
-@pytest.mark.parametrize("rotation", [np.eye(3), turned()])
 @pytest.mark.parametrize("name", MESHES)
-def test_known_thickness_of_a_mesh(tmp_path, name, rotation):
+def test_known_thickness_of_a_mesh(tmp_path, name):
     (vertices, faces), thickness = MESHES[name]
-    shape = Mesh(write(tmp_path, (vertices @ rotation.T, faces)))
+    shape = Mesh(write(tmp_path, (vertices @ turned().T, faces)))
     assert thinnest_part(shape, thickness, None) == pytest.approx(thickness, rel=0.08)
     assert thinnest_part(shape, thickness / 2.5, None) > 1.9 * thickness / 2.5
 
@@ -77,7 +76,7 @@ def test_known_thickness_of_a_mesh(tmp_path, name, rotation):
 def test_blunt_edges_and_tips_are_not_thin(tmp_path):
     vertices = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) * 1.0
     faces = np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]])
-    for rotation in (np.eye(3), turned(), turned(2.1, (0.3, -1.0, 0.2))):
+    for rotation in (np.eye(3), turned()):
         tetrahedron = Mesh(write(tmp_path, (vertices @ rotation.T, faces), name=f"t{rotation[0, 0]:.3f}"))
         assert thinnest_part(tetrahedron, 0.1, None) == np.inf
 

@@ -98,32 +98,14 @@ def test_parameters_are_refused(sand, parameters, quoted):
         sand.at(parameters)
 
 
-def test_parameter_key_must_exist():
-    with pytest.raises(
-        ConfigError, match=r"scene\.parameters\.friction_angle\.key='material\.cohesion' names no key"
-    ):
-        load_scene("sand", [FEW, f"{KEY}=material.cohesion"])
-
-
 @pytest.mark.parametrize(
     ("key", "told"),
     [
-        ("''", "names no key that holds a number"),
-        ("material", "names no key that holds a number"),
         ("material._target_", "names no key that holds a number"),
-        ("scene.title", "names no key that holds a number"),
         ("scene..dx", "names no key that holds a number"),
-        ("scene.gravity.7", "names no key that holds a number"),
         ("reduction.sample", "names no key that holds a number"),
         ("sampler.size", "names no key that holds a number"),
-        ("latent_dim", "names no key that holds a number"),
-        ("seed", "names no key that holds a number"),
-        ("scene.paper.nsf.r", "names no key that holds a number"),
-        ("scene.design.train.0", "changes no physics"),
         ("scene.dx", "changes scene.dx"),
-        ("scene.dt", "changes scene.dt"),
-        ("scene.steps", "changes scene.steps"),
-        ("scene.size.0", "changes scene.size.0"),
         ("scene.bodies.column.particles", "changes scene.bodies.column.particles"),
         ("scene.bodies.column.shape.radius", "changes scene.bodies.column.shape.radius"),
     ],
@@ -201,38 +183,14 @@ def test_a_parameter_that_is_no_key_is_refused():
 @pytest.mark.parametrize(
     ("overrides", "quoted"),
     [
-        (["scene.dtt=0.1"], "unknown key 'scene.dtt'; did you mean scene.dt"),
-        (
-            ["material.friction_angel=30"],
-            "unknown key 'material.friction_angel'; did you mean material.friction_angle",
-        ),
         (["transfer=apicc"], "unknown transfer=apicc; choose one of apic, pic, rpic (did you mean apic?)"),
-        (["scale=huge"], "scale=huge"),
         (["scene.steps=0"], "scene.steps=0"),
         (["scene.dx=0"], "scene.dx=0"),
         (["+scene.bodies.column.particles_per_cell=8"], "particles_per_cell=8: give exactly one"),
-        (["scene.steps=2.5"], "scene.steps=2.5"),
-        (["scene.steps=many"], "scene.steps=many"),
-        (["scene.dt=soon"], "scene.dt=soon"),
         (["scene.gravity=[0.0, 0.0]"], "scene.gravity=[0.0, 0.0]"),
-        (["scene.gravity=[0.0, 0.0, nan]"], "scene.gravity=[0.0, 0.0, nan]"),
-        (["scene.size=[1.0, 1.0]"], "scene.size=[1.0, 1.0]"),
         (["scene.bodies.column.velocity=[1.0, 2.0]"], "velocity=[1.0, 2.0]"),
         (["scene.bodies.column.particles=0"], "particles=0"),
-        (["scene.bodies.column.particles=2.5"], "particles=2.5"),
-        (["scene.bodies.column.density=-1"], "density=-1"),
-        (["scene.bodies.column.density=inf"], "density=inf"),
-        (["scene.bodies.column.shape.base=[nan,0.5,0.13]"], "base=[nan, 0.5, 0.13]"),
-        (["material.E=inf"], "material.E=inf"),
-        (["scene.walls.kind=open"], "walls.kind='open'"),
-        (["scene.walls.padding=0"], "walls.padding=0"),
-        (["scene.colliders.floor.kind=glue"], "half-space.kind='glue'"),
-        (["+scene.colliders.floor.frictin=1"], "frictin"),
-        (["material.E=-1"], "material.E=-1"),
-        (["scene.design.train=[]"], "scene.design.train=[]"),
         (["scene.design.test=[21.0]"], "21°"),
-        (["scene.design.test=[26.0, nan]"], "nan"),
-        (["scene.dt=[1"], "[1"),
     ],
 )
 def test_refused(overrides, quoted):
@@ -256,12 +214,7 @@ def test_a_refusal_names_the_node(overrides, quoted):
         load_scene("sand", [FEW, *overrides])
 
 
-def test_unknown_scene():
-    with pytest.raises(ConfigError, match=r"unknown scene=sandd; choose one of .*did you mean sand\?"):
-        load_scene("sandd")
-
-
-@pytest.mark.parametrize("target", ["os.system", "nsf", "builtins.eval", "nsfx.evil", "nsf.mpm;os"])
+@pytest.mark.parametrize("target", ["os.system", "nsf.mpm;os"])
 def test_foreign_targets_are_refused(target):
     with pytest.raises(NSFError, match=re.escape(f"_target_: {target} is refused")):
         configuration.load(["scene=sand", f"scene.colliders.floor._target_='{target}'"])
@@ -304,10 +257,7 @@ def test_moving_colliders():
     [
         ("until=soon", "scene.colliders.grip.until=soon must be a number"),
         ("motion.times=[0.2,0.0]", "motion.times=[0.2, 0.0] s"),
-        ("motion.times=soon", "motion.times=soon must be a list of numbers"),
-        ("motion.translations=[[0,0,0]]", "motion.translations=[[0, 0, 0]] must be a list of 2"),
         ("+motion.axes=[0,0,1]", "axes"),
-        ("motion._target_=os.system", "os.system is refused"),
     ],
 )
 def test_refused_motions(change, quoted):
@@ -482,16 +432,12 @@ def test_a_value_that_is_not_there_is_refused(sand):
     ("change", "quoted"),
     [
         ({"scene.gravty": [0, 0, -1]}, "unknown key 'scene.gravty'; did you mean scene.gravity"),
-        ({"scene.bodies.column.velocty": 1}, "did you mean scene.bodies.column.velocity"),
         ({"scene.walls": 1}, "several keys in 'scene.walls'; did you mean scene.walls.kind"),
-        ({"latent_dim": 3}, "unknown key 'latent_dim'"),
-        ({"scene.design.test": [3]}, "unknown key 'scene.design.test'"),
         ({"material.friction_angle": 3}, "is a problem parameter; set scene.design.test"),
         ({"scene.bodies.column.particles": 200}, "scene.bodies.column.particles gives other particles"),
         ({"scene.bodies.column.shape.radius": 0.05}, "gives other particles than the manifold is trained on"),
         ({"scene.dx": 0.02}, "scene.dx gives other grid nodes"),
         ({"scene.dt": 0.001}, "set it for the whole chain, scene.dt=…"),
-        ({"scene.steps": 5}, "scene.steps gives other time steps"),
         ({"material.nu": 0.7}, "material.nu=0.7 must lie in"),
     ],
 )
