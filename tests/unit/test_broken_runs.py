@@ -3,23 +3,18 @@
 import contextlib
 import json
 import os
-import random
 import shutil
-import sys
 import zlib
 
 import pytest
-from rich.console import Console
 
 import nsf.manifest
 from nsf.cli import main
-from nsf.errors import ConfigError, MissingRunError, NSFError, SchemaError, StorageError
+from nsf.errors import ConfigError, MissingRunError, SchemaError, StorageError
 from nsf.results.overview.index import write_index
-from nsf.results.overview.tables import difference_table, runs_table
+from nsf.results.overview.tables import difference_table
 from nsf.runs import Run
 from nsf.runs.listing import entries
-
-MUTATIONS = 40  # of each kind; a few thousand were tried
 
 
 def made(root, stage, config, parents=()):
@@ -92,48 +87,28 @@ BOMB = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
 )
 DAMAGES = [
     rewritten("created-number", created=5),
-    rewritten("created-text", created="yesterday"),
-    rewritten("created-early", created="0001-01-01T00:00:00"),
-    rewritten("parents-numbers", parents=[1, 2]),
     rewritten("parents-text", parents="train/sand/0123"),
     rewritten("parents-outside", parents=["../../etc"]),
-    rewritten("parents-mapping", parents={"a": 1}),
     rewritten("status-list", status=["complete"]),
     rewritten("status-unknown", status="splendid"),
     rewritten("metrics-list", metrics=[1]),
-    rewritten("metrics-text", metrics="good"),
-    rewritten("seconds-text", seconds="long"),
     rewritten("seconds-huge", seconds=10**400),
-    rewritten("outputs-mapping", outputs={"path": "data.bin"}),
     rewritten("outputs-odd", outputs=[{"path": 5, "bytes": "x", "sha256": None}]),
     rewritten("outputs-outside", outputs=[{"path": "../data.bin", "bytes": 7, "sha256": "0" * 64}]),
     rewritten("format", format=1),
     rewritten("hash", hash="0" * 12),
     rewritten("surrogate", error="\ud800"),
     replaced("manifest-list", "manifest.json", "[1, 2]"),
-    replaced("manifest-null", "manifest.json", "null"),
-    replaced("manifest-empty", "manifest.json", ""),
     replaced("manifest-nan", "manifest.json", '{"status": "complete", "seconds": NaN}'),
-    replaced("manifest-infinite", "manifest.json", '{"status": "complete", "seconds": 1e999}'),
     replaced("manifest-binary", "manifest.json", bytes(range(256))),
-    replaced(
-        "manifest-deep", "manifest.json", f'{{"status": "complete", "metrics": {{"a": {nested(500)}}}}}'
-    ),
     replaced("manifest-deeper", "manifest.json", nested(500_000)),
     replaced("manifest-large", "manifest.json", "{" + " " * 3_000_000 + "}"),
     replaced("config-text", "config.yaml", "just words"),
-    replaced("config-list", "config.yaml", "- 1\n- 2\n"),
-    replaced("config-broken", "config.yaml", "a: [1, 2\nb: }"),
     replaced("config-binary", "config.yaml", bytes(range(256))),
-    replaced("config-nul", "config.yaml", "a: \0\n"),
-    replaced("config-utf16", "config.yaml", "latent_dim: 4\n".encode("utf-16")),
     replaced("config-tag", "config.yaml", "a: !!python/object/apply:os.system [true]\n"),
-    replaced("config-date", "config.yaml", "a: 2001-99-99\n"),
     replaced("config-inf", "config.yaml", "a: .inf\n"),
-    replaced("config-deep", "config.yaml", f"a: {nested(5000)}\n"),
     replaced("config-deeper", "config.yaml", "a: " + "[" * 250_000),
     replaced("config-questions", "config.yaml", "? " * 100_000),
-    replaced("config-quotes", "config.yaml", 'a: "' + "\\n " * 60_000),
     replaced("config-bomb", "config.yaml", BOMB),
     replaced("config-large", "config.yaml", "a: 1\n" + "# \n" * 100_000),
     replaced("config-changed", "config.yaml", "latent_dim: 5\n"),
@@ -341,86 +316,3 @@ def test_a_metric_is_a_number_or_is_named(runs, odd):
     (runs[1].path / "manifest.json").write_text(json.dumps(manifest | {"metrics": odd}))
     with pytest.raises(SchemaError, match=r"among its metrics loss=.* must be a number"):
         runs[1].metric("loss")
-
-
-# ---- mutations ------------------------------------------------------------------------------------------
-
-ODD = [
-    None, True, False, 0, -1, 2**70, 1e308, 1e-5, "", "x", "\x00", "\x1b[2J", "\ud800", "../..", [], {}, [[]],
-    {"a": {"b": [1, {"c": None}]}}, ["train/sand/0123456789ab"], [None, 1, "a"], {"": ""}, "2024-01-01",
-    [{"path": "data.bin"}], [{"path": "/etc/passwd", "bytes": 1, "sha256": "0" * 64}],
-]  # fmt: skip
-
-
-def mutated(text: str, rng: random.Random) -> bytes:
-    """The text with some bytes, lines or spans changed, gone, doubled or moved."""
-    data = bytearray(text.encode())
-    for _ in range(rng.randint(1, 4)):
-        at, other = sorted((rng.randrange(len(data) + 1), rng.randrange(len(data) + 1)))
-        match rng.randrange(6):
-            case 0:
-                data[at : at + 1] = bytes([rng.randrange(256)])
-            case 1:
-                del data[at : min(other, at + 40)]
-            case 2:
-                data[at:at] = data[at : min(other, at + 40)]
-            case 3:
-                data[at:at] = rng.choice(
-                    [b"*a", b"&a ", b"{", b"]", b"${oc.env:HOME}", b"\0", b"\n- ", b"!!binary "]
-                )
-            case 4:
-                del data[at:]
-            case _:
-                data[at : at + 1] = rng.choice([b"[", b'"', b":", b"\\u0000", b"1e999", b"\xff\xfe"])
-    return bytes(data)
-
-
-def odd_manifest(text: str, rng: random.Random) -> bytes:
-    """The manifest with some keys gone, or of another kind at any depth."""
-    manifest = json.loads(text)
-    for _ in range(rng.randint(1, 3)):
-        node = manifest
-        while True:
-            key = rng.choice(list(node) if isinstance(node, dict) else range(len(node)))
-            if isinstance(node[key], dict | list) and node[key] and rng.random() < 0.5:
-                node = node[key]
-                continue
-            if isinstance(node, dict) and rng.random() < 0.2:
-                del node[key]
-            else:
-                node[key] = rng.choice(ODD)
-            break
-        manifest = manifest or {"status": "complete"}
-    return json.dumps(manifest).encode()
-
-
-@pytest.mark.parametrize(
-    ("name", "mutate"),
-    [("manifest.json", mutated), ("manifest.json", odd_manifest), ("config.yaml", mutated)],
-    ids=["manifest-bytes", "manifest-keys", "config-bytes"],
-)
-def test_no_mutation_ends_in_anything_but_our_own_errors(runs, tmp_path, name, mutate):
-    rng, seen = random.Random(f"{name} {mutate.__name__}"), {"broken": 0, "told": 0}
-    for _ in range(MUTATIONS):
-        run = rng.choice(runs)
-        path = run.path / name
-        before = path.read_text()
-        path.write_bytes(mutate(before, rng))
-        found = entries({"stage": "*"}, rng.choice(["created", "-seconds", "metric"]), tmp_path)
-        assert len(found) == 3
-        for filters in ({"latent_dim": "4"}, {"delta": "*"}):
-            with contextlib.suppress(NSFError):
-                entries(filters, root=tmp_path)
-        Console(file=open(os.devnull, "w"), width=160).print(runs_table(found))  # noqa: SIM115
-        write_index(tmp_path / "page", tmp_path)
-        broken = run.status == "broken"
-        seen["broken"] += broken
-        assert broken == bool(run.fault)
-        for work in (run.require, lambda run=run: run.file("data.bin"), lambda run=run: run.metric("delta")):
-            with contextlib.suppress(NSFError):
-                work()
-        seen["told"] += bool(run.verify())
-        path.write_text(before)
-    assert seen["told"] >= seen["broken"] > MUTATIONS // 3
-    assert all(run.complete for run in runs)
-    print(name, mutate.__name__, seen, file=sys.stderr)
