@@ -5,6 +5,7 @@ names a fault that the child brings upon itself at an exact moment, so that no t
 runs.
 """
 
+import gc
 import importlib
 import multiprocessing
 import os
@@ -127,6 +128,7 @@ def _child(arguments, environment, folder, faults):
     sys.stdout, sys.stderr = (os.fdopen(os.dup(n), "w", buffering=1, encoding="utf-8") for n in (1, 2))
     os.environ.update(environment)
     os.chdir(folder)
+    gc.freeze()  # as pytest_collection_finish does: an evaluation collects garbage six times
     for fault in faults:
         fault()
     import torch

@@ -245,7 +245,7 @@ def test_deploying_on_another_scene_than_the_one_trained_on(copied, pipeline_at)
     change = "scene.gravity"
     plain = pipeline_at(root)
     pipeline, said = said_by(
-        pipeline_at, root, f"deploy.changes={{{change}:[0,0,-6]}}", "evaluation.trials=1"
+        pipeline_at, root, f"deploy.changes={{{change}:[0,0,-6]}}", "evaluation.trials=0"
     )
     assert said[0] == "simulate: 3 of 4 trajectories are there, reused"
     assert "train: inputs unchanged, reused" in said[2]
@@ -276,7 +276,7 @@ def test_deploying_on_another_scene_than_the_one_trained_on(copied, pipeline_at)
 def test_extrapolation(copied, pipeline_at):
     """Appendix "Generalization": friction angles beyond those of training, which reach 38° here."""
     root = copied("simulate", "train")
-    pipeline, said = said_by(pipeline_at, root, "scene.design.test=[44,55]", "evaluation.trials=1")
+    pipeline, said = said_by(pipeline_at, root, "scene.design.test=[44,55]", "evaluation.trials=0")
     assert "train: inputs unchanged, reused" in said[2]
     results = pd.read_csv(pipeline.evaluation.path / "results.csv")
     assert results["value"].tolist() == [44.0, 55.0]
@@ -378,7 +378,7 @@ def test_a_lost_truth_leaves_no_failed_run(copied, pipeline_at, stage):
 
 def test_training_values_can_be_deployed(copied, pipeline_at):
     root = copied("simulate", "train")
-    pipeline, _ = said_by(pipeline_at, root, "deploy.split=train", "evaluation.trials=1")
+    pipeline, _ = said_by(pipeline_at, root, "deploy.split=train", "evaluation.trials=0")
     results = pd.read_csv(pipeline.evaluation.path / "results.csv")
     assert results["split"].tolist() == ["train"] * 3
     assert results["value"].tolist() == [22.0, 30.0, 38.0]
@@ -426,7 +426,7 @@ def test_a_split_without_values(pipeline_at, tmp_path):
 
 def test_a_longer_step_is_deployed_and_evaluated(copied, pipeline_at):
     root = copied("simulate", "train")
-    pipeline, _ = said_by(pipeline_at, root, "deploy.dt_multiplier=1.5", "evaluation.trials=1")
+    pipeline, _ = said_by(pipeline_at, root, "deploy.dt_multiplier=1.5", "evaluation.trials=0")
     with h5py.File(pipeline.deployment.path / "rollout_0.h5") as file:
         assert file["xhat"].shape == (17, 4)
     assert 0 < pd.read_csv(pipeline.evaluation.path / "results.csv")["delta"][0] < 0.03
