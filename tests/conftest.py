@@ -68,7 +68,7 @@ def one_thread_for_torch():
 
 @pytest.fixture(scope="session", autouse=True)
 def garbage_stays():
-    """Costs are measured after collections of garbage, which take most of it; only a GPU's memory needs them."""
+    """Costs are measured after collections of garbage, which only the memory of a GPU needs."""
     from nsf.evaluation import cost
 
     with pytest.MonkeyPatch.context() as patch:

@@ -57,13 +57,12 @@ def test_scene_is_runnable(name, scale):
 
 
 @pytest.mark.parametrize("name", GROUPS["material"])
-@pytest.mark.parametrize("path", PATHS)
-def test_material_follows_a_path(name, path):
-    c = config.load([f"material={name}", f"path={path}"], "point")
-    material = config.build(c.material, "material")
-    tau = drive(material, deformation_path(path, 0.01, 5)[1], dt=1e-3)
-    assert np.isfinite(tau).all()
-    assert np.abs(tau - tau.swapaxes(1, 2)).max() <= 1e-9 * np.abs(tau).max()
+def test_material_follows_every_path(name):
+    material = config.build(config.load([f"material={name}"], "point").material, "material")
+    for path in PATHS:
+        tau = drive(material, deformation_path(path, 0.01, 5)[1], dt=1e-3)
+        assert np.isfinite(tau).all()
+        assert np.abs(tau - tau.swapaxes(1, 2)).max() <= 1e-9 * np.abs(tau).max()
 
 
 def test_a_scene_may_state_its_sample_regions():

@@ -1,5 +1,6 @@
 """What is refused, and what is there already, is told before anything heavy is imported."""
 
+import json
 import subprocess
 import sys
 
@@ -8,54 +9,59 @@ import pytest
 from nsf.cli import main
 
 HEAVY = ("torch", "warp", "pytorch_lightning", "lightning_fabric", "matplotlib", "pandas", "scipy")
+#: Every command line of `sys.argv[1]` in turn: its exit code, both outputs, and what is imported by then.
 _PROGRAM = f"""
-import sys
+import contextlib, io, json, sys
 from nsf.cli import main
-try:
-    main(sys.argv[1:])
-except SystemExit as end:
-    code = end.code or 0
-print("imported:", *(name for name in {HEAVY} if name in sys.modules))
-sys.exit(code)
+ended = []
+for words in json.loads(sys.argv[1]):
+    out, err, code = io.StringIO(), io.StringIO(), 0
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            main(words)
+        except SystemExit as end:
+            code = end.code or 0
+    heavy = [name for name in {HEAVY} if name in sys.modules]
+    ended.append((code, out.getvalue(), err.getvalue(), heavy))
+print(json.dumps(ended))
 """
 
 
 @pytest.fixture
 def started(tmp_path, monkeypatch):
-    """(*words) → exit code, both outputs, and which heavy modules the command imported."""
+    """(command lines, runs) → exit code, both outputs and heavy modules of each, in one fresh process."""
     monkeypatch.setenv("NSF_REPORTS", str(tmp_path / "reports"))
 
-    def start(*words, runs=tmp_path / "runs"):
+    def start(commands, runs=tmp_path / "runs"):
         monkeypatch.setenv("NSF_RUNS", str(runs))
-        done = subprocess.run([sys.executable, "-c", _PROGRAM, *words], capture_output=True, text=True)
-        *told, last = done.stdout.splitlines()
-        return done.returncode, "\n".join(told), done.stderr, last.removeprefix("imported:").split()
+        words = [sys.executable, "-c", _PROGRAM, json.dumps(commands)]
+        done = subprocess.run(words, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return json.loads(done.stdout.splitlines()[-1])
 
     return start
 
 
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (["run", "scene=sannd"], "did you mean sand"),
-        (["run", "scene=sand", "latent_dim=0"], "latent_dim=0 must be"),
-        (["train", "scene=sand", "latent_dmi=4"], "unknown key 'latent_dmi'"),
-        (["run", "scene=sand", "model=recurence"], "did you mean recurrence"),
-        (["run", "scene=sand", "model=recurrence", "model.teaching.width=0"], "width=0 must be at least 1"),
-        (["run", "+experiment=tabel1"], "did you mean table1"),
-        (["run", "-m", "scene=sand", "latent_dim=4,0"], "latent_dim=0 must be"),
-        (["run", "scene=sand", "scene.bodies.column.density=0"], "density=0"),
-        (["run", "scene=sand", "scene.design.train=[30]"], "1 training cases"),
-        (["run", "scene=drop", "scene.geometry.mesh=none.obj"], "none.obj"),
-        (["run"], "choose one of block, bread"),
-    ],
-)
-def test_a_refused_configuration_imports_nothing_heavy(started, words, told):
-    code, _, err, heavy = started(*words)
-    assert code == 2
-    assert told in err
-    assert len(err.splitlines()) == 1
-    assert not heavy
+REFUSED = [
+    (["run", "scene=sannd"], "did you mean sand"),
+    (["run", "scene=sand", "latent_dim=0"], "latent_dim=0 must be"),
+    (["train", "scene=sand", "latent_dmi=4"], "unknown key 'latent_dmi'"),
+    (["run", "scene=sand", "model=recurence"], "did you mean recurrence"),
+    (["run", "+experiment=tabel1"], "did you mean table1"),
+    (["run", "-m", "scene=sand", "latent_dim=4,0"], "latent_dim=0 must be"),
+    (["run", "scene=sand", "scene.bodies.column.density=0"], "density=0"),
+    (["run", "scene=sand", "scene.design.train=[30]"], "1 training cases"),
+    (["run", "scene=drop", "scene.geometry.mesh=none.obj"], "none.obj"),
+    (["run"], "choose one of block, bread"),
+]
+
+
+def test_a_refused_configuration_imports_nothing_heavy(started):
+    ended = started([words for words, _ in REFUSED])
+    for (words, quoted), (code, _, err, heavy) in zip(REFUSED, ended, strict=True):
+        assert (code, heavy) == (2, []), words
+        assert quoted in err
+        assert len(err.splitlines()) == 1, err
 
 
 def test_a_chain_whose_results_are_there_imports_nothing_that_computes(started, chain, tiny, monkeypatch):
@@ -65,7 +71,7 @@ def test_a_chain_whose_results_are_there_imports_nothing_that_computes(started, 
     with pytest.raises(SystemExit) as ended:
         main(["report", *tiny])
     assert not ended.value.code
-    code, out, _, heavy = started("run", *tiny, runs=chain.root)
+    ((code, out, _, heavy),) = started([["run", *tiny]], chain.root)
     assert code == 0
     assert "evaluate: inputs unchanged, reused" in out
     assert "report: evaluated runs: 1, unchanged, reused" in out
@@ -74,6 +80,6 @@ def test_a_chain_whose_results_are_there_imports_nothing_that_computes(started, 
 
 @pytest.mark.slow
 def test_no_missing_driver_is_told_of_where_nothing_asks_for_it(started, chain, tiny):
-    _, _, err, heavy = started("simulate", *tiny, "scene.steps=2", "deploy.split=train")
+    ((_, _, err, heavy),) = started([["simulate", *tiny, "scene.steps=2", "deploy.split=train"]])
     assert "warp" in heavy
     assert "driver" not in err

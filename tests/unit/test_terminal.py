@@ -1,8 +1,6 @@
 """Terminals that are not UTF-8, folders that cannot be written, too little memory: a line, no traceback."""
 
 import io
-import os
-import subprocess
 import sys
 
 import pytest
@@ -24,9 +22,9 @@ def terminal(monkeypatch):
     return make
 
 
-@pytest.mark.parametrize("encoding", ["ascii", "iso-8859-1", "cp1252", "utf-8"])
+@pytest.mark.parametrize("encoding", ["ascii", "cp1252"])
 @pytest.mark.parametrize(
-    "words", [["--help"], ["run", "--help"], ["plan", "scene=drop", "scale=small"], ["runs"]]
+    "words", [["--help"], ["run", "--help"], ["plan", "scene=drop", "scale=small"], ["runs"]], ids=" ".join
 )
 def test_what_a_terminal_cannot_show_is_replaced(terminal, encoding, words, tmp_path, monkeypatch):
     monkeypatch.setenv("NSF_RUNS", str(tmp_path))
@@ -47,16 +45,14 @@ def test_a_name_that_is_no_text_can_be_printed(terminal):
     assert b"mesh=?.stl" in shown.getvalue()
 
 
-def test_a_job_of_a_sweep_on_such_a_terminal(tmp_path):
+def test_a_job_of_a_sweep_on_such_a_terminal(terminal, tmp_path, monkeypatch):
     words = ["simulate", "-m", "scene=drop", "scale=small", "scene.dx=0.08", "scene.steps=2", "device=cpu"]
-    done = subprocess.run(
-        [sys.executable, "-m", "nsf.cli", *words, "scene.parameters.E.unit='µPa'"],
-        capture_output=True,
-        env={**os.environ, "PYTHONIOENCODING": "ascii", "NSF_RUNS": str(tmp_path)},
-    )
-    assert done.returncode == 0, done.stderr.decode()
-    assert b"scene.parameters.E.unit='?Pa'" in done.stdout
-    assert b"Traceback" not in done.stderr
+    monkeypatch.setenv("NSF_RUNS", str(tmp_path))
+    shown = terminal("ascii")
+    with pytest.raises(SystemExit) as end:
+        main([*words, "scene.parameters.E.unit='µPa'"])
+    assert end.value.code in (0, None)
+    assert b"scene.parameters.E.unit='?Pa'" in shown.getvalue()
 
 
 @pytest.fixture

@@ -34,6 +34,8 @@ SCENES = {
     "squishy_ball": "[20.0,30.0]",
     "toothpaste": "[5.0,25.0]",
 }
+#: Of two laws and contacts; the others are slow tests, and goldens hold both engines of each.
+FAST = ("sand", "jelly_cube")
 SOURCES = [Sources(stress, affine) for stress in ("field", "deformation") for affine in ("field", "none")]
 WAYS = [
     *({"sources": sources} for sources in SOURCES),
@@ -56,7 +58,10 @@ def trained(name, folder, *more):
     return pipeline.scene, pipeline.manifold(), pipeline.scene.case(pipeline.split.box.mean(1))
 
 
-@pytest.fixture(scope="module", params=SCENES)
+@pytest.fixture(
+    scope="module",
+    params=[name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in SCENES],
+)
 def model(request, tmp_path_factory):
     return trained(request.param, tmp_path_factory.mktemp("runs"))
 

@@ -53,7 +53,7 @@ def test_a_configuration_that_was_handed_over_runs_nothing(chain, tmp_path, monk
         Pipeline.of_run(run, device="cpu")
 
 
-@pytest.mark.parametrize("content", [b"", b"- 1\n", b"5", b"a: [", b"\xff\xfe", b"a: \0", b"a: b\n"])
+@pytest.mark.parametrize("content", [b"", b"\xff\xfe", b"a: b\n"])
 def test_a_configuration_that_is_none_is_told_by_name(chain, tmp_path, content):
     shutil.copytree(chain.root / "deploy", tmp_path / "deploy")
     run = replace(chain.pipeline.deployment, root=tmp_path)
