@@ -75,7 +75,7 @@ def says_its_gpu(config, stages, folder, beside, labels=()):
 @pytest.mark.parametrize(
     ("overrides", "launcher", "seen"),
     [
-        (["device=auto"], JOBLIB, {"4", "7"}),
+        pytest.param(["device=auto"], JOBLIB, {"4", "7"}, marks=pytest.mark.slow),
         pytest.param(["device=auto,cpu"], JOBLIB, {"all"}, marks=pytest.mark.slow),
         (["device=auto"], [], {"all"}),
     ],

@@ -24,7 +24,7 @@ FEW = (
     "trainer.steps=100",
     "latent_dim=4",
     "sampler.size=20",
-    "evaluation.trials=2",
+    "evaluation.trials=0",
     "evaluation.picture_particles=100",
     "evaluation.picture_frames=3",
 )

@@ -72,16 +72,11 @@ def test_a_failed_trial_is_kept_and_the_others_go_on(tried, monkeypatch):
     ("words", "quoted"),
     [
         (["latent_dim=4..6"], "no validation cases.*scene.design.validation"),
-        (["latent_dim=4..6", "scene.design.validation=[26]"], "26"),  # a test value
         (["latent_dim=4"], "needs a range"),
-        (["latent_dim=4..6", "+experiment=table1"], "has no experiment"),
         (["latent_dim=6..4"], "nothing between"),
-        (["latent_dimm=4..6"], "did you mean latent_dim"),
         (["field.noise=0.0..0.1:log"], "reaches zero"),
         (["latent_dim=0..4", "scene.design.validation=[25]"], "latent_dim=0"),
         (["latent_dim=4..6", "search.objectives=[speed]"], "delta, step_ms"),
-        (["latent_dim=4..6", "search.objectives=delta"], "delta, step_ms"),
-        (["latent_dim=4..6", "search.trials=0"], "search.trials=0"),
         (["latent_dim=4..6", "search.objectives=[step_ms]", "evaluation.trials=0"], "evaluation.trials=0"),
     ],
 )
