@@ -6,9 +6,10 @@ from typing import ClassVar
 from typing_extensions import override
 
 from nsf.dynamics.batch import Batch
+from nsf.dynamics.history import HistoryStep
 from nsf.dynamics.setup import Setup
 from nsf.dynamics.span import Span
-from nsf.dynamics.step import steps_of
+from nsf.dynamics.step import SearchingStep, Step
 from nsf.engines.base import Engine
 
 
@@ -27,4 +28,7 @@ class Reference(Engine):
 
     @override
     def spans(self, batch: Batch) -> Sequence[Span]:
-        return steps_of(batch)
+        setup = batch.shared
+        kind = SearchingStep if setup.integration.strategy == "search" else Step
+        kind = HistoryStep if setup.sources.carried else kind
+        return [kind(batch, sample, sets) for sample, sets in zip(setup.samples, setup.sets, strict=True)]

@@ -22,7 +22,7 @@ TABLE = Path(__file__).with_name("mirrors.json")
 MIRRORED = (
     "nsf.dynamics.step:Step",
     "nsf.dynamics.step:SearchingStep",
-    "nsf.dynamics.step:steps_of",
+    "nsf.engines.reference:Reference.spans",
     "nsf.dynamics.span:Span.first_rate",
     "nsf.dynamics.setup:first_change",
     "nsf.dynamics.setup:first_changes",

@@ -164,9 +164,8 @@ class FieldTraining(pl.LightningModule):
     def __init__(self, fit: Fit, schedule: Trainer, snapshots: Snapshots, seed: int):
         super().__init__()
         self.automatic_optimization = False
-        self.network, self.phase, self.schedule, self.snapshots, self.seed = (
-            fit.network, fit, schedule, snapshots, seed,
-        )  # fmt: skip
+        self.phase, self.network = fit, fit.network
+        self.schedule, self.snapshots, self.seed = schedule, snapshots, seed
         self.steps = schedule.steps_of(fit.name, snapshots.M)
         self.loss, self.seconds = float("nan"), 0.0
 

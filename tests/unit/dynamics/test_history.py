@@ -125,7 +125,7 @@ def test_two_samples_in_one_run_are_refused(chain, tiny_manifold):
 )
 def test_what_asks_for_steps_without_a_history_is_refused(pipeline_at, tmp_path, keys, told):
     with pytest.raises(ConfigError, match=told):
-        pipeline_at(tmp_path, "stress=particles", "affine=particles", *keys)
+        pipeline_at(tmp_path, "stress=particles", "affine=particles", *keys).check()
 
 
 def test_the_compiled_engine_leaves_it_to_the_reference(solver_of):

@@ -14,8 +14,8 @@ import nsf
 from nsf import config, engines
 from nsf.dynamics import GaussNewton, Integration, ReducedBatch, Sources, Taylor
 from nsf.dynamics.latent import LatentRecord
-from nsf.dynamics.step import Step, steps_of
-from nsf.engines import ENGINES, NAMES, Engine
+from nsf.dynamics.step import Step
+from nsf.engines import ENGINES, NAMES, Engine, Reference
 from nsf.engines.modal import mirrors
 from nsf.errors import ConfigError
 from nsf.kinematics.fields.basis import BasisManifold
@@ -233,7 +233,7 @@ def test_an_engine_of_ones_own(reduced):
 
         @override
         def spans(self, batch):
-            return steps_of(batch)
+            return Reference().spans(batch)
 
     assert reduced(engine=Own()).engine == "own"
     with pytest.raises(ConfigError, match=re.escape("engine own: it knows one sources")):
