@@ -11,7 +11,7 @@ from omegaconf import DictConfig, ListConfig
 
 from nsf import config as configuration
 from nsf.canonical import content_hash
-from nsf.errors import ConfigError, MissingRunError, NSFError
+from nsf.errors import ConfigError, MissingRunError, NSFError, SchemaError, first_line
 from nsf.extras import optional
 from nsf.pipeline.chain import Pipeline
 from nsf.results.search import OBJECTIVES, write_search
@@ -151,6 +151,7 @@ def _check(ranges: Sequence[Range], fixed: Sequence[str], root: Path | None) -> 
 
 def _study(config: DictConfig, ranges, fixed: Sequence[str], objectives: Sequence[str], root: Path):
     import optuna
+    from sqlalchemy.exc import DatabaseError
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     content = {
@@ -161,15 +162,21 @@ def _study(config: DictConfig, ranges, fixed: Sequence[str], objectives: Sequenc
     root.mkdir(parents=True, exist_ok=True)
     storage = f"sqlite:///{root.resolve() / 'search.db'}"
     # Two processes that make the same tables at once would fail.
-    with locked(root / "search.lock", waiting=lambda: None):
-        study = optuna.create_study(
-            storage=storage,
-            study_name=f"{config.scene.name}_{content_hash(content)[:6]}",
-            directions=["minimize"] * len(objectives),
-            load_if_exists=True,
-        )
-    # A generator that began again with the same seed would suggest again what was tried.
-    study.sampler = optuna.samplers.TPESampler(seed=config.seed + len(study.trials))
+    try:
+        with locked(root / "search.lock", waiting=lambda: None):
+            study = optuna.create_study(
+                storage=storage,
+                study_name=f"{config.scene.name}_{content_hash(content)[:6]}",
+                directions=["minimize"] * len(objectives),
+                load_if_exists=True,
+            )
+        # A generator that began again with the same seed would suggest again what was tried.
+        study.sampler = optuna.samplers.TPESampler(seed=config.seed + len(study.trials))
+    except (DatabaseError, optuna.exceptions.StorageInternalError, RuntimeError) as error:
+        raise SchemaError(
+            f"{root / 'search.db'} is damaged, or of another Optuna ({first_line(error)}); delete it: runs "
+            "of its trials are reused"
+        ) from error
     return study
 
 

@@ -42,6 +42,8 @@ from nsf.terminal import visible
 CONF = nsf.paths.CONF
 #: Keys of the tiny chain that make a run of it shorter still.
 _SHORT = ("scene.steps=2", "evaluation.trials=0")
+#: Those of a training that is interrupted: two blocks a phase.
+_BRIEF = ("trainer.steps=60",)
 
 
 @dataclass(frozen=True)
@@ -135,8 +137,8 @@ class Workshop:
         return [key for key in leaves(config) if not key.startswith("scene.paper")]
 
     @cached_property
-    def interrupted(self) -> Path:
-        """The folder of a training of the tiny chain that was interrupted in its last phase."""
+    def interrupted(self) -> tuple[Path, dict]:
+        """Runs with a short training that was interrupted in its last phase, and the weights it ends with."""
         from conftest import tiny_pipeline
 
         from nsf.kinematics.training.lightning import BlockCheckpoint
@@ -148,18 +150,16 @@ class Workshop:
         def interrupted(callback, trainer, module) -> None:
             true_end(callback, trainer, module)
             ends.append(callback)
-            if len(ends) == 6:  # of eight blocks in two phases
+            if len(ends) == 3:  # of four blocks in two phases
                 raise KeyboardInterrupt
 
-        BlockCheckpoint.on_train_epoch_end = interrupted
-        try:
-            with contextlib.suppress(KeyboardInterrupt):
-                tiny_pipeline(root).run("train")
-        finally:
-            BlockCheckpoint.on_train_epoch_end = true_end
-        (run,) = Run.find("train", root=root)
-        assert list(run.path.rglob("last.ckpt"))
-        return run.path
+        interrupting = mock.patch.object(BlockCheckpoint, "on_train_epoch_end", interrupted)
+        with interrupting, contextlib.suppress(KeyboardInterrupt):
+            tiny_pipeline(root, *_BRIEF).run("train")
+        whole = self.folder / "whole"
+        shutil.copytree(root, whole)
+        manifold = tiny_pipeline(whole, *_BRIEF).run("train").path / "manifold.pt"
+        return root, torch.load(manifold, weights_only=True)["state"]
 
     @cached_property
     def model(self):
@@ -413,12 +413,10 @@ def intermediates(shop: Workshop, draw: random.Random) -> Case:
     """A file that an interrupted training left, damaged, or forged with a sum that fits."""
     from nsf.data import archives
 
-    before = shop.interrupted
-    run = before.parent.parent.name
-    folder = shop.fresh() / "train" / run / before.name
-    shutil.rmtree(folder)
-    shutil.copytree(before, folder)
-    path = draw.choice(sorted([*folder.rglob("*.pt"), *folder.rglob("*.ckpt")]))
+    before, weights = shop.interrupted
+    shutil.rmtree(shop.runs, ignore_errors=True)
+    shutil.copytree(before, shop.runs)
+    path = draw.choice(sorted([*shop.runs.rglob("*.pt"), *shop.runs.rglob("*.ckpt")]))
     forged = draw.random() < 0.4
     if forged:
         content = inputs.mutated_tensors(torch.load(path, weights_only=True), draw)
@@ -433,15 +431,13 @@ def intermediates(shop: Workshop, draw: random.Random) -> Case:
         else:
             path.write_bytes(data)
         lines: list[str] = []
-        pipeline = tiny_pipeline(shop.runs, say=lines.append)
-        trained = pipeline.run("train").path / "manifold.pt"
+        trained = tiny_pipeline(shop.runs, *_BRIEF, say=lines.append).run("train").path / "manifold.pt"
         if not forged:
             assert any(str(path) in line for line in lines), lines
-            same = torch.load(trained, weights_only=True)["state"]
-            whole = torch.load(shop.root / trained.relative_to(shop.runs), weights_only=True)["state"]
-            assert all(torch.equal(same[name], value) for name, value in whole.items())
+            found = torch.load(trained, weights_only=True)["state"]
+            assert all(torch.equal(found[name], value) for name, value in weights.items())
 
-    return Case(f"{path.relative_to(folder)} {'forged' if forged else 'damaged'}", hand_over)
+    return Case(f"{path.name} {'forged' if forged else 'damaged'}", hand_over)
 
 
 def evaluations(shop: Workshop, draw: random.Random) -> Case:

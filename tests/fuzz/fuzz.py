@@ -46,10 +46,10 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cases", type=int, default=2400, help="in all, spread over the kinds")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", help="a kind, or one case of it: kind or kind:number")
+    parser.add_argument("--only", help="kinds, or one case of one: kind,kind or kind:number")
     options = parser.parse_args()
     kind, _, number = (options.only or "").partition(":")
-    kinds = [kind] if kind else list(cases.KINDS)
+    kinds = kind.split(",") if kind else list(cases.KINDS)
     each = -(-options.cases // len(cases.KINDS))
     numbers = [int(number)] if number else range(each)
     endings = {kind: collections.Counter() for kind in kinds}

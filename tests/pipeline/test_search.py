@@ -6,7 +6,7 @@ import sys
 import pandas as pd
 import pytest
 
-from nsf.errors import ConfigError, MissingExtraError, MissingRunError
+from nsf.errors import ConfigError, MissingExtraError, MissingRunError, SchemaError
 from nsf.pipeline.search import Range, search
 from nsf.runs import Run
 
@@ -84,6 +84,12 @@ def test_bad_input_is_refused_before_any_trial(tried, words, quoted):
     with pytest.raises(ConfigError, match=quoted):
         tried(*words)
     assert not Run.find("train", root=tried.root)
+
+
+def test_a_damaged_data_base_is_refused(tried):
+    (tried.root / "search.db").write_bytes(b"SQLite format 3\0" + bytes(4000))
+    with pytest.raises(SchemaError, match=r"search\.db is damaged, .* delete it"):
+        tried("latent_dim=4..6", "scene.design.validation=[25]")
 
 
 def test_ranges_are_whole_where_both_ends_are():
