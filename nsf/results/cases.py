@@ -14,18 +14,29 @@ from matplotlib.lines import Line2D
 
 from nsf.data.case import PROGRAM, Case
 from nsf.errors import ConfigError
-from nsf.results.charts import Figures, View, _legend, _panels, chart
-from nsf.results.columns import COLUMNS, axis, number
-from nsf.results.scales import LOST, error_scale, plain_ticks
-from nsf.results.style import INK, WARNING, WIDTH, figure, line_style, styled
+from nsf.results.charts import ERROR, Figures, View, chart, whole_mean
+from nsf.results.columns import axis, number
+from nsf.results.style import (
+    INK,
+    LOST,
+    WARNING,
+    WIDTH,
+    band,
+    error_scale,
+    figure,
+    legend,
+    line_style,
+    panels,
+    plain_ticks,
+)
 
-COLORS = "viridis"  # of the maps
+COLORS = "viridis"
+"""Colour scale of the maps of errors."""
 _FEWEST = 6  # cases of which means of neighbours say anything
 _CROSS = {"ls": "", "marker": "x", "ms": 4, "mew": 0.9, "color": "#aaaaaa"}
 _LOST = {"ls": "", "marker": "X", "ms": 8, "mec": "white", "mew": 0.8}
 _MAPS = 4  # in a row
 _WIDEST = 28  # letters of a line above a map
-_ERROR = COLUMNS["displacement_error"].heading
 
 
 @chart(
@@ -35,21 +46,20 @@ _ERROR = COLUMNS["displacement_error"].heading
 )
 def error_over_parameters(view: View) -> Figures:
     """Errors over each parameter of each body, a panel each."""
-    panels = [(body, part, name) for body, part, names in _several(view) for name in names]
-    if not panels:
+    planes = [(body, part, name) for body, part, names in _several(view) for name in names]
+    if not planes:
         return {}
     models = list(dict.fromkeys(view.frame["variant"]))
-    with styled():
-        fig, drawn = _panels(len(panels), 3.0, 3)
-        for panel, (body, part, name) in zip(drawn, panels, strict=True):
-            for variant, own in part.groupby("variant", sort=False):
-                style = line_style(models.index(variant)) | {"label": variant}
-                _over(panel, own.groupby(name)["error"].mean(), style, name in view.logarithmic)
-            panel.set_title(body, pad=14)
-            panel.set(ylabel=_ERROR)
-            _scaled(panel, "x", part, name, name in view.logarithmic)
-            error_scale(panel, 100 * part["error"][part["error"] <= LOST / 100])
-        _legend(fig, drawn)
+    fig, drawn = panels(len(planes), 3.0, 3)
+    for panel, (body, part, name) in zip(drawn, planes, strict=True):
+        for variant, rows in part.groupby("variant", sort=False):
+            style = line_style(models.index(variant)) | {"label": variant}
+            _neighbours(panel, rows.groupby(name)["error"].mean(), style, name in view.logarithmic)
+        panel.set_title(body, pad=14)
+        panel.set(ylabel=ERROR)
+        _scaled(panel, "x", part, name, name in view.logarithmic)
+        error_scale(panel, 100 * part["error"][part["error"] <= LOST / 100])
+    legend(fig)
     return {"error-over-parameters": fig}
 
 
@@ -70,23 +80,22 @@ def _maps(view: View, planes: list) -> Figure:
         rows += [(body, names, ranked[i : i + _MAPS]) for i in range(0, len(ranked), _MAPS)]
     columns = max(len(ranked) for *_, ranked in rows)
     scale = _colors(100 * pd.concat([part["error"] for _, part, _ in planes]))
-    with styled():
-        fig = figure(0.9 + 2.45 * len(rows), min(WIDTH, 2.0 + 2.4 * columns))
-        grid = fig.subplots(len(rows), columns, squeeze=False)
-        for across, (body, names, ranked) in zip(grid, rows, strict=True):
-            for panel, (variant, own) in zip(across, ranked, strict=False):
-                _map(panel, view, own, names, scale)
-                title = [body, *textwrap.wrap(variant, _WIDEST), _summary(own["error"])]
-                panel.set_title("\n".join(title), fontsize=9, fontweight="normal")
-            for panel in across[len(ranked) :]:
-                panel.axis("off")
-        bar = fig.colorbar(scale, ax=grid, label=_ERROR, aspect=16 * len(rows))
-        plain_ticks(bar.ax.yaxis)
-        bar.outline.set_visible(False)
-        marks = [Line2D([], [], ls="", marker="o", ms=7, mfc="white", mec=INK, label="held-out case")]
-        marks += [Line2D([], [], **_LOST, color=WARNING, label="lost")]
-        marks += [Line2D([], [], **_CROSS, label="training case")] if view.trained else []
-        fig.legend(handles=marks, loc="outside upper left", ncols=3)
+    fig = figure(0.9 + 2.45 * len(rows), min(WIDTH, 2.0 + 2.4 * columns))
+    grid = fig.subplots(len(rows), columns, squeeze=False)
+    for across, (body, names, ranked) in zip(grid, rows, strict=True):
+        for panel, (variant, cases) in zip(across, ranked, strict=False):
+            _map(panel, view, cases, names, scale)
+            title = [body, *textwrap.wrap(variant, _WIDEST), _summary(cases["error"])]
+            panel.set_title("\n".join(title), fontsize=9, fontweight="normal")
+        for panel in across[len(ranked) :]:
+            panel.axis("off")
+    bar = fig.colorbar(scale, ax=grid, label=ERROR, aspect=16 * len(rows))
+    plain_ticks(bar.ax.yaxis)
+    bar.outline.set_visible(False)
+    marks = [Line2D([], [], ls="", marker="o", ms=7, mfc="white", mec=INK, label="held-out case")]
+    marks += [Line2D([], [], **_LOST, color=WARNING, label="lost")]
+    marks += [Line2D([], [], **_CROSS, label="training case")] if view.trained else []
+    fig.legend(handles=marks, loc="outside upper left", ncols=3)
     return fig
 
 
@@ -106,12 +115,11 @@ def _several(view: View) -> Iterator[tuple[str, pd.DataFrame, list[str]]]:
         if all(len(case) < 2 for case in cases.values()) or not names:
             continue
         errors = part.groupby(["scene", "variant", "case"], sort=False)["displacement_error"]
-        rows = errors.agg(lambda values: values.mean(skipna=False)).rename("error").reset_index()
-        rows = rows.dropna(subset="error")
+        rows = errors.agg(whole_mean).rename("error").reset_index().dropna(subset="error")
         yield body, rows.assign(**{n: [cases[text][n] for text in rows["case"]] for n in names}), names
 
 
-def _over(panel, errors: pd.Series, style: dict, log: bool) -> None:
+def _neighbours(panel, errors: pd.Series, style: dict, log: bool) -> None:
     """Dots of one variant [%], and their means over neighbours where they are enough."""
     at, values = errors.index.to_numpy(float), 100 * errors.to_numpy(float)
     lost = ~(values <= LOST)
@@ -124,25 +132,23 @@ def _over(panel, errors: pd.Series, style: dict, log: bool) -> None:
         panel.plot([], [], "o", **{k: v for k, v in style.items() if k != "linestyle"})
         return
     values[lost] = np.nan  # a lost run leaves a gap: it is never averaged around
-    windows = [
-        np.lib.stride_tricks.sliding_window_view(v, math.ceil(math.sqrt(len(at))) + 1) for v in (at, values)
-    ]
-    middle = np.exp(np.log(windows[0]).mean(1)) if log else windows[0].mean(1)
-    panel.fill_between(middle, windows[1].min(1), windows[1].max(1), color=color, alpha=0.18, linewidth=0)
-    panel.plot(middle, windows[1].mean(1), **style)
+    several = math.ceil(math.sqrt(len(at))) + 1
+    places, near = (np.lib.stride_tricks.sliding_window_view(v, several) for v in (at, values))
+    middle = np.exp(np.log(places).mean(1)) if log else places.mean(1)
+    band(panel, middle, near.mean(1), near.min(1), near.max(1), **style)
 
 
-def _map(panel, view: View, own: pd.DataFrame, names: list[str], scale: ScalarMappable) -> None:
-    lost = ~(100 * own["error"] <= LOST)
-    trained = view.trained.get(own["scene"].iloc[0], ())
+def _map(panel, view: View, cases: pd.DataFrame, names: list[str], scale: ScalarMappable) -> None:
+    lost = ~(100 * cases["error"] <= LOST)
+    trained = view.trained.get(cases["scene"].iloc[0], ())
     crosses = np.array([[case[name] for name in names] for case in trained if case.keys() >= {*names}])
     panel.plot(*crosses.reshape(-1, 2).T, zorder=1, **_CROSS)
-    colors = scale.to_rgba(100 * own["error"][~lost])
-    at = [own[name] for name in names]
+    colors = scale.to_rgba(100 * cases["error"][~lost])
+    at = [cases[name] for name in names]
     panel.scatter(*(v[~lost] for v in at), s=52, c=colors, edgecolors=INK, linewidths=0.8, zorder=2)
     panel.plot(*(v[lost] for v in at), zorder=3, color=WARNING, **_LOST)
     for which, name in zip("xy", names, strict=True):
-        _scaled(panel, which, own, name, name in view.logarithmic)
+        _scaled(panel, which, cases, name, name in view.logarithmic)
     panel.margins(0.06)
     panel.grid()
 

@@ -1,26 +1,28 @@
 """A folder of reports as one: one table of all their rows, one page, one picture a chart.
 
-`reports/results.csv` is the table, with the name of the report in each row; `provenance.json` has what each
-report says beside it, the origin of each run, and the sha256 of each picture that runs alone can make.
-`index.md` and the charts are made of these two. Reports of inverse problems and benchmarks, whose rows are
-no cases, keep files of their own and are listed.
+`reports/results.csv` is the table, with the name of the report in each row; `provenance.json` has the
+question of each report, the origin of each run, the sha256 of each picture that runs alone can make, and of
+each chart one of its file and of all that it draws. `index.md` and the charts are made of these two, in the
+order of `contents.yaml`. Reports of inverse problems and benchmarks, whose rows are no cases, keep files of
+their own and are listed.
 """
 
+import hashlib
 import html
 import re
-import tempfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
-import numpy as np
 import pandas as pd
-from PIL import Image
+import yaml
+from matplotlib.figure import Figure
 
 from nsf import schemas
 from nsf.errors import SchemaError
 from nsf.results import report, table
-from nsf.results.averages import averaged
+from nsf.results.cases import COLORS
 from nsf.results.charts import CHARTS, View
 from nsf.results.columns import COLUMNS
 from nsf.results.folder import MARK
@@ -28,62 +30,13 @@ from nsf.results.formats import Rows, markdown_document
 from nsf.results.page import Picture, Section
 from nsf.results.question import Question
 from nsf.results.sources import file_hash
+from nsf.results.style import fingerprint, save
 from nsf.runs.provenance import not_ignored
 from nsf.schemas import Maybe
 from nsf.storage import write_json, writing
 
-TABLE, PROVENANCE, LIST = "results.csv", "provenance.json", "index.md"
-CHAPTERS = {
-    "Main results": (
-        *("quickstart", "table1/seeds", "table1/scenes", "table1/operators", "table1/operators_seeds"),
-        *("table1/networks", "table1/ablation", "table1/small", "table1/figures"),
-        *("forcing", "large", "super_resolution"),
-    ),
-    "Choices of the method": ("latent_dim", "sampling", "timestep", "training", "training_runs", "noise"),
-    "Beyond training": ("generalise",),
-    "Inverse problems and speed": (),
-}
-"""Headings of the page and the reports, or experiments, below each; the last one is of all others."""
-OF_THE_PAPER = (
-    ("Figure 1", "cake, cut at several angles", "table1/scenes/cake-final-shapes.png"),
-    ("Figure 4", "sample and integration particles", "table1/scenes/cake-particle-sets.png"),
-    ("Figure 5", "bread beside the baseline", "table1/scenes/bread-strip.png"),
-    ("Figure 6", "sand at many more points", "super_resolution/sand-basis-superresolution.png"),
-    ("Figure 7", "sand at several friction angles", "table1/scenes/sand-final-shapes.png"),
-    ("Table 1", "seven scenes", "table1/scenes/delta.png", "table1/seeds/delta.png"),
-    ("Figures 8 and 9", "metal at several hardenings", "table1/scenes/metal-final-shapes.png"),
-    ("Figure 10", "toothpaste at several angles", "table1/scenes/toothpaste-final-shapes.png"),
-    (
-        "Figure 11",
-        "toothpaste with fewer sample particles",
-        "table1/figures/toothpaste-settings.png",
-        "sampling/size/delta-over-sampler-size.png",
-    ),
-    ("Figure 12", "jelly cube beside the baseline", "table1/scenes/jelly_cube-strip.png"),
-    ("Figure 13", "squishy ball beside the baseline", "table1/scenes/squishy_ball-strip.png"),
-    (
-        "Figure 14",
-        "bread with perturbed weak elements",
-        "generalise/weak_elements/8-percent-final-shapes.png",
-        "generalise/weak_elements/30-percent-final-shapes.png",
-    ),
-    ("Figure 15", "training data of bread", "table1/figures/bread-final-shapes.png"),
-    ("Figure 16", "training data of sand", "table1/figures/sand-final-shapes.png"),
-    ("Figure 17", "sand beyond its training", "generalise/extrapolation/final-shapes.png"),
-    (
-        "Figure 18",
-        "time of a step by stage",
-        "table1/scenes/cake-runtime.png",
-        "table1/scenes/metal-runtime.png",
-    ),
-    (
-        "Sections 6.1, 6.3",
-        "1.5 Δt",
-        "timestep/delta-over-deploy-dt-multiplier.png",
-        "table1/figures/metal-settings.png",
-    ),
-)
-"""The paper's figures: what they show, and their counterparts among the reports."""
+TABLE, PROVENANCE, LIST, CONTENTS = "results.csv", "provenance.json", "index.md", "contents.yaml"
+_PARTS = ("reports", "runs", "pictures", "charts")  # of the provenance
 _COLUMNS = (
     *("body", "variant", "case", "paper_delta", "delta", "displacement_error", "displacement_interpolated"),
     *("speedup_decoded", "stress_error"),
@@ -91,11 +44,14 @@ _COLUMNS = (
 _WIDE, _LONG = 7, 14  # columns and rows of a table of the page
 _EXPLAINED = ("delta", "displacement_error", "stress_error", "displacement_interpolated")
 _MADE_ANEW = (".gif", ".html", ".mp4", ".svg", ".tex")  # of a report, and not committed
-_SAME = 1.0  # mean difference of pixels, of 255, that another version of a library may make
 _REBUILD = "build it again with `nsf report`"
 
 
-_PROVENANCE = {key: {...: dict} for key in ("reports", "runs", "pictures")}
+_PROVENANCE = {key: {...: dict} for key in ("reports", "runs", "pictures")} | {Maybe("charts"): {...: str}}
+_CONTENTS = {
+    Maybe("chapters"): {...: [str]},
+    Maybe("paper"): {...: {"shows": str, "here": [str]}},
+}
 _MARK = {
     Maybe("title"): str,
     Maybe("files"): {...: str},
@@ -113,7 +69,7 @@ _WRITTEN = {
 
 @dataclass(frozen=True)
 class Reports:
-    """What a folder of reports holds.
+    """A folder of reports: its table, texts, origins and pictures.
 
     Attributes:
         folder: the folder.
@@ -121,6 +77,7 @@ class Reports:
         texts: by report, what it says beside the table.
         runs: by run id, its origin.
         pictures: by path, caption, runs and sha256 of what was drawn from runs.
+        charts: by path, `_seal` of what was drawn from the table.
         questions: by report, title, question and paper of its experiment, which say more than `texts`.
     """
 
@@ -129,6 +86,7 @@ class Reports:
     texts: Mapping[str, Mapping]
     runs: Mapping[str, Mapping]
     pictures: Mapping[str, Mapping]
+    charts: Mapping[str, str]
     questions: Mapping[str, Mapping] = field(default_factory=dict)
 
     @classmethod
@@ -141,17 +99,16 @@ class Reports:
         path = folder / PROVENANCE
         content = _read(path, _PROVENANCE) if path.is_file() else {}
         frame = table.read(folder / TABLE) if (folder / TABLE).is_file() else pd.DataFrame(columns=[*COLUMNS])
-        beside = (content.get(key, {}) for key in ("reports", "runs", "pictures"))
-        return cls(folder, frame, *beside, questions or {})
+        return cls(folder, frame, *(content.get(key, {}) for key in _PARTS), questions or {})
 
     def collected(self) -> "Reports":
         """With every report that `nsf report` wrote in the folder, each in the place of its older rows."""
-        found = self
+        whole = self
         for mark in sorted(self.folder.rglob(MARK)):
             content = _read(mark, _MARK)
             if "made_of" in content and not_ignored([mark.with_name("delta.png")]):
-                found = found._with(mark.parent, _read(mark, _WRITTEN))
-        return found
+                whole = whole._with(mark.parent, _read(mark, _WRITTEN))
+        return whole
 
     def _with(self, place: Path, content: Mapping) -> "Reports":
         rows, name = table.read(place / TABLE), str(content["name"])
@@ -163,11 +120,11 @@ class Reports:
             for file, picture in content["pictures"].items()
             if picture["caption"] not in {chart.caption for chart in CHARTS.values()}
         }
-        kept = {path: one for path, one in self.pictures.items() if not path.startswith(f"{prefix}/")}
+        older = {path: one for path, one in self.pictures.items() if not path.startswith(f"{prefix}/")}
         keys = ("title", "question", "paper", "missing", "plots", "trained", "logarithmic")
         texts = dict(self.texts) | {name: {key: content.get(key) for key in keys}}
         return replace(
-            self, frame=frame, texts=texts, runs={**self.runs, **content["runs"]}, pictures=kept | drawn
+            self, frame=frame, texts=texts, runs={**self.runs, **content["runs"]}, pictures=older | drawn
         )
 
     def save(self) -> None:
@@ -178,38 +135,66 @@ class Reports:
             "reports": {name: self.texts[name] for name in sorted(self.texts)},
             "runs": {run: self.runs[run] for run in sorted(self.runs) if run in runs},
             "pictures": {path: self.pictures[path] for path in sorted(self.pictures)},
+            "charts": dict(self.charts),
         }
         write_json(self.folder / PROVENANCE, content)
 
-    @property
+    @cached_property
+    def contents(self) -> dict[str, Mapping]:
+        """Reports of each chapter, and pictures of each figure of the paper, as `contents.yaml` has them."""
+        path = self.folder / CONTENTS
+        content = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else {}
+        schemas.check(content, _CONTENTS, str(path))
+        return {"chapters": content.get("chapters") or {"Results": []}, "paper": content.get("paper") or {}}
+
+    def place(self, name: str) -> tuple[int, str, int, str]:
+        """Number and heading of a report's chapter, its place in there, and its name."""
+        whole = name.removesuffix("_small")
+        chapters = self.contents["chapters"]
+        for number, (heading, names) in enumerate(chapters.items()):
+            for one in (whole, whole.partition("/")[0]):
+                if one in names:
+                    return number, heading, names.index(one), name
+        return len(chapters) - 1, list(chapters)[-1], 0, name
+
+    @cached_property
     def names(self) -> list[str]:
         """The reports, in the order of the page."""
-        return sorted(set(self.frame["report"]), key=_place)
+        return sorted(set(self.frame["report"]), key=self.place)
 
     def rows(self, name: str) -> pd.DataFrame:
         """The table of one report."""
         return self.frame[self.frame["report"] == name].reset_index(drop=True)
 
     def question(self, name: str) -> Question:
-        """What a report is about."""
-        told = {**self.texts.get(name, {}), **self.questions.get(name, {})}
+        """The question of a report."""
+        texts = {**self.texts.get(name, {}), **self.questions.get(name, {})}
         return Question(
-            name, told.get("title") or name, told.get("question") or "", told.get("paper") or "",
-            missing=told.get("missing") or (), plots=told.get("plots"),
+            name, texts.get("title") or name, texts.get("question") or "", texts.get("paper") or "",
+            missing=texts.get("missing") or (), plots=texts.get("plots"),
         )  # fmt: skip
 
-    def view(self, name: str) -> View:
-        """What charts see of a report."""
-        told = self.texts.get(name, {})
-        logarithmic = frozenset(told.get("logarithmic") or ())
-        return View(table.labelled(self.rows(name)), None, {}, told.get("trained") or {}, logarithmic)
+    def figures(self, name: str) -> Iterator[tuple[str, Figure]]:
+        """File stem and figure of each chart of a report."""
+        for stem, _, figure in report.figures(self.views[name], self.question(name).plots):
+            yield stem, figure
+
+    @cached_property
+    def views(self) -> dict[str, View]:
+        """Each report as charts see it, by name."""
+        return {name: self._view(name) for name in self.names}
+
+    def _view(self, name: str) -> View:
+        texts = self.texts.get(name, {})
+        logarithmic = frozenset(texts.get("logarithmic") or ())
+        return View(table.labelled(self.rows(name)), None, {}, texts.get("trained") or {}, logarithmic)
 
     def drawn(self, name: str) -> list[Picture]:
         """Pictures of a report that were drawn from runs."""
-        own = {path: one for path, one in self.pictures.items() if path.rpartition("/")[0] == name}
+        drawn = {path: one for path, one in self.pictures.items() if path.rpartition("/")[0] == name}
         return [
             Picture([path.rpartition("/")[2]], str(one["caption"]), list(one["runs"]))
-            for path, one in own.items()
+            for path, one in drawn.items()
         ]
 
 
@@ -231,15 +216,20 @@ def write_list(folder: Path, pages: bool = False, questions: Mapping[str, Mappin
     reports = Reports.of(folder, questions).collected()
     if len(reports.frame):
         reports.save()
-        reports = Reports.of(folder, questions)
-    charts = {name: _draw(reports, name, folder, pages) for name in reports.names}
+        reports = Reports.of(folder, questions)  # as another process would read it
+        for name in reports.names if pages else ():
+            _write_pages(reports, name)
+        reports = replace(reports, charts=_drawn(reports))
+        reports.save()
     with writing(folder / LIST) as partial:
-        partial.write_text(_page(reports, charts), encoding="utf-8")
+        partial.write_text(_page(reports), encoding="utf-8")
     return folder / LIST
 
 
 def faults(folder: Path, questions: Mapping[str, Mapping] | None = None) -> list[str]:
-    """What differs from what was generated, each with its remedy: pictures, charts, and the page of them.
+    """Differences from what was generated, each with its remedy: of pictures, charts, and their page.
+
+    A chart is as it was if its file is, and would draw the same data: nothing is rendered.
 
     Args:
         folder, questions: as for `write_list`.
@@ -248,59 +238,70 @@ def faults(folder: Path, questions: Mapping[str, Mapping] | None = None) -> list
         SchemaError: the table is none, or a key is missing.
     """
     reports = Reports.of(folder, questions)
-    found = [fault for mark in _listed(folder) for fault in _changed(mark.parent)]
+    differing = [fault for mark in _listed(folder) for fault in _changed(mark.parent)]
     for path, one in reports.pictures.items():
         if not (folder / path).is_file():
-            found.append(f"{folder / path} is missing; {_REBUILD}")
+            differing.append(f"{folder / path} is missing; {_REBUILD}")
         elif file_hash(folder / path) != one["sha256"]:
-            found.append(f"{folder / path} was changed; {_REBUILD}")
+            differing.append(f"{folder / path} was changed; {_REBUILD}")
     if missing := set(reports.frame["run"]) - set(reports.runs):
-        found.append(f"{folder / PROVENANCE} has no origin of {sorted(missing)[0]}; {_REBUILD}")
+        differing.append(f"{folder / PROVENANCE} has no origin of {sorted(missing)[0]}; {_REBUILD}")
     again = f"write it with `nsf reports folder={folder}`"
-    with tempfile.TemporaryDirectory() as fresh:
-        charts = {name: _draw(reports, name, Path(fresh)) for name in reports.names}
-        for name, pictures in charts.items():
-            for file in (picture.files[-1] for picture in pictures):
-                if not _alike(Path(fresh) / name / file, folder / name / file):
-                    found.append(f"{folder / name / file} is not the chart of {folder / TABLE}; {again}")
-        page = folder / LIST
-        if not page.is_file() or page.read_text(encoding="utf-8") != _page(reports, charts):
-            found.append(f"{page} does not list the reports as they are; {again}")
-    return found
+    drawn = {
+        f"{name}/{stem}.png": fingerprint(figure)
+        for name in reports.names
+        for stem, figure in reports.figures(name)
+    }
+    for path in sorted(drawn.keys() | reports.charts.keys()):
+        if path not in drawn or reports.charts.get(path) != _seal(drawn[path], folder / path):
+            differing.append(f"{folder / path} is not the chart of {folder / TABLE}; {again}")
+    page = folder / LIST
+    if not page.is_file() or page.read_text(encoding="utf-8") != _page(reports):
+        differing.append(f"{page} does not list the reports as they are; {again}")
+    return differing
 
 
-def _draw(reports: Reports, name: str, folder: Path, pages: bool = False) -> list[Picture]:
-    """The charts of a report in its folder, and its pages."""
-    place, question, view = folder / name, reports.question(name), reports.view(name)
-    place.mkdir(parents=True, exist_ok=True)
-    charts = report.draw(view, place, question.plots, ("svg", "png") if pages else ("png",))
-    if pages:
-        runs = {run: reports.runs[run] for run in sorted(set(view.frame["run"])) if run in reports.runs}
-        sections = [Section("Charts", charts), Section("Pictures", reports.drawn(name))]
-        report.write_pages(reports.rows(name), question, place, sections, runs, view)
-    return charts
-
-
-def _alike(made: Path, there: Path) -> bool:
-    """Whether two pictures are one, but for what another version of a library may change."""
-    if not there.is_file():
-        return False
-    with Image.open(made) as a, Image.open(there) as b:
-        if a.size != b.size:
-            return False
-        pixels = [np.asarray(image.convert("RGB"), float) for image in (a, b)]
-    return float(np.abs(pixels[0] - pixels[1]).mean()) <= _SAME
-
-
-def _page(reports: Reports, charts: Mapping[str, list[Picture]]) -> str:
-    """The text of `index.md`."""
-    chapters: dict[str, list[dict]] = {heading: [] for heading in CHAPTERS}
+def _drawn(reports: Reports) -> dict[str, str]:
+    """Draw the charts that are not there as the table has them; gives the seals of all, by path."""
+    seals = {}
     for name in reports.names:
-        chapters[_place(name)[1]].append(_section(reports, name, charts[name]))
+        for stem, figure in reports.figures(name):
+            path, data = f"{name}/{stem}.png", fingerprint(figure)
+            file = reports.folder / path
+            if reports.charts.get(path) != _seal(data, file):
+                file.parent.mkdir(parents=True, exist_ok=True)
+                save(figure, file.parent, stem, ("png",), [COLORS])
+            seals[path] = _seal(data, file)
+    return seals
+
+
+def _seal(data: str, file: Path) -> str:
+    """sha256 of a figure's fingerprint and of the file that shows it; empty where there is no file."""
+    return hashlib.sha256(f"{data} {file_hash(file)}".encode()).hexdigest() if file.is_file() else ""
+
+
+def _write_pages(reports: Reports, name: str) -> None:
+    """The charts of a report as SVG, and its pages."""
+    place, question, view = reports.folder / name, reports.question(name), reports.views[name]
+    place.mkdir(parents=True, exist_ok=True)
+    runs = {run: reports.runs[run] for run in sorted(set(view.frame["run"])) if run in reports.runs}
+    charts = report.draw(view, place, question.plots)
+    sections = [Section("Charts", charts), Section("Pictures", reports.drawn(name))]
+    report.write_pages(reports.rows(name), question, place, sections, runs, view)
+
+
+def _page(reports: Reports) -> str:
+    """The text of `index.md`."""
+    chapters: dict[str, list[dict]] = {heading: [] for heading in reports.contents["chapters"]}
+    for name in reports.names:
+        chapters[reports.place(name)[1]].append(_section(reports, name))
     for entry in (*map(_listed_section, _listed(reports.folder)), *map(_bench, _benches(reports.folder))):
-        chapters[list(CHAPTERS)[-1]].append(entry)
-    known = {*reports.pictures, *(f"{n}/{p.files[-1]}" for n, of in charts.items() for p in of)}
-    figures = [(figure, shows, [p for p in paths if p in known]) for figure, shows, *paths in OF_THE_PAPER]
+        chapters[list(chapters)[-1]].append(entry)
+    pictures = reports.pictures.keys() | reports.charts.keys()
+    figures = [
+        (figure, entry["shows"], [path for path in entry["here"] if path in pictures])
+        for figure, entry in reports.contents["paper"].items()
+    ]
     return markdown_document(
         "list.md",
         chapters={heading: entries for heading, entries in chapters.items() if entries},
@@ -309,23 +310,24 @@ def _page(reports: Reports, charts: Mapping[str, list[Picture]]) -> str:
     )
 
 
-def _section(reports: Reports, name: str, charts: list[Picture]) -> dict:
-    """What the page says of one report."""
-    frame = reports.view(name).frame
-    averages = averaged(frame)
-    best = len(averages) > _LONG
-    if best:
+def _section(reports: Reports, name: str) -> dict:
+    """One report on the page."""
+    view = reports.views[name]
+    averages, said = table.averaged(view.frame), []
+    if len(averages) > _LONG:
         averages = averages.loc[sorted(averages.groupby("body", sort=False)["delta"].idxmin().dropna())]
+        said.append("The best of each scene.")
+    if averages["variant"].nunique() == 1:
+        said.append(f"Model: {averages['model_name'].iloc[0]}.")
     varying = [c for c in _COLUMNS if c != "variant" or averages[c].nunique() > 1]
     names = [c for c in varying if c in averages and not averages[c].isna().all()][:_WIDE]
-    said = "The best of each scene. " if best else ""
-    files = [chart.files[-1] for chart in charts]
+    files = [Path(path).name for path in reports.charts if path.rpartition("/")[0] == name]
     first = next((file for file in files if file.startswith("delta-over")), files[0] if files else "")
     return {
         "name": name,
         "title": reports.question(name).title,
         "table": table.rows_of(averages, names),
-        "said": f"{said}{' '.join(report.findings(frame)[:1])}",
+        "said": " ".join([*said, *report.findings(view)[:1]]),
         "chart": first,
         "more": [file for file in [*files, *(p.files[-1] for p in reports.drawn(name))] if file != first],
         "made": _made(reports, name),
@@ -340,16 +342,6 @@ def _made(reports: Reports, name: str) -> str:
     commits = ", ".join(sorted({report.commit_text(run) for run in runs}))
     devices = sorted({re.sub(r"^NVIDIA | \d+GB.*", "", device) for device in rows["device"]})
     return f"{len(runs)} run{'s' * (len(runs) > 1)}, {scales} scale, {', '.join(devices)}, {commits}"
-
-
-def _place(name: str) -> tuple[int, str, int, str]:
-    """Number and heading of a report's chapter, its place in there, and its name."""
-    whole = name.removesuffix("_small")
-    for number, (heading, names) in enumerate(CHAPTERS.items()):
-        for known in (whole, whole.partition("/")[0]):
-            if known in names:
-                return number, heading, names.index(known), name
-    return len(CHAPTERS) - 1, list(CHAPTERS)[-1], 0, name
 
 
 def _read(path: Path, schema: Mapping) -> dict:
@@ -367,7 +359,7 @@ def _listed(folder: Path) -> Iterator[Path]:
 
 
 def _listed_section(mark: Path) -> dict:
-    """What the page says of a report with files of its own: what it says itself."""
+    """A report that has its files, on the page: its first table, as its `sources.json` has it."""
     content = _read(mark, _MARK)
     rows = content["listed"]
     wide = [text[:_WIDE] for text in rows["body"]]
@@ -384,10 +376,10 @@ def _listed_section(mark: Path) -> dict:
 
 def _changed(folder: Path) -> list[str]:
     """Files of such a report that are not those whose hashes it holds."""
-    known = _read(folder / MARK, _MARK).get("files", {})
-    there = {path.name: file_hash(path) for path in sorted(folder.iterdir()) if path.name != MARK}
-    missing = {name for name in known.keys() - there.keys() if not name.endswith(_MADE_ANEW)}
-    changed = {name for name in known.keys() & there.keys() if known[name] != there[name]}
+    recorded = _read(folder / MARK, _MARK).get("files", {})
+    present = {path.name: file_hash(path) for path in sorted(folder.iterdir()) if path.name != MARK}
+    missing = {name for name in recorded.keys() - present.keys() if not name.endswith(_MADE_ANEW)}
+    changed = {name for name in recorded.keys() & present.keys() if recorded[name] != present[name]}
     return [
         *(f"{folder / name} is missing; {_REBUILD}" for name in sorted(missing)),
         *(f"{folder / name} was changed; {_REBUILD}" for name in sorted(changed)),
@@ -400,7 +392,7 @@ def _benches(folder: Path) -> list[Path]:
 
 
 def _bench(folder: Path) -> dict:
-    """What the page says of benchmarks: their title and first chart."""
+    """Benchmarks on the page: their title and first chart."""
     text = (folder / LIST).read_text(encoding="utf-8")
     chart = re.search(r"^!\[.*\]\(([\w-]+\.png)\)$", text, re.MULTILINE)
     rows = table.parsed(folder / "bench.csv", ())

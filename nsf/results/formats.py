@@ -4,7 +4,6 @@ Titles, names, units, paths and errors come from files that anyone may have writ
 value for their own format; no other module writes a format by hand.
 """
 
-import html
 import re
 from dataclasses import dataclass
 from urllib.parse import quote
@@ -53,30 +52,25 @@ def plain(text) -> str:
 def markdown(text) -> str:
     """Text as Markdown shows it; what stands between backticks is shown as code."""
 
-    def written(found: re.Match) -> str:
-        match found.lastgroup:
+    def written(part: re.Match) -> str:
+        match part.lastgroup:
             case "code":
-                return found[0].replace("|", r"\|")
+                return part[0].replace("|", r"\|")
             case "entity":
-                return str(escape(found[0]))
+                return str(escape(part[0]))
             case "sign":
-                return f"\\{found[0]}"
+                return f"\\{part[0]}"
             case "number":
-                return f"{found[0]}\\"
-        return found[0]
+                return f"{part[0]}\\"
+        return part[0]
 
     return _MARKDOWN.sub(written, plain(text))
-
-
-def unescaped(text: str) -> str:
-    """The text that `markdown` wrote."""
-    return html.unescape(re.sub(r"\\([\\`*~$|\[\]_#=+.)-])", r"\1", text))
 
 
 def latex(text) -> str:
     """Text as LaTeX prints it, in a cell or a comment."""
     # A row that begins with one of these would be read as the argument of the line end before it.
-    return _SPECIAL.sub(lambda found: _TEX.get(found[0], f"{{{found[0]}}}"), plain(text))
+    return _SPECIAL.sub(lambda sign: _TEX.get(sign[0], f"{{{sign[0]}}}"), plain(text))
 
 
 def terminal(text) -> str:
@@ -127,11 +121,6 @@ LATEX = _environment(
 def markdown_document(template: str, **values) -> str:
     """A whole file from a template."""
     return MARKDOWN.get_template(template).render(values).rstrip("\n") + "\n"
-
-
-def markdown_table(rows: Rows) -> str:
-    """A GitHub table."""
-    return str(MARKDOWN.get_template("tables.md").module.table(rows)).rstrip("\n")  # type: ignore[attr-defined]
 
 
 def latex_table(rows: Rows, title: str, note: str) -> str:

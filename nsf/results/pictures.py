@@ -98,17 +98,17 @@ def sections(
     opened = {source.id: source for source in sources}
     chosen = list(best(frame))
     films = films and len(chosen) <= _MANY
-    found = []
+    parts = []
     for stem, body, variant in chosen:
         rows = frame[(frame["body"] == body) & (frame["variant"] == variant)]
         heading = body if body == variant or len(chosen) == 1 else f"{body} · {variant}"
         bytes_of_one = min(GIF_BYTES, _FILMS // len(chosen)) if films else 0
         baseline = frame[(frame["body"] == body) & (frame["model_name"] == BASELINE)]
         pictures = _of_variant(rows, baseline, opened, folder, stem, bytes_of_one, len(chosen) <= _MANY)
-        found.append(Section(heading, pictures))
-    found += [Section("At each setting", shown)] if (shown := _settings(frame, opened, folder)) else []
+        parts.append(Section(heading, pictures))
+    parts += [Section("At each setting", shown)] if (shown := _settings(frame, opened, folder)) else []
     fine = [_fine(of, run, frame, folder) for of, run in question.fine.items() if of in opened]
-    return [*found, *([Section("At many more points", fine)] if fine else [])]
+    return [*parts, *([Section("At many more points", fine)] if fine else [])]
 
 
 def _of_variant(
@@ -121,31 +121,31 @@ def _of_variant(
     whole: bool,
 ) -> list[Picture]:
     """A strip; and where `whole`, final shapes, particle sets and a film of at most so many bytes."""
-    own = rows[rows["run"] == rows["run"].iloc[0]]
-    beside = baseline[baseline["run"] == baseline["run"].iloc[0]] if len(baseline) else baseline
-    ends = cases(own, beside, sources, _ENDS)
+    of_model = rows[rows["run"] == rows["run"].iloc[0]]
+    of_baseline = baseline[baseline["run"] == baseline["run"].iloc[0]] if len(baseline) else baseline
+    ends = cases(of_model, of_baseline, sources, _ENDS)
     if not ends:
         return []
-    runs = sorted({own["run"].iloc[0], *beside["run"]})
+    runs = sorted({of_model["run"].iloc[0], *of_baseline["run"]})
     over = "cut open" if hides_stress(ends[0].motion) else "whole"
-    told = f"Bodies over time, {over}: full order, {ends[0].model}"
-    told += f", {BASELINE}." if ends[0].baseline is not None else "."
-    pictures = [Picture(save(strip(ends), folder, f"{stem}strip", ("png",), [STRESS_COLORS]), told, runs)]
+    caption = f"Bodies over time, {over}: full order, {ends[0].model}"
+    caption += f", {BASELINE}." if ends[0].baseline is not None else "."
+    pictures = [Picture(save(strip(ends), folder, f"{stem}strip", ("png",), [STRESS_COLORS]), caption, runs)]
     if not whole:
         return pictures
-    every = sorted(cases(own, beside, sources, _ROWS), key=lambda case: natural(case.motion.case))
+    every = sorted(cases(of_model, of_baseline, sources, _ROWS), key=lambda case: natural(case.motion.case))
     ramps = [STRESS_COLORS, DIFFERENCE_COLORS]
     final = save(final_shapes(every), folder, f"{stem}final-shapes", ("png",), ramps)
-    told = "The last frame of each case, and how far each particle lies from the full-order run's."
-    pictures.append(Picture(final, told, runs))
+    caption = "The last frame of each case, and how far each particle lies from the full-order run's."
+    pictures.append(Picture(final, caption, runs))
     if ends[-1].motion.role is not None:
         sets = save(particle_sets(ends[-1]), folder, f"{stem}particle-sets", ("png",))
-        told = "Sample particles S, and integration particles N that a projected step needs for them."
-        pictures.append(Picture(sets, told, runs))
+        caption = "Sample particles S, and integration particles N that a projected step needs for them."
+        pictures.append(Picture(sets, caption, runs))
     if film_bytes:
         animation(ends, folder / f"{stem}animation.gif", max_bytes=film_bytes)
-        told = f"Full order beside {ends[0].model}."
-        pictures.append(Picture([f"{stem}animation.gif"], told, runs))
+        caption = f"Full order beside {ends[0].model}."
+        pictures.append(Picture([f"{stem}animation.gif"], caption, runs))
     return pictures
 
 
@@ -153,17 +153,17 @@ def _settings(frame: pd.DataFrame, sources: Mapping[str, Source], folder: Path) 
     """The last frame of one case of each body at the settings of its model, at most six of them."""
     pictures = []
     for body, rows in frame[frame["model_name"] != BASELINE].groupby("body", sort=False):
-        settings = [own for _, own in rows.groupby("variant", sort=False)]
+        settings = [part for _, part in rows.groupby("variant", sort=False)]
         if len(settings) < 2 or rows["model_name"].nunique() > 1:
             continue
         worst = settings[0].loc[settings[0]["delta"].fillna(math.inf).idxmax(), "case"]
         chosen = [settings[i] for i in spaced(len(settings), _ROWS)]
         shown = []
-        for own in (own[own["case"] == worst].head(1) for own in chosen):
-            place = own["variant"].iloc[0] if len(own) else ""
-            motions = _motions(own, [worst], sources) if len(own) else {}
+        for part in (part[part["case"] == worst].head(1) for part in chosen):
+            place = part["variant"].iloc[0] if len(part) else ""
+            motions = _motions(part, [worst], sources) if len(part) else {}
             shown += [
-                Shown(m, model_name(own.iloc[0]), place, own["delta"].iloc[0]) for m in motions.values()
+                Shown(m, model_name(part.iloc[0]), place, part["delta"].iloc[0]) for m in motions.values()
             ]
         if len(shown) > 1:
             stem = f"{re.sub(r'[^0-9A-Za-z_-]+', '-', str(body))}-settings"
@@ -179,18 +179,18 @@ def cases(
     """At most `limit` cases of a run, from the worst to the best, which are always among them."""
     ranked = rows.assign(rank=-rows["delta"].fillna(math.inf)).sort_values("rank", kind="stable")
     chosen = ranked.iloc[spaced(len(ranked), limit)]
-    other = _motions(baseline, chosen["case"], sources)
-    found = []
+    of_baseline = _motions(baseline, chosen["case"], sources)
+    shown = []
     for case, motion in _motions(chosen, chosen["case"], sources).items():
         row = chosen[chosen["case"] == case].iloc[0]
         place = "worst" if case == ranked["case"].iloc[0] else ""
         place = "best" if case == ranked["case"].iloc[-1] else place
-        beside = other.get(case)
-        if beside is not None and (len(beside.t) != len(motion.t) or row["model_name"] == BASELINE):
-            beside = None
+        other = of_baseline.get(case)
+        if other is not None and (len(other.t) != len(motion.t) or row["model_name"] == BASELINE):
+            other = None
         place = place if len(ranked) > 1 else ""
-        found.append(Shown(motion, model_name(row), place, row["delta"], beside))
-    return found
+        shown.append(Shown(motion, model_name(row), place, row["delta"], other))
+    return shown
 
 
 def _motions(rows: pd.DataFrame, wanted: Sequence[str], sources: Mapping[str, Source]) -> dict[str, Motion]:
@@ -206,8 +206,8 @@ def _fine(of: str, run, frame: pd.DataFrame, folder: Path) -> Picture:
     row = frame[frame["run"] == of].iloc[0]
     name = f"{row['scene']}-{row['field']}-{_FINE}"
     shutil.copyfile(Path(run.path) / _FINE, folder / name)
-    told = "The last frame at the particles, at many more points, and of a full-order run of as many."
-    return Picture([name], told, [run.id])
+    caption = "The last frame at the particles, at many more points, and of a full-order run of as many."
+    return Picture([name], caption, [run.id])
 
 
 def final_shapes(cases: Sequence[Shown]) -> Figure:
@@ -226,11 +226,11 @@ def final_shapes(cases: Sequence[Shown]) -> Figure:
     distance = ColorScale.up_to(top, DIFFERENCE_COLORS, METRES, title="distance ‖x_rom − x_fom‖")
     rows = []
     for case, m, d in zip(cases, motions, apart, strict=True):
-        told = f"{case.name}, t = {m.t[-1]:.3g} s"
+        title = f"{case.name}, t = {m.t[-1]:.3g} s"
         around, warning = _at(m.surroundings, ends), _warning(m.stopped)
         rows.append(
             [
-                Body(x[ends], values, scale, around, told, warning)
+                Body(x[ends], values, scale, around, title, warning)
                 for x, values, scale in (
                     (m.x_full, m.stress_full[ends], stress),
                     (m.x_reduced, m.stress_reduced[ends], stress),
@@ -257,14 +257,14 @@ def fine_shapes(fine: list["SuperResolution"], around: Sequence[Mapping]) -> Fig
     )  # fmt: skip
     rows = []
     for f, by in zip(fine, around, strict=True):
-        told, twice = str(f.row["case"]).replace("_", " "), _at(by, [-1, -1])
+        title, twice = str(f.row["case"]).replace("_", " "), _at(by, [-1, -1])
         shown = ((f.x_reduced, f.particles), (f.x_reduced, ...), (f.x_full, ...))
         rows.append(
             [
                 Body(
                     np.stack([f.X[which], x[which]]),
                     np.linalg.norm(np.stack([np.zeros_like(x), x - f.X])[:, which], axis=-1),
-                    moved, twice, told,
+                    moved, twice, title,
                 )
                 for x, which in shown
             ]
@@ -338,5 +338,5 @@ def _at(around: Mapping[str, np.ndarray], frames: list[int]) -> dict[str, np.nda
 
 
 def _stress_scale(values: Sequence[np.ndarray]) -> ColorScale:
-    top = np.percentile(np.concatenate([own.ravel() for own in values]), CLIP)
+    top = np.percentile(np.concatenate([one.ravel() for one in values]), CLIP)
     return ColorScale.up_to(top, STRESS_COLORS, PASCALS, title=_STRESS)

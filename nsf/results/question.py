@@ -29,7 +29,7 @@ _LIBRARIES = ("matplotlib", "pandas", "numpy", "pillow", "jinja2")  # that draw 
 
 @dataclass(frozen=True)
 class Question:
-    """What a report is about.
+    """A question that a report answers.
 
     Attributes:
         name: of the report, as `table1/seeds`.
@@ -57,10 +57,10 @@ class Question:
     def settings(self) -> dict[str, dict[str, str]]:
         """By run id, the keys that its jobs vary, but for those that columns of the table have."""
         jobs = list(self.keys.values())
-        known = dict.fromkeys(key for job in jobs for key in job)
+        keys = dict.fromkeys(key for job in jobs for key in job)
         varied = [
             key
-            for key in known
+            for key in keys
             if key not in _IN_COLUMNS
             and not key.startswith(_PASSING)
             and len({job.get(key) for job in jobs}) > 1

@@ -6,15 +6,15 @@ booktabs), charts and pictures, and `sources.json`: the origin of each run, and 
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from matplotlib.figure import Figure
 
 from nsf.errors import ConfigError
 from nsf.results import table
-from nsf.results.averages import SAID_ONCE, averaged
 from nsf.results.cases import COLORS
 from nsf.results.charts import CHARTS, View
 from nsf.results.columns import (
@@ -101,7 +101,7 @@ def build_report(
         table.write(frame, fresh / "results.csv")
         view = view_of(frame, sources)
         sections = [
-            Section("Charts", draw(view, fresh, question.plots, ("svg", "png"))),
+            Section("Charts", draw(view, fresh, question.plots)),
             *pictures.sections(view.frame, sources, fresh, question, films),
         ]
         fine = _fine_tables(view.frame, question, fresh)
@@ -124,7 +124,7 @@ def build_report(
 
 
 def texts(question: Question) -> dict:
-    """What a report says beside its table, for files."""
+    """Title, question and other texts of a report, for files."""
     return {
         "title": question.title,
         "question": question.text,
@@ -167,22 +167,22 @@ def printed(row: Mapping, source: Source, question: Question, job: Mapping[str, 
     sample particles where the job sets one.
     """
     if question.printed is not None:
-        known = {name: str(value) for name, value in {**row, **job}.items()}
-        known["parameter"] = f"{row['value']:g}"
-        fits = [e for e in question.printed if all(known.get(k, "null") == e[k] for k in e if k != "delta")]
+        values = {name: str(value) for name, value in {**row, **job}.items()}
+        values["parameter"] = f"{row['value']:g}"
+        fits = [e for e in question.printed if all(values.get(k, "null") == e[k] for k in e if k != "delta")]
         return fits[0]["delta"] if fits else math.nan
     name = {("field", "field"): "nsf", ("deformation", "none"): "deformation_only"}
     paper = source.summary.get("paper") or {}
     stated = paper.get(name.get((row["stress"], row["affine"]), ""), {})
-    same, asked = stated.get("r", row["r"]) == row["r"], job.get("sampler.size", "null")
-    same &= asked in ("null", str(stated.get("sample", asked)))
+    same, size = stated.get("r", row["r"]) == row["r"], job.get("sampler.size", "null")
+    same &= size in ("null", str(stated.get("sample", size)))
     return stated.get("delta", math.nan) if same else math.nan
 
 
 def told_apart(sources: Sequence[Source]) -> dict[str, dict[str, str]]:
     """By run id, the keys in which runs without an experiment differ, but for those that columns say."""
-    known: dict = {}
-    entries = [Entry(source.run, known) for source in sources]
+    cache: dict = {}
+    entries = [Entry(source.run, cache) for source in sources]
     differ = differing(entries)
     keys = [key for key in (*differ.keys, *differ.more) if key not in _OF_COLUMNS]
     keys = [key for key in keys if not key.startswith(_PASSING)][:_MOST]
@@ -193,17 +193,17 @@ def told_apart(sources: Sequence[Source]) -> dict[str, dict[str, str]]:
 
 
 def view_of(frame: pd.DataFrame, sources: Sequence[Source] = ()) -> View:
-    """What charts see of a table, and of its runs where these are there."""
+    """A table as charts see it, with series and stages of the runs that are there."""
     frame = table.labelled(frame)
     opened = {source.id: source for source in sources}
     parts, stages, trained = [], {}, {}
-    for run, own in frame.groupby("run", sort=False):
+    for run, rows in frame.groupby("run", sort=False):
         if run not in opened:
             continue
         source = opened[run]
-        names = own.drop_duplicates("case").set_index("case")[["run", "body", "variant", "model_name"]]
+        names = rows.drop_duplicates("case").set_index("case")[["run", "body", "variant", "model_name"]]
         parts.append(source.series.join(names, on="case", how="inner"))
-        measured, row = source.cost.get("breakdown", {}), own.iloc[0]
+        measured, row = source.cost.get("breakdown", {}), rows.iloc[0]
         stages[f"{row['body']} · {row['variant']}"] = measured.get("reduced", {})
         stages["full order"] = measured.get("full_order", {})
         trained.setdefault(row["scene"], source.training_cases)
@@ -212,14 +212,21 @@ def view_of(frame: pd.DataFrame, sources: Sequence[Source] = ()) -> View:
     return View(frame, series, stages, trained, logarithmic)
 
 
-def draw(view: View, folder: Path, plots: Sequence[str] | None, kinds: Sequence[str]) -> list[Picture]:
-    """Draw charts into a folder, the ones named or all, and give them with their captions."""
-    pictures, runs = [], sorted(set(view.frame["run"]) - {""})
+def figures(view: View, plots: Sequence[str] | None) -> Iterator[tuple[str, str, Figure]]:
+    """File stem, caption and figure of the charts that are named, or of all."""
     for name, chart in CHARTS.items():
         if plots is None or name in plots:
             for stem, figure in chart.draw(view).items():
-                pictures.append(Picture(save(figure, folder, stem, kinds, [COLORS]), chart.caption, runs))
-    return pictures
+                yield stem, chart.caption, figure
+
+
+def draw(view: View, folder: Path, plots: Sequence[str] | None) -> list[Picture]:
+    """Charts as SVG and PNG in a folder, with their captions and runs."""
+    runs = sorted(set(view.frame["run"]) - {""})
+    return [
+        Picture(save(figure, folder, stem, ramps=[COLORS]), caption, runs)
+        for stem, caption, figure in figures(view, plots)
+    ]
 
 
 def write_pages(
@@ -242,14 +249,14 @@ def write_pages(
         more: tables after the first.
         warnings: of its simulations.
     """
-    averages = averaged(view.frame)
+    averages = table.with_intervals(table.averaged(view.frame), view.frame)
     names = [name for name in _MEANS if name not in ("variant", "body") or averages[name].nunique() > 1]
     shown = table.rows_of(averages, [name for name in names if name != "case" or "case" in averages])
-    once = table.constants(view.frame, (*SAID_ONCE, "body"))
+    once = table.constants(view.frame, (*table.SAID_ONCE, "body"))
     said = ", ".join(f"{title} {text}" for title, text in once.items())
-    first = Table("Results", shown, " ".join([_averages_of(view.frame), *findings(view.frame)]))
+    first = Table("Results", shown, " ".join([_averages_of(view.frame), *findings(view)]))
     each = table.rows_of(view.frame, _EACH)
-    headings = {*shown.headings, *each.headings, *(one for own in more for one in own.content.headings)}
+    headings = {*shown.headings, *each.headings, *(name for one in more for name in one.content.headings)}
     used = [name for name, column in {**COLUMNS, **DERIVED}.items() if column.heading in headings]
     page = Page(
         title=question.title,
@@ -276,10 +283,10 @@ def _fine_tables(frame: pd.DataFrame, question: Question, folder: Path) -> list[
     """The table of superresolve runs, in full in `superresolution.csv`; none without such runs."""
     parts = []
     for of, run in question.fine.items():
-        own = frame[frame["run"] == of]
-        if len(own):
+        rows = frame[frame["run"] == of]
+        if len(rows):
             checked_hash(run, _FINE)
-            head = {name: own[name].iloc[0] for name in ("body", "variant")} | {"run": run.id}
+            head = {name: rows[name].iloc[0] for name in ("body", "variant")} | {"run": run.id}
             parts.append(table.parsed(Path(run.path) / _FINE, ("case",)).assign(**head))
     if not parts:
         return []
@@ -291,14 +298,14 @@ def _fine_tables(frame: pd.DataFrame, question: Question, folder: Path) -> list[
     return [Table("At many more points", table.rows_of(fine, [n for n in shown if n != "run"]), note)]
 
 
-def findings(frame: pd.DataFrame) -> list[str]:
-    """Sentences: where δ is below the paper's, where rivals win, and what diverged."""
-    averages, sentences = table.means(frame), []
-    beside = averages.dropna(subset="paper_delta")
-    beside = beside[beside["stress"].ne("deformation")]
-    if len(beside):
-        below = int((beside["delta"] < beside["paper_delta"]).sum())
-        sentences.append(f"δ is below the paper's in {below} of {len(beside)} rows that it prints.")
+def findings(view: View) -> list[str]:
+    """Sentences: where δ is below the paper's, where rivals win, and how many runs diverged."""
+    averages, frame, sentences = view.averages, view.frame, []
+    compared = averages.dropna(subset="paper_delta")
+    compared = compared[compared["stress"].ne("deformation")]
+    if len(compared):
+        below = int((compared["delta"] < compared["paper_delta"]).sum())
+        sentences.append(f"δ is below the paper's in {below} of {len(compared)} rows that it prints.")
     if won := table.where_rivals_win(averages):
         sentences.append(won)
     if lost := int(np.isinf(frame["delta"]).sum()):
@@ -308,8 +315,8 @@ def findings(frame: pd.DataFrame) -> list[str]:
 
 def definitions(names: Iterable[str]) -> list[tuple[str, str]]:
     """Title and meaning of columns."""
-    known = {**COLUMNS, **DERIVED}
-    return [(known[name].title, known[name].meaning) for name in dict.fromkeys(names) if known[name].meaning]
+    columns = [(COLUMNS | DERIVED)[name] for name in dict.fromkeys(names)]
+    return [(column.title, column.meaning) for column in columns if column.meaning]
 
 
 def origins(sources: Iterable[Source]) -> dict[str, dict]:
@@ -363,7 +370,7 @@ def _facts(frame: pd.DataFrame) -> list[tuple[str, str]]:
 
 
 def _averages_of(frame: pd.DataFrame) -> str:
-    """What the rows of the first table are means over."""
+    """Over which cases and seeds the first table averages, in a sentence."""
     seeds = any(name in frame and frame[name].nunique() > 1 for name in SEEDS)
     splits = " and ".join(frame["split"].unique())
     return (
@@ -373,9 +380,9 @@ def _averages_of(frame: pd.DataFrame) -> str:
 
 def _correlations(frame: pd.DataFrame) -> str:
     """How ranks of the distrust ratio and of the estimated error agree with the errors."""
-    said, own = [], frame[frame["fallback_share"].fillna(0) == 0]
+    said, unaided = [], frame[frame["fallback_share"].fillna(0) == 0]
     for name, error in (("distrust", "delta"), ("estimated_error", "distance_max")):
-        rows = own.dropna(subset=[name, error])
+        rows = unaided.dropna(subset=[name, error])
         if len(rows) >= _FEW and rows[name].nunique() > 1:
             agreement = rows[name].rank().corr(rows[error].rank())
             said.append(

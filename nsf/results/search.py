@@ -1,4 +1,4 @@
-"""What a search found: its trials as a table, and the best of them on a chart."""
+"""The trials of a search: a table, the best of them, and a chart."""
 
 from collections.abc import Sequence
 from pathlib import Path

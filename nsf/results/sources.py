@@ -5,7 +5,6 @@ and by method the figures that it prints.
 """
 
 import hashlib
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -24,7 +23,7 @@ from nsf.runs import Run
 from nsf.schemas import Maybe, Number
 
 KEPT = ("commit", "dirty", "device", "precision", "seed", "created", "versions")
-"""What a report says of the origin of a run."""
+"""Keys of a manifest that a report has of the origin of a run."""
 _PARTICLES = ("x_full", "x_reduced", "stress_full", "stress_reduced")
 _AROUND = {
     Maybe("gravity"): "f case frame 3",
@@ -119,17 +118,17 @@ class Source:
     def training_cases(self) -> list[dict[str, float]]:
         """The parameter values of each training case, as far as the runs are there."""
         trained = _whole(self._deployed, "train") if self._deployed else []
-        found = [run.config.get("parameters") for train in trained for run in _whole(train, "simulate")]
+        configured = [run.config.get("parameters") for train in trained for run in _whole(train, "simulate")]
         cases = [
             {name: one.get("value") for name, one in parameters.items() if isinstance(one, Mapping)}
-            for parameters in found
+            for parameters in configured
             if isinstance(parameters, Mapping)
         ]
         return [case for case in cases if all(isinstance(value, int | float) for value in case.values())]
 
     @property
     def warnings(self) -> list[str]:
-        """What the simulations behind the run warned of."""
+        """Warnings of the simulations behind the run."""
         waiting, lines = list(self.run.parent_runs), {}
         for run in waiting:
             waiting += [parent for parent in run.parent_runs if parent not in waiting]
@@ -156,9 +155,9 @@ class Source:
         ]
 
     def _stopped(self, case: str) -> float | None:
-        own = self.series[self.series["case"] == case]
-        lost = np.isinf(own["delta"])
-        return float(max(own.loc[~lost, "t"], default=0.0)) if lost.any() else None
+        series = self.series[self.series["case"] == case]
+        lost = np.isinf(series["delta"])
+        return float(max(series.loc[~lost, "t"], default=0.0)) if lost.any() else None
 
     @cached_property
     def _deployed(self) -> Run | None:
@@ -228,14 +227,7 @@ def file_hash(path: Path) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def material_of(config: Mapping) -> str:
-    """The name of the law in a run's configuration: `von_mises`; empty where it has none."""
-    material = config.get("material")
-    target = str(material.get("_target_", "")) if isinstance(material, Mapping) else ""
-    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", target.rpartition(".")[2]).lower()
-
-
 def _whole(run: Run, stage: str) -> list[Run]:
     """The runs of a stage that a run was made from, those that are there and whole."""
-    found = [parent for parent in run.parent_runs if parent.stage == stage]
-    return [parent for parent in found if parent.manifest and not parent.fault]
+    parents = [parent for parent in run.parent_runs if parent.stage == stage]
+    return [parent for parent in parents if parent.manifest and not parent.fault]

@@ -1,15 +1,22 @@
-"""How every chart looks, its colours safe for the colour-blind; colour scales; and the files it becomes."""
+"""The look of every chart, in colours safe for the colour-blind: panels, scales, legends, bands and files.
 
+Charts of reports, of inverse problems and of benchmarks are drawn with the functions here.
+"""
+
+import hashlib
 import io
 import itertools
+import json
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import matplotlib
 import numpy as np
 from matplotlib import rc_context
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FixedFormatter, FuncFormatter, LogLocator, NullFormatter
 from PIL import Image
 
 from nsf.results.formats import plain
@@ -70,13 +77,16 @@ _RC = {
 
 WIDTH = 9.6  # [inch] 960 px at 100 dpi: the width of a report's column
 PIXELS = 120  # an inch of a png: sharp at that width, and a report of many pictures stays small
+LOST = 1000.0  # [%] error from which a run is lost, by how much tells nothing: axes end there
 _COLORS = 256
 _RAMP = 64  # colours kept of each colour scale: its bar shows no steps
 # Of text, and of floors and their shadows, whose soft edges would else become contours.
 _GREYS = (*range(34, 195, 17), *range(195, 256, 4))
-LETTER = 5.5  # [pt] width of a letter of a legend, or of a number below an axis, about
+_LETTER = 5.5  # [pt] width of a letter of a legend, or of a number below an axis, about
 _ENTRY = 40.0  # [pt] width of what is about a legend's entry
 _ROW = 16.5  # [pt] height of a legend's row, about
+_MOST_COLUMNS = 6  # of a legend
+_SPARSER = ((1, 2, 3, 4, 5, 6, 8), (1, 2, 5), (1, 3), (1,))  # ticks of a decade, where more would touch
 _CELL = 4  # levels of a channel that Pillow does not tell apart when it looks up a colour
 
 
@@ -95,23 +105,145 @@ def line_style(i: int) -> dict:
     return {"color": PALETTE[i % len(PALETTE)], "linestyle": DASHES[i // len(PALETTE) % len(DASHES)]}
 
 
-def legend_above(fig: Figure, handles: Collection, labels: Collection[str], most: int, **options) -> None:
-    """A legend over the panels, in as many columns as fit, `most` at most; options as of `Figure.legend`.
+def panels(count: int, height: float, across: int = 4, **shared) -> tuple[Figure, list[Axes]]:
+    """A figure with `count` panels of a height [inch], `across` in a row; options as of `subplots`."""
+    rows = math.ceil(count / across)
+    fig = figure(0.9 + height * rows)
+    grid = fig.subplots(rows, min(across, count), squeeze=False, **shared).ravel()
+    for panel in grid[count:]:
+        panel.axis("off")
+    return fig, list(grid[:count])
 
-    A legend of more than three rows makes the figure higher, so that panels keep their room.
+
+def band(panel: Axes, x, middle, low, high, **style) -> None:
+    """A line in the middle of a band from `low` to `high`; `style` is of the line and has a colour."""
+    panel.fill_between(x, low, high, color=style["color"], alpha=0.18, linewidth=0)
+    panel.plot(x, middle, **style)
+
+
+def legend(fig: Figure, title: str | None = None) -> None:
+    """One legend of all panels, above them; none where everything is one line.
+
+    Lines without a point that is drawn have no entry. A legend of more than three rows makes the figure
+    higher, so that panels keep their room.
     """
-    columns = int(72.0 * fig.get_figwidth() / (LETTER * max(map(len, labels), default=0) + _ENTRY))
-    columns = max(1, min(len(labels), most, columns))
-    more = math.ceil(len(labels) / columns) - 3
+    handles: dict[str, object] = {}
+    for panel in fig.axes:
+        for handle, text in zip(*panel.get_legend_handles_labels(), strict=True):
+            if not _is_invisible(handle):
+                handles.setdefault(text, handle)
+    if len(handles) < 2 and not title:
+        return
+    columns = int(72.0 * fig.get_figwidth() / (_LETTER * max(map(len, handles), default=0) + _ENTRY))
+    columns = max(1, min(len(handles), _MOST_COLUMNS, columns))
+    more = math.ceil(len(handles) / columns) - 3
     fig.set_figheight(fig.get_figheight() + max(more, 0) * _ROW / 72.0)
-    legend = fig.legend(handles, labels, loc="outside upper left", ncols=columns, handlelength=2.2, **options)
-    legend.get_title().set_fontsize(9)
+    place = {"loc": "outside upper left", "ncols": columns, "handlelength": 2.2, "alignment": "left"}
+    shown = fig.legend(list(handles.values()), list(handles), title=title, **place)
+    shown.get_title().set_fontsize(9)
+
+
+def _is_invisible(handle) -> bool:
+    """Whether no coordinate of a line is a number, as of what the paper does not print."""
+    if not hasattr(handle, "get_xydata"):
+        return False
+    points = np.asarray(handle.get_xydata(), float)
+    return len(points) > 0 and not np.isfinite(points).all(axis=1).any()
+
+
+def error_scale(panel, values, along: str = "y") -> None:
+    """Logarithmic once the errors span more than a factor of 30, else linear from zero; to `LOST` at most."""
+    values = np.asarray(values, float)
+    values = np.minimum(values[np.isfinite(values) & (values > 0)], LOST)
+    panel.grid(axis=along)
+    limits = (0, 1.08 * np.max(values, initial=1e-12))
+    logarithmic = len(values) > 0 and np.max(values) > 30 * np.quantile(values, 0.05)
+    if logarithmic:
+        panel.set(**{f"{along}scale": "log"})
+        limits = (np.quantile(values, 0.02) / 1.6, np.max(values) * 1.6)
+    panel.set(**{f"{along}lim": limits})
+    if logarithmic:
+        plain_ticks(getattr(panel, f"{along}axis"))
+
+
+def plain_ticks(axis_line, text: Callable[[float], str] = "{:g}".format) -> None:
+    """Give a logarithmic axis ticks as plain numbers, or as `text` says: at 1, 2 and 5 of a decade.
+
+    At more of it where the axis spans less than a factor of 4, at 1 alone from three decades on.
+    """
+    low, high = axis_line.get_view_interval()
+    few = (1, 2, 5) if high < 1e3 * low else (1,)
+    subs = (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8) if high < 4 * low else few
+    axis_line.set_major_locator(LogLocator(subs=subs))
+    axis_line.set_major_formatter(FuncFormatter(lambda v, _: text(v)))
+    axis_line.set_minor_formatter(NullFormatter())
+
+
+def _set_apart(fig: Figure) -> None:
+    """Leave fewer plain ticks below logarithmic axes where their numbers would touch, but two at least."""
+    logarithmic = [panel for panel in fig.axes if isinstance(panel.xaxis.get_major_locator(), LogLocator)]
+    if logarithmic:
+        fig.get_layout_engine().execute(fig)  # labels beside a panel take of its width
+    for panel in logarithmic:
+        sparser = (LogLocator(subs=subs) for subs in _SPARSER)
+        for locator in itertools.chain([panel.xaxis.get_major_locator()], sparser):
+            if len(ticks := _ticks(panel, locator)) < 2:
+                break
+            panel.xaxis.set_major_locator(locator)
+            if _have_room(panel, ticks):
+                break
+
+
+def _have_room(panel: Axes, ticks: Sequence[float]) -> bool:
+    """Whether the numbers of ticks below a panel are two letters apart."""
+    low, high = panel.get_xlim()
+    letter = _LETTER * panel.figure.dpi / 72 / panel.bbox.width * math.log(high / low)
+    lengths = [len(panel.xaxis.get_major_formatter()(tick)) for tick in ticks]
+    return all(
+        math.log(after / before) > letter * (2 + (a + b) / 2)
+        for (before, a), (after, b) in itertools.pairwise(zip(ticks, lengths, strict=True))
+    )
+
+
+def _ticks(panel: Axes, locator: LogLocator) -> list[float]:
+    low, high = panel.get_xlim()
+    return [v for v in locator.tick_values(low, high) if low <= v <= high]
 
 
 def stage_colors(stages) -> list[str]:
     """A stage has one colour in every chart; stages not listed take greys."""
     greys = itertools.cycle(("#bbbbbb", "#555555", "#dddddd", "#333333"))
     return [STAGE_COLORS[stage] if stage in STAGE_COLORS else next(greys) for stage in stages]
+
+
+def fingerprint(fig: Figure) -> str:
+    """sha256 of all that a figure draws: its data, colours, texts and scales, to four digits.
+
+    It takes no rendering, and is the same whatever fonts and versions of libraries there are. To be taken
+    before the figure is saved, which lays it out.
+    """
+    content: list = [_rounded(fig.get_size_inches()), fig.get_supxlabel()]
+    for panel in fig.axes:
+        content += [panel.get_xscale(), panel.get_yscale(), _rounded([*panel.get_xlim(), *panel.get_ylim()])]
+        content += [panel.get_title(loc) for loc in ("left", "center")]
+        content += [panel.get_xlabel(), panel.get_ylabel(), *(text.get_text() for text in panel.texts)]
+        fixed = [axis.get_major_formatter() for axis in (panel.xaxis, panel.yaxis)]
+        content += [list(one.seq) for one in fixed if isinstance(one, FixedFormatter)]
+        for line in panel.lines:
+            style = (line.get_color(), line.get_marker(), line.get_linestyle(), line.get_linewidth())
+            content.append([_rounded(line.get_xydata()), list(map(str, style)), line.get_label()])
+        for one in panel.collections:
+            content += [_rounded(one.get_offsets()), _rounded(one.get_facecolor())]
+            content += [_rounded(path.vertices) for path in one.get_paths()]
+        for patch in panel.patches:
+            corners = patch.get_patch_transform().transform_path(patch.get_path()).vertices
+            content += [_rounded(corners), _rounded(patch.get_facecolor())]
+    content += [text.get_text() for one in fig.legends for text in one.get_texts()]
+    return hashlib.sha256(json.dumps(content).encode(errors="backslashreplace")).hexdigest()
+
+
+def _rounded(values) -> list[str]:
+    return [f"{value:.4g}" for value in np.ma.filled(np.ma.asarray(values, float), np.nan).ravel()]
 
 
 def save(fig: Figure, folder, stem: str, kinds=("svg", "png"), ramps=()) -> list[str]:
@@ -126,6 +258,7 @@ def save(fig: Figure, folder, stem: str, kinds=("svg", "png"), ramps=()) -> list
     """
     names = [f"{stem}.{kind}" for kind in kinds]
     with styled():
+        _set_apart(fig)
         for kind in sorted(kinds):
             if kind == "png":
                 write_png(fig, folder / f"{stem}.png", PIXELS, ramps)
@@ -157,23 +290,23 @@ def indexed(image: Image.Image, ramps: Sequence[str] = ()) -> Image.Image:
     """An RGB image with a palette; exact where it has no more than 256 colours."""
     if image.getcolors(_COLORS) is not None:
         return image.quantize(_COLORS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-    kept = [_ramp(name) for name in ramps]
-    if kept:
-        kept.append(np.repeat(np.array([_GREYS]).T, 3, axis=1))
+    fixed = [_ramp(name) for name in ramps]
+    if fixed:
+        fixed.append(np.repeat(np.array([_GREYS]).T, 3, axis=1))
     # With two bits less a channel it takes a sixth of the time. By the span of colours and not by their
     # pixels: the few of a thin line count as much as those of a surface.
     coarse = image.point(lambda value: value - value % _CELL + value // 64)
-    count = _COLORS - sum(map(len, kept))
+    count = _COLORS - sum(map(len, fixed))
     adapted = coarse.quantize(count, Image.Quantize.MAXCOVERAGE, kmeans=1, dither=Image.Dither.NONE)
-    if not kept:
+    if not fixed:
         return adapted
-    colors = np.concatenate([*kept, np.array(adapted.getpalette()).reshape(-1, 3)])
+    colors = np.concatenate([*fixed, np.array(adapted.getpalette()).reshape(-1, 3)])
     lookup = Image.new("P", (1, 1))
     # Pillow compares the lowest colour of a cell: unshifted, white would become the grey below it.
     lookup.putpalette(np.maximum(colors - _CELL // 2, 0).ravel().tolist())
-    found = image.quantize(palette=lookup, dither=Image.Dither.NONE)
-    found.putpalette(colors.ravel().tolist())
-    return found
+    converted = image.quantize(palette=lookup, dither=Image.Dither.NONE)
+    converted.putpalette(colors.ravel().tolist())
+    return converted
 
 
 def _ramp(name: str) -> np.ndarray:

@@ -10,7 +10,9 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
+import rich.console
 
 from nsf import schemas
 from nsf.data.case import Case
@@ -28,7 +30,7 @@ from nsf.results.columns import (
     number,
     plus_minus,
 )
-from nsf.results.formats import Rows, spreadsheet
+from nsf.results.formats import Rows, spreadsheet, terminal, terminal_table
 from nsf.storage import writing
 
 _TRAIN = "scene.design.train"  # a list, whose length is shown
@@ -44,6 +46,14 @@ _COMPUTED = (
     *("body", "variant", "model_name", "delta_static", "delta_interpolated", "integration_share", "gamma"),
     *("decoded_ms", "line", "rank"),
 )
+SAID_ONCE = ("model_name", "stress", "affine", "field", "r", "material", "particles", "precision", "device")
+"""Columns that are said above a table where all rows have one value."""
+_CONSOLE = (
+    *("variant", "case", "cases", "paper_delta", "delta", "displacement_error", "displacement_interpolated"),
+    *("stress_error", "speedup_step", "speedup_decoded", "fallback_share"),
+)
+_TELLING = ("variant", "case", "cases", "paper_delta")  # shown where they vary
+_DRAWS = 10_000  # of seeds and cases, for the interval of a mean
 DEVIATION = ", deviation"
 """Ends the names of columns of `means` that have the deviation over seeds."""
 
@@ -127,17 +137,17 @@ def query(frame: pd.DataFrame, **wanted) -> pd.DataFrame:
     held_out = wanted.pop("held_out", False)
     if unknown := [name for name in wanted if name not in frame]:
         raise ConfigError(f"no column {unknown[0]}; there are {', '.join(frame)}")
-    found = frame
+    rows = frame
     for name, values in wanted.items():
         values = [values] if isinstance(values, str | int | float) else list(values)
-        kept = found[found[name].isin(values)]
-        if kept.empty:
-            there = ", ".join(sorted(map(str, found[name].unique()))[:20])
-            raise ConfigError(f"no row has {name}={', '.join(map(str, values))}; there are {there}")
-        found = kept
-    if held_out and (found["split"] != "train").any():
-        found = found[found["split"] != "train"]
-    return found
+        chosen = rows[rows[name].isin(values)]
+        if chosen.empty:
+            present = ", ".join(sorted(map(str, rows[name].unique()))[:20])
+            raise ConfigError(f"no row has {name}={', '.join(map(str, values))}; there are {present}")
+        rows = chosen
+    if held_out and (rows["split"] != "train").any():
+        rows = rows[rows["split"] != "train"]
+    return rows
 
 
 def settings(text: str) -> dict[str, str]:
@@ -179,11 +189,11 @@ def labelled(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def variants(frame: pd.DataFrame, without: Iterable[str] = ()) -> list[str]:
-    """What tells the rows of a body apart, in words, but for seeds, cases and the columns of `without`."""
-    known = [name for name in frame if name not in COLUMNS and name not in _COMPUTED]
-    known = ["model_name", "field", *known, "r", "precision", "device", "material"]
-    hidden = {*SEEDS, _TRAIN if "training_runs" in known else "", *without}
-    keys = telling(frame, [name for name in known if name in frame and name not in hidden])
+    """Names that tell the rows of a body apart, but for seeds, cases and the columns of `without`."""
+    names = [name for name in frame if name not in COLUMNS and name not in _COMPUTED]
+    names = ["model_name", "field", *names, "r", "precision", "device", "material"]
+    hidden = {*SEEDS, _TRAIN if "training_runs" in names else "", *without}
+    keys = telling(frame, [name for name in names if name in frame and name not in hidden])
     shown = frame[keys].drop(columns="model_name", errors="ignore")
     names = frame["model_name"] if "model_name" in keys or shown.empty else pd.Series("", frame.index)
     parts = [
@@ -196,16 +206,16 @@ def variants(frame: pd.DataFrame, without: Iterable[str] = ()) -> list[str]:
 
 def telling(frame: pd.DataFrame, keys: Sequence[str]) -> list[str]:
     """Keys, each of which parts rows of a body that those before it leave together, seeds and cases alike."""
-    found: list[str] = []
-    beside = ["body", *(seed for seed in SEEDS if seed in frame)]
-    texts = frame[[*beside, *keys]].astype(object).where(frame[[*beside, *keys]].notna(), "").astype(str)
-    kinds = len(texts[beside].drop_duplicates())
+    chosen: list[str] = []
+    fixed = ["body", *(seed for seed in SEEDS if seed in frame)]
+    texts = frame[[*fixed, *keys]].astype(object).where(frame[[*fixed, *keys]].notna(), "").astype(str)
+    kinds = len(texts[fixed].drop_duplicates())
     for key in keys:
-        more = len(texts[[*beside, *found, key]].drop_duplicates())
+        more = len(texts[[*fixed, *chosen, key]].drop_duplicates())
         if more > kinds:
-            found.append(key)
+            chosen.append(key)
             kinds = more
-    return found
+    return chosen
 
 
 def means(frame: pd.DataFrame, by: Sequence[str] = ("body", "variant")) -> pd.DataFrame:
@@ -218,7 +228,9 @@ def means(frame: pd.DataFrame, by: Sequence[str] = ("body", "variant")) -> pd.Da
     averaged = [*MEASURED, "delta_static", "delta_interpolated", "decoded_ms", "paper_delta"]
     rows = []
     for values, part in frame.groupby(list(by), sort=False, dropna=False):
-        row = dict(zip(by, values, strict=True)) | part[averaged].mean(skipna=False).to_dict()
+        # pandas takes ten times as long for groups of a few rows
+        numbers = zip(averaged, part[averaged].to_numpy(float).mean(0).tolist(), strict=True)
+        row = dict(zip(by, values, strict=True)) | dict(numbers)
         row |= {"cases": len(part), "diverged": int(part["delta"].map(math.isinf).sum())}
         row |= {"displacement_worst": part["displacement_error"].max()}
         row |= {name: _only(part[name]) for name in (*_KEPT, "body") if name not in row}
@@ -237,7 +249,7 @@ _KEPT = (
 def speedups(times: Mapping[str, float]) -> dict[str, float]:
     """Speedups of mean times, NaN where they were not measured: a mean of ratios would hide slow runs."""
     pairs = {name: [times.get(time, math.nan) for time in of] for name, of in _TIMES.items()}
-    return {n: full / own if full > 0 and own > 0 else math.nan for n, (full, own) in pairs.items()}
+    return {n: full / model if full > 0 and model > 0 else math.nan for n, (full, model) in pairs.items()}
 
 
 def _deviations(part: pd.DataFrame) -> dict[str, float]:
@@ -249,15 +261,51 @@ def _deviations(part: pd.DataFrame) -> dict[str, float]:
     return {f"{name}{DEVIATION}": of_each[name].std(skipna=False) for name in _SCATTERED}
 
 
+def averaged(frame: pd.DataFrame) -> pd.DataFrame:
+    """Means of a labelled frame; each case by itself where the paper prints single ones."""
+    return means(frame, _grouping(frame))
+
+
+def with_intervals(averages: pd.DataFrame, frame: pd.DataFrame) -> pd.DataFrame:
+    """The rows of `averaged` with the middle 95 % of means of seeds and cases drawn with replacement."""
+    by = _grouping(frame)
+    seeds = [name for name in SEEDS if name in frame and frame[name].nunique() > 1]
+    if not seeds:
+        return averages
+    groups = frame.assign(**{name: frame[name].fillna(-1) for name in seeds}).groupby(by, sort=False)
+    squares = [part.pivot_table("delta", seeds, "case", dropna=True).to_numpy() for _, part in groups]
+    return averages.assign(delta_interval=[interval(values) for values in squares])
+
+
+def interval(values: np.ndarray) -> str:
+    """The middle 95 % of means of values [seeds, cases], both drawn anew, as text in per cent.
+
+    Empty of one seed, and where a value is missing or a run diverged. The draws are the same at each call.
+
+    Source: the percentile bootstrap, Efron and Tibshirani 1993, chapter 13, of rows and of columns.
+    """
+    if len(values) < 2 or not np.isfinite(values).all():
+        return ""
+    generator = np.random.default_rng(0)
+    rows, columns = (generator.integers(n, size=(_DRAWS, n)) for n in values.shape)
+    drawn = values[rows[:, :, None], columns[:, None, :]].mean((1, 2))
+    return " to ".join(number(end, 100) for end in np.quantile(drawn, (0.025, 0.975)))
+
+
+def _grouping(frame: pd.DataFrame) -> list[str]:
+    single = frame.groupby(["body", "variant"])["paper_delta"].nunique(dropna=False).max() > 1
+    return ["body", "variant", *(["case"] if single else [])]
+
+
 def constants(frame: pd.DataFrame, names: Iterable[str]) -> dict[str, str]:
-    """Of some columns those that say one thing in all rows, as heading and text."""
-    found = {}
-    for name in names:
-        values = frame[name].dropna().astype(str).replace("", None).dropna().unique() if name in frame else ()
-        if len(values) == 1:
-            first = frame[name].dropna().iloc[0]
-            found[column(name).title] = f"{column(name).cell(first)} {column(name).unit}".strip()
-    return found
+    """Of some columns those that have one value in all rows, as heading and text."""
+    alike = [name for name in names if name in frame and frame[name].nunique(dropna=False) == 1]
+    values = {name: frame[name].iloc[0] for name in alike}
+    return {
+        column(name).title: f"{column(name).cell(value)} {column(name).unit}".strip()
+        for name, value in values.items()
+        if not _is_empty(value)
+    }
 
 
 def rows_of(frame: pd.DataFrame, names: Sequence[str]) -> Rows:
@@ -268,15 +316,25 @@ def rows_of(frame: pd.DataFrame, names: Sequence[str]) -> Rows:
     return Rows(headings, body, [not column(name).text for name in shown])
 
 
+def console_table(path: Path) -> rich.console.Group:
+    """The means of a report's `results.csv` for a terminal; what never changes is said once, below."""
+    frame = labelled(read(path))
+    averages = averaged(frame)
+    same = {name for name in _TELLING if name in averages and averages[name].nunique() < 2}
+    shown = [name for name in _CONSOLE if name in averages and name not in same]
+    once = ", ".join(f"{title} {text}" for title, text in constants(frame, SAID_ONCE).items())
+    return rich.console.Group(terminal_table(rows_of(averages, ["body", *shown])), terminal(once))
+
+
 def where_rivals_win(averages: pd.DataFrame) -> str:
     """A sentence: on which bodies a rival is nearer than the best row of `means`, and by how much."""
     held = averages[averages["displacement_error"] > 0].dropna(subset=list(RIVALS), how="all")
     won = []
     for body, part in held.groupby("body", sort=False):
-        own = part["displacement_error"].min()
-        nearer = [f"{COLUMNS[n].title} ({_percent(part[n].min())})" for n in RIVALS if part[n].min() < own]
+        best = part["displacement_error"].min()
+        nearer = [f"{COLUMNS[n].title} ({_percent(part[n].min())})" for n in RIVALS if part[n].min() < best]
         if nearer:
-            won.append(f"on {body} {' and '.join(nearer)} beside {_percent(own)}")
+            won.append(f"on {body} {' and '.join(nearer)} beside {_percent(best)}")
     if won:
         return f"A rival has a smaller displacement error than the best model: {'; '.join(won)}."
     return "No rival has a smaller displacement error than the best model." if len(held) else ""
@@ -347,7 +405,7 @@ def _cell(name: str, row: Mapping) -> str:
 
 def _only(values: pd.Series):
     """The one value of a group, or what stands for several."""
-    return values.iloc[0] if values.astype(str).nunique() == 1 else None
+    return values.iloc[0] if len(set(map(str, values))) == 1 else None
 
 
 def _percent(value: float) -> str:

@@ -71,31 +71,31 @@ def main(words: Sequence[str], print_table: Callable[[object], object]) -> int:
         return _remove(words[1:])
     if words[:1] == ["prune"]:
         return _prune(words[1:])
-    asked = _asked(words)
-    sort = asked.pop("sort", "-created")
-    found = _matching(asked, sort)
-    sorted_by = [sort.removeprefix("-")] if len(words) > len(asked) else []
-    print_table(runs_table(found, [*asked, *sorted_by]))
-    _tell(f"broken: {entry.run.path}: {entry.fault}" for entry in found if entry.fault)
-    _tell([f"{len(found)} runs" + (", of which `nsf runs --help` says more" if not words else "")])
+    filters = _filters(words)
+    sort = filters.pop("sort", "-created")
+    runs = _matching(filters, sort)
+    sorted_by = [sort.removeprefix("-")] if len(words) > len(filters) else []
+    print_table(runs_table(runs, [*filters, *sorted_by]))
+    _say(f"broken: {entry.run.path}: {entry.fault}" for entry in runs if entry.fault)
+    _say([f"{len(runs)} runs" + (", of which `nsf runs --help` says more" if not words else "")])
     return 0
 
 
-def _asked(words: Sequence[str]) -> dict[str, str]:
+def _filters(words: Sequence[str]) -> dict[str, str]:
     unknown = [word for word in words if word.startswith("-") or "=" not in word]
     if unknown:
         raise ConfigError(f"{unknown[0]!r} is not key=value; see `nsf runs --help`")
     return dict(word.split("=", 1) for word in words)
 
 
-def _matching(asked: dict[str, str], sort: str = "-created") -> list[Entry]:
+def _matching(filters: dict[str, str], sort: str = "-created") -> list[Entry]:
     """The runs that pass all filters; a key that was removed is refused by naming its replacement."""
     try:
-        return entries(asked, sort)
+        return entries(filters, sort)
     except ConfigError:
         from nsf.config.removed import refuse_overrides  # with all of Hydra, for a mistake alone
 
-        refuse_overrides([*asked, sort.removeprefix("-")])
+        refuse_overrides([*filters, sort.removeprefix("-")])
         raise
 
 
@@ -107,17 +107,17 @@ def _named(command: str, words: Sequence[str], count: int) -> list[Run]:
 
 
 def _verify(words: Sequence[str]) -> int:
-    asked = _asked(words)
-    found = _matching(asked, asked.pop("sort", "-created"))
-    faults = [fault for entry in found for fault in entry.run.verify()]
-    _tell(faults)
-    _tell([f"{len(found)} runs, {len(faults)} faults"])
+    filters = _filters(words)
+    runs = _matching(filters, filters.pop("sort", "-created"))
+    faults = [fault for entry in runs for fault in entry.run.verify()]
+    _say(faults)
+    _say([f"{len(runs)} runs, {len(faults)} faults"])
     return 2 if faults else 0
 
 
 def _remove(words: Sequence[str]) -> int:
     ids = [word for word in words if "=" not in word]
-    sure = _is_sure(_asked([word for word in words if "=" in word]), "rm")
+    sure = _is_sure(_filters([word for word in words if "=" in word]), "rm")
     if not ids:
         raise ConfigError("nsf runs rm takes the runs that are to go; `nsf runs` lists them")
     going = list(dict.fromkeys(map(Run.named, ids)))
@@ -125,45 +125,45 @@ def _remove(words: Sequence[str]) -> int:
     for run in going:
         if needed := sorted(one.id for one in of.get(run, set()).difference(going)):
             more = f" and {len(needed) - 1} more" if len(needed) > 1 else ""
-            _tell([f"{needed[0]}{more} was made from {run.id}, and cannot be made again without it"])
+            _say([f"{needed[0]}{more} was made from {run.id}, and cannot be made again without it"])
     return _delete(going, sure)
 
 
 def _prune(words: Sequence[str]) -> int:
-    asked = _asked(words)
-    sure = _is_sure(asked, "prune", ("results",))
-    results = asked.pop("results", "false") == "true"
-    age = asked.pop("older", None)
-    asked.pop("yes", None)
-    found = _matching(asked)
+    filters = _filters(words)
+    sure = _is_sure(filters, "prune", ("results",))
+    results = filters.pop("results", "false") == "true"
+    age = filters.pop("older", None)
+    filters.pop("yes", None)
+    runs = _matching(filters)
     if age is not None:
-        found = older(found, age)
-    return _delete(prunable(found, Run.find(), results), sure)
+        runs = older(runs, age)
+    return _delete(prunable(runs, Run.find(), results), sure)
 
 
-def _is_sure(asked: dict[str, str], command: str, more: Sequence[str] = ()) -> bool:
+def _is_sure(filters: dict[str, str], command: str, more: Sequence[str] = ()) -> bool:
     for key in ("yes", *more):
-        if asked.get(key, "true") not in ("true", "false"):
-            raise ConfigError(f"{key}={asked[key]} must be true or false")
-    if command == "rm" and (unknown := [key for key in asked if key != "yes"]):
+        if filters.get(key, "true") not in ("true", "false"):
+            raise ConfigError(f"{key}={filters[key]} must be true or false")
+    if command == "rm" and (unknown := [key for key in filters if key != "yes"]):
         raise ConfigError(f"nsf runs rm has no key {unknown[0]!r}; it takes yes=")
-    return asked.get("yes") == "true"
+    return filters.get("yes") == "true"
 
 
 def _delete(going: Sequence[Run], sure: bool) -> int:
     """Delete runs, once that is agreed to; 2 if one of them could not be."""
     if not going:
-        _tell(["nothing to delete"])
+        _say(["nothing to delete"])
         return 0
     sizes = {run: size_of(run) for run in going}
     for run, size in sizes.items():
         print(f"{run.id}  {run.status}  {bytes_text(size)}")
-    told = f"{len(going)} run{'s' * (len(going) > 1)}, {bytes_text(sum(sizes.values()))}"
+    total = f"{len(going)} run{'s' * (len(going) > 1)}, {bytes_text(sum(sizes.values()))}"
     if not sure:
         if not sys.stdin.isatty():
-            raise ConfigError(f"{told}: say yes=true to delete them")
-        if input(f"delete {told}? [y/N] ").strip().lower() not in ("y", "yes"):
-            _tell(["nothing deleted"])
+            raise ConfigError(f"{total}: say yes=true to delete them")
+        if input(f"delete {total}? [y/N] ").strip().lower() not in ("y", "yes"):
+            _say(["nothing deleted"])
             return 0
     faults = []
     for run in going:
@@ -171,11 +171,11 @@ def _delete(going: Sequence[Run], sure: bool) -> int:
             remove(run)
         except StorageError as error:
             faults.append(str(error))
-    _tell(faults)
-    _tell([f"deleted {told}" if not faults else f"{len(faults)} of {told} stay"])
+    _say(faults)
+    _say([f"deleted {total}" if not faults else f"{len(faults)} of {total} stay"])
     return 2 if faults else 0
 
 
-def _tell(lines) -> None:
+def _say(lines) -> None:
     for line in lines:
         print(text(line), file=sys.stderr)

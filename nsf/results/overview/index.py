@@ -1,8 +1,7 @@
 """A page of all runs that sorts and filters in the browser, and needs nothing but itself."""
 
 import os
-import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,21 +13,13 @@ from nsf.data import Trajectory, archives
 from nsf.data.schema import TRAJECTORY
 from nsf.deployment import Rollout
 from nsf.results.formats import HTML
-from nsf.results.overview.tables import texts
+from nsf.results.overview.tables import cells, headings
 from nsf.results.style import FULL, PALETTE, REDUCED, figure, styled
 from nsf.runs import Run
+from nsf.runs.columns import differing
 from nsf.runs.listing import FIELDS, Entry, entries, text
 from nsf.storage import writing
 
-#: What tells variants apart, beside the fields: keys of the configuration, by the heading they get.
-_SETTINGS = {
-    "model": "model.name",
-    "stress": "stress",
-    "r": "latent_dim",
-    "|S|": "sampler.size",
-}
-_CASE = re.compile(r"parameters\.(\w+)\.value")
-_HEADINGS = {"seconds": "time [s]"}
 _CHOSEN = ("stage", "scene", "status")
 
 _SIZE = (1.6, 1.0)  # [inch] at 100 dpi
@@ -48,42 +39,38 @@ def write_index(folder: Path, root: Path | None = None) -> Path:
     Raises:
         StorageError: the disk refused a file.
     """
-    found = entries(root=root)
+    runs = entries(root=root)
+    keys = differing(runs).keys
     choices = [
         {
             "name": field,
             "column": 1 + FIELDS.index(field),  # the first is the thumbnail
-            "choices": sorted({str(entry.values[field]) for entry in found}),
+            "choices": sorted({str(entry.values[field]) for entry in runs}),
         }
         for field in _CHOSEN
     ]
     page = HTML.get_template("runs.html").render(
         title="Runs",
         choices=choices,
-        headings=[*(_HEADINGS.get(field, field) for field in FIELDS), *_SETTINGS, "case"],
-        rows=[_row(entry, folder) for entry in found],
+        headings=headings(keys),
+        rows=[_row(entry, keys, folder) for entry in runs],
     )
     with writing(folder / "index.html") as partial:
         partial.write_text(page, encoding="utf-8")
     return folder / "index.html"
 
 
-def _row(entry: Entry, folder: Path) -> dict:
+def _row(entry: Entry, keys: Sequence[str], folder: Path) -> dict:
     """A row of the page: its cells as shown, and the values by which they sort."""
-    shown = list(zip(FIELDS, texts(entry), (entry.values[field] for field in FIELDS), strict=True))
-    settings = [(key, entry.settings.get(key)) for key in _SETTINGS.values()]
-    case = {found[1]: value for key, value in entry.settings.items() if (found := _CASE.fullmatch(key))}
-    several = "; ".join(f"{name}={text(value)}" for name, value in case.items()) or None
-    settings.append(("case", next(iter(case.values())) if len(case) == 1 else several))
-    shown += [(key, text(value), value) for key, value in settings]
     picture = f"thumbnails/{entry.run.id}.png"
+    row = zip([*FIELDS, *keys], cells(entry, keys), strict=True)
     return {
         "picture": picture if thumbnail(entry.run, folder / picture) else None,
         "link": Path(os.path.relpath(entry.run.path / "manifest.json", folder)).as_posix(),
         "error": text(entry.fault or entry.manifest.get("error") or ""),
         "cells": [
-            {"name": name, "text": told, "value": "" if value is None else value}
-            for name, told, value in shown
+            {"name": name, "text": cell.text, "value": "" if cell.value is None else cell.value}
+            for name, cell in row
         ],
     }
 

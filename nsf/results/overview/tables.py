@@ -1,6 +1,7 @@
 """Runs for the terminal: listed, one in full, and what differs between two."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from typing import Any
 
@@ -11,16 +12,29 @@ from nsf.errors import SchemaError
 from nsf.results.columns import number
 from nsf.runs import Run
 from nsf.runs.columns import cell, differing, scaled, title_of, unit_of
-from nsf.runs.listing import FIELDS, MAIN, ORIGIN, Entry, flat, text
+from nsf.runs.listing import FIELDS, MAIN, ORIGIN, Entry, flat, text, value_of
 from nsf.runs.pruning import bytes_text, size_of
 
 #: Characters that a terminal, however narrow, leaves of a field.
 _WIDTHS = {"stage": 8, "id": 12}
 
 
-def texts(entry: Entry) -> list[str]:
-    """The fields of a run as shown."""
-    shown = {key: text(value) for key, value in entry.values.items()}
+@dataclass(frozen=True)
+class Cell:
+    """A value of a listed run: its text, and the value by which it sorts."""
+
+    text: str
+    value: Any
+
+
+def headings(keys: Sequence[str]) -> list[str]:
+    """Of the fields of a run, and of keys."""
+    return ["time [s]" if field == "seconds" else field for field in FIELDS] + list(map(title_of, keys))
+
+
+def cells(entry: Entry, keys: Sequence[str]) -> list[Cell]:
+    """A run below `headings`."""
+    shown = {field: text(entry.values[field]) for field in FIELDS}
     if entry.values["created"]:
         shown["created"] = _when(entry.values["created"])
     shown["seconds"] = number(entry.values["seconds"])
@@ -30,21 +44,19 @@ def texts(entry: Entry) -> list[str]:
         shown["metric"] = f"{title} {number(entry.values['metric'], 100 if percent else 1)}" + " %" * percent
     elif entry.metrics.get("diverged"):
         shown["metric"] = "diverged"
-    return [shown[field] for field in FIELDS]
+    fields = [Cell(shown[field], entry.values[field]) for field in FIELDS]
+    return fields + [Cell(_setting(entry, key), value_of(entry, key)) for key in keys]
 
 
-def runs_table(found: Sequence[Entry], asked: Sequence[str] = ()) -> Table:
+def runs_table(runs: Sequence[Entry], named: Sequence[str] = ()) -> Table:
     """Runs, with a column for each key in which they differ, or that was filtered or sorted by."""
-    keys = differing(found, asked)
+    keys = differing(runs, named)
     table = Table(box=None, header_style="bold", pad_edge=False)
-    for field in FIELDS:
-        heading = "time [s]" if field == "seconds" else field
-        justify = "right" if field == "seconds" else "left"
-        table.add_column(escape(heading), justify=justify, no_wrap=True, min_width=_WIDTHS.get(field))
-    for key in keys.keys:
-        table.add_column(escape(title_of(key)), no_wrap=True)
-    for entry in found:
-        table.add_row(*map(escape, [*texts(entry), *(_setting(entry, key) for key in keys.keys)]))
+    for heading in headings(keys.keys):
+        justify = "right" if heading == "time [s]" else "left"
+        table.add_column(escape(heading), justify=justify, no_wrap=True, min_width=_WIDTHS.get(heading))
+    for entry in runs:
+        table.add_row(*(escape(cell.text) for cell in cells(entry, keys.keys)))
     if keys.more:
         table.caption = f"These differ as well, and have a column with KEY=*: {', '.join(keys.more)}"
         table.caption_justify = "left"
@@ -65,13 +77,13 @@ def run_table(run: Run, everything: Sequence[Run]) -> Table:
     table.add_column(overflow="fold")
 
     def part(title: str, rows: dict[str, str]) -> None:
-        for at, (key, told) in enumerate(rows.items()):
-            table.add_row("" if at else title, escape(key), escape(told))
+        for at, (key, value) in enumerate(rows.items()):
+            table.add_row("" if at else title, escape(key), escape(value))
 
     manifest = entry.manifest
     state = {"id": run.id, "folder": str(run.path), "status": run.status, "size": bytes_text(size_of(run))}
-    if told := entry.fault or manifest.get("error"):
-        state["error"] = text(told)
+    if value := entry.fault or manifest.get("error"):
+        state["error"] = text(value)
     if manifest.get("created"):
         state["created"] = _when(manifest["created"])
     if entry.values["seconds"] is not None:
@@ -83,14 +95,14 @@ def run_table(run: Run, everything: Sequence[Run]) -> Table:
     part("needed by", {one.id: one.status for one in everything if run.id in one.parents})
     part("warnings", {str(at + 1): text(line) for at, line in enumerate(manifest.get("warnings", ()))})
     part("result", {key: _with_unit(key, value) for key, value in entry.metrics.items()})
-    own = {} if entry.fault or not manifest else flat(run.config)
-    part("keys", {key: _with_unit(key, value) for key, value in own.items()})
+    settings = {} if entry.fault or not manifest else flat(run.config)
+    part("keys", {key: _with_unit(key, value) for key, value in settings.items()})
     part("files", {o["path"]: bytes_text(o["bytes"]) for o in manifest.get("outputs", ())})
     return table
 
 
 def difference_table(first: Run, second: Run) -> Table:
-    """What differs between two runs: configuration, origin, and result with its relative change.
+    """Differences of two runs: configuration, origin, and result with its relative change.
 
     Raises:
         SchemaError: one of them is broken.

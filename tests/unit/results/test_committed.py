@@ -8,7 +8,7 @@ from PIL import Image
 
 from nsf.cli import main
 from nsf.errors import SchemaError
-from nsf.results import committed, pictures, table
+from nsf.results import charts, committed, pictures, table
 from nsf.results.page import Picture, Section
 from nsf.results.question import Question
 from nsf.results.report import build_report
@@ -20,12 +20,19 @@ def body(frame, sources, folder, question, films):
     return [Section("Bodies", [Picture(["strip.png"], "A body.", sorted(set(frame["run"])))])]
 
 
+CONTENTS = """
+chapters: {Main results: [table1/seeds], Choices of the method: [noise]}
+paper: {Table 1: {shows: seven scenes, here: [table1/seeds/delta.png, none.png]}}
+"""
+
+
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     monkeypatch.setattr(pictures, "sections", body)
     for name, delta in (("table1/seeds", 0.01), ("noise/weak", 0.02)):
         run = write_run(tmp_path / "runs", Made((delta, delta)))
         build_report([run], tmp_path / "reports" / name, Question(name, f"Title of {name}"))
+    (tmp_path / "reports/contents.yaml").write_text(CONTENTS)
     committed.write_list(tmp_path / "reports")
     return tmp_path / "reports"
 
@@ -101,8 +108,27 @@ def test_what_was_changed_is_named_with_its_remedy(folder, capsys):
 
 def test_a_row_that_was_changed_is_noticed_by_its_charts_and_page(folder):
     frame = table.read(folder / "results.csv")
-    table.write(frame.assign(delta=0.5 * frame["delta"]), folder / "results.csv")
-    assert any("index.md does not list" in fault for fault in faults(folder))
+    frame.loc[frame["report"] == "noise/weak", "delta"] *= 1.001  # less than a pixel of the chart
+    table.write(frame, folder / "results.csv")
+    named = [fault.partition(" ")[0] for fault in faults(folder)]
+    assert named == ["noise/weak/delta.png"]
+    committed.write_list(folder)
+    assert faults(folder) == []
+
+
+def test_a_chart_that_is_drawn_otherwise_is_noticed_and_drawn_again(folder, monkeypatch):
+    before = (folder / "noise/weak/delta.png").read_bytes()
+    monkeypatch.setattr(charts, "REDUCED", "#00ff00")
+    assert any("noise/weak/delta.png is not the chart" in fault for fault in faults(folder))
+    committed.write_list(folder)
+    assert faults(folder) == []
+    assert (folder / "noise/weak/delta.png").read_bytes() != before
+
+
+def test_a_chart_that_no_report_has_any_more_is_noticed(folder):
+    frame = table.read(folder / "results.csv")
+    table.write(frame[frame["report"] != "noise/weak"], folder / "results.csv")
+    assert any("noise/weak/delta.png is not the chart" in fault for fault in faults(folder))
 
 
 def test_a_half_written_provenance_is_refused(folder):

@@ -66,6 +66,9 @@ def test_a_body_has_its_material_or_size_where_a_scene_has_several():
 def test_what_never_changes_is_said_once():
     shown = rows(Made(), Made(model="recurrence"))
     assert table.constants(shown, ("field", "model", "r")) == {"field": "basis", "r": "6"}
+    baseline = rows(Made(), Made(stress="deformation", affine="none"))
+    assert {"model", "stress", "affine"}.isdisjoint(table.constants(baseline, table.SAID_ONCE))
+    assert table.constants(rows(Made()), table.SAID_ONCE)["model"] == "projected"
 
 
 def test_a_table_survives_its_file(tmp_path):
