@@ -12,7 +12,7 @@ from nsf.mpm.device import warp_device
 from nsf.mpm.precision import precision_of
 from nsf.storage import require_folder
 
-BENCHES = ("full_order", "scaling", "reduced", "batch", "operators", "training")
+BENCHES = ("full_order", "scaling", "reduced", "batch", "recurrence", "training")
 """Modules of this package with `run(found)`, which adds its figures to `Measurements`."""
 
 SCENES = ("cake", "metal")  # of benchmarks of reduced steps

@@ -12,10 +12,10 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from nsf.bench.rows import FILE, read, size_name
+from nsf.results.charts import bars
 from nsf.results.columns import axis, number
 from nsf.results.formats import Rows, markdown_document, terminal_table
-from nsf.results.scales import plain_ticks
-from nsf.results.style import INK, PALETTE, figure, line_style, save, stage_colors, styled
+from nsf.results.style import INK, PALETTE, band, figure, legend, line_style, plain_ticks, save, styled
 from nsf.storage import writing
 
 _LEAD = (
@@ -39,14 +39,13 @@ _TRAINING = (
     "Training of all networks of a scene with field=basis: the time is that of a whole training, from "
     "opening its files to the manifold, and the trials are seeds."
 )
-_OPERATORS = (
-    "Time of a step by operators: all steps of a run in one launch, over their number; of many runs at once, "
-    "over their number too. Checked: the same with what `nsf deploy` adds to a run, a projected step for "
-    "every 20 steps, the estimated error and the distrust ratio. Speed-up: over the full-order step of the "
-    "same call, without checks. A run holds no particles "
-    "but S; the time of decoding a frame stands apart. The operators of the sand column step as at the "
-    "scene's own size, while the full-order step of as many particles as are decoded is on a finer grid, and "
-    "shorter."
+_RECURRENCE = (
+    "Time of a step by the recurrence: all steps of a run in one launch, over their number; of many runs at "
+    "once, over their number too. Checked: the same with all that `nsf deploy` adds to a run, a projected "
+    "step for every 20 steps, the estimated error and the distrust ratio. Speed-up: over the full-order step "
+    "of the same call, without checks. A run holds no particles but S; the time of decoding a frame stands "
+    "apart. The recurrence of the sand column steps as at the scene's own size, while the full-order step of "
+    "as many particles as are decoded is on a finer grid, and shorter."
 )
 _BATCH = (
     "Time of a simulation-step, which is the step of a batch over the simulations that take it together, by "
@@ -173,9 +172,8 @@ def steps_over(
     panel = fig.subplots()
     panel.set(xscale="log", yscale="log", xlabel=label, ylabel=f"time of {y} [ms]")
     for i, (name, part) in enumerate(by):
-        part, style = part.sort_values(x), line_style(i)
-        panel.fill_between(part[x], part["p10"], part["p90"], color=style["color"], alpha=0.18, lw=0)
-        panel.plot(part[x], part["median"], marker="o", ms=4.5, label=name, **style)
+        part, style = part.sort_values(x), {"marker": "o", "ms": 4.5, "label": name, **line_style(i)}
+        band(panel, part[x], part["median"], part["p10"], part["p90"], **style)
     plain_ticks(panel.yaxis)
     sizes = sorted(rows[x].unique())
     if len(sizes) < 8:
@@ -202,7 +200,7 @@ def step_over_particles(rows: pd.DataFrame) -> Figure:
             floor = part.groupby(["bench", "particles"])["median"].sum().groupby("particles").mean()
             name, dashes = f"full-order floor, {precision}", (0, (5, 2))
             panel.plot(floor.index, floor, ls=dashes, lw=1.2, label=name, color=(INK, "#888888")[i])
-        fig.legend(loc="outside upper left", ncols=3, handlelength=2.6)
+        legend(fig)
     return fig
 
 
@@ -227,7 +225,7 @@ def step_over_sample(rows: pd.DataFrame) -> Figure:
                 )  # fmt: skip
             for ms in full.loc[full["precision"] == precision, "median"]:
                 panel.axhline(ms, ls=":", lw=1.4, color=color, label=f"full-order, {precision}")
-        fig.legend(loc="outside upper left", ncols=2, handlelength=2.6)
+        legend(fig)
     return fig
 
 
@@ -243,7 +241,7 @@ def step_over_batch(rows: pd.DataFrame) -> Figure:
             part = part.sort_values("batch")
             shared = part["median"].iloc[0] * part["batch"].iloc[0] / part["batch"]
             panel.plot(part["batch"], shared, ls=":", lw=1.2, color=line_style(i)["color"])
-        fig.legend(loc="outside upper left", ncols=2, handlelength=2.6)
+        legend(fig)
     return fig
 
 
@@ -278,32 +276,6 @@ def steps_by_scene(rows: pd.DataFrame) -> Figure:
     return fig
 
 
-def bars(panels: dict[str, pd.Series], floors: dict[str, pd.Series], colors: list[str]) -> Figure:
-    """Times [ms] of passes or stages, a bar each, with a floor as a mark; a panel each title."""
-    names = list(dict.fromkeys(name for times in panels.values() for name in times.index))
-    with styled():
-        fig = figure(1.5 + 0.42 * len(names))
-        for panel, (title, times) in zip(
-            fig.subplots(1, len(panels), sharey=True, squeeze=False)[0], panels.items(), strict=True
-        ):
-            at = [names.index(name) for name in times.index]
-            drawn = panel.barh(
-                at, times, height=0.6, color=[colors[k % len(colors)] for k in at], label="time"
-            )
-            panel.bar_label(drawn, [number(ms) for ms in times], padding=4, fontsize=8.5, color=INK)
-            if title in floors:
-                panel.plot(floors[title], at, "|", ms=17, mew=2.4, color=INK, label="floor")
-            panel.set(title=title, xlabel="time [ms]", xlim=(0, 1.2 * times.max()))
-            panel.set_yticks(range(len(names)), names)
-            panel.set_ylim(len(names) - 0.5, -0.5)
-            panel.grid(axis="x")
-            panel.tick_params(axis="y", length=0)
-        if floors:
-            handles, texts = panel.get_legend_handles_labels()
-            fig.legend(handles, texts, loc="outside upper left", ncols=2)
-    return fig
-
-
 def passes_beside_floor(rows: pd.DataFrame) -> Figure:
     """The passes of a full-order step of the largest case."""
     own = rows[_passes(rows)]
@@ -313,7 +285,7 @@ def passes_beside_floor(rows: pd.DataFrame) -> Figure:
         for chosen, what in ((times, "time"), (floors, "floor")):
             values = part[part["what"] == what].set_index("part")["median"]
             chosen[f"{case}, {precision}"] = values[~values.index.duplicated(keep="last")]
-    return bars(times, floors, stage_colors(["p2g"]))
+    return bars(times, floors)
 
 
 def step_beside_paper(rows: pd.DataFrame) -> Figure:
@@ -325,8 +297,7 @@ def step_beside_paper(rows: pd.DataFrame) -> Figure:
         panels[f"{scene}, {precision}"] = own.set_index("part")["median"]
         paper = {"networks, projection, copies": networks, "MPM": whole - networks}
         panels[f"{scene}, the paper"] = pd.Series(paper)
-    stages = [name for times in panels.values() for name in times.index]
-    return bars(panels, {}, stage_colors(list(dict.fromkeys(stages))))
+    return bars(panels)
 
 
 # -- parts of the page ----------------------------------------------------------------------------------
@@ -362,7 +333,7 @@ SECTIONS = (
     Section(_STAGES, _paper, "stages", step_beside_paper, listed=False),
     Section(_FLOORS, _floors),
     Section(_TRAINING, _of_bench("training")),
-    Section(_OPERATORS, _of_bench("operators")),
+    Section(_RECURRENCE, _of_bench("recurrence")),
     Section(_BATCH, _of_bench("batch"), "batch", step_over_batch),
     Section(_SIZES, _sizes, "step", step_over_particles),
     Section(_SAMPLES, _samples, "sample", step_over_sample),

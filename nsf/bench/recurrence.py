@@ -1,4 +1,4 @@
-"""A step by operators beside the full-order one: single runs, many at once, and frames of many particles."""
+"""A step by the recurrence beside the full-order one: single runs, many at once, frames of many points."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -79,9 +79,9 @@ def measured(chain: Pipeline, found: Measurements, many: int = 0) -> None:
 def measured_decoded(chain: Pipeline, particles: int, found: Measurements) -> None:
     """Add the rows of one scene with another number of particles, in its first held-out case.
 
-    A step by operators does not depend on the particles. So the run is that of the chain's own scene, and
-    its frames are decoded at the particles asked for. The full-order run is theirs, on a finer grid and in
-    shorter steps (`scaling.at_size`), each of which counts as one by operators.
+    A step by the recurrence does not depend on the particles. So the run is of the chain's scene, and its
+    frames are decoded at other particles. The full-order run is of these, on a finer grid and in shorter
+    steps (`scaling.at_size`), each of which counts as one by the recurrence.
 
     Args:
         chain: of the scene, with `model=recurrence` and `field=basis`.
@@ -123,14 +123,14 @@ def _compared(
     """Add the rows of either solver in one precision, turn by turn.
 
     Args:
-        chain, manifold: whose operators are run.
+        chain, manifold: whose recurrence is run.
         scene: of the full-order step.
         name: the end of both cases.
         precision, truth, found: of the rows.
         decode: run → positions of all particles.
 
     Returns:
-        Time of a full-order step [ms], the case of the run by operators, and that run at its end.
+        Time of a full-order step [ms], the case of the run by the recurrence, and that run at its end.
     """
     settings, device, held_out, teaching = (
         found.settings,
@@ -142,11 +142,11 @@ def _compared(
     run, peak = build(partial(chain.solver_at, manifold, held_out, precision=precision), device)
     times = window_times({"full": full}, scene.steps, settings.trials, device, whole={"own": run})
     position = decode(run)
-    of = partial(Case, bench="operators", particles=scene.particle_count, precision=precision)
+    of = partial(Case, bench="recurrence", particles=scene.particle_count, precision=precision)
     case = of(name=f"full_order_{name}")
     full_ms = found.add(case, "step", times["full"])
     found.add(case, "peak memory", full_peak, "MiB")
-    case = of(name=f"operators_{name}", sample=run.sample_size)
+    case = of(name=f"recurrence_{name}", sample=run.sample_size)
     delta = deformation_error(run, truth, position)
     _add_run(found, case, times["own"], full_ms, delta, run.nbytes, peak, teaching)
     found.add(case, "decoding of a frame", _decode_ms(position, run.xhat, settings))
@@ -156,7 +156,7 @@ def _compared(
 
 
 def _add_run(found: Measurements, case: Case, ms, full_ms: float, delta: float, nbytes: int, peak, teaching):
-    """Add the figures of runs by operators, alone or many at once."""
+    """Add the figures of runs by the recurrence, alone or many at once."""
     own = found.add(case, "step", ms)
     found.add(case, "peak memory", peak, "MiB")
     found.add(case, "δ", delta, "1")
@@ -177,7 +177,7 @@ def _together(
 
     Args:
         run, case: that one.
-        chain: whose operators are run.
+        chain: whose recurrence is run.
         count: how many.
         full_ms: time of a full-order step [ms].
         truth: trajectory file of the first run.
@@ -191,18 +191,18 @@ def _together(
     (ms,) = run_times({count: many}, found.settings.trials, found.settings.device).values()
     latents = run.trajectory().t, many.record.xhat[0], run.decoder().position
     delta = error_of_latents(*latents, truth, run.xhat)
-    case = replace(case, name=f"operators_batch{count}", batch=count)
+    case = replace(case, name=f"recurrence_batch{count}", batch=count)
     _add_run(found, case, ms / count, full_ms, delta, many.nbytes, peak, chain.taught)
 
 
 class Many:
-    """Runs by operators of many cases, from one that is set up; all steps in one launch.
+    """Runs by the recurrence of many cases, from one that is set up; all steps in one launch.
 
     A batch of solvers builds every scene and holds all of its particles, which takes minutes for a thousand.
     The cases may change no collider, no gravity and no start, as that of a material does not.
 
     Args:
-        model: the operators.
+        model: the recurrence.
         run: one of their runs.
         cases: B of them.
 
@@ -239,10 +239,10 @@ class Many:
 
 
 class Checked:
-    """Runs by operators, and what `nsf deploy` does to know how far to believe them, for `run_times`.
+    """Runs by the recurrence with the checks of `nsf deploy`, for `run_times`.
 
     Args:
-        run: by operators, alone in its batch.
+        run: by the recurrence, alone in its batch.
         fallback: how it is watched, and who goes on with it.
         projected: the same run by projected steps, built as well before a clock starts.
         trust: the estimate of whether to believe it.

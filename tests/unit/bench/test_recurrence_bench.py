@@ -1,4 +1,4 @@
-"""`nsf bench benches=operators` on the tiny chain; what a step takes is asserted nowhere."""
+"""`nsf bench benches=recurrence` on the tiny chain; what a step takes is asserted nowhere."""
 
 import shutil
 
@@ -8,7 +8,7 @@ import pytest
 import torch
 from angles import angle
 
-from nsf.bench.operators import Checked, Many, measured, measured_decoded
+from nsf.bench.recurrence import Checked, Many, measured, measured_decoded
 from nsf.bench.report import wide
 from nsf.bench.rows import Measurements, Settings
 from nsf.deployment import Fallback, Rollout, rollout_file
