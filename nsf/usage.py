@@ -62,7 +62,7 @@ TOOLS = {
     ),
     "bench": (
         "time and memory of a step, kernel by kernel; writes reports/speed",
-        "[benches=full_order,scaling,reduced,batch,operators,training]\n"
+        "[benches=full_order,scaling,reduced,batch,recurrence,training]\n"
         "       [particles=10k,200k,1m] [scenes=cake,metal] [precision=fp32,fp64] [device=auto] [trials=10]\n"
         "       [folder=PATH]; sizes that suit the device by default",
     ),

@@ -9,7 +9,7 @@ from nsf.errors import ConfigError
 from nsf.inverse.design import Designed, Program, Tilt, design, full_order
 from nsf.inverse.error import ModelError
 from nsf.inverse.observations import View
-from nsf.inverse.reports.charts import program_chart, residuals_chart
+from nsf.inverse.reports.charts import program_chart, targets_chart
 from nsf.inverse.reports.page import Chart, Results, frame_table, rms, title_of
 from nsf.results.columns import number
 
@@ -55,7 +55,7 @@ def designing(
     ways = dict(zip(program.names, designed.values.T, strict=True))
     table = pd.DataFrame({"": list(off), "off [mm]": [1e3 * value for value in off.values()]})
     drawn, over = program_chart(model.t, ways, program.unit), "The program over time."
-    left, less = residuals_chart(rows, "target"), "Targets less what the runs have."
+    left, less = targets_chart(rows), "Targets less the values of the runs; a bar is the tolerance."
     return Results(
         title=f"{title_of(model)}: design",
         lead=_LEAD,

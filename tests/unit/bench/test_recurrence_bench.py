@@ -23,7 +23,7 @@ TAUGHT = (
 
 @pytest.fixture(scope="module")
 def taught(chain, pipeline_at, tmp_path_factory):
-    """The tiny chain by operators, its rows, and what was said of them."""
+    """The tiny chain by the recurrence, its rows, and what was said of them."""
     root, said = tmp_path_factory.mktemp("taught") / "runs", []
     found = Measurements(Settings((), ("fp32", "fp64"), "cpu", 2), said.append)
     for stage in ("simulate", "train"):
@@ -36,11 +36,11 @@ def taught(chain, pipeline_at, tmp_path_factory):
 
 def test_every_case_has_a_row(taught):
     pipeline, rows, _ = taught
-    cases = ["full_order_sand", "operators_sand", "operators_batch3"]
-    assert rows["case"].tolist() == 2 * cases + 2 * ["full_order_1k", "operators_1k"]
+    cases = ["full_order_sand", "recurrence_sand", "recurrence_batch3"]
+    assert rows["case"].tolist() == 2 * cases + 2 * ["full_order_1k", "recurrence_1k"]
     assert rows["precision"].tolist() == 3 * ["fp32"] + 3 * ["fp64"] + 2 * ["fp32"] + 2 * ["fp64"]
     assert rows["particles"].tolist() == 6 * [500] + 4 * [1200]
-    own, full = (rows[rows["case"].str.startswith(kind)] for kind in ("operators", "full_order"))
+    own, full = (rows[rows["case"].str.startswith(kind)] for kind in ("recurrence", "full_order"))
     assert own["batch"].tolist() == [1, 3, 1, 3, 1, 1]
     for name in ("sample", "δ", "speed-up", "memory of a run [MiB]", "teaching [s]"):
         assert own[name].notna().all()
@@ -78,19 +78,19 @@ def test_delta_is_that_of_the_evaluation(taught):
     pipeline.evaluate()
     evaluated = pd.read_csv(pipeline.evaluation.path / "results.csv")["delta"][0]
     double = rows[rows["precision"] == "fp64"].set_index("case")["δ"]
-    assert double["operators_sand"] == pytest.approx(evaluated, rel=1e-6)
-    assert double["operators_batch3"] == pytest.approx(evaluated, rel=1e-6)
+    assert double["recurrence_sand"] == pytest.approx(evaluated, rel=1e-6)
+    assert double["recurrence_batch3"] == pytest.approx(evaluated, rel=1e-6)
     # Another body, by its grid; see the same bound in test_bench.
-    assert double["operators_1k"] < 0.01
+    assert double["recurrence_1k"] < 0.01
 
 
 def test_a_run_holds_little(taught):
     pipeline, rows, _ = taught
     run = pipeline.solver_at(pipeline.manifold(), angle(26.0))
-    own = rows[(rows["case"] == "operators_sand") & (rows["precision"] == "fp64")].iloc[0]
+    own = rows[(rows["case"] == "recurrence_sand") & (rows["precision"] == "fp64")].iloc[0]
     assert own["memory of a run [MiB]"] == run.nbytes / 2**20
     assert run.nbytes < 0.2 * run.decoder().at.nbytes
-    more = rows[(rows["case"] == "operators_batch3") & (rows["precision"] == "fp64")].iloc[0]
+    more = rows[(rows["case"] == "recurrence_batch3") & (rows["precision"] == "fp64")].iloc[0]
     assert more["memory of a run [MiB]"] < 3 * own["memory of a run [MiB]"]
 
 
