@@ -1,6 +1,4 @@
-"""What stands about the bodies of a run, for its pictures."""
-
-from collections.abc import Sequence
+"""Gravity and colliders about the bodies of a run, for its pictures."""
 
 import numpy as np
 
@@ -19,15 +17,11 @@ def surroundings(scene: Scene, t: np.ndarray) -> dict[str, np.ndarray]:
         solid_position: [F, c, 3] [m]; solid_orientation: [F, c, 3, 3].
         solid_active: [F, c] whether the collider acts.
     """
-    return {"gravity": scene.acting_gravity.at(t).astype(np.float32), **colliders_at(scene.solids, t)}
-
-
-def colliders_at(solids: Sequence[Collider], t: np.ndarray) -> dict[str, np.ndarray]:
-    """The part of `surroundings` that is of colliders."""
-    frames = len(t)
+    frames, solids = len(t), scene.solids
     poses = [_poses(solid, t) for solid in solids]
     acts = [(solid.since <= t) & (t < solid.until) for solid in solids]
     return {
+        "gravity": scene.acting_gravity.at(t).astype(np.float32),
         "solid_shape": np.array([solid.name for solid in solids], dtype=str),
         "solid_extents": np.array([solid.extents for solid in solids], np.float32).reshape(-1, 3),
         "solid_position": _stacked([position for position, _ in poses], (frames, 0, 3)),

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from nsf.errors import ConfigError
 from nsf.export import FORMATS
+from nsf.paths import reports_folder
 
 if TYPE_CHECKING:
     from nsf.export.playback import Playback

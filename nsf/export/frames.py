@@ -29,7 +29,6 @@ def write(playback: Playback, folder: Path) -> Path:
         StorageError: the disk cannot hold the temporary file.
     """
     optional(*NEEDS, "export")  # before any work
-    optional(*NEEDS, "export")  # before any work
     pictures, path = folder / f"{playback.name}_frames", folder / f"{playback.name}.mp4"
     with writing(path) as partial, tempfile.TemporaryDirectory(dir=partial.parent) as scratch:
         body = _body(playback, Path(scratch) / "points")

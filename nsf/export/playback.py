@@ -19,11 +19,11 @@ from nsf.dynamics.interop import torch_device, torch_dtype
 from nsf.errors import ConfigError, SchemaError
 from nsf.evaluation import metrics
 from nsf.evaluation.superresolution import POINTS
-from nsf.evaluation.surroundings import colliders_at
+from nsf.evaluation.surroundings import surroundings
 from nsf.kinematics.interpolation import lying_together
 from nsf.kinematics.manifold import Manifold, Restriction
 from nsf.live import page
-from nsf.mpm import Collider, floor_height, precision_of
+from nsf.mpm import floor_height, precision_of
 from nsf.mpm.device import warp_device
 from nsf.progress import Progress
 from nsf.runs import Run
@@ -91,9 +91,8 @@ class Block:
 class Playback:
     """One reduced run of a deploy run: its frames, and its points at rest.
 
-    A playback reads the files of the deploy run and of its train run. It builds the scene only where it needs
-    points between the particles or the elastic law. It then takes the keys of the parameters from the
-    configuration of a simulate run.
+    A playback reads the files of the deploy run and of its train run. It builds the scene where it needs
+    solids, points between the particles or the elastic law.
 
     Args:
         run: complete deploy run.
@@ -162,19 +161,19 @@ class Playback:
         rollout = self._rollout
         diverged, handed_over = rollout.diverged, rollout.handed_over
         t = rollout.t if diverged < 0 else rollout.t[:diverged]
-        own = len(t)  # frames of the reduced run; the full-order solver made the later ones
+        reduced = len(t)  # frames of the reduced run; the full-order solver made the later ones
         if handed_over >= 0:
-            own = handed_over + 1
+            reduced = handed_over + 1
             with Trajectory.open(self.run.file(self._rest)) as rest:
-                t = np.concatenate([t[:own], rest.t[1:]])
+                t = np.concatenate([t[:reduced], rest.t[1:]])
         chosen = np.union1d(np.arange(0, len(t), self.every), len(t) - 1)
         self.stopped = float(rollout.t[diverged]) if diverged >= 0 else None
         self.t = t[chosen]
         self._xhat = torch.as_tensor(
-            rollout.xhat[chosen[chosen < own]], dtype=self._dtype, device=self.device
+            rollout.xhat[chosen[chosen < reduced]], dtype=self._dtype, device=self.device
         )
-        self._rate = _rates(rollout, max(own, 2))[chosen[chosen < own]]
-        self._later = chosen[chosen >= own] - (own - 1)  # of the continuation, whose first frame is reduced
+        self._rate = _rates(rollout, max(reduced, 2))[chosen[chosen < reduced]]
+        self._later = chosen[chosen >= reduced] - (reduced - 1)  # its first frame is reduced
 
     def _choose_points(self, points: int | None) -> None:
         X = self.manifold.X.cpu().numpy()
@@ -227,34 +226,17 @@ class Playback:
     @property
     def floor(self) -> float | None:
         """Height of a horizontal floor at rest [m]."""
-        return floor_height(list(self._colliders.values()))
+        return floor_height(list(self._scene.solids))
 
     @property
     def solids(self) -> list[dict]:
         """The solids, for a page."""
-        return [page.solid(name, own) for name, own in self._shown.items()]
+        return [page.solid(*solid) for solid in zip(self._scene.colliders, self._scene.solids, strict=True)]
 
     @property
     def around(self) -> dict[str, np.ndarray]:
-        """Gravity and colliders in the frames, as `nsf.evaluation.surroundings` returns them."""
-        scene = self._settings["scene"]
-        gravity = scene["gravity"]
-        if "inclination" in scene:
-            gravity = configuration.build(scene["inclination"], "scene.inclination").turned(gravity)
-        return {
-            "gravity": np.tile(np.array(gravity, np.float32), (len(self.t), 1)),
-            **colliders_at(list(self._shown.values()), self.t),
-        }
-
-    @cached_property
-    def _shown(self) -> dict[str, Collider]:
-        """The solids without those that a program moves, whose way only the scene knows."""
-        programs = (self._settings["scene"].get("forcing") or {}).get("colliders") or {}
-        return {name: own for name, own in self._colliders.items() if name not in programs}
-
-    @cached_property
-    def _colliders(self) -> dict[str, Collider]:
-        return configuration.build_all(self._settings["scene"]["colliders"], "scene.colliders")
+        """Gravity and colliders in the frames, as `nsf.evaluation.surroundings` gives them."""
+        return surroundings(self._scene, self.t)
 
     @property
     def radius(self) -> float:
@@ -270,11 +252,11 @@ class Playback:
     @cached_property
     def tops(self) -> dict[str, float]:
         """The end of the colour scale of each of `QUANTITIES`, the same for any number of points."""
-        found: dict[str, float] = {}
+        tops: dict[str, float] = {}
         for name, quantity in QUANTITIES.items():
             values = torch.cat([block.magnitude(name).flatten() for block in self._some])
-            found[name] = float(np.percentile(values.double().numpy(), quantity.clip)) or 1.0
-        return found
+            tops[name] = float(np.percentile(values.double().numpy(), quantity.clip)) or 1.0
+        return tops
 
     @cached_property
     def _some(self) -> list[Block]:
@@ -329,8 +311,9 @@ class Playback:
     def _read(self, rows: slice) -> tuple[torch.Tensor, torch.Tensor]:
         """x and τ of some of the points, in the frames of the full-order solver."""
         with Trajectory.open(self.run.file(self._rest)) as rest:
-            found = (rest.read(name, frames=self._later, particles=self._rows[rows]) for name in ("x", "tau"))
-            return tuple(torch.as_tensor(values) for values in found)
+            of = {"frames": self._later, "particles": self._rows[rows]}
+            fields = (rest.read(name, **of) for name in ("x", "tau"))
+            return tuple(torch.as_tensor(values) for values in fields)
 
     @cached_property
     def _scene(self) -> Scene:
@@ -356,39 +339,41 @@ def _parent(run: Run) -> Run:
     return Run.load(run.parents[0] if run.parents else "", run.root)
 
 
-def _chosen(cases: Sequence[Mapping[str, float]], asked: Mapping[str, float] | float | str | None) -> int:
+def _chosen(cases: Sequence[Mapping[str, float]], parameter: Mapping[str, float] | float | str | None) -> int:
     """Index of a held-out case: the first, the one of a value, or that nearest to values by name.
 
     Raises:
         ConfigError: no such case was deployed, or the text is none; names those that are there.
     """
-    if asked is None:
+    if parameter is None:
         return 0
     names = list(cases[0])
-    there = np.array([[case[name] for name in names] for case in cases])
-    wanted = _by_name(asked, names)
+    values = np.array([[case[name] for name in names] for case in cases])
+    wanted = _by_name(parameter, names)
     if wanted and wanted.keys() <= set(names):
-        known = there[:, [names.index(name) for name in wanted]]
-        off, spread = abs(known - list(wanted.values())), np.ptp(known, axis=0)
+        at = values[:, [names.index(name) for name in wanted]]
+        off, spread = abs(at - list(wanted.values())), np.ptp(at, axis=0)
         if len(names) > 1:
             return int((off / np.where(spread > 0, spread, 1.0)).max(1).argmin())
         if (same := off[:, 0] == 0.0).any():
             return int(same.argmax())
     listed = [Case.of(case) for case in cases]
     held_out = "; ".join(map(str, listed)) if len(names) > 1 else ", ".join(map(str, listed))
-    shown = dict(asked) if isinstance(asked, Mapping) else asked
+    shown = dict(parameter) if isinstance(parameter, Mapping) else parameter
     raise ConfigError(
         f"parameter={shown} was not deployed; choose one of {held_out}, or deploy with scene.design.test"
     )
 
 
-def _by_name(asked: Mapping[str, float] | float | str, names: Sequence[str]) -> dict[str, float]:
-    """Values by name of what a user asks for; empty where it is no text of numbers."""
-    if isinstance(asked, Mapping):
-        return dict(asked)
+def _by_name(parameter: Mapping[str, float] | float | str, names: Sequence[str]) -> dict[str, float]:
+    """Values by name of a parameter as a user writes it; empty where it is no text of numbers."""
+    if isinstance(parameter, Mapping):
+        return dict(parameter)
     try:
-        if isinstance(asked, str) and "=" in asked:
-            return {name.strip(): float(value) for name, value in (p.split("=") for p in asked.split(","))}
-        return {names[0]: float(asked)} if len(names) == 1 else {}
+        if isinstance(parameter, str) and "=" in parameter:
+            return {
+                name.strip(): float(value) for name, value in (p.split("=") for p in parameter.split(","))
+            }
+        return {names[0]: float(parameter)} if len(names) == 1 else {}
     except ValueError:
         return {}
