@@ -63,17 +63,17 @@ class View:
 
     @classmethod
     def around(
-        cls, x: np.ndarray, width: int, camera: Camera | None = None, beside: np.ndarray | None = None
+        cls, x: np.ndarray, width: int, camera: Camera | None = None, solids: np.ndarray | None = None
     ) -> "View":
-        """The window that holds every point of x [..., 3] and, within reason, the points `beside` [k, 3]."""
+        """The window that holds every point of x [..., 3] and, within reason, those of `solids` [k, 3]."""
         points = x.reshape(-1, 3)
         points = points[np.isfinite(points).all(axis=1)]
         camera = camera or Camera.facing(points)
         flat = camera.project(points)[:, :2]
         low, high = flat.min(axis=0), flat.max(axis=0)
         reach = _BEYOND * max(high - low)
-        if beside is not None and len(beside):
-            there = camera.project(beside)[:, :2]
+        if solids is not None and len(solids):
+            there = camera.project(solids)[:, :2]
             low, high = (
                 np.maximum(np.minimum(low, there.min(axis=0)), low - reach),
                 np.minimum(np.maximum(high, there.max(axis=0)), high + reach),
@@ -146,9 +146,9 @@ class View:
             return
         part = _box_of(np.argwhere(covered), nearest.shape)
         covered, depths, normal = covered[part], depths[part], normal[part]
-        own = np.zeros((*covered.shape, 3), np.float32)
-        own[covered] = colors[owner[part][covered]]
-        surface = _surface(covered, np.where(covered, depths, 0.0), own, normal, radius, scale)
+        painted = np.zeros((*covered.shape, 3), np.float32)
+        painted[covered] = colors[owner[part][covered]]
+        surface = _surface(covered, np.where(covered, depths, 0.0), painted, normal, radius, scale)
         shown = covered & (depths > nearest[part])
         canvas[part][shown] = surface[shown]
         nearest[part][shown] = depths[shown]
@@ -284,10 +284,10 @@ def _at_once(centre: np.ndarray, cell: np.ndarray, reach: int, shape):
     nearest = np.full(shape[0] * shape[1], -np.inf, np.float32)
     nearness = nearness.astype(np.float32)
     np.maximum.at(nearest, index, nearness)
-    own, offset = np.nonzero(seen)
+    ball, offset = np.nonzero(seen)
     first = np.flatnonzero(nearness == nearest[index])
     owner, places = np.full(nearest.shape, -1), np.zeros(nearest.shape, int)
-    owner[index[first]], places[index[first]] = own[first], place[offset[first]]
+    owner[index[first]], places[index[first]] = ball[first], place[offset[first]]
     return nearest.reshape(shape), owner.reshape(shape), places.reshape(shape)
 
 
@@ -297,14 +297,14 @@ def _one_by_one(centre: np.ndarray, cell: np.ndarray, reach: int, shape):
     depth = np.full((shape[0] + 2 * wide, shape[1] + 2 * wide), -np.inf, np.float32)
     owner, places = np.full(depth.shape, -1), np.zeros(depth.shape, int)
     at = np.arange(size * size).reshape(size, size)
-    for own, (column, row, nearness) in enumerate(centre):
+    for ball, (column, row, nearness) in enumerate(centre):
         left, top = round(column) - reach + wide, round(row) - reach + wide
         if min(left, top) < 0 or left + size > depth.shape[1] or top + size > depth.shape[0]:
             continue  # beyond the picture
         part = slice(top, top + size), slice(left, left + size)
         nearer = cell + np.float32(nearness) > depth[part]
         depth[part][nearer] = cell[nearer] + np.float32(nearness)
-        owner[part][nearer], places[part][nearer] = own, at[nearer]
+        owner[part][nearer], places[part][nearer] = ball, at[nearer]
     inner = slice(wide, wide + shape[0]), slice(wide, wide + shape[1])
     return depth[inner], owner[inner], places[inner]
 

@@ -184,7 +184,7 @@ def _sheet(stage: Stage, rows, titles: Sequence[str], width: int, **size) -> She
         sheet.name_row(i, row[0].name, row[0].warning)
     scales = [body.scale for body in rows[0]]
     for scale in dict.fromkeys(scales):
-        columns = [j for j, own in enumerate(scales) if own is scale]
+        columns = [j for j, one in enumerate(scales) if one is scale]
         if isinstance(scale, Categories):
             sheet.legend(scale.named)
         else:

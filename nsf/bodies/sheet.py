@@ -62,7 +62,7 @@ class Sheet:
         bar.set_label(scale.label, fontsize=9, labelpad=2, color=INK, parse_math=False)
 
     def legend(self, colors: Mapping[str, str]) -> None:
-        """What colours stand for, below the pictures."""
+        """Names of the colours, below the pictures."""
         dots = [
             Line2D([], [], color=color, label=name, linestyle="none", marker="o", markersize=6)
             for name, color in colors.items()

@@ -51,27 +51,27 @@ class Solids:
 
     def reach(self, bodies: Sequence[np.ndarray]) -> list[np.ndarray]:
         """How far points [n, 3] of each body, with z up, come in the axes of each collider at first."""
-        found = []
+        boxes = []
         for c in range(len(self._around.get("solid_shape", ()))):
             placed = [x @ self._axes(0, c) for x in bodies]
             ends = np.array([(np.nanmin(x, axis=0), np.nanmax(x, axis=0)) for x in placed])
-            found.append(np.stack([ends[:, 0].min(axis=0), ends[:, 1].max(axis=0)]))
-        return found
+            boxes.append(np.stack([ends[:, 0].min(axis=0), ends[:, 1].max(axis=0)]))
+        return boxes
 
     def faces(self, frame: int, toward: np.ndarray) -> list[Face]:
-        """What a viewer in the direction `toward` [3] sees of the colliders in a frame."""
+        """The colliders in a frame, as a viewer in the direction `toward` [3] sees them."""
         around = self._around
-        found: list[Face] = []
+        faces: list[Face] = []
         for c in np.flatnonzero(around["solid_active"][frame]) if around else ():
             position, shape = self.turned(around["solid_position"][frame, c]), str(around["solid_shape"][c])
             axes, extents = self._axes(frame, c), around["solid_extents"][c]
             if shape == "half-space":
-                found += _slab(self.reached[c], position, axes, toward)
+                faces += _slab(self.reached[c], position, axes, toward)
             elif shape == "cuboid":
-                found += _box(position, axes * extents, toward, _STEEL, _CLEAR)
+                faces += _box(position, axes * extents, toward, _STEEL, _CLEAR)
             else:
-                found.append(_disc(position, float(extents[0]), toward))
-        return found
+                faces.append(_disc(position, float(extents[0]), toward))
+        return faces
 
     def _axes(self, frame: int, c: int) -> np.ndarray:
         """A collider's axes as columns [3, 3]; the last of a half-space is its normal."""
@@ -108,21 +108,21 @@ def _slab(reach: np.ndarray, point: np.ndarray, axes: np.ndarray, toward: np.nda
     top = float(point @ normal)
     low[2], high[2] = min(top - _THICK / _BESIDE * margin, reach[0, 2]), top
     centre, half = axes @ (0.5 * (low + high)), 0.5 * (high - low)
-    found = _box(centre, axes * half, toward, _GROUND, 1.0)
-    return [replace(face, ground=bool(face.normal @ normal > 0.99)) for face in found]
+    faces = _box(centre, axes * half, toward, _GROUND, 1.0)
+    return [replace(face, ground=bool(face.normal @ normal > 0.99)) for face in faces]
 
 
 def _box(centre, half: np.ndarray, toward, color: np.ndarray, opacity: float) -> list[Face]:
     """The faces of a box that the viewer sees; `half` [3, 3]: its half edges as columns."""
     light = _LIGHT / np.linalg.norm(_LIGHT)
-    found = []
+    faces = []
     for out, a, b in _sides(half):
         if out @ toward <= 0.0:
             continue
         corners = np.stack([out + sa * a + sb * b for sa, sb in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
         lit = max(0.0, float(out @ light) / np.linalg.norm(out))
-        found.append(Face(centre + corners, color * (1 - _SHADE * (1 - lit)), opacity))
-    return found
+        faces.append(Face(centre + corners, color * (1 - _SHADE * (1 - lit)), opacity))
+    return faces
 
 
 def _sides(half: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:

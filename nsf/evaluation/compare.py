@@ -27,7 +27,7 @@ _UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])  # entries xx, xy, xz, yy, yz,
 
 @dataclass(frozen=True)
 class Comparison:
-    """What one case gave.
+    """Errors, series and pictures of one case.
 
     Attributes:
         delta, displacement_error, stress_error: totals over frames 1..N, fractions; ∞ when the run diverged.

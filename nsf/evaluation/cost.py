@@ -19,7 +19,7 @@ _WARM_UP = 2  # steps of a fresh solver that compile, load and capture everythin
 
 @dataclass(frozen=True)
 class Subject:
-    """What is timed.
+    """A solver to be timed.
 
     Attributes:
         build: gives a solver at t = 0 (`step`, `timed_step`, `nbytes`).
@@ -78,11 +78,11 @@ def measure(subjects: dict[str, Subject], trials: int, device: str) -> dict[str,
             else:
                 taken = _times(subject.build(), subject.steps, device)
             times[name].append(taken)
-    found = {}
+    costs = {}
     for name, subject in subjects.items():
         steps, totals = np.array(times[name]).T
         p10, median, p90 = np.percentile(steps, [10, 50, 90]).tolist()
-        found[name] = SolverCost(
+        costs[name] = SolverCost(
             step_ms=median,
             step_ms_p10=p10,
             step_ms_p90=p90,
@@ -93,7 +93,7 @@ def measure(subjects: dict[str, Subject], trials: int, device: str) -> dict[str,
             trials=trials,
             steps=subjects[name].steps,
         )
-    return found
+    return costs
 
 
 def decoding_ms(solver: ReducedMPM, rollout: Rollout, trials: int) -> float:
@@ -153,7 +153,7 @@ def _stages(subject: Subject, samples: int, device: str) -> dict[str, float]:
     """Median time of each stage [ms] over steps spread evenly through a run."""
     solver = subject.build()
     chosen = np.unique(np.linspace(min(_WARM_UP, subject.steps - 1), subject.steps - 1, samples).astype(int))
-    found: dict[str, list[float]] = {}
+    times: dict[str, list[float]] = {}
     taken = 0
     for step in chosen.tolist():
         solver.step(step - taken)
@@ -161,5 +161,5 @@ def _stages(subject: Subject, samples: int, device: str) -> dict[str, float]:
         solver.timed_step(timer)
         taken = step + 1
         for name, ms in timer.per_step(1).items():
-            found.setdefault(name, []).append(ms)
-    return {name: float(np.median(values)) for name, values in found.items()}
+            times.setdefault(name, []).append(ms)
+    return {name: float(np.median(values)) for name, values in times.items()}

@@ -77,8 +77,8 @@ def at_end(heights: Tensor, x: Tensor, X: Tensor) -> dict[str, float]:
         heights: [frame] `height` of each frame [m].
         x: [particle, 3] m of the last frame; X: as for `height`.
     """
-    found = {name: float(own.of(x, X)) for name, own in QUANTITIES.items() if not own.whole}
-    return found | {"springback": float(heights[-1] - heights.min())}
+    values = {name: float(one.of(x, X)) for name, one in QUANTITIES.items() if not one.whole}
+    return values | {"springback": float(heights[-1] - heights.min())}
 
 
 #: By the name that files of observations use.

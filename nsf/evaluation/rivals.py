@@ -28,12 +28,12 @@ def forcing_of(scene: Scene) -> np.ndarray:
 
     Gravity in units of its reach and shifts in Δx, so that they can be held side by side.
     """
-    acting, found = scene.forcing_at(scene.dt * np.arange(scene.steps)), []
+    acting, parts = scene.forcing_at(scene.dt * np.arange(scene.steps)), []
     if scene.forcing.gravity:
-        found.append(acting["gravity"].ravel() / (scene.forcing.reach(scene.base_gravity) or 1.0))
+        parts.append(acting["gravity"].ravel() / (scene.forcing.reach(scene.base_gravity) or 1.0))
     moved = [name in scene.forcing.colliders for name in scene.colliders]
-    found.append(acting["solids"][:, moved, :3].ravel() / scene.dx)
-    return np.concatenate(found)
+    parts.append(acting["solids"][:, moved, :3].ravel() / scene.dx)
+    return np.concatenate(parts)
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ class Rivals:
     @property
     def factors(self) -> list[int]:
         """Those at which there is a coarse run."""
-        return [factor for factor, told in self.coarse.items() if "why" not in told]
+        return [factor for factor, run in self.coarse.items() if "why" not in run]
 
 
 def rivals(
@@ -180,15 +180,15 @@ def rivals(
     for start in range(1, trajectory.frames, rows):
         block = slice(start, min(start + rows, trajectory.frames))
         x = tensor(trajectory.read("x", frames=block))
-        found = {"norm": x - X, "static": X - x}
-        found |= {name: decoder.position(xhat[block]) - x for name, xhat in latents.items()}
-        found |= {factor: tensor(run.x[block]) - x for factor, run in ran.items()}
-        for name, apart in found.items():
+        differences = {"norm": x - X, "static": X - x}
+        differences |= {name: decoder.position(xhat[block]) - x for name, xhat in latents.items()}
+        differences |= {factor: tensor(run.x[block]) - x for factor, run in ran.items()}
+        for name, apart in differences.items():
             squares.setdefault(name, []).append(metrics.frame_squares(apart))
         advance(len(x))
     norm = torch.cat(squares.pop("norm"))
     errors = {name: metrics.relative(torch.cat(of), norm) for name, of in squares.items()}
-    told = {
+    coarse_runs = {
         factor: {"why": run}
         if isinstance(run, str)
         else {
@@ -199,7 +199,7 @@ def rivals(
         }
         for factor, run in coarse.items()
     }
-    return Rivals(**errors, coarse=told)
+    return Rivals(**errors, coarse=coarse_runs)
 
 
 def coarse_subjects(

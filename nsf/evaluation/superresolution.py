@@ -24,7 +24,7 @@ POINTS = 1 << 15  # queried at once: their modes and weights take some hundred M
 
 @dataclass(frozen=True)
 class SuperResolution:
-    """What one case gave; errors are fractions over the chosen frames, ∞ when the run diverged.
+    """Errors and shapes of one case; errors are fractions over the chosen frames, ∞ when the run diverged.
 
     Attributes:
         row: of `superresolution.csv`:
@@ -74,11 +74,11 @@ def query(manifold, X: torch.Tensor, xhat: torch.Tensor) -> torch.Tensor:
 
 def interpolated(X: torch.Tensor, particles: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
     """Values [F, P, 3] at particles [P, 3] interpolated to points X [n, 3]: [F, n, 3], all on one device."""
-    found = values.new_empty(len(values), *X.shape)
+    x = values.new_empty(len(values), *X.shape)
     values = values.movedim(0, 1)
     for rows in lying_together(X, POINTS):
-        found[:, rows] = interpolation(X[rows], particles).value(values).movedim(1, 0)
-    return found
+        x[:, rows] = interpolation(X[rows], particles).value(values).movedim(1, 0)
+    return x
 
 
 def superresolve(
@@ -144,10 +144,10 @@ def superresolve(
     seconds = (time.perf_counter() - started) / len(rollouts)
     at_particles = manifold.restrict(dtype=dtype, device=where).position(xhat)
 
-    found = []
+    results = []
     of_each = zip(x.split(len(frames)), at_particles.split(len(frames)), x_full, strict=True)
     for k, (x_k, at_particles_k, x_full_k) in enumerate(of_each):
-        own = {"case": rollouts[k].case.named, "factor": factor, "points": len(X)}
+        head = {"case": rollouts[k].case.named, "factor": factor, "points": len(X)}
         errors = _errors(rollouts[k], trajectories[k], frames, x_k, x_full_k, X, shared)
         interpolation_error, smeared = interpolation_errors[k]
         rest = {
@@ -158,8 +158,8 @@ def superresolve(
             "full_order_seconds": full_order_seconds[k],
         }
         last = (frames_k[-1].cpu().numpy() for frames_k in (x_k, x_full_k))
-        found.append(SuperResolution(own | errors | rest, points, *last, particles))
-    return found
+        results.append(SuperResolution(head | errors | rest, points, *last, particles))
+    return results
 
 
 def _check_own(rollout: Rollout) -> None:
@@ -226,13 +226,13 @@ def _interpolation_errors(
     """
     left_out = torch.ones(len(X), dtype=torch.bool, device=X.device).index_fill(0, shared, False)
     left_out = left_out.nonzero()[:, 0]
-    X_left, found = X[left_out], []
+    X_left, errors = X[left_out], []
     x_between = interpolated(X_left, X[shared], torch.cat([run[:, shared] for run in x]))
     for run, run_between in zip(x, x_between.chunk(len(x)), strict=True):
         x_left = run[:, left_out]
         smeared = ((run_between[-1] - x_left[-1]).norm(dim=1) > far).double().mean()
-        found.append((metrics.displacement_error(run_between, x_left, X_left), float(smeared)))
-    return found
+        errors.append((metrics.displacement_error(run_between, x_left, X_left), float(smeared)))
+    return errors
 
 
 def _full_order_frames(build: Callable[[], FullOrderMPM], steps: Sequence[int]) -> torch.Tensor:
@@ -249,8 +249,8 @@ def _full_order_frames(build: Callable[[], FullOrderMPM], steps: Sequence[int]) 
             wait()
         solver.check()
     except InstabilityError as error:
-        found = diagnosed(error, build, solver.steps_taken)
-        raise InstabilityError(f"fine full-order run: {found}; raise super_resolution.substeps") from error
+        reason = diagnosed(error, build, solver.steps_taken)
+        raise InstabilityError(f"fine full-order run: {reason}; raise super_resolution.substeps") from error
     return x
 
 

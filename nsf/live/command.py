@@ -94,11 +94,11 @@ def _bench(command: str, player: "Player", options: argparse.Namespace) -> None:
     if command == "view":
         print(follow(player).to_string(index=False))
         return
-    found = sizes(player)
-    print(f"serve: a frame is {found['frame']} bytes a user, of which x̂ is {found['latent']}")
-    told = f"{found['positions']:,} bytes, with their stress {found['positions and stress']:,}"
-    print(f"serve: the positions of all particles would be {told}")
-    print(f"serve: the field, once a user, is {found['field']:,} bytes")
+    bytes_of = sizes(player)
+    print(f"serve: a frame is {bytes_of['frame']} bytes a user, of which x̂ is {bytes_of['latent']}")
+    text = f"{bytes_of['positions']:,} bytes, with their stress {bytes_of['positions and stress']:,}"
+    print(f"serve: the positions of all particles would be {text}")
+    print(f"serve: the field, once a user, is {bytes_of['field']:,} bytes")
     with player:
         print(bench(player, options.bench, options.rate).to_string(index=False))
 
@@ -135,13 +135,13 @@ def _number(kind: type, least: float, most: float = float("inf")) -> Callable[[s
         try:
             value = kind(text)
         except ValueError:
-            told = {int: "a whole number", float: "a number"}[kind]
-            raise argparse.ArgumentTypeError(f"{text!r} must be {told}") from None
+            needed = {int: "a whole number", float: "a number"}[kind]
+            raise argparse.ArgumentTypeError(f"{text!r} must be {needed}") from None
         if kind is float and not least < value < most:
             raise argparse.ArgumentTypeError(f"{text} must be positive and finite")
         if not least <= value <= most:
-            told = f"lie in [{least}, {most}]" if most < float("inf") else f"be at least {least}"
-            raise argparse.ArgumentTypeError(f"{text} must {told}")
+            needed = f"lie in [{least}, {most}]" if most < float("inf") else f"be at least {least}"
+            raise argparse.ArgumentTypeError(f"{text} must {needed}")
         return value
 
     return read

@@ -32,9 +32,9 @@ def check_token(host: str, token: str | None) -> None:
     if token is None and host in LOOPBACK:
         return
     if len(token or "") < LEAST_TOKEN:
-        told = "is empty" if not token else f"has {len(token)} letters"
+        fault = "is empty" if not token else f"has {len(token)} letters"
         raise ConfigError(
-            f"the token {told}; give at least {LEAST_TOKEN} random ones, or leave --token out: one is drawn"
+            f"the token {fault}; give at least {LEAST_TOKEN} random ones, or leave --token out: one is drawn"
         )
 
 
@@ -54,27 +54,27 @@ def refusal(request: Request, host: str, token: str | None = None) -> tuple[HTTP
     if not _TARGET.fullmatch(request.path):
         return HTTPStatus.BAD_REQUEST, f"{_told(request.path)} is no path of this server"
     named, origins = request.headers.get_all("Host"), request.headers.get_all("Origin")
-    found = _HOST.fullmatch(named[0]) if len(named) == 1 else None
-    if found is None:
+    match = _HOST.fullmatch(named[0]) if len(named) == 1 else None
+    if match is None:
         return HTTPStatus.BAD_REQUEST, f"host {_told(', '.join(named))} is not one name with its port"
-    if host in LOOPBACK and (found[1] or found[2]) not in LOOPBACK:
+    if host in LOOPBACK and (match[1] or match[2]) not in LOOPBACK:
         # Another name for this machine is how a foreign page would get past the check of its origin.
         return HTTPStatus.FORBIDDEN, f"host {_told(named[0])} is not this machine's own name"
     # Only browsers send an origin, and they always do so for a WebSocket.
     if any(origin not in (f"http://{named[0]}", f"https://{named[0]}") for origin in origins):
         return HTTPStatus.FORBIDDEN, f"origin {_told(', '.join(origins))} is another site"
-    given = parse_qs(request.path.partition("?")[2]).get("token", [""])[-1]
-    if token is not None and not hmac.compare_digest(given.encode(), token.encode()):
+    offered = parse_qs(request.path.partition("?")[2]).get("token", [""])[-1]
+    if token is not None and not hmac.compare_digest(offered.encode(), token.encode()):
         return HTTPStatus.FORBIDDEN, "token is missing or wrong"
     return None
 
 
 def refused(connection: ServerConnection, request: Request, host: str, token: str | None) -> Response | None:
     """The answer to a request that is refused, which the log tells in a line; None to any other."""
-    found = refusal(request, host, token)
-    if found is None:
+    answer = refusal(request, host, token)
+    if answer is None:
         return None
-    status, why = found
+    status, why = answer
     log.warning("%s refused: %s", name_of(connection), why)
     return connection.respond(status, f"{why}\n")
 
@@ -104,5 +104,5 @@ class Connection(ServerConnection):
 
 
 def _told(text: object) -> str:
-    """What someone sent, in one line of a log."""
+    """A message from outside, in one line of a log."""
     return repr(str(text)[:_LONGEST_TOLD])

@@ -45,10 +45,10 @@ def packed(header: Mapping, arrays: Mapping[str, np.ndarray]) -> bytes:
         ValueError: an array is of a type that no browser views.
     """
     arrays = {name: np.ascontiguousarray(a, a.dtype.newbyteorder("<")) for name, a in arrays.items()}
-    told = {name: {"shape": a.shape, "type": f"{a.dtype.kind}{a.itemsize}"} for name, a in arrays.items()}
-    if unknown := [f"{name}: {own['type']}" for name, own in told.items() if own["type"] not in _TYPES]:
+    types = {name: {"shape": a.shape, "type": f"{a.dtype.kind}{a.itemsize}"} for name, a in arrays.items()}
+    if unknown := [f"{name}: {one['type']}" for name, one in types.items() if one["type"] not in _TYPES]:
         raise ValueError(f"{', '.join(unknown)}: arrays must be of {', '.join(_TYPES)}")
-    text = json.dumps({**header, "arrays": told}).encode()
+    text = json.dumps({**header, "arrays": types}).encode()
     text += b" " * (-(4 + len(text)) % _WORD)
     body = b"".join(a.tobytes() + b"\0" * (-a.nbytes % _WORD) for a in arrays.values())
     return struct.pack("<I", len(text)) + text + body
@@ -73,18 +73,18 @@ def script(entry: str = ENTRY) -> str:
             return
         text = _text(f"{module}.mjs")
         texts[module] = ""  # a circle of imports ends here; functions are called after all are there
-        wanted = [(own.split(", "), other) for own, other in _IMPORT.findall(text)]
+        wanted = [(imported.split(", "), other) for imported, other in _IMPORT.findall(text)]
         for _, other in wanted:
             add(other)
-        for own, other in wanted:
-            if missing := set(own) - exported.get(other, set(own)):
+        for imported, other in wanted:
+            if missing := set(imported) - exported.get(other, set(imported)):
                 raise ValueError(f"{module}.mjs imports {', '.join(missing)}, which {other}.mjs lacks")
-        found = _TOP.findall(text)
-        for _, name in found:
+        declared = _TOP.findall(text)
+        for _, name in declared:
             if name in names:
                 raise ValueError(f"{module}.mjs and {names[name]}.mjs both have {name}")
             names[name] = module
-        exported[module] = {name for export, name in found if export}
+        exported[module] = {name for export, name in declared if export}
         del texts[module]
         texts[module] = re.sub(r"^export ", "", _IMPORT.sub("", text), flags=re.MULTILINE)
 
@@ -96,11 +96,11 @@ def script(entry: str = ENTRY) -> str:
 
 
 def policy(connects: bool = False) -> str:
-    """What the page may do: run its one script, be styled, and where it connects, reach its own server."""
+    """The rights of the page: to run its one script, be styled, and where it connects, reach its server."""
     hashes = (_hashed(text) for text in (script(), _style()))
     allowed = "script-src 'sha256-{}'; style-src 'sha256-{}'; img-src data: blob:".format(*hashes)
-    own = "; connect-src 'self' ws: wss:" if connects else ""
-    return f"default-src 'none'; {allowed}{own}; base-uri 'none'; form-action 'none'"
+    connecting = "; connect-src 'self' ws: wss:" if connects else ""
+    return f"default-src 'none'; {allowed}{connecting}; base-uri 'none'; form-action 'none'"
 
 
 def html(title: str, data: bytes = b"", connects: bool = False) -> str:
@@ -135,7 +135,7 @@ def colors() -> list[int]:
 
 def solid(name: str, collider: "Collider") -> dict:
     """A solid as `solids.mjs` has it."""
-    found = {
+    entry = {
         "name": name,
         "shape": collider.name,
         "position": collider.position.tolist(),
@@ -149,8 +149,8 @@ def solid(name: str, collider: "Collider") -> dict:
         times, translations, angles = collider.motion.keyframes()
         axis, pivot = collider.motion.hinge()
         held = {"times": times, "translations": translations, "angles": angles, "axis": axis, "pivot": pivot}
-        found["motion"] = {key: values.tolist() for key, values in held.items()}
-    return found
+        entry["motion"] = {key: values.tolist() for key, values in held.items()}
+    return entry
 
 
 def recording(x: np.ndarray, stress: np.ndarray, t: Sequence[float]) -> tuple[dict, dict[str, np.ndarray]]:
@@ -165,12 +165,12 @@ def recording(x: np.ndarray, stress: np.ndarray, t: Sequence[float]) -> tuple[di
         t: [F] times [s].
     """
     lower, upper = x.min((0, 1)), x.max((0, 1))
-    told = {
+    header = {
         "t": [float(value) for value in t], "points": x.shape[1],
         "lower": lower.tolist(), "upper": upper.tolist(),
     }  # fmt: skip
     planes = quantised(x, lower, upper, np.uint16), quantised(stress, 0.0, 1.0, np.uint8)
-    return told, dict(zip(("x", "stress"), map(_differences, planes), strict=True))
+    return header, dict(zip(("x", "stress"), map(_differences, planes), strict=True))
 
 
 def quantised(values: np.ndarray, lower, upper, kind: type) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What a page is told of a model: the header, and fields of modes as arrays."""
+"""A model as a page takes it: the header, and fields of modes as arrays."""
 
 import numpy as np
 import torch
@@ -22,13 +22,13 @@ def field_message(model: LiveModel) -> bytes:
         ConfigError: the field does not consist of linear modes.
     """
     check_field(model)
-    told, arrays = modal_field(model.at.fields["deformation"], np.int16)
-    header = shown(model) | {"fields": {"deformation": told | {"parameters": False}}}
+    entry, arrays = modal_field(model.at.fields["deformation"], np.int16)
+    header = shown(model) | {"fields": {"deformation": entry | {"parameters": False}}}
     return page.packed(header, {"rest": model.X} | {f"deformation.{name}": a for name, a in arrays.items()})
 
 
 def shown(model: LiveModel) -> dict:
-    """What a page of a model is told of it, whatever it draws it from."""
+    """The part of the header that every page of a model has."""
     x, _ = model.training_frames()
     moved = float(np.percentile(np.linalg.norm(x - model.X, axis=2), 99.5)) or 1.0
     return {
