@@ -1,7 +1,7 @@
 """`nsf bench`: the time of a step, how near it is to the memory's bandwidth, and how it grows.
 
-A benchmark is a module of `BENCHES` with `run(found)`, which adds rows to one long table; the frame keeps the
-rows of the others and of one that was interrupted, and draws all.
+A benchmark is a module of `BENCHES` with `run(figures)`, which adds rows to one long table. The frame has
+the rows of the others, too, and of one that was interrupted, and draws all.
 """
 
 from nsf.bench.command import BENCHES, bench

@@ -18,21 +18,21 @@ SIZES = {"cuda": (1, 4, 16, 64, 256), "cpu": (1, 4)}
 _SHARE = 0.8  # of the free device memory that a batch may be expected to take
 
 
-def run(found: Measurements) -> None:
+def run(figures: Measurements) -> None:
     """Each scene: at the paper's size on a GPU, at small scale on a CPU.
 
     Data and training are made, or reused, as by `nsf train`. The first simulation of a batch is that of the
     first held-out case, of which δ is told; the others fill the box of training. Sample particles
     are chosen in the scene's own way, or as the name of a case says.
     """
-    for end, chain in pipelines(found, samplers=True):
-        measured(chain, SIZES["cuda" if found.settings.on_gpu else "cpu"], found, end)
+    for end, chain in pipelines(figures, samplers=True):
+        measured(chain, SIZES["cuda" if figures.settings.on_gpu else "cpu"], figures, end)
 
 
-def measured(chain: Pipeline, sizes: Sequence[int], found: Measurements, end: str = "") -> None:
+def measured(chain: Pipeline, sizes: Sequence[int], figures: Measurements, end: str = "") -> None:
     """Add the rows of one scene, whose cases end so; all of a precision turn by turn, in whole runs."""
     manifold, truth, how = prepared(chain)
-    settings, scene = found.settings, chain.scene
+    settings, scene = figures.settings, chain.scene
 
     def make(size: int, precision: str):
         options = how | {"precision": precision, "device": settings.device}
@@ -43,7 +43,7 @@ def measured(chain: Pipeline, sizes: Sequence[int], found: Measurements, end: st
         built: dict[int, tuple] = {}
         for size in sorted(sizes):
             if _too_large(size, {n: solver.nbytes for n, (solver, _) in built.items()}, settings.device):
-                found.say(f"reduced_batch{size}{end} {precision}: left out, the device has not the memory")
+                figures.say(f"reduced_batch{size}{end} {precision}: left out, the device has not the memory")
                 break
             built[size] = build(partial(make, size, precision), settings.device)
         times = run_times({n: solver for n, (solver, _) in built.items()}, settings.trials, settings.device)
@@ -53,11 +53,11 @@ def measured(chain: Pipeline, sizes: Sequence[int], found: Measurements, end: st
                 bench="batch", name=f"reduced_batch{size}{end}", particles=len(manifold.X), batch=size,
                 sample=run.sample_size, integration=round(run.integration_mean), precision=precision,
             )  # fmt: skip
-            ms = found.add(case, "step", times[size] / size)
-            found.add(case, "peak memory", peak, "MiB")
-            delta = found.add(case, "δ", deformation_error(run, truth), "1")
+            ms = figures.add(case, "step", times[size] / size)
+            figures.add(case, "peak memory", peak, "MiB")
+            delta = figures.add(case, "δ", deformation_error(run, truth), "1")
             error = f"δ {100 * delta:.3g} %"
-            found.say(f"{case.name} {scene.name} {precision}: {ms:.4g} ms a simulation-step, {error}")
+            figures.say(f"{case.name} {scene.name} {precision}: {ms:.4g} ms a simulation-step, {error}")
 
 
 def cases_of(chain: Pipeline, size: int) -> list[Parameters]:

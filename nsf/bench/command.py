@@ -13,19 +13,19 @@ from nsf.mpm.precision import precision_of
 from nsf.storage import require_folder
 
 BENCHES = ("full_order", "scaling", "reduced", "batch", "recurrence", "training")
-"""Modules of this package with `run(found)`, which adds its figures to `Measurements`."""
+"""Modules of this package with `run(figures)`, which adds its figures to `Measurements`."""
 
 SCENES = ("cake", "metal")  # of benchmarks of reduced steps
 _MOST = 10**9  # particles: some hundred GB of them
 _UNITS = {"": 1, "k": 1_000, "m": 1_000_000}
 
 
-def bench(folder: str | Path, asked: Mapping[str, str], say: Callable[[str], object]) -> Path:
+def bench(folder: str | Path, options: Mapping[str, str], say: Callable[[str], object]) -> Path:
     """Run benchmarks, and write the report of these and of those that the folder has already.
 
     Args:
         folder: of the table, index.md and charts; rows of other benchmarks or devices are kept.
-        asked: `benches`, `particles`, `precision`, `device`, `trials`, `scenes`, as on the command line.
+        options: `benches`, `particles`, `precision`, `device`, `trials`, `scenes`, as on the command line.
         say: told of every result.
 
     Returns:
@@ -37,35 +37,35 @@ def bench(folder: str | Path, asked: Mapping[str, str], say: Callable[[str], obj
         StorageError: the folder cannot be made or written.
     """
     folder = Path(folder)
-    names = _chosen("benches", asked.get("benches", ",".join(BENCHES)), BENCHES)
-    settings = _settings(asked)
+    names = _chosen("benches", options.get("benches", ",".join(BENCHES)), BENCHES)
+    settings = _settings(options)
     require_folder(folder)
     for name in names:
-        found = Measurements(settings, say)
+        figures = Measurements(settings, say)
         try:
-            import_module(f"nsf.bench.{name}").run(found)
+            import_module(f"nsf.bench.{name}").run(figures)
         except BaseException:
-            if found.rows:  # those that were measured stay
-                _write(folder, found)
+            if figures.rows:  # those that were measured stay
+                _write(folder, figures)
             raise
-        page = _write(folder, found)
+        page = _write(folder, figures)
     return page
 
 
-def _write(folder: Path, found: Measurements) -> Path:
-    merge(folder / FILE, found.frame)
+def _write(folder: Path, figures: Measurements) -> Path:
+    merge(folder / FILE, figures.frame)
     return write_report(folder)
 
 
-def _settings(asked: Mapping[str, str]) -> Settings:
-    trials, sizes, scenes = (asked.get(key, "") for key in ("trials", "particles", "scenes"))
+def _settings(options: Mapping[str, str]) -> Settings:
+    trials, sizes, scenes = (options.get(key, "") for key in ("trials", "particles", "scenes"))
     if trials and not (trials.isdigit() and int(trials)):
         raise ConfigError(f"trials={trials} must be a whole number of at least 1")
-    precisions = asked.get("precision", "fp32,fp64").split(",")
+    precisions = options.get("precision", "fp32,fp64").split(",")
     return Settings(
         particles=tuple(map(_count, sizes.split(","))) if sizes else (),
         precisions=tuple(precision_of(name).name for name in precisions),
-        device=str(warp_device(asked.get("device", "auto"))),
+        device=str(warp_device(options.get("device", "auto"))),
         trials=int(trials or 10),
         scenes=_chosen("scenes", scenes, SCENES) if scenes else (),
     )
@@ -81,8 +81,8 @@ def _chosen(key: str, text: str, known: tuple[str, ...]) -> tuple[str, ...]:
 
 def _count(text: str) -> int:
     """`71363`, `200k` or `1.5m` particles."""
-    found = re.fullmatch(r"(\d+(?:\.\d+)?)([km]?)", text.strip().lower())
-    count = float(found[1]) * _UNITS[found[2]] if found else 0.0
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)([km]?)", text.strip().lower())
+    count = float(match[1]) * _UNITS[match[2]] if match else 0.0
     if not 1.0 <= count <= _MOST:
         raise ConfigError(
             f"particles={text} is no number of particles up to a billion; give for example 71363, 200k or 1m"

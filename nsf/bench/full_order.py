@@ -44,11 +44,11 @@ def collapse(particles: int, precision: str, device: str) -> FullOrderMPM:
     )
 
 
-def run(found: Measurements) -> None:
+def run(figures: Measurements) -> None:
     """Every size; the precisions of a size turn by turn."""
-    settings, device = found.settings, found.settings.device
+    settings, device = figures.settings, figures.settings.device
     speed = bandwidth(device)
-    found.say(f"full_order: a copy on {name_of(device)} moves {speed / 1e9:.0f} GB/s")
+    figures.say(f"full_order: a copy on {name_of(device)} moves {speed / 1e9:.0f} GB/s")
     for particles in settings.particles or SIZES["cuda" if settings.on_gpu else "cpu"]:
         built = {p: build(partial(collapse, particles, p, device), device) for p in settings.precisions}
         solvers = {precision: solver for precision, (solver, _) in built.items()}
@@ -56,12 +56,12 @@ def run(found: Measurements) -> None:
         for precision, (solver, peak) in built.items():
             name = f"full_order_{size_name(particles)}"
             case = Case(bench="full_order", name=name, particles=particles, precision=precision)
-            ms = found.add(case, "step", times[precision])
-            found.add(case, "peak memory", peak, "MiB")
+            ms = figures.add(case, "step", times[precision])
+            figures.add(case, "peak memory", peak, "MiB")
             looks = look_times(solver, settings.trials)
-            share = 100.0 * found.add(case, "watch", looks) / ms
-            found.say(f"{name} {precision}: {ms:.4g} ms a step, {share:.2g} % of it the watch")
-            add_passes(found, case, solver, speed)
+            share = 100.0 * figures.add(case, "watch", looks) / ms
+            figures.say(f"{name} {precision}: {ms:.4g} ms a step, {share:.2g} % of it the watch")
+            add_passes(figures, case, solver, speed)
 
 
 def look_times(solver: FullOrderMPM, trials: int) -> list[float]:
@@ -75,17 +75,17 @@ def look_times(solver: FullOrderMPM, trials: int) -> list[float]:
     return times[1:]
 
 
-def add_passes(found: Measurements, case: Case, solver: FullOrderMPM, speed: float) -> None:
+def add_passes(figures: Measurements, case: Case, solver: FullOrderMPM, speed: float) -> None:
     """Add the passes of a solver's step, beside what a copy of `speed` [B/s] takes; ends the solver's use."""
     for part, (ms, size) in pass_times(solver).items():
-        add_pass(found, case, part, ms, size, 1e3 * size / speed)
+        add_pass(figures, case, part, ms, size, 1e3 * size / speed)
 
 
-def add_pass(found: Measurements, case: Case, part: str, ms: float, size: float, floor: float) -> None:
+def add_pass(figures: Measurements, case: Case, part: str, ms: float, size: float, floor: float) -> None:
     """Add a pass's time [ms], the bytes it reads and writes, and the time that these take a copy [ms]."""
-    found.add(case, "time", ms, part=part)
-    found.add(case, "moved", size / 2**20, "MiB", part)
-    found.add(case, "floor", floor, part=part)
+    figures.add(case, "time", ms, part=part)
+    figures.add(case, "moved", size / 2**20, "MiB", part)
+    figures.add(case, "floor", floor, part=part)
 
 
 def pass_times(solver: FullOrderMPM) -> dict[str, tuple[float, int]]:
@@ -110,10 +110,10 @@ def pass_times(solver: FullOrderMPM) -> dict[str, tuple[float, int]]:
         "grid": step.update,
         "g2p_stress": solver.g2p_stress,
     }
-    found = {}
+    passes = {}
     for name, call in calls.items():
         solver.p2g()  # the pass before has left nothing that has a meaning
         if name == "g2p_stress":
             step.update()
-        found[name] = pass_time(call, device), np.dtype(solver.precision.numpy).itemsize * values[name]
-    return found
+        passes[name] = pass_time(call, device), np.dtype(solver.precision.numpy).itemsize * values[name]
+    return passes

@@ -56,7 +56,7 @@ def window_times(
         device: of all.
         whole: others by name, each of which takes a whole run in every turn; as for `run_times`.
     """
-    wait, found = synchronizer(device), {name: [] for name in (*solvers, *whole)}
+    wait, taken = synchronizer(device), {name: [] for name in (*solvers, *whole)}
     for solver in whole.values():
         _whole_run(solver, wait)
     edges = np.unique(np.linspace(WARM_UP, total, trials + 1).round().astype(int)).tolist()
@@ -68,10 +68,10 @@ def window_times(
             begun = time.perf_counter()
             solver.step(steps)
             wait()
-            found[name].append(1e3 * (time.perf_counter() - begun) / steps)
+            taken[name].append(1e3 * (time.perf_counter() - begun) / steps)
         for name, solver in whole.items():
-            found[name].append(_whole_run(solver, wait))
-    return {name: np.array(times) for name, times in found.items()}
+            taken[name].append(_whole_run(solver, wait))
+    return {name: np.array(times) for name, times in taken.items()}
 
 
 def run_times(solvers: Mapping[str, object], trials: int, device: str) -> dict[str, np.ndarray]:
@@ -80,13 +80,13 @@ def run_times(solvers: Mapping[str, object], trials: int, device: str) -> dict[s
     A solver that has an end is restarted before each; its first run, which compiles, loads and captures, is
     left out.
     """
-    wait, found = synchronizer(device), {name: [] for name in solvers}
+    wait, taken = synchronizer(device), {name: [] for name in solvers}
     for trial in range(trials + 1):
         for name, solver in solvers.items():
             ms = _whole_run(solver, wait)
             if trial:
-                found[name].append(ms)
-    return {name: np.array(times) for name, times in found.items()}
+                taken[name].append(ms)
+    return {name: np.array(times) for name, times in taken.items()}
 
 
 def _whole_run(solver, wait: Callable[[], object]) -> float:

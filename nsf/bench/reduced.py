@@ -36,7 +36,7 @@ Frames = Iterable[tuple[float, Tensor]]
 """Time [s] and positions [P, 3] [m] of full-order frames after the first."""
 
 
-def run(found: Measurements) -> None:
+def run(figures: Measurements) -> None:
     """Each scene: at the paper's size on a GPU, at small scale on a CPU.
 
     Data and training are made, or reused, as by `nsf train`. A step of k Δt stands in the case's name; it
@@ -44,26 +44,26 @@ def run(found: Measurements) -> None:
     chosen, else in the scene's own way. With field=mlp it names what multiplies the hidden layers of h and
     l: tf32 or bf16 on tensor cores, or nothing where they are in the precision of the step.
     """
-    for scene in found.settings.scenes or SCENES:
-        measured(dict(_by_sampler(scene, found)), found)
-        measured_networks(_pipeline(scene, found, "field=mlp"), found)
+    for scene in figures.settings.scenes or SCENES:
+        measured(dict(_by_sampler(scene, figures)), figures)
+        measured_networks(_pipeline(scene, figures, "field=mlp"), figures)
 
 
-def pipelines(found: Measurements, samplers: bool = False) -> Iterator[tuple[str, Pipeline]]:
+def pipelines(figures: Measurements, samplers: bool = False) -> Iterator[tuple[str, Pipeline]]:
     """The configuration of each scene, after the end of its cases; with another sampler too where asked."""
-    for scene in found.settings.scenes or SCENES:
-        yield from itertools.islice(_by_sampler(scene, found), 1 + samplers)
+    for scene in figures.settings.scenes or SCENES:
+        yield from itertools.islice(_by_sampler(scene, figures), 1 + samplers)
 
 
-def _by_sampler(scene: str, found: Measurements) -> Iterator[tuple[str, Pipeline]]:
-    yield "", _pipeline(scene, found)
+def _by_sampler(scene: str, figures: Measurements) -> Iterator[tuple[str, Pipeline]]:
+    yield "", _pipeline(scene, figures)
     other = OTHER_SAMPLER[scene]
-    yield f"_{other}", _pipeline(scene, found, f"sampler={other}")
+    yield f"_{other}", _pipeline(scene, figures, f"sampler={other}")
 
 
-def _pipeline(scene: str, found: Measurements, *overrides: str) -> Pipeline:
-    asked = f"scene={scene}", f"scale={found.settings.scale}", f"device={found.settings.device}"
-    return Pipeline(config.load([*asked, *overrides]), say=found.say)
+def _pipeline(scene: str, figures: Measurements, *overrides: str) -> Pipeline:
+    keys = f"scene={scene}", f"scale={figures.settings.scale}", f"device={figures.settings.device}"
+    return Pipeline(config.load([*keys, *overrides]), say=figures.say)
 
 
 def prepared(chain: Pipeline) -> tuple[object, Path, dict]:
@@ -77,15 +77,15 @@ def prepared(chain: Pipeline) -> tuple[object, Path, dict]:
     return manifold, chain.truth(chain.held_out[0]).path / TRAJECTORY, options
 
 
-def measured(chains: Mapping[str, Pipeline], found: Measurements) -> None:
+def measured(chains: Mapping[str, Pipeline], figures: Measurements) -> None:
     """Add the rows of one scene in its first held-out case; every side of a precision turn by turn.
 
     Args:
         chains: by the end of a case's name, configurations that differ in the sampler alone; longer steps are
             those of the first.
-        found: see `run`.
+        figures: see `run`.
     """
-    chain, device = chains[""], found.settings.device
+    chain, device = chains[""], figures.settings.device
     scene, first, name = chain.scene, chain.held_out[0], chain.scene.name
     ready = {end: prepared(one) for end, one in chains.items()}
     manifold, truth, _ = ready[""]
@@ -95,7 +95,7 @@ def measured(chains: Mapping[str, Pipeline], found: Measurements) -> None:
         how = ready[end][2] | {"precision": precision, "device": device}
         return engines.reduced(scene, manifold, first, dt_multiplier=multiplier, **how)
 
-    for precision in found.settings.precisions:
+    for precision in figures.settings.precisions:
         full = Subject(partial(scene.full_order, first, precision, device), scene.steps)
         subjects = {f"full_order_{name}": full}
         for end in chains:
@@ -104,23 +104,23 @@ def measured(chains: Mapping[str, Pipeline], found: Measurements) -> None:
         for k in MULTIPLIERS:
             steps = reduced_steps(scene.steps, k)
             subjects[f"reduced_{name}_{k:g}dt"] = Subject(partial(reduced, precision, k), steps)
-        for side, cost in measure(subjects, found.settings.trials, device).items():
+        for side, cost in measure(subjects, figures.settings.trials, device).items():
             solver = _at_end(subjects[side]) if side.startswith("reduced_") else None
-            case = _add(found, side, precision, len(manifold.X), cost, solver, truth)
+            case = _add(figures, side, precision, len(manifold.X), cost, solver, truth)
             if side not in whole:
                 continue
             for stage, ms in cost.stages.items():
-                found.add(case, "stage", ms, part=stage)
+                figures.add(case, "stage", ms, part=stage)
             if solver:
-                _add_floors(found, case, solver, cost.stages, speed, launches)
+                _add_floors(figures, case, solver, cost.stages, speed, launches)
 
 
-def measured_networks(chain: Pipeline, found: Measurements) -> None:
+def measured_networks(chain: Pipeline, figures: Measurements) -> None:
     """Add the rows of one scene with field=mlp, likewise, in each arithmetic of the networks.
 
     A step's time is that of the first ones of a run, δ that of a whole one. A CPU has no tensor cores.
     """
-    settings, name = found.settings, chain.scene.name
+    settings, name = figures.settings, chain.scene.name
     manifold, truth, how = prepared(chain)
 
     def reduced(arithmetic: str | None, precision: str):
@@ -134,7 +134,7 @@ def measured_networks(chain: Pipeline, found: Measurements) -> None:
             side = f"reduced_{name}_mlp" + (f"_{arithmetic}" if arithmetic else "")
             subjects[side] = Subject(partial(reduced, arithmetic, precision), min(chain.scene.steps, _FEW))
         for side, cost in measure(subjects, min(settings.trials, _MOST), settings.device).items():
-            _add(found, side, precision, len(manifold.X), cost, _at_end(subjects[side]), truth)
+            _add(figures, side, precision, len(manifold.X), cost, _at_end(subjects[side]), truth)
 
 
 def _at_end(subject: Subject):
@@ -144,24 +144,24 @@ def _at_end(subject: Subject):
 
 
 def _add(
-    found: Measurements, side: str, precision: str, particles: int, cost: SolverCost, solver, truth: Path
+    figures: Measurements, side: str, precision: str, particles: int, cost: SolverCost, solver, truth: Path
 ) -> Case:
     """Add a side's time, memory and, of a reduced run at its end, δ."""
     sizes = {}
     if solver:
         sizes = {"sample": solver.sample_size, "integration": round(solver.integration_mean)}
     case = Case(bench="reduced", name=side, particles=particles, precision=precision, **sizes)
-    found.add(case, "step", cost.step_ms, quantiles=(cost.step_ms_p10, cost.step_ms_p90))
-    found.add(case, "peak memory", cost.memory_mib, "MiB")
+    figures.add(case, "step", cost.step_ms, quantiles=(cost.step_ms_p10, cost.step_ms_p90))
+    figures.add(case, "peak memory", cost.memory_mib, "MiB")
     error = ""
     if solver:
-        error = f", δ {100 * found.add(case, 'δ', deformation_error(solver, truth), '1'):.3g} %"
-    found.say(f"{side} {precision}: {cost.step_ms:.4g} ms a step{error}")
+        error = f", δ {100 * figures.add(case, 'δ', deformation_error(solver, truth), '1'):.3g} %"
+    figures.say(f"{side} {precision}: {cost.step_ms:.4g} ms a step{error}")
     return case
 
 
 def _add_floors(
-    found: Measurements, case: Case, solver, stages: Mapping[str, float], speed: float, launches: float
+    figures: Measurements, case: Case, solver, stages: Mapping[str, float], speed: float, launches: float
 ) -> None:
     """Add what bounds a reduced step: its largest passes over memory, if no cache holds that, and launches.
 
@@ -169,7 +169,7 @@ def _add_floors(
     first.
 
     Args:
-        found, case: of the step.
+        figures, case: of the step.
         solver: a `ReducedMPM` that has taken its steps.
         stages: time of each stage [ms].
         speed: of a copy [B/s].
@@ -182,8 +182,8 @@ def _add_floors(
         "p2g": real * (26 * N + 8 * nodes),  # x, v, C, τ, m, V; the nodes, there and back
     }
     for part, size in moved.items():
-        add_pass(found, case, part, stages[part], size, 1e3 * size / speed)
-    add_pass(found, case, f"{_DEPENDENT} empty launches", launches, 0.0, launches)
+        add_pass(figures, case, part, stages[part], size, 1e3 * size / speed)
+    add_pass(figures, case, f"{_DEPENDENT} empty launches", launches, 0.0, launches)
 
 
 def deformation_error(

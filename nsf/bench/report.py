@@ -105,13 +105,13 @@ def _parts(folder: Path, rows: pd.DataFrame) -> list[dict]:
     """The page's parts on one device: charts, their captions, and tables, each where it has rows."""
     device, parts = re.sub("[^a-z0-9]+", "-", rows["device"].iloc[0].lower()), []
     for section in SECTIONS:
-        own = rows[section.chosen(rows)]
-        if not len(own):
+        chosen = rows[section.chosen(rows)]
+        if not len(chosen):
             continue
         chart = section.chart and f"{section.chart}-{device}"
         if section.draw:
             save(section.draw(rows), folder, chart, kinds=("png",))
-        constant, table = _rows(own)
+        constant, table = _rows(chosen)
         texts = [section.text, constant] if section.listed and constant else [section.text]
         parts.append({"chart": chart, "texts": texts, "table": table if section.listed else None})
     return parts
@@ -206,10 +206,10 @@ def step_over_particles(rows: pd.DataFrame) -> Figure:
 
 def step_over_sample(rows: pd.DataFrame) -> Figure:
     """A line a precision over |S|, δ at each point, and the full-order step of as many particles."""
-    own = rows[_samples(rows)]
-    steps, deltas = own[own["what"] == "step"], own[own["what"] == "δ"]
+    chosen = rows[_samples(rows)]
+    steps, deltas = chosen[chosen["what"] == "step"], chosen[chosen["what"] == "δ"]
     full = rows[(rows["bench"] == "scaling") & rows["case"].str.startswith("full_order")]
-    full = full[(full["what"] == "step") & full["particles"].isin(own["particles"])]
+    full = full[(full["what"] == "step") & full["particles"].isin(chosen["particles"])]
     groups = steps.groupby("precision")
     with styled():
         fig, panel = steps_over(
@@ -247,9 +247,9 @@ def step_over_batch(rows: pd.DataFrame) -> Figure:
 
 def steps_by_scene(rows: pd.DataFrame) -> Figure:
     """Time of a step [ms] of either solver, a point each with its δ, a panel a scene."""
-    own = rows[(rows["bench"] == "reduced") & (rows["part"] == "")]
-    steps = own[own["what"] == "step"]
-    deltas = own[own["what"] == "δ"].set_index(["case", "precision"])["median"]
+    chosen = rows[(rows["bench"] == "reduced") & (rows["part"] == "")]
+    steps = chosen[chosen["what"] == "step"]
+    deltas = chosen[chosen["what"] == "δ"].set_index(["case", "precision"])["median"]
     scene = steps["case"].str.extract(r"^(?:full_order|reduced)_([^_]+(?:_cube)?)")[0]
     panels_of = list(steps.groupby(scene, sort=False))
     with styled():
@@ -278,10 +278,10 @@ def steps_by_scene(rows: pd.DataFrame) -> Figure:
 
 def passes_beside_floor(rows: pd.DataFrame) -> Figure:
     """The passes of a full-order step of the largest case."""
-    own = rows[_passes(rows)]
-    own = own[own["particles"] == own["particles"].max()]
+    chosen = rows[_passes(rows)]
+    chosen = chosen[chosen["particles"] == chosen["particles"].max()]
     times, floors = {}, {}
-    for (case, precision), part in own.groupby(["case", "precision"]):
+    for (case, precision), part in chosen.groupby(["case", "precision"]):
         for chosen, what in ((times, "time"), (floors, "floor")):
             values = part[part["what"] == what].set_index("part")["median"]
             chosen[f"{case}, {precision}"] = values[~values.index.duplicated(keep="last")]
@@ -291,10 +291,10 @@ def passes_beside_floor(rows: pd.DataFrame) -> Figure:
 def step_beside_paper(rows: pd.DataFrame) -> Figure:
     """The stages of a reduced step and those of the paper's frame, a scene each; in fp64 if measured."""
     panels = {}
-    for case, own in rows[_paper(rows)].groupby("case"):
-        precision, (networks, whole) = own["precision"].max(), _PAPER[case]
-        own, scene = own[own["precision"] == precision], case.partition("_")[2]
-        panels[f"{scene}, {precision}"] = own.set_index("part")["median"]
+    for case, stages in rows[_paper(rows)].groupby("case"):
+        precision, (networks, whole) = stages["precision"].max(), _PAPER[case]
+        stages, scene = stages[stages["precision"] == precision], case.partition("_")[2]
+        panels[f"{scene}, {precision}"] = stages.set_index("part")["median"]
         paper = {"networks, projection, copies": networks, "MPM": whole - networks}
         panels[f"{scene}, the paper"] = pd.Series(paper)
     return bars(panels)

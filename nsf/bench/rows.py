@@ -87,9 +87,9 @@ class Measurements:
         if np.ndim(values):
             quantiles = np.percentile(values, [10, 90]).tolist()
         subject = asdict(case) | {"case": case.name, "device": name_of(self.settings.device)}
-        own = [*(subject[name] for name in SUBJECT), part, what, median]
-        own += [*(quantiles or (None, None)), unit, commit()]
-        self.rows.append(dict(zip(COLUMNS, own, strict=True)))
+        row = [*(subject[name] for name in SUBJECT), part, what, median]
+        row += [*(quantiles or (None, None)), unit, commit()]
+        self.rows.append(dict(zip(COLUMNS, row, strict=True)))
         return median
 
     @property
@@ -120,14 +120,14 @@ def merge(path: Path, fresh: pd.DataFrame) -> None:
 
 def name_of(device: str) -> str:
     """The name of a figure's device: the product of a GPU, else `cpu`."""
-    found = wp.get_device(device)
-    return found.name if found.is_cuda else "cpu"
+    unit = wp.get_device(device)
+    return unit.name if unit.is_cuda else "cpu"
 
 
 def commit() -> str:
     """The commit that runs, with a plus sign where files differ from it."""
-    found = provenance()
-    return str(found["commit"] or "unknown")[:12] + ("+" if found["dirty"] else "")
+    origin = provenance()
+    return str(origin["commit"] or "unknown")[:12] + ("+" if origin["dirty"] else "")
 
 
 def size_name(particles: int) -> str:

@@ -30,38 +30,38 @@ _SAMPLE = 20  # |S| while P grows
 _FRAMES = 5  # at which δ is taken, evenly spread over the run
 
 
-def run(found: Measurements) -> None:
+def run(figures: Measurements) -> None:
     """The sand column: from 10 000 to 4 million particles on a GPU, to 20 000 on a CPU.
 
     The fields are trained once, at the paper's size on a GPU and at small scale on a CPU, and evaluated
     between their particles at all other numbers, where the dynamics run on them with another Δx and Δt: how
     far that goes, δ tells. Data and training are made, or reused, as by `nsf train`.
     """
-    settings = found.settings
+    settings = figures.settings
     overrides = ["scene=sand", f"scale={settings.scale}", f"device={settings.device}"]
-    chain = Pipeline(config.load(overrides), say=found.say)
-    measured(chain, settings.particles or SIZES["cuda" if settings.on_gpu else "cpu"], SAMPLES, found)
+    chain = Pipeline(config.load(overrides), say=figures.say)
+    measured(chain, settings.particles or SIZES["cuda" if settings.on_gpu else "cpu"], SAMPLES, figures)
 
 
-def measured(chain: Pipeline, sizes: Sequence[int], samples: Sequence[int], found: Measurements) -> None:
+def measured(chain: Pipeline, sizes: Sequence[int], samples: Sequence[int], figures: Measurements) -> None:
     """Add the rows of one scene with `field=basis`, in its first held-out case.
 
     Args:
         chain: of the scene.
         sizes: numbers of particles P, all at one |S|.
         samples: numbers of samples |S|, all at the scene's own P.
-        found: see `run`.
+        figures: see `run`.
     """
     if not chain.training.complete:
         chain.simulate(("train",))
     chain.train()
-    manifold, speed = chain.manifold(), bandwidth(found.settings.device)
+    manifold, speed = chain.manifold(), bandwidth(figures.settings.device)
     for particles in sizes:
         if particles != len(manifold.X):  # measured below
             scene = at_size(chain.scene, particles)
-            fields = partial(carried_over, manifold, scene, found.settings.device)
-            _compared(chain, scene, fields, (_SAMPLE,), speed, found)
-    _compared(chain, chain.scene, lambda: manifold, samples, speed, found)
+            fields = partial(carried_over, manifold, scene, figures.settings.device)
+            _compared(chain, scene, fields, (_SAMPLE,), speed, figures)
+    _compared(chain, chain.scene, lambda: manifold, samples, speed, figures)
 
 
 def at_size(scene: Scene, particles: int) -> Scene:
@@ -93,14 +93,14 @@ def carried_over(manifold: BasisManifold, scene: Scene, device: str) -> BasisMan
         for name, values in tables.items():
             state[name][rows] = at_rows.value(values).to(values)
     with torch.device("meta"):
-        found = BasisManifold(
+        carried = BasisManifold(
             manifold.latent_dim,
             hash_of_positions(scene.particles().X),
             list(manifold.parameter_names),
             manifold.hyperparameters | {"particles": len(X)},
         )
-    found.load_state_dict(state, assign=True)
-    return found.requires_grad_(False).eval()
+    carried.load_state_dict(state, assign=True)
+    return carried.requires_grad_(False).eval()
 
 
 def _compared(
@@ -109,36 +109,36 @@ def _compared(
     fields: Callable[[], BasisManifold],
     samples: Sequence[int],
     speed: float,
-    found: Measurements,
+    figures: Measurements,
 ) -> None:
     """Add both solvers of a scene in every precision, all in turns; nothing of them stays on the device."""
-    settings, scene = found.settings, scene.at(chain.held_out[0])
+    settings, scene = figures.settings, scene.at(chain.held_out[0])
     device = settings.device
-    built = _built(chain, scene, fields(), samples, found)
+    built = _built(chain, scene, fields(), samples, figures)
     solvers = {of: solver for of, (solver, _) in built.items()}
     times = window_times(solvers, scene.steps, settings.trials, device)
     full = scene.full_order(precision=max(settings.precisions), device=device)
     truth = frames_after(full, scene)
     for case, (solver, peak) in built.items():
-        ms = found.add(case, "step", times[case])
-        found.add(case, "peak memory", peak, "MiB")
+        ms = figures.add(case, "step", times[case])
+        figures.add(case, "peak memory", peak, "MiB")
         if case.sample is None:
-            found.say(f"{case.name} {case.precision}: {ms:.4g} ms a step")
-            add_passes(found, case, solver, speed)
+            figures.say(f"{case.name} {case.precision}: {ms:.4g} ms a step")
+            add_passes(figures, case, solver, speed)
             continue
         solver.restart()
         solver.step(solver.total_steps)
-        delta = found.add(case, "δ", deformation_error(solver, truth), "1")
-        found.say(f"{case.name} {case.precision}: {ms:.4g} ms a step, δ {100 * delta:.3g} %")
+        delta = figures.add(case, "δ", deformation_error(solver, truth), "1")
+        figures.say(f"{case.name} {case.precision}: {ms:.4g} ms a step, δ {100 * delta:.3g} %")
 
 
 def _built(
-    chain: Pipeline, scene: Scene, fields: BasisManifold, samples: Sequence[int], found: Measurements
+    chain: Pipeline, scene: Scene, fields: BasisManifold, samples: Sequence[int], figures: Measurements
 ) -> dict[Case, tuple[FullOrderMPM | ReducedMPM, float]]:
     """Each solver after its warm-up, and the most memory it took [MiB]."""
-    device, size, built = found.settings.device, size_name(len(fields.X)), {}
+    device, size, built = figures.settings.device, size_name(len(fields.X)), {}
     of = partial(Case, bench="scaling", particles=len(fields.X))
-    for p in found.settings.precisions:
+    for p in figures.settings.precisions:
         case = of(name=f"full_order_{size}", precision=p)
         built[case] = build(partial(scene.full_order, precision=p, device=device), device)
     rest = torch.as_tensor(chain.scene.particles().X)[None]
@@ -153,15 +153,15 @@ def _built(
         how = {"sample": first.samples, "sets": first.sets}
         sizes = {"sample": first.sample_size, "integration": round(first.integration_mean)}
         del first  # its arrays are on the device
-        for p in found.settings.precisions:
+        for p in figures.settings.precisions:
             built[of(name=name, precision=p, **sizes)] = build(partial(make, **how, precision=p), device)
     return built
 
 
 def frames_after(solver: FullOrderMPM, scene: Scene) -> list[tuple[float, torch.Tensor]]:
     """Times [s] and positions [P, 3] [m], on the host, of a few frames that are spread over a run."""
-    found = []
+    frames = []
     for step in spaced(scene.steps + 1, _FRAMES + 1)[1:].tolist():
         solver.step(step - solver.steps_taken)
-        found.append((scene.dt * step, torch.as_tensor(solver.state.x.numpy())))
-    return found
+        frames.append((scene.dt * step, torch.as_tensor(solver.state.x.numpy())))
+    return frames

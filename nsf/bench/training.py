@@ -16,16 +16,16 @@ from nsf.pipeline import Pipeline
 _MOST = 3  # trainings of a scene; a seed each
 
 
-def run(found: Measurements) -> None:
+def run(figures: Measurements) -> None:
     """Both scenes: at the paper's size on a GPU, at small scale on a CPU; the precision of networks is fp32.
 
     Data are made, or reused, as by `nsf simulate`. A training goes from its files to the manifold.
     """
-    for _, chain in pipelines(found):
-        measured(chain, found)
+    for _, chain in pipelines(figures):
+        measured(chain, figures)
 
 
-def measured(chain: Pipeline, found: Measurements) -> None:
+def measured(chain: Pipeline, figures: Measurements) -> None:
     """Add the time of whole trainings of one scene [ms]."""
     chain.simulate()
     paths = [chain.simulation(case).path / TRAJECTORY for case in chain.split.train]
@@ -38,13 +38,13 @@ def measured(chain: Pipeline, found: Measurements) -> None:
                 folder=Path(folder), device=chain.device,
             )  # fmt: skip
 
-    for seed in range(min(found.settings.trials, _MOST)):
+    for seed in range(min(figures.settings.trials, _MOST)):
         with TemporaryDirectory() as folder:
             begun = time.perf_counter()
             peaks.append(peak_mib(lambda seed=seed, folder=folder: once(seed, folder), chain.device))
             times.append(1e3 * (time.perf_counter() - begun))
-        found.say(f"{name}: {times[-1] / 1e3:.3g} s")
+        figures.say(f"{name}: {times[-1] / 1e3:.3g} s")
     case = Case(bench="training", name=name, particles=len(chain.scene.particles()), precision="fp32")
-    found.add(case, "training", times)
+    figures.add(case, "training", times)
     if any(peaks):
-        found.add(case, "peak memory", max(peaks), "MiB")
+        figures.add(case, "peak memory", max(peaks), "MiB")
