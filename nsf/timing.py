@@ -39,6 +39,15 @@ def synchronizer(device: Any = "cpu") -> Synchronize:
     )
 
 
+def elapsed_ms(call: Callable[[], object], wait: Synchronize) -> float:
+    """Time of a call [ms], around a device that `wait` synchronises."""
+    wait()
+    begun = time.perf_counter()
+    call()
+    wait()
+    return 1e3 * (time.perf_counter() - begun)
+
+
 def untimed(stage: str) -> AbstractContextManager[None]:
     """A stand-in for a `StageTimer` that times nothing."""
     return nullcontext()

@@ -1,16 +1,16 @@
 """A full-order step: a block of dry sand that collapses, at several sizes."""
 
-import time
 from functools import partial
 
 import numpy as np
 
-from nsf.bench.measure import WARM_UP, WINDOW, bandwidth, build, pass_time, synchronizer, window_times
+from nsf.bench.measure import WARM_UP, WINDOW, bandwidth, build, pass_time, window_times
 from nsf.bench.rows import Case, Measurements, name_of, size_name
 from nsf.mpm import DomainWalls, FullOrderMPM, GridGeometry, HalfSpace, ParticleConstants
 from nsf.mpm.grid.nodes import BLOCK
 from nsf.mpm.materials import DruckerPrager
 from nsf.scenes import Box
+from nsf.timing import elapsed_ms, synchronizer
 
 SIZES = {"cuda": (71_000, 200_000, 1_000_000), "cpu": (10_000, 40_000)}
 _CELLS = 160  # along the edge of the domain, the paper's grid
@@ -66,13 +66,9 @@ def run(figures: Measurements) -> None:
 
 def look_times(solver: FullOrderMPM, trials: int) -> list[float]:
     """[trials] time of a look at J, |v| Δt/Δx, contact and energy, over the steps between two looks [ms]."""
-    wait, times = synchronizer(solver.device), []
-    for _ in range(trials + 1):  # the first one compiles nothing, but finds cold caches
-        wait()
-        begun = time.perf_counter()
-        solver.check()
-        times.append(1e3 * (time.perf_counter() - begun) / solver.check_every)
-    return times[1:]
+    wait = synchronizer(solver.device)
+    times = [elapsed_ms(solver.check, wait) / solver.check_every for _ in range(trials + 1)]
+    return times[1:]  # the first one compiles nothing, but finds cold caches
 
 
 def add_passes(figures: Measurements, case: Case, solver: FullOrderMPM, speed: float) -> None:

@@ -2,14 +2,14 @@
 
 import gc
 import itertools
-import time
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import numpy as np
 import warp as wp
 
 from nsf.gpu import without_collection
-from nsf.timing import MemoryProbe, synchronizer
+from nsf.timing import MemoryProbe, elapsed_ms, synchronizer
 
 WINDOW = 100  # steps of a trial at most, so that the clock and the last synchronisation are lost in it
 WARM_UP = 3  # steps that compile, load and capture
@@ -64,11 +64,7 @@ def window_times(
         steps = min(end - start, WINDOW)
         for name, solver in solvers.items():
             solver.step(start - solver.steps_taken)
-            wait()
-            begun = time.perf_counter()
-            solver.step(steps)
-            wait()
-            taken[name].append(1e3 * (time.perf_counter() - begun) / steps)
+            taken[name].append(elapsed_ms(partial(solver.step, steps), wait) / steps)
         for name, solver in whole.items():
             taken[name].append(_whole_run(solver, wait))
     return {name: np.array(times) for name, times in taken.items()}
@@ -92,11 +88,7 @@ def run_times(solvers: Mapping[str, object], trials: int, device: str) -> dict[s
 def _whole_run(solver, wait: Callable[[], object]) -> float:
     """Mean time of a step [ms] of a run from t = 0 to its end."""
     solver.restart()
-    wait()
-    begun = time.perf_counter()
-    solver.step(solver.total_steps)
-    wait()
-    return 1e3 * (time.perf_counter() - begun) / solver.total_steps
+    return elapsed_ms(lambda: solver.step(solver.total_steps), wait) / solver.total_steps
 
 
 def pass_time(call: Callable[[], None], device: str, trials: int = 5) -> float:
@@ -116,14 +108,7 @@ def pass_time(call: Callable[[], None], device: str, trials: int = 5) -> float:
             wp.capture_launch(capture.graph)
 
         many()
-    times = []
-    for _ in range(trials):
-        wait()
-        begun = time.perf_counter()
-        many()
-        wait()
-        times.append(1e3 * (time.perf_counter() - begun) / _REPEATS)
-    return float(np.median(times))
+    return float(np.median([elapsed_ms(many, wait) for _ in range(trials)])) / _REPEATS
 
 
 def launch_time(device: str, count: int) -> float:

@@ -1,6 +1,5 @@
 """A step by the recurrence beside the full-order one: single runs, many at once, frames of many points."""
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -28,7 +27,7 @@ from nsf.pipeline import Pipeline
 from nsf.pipeline.stages.deployment import calibrated, fallback_of
 from nsf.pipeline.stages.teaching import OPERATORS
 from nsf.scenes import Scene
-from nsf.timing import synchronizer
+from nsf.timing import elapsed_ms, synchronizer
 
 #: Runs at once, and the scene that they are of.
 MANY, OF_MANY = 1024, "metal"
@@ -38,45 +37,45 @@ PARTICLES = {"cuda": 4_000_000, "cpu": 20_000}
 Decode = Callable[[torch.Tensor], torch.Tensor]
 
 
-def run(found: Measurements) -> None:
+def run(figures: Measurements) -> None:
     """Each scene, 1 024 runs of `metal` at once, and the sand column with 4 million particles.
 
     At the paper's size on a GPU; on a CPU at small scale, and with 20 000 particles. Data, training and
     teaching are made, or reused, as by `nsf teach model=recurrence`. Where `scenes` or `particles` are given,
     these are all.
     """
-    settings = found.settings
+    settings = figures.settings
     for scene in settings.scenes or (() if settings.particles else SCENES):
-        measured(_chain(scene, found), found, MANY if scene == OF_MANY else 0)
+        measured(_chain(scene, figures), figures, MANY if scene == OF_MANY else 0)
     if settings.particles or not settings.scenes:
         for particles in settings.particles or (PARTICLES["cuda" if settings.on_gpu else "cpu"],):
-            measured_decoded(_chain("sand", found), particles, found)
+            measured_decoded(_chain("sand", figures), particles, figures)
 
 
-def _chain(scene: str, found: Measurements) -> Pipeline:
-    asked = [f"scene={scene}", f"scale={found.settings.scale}", f"device={found.settings.device}"]
-    return Pipeline(config.load([*asked, "model=recurrence"]), say=found.say)
+def _chain(scene: str, figures: Measurements) -> Pipeline:
+    keys = [f"scene={scene}", f"scale={figures.settings.scale}", f"device={figures.settings.device}"]
+    return Pipeline(config.load([*keys, "model=recurrence"]), say=figures.say)
 
 
-def measured(chain: Pipeline, found: Measurements, many: int = 0) -> None:
+def measured(chain: Pipeline, figures: Measurements, many: int = 0) -> None:
     """Add the rows of one scene in its first held-out case.
 
     Args:
         chain: of the scene, with `model=recurrence`.
-        found: as for `run`.
+        figures: as for `run`.
         many: runs at once, in rows of their own; 0 for none.
     """
     _taught(chain)
     manifold, truth = chain.manifold(), chain.truth(chain.held_out[0]).path / TRAJECTORY
-    for precision in found.settings.precisions:
+    for precision in figures.settings.precisions:
         full_ms, case, run = _compared(
-            chain, manifold, chain.scene, chain.scene.name, precision, truth, found
+            chain, manifold, chain.scene, chain.scene.name, precision, truth, figures
         )
         if many:
-            _together(run, chain, many, full_ms, case, truth, found)
+            _together(run, chain, many, full_ms, case, truth, figures)
 
 
-def measured_decoded(chain: Pipeline, particles: int, found: Measurements) -> None:
+def measured_decoded(chain: Pipeline, particles: int, figures: Measurements) -> None:
     """Add the rows of one scene with another number of particles, in its first held-out case.
 
     A step by the recurrence does not depend on the particles. So the run is of the chain's scene, and its
@@ -86,10 +85,10 @@ def measured_decoded(chain: Pipeline, particles: int, found: Measurements) -> No
     Args:
         chain: of the scene, with `model=recurrence` and `field=basis`.
         particles: P.
-        found: as for `run`.
+        figures: as for `run`.
     """
     _taught(chain)
-    settings = found.settings
+    settings = figures.settings
     scene, manifold, case = at_size(chain.scene, particles), chain.manifold(), chain.held_out[0]
     fields = carried_over(chain.manifold(), scene, settings.device)
     truth = frames_after(scene.full_order(case, max(settings.precisions), settings.device), scene)
@@ -99,7 +98,7 @@ def measured_decoded(chain: Pipeline, particles: int, found: Measurements) -> No
         return fields.restrict(np.arange(particles), **like).position
 
     for precision in settings.precisions:
-        _compared(chain, manifold, scene, size_name(particles), precision, truth, found, decode)
+        _compared(chain, manifold, scene, size_name(particles), precision, truth, figures, decode)
 
 
 def _taught(chain: Pipeline) -> None:
@@ -117,7 +116,7 @@ def _compared(
     name: str,
     precision: str,
     truth: Path | Frames,
-    found: Measurements,
+    figures: Measurements,
     decode: Callable[[ReducedMPM], Decode] = lambda run: run.decoder().position,
 ) -> tuple[float, Case, ReducedMPM]:
     """Add the rows of either solver in one precision, turn by turn.
@@ -126,15 +125,15 @@ def _compared(
         chain, manifold: whose recurrence is run.
         scene: of the full-order step.
         name: the end of both cases.
-        precision, truth, found: of the rows.
+        precision, truth, figures: of the rows.
         decode: run → positions of all particles.
 
     Returns:
         Time of a full-order step [ms], the case of the run by the recurrence, and that run at its end.
     """
     settings, device, held_out, teaching = (
-        found.settings,
-        found.settings.device,
+        figures.settings,
+        figures.settings.device,
         chain.held_out[0],
         chain.taught,
     )
@@ -144,34 +143,42 @@ def _compared(
     position = decode(run)
     of = partial(Case, bench="recurrence", particles=scene.particle_count, precision=precision)
     case = of(name=f"full_order_{name}")
-    full_ms = found.add(case, "step", times["full"])
-    found.add(case, "peak memory", full_peak, "MiB")
+    full_ms = figures.add(case, "step", times["full"])
+    figures.add(case, "peak memory", full_peak, "MiB")
     case = of(name=f"recurrence_{name}", sample=run.sample_size)
     delta = deformation_error(run, truth, position)
-    _add_run(found, case, times["own"], full_ms, delta, run.nbytes, peak, teaching)
-    found.add(case, "decoding of a frame", _decode_ms(position, run.xhat, settings))
-    checked = found.add(case, "checked step", _checked_ms(chain, manifold, run, precision, settings))
-    found.say(f"{case.name} {precision}: {checked:.4g} ms a step with checks")
+    _add_run(figures, case, times["own"], full_ms, delta, run.nbytes, peak, teaching)
+    figures.add(case, "decoding of a frame", _decode_ms(position, run.xhat, settings))
+    checked = figures.add(case, "checked step", _checked_ms(chain, manifold, run, precision, settings))
+    figures.say(f"{case.name} {precision}: {checked:.4g} ms a step with checks")
     return full_ms, case, run
 
 
-def _add_run(found: Measurements, case: Case, ms, full_ms: float, delta: float, nbytes: int, peak, teaching):
+def _add_run(
+    figures: Measurements, case: Case, ms, full_ms: float, delta: float, nbytes: int, peak, teaching
+):
     """Add the figures of runs by the recurrence, alone or many at once."""
-    own = found.add(case, "step", ms)
-    found.add(case, "peak memory", peak, "MiB")
-    found.add(case, "δ", delta, "1")
-    ratio = found.add(case, "speed-up", full_ms / own, "1")
-    memory = found.add(case, "memory of a run", nbytes / 2**20, "MiB")
-    found.add(case, "teaching", teaching.metric("teach_seconds"), "s")
-    found.add(case, "steps of the teacher", teaching.metric("teacher_steps"), "1")
-    found.say(
+    own = figures.add(case, "step", ms)
+    figures.add(case, "peak memory", peak, "MiB")
+    figures.add(case, "δ", delta, "1")
+    ratio = figures.add(case, "speed-up", full_ms / own, "1")
+    memory = figures.add(case, "memory of a run", nbytes / 2**20, "MiB")
+    figures.add(case, "teaching", teaching.metric("teach_seconds"), "s")
+    figures.add(case, "steps of the teacher", teaching.metric("teacher_steps"), "1")
+    figures.say(
         f"{case.name} {case.precision}: {own:.4g} ms a {'simulation-' * (case.batch > 1)}step, {ratio:.4g} "
         f"times the full-order step's speed, δ {100 * delta:.3g} %, {memory:.3g} MiB"
     )
 
 
 def _together(
-    run: ReducedMPM, chain: Pipeline, count: int, full_ms: float, case: Case, truth: Path, found: Measurements
+    run: ReducedMPM,
+    chain: Pipeline,
+    count: int,
+    full_ms: float,
+    case: Case,
+    truth: Path,
+    figures: Measurements,
 ) -> None:
     """Add the rows of many runs at once, the first of which is one that has been timed alone.
 
@@ -181,18 +188,18 @@ def _together(
         count: how many.
         full_ms: time of a full-order step [ms].
         truth: trajectory file of the first run.
-        found: gets the rows.
+        figures: gets the rows.
     """
     low, high = chain.split.box.T
     drawn = np.random.default_rng(0).uniform(low, high, (count - 1, len(low)))
     model = Operators.load(chain.taught.file(OPERATORS)).model
     cases = [chain.held_out[0], *map(chain.scene.case, drawn)]
-    many, peak = build(partial(Many, model, run, cases), found.settings.device)
-    (ms,) = run_times({count: many}, found.settings.trials, found.settings.device).values()
+    many, peak = build(partial(Many, model, run, cases), figures.settings.device)
+    (ms,) = run_times({count: many}, figures.settings.trials, figures.settings.device).values()
     latents = run.trajectory().t, many.record.xhat[0], run.decoder().position
     delta = error_of_latents(*latents, truth, run.xhat)
     case = replace(case, name=f"recurrence_batch{count}", batch=count)
-    _add_run(found, case, ms / count, full_ms, delta, many.nbytes, peak, chain.taught)
+    _add_run(figures, case, ms / count, full_ms, delta, many.nbytes, peak, chain.taught)
 
 
 class Many:
@@ -272,11 +279,6 @@ def _checked_ms(chain: Pipeline, manifold, run: ReducedMPM, precision: str, sett
 
 def _decode_ms(position: Decode, xhat: torch.Tensor, settings: Settings) -> float:
     """Median time [ms] of the positions of one frame."""
-    wait, times = synchronizer(settings.device), []
-    for _ in range(settings.trials + 1):  # the first one loads
-        wait()
-        begun = time.perf_counter()
-        position(xhat)
-        wait()
-        times.append(1e3 * (time.perf_counter() - begun))
-    return float(np.median(times[1:]))
+    wait = synchronizer(settings.device)
+    times = [elapsed_ms(lambda: position(xhat), wait) for _ in range(settings.trials + 1)]
+    return float(np.median(times[1:]))  # the first one loads

@@ -1,7 +1,6 @@
 """Time and memory of the full-order and the reduced solver, both measured in one process."""
 
 import gc
-import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
@@ -11,7 +10,7 @@ import torch
 from nsf.deployment import Rollout
 from nsf.dynamics import ReducedMPM
 from nsf.evaluation.compare import at_frames
-from nsf.timing import MemoryProbe, StageTimer, synchronizer
+from nsf.timing import MemoryProbe, StageTimer, elapsed_ms, synchronizer
 
 _CHUNK = 2**24  # numbers decoded at once
 _WARM_UP = 2  # steps of a fresh solver that compile, load and capture everything
@@ -111,15 +110,12 @@ def decoding_ms(solver: ReducedMPM, rollout: Rollout, trials: int) -> float:
     xhat = torch.as_tensor(frames, dtype=setup.dtype, device=setup.torch_device)
     decoder, wait = solver.decoder(), synchronizer(str(setup.torch_device))
     blocks = xhat.split(max(1, _CHUNK // (3 * decoder.at.points)))
-    times = []
-    for _ in range(trials + 1):
-        wait()
-        begun = time.perf_counter()
+
+    def decode() -> None:
         for block in blocks:
             decoder.position(block)
-        wait()
-        times.append(1e3 * (time.perf_counter() - begun))
-    return float(np.median(times[1:]))
+
+    return float(np.median([elapsed_ms(decode, wait) for _ in range(trials + 1)][1:]))
 
 
 def _first_trial(subject: Subject, device: str) -> tuple[tuple[float, float], float, dict[str, float]]:
@@ -136,17 +132,9 @@ def _first_trial(subject: Subject, device: str) -> tuple[tuple[float, float], fl
 
 def _times(solver, steps: int, device: str) -> tuple[float, float]:
     """Mean time of a step over a whole run, those that warm up left out, and time of all steps [ms]."""
-    wait = synchronizer(device)
-    warm = min(_WARM_UP, steps - 1)
-    wait()
-    begun = time.perf_counter()
-    solver.step(warm)
-    wait()
-    started = time.perf_counter()
-    solver.step(steps - warm)
-    wait()
-    ended = time.perf_counter()
-    return 1e3 * (ended - started) / (steps - warm), 1e3 * (ended - begun)
+    wait, warm = synchronizer(device), min(_WARM_UP, steps - 1)
+    first, rest = (elapsed_ms(lambda n=n: solver.step(n), wait) for n in (warm, steps - warm))
+    return rest / (steps - warm), first + rest
 
 
 def _stages(subject: Subject, samples: int, device: str) -> dict[str, float]:
