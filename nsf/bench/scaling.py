@@ -13,6 +13,7 @@ from nsf.bench.reduced import deformation_error
 from nsf.bench.rows import Case, Measurements, size_name
 from nsf.data import hash_of_positions
 from nsf.dynamics import ReducedMPM
+from nsf.engines import reduced
 from nsf.evaluation.superresolution import POINTS
 from nsf.kinematics.fields.basis import BasisManifold
 from nsf.kinematics.interpolation import interpolation, lying_together
@@ -144,7 +145,7 @@ def _built(
     rest = torch.as_tensor(chain.scene.particles().X)[None]
     xhat = chain.manifold().encode(rest)[0].numpy()
     make = partial(
-        scene.reduced, fields, chain.held_out[0], sources=chain.sources, device=device,
+        reduced, scene, fields, chain.held_out[0], sources=chain.sources, device=device,
         projector=chain.projector, integration=chain.integration, xhat=xhat,
     )  # fmt: skip
     for number in samples:
