@@ -15,8 +15,12 @@ from nsf.storage import in_use, locked
 MARK = "sources.json"
 """The file by which a folder is known as a report: it names every other file of the folder."""
 
+PROVENANCE = "provenance.json"
+"""The file of a folder of reports that names what is committed of each."""
+
 _LEFT = re.compile(r"\.(?P<name>.+)\.(?P<kind>new|old)-\w{8}")  # beside a folder while it is replaced
-_MOST_BYTES = 2**26  # of `MARK`
+_PAGES = ("index.html", "index.md", "results.csv", "results.tex", "superresolution.csv")
+_MOST_BYTES = 2**26  # of a record
 
 
 def check_place(folder: Path) -> None:
@@ -53,25 +57,49 @@ def check_inside(folder: Path, reports: Path) -> None:
 
 def _of_others(folder: Path) -> str:
     """Why a folder may not be replaced: what is in it that no report wrote; empty where it may."""
-    if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
-        return ""
     try:
-        if (folder / MARK).stat().st_size > _MOST_BYTES:
-            return f"its {MARK} is too large"
-        content = json.loads((folder / MARK).read_bytes())
-        files = content["files"]
-        if [type(content[key]) for key in ("title", "runs", "files")] != [str, dict, dict]:
-            return f"its {MARK} is of another program"
+        if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
+            return ""
+        named = {MARK} | (_recorded(folder) if (folder / MARK).exists() else _committed(folder))
+        others = [path for path in sorted(folder.iterdir()) if path.name not in named or not path.is_file()]
     except NotADirectoryError:
         return "it is a file"
-    except FileNotFoundError:
-        return f"it has no {MARK}"
-    except (OSError, ValueError, TypeError, LookupError, RecursionError):
+    except PermissionError:
+        return "it cannot be read"
+    except (OSError, ValueError, TypeError, LookupError, AttributeError, RecursionError):
         return f"its {MARK} is of another program"
-    others = [
-        path for path in sorted(folder.iterdir()) if path.name not in {MARK, *files} or not path.is_file()
-    ]
+    if others and not (folder / MARK).exists():
+        return f"it has no {MARK}"
     return f"no report wrote its {others[0].name}" if others else ""
+
+
+def _recorded(folder: Path) -> set[str]:
+    """Names of the files that a report's own record has."""
+    content = _read(folder / MARK)
+    if [type(content[key]) for key in ("title", "runs", "files")] != [str, dict, dict]:
+        raise TypeError(MARK)
+    return set(content["files"])
+
+
+def _committed(folder: Path) -> set[str]:
+    """Names of the files of a report whose pictures a folder of reports above names; none of others.
+
+    They are its pictures, the same as SVG, and the pages and tables that `nsf reports` makes of it.
+    """
+    for reports in folder.parents[:2]:
+        if (reports / PROVENANCE).is_file():
+            record = _read(reports / PROVENANCE)
+            paths = [reports / path for key in ("pictures", "charts") for path in record.get(key, {})]
+            pictures = [path for path in paths if path.parent == folder]
+            files = {path.with_suffix(kind).name for path in pictures for kind in (".png", ".svg")}
+            return files | {*_PAGES} if files else set()
+    return set()
+
+
+def _read(path: Path) -> dict:
+    if path.stat().st_size > _MOST_BYTES:
+        raise ValueError(f"{path} is too large")
+    return json.loads(path.read_bytes())
 
 
 def _no_place(folder: Path, error: OSError) -> StorageError:

@@ -135,9 +135,10 @@ def test_an_observation_that_no_run_passes_is_said(tmp_path, deployed, seen):
     assert any(re.search(r"no run passes the observations.*row 7: x at t = 0\.06 s", line) for line in said)
 
 
-def test_trials(tmp_path, deployed):
-    folder = tmp_path / "calibration"
-    calibrate([f"run={deployed.deployment.path}", "trials=2", f"folder={folder}", "device=cpu"])
+def test_trials(tmp_path, deployed, monkeypatch):
+    monkeypatch.setenv("NSF_REPORTS", str(tmp_path))
+    folder = calibrate([f"run={deployed.deployment.path}", "trials=2", "device=cpu"]).parent
+    assert folder == tmp_path / f"calibration_{deployed.scene.name}_2_seed0"
     table = pd.read_csv(folder / "results.csv")
     assert list(table) == [
         "scene", "parameter", "trial", "truth", "estimate", "standard_error", "inside_90", "seconds",

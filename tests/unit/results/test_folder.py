@@ -56,6 +56,22 @@ def test_sources_of_another_program_are_none(report, text):
     assert (report / "index.md").exists()
 
 
+def test_a_report_of_a_fresh_clone_is_replaced(report):
+    """Of a committed report there are some files, which provenance.json names, and no record of its own."""
+    (report / MARK).unlink()
+    (report / "delta.png").touch()
+    record = {"charts": {"heap/delta.png": "00"}, "pictures": {"other/thesis.tex": {}}}
+    (report.parent / "provenance.json").write_text(json.dumps(record))
+    check_place(report)
+    (report / "thesis.tex").touch()
+    with pytest.raises(ConfigError, match=f"it has no {MARK}"):
+        rewrite(report)
+    (report.parent / "provenance.json").write_text("[]")
+    with pytest.raises(ConfigError, match="is of another program"):
+        rewrite(report)
+    assert (report / "thesis.tex").exists()
+
+
 def test_names_like_those_of_killed_processes_are_left_alone(report):
     """A folder beside a report, as an editor or a person names it, is not removed or renamed."""
     others = [
