@@ -7,7 +7,7 @@ filters. The writers of this package do none of that, so all of it is refused be
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import h5py
 import numpy as np
@@ -18,6 +18,8 @@ from nsf.manifest import verified
 _LONGEST = 64  # [byte] of a text in an array of texts
 #: On disk each text of an array is its length, and where it lies: 4 and 12 bytes (HDF5's "Global Heap ID").
 _TEXT_BYTES = 16
+_REFERENCE = np.dtype([("length", "<u4"), ("heap", "<u8"), ("index", "<u4")])
+_OBJECTS = 16, 2**17  # of all heaps at most, for each text, and besides: one holds 65,535 at most
 #: Errors of HDF5 on a file whose bytes are damaged.
 _FAULTS = (OSError, RuntimeError, TypeError, ValueError, AttributeError, LookupError, ArithmeticError)
 
@@ -153,13 +155,42 @@ def texts(file: h5py.Group, name: str, shape: Sequence[int | None]) -> list[str]
     dataset = array(file, name, ["text"], shape)
     if not dataset.size:
         return []
-    # HDF5 would give each as long as it claims to be, and a few bytes of a file can claim one text often.
+    # HDF5 would give each as long as it claims to be, and walks a damaged heap of texts for ever.
     with open(file.file.filename, "rb") as raw:
         raw.seek(dataset.id.get_offset())
-        lengths = np.frombuffer(raw.read(_TEXT_BYTES * dataset.size), "<u4")[:: _TEXT_BYTES // 4]
-    if lengths.max() > _LONGEST:
-        raise SchemaError(f"has {name} with a text of {lengths.max()} bytes")
-    return [text.decode() for text in dataset[()]]
+        references = np.frombuffer(raw.read(_TEXT_BYTES * dataset.size), _REFERENCE)
+        if (longest := references["length"].max()) > _LONGEST:
+            raise SchemaError(f"has {name} with a text of {longest} bytes")
+        base = file.file.userblock_size
+        heaps: dict[int, dict[int, int]] = {}
+        read, objects = [], 0
+        for length, heap, index in references.ravel().tolist():
+            if length and heap not in heaps:
+                heaps[heap] = _objects(raw, base + heap)
+                objects += len(heaps[heap])
+                if objects > _OBJECTS[0] * dataset.size + _OBJECTS[1]:
+                    raise SchemaError(f"has {name} with texts in too many heaps")
+            if length:
+                raw.seek(heaps[heap][index])
+            read.append(raw.read(length).decode())
+    return read
+
+
+def _objects(raw: BinaryIO, heap: int) -> dict[int, int]:
+    """Where the objects of a heap lie in a file, by their index (HDF5's "Global Heap Collection")."""
+    raw.seek(heap)
+    head = raw.read(16)
+    size = int.from_bytes(head[8:], "little") if head[:4] == b"GCOL" else 0
+    places, at = {}, 16
+    while at + 16 <= size:
+        raw.seek(heap + at)
+        head = raw.read(16)
+        index = int.from_bytes(head[:2], "little")
+        if not index or index in places:  # the rest is free; no index stands twice
+            break
+        places[index] = heap + at + 16
+        at += 16 + -(-int.from_bytes(head[8:], "little") // 8) * 8
+    return places
 
 
 def attribute(file: h5py.File, name: str, kind: type) -> Any:

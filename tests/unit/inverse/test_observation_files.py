@@ -219,6 +219,20 @@ def test_flipped_bits_end_in_a_line_or_in_numbers(tmp_path):
     refused(path)
 
 
+def test_a_damaged_heap_of_texts_ends(tmp_path):
+    """HDF5 itself walks an object of no size for ever."""
+    names = np.array(["height", "run_out"], object)
+    path = hdf5(tmp_path / "seen.h5", particle=None, x=None, value=np.array([0.1, 0.2]), quantity=names)
+    assert Observations.read(path, MODEL).what == ("height", "run_out")
+    whole = bytearray(path.read_bytes())
+    heap = whole.index(b"GCOL")
+    for at in (8, 24, 16):  # sizes of the heap and of its first object, and the index of that
+        damaged = bytearray(whole)
+        damaged[heap + at : heap + at + 8] = bytes(8)
+        path.write_bytes(damaged)
+        refused(path, "write it again")
+
+
 def test_places_without_a_file(tmp_path):
     refused(tmp_path, "no file")
     (tmp_path / "loop.csv").symlink_to(tmp_path / "loop.csv")
