@@ -23,4 +23,4 @@ def test_arithmetic_names_the_deployment_alone(on):
     assert one.deployment != two.deployment
     assert one.deployment == on().deployment
     with pytest.raises(ConfigError, match=r"field\.arithmetic=fp8 is unknown; choose tf32, bf16 or null"):
-        on("field.arithmetic=fp8")
+        on("field.arithmetic=fp8").check()
