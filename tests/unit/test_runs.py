@@ -10,7 +10,6 @@ import subprocess
 import numpy as np
 import pytest
 import yaml
-from omegaconf import OmegaConf
 
 import nsf.runs.provenance
 import nsf.runs.record
@@ -36,7 +35,7 @@ def recorded(run, text="payload", **metrics):
 
 
 def test_the_hash_is_that_of_the_documented_content(run):
-    content = '{"config":{"mu":5},"format":2,"parents":[],"scene":"sand","stage":"simulate"}'
+    content = '{"config":{"mu":5},"format":3,"parents":[],"scene":"sand","stage":"simulate"}'
     expected = hashlib.sha256(content.encode()).hexdigest()[:12]
     assert Run.open("simulate", "sand", {"mu": 5}, root=run.root).hash == expected
 
@@ -44,8 +43,6 @@ def test_the_hash_is_that_of_the_documented_content(run):
 def test_the_hash_is_of_content_and_not_of_spelling(tmp_path):
     first = Run.open("simulate", "sand", {"a": 1, "b": (2.0, np.float64(3))}, root=tmp_path)
     assert first.hash == Run.open("simulate", "sand", {"b": [2, 3], "a": np.int64(1)}, root="elsewhere").hash
-    config = OmegaConf.create({"a": 1, "b": [2, "${c}"], "c": 3})
-    assert Run.open("s", "s", config).hash == Run.open("s", "s", {"a": 1, "b": [2, 3], "c": 3}).hash
     assert content_hash(True) != content_hash(1)
     assert content_hash("1") != content_hash(1)
 
@@ -61,7 +58,7 @@ def test_everything_that_determines_the_content_changes_the_hash(tmp_path, monke
         Run.open("train", "sand", {"r": 5}, parents=[other]),
         Run.open("train", "sand", {"r": 5}, parents=[parent, other]),
     ]
-    monkeypatch.setattr(nsf.runs.run, "FORMAT", 3)
+    monkeypatch.setattr(nsf.runs.run, "FORMAT", 4)
     runs.append(Run.open("train", "sand", {"r": 5}))
     assert len({run.hash for run in runs}) == len(runs)
 
@@ -295,8 +292,6 @@ def test_outputs_must_lie_in_the_run(run, tmp_path):
         ({"a": {"b": [1, float("nan")]}}, r"config\.a\.b\[1\]=nan"),
         ({"a": object()}, r"config\.a="),
         ({"a": {1, 2}}, r"config\.a="),
-        (OmegaConf.create({"a": "???"}), "missing"),
-        (OmegaConf.create({"a": "${b}"}), "not resolved"),
     ],
 )
 def test_a_config_that_names_no_run(config, message):
