@@ -179,7 +179,7 @@ def _bench(words: list[str]) -> int:
 
 
 def _doctor(words: list[str]) -> int:
-    """What this installation consists of."""
+    """Versions, devices and extras of this installation."""
     if words:
         raise ConfigError(f"nsf doctor takes nothing, not {words[0]!r}")
     from nsf.doctor import report
@@ -226,7 +226,7 @@ def _init(words: list[str]) -> int:
 
 
 def _plan(words: list[str]) -> int:
-    """What a run would do."""
+    """The stages of a run and their states, before any work."""
     from nsf import config
     from nsf.pipeline import preview
 

@@ -1,4 +1,4 @@
-"""What a run's folder says of itself, checked: its manifest, its configuration, and the sums of its files.
+"""The records of a run's folder, checked: its manifest, its configuration, and the sums of its files.
 
 A folder may have been cut short, edited or made by someone else. Nothing here follows a link out of it, waits
 for a pipe, reads more than a bound, or takes a value of another kind for what it should be.
@@ -142,7 +142,7 @@ def verified(path: str | Path) -> Path:
 
 
 def _read(read: Callable[[Path], dict[str, Any]], path: Path) -> dict[str, Any] | None:
-    """What `read` makes of a file, for the caller to keep; None where there is none."""
+    """The result of `read` on a file; None where there is none."""
     try:
         return copy.deepcopy(_once(read, path, _regular(path)))
     except (FileNotFoundError, NotADirectoryError):
@@ -152,7 +152,7 @@ def _read(read: Callable[[Path], dict[str, Any]], path: Path) -> dict[str, Any] 
 
 
 def _once(read: Callable[[Path], Any], path: Path, found: os.stat_result) -> Any:
-    """What `read` makes of a file, once a process for as long as the file stays the same."""
+    """The result of `read` on a file, read once a process for as long as the file stays the same."""
     stamp = (found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
     key = (read, *stamp)
     if key in _KNOWN:

@@ -43,7 +43,7 @@ def _free_pages() -> int:
 
 
 def _left_in_groups() -> list[int]:
-    """What each control group of this process still allows; inside a container the root is its own."""
+    """Memory that each control group of this process still allows; inside a container the root is one."""
     try:
         lines = Path("/proc/self/cgroup").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -58,7 +58,7 @@ def _left_in_groups() -> list[int]:
 
 
 def _left(group: Path) -> int | None:
-    """What one group still allows; None where it has no limit."""
+    """The memory that one group still allows; None where it has no limit."""
     for name, used in _LIMITS.items():
         try:
             limit = int((group / name).read_text())

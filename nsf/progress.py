@@ -83,7 +83,7 @@ _LABEL: list[str] = []  # of this process's job
 
 
 def label() -> str:
-    """What each line of this process begins with; empty unless it is one of several side by side."""
+    """The beginning of each line of this process; empty unless it is one of several side by side."""
     return f"[{_LABEL[-1]}] " if _LABEL and _LABEL[-1] else ""
 
 

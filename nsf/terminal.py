@@ -54,7 +54,7 @@ def guard() -> None:
 
 
 def console(stream: TextIO, width: int | None = None) -> "Console":
-    """What prints tables and progress bars to a stream, standard output or error.
+    """A console for tables and progress bars on a stream, standard output or error.
 
     Args:
         stream: as it is in `sys`.

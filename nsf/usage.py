@@ -1,4 +1,4 @@
-"""What the command line can do: stages, tools, examples, groups and keys, as `nsf --help` tells."""
+"""The text of `nsf --help`: stages, tools, examples, groups and keys."""
 
 STAGES = {
     "run": "the whole chain: simulate, train, deploy, evaluate, report; unchanged stages are reused",

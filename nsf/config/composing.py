@@ -118,7 +118,7 @@ def _compose(config_name: str, overrides: Sequence[str]) -> DictConfig:
 def _composed(
     config_name: str, overrides: tuple[str, ...], _files: tuple[tuple[Path, int, int], ...]
 ) -> bytes:
-    """What Hydra makes of overrides and of the files as they are, pickled: jobs ask for the same again."""
+    """The configuration that Hydra composes of overrides and files, pickled: jobs ask for the same again."""
     config = _with_hydra(config_name, overrides)
     own = _of_hydra(config)
     if own != _default_hydra():

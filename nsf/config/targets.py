@@ -24,7 +24,7 @@ from nsf.vectors import is_finite
 
 
 class Kind(NamedTuple):
-    """What a key expects.
+    """The kind of object that a key expects.
 
     Attributes:
         package: in which its classes lie; nothing else is imported.
@@ -191,7 +191,7 @@ def _built(node: Any, path: tuple[str, ...]) -> Any:
 
 
 def kind_at(path: tuple[str, ...]) -> Kind | None:
-    """What a key expects a `_target_` of; None where nothing is built from it."""
+    """The kind of which a key expects a `_target_`; None where nothing is built from it."""
     for key, kind in KINDS.items():
         parts = key.split(".")
         if len(parts) == len(path) and all(map(lambda part, name: part in ("*", name), parts, path)):
@@ -200,7 +200,7 @@ def kind_at(path: tuple[str, ...]) -> Kind | None:
 
 
 def _kind(path: tuple[str, ...], target: Any) -> Kind:
-    """What a key expects, if it is where a target could lie."""
+    """The kind that a key expects, if it is where a target could lie."""
     kind = kind_at(path)
     refused = f"{'.'.join(path) or 'the configuration'}: _target_: {target} is refused; "
     if kind is None:
@@ -242,7 +242,7 @@ def _named(target: str, path: tuple[str, ...]) -> Any:
 
 
 def _imported(target: str, where: str) -> Any:
-    """What a dotted name stands for; an error of the user's module is one line that names its entry point."""
+    """The object of a dotted name; an error of the user's module is one line that names its entry point."""
     module, _, name = target.rpartition(".")
     point = None if target.startswith("nsf.") else entry_point_of(target)
     try:
@@ -270,7 +270,7 @@ def _is_a(named: type, base: type) -> bool:
 
 
 def _lacking(found: Any, protocol: type) -> str:
-    """What a class of one's own lacks of a protocol, as the end of a sentence."""
+    """Parts of a protocol that a user's class lacks, as the end of a sentence."""
     if not (inspect.isclass(found) and getattr(protocol, "_is_protocol", False)):
         return ""
     if missing := sorted(members(protocol) - _members(found)):

@@ -56,7 +56,7 @@ def keep(path: Path, value: Any) -> None:
 
 
 def kept(path: Path, say: Callable[[str], object]) -> Any:
-    """What `keep` left in a file; None where there is none, or where it was damaged since, which is said.
+    """The content of a file of `keep`; None where there is none, or it was damaged since, which is said.
 
     Raises:
         SchemaError: somebody made the file.
@@ -68,7 +68,7 @@ def kept(path: Path, say: Callable[[str], object]) -> Any:
 
 @contextmanager
 def taken_up(folder: Path, stage: str) -> Iterator[None]:
-    """What `kept` gave, and does not fit the work in the block, is a `SchemaError` that names the folder."""
+    """Content of `kept` that does not fit the work in the block is a `SchemaError` that names the folder."""
     try:
         yield
     except FAULTS as error:

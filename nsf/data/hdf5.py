@@ -46,7 +46,7 @@ def opened(path: str | Path, what: str, stage: str) -> h5py.File:
 
 @contextmanager
 def reading(path: str | Path, what: str, stage: str) -> Iterator[None]:
-    """Whatever goes wrong in the block is a `SchemaError` that names the file and what makes it anew."""
+    """Any error in the block is a `SchemaError` that names the file and the command that makes it anew."""
     try:
         yield
     except KeyError as error:

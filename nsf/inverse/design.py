@@ -271,7 +271,7 @@ class Moves(Program):
 
 @dataclass(frozen=True)
 class Designed:
-    """What was found.
+    """The designed program and its run.
 
     Attributes:
         values: [N + 1, ways] of the program at the steps.

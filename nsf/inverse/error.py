@@ -22,7 +22,7 @@ _FREEDOM = 2.0  # degrees that a plane has to leave
 
 @dataclass(frozen=True)
 class ModelError:
-    """What full-order runs of the validation cases have that runs by recurrence lack.
+    """Differences of full-order runs of the validation cases from runs by recurrence.
 
     Attributes:
         parameters: [V, n] of the cases.

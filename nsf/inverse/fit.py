@@ -40,7 +40,7 @@ _POLISHED = 3  # starts that are followed to their end
 
 @dataclass(frozen=True)
 class Fit:
-    """What was found.
+    """The fitted parameters and their run.
 
     Attributes:
         space: of the parameters; u: [n] the estimate in units of the ranges.

@@ -1,4 +1,4 @@
-"""What a run begins with and what forces it, as polynomials of the problem parameters.
+"""The start and the forcing of a run, as polynomials of the problem parameters.
 
 A parameter may change the initial velocity, gravity or the motion of a solid. It does so through the
 scene's configuration, which knows no gradient. A few scenes at chosen values tell the polynomial, and others

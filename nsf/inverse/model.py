@@ -30,7 +30,7 @@ _NEAR = 0.02  # of the scale of distances, by which one may be off
 
 @dataclass(frozen=True)
 class Forcing:
-    """What acts on runs from outside at each step.
+    """Gravity and solids that act on runs from outside at each step.
 
     Attributes:
         gravity: [N, 3], or [B, N, 3] of each run [m/s²].
@@ -236,7 +236,7 @@ class Model:
         return np.maximum(np.where(far > 1.0 + 1e-6, far, 0.0), programs)
 
     def _of(self, name: str, mu: Tensor) -> Tensor:
-        """What runs begin with, or what forces them, at parameters."""
+        """The start of runs, or their forcing, at parameters."""
         if name not in self._given:
             of = partial(self._input, name)
             self._given[name] = Polynomial(of, self.ranges, (self.names, name)).to(self.device)
@@ -246,7 +246,7 @@ class Model:
         return self._inputs(mu)[name]
 
     def _inputs(self, mu: Sequence[float], program: int | None = None) -> dict[str, np.ndarray]:
-        """What the scene has at parameters: start d_0 [r], gravity [N, 3], solids [N, f]; built once."""
+        """Values of the scene at parameters: start d_0 [r], gravity [N, 3], solids [N, f]; built once."""
         case = dict(zip(self.names, map(float, mu), strict=True))
         if program is not None:
             case[PROGRAM] = program

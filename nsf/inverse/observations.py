@@ -1,4 +1,4 @@
-"""What was measured of one run: points of the body over time, and scalars of its shape."""
+"""Observations of one run: points of the body over time, and scalars of its shape."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence

@@ -65,7 +65,7 @@ def _number(text: str) -> float:
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of the parameters before anything is observed: they are independent.
+    """The prior of the parameters, which are independent.
 
     Attributes:
         model: whose they are; each: a frozen distribution of scipy.stats by name, in the model's order.

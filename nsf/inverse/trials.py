@@ -45,7 +45,7 @@ class Trials:
         return random_cases(split.box, self.count, _SEED + self.seed, list(split.cases))
 
     def observed(self, model: Model, truth: Trajectory, trial: int) -> Observations:
-        """What is observed of a full-order run, with noise."""
+        """Observations of a full-order run, with noise."""
         generator = np.random.default_rng([self.seed, trial])
         X = model.manifold.X.cpu().numpy()
         points = X[np.sort(generator.choice(len(X), min(self.points, len(X)), replace=False))]

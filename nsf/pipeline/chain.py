@@ -51,7 +51,7 @@ _STORED = {"float32": FP32, "float64": FP64}
 
 
 def _part(key: str) -> cached_property:
-    """What a section of the configuration names, built when it is first asked for."""
+    """The object that a section of the configuration names, built at its first use."""
     return cached_property(lambda pipeline: configuration.build(pipeline.config[key], key))
 
 
@@ -406,7 +406,7 @@ class Pipeline:
         return self._made(self.training, "training.train")
 
     def teach(self) -> Run:
-        """What the configured model learns, once, that all its runs use.
+        """The part that the configured model learns once, for all its runs.
 
         Raises:
             ConfigError: it learns nothing.
@@ -555,7 +555,7 @@ class Pipeline:
         return self._taught
 
     def fitted(self, manifold: "Manifold") -> Any:
-        """What a model of latent vectors was fitted to, from its file where it learns.
+        """The fit of a model of latent vectors, from its file where it learns.
 
         Raises:
             MissingRunError: it was not taught.

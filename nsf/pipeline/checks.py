@@ -1,4 +1,4 @@
-"""What a pipeline's stages need, built and checked before any work: a bad value is refused at once."""
+"""Checks of a pipeline before any work: all that its stages need is built, and a bad value refused."""
 
 from collections.abc import Mapping
 

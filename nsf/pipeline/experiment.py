@@ -300,7 +300,7 @@ def _grid(values, where: str) -> dict[str, str]:
 
 
 def _why(pipeline: Pipeline) -> str:
-    """What became of a job that has no result: the first stage that did not end well."""
+    """The reason why a job has no result: the first stage that did not end well."""
     needed = (
         pipeline.training_data,
         [pipeline.training],

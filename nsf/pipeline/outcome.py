@@ -1,4 +1,4 @@
-"""What became of each job of a sweep, in a table over the keys that it varied."""
+"""The outcome of each job of a sweep, in a table over the keys that it varied."""
 
 import csv
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""What a run would do, before any work: its stages and their states, its size, and what that will take."""
+"""A run before any work: its stages and their states, its size, and the time and space that it will take."""
 
 import math
 import statistics
@@ -21,7 +21,7 @@ _ALIKE = {"train": "field", "deploy": "model"}
 
 @dataclass
 class Expected:
-    """What the runs of a stage take that are to be made.
+    """Time and space of the runs of a stage that are to be made.
 
     Attributes:
         runs: how many there are in all; made: how many are there already.
@@ -92,7 +92,7 @@ def stages_table(found: Sequence[Pipeline]) -> Table:
 
 
 def expected(stage: str, runs: dict[Run, Pipeline]) -> Expected:
-    """What the runs of a stage will take, by those of its kind that are there, at best of the same scene."""
+    """Time and space of runs of a stage, by those of its kind that are there, at best of the same scene."""
     missing = {run: pipeline for run, pipeline in runs.items() if not run.complete}
     told = Expected(len(runs), len(runs) - len(missing))
     if not missing:
@@ -175,7 +175,7 @@ def trajectory_bytes(pipeline: Pipeline) -> float:
 
 
 def _kind(run: Run) -> str:
-    """What runs of a stage have in common whose times can be compared."""
+    """Values that runs of a stage share whose times can be compared."""
     value = run.config.get(_ALIKE.get(run.stage, ""))
     return str(value.get("_target_") if isinstance(value, dict) else value)
 

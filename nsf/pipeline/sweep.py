@@ -315,7 +315,7 @@ def _one_by_one(launcher: Launcher, jobs: list[list[str]], first: int) -> list[s
 
 
 def _from_slurm(logs: Path, submitted: Iterable[str], count: int) -> list[str | None]:
-    """What each job of an array left, once all have ended."""
+    """The outcome of each job of an array, once all have ended."""
     from submitit import SlurmJob
     from submitit.core.utils import UncompletedJobError
 

@@ -68,7 +68,7 @@ def one_of(key: str, value, options: Sequence) -> None:
 
 
 def _check_paper(stated) -> None:
-    """What a scene's paper reports: its place, and figures by method."""
+    """The paper's place and figures of a scene, by method."""
     if stated is None:
         return
     stated = OmegaConf.to_container(stated) if isinstance(stated, DictConfig) else {"": stated}

@@ -1,4 +1,4 @@
-"""What tells listed runs apart: the keys in which they differ, and units."""
+"""Keys in which listed runs differ, and their units."""
 
 import re
 from collections.abc import Iterable, Sequence

@@ -13,7 +13,7 @@ from nsf.storage import AGAIN, write_json
 
 
 class Record:
-    """What a running stage says about itself: `metrics`, and the files it made.
+    """The record of a running stage: its `metrics`, and the files it made.
 
     Args:
         path: folder of the run.

@@ -288,7 +288,7 @@ class Run:
         return value
 
     def verify(self) -> list[str]:
-        """What is wrong with the folder, a line a fault; every recorded file is held to its sha256."""
+        """Faults of the folder, a line each; every recorded file is held to its sha256."""
         if fault := self.fault:
             return [f"{self.path}: {fault}"]
         found = ((o["path"], altered(self.path, o)) for o in self.manifest.get("outputs", ()))

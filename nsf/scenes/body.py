@@ -117,13 +117,13 @@ class Body:
 
     @property
     def placing(self) -> "Placing":
-        """What its points depend on, to look up by."""
+        """A key of all that its points depend on."""
         return Placing(self.shape, self.particles, tuple(self.shape.files.values()))
 
 
 @dataclass(frozen=True)
 class Placing:
-    """What the points of a body depend on; hashed by its text, as shapes hold lists."""
+    """All that the points of a body depend on; hashed by its text, as shapes hold lists."""
 
     shape: Shape
     particles: int

@@ -24,7 +24,7 @@ _MIDDLES, _DIRECTIONS = 32, 32
 
 
 def resolution_warnings(scene: Scene) -> list[str]:
-    """What of a scene is too coarse to be trusted, in a line each, with the value that would do."""
+    """Warnings of a scene that is too coarse to be trusted, a line each, with the value that would do."""
     found = []
     for name, body in scene.bodies.items():
         key, volume = f"scene.bodies.{name}", body.shape.volume

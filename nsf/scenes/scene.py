@@ -112,7 +112,7 @@ class Scene:
         )
 
     def forcing_at(self, t: np.ndarray) -> dict[str, np.ndarray]:
-        """What forces a run at times t [n] [s].
+        """The forcing of a run at times t [n] [s].
 
         Returns:
             gravity: [n, 3] [m/s²]; solids: [n, c, 4] shift [m] and angle [rad] of each collider.
@@ -125,7 +125,7 @@ class Scene:
 
     @cached_property
     def varied(self) -> dict[str, Parameter]:
-        """What a case has a value of: the problem parameters, and the program's number if there is any."""
+        """Names of the values of a case: the problem parameters, and the program's number if there is any."""
         return dict(self.parameters) | ({PROGRAM: Parameter(f"scene.{PROGRAM}", "")} if self.forcing else {})
 
     @cached_property

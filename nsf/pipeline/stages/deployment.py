@@ -131,7 +131,7 @@ def _range_of_gravity(scene) -> tuple[Sequence[float], float] | None:
 
 
 def _range_of_solids(pipeline) -> SolidsRange | None:
-    """What programs of training did with the solids; None where they move none."""
+    """Motions of the solids by programs of training; None where they move none."""
     scene = pipeline.scene
     if not scene.forcing.colliders:
         return None

@@ -33,13 +33,13 @@ def fit(pipeline, run: Run) -> None:
 
 
 def fitted(pipeline, manifold: Manifold) -> Any:
-    """What the model of a pipeline learns from the training runs."""
+    """The fit of a pipeline's model to the training runs."""
     known = training_inputs(manifold, pipeline.scene, pipeline.split.train)
     return pipeline.model.fit(manifold, known, int(pipeline.config.seed))
 
 
 def loaded(run: Run) -> Any:
-    """What a teach run left.
+    """The result of a teach run.
 
     Raises:
         MissingRunError: it has not run.

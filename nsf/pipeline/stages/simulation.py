@@ -50,7 +50,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Shared:
-    """What the jobs have in common.
+    """Values that all jobs share.
 
     Attributes:
         steps: of each, one frame a step and one at t = 0.
@@ -67,14 +67,14 @@ class Shared:
 
 
 class Cost(NamedTuple):
-    """What a trajectory took, under the names of its file: wall time [s], and memory of the device [byte]."""
+    """Cost of a trajectory, under the names of its file: wall time [s], and memory of the device [byte]."""
 
     seconds: float
     bytes: int
 
 
 class Ending(NamedTuple):
-    """What follows the last frame of a trajectory: its cost, and lines about what was odd in it."""
+    """The end of a trajectory's file after its last frame: its cost, and warnings."""
 
     cost: Cost
     warnings: Sequence[str]
