@@ -83,13 +83,6 @@ def test_keys_that_only_some_runs_have_are_no_difference(root):
     assert "teaching.width" in differing(entries({"stage": "train"})).keys
 
 
-def test_help_has_keys_and_examples(nsf):
-    code, out, _ = nsf("--help")
-    assert code == 0
-    for word in ("latent_dim", "sort=delta", "prune", "verify", "older="):
-        assert word in out
-
-
 def test_one_run_in_full(root, nsf):
     run = next(e.run for e in entries({"stage": "evaluate"}))
     code, out, _ = nsf("show", run.hash[:8])

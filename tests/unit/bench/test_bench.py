@@ -9,7 +9,7 @@ import torch
 from angles import angle
 
 from nsf import config
-from nsf.bench import BENCHES, bench
+from nsf.bench import bench
 from nsf.bench.batch import _too_large, cases_of
 from nsf.bench.batch import measured as measured_batches
 from nsf.bench.full_order import collapse, pass_times
@@ -17,22 +17,17 @@ from nsf.bench.measure import bandwidth, run_times, window_times
 from nsf.bench.reduced import measured as measured_chain
 from nsf.bench.reduced import measured_networks
 from nsf.bench.report import (
-    passes_beside_floor,
     step_over_batch,
-    step_over_particles,
-    step_over_sample,
-    steps_by_scene,
     wide,
     write_report,
 )
-from nsf.bench.rows import COLUMNS, FILE, Measurements, Settings, read, size_name
+from nsf.bench.rows import COLUMNS, FILE, Measurements, Settings, read
 from nsf.bench.scaling import at_size, carried_over
 from nsf.bench.scaling import measured as measured_sizes
 from nsf.bench.training import measured as measured_training
 from nsf.cli import main
 from nsf.errors import ConfigError, DeviceError, StorageError
 from nsf.pipeline import Pipeline
-from nsf.usage import TOOLS
 
 SMALL = {"benches": "full_order", "particles": "200,500", "trials": "2", "device": "cpu", "precision": "fp32"}
 PASSES = ["clear", "p2g", "grid", "g2p_stress"]
@@ -70,10 +65,6 @@ def speed(tmp_path_factory):
     return folder
 
 
-def test_help_names_every_benchmark():
-    assert f"benches={','.join(BENCHES)}]" in TOOLS["bench"][1]
-
-
 def test_a_benchmark_gives_its_rows(speed):
     rows = read(speed / FILE)
     assert list(rows) == list(COLUMNS)
@@ -87,25 +78,6 @@ def test_a_benchmark_gives_its_rows(speed):
     np.testing.assert_allclose(
         passes["bandwidth [GB/s]"], passes["moved [MiB]"] * 2**20 / passes["time [ms]"] / 1e6
     )
-
-
-def test_the_page_shows_every_row_and_chart(speed):
-    page = (speed / "index.md").read_text()
-    assert page.count("| full_order_200 |") == 1 + 4
-    assert re.findall(r"\]\((.*?)\)", page) == ["step-cpu.png", "kernels-cpu.png"]
-    assert {path.name for path in speed.glob("*.*")} == {FILE, "index.md", "step-cpu.png", "kernels-cpu.png"}
-
-
-def test_charts_show_every_row(speed):
-    rows = read(speed / FILE)
-    line, floor = step_over_particles(rows).axes[0].lines
-    np.testing.assert_array_equal(line.get_ydata(), of(rows, "step")["median"])
-    floors = rows[rows["what"] == "floor"]
-    np.testing.assert_allclose(floor.get_ydata(), floors.groupby("case", sort=False)["median"].sum())
-    (panel,) = passes_beside_floor(rows).axes
-    last = rows[(rows["case"] == "full_order_500") & (rows["part"] != "")]
-    assert [bar.get_width() for bar in panel.patches] == last[last["what"] == "time"]["median"].tolist()
-    np.testing.assert_array_equal(panel.lines[0].get_xdata(), last[last["what"] == "floor"]["median"])
 
 
 def test_other_rows_are_kept(speed, tmp_path):
@@ -215,14 +187,6 @@ def test_a_floor_is_bytes_over_the_bandwidth_of_a_copy(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("count", "name"),
-    [(300, "300"), (71_363, "71k"), (200_000, "200k"), (1_000_000, "1m"), (1_500_000, "1.5m")],
-)
-def test_sizes_by_name(count, name):
-    assert size_name(count) == name
-
-
-@pytest.mark.parametrize(
     ("asked", "error", "message"),
     [
         ({"benches": "sorting"}, ConfigError, "benches=sorting is unknown; choose from full_order, scaling"),
@@ -306,18 +270,6 @@ def test_stages_and_floors_of_both_solvers(reduced):
 
 
 @pytest.mark.slow
-def test_a_report_of_scenes(reduced, tmp_path):
-    page, pictures = reported(reduced, tmp_path)
-    assert pictures == ["reduced-cpu.png"]  # the paper has no stages of sand
-    assert "| reduced_sand_1.5dt |" in page
-    assert page.count("| 7 empty launches |") == 4
-    metal = reduced.replace({"case": {"reduced_sand": "reduced_metal"}})
-    assert "stages-cpu.png" in reported(metal, tmp_path)[1]
-    points = steps_by_scene(reduced).axes[0].collections[0].get_offsets()
-    np.testing.assert_array_equal(points[:, 0], of(reduced, "step")["median"])
-
-
-@pytest.mark.slow
 def test_networks_have_a_row(tiny, chain):
     mlp = ("field=mlp", "trainer.steps=20", "trainer.frames_per_batch=8", "trainer.particles_per_batch=4")
     base = [o for o in tiny if not o.startswith(("field.modes", "field.depth", "trainer.steps"))]
@@ -364,13 +316,6 @@ def test_both_solvers_have_rows_at_every_size(sizes):
     assert (deltas["median"] < 0.01).all()
     times = sizes[sizes["what"] == "time"]
     assert times.groupby(["case", "precision"])["part"].apply(list).tolist() == [PASSES] * 6
-
-
-def test_a_report_of_sizes(sizes, tmp_path):
-    page, pictures = reported(sizes, tmp_path)
-    assert pictures == ["step-cpu.png", "sample-cpu.png", "kernels-cpu.png"]
-    assert page.count("| reduced_500_s40 |") == 2
-    assert [len(line.get_xdata()) for line in step_over_sample(sizes).axes[0].lines] == 4 * [2]
 
 
 def test_fields_carried_over_are_those_between_the_particles(chain):

@@ -220,7 +220,6 @@ def swap_particles(file):
     ("change", "message"),
     [
         (attribute("schema_version", 2), "schema_version=2, this nsf reads 1; simulate again with `nsf sim"),
-        (attribute("schema_version", "one"), "not written by nsf"),
         (attribute("complete", False), "not finished"),
         (attribute("tau_order", "xx,yy,zz,xy,xz,yz"), "tau_order=xx,yy"),
         (lambda file: file.attrs.__delitem__("dt"), "lacks"),
@@ -228,12 +227,8 @@ def swap_particles(file):
             (attribute(name, value), f"attribute {name}, which is no single")
             for name, value in {"dt": "soon", "dx": [1.0, 2.0], "complete": "yes", "tau_order": 5}.items()
         ],
-        (attribute("x_sha256", b"0"), "x_sha256=0"),
         (attribute("units", '{"x": "mm"}'), "has units that are not those of this schema"),
-        (attribute("schema_version", [1]), "not written by nsf"),
-        (attribute("dt", np.nan), "non-finite values of dt"),
         (attribute("dt", 0.0), "values of dt and dx that are not positive"),
-        (attribute("dx", -0.1), "values of dt and dx that are not positive"),
         *[
             (at(f"particles/{name}", 3, value), rf"{told} particles/{name}")
             for name in ("mass", "volume0")
@@ -243,29 +238,19 @@ def swap_particles(file):
                 (0.0, "values of"),
             )
         ],
-        (at("particles/X", (1, 1), np.nan), "non-finite values of particles/X"),
         (at("frames/t", 2, np.nan), "non-finite values of frames/t"),
         (at("frames/t", 2, 0.1), "frames/t that does not increase"),
-        (at("frames/t", 1, 0.0), "frames/t that does not increase"),
         (at("parameters/friction_angle", (), np.inf), "non-finite values of friction_angle"),
-        (at("cost/seconds", (), np.nan), "non-finite values of seconds"),
         (replace("frames/x", np.zeros((4, 11, 3), "i4")), "frames/x of <i4, not <f4 or <f8"),
-        (replace("frames/x", np.zeros((4, 11, 3), ">f4")), "frames/x of >f4"),
-        (replace("particles/mass", np.ones(11, "f4")), "particles/mass of <f4, not <f8"),
-        (replace("parameters/friction_angle", "steep"), "friction_angle of .*, not <f8"),
         (replace("frames", 1.0), "lacks"),
         (replace("particles/X", h5py.Empty("f8")), r"particles/X of shape \[\], not \[any, 3\]"),
         (laid_out("frames/C", chunks=(1, 11, 9)), "frames/C in chunks"),
-        (laid_out("frames/C", compression="gzip"), "frames/C in chunks"),
         (claims("frames/x", (4, 11, 3)), "ends before frames/x does"),
-        (claims("frames/t", (3 * 10**12,)), "frames/t of <f4"),
         (outside, "frames/x in chunks or outside the file"),
         (virtual, "frames/x in chunks or outside the file"),
         (replace("frames/x", h5py.ExternalLink("other.h5", "/secret")), "a link in the place of frames/x"),
         (replace("frames", h5py.ExternalLink("other.h5", "/")), "a link in the place of frames"),
-        (replace("parameters", h5py.SoftLink("/cost")), "a link in the place of parameters"),
         (swap_particles, "x_sha256"),
-        (attribute("x_sha256", "0" * 64), "x_sha256=000000000000"),
         *[
             (remove(name), "lacks")
             for name in (
@@ -279,12 +264,7 @@ def swap_particles(file):
             )
         ],
         (replace("frames/x", np.zeros((4, 10, 3))), r"frames/x of shape \[4, 10, 3\], not \[4, 11, 3\]"),
-        (replace("frames/tau", np.zeros((4, 11, 9))), "frames/tau"),
-        (replace("frames/t", np.zeros(5)), "frames/"),
-        (replace("particles/mass", np.zeros(10)), "particles/mass"),
         (replace("particles/X", np.zeros((11, 2))), r"particles/X of shape \[11, 2\], not \[any, 3\]"),
-        (replace("particles/X", 1.0), r"particles/X of shape \[\], not \[any, 3\]"),
-        (replace("frames/x", h5py.SoftLink("/nowhere")), "a link in the place of frames/x"),
     ],
 )
 def test_a_file_of_other_content(write, change, message):

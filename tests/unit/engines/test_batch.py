@@ -172,8 +172,11 @@ PROGRAMS = (
 )
 
 
-@pytest.mark.parametrize("what", CHANGES)
-@pytest.mark.parametrize("sources", [Sources(), Sources("deformation", "none")], ids=str)
+@pytest.mark.parametrize(
+    ("what", "sources"),
+    [*((what, Sources()) for what in CHANGES), ("stiffness", Sources("deformation", "none"))],
+    ids=str,
+)
 def test_what_a_parameter_changes_is_each_ones_own(tiny, setup_of, what, sources):
     added = {"plate": PLATE, "program": PROGRAMS}.get(what, ())
     scene = nsf.load_scene("sand", [*tiny[1:], *added])

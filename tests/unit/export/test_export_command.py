@@ -6,7 +6,6 @@ import sys
 import pytest
 
 from nsf.cli import main
-from nsf.export import FORMATS
 
 
 @pytest.fixture
@@ -22,12 +21,6 @@ def export(chain, tmp_path, monkeypatch, capsys):
         return (end.value.code or 0, *capsys.readouterr())
 
     return call
-
-
-def test_help_names_every_format_and_option(export):
-    code, out, _ = export("--help")
-    assert code == 0
-    assert all(f"--{name}" in out for name in (*FORMATS, "parameter", "points", "every", "output"))
 
 
 def test_help_does_not_wait_for_torch():

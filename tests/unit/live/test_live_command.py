@@ -11,7 +11,7 @@ import urllib.request
 import pytest
 from test_player import wait_until
 
-from nsf.cli import TOOLS, main
+from nsf.cli import main
 
 LIVE = ("view", "serve")
 
@@ -29,21 +29,6 @@ def nsf(chain, monkeypatch, capsys):
 
     yield call
     signal.signal(signal.SIGTERM, handler)
-
-
-@pytest.mark.parametrize("command", LIVE)
-def test_help(nsf, command):
-    code, out, _ = nsf(command, "--help")
-    assert code == 0
-    assert f"usage: nsf {command}" in out
-    assert "--port" in out
-
-
-def test_help_names_the_commands(nsf):
-    _, out, _ = nsf("--help")
-    for command in LIVE:
-        text, _ = TOOLS[command]
-        assert re.search(rf"^ +{command} +{text}$", out, re.MULTILINE)
 
 
 REFUSED = [

@@ -25,7 +25,7 @@ def named_dt(error):
     return float(re.search(r"largest stable dt is (\S+) s", str(error)).group(1))
 
 
-@pytest.mark.parametrize("E", [3.0, 7.0, 10.0, 123.0, 4567.0])
+@pytest.mark.parametrize("E", [3.0, 4567.0])
 @pytest.mark.parametrize("limit", ["elastic", "advective"])
 def test_cfl_refusal_names_an_accepted_step(limit, E, block, solver_of):
     v = np.zeros_like(block)

@@ -60,22 +60,6 @@ def test_rows_of_all_reports_are_one_table(folder):
     assert set(content["pictures"]) == {"noise/weak/strip.png", "table1/seeds/strip.png"}
 
 
-def test_the_page_has_each_report_in_its_chapter(folder):
-    text = (folder / "index.md").read_text()
-    marks = (
-        *(
-            "\n## Main results",
-            "### Title of table1/seeds",
-            "|sand|0.400|1|10|5|3|5|",
-            "![table1/seeds]",
-        ),
-        *("1 run, small scale, cpu, 1f2e3d4c5b6a", "## Choices of the method", "### Title of noise/weak"),
-    )
-    places = [text.index(mark) for mark in marks]
-    assert places == sorted(places)
-    assert "|Table 1|seven scenes|[1](table1/seeds/delta.png)|" in text
-
-
 def test_a_report_that_is_made_anew_takes_the_place_of_its_rows(folder, tmp_path):
     run = write_run(tmp_path / "runs", Made((0.05, 0.07)))
     build_report([run], folder / "noise/weak", Question("noise/weak", "New"))

@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from nsf.errors import ConfigError
-from nsf.results.overview.tables import difference_table, runs_table
+from nsf.results.overview.tables import difference_table
 from nsf.runs import Run
 from nsf.runs.listing import entries
 
@@ -84,25 +84,6 @@ def test_an_unknown_key_names_the_nearest(root):
         entries({"latent_dimm": "4"}, root=root)
     with pytest.raises(ConfigError, match="'secnds'; did you mean seconds"):
         entries(sort="secnds", root=root)
-
-
-def test_the_table(root):
-    text = shown(runs_table(entries({"scene": "sand"}, "created", root)))
-    assert text.splitlines()[0].split() == [
-        "stage",
-        "scene",
-        "id",
-        "created",
-        "status",
-        "time",
-        "[s]",
-        "metric",
-        "case",
-        "r",
-    ]
-    assert "δ 2 %" in text
-    assert "loss of g 0.0167" in text
-    assert "failed" in text
 
 
 def test_no_runs_at_all(tmp_path):
