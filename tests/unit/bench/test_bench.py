@@ -304,6 +304,7 @@ def sizes(chain):
     return found.frame
 
 
+@pytest.mark.slow
 def test_both_solvers_have_rows_at_every_size(sizes):
     steps, deltas = of(sizes, "step"), of(sizes, "δ")
     assert sorted(steps["case"]) == sorted(
@@ -354,6 +355,7 @@ def batches(chain):
     return found.frame
 
 
+@pytest.mark.slow
 def test_batches_have_rows_by_their_size(batches, chain):
     steps = of(batches, "step")
     assert steps["case"].tolist() == 2 * ["reduced_batch1", "reduced_batch2", "reduced_batch3"]
@@ -382,6 +384,7 @@ def test_a_batch_that_would_not_fit_is_left_out(monkeypatch):
     assert not _too_large(256, {1: 100}, "cuda:0")
 
 
+@pytest.mark.slow
 def test_a_report_of_batches(batches, tmp_path):
     page, pictures = reported(batches, tmp_path)
     assert pictures == ["batch-cpu.png"]

@@ -296,6 +296,7 @@ def test_a_drag_on_the_picture_turns_it_or_tilts(opened, tilting_page):
     assert hand is not None
 
 
+@pytest.mark.slow
 def test_a_program_of_each_held_out_case_is_followed(opened, tilting_page, tilting_model):
     tab = opened(tilting_page)
     for index, case in enumerate(tilting_model.pipeline.held_out):
@@ -349,6 +350,7 @@ def test_on_a_phone_in_the_dark(opened, page):
     assert tab.locator("#canvas").bounding_box()["height"] > 250
 
 
+@pytest.mark.slow
 def test_a_phone_may_tilt_it(opened, tilting_page):
     tab = opened(tilting_page, 390, 800, has_touch=True, is_mobile=True)
     tab.evaluate("() => { DeviceOrientationEvent.requestPermission = async () => 'denied'; }")

@@ -166,6 +166,7 @@ def wait_until(true):
 # -- gravity by hand ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_tilt_holds_from_the_shown_step_on(tilting_model):
     player = Player(tilting_model)
     player.playing = False
@@ -188,6 +189,7 @@ def test_a_tilt_holds_from_the_shown_step_on(tilting_model):
     assert player.tick().run is before
 
 
+@pytest.mark.slow
 def test_beyond_what_programs_may_give_a_tilt_is_distrusted(tilting_model):
     assert tilting_model.tilt == pytest.approx(np.radians(35.0))
     run = tilting_model.start(tilting_model.initial)

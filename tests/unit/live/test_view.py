@@ -70,6 +70,7 @@ def test_a_frame_is_both_runs_at_the_moment(model, run):
     assert other.away > 1.0
 
 
+@pytest.mark.slow
 def test_what_is_said_is_what_is_shown(tilting_model):
     """A run beside it is of the same problem; a hand that tilts gravity makes another."""
     player, feed, (known, *_) = Player(tilting_model), PointFeed(tilting_model), tilting_model.known
