@@ -9,7 +9,7 @@ from nsf.config.composing import (
     read,
     resolve,
 )
-from nsf.config.keys import leaves, naming_the_missing, replaced, section
+from nsf.config.keys import naming_the_missing, replaced, section
 from nsf.config.sweeps import check_sweep, jobs, scene_of
 from nsf.config.targets import build, build_all
 from nsf.vectors import length, number, text
@@ -21,7 +21,6 @@ __all__ = [
     "checked",
     "jobs",
     "launching",
-    "leaves",
     "length",
     "load",
     "names_scene",

@@ -30,7 +30,7 @@ from nsf import paths
 from nsf.config import targets
 from nsf.config.documents import check_sizes, text_of
 from nsf.config.removed import refuse_keys, refuse_overrides
-from nsf.config.resolvers import resolved
+from nsf.config.resolvers import leaves, resolved
 from nsf.config.schema import refuse_unread
 from nsf.errors import ConfigError, first_line, unknown
 from nsf.paths import REMEDY, files, groups, user_folders
@@ -186,33 +186,24 @@ def resolve(config: DictConfig) -> DictConfig:
     return pickle.loads(_packed(config)[1])
 
 
-#: By the text of a configuration, what `_packed` made of the last ones.
-_PACKED: dict[str, tuple[bytes, bytes]] = {}
-
-
 def _packed(config: DictConfig) -> tuple[bytes, bytes]:
-    """A configuration and the same resolved, both checked and pickled: one is asked for again and again."""
-    with _telling_of_depth():
-        raw = OmegaConf.to_container(config)
-        text = f"{os.environ.get('NSF_REPORTS')}{raw}"
-        if (found := _PACKED.get(text)) is None:
-            plain = resolved(config)
-            refuse_keys(plain)
-            targets.check(plain)
-            refuse_unread(raw, plain)
-            found = pickle.dumps(OmegaConf.create(raw)), pickle.dumps(OmegaConf.create(plain))
-            _PACKED[text] = found
-            if len(_PACKED) > 64:
-                _PACKED.pop(next(iter(_PACKED)), None)
-        return found
-
-
-@contextmanager
-def _telling_of_depth() -> Iterator[None]:
+    """A configuration and the same resolved, both checked and pickled."""
     try:
-        yield
+        return _checked(pickle.dumps(OmegaConf.to_container(config)), os.environ.get("NSF_REPORTS"))
     except RecursionError as error:
         raise ConfigError("the configuration is nested too deeply; flatten it") from error
+
+
+@lru_cache(maxsize=64)
+def _checked(pickled: bytes, _reports: str | None) -> tuple[bytes, bytes]:
+    """`_packed` of a pickled tree: jobs and stages ask for the same again. A value may name NSF_REPORTS."""
+    raw = pickle.loads(pickled)
+    config = OmegaConf.create(raw)
+    plain = resolved(config)
+    refuse_keys(plain)
+    targets.check(plain)
+    refuse_unread(raw, plain)
+    return pickle.dumps(config), pickle.dumps(OmegaConf.create(plain))
 
 
 def of_launcher(override: str) -> bool:
@@ -246,14 +237,6 @@ def launching(overrides: Sequence[str], config_name: str = "config") -> tuple[Di
         return config, hydra.config_loader
 
 
-def _keys(node, prefix: str = "") -> list[str]:
-    if not isinstance(node, dict):
-        return [prefix]
-    return [prefix] * bool(prefix) + [
-        k for n, v in node.items() for k in _keys(v, f"{prefix}.{n}" if prefix else n)
-    ]
-
-
 def _unparsed(override: str, first: str) -> str:
     """Why Hydra does not read an override, and how to write it; a shell takes one pair of quotes away."""
     key, _, value = override.partition("=")
@@ -262,20 +245,39 @@ def _unparsed(override: str, first: str) -> str:
     return f"{override!r} is not Hydra's key=value ({first}); quote brackets, commas and spaces"
 
 
+def _missing_key(error: Exception) -> str | None:
+    """The key of an override that Hydra does not take, as the configuration has none like it."""
+    match = re.search(r"Could not override '([^']+)'", str(error))
+    return match[1] if match else None
+
+
+def _unknown(key: str, config_name: str, overrides: Sequence[str]) -> str:
+    """The message about a key that no file sets."""
+    others = [o for o in overrides if not o.lstrip("+~").startswith(key)]
+    if of_launcher(key):
+        tree = OmegaConf.to_container(launching(others, config_name)[0])
+        return unknown(key, [".".join(path) for path, _ in leaves(tree)])
+    added = [f"+{o}" if o.startswith(f"{key}=") else o for o in overrides]
+    try:
+        if OmegaConf.select(_compose(config_name, others), key) is not None:
+            return f"{key!r} takes no keys beyond its own; set them one by one, or write a scene's yaml"
+        checked(_compose(config_name, added))
+    except ConfigError as error:
+        return str(error)
+    except HydraException as error:
+        other = _missing_key(error)
+        return first_line(error) if other in (None, key) else _unknown(other, config_name, added)
+    return f"no file sets {key!r}; add it with a plus, +{key}=…"
+
+
 def explained(error: Exception, config_name: str, overrides: Sequence[str]) -> str:
     """Hydra's message in one line, with the nearest known key."""
     text = str(error)
     first = (text.splitlines() or ["a value cannot be read; check quotes, brackets and ${…}"])[0]
-    missing = re.search(r"Could not override '([^']+)'", text)
-    if missing:
-        key = missing.group(1)
+    if key := _missing_key(error):
         if key == "experiment":
             return "an experiment is named with a plus: +experiment=NAME"
-        others = [o for o in overrides if not o.lstrip("+~").startswith(key)]
-        known = _known_keys(config_name, others, of_launcher(key))
-        if key in known:
-            return f"{key!r} takes no keys beyond its own; set them one by one, or write a scene's yaml"
-        return unknown(key, known)
+        return _unknown(key, config_name, overrides)
     if isinstance(error, OverrideParseException):
         return _unparsed(str(error.override), first)
     if first.startswith("Ambiguous value"):
@@ -301,11 +303,3 @@ def explained(error: Exception, config_name: str, overrides: Sequence[str]) -> s
             f" (did you mean {near[0]}?)" if near else ""
         )
     return first
-
-
-def _known_keys(config_name: str, overrides: Sequence[str], launcher: bool) -> list[str]:
-    try:
-        config = launching(overrides, config_name)[0] if launcher else _compose(config_name, overrides)
-    except HydraException:
-        return list(groups())
-    return _keys(OmegaConf.to_container(config, resolve=False))

@@ -9,7 +9,7 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from nsf.config.composing import load, resolve
-from nsf.config.keys import leaves, naming_the_missing, replaced, section
+from nsf.config.keys import naming_the_missing, replaced, section
 from nsf.config.resolvers import following
 from nsf.config.targets import build, build_all, filled
 from nsf.data import PROGRAM
@@ -138,10 +138,11 @@ def changed_scene(config: DictConfig, scene: Scene, changes: Mapping[str, Any]) 
     """
     if keys := [p.key for p in scene.parameters.values() if p.key in changes]:
         raise ConfigError(f"{keys[0]} is a problem parameter; set scene.design.test")
-    plain = OmegaConf.to_container(resolve(config))
-    plain["scene"] = {k: v for k, v in plain["scene"].items() if k not in NOT_PHYSICS}
-    known = leaves({part: plain[part] for part in ("scene", "material", "transfer")})
-    changed = scene_of(replaced(config, changes, known))
+    for key in changes:
+        part, *names = key.split(".")
+        if part not in ("scene", "material", "transfer") or not names or names[0] in NOT_PHYSICS:
+            raise ConfigError(f"unknown key {key!r}; give a dotted key of the physics, as scene.gravity")
+    changed = scene_of(replaced(config, changes))
     same = {
         "particles": np.array_equal(changed.particles().X, scene.particles().X),
         "grid nodes": (changed.grid, changed.size) == (scene.grid, scene.size),

@@ -172,15 +172,6 @@ def filled(made_of: Any, values: Mapping[str, Any], where: str) -> Any:
         raise ConfigError(f"{where}: {first_line(error)}") from error
 
 
-def keys_of(target: str, path: tuple[str, ...]) -> list[str]:
-    """Keys that a target takes.
-
-    Raises:
-        ConfigError: as for `build`.
-    """
-    return list(inspect.signature(_named(target, path)).parameters)
-
-
 def _built(node: Any, path: tuple[str, ...]) -> Any:
     if isinstance(node, list):
         return [_built(child, (*path, str(at))) for at, child in enumerate(node)]
