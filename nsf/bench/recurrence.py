@@ -1,4 +1,4 @@
-"""A step by the recurrence beside the full-order one: single runs, many at once, frames of many points."""
+"""A step by a recurrence beside the full-order one: single runs, many at once, and many particles."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -16,16 +16,11 @@ from nsf.bench.rows import Case, Measurements, Settings, size_name
 from nsf.bench.scaling import at_size, carried_over, frames_after
 from nsf.data import Case as Parameters
 from nsf.data.schema import TRAJECTORY
-from nsf.deployment import Fallback, Trust
-from nsf.dynamics import ReducedBatch, ReducedMPM
-from nsf.dynamics.latent import LatentRecord
-from nsf.dynamics.setup import first_changes
-from nsf.engines import Operators
-from nsf.engines.operators.recurrence import Recurrence
-from nsf.engines.operators.states import collider_states
+from nsf.dynamics import ReducedMPM
 from nsf.pipeline import Pipeline
-from nsf.pipeline.stages.deployment import calibrated, fallback_of
-from nsf.pipeline.stages.teaching import OPERATORS
+from nsf.recurrence import Loop, RecurrenceEngine, collider_states, first_change
+from nsf.recurrence.descent import of_strides
+from nsf.recurrence.engine import between
 from nsf.scenes import Scene
 from nsf.timing import elapsed_ms, synchronizer
 
@@ -78,9 +73,9 @@ def measured(chain: Pipeline, figures: Measurements, many: int = 0) -> None:
 def measured_decoded(chain: Pipeline, particles: int, figures: Measurements) -> None:
     """Add the rows of one scene with another number of particles, in its first held-out case.
 
-    A step by the recurrence does not depend on the particles. So the run is of the chain's scene, and its
-    frames are decoded at other particles. The full-order run is of these, on a finer grid and in shorter
-    steps (`scaling.at_size`), each of which counts as one by the recurrence.
+    A step by a recurrence does not depend on the particles. So the run is that of the chain's own scene, and
+    its frames are decoded at the particles asked for. The full-order run is theirs, on a finer grid and in
+    shorter steps (`scaling.at_size`), each of which counts as one by the recurrence.
 
     Args:
         chain: of the scene, with `model=recurrence` and `field=basis`.
@@ -129,7 +124,7 @@ def _compared(
         decode: run → positions of all particles.
 
     Returns:
-        Time of a full-order step [ms], the case of the run by the recurrence, and that run at its end.
+        Time of a full-order step [ms], the case of the run by recurrence, and that run at its end.
     """
     settings, device, held_out, teaching = (
         figures.settings,
@@ -149,22 +144,20 @@ def _compared(
     delta = deformation_error(run, truth, position)
     _add_run(figures, case, times["own"], full_ms, delta, run.nbytes, peak, teaching)
     figures.add(case, "decoding of a frame", _decode_ms(position, run.xhat, settings))
-    checked = figures.add(case, "checked step", _checked_ms(chain, manifold, run, precision, settings))
-    figures.say(f"{case.name} {precision}: {checked:.4g} ms a step with checks")
     return full_ms, case, run
 
 
 def _add_run(
     figures: Measurements, case: Case, ms, full_ms: float, delta: float, nbytes: int, peak, teaching
 ):
-    """Add the figures of runs by the recurrence, alone or many at once."""
+    """Add the figures of runs by a recurrence, alone or many at once."""
     own = figures.add(case, "step", ms)
     figures.add(case, "peak memory", peak, "MiB")
     figures.add(case, "δ", delta, "1")
     ratio = figures.add(case, "speed-up", full_ms / own, "1")
     memory = figures.add(case, "memory of a run", nbytes / 2**20, "MiB")
     figures.add(case, "teaching", teaching.metric("teach_seconds"), "s")
-    figures.add(case, "steps of the teacher", teaching.metric("teacher_steps"), "1")
+    figures.add(case, "runs that taught it", teaching.metric("runs"), "1")
     figures.say(
         f"{case.name} {case.precision}: {own:.4g} ms a {'simulation-' * (case.batch > 1)}step, {ratio:.4g} "
         f"times the full-order step's speed, δ {100 * delta:.3g} %, {memory:.3g} MiB"
@@ -192,89 +185,64 @@ def _together(
     """
     low, high = chain.split.box.T
     drawn = np.random.default_rng(0).uniform(low, high, (count - 1, len(low)))
-    model = Operators.load(chain.taught.file(OPERATORS)).model
     cases = [chain.held_out[0], *map(chain.scene.case, drawn)]
-    many, peak = build(partial(Many, model, run, cases), figures.settings.device)
+    many, peak = build(partial(Many, chain.recurrence(), run, cases), figures.settings.device)
     (ms,) = run_times({count: many}, figures.settings.trials, figures.settings.device).values()
-    latents = run.trajectory().t, many.record.xhat[0], run.decoder().position
+    latents = run.trajectory().t, many.xhat[0], run.decoder().position
     delta = error_of_latents(*latents, truth, run.xhat)
     case = replace(case, name=f"recurrence_batch{count}", batch=count)
     _add_run(figures, case, ms / count, full_ms, delta, many.nbytes, peak, chain.taught)
 
 
 class Many:
-    """Runs by the recurrence of many cases, from one that is set up; all steps in one launch.
+    """Runs of many cases by a recurrence, from one that is set up; all steps in one launch.
 
     A batch of solvers builds every scene and holds all of its particles, which takes minutes for a thousand.
     The cases may change no collider, no gravity and no start, as that of a material does not.
 
     Args:
-        model: the recurrence.
-        run: one of their runs.
+        engine: the recurrence.
+        run: one of its runs.
         cases: B of them.
 
     Attributes:
-        record: of the runs, on the device; total_steps: of each.
+        total_steps: of each.
     """
 
-    def __init__(self, model, run: ReducedMPM, cases: Sequence[Parameters]):
-        setup, span, self.total_steps = run.setup, run.together.span_at(0), run.total_steps
-        self.record = LatentRecord(setup.xhat.expand(len(cases), -1), self.total_steps, 1)
-        names = setup.manifold.parameter_names
+    def __init__(self, engine: RecurrenceEngine, run: ReducedMPM, cases: Sequence[Parameters]):
+        setup, self.total_steps = run.setup, run.total_steps
+        form, names = engine.form, setup.manifold.parameter_names
         mu = torch.tensor([[case[name] for name in names] for case in cases], dtype=torch.float64)
-        gravity = torch.as_tensor(setup.gravity.at(setup.dt * np.arange(self.total_steps))[None])
-        states = collider_states(setup.scene.solids, setup.dt, self.total_steps)[None]
-        given = mu, gravity, torch.as_tensor(states), self.record, setup.precision, setup.device
-        self._recurrence = Recurrence(model, *given)
-        first = first_changes(span.at_sample, span.sets.sample, [setup])
-        self._first = first.to(self.record.xhat.device).expand(len(mu), -1)
+        t = setup.dt * np.arange(self.total_steps)
+        states = collider_states(setup.scene.solids, setup.dt, self.total_steps)
+        acting = (of_strides(torch.as_tensor(v), form.stride)[None] for v in (setup.gravity.at(t), states))
+        self._loop = Loop(form, mu, *acting, setup.precision, setup.device)
+        stride = form.stride * setup.dt
+        first = first_change(setup.manifold, setup.constants.X, setup.initial_velocity, stride)
+        self._first, self._stride = first.expand(len(mu), -1), form.stride
+        self._start = form.begin(setup.xhat.double().cpu().expand(len(mu), -1), self._first)
         self.restart()
 
     def restart(self) -> None:
         """Go back to t = 0."""
-        self.record.restart()
-        self._recurrence.begin(self.record.now, self._first)
+        self._done = 0
+        self._loop.begin(self._start)
 
     def step(self, n: int = 1) -> None:
-        """Take steps of all runs."""
-        self._recurrence.advance(n)
+        """Take steps of all runs, a multiple of the stride."""
+        self._loop.advance(self._done, n // self._stride)
+        self._done += n // self._stride
+
+    @property
+    def xhat(self) -> torch.Tensor:
+        """[B, N + 1, r] latent vectors at each step."""
+        nodes = self._loop.xhat.mean(0)
+        return between(nodes, self._first.to(nodes), self._stride)
 
     @property
     def nbytes(self) -> int:
         """Bytes on the device."""
-        return self._recurrence.nbytes + self.record.nbytes
-
-
-class Checked:
-    """Runs by the recurrence with the checks of `nsf deploy`, for `run_times`.
-
-    Args:
-        run: by the recurrence, alone in its batch.
-        fallback: how it is watched, and who goes on with it.
-        projected: the same run by projected steps, built as well before a clock starts.
-        trust: the estimate of whether to believe it.
-
-    Attributes:
-        total_steps: of the run.
-    """
-
-    def __init__(self, run: ReducedMPM, fallback: Fallback, projected: ReducedBatch, trust: Trust):
-        self._run, self._look_at = run, partial(fallback.apply, run.together, projected, trust)
-        self.restart, self.total_steps = run.restart, run.total_steps
-
-    def step(self, n: int) -> None:
-        """Take the steps of the whole run and check them."""
-        self._run.step(n)
-        self._look_at()
-
-
-def _checked_ms(chain: Pipeline, manifold, run: ReducedMPM, precision: str, settings: Settings) -> float:
-    """Median time [ms] of a step of checked runs; where projected steps go on with one, with these."""
-    fallback, trust = fallback_of(chain, manifold), calibrated(chain, manifold)
-    like = {"precision": precision, "engine": chain.projecting}
-    projected = chain.batch_at(manifold, [chain.held_out[0]], **like)
-    checked = Checked(run, fallback, projected, trust)
-    return float(np.median(run_times({"own": checked}, settings.trials, settings.device)["own"]))
+        return self._loop.nbytes
 
 
 def _decode_ms(position: Decode, xhat: torch.Tensor, settings: Settings) -> float:

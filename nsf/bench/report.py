@@ -41,11 +41,10 @@ _TRAINING = (
 )
 _RECURRENCE = (
     "Time of a step by the recurrence: all steps of a run in one launch, over their number; of many runs at "
-    "once, over their number too. Checked: the same with all that `nsf deploy` adds to a run, a projected "
-    "step for every 20 steps, the estimated error and the distrust ratio. Speed-up: over the full-order step "
-    "of the same call, without checks. A run holds no particles but S; the time of decoding a frame stands "
-    "apart. The recurrence of the sand column steps as at the scene's own size, while the full-order step of "
-    "as many particles as are decoded is on a finer grid, and shorter."
+    "once, over their number too. Speed-up: over the full-order step of the same call. A run holds no "
+    "particles but S; the time of decoding a frame stands apart. The recurrence of the sand column steps as "
+    "at the scene's own size, while the full-order step of as many particles as are decoded is on a finer "
+    "grid, and shorter."
 )
 _BATCH = (
     "Time of a simulation-step, which is the step of a batch over the simulations that take it together, by "

@@ -38,8 +38,6 @@ class Kind(NamedTuple):
 
 
 _MODEL = Kind("nsf.models", "nsf.models.Model")
-_TEACHING = Kind("nsf.engines.operators", "nsf.engines.operators.Teaching")
-_SYMMETRY = Kind("nsf.scenes", "nsf.scenes.Symmetry")
 _SHAPE = Kind("nsf.scenes", "nsf.scenes.Shape", ("nsf.scenes.mesh_or_ball",))
 
 #: What each key expects; `*` stands for any name. A new group of conf/ is a line here.
@@ -48,18 +46,13 @@ KINDS = {
     "integration": Kind("nsf.dynamics", "nsf.dynamics.Integration"),
     "material": Kind("nsf.mpm.materials", "nsf.mpm.materials.Material"),
     "model": _MODEL,
-    "model.teaching": _TEACHING,
-    "model.teaching.symmetry": _SYMMETRY,
     "model.of.*": _MODEL,
-    "model.of.*.teaching": _TEACHING,
-    "model.of.*.teaching.symmetry": _SYMMETRY,
     "projector": Kind("nsf.dynamics", "nsf.dynamics.projection.Projector"),
     "sampler": Kind("nsf.sampling", "nsf.sampling.Sampler"),
     "trainer": Kind("nsf.kinematics.training", "nsf.kinematics.training.schedules.Trainer"),
     "transfer": Kind("nsf.mpm", "nsf.mpm.Transfer"),
     "scene.design": Kind("nsf.scenes", "nsf.scenes.Design"),
     "scene.inclination": Kind("nsf.scenes", "nsf.scenes.Inclination"),
-    "reduction.symmetry": _SYMMETRY,
     "scene.walls": Kind("nsf.mpm", "nsf.mpm.DomainWalls"),
     "scene.colliders.*": Kind("nsf.mpm", "nsf.mpm.Collider"),
     "scene.colliders.*.motion": Kind("nsf.mpm", "nsf.mpm.Motion"),

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 from nsf.deployment.fallback import Fallback, go_on, hand_over
 from nsf.deployment.rollout import (
     FULL_ORDER,
-    OPERATORS,
+    LATENT_MODEL,
     PROJECTED,
     Rollout,
     continuation_file,
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "FULL_ORDER",
-    "OPERATORS",
+    "LATENT_MODEL",
     "PROJECTED",
     "Fallback",
     "Rollout",

@@ -14,8 +14,7 @@ import numpy as np
 import torch
 
 from nsf.data import Case, TrajectoryWriter
-from nsf.deployment.estimate import estimated_errors
-from nsf.deployment.rollout import OPERATORS, PROJECTED, Rollout
+from nsf.deployment.rollout import LATENT_MODEL, PROJECTED, Rollout
 from nsf.deployment.trust import Trust, first_distrusted
 from nsf.dynamics import ReducedBatch, ReducedMPM
 from nsf.errors import InstabilityError
@@ -48,33 +47,30 @@ class Fallback:
     Attributes:
         to: `none`, `projected` or `full`.
         projected: cases → runs of the projected step at t = 0; None for runs whose model projects itself.
-        every: steps between two projected steps that estimate the error; 0: nothing is estimated.
-        near: whether the model was near enough at validation runs; else the projected step takes all runs.
     """
 
     to: str = "none"
     projected: Callable[[Sequence[Case]], ReducedBatch] | None = None
-    every: int = 0
-    near: bool = True
 
     def projected_runs(self, cases: Sequence[Case]) -> ReducedBatch | None:
         """The runs by projected steps that `apply` needs; None where it takes none."""
-        return self.projected(cases) if self.every or self.to == "projected" else None
+        return self.projected(cases) if self.to == "projected" else None
 
     def apply(self, batch: ReducedBatch, projected: ReducedBatch | None, trust: Trust) -> list[Stepped]:
-        """Estimate the errors of runs of latent vectors alone, and let the projected step go on with them.
+        """Find the spread of members of runs of latent vectors alone; let the projected step go on with runs.
 
         Args:
             batch: the runs, at their end.
             projected: the same runs, from `projected_runs`; left in the midst of one.
             trust: the estimate of whether to believe a run.
         """
-        errors = estimated_errors(batch, projected, self.every) if self.every else [None] * len(batch)
+        spread = batch.span_at(0).spread(batch.steps_taken)
+        errors = [None] * len(batch) if spread is None else spread.cpu().numpy()
         ended = []
         for run, estimate in zip(batch.runs, errors, strict=True):
             distrusted = first_distrusted(trust.of_run(run)) if self.to == "projected" else -1
             if distrusted < 0:
-                by = np.full(run.steps_taken, OPERATORS, np.int8)
+                by = np.full(run.steps_taken, LATENT_MODEL, np.int8)
                 ended.append(Stepped(run, by, estimate))
             else:
                 solver = projected.alone(run.index).runs[0]
@@ -95,7 +91,7 @@ def _projected_from(step: int, run: ReducedMPM, solver: ReducedMPM, estimate: np
     if solver.setup.sources.carried:
         step = 0
     if step:
-        by[:step] = OPERATORS
+        by[:step] = LATENT_MODEL
         target, source = solver.record, run.record
         target.xhat[: step + 1] = source.xhat[: step + 1]
         target.residuals[:step], target.updates[:step] = source.residuals[:step], 0.0
@@ -144,7 +140,8 @@ def hand_over(solver: ReducedMPM, rollout: Rollout) -> FullOrderMPM:
         x = decoder.position(now)
         v = (x - decoder.position(before)) / solver.dt
         rate = (now - before) / solver.dt
-        C, tau = decoder.affine(now[None], rate[None])[0], decoder.stress(now[None])[0]
+        stress = None if rollout.stress is None else torch.as_tensor(rollout.stress[n : n + 1])
+        C, tau = decoder.affine(now[None], rate[None])[0], decoder.stress(now[None], stress)[0]
     state = (a.double().cpu().numpy() for a in (x, v, C, 0.5 * (tau + tau.mT)))
     full.resume(round(rollout.t[n] / full.dt), *state)
     return full

@@ -16,8 +16,8 @@ from nsf.errors import SchemaError
 from nsf.storage import writing
 
 #: Who takes a step: a model of latent vectors alone, the projected step, the full-order solver.
-OPERATORS, PROJECTED, FULL_ORDER = range(3)
-LEVELS = ("operators", "projected", "full_order")
+LATENT_MODEL, PROJECTED, FULL_ORDER = range(3)
+LEVELS = ("latent_model", "projected", "full_order")
 #: Stands for a stop reason where a step of the latent vector alone ends in no inversion.
 LATENT = "latent"
 
@@ -47,10 +47,10 @@ class Rollout:
         diverged: step at which x̂ ceased to be finite or a sample particle left the grid, −1 when neither did.
         handed_over: step from whose state the full-order solver goes on, −1 when it does not. The steps then
             end with the first distrusted one.
-        estimate: [N + 1] how far a run by operators is from one by projected steps alone, as far as is known
-            [m]; None where nothing is estimated.
-        by: [N] who took each step (`OPERATORS`, `PROJECTED`; `FULL_ORDER` from `handed_over` on); None for a
-            run whose model projects itself.
+        estimate: [N + 1] how far the members of a model are from their mean at S [m]; None of a single one.
+        by: [N] who took each step (`LATENT_MODEL`, `PROJECTED`; `FULL_ORDER` from `handed_over` on); None for
+            a run whose model projects itself.
+        stress: [N + 1, n_s] ŝ, coordinates of τ, of a run whose model has them; None of others.
     """
 
     case: Case
@@ -68,6 +68,7 @@ class Rollout:
     handed_over: int = -1
     estimate: np.ndarray | None = None
     by: np.ndarray | None = None
+    stress: np.ndarray | None = None
 
     @property
     def levels(self) -> np.ndarray:
@@ -82,14 +83,14 @@ class Rollout:
         return 0.0 if self.by is None else float((self.levels == PROJECTED).sum()) / max(1, len(self.by))
 
     @property
-    def by_operators(self) -> int:
+    def by_latent_model(self) -> int:
         """How many steps a model of latent vectors alone took."""
-        return int((self.levels == OPERATORS).sum())
+        return int((self.levels == LATENT_MODEL).sum())
 
     @property
     def estimated_error(self) -> float:
         """Largest of `estimate` [m]; NaN where nothing is estimated, or another model took every step."""
-        return math.nan if self.estimate is None or not self.by_operators else float(self.estimate.max())
+        return math.nan if self.estimate is None or not self.by_latent_model else float(self.estimate.max())
 
     @property
     def distrusted(self) -> int:
@@ -108,6 +109,8 @@ class Rollout:
                 file["by"] = self.levels
             if self.estimate is not None:
                 file["estimate"] = self.estimate
+            if self.stress is not None:
+                file["stress"] = self.stress
             file["stops"] = np.array(self.stops, dtype=h5py.string_dtype())
             file["case"] = self.case.numbers
             for name in ("names", "units"):
@@ -146,6 +149,8 @@ class Rollout:
                 arrays["by"] = hdf5.array(file, "by", ("|i1",), (len(t) - 1,))[()]
             if "estimate" in file:
                 arrays["estimate"] = hdf5.array(file, "estimate", _REAL, (len(t),))[()]
+            if "stress" in file:
+                arrays["stress"] = hdf5.array(file, "stress", _REAL, (len(t), None))[()]
             rollout = cls(Case(names, numbers, units), **scalars, t=t, **arrays, stops=stops)
             rollout._check()
         return rollout

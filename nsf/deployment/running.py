@@ -3,13 +3,12 @@
 import time
 from collections.abc import Callable, Sequence
 
-import numpy as np
 import pytorch_lightning as pl
 from torch.utils.data import DataLoader
 
 from nsf.data import Case
 from nsf.deployment.fallback import Fallback, Stepped, full_order_step
-from nsf.deployment.rollout import LATENT, OPERATORS, PROJECTED, Rollout
+from nsf.deployment.rollout import LATENT, LATENT_MODEL, Rollout
 from nsf.deployment.trust import Trust, first_distrusted
 from nsf.dynamics import ReducedBatch
 from nsf.kinematics.training.lightning import trainer_on
@@ -97,10 +96,6 @@ def rollouts(
     if fallback.projected is None:
         seconds = _timed_run(batch, until_distrusted)
         ended = [Stepped(run) for run in batch.runs]
-    elif not fallback.near:
-        batch = fallback.projected(cases)
-        seconds, N = _timed_run(batch, until_distrusted), batch.total_steps
-        ended = [Stepped(run, np.full(N, PROJECTED, np.int8), np.zeros(N + 1)) for run in batch.runs]
     else:
         projected = fallback.projected_runs(cases)  # built before the clock starts, as `batch` is
         seconds, started = _timed_run(batch, None), time.perf_counter()
@@ -124,7 +119,7 @@ def _rollout_of(stepped: Stepped, case: Case, trust: Trust, fallback: Fallback, 
     stops = latent.stops[:steps]
     if by is not None:
         by = by[:steps]
-        stops = [LATENT if who == OPERATORS else stop for who, stop in zip(by, stops, strict=True)]
+        stops = [LATENT if who == LATENT_MODEL else stop for who, stop in zip(by, stops, strict=True)]
     return Rollout(
         case=case,
         t=latent.t[: steps + 1],
@@ -141,6 +136,7 @@ def _rollout_of(stepped: Stepped, case: Case, trust: Trust, fallback: Fallback, 
         handed_over=handed_over,
         estimate=None if estimate is None else estimate[: steps + 1],
         by=by,
+        stress=None if latent.stress is None or not latent.stress.shape[1] else latent.stress[: steps + 1],
     )
 
 

@@ -19,8 +19,8 @@ from scipy.spatial.distance import cdist
 
 from nsf.data.normalize import deviation
 from nsf.dynamics import ReducedMPM
-from nsf.engines.operators.states import FEATURES, collider_states
 from nsf.progress import Progress
+from nsf.recurrence.solids import FEATURES, collider_states
 
 #: Of the distances between training trajectories: the largest ones are of single frames.
 QUANTILE = 0.95

@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import torch
 
+from nsf.data import TAU_MATRIX
 from nsf.kinematics.manifold import Restriction
 
 #: Sources at n points: of τ, x̂ [r] → [n, 3, 3]; of C, x̂ and dx̂/dt [r] → [n, 3, 3], or None for zero.
@@ -75,14 +76,18 @@ class Decoder:
 
     def __init__(self, at: Restriction, stress: StressSource, affine: AffineSource):
         self.at, self._stress, self._affine = at, stress, affine
+        self._expand = torch.tensor(TAU_MATRIX, device=at.device).flatten()
 
     def position(self, xhat: torch.Tensor) -> torch.Tensor:
         """x = g(X, x̂), [n, 3] of x̂ [r] or [F, n, 3] of x̂ [F, r], in metres."""
         return self.at.position(xhat)
 
-    def stress(self, xhat: torch.Tensor) -> torch.Tensor:
-        """τ [F, n, 3, 3] of x̂ [F, r], in pascals."""
-        return torch.stack([self._stress(row).clone() for row in xhat])
+    def stress(self, xhat: torch.Tensor, stress: torch.Tensor | None = None) -> torch.Tensor:
+        """τ [F, n, 3, 3] of x̂ [F, r], in pascals; of ŝ [F, n_s], coordinates of τ, where there are any."""
+        if stress is None or not stress.shape[-1]:
+            return torch.stack([self._stress(row).clone() for row in xhat])
+        tau = self.at.stress_of(stress.to(self.at.device, self.at.dtype))
+        return tau[..., self._expand].unflatten(-1, (3, 3))
 
     def affine(self, xhat: torch.Tensor, rate: torch.Tensor) -> torch.Tensor:
         """C [F, n, 3, 3] of x̂ and dx̂/dt [F, r], in 1/s."""

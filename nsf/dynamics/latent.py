@@ -35,6 +35,7 @@ class LatentTrajectory:
         xhat: [N + 1, r] latent vectors.
         residuals: [N, k + 1] projection residuals [m]; updates: [N, k] lengths of latent updates.
         stops: [N] named stop reasons.
+        stress: [N + 1, n_s] ŝ, the coordinates of τ, of a run that has them.
     """
 
     t: np.ndarray
@@ -42,6 +43,7 @@ class LatentTrajectory:
     residuals: np.ndarray
     updates: np.ndarray
     stops: list[str]
+    stress: np.ndarray | None = None
 
 
 class LatentRecord:
@@ -57,7 +59,10 @@ class LatentRecord:
         row: [1] n, or [B].
         xhat: [steps + 1, r] latent vectors; zero where no step has been.
         residuals: [steps, k + 1] and updates: [steps, k], as in `ProjectionResult`.
+        stress: [steps + 1, n_s] ŝ of a run that has them, which its engine makes; else None.
     """
+
+    stress: torch.Tensor | None = None
 
     def __init__(self, xhat: torch.Tensor, steps: int, iterations: int):
         runs, r = xhat.shape[:-1], xhat.shape[-1]
@@ -73,6 +78,7 @@ class LatentRecord:
         record.row = self.row[run : run + 1]
         for name in ("now", "before", "xhat", "residuals", "updates"):
             setattr(record, name, getattr(self, name)[run])
+        record.stress = None if self.stress is None else self.stress[run]
         return record
 
     def restart(self) -> None:
@@ -111,7 +117,8 @@ class LatentRecord:
         residuals, updates = self.residuals[:steps].cpu(), self.updates[:steps].cpu()
         stops = stop_reasons(residuals, updates, tolerance)
         t, xhat = np.arange(steps + 1) * dt, self.xhat[: steps + 1].cpu().numpy()
-        return LatentTrajectory(t, xhat, residuals.numpy(), updates.numpy(), stops)
+        stress = None if self.stress is None else self.stress[: steps + 1].cpu().numpy()
+        return LatentTrajectory(t, xhat, residuals.numpy(), updates.numpy(), stops, stress)
 
 
 class LatentState:
@@ -135,7 +142,7 @@ class LatentState:
     def numpy(self) -> dict[str, np.ndarray]:
         """Every particle's x, v [P, 3], C, tau [P, 3, 3], as of the full-order state, and xhat [r].
 
-        C and tau are the fields', also where particles carry others (`Sources`).
+        C and tau are the fields', or those of ŝ, also where particles carry others (`Sources`).
         """
         run = self._run
         decoder, now = run.decoder(), run.xhat[None]
@@ -144,7 +151,8 @@ class LatentState:
             v = run.setup.initial_velocity
         else:
             v = (x - decoder.position(run.record.before)) / run.dt
-        fields = {"x": x, "v": v, "C": decoder.affine(now, run.rate[None])[0], "tau": decoder.stress(now)[0]}
+        C, tau = decoder.affine(now, run.rate[None])[0], decoder.stress(now, run.stress)[0]
+        fields = {"x": x, "v": v, "C": C, "tau": tau}
         return {name: value.cpu().numpy() for name, value in fields.items()} | {"xhat": self.xhat}
 
 

@@ -284,6 +284,12 @@ class ReducedMPM:
         return self.record.now
 
     @property
+    def stress(self) -> torch.Tensor | None:
+        """[1, n_s] ŝ now, on the device, of a run that has it."""
+        held = self.record.stress
+        return None if held is None else held[self.steps_taken][None]
+
+    @property
     def rate(self) -> torch.Tensor:
         """[r] dx̂/dt [1/s] as the next step takes it, on the device."""
         return (self.xhat - self.record.before) / self.dt if self.steps_taken else self.first_rate

@@ -77,6 +77,10 @@ class Span(ABC):
         """Take steps at once, where they are `latent_only`."""
         raise NotImplementedError(f"{type(self).__name__} takes its steps one by one")
 
+    def spread(self, steps: int) -> torch.Tensor | None:
+        """How far the members of a model are from their mean at S [B, steps + 1] [m]; None of one member."""
+        return None
+
     @property
     def mean_sizes(self) -> list[float]:
         """Mean |N| of each run over the steps taken in this span."""

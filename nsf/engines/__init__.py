@@ -12,7 +12,6 @@ if TYPE_CHECKING:
     from nsf.engines.building import reduced, reduced_batch
     from nsf.engines.choice import ENGINES, NAMES, choose
     from nsf.engines.modal import Modal
-    from nsf.engines.operators import Operators
     from nsf.engines.reference import Reference
 
 __all__ = [
@@ -20,7 +19,6 @@ __all__ = [
     "NAMES",
     "Engine",
     "Modal",
-    "Operators",
     "Reference",
     "choose",
     "reduced",

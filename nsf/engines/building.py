@@ -34,8 +34,8 @@ def reduced(
         parameters: `{name: value}`; those left out are as configured.
         sample: particle indices, a number (drawn at random), a `Sampler`, the `samples` of an earlier
             solver, or None for `SAMPLE` of them.
-        engine: how steps are computed: `auto`, the fastest engine that can; `reference`, `modal`, taught
-            operators (`Operators.load`), or an engine of the user.
+        engine: how steps are computed: `auto`, the fastest engine that can; `reference`, `modal`, a taught
+            recurrence (`RecurrenceEngine.load`), or an engine of the user.
         **options: further arguments of `nsf.dynamics.Setup`.
 
     Raises:

@@ -36,7 +36,7 @@ def choose(name: str | Engine, setups: Sequence[Setup]) -> tuple[Engine, str]:
     else:
         raise ConfigError(
             f"engine={name} is unknown; choose one of {', '.join(NAMES)}, or give "
-            "nsf.engines.Operators.load(FILE) of a teach run"
+            "nsf.recurrence.RecurrenceEngine.load(FILE) of a teach run"
         )
     refusals = []
     for engine in candidates:

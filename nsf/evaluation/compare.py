@@ -55,7 +55,12 @@ class Comparison:
 
 def at_frames(rollout: Rollout, t: np.ndarray) -> np.ndarray:
     """Latent vectors [F, r] at the full-order frame times, linear between deployment steps."""
-    return np.stack([np.interp(t, rollout.t, column) for column in rollout.xhat.T], axis=1)
+    return _between(t, rollout.t, rollout.xhat)
+
+
+def _between(t: np.ndarray, times: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Rows [n, q] at times [n], at other times t [F], linear between them."""
+    return np.stack([np.interp(t, times, column) for column in rows.T], axis=1)
 
 
 def trust_at_frames(rollout: Rollout, t: np.ndarray) -> np.ndarray:
@@ -132,6 +137,7 @@ def compare(
         return torch.as_tensor(np.asarray(values)).to(device).to(setup.dtype)
 
     xhat, X, mass = tensor(xhat), tensor(trajectory.X), tensor(trajectory.mass)
+    stress = None if rollout.stress is None else tensor(_between(trajectory.t, rollout.t, rollout.stress))
     rate = torch.diff(xhat, dim=0, prepend=xhat[:1]) / trajectory.dt
     rate[0] = solver.first_rate
     inertia = scene.dx**2 * (DEGREES[scene.transfer.shape] + 1) / 12.0
@@ -152,7 +158,8 @@ def compare(
         block = slice(start, min(start + per_chunk, frames))
         x, tau, C, v = (tensor(trajectory.read(name, frames=block)) for name in ("x", "tau", "C", "v"))
         C = C.view(*C.shape[:2], 3, 3)
-        x_rom, C_rom, tau_rom = _reduced_fields(decoder, xhat[:own], rate[:own], continuation, block, carried)
+        latent = xhat[:own], rate[:own], stress
+        x_rom, C_rom, tau_rom = _reduced_fields(decoder, *latent, continuation, block, carried)
         v_rom = torch.diff(torch.cat([previous[None], x_rom]), dim=0) / trajectory.dt
         if start == 0:
             v_rom[0] = v[0]
@@ -285,6 +292,7 @@ def _reduced_fields(
     decoder: Decoder,
     xhat: torch.Tensor,
     rate: torch.Tensor,
+    stress: torch.Tensor | None,
     continuation: Trajectory | None,
     frames: slice,
     carried: "_Carried | None",
@@ -294,6 +302,7 @@ def _reduced_fields(
     Args:
         decoder: the fields at every particle.
         xhat, rate: [own, r] x̂ and dx̂/dt of the frames up to the hand-over; the later frames are read.
+        stress: [F, n_s] ŝ of a run that has them.
         continuation: full-order frames, of which the first is the last of `xhat`.
         frames: which, of the whole run; those before them were asked for already.
         carried: gives τ and C in place of the fields.
@@ -302,7 +311,8 @@ def _reduced_fields(
     latent, its_rate = (values[frames.start : frames.stop] for values in (xhat, rate))
     if len(latent):
         if carried is None:
-            C, tau = decoder.affine(latent, its_rate), decoder.stress(latent)
+            coordinates = None if stress is None else stress[frames.start : frames.start + len(latent)]
+            C, tau = decoder.affine(latent, its_rate), decoder.stress(latent, coordinates)
         else:
             C, tau = carried.next(len(latent))
         parts.append((decoder.position(latent), C, tau[..., _UPPER[0], _UPPER[1]]))

@@ -172,6 +172,9 @@ class Playback:
         self._xhat = torch.as_tensor(
             rollout.xhat[chosen[chosen < reduced]], dtype=self._dtype, device=self.device
         )
+        self._shat = (
+            None if rollout.stress is None else torch.as_tensor(rollout.stress[chosen[chosen < reduced]])
+        )
         self._rate = _rates(rollout, max(reduced, 2))[chosen[chosen < reduced]]
         self._later = chosen[chosen >= reduced] - (reduced - 1)  # its first frame is reduced
 
@@ -289,7 +292,7 @@ class Playback:
             with torch.no_grad():
                 decoder = self._decoder(rows)
                 x = decoder.position(self._xhat).cpu()
-                tau = decoder.stress(self._xhat)[..., TAU_ROWS, TAU_COLUMNS].cpu()
+                tau = decoder.stress(self._xhat, self._shat)[..., TAU_ROWS, TAU_COLUMNS].cpu()
             if len(self._later):
                 x, tau = (torch.cat([a, b.to(a)]) for a, b in zip((x, tau), self._read(rows), strict=True))
             yield Block(rows, torch.as_tensor(self.X[rows]).to(x), x, tau)

@@ -10,11 +10,11 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-from nsf.engines.operators.states import FEATURES
 from nsf.errors import ConfigError, InstabilityError
 from nsf.inverse.model import Forcing, Model
 from nsf.inverse.observations import View
 from nsf.mpm import Motion
+from nsf.recurrence.solids import FEATURES
 from nsf.scenes import Keyframes, Scene
 from nsf.scenes.programs import Programs, across
 
@@ -82,7 +82,7 @@ class Tilt(Program):
         model: of the runs; angle: the largest tilt [°]; knots: see `Program`.
 
     Raises:
-        ConfigError: operators were taught no gravity so far off in every direction; or the scene has none.
+        ConfigError: no gravity so far off in every direction was taught; or the scene has none.
     """
 
     model: Model
@@ -94,12 +94,12 @@ class Tilt(Program):
     def __post_init__(self):
         if not np.any(self.model.scene.base_gravity):
             raise ConfigError(f"{self.model.scene.name} has no gravity to tilt; move a solid, as move=NAME")
-        taught = self.model.operators.taught
+        taught = self.model.recurrence.taught
         most = _largest_tilt(np.array(self.model.scene.base_gravity), np.array(taught.gravity), taught.reach)
         if not 0.0 < self.angle <= most + 1e-9:
             raise ConfigError(
                 f"tilt={self.angle:g}° must lie above 0° and within the {most:.3g}° that was taught; or "
-                "teach with a larger model.teaching.gravity"
+                "train with programs of scene.forcing.gravity"
             )
 
     @property
@@ -172,7 +172,7 @@ class Moves(Program):
         programs = self.model.pipeline.scene.forcing.colliders
         if still := [name for name in self.solids if name not in programs or not len(self._axes[name])]:
             raise ConfigError(
-                f"move={still[0]} follows no program in training runs, so operators know no other way of it; "
+                f"move={still[0]} follows no program in training runs, so no other way of it was taught; "
                 f"train with scene.forcing.colliders.{still[0]}"
             )
         colliders = dict(zip(there, self.model.scene.solids, strict=True))

@@ -185,8 +185,7 @@ def _best_starts(seen, values: np.ndarray, s: np.ndarray, n: int, starts: int, d
     order = np.argsort(costs)
     if not np.isfinite(costs[order[0]]):
         raise InstabilityError(
-            "no run of the ranges stays finite; choose smaller ranges, or teach again with more "
-            "model.teaching.steps"
+            "no run of the ranges stays finite; choose smaller ranges, or teach again with more model.runs"
         )
     # Those beside a better one would end where it ends.
     reach, chosen = 1.5 * starts ** (-1.0 / n), []

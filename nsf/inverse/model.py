@@ -11,16 +11,14 @@ from torch import Tensor
 
 from nsf.data import PROGRAM
 from nsf.deployment import Trust
-from nsf.dynamics.setup import first_change
-from nsf.engines import Operators
-from nsf.engines.operators import collider_states
 from nsf.errors import ConfigError, ShapeError
 from nsf.inverse.inputs import Polynomial
 from nsf.inverse.recurrence import differentiable_run
 from nsf.kinematics.manifold import Restriction
+from nsf.models import Recurrence
 from nsf.pipeline import Pipeline
 from nsf.pipeline.stages.deployment import trust_of
-from nsf.pipeline.stages.teaching import OPERATORS
+from nsf.recurrence import RecurrenceEngine, collider_states, first_change
 from nsf.runs import Run
 
 #: Frames of a run at which it is asked how far it is from the training runs.
@@ -34,7 +32,7 @@ class Forcing:
 
     Attributes:
         gravity: [N, 3], or [B, N, 3] of each run [m/s²].
-        solids: [N, f], or [B, N, f]: state of the colliders, as `collider_states` of the operators has it.
+        solids: [N, f], or [B, N, f]: state of the colliders, as `nsf.recurrence.collider_states` has it.
     """
 
     gravity: Tensor
@@ -57,39 +55,32 @@ class Model:
 
     Raises:
         MissingRunError: the run, or its teaching, is not whole.
-        ConfigError: the run has another model, or its operators do not fit it.
+        ConfigError: the run has another model, or its recurrence does not fit it.
         DeviceError: the device does not exist.
     """
 
     def __init__(self, run: Run, device: str = "auto"):
         self.run = run.require()
         self.pipeline = Pipeline.of_run(run, device, say=lambda line: None)
-        if self.pipeline.teaching is None:
+        if not isinstance(self.pipeline.model, Recurrence):
             raise ConfigError(
                 f"{run.id} has model={self.pipeline.model.name}, whose steps know no gradient; deploy it "
                 "with model=recurrence, which is taught first"
             )
         self.manifold = self.pipeline.manifold()
-        taught = next(parent for parent in run.parent_runs if parent.stage == "teach")
-        self.operators = Operators.load(taught.require().file(OPERATORS))
-        if self.operators.model.sizes.memory:
-            raise ConfigError(
-                f"{run.id} has operators with a memory, whose steps know no gradient here; deploy it with "
-                "model.teaching.memory=[]"
-            )
+        self.recurrence: RecurrenceEngine = self.pipeline.recurrence()
         self.scene = self.pipeline.deployed
         one = self.pipeline.batch_at(
-            self.manifold, self.pipeline.split.train[:1], engine=self.operators, scene=self.pipeline.scene
+            self.manifold, self.pipeline.split.train[:1], engine=self.recurrence, scene=self.pipeline.scene
         ).batch.shared
         self.device = one.torch_device
-        self.names = self.operators.taught.parameters
+        self.names = self.recurrence.taught.parameters
         self.units = tuple(self.scene.parameters[name].unit for name in self.names)
-        self.ranges = np.array(self.operators.taught.ranges)
+        self.ranges = np.array(self.recurrence.taught.ranges)
         self.dt, self.t = one.dt, one.dt * np.arange(one.total_steps + 1)
         self.spacing = float(one.constants.volume0.mean() ** (1 / 3))
-        self._sample = one.sets[0].sample
         self._every = np.unique(np.concatenate([sets.sample for sets in one.sets]))
-        self._network = self.operators.model.to(self.device)
+        self._form = self.recurrence.form.to(self.device)
         self._xhat = one.xhat.to(self.device, torch.float64)
         self._given: dict[str, Polynomial] = {}
         self._built: dict[tuple, dict[str, np.ndarray]] = {}
@@ -141,7 +132,7 @@ class Model:
             for values in (given.gravity, given.solids)
         )
         xhat = self._xhat.repeat(len(rows), 1)
-        found = differentiable_run(self._network, xhat, first, rows, gravity, solids)
+        found = differentiable_run(self._form, xhat, first, rows, gravity, solids)
         return found.movedim(0, -2).unflatten(0, mu.shape[:-1]) if mu.ndim > 1 else found[:, 0]
 
     def at(self, points) -> Restriction:
@@ -194,7 +185,7 @@ class Model:
 
         The largest along a run of the distance of its shape from the training runs, in units of theirs from
         each other; and, above 1, how far parameters, gravity and solids are outside. It takes no projected
-        step, so it does not see how far the operators are from one (docs/method.md, Trust).
+        step, so it does not see how far the recurrence is from one (docs/method.md, Trust).
 
         Args:
             xhat: [..., N + 1, r], as this model gave them.
@@ -223,14 +214,14 @@ class Model:
 
     def _outside(self, values: Sequence[float]) -> float:
         """How far parameters are outside of what was taught, or from the training cases; 0 up to 1."""
-        case, taught = dict(zip(self.names, values, strict=True)), self.operators.taught
+        case, taught = dict(zip(self.names, values, strict=True)), self.recurrence.taught
         found = max(taught.outside(case, np.array(taught.gravity))[0], self.trust.cases.of(case))
         return found if found > 1.0 else 0.0
 
     def _forced(self, forcing: Forcing) -> np.ndarray:
         """[] or [B] how far gravity and solids are outside of what was taught; 0 up to 1."""
         gravity, solids = (v.detach().cpu().numpy() for v in (forcing.gravity, forcing.solids))
-        taught = self.operators.taught
+        taught = self.recurrence.taught
         far = np.linalg.norm(gravity - taught.gravity, axis=-1).max(-1) / max(taught.reach, 1e-30)
         programs = self.trust.of_forcing(gravity, solids, self.dt).max(-1)
         return np.maximum(np.where(far > 1.0 + 1e-6, far, 0.0), programs)
@@ -256,15 +247,10 @@ class Model:
 
     def _inputs_of(self, case: Mapping[str, float]) -> dict[str, np.ndarray]:
         scene, steps = self.scene.at(self.scene.case(case)), len(self.t) - 1
-        rows = torch.as_tensor(self._sample).long()
-        velocity = torch.as_tensor(scene.initial_velocity())[rows]
-        _, jacobian = self._at_sample.position_and_jacobian(self._xhat)
+        stride = self.dt * self.recurrence.form.stride
+        start = first_change(self.manifold, scene.particles().X, scene.initial_velocity(), stride)
         return {
-            "start": first_change(jacobian.cpu(), velocity.double(), self.dt).numpy(),
+            "start": start.numpy(),
             "gravity": scene.acting_gravity.at(self.t[:-1]),
             "solids": collider_states(scene.solids, self.dt, steps),
         }
-
-    @cached_property
-    def _at_sample(self) -> Restriction:
-        return self.at(torch.as_tensor(self._sample).long())

@@ -15,7 +15,7 @@ UNKNOWN = 12.0**-0.5
 
 
 def check_taught(model: Model, name: str, low: float, high: float) -> None:
-    """Refuse a range of a parameter, or a value as both its ends, that the operators were not taught.
+    """Refuse a range of a parameter, or a value as both its ends, that the recurrence was not taught.
 
     Raises:
         ConfigError: its ends are the wrong way round, or one lies outside.

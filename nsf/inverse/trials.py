@@ -9,17 +9,17 @@ import pandas as pd
 
 from nsf.data import PROGRAM, Case, Trajectory
 from nsf.data.schema import TRAJECTORY
-from nsf.engines.operators.teaching import random_cases
 from nsf.inverse.fit import Fit, fit
 from nsf.inverse.model import Model
 from nsf.inverse.observations import Observations, View
 from nsf.inverse.space import Space
+from nsf.scenes.designs import random_cases
 
 #: Columns of results.csv.
 COLUMNS = (
     "scene", "parameter", "trial", "truth", "estimate", "standard_error", "inside_90", "seconds", "distrust",
 )  # fmt: skip
-_SEED = 100  # of the cases, apart from those that operators are taught in
+_SEED = 100  # of the cases, apart from those that teach a recurrence
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,10 @@ class Restriction(ABC):
     def stress(self, xhat: Tensor, parameters: Tensor) -> Tensor:
         """Kirchhoff stress tau = h(X, xhat, μ), [n, 6] in pascals, order xx xy xz yy yz zz."""
 
+    def stress_of(self, coordinates: Tensor) -> Tensor:
+        """τ [..., n, 6] [Pa] of its coordinates [..., n_s] in the leading modes of a field that has modes."""
+        raise ShapeError("the stress field has no modes, whose coordinates these would be")
+
     @abstractmethod
     def affine(self, xhat: Tensor, parameters: Tensor, rate: Tensor | None = None) -> Tensor:
         """Affine velocity matrix C = l(X, xhat, μ), [n, 3, 3] in 1/s.

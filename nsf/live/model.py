@@ -113,6 +113,7 @@ class LiveRun:
         self._solver: ReducedMPM | None = solver
         self._decoder, self._trust = decoder, trust
         self._xhat = np.zeros((self.steps + 1, solver.manifold.latent_dim), np.float32)
+        self._shat: np.ndarray | None = None
         self._ratios = np.zeros(self.steps + 1)
         self._xhat[0] = solver.state.xhat
         self._ratios[0] = trust.ratios(self._xhat[:1], np.zeros(0))[0]
@@ -135,6 +136,10 @@ class LiveRun:
         last = solver.steps_taken if lost < 0 else lost - 1
         found = slice(first, last + 1)
         self._xhat[found] = latent.xhat[found]
+        if latent.stress is not None:
+            if self._shat is None:
+                self._shat = np.zeros((self.steps + 1, latent.stress.shape[1]), np.float32)
+            self._shat[found] = latent.stress[found]
         residuals = latent.residuals[first - 1 : last, -1]
         ratios = self._trust.ratios(latent.xhat[first - 1 : last + 1], residuals)[1:]
         forced = self._trust.of_forcing_in(solver, first - 1)[: last - first + 1]
@@ -160,6 +165,7 @@ class LiveRun:
         solver, kept = self._solver, slice(0, step + 1)
         assert solver is not None, "the run has begun"
         self._xhat[kept], self._ratios[kept] = run._xhat[kept], run._ratios[kept]
+        self._shat = None if run._shat is None else run._shat.copy()
         self.reached, self.by_hand = step, True
         record = solver.record
         record.xhat[kept] = torch.as_tensor(run._xhat[kept]).to(record.xhat)
@@ -186,7 +192,8 @@ class LiveRun:
     def stress(self, step: int) -> np.ndarray:
         """[n, 6] Kirchhoff stress [Pa] that the run's method uses, float32."""
         now = torch.as_tensor(self._xhat[step], device=self._decoder.at.device)
-        return packed("tau", self._decoder.stress(now[None])[0].cpu().numpy())
+        shat = None if self._shat is None else torch.as_tensor(self._shat[step : step + 1])
+        return packed("tau", self._decoder.stress(now[None], shat)[0].cpu().numpy())
 
 
 class LiveModel:

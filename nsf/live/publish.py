@@ -14,15 +14,14 @@ from nsf.data import Case
 from nsf.data.schema import TRAJECTORY
 from nsf.data.trajectory import Trajectory
 from nsf.deployment import Rollout, rollout_file
-from nsf.dynamics.setup import first_changes
-from nsf.engines import Operators
 from nsf.errors import ConfigError
 from nsf.evaluation.metrics import von_mises
 from nsf.live import page
 from nsf.live.model import LiveModel
-from nsf.live.wire import check_field, modal_field, network_arrays, shown
+from nsf.live.wire import check_field, modal_field, shown
 from nsf.models import Model, Recurrence
 from nsf.pipeline import Pipeline
+from nsf.recurrence import Form, RecurrenceEngine, first_change
 from nsf.results.formats import file_name
 from nsf.runs import Run
 from nsf.scenes import Scene
@@ -39,7 +38,7 @@ _SAME = 1e-9
 
 
 def write(run: Run, folder: Path, points: int | None = None, device: str = "auto") -> Path:
-    """Write the page of a deployment by operators.
+    """Write the page of a deployment by a recurrence.
 
     Args:
         run: complete deploy run.
@@ -85,38 +84,29 @@ def model_data(model: LiveModel, sizes: Sizes = Sizes()) -> tuple[str, bytes]:
         sizes: of what goes into it.
 
     Raises:
-        ConfigError: its steps are taken by no operators, its field has no modes, or a parameter changes the
+        ConfigError: its steps are taken by no recurrence, its field has no modes, or a parameter changes the
             forcing or the start.
     """
     check_field(model)
     pipeline = model.pipeline
     _check_model(model.run, pipeline.model)
-    operators = pipeline.operators()
-    taught, network = operators.taught, operators.model
-    if network.sizes.memory:
-        raise ConfigError(
-            f"{model.run.id} has operators with a memory, which a page has not; deploy it with "
-            "model.teaching.memory=[]"
-        )
+    recurrence = pipeline.recurrence()
+    taught, stress = recurrence.taught, recurrence.form.sizes.stress
     header, order = shown(model), {p.name: i for i, p in enumerate(model.parameters)}
     header["parameters"] = [header["parameters"][order[name]] for name in taught.parameters]
     arrays = {"rest": model.X}
-    header["fields"] = _fields(model, arrays, header, sizes)
-    with torch.no_grad():
-        layers = [_Layer(*own) for own in network.raw_layers()]
-    arrays |= {f"operators.{name}": a for name, a in network_arrays(layers, "f8").items()}
+    header["fields"] = _fields(model, arrays, header, sizes, stress)
+    arrays |= recurrence_arrays(recurrence.form)
     batch = pipeline.batch_at(model.manifold, [model.initial], precision="fp64")
     header |= {
         "file": file_name(f"{model.run.scene}-{model.run.hash}"),
         "latents": model.manifold.latent_dim,
         "dt": taught.dt,
         "steps": batch.total_steps,
-        "operators": {
-            "latents": network.sizes.latents, "gravity": network.sizes.gravity, "layers": len(layers)
-        },
-        "start": _start(model),
-        "gravity": _tilt(model, operators),
-        "trust": _trust(model, operators, arrays),
+        "recurrence": recurrence_header(recurrence.form),
+        "start": _start(model, recurrence.form.stride),
+        "gravity": _tilt(model, recurrence),
+        "trust": _trust(model, recurrence, arrays),
         "recordings": {},
     }  # fmt: skip
     header["cases"] = _cases(model, taught.parameters, arrays, header, sizes)
@@ -127,7 +117,7 @@ def ship(run: Run, path: Path, points: int, sizes: Sizes) -> None:
     """Write the data of a page alone, as `nsf demo` reads them.
 
     Args:
-        run: complete deploy run by operators.
+        run: complete deploy run by a recurrence.
         path: of the file.
         points: how many are shown; sizes: as for `model_data`.
     """
@@ -144,19 +134,36 @@ def _check_model(run: Run, model: Model) -> None:
         )
 
 
-class _Layer:
-    """A linear layer of given weights."""
+def recurrence_header(form: Form) -> dict:
+    """The sizes of a recurrence, as `Recurrence` in `recurrence.mjs` reads them."""
+    sizes = form.sizes
+    return {
+        "latents": sizes.latents, "stress": sizes.stress, "gravity": sizes.gravity, "stride": form.stride,
+        "members": sizes.members, "layers": 3,
+    }  # fmt: skip
 
-    def __init__(self, weight: torch.Tensor, bias: torch.Tensor):
-        self.weight, self.bias = weight, bias
+
+def recurrence_arrays(form: Form) -> dict[str, np.ndarray]:
+    """Weights [out, in] and biases [out] of each member's networks, which take states of colliders."""
+    arrays, at = {}, form.sizes.latents + form.sizes.parameters
+    for name, layers in form.in_raw_units().items():
+        (W, b), *rest = layers
+        before, of_c, after = W.split([at, form.sizes.states, W.shape[1] - at - form.sizes.states], 1)
+        of_states = form.c_matrix @ of_c
+        first = torch.cat([before, of_states, after], 1), b - form.c_mean @ of_states
+        for k, (weight, bias) in enumerate([first, *rest]):
+            for member in range(form.sizes.members):
+                arrays[f"{name}{member}.weight{k}"] = weight[member].T.contiguous().numpy()
+                arrays[f"{name}{member}.bias{k}"] = bias[member].contiguous().numpy()
+    return arrays
 
 
-def _fields(model: LiveModel, arrays: dict, header: dict, sizes: Sizes) -> dict:
-    """Put the fields of x and, where the method takes τ from one, of τ into a page."""
+def _fields(model: LiveModel, arrays: dict, header: dict, sizes: Sizes, stress: int) -> dict:
+    """Put the fields of x and, where τ follows from one or from ŝ, of τ into a page."""
     found = {}
     kinds: dict[str, tuple[type, int | None]] = {"deformation": (np.int16, sizes.modes)}
-    if model.pipeline.sources.neural_stress:
-        kinds["stress"] = np.int8, max(1, sizes.stress // (6 * len(model.X)))
+    if model.pipeline.sources.neural_stress or stress:
+        kinds["stress"] = np.int8, max(stress, 1, sizes.stress // (6 * len(model.X)))
         _, tau = model.training_frames()
         top = float(np.percentile(von_mises(torch.as_tensor(tau)).numpy(), CLIP)) or 1.0
         title = "von Mises stress"
@@ -181,11 +188,16 @@ def _corners(model: LiveModel) -> list[Case]:
     ]
 
 
-def _start(model: LiveModel) -> dict:
+def _start(model: LiveModel, stride: int) -> dict:
     """x̂ and what stands for d at t = 0, which no parameter may change."""
     batch = model.pipeline.batch_at(model.manifold, _corners(model), precision="fp64")
-    span, setups = batch.span_at(0), batch.batch.setups
-    changes = first_changes(span.at_sample, span.sets.sample, setups).cpu().numpy()
+    setups = batch.batch.setups
+    changes = np.stack(
+        [
+            first_change(model.manifold, s.constants.X, s.initial_velocity, stride * s.dt).numpy()
+            for s in setups
+        ]
+    )
     latents = np.stack([setup.xhat.double().cpu().numpy() for setup in setups])
     for name, rows in (("velocity", changes), ("shape", latents)):
         if np.abs(rows - rows[0]).max() > _SAME * max(1.0, np.abs(rows).max()):
@@ -193,24 +205,24 @@ def _start(model: LiveModel) -> dict:
     return {"xhat": latents[0].tolist(), "change": changes[0].tolist()}
 
 
-def _tilt(model: LiveModel, operators: Operators) -> dict | None:
+def _tilt(model: LiveModel, recurrence: RecurrenceEngine) -> dict | None:
     """Gravity of the scene, and the largest tilt that was taught [rad]; None where it has no programs.
 
-    Operators of other scenes take gravity as well, but no shape that their manifold knows leans to a side.
+    Recurrences of other scenes take gravity as well, but no shape that their manifold knows leans to a side.
     """
-    scene, taught = model.pipeline.deployed, operators.taught
+    scene, taught = model.pipeline.deployed, recurrence.taught
     down = np.array(scene.gravity)
     size = float(np.linalg.norm(down))
-    if not operators.model.sizes.gravity or not size or not scene.forcing.gravity:
+    if not recurrence.form.sizes.gravity or not size or not scene.forcing.gravity:
         return None
     # A ball about the mean of what was taught; its rim is nearest where the mean is off to one side.
     reach = max(taught.reach - float(np.linalg.norm(down - taught.gravity)), 0.05 * size)
     return {"down": down.tolist(), "angle": float(2.0 * np.arcsin(min(1.0, 0.5 * reach / size)))}
 
 
-def _trust(model: LiveModel, operators: Operators, arrays: dict) -> dict:
+def _trust(model: LiveModel, recurrence: RecurrenceEngine, arrays: dict) -> dict:
     """Put the distances to the training runs into a page."""
-    trust, taught = model.trust, operators.taught
+    trust, taught = model.trust, recurrence.taught
     matrix, known = trust.latent_distance.embedded(_TUBE * trust.distance)
     matrix = matrix[:, : len(arrays["deformation.scale"])]  # modes that were left out move little
     known = known[:: -(-len(known) // _SNAPSHOTS)]
@@ -221,7 +233,7 @@ def _trust(model: LiveModel, operators: Operators, arrays: dict) -> dict:
         "tube.known": np.rint(known / scale).astype(np.int16),
     }
     gravity = (
-        {"middle": list(taught.gravity), "reach": taught.reach} if operators.model.sizes.gravity else None
+        {"middle": list(taught.gravity), "reach": taught.reach} if recurrence.form.sizes.gravity else None
     )
     return {"distance": trust.distance, "cases": trust.cases.plain(), "gravity": gravity}
 

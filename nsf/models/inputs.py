@@ -14,7 +14,7 @@ class Inputs:
         start: [B, r] x̂ at t = 0.
         gravity: [B, N, 3] at the start of each step [m/s²].
         solids: [B, N, f] state of the solids there: of each shift [m], angle [rad] and their changes in a
-            step (`nsf.engines.operators.collider_states`).
+            step (`nsf.recurrence.collider_states`).
         dt: step [s].
     """
 

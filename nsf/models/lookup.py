@@ -11,10 +11,10 @@ from nsf.dynamics.batch import Batch
 from nsf.dynamics.setup import Setup
 from nsf.dynamics.span import Span, Stages
 from nsf.engines.base import Engine
-from nsf.engines.operators.states import collider_states
 from nsf.models.base import Model
 from nsf.models.inputs import Inputs
 from nsf.mpm import Gravity
+from nsf.recurrence.solids import collider_states
 
 
 def inputs_of(batch: Batch) -> Inputs:

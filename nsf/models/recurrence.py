@@ -1,81 +1,88 @@
-"""A learned recurrence of the latent vector (docs/method.md); microseconds a step."""
+"""A learned recurrence of the latent state (docs/method.md); microseconds a step."""
 
-from dataclasses import asdict, dataclass
-from typing import Any, ClassVar
+from dataclasses import dataclass
+from typing import ClassVar
 
 from typing_extensions import override
 
-from nsf.engines.operators.teaching import Teaching
 from nsf.errors import ConfigError
 from nsf.models.base import Model
+from nsf.recurrence.fitting import Fitting, check_stride
 from nsf.vectors import number
 
-#: Whose steps a recurrence learns: the projected model's, or those of the full-order runs of training.
-TEACHERS = (PROJECTED, RUNS) = ("projected", "runs")
+#: Drawn full-order runs that teach it, and coordinates of stress, where programs force a scene or do not.
+RUNS, STRESS = {True: 256, False: 32}, {True: 32, False: 0}
+STRIDE = 5
 
 
 @dataclass(frozen=True)
 class Recurrence(Model):
-    """Steps of the latent vector alone, learned from projected steps or from full-order runs of training.
+    """Strides of the latent state, learned from full-order runs: those of training, and of drawn cases.
 
     Attributes:
-        teacher: `projected` or `runs`.
-        check: steps from one projected step to the next, which estimate the error.
-        error_ratio: with teacher=runs: where the recurrence is more than this many times as far off at
-            validation runs as the projected model, that takes all runs; None: never.
-        teaching: how it is taught.
+        runs: full-order runs of drawn cases, which are encoded as they are made and not stored; None: `RUNS`.
+        stress: coordinates ŝ of τ beside x̂; None: `STRESS`.
+        stride: steps of the full-order run that a step of the recurrence covers; None: the most, up to
+            `STRIDE`, that divide the steps of a run.
+        gravity: of its magnitude, by how much gravity of drawn runs is varied where no program does, so that
+            it may be changed in deployment [-].
+        members, width, descents: as for `nsf.recurrence.Fitting`.
     """
 
-    teaching: Teaching
-    teacher: str = PROJECTED
-    check: int = 20
-    error_ratio: float | None = 1.25
+    runs: int | None = None
+    stress: int | None = None
+    stride: int | None = None
+    members: int = 4
+    width: int = 96
+    descents: int = 2000
+    gravity: float = 0.1
     learns: ClassVar[bool] = True
-    projects: ClassVar[bool] = True
 
     def __post_init__(self):
-        if self.teacher not in TEACHERS:
-            raise ConfigError(f"teacher={self.teacher} is unknown; choose one of {', '.join(TEACHERS)}")
-        number("check", self.check, least=1, whole=True)
-        if self.error_ratio is not None and not number("error_ratio", self.error_ratio) > 0:
-            raise ConfigError(
-                f"error_ratio={self.error_ratio} must be positive, or null to leave it all runs"
-            )
+        for name, least in (("runs", 0), ("stress", 0), ("stride", 1)):
+            if getattr(self, name) is not None:
+                number(f"model.{name}", getattr(self, name), least=least, whole=True)
+        number("model.gravity", self.gravity, least=0)
+        self.fitting  # noqa: B018 — checks its values
 
     @property
-    def of_runs(self) -> bool:
-        """Whether it learns from full-order runs of training."""
-        return self.teacher == RUNS
+    def fitting(self) -> Fitting:
+        """How it is fitted."""
+        return Fitting(self.width, self.members, self.descents)
+
+    def stride_of(self, steps: int) -> int:
+        """Stride in runs of so many steps."""
+        return self.stride or next(k for k in range(STRIDE, 0, -1) if steps % k == 0)
+
+    def runs_of(self, forced: bool) -> int:
+        """Drawn runs of a scene that programs force, or do not."""
+        return self.runs if self.runs is not None else RUNS[forced]
+
+    def stress_of(self, forced: bool) -> int:
+        """Coordinates of τ, likewise."""
+        return self.stress if self.stress is not None else STRESS[forced]
 
     @override
     def refuse(self, names) -> None:
-        c, teaching = names.config, self.teaching
-        if teaching.memory and not self.of_runs:
+        c, split, forced = names.config, names.split, bool(names.scene.forcing)
+        check_stride(self.stride_of(names.scene.steps), names.scene.steps)
+        if c.deploy.dt_multiplier != 1:
             raise ConfigError(
-                f"model.teaching.memory={list(teaching.memory)} is learned from runs "
-                f"alone; set model.teacher={RUNS}, or model.teaching.memory=[]"
+                f"model=recurrence takes strides of the scene's Δt, and deploy.dt_multiplier is "
+                f"{c.deploy.dt_multiplier:g}; set it to 1, and model.stride"
             )
-        if teaching.runs and not self.of_runs:
+        if forced and not split.validation:
             raise ConfigError(
-                f"model.teaching.runs={teaching.runs} stand beside full-order runs; set "
-                f"model.teacher={RUNS}, or model.teaching.runs=0"
+                "model=recurrence chooses its weights by validation programs, and scene.design.validation is "
+                f"{len(split.validation)}; set it to 4"
             )
-        if self.of_runs and c.deploy.dt_multiplier != 1:
+        runs, stress = len(split.train) + self.runs_of(forced), self.stress_of(forced)
+        if runs < stress:
             raise ConfigError(
-                f"model.teacher={RUNS} teaches steps of the scene's Δt, and deploy.dt_multiplier is "
-                f"{c.deploy.dt_multiplier:g}; set it to 1, or model.teacher={PROJECTED}"
-            )
-        if c.stress == "particles" and not self.of_runs:
-            raise ConfigError(
-                f"model.teacher={self.teacher} is asked for single steps, which depend on what particles "
-                f"went through with stress=particles; set model.teacher={RUNS}, or stress=field affine=field"
+                f"model.stress={stress} coordinates need as many runs, and there are {runs}; set "
+                f"model.runs={stress - len(split.train)}, or model.stress={runs} or fewer"
             )
 
     @override
     def engine(self, pipeline, manifold):
-        return pipeline.operators()
-
-    @property
-    @override
-    def lesson(self) -> dict[str, Any]:
-        return {"name": self.name, "teacher": self.teacher, "teaching": asdict(self.teaching)}
+        return pipeline.recurrence()

@@ -118,6 +118,7 @@ class FrameRecorder:
         precision: of the state.
         stored: precision of the recorded values.
         memory: host memory of the blocks.
+        capacity: most frames of a block; as many as 64 MiB hold if that is less.
     """
 
     def __init__(
@@ -126,11 +127,13 @@ class FrameRecorder:
         precision: Precision,
         stored: Precision = FP32,
         memory: HostMemory | None = None,
+        capacity: int | None = None,
     ):
         self._memory = memory or HostMemory()
         self._state = state
         self._device = state.order.device
-        self.capacity = max(1, _BLOCK_BYTES // frame_bytes(len(state), stored))
+        fitting = max(1, _BLOCK_BYTES // frame_bytes(len(state), stored))
+        self.capacity = min(capacity or fitting, fitting)
         # A field lies in one piece, as on disk, so that its frames are written without another copy.
         self._block = {
             name: wp.empty((self.capacity, len(state), c), dtype=stored.real, device=self._device)
@@ -151,6 +154,12 @@ class FrameRecorder:
         inputs = [s.x.rows, s.v.rows, s.C.rows, s.tau.rows, s.order, *outputs]
         wp.launch(self._pack, dim=len(s), inputs=inputs, device=self._device)
         self.count += 1
+
+    def on_device(self) -> dict[str, wp.array]:
+        """The frames recorded since the last call, where they are; the next one writes over them."""
+        wp.synchronize_device(self._device)
+        count, self.count = self.count, 0
+        return {name: block[:count] for name, block in self._block.items()}
 
     def take(self) -> Block:
         """Host copy of the frames recorded since the last call."""

@@ -19,7 +19,6 @@ from omegaconf import DictConfig, OmegaConf
 from nsf import config as configuration
 from nsf.config.scenes import changed_scene, scene_of
 from nsf.data.case import Case
-from nsf.engines.operators.teaching import Teaching, random_cases
 from nsf.errors import ConfigError, MissingRunError
 from nsf.gpu import has_driver
 from nsf.models import Auto, Model, Recurrence
@@ -31,11 +30,13 @@ from nsf.results.folder import check_place
 from nsf.results.question import Question, unchanged
 from nsf.runs import Run
 from nsf.scenes import Scene
+from nsf.scenes.designs import random_cases
 
 if TYPE_CHECKING:
     from nsf.dynamics import ReducedBatch, ReducedMPM, Sources
-    from nsf.engines import Engine, Operators
+    from nsf.engines import Engine
     from nsf.kinematics.manifold import Manifold
+    from nsf.recurrence import RecurrenceEngine
 
 #: Of the chain, in order.
 STAGES = ("simulate", "train", "teach", "deploy", "evaluate", "report")
@@ -44,8 +45,6 @@ _SECTIONS = (
     *("material", "transfer", "field", "trainer", "model", "sampler", "projector", "integration"),
     *("data", "deploy", "evaluation", "super_resolution", "report"),
 )
-#: Cases between the training ones whose runs decide which round of teaching is kept.
-HELD_BACK = 3
 #: Precision of stored frames by the name of their type.
 _STORED = {"float32": FP32, "float64": FP64}
 
@@ -208,34 +207,23 @@ class Pipeline:
         return self.configured.learns
 
     @property
-    def teaching(self) -> Teaching | None:
-        """How the recurrence is taught; None for another model."""
-        return self.model.teaching if isinstance(self.model, Recurrence) else None
-
-    @property
-    def of_runs(self) -> bool:
-        """Whether a recurrence learns from the full-order runs of training, not from projected steps."""
-        return isinstance(self.model, Recurrence) and self.model.of_runs
+    def forced(self) -> bool:
+        """Whether programs force the scene."""
+        return bool(self.scene.forcing)
 
     @property
     def lessons(self) -> list[list[Case]]:
-        """Cases of three kinds that the teacher is asked in: of training, between them, and held back.
+        """Cases that a model learns from: of training, and for a recurrence those drawn and of validation.
 
-        Runs in those held back decide which round of teaching is kept. None is a validation or test case.
-        Where runs are the teacher there is one round; how far its runs at validation values are off, or, if
-        there are none, at training, is what `model.error_ratio` is held to. Between are as many as asked.
+        Validation runs choose its weights; where there are none, and no programs, those of training do.
         """
-        known, seed = sorted(self.split.train), int(self.config.seed)
-        taken = [*known, *self.split.validation, *self.split.test]
-        if self.teaching is None:
+        known = sorted(self.split.train)
+        if not isinstance(self.model, Recurrence):
             return [known]
-        if self.of_runs:
-            drawn = self.teaching.runs
-            between = random_cases(self.split.box, drawn, seed, taken) if drawn else []
-            return [known, between, sorted(self.split.validation) or known]
-        between = random_cases(self.split.box, len(known), seed, taken)
-        back = random_cases(self.split.box, HELD_BACK, seed + 1, [*taken, *between])
-        return [known, between, back]
+        taken = [*known, *self.split.validation, *self.split.test]
+        count = self.model.runs_of(self.forced)
+        drawn = random_cases(self.split.box, count, int(self.config.seed), taken) if count else []
+        return [known, drawn, sorted(self.split.validation) or known]
 
     @property
     def held_out(self) -> tuple[Case, ...]:
@@ -411,7 +399,9 @@ class Pipeline:
         Raises:
             ConfigError: it learns nothing.
         """
-        return self._made(self.taught, "fitting.fit" if self.teaching is None else "teaching.teach")
+        return self._made(
+            self.taught, "teaching.teach" if isinstance(self.model, Recurrence) else "fitting.fit"
+        )
 
     def deploy(self) -> Run:
         """Reduced trajectories of the held-out cases, through Lightning's `Trainer.predict`."""
@@ -518,8 +508,6 @@ class Pipeline:
         """
         from nsf.engines import reduced_batch
 
-        if self.teaching is not None and self.taught.complete:
-            self.operators()  # which bring the sample, whoever takes the steps
         if engine is None:
             engine = self.model.engine(self, manifold)
         batch = reduced_batch(
@@ -540,18 +528,17 @@ class Pipeline:
         self._samples, self._sets = batch.batch.shared.samples, batch.batch.shared.sets
         return batch
 
-    def operators(self) -> "Operators":
-        """The operators that were taught; their sample is that of all runs from here on.
+    def recurrence(self) -> "RecurrenceEngine":
+        """The recurrence that was taught.
 
         Raises:
-            MissingRunError: none were taught.
+            MissingRunError: none was.
         """
         if self._taught is None:
-            from nsf.engines import Operators
-            from nsf.pipeline.stages.teaching import OPERATORS
+            from nsf.pipeline.stages.teaching import RECURRENCE
+            from nsf.recurrence import RecurrenceEngine
 
-            self._taught = Operators.load(self.taught.require().file(OPERATORS))
-            self._samples = self._taught.samples
+            self._taught = RecurrenceEngine.load(self.taught.require().file(RECURRENCE))
         return self._taught
 
     def fitted(self, manifold: "Manifold") -> Any:

@@ -6,7 +6,6 @@ from nsf import config as configuration
 from nsf.data import Case
 from nsf.errors import ConfigError
 from nsf.kinematics.fields.basis import BasisField
-from nsf.models import Recurrence
 from nsf.mpm.recording import frame_bytes
 from nsf.mpm.stability import check_colliders, check_time_step
 from nsf.runs import Run
@@ -36,7 +35,6 @@ def check(pipeline) -> None:
         check_batched(c.deploy.batch, field, integration.strategy)
         if pipeline.sources.carried:
             _check_carried(c.deploy.batch, sampler)
-        _check_symmetry(pipeline)
         X = pipeline.scene.particles().X
         for region in sampler.regions:
             check_well_posed(region.size, c.latent_dim)
@@ -73,13 +71,6 @@ def _check_carried(batch: int, sampler) -> None:
             f"the sampler has {len(sampler.regions)} samples in a run, and stress=particles takes "
             "one; set sampler.phases=[], or another sampler"
         )
-
-
-def _check_symmetry(pipeline) -> None:
-    """Refuse mirror planes that the scene has not."""
-    for model in [pipeline.configured, *(getattr(pipeline.configured, "of", None) or {}).values()]:
-        if isinstance(model, Recurrence) and model.of_runs and model.teaching.symmetry:
-            model.teaching.symmetry.images(pipeline.scene)
 
 
 def _check_cases(pipeline) -> None:

@@ -59,11 +59,10 @@ def taught(pipeline) -> Run:
     model = pipeline.model
     if not model.learns:
         raise ConfigError(f"model={model.name} is not taught; set model=recurrence")
-    keys = ("stress", "affine", "sampler", "projector", "integration", "precision", "seed")
     case = pipeline.split.train[0]
-    content = _content(pipeline, *keys) | _physics(pipeline.config.scale, pipeline.scene, case)
+    content = _content(pipeline, "precision", "seed") | _physics(pipeline.config.scale, pipeline.scene, case)
     content |= {"cases": [list(map(dict, cases)) for cases in pipeline.lessons], "device": pipeline.device}
-    content |= {"model": model.lesson, "dt_multiplier": pipeline.config.deploy.dt_multiplier}
+    content |= {"model": model.lesson}
     return _run(pipeline, "teach", content | _edited(), [pipeline.training])
 
 

@@ -67,7 +67,7 @@ def differing(found: Sequence[Entry], asked: Iterable[str] = ()) -> Differing:
     for entries in groups.values():
         known = dict.fromkeys(key for entry in entries for key in (*TITLES, *entry.settings))
         for key in known:
-            # Some have no such key at all, as those of operators.
+            # Some have no such key at all, as those of a recurrence.
             values = {cell(entry, key) for entry in entries} - {ABSENT}
             if not _SAID.search(key) and key not in replaced and len(values) > 1:
                 differ[key] = None

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     )
     from nsf.scenes.scene import Scene
     from nsf.scenes.shapes import Ball, Box, Cylinder, Frame, Mesh, Ribbon, Shape, TentacleBall, mesh_or_ball
-    from nsf.scenes.symmetry import Symmetry
     from nsf.scenes.weakness import Weakness
 
 __all__ = [
@@ -51,7 +50,6 @@ __all__ = [
     "Scene",
     "Shape",
     "Sobol",
-    "Symmetry",
     "TentacleBall",
     "Values",
     "Weakness",

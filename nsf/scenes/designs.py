@@ -268,3 +268,26 @@ def _split(train: Sequence[Case], validation: Sequence[Case], test: Sequence[Cas
         return Split(train=train, validation=validation, test=test)
     except ConfigError as error:
         raise ConfigError(f"scene.design: {error}") from error
+
+
+#: Forcing programs of `random_cases` have numbers from here on, for each seed.
+_PROGRAMS = 1_000_000
+
+
+def random_cases(box: np.ndarray, count: int, seed: int, taken: Sequence[Case]) -> list[Case]:
+    """Cases in a box, spread evenly and shaken: points of a Hammersley set, each moved by up to 1/count.
+
+    Args:
+        box: [n, 2] smallest and largest value of each parameter.
+        count: how many; one fewer for each that would be a case that is taken.
+        seed: of the generator.
+        taken: cases that are left out, at least one; they name the parameters.
+    """
+    even = np.column_stack([np.arange(count), count * evenly(count, len(box) - 1)])
+    shaken = (even + np.random.default_rng(seed).random(even.shape)) / count % 1.0
+    low, high = box.T
+    rows = low + (high - low) * shaken
+    if PROGRAM in taken[0].names:
+        rows = np.column_stack([rows, _PROGRAMS * (1 + seed) + np.arange(count)])
+    cases = [Case(taken[0].names, point, taken[0].units) for point in rows]
+    return [case for case in cases if case not in taken]

@@ -84,15 +84,15 @@ def train(scene: str) -> None:
     pipeline.train()
 
 
-#: The same for runs by operators, which few lessons will do for.
+#: The same for runs by a recurrence, for which a short descent will do.
 TAUGHT = [
     "model=recurrence", "scene.design.validation=[24,36]", "scene.design.test=[27]",
-    *(f"model.teaching.{key}" for key in ("steps=300", "descent=100", "rounds=1", "width=16")),
+    *("model.runs=4", "model.descents=60", "model.width=16"),
 ]  # fmt: skip
 
 
 def deploy(scene: str) -> None:
-    """A deployed run by operators, likewise."""
+    """A deployed run by a recurrence, likewise."""
     keys = [f"scene={scene}", "scale=small", "device=cpu", *SHORT[scene], *TAUGHT]
     pipeline = Pipeline(config.load(keys))
     for stage in ("simulate", "train", "deploy"):

@@ -19,12 +19,12 @@ from configurations import BUILT, EVERY, EXPERIMENTS, MODELS, NETWORKS, PAPER, S
 from nsf import config
 from nsf.data import Trajectory
 from nsf.deployment import Rollout, rollout_file
-from nsf.engines import Operators
 from nsf.export.playback import Playback
 from nsf.kinematics.manifold import Manifold
 from nsf.live import publish
 from nsf.live.model import LiveModel
 from nsf.pipeline import Pipeline
+from nsf.recurrence import taught
 from nsf.runs import Record, Run
 
 HERE = Path(__file__).parent
@@ -76,7 +76,7 @@ class Chains:
         self._give(pipeline.training, "manifold.pt", input_of(scene, model, "train"))
         if pipeline.is_taught:
             pipeline.run("teach")
-            self._give(pipeline.taught, "operators.pt", input_of(scene, model, "teach"))
+            self._give(pipeline.taught, "recurrence.pt", input_of(scene, model, "teach"))
         return pipeline
 
     def deployed(self, scene: str, model: str, *further: str) -> Pipeline:
@@ -95,9 +95,9 @@ class Chains:
             _fill(manifold, source)
             manifold.save(run.path / name)
         else:
-            engine = Operators.load(run.path / name)
-            _fill(engine.model, source)
-            engine.model.save(run.path / name, engine.taught, engine.samples)
+            form, by = taught.load(run.path / name)
+            _fill(form, source)
+            taught.save(form, by, run.path / name)
         record = Record(run.path, run.manifest)
         for output in run.manifest["outputs"]:
             record.output(output["path"])
@@ -119,7 +119,8 @@ def write_inputs(chains: Chains) -> None:
             _write(Manifold.load(chains(scene, model).training.path / "manifold.pt"), path)
     for scene, model in TAUGHT:
         if not (path := input_of(scene, model, "teach")).exists():
-            _write(Operators.load(chains(scene, model).taught.path / "operators.pt").model, path)
+            form, _ = taught.load(chains(scene, model).taught.path / "recurrence.pt")
+            _write(form, path)
 
 
 def _write(module: torch.nn.Module, path: Path) -> None:

@@ -91,13 +91,9 @@ SCENES = {
 }
 PAPER = ("bread", "cake", "sand", "metal", "toothpaste", "jelly_cube", "squishy_ball")
 
-_TAUGHT = (
-    "model=recurrence",
-    "model.teacher=runs",
-    "model.teaching.descent=2",
-    "model.teaching.width=8",
-    "model.teaching.unroll=4",
-)
+_TAUGHT = ("model=recurrence", "model.runs=0", "model.members=1", "model.descents=3", "model.width=8")
+#: A state of stress, strides of five steps, two members, and the validation program that is asked for.
+_STRESS = ("model.stress=2", "model.members=2", "scene.design.validation=1")
 _PAPER = ("model=projected", "stress=field", "affine=field")
 #: Of every field but the paper's networks.
 MODES = ("field.modes=[4,2,2]", "field.beta=4", "field.depth=1", "field.members=1", "field.noise=0.03")
@@ -108,7 +104,7 @@ MODELS = {
     "baseline": (*MODES, "model=projected", "stress=deformation", "affine=none"),
     "history": (*MODES, "model=projected", "stress=particles", "affine=particles"),
     "recurrence": (*MODES, *_TAUGHT, "stress=field", "affine=field"),
-    "history recurrence": (*MODES, *_TAUGHT, "stress=particles", "affine=particles"),
+    "history recurrence": (*MODES, *_TAUGHT, *_STRESS, "stress=particles", "affine=particles"),
     "networks": (*_PAPER, "field=mlp", "field.beta=2"),
 }
 #: Models whose runs are built without their stage, as no key says how a step is computed.
@@ -126,7 +122,7 @@ NETWORKS = ("sand",)
 FEW = ("trainer.steps=3",)
 #: Keys that `make.py` adds, where it trains and teaches in earnest.
 TRAINED = ("trainer.steps=300",)
-TAUGHT_WELL = ("model.teaching.descent=400",)
+TAUGHT_WELL = ("model.descents=300",)
 
 #: (scene, model, further keys) of each row of three experiments.
 EXPERIMENTS = {

@@ -133,7 +133,8 @@ FORCED = (
 @pytest.mark.slow
 def test_programs_through_the_whole_chain(pipeline_at, tmp_path):
     """Simulated, trained on, taught from, evaluated; a program beyond the range is distrusted."""
-    taught = ("model=recurrence", "model.teaching.descent=60", "model.teaching.rounds=0", "model.check=4")
+    taught = ("model=recurrence", "model.descents=30", "model.runs=3", "model.stress=4", "model.width=16")
+    taught += ("scene.design.validation=[[24, 1000]]",)
     pipeline = pipeline_at(tmp_path, *FORCED, *taught)
     for stage in ("simulate", "train", "teach", "deploy", "evaluate"):
         pipeline.run(stage)

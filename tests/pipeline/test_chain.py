@@ -496,7 +496,7 @@ def test_a_diverged_rollout_is_infinite_and_never_nan(copied, pipeline_at):
         "estimated_error",
         "fallback_at",
     ]
-    assert results[costs].isna().all().all()  # of a run that has left the grid, and is none by operators
+    assert results[costs].isna().all().all()  # of a run that has left the grid, and is none by a recurrence
     assert not results.drop(columns=[*costs, "teacher", "distrusted_at"]).isna().any().any()
     frames = np.load(pipeline.evaluation.path / "frames.npz")
     assert np.isfinite(frames["x_reduced"]).all()

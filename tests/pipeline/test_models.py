@@ -101,7 +101,7 @@ def test_beyond_its_training_an_interpolated_run_may_be_projected(copied, pipeli
     root, keys = copied("simulate", "train"), ("model=interpolate", "scene.design.test=[60]")
     pipeline, _, said = run_of(pipeline_at, root, *keys, "fallback=projected")
     kept = Rollout.open(pipeline.deployment.file("rollout_0.h5"))
-    assert kept.by_operators == 0 or kept.trust[: kept.by_operators].max() <= 1.0
+    assert kept.by_latent_model == 0 or kept.trust[: kept.by_latent_model].max() <= 1.0
     assert any("is none of the cases that the model was trained for" in line for line in said)
     handed, rows, _ = run_of(pipeline_at, root, *keys, "fallback=full")
     assert Rollout.open(handed.deployment.file("rollout_0.h5")).handed_over == 0
@@ -178,7 +178,7 @@ def test_what_cannot_be_asked_for(tmp_path, tiny, overrides, message):
     ("override", "message"),
     [
         ("engine=operators", "engine=operators was removed; choose model=recurrence"),
-        ("engine.teaching.width=8", "engine.teaching was removed; set model.teaching"),
+        ("engine.teaching.width=8", "engine.teaching was removed; set model.runs"),
         (
             "method=deformation_only",
             "method=deformation_only was removed; set stress=deformation",

@@ -234,11 +234,10 @@ def test_what_is_not_deployed_together_is_refused_before_any_work(nsf, override,
     assert "deploy.batch=1" in err
 
 
-def test_a_memory_is_learned_from_full_order_runs_alone(nsf):
+def test_a_removed_key_of_teaching_names_its_remedy(nsf):
     code, _, err = nsf("run", "model=recurrence", "model.teaching.memory=[0.1]")
     assert code == 2
-    assert "model.teaching.memory=[0.1] is learned from runs alone" in err
-    assert "model.teacher=runs" in err
+    assert "model.teaching.memory was removed; set model.stress" in err
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU here")

@@ -292,6 +292,11 @@ class ModalRestriction(Restriction):
         return self.fields["stress"].values(self._inputs(xhat, parameters))
 
     @override
+    def stress_of(self, coordinates):
+        modes = self.fields["stress"].modes[..., : coordinates.shape[-1]]
+        return torch.einsum("...k,nck->...nc", coordinates.to(modes), modes)
+
+    @override
     def affine(self, xhat, parameters, rate=None):
         return self.fields["affine"].values(self._inputs(xhat, parameters), rate).unflatten(-1, (3, 3))
 

@@ -106,8 +106,18 @@ export class Field {
    * @param {number} components c of a point
    */
   at(xhat, parameters, rows = null, components = 1) {
-    const a = this.coefficientsAt(xhat, parameters), { scaled, scale } = this;
-    for (let k = 0; k < a.length; k++) scaled[k] = a[k] * scale[k];
+    return this.of(this.coefficientsAt(xhat, parameters), rows, components);
+  }
+
+  /**
+   * The same of coefficients of the first modes.
+   * @param {Vector} coefficients
+   * @param {Uint32Array | null} rows of the points
+   * @param {number} components c of a point
+   */
+  of(coefficients, rows, components) {
+    const { scaled, scale } = this;
+    for (let k = 0; k < scaled.length; k++) scaled[k] = (coefficients[k] ?? 0) * scale[k];
     return combined(this.mean, this.modes, scaled, this.values, rows, components);
   }
 }

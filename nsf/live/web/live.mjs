@@ -1,9 +1,9 @@
-// A model that runs in the page: closure, operators and modes are in the file, and a hand steers it.
+// A model that runs in the page: closure, recurrence and modes are in the file, and a hand steers it.
 
 import { button, choice, counted, download, element, find, slider, sliders, tick } from "./controls.mjs";
 import { Recording } from "./data.mjs";
 import { Field, displacement, vonMises } from "./field.mjs";
-import { Operators, Run } from "./operators.mjs";
+import { Recurrence, Run } from "./recurrence.mjs";
 import { along, moved } from "./solids.mjs";
 import { Tilt } from "./tilt.mjs";
 import { Trust } from "./trust.mjs";
@@ -25,7 +25,7 @@ export class Live {
     this.trust = new Trust(packed, this.deformation);
     /** @type {Map<string, Recording>} */
     this.recordings = new Map(Object.keys(told.recordings).map((name) => [name, new Recording(packed, name)]));
-    this.run = new Run(new Operators(packed), told.start, told.dt, MOST);
+    this.run = new Run(new Recurrence(packed), told.start, told.dt, MOST);
     this.cursor = 0; // of steps, with its fraction
     /** @type {number[]} distance from the training runs in the steps that were looked at */ this.tube = [];
     /** @type {number[]} largest distance of gravity up to each step */ this.gravity = [];
@@ -128,6 +128,20 @@ export class Live {
     const { latents, steps } = this.run, n = this.step, part = this.cursor - n;
     const here = latents[n];
     return part > 0 && n < steps ? here.map((value, i) => value + part * (latents[n + 1][i] - value)) : here;
+  }
+
+  /** Coordinates of stress in the step that is shown; none where they follow from x̂. */
+  get shat() {
+    return this.run.stresses[this.step];
+  }
+
+  /**
+   * Stress [n, 6] [Pa] of some points, as it is shown.
+   * @param {Field} stress its field
+   * @param {Uint32Array} rows of the points
+   */
+  stressOf(stress, rows) {
+    return this.shat.length ? stress.of(this.shat, rows, 6) : stress.at(this.xhat, this.parameters, rows, 6);
   }
 
   /** Parameters in the step that is shown. */
@@ -272,7 +286,7 @@ export class LivePlayer extends Live {
   draw(color) {
     const { xhat, parameters, told, rest } = this, { top } = told.quantities[color], byStress = color === "von_mises" ? this.stress : null;
     const x = this.deformation.at(xhat, parameters);
-    this.body?.show(x, (rows) => byStress ? vonMises(byStress.at(xhat, parameters, rows, 6), top, rows.length) : displacement(x, rest, top, rows));
+    this.body?.show(x, (rows) => byStress ? vonMises(this.stressOf(byStress, rows), top, rows.length) : displacement(x, rest, top, rows));
     const wanted = this.held && this.recordings.size && find("truth").checked ? this.case.recording : null;
     for (const [name, own] of this.truths) {
       own.visible = name === wanted;
@@ -292,8 +306,8 @@ export class LivePlayer extends Live {
       find("sides").textContent = find("truth").checked ? stored : "";
     }
     const estimate = this.held && this.case.estimate !== null
-      ? ` Estimated distance from the projected run, at most ${(1000 * this.case.estimate).toPrecision(2)} mm.` : "";
-    return { light: this.light(), note: `Steps of ${this.told.dt} s by operators.${estimate}` };
+      ? ` Estimated error, at most ${(1000 * this.case.estimate).toPrecision(2)} mm.` : "";
+    return { light: this.light(), note: `Strides of ${Number((this.told.dt * this.run.recurrence.stride).toPrecision(3))} s by a recurrence.${estimate}` };
   }
 
   /** @param {import("./page.mjs").Page} page */

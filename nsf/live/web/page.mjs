@@ -190,7 +190,7 @@ async function show() {
   const packed = data && unpacked(await inflated(data.textContent ?? ""));
   data?.remove();
   /** @type {Player} */
-  const player = !packed ? await StreamPlayer.joined() : packed.header.operators ? new LivePlayer(packed) : new RecordedPlayer(packed);
+  const player = !packed ? await StreamPlayer.joined() : packed.header.recurrence ? new LivePlayer(packed) : new RecordedPlayer(packed);
   const page = new Page(player), asked = new URLSearchParams(location.hash.slice(1)), color = asked.get("color") ?? "";
   page.camera.follow(find("canvas"), (dx, dy) => player.drag?.(dx, dy) ?? false);
   page.paint(color in player.told.quantities ? color : player.color);

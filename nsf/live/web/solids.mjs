@@ -1,4 +1,4 @@
-// Solids that the material meets: where they are, and their state as operators take it.
+// Solids that the material meets: where they are, and their state as a recurrence takes it.
 
 /** @typedef {{ times: number[], values: number[][] }} Keyframes */
 /** @typedef {{ times: number[], translations: number[][], angles: number[], axis: number[], pivot: number[] }} Motion */

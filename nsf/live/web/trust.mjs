@@ -1,4 +1,4 @@
-// Whether a run by operators is to be believed, and why not, as far as a page can tell without a projected step.
+// Whether a run by a recurrence is to be believed, and why not, as far as a page can tell without a projected step.
 
 /** @typedef {import("./data.mjs").Packed} Packed */
 /** @typedef {import("./field.mjs").Field} Field */
@@ -88,7 +88,7 @@ export class Trust {
    * @param {number} tube largest `ofLatent` so far
    * @param {number} gravity largest `ofGravity` so far
    * @param {number | null} diverged time at which the run ceased to be finite [s]
-   * @param {number | null} estimate how far the run is from the projected one, as a deployment estimated it [m]
+   * @param {number | null} estimate estimated error of the run, as its deployment had it [m]
    * @returns {Light}
    */
   light(parameters, tube, gravity, diverged = null, estimate = null) {
@@ -115,7 +115,7 @@ export class Trust {
       return { level: "away", text: `away from the training cases, ratio ${away.toPrecision(3)}, above 1`, ratio };
     if (estimate !== null && estimate > this.told.distance) {
       const [most, scale] = [estimate, this.told.distance].map((value) => quantity(1000 * value, "mm", 2));
-      const text = `operators may be ${most} from the projected run; training runs are ${scale} from each other`;
+      const text = `the run may be ${most} off; training runs are ${scale} from each other`;
       return { level: "away", text, ratio };
     }
     return { level: "good", text: `distrust ratio ${ratio.toFixed(2)}, below 1`, ratio };

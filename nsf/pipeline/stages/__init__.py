@@ -1,1 +1,1 @@
-"""The work of each stage: trajectories, manifold, operators, reduced runs, errors and costs."""
+"""The work of each stage: trajectories, manifold, recurrence, reduced runs, errors and costs."""

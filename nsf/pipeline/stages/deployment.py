@@ -24,11 +24,11 @@ from nsf.deployment import (
 )
 from nsf.deployment.trust import CaseDistance, LatentDistance, SolidsRange
 from nsf.dynamics import ReducedBatch, ReducedMPM
-from nsf.engines.operators import collider_states
 from nsf.kinematics.manifold import Manifold
-from nsf.models import Auto, FullOrder, Projected, Recurrence
+from nsf.models import Auto, FullOrder, Projected
 from nsf.mpm.stability import largest_stable_dt, multiplied_step_warning
 from nsf.pipeline.stages.choosing import measure_candidates
+from nsf.recurrence.solids import collider_states
 from nsf.runs import Record, Run
 from nsf.storage import writing
 
@@ -69,7 +69,7 @@ def deploy_held_out(pipeline, run: Run) -> None:
                 record.output(continuation_file(index))
         write_configuration(pipeline, record)
         record.metrics["seconds"] = [r.seconds for r in rollouts]
-        record.metrics["by_operators"] = [r.by_operators for r in rollouts]
+        record.metrics["by_latent_model"] = [r.by_latent_model for r in rollouts]
         record.metrics["needed_outside"] = max(r.needed_outside for r in rollouts)
         record.metrics["diverged"] = [r.case.column for r in rollouts if r.diverged >= 0]
         record.metrics["distrusted"] = [r.case.column for r in rollouts if r.distrusted >= 0]
@@ -203,34 +203,11 @@ def _case_of(cases: Sequence[Case], values: Mapping[str, float]) -> Case:
 
 
 def fallback_of(pipeline, manifold: Manifold) -> Fallback:
-    """How the pipeline's runs are watched, and who goes on with one that is no longer believed."""
-    model, to = pipeline.model, pipeline.config.fallback
-    if isinstance(model, Projected):
+    """Who goes on with a run of the pipeline that is no longer believed."""
+    to = pipeline.config.fallback
+    if isinstance(pipeline.model, Projected):
         return Fallback(to)
-    projected = partial(pipeline.batch_at, manifold, engine=pipeline.projecting)
-    return Fallback(to, projected, model.check if isinstance(model, Recurrence) else 0, _near(pipeline))
-
-
-def _near(pipeline) -> bool:
-    """Whether operators were near enough at validation runs, beside the projected step; tells where not.
-
-    True as well where there are no such runs, or the projected step loses one of them.
-    """
-    if not pipeline.of_runs or pipeline.model.error_ratio is None or not pipeline.split.validation:
-        return True
-    taught = pipeline.taught
-    told = taught.manifest["metrics"]
-    if "projected_error" in told and told["projected_error"] is None:  # not finite
-        return True
-    own, projected = min(told["errors"]), taught.metric("projected_error")
-    if own <= pipeline.model.error_ratio * projected:
-        return True
-    pipeline.say(
-        f"deploy: warning: the recurrence is {100 * own:.2g} % off at validation runs and the projected step "
-        f"{100 * projected:.2g} %, so that the projected step takes all runs; model.error_ratio=null leaves "
-        "them to the recurrence"
-    )
-    return False
+    return Fallback(to, partial(pipeline.batch_at, manifold, engine=pipeline.projecting))
 
 
 def _told(rollout: Rollout) -> list[str]:

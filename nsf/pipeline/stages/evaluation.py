@@ -115,7 +115,7 @@ def _rollouts(pipeline, manifold: Manifold) -> list[Rollout]:
 
 def _took(pipeline, rollout: Rollout) -> str | None:
     """The engine of a run that another model began and took no step of; None: as configured."""
-    return None if rollout.by is None or rollout.by_operators else pipeline.projecting
+    return None if rollout.by is None or rollout.by_latent_model else pipeline.projecting
 
 
 def _compare(
@@ -143,7 +143,7 @@ def _cost(pipeline, manifold: Manifold, rollouts: Sequence[Rollout], factors: Se
     Args:
         pipeline, manifold: that are timed.
         rollouts: the reduced runs; that of the first case is decoded. Where projected steps took
-            some of a run with operators, they are timed as well.
+            some of a run by a recurrence, they are timed as well.
         factors: of Δx of the coarse full-order runs that there are.
     """
     c, scene, case = pipeline.config, pipeline.deployed, pipeline.held_out[0]

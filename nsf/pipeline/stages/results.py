@@ -126,8 +126,7 @@ def rows(
 def model_columns(config: DictConfig, chosen: str = "") -> dict[str, str]:
     """Which model took the steps, what it learned from, and where a projected step takes τ and C from."""
     found = describe(config, chosen)
-    teacher = str(OmegaConf.select(config, "model.teacher", default=""))
-    return found | {"teacher": teacher if found["model"] == "recurrence" else ""}
+    return found | {"teacher": "runs" if found["model"] == "recurrence" else ""}
 
 
 def _material(config: DictConfig) -> str:
@@ -153,7 +152,7 @@ def _beside(rivals: Rivals) -> dict[str, float]:
 
 
 def _cost_of_share(cost: dict, share: float) -> dict:
-    """`cost.json` of a run with operators, of which the projected step took a share."""
+    """`cost.json` of a run by a recurrence, of which the projected step took a share."""
     if not share or "projected" not in cost:
         return cost
     own, other = cost["reduced"], cost["projected"]
@@ -190,11 +189,11 @@ def _break_even(cost: dict, seconds: float) -> float:
 
 
 def _handed_over(rollout: Rollout, config: DictConfig) -> float:
-    """Share of the steps that were not taken by the first level: operators, or else the projected step."""
+    """Share of the steps that were not taken by the first level: a recurrence, or else the projected step."""
     steps = reduced_steps(config.scene.steps, config.deploy.dt_multiplier)
     own = steps if rollout.handed_over < 0 else rollout.handed_over
     if rollout.by is not None:
-        own = min(own, rollout.by_operators)
+        own = min(own, rollout.by_latent_model)
     return 1.0 - own / steps
 
 

@@ -1,38 +1,42 @@
-"""The stage `teach` of `model=recurrence`: operators of the deployed step."""
+"""The stage `teach` of `model=recurrence`: full-order runs, encoded as they are made, and a fit."""
 
-import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from joblib.externals.loky import ProcessPoolExecutor, cpu_count
-from omegaconf import OmegaConf
 
 from nsf.data import Case, Trajectory
 from nsf.data.schema import TRAJECTORY
-from nsf.dynamics import ReducedBatch
-from nsf.engines import Engine
-from nsf.engines.operators import Course, Mirrored, Recorded, Taught, Teacher, Yardstick
+from nsf.errors import ConfigError, InstabilityError
 from nsf.kinematics.manifold import Manifold
 from nsf.progress import Progress
+from nsf.recurrence import taught as files
+from nsf.recurrence.descent import Runs, Yardstick, fit, standardised
+from nsf.recurrence.engine import first_change
+from nsf.recurrence.solids import collider_states
+from nsf.recurrence.stream import Encoded, Encoder, encoded_trajectory, streamed
+from nsf.recurrence.taught import Taught
 from nsf.runs import Record, Run
-from nsf.scenes.symmetry import Image, Symmetry
+from nsf.scenes import Scene
+from nsf.scenes.identity import physics_hash
 
-#: File of a teach run with the operators.
-OPERATORS = "operators.pt"
-#: Particles that say how far a round's runs are off.
-_LOOKED_AT = 1000
-#: Shapes whose images are found together.
-_SEEN_AT_ONCE = 200
-#: Drawn runs of a process, at least: it takes seconds to start.
+#: File of a teach run with the recurrence.
+RECURRENCE = "recurrence.pt"
+_MANIFOLD = "manifold.pt"
+#: Particles, and frames at most, at which validation runs are compared.
+_PARTICLES, _FRAMES = 500, 50
+#: Runs of a process, at least: it takes seconds to start.
 _LEAST_RUNS = 8
 
 
 def teach(pipeline, run: Run) -> None:
-    """Teach the operators of a pipeline's configuration; finished rounds in the run's folder are taken up.
+    """Teach the recurrence of a pipeline's configuration; encoded runs in the run's folder are taken up.
 
     Args:
         pipeline: a `nsf.pipeline.Pipeline`.
@@ -40,196 +44,191 @@ def teach(pipeline, run: Run) -> None:
     """
     manifold, c = pipeline.manifold().to(pipeline.device), pipeline.config
     with run.record(device=pipeline.device, seed=c.seed, precision=c.precision) as record:
-        _follow(pipeline, manifold, record)
-    found, known = record.metrics, len(pipeline.split.train)
-    steps = f"{found['teacher_steps']} steps of the teacher"
-    asked = f"{known} full-order runs" if pipeline.of_runs else steps
-    if drawn_cases := pipeline.of_runs and len(pipeline.lessons[1]):
-        asked += f" and {drawn_cases} projected ones"
-    # Full-order runs in cases that nothing was learned from are those of validation alone.
-    back = not pipeline.of_runs or pipeline.split.validation
-    where = "in cases held back" if back else "in the training cases, as there are no validation cases"
-    beside = f", the projected step {100 * found['projected_error']:.2g} %" if pipeline.of_runs else ""
+        _teach(pipeline, manifold, record)
+        metrics = record.metrics
+    held_back = "validation" if pipeline.split.validation else "the training cases, as no others are there"
     pipeline.say(
-        f"teach: {asked} in {found['teach_seconds']:.1f} s, "
-        f"{100 * min(found['errors']):.2g} % off {where}{beside} → {run.id}"
+        f"teach: {metrics['runs']} full-order runs, {metrics['streamed']} of them streamed, in "
+        f"{metrics['stream_seconds']:.1f} s, fitted in {metrics['fit_seconds']:.1f} s, "
+        f"{100 * min(metrics['errors']):.2g} % off at {held_back} → {run.id}"
     )
 
 
-def _follow(pipeline, manifold: Manifold, record: Record) -> None:
+def _teach(pipeline, manifold: Manifold, record: Record) -> None:
+    model, device = pipeline.model, pipeline.device
     started = time.perf_counter()
-    teaching, seed, device = pipeline.teaching, int(pipeline.config.seed), pipeline.device
-    work = (1 + teaching.runs, "runs") if pipeline.of_runs else (teaching.steps, "teacher's steps")
-    with Progress("teach", *work) as progress:
-        truth = truth_of(pipeline, manifold)
-        if pipeline.of_runs:
-            images = teaching.symmetry.images(pipeline.scene) if teaching.symmetry else []
-            lessons, yardstick = recorded(pipeline, manifold, truth)
-            lessons += drawn(pipeline, manifold, lambda steps: progress.advance(steps / pipeline.scene.steps))
-            if teaching.symmetry:
-                seen = mirror(manifold, teaching.symmetry)
-                lessons = [Mirrored(lesson, images, seen) for lesson in lessons]
-            truth = None  # is the teacher
-        else:
-            lessons, yardstick = _asked(pipeline, manifold, progress)
-
-        def told(line: str) -> None:
-            progress.describe(line)
-            if pipeline.of_runs:
-                progress.advance(1)
-
-        course = Course(lessons, truth, yardstick, teaching, seed, device, record.path, told, pipeline.say)
-        before = time.perf_counter() - started
-        operators, steps = course.follow(), course.steps
-        broken = course.broken_affinity()
-        last, beside = time.perf_counter(), {}
-        if pipeline.of_runs:
-            runs = yardstick.teacher.run()
-            lost = any(yardstick.teacher.left_grid())
-            beside["projected_error"] = math.inf if lost else yardstick.error(runs)
-        spent = before + course.seconds + time.perf_counter() - last
-    taught = Taught.of(lessons[0].setup, *course.gravity)
-    operators.save(record.path / OPERATORS, taught, lessons[0].setup.samples)
-    record.output(OPERATORS)
-    for left in record.path.glob("round_*.pt"):
-        left.unlink()
+    known, drawn, back = pipeline.lessons
+    encoder = Encoder(manifold, model.stress_of(pipeline.forced))
+    scenes = [*map(pipeline.scene.at, known), *_varied(pipeline, drawn)]
+    lessons = list(map(Lesson, [*known, *drawn], scenes))
+    lessons, encoded = _encoded(pipeline, encoder, lessons, record)
+    fitted = time.perf_counter()
+    runs = _runs(pipeline, manifold, lessons, encoded)
+    yardstick = _yardstick(pipeline, manifold, encoder, back)
+    seed, stride = int(pipeline.config.seed), model.stride_of(pipeline.scene.steps)
+    form = standardised(runs, model.fitting, pipeline.scene.dt, stride, pipeline.forced, seed)
+    sigma = _moves(yardstick, form.x_mean, form.x_scale)
+    with Progress("teach: fit", model.descents, "descents") as progress:
+        errors = fit(form, runs, yardstick, sigma, model.fitting, seed, device, progress.advance)
+    gravity = runs.gravity.flatten(0, 1).numpy()
+    taught = Taught.of(manifold, physics_hash(pipeline.scene), pipeline.scene.dt, gravity)
+    files.save(form, taught, record.path / RECURRENCE)
+    record.output(RECURRENCE)
+    for path in record.path.glob("encoded_*.npz"):
+        path.unlink()
     record.metrics |= {
-        "teach_seconds": spent,
-        "teacher_steps": steps,
-        "errors": course.errors,
-        "broken_affinity": broken,
-        "round": course.best,
-    } | beside
+        "errors": errors,
+        "runs": len(lessons),
+        "streamed": sum(run.seconds > 0.0 for run in encoded),
+        "run_seconds": sum(run.seconds for run in encoded),
+        "stream_seconds": fitted - started,
+        "fit_seconds": time.perf_counter() - fitted,
+        "teach_seconds": time.perf_counter() - started,
+    }
 
 
-def truth_of(pipeline, manifold: Manifold) -> torch.Tensor | None:
-    """[N + 1, K, r] training latents, by ascending case; None where a step is not one of theirs."""
-    if pipeline.config.deploy.dt_multiplier != 1.0:
-        return None
-    cases = pipeline.split.train
-    order = sorted(range(len(cases)), key=cases.__getitem__)
-    latents = manifold.training_latents.detach().to("cpu", torch.float64)
-    return latents.unflatten(0, (len(cases), -1)).transpose(0, 1)[:, order]
+# -- runs ---------------------------------------------------------------------------------------------------
 
 
-def _asked(pipeline, manifold: Manifold, progress: Progress) -> tuple[list[Teacher], Yardstick]:
-    """An engine's runs, and its own runs in cases that are held back.
+class Lesson(NamedTuple):
+    """A case, and the scene in it, whose gravity may be another than the case has."""
 
-    Not full-order runs there: where the teacher is off, a round could pass by straying towards them.
-    """
-    *cases, back = pipeline.lessons
-    lessons = [Teacher(batches(pipeline, manifold, v), progress.advance) for v in cases if v]
-    teacher, positions = Teacher(batches(pipeline, manifold, back), progress.advance), _positions(manifold)
-    truth = torch.stack([positions(run) for run in teacher.run().unbind(1)], 1)
-    return lessons, Yardstick(teacher, positions, truth)
+    case: Case
+    scene: Scene
 
 
-def recorded(pipeline, manifold: Manifold, latents: torch.Tensor) -> tuple[list[Teacher], Yardstick]:
-    """Full-order runs of training, whose latents [N + 1, K, r] are given, and those held back."""
-    known, _, back = pipeline.lessons
-    truth = []
-    for case in back:
-        with Trajectory.open(pipeline.simulation(case).require().file(TRAJECTORY)) as trajectory:
-            truth.append(torch.as_tensor(trajectory.read("x", particles=_looked_at(manifold))).double())
-    lessons = [Recorded(batches(pipeline, manifold, known), latents)]
-    beside = Teacher(batches(pipeline, manifold, back))
-    return lessons, Yardstick(beside, _positions(manifold), torch.stack(truth, 1))
+def _varied(pipeline, cases: Sequence[Case]) -> list[Scene]:
+    """The scene in drawn cases; where no program forces it, gravity is varied in a ball about its own."""
+    scenes, generator = (
+        [pipeline.scene.at(case) for case in cases],
+        np.random.default_rng(pipeline.config.seed),
+    )
+    if pipeline.scene.forcing.gravity:
+        return scenes
+    generator = np.random.default_rng(pipeline.config.seed)
+    ways = generator.standard_normal((len(cases), 3))
+    ways *= generator.random((len(cases), 1)) ** (1 / 3) / np.linalg.norm(ways, axis=1, keepdims=True)
+    reach = pipeline.model.gravity * float(np.linalg.norm(pipeline.scene.gravity))
+    varied = zip(scenes, reach * ways, strict=True)
+    return [replace(scene, gravity=tuple((scene.gravity + way).tolist())) for scene, way in varied]
 
 
-def drawn(pipeline, manifold: Manifold, told: Callable[[float], object]) -> list[Teacher]:
-    """Projected runs in the drawn cases between, those that are lost left out; of none, no teacher."""
-    _, between, _ = pipeline.lessons
-    if not between:
-        return []
-    taken = batches(pipeline, manifold, between)
-    processes = min(cpu_count(), len(between) // _LEAST_RUNS)
-    if processes > 1 and len(taken) == len(between) and taken[0].device.is_cpu:
-        runs, left = _side_by_side(pipeline, between, processes, told)
+def _encoded(
+    pipeline, encoder: Encoder, lessons: Sequence[Lesson], record: Record
+) -> tuple[list[Lesson], list[Encoded]]:
+    """Full-order runs of some lessons, those that are lost left out; each is a file until all are there."""
+    paths = [record.path / f"encoded_{index}.npz" for index in range(len(lessons))]
+    steps, known = pipeline.scene.steps, pipeline.split.train
+    with Progress("teach: full-order runs", len(lessons) * steps, "steps") as progress:
+        missing = []
+        for lesson, path in zip(lessons, paths, strict=True):
+            stored = pipeline.simulation(lesson.case)
+            if path.is_file():
+                progress.advance(steps)
+            elif lesson.case in known and stored.complete:
+                with Trajectory.open(stored.file(TRAJECTORY)) as trajectory:
+                    encoded_trajectory(trajectory, encoder, pipeline.device).save(path)
+                progress.advance(steps)
+            else:
+                missing.append((lesson, path))
+        lost = _stream(pipeline, encoder, missing, progress.advance)
+    if lost:
+        pipeline.say(f"teach: warning: {len(lost)} of {len(lessons)} full-order runs are lost: {lost[0]}")
+    pairs = [(own, Encoded.open(path)) for own, path in zip(lessons, paths, strict=True) if path.is_file()]
+    pairs = [(lesson, run) for lesson, run in pairs if run.finite]
+    if len(pairs) < encoder.stress:
+        raise ConfigError(
+            f"model.stress={encoder.stress} coordinates need as many runs, and {len(pairs)} are whole; set "
+            f"model.stress={len(pairs)} or fewer"
+        )
+    return [lesson for lesson, _ in pairs], [run for _, run in pairs]
+
+
+def _stream(pipeline, encoder: Encoder, missing, after: Callable[[int], object]) -> list[str]:
+    """Make runs and write each one's file, side by side where there are cores; why some are lost."""
+    how = pipeline.config.precision, pipeline.device
+    processes = min(cpu_count(), len(missing) // _LEAST_RUNS)
+    if processes > 1 and pipeline.device == "cpu":
+        trained = pipeline.training.file(_MANIFOLD)
+        with ProcessPoolExecutor(processes, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            ends = []
+            for end in pool.map(partial(_alone, trained, encoder.stress, how), *zip(*missing, strict=True)):
+                ends.append(end)
+                after(pipeline.scene.steps)
     else:
-        beside = Teacher(taken, told)
-        runs, left = beside.run(), beside.left_grid()
-    kept = torch.isfinite(runs).all(-1).all(0) & ~torch.tensor(left)
-    cases = [case for case, good in zip(between, kept.tolist(), strict=True) if good]
-    if len(cases) < len(between):
-        pipeline.say(f"teach: warning: {len(between) - len(cases)} of {len(between)} projected runs are lost")
-    if not cases:
-        return []
-    if len(cases) < len(between):
-        taken = batches(pipeline, manifold, cases)
-    found = Recorded(taken, runs[:, kept])
-    found.steps = (len(runs) - 1) * len(between)
-    return [found]
+        ends = [_run(encoder, how, *pair, lambda: after(1)) for pair in missing]
+    return [end for end in ends if end]
 
 
-def _side_by_side(
-    pipeline, cases: list[Case], processes: int, told: Callable[[float], object]
-) -> tuple[torch.Tensor, list[bool]]:
-    """x̂ [N + 1, R, r] of projected runs, and whether each left the grid; by several processes."""
-    runs, left = [], []
-    one = partial(_alone, type(pipeline), OmegaConf.to_yaml(pipeline.template), pipeline.root)
-    with ProcessPoolExecutor(processes, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-        for run, gone in pool.map(one, cases):
-            runs.append(run)
-            left.append(gone)
-            told(len(run) - 1)
-    return torch.from_numpy(np.stack(runs, 1)), left
+def _run(encoder: Encoder, how: tuple[str, str], lesson: Lesson, path: Path, after=lambda: None) -> str:
+    """Make one run and write its file; why it is lost, empty where it is not."""
+    try:
+        solver = lesson.scene.full_order({}, *how)
+        streamed(solver, lesson.scene.steps, encoder, after).save(path)
+    except InstabilityError as error:
+        return f"{lesson.case.named}: {error}"
+    return ""
 
 
-def _alone(kind: type, text: str, root: Path | None, case: Case) -> tuple[np.ndarray, bool]:
-    """One run [N + 1, r] in a process of its own, and whether it left the grid."""
-    pipeline, manifold = _opened(kind, text, root)
-    teacher = Teacher(batches(pipeline, manifold, [case]))
-    return teacher.run()[:, 0].numpy(), teacher.left_grid()[0]
+def _alone(trained: Path, stress: int, how: tuple[str, str], lesson: Lesson, path: Path) -> str:
+    """The same in a process of its own."""
+    return _run(_encoder(trained, stress), how, lesson, path)
 
 
 @cache
-def _opened(kind: type, text: str, root: Path | None) -> tuple:
-    """The pipeline of a configuration and its manifold, once in a process."""
-    pipeline = kind(OmegaConf.create(text), lambda line: None, root)
-    return pipeline, pipeline.manifold().to(pipeline.device)
+def _encoder(trained: Path, stress: int) -> Encoder:
+    """The encoder of a manifold's file, once in a process."""
+    return Encoder(Manifold.load(trained), stress)
 
 
-def mirror(manifold: Manifold, symmetry: Symmetry) -> Callable[[torch.Tensor, Image], torch.Tensor]:
-    """(xhat [..., r], image) → the latent vectors whose shapes are nearest to the shapes' images."""
-    X = manifold.X.cpu().numpy().astype(np.float64)
+def _runs(pipeline, manifold: Manifold, lessons: Sequence[Lesson], encoded: Sequence[Encoded]) -> Runs:
+    """Encoded runs, and what determines each of them."""
+    cases, scenes = zip(*lessons, strict=True)
+    dt, steps = pipeline.scene.dt, pipeline.scene.steps
+    t = dt * np.arange(steps)
+    first = [first_change(manifold, s.particles().X, s.initial_velocity(), dt) for s in scenes]
+    parameters = np.array([[case[name] for name in manifold.parameter_names] for case in cases])
+    stacked = (
+        np.stack([run.xhat for run in encoded], 1),
+        np.stack([run.stress for run in encoded], 1),
+        torch.stack(first),
+        parameters.reshape(len(cases), -1),
+        np.stack([scene.acting_gravity.at(t) for scene in scenes], 1),
+        np.stack([collider_states(scene.solids, dt, steps) for scene in scenes], 1),
+    )
+    return Runs.in_strides(
+        pipeline.model.stride_of(pipeline.scene.steps),
+        *(torch.as_tensor(values).double() for values in stacked),
+    )
 
-    def seen(xhat: torch.Tensor, image: Image) -> torch.Tensor:
-        if np.array_equal(image.R, np.eye(3)):
-            return xhat
-        behind = manifold.restrict(X=symmetry.at(X, image.R.T), device=manifold.X.device)
-        found = []
+
+# -- validation ---------------------------------------------------------------------------------------------
+
+
+def _yardstick(pipeline, manifold: Manifold, encoder: Encoder, cases: Sequence[Case]) -> Yardstick:
+    """The full-order runs that choose the weights, none of them held out."""
+    particles = np.sort(np.random.default_rng(0).permutation(len(manifold.X))[:_PARTICLES])
+    strides = pipeline.scene.steps // pipeline.model.stride_of(pipeline.scene.steps)
+    every = max(1, strides // _FRAMES)
+    encoded, truth = [], []
+    for case in cases:
+        with Trajectory.open(pipeline.simulation(case).require().file(TRAJECTORY)) as trajectory:
+            encoded.append(encoded_trajectory(trajectory, encoder, pipeline.device))
+            frames = range(0, trajectory.frames, every * pipeline.model.stride_of(pipeline.scene.steps))
+            truth.append(torch.as_tensor(trajectory.read("x", frames=list(frames), particles=particles)))
+    at = manifold.restrict(torch.as_tensor(particles), device=manifold.X.device)
+
+    def positions(xhat: torch.Tensor) -> torch.Tensor:
         with torch.no_grad():
-            for part in xhat.flatten(0, -2).split(_SEEN_AT_ONCE):
-                x = symmetry.at(behind.position(part.to(behind.device)).cpu().numpy(), image.R)
-                found.append(manifold.encode(torch.as_tensor(x, device=behind.device)).cpu().double())
-        return torch.cat(found).view(xhat.shape)
+            return at.position(xhat.to(at.device)).double().cpu()
 
-    return seen
-
-
-def _looked_at(manifold: Manifold) -> np.ndarray:
-    """Particles of the whole body: S may lie where little is like the rest, as beside a tear."""
-    return np.sort(np.random.default_rng(0).permutation(len(manifold.X))[:_LOOKED_AT])
+    lessons = [Lesson(case, pipeline.scene.at(case)) for case in cases]
+    runs = _runs(pipeline, manifold, lessons, encoded)
+    return Yardstick(runs, positions, torch.stack(truth, 1).double(), every)
 
 
-def _positions(manifold: Manifold) -> Callable[[torch.Tensor], torch.Tensor]:
-    """xhat [N + 1, r] → positions [N + 1, s, 3] [m] of the particles that are looked at."""
-    at = manifold.restrict(torch.as_tensor(_looked_at(manifold)), device=manifold.X.device)
-
-    def positions(run: torch.Tensor) -> torch.Tensor:
-        with torch.no_grad():
-            return at.position(run.to(at.device)).cpu()
-
-    return positions
-
-
-def batches(
-    pipeline, manifold: Manifold, cases: list[Case], engine: str | Engine | None = None
-) -> list[ReducedBatch]:
-    """Runs of the scene of training by an engine, the teacher's by default; one by one where it must be."""
-    asked = {"engine": engine or pipeline.projecting, "scene": pipeline.scene}
-    alone = pipeline.batch_at(manifold, cases[:1], engine=pipeline.projecting, scene=pipeline.scene)
-    first = alone if engine is None else pipeline.batch_at(manifold, cases[:1], **asked)
-    if alone.engine == "reference" or pipeline.integration.strategy == "search":
-        return [first, *(pipeline.batch_at(manifold, [case], **asked) for case in cases[1:])]
-    return [pipeline.batch_at(manifold, cases, **asked)]
+def _moves(yardstick: Yardstick, xhat: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
+    """[r] how far particles move with each coordinate, RMS [m] a unit of it; at x̂ [r], by ± scale [r]."""
+    either = [yardstick.positions(xhat + way * torch.diag(scale)) for way in (1.0, -1.0)]
+    moved = (either[0] - either[1]).square().sum(-1).mean(1).sqrt() / (2.0 * scale)
+    return moved.clamp_min(max(1e-3 * float(moved.max()), torch.finfo(moved.dtype).tiny))

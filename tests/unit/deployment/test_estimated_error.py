@@ -16,5 +16,5 @@ def test_where_another_model_took_all_steps_nothing_is_estimated(by, handed_over
     own = {"stops": by, "by": np.array(by), "handed_over": handed_over, "estimate": np.array([0.0, 0.1, 0.3])}
     run = SimpleNamespace(**own)
     run.levels = Rollout.levels.fget(run)
-    run.by_operators = Rollout.by_operators.fget(run)
+    run.by_latent_model = Rollout.by_latent_model.fget(run)
     np.testing.assert_equal(Rollout.estimated_error.fget(run), expected)

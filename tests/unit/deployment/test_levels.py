@@ -1,7 +1,6 @@
-"""Who takes the steps of a run, on a motion made up: x̂ goes on as it went, and operators miss some steps."""
+"""Who takes the steps of a run, on a motion made up: x̂ goes on as it went, and a model misses some steps."""
 
 from dataclasses import replace
-from importlib import import_module
 from types import SimpleNamespace
 
 import numpy as np
@@ -9,8 +8,7 @@ import pytest
 import torch
 from angles import angle
 
-from nsf.deployment import FULL_ORDER, OPERATORS, PROJECTED, Fallback, Rollout, rollouts
-from nsf.deployment.estimate import _moved_by
+from nsf.deployment import FULL_ORDER, LATENT_MODEL, PROJECTED, Fallback, Rollout, rollouts
 from nsf.dynamics import ReducedBatch, Sources
 from nsf.dynamics.span import Span
 
@@ -47,18 +45,8 @@ class Line(Span):
             record.row += 1
             record.xhat[:, n + 1] = now
 
-    def pushed(self, push):
-        found = self.record.xhat.clone()
-        xhat = found[:, 0]
-        change = torch.full_like(xhat, CHANGE)
-        for n in range(push.shape[1]):
-            xhat, change = self.next(n, xhat, change + push[:, n])
-            found[:, n + 1] = xhat
-        return found
-
-
-class Kicked(Line):
-    kicks = (8, 9, 10)
+    def spread(self, steps):
+        return torch.arange(steps + 1.0)[None].expand(len(self.record.row), -1)
 
 
 class Straying(Line):
@@ -86,47 +74,37 @@ def batch_of(chain, tiny_manifold):
 
 @pytest.fixture
 def shared(batch_of, tiny_trust):
-    """(operators, projected step, check, who goes on) → the run at 26° that both take."""
+    """(model, projected step, who goes on) → the run at 26° that both take."""
 
-    def run(operators, projected, check, to="none", values=(26.0,), doubt=None, **changed):
+    def run(model, projected, to="none", values=(26.0,), doubt=None, **changed):
         cases = list(map(angle, values))
-        fallback = Fallback(to, lambda cases: batch_of(projected, cases, **changed), check)
-        return rollouts(batch_of(operators, cases, doubt), cases, tiny_trust, fallback)
+        fallback = Fallback(to, lambda cases: batch_of(projected, cases, **changed))
+        return rollouts(batch_of(model, cases, doubt), cases, tiny_trust, fallback)
 
     return run
 
 
 def test_a_run_that_is_not_believed_is_taken_to_its_end(shared, batch_of, tmp_path):
-    (found,) = shared(Straying, Line, 2, "projected")
-    n = found.by_operators
+    (found,) = shared(Straying, Line, "projected")
+    n = found.by_latent_model
     assert 0 < n < STEPS
-    assert found.levels.tolist() == [OPERATORS] * n + [PROJECTED] * (STEPS - n)
+    assert found.levels.tolist() == [LATENT_MODEL] * n + [PROJECTED] * (STEPS - n)
     alone = batch_of(Straying).runs[0]
     alone.step(STEPS)
     np.testing.assert_array_equal(found.xhat[: n + 1], alone.record.xhat[: n + 1].numpy())
     changes = np.diff(found.xhat[n - 1 :], axis=0)
     np.testing.assert_allclose(changes, np.broadcast_to(changes[0], changes.shape), rtol=0, atol=1e-12)
     assert (found.estimate[n:] == found.estimate[n]).all()
-    (kept,) = shared(Straying, Line, 2)
-    assert (kept.levels == OPERATORS).all()
+    (kept,) = shared(Straying, Line)
+    assert (kept.levels == LATENT_MODEL).all()
     found.save(tmp_path / "rollout_0.h5")
     read = Rollout.open(tmp_path / "rollout_0.h5")
     np.testing.assert_array_equal(read.levels, found.levels)
-    assert read.by_operators == n
-
-
-def test_an_estimate_is_how_far_a_kick_takes_a_run(shared, batch_of):
-    (found,) = shared(Kicked, Line, 1)
-    runs = [batch_of(span).runs[0] for span in (Kicked, Line)]
-    for run in runs:
-        run.step(STEPS)
-    at = runs[0].together.span_at(0).at_sample
-    apart = at.position(runs[0].record.xhat) - at.position(runs[1].record.xhat)
-    np.testing.assert_allclose(found.estimate, apart.square().sum(-1).mean(-1).sqrt(), atol=1e-12)
+    assert read.by_latent_model == n
 
 
 def test_a_run_that_is_doubted_is_the_projected_steps_from_the_start(shared):
-    (found,) = shared(Line, Line, 2, "projected", doubt=lambda setup, gravity: (1.5, "outside"))
+    (found,) = shared(Line, Line, "projected", doubt=lambda setup, gravity: (1.5, "outside"))
     assert (found.levels == PROJECTED).all()
     assert (found.estimate == 0.0).all()
 
@@ -140,7 +118,7 @@ def test_the_projected_step_goes_on_where_forcing_is_beyond_training(batch_of, t
 
 def test_a_run_that_the_full_order_solver_takes_from_the_start_can_be_read(batch_of, tiny_trust, tmp_path):
     cases = [angle(60.0)]  # outside of the box
-    fallback = Fallback("full", lambda cases: batch_of(Line, cases), 2)
+    fallback = Fallback("full", lambda cases: batch_of(Line, cases))
     batch = batch_of(Line, cases, lambda setup, gravity: (2.5, "outside"))
     (found,) = rollouts(batch, cases, tiny_trust, fallback)
     assert (found.handed_over, len(found.stops)) == (0, 0)
@@ -150,50 +128,31 @@ def test_a_run_that_the_full_order_solver_takes_from_the_start_can_be_read(batch
     assert kept.trust[0] > 1.0
 
 
-def test_the_full_order_solver_goes_on_with_operators(batch_of, tiny_trust):
-    fallback, cases = Fallback("full", lambda cases: batch_of(Line, cases), 2), [angle(26.0)]
+def test_the_full_order_solver_goes_on_with_a_recurrence(batch_of, tiny_trust):
+    fallback, cases = Fallback("full", lambda cases: batch_of(Line, cases)), [angle(26.0)]
     (found,) = rollouts(batch_of(Straying, cases), cases, tiny_trust, fallback)
     assert 0 < found.handed_over < found.distrusted == len(found.stops)
-    assert (found.levels[: found.handed_over] == OPERATORS).all()
+    assert (found.levels[: found.handed_over] == LATENT_MODEL).all()
     assert (found.levels[found.handed_over :] == FULL_ORDER).all()
-
-
-def test_the_solver_that_checks_is_built_before_the_clock_starts(batch_of, tiny_trust, monkeypatch):
-    done, module = [], import_module("nsf.deployment.running")
-    timed = module._timed_run
-    monkeypatch.setattr(module, "_timed_run", lambda *given: done.append("timed") or timed(*given))
-    fallback = Fallback("none", lambda cases: done.append("built") or batch_of(Line, cases), 1)
-    rollouts(batch_of(Line), [angle(26.0)], tiny_trust, fallback)
-    assert done == ["built", "timed"]
-
-
-def test_an_estimate_in_single_precision_overflows_no_earlier_than_positions(batch_of, tiny_manifold):
-    batch, far = batch_of(Line), 1e21  # its square is no float32
-    batch.step(STEPS)
-    particles = batch.batch.shared.samples[0].particles
-    batch.span_at(0).at_sample = tiny_manifold.restrict(particles, dtype=torch.float32)
-    defects = torch.full((1, 1, batch.batch.record.xhat.shape[-1]), far)
-    found = _moved_by(batch, [STEPS - 1], defects)
-    assert 1e19 < found[0, -1] < np.inf
 
 
 def test_a_run_whose_particles_carry_stress_is_taken_anew(shared, batch_of):
     """From t = 0: in its midst the stress that they would carry is not known."""
     sources = Sources("particles", "particles")
-    (found,) = shared(Straying, Line, 2, "projected", sources=sources)
+    (found,) = shared(Straying, Line, "projected", sources=sources)
     assert (found.levels == PROJECTED).all()
     assert (found.estimate == 0.0).all()
     straight = batch_of(Line).runs[0]
     straight.step(STEPS)
     np.testing.assert_array_equal(found.xhat, straight.record.xhat.numpy())
-    (kept,) = shared(Line, Line, 2, "projected", sources=sources)
-    assert (kept.levels == OPERATORS).all()
+    (kept,) = shared(Line, Line, "projected", sources=sources)
+    assert (kept.levels == LATENT_MODEL).all()
 
 
 def test_each_run_of_a_batch_is_handed_on_by_itself(shared):
-    many = shared(Straying, Line, 2, "projected", values=(23.0, 26.0))
+    many = shared(Straying, Line, "projected", values=(23.0, 26.0))
     for value, run in zip((23.0, 26.0), many, strict=True):
-        (alone,) = shared(Straying, Line, 2, "projected", values=(value,))
+        (alone,) = shared(Straying, Line, "projected", values=(value,))
         np.testing.assert_array_equal(run.levels, alone.levels)
         np.testing.assert_allclose(run.xhat, alone.xhat, rtol=0, atol=1e-12)
 
@@ -202,9 +161,8 @@ def test_a_run_that_is_not_finite_is_handed_on(shared):
     class Lost(Line):
         kicks, kick = (5,), np.nan
 
-    (found,) = shared(Lost, Line, 4, "projected")
-    assert found.by_operators < 6
+    (found,) = shared(Lost, Line, "projected")
+    assert found.by_latent_model < 6
     assert np.isfinite(found.xhat).all()
-    (lost,) = shared(Lost, Line, 4)
+    (lost,) = shared(Lost, Line)
     assert lost.diverged == 6
-    assert np.isinf(lost.estimate[6:]).all()

@@ -14,9 +14,9 @@ from nsf.deployment import Trust, calibrate
 from nsf.deployment.fallback import full_order_step
 from nsf.deployment.trust import QUANTILE, STRAY, CaseDistance, LatentDistance, SolidsRange
 from nsf.dynamics import Taylor
-from nsf.engines.operators import collider_states
 from nsf.kinematics.manifold import Manifold
 from nsf.mpm import Cuboid, Motion
+from nsf.recurrence import collider_states
 
 
 class Line:

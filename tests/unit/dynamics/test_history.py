@@ -111,10 +111,6 @@ def test_two_samples_in_one_run_are_refused(chain, tiny_manifold):
 @pytest.mark.parametrize(
     ("keys", "told"),
     [
-        (
-            ["model=recurrence"],
-            "teacher=projected is asked for single steps.*; set model.teacher=runs, or",
-        ),
         (["deploy.batch=2"], "deploy.batch=2 needs compiled steps.*; set deploy.batch=1, or stress=field"),
         (
             ["sampler=region", "sampler.phases=[{start: 0.5, size: 30}]"],

@@ -11,7 +11,7 @@ from angles import angle, rollout
 import nsf
 import nsf.scenes
 from nsf.data import Trajectory
-from nsf.deployment import FULL_ORDER, OPERATORS, PROJECTED, Rollout, go_on
+from nsf.deployment import FULL_ORDER, LATENT_MODEL, PROJECTED, Rollout, go_on
 from nsf.dynamics import Sources
 from nsf.errors import InstabilityError, SchemaError
 from nsf.evaluation import at_frames, compare, metrics
@@ -151,7 +151,7 @@ def test_frames_at_deployment_steps_are_exact(made):
 
 
 def test_who_took_the_step_to_each_frame(made):
-    by = np.repeat(np.array([OPERATORS, PROJECTED], np.int8), [10, 14])
+    by = np.repeat(np.array([LATENT_MODEL, PROJECTED], np.int8), [10, 14])
     run = replace(made, by=by, estimate=np.zeros(25))
     t = np.append(0.0, made.t[1:])
     np.testing.assert_array_equal(levels_at_frames(run, t), [np.nan, *by])

@@ -1,4 +1,4 @@
-"""Estimates from observations that runs by operators made, where the truth is known to round-off."""
+"""Estimates from observations that runs by a recurrence made, where the truth is known to round-off."""
 
 from dataclasses import replace
 

@@ -22,9 +22,9 @@ def player(model):
 
 @pytest.fixture(scope="session")
 def taught_model(chain, pipeline_at, tmp_path_factory):
-    """The live model of the tiny chain by operators that were hardly taught, at three held-out values."""
+    """The live model of the tiny chain by a recurrence that was hardly taught, at three held-out values."""
     root = shutil.copytree(chain.root, tmp_path_factory.mktemp("taught") / "runs")
-    taught = [f"model.teaching.{key}" for key in ("steps=400", "descent=300", "rounds=1", "width=32")]
+    taught = ["model.runs=4", "model.stride=2", "model.descents=200", "model.width=32"]
     pipeline = pipeline_at(root, "model=recurrence", *taught, "scene.design.test=[24,26,34]")
     pipeline.simulate()
     pipeline.deploy()
@@ -33,15 +33,15 @@ def taught_model(chain, pipeline_at, tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def tilting_model(tmp_path_factory):
-    """A tiny soft block under gravity that wanders, by operators that were hardly taught."""
+    """A tiny soft block under gravity that wanders, by a recurrence that was hardly taught."""
     from nsf import config
     from nsf.pipeline import Pipeline
 
-    taught = [f"model.teaching.{key}" for key in ("steps=1200", "descent=300", "rounds=1", "width=32")]
+    taught = [f"model.{key}" for key in ("runs=8", "stress=4", "members=2", "descents=200", "width=32")]
     keys = [
         "scene=block", "scale=small", "device=cpu", "model=recurrence", *taught,
         "scene.dx=0.03", "scene.dt=0.002", "scene.steps=80", "scene.bodies.block.particles=400",
-        "scene.design.train=6", "scene.design.validation=0", "scene.design.test=2",
+        "scene.design.train=6", "scene.design.validation=1", "scene.design.test=2",
         "field.modes=[12,12,12]", "field.beta=4", "field.depth=1", "trainer.steps=200", "latent_dim=4",
         "sampler.size=40",
     ]  # fmt: skip

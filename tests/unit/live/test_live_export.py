@@ -36,7 +36,7 @@ def node():
 
 @pytest.fixture(scope="session")
 def page(taught_model, tmp_path_factory):
-    """The page of the tiny chain by operators, all of its particles in it."""
+    """The page of the tiny chain by a recurrence, all of its particles in it."""
     return publish.write(taught_model.run, tmp_path_factory.mktemp("live"), device="cpu")
 
 
@@ -99,7 +99,7 @@ def test_most_of_few_points_lie_at_the_surface(chain):
     assert set(model.sample) <= set(model.shown)
 
 
-def test_a_run_that_no_operators_step_is_refused(model, tmp_path, monkeypatch):
+def test_a_run_that_no_recurrence_takes_is_refused(model, tmp_path, monkeypatch):
     with pytest.raises(
         ConfigError, match=r"model=projected, whose steps a page does not take.* model=recurrence"
     ):
@@ -109,13 +109,6 @@ def test_a_run_that_no_operators_step_is_refused(model, tmp_path, monkeypatch):
         ConfigError, match=r"model=projected, whose steps a page does not take.* model=recurrence"
     ):
         publish.write(model.run, tmp_path, device="cpu")
-
-
-def test_operators_with_a_memory_are_refused(taught_model, monkeypatch):
-    model = taught_model.pipeline.operators().model
-    monkeypatch.setattr(model, "sizes", replace(model.sizes, memory=1))
-    with pytest.raises(ConfigError, match=r"memory, which a page has not; .* model.teaching.memory=\[\]"):
-        publish.model_data(taught_model)
 
 
 def test_options_of_other_formats_are_refused(capsys):
@@ -386,7 +379,6 @@ def test_every_control_has_a_name(opened, page):
 
 def test_titles_units_and_names_are_text(opened, taught_model, tmp_path, monkeypatch):
     hostile = "</script><script>alert(1)</script><img src=x onerror=alert(1)>a\"'&amp;"
-    from dataclasses import replace
 
     monkeypatch.setattr(taught_model, "title", hostile)
     parameters = tuple(replace(p, unit=hostile) for p in taught_model.parameters)

@@ -202,7 +202,7 @@ def test_beyond_what_programs_may_give_a_tilt_is_distrusted(tilting_model):
     )
 
 
-def test_a_run_by_operators_is_what_is_shown(taught_model):
+def test_a_run_by_a_recurrence_is_what_is_shown(taught_model):
     player = Player(taught_model)
     work(player)
     run = player.tick().run

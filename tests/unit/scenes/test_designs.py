@@ -11,7 +11,7 @@ from nsf import load_scene
 from nsf.data import Case
 from nsf.errors import ConfigError
 from nsf.scenes import Grid, LatinHypercube, Parameter, Sobol, Values
-from nsf.scenes.designs import evenly
+from nsf.scenes.designs import evenly, random_cases
 
 RANGES = {
     "E": Parameter("material.E", "Pa", [800, 3000], log=True),
@@ -162,3 +162,22 @@ def test_evenly_fills_a_cube_however_many_points_are_taken():
     for count in (16, 40):
         quarters = np.floor(2 * evenly(count, 2)) @ [1, 2]
         assert (np.bincount(quarters.astype(int), minlength=4) >= 0.75 * count / 4).all()
+
+
+def test_random_cases_are_spread_and_none_is_taken():
+    box, known = np.array([[20.0, 40.0]]), [Case(("friction_angle",), (20.0,))]
+    cases = random_cases(box, 5, 0, known)
+    assert cases == sorted(cases) == random_cases(box, 5, 0, known)
+    fifths = [int((case["friction_angle"] - 20.0) // 4.0) for case in cases]
+    assert fifths == list(range(5))  # shaken, each in its own
+    assert random_cases(box, 5, 0, [*known, cases[2]]) == cases[:2] + cases[3:]
+    assert random_cases(box, 5, 1, known) != cases
+
+
+def test_random_cases_fill_a_box_of_two_parameters():
+    known = Case(("E", "friction"), (0.0, 0.0))
+    cases = random_cases(np.array([[0.0, 1.0], [-2.0, 2.0]]), 16, 0, [known])
+    numbers = np.array([case.numbers for case in cases])
+    halves = (numbers[:, 0] >= 0.5) + 2 * (numbers[:, 1] >= 0.0)
+    assert numbers.shape == (16, 2)
+    assert np.bincount(halves, minlength=4).min() >= 3

@@ -9,7 +9,7 @@ import { prefixed, valued } from "../../../nsf/live/web/controls.mjs";
 import { Recording, undifferenced, unpacked } from "../../../nsf/live/web/data.mjs";
 import { Pace } from "../../../nsf/live/web/drawing.mjs";
 import { Field, Network, displacement, vonMises } from "../../../nsf/live/web/field.mjs";
-import { Operators, Run } from "../../../nsf/live/web/operators.mjs";
+import { Recurrence, Run } from "../../../nsf/live/web/recurrence.mjs";
 import { acts, along, moved, placed, poseAt, stateOf, valueAt } from "../../../nsf/live/web/solids.mjs";
 import { tilted } from "../../../nsf/live/web/tilt.mjs";
 import { Trust, lightOf, quantity } from "../../../nsf/live/web/trust.mjs";
@@ -94,29 +94,47 @@ test("von Mises of shear and of pressure; displacement", () => {
   near(displacement(Float32Array.of(9, 9, 9, 3, 4, 0), [0, 0, 0, 0, 0, 0], 10, Uint32Array.of(1)), [0.5], 1e-6);
 });
 
-/** Operators of one latent without inner layers: B = 0.5 + x̂, f = μ, G = [0, 0, 2]; a state adds to f. */
-function operators() {
-  const header = { operators: { latents: 1, gravity: true, layers: 1 } };
-  const weight = Float64Array.of(1, 0, 0, 0, 1, 1, 0, 0, 0, 0, 0, 0, 0, 0, 0);
-  return new Operators({ header, arrays: { "operators.weight0": weight, "operators.bias0": Float64Array.of(0.5, 0, 0, 0, 2) } });
+/**
+ * A recurrence of one latent without inner layers: B = 0.5 + x̂, f = μ, G = [0, 0, 2]; a state adds to f.
+ * @param {number} states of solids
+ * @param {number} stride
+ */
+function recurrence(states, stride = 1) {
+  const header = { recurrence: { latents: 1, stress: 0, gravity: true, stride, members: 1, layers: 1 } };
+  const n = 2 + states, weight = new Float64Array(5 * n);
+  weight[0] = weight[n + 1] = 1;
+  if (states === 1) weight[n + 2] = 1;
+  const arrays = { "motion0.weight0": weight, "motion0.bias0": Float64Array.of(0.5, 0, 0, 0, 2) };
+  return new Recurrence({ header, arrays });
 }
 
-test("a step by operators", () => {
-  const xhat = Float64Array.of(1), change = Float64Array.of(0.1);
-  operators().step(xhat, change, [0.3], [9, 9, -0.1], [0.05]);
+test("a step by a recurrence", () => {
+  const made = recurrence(1), [next] = made.step(made.begin({ xhat: [1], change: [0.1] }), [0.3], [9, 9, -0.1], [0.05]);
   // d' = 0.1 + (0.5 + 1) 0.1 + (0.3 + 0.05) + 2 (−0.1)
-  near(change, [0.4]);
-  near(xhat, [1.4]);
+  near(next.change, [0.4]);
+  near(next.xhat, [1.4]);
+});
+
+test("frames between strides lie on a parabola, and a run that is rewound begins its stride again", () => {
+  const made = new Run(recurrence(0, 2), { xhat: [0], change: [0] }, 0.1, 100);
+  made.parameters = [0.1];
+  made.advance(3);
+  assert.equal(made.steps, 4);
+  // d = 0, then 0.1: half of the way a quarter of the parabola, 0.5 · ½ (0 + 0.1 + ½ 0.1)
+  near(made.latents[1], [0.0375]);
+  near(made.latents[2], [0.1]);
+  const kept = made.latents.map((xhat) => xhat[0]);
+  made.rewind(3);
+  assert.equal(made.steps, 2);
+  made.advance(2);
+  near(made.latents.map((xhat) => xhat[0]), kept, 1e-14);
 });
 
 function run() {
-  const made = new Run(operators(), { xhat: [0], change: [0] }, 0.1, 100);
+  const made = new Run(recurrence(9), { xhat: [0], change: [0] }, 0.1, 100);
   made.parameters = [0.001];
   const state = { name: "s", shape: "sphere", position: [0, 0, 0], extents: [1, 0, 0], orientation: [1, 0, 0, 0, 1, 0, 0, 0, 1], motion: null, since: 0, until: null };
   made.solids = [state];
-  // One state of nine is read by these operators.
-  made.operators.network.layers[0].weight = Float64Array.from({ length: 55 }, (_, i) => ({ 0: 1, 12: 1 })[i] ?? 0);
-  made.operators.network.inputs = new Float64Array(11);
   return made;
 }
 
@@ -216,7 +234,7 @@ test("the light names its reason", () => {
   assert.equal(why([30], 1.5, 0), "distrusted: the shape left the training runs, ratio 1.50, above 1");
   assert.equal(why([30], 0, 0, 0.2), "diverged at t = 0.2 s");
   assert.equal(own.light([30], 0.25, 0, null, 1.9).level, "good");
-  assert.equal(why([30], 0.25, 0, null, 2.5), "operators may be 2500 mm from the projected run; training runs are 2000 mm from each other");
+  assert.equal(why([30], 0.25, 0, null, 2.5), "the run may be 2500 mm off; training runs are 2000 mm from each other");
   assert.equal(lightOf(0.2, 2, false, 0).level, "away");
   assert.equal(lightOf(1.2, 2, false, 0).level, "bad");
 });

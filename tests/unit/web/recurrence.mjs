@@ -1,16 +1,16 @@
-// Steps of operators as a page takes them: `node recurrence.mjs` reads layers and runs as JSON, and prints x̂ of each.
+// A recurrence as a page takes it: `node recurrence.mjs` reads layers and runs as JSON, and prints x̂ and ŝ of all members of each.
 
 import { readFileSync } from "node:fs";
 
-import { Operators } from "../../../nsf/live/web/operators.mjs";
+import { Recurrence } from "../../../nsf/live/web/recurrence.mjs";
 
 const { header, arrays, runs } = JSON.parse(readFileSync(0, "utf-8"));
-const operators = new Operators({ header, arrays });
+const recurrence = new Recurrence({ header, arrays });
 const taken = runs.map(({ xhat, change, parameters, gravity, states }) => {
-  const x = Float64Array.from(xhat), d = Float64Array.from(change);
+  let now = recurrence.begin({ xhat, change });
   return gravity.map((g, n) => {
-    operators.step(x, d, parameters, g, states[n]);
-    return Array.from(x);
+    now = recurrence.step(now, parameters, g, states[n]);
+    return now.map((own) => [Array.from(own.xhat), Array.from(own.stress)]);
   });
 });
 console.log(JSON.stringify(taken));

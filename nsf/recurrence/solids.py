@@ -1,11 +1,10 @@
-"""What colliders do at each step, as a few numbers: the moment's state, never the time itself."""
+"""States of colliders at each step, as a few numbers of the moment, never the time itself."""
 
 from collections.abc import Sequence
 
 import numpy as np
 
 from nsf.mpm import Collider
-from nsf.scenes.symmetry import Image
 
 #: Shift [m], angle [rad], both over the coming step too, and whether it acts.
 FEATURES = 9
@@ -38,16 +37,6 @@ def collider_states(colliders: Sequence[Collider], dt: float, steps: int) -> np.
         active = (later >= collider.since) & (later < collider.until)
         found += [pose[:-1], np.diff(pose, axis=0), active[:, None].astype(float)]
     return np.concatenate(found, 1)
-
-
-def mirrored_states(states: np.ndarray, image: Image) -> np.ndarray:
-    """States [..., 9 c] of `collider_states` in an image: shifts turn, and colliders change places."""
-    own = states.reshape(*states.shape[:-1], len(image.partners), FEATURES)
-    found = np.empty_like(own)
-    found[..., image.partners, :] = own
-    for shift in (slice(0, 3), slice(4, 7)):
-        found[..., shift] = found[..., shift] @ image.R.T
-    return found.reshape(states.shape)
 
 
 def principal(states: Sequence[np.ndarray], programs: bool = False) -> tuple[np.ndarray, np.ndarray]:

@@ -1,0 +1,369 @@
+"""Fits a recurrence to runs: descent on windows of them, from 16 strides to half a run."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nsf.errors import InstabilityError
+from nsf.gpu import without_collection
+from nsf.recurrence.fitting import Fitting, check_stride
+from nsf.recurrence.form import Form, Sizes, State
+from nsf.recurrence.solids import principal
+
+_RATE, _LAST_RATE = 2e-3, 1e-5  # of Adam, along a cosine
+_BETAS = (0.9, 0.98)
+_STEEPEST = 1.0  # length at which a member's gradient is cut
+#: Deviations to which a window holds how far x̂, d and ŝ are off, so that a lost one stays bounded.
+_FAR = 8.0
+#: In a window's loss: share of each coordinate beside how far particles move, of ŝ, and of single strides.
+_EACH, _STRESS, _SINGLE = 0.02, 0.1, 0.3
+_GROWTH = 1000.0  # of an error in the loss log(1 + growth · e/(1 + j)) of stride j
+#: Strides of the windows and share of the descent that each takes; the last is half a run where that is more.
+_WINDOWS = ((16, 0.35), (64, 0.45), (64, 0.2))
+_WARM_UP = 3  # steps before a graph is captured, as CUDA asks for
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Runs in strides, with what determines them; in fp64 on the host.
+
+    Attributes:
+        xhat: [N + 1, R, r]; stress: [N + 1, R, n_s] ŝ; first: [R, r] what stands for d at t = 0.
+        parameters: [R, n]; gravity: [N, R, 3] [m/s²] and features: [N, R, f] of colliders, in strides.
+    """
+
+    xhat: Tensor
+    stress: Tensor
+    first: Tensor
+    parameters: Tensor
+    gravity: Tensor
+    features: Tensor
+
+    @classmethod
+    def in_strides(cls, stride: int, xhat, stress, first, parameters, gravity, features) -> "Runs":
+        """Those of runs at every step: x̂ [N k + 1, R, r] and so on.
+
+        Raises:
+            ConfigError: the stride does not divide the steps.
+        """
+        check_stride(stride, len(xhat) - 1)
+        g, f = (of_strides(values, stride) for values in (gravity, features))
+        return cls(xhat[::stride], stress[::stride], stride * first, parameters, g, f)
+
+    @property
+    def changes(self) -> Tensor:
+        """d [N + 1, R, r]."""
+        return torch.cat([self.first[None], torch.diff(self.xhat, dim=0)])
+
+
+def of_strides(values: Tensor, stride: int) -> Tensor:
+    """Means over strides [N, ...] of values at each step [N k, ...]."""
+    return values.unflatten(0, (-1, stride)).mean(1)
+
+
+@dataclass(frozen=True)
+class Yardstick:
+    """Validation runs, which choose the weights.
+
+    Attributes:
+        runs: in strides.
+        positions: x̂ [F, r] → [F, s, 3] [m] of particles all over the body.
+        truth: [F, R, s, 3] [m] where these are, at every `every`-th stride.
+        every: strides.
+    """
+
+    runs: Runs
+    positions: Callable[[Tensor], Tensor]
+    truth: Tensor
+    every: int = 1
+
+    def errors(self, form: Form) -> Tensor:
+        """[R] displacement error of the members' mean, a fraction; not finite of a run that is lost."""
+        runs = self.runs
+        start = form.begin(runs.xhat[0], runs.first, runs.stress[0])
+        with torch.no_grad():
+            xhat, _ = form.run(start, runs.parameters, runs.gravity, form.collider_state(runs.features))
+        found = []
+        for run, truth in zip(xhat.mean(1)[:: self.every].unbind(1), self.truth.unbind(1), strict=True):
+            off = (self.positions(run) - truth).square().sum()
+            found.append((off / (truth - truth[:1]).square().sum()).sqrt())
+        return torch.stack(found)
+
+
+def standardised(runs: Runs, fitting: Fitting, dt: float, stride: int, programs: bool, seed: int) -> Form:
+    """A recurrence that accelerates nothing yet, with the scales of the runs, in fp64.
+
+    Args:
+        runs: that teach; fitting: widths and members.
+        dt: step of the full-order run [s]; stride: steps of one of the recurrence.
+        programs: whether the runs follow forcing programs.
+        seed: of the weights.
+    """
+    c_mean, c_matrix = principal(list(runs.features.transpose(0, 1).numpy()), programs)
+    sizes = Sizes(
+        latents=runs.xhat.shape[-1], stress=runs.stress.shape[-1], parameters=runs.parameters.shape[1],
+        features=len(c_mean), states=c_matrix.shape[1], gravity=bool(runs.gravity.any()),
+        width=fitting.width, members=fitting.members,
+    )  # fmt: skip
+    form, changes = Form(sizes, dt, stride, seed).double(), runs.changes
+    scales = {
+        "x_mean": runs.xhat.flatten(0, 1).mean(0), "x_scale": _deviation(runs.xhat),
+        "d_scale": _deviation(changes), "a_scale": _deviation(torch.diff(changes, dim=0)),
+        "mu_mean": runs.parameters.mean(0), "mu_scale": _spread(runs.parameters),
+        "s_mean": runs.stress.flatten(0, 1).mean(0), "s_scale": _deviation(runs.stress),
+        "t_scale": _deviation(torch.diff(runs.stress, dim=0)),
+        "c_mean": torch.as_tensor(c_mean), "c_matrix": torch.as_tensor(c_matrix),
+        "g_mean": runs.gravity.flatten(0, 1).mean(0),
+        "g_scale": _gravity_scale(runs.gravity),
+    }  # fmt: skip
+    for name, value in scales.items():
+        getattr(form, name).copy_(value)
+    return form
+
+
+def _deviation(values: Tensor) -> Tensor:
+    """Deviation [k] of [N, R, k]; of what hardly varies a billionth of the largest."""
+    if not values.shape[-1]:
+        return values.new_ones(0)
+    found = values.flatten(0, -2).std(0)
+    return found.clamp_min(1e-9 * float(found.max().clamp_min(1e-30)))
+
+
+def _spread(values: Tensor) -> Tensor:
+    """Deviation [n] of rows, 1 where there is none."""
+    found = values.std(0, correction=0)
+    return torch.where(found > 0, found, 1.0)
+
+
+def _gravity_scale(gravity: Tensor) -> Tensor:
+    """Deviation of gravity; its size where it hardly varies."""
+    rows = gravity.flatten(0, -2)
+    spread = (rows - rows.mean(0)).square().mean().sqrt()
+    size = rows.norm(dim=1).max().clamp_min(1e-30)
+    return spread if spread > 1e-3 * size else size
+
+
+def fit(
+    form: Form,
+    runs: Runs,
+    yardstick: Yardstick,
+    sigma: Tensor,
+    fitting: Fitting,
+    seed: int,
+    device: torch.device | str = "cpu",
+    after: Callable[[int], object] = lambda descents: None,
+) -> list[float]:
+    """Descend; the recurrence, in place, is then the best at the validation runs.
+
+    Args:
+        form: of `standardised`.
+        runs: that teach. yardstick: validation runs, looked at after each kind of window.
+        sigma: [r] how far particles move with each coordinate, in any common unit.
+        fitting: how long and how wide; seed: of windows and noise; device: of the descent.
+        after: called with each number of steps taken.
+
+    Returns:
+        Mean displacement error at validation runs after each kind of window; ∞ where one is lost.
+
+    Raises:
+        InstabilityError: every one is lost.
+    """
+    descent = Descent(form, runs, sigma, fitting, seed, device)
+    errors, best = [], None
+    with one_thread():
+        for window, steps in windows(len(runs.xhat) - 1, fitting.descents):
+            descent.run(window, steps, after)
+            descent.copy_to(form)
+            error = float(yardstick.errors(form).mean())
+            errors.append(error if np.isfinite(error) else np.inf)
+            if np.isfinite(error) and error == min(errors):
+                best = {name: value.clone() for name, value in form.state_dict().items()}
+    if best is None:
+        raise InstabilityError(
+            "every recurrence that was fitted loses a validation run; raise model.descents or model.runs, or "
+            "deploy with model=projected"
+        )
+    form.load_state_dict(best)
+    _check_members(form, yardstick.runs)
+    return errors
+
+
+def _check_members(form: Form, runs: Runs) -> None:
+    """Refuse members that say different things of the first stride of the runs.
+
+    Raises:
+        InstabilityError: their changes differ by more than these vary in all runs.
+    """
+    c, start = form.collider_state(runs.features[0]), form.begin(runs.xhat[0], runs.first, runs.stress[0])
+    with torch.no_grad():
+        change = form.step(start, runs.parameters, runs.gravity[0], c).change
+    apart = float(((change - change.mean(0)) / form.d_scale).square().mean().sqrt())
+    if not apart <= 1.0:
+        raise InstabilityError(
+            f"the {form.sizes.members} members disagree from the first step, by {apart:.3g} deviations of a "
+            "change; raise model.descents or model.runs"
+        )
+
+
+def windows(strides: int, descents: int) -> list[tuple[int, int]]:
+    """Strides of each kind of window, and how many steps of the descent take it."""
+    longest = max(1, strides - 2)
+    lengths = [min(length, longest) for length, _ in _WINDOWS[:-1]]
+    lengths.append(min(max(_WINDOWS[-1][0], strides // 2), longest))
+    steps = [max(1, round(share * descents)) for _, share in _WINDOWS]
+    return list(zip(lengths, steps, strict=True))
+
+
+class Descent:
+    """Steps of Adam on all members together, none of which sees the others.
+
+    On a GPU a step is captured once for each kind of window: its thousands of kernels are so small that to
+    launch them one by one takes longer than the step on a CPU.
+
+    Args:
+        form: where it begins; it stays as it is.
+        runs, sigma, fitting, seed, device: as for `fit`.
+    """
+
+    def __init__(self, form: Form, runs: Runs, sigma: Tensor, fitting: Fitting, seed: int, device):
+        def here(values: Tensor) -> Tensor:
+            return values.detach().to(device, torch.float32)
+
+        self._form = Form(form.sizes, form.dt, form.stride).to(device)
+        self._form.load_state_dict(form.state_dict())
+        self._runs = [here(v) for v in (runs.xhat, runs.changes, runs.stress, runs.parameters, runs.gravity)]
+        self._c = here(form.collider_state(runs.features))
+        self._fitting, self._generator = fitting, torch.Generator().manual_seed(seed)
+        self._device, self._taken = torch.device(device), 0
+        sigma = here(sigma)
+        self._weight = sigma.square() / (sigma * self._form.x_scale).square().sum()
+        self._weight = self._weight + _EACH / (self._form.x_scale.square() * len(sigma))
+        captured = self._device.type == "cuda"
+        rate = torch.tensor(_RATE, device=device) if captured else _RATE
+        self._adam = torch.optim.Adam(self._form.parameters(), lr=rate, betas=_BETAS, capturable=captured)
+
+    def run(self, window: int, steps: int, after: Callable[[int], object]) -> None:
+        """Take steps on windows of some strides."""
+        descend = self._captured(window) if self._device.type == "cuda" else self._descend
+        for _ in range(steps):
+            self._set_rate()
+            descend(window, *self._drawn(window))
+            self._taken += 1
+            after(1)
+
+    def copy_to(self, form: Form) -> None:
+        """Give the weights to a recurrence."""
+        form.load_state_dict(self._form.state_dict())
+
+    def _set_rate(self) -> None:
+        turn = min(1.0, self._taken / self._fitting.descents)
+        rate = _LAST_RATE + 0.5 * _RATE * (1.0 + np.cos(np.pi * turn))
+        group = self._adam.param_groups[0]
+        if isinstance(group["lr"], Tensor):
+            group["lr"].fill_(rate)
+        else:
+            group["lr"] = rate
+
+    def _drawn(self, window: int) -> list[Tensor]:
+        """Runs and first strides [M, b] of windows, and noise on x̂ and ŝ [M, b, ·], for each member."""
+        x, _, s, *_ = self._runs
+        shape, generator = (self._form.sizes.members, self._fitting.batch), self._generator
+        drawn = [
+            torch.randint(x.shape[1], shape, generator=generator),
+            torch.randint(len(x) - window, shape, generator=generator),
+            torch.randn(*shape, x.shape[2], generator=generator),
+            torch.randn(*shape, s.shape[2], generator=generator),
+        ]
+        return [values.to(self._device) for values in drawn]
+
+    def _descend(self, window: int, *drawn: Tensor) -> None:
+        form = self._form
+        form.zero_grad(set_to_none=False)
+        self._loss(window, *drawn).backward()
+        gradients = [weights.grad for weights in form.parameters()]
+        for gradient in gradients:  # a slope that overflows in a long window tells no way
+            gradient.nan_to_num_(0.0, 0.0, 0.0)
+        length = torch.stack([g.flatten(1).square().sum(1) for g in gradients]).sum(0).sqrt()
+        share = (_STEEPEST / (length + 1e-6)).clamp_max(1.0)
+        for gradient in gradients:
+            gradient.mul_(share.view(-1, *[1] * (gradient.ndim - 1)))
+        self._adam.step()
+
+    def _loss(self, window: int, k: Tensor, n: Tensor, of_x: Tensor, of_s: Tensor) -> Tensor:
+        """Sum over members of the mean loss of their windows."""
+        form, noise = self._form, self._fitting.noise
+        x, d, s, mu, g = self._runs
+        begun = State(x[n, k], d[n, k], s[n, k])
+        state = State(
+            begun.xhat + noise * form.x_scale * of_x, begun.change, begun.stress + noise * form.s_scale * of_s
+        )
+        loss = 0.0
+        for j in range(window):
+            state = form.step(state, mu[k], g[n + j, k], self._c[n + j, k])
+            target = State(x[n + j + 1, k], d[n + j + 1, k], s[n + j + 1, k])
+            scales = form.x_scale, form.d_scale, form.s_scale
+            off = [_held(a - b, scale) for a, b, scale in zip(state, target, scales, strict=True)]
+            state = State(*(b + by for b, by in zip(target, off, strict=True)))
+            error = (self._weight * off[0].square()).sum(-1)
+            if form.sizes.stress:
+                error = error + _STRESS * (off[2] / form.s_scale).square().mean(-1)
+            loss = loss + torch.log1p(_GROWTH * error / (1 + j)).mean(1)
+        after = form.step(begun, mu[k], g[n, k], self._c[n, k])
+        single = ((after.change - d[n + 1, k]) / form.a_scale).square().mean((1, 2))
+        if form.sizes.stress:
+            single = single + ((after.stress - s[n + 1, k]) / form.t_scale).square().mean((1, 2))
+        return (loss / window + _SINGLE * single).sum()
+
+    def _captured(self, window: int) -> Callable[..., None]:
+        """The same step as a graph."""
+        state = self._generator.get_state()
+        held = self._drawn(window)
+        self._generator.set_state(state)
+        weights = [w.detach().clone() for w in self._form.parameters()]
+        moments = {i: {k: v.clone() for k, v in s.items()} for i, s in enumerate(self._adam.state.values())}
+        aside = torch.cuda.Stream(self._device)
+        aside.wait_stream(torch.cuda.current_stream(self._device))
+        with torch.cuda.stream(aside):
+            for _ in range(_WARM_UP):
+                self._descend(window, *held)
+        torch.cuda.current_stream(self._device).wait_stream(aside)
+        graph = torch.cuda.CUDAGraph()
+        with without_collection(), torch.cuda.graph(graph):
+            self._descend(window, *held)
+        self._restore(weights, moments)
+
+        def take(window: int, *drawn: Tensor) -> None:
+            for there, values in zip(held, drawn, strict=True):
+                there.copy_(values)
+            graph.replay()
+
+        return take
+
+    @torch.no_grad()
+    def _restore(self, weights: Sequence[Tensor], moments: dict) -> None:
+        """Undo the steps that warmed up, in place, as the graph reads where they lie."""
+        for now, before in zip(self._form.parameters(), weights, strict=True):
+            now.copy_(before)
+        for i, state in enumerate(self._adam.state.values()):
+            for name, value in state.items():
+                value.copy_(moments[i][name]) if i in moments else value.zero_()
+
+
+def _held(values: Tensor, scale: Tensor) -> Tensor:
+    """Values held within ± `_FAR` deviations, small ones nearly as they are."""
+    return _FAR * scale * torch.tanh(values / (_FAR * scale))
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """So small a network gains little by more threads, and its bits would depend on how many there are."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

@@ -1,0 +1,148 @@
+"""Fits of a recurrence to runs of a law that it can hold exactly."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from nsf.errors import ConfigError, InstabilityError
+from nsf.recurrence import Fitting, Runs, Yardstick, fit, standardised
+from nsf.recurrence.descent import windows
+from nsf.recurrence.fitting import check_stride
+
+SHORT = Fitting(width=16, descents=60, batch=32)
+
+
+def damped(count=6, steps=40, stride=1):
+    """Oscillators under a gravity of their own, whose stress follows their speed with a delay."""
+    generator = torch.Generator().manual_seed(0)
+    gravity = 0.5 * torch.randn(1, count, 3, generator=generator).double().expand(steps, -1, -1)
+    x, d, s = (
+        [torch.zeros(count, 2).double()],
+        torch.zeros(count, 2).double(),
+        [torch.zeros(count, 1).double()],
+    )
+    for n in range(steps):
+        d = d - 0.05 * x[-1] - 0.02 * d - 0.01 * s[-1] + 0.01 * gravity[n, :, :2]
+        x.append(x[-1] + d)
+        s.append(s[-1] + d[:, :1] - 0.1 * s[-1])
+    given = (
+        torch.zeros(count, 2).double(),
+        torch.ones(count, 1).double(),
+        gravity,
+        torch.zeros(steps, count, 0),
+    )
+    return Runs.in_strides(stride, torch.stack(x), torch.stack(s), *given)
+
+
+def yardstick(runs):
+    """Runs whose latents are the places of two particles along one axis."""
+
+    def positions(xhat):
+        return torch.stack([xhat, 0.0 * xhat, 0.0 * xhat], -1)
+
+    return Yardstick(runs, positions, positions(runs.xhat))
+
+
+def fitted(fitting=SHORT, stride=1, seed=0):
+    runs = damped(stride=stride)
+    form = standardised(runs, fitting, 0.01, stride, True, seed)
+    errors = fit(form, runs, yardstick(runs), torch.ones(2), fitting, seed)
+    return form, errors
+
+
+@pytest.mark.parametrize("stride", [1, 2])
+def test_it_follows_the_runs_that_taught_it(stride):
+    form, errors = fitted(replace(SHORT, descents=300), stride)
+    assert min(errors) < 0.5  # a run that does not move is off by 1
+    assert float(yardstick(damped(stride=stride)).errors(form).mean()) == min(errors)
+
+
+def test_the_same_seed_gives_the_same_bits():
+    one, other, third = (fitted(seed=seed)[0].state_dict() for seed in (0, 0, 1))
+    assert all(torch.equal(one[name], other[name]) for name in one)
+    assert any(not torch.equal(one[name], third[name]) for name in one)
+
+
+def test_members_begin_apart_and_each_is_that_of_its_seed():
+    runs = damped()
+    both = standardised(runs, replace(SHORT, members=2), 0.01, 1, True, 3)
+    alone = standardised(runs, SHORT, 0.01, 1, True, 4)
+    weights = both.networks["motion"].weights[0]
+    assert not torch.equal(weights[0], weights[1])
+    assert torch.equal(weights[1], alone.networks["motion"].weights[0][0])
+
+
+def test_a_member_that_is_lost_moves_no_other(monkeypatch):
+    monkeypatch.setattr("nsf.recurrence.descent._check_members", lambda form, runs: None)
+    runs = damped()
+    form = standardised(runs, replace(SHORT, members=2), 0.01, 1, True, 0)
+    form.networks["motion"].biases[2].data[1] = 1e30
+    fit(
+        form,
+        runs,
+        replace(yardstick(runs), positions=lambda x: torch.zeros(len(x), 2, 3)),
+        torch.ones(2),
+        SHORT,
+        0,
+    )
+    assert bool(torch.isfinite(form.networks["motion"].weights[2][0]).all())
+
+
+def test_runs_that_are_all_lost_are_an_error():
+    runs = damped()
+    form = standardised(runs, SHORT, 0.01, 1, True, 0)
+    lost = replace(yardstick(runs), positions=lambda xhat: torch.full((len(xhat), 2, 3), torch.nan))
+    with pytest.raises(
+        InstabilityError, match=r"loses a validation run; raise model\.descents or model\.runs"
+    ):
+        fit(form, runs, lost, torch.ones(2), SHORT, 0)
+
+
+def test_members_that_disagree_from_the_first_step_are_an_error(monkeypatch):
+    runs = damped()
+    form = standardised(runs, replace(SHORT, members=2), 0.01, 1, True, 0)
+    form.networks["motion"].biases[2].data[1] = 1e3
+    monkeypatch.setattr("nsf.recurrence.descent.windows", lambda strides, descents: [(1, 1)])
+    near = replace(yardstick(runs), positions=lambda xhat: torch.zeros(len(xhat), 2, 3).double())
+    with pytest.raises(InstabilityError, match=r"the 2 members disagree from the first step.* model\.runs"):
+        fit(form, runs, near, torch.ones(2), SHORT, 0)
+
+
+def test_windows_grow_to_half_a_run():
+    assert windows(400, 1000) == [(16, 350), (64, 450), (200, 200)]
+    assert windows(50, 100) == [(16, 35), (48, 45), (48, 20)]
+    assert [length for length, _ in windows(2, 3)] == [1, 1, 1]
+
+
+def test_a_captured_descent_is_that_of_the_host(device):
+    if device == "cpu":
+        pytest.skip("nothing is captured on a CPU")
+    runs, states = damped(), []
+    for where in ("cpu", device):
+        form = standardised(runs, SHORT, 0.01, 1, True, 0)
+        fit(form, runs, yardstick(runs), torch.ones(2), replace(SHORT, descents=6), 0, where)
+        states.append(form.state_dict())
+    for name, values in states[0].items():
+        np.testing.assert_allclose(states[1][name], values, atol=1e-4, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"width": 0}, "width=0 must be at least 1"),
+        ({"members": 0}, "members=0 must be at least 1"),
+        ({"noise": -1.0}, "noise=-1.0 must be finite"),
+    ],
+)
+def test_bad_values(options, message):
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        Fitting(**options)
+
+
+def test_a_stride_divides_the_steps():
+    check_stride(5, 250)
+    with pytest.raises(ConfigError, match=r"model\.stride=3 does not divide the 250 steps .* one of 1, 2, 5"):
+        check_stride(3, 250)
