@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import warp as wp
 
+from nsf.results.table import parsed
 from nsf.runs.provenance import provenance
 from nsf.storage import writing
 
@@ -102,7 +103,7 @@ def read(path: Path) -> pd.DataFrame:
     """The table of a file, to the last digit; an empty one where there is none."""
     if not path.is_file():
         return pd.DataFrame(columns=list(COLUMNS))
-    frame = table.parsed(path, ("part", "unit"))
+    frame = parsed(path, ("part", "unit"))
     return frame.fillna({"part": "", "unit": ""})
 
 

@@ -15,12 +15,12 @@ def _same_shape(a: Tensor, b: Tensor) -> None:
         raise ShapeError(f"trajectories differ in shape: {tuple(a.shape)} and {tuple(b.shape)}")
 
 
-def frame_squares(values: Float[Tensor, "frame particle component"]) -> Float[Tensor, "frame"]:
+def frame_squares(values: Float[Tensor, "frame particle component"]) -> Float[Tensor, " frame"]:
     """Σ over particles and components of the squares, in float64, a frame at a time."""
     return values.double().square().sum((1, 2))
 
 
-def relative(error: Float[Tensor, "frame"], reference: Float[Tensor, "frame"]) -> float:
+def relative(error: Float[Tensor, " frame"], reference: Float[Tensor, " frame"]) -> float:
     """√(Σ error / Σ reference) of sums of squares by frame."""
     return float((error.sum() / reference.sum()).sqrt())
 
@@ -82,7 +82,7 @@ def displacement_error(
     return relative(frame_squares(x_rom - x_fom), frame_squares(x_fom - X))
 
 
-def tensor_squares(tau: Float[Tensor, "frame particle 6"]) -> Float[Tensor, "frame"]:
+def tensor_squares(tau: Float[Tensor, "frame particle 6"]) -> Float[Tensor, " frame"]:
     """Σ over particles of ‖τ‖_F² of symmetric tensors xx, xy, xz, yy, yz, zz (off-diagonals count twice)."""
     twice = torch.tensor([1.0, 2.0, 2.0, 1.0, 2.0, 1.0], dtype=torch.float64, device=tau.device)
     return (tau.double().square() * twice).sum((1, 2))
@@ -117,7 +117,7 @@ def stress_error(
 
 
 def linear_momentum(
-    v: Float[Tensor, "frame particle 3"], mass: Float[Tensor, "particle"]
+    v: Float[Tensor, "frame particle 3"], mass: Float[Tensor, " particle"]
 ) -> Float[Tensor, "frame 3"]:
     """Σ m v [kg m/s]."""
     return torch.einsum("fpc,p->fc", v.double(), mass.double())
@@ -127,7 +127,7 @@ def angular_momentum(
     x: Float[Tensor, "frame particle 3"],
     v: Float[Tensor, "frame particle 3"],
     C: Float[Tensor, "frame particle 3 3"],
-    mass: Float[Tensor, "particle"],
+    mass: Float[Tensor, " particle"],
     inertia: float,
 ) -> Float[Tensor, "frame 3"]:
     """Σ x × m v + m D axial(C − Cᵀ) [kg m²/s], about the origin.
@@ -149,8 +149,8 @@ def angular_momentum(
 
 
 def momentum_error(
-    rom: Float[Tensor, "frame 3"], fom: Float[Tensor, "frame 3"], scale: Float[Tensor, "frame"]
-) -> Float[Tensor, "frame"]:
+    rom: Float[Tensor, "frame 3"], fom: Float[Tensor, "frame 3"], scale: Float[Tensor, " frame"]
+) -> Float[Tensor, " frame"]:
     """‖p_rom − p_fom‖ of each frame over the largest `scale`, dimensionless.
 
     Args:

@@ -15,6 +15,7 @@ from nsf.errors import ConfigError, MissingRunError, NSFError, SchemaError, firs
 from nsf.extras import optional
 from nsf.pipeline.chain import Pipeline
 from nsf.results.search import OBJECTIVES, write_search
+from nsf.results.table import read
 from nsf.storage import locked
 
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
@@ -199,7 +200,7 @@ def _tried(overrides: list[str], objectives: Sequence[str], root: Path | None) -
     pipeline.split = replace(pipeline.split, test=())  # which a search never looks at
     for stage in pipeline.stages[:-1]:
         run = pipeline.run(stage)
-    results = table.read(run.file("results.csv"))
+    results = read(run.file("results.csv"))
     if set(results["split"]) != {"validation"}:
         raise ConfigError(f"{run.id} is not of the validation cases alone; leave deploy.split out")
     values = [float(results[OBJECTIVES[name].name].mean()) for name in objectives]

@@ -11,6 +11,7 @@ from rich.table import Table
 from nsf.results.columns import COLUMNS, Column
 from nsf.results.formats import Rows, spreadsheet, terminal_table
 from nsf.results.style import MUTED, PALETTE, figure, save, styled
+from nsf.results.table import parsed
 from nsf.storage import writing
 
 #: What a search can make small, by the name that a user gives it.
@@ -47,7 +48,7 @@ def search_chart(table: pd.DataFrame, objectives: Sequence[str]) -> Figure:
 
 def best_table(path: Path) -> Table:
     """The best trials of a `trials.csv`, for the terminal: the Pareto front."""
-    trials = table.parsed(path, ())
+    trials = parsed(path, ())
     best = trials[trials["pareto"]].drop(columns=["pareto", "error"])
     columns = [OBJECTIVES.get(name, Column(name, name)) for name in best]
     body = [
