@@ -101,6 +101,7 @@ class Experiment:
         parts = {
             f"{stem}/{one}": cls._of(f"{stem}/{one}", of_part, overrides, f"{path}: {one}")
             for one, of_part in content["parts"].items()
+            if part in ("", one)
         }
         if part:
             return parts[name]

@@ -182,3 +182,11 @@ def test_an_option_that_lacks_a_key_of_the_experiment_is_named(written):
     ):
         written(text, "model=interpolate")
     assert written(text, "model=recurrence")
+
+
+def test_keys_of_another_part_refuse_no_option(tmp_path):
+    text = PARTS.replace("each: {seed: 2}", "each: {seed: 2, model: recurrence, model.teaching.steps: 9}")
+    (tmp_path / "one.yaml").write_text(text)
+    assert Experiment.load("one/first", ["model=interpolate"], tmp_path).jobs
+    with pytest.raises(ConfigError, match=r"second sets model\.teaching\.steps"):
+        Experiment.load("one", ["model=interpolate"], tmp_path)
