@@ -58,7 +58,7 @@ def test_delta_is_that_of_the_evaluation(taught):
     assert double["recurrence_sand"] == pytest.approx(evaluated, rel=1e-6)
     assert double["recurrence_batch3"] == pytest.approx(evaluated, rel=1e-6)
     # Another body, by its grid; see the same bound in test_bench.
-    assert double["recurrence_1k"] < 0.01
+    assert double["recurrence_1k"] < 0.03
 
 
 def test_a_run_holds_little(taught):
@@ -66,7 +66,7 @@ def test_a_run_holds_little(taught):
     run = pipeline.solver_at(pipeline.manifold(), angle(26.0))
     own = rows[(rows["case"] == "recurrence_sand") & (rows["precision"] == "fp64")].iloc[0]
     assert own["memory of a run [MiB]"] == run.nbytes / 2**20
-    assert run.nbytes < 0.2 * run.decoder().at.nbytes
+    assert run.nbytes < 0.3 * run.decoder().at.nbytes
     more = rows[(rows["case"] == "recurrence_batch3") & (rows["precision"] == "fp64")].iloc[0]
     assert more["memory of a run [MiB]"] < 3 * own["memory of a run [MiB]"]
 
