@@ -1,6 +1,5 @@
 """Models by name, from the configuration to the errors of their runs on the tiny chain."""
 
-import shutil
 import sys
 
 import numpy as np
@@ -16,7 +15,6 @@ from nsf.deployment import Rollout
 from nsf.errors import ConfigError
 from nsf.models import describe
 from nsf.models.auto import Auto, Measured
-from nsf.paths import CONF
 from nsf.pipeline import Pipeline
 
 #: A recurrent network from parameters and forcing to latent vectors; docs/howto/model.md has the same.
@@ -202,11 +200,10 @@ def own_model(tmp_path, monkeypatch):
     """A model of one's own, in one file of Python and one yaml."""
     monkeypatch.setattr(nsf.models, "__path__", [*nsf.models.__path__, str(tmp_path)])
     (tmp_path / "gru.py").write_text(GRU)
-    shutil.copytree(CONF, tmp_path / "conf")
+    (tmp_path / "conf/model").mkdir(parents=True)
     yaml = "_target_: nsf.models.gru.GRU\nname: gru\nwidth: 8\ndescent: 200\n"
     (tmp_path / "conf/model/gru.yaml").write_text(yaml)
-    for module in ("nsf.config.composing", "nsf.paths", "nsf.pipeline.chain"):
-        monkeypatch.setattr(sys.modules[module], "CONF", tmp_path / "conf")
+    monkeypatch.setenv("NSF_CONFIG", str(tmp_path / "conf"))
     yield "gru"
     sys.modules.pop("nsf.models.gru", None)
 
