@@ -261,7 +261,7 @@ def mutated_json(tree, draw: random.Random):
     elif way < 0.3 and isinstance(parent, dict):
         parent[draw.choice(HOSTILE)] = parent.pop(key)
     elif way < 0.33:
-        for _ in range(draw.choice((40, 2000))):
+        for _ in range(draw.choice((40, 300))):
             parent[key] = [parent[key]]
     else:
         parent[key] = value_like(parent[key], draw)
