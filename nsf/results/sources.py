@@ -87,6 +87,8 @@ class Source:
         self.run, self.id, self.manifest = run, run.id, run.manifest
         self.hashes = {name: checked_hash(run, name) for name in FILES}
         self.rows = table.complete(self._csv("results.csv", ("case",)), self._path("results.csv"))
+        if self.rows.empty:
+            raise SchemaError(f"{self._path('results.csv')} has no rows; run `nsf evaluate` again")
         self.summary = self._json("summary.json", _SUMMARY)
         self.cost = self._json("cost.json", _COST)
 
@@ -139,7 +141,8 @@ class Source:
     def motions(self, cases: Sequence[str]) -> list[Motion]:
         """The particles of some cases; those that were not stored are left out."""
         arrays = archives.arrays(self._path("frames.npz"), "frames", "evaluate", FRAMES)
-        around = [one.key for one in _AROUND if one.key in arrays]
+        around = [one.key for one in _AROUND]
+        around = around if all(name in arrays for name in around) else []
         rows = {str(case): row for row, case in enumerate(arrays["cases"])}
         return [
             Motion(

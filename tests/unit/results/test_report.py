@@ -168,6 +168,7 @@ def test_an_interval_is_of_seeds_and_cases_drawn_anew():
         ("cost.json", '{"breakdown": {"reduced": {"p2g": "abc"}}}'),
         ("cost.json", "null"),
         ("results.csv", ""),
+        ("results.csv", "scene,model,case,split,delta\n"),
         ("results.csv", "scene,model,case,split,delta,memory_full_mib\nsand,projected,a=1,test,0.1,abc\n"),
         ("results.csv", "scene,model,case,split,delta\nsand,projected,a=1,test,0.1,1\n"),
         ("series.csv", "case,split,frame,t,delta,displacement_error,stress_error\na=1,test,0,abc,0,0,0\n"),
