@@ -260,4 +260,4 @@ def _array(data: bytes) -> np.ndarray:
     if math.prod(shape) * dtype.itemsize != len(data) - stream.tell():
         raise ValueError(f"an array of shape {list(shape)} in {len(data)} bytes")
     values = np.frombuffer(data, dtype, offset=stream.tell())
-    return values.reshape(shape, order="F" if by_columns else "C")
+    return values.reshape(shape, order="F" if by_columns else "C").copy()  # which may be written to

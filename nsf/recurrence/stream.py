@@ -10,6 +10,7 @@ import torch
 import warp as wp
 from torch import Tensor
 
+from nsf.data import archives
 from nsf.errors import ConfigError, SchemaError
 from nsf.mpm import FP32
 from nsf.mpm.recording import FrameRecorder
@@ -37,8 +38,8 @@ class Encoded:
         return bool(np.isfinite(self.xhat).all() and np.isfinite(self.stress).all())
 
     def save(self, path: Path) -> None:
-        """Write as npz, whole or not at all."""
-        with writing(path) as partial, partial.open("wb") as file:
+        """Write as npz with its own sha256, whole or not at all."""
+        with writing(path, sealed=True) as partial, partial.open("wb") as file:
             np.savez(file, xhat=self.xhat, stress=self.stress, seconds=self.seconds)
 
     @classmethod
@@ -48,10 +49,10 @@ class Encoded:
         Raises:
             SchemaError: the file holds none.
         """
+        file = archives.arrays(path, "encoded run", "teach")
         try:
-            with np.load(path, allow_pickle=False) as file:
-                return cls(file["xhat"], file["stress"], float(file["seconds"]))
-        except (OSError, ValueError, KeyError, EOFError) as error:
+            return cls(file["xhat"], file["stress"], float(file["seconds"]))
+        except (ValueError, TypeError, KeyError) as error:
             raise SchemaError(f"{path} holds no encoded run; delete it and run `nsf teach` again") from error
 
 

@@ -1,7 +1,6 @@
 """The file of a recurrence, and the identity of what taught it, so that it is used on nothing else."""
 
 import hashlib
-import pickle
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
@@ -10,8 +9,8 @@ import numpy as np
 import torch
 
 from nsf.canonical import plain
-from nsf.errors import ConfigError, MissingRunError, SchemaError, first_line
-from nsf.manifest import verified
+from nsf.data import archives
+from nsf.errors import ConfigError, SchemaError, first_line
 from nsf.recurrence.form import Form, Sizes
 from nsf.storage import writing
 
@@ -155,7 +154,7 @@ def load(path: Path | str) -> tuple[Form, Taught]:
         SchemaError: the file is truncated, foreign or of another version, or does not fit together.
     """
     path = Path(path)
-    content = _read(path)
+    content = archives.tensors(path, "recurrence", "teach", (FORMAT, FORMAT_VERSION))
     try:
         taught, sizes = Taught.read(content["taught"]), Sizes(**content["sizes"])
         with torch.device("meta"):  # whatever sizes the file claims, nothing of theirs is made
@@ -174,28 +173,3 @@ def _whole(value) -> int:
     if not isinstance(value, int) or value < 1:
         raise ValueError(f"a stride of {value!r} steps")
     return value
-
-
-def _read(path: Path) -> dict:
-    try:
-        verified(path)
-    except FileNotFoundError as error:
-        raise MissingRunError(f"{path} does not exist; run `nsf teach` first") from error
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, EOFError, OSError, ValueError, KeyError, pickle.UnpicklingError) as error:
-        raise SchemaError(
-            f"{path} is truncated or holds no recurrence ({first_line(error)}); delete it and run "
-            "`nsf teach` again"
-        ) from error
-    kind = content.get("format") if isinstance(content, dict) else None
-    if kind == "nsf-operators":
-        raise SchemaError(f"{path} holds a recurrence of an earlier form; run `nsf teach` again")
-    if kind != FORMAT:
-        raise SchemaError(f"{path} is a torch file but holds no recurrence; pass the file of a teach run")
-    if content.get("format_version") != FORMAT_VERSION:
-        raise SchemaError(
-            f"{path} has format_version {content.get('format_version')!r}, this nsf reads {FORMAT_VERSION}; "
-            "install the nsf that wrote it or run `nsf teach` again"
-        )
-    return content

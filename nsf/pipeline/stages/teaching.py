@@ -25,6 +25,7 @@ from nsf.recurrence.taught import Taught
 from nsf.runs import Record, Run
 from nsf.scenes import Scene
 from nsf.scenes.identity import physics_hash
+from nsf.storage import intact
 
 #: File of a teach run with the recurrence.
 RECURRENCE = "recurrence.pt"
@@ -123,7 +124,7 @@ def _encoded(
         missing = []
         for lesson, path in zip(lessons, paths, strict=True):
             stored = pipeline.simulation(lesson.case)
-            if path.is_file():
+            if intact(path, pipeline.say):
                 progress.advance(steps)
             elif lesson.case in known and stored.complete:
                 with Trajectory.open(stored.file(TRAJECTORY)) as trajectory:

@@ -9,7 +9,9 @@ from forms import form, inputs
 
 from nsf.errors import MissingRunError, SchemaError
 from nsf.recurrence import RecurrenceEngine, Taught
+from nsf.recurrence.stream import Encoded
 from nsf.recurrence.taught import load, save
+from nsf.storage import intact
 
 TAUGHT = Taught(
     manifold="aa", scene="bb", dt=0.01, parameters=("angle",), ranges=((20.0, 40.0),),
@@ -37,8 +39,8 @@ class Evil:
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (lambda content: content | {"format": "other"}, "holds no recurrence"),
-        (lambda content: content | {"format": "nsf-operators"}, "a recurrence of an earlier form"),
+        (lambda content: content | {"format": "other"}, "no recurrence of nsf"),
+        (lambda content: content | {"format": "nsf-operators"}, "no recurrence of nsf"),
         (lambda content: content | {"format_version": 9}, "has format_version 9, this nsf reads 1"),
         (lambda content: content | {"taught": {}}, "does not say what taught it"),
         (lambda content: content | {"stride": 0}, "a stride of 0 steps"),
@@ -48,7 +50,7 @@ class Evil:
             lambda content: content | {"state": content["state"] | {"x_mean": torch.full((4,), torch.nan)}},
             "a value is not finite",
         ),
-        (lambda content: content | {"more": Evil()}, "truncated or holds no recurrence"),
+        (lambda content: content | {"more": Evil()}, "and no data do"),
     ],
 )  # fmt: skip
 def test_a_bad_file_is_refused(tmp_path, capsys, spoil, message):
@@ -96,3 +98,17 @@ def test_identities_are_compared(changed, message):
 )
 def test_how_far_an_input_lies_outside(angle, gravity, off, text):
     assert TAUGHT.outside({"angle": angle}, np.array(gravity)) == (pytest.approx(off), text)
+
+
+def test_an_encoded_run_is_read_again_until_it_is_damaged(tmp_path):
+    path, lines = tmp_path / "encoded_0.npz", []
+    run = Encoded(np.ones((3, 2), np.float32), np.zeros((3, 0), np.float32), 1.5)
+    run.save(path)
+    assert intact(path, lines.append)
+    np.testing.assert_array_equal(Encoded.open(path).xhat, run.xhat)
+    data = bytearray(path.read_bytes())
+    data[60] ^= 1
+    path.write_bytes(data)
+    assert not intact(path, lines.append)
+    assert "encoded_0.npz" in lines[0]
+    assert not path.exists()
