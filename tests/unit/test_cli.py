@@ -123,7 +123,7 @@ MALFORMED = [
         "deploy.changes={material:{_target_:os.system}}",
         "deploy.changes.material: _target_: os.system is refused",
     ),
-    ("+scene.x='${scene.x}'", "scene.x: Recursive interpolation detected"),
+    ("+scene.x='${scene.x}'", "scene.x: it refers to itself"),
     ("+scene.x='${scaled:5}'", "scene.x: ${scaled:5} has no values by scale"),
     ("+scene.x='${per:1,2}'", "scene.x: per() takes 1 positional argument"),
 ]

@@ -7,7 +7,7 @@ import warp as wp
 
 from nsf.engines.modal.gathering import make_contraction, make_gathering
 from nsf.engines.modal.networks import make_layer, make_product
-from nsf.engines.modal.placing import make_others, make_sample
+from nsf.engines.modal.placing import make_neighbours, make_sample
 from nsf.engines.modal.projection import make_projection
 from nsf.mpm import precision_of
 from nsf.mpm.transfer import make_g2p, make_p2g
@@ -22,7 +22,7 @@ KERNELS = {
     "g2p": lambda precision, several: make_g2p(precision, "quadratic"),
     "update_g2p": lambda precision, several: make_update_g2p(precision, "quadratic", several),
     "sample": lambda precision, several: make_sample(precision, "quadratic", several),
-    "others": lambda precision, several: make_others(precision, "quadratic", 9, 2, several, wp.float16),
+    "others": lambda precision, several: make_neighbours(precision, "quadratic", 9, 2, several, wp.float16),
     "contraction": lambda precision, several: make_contraction(
         precision, (9, 8), precision.real, 2, several, wp.float16
     ),

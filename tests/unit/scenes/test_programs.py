@@ -126,9 +126,9 @@ def test_a_case_left_out_is_as_configured(block):
          "moves a collider that does not exist; there are floor"),
         ([f"+scene.forcing.colliders.floor={{{PUSH}, reach: [0,5]}}"], "more than a cell"),
         (["scene.forcing.gravity.tilt.angle=-3"], "angle=-3° must lie between"),
-        (["+scene.forcing.wind={}"], "must have the keys gravity and colliders"),
+        (["+scene.forcing.wind={}"], r"unknown key 'scene\.forcing\.wind'"),
         (["scene.program=-1"], "scene.program=-1 must be a whole number of at least 0"),
-        (["scene.forcing.gravity.tilt._target_=nsf.scenes.Ball"], "name a GravityProgram of nsf.scenes"),
+        (["scene.forcing.gravity.tilt._target_=nsf.scenes.Ball"], r"unknown key 'scene.forcing.gravity.tilt"),
     ],
 )  # fmt: skip
 def test_a_forcing_that_cannot_be_meant_is_refused(overrides, message):
