@@ -61,6 +61,12 @@ class Case:
     altered: bool = False
 
 
+def draw_coarsely(setattr=setattr) -> None:
+    """Draw charts and bodies with few pixels, as nobody looks at them; a test passes its own `setattr`."""
+    setattr(style, "PIXELS", style.PIXELS // 4)
+    setattr(camera, "_OVERSAMPLE", 1)
+
+
 class Workshop:
     """A tiny chain on disk, of which cases spoil copies.
 
@@ -74,7 +80,6 @@ class Workshop:
         self.folder, self.root, self.tiny = folder, root, tiny
         self.runs, self.conf = folder / "runs", folder / "conf"
         shutil.copytree(CONF, self.conf)
-        style.PIXELS, camera._OVERSAMPLE = style.PIXELS // 4, 1  # pictures are not looked at
         os.environ["NSF_RUNS"], os.environ["NSF_REPORTS"] = str(self.runs), str(folder / "reports")
 
     def fresh(self) -> Path:

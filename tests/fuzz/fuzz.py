@@ -30,6 +30,7 @@ def made(folder: Path) -> cases.Workshop:
     for stage in ("simulate", "train", "deploy", "evaluate"):
         pipeline.run(stage)
     (folder / "work").mkdir()
+    cases.draw_coarsely()
     return cases.Workshop(folder / "work", root, TINY)
 
 

@@ -19,7 +19,9 @@ SEED = 2023  # not that of `make fuzz`
 def shop(chain, tiny, tmp_path_factory):
     before = {name: os.environ.get(name) for name in ("NSF_RUNS", "NSF_REPORTS")}
     folder = tmp_path_factory.mktemp("fuzz")
-    yield cases.Workshop(folder, chain.root, tiny)
+    with pytest.MonkeyPatch.context() as patch:
+        cases.draw_coarsely(patch.setattr)
+        yield cases.Workshop(folder, chain.root, tiny)
     for name, value in before.items():
         os.environ.pop(name) if value is None else os.environ.update({name: value})
 
