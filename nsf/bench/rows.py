@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import warp as wp
 
+from nsf.errors import SchemaError
 from nsf.results.table import parsed
 from nsf.runs.provenance import provenance
 from nsf.storage import writing
@@ -104,6 +105,10 @@ def read(path: Path) -> pd.DataFrame:
     if not path.is_file():
         return pd.DataFrame(columns=list(COLUMNS))
     frame = parsed(path, ("part", "unit"))
+    if absent := [name for name in COLUMNS if name not in frame]:
+        raise SchemaError(
+            f"{path} lacks the columns {', '.join(absent)}; delete it, and run `nsf bench` again"
+        )
     return frame.fillna({"part": "", "unit": ""})
 
 

@@ -1,6 +1,5 @@
 """The outcome of each job of a sweep, in a table over the keys that it varied."""
 
-import csv
 from collections.abc import Mapping, Sequence
 
 from rich.markup import escape
@@ -10,6 +9,7 @@ from nsf import config as configuration
 from nsf.errors import MissingRunError
 from nsf.pipeline.chain import Pipeline
 from nsf.results.columns import COLUMNS
+from nsf.results.table import read
 from nsf.runs import Run
 
 #: Columns of `results.csv` of which a job's mean is shown.
@@ -47,10 +47,5 @@ def outcome_table(sweeps: Sequence[Sequence[str]], failed: Mapping[str, str]) ->
 
 
 def _means(run: Run) -> list[str]:
-    with run.file("results.csv").open(encoding="utf-8", newline="") as file:
-        rows = list(csv.DictReader(file))
-    means = []
-    for name in _SHOWN:
-        values = [float(row.get(name) or "nan") for row in rows]
-        means.append(COLUMNS[name].cell(sum(values) / len(values)))
-    return means
+    results = read(run.file("results.csv"))
+    return [COLUMNS[name].cell(results[name].mean(skipna=False)) for name in _SHOWN]

@@ -287,7 +287,8 @@ def _fine_tables(frame: pd.DataFrame, question: Question, folder: Path) -> list[
         if len(rows):
             checked_hash(run, _FINE)
             head = {name: rows[name].iloc[0] for name in ("body", "variant")} | {"run": run.id}
-            parts.append(table.parsed(Path(run.path) / _FINE, ("case",)).assign(**head))
+            path = Path(run.path) / _FINE
+            parts.append(table.numbers(table.parsed(path, ("case",)), path, ("case",)).assign(**head))
     if not parts:
         return []
     fine = pd.concat(parts, ignore_index=True)

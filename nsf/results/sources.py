@@ -100,7 +100,14 @@ class Source:
     @cached_property
     def series(self) -> pd.DataFrame:
         """Errors and latent coordinates, one row a frame and case."""
-        return table.numbers(self._csv("series.csv", _SERIES), self._path("series.csv"), ("case", "split"))
+        path, frame = self._path("series.csv"), self._csv("series.csv", _SERIES)
+        for head in ("xhat_", "encoded_"):
+            names = {name for name in frame if name.startswith(head)}
+            if names != {f"{head}{k + 1}" for k in range(len(names))}:
+                raise SchemaError(
+                    f"{path} has {', '.join(sorted(names))}, not {head}1 to {head}r; run `nsf evaluate` again"
+                )
+        return table.numbers(frame, path, ("case", "split"))
 
     @cached_property
     def logarithmic(self) -> set[str]:

@@ -1,6 +1,7 @@
 """`nsf plan`: what a run would do, said before any work; and what a run says while it works."""
 
 import re
+from types import SimpleNamespace
 
 import pytest
 from omegaconf import OmegaConf
@@ -8,6 +9,7 @@ from omegaconf import OmegaConf
 from nsf import progress
 from nsf.cli import main
 from nsf.config import load
+from nsf.errors import SchemaError
 from nsf.pipeline import Pipeline, preview
 from nsf.pipeline.outcome import outcome_table
 from nsf.progress import Progress, label, labelled
@@ -148,7 +150,7 @@ def test_a_log_tells_of_work_that_has_not_begun(monkeypatch, capsys):
     assert capsys.readouterr().err == "train, 0 of 10 steps, 0.0/s\n"
 
 
-def test_a_sweep_ends_with_a_table_over_what_it_varied(chain, tiny, monkeypatch):
+def test_a_sweep_ends_with_a_table_over_what_it_varied(chain, tiny, monkeypatch, tmp_path):
     monkeypatch.setenv("NSF_RUNS", str(chain.root))
     words = [word for word in tiny if not word.startswith("latent_dim")]
     table = outcome_table([[*words, "latent_dim=4,3"]], {"latent_dim=3": "lost"})
@@ -157,3 +159,8 @@ def test_a_sweep_ends_with_a_table_over_what_it_varied(chain, tiny, monkeypatch)
     assert columns["run"] == [chain.pipeline.evaluation.hash, "failed"]
     assert float(columns[r"δ \[%]" if r"δ \[%]" in columns else "δ [%]"][0]) > 0
     assert outcome_table([list(tiny)], {}) is None
+    results = tmp_path / "results.csv"
+    results.write_text("scene,model,case,split,delta\nsand,projected,a=1,test,abc\n")
+    monkeypatch.setattr(Pipeline, "evaluated", lambda _: SimpleNamespace(file=lambda _: results, hash="0"))
+    with pytest.raises(SchemaError, match="delta holds text"):
+        outcome_table([[*words, "latent_dim=4,3"]], {})

@@ -26,7 +26,7 @@ from nsf.bench.scaling import at_size, carried_over
 from nsf.bench.scaling import measured as measured_sizes
 from nsf.bench.training import measured as measured_training
 from nsf.cli import main
-from nsf.errors import ConfigError, DeviceError, StorageError
+from nsf.errors import ConfigError, DeviceError, SchemaError, StorageError
 from nsf.pipeline import Pipeline
 
 SMALL = {"benches": "full_order", "particles": "200,500", "trials": "2", "device": "cpu", "precision": "fp32"}
@@ -55,6 +55,12 @@ def reported(rows, folder):
     rows.to_csv(folder / FILE, index=False)
     page = write_report(folder).read_text()
     return page, re.findall(r"\]\((.*?)\)", page)
+
+
+def test_a_table_of_something_else_is_refused(tmp_path):
+    (tmp_path / FILE).write_text("bench,case\nfull_order,first\n")
+    with pytest.raises(SchemaError, match="lacks the columns particles"):
+        read(tmp_path / FILE)
 
 
 @pytest.fixture(scope="module")

@@ -50,9 +50,9 @@ def rewrite(run: Run, **keys) -> None:
     path.write_text(json.dumps(json.loads(path.read_text()) | keys))
 
 
-def seal(run: Run) -> None:
-    """Record the files as they now stand."""
-    files = [(name, (run.path / name).read_bytes()) for name in FILES]
+def seal(run: Run, *more: str) -> None:
+    """Record the files as they now stand, and more than an evaluate run has."""
+    files = [(name, (run.path / name).read_bytes()) for name in (*FILES, *more)]
     outputs = [{"path": n, "bytes": len(d), "sha256": hashlib.sha256(d).hexdigest()} for n, d in files]
     rewrite(run, outputs=outputs)
 

@@ -172,6 +172,10 @@ def test_an_interval_is_of_seeds_and_cases_drawn_anew():
         ("results.csv", "scene,model,case,split,delta,memory_full_mib\nsand,projected,a=1,test,0.1,abc\n"),
         ("results.csv", "scene,model,case,split,delta\nsand,projected,a=1,test,0.1,1\n"),
         ("series.csv", "case,split,frame,t,delta,displacement_error,stress_error\na=1,test,0,abc,0,0,0\n"),
+        (
+            "series.csv",
+            "case,split,frame,t,delta,displacement_error,stress_error,xhat_2\na=1,test,0,0,0,0,0,1\n",
+        ),
     ],
 )
 def test_a_forged_file_is_refused(tmp_path, no_pictures, name, content):
@@ -180,6 +184,14 @@ def test_a_forged_file_is_refused(tmp_path, no_pictures, name, content):
     seal(run)
     with pytest.raises(SchemaError, match=rf"{re.escape(name)}.*evaluate.* again|write it again"):
         build_report([run], tmp_path / "reports", ASKED)
+
+
+def test_a_forged_table_of_more_points_is_refused(tmp_path, no_pictures):
+    run = write_run(tmp_path / "runs", Made())
+    (run.path / "superresolution.csv").write_text("case,displacement_error\na=1,abc\n")
+    seal(run, "superresolution.csv")
+    with pytest.raises(SchemaError, match=r"superresolution\.csv: displacement_error holds text"):
+        build_report([run], tmp_path / "reports", Question("trial", "T", fine={run.id: run}))
 
 
 @pytest.mark.parametrize(
