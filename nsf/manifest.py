@@ -88,7 +88,7 @@ def digest(path: Path) -> str:
 
     A processor with instructions for it takes about a second a GB.
     """
-    return _once(_sha256, path, path.stat())
+    return once(_sha256, path, path.stat())
 
 
 def altered(folder: Path, output: Mapping[str, Any], sums: bool = True) -> str | None:
@@ -144,14 +144,14 @@ def verified(path: str | Path) -> Path:
 def _read(read: Callable[[Path], dict[str, Any]], path: Path) -> dict[str, Any] | None:
     """The result of `read` on a file; None where there is none."""
     try:
-        return copy.deepcopy(_once(read, path, _regular(path)))
+        return copy.deepcopy(once(read, path, _regular(path)))
     except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
         raise SchemaError(f"{path.name} cannot be read: {error.strerror}") from error
 
 
-def _once(read: Callable[[Path], Any], path: Path, found: os.stat_result) -> Any:
+def once(read: Callable[[Path], Any], path: Path, found: os.stat_result) -> Any:
     """The result of `read` on a file, read once a process for as long as the file stays the same."""
     stamp = (found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
     key = (read, *stamp)

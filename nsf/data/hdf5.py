@@ -12,6 +12,7 @@ from typing import Any, BinaryIO
 import h5py
 import numpy as np
 
+from nsf.data import heaps
 from nsf.errors import MissingRunError, SchemaError, ShapeError
 from nsf.manifest import verified
 
@@ -37,7 +38,7 @@ def opened(path: str | Path, what: str, stage: str) -> h5py.File:
         SchemaError: it was changed after its run, is truncated, or is not HDF5.
     """
     try:
-        return h5py.File(verified(path), "r")
+        return h5py.File(heaps.checked(verified(path)), "r")
     except FileNotFoundError as error:
         raise MissingRunError(f"no {what} at {path}; run `nsf {stage}` first") from error
     except OSError as error:

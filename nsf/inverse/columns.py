@@ -13,7 +13,7 @@ from typing import TextIO
 import h5py
 import numpy as np
 
-from nsf.data import hdf5
+from nsf.data import hdf5, heaps
 from nsf.errors import ConfigError, SchemaError, first_line
 
 COLUMNS = ("t", "particle", "X", "Y", "Z", "x", "y", "z", "quantity", "value", "deviation")
@@ -158,6 +158,7 @@ def _lines(path: Path, file: TextIO) -> Iterator[str]:
 
 
 def _of_hdf5(path: Path) -> dict[str, np.ndarray]:
+    heaps.checked(path)
     with hdf5.reading(path, "file of observations", "write it"), h5py.File(path, "r") as file:
         names = list(itertools.islice(file, len(COLUMNS) + 1))
         _check_names(path, names)

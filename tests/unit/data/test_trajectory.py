@@ -6,6 +6,7 @@ import pickle
 import resource
 import shutil
 import subprocess
+import sys
 
 import h5py
 import numpy as np
@@ -275,6 +276,44 @@ def test_a_file_of_other_content(write, change, message):
     with pytest.raises(SchemaError, match=rf"a\.h5.*{message}"):
         Trajectory.open(path)
     path.unlink()
+
+
+_OPEN = """
+import resource, sys
+from pathlib import Path
+from nsf.data import Trajectory
+from nsf.deployment import Rollout
+from nsf.errors import NSFError
+from nsf.inverse.columns import read_columns
+resource.setrlimit(resource.RLIMIT_DATA, (2**32, 2**32))
+for path in map(Path, sys.argv[1:]):
+    for read in (Trajectory.open, Rollout.open, read_columns):
+        try:
+            read(path)
+        except NSFError as error:
+            print(error)
+"""
+
+
+def test_heaps_without_an_end_are_refused_before_hdf5_walks_them(write, tmp_path):
+    """An object of no size, in texts of attributes or where a virtual data set names its files; a free place
+    that leads to itself. HDF5 walks the first two for ever and fills the memory with the third."""
+    paths = [write(f"{name}.h5")[0] for name in ("texts", "virtual", "names")]
+    with h5py.File(paths[1], "r+") as file:
+        virtual(file)
+    for path in paths:
+        data = bytearray(path.read_bytes())
+        for heap in range(len(data) - 32):
+            if path.stem != "names" and data[heap : heap + 4] == b"GCOL":
+                data[heap + 16 : heap + 32] = bytes(16)
+            if path.stem == "names" and data[heap : heap + 4] == b"HEAP":
+                free, segment = np.frombuffer(data[heap + 16 : heap + 32], "<u8").tolist()
+                if free != 1:
+                    data[segment + free : segment + free + 8] = free.to_bytes(8, "little")
+        path.write_bytes(data)
+    ended = subprocess.run([sys.executable, "-c", _OPEN, *paths], capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout.count("has a heap of texts or names without an end") == 9, ended.stdout
 
 
 def test_a_file_that_claims_terabytes_is_refused_before_any_is_asked_for(tmp_path, constants):
