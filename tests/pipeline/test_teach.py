@@ -108,9 +108,15 @@ def test_runs_of_a_teaching_that_was_broken_off_are_taken_up(lesson, copied, pip
     monkeypatch.setattr(teaching, "streamed", broken)
     with pytest.raises(KeyboardInterrupt):
         pipeline_at(root, *TAUGHT).teach()
+    damaged, said = [next(root.rglob(f"encoded_{index}.npz")) for index in (0, 3)], []
+    for path in damaged:  # of a simulation that is there, and of a streamed run
+        data = bytearray(path.read_bytes())
+        data[len(data) // 2] ^= 4
+        path.write_bytes(data)
     made[:] = [1] * 6
-    again = pipeline_at(root, *TAUGHT).teach()
-    assert len(made) == 9  # three of eight runs were left
+    again = pipeline_at(root, *TAUGHT, say=said.append).teach()
+    assert len(made) == 10  # three of eight runs were left, and one was damaged
+    assert all(any(str(path) in line for line in said) for path in damaged)
     one, other = (torch.load(r.path / "recurrence.pt", weights_only=True) for r in (pipeline.taught, again))
     assert one["taught"] == other["taught"]
     assert all(torch.equal(one["state"][name], other["state"][name]) for name in one["state"])
