@@ -50,7 +50,7 @@ def _key(sources: Sources, tolerance: float, name: str) -> str:
 
 def write() -> None:
     """Write what is missing of the manifold, and the steps."""
-    from conftest import tiny_pipeline  # that of this folder, as this is run as a script
+    from tiny import tiny_pipeline
 
     FOLDER.mkdir(exist_ok=True)
     with TemporaryDirectory() as root:

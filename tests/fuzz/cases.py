@@ -144,7 +144,7 @@ class Workshop:
     @cached_property
     def interrupted(self) -> tuple[Path, dict]:
         """Runs with a short training that was interrupted in its last phase, and the weights it ends with."""
-        from conftest import tiny_pipeline
+        from tiny import tiny_pipeline
 
         from nsf.kinematics.training.lightning import BlockCheckpoint
 
@@ -429,7 +429,7 @@ def intermediates(shop: Workshop, draw: random.Random) -> Case:
         data = inputs.mutated(path.read_bytes(), draw)
 
     def hand_over() -> None:
-        from conftest import tiny_pipeline
+        from tiny import tiny_pipeline
 
         if forged:
             archives.keep(path, content)

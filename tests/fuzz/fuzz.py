@@ -18,7 +18,7 @@ sys.path[:0] = [str(TESTS.parent), str(TESTS)]
 
 import cases  # noqa: E402
 import watch  # noqa: E402
-from conftest import TINY, tiny_pipeline  # noqa: E402
+from tiny import TINY, tiny_pipeline  # noqa: E402
 
 VIOLATIONS = ("code", "hang", "memory", "traceback", "altered")
 
