@@ -144,8 +144,9 @@ def test_programs_through_the_whole_chain(pipeline_at, tmp_path):
         acting = pipeline.scene.at(case).acting_gravity
         np.testing.assert_allclose(trajectory.forcing["gravity"], acting.at(trajectory.t), atol=1e-12)
         assert list(trajectory.parameters) == ["friction_angle"]
-    _, between, back = pipeline.lessons
-    programs = [case["program"] for case in (*pipeline.split.cases, *between, *back)]
+    _, drawn, validation = pipeline.lessons
+    assert validation == sorted(pipeline.split.validation)
+    programs = [case["program"] for case in (*pipeline.split.cases, *drawn)]
     assert len(set(programs)) == len(programs)
     steep = pipeline_at(tmp_path, *FORCED, "deploy.changes={scene.forcing.gravity.tilt.angle:60}")
     for stage in ("simulate", "deploy"):
