@@ -14,6 +14,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import yaml
@@ -49,6 +50,7 @@ _REBUILD = "build it again with `nsf report`"
 
 _PROVENANCE = {key: {...: dict} for key in ("reports", "runs", "pictures")} | {Maybe("charts"): {...: str}}
 _CONTENTS = {
+    Maybe("note"): str,
     Maybe("chapters"): {...: [str]},
     Maybe("paper"): {...: {"shows": str, "here": [str]}},
 }
@@ -140,12 +142,13 @@ class Reports:
         write_json(self.folder / PROVENANCE, content)
 
     @cached_property
-    def contents(self) -> dict[str, Mapping]:
-        """Reports of each chapter, and pictures of each figure of the paper, as `contents.yaml` has them."""
+    def contents(self) -> dict[str, Any]:
+        """A note on all reports, those of each chapter, and pictures of each figure of the paper, of `contents.yaml`."""
         path = self.folder / CONTENTS
         content = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else {}
         schemas.check(content, _CONTENTS, str(path))
-        return {"chapters": content.get("chapters") or {"Results": []}, "paper": content.get("paper") or {}}
+        parts = {"note": "", "chapters": {"Results": []}, "paper": {}}
+        return {name: content.get(name) or part for name, part in parts.items()}
 
     def place(self, name: str) -> tuple[int, str, int, str]:
         """Number and heading of a report's chapter, its place in there, and its name."""
@@ -304,6 +307,7 @@ def _page(reports: Reports) -> str:
     ]
     return markdown_document(
         "list.md",
+        note=reports.contents["note"],
         chapters={heading: entries for heading, entries in chapters.items() if entries},
         definitions=report.definitions(_EXPLAINED),
         of_the_paper=figures if any(paths for *_, paths in figures) else [],
