@@ -88,8 +88,8 @@ def load(overrides: Sequence[str] = (), config_name: str = "config") -> DictConf
     except _OF_BROKEN_FILES as error:
         for path in files():
             text_of(path)  # tells of the one that cannot be read
-        told = explained(error, config_name, overrides)
-        raise ConfigError(f"the configuration cannot be composed: {told}") from error
+        reason = explained(error, config_name, overrides)
+        raise ConfigError(f"the configuration cannot be composed: {reason}") from error
 
 
 def read(path: Path) -> DictConfig:
@@ -120,9 +120,9 @@ def _composed(
 ) -> bytes:
     """The configuration that Hydra composes of overrides and files, pickled: jobs ask for the same again."""
     config = _with_hydra(config_name, overrides)
-    own = _of_hydra(config)
-    if own != _default_hydra():
-        changed = [f"hydra.{key}" for key, value in own.items() if value != _default_hydra().get(key)]
+    hydra = _of_hydra(config)
+    if hydra != _default_hydra():
+        changed = [f"hydra.{key}" for key, value in hydra.items() if value != _default_hydra().get(key)]
         if "hydra.searchpath" in changed:
             raise ConfigError(f"hydra.searchpath is refused; {REMEDY}")
         raise ConfigError(
@@ -158,9 +158,9 @@ def _with_hydra(config_name: str | None, overrides: Sequence[str]) -> DictConfig
 
 def _of_hydra(config: DictConfig) -> dict[str, typing.Any]:
     """Hydra's own part of a configuration, without what it tells of the overrides."""
-    own = OmegaConf.to_container(config.hydra)
-    own["job"] = {k: v for k, v in own["job"].items() if k not in ("override_dirname", "config_name")}
-    return {k: v for k, v in own.items() if k not in ("overrides", "runtime")}
+    hydra = OmegaConf.to_container(config.hydra)
+    hydra["job"] = {k: v for k, v in hydra["job"].items() if k not in ("override_dirname", "config_name")}
+    return {k: v for k, v in hydra.items() if k not in ("overrides", "runtime")}
 
 
 @cache
@@ -289,17 +289,17 @@ def explained(error: Exception, config_name: str, overrides: Sequence[str]) -> s
         return f"{nameless[0]!r} has no key; give key=value"
     if "Config group override must be" in first:
         pairs = (o.lstrip("+").split("=", 1) for o in overrides if "=" in o)
-        told = [f"{group}={name}" for group, name in pairs if name not in groups().get(group, [name])]
-        if told:
-            return f"{told[0]} names no option of its group; `nsf --help` lists them"
+        options = [f"{group}={name}" for group, name in pairs if name not in groups().get(group, [name])]
+        if options:
+            return f"{options[0]} names no option of its group; `nsf --help` lists them"
     if first.startswith("Error merging override") and error.__cause__ is not None:
         return f"{first.removeprefix('Error merging override ')}: {str(error.__cause__).splitlines()[0]}"
     option = re.search(r"Could not find '([^']+)'", text)
     group = max((g for g in groups() if option and option[1].startswith(f"{g}/")), key=len, default=None)
     if option and group:
-        name, known = option[1].removeprefix(f"{group}/"), groups()[group]
-        near = difflib.get_close_matches(name, known, n=1)
-        return f"unknown {group}={name}; choose one of {', '.join(known)}" + (
+        name, names = option[1].removeprefix(f"{group}/"), groups()[group]
+        near = difflib.get_close_matches(name, names, n=1)
+        return f"unknown {group}={name}; choose one of {', '.join(names)}" + (
             f" (did you mean {near[0]}?)" if near else ""
         )
     return first

@@ -58,9 +58,9 @@ def _text_of(path: Path, _changed: int, size: int) -> str:
         text = path.read_bytes().decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} cannot be read: {error}; save it as UTF-8") from error
-    if found := re.search(r"[\x00-\x08\x0b-\x1f\x7f]", text.replace("\r\n", "\n")):
-        line = text.count("\n", 0, found.start()) + 1
-        raise ConfigError(f"{path}, line {line}: control character {found[0]!r}; delete it")
+    if control := re.search(r"[\x00-\x08\x0b-\x1f\x7f]", text.replace("\r\n", "\n")):
+        line = text.count("\n", 0, control.start()) + 1
+        raise ConfigError(f"{path}, line {line}: control character {control[0]!r}; delete it")
     try:
         node = yaml.compose(text, LOADER)
         if _repeated(node, {}) > _MOST:
@@ -74,12 +74,12 @@ def _text_of(path: Path, _changed: int, size: int) -> str:
     return text
 
 
-def _repeated(node: yaml.Node | None, known: dict[int, int]) -> int:
+def _repeated(node: yaml.Node | None, counts: dict[int, int]) -> int:
     """How many values a node stands for, with those of aliases each time."""
     if not isinstance(node, yaml.CollectionNode):
         return 1
-    if id(node) not in known:
+    if id(node) not in counts:
         mapping = isinstance(node, yaml.MappingNode)
         children = [one for pair in node.value for one in pair] if mapping else node.value
-        known[id(node)] = 1 + sum(_repeated(child, known) for child in children)
-    return known[id(node)]
+        counts[id(node)] = 1 + sum(_repeated(child, counts) for child in children)
+    return counts[id(node)]

@@ -103,9 +103,9 @@ def resolved(config: DictConfig) -> Any:
 def _check(key: str, value: Any) -> None:
     if not isinstance(value, str) or (key in _FOLDERS and _FROM_ENVIRONMENT.fullmatch(value)):
         return
-    for found in _BEGINNING.finditer(value):
-        name, end = found.groups()
-        written_out = name != "oc.select" or _SELECTION.match(value, found.start())
+    for beginning in _BEGINNING.finditer(value):
+        name, end = beginning.groups()
+        written_out = name != "oc.select" or _SELECTION.match(value, beginning.start())
         if end != "}" and not (end == ":" and name in ALLOWED and written_out):
             raise ConfigError(
                 f"{key}: ${{{name}{end}…}} is refused; a value may refer to a key, as ${{scene.dx}}, "
@@ -126,15 +126,15 @@ def references(raw: Any) -> dict[tuple[str, ...], list[tuple[str, ...]]]:
 def following(config: DictConfig, key: str) -> list[tuple[str, ...]]:
     """Paths of the values of a configuration that may follow a key, directly or through others."""
     referring = references(OmegaConf.to_container(config))
-    found, keys = [], [_target("", key, ())]
+    dependent, keys = [], [_target("", key, ())]
     while keys:
-        own = keys.pop()
+        reached = keys.pop()
         for path in list(referring):
-            if any(own[: len(target)] == target[: len(own)] for target in referring[path]):
+            if any(reached[: len(target)] == target[: len(reached)] for target in referring[path]):
                 del referring[path]
-                found.append(path)
+                dependent.append(path)
                 keys.append(path)
-    return found
+    return dependent
 
 
 def _target(dots: str, name: str, path: tuple[str, ...]) -> tuple[str, ...]:
@@ -144,17 +144,17 @@ def _target(dots: str, name: str, path: tuple[str, ...]) -> tuple[str, ...]:
 
 def _size(raw: Any) -> int:
     """How many values a tree has once every reference in it is replaced by what it refers to."""
-    known: dict[tuple[str, ...], int] = {}
+    sizes: dict[tuple[str, ...], int] = {}
 
     def of(node: Any, path: tuple[str, ...]) -> int:
-        if path not in known:
-            known[path] = 1  # of one that refers to itself, which OmegaConf refuses
+        if path not in sizes:
+            sizes[path] = 1  # of one that refers to itself, which OmegaConf refuses
             if isinstance(node, dict | list):
                 children = node.items() if isinstance(node, dict) else enumerate(node)
-                known[path] += sum(of(child, (*path, str(key))) for key, child in children)
+                sizes[path] += sum(of(child, (*path, str(key))) for key, child in children)
             elif isinstance(node, str):
-                known[path] += sum(referred(*found, path) for found in _REFERENCE.findall(node))
-        return known[path]
+                sizes[path] += sum(referred(*reference, path) for reference in _REFERENCE.findall(node))
+        return sizes[path]
 
     def referred(dots: str, name: str, path: tuple[str, ...]) -> int:
         target, node = _target(dots, name, path), raw

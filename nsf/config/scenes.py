@@ -112,8 +112,8 @@ def recorded_scene(settings: Mapping[str, Any]) -> Scene:
         ConfigError: a value is refused, as a mesh that is no longer there.
     """
     parameters = {
-        name: {"key": own["key"], "unit": ""}
-        for name, own in settings["parameters"].items()
+        name: {"key": parameter["key"], "unit": ""}
+        for name, parameter in settings["parameters"].items()
         if name != PROGRAM
     }
     content = {key: settings[key] for key in ("material", "transfer")}

@@ -35,16 +35,16 @@ def refuse_unread(raw: Mapping[str, Any], plain: Mapping[str, Any]) -> None:
     referred = {target for targets in references(raw).values() for target in targets}
     alone = "scene" not in plain and {"point", "path"} & plain.keys()
     stock = stock_keys("point" if alone else "config")
-    known: list[Keys] = []
-    if unread := list(_unread(plain, stock, (), referred, known)):
-        names = [".".join(keys) for keys in known]
+    readable: list[Keys] = []
+    if unread := list(_unread(plain, stock, (), referred, readable)):
+        names = [".".join(keys) for keys in readable]
         raise ConfigError(" ".join(unknown(".".join(keys), names) for keys in unread))
 
 
 def _unread(
-    node: Mapping[str, Any], stock: Mapping[str, Any], at: Keys, referred: set[Keys], known: list[Keys]
+    node: Mapping[str, Any], stock: Mapping[str, Any], at: Keys, referred: set[Keys], readable: list[Keys]
 ) -> Iterator[Keys]:
-    """Keys below a node that nothing reads; `known` gets those that are, or would be, read.
+    """Keys below a node that nothing reads; `readable` gets those that are, or would be, read.
 
     Args:
         node: plain.
@@ -58,7 +58,7 @@ def _unread(
     taken = set(stock)
     if "_target_" in node:
         taken = arguments(str(node["_target_"]))
-    known += [(*at, str(name)) for name in sorted(taken or ())]
+    readable += [(*at, str(name)) for name in sorted(taken or ())]
     for name, child in node.items():
         below = (*at, str(name))
         inner = {} if "_target_" in node else stock.get(name, {})
@@ -66,11 +66,11 @@ def _unread(
             if not any(one[: len(below)] == below[: len(one)] for one in referred):
                 yield below
                 continue
-            known.append(below)
+            readable.append(below)
         elif not (inner or kind_at(below) or kind_at((*below, "*"))):
             continue  # a value, which may be a mapping
         if isinstance(child, Mapping) and below not in _CHECKED_BY_READER:
-            yield from _unread(child, inner, below, referred, known)
+            yield from _unread(child, inner, below, referred, readable)
 
 
 @cache

@@ -28,9 +28,10 @@ def jobs(sweeps: Sequence[Sequence[str]], config_name: str = "config") -> list[t
     options = [_options(overrides, config_name) for overrides in sweeps]
     if (count := sum(math.prod(map(len, values)) for values in options)) > _MOST_JOBS:
         raise ConfigError(f"{count} jobs are more than the {_MOST_JOBS} of a sweep; give fewer values")
-    found = list(dict.fromkeys(job for values in options for job in itertools.product(*values)))
-    scenes = [scene_of(job) for job in found]
-    return [job for _, job in sorted(zip(scenes, found, strict=True), key=lambda one: scenes.index(one[0]))]
+    combinations = list(dict.fromkeys(job for values in options for job in itertools.product(*values)))
+    scenes = [scene_of(job) for job in combinations]
+    pairs = sorted(zip(scenes, combinations, strict=True), key=lambda pair: scenes.index(pair[0]))
+    return [job for _, job in pairs]
 
 
 def scene_of(job: Sequence[str]) -> str:
@@ -61,14 +62,14 @@ def _values(override: Override) -> list[str]:
     """The values of an override that has several."""
     try:
         if isinstance(several := override.value(), RangeSweep):
-            found = list(itertools.islice(several.range(), _MOST_JOBS + 1))  # a shuffled one would be listed
-        if not isinstance(several, RangeSweep) or len(found) <= _MOST_JOBS:
-            found = list(override.sweep_string_iterator())
+            values = list(itertools.islice(several.range(), _MOST_JOBS + 1))  # a shuffled one would be listed
+        if not isinstance(several, RangeSweep) or len(values) <= _MOST_JOBS:
+            values = list(override.sweep_string_iterator())
     except (HydraException, ValueError, ArithmeticError) as error:
         raise ConfigError(f"{override.input_line}: {error}; give start, stop and step") from error
-    if len(found) > _MOST_JOBS:
+    if len(values) > _MOST_JOBS:
         raise ConfigError(f"{override.input_line} has more than {_MOST_JOBS} values; give fewer")
-    return found
+    return values
 
 
 def check_sweep(

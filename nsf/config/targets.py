@@ -253,18 +253,18 @@ def _is_a(named: type, base: type) -> bool:
     return (name.startswith("nsf.") or _is_installed(name)) and members(base) <= _members(named)
 
 
-def _lacking(found: Any, protocol: type) -> str:
+def _lacking(cls: Any, protocol: type) -> str:
     """Parts of a protocol that a user's class lacks, as the end of a sentence."""
-    if not (inspect.isclass(found) and getattr(protocol, "_is_protocol", False)):
+    if not (inspect.isclass(cls) and getattr(protocol, "_is_protocol", False)):
         return ""
-    if missing := sorted(members(protocol) - _members(found)):
+    if missing := sorted(members(protocol) - _members(cls)):
         return f", which has {', '.join(missing)} as well"
     return ""
 
 
-def _members(found: type) -> set[str]:
-    own = {field.name for field in dataclasses.fields(found)} if dataclasses.is_dataclass(found) else set()
-    return own | set(dir(found))
+def _members(cls: type) -> set[str]:
+    fields = {field.name for field in dataclasses.fields(cls)} if dataclasses.is_dataclass(cls) else set()
+    return fields | set(dir(cls))
 
 
 def members(protocol: type) -> set[str]:

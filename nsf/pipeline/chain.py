@@ -128,13 +128,13 @@ class Pipeline(Configured):
 
         Validation runs choose its weights; where there are none, and no programs, those of training do.
         """
-        known = sorted(self.split.train)
+        training = sorted(self.split.train)
         if not isinstance(self.model, Recurrence):
-            return [known]
-        taken = [*known, *self.split.validation, *self.split.test]
+            return [training]
+        taken = [*training, *self.split.validation, *self.split.test]
         count = self.model.runs_of(self.forced)
         drawn = random_cases(self.split.box, count, int(self.config.seed), taken) if count else []
-        return [known, drawn, sorted(self.split.validation) or known]
+        return [training, drawn, sorted(self.split.validation) or training]
 
     # -- the run of each stage ---------------------------------------------------------------------------
 
@@ -261,14 +261,14 @@ class Pipeline(Configured):
             self.say(
                 f"simulate: {len(needless)} of {len(runs)} trajectories are gone, and nothing needs them"
             )
-        known = dict.fromkeys(line for run in there for line in run.manifest.get("warnings", ()))
-        for line in known:
+        warned = dict.fromkeys(line for run in there for line in run.manifest.get("warnings", ()))
+        for line in warned:
             self.say(f"simulate: warning: {line}")
         if missing := {run for run in runs if run not in there and run not in needless}:
             from nsf.pipeline.stages.simulation import simulate_missing
 
             self.check()
-            simulate_missing(self, missing, known)
+            simulate_missing(self, missing, warned)
         return runs
 
     def full_order(self, cases: Sequence[Case]) -> list[Run]:

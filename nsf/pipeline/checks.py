@@ -76,8 +76,8 @@ def _check_carried(batch: int, sampler) -> None:
 def _check_cases(pipeline) -> None:
     """Build the scene in every case: a value out of range fails before any work."""
     needed, multiplier = pipeline.needed(), pipeline.config.deploy.dt_multiplier
-    asked = repr((pipeline.scene, pipeline.deployed, needed, multiplier))
-    if asked in _PASSED:
+    signature = repr((pipeline.scene, pipeline.deployed, needed, multiplier))
+    if signature in _PASSED:
         return
     for case, scene in needed:
         scene = scene.at(case)
@@ -85,7 +85,7 @@ def _check_cases(pipeline) -> None:
         check_time_step(scene.particles(), scene.initial_velocity(), scene.dx, scene.dt)
         for factor in (1.0, multiplier):
             check_colliders(scene.solids, scene.grid, factor * scene.dt)
-    _PASSED.add(asked)
+    _PASSED.add(signature)
 
 
 def check_room(pipeline, runs: Mapping[Run, tuple[Case, Scene]]) -> None:

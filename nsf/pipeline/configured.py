@@ -153,11 +153,11 @@ def with_candidates(config: DictConfig) -> DictConfig:
     return config
 
 
-def _device(asked) -> str:
+def _device(name) -> str:
     """The name of the device that is asked for."""
-    if str(asked) in ("auto", "cpu") and not has_driver():
+    if str(name) in ("auto", "cpu") and not has_driver():
         return "cpu"
     from nsf.mpm.device import warp_device
 
-    device = warp_device(asked)
+    device = warp_device(name)
     return str(device) if device.is_cuda else "cpu"

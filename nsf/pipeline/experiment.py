@@ -116,11 +116,11 @@ class Experiment:
         if not isinstance(stages, list) or any(stage not in _MORE_STAGES for stage in stages):
             raise ConfigError(f"{where}: stages={stages} must be a list of {', '.join(_MORE_STAGES)}")
         each = _grid(content.get("each", {}), f"{where}: each")
-        own = {override.split("=", 1)[0]: override for override in overrides}
+        replaced = {override.split("=", 1)[0]: override for override in overrides}
         stated = [each | _grid(grid, f"{where}: jobs[{at}]") for at, grid in enumerate(content["jobs"])]
         for grid in stated:
-            _check_options(grid, own, where)
-        grids = tuple(grid | own for grid in stated)
+            _check_options(grid, replaced, where)
+        grids = tuple(grid | replaced for grid in stated)
         small = all(grid.get("scale") == "scale=small" for grid in stated)
         texts = _texts(content, ("title", "question", "paper"), where)
         printed, plots = _printed(content.get("printed"), where), content.get("plots")
@@ -128,7 +128,7 @@ class Experiment:
             raise ConfigError(f"{where}: plots={plots} must be a list of names of charts")
         return cls(
             name=name, grids=grids, stages=tuple(stages), printed=printed, small=small,
-            placed="report.folder" in own, plots=None if plots is None else tuple(plots), **texts,
+            placed="report.folder" in replaced, plots=None if plots is None else tuple(plots), **texts,
         )  # fmt: skip
 
     @property
@@ -310,8 +310,8 @@ def _why(pipeline: Pipeline) -> str:
     )
     for runs in needed:
         for run in runs:
-            if told := _ended(run):
-                return told
+            if reason := _ended(run):
+                return reason
     return "not run"
 
 
@@ -321,11 +321,11 @@ def _ended(run: Run) -> str | None:
     return f"{run.stage} {run.manifest.get('status')}: {error}" if error else None
 
 
-def _check_options(grid: Mapping[str, str], own: Mapping[str, str], where: str) -> None:
+def _check_options(grid: Mapping[str, str], replaced: Mapping[str, str], where: str) -> None:
     """Refuse an option of the command line, as model=interpolate, that lacks a key which a job sets."""
-    for group in own.keys() & groups().keys():
-        keys = [key for key in grid if key.startswith(f"{group}.") and key not in own]
-        for name in own[group].partition("=")[2].split(",") if keys else ():
+    for group in replaced.keys() & groups().keys():
+        keys = [key for key in grid if key.startswith(f"{group}.") and key not in replaced]
+        for name in replaced[group].partition("=")[2].split(",") if keys else ():
             lacking = [key for key in keys if not _has(group, name, key)]
             if lacking:
                 raise ConfigError(

@@ -26,14 +26,14 @@ class Expected:
     Attributes:
         runs: how many there are in all; made: how many are there already.
         seconds, size: of those that are to be made [s, byte]; NaN where nothing like them was ever made.
-        known: from how many runs that is known; like: which.
+        samples: how many runs that rests on; like: which.
     """
 
     runs: int
     made: int
     seconds: float = math.nan
     size: float = math.nan
-    known: int = 0
+    samples: int = 0
     like: str = ""
 
     @property
@@ -50,22 +50,22 @@ def plans(jobs: Sequence[Sequence[str]]) -> list[Pipeline]:
     Raises:
         NSFError: of every kind that a run begins with.
     """
-    found = []
+    pipelines = []
     for job in jobs:
         config = configuration.load(job)
         pipeline = Pipeline(config)
         _ = pipeline.held_out
         if not all(run.complete for stage in ("simulate", "evaluate") for run in pipeline.runs_of(stage)):
             pipeline.check()
-        found.append(pipeline)
-    return found
+        pipelines.append(pipeline)
+    return pipelines
 
 
-def stages_table(found: Sequence[Pipeline]) -> Table:
+def stages_table(pipelines: Sequence[Pipeline]) -> Table:
     """State, expected time and room of every stage of some jobs, whose common runs count once."""
     table = Table(box=None, header_style="bold", pad_edge=False)
-    if len(found) > 1:
-        table.caption = f"{len(found)} jobs; runs that they share are made once"
+    if len(pipelines) > 1:
+        table.caption = f"{len(pipelines)} jobs; runs that they share are made once"
         table.caption_justify = "left"
     for heading, side in (
         ("stage", "left"), ("state", "left"), ("run", "left"), ("time", "right"), ("disk", "right"),
@@ -74,18 +74,19 @@ def stages_table(found: Sequence[Pipeline]) -> Table:
         table.add_column(heading, justify=side, no_wrap=heading == "run")
     seconds, size = 0.0, 0.0
     for stage in STAGES:
-        own = {run: pipeline for pipeline in found for run in pipeline.runs_of(stage)}
-        if not own:
+        runs = {run: pipeline for pipeline in pipelines for run in pipeline.runs_of(stage)}
+        if not runs:
             continue
-        told = expected(stage, own)
-        if told.made < told.runs:
-            seconds, size = seconds + told.seconds, size + told.size
-        only = next(iter(own)).hash if len(own) == 1 else ""
+        estimate = expected(stage, runs)
+        if estimate.made < estimate.runs:
+            seconds, size = seconds + estimate.seconds, size + estimate.size
+        only = next(iter(runs)).hash if len(runs) == 1 else ""
         cost = ["", "", ""]
-        if told.made < told.runs:
-            like = f"{told.known} {told.like}" if told.known else "nothing like it was made here"
-            cost = [_time(told.seconds), _size(told.size), like]
-        table.add_row(stage, told.state, only, *map(escape, cost))
+        if estimate.made < estimate.runs:
+            none = "nothing like it was made here"
+            like = f"{estimate.samples} {estimate.like}" if estimate.samples else none
+            cost = [_time(estimate.seconds), _size(estimate.size), like]
+        table.add_row(stage, estimate.state, only, *map(escape, cost))
     if seconds:
         table.add_row("in all", "", "", _time(seconds), _size(size), "")
     return table
@@ -94,17 +95,17 @@ def stages_table(found: Sequence[Pipeline]) -> Table:
 def expected(stage: str, runs: dict[Run, Pipeline]) -> Expected:
     """Time and space of runs of a stage, by those of its kind that are there, at best of the same scene."""
     missing = {run: pipeline for run, pipeline in runs.items() if not run.complete}
-    told = Expected(len(runs), len(runs) - len(missing))
+    estimate = Expected(len(runs), len(runs) - len(missing))
     if not missing:
-        return told
+        return estimate
     there = [run for run in Run.find(stage, root=next(iter(runs)).root) if run.complete]
     seconds, size = 0.0, 0.0
     for run, pipeline in missing.items():
         alike = [r for r in there if r.manifest.get("device") == pipeline.device and _kind(r) == _kind(run)]
         near = [r for r in alike if r.scene == run.scene] or alike
-        told.known = len(near)
+        estimate.samples = len(near)
         of = run.scene if near and near[0].scene == run.scene else "other scenes"
-        told.like = f"run{'s' * (len(near) > 1)} of {of}"
+        estimate.like = f"run{'s' * (len(near) > 1)} of {of}"
         if stage == "simulate":
             stored = trajectory_bytes(pipeline)
             rates = [r.manifest["seconds"] / _bytes(r) for r in near if _bytes(r)]
@@ -113,8 +114,8 @@ def expected(stage: str, runs: dict[Run, Pipeline]) -> Expected:
         else:
             seconds += statistics.median(r.manifest["seconds"] for r in near) if near else math.nan
             size += statistics.median(map(_bytes, near)) if near else math.nan
-    told.seconds, told.size = seconds, size
-    return told
+    estimate.seconds, estimate.size = seconds, size
+    return estimate
 
 
 def scene_table(pipeline: Pipeline) -> Table:
@@ -148,16 +149,15 @@ def scene_table(pipeline: Pipeline) -> Table:
     rows["deployed"] = f"on {pipeline.device}, model {pipeline.configured.name}, r {c.latent_dim}"
     if line := multiplied_step_warning(c.deploy.dt_multiplier, scene.dt, stable):
         rows["warning"] = line
-    for key, told in rows.items():
-        table.add_row(key, escape(told))
+    for key, value in rows.items():
+        table.add_row(key, escape(value))
     return table
 
 
-def scenes(found: Sequence[Pipeline]) -> list[Pipeline]:
+def scenes(pipelines: Sequence[Pipeline]) -> list[Pipeline]:
     """One job for each scene and size."""
-    return list({(n.scene.name, n.scene.particle_count, n.scene.dt): n for n in reversed(found)}.values())[
-        ::-1
-    ]
+    first = {(p.scene.name, p.scene.particle_count, p.scene.dt): p for p in reversed(pipelines)}
+    return list(first.values())[::-1]
 
 
 def composed(pipeline: Pipeline) -> str:

@@ -49,12 +49,12 @@ class Range:
     @classmethod
     def parse(cls, word: str) -> "Range | None":
         """The range that `key=low..high` or `key=low..high:log` stands for; None for any other word."""
-        found = _RANGE.fullmatch(word)
-        if not found:
+        match = _RANGE.fullmatch(word)
+        if not match:
             return None
-        ends = found["low"], found["high"]
+        ends = match["low"], match["high"]
         kind = int if all(re.fullmatch(r"[+-]?\d+", end) for end in ends) else float
-        return cls(found["key"], *map(kind, ends), bool(found["log"]))
+        return cls(match["key"], *map(kind, ends), bool(match["log"]))
 
     def suggest(self, trial) -> str:
         """The override with a trial's value."""
@@ -99,8 +99,8 @@ def search(words: Sequence[str], say: Callable[[str], object] = print, root: Pat
             raise
         trial.set_user_attr("run", run)
         columns = [OBJECTIVES[name] for name in objectives]
-        told = [f"{c.title} {c.cell(value)} {c.unit}" for c, value in zip(columns, values, strict=True)]
-        say(f"trial {trial.number}: {' '.join(tried)}: {', '.join(told)}")
+        scores = [f"{c.title} {c.cell(value)} {c.unit}" for c, value in zip(columns, values, strict=True)]
+        say(f"trial {trial.number}: {' '.join(tried)}: {', '.join(scores)}")
         return values
 
     _optimize(study, objective, trials, say)
@@ -112,30 +112,30 @@ def search(words: Sequence[str], say: Callable[[str], object] = print, root: Pat
 
 
 def _parted(words: Sequence[str]) -> tuple[list[Range], list[str]]:
-    found = {word: Range.parse(word) for word in words}
-    ranges = [r for r in found.values() if r]
+    ranged = {word: Range.parse(word) for word in words}
+    ranges = [r for r in ranged.values() if r]
     if not ranges:
         raise ConfigError("nsf search needs a range, as latent_dim=4..8 or field.noise=1e-3..0.1:log")
     if any(word.startswith("+experiment=") for word in words):
         raise ConfigError("a search has no experiment; give the keys of one of its jobs instead")
-    return ranges, [word for word, r in found.items() if not r]
+    return ranges, [word for word, r in ranged.items() if not r]
 
 
 def _asked(config: DictConfig) -> tuple[list[str], int]:
-    asked = configuration.section(config, "search")
-    objectives = asked.objectives
-    known = (
+    keys = configuration.section(config, "search")
+    objectives = keys.objectives
+    listed = (
         isinstance(objectives, ListConfig)
         and objectives
         and all(name in list(OBJECTIVES) for name in objectives)
     )
-    if not known or len(set(objectives)) < len(objectives):
+    if not listed or len(set(objectives)) < len(objectives):
         raise ConfigError(f"search.objectives={objectives} must list one or more of {', '.join(OBJECTIVES)}")
     if "step_ms" in objectives and not configuration.section(config, "evaluation").trials:
         raise ConfigError(
             "search.objectives has step_ms, but evaluation.trials=0 measures none; give 1 or more"
         )
-    return list(objectives), configuration.number("search.trials", asked.trials, least=1, whole=True)
+    return list(objectives), configuration.number("search.trials", keys.trials, least=1, whole=True)
 
 
 def _check(ranges: Sequence[Range], fixed: Sequence[str], root: Path | None) -> None:

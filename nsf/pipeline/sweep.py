@@ -135,18 +135,18 @@ def sweep(
     with reserving(needed), _own_processes() if len(gpus) > 1 else nullcontext():
         for scene in _scenes(jobs) if dropped else [jobs]:
             try:
-                found = _launched(started, [list(job) for job in scene], say, len(errors))
+                ended = _launched(started, [list(job) for job in scene], say, len(errors))
             except LaunchError as error:
                 if not errors:
                     raise
-                found = [str(error)] * len(scene)
+                ended = [str(error)] * len(scene)
             except KeyboardInterrupt:
                 if later := len(jobs) - len(errors) - len(scene):
                     say(f"not started: the jobs of later scenes, {later}; the same command goes on with them")
                 raise
-            if dropped and not any(found):
+            if dropped and not any(ended):
                 _drop_training([Pipeline(configuration.load(job, config_name)) for job in scene], say)
-            errors += found
+            errors += ended
     return [
         Failure(tuple(override for override in job if override not in common), error)
         for job, error in zip(jobs, errors, strict=True)
@@ -289,9 +289,9 @@ def _launched(
             return _one_by_one(launcher, jobs, first)
         if kind == "SlurmLauncher" and (submitted := set(logs.glob(_SUBMITTED)) - before):
             return _from_slurm(logs, {pickle.parent.name for pickle in submitted}, len(jobs))
-        told = [line for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
+        lines = [line for line in str(error).splitlines() if line.strip()] or [type(error).__name__]
         raise LaunchError(
-            f"no job could be launched: {told[-1]}; correct the keys of hydra.launcher"
+            f"no job could be launched: {lines[-1]}; correct the keys of hydra.launcher"
         ) from error
 
 

@@ -46,18 +46,18 @@ def check_words(c: DictConfig) -> None:
     _check_paper(c.scene.get("paper"))
 
 
-def factors(key: str, asked) -> list[int]:
+def factors(key: str, value) -> list[int]:
     """Different whole numbers of at least 2.
 
     Raises:
         ConfigError: the key's value is no list of them.
     """
-    if not isinstance(asked, list | ListConfig):
-        raise ConfigError(f"{key}={asked} must be a list of factors, as [2] or []")
-    found = [int(configuration.number(key, factor, least=2, whole=True)) for factor in asked]
-    if len(set(found)) < len(found):
-        raise ConfigError(f"{key}={asked} names a factor twice; give each once")
-    return found
+    if not isinstance(value, list | ListConfig):
+        raise ConfigError(f"{key}={value} must be a list of factors, as [2] or []")
+    numbers = [int(configuration.number(key, factor, least=2, whole=True)) for factor in value]
+    if len(set(numbers)) < len(numbers):
+        raise ConfigError(f"{key}={value} names a factor twice; give each once")
+    return numbers
 
 
 def one_of(key: str, value, options: Sequence) -> None:

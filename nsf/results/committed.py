@@ -143,7 +143,7 @@ class Reports:
 
     @cached_property
     def contents(self) -> dict[str, Any]:
-        """A note on all reports, those of each chapter, and pictures of each figure of the paper, of `contents.yaml`."""
+        """`contents.yaml`: a note on all reports, those of each chapter, pictures of the paper's figures."""
         path = self.folder / CONTENTS
         content = yaml.safe_load(path.read_text(encoding="utf-8")) if path.is_file() else {}
         schemas.check(content, _CONTENTS, str(path))

@@ -107,9 +107,9 @@ def trust_of(run: Run, manifold: Manifold, particles: np.ndarray, pipeline) -> T
         pipeline: the chain that the run is part of.
     """
     residual, distance = (run.metric("trust", scale) for scale in ("residual_m", "distance_m"))
-    known = LatentDistance(manifold, particles, pipeline.device)
+    latent_distance = LatentDistance(manifold, particles, pipeline.device)
     forcing = _range_of_gravity(pipeline.scene), _range_of_solids(pipeline)
-    return Trust(residual, distance, known, CaseDistance(manifold), *forcing)
+    return Trust(residual, distance, latent_distance, CaseDistance(manifold), *forcing)
 
 
 def calibrated(pipeline, manifold: Manifold) -> Trust:
@@ -153,9 +153,9 @@ def _calibrated(pipeline, manifold: Manifold, record: Record) -> Trust:
 
 def _rollouts(pipeline, manifold: Manifold, record: Record) -> list[Rollout]:
     """The reduced runs; how far they may be believed, and who takes their steps, go on record."""
-    asked, trust = pipeline.config.deploy, _calibrated(pipeline, manifold, record)
+    keys, trust = pipeline.config.deploy, _calibrated(pipeline, manifold, record)
     # Runs that take their steps together share the time of these equally.
-    together = record.metrics["batch"] = min(asked.batch, len(pipeline.held_out))
+    together = record.metrics["batch"] = min(keys.batch, len(pipeline.held_out))
 
     def batch_at(cases: Sequence[Case], device: str) -> ReducedBatch:
         batch = pipeline.batch_at(manifold, cases, device)

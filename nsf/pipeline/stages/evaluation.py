@@ -49,16 +49,16 @@ def evaluate(pipeline, run: Run) -> None:
         frames, coarse = pipeline.deployed.steps + 1, len(pipeline.coarse)
         total = len(rollouts) * ((2 + coarse) * frames - 1)  # rivals are not compared in the first
         with Progress("evaluate", total, "frames") as progress:
-            found = [
+            pairs = [
                 _compare(pipeline, manifold, rollout, truth, index, progress)
                 for index, (rollout, truth) in enumerate(zip(rollouts, truths, strict=True))
             ]
-        comparisons, beside = zip(*found, strict=True)
+        comparisons, beside = zip(*pairs, strict=True)
         cost = _cost(pipeline, manifold, rollouts, beside[0].factors)
         seconds = pipeline.training.metric("training_seconds")
         offline = seconds, pipeline.taught.metric("teach_seconds") if pipeline.model.learns else 0.0
-        own = cost, pipeline.device, run.manifest, pipeline.model.name, offline
-        table = results.rows(pipeline.config, manifold, rollouts, comparisons, beside, *own)
+        origin = cost, pipeline.device, run.manifest, pipeline.model.name, offline
+        table = results.rows(pipeline.config, manifold, rollouts, comparisons, beside, *origin)
         summary = results.summarise(pipeline.config, comparisons, beside, rollouts, seconds)
         results.write(record, table, comparisons, cost, summary)
     pipeline.say(f"evaluate: mean δ {100 * table['delta'].mean():.3g} % over {len(table)} cases → {run.id}")
@@ -71,10 +71,10 @@ def superresolve_held_out(pipeline, run: Run) -> None:
         pipeline: a `nsf.pipeline.Pipeline`.
         run: its superresolve run.
     """
-    c, asked, steps = pipeline.config, pipeline.config.super_resolution, pipeline.scene.steps
+    c, keys, steps = pipeline.config, pipeline.config.super_resolution, pipeline.scene.steps
     truths, manifold = _truths(pipeline), pipeline.manifold()
     # Evenly spread, without frame 0, at which nothing has moved.
-    frames = spaced(steps + 1, asked.frames + 1)[1:]
+    frames = spaced(steps + 1, keys.frames + 1)[1:]
     with run.record(device=pipeline.device, precision=c.precision) as record:
         rollouts = _rollouts(pipeline, manifold)
         with contextlib.ExitStack() as files:
@@ -83,9 +83,9 @@ def superresolve_held_out(pipeline, run: Run) -> None:
                 pipeline.deployed,
                 [files.enter_context(Trajectory.open(truth)) for truth in truths],
                 rollouts,
-                asked.factor,
+                keys.factor,
                 frames.tolist(),
-                asked.substeps,
+                keys.substeps,
                 c.precision,
                 pipeline.device,
                 pipeline.say,
@@ -97,8 +97,8 @@ def superresolve_held_out(pipeline, run: Run) -> None:
         f"({mean['particles_delta']} at the {len(manifold.X):,} particles), "
         f"queried in {table['seconds'].sum():.1f} s → {run.id}"
     )
-    for name, told in _EXPLAINED.items():
-        pipeline.say(f"superresolve: {mean[name]:>8} {told}")
+    for name, meaning in _EXPLAINED.items():
+        pipeline.say(f"superresolve: {mean[name]:>8} {meaning}")
     pipeline.say(f"superresolve: open {(run.path / 'superresolution.png').resolve()}")
 
 
@@ -121,7 +121,7 @@ def _took(pipeline, rollout: Rollout) -> str | None:
 def _compare(
     pipeline, manifold: Manifold, rollout: Rollout, truth: Path, index: int, progress: Progress
 ) -> tuple[Comparison, Rivals]:
-    asked = pipeline.config.evaluation
+    keys = pipeline.config.evaluation
     progress.describe(rollout.case.named)
     with contextlib.ExitStack() as files:
         trajectory = files.enter_context(Trajectory.open(truth))
@@ -129,12 +129,12 @@ def _compare(
         if rollout.handed_over >= 0:
             rest = files.enter_context(Trajectory.open(pipeline.deployment.file(continuation_file(index))))
         solver = pipeline.solver_at(manifold, rollout.case, engine=_took(pipeline, rollout))
-        shown = (asked.picture_particles, asked.picture_frames)
+        shown = (keys.picture_particles, keys.picture_frames)
         split = pipeline.config.deploy.split
-        found = compare(solver, trajectory, rollout, split, shown, rest, progress.advance)
+        comparison = compare(solver, trajectory, rollout, split, shown, rest, progress.advance)
         forced = pipeline.split.train if pipeline.scene.forcing else ()
-        known = list(map(pipeline.scene.at, forced))
-        return found, rivals(solver, trajectory, pipeline.coarse, known, progress.advance)
+        training = list(map(pipeline.scene.at, forced))
+        return comparison, rivals(solver, trajectory, pipeline.coarse, training, progress.advance)
 
 
 def _cost(pipeline, manifold: Manifold, rollouts: Sequence[Rollout], factors: Sequence[int]) -> dict:

@@ -34,8 +34,8 @@ def fit(pipeline, run: Run) -> None:
 
 def fitted(pipeline, manifold: Manifold) -> Any:
     """The fit of a pipeline's model to the training runs."""
-    known = training_inputs(manifold, pipeline.scene, pipeline.split.train)
-    return pipeline.model.fit(manifold, known, int(pipeline.config.seed))
+    inputs = training_inputs(manifold, pipeline.scene, pipeline.split.train)
+    return pipeline.model.fit(manifold, inputs, int(pipeline.config.seed))
 
 
 def loaded(run: Run) -> Any:

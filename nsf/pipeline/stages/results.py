@@ -93,8 +93,8 @@ def rows(
         "device": torch.cuda.get_device_name(device) if device.startswith("cuda") else "cpu",
         "commit": commit,
     }
-    found = []
-    for rollout, comparison, beside in zip(rollouts, comparisons, rivals, strict=True):
+    content = []
+    for rollout, comparison, rival in zip(rollouts, comparisons, rivals, strict=True):
         as_run = _cost_of_share(cost, rollout.projected_share)
         times = _costs_in_a_row(as_run, next(iter(rivals[0].coarse), None))
         times |= {"break_even_runs": _break_even(as_run, sum(offline))}
@@ -102,7 +102,7 @@ def rows(
             # A step whose particles have left the grid costs no one's speedup, nor does half a run.
             times |= dict.fromkeys(_OF_WHOLE_RUNS, math.nan)
         numbers = list(rollout.case.values())
-        own = {
+        of_case = {
             "case": rollout.case.named,
             "value": numbers[0] if len(numbers) == 1 else math.nan,
             "sample": rollout.sample,
@@ -119,14 +119,14 @@ def rows(
             "fallback_at": _time(rollout, rollout.handed_over),
         }
         off = {f"{name}_error": comparison.quantities.get(name, math.nan) for name in QUANTITIES}
-        found.append(shared | own | _beside(beside) | times | off)
-    return pd.DataFrame(found).reindex(columns=list(EVALUATED))
+        content.append(shared | of_case | _beside(rival) | times | off)
+    return pd.DataFrame(content).reindex(columns=list(EVALUATED))
 
 
 def model_columns(config: DictConfig, chosen: str = "") -> dict[str, str]:
     """Which model took the steps, what it learned from, and where a projected step takes τ and C from."""
-    found = describe(config, chosen)
-    return found | {"teacher": "runs" if found["model"] == "recurrence" else ""}
+    columns = describe(config, chosen)
+    return columns | {"teacher": "runs" if columns["model"] == "recurrence" else ""}
 
 
 def _material(config: DictConfig) -> str:
@@ -155,29 +155,31 @@ def _cost_of_share(cost: dict, share: float) -> dict:
     """`cost.json` of a run by a recurrence, of which the projected step took a share."""
     if not share or "projected" not in cost:
         return cost
-    own, other = cost["reduced"], cost["projected"]
-    times = {name: (1.0 - share) * own[name] + share * other[name] for name in ("step_ms", "total_ms")}
-    memory = max(own["memory_mib"], other["memory_mib"])
-    return cost | {"reduced": own | times | {"memory_mib": memory}}
+    reduced, projected = cost["reduced"], cost["projected"]
+    times = {
+        name: (1.0 - share) * reduced[name] + share * projected[name] for name in ("step_ms", "total_ms")
+    }
+    memory = max(reduced["memory_mib"], projected["memory_mib"])
+    return cost | {"reduced": reduced | times | {"memory_mib": memory}}
 
 
 def _costs_in_a_row(cost: dict, factor: int | None) -> dict[str, float]:
     """Columns of `results.csv`, of the coarse run at a factor of Δx; NaN where nothing was measured."""
 
-    full, own = cost.get("full_order", {}), cost.get("reduced", {})
+    full, reduced = cost.get("full_order", {}), cost.get("reduced", {})
     coarse = cost.get("coarse", {}).get(str(factor), {})
     return {
         "step_ms_full": full.get("step_ms", math.nan),
-        "step_ms": own.get("step_ms", math.nan),
-        "step_ms_p10": own.get("step_ms_p10", math.nan),
-        "step_ms_p90": own.get("step_ms_p90", math.nan),
+        "step_ms": reduced.get("step_ms", math.nan),
+        "step_ms_p10": reduced.get("step_ms_p10", math.nan),
+        "step_ms_p90": reduced.get("step_ms_p90", math.nan),
         "step_ms_coarse": coarse.get("step_ms", math.nan),
         "total_ms_full": full.get("total_ms", math.nan),
-        "total_ms": own.get("total_ms", math.nan),
+        "total_ms": reduced.get("total_ms", math.nan),
         "total_ms_coarse": coarse.get("total_ms", math.nan),
         "decode_ms": cost.get("decode_ms", math.nan),
         "memory_full_mib": full.get("memory_mib", math.nan),
-        "memory_mib": own.get("memory_mib", math.nan),
+        "memory_mib": reduced.get("memory_mib", math.nan),
     }
 
 
@@ -191,10 +193,10 @@ def _break_even(cost: dict, seconds: float) -> float:
 def _handed_over(rollout: Rollout, config: DictConfig) -> float:
     """Share of the steps that were not taken by the first level: a recurrence, or else the projected step."""
     steps = reduced_steps(config.scene.steps, config.deploy.dt_multiplier)
-    own = steps if rollout.handed_over < 0 else rollout.handed_over
+    first = steps if rollout.handed_over < 0 else rollout.handed_over
     if rollout.by is not None:
-        own = min(own, rollout.by_latent_model)
-    return 1.0 - own / steps
+        first = min(first, rollout.by_latent_model)
+    return 1.0 - first / steps
 
 
 def trust_of(rollout: Rollout) -> dict:

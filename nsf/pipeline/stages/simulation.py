@@ -204,20 +204,20 @@ def _store(
         record.output(TRAJECTORY)
 
 
-def simulate_missing(pipeline, missing: Collection[Run], known: Collection[str]) -> None:
+def simulate_missing(pipeline, missing: Collection[Run], warned: Collection[str]) -> None:
     """Make the trajectories of a pipeline that are not there.
 
     Args:
         pipeline: a `nsf.pipeline.Pipeline`.
         missing: their runs.
-        known: warnings that were said already.
+        warned: warnings that were said already.
     """
     # A changed scene that changes nothing, or trains on what it deploys, names one run twice.
     runs = {pipeline.simulation(*needed): needed for needed in pipeline.needed()}
     runs = {run: needed for run, needed in runs.items() if run in missing}
     warnings = {run: resolution_warnings(scene.at(case)) for run, (case, scene) in runs.items()}
     for line in dict.fromkeys(line for lines in warnings.values() for line in lines):
-        if line not in known:
+        if line not in warned:
             pipeline.say(f"simulate: warning: {line}")
     started = time.perf_counter()
     made = make(pipeline, runs, warnings)
