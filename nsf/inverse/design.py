@@ -63,11 +63,11 @@ class Program(ABC):
         """[B, N + 1, ways] of knots [B, knots, ways], each from 0 to 1 of what is in reach of the last."""
         low, high = torch.as_tensor(self.bounds).to(knots).unbind(1)
         back, on = torch.as_tensor(self.strides).to(knots).unbind(1)
-        found = [torch.as_tensor(self.first).to(knots).expand(len(knots), -1)]
+        states = [torch.as_tensor(self.first).to(knots).expand(len(knots), -1)]
         for share in knots.unbind(1):
-            least, most = torch.maximum(low, found[-1] + back), torch.minimum(high, found[-1] + on)
-            found.append(least + share * (most - least))
-        every = torch.stack(found, 1)
+            least, most = torch.maximum(low, states[-1] + back), torch.minimum(high, states[-1] + on)
+            states.append(least + share * (most - least))
+        every = torch.stack(states, 1)
         at = torch.linspace(0.0, self.knots, len(self.model.t), dtype=knots.dtype, device=knots.device)
         before = at.floor().clamp_max(self.knots - 1)
         share, n = (at - before)[:, None], before.long()
@@ -122,15 +122,15 @@ class Tilt(Program):
         sinc = torch.where(square > 1e-12, torch.sin(angle) / angle, 1.0 - square / 6.0)
         cosine = torch.where(square > 1e-12, torch.cos(angle), 1.0 - square / 2.0)
         aside = torch.as_tensor(across(np.array(self.model.scene.base_gravity))).to(values)
-        found = cosine * gravity + size * sinc * (tilt @ aside)
-        return Forcing(found, self._solids.expand(len(values), -1, -1))
+        turned = cosine * gravity + size * sinc * (tilt @ aside)
+        return Forcing(turned, self._solids.expand(len(values), -1, -1))
 
     def scene(self, scene: Scene, values: np.ndarray) -> Scene:
         """See `Program.scene`."""
         with torch.no_grad():
             gravity = self.forcing(torch.as_tensor(values)[None]).gravity[0].cpu().numpy()
-        own = Keyframes(self.model.t[:-1].tolist(), gravity.tolist())
-        return replace(scene, forcing=Programs({"designed": own}, scene.forcing.colliders))
+        keyframes = Keyframes(self.model.t[:-1].tolist(), gravity.tolist())
+        return replace(scene, forcing=Programs({"designed": keyframes}, scene.forcing.colliders))
 
     @cached_property
     def _solids(self) -> Tensor:
@@ -199,7 +199,7 @@ class Moves(Program):
         steps = (len(self.model.t) - 1) / self.knots
         along = [self._changes(name) @ self._axes[name].T for name in self.solids]
         return steps * np.concatenate(
-            [np.stack([own.min(0, initial=0.0), own.max(0, initial=0.0)], 1) for own in along]
+            [np.stack([reached.min(0, initial=0.0), reached.max(0, initial=0.0)], 1) for reached in along]
         )
 
     @property
@@ -209,14 +209,14 @@ class Moves(Program):
 
     def forcing(self, values: Tensor) -> Forcing:
         """See `Program.forcing`."""
-        own = self.model.forcing()
-        solids = own.solids.expand(len(values), -1, -1).clone()
+        scene = self.model.forcing()
+        solids = scene.solids.expand(len(values), -1, -1).clone()
         for c, shift in self._by_collider(values):
             k = FEATURES * c
             solids = solids.clone()
             solids[..., k : k + 3] = shift[:, :-1]
             solids[..., k + 4 : k + 7] = torch.diff(shift, dim=1)
-        return Forcing(own.gravity.expand(len(values), -1, -1), solids)
+        return Forcing(scene.gravity.expand(len(values), -1, -1), solids)
 
     def scene(self, scene: Scene, values: np.ndarray) -> Scene:
         """See `Program.scene`."""
@@ -230,30 +230,30 @@ class Moves(Program):
 
     def _by_collider(self, values: Tensor) -> list[tuple[int, Tensor]]:
         """Number and shift [B, N + 1, 3] of each solid."""
-        found, k = [], 0
+        shifts, k = [], 0
         for name in self.solids:
-            own, begun = self._axes[name], self._begun(name)
-            axes, aside = (torch.as_tensor(v).to(values) for v in (own, begun - begun @ own.T @ own))
+            ways, begun = self._axes[name], self._begun(name)
+            axes, aside = (torch.as_tensor(v).to(values) for v in (ways, begun - begun @ ways.T @ ways))
             shift = aside + values[..., k : k + len(axes)] @ axes
-            found.append((tuple(self.model.scene.colliders).index(name), shift))
+            shifts.append((tuple(self.model.scene.colliders).index(name), shift))
             k += len(axes)
-        return found
+        return shifts
 
     @cached_property
     def _shifts(self) -> dict[str, np.ndarray]:
         """[R, N + 1, 3] of each solid in the training runs [m]."""
-        model, there = self.model, tuple(self.model.scene.colliders)
+        model, names = self.model, tuple(self.model.scene.colliders)
         scenes = [model.pipeline.scene.at(case) for case in model.pipeline.split.train]
         solids = np.stack([scene.forcing_at(model.t)["solids"] for scene in scenes])
-        return {name: solids[:, :, there.index(name), :3] for name in self.solids}
+        return {name: solids[:, :, names.index(name), :3] for name in self.solids}
 
     @cached_property
     def _axes(self) -> dict[str, np.ndarray]:
         """[ways, 3] of each solid: the axes along which training runs moved it."""
         axes = {}
         for name in self.solids:
-            _, sizes, own = np.linalg.svd(self._changes(name), full_matrices=False)
-            axes[name] = own[sizes > _HARDLY]
+            _, sizes, directions = np.linalg.svd(self._changes(name), full_matrices=False)
+            axes[name] = directions[sizes > _HARDLY]
         return axes
 
     def _begun(self, name: str) -> np.ndarray:
@@ -305,8 +305,10 @@ def design(
     Raises:
         InstabilityError: no program gives a run that stays finite.
     """
-    model, own = program.model, view.observations
-    target, tolerance = (torch.as_tensor(v, device=model.device) for v in (own.values, own.deviations))
+    model, targets = program.model, view.observations
+    target, tolerance = (
+        torch.as_tensor(v, device=model.device) for v in (targets.values, targets.deviations)
+    )
     mu, shape = model.tensor(parameters), (program.knots, len(program.names))
 
     def run(knots: Tensor) -> tuple[Tensor, Forcing]:
@@ -321,7 +323,7 @@ def design(
     best, least = _best_of(costs, starts)
     if not np.isfinite(least):
         raise InstabilityError("no program gives a run that stays finite; choose narrower bounds")
-    say(f"design: the best of {_STARTS} programs is {np.sqrt(least / len(own)):.3g} tolerances off (RMS)")
+    say(f"design: the best of {_STARTS} programs is {np.sqrt(least / len(targets)):.3g} tolerances off (RMS)")
     end = _followed(costs, best)
     knots = torch.as_tensor(end.x.reshape(1, *shape), device=model.device)
     with torch.no_grad():
@@ -378,8 +380,8 @@ class Held:
 
     def read(self, _: str, frames, particles: np.ndarray | None = None) -> np.ndarray:
         """[frames, particles, 3] m."""
-        found = self._x[frames]
-        return found if particles is None else found[:, particles]
+        x = self._x[frames]
+        return x if particles is None else x[:, particles]
 
 
 def full_order(program: Program, designed: Designed, parameters) -> Held:

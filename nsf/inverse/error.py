@@ -50,8 +50,8 @@ class ModelError:
             )
         parameters, forcing = np.array([[case[name] for name in model.names] for case in cases]), None
         if PROGRAM in cases[0]:
-            own = [model.forcing(case.parameters, int(case[PROGRAM])) for case in cases]
-            forcing = Forcing(*(torch.stack([getattr(f, k) for f in own]) for k in ("gravity", "solids")))
+            runs = [model.forcing(case.parameters, int(case[PROGRAM])) for case in cases]
+            forcing = Forcing(*(torch.stack([getattr(f, k) for f in runs]) for k in ("gravity", "solids")))
         with torch.no_grad():
             seen = view.of_runs(model(parameters, forcing)).cpu().numpy()
         truths = []

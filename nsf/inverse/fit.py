@@ -116,27 +116,27 @@ def fit(
     began = time.perf_counter()
     space = space or Space.of(model)
     error = error or ModelError.of(view, model)
-    own = view.observations
-    if len(own) < len(space.free):
+    observations = view.observations
+    if len(observations) < len(space.free):
         raise ConfigError(
-            f"{len(own)} observation{'s' * (len(own) != 1)} cannot tell {len(space.free)} parameters, "
-            f"{', '.join(space.free)}; observe more, or give one of them as NAME=VALUE"
+            f"{len(observations)} observation{'s' * (len(observations) != 1)} cannot tell {len(space.free)} "
+            f"parameters, {', '.join(space.free)}; observe more, or give one of them as NAME=VALUE"
         )
-    s = np.sqrt(own.deviations**2 + error.deviations**2)
+    s = np.sqrt(observations.deviations**2 + error.deviations**2)
 
     def seen(u: Tensor) -> Tensor:
         return view.of_runs(model(space.parameters(u), forcing))
 
     def residuals(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         values, slopes = with_jacobian(seen, torch.as_tensor(u, device=model.device)[None])
-        return (values[0].cpu().numpy() - own.values) / s, slopes[0].cpu().numpy() / s[:, None]
+        return (values[0].cpu().numpy() - observations.values) / s, slopes[0].cpu().numpy() / s[:, None]
 
-    first = _best_starts(seen, own.values, s, len(space.free), starts, model.device)
+    first = _best_starts(seen, observations.values, s, len(space.free), starts, model.device)
     best = min((_followed(residuals, u) for u in first), key=lambda result: result.cost)
     J = best.jac
     _check_told_apart(J, space)
     A = np.linalg.pinv(J)
-    noise = (A * (own.deviations / s) ** 2) @ A.T
+    noise = (A * (observations.deviations / s) ** 2) @ A.T
     off, of_model, V = error.offsets(view, model, space, s).near(best.x)
     u = np.clip(best.x - off, 0.0, 1.0)
     covariance = noise + of_model
@@ -162,7 +162,7 @@ def fit(
         lower=valued(u - reach),
         upper=valued(u + reach),
         covariance=covariance,
-        seen=best.fun * s + own.values,
+        seen=best.fun * s + observations.values,
         residuals=best.fun,
         scale=s,
         share=share,
@@ -179,9 +179,9 @@ def _best_starts(seen, values: np.ndarray, s: np.ndarray, n: int, starts: int, d
     power = max(0, starts - 1).bit_length()
     cube = qmc.Sobol(n, seed=0).random_base2(power)[:starts]
     with torch.no_grad():
-        found = seen(torch.as_tensor(cube, device=device)).cpu().numpy()
-    costs = np.nansum(((found - values) / s) ** 2, axis=1)
-    costs[~np.isfinite(found).all(1)] = np.inf
+        runs = seen(torch.as_tensor(cube, device=device)).cpu().numpy()
+    costs = np.nansum(((runs - values) / s) ** 2, axis=1)
+    costs[~np.isfinite(runs).all(1)] = np.inf
     order = np.argsort(costs)
     if not np.isfinite(costs[order[0]]):
         raise InstabilityError(

@@ -103,11 +103,11 @@ class Polynomial:
 
     def _term(self, group: Sequence[int], degrees: dict[int, int]) -> tuple[dict[int, int], Tensor]:
         """Degrees of some parameters, and coefficients [products, size] of what they change together."""
-        own = {p: degrees[p] for p in group}
-        nodes = [0.5 + 0.5 * chebyshev.chebpts1(degree + 1) for degree in own.values()]
-        places = [dict(zip(own, us, strict=True)) for us in itertools.product(*nodes)]
+        chosen = {p: degrees[p] for p in group}
+        nodes = [0.5 + 0.5 * chebyshev.chebpts1(degree + 1) for degree in chosen.values()]
+        places = [dict(zip(chosen, us, strict=True)) for us in itertools.product(*nodes)]
         change = torch.stack([self._change(place) for place in places])
-        return own, torch.linalg.solve(_products(self._units(places), own), change)
+        return chosen, torch.linalg.solve(_products(self._units(places), chosen), change)
 
     def _groups(self, along: Sequence[int], one: dict[int, Tensor]) -> list[list[int]]:
         """Parameters that act together: what two change at once is not what each changes by itself."""
@@ -116,7 +116,7 @@ class Polynomial:
             both = self._change({p: _COMPARED[0], other: _COMPARED[0]})
             together[i, j] = float((both - one[p] - one[other]).abs().max()) > self._slack
         count, label = connected_components(together, directed=False)
-        return [[p for p, own in zip(along, label, strict=True) if own == k] for k in range(count)]
+        return [[p for p, part in zip(along, label, strict=True) if part == k] for k in range(count)]
 
     def _refuse(self, along: Sequence[int]) -> NoReturn:
         which = " and ".join(self._names[0][p] for p in along)

@@ -106,15 +106,15 @@ class Model:
         if isinstance(parameters, Mapping):
             if wrong := set(self.names) ^ set(parameters):
                 raise ConfigError(f"{sorted(wrong)[0]!r}: give a value for each of {', '.join(self.names)}")
-            own = [torch.as_tensor(parameters[name], dtype=torch.float64) for name in self.names]
-            parameters = torch.stack(torch.broadcast_tensors(*own), -1)
-        found = torch.as_tensor(parameters, dtype=torch.float64, device=self.device)
-        if found.ndim == 0 or found.shape[-1] != len(self.names):
+            columns = [torch.as_tensor(parameters[name], dtype=torch.float64) for name in self.names]
+            parameters = torch.stack(torch.broadcast_tensors(*columns), -1)
+        tensor = torch.as_tensor(parameters, dtype=torch.float64, device=self.device)
+        if tensor.ndim == 0 or tensor.shape[-1] != len(self.names):
             raise ShapeError(
-                f"parameters have shape {list(found.shape)}; give [..., {len(self.names)}], as "
+                f"parameters have shape {list(tensor.shape)}; give [..., {len(self.names)}], as "
                 f"{', '.join(self.names)}"
             )
-        return found
+        return tensor
 
     def __call__(self, parameters, forcing: Forcing | None = None) -> Tensor:
         """Latent vectors [..., N + 1, r] of runs, differentiable in parameters and forcing.
@@ -126,14 +126,14 @@ class Model:
         mu = self.tensor(parameters)
         rows = mu.reshape(-1, mu.shape[-1])
         first = self._of("start", rows).expand(len(rows), -1).clone()
-        given = forcing or Forcing(self._of("gravity", rows), self._of("solids", rows))
+        acting = forcing or Forcing(self._of("gravity", rows), self._of("solids", rows))
         gravity, solids = (
             values.to(self.device).flatten(0, -3).movedim(-2, 0) if values.ndim > 2 else values[:, None]
-            for values in (given.gravity, given.solids)
+            for values in (acting.gravity, acting.solids)
         )
         xhat = self._xhat.repeat(len(rows), 1)
-        found = differentiable_run(self._form, xhat, first, rows, gravity, solids)
-        return found.movedim(0, -2).unflatten(0, mu.shape[:-1]) if mu.ndim > 1 else found[:, 0]
+        run = differentiable_run(self._form, xhat, first, rows, gravity, solids)
+        return run.movedim(0, -2).unflatten(0, mu.shape[:-1]) if mu.ndim > 1 else run[:, 0]
 
     def at(self, points) -> Restriction:
         """The fields at particles [n] or rest positions [n, 3] [m], for many calls of `positions`."""
@@ -150,8 +150,8 @@ class Model:
             xhat: latent vectors.
             points: particles or rest positions, as for `at`, or what it gave.
         """
-        found = self.at(points).position(xhat.flatten(0, -2) if xhat.ndim > 1 else xhat)
-        return found.unflatten(0, xhat.shape[:-1]) if xhat.ndim > 1 else found
+        x = self.at(points).position(xhat.flatten(0, -2) if xhat.ndim > 1 else xhat)
+        return x.unflatten(0, xhat.shape[:-1]) if xhat.ndim > 1 else x
 
     def check_points(self, points: np.ndarray, where: Callable[[int], str] = lambda k: "") -> None:
         """Refuse rest positions [n, 3] [m] that are not of the body; `where` begins the message of one.
@@ -177,8 +177,8 @@ class Model:
             program: number of the run's program, where the scene has programs; as configured by default.
         """
         mu = self.ranges.mean(1) if parameters is None else self.tensor(parameters).cpu().numpy()
-        given = (torch.as_tensor(self._inputs(mu, program)[name]) for name in ("gravity", "solids"))
-        return Forcing(*(values.to(self.device) for values in given))
+        parts = (torch.as_tensor(self._inputs(mu, program)[name]) for name in ("gravity", "solids"))
+        return Forcing(*(values.to(self.device) for values in parts))
 
     def distrust(self, xhat: Tensor, parameters, forcing: Forcing | None = None) -> Tensor:
         """[...] how far runs are from what was taught; above 1 a run is not to be believed.
@@ -215,8 +215,8 @@ class Model:
     def _outside(self, values: Sequence[float]) -> float:
         """How far parameters are outside of what was taught, or from the training cases; 0 up to 1."""
         case, taught = dict(zip(self.names, values, strict=True)), self.recurrence.taught
-        found = max(taught.outside(case, np.array(taught.gravity))[0], self.trust.cases.of(case))
-        return found if found > 1.0 else 0.0
+        ratio = max(taught.outside(case, np.array(taught.gravity))[0], self.trust.cases.of(case))
+        return ratio if ratio > 1.0 else 0.0
 
     def _forced(self, forcing: Forcing) -> np.ndarray:
         """[] or [B] how far gravity and solids are outside of what was taught; 0 up to 1."""

@@ -32,8 +32,8 @@ _SAME_TIME = 1e-6
 
 def component(text: str) -> tuple[str, np.ndarray] | None:
     """Axis and rest position [3] [m] of a component of a point, as `z@0.5:0.5:0.2`; None of another text."""
-    found = _COMPONENT.fullmatch(text)
-    return (found[1], np.array(found.groups()[1:], float)) if found else None
+    match = _COMPONENT.fullmatch(text)
+    return (match[1], np.array(match.groups()[1:], float)) if match else None
 
 
 def is_scalar(text: str) -> bool:

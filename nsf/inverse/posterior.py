@@ -56,7 +56,7 @@ class Posterior:
 def posterior(
     prior: Prior,
     view: View,
-    found: Fit,
+    best: Fit,
     draws: int,
     forcing: Forcing | None = None,
     seed: int = 0,
@@ -71,7 +71,7 @@ def posterior(
 
     Args:
         prior: of the parameters.
-        view: of the observations; found: their fit, of every parameter.
+        view: of the observations; best: their fit, of every parameter.
         draws: how many.
         forcing, seed: of the runs, and of the ensemble.
 
@@ -83,23 +83,23 @@ def posterior(
     Source: Goodman and Weare 2010; Foreman-Mackey et al. 2013.
     """
     emcee = optional("emcee", "inverse")
-    model, space = prior.model, found.space
-    precision = np.linalg.inv(found.covariance)
-    shift = found.u - space.units(found.fitted)
+    model, space = prior.model, best.space
+    precision = np.linalg.inv(best.covariance)
+    shift = best.u - space.units(best.fitted)
     low, high = model.ranges.T
 
     def log_probability(values: np.ndarray) -> np.ndarray:
-        known = prior.log_density(values)
+        prior_density = prior.log_density(values)
         with torch.no_grad():
             inside = np.clip(values, low, high)
             seen = view.of_runs(model(model.tensor(inside), forcing)).cpu().numpy()
-        off = (view.observations.values - seen) @ found.project.T + shift
-        told = -0.5 * np.einsum("bi,ij,bj->b", off, precision, off)
-        return np.where(np.isfinite(told), told, -np.inf) + known
+        off = (view.observations.values - seen) @ best.project.T + shift
+        likelihood = -0.5 * np.einsum("bi,ij,bj->b", off, precision, off)
+        return np.where(np.isfinite(likelihood), likelihood, -np.inf) + prior_density
 
     generator = np.random.default_rng(seed)
-    deviation = np.minimum(np.sqrt(np.diag(found.covariance)), 0.1)
-    about = found.u + deviation * generator.standard_normal((_TRIED, len(space.free)))
+    deviation = np.minimum(np.sqrt(np.diag(best.covariance)), 0.1)
+    about = best.u + deviation * generator.standard_normal((_TRIED, len(space.free)))
     about = space.values(torch.as_tensor(np.clip(about, 1e-3, 1.0 - 1e-3))).numpy()
     tried = np.concatenate([prior.draw(_TRIED, seed, taught=True), about])
     heights = log_probability(tried)

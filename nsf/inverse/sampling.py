@@ -41,18 +41,18 @@ def distribution(text: str):
         if not low < high:
             raise ConfigError(f"{text} has nothing between its ends; give the smaller one first")
         return stats.uniform(low, high - low)
-    found = _CALL.fullmatch(text)
-    family = getattr(stats, found[1], None) if found else None
+    match = _CALL.fullmatch(text)
+    family = getattr(stats, match[1], None) if match else None
     if not isinstance(family, stats.rv_continuous):
         raise ConfigError(f"{text} is no distribution; give one of scipy.stats, as norm(30,2), or LOW..HIGH")
-    numbers = [_number(part) for part in found[2].split(",")]
+    numbers = [_number(part) for part in match[2].split(",")]
     try:
         frozen = family(*numbers)
         spread = frozen.std()
     except (TypeError, ValueError) as error:
-        raise ConfigError(f"{text}: {error}; see scipy.stats.{found[1]}") from error
+        raise ConfigError(f"{text}: {error}; see scipy.stats.{match[1]}") from error
     if not (np.isfinite(spread) and spread > 0.0):
-        raise ConfigError(f"{text} has no finite spread; see scipy.stats.{found[1]} for its numbers")
+        raise ConfigError(f"{text} has no finite spread; see scipy.stats.{match[1]} for its numbers")
     return frozen
 
 
@@ -75,29 +75,29 @@ class Prior:
     each: Mapping[str, object]
 
     @classmethod
-    def of(cls, model: Model, asked: Mapping[str, str]) -> "Prior":
+    def of(cls, model: Model, texts: Mapping[str, str]) -> "Prior":
         """From texts by name; evenly over the range that was taught, or over its logarithm, of the others.
 
         Raises:
             ConfigError: a name is unknown, a text no distribution, or a range goes beyond what was taught.
         """
-        if unknown := [name for name in asked if name not in model.names]:
+        if unknown := [name for name in texts if name not in model.names]:
             raise ConfigError(f"there is no parameter {unknown[0]!r}; there are {', '.join(model.names)}")
         each = {}
         for name, (low, high) in zip(model.names, model.ranges.tolist(), strict=True):
-            if name not in asked:
+            if name not in texts:
                 log = model.scene.parameters[name].log
                 each[name] = stats.loguniform(low, high) if log else stats.uniform(low, high - low)
                 continue
-            each[name] = distribution(asked[name])
-            if ".." in asked[name]:
-                Space.of(model, {name: [*map(_number, asked[name].split(".."))]})
+            each[name] = distribution(texts[name])
+            if ".." in texts[name]:
+                Space.of(model, {name: [*map(_number, texts[name].split(".."))]})
         return cls(model, each)
 
     def values(self, u: np.ndarray) -> np.ndarray:
         """Parameters [..., n] of points [..., n] of the unit cube, by the inverse distribution functions."""
         u = np.clip(u, _ENDS, 1.0 - _ENDS)
-        return np.stack([own.ppf(u[..., k]) for k, own in enumerate(self.each.values())], -1)
+        return np.stack([marginal.ppf(u[..., k]) for k, marginal in enumerate(self.each.values())], -1)
 
     def draw(self, count: int, seed: int, taught: bool = False) -> np.ndarray:
         """[count, n] parameters; those within what was taught alone where that is asked for.
@@ -107,9 +107,9 @@ class Prior:
         """
         u = np.random.default_rng(seed).random((count, len(self.each)))
         if taught:
-            for k, (name, own) in enumerate(self.each.items()):
+            for k, (name, marginal) in enumerate(self.each.items()):
                 least, most = self.model.ranges[k]
-                low, high = own.cdf([least, most])
+                low, high = marginal.cdf([least, most])
                 if high - low < _ENDS:
                     raise ConfigError(
                         f"the distribution of {name} has nothing within what was taught, "
@@ -120,10 +120,10 @@ class Prior:
 
     def log_density(self, values: np.ndarray) -> np.ndarray:
         """[...] of parameters [..., n]; −∞ outside of what was taught."""
-        found = sum(own.logpdf(values[..., k]) for k, own in enumerate(self.each.values()))
+        density = sum(marginal.logpdf(values[..., k]) for k, marginal in enumerate(self.each.values()))
         low, high = self.model.ranges.T
         inside = np.all((values >= low) & (values <= high), axis=-1)
-        return np.where(inside, found, -np.inf)
+        return np.where(inside, density, -np.inf)
 
 
 class Scalars:
@@ -189,8 +189,8 @@ class Runs:
         """
         if not self.trusted.any():
             raise InstabilityError("no run is to be believed; draw parameters within what was taught")
-        found = np.quantile(self.values[self.trusted], levels, axis=0)
-        return {name: found[:, k] for k, name in enumerate(self.names)}
+        quantiles = np.quantile(self.values[self.trusted], levels, axis=0)
+        return {name: quantiles[:, k] for k, name in enumerate(self.names)}
 
 
 def runs(model: Model, parameters: np.ndarray, scalars: Scalars, forcing: Forcing | None = None) -> Runs:
@@ -236,17 +236,17 @@ def sensitivities(
 
     if count < 2 or count & (count - 1):
         raise ConfigError(f"a design of {count} must be of a power of two, as 1024")
-    own = list(prior.each)
-    problem = {"num_vars": len(own), "names": own, "bounds": [[0.0, 1.0]] * len(own)}
+    parameters = list(prior.each)
+    problem = {"num_vars": len(parameters), "names": parameters, "bounds": [[0.0, 1.0]] * len(parameters)}
     # One parameter has no other beside it, and SALib wants two.
-    if len(own) == 1:
-        problem = {"num_vars": 2, "names": [*own, "none"], "bounds": [[0.0, 1.0]] * 2}
+    if len(parameters) == 1:
+        problem = {"num_vars": 2, "names": [*parameters, "none"], "bounds": [[0.0, 1.0]] * 2}
     u = sample.sample(problem, count, calc_second_order=False, seed=seed)
-    found = evaluate(prior.values(u[:, : len(own)]))
+    outputs = evaluate(prior.values(u[:, : len(parameters)]))
     rows = []
     for k, name in enumerate(names):
-        index = analyze.analyze(problem, found[:, k], calc_second_order=False, seed=seed)
-        for p, parameter in enumerate(own):
+        index = analyze.analyze(problem, outputs[:, k], calc_second_order=False, seed=seed)
+        for p, parameter in enumerate(parameters):
             values = [float(index[key][p]) for key in ("S1", "S1_conf", "ST", "ST_conf")]
             rows.append([name, parameter, *values])
     return pd.DataFrame(rows, columns=["quantity", "parameter", "first", "first_95", "total", "total_95"])

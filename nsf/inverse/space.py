@@ -25,9 +25,9 @@ def check_taught(model: Model, name: str, low: float, high: float) -> None:
     least, most = model.ranges.tolist()[model.names.index(name)]
     slack = 1e-9 * max(abs(least), abs(most))
     if not least - slack <= low <= high <= most + slack:
-        given = f"{low:g}" if low == high else f"{low:g}..{high:g}"
+        text = f"{low:g}" if low == high else f"{low:g}..{high:g}"
         raise ConfigError(
-            f"{name}={given} goes beyond what was taught, {least:g}..{most:g}; stay within, or train with a "
+            f"{name}={text} goes beyond what was taught, {least:g}..{most:g}; stay within, or train with a "
             "wider range"
         )
 
@@ -49,19 +49,19 @@ class Space:
     fixed: Mapping[str, float]
 
     @classmethod
-    def of(cls, model: Model, asked: Mapping[str, Sequence[float] | float] | None = None) -> "Space":
+    def of(cls, model: Model, stated: Mapping[str, Sequence[float] | float] | None = None) -> "Space":
         """Ranges, or values that are known, by name; what was taught of the others.
 
         Raises:
             ConfigError: a name is unknown, nothing is left to seek, or a range goes beyond what was taught.
         """
-        asked = dict(asked or {})
-        if unknown := [name for name in asked if name not in model.names]:
+        stated = dict(stated or {})
+        if unknown := [name for name in stated if name not in model.names]:
             raise ConfigError(f"there is no parameter {unknown[0]!r}; there are {', '.join(model.names)}")
         taught = dict(zip(model.names, model.ranges.tolist(), strict=True))
-        fixed = {name: float(value) for name, value in asked.items() if np.ndim(value) == 0}
+        fixed = {name: float(value) for name, value in stated.items() if np.ndim(value) == 0}
         ranges = {
-            name: list(map(float, asked.get(name, taught[name]))) for name in taught if name not in fixed
+            name: list(map(float, stated.get(name, taught[name]))) for name in taught if name not in fixed
         }
         for name, (low, high) in [*ranges.items(), *((name, (v, v)) for name, v in fixed.items())]:
             check_taught(model, name, low, high)
@@ -74,9 +74,10 @@ class Space:
 
     def parameters(self, u: Tensor) -> Tensor:
         """All parameters [..., n] of those sought, u [..., free] in units of their ranges."""
-        own = dict(zip(self.free, self.values(u).unbind(-1), strict=True))
+        sought = dict(zip(self.free, self.values(u).unbind(-1), strict=True))
         every = [
-            own.get(name, torch.full_like(u[..., 0], self.fixed.get(name, 0.0))) for name in self.model.names
+            sought.get(name, torch.full_like(u[..., 0], self.fixed.get(name, 0.0)))
+            for name in self.model.names
         ]
         return torch.stack(every, -1)
 

@@ -71,21 +71,21 @@ def run(model: Model, trials: Trials, say: Callable[[str], object] = print) -> t
     cases = trials.cases(model)
     say(f"calibrate: full-order runs of {len(cases)} trials of {model.scene.name}")
     runs, rows, fits = model.pipeline.full_order(cases), [], []
-    for trial, (case, own) in enumerate(zip(cases, runs, strict=True)):
-        with Trajectory.open(own.file(TRAJECTORY)) as truth:
+    for trial, (case, simulated) in enumerate(zip(cases, runs, strict=True)):
+        with Trajectory.open(simulated.file(TRAJECTORY)) as truth:
             seen = trials.observed(model, truth, trial)
         began = time.perf_counter()
         forcing = model.forcing(case.parameters, int(case[PROGRAM])) if PROGRAM in case else None
-        found = fit(View(seen, model), model, Space.of(model), forcing=forcing)
+        best = fit(View(seen, model), model, Space.of(model), forcing=forcing)
         seconds = time.perf_counter() - began
-        fits.append(found)
-        for k, name in enumerate(found.space.free):
-            inside = found.lower[k] <= case[name] <= found.upper[k]
-            values = case[name], found.estimate[k], found.standard_error[k], int(inside), seconds
-            rows.append([model.scene.name, name, trial, *values, found.distrust])
-        told = ", ".join(
-            f"{name} {found.estimate[k]:.4g} ± {found.standard_error[k]:.2g} for {case[name]:.4g}"
-            for k, name in enumerate(found.space.free)
+        fits.append(best)
+        for k, name in enumerate(best.space.free):
+            inside = best.lower[k] <= case[name] <= best.upper[k]
+            values = case[name], best.estimate[k], best.standard_error[k], int(inside), seconds
+            rows.append([model.scene.name, name, trial, *values, best.distrust])
+        text = ", ".join(
+            f"{name} {best.estimate[k]:.4g} ± {best.standard_error[k]:.2g} for {case[name]:.4g}"
+            for k, name in enumerate(best.space.free)
         )
-        say(f"calibrate: trial {trial}: {told}, {seconds:.2f} s")
+        say(f"calibrate: trial {trial}: {text}, {seconds:.2f} s")
     return pd.DataFrame(rows, columns=list(COLUMNS)), fits

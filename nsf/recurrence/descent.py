@@ -87,11 +87,11 @@ class Yardstick:
         start = form.begin(runs.xhat[0], runs.first, runs.stress[0])
         with torch.no_grad():
             xhat, _ = form.run(start, runs.parameters, runs.gravity, form.collider_state(runs.features))
-        found = []
+        errors = []
         for run, truth in zip(xhat.mean(1)[:: self.every].unbind(1), self.truth.unbind(1), strict=True):
             off = (self.positions(run) - truth).square().sum()
-            found.append((off / (truth - truth[:1]).square().sum()).sqrt())
-        return torch.stack(found)
+            errors.append((off / (truth - truth[:1]).square().sum()).sqrt())
+        return torch.stack(errors)
 
 
 def standardised(runs: Runs, fitting: Fitting, dt: float, stride: int, programs: bool, seed: int) -> Form:
@@ -129,14 +129,14 @@ def _deviation(values: Tensor) -> Tensor:
     """Deviation [k] of [N, R, k]; of what hardly varies a billionth of the largest."""
     if not values.shape[-1]:
         return values.new_ones(0)
-    found = values.flatten(0, -2).std(0)
-    return found.clamp_min(1e-9 * float(found.max().clamp_min(1e-30)))
+    deviation = values.flatten(0, -2).std(0)
+    return deviation.clamp_min(1e-9 * float(deviation.max().clamp_min(1e-30)))
 
 
 def _spread(values: Tensor) -> Tensor:
     """Deviation [n] of rows, 1 where there is none."""
-    found = values.std(0, correction=0)
-    return torch.where(found > 0, found, 1.0)
+    deviation = values.std(0, correction=0)
+    return torch.where(deviation > 0, deviation, 1.0)
 
 
 def _gravity_scale(gravity: Tensor) -> Tensor:

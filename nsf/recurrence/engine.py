@@ -208,14 +208,14 @@ class Runs:
             return None
         nodes = self.loop.xhat[:, :, : -(-steps // k) + 1]
         M, B, n, r = nodes.shape
-        found = nodes.new_zeros(B, n, dtype=torch.float64)
+        deviation = nodes.new_zeros(B, n, dtype=torch.float64)
         for rows in torch.arange(n).split(max(1, _ROWS // (M * B))):
             part = nodes[:, :, rows].to(at.dtype).reshape(-1, r)
             x = at.position(part).double().unflatten(0, (M, B, len(rows)))
             off = (x - x.mean(0)).square().sum((0, -1)).mean(-1) / (M - 1)
-            found[:, rows] = off.sqrt()
-        found = torch.nan_to_num(found, nan=torch.inf, posinf=torch.inf)
-        return _linear(found[..., None], k)[:, : steps + 1, 0]
+            deviation[:, rows] = off.sqrt()
+        deviation = torch.nan_to_num(deviation, nan=torch.inf, posinf=torch.inf)
+        return _linear(deviation[..., None], k)[:, : steps + 1, 0]
 
     @property
     def nbytes(self) -> int:

@@ -208,12 +208,12 @@ class Form(nn.Module):
             terms[1].append(self.g_scale.expand(3))
         terms[0].append(self.s_mean)
         terms[1].append(self.s_scale)
-        found = {"motion": _raw(self.networks["motion"], (means, scales), terms, self.a_scale)}
+        layers = {"motion": _raw(self.networks["motion"], (means, scales), terms, self.a_scale)}
         if self.sizes.stress:
             seen = [*means, self.s_mean, zero(self.d_scale)], [*scales, self.s_scale, self.d_scale]
             terms = [zero(self.d_scale), zero(unit)], [self.d_scale, unit]
-            found["stress"] = _raw(self.networks["stress"], seen, terms, self.t_scale)
-        return found
+            layers["stress"] = _raw(self.networks["stress"], seen, terms, self.t_scale)
+        return layers
 
 
 def _raw(network: Layers, seen, terms, rows: Tensor) -> list[tuple[Tensor, Tensor]]:

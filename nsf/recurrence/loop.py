@@ -67,13 +67,13 @@ def folded(form: Form, parameters: torch.Tensor) -> dict[str, torch.Tensor]:
         form: in fp64.
         parameters: μ [B, n] of the runs.
     """
-    r, n, found = form.sizes.latents, form.sizes.parameters, {}
+    r, n, weights = form.sizes.latents, form.sizes.parameters, {}
     for name, layers in form.in_raw_units().items():
         (W, b), middle, last = layers
         of_mu = b[:, None] + parameters @ W[:, r : r + n]
         values = torch.cat([W[:, :r], W[:, r + n :]], 1), of_mu, *middle, *last
-        found |= {f"{name}_{part}": v for part, v in zip(_WEIGHTS, values, strict=True)}
-    return found
+        weights |= {f"{name}_{part}": v for part, v in zip(_WEIGHTS, values, strict=True)}
+    return weights
 
 
 class Loop:

@@ -28,15 +28,15 @@ def collider_states(colliders: Sequence[Collider], dt: float, steps: int) -> np.
         step, and 1 where it acts, else 0.
     """
     t = dt * np.arange(steps + 1)
-    found = [np.zeros((steps, 0))]
+    states = [np.zeros((steps, 0))]
     for collider in colliders:
         pose = np.zeros((steps + 1, 4))
         if collider.motion is not None:
             pose = collider.motion.pose(t)
         later = t[:-1] + _SAME_TIME * dt
         active = (later >= collider.since) & (later < collider.until)
-        found += [pose[:-1], np.diff(pose, axis=0), active[:, None].astype(float)]
-    return np.concatenate(found, 1)
+        states += [pose[:-1], np.diff(pose, axis=0), active[:, None].astype(float)]
+    return np.concatenate(states, 1)
 
 
 def principal(states: Sequence[np.ndarray], programs: bool = False) -> tuple[np.ndarray, np.ndarray]:
@@ -59,6 +59,6 @@ def principal(states: Sequence[np.ndarray], programs: bool = False) -> tuple[np.
     mean = rows.mean(0)
     deviation = np.where(varies, rows.std(0), np.inf)
     _, sizes, axes = np.linalg.svd((rows - mean) / deviation, full_matrices=False)
-    kept = sizes > _HARDLY * max(sizes.max(initial=0.0), np.finfo(float).tiny)
-    scale = sizes[0] / np.sqrt(len(rows)) if kept.any() else 1.0
-    return mean, (axes[kept] / scale / deviation).T
+    varying = sizes > _HARDLY * max(sizes.max(initial=0.0), np.finfo(float).tiny)
+    scale = sizes[0] / np.sqrt(len(rows)) if varying.any() else 1.0
+    return mean, (axes[varying] / scale / deviation).T

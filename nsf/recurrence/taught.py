@@ -52,7 +52,7 @@ class Taught:
             dt: step [s].
             gravity: [n, 3] of all steps of all runs [m/s²]; None where it does not matter.
         """
-        known = manifold.training_parameters
+        parameters = manifold.training_parameters
         middle = np.zeros(3) if gravity is None else gravity.mean(0)
         reach = 0.0 if gravity is None else float(np.linalg.norm(gravity - middle, axis=1).max())
         return cls(
@@ -60,7 +60,7 @@ class Taught:
             scene=scene,
             dt=float(dt),
             parameters=tuple(manifold.parameter_names),
-            ranges=tuple(zip(known.amin(0).tolist(), known.amax(0).tolist(), strict=True)),
+            ranges=tuple(zip(parameters.amin(0).tolist(), parameters.amax(0).tolist(), strict=True)),
             gravity=tuple(map(float, middle)),
             reach=reach,
         )

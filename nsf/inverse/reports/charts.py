@@ -27,12 +27,12 @@ def trials_chart(table: pd.DataFrame, units: Mapping[tuple[str, str], str]) -> F
         fig = figure(3.4 * rows)
         panels = np.ravel(fig.subplots(rows, min(2, len(groups)), squeeze=False))
         for panel, ((scene, name), part) in zip(panels, groups, strict=False):
-            for holds, own in part.groupby("inside_90", sort=False):
-                bars = [own["estimate"] - own["lower"], own["upper"] - own["estimate"]]
+            for holds, trials in part.groupby("inside_90", sort=False):
+                bars = [trials["estimate"] - trials["lower"], trials["upper"] - trials["estimate"]]
                 panel.errorbar(
-                    own["truth"], own["estimate"] - own["truth"], bars, fmt="o", ms=3.5, lw=1.1,
+                    trials["truth"], trials["estimate"] - trials["truth"], bars, fmt="o", ms=3.5, lw=1.1,
                     color=PALETTE[1 - holds],
-                    label=f"interval {'holds' if holds else 'misses'} the truth: {len(own)}",
+                    label=f"interval {'holds' if holds else 'misses'} the truth: {len(trials)}",
                 )  # fmt: skip
             panel.axhline(0.0, color=INK, lw=0.8)
             unit = units[scene, name]

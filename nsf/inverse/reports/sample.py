@@ -57,15 +57,15 @@ def sampling(
         A page with `quantiles.csv`, `runs.csv.gz`, `sensitivities.csv` and `posterior.csv`.
     """
     model, warnings, files, tables, charts, simulated = problem.model, [], {}, [], [], []
-    known = None
+    chain = None
     if view is None:
         drawn = prior.draw(count, seed)
     else:
         best = fit(view, model, Space.of(model), forcing=problem.forcing)
-        known = posterior(prior, view, best, _DRAWS, problem.forcing, seed)
-        warnings = [*warnings_of(best, view.observations), *known.warnings]
-        say(f"sample: posterior given {len(view.observations)} observations: {known.text}")
-        drawn = known.values[np.random.default_rng(seed).integers(0, len(known.values), count)]
+        chain = posterior(prior, view, best, _DRAWS, problem.forcing, seed)
+        warnings = [*warnings_of(best, view.observations), *chain.warnings]
+        say(f"sample: posterior given {len(view.observations)} observations: {chain.text}")
+        drawn = chain.values[np.random.default_rng(seed).integers(0, len(chain.values), count)]
     made = runs(model, drawn, scalars, problem.forcing)
     lost, bands = int((~made.trusted).sum()), made.quantiles()
     say(f"sample: {count:,} runs in {made.seconds:.2f} s, {lost:,} of them distrusted")
@@ -82,11 +82,11 @@ def sampling(
     tables.append(frame_table("At the end", _ends(bands), note))
     caption = "Quantiles of trusted runs over time."
     charts.append(Chart("Quantiles over time", "quantiles", caption, bands_chart(scalars.t, bands, LEVELS)))
-    if known is not None:
+    if chain is not None:
         names = [named(model, name) for name in model.names]
-        files["posterior.csv"] = pd.DataFrame(known.values, columns=list(model.names))
-        tables.append(frame_table("Posterior", _moments(known, names), f"{known.text}."))
-        drawing = posterior_chart(known.values, names)
+        files["posterior.csv"] = pd.DataFrame(chain.values, columns=list(model.names))
+        tables.append(frame_table("Posterior", _moments(chain, names), f"{chain.text}."))
+        drawing = posterior_chart(chain.values, names)
         charts.append(Chart("Posterior", "posterior", "Draws of the posterior.", drawing))
     return Results(
         title=f"{title_of(model)}: sampling",
@@ -161,12 +161,13 @@ def _ends(bands: dict[str, np.ndarray]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["quantity", *heads])
 
 
-def _moments(known: Posterior, names: list[str]) -> pd.DataFrame:
+def _moments(posterior: Posterior, names: list[str]) -> pd.DataFrame:
     """A row a parameter."""
-    low, high = np.quantile(known.values, [0.05, 0.95], axis=0)
-    mean, deviation = known.values.mean(0), known.values.std(0)
+    low, high = np.quantile(posterior.values, [0.05, 0.95], axis=0)
+    mean, deviation = posterior.values.mean(0), posterior.values.std(0)
     columns = {"mean": mean, "deviation": deviation, "5 %": low, "95 %": high}
     texts = {
-        name: own if name == "deviation" else list(map("{:.5g}".format, own)) for name, own in columns.items()
+        name: value if name == "deviation" else list(map("{:.5g}".format, value))
+        for name, value in columns.items()
     }
     return pd.DataFrame({"parameter": names} | texts)

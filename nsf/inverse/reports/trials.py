@@ -47,7 +47,7 @@ def trying(models: Sequence[Model], trials: Trials, say: Callable[[str], object]
         f"component, seed {trials.seed}"
     )
     pairs = zip(models, made, strict=True)
-    summary = pd.DataFrame([row for model, own in pairs for row in _rows(model, *own)])
+    summary = pd.DataFrame([row for model, results in pairs for row in _rows(model, *results)])
     return Results(
         title="Calibration",
         lead=_LEAD,

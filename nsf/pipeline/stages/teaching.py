@@ -58,14 +58,14 @@ def teach(pipeline, run: Run) -> None:
 def _teach(pipeline, manifold: Manifold, record: Record) -> None:
     model, device = pipeline.model, pipeline.device
     started = time.perf_counter()
-    known, drawn, back = pipeline.lessons
+    training, drawn, validation = pipeline.lessons
     encoder = Encoder(manifold, model.stress_of(pipeline.forced))
-    scenes = [*map(pipeline.scene.at, known), *_varied(pipeline, drawn)]
-    lessons = list(map(Lesson, [*known, *drawn], scenes))
+    scenes = [*map(pipeline.scene.at, training), *_varied(pipeline, drawn)]
+    lessons = list(map(Lesson, [*training, *drawn], scenes))
     lessons, encoded = _encoded(pipeline, encoder, lessons, record)
     fitted = time.perf_counter()
     runs = _runs(pipeline, manifold, lessons, encoded)
-    yardstick = _yardstick(pipeline, manifold, encoder, back)
+    yardstick = _yardstick(pipeline, manifold, encoder, validation)
     seed, stride = int(pipeline.config.seed), model.stride_of(pipeline.scene.steps)
     form = standardised(runs, model.fitting, pipeline.scene.dt, stride, pipeline.forced, seed)
     sigma = _moves(yardstick, form.x_mean, form.x_scale)
@@ -100,10 +100,7 @@ class Lesson(NamedTuple):
 
 def _varied(pipeline, cases: Sequence[Case]) -> list[Scene]:
     """The scene in drawn cases; where no program forces it, gravity is varied in a ball about its own."""
-    scenes, generator = (
-        [pipeline.scene.at(case) for case in cases],
-        np.random.default_rng(pipeline.config.seed),
-    )
+    scenes = [pipeline.scene.at(case) for case in cases]
     if pipeline.scene.forcing.gravity:
         return scenes
     generator = np.random.default_rng(pipeline.config.seed)
@@ -119,14 +116,14 @@ def _encoded(
 ) -> tuple[list[Lesson], list[Encoded]]:
     """Full-order runs of some lessons, those that are lost left out; each is a file until all are there."""
     paths = [record.path / f"encoded_{index}.npz" for index in range(len(lessons))]
-    steps, known = pipeline.scene.steps, pipeline.split.train
+    steps, training = pipeline.scene.steps, pipeline.split.train
     with Progress("teach: full-order runs", len(lessons) * steps, "steps") as progress:
         missing = []
         for lesson, path in zip(lessons, paths, strict=True):
             stored = pipeline.simulation(lesson.case)
             if intact(path, pipeline.say):
                 progress.advance(steps)
-            elif lesson.case in known and stored.complete:
+            elif lesson.case in training and stored.complete:
                 with Trajectory.open(stored.file(TRAJECTORY)) as trajectory:
                     encoded_trajectory(trajectory, encoder, pipeline.device).save(path)
                 progress.advance(steps)
@@ -135,7 +132,9 @@ def _encoded(
         lost = _stream(pipeline, encoder, missing, progress.advance)
     if lost:
         pipeline.say(f"teach: warning: {len(lost)} of {len(lessons)} full-order runs are lost: {lost[0]}")
-    pairs = [(own, Encoded.open(path)) for own, path in zip(lessons, paths, strict=True) if path.is_file()]
+    pairs = [
+        (lesson, Encoded.open(path)) for lesson, path in zip(lessons, paths, strict=True) if path.is_file()
+    ]
     pairs = [(lesson, run) for lesson, run in pairs if run.finite]
     if len(pairs) < encoder.stress:
         raise ConfigError(
