@@ -125,10 +125,10 @@ def compare(
     last = rollout.t[rollout.diverged - 1] if diverged else np.inf
     good = trajectory.t <= last + _SAME_TIME
     xhat[~good] = xhat[good][-1]  # pictures of a diverged run hold its last state; its errors are ∞
-    own = int((~_of_continuation(rollout, trajectory.t)).sum())  # frames up to the hand-over
-    if own < frames and (continuation is None or continuation.frames != frames - own + 1):
+    until = int((~_of_continuation(rollout, trajectory.t)).sum())  # frames up to the hand-over
+    if until < frames and (continuation is None or continuation.frames != frames - until + 1):
         raise SchemaError(
-            f"the run at {rollout.case.named} was handed over at frame {own - 1} of {frames - 1}, and its "
+            f"the run at {rollout.case.named} was handed over at frame {until - 1} of {frames - 1}, and its "
             "full-order continuation does not reach the end; deploy again"
         )
 
@@ -158,7 +158,7 @@ def compare(
         block = slice(start, min(start + per_chunk, frames))
         x, tau, C, v = (tensor(trajectory.read(name, frames=block)) for name in ("x", "tau", "C", "v"))
         C = C.view(*C.shape[:2], 3, 3)
-        latent = xhat[:own], rate[:own], stress
+        latent = xhat[:until], rate[:until], stress
         x_rom, C_rom, tau_rom = _reduced_fields(decoder, *latent, continuation, block, carried)
         v_rom = torch.diff(torch.cat([previous[None], x_rom]), dim=0) / trajectory.dt
         if start == 0:
@@ -224,7 +224,7 @@ def compare(
     metrics.require_finite(errors, rollout.case.named)
     ends = [at_end(column[f"height_{of}"], shape[-1], X) for of, shape in (("rom", x_rom), ("fom", x))]
     off = {name: np.inf if diverged else ends[0][name] - ends[1][name] for name in QUANTITIES}
-    xhat[own:] = torch.nan  # full-order frames are no latent vectors
+    xhat[until:] = torch.nan  # full-order frames are no latent vectors
     return Comparison(
         **dict.fromkeys((*reduced, "distance", "distance_max"), np.inf) | errors,
         quantities=off,
@@ -301,13 +301,13 @@ def _reduced_fields(
 
     Args:
         decoder: the fields at every particle.
-        xhat, rate: [own, r] x̂ and dx̂/dt of the frames up to the hand-over; the later frames are read.
+        xhat, rate: [until, r] x̂ and dx̂/dt of the frames up to the hand-over; the later frames are read.
         stress: [F, n_s] ŝ of a run that has them.
         continuation: full-order frames, of which the first is the last of `xhat`.
-        frames: which, of the whole run; those before them were asked for already.
+        frames: which, of the whole run; those before them were read already.
         carried: gives τ and C in place of the fields.
     """
-    own, parts = len(xhat), []
+    until, parts = len(xhat), []
     latent, its_rate = (values[frames.start : frames.stop] for values in (xhat, rate))
     if len(latent):
         if carried is None:
@@ -316,8 +316,8 @@ def _reduced_fields(
         else:
             C, tau = carried.next(len(latent))
         parts.append((decoder.position(latent), C, tau[..., _UPPER[0], _UPPER[1]]))
-    if frames.stop > own:
-        since = slice(max(frames.start, own) - own + 1, frames.stop - own + 1)
+    if frames.stop > until:
+        since = slice(max(frames.start, until) - until + 1, frames.stop - until + 1)
         x, C, tau = (torch.as_tensor(continuation.read(k, frames=since)).to(xhat) for k in ("x", "C", "tau"))
         parts.append((x, C.unflatten(2, (3, 3)), tau))
     return tuple(torch.cat(fields) for fields in zip(*parts, strict=True))
@@ -325,8 +325,8 @@ def _reduced_fields(
 
 def _carries(solver: ReducedMPM, rollout: Rollout, trajectory: Trajectory) -> bool:
     """Whether the solver takes the steps of the rollout itself, and its particles carry their stress."""
-    own = not solver.span.latent_only and rollout.handed_over < 0 and rollout.diverged < 0
-    return solver.setup.sources.carried and own and solver.dt == trajectory.dt
+    whole = not solver.span.latent_only and rollout.handed_over < 0 and rollout.diverged < 0
+    return solver.setup.sources.carried and whole and solver.dt == trajectory.dt
 
 
 class _Carried:
@@ -342,14 +342,14 @@ class _Carried:
 
     def next(self, frames: int) -> tuple[torch.Tensor, torch.Tensor]:
         """C [F, P, 3, 3] [1/s] and τ [F, P, 3, 3] [Pa] of the next frames."""
-        found = []
+        steps = []
         for _ in range(frames):
             if not self._first:
                 self._solver.step()
             self._first, span = False, self._solver.span
             order = torch.as_tensor(span.order, device=span.tau.device)
-            found.append([torch.empty_like(a).index_copy_(0, order, a) for a in (span.C, span.tau)])
-        return tuple(torch.stack(values) for values in zip(*found, strict=True))
+            steps.append([torch.empty_like(a).index_copy_(0, order, a) for a in (span.C, span.tau)])
+        return tuple(torch.stack(values) for values in zip(*steps, strict=True))
 
 
 def _roles(setup: Setup, x: torch.Tensor, sample: np.ndarray) -> np.ndarray:

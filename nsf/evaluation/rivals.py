@@ -97,11 +97,11 @@ def coarse_run(
     try:
         coarse = coarse_scene(scene, parameters, factor)
         solver = coarse.full_order(precision=precision, device=device)
-        own = torch.as_tensor(coarse.particles().X)
-        carried = interpolation(torch.as_tensor(X), own)
+        particles = torch.as_tensor(coarse.particles().X)
+        carried = interpolation(torch.as_tensor(X), particles)
 
         def moved() -> np.ndarray:
-            return carried.value(torch.as_tensor(solver.state.numpy()["x"]) - own).numpy()
+            return carried.value(torch.as_tensor(solver.state.numpy()["x"]) - particles).numpy()
 
         at = np.arange(scene.steps + 1) * (coarse.steps / scene.steps)
         below = np.minimum(at.astype(int), coarse.steps - 1)
@@ -116,7 +116,7 @@ def coarse_run(
     except NSFError as error:
         advance(left)
         return str(error)
-    return CoarseRun(x=x, steps=coarse.steps, dx=coarse.dx, particles=len(own))
+    return CoarseRun(x=x, steps=coarse.steps, dx=coarse.dx, particles=len(particles))
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ def rivals(
     solver: ReducedMPM,
     trajectory: Trajectory,
     factors: Sequence[int] = (),
-    known: Sequence[Scene] = (),
+    training: Sequence[Scene] = (),
     advance: Callable[[int], object] = lambda frames: None,
 ) -> Rivals:
     """Hold the rivals of a reduced run to its full-order trajectory, at all particles and frames.
@@ -157,11 +157,11 @@ def rivals(
         solver: the reduced solver of the run, with the training runs' latent vectors in its manifold.
         trajectory: the full-order run; its frames are those of the training runs.
         factors: of Δx of coarse full-order runs.
-        known: the scene in each training case, in order; asked for where programs force the runs.
+        training: the scene in each training case, in order; read where programs force the runs.
         advance: told how many frames more there are of a coarse run, or are compared.
     """
     scene, setup = solver.scene, solver.setup
-    forcing = [forcing_of(one) for one in known] if scene.forcing else []
+    forcing = [forcing_of(one) for one in training] if scene.forcing else []
     decoder, runs = solver.decoder(), TrainingRuns.of(solver.manifold, forcing)
     parameters = setup.parameters.cpu().double().numpy()
     if forcing:

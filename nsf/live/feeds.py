@@ -147,8 +147,8 @@ class PointFeed(LatentFeed):
             case {"color": str(color), **more} if not more and color in self._coloring.quantities:
                 self.color = color
             case _:
-                return (told := super().obey(player, wish)) and (
-                    f'{told}, {{"step": n}}, {{"tilt": [°, °] or null}}, {{"color": name}}'
+                return (reply := super().obey(player, wish)) and (
+                    f'{reply}, {{"step": n}}, {{"tilt": [°, °] or null}}, {{"color": name}}'
                 )
         return None
 

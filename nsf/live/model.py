@@ -134,16 +134,16 @@ class LiveRun:
         latent = solver.trajectory()
         lost = solver.left_grid(since=first)
         last = solver.steps_taken if lost < 0 else lost - 1
-        found = slice(first, last + 1)
-        self._xhat[found] = latent.xhat[found]
+        block = slice(first, last + 1)
+        self._xhat[block] = latent.xhat[block]
         if latent.stress is not None:
             if self._shat is None:
                 self._shat = np.zeros((self.steps + 1, latent.stress.shape[1]), np.float32)
-            self._shat[found] = latent.stress[found]
+            self._shat[block] = latent.stress[block]
         residuals = latent.residuals[first - 1 : last, -1]
         ratios = self._trust.ratios(latent.xhat[first - 1 : last + 1], residuals)[1:]
         forced = self._trust.of_forcing_in(solver, first - 1)[: last - first + 1]
-        self._ratios[found] = np.maximum(ratios, forced)
+        self._ratios[block] = np.maximum(ratios, forced)
         self.seconds += time.perf_counter() - started
         self.diverged = lost >= 0
         self.reached = last  # only now, since other threads read all steps up to here
@@ -291,9 +291,9 @@ class LiveModel:
             tilt: [2] [rad] along x and y, where gravity points down.
         """
         gravity = tilted(np.array([self.pipeline.deployed.gravity]), np.array([tilt]))[0]
-        found = self.start(run.case)
-        found.goes_on(run, step, gravity.tolist())
-        return found
+        other = self.start(run.case)
+        other.goes_on(run, step, gravity.tolist())
+        return other
 
     def truth_run(self, case: Case) -> Run | None:
         """The simulate run of a known case; None of other cases."""
@@ -312,7 +312,7 @@ class LiveModel:
     def solids(self, case: Case) -> list[dict]:
         """The solids of a case, for a page."""
         scene = self.pipeline.deployed.at(case)
-        return [page.solid(name, own) for name, own in zip(scene.colliders, scene.solids, strict=True)]
+        return [page.solid(name, pose) for name, pose in zip(scene.colliders, scene.solids, strict=True)]
 
     def roles(self, step: int) -> np.ndarray:
         """[n] set of each shown particle in the step that starts at `step`: 2 S, 1 N only, 0 neither.
@@ -326,9 +326,9 @@ class LiveModel:
 
     def training_frames(self) -> tuple[np.ndarray, np.ndarray]:
         """x [F, n, 3] m and τ [F, n, 6] Pa of some training snapshots, evaluated by the fields."""
-        known = self.manifold.training_latents
-        rows = torch.linspace(0, len(known) - 1, min(len(known), _SNAPSHOTS)).long()
-        xhat = known[rows].to(self.at.device)
+        latents = self.manifold.training_latents
+        rows = torch.linspace(0, len(latents) - 1, min(len(latents), _SNAPSHOTS)).long()
+        xhat = latents[rows].to(self.at.device)
         parameters = self.manifold.training_parameters[rows].to(self.at.device)
         return self.at.position(xhat).cpu().numpy(), self.at.stress(xhat, parameters).cpu().numpy()
 
@@ -340,9 +340,9 @@ def _truths(pipeline: Pipeline) -> Mapping[Case, Run]:
     return {case: run for case, run in runs.items() if run.complete}
 
 
-def _parameters(pipeline: Pipeline, known: Sequence[Case]) -> tuple[Parameter, ...]:
+def _parameters(pipeline: Pipeline, simulated: Sequence[Case]) -> tuple[Parameter, ...]:
     """The parameters and their ranges, which end where the scene cannot be built or is not stable."""
-    found, middle = [], pipeline.scene.case(pipeline.split.box.mean(1))
+    parameters, middle = [], pipeline.scene.case(pipeline.split.box.mean(1))
     for (name, p), (low, high) in zip(
         pipeline.scene.parameters.items(), pipeline.split.box.tolist(), strict=True
     ):
@@ -355,10 +355,10 @@ def _parameters(pipeline: Pipeline, known: Sequence[Case]) -> tuple[Parameter, .
                     return value
             return end
 
-        wanted = [case[name] for case in (*known, *pipeline.held_out)]
+        wanted = [case[name] for case in (*simulated, *pipeline.held_out)]
         lower, upper = min(reach(low, -1.0), *wanted), max(reach(high, 1.0), *wanted)
-        found.append(Parameter(name, p.unit, (low, high), lower, upper))
-    return tuple(found)
+        parameters.append(Parameter(name, p.unit, (low, high), lower, upper))
+    return tuple(parameters)
 
 
 def _possible(pipeline: Pipeline, case: Mapping[str, float]) -> bool:

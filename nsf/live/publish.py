@@ -160,7 +160,7 @@ def recurrence_arrays(form: Form) -> dict[str, np.ndarray]:
 
 def _fields(model: LiveModel, arrays: dict, header: dict, sizes: Sizes, stress: int) -> dict:
     """Put the fields of x and, where τ follows from one or from ŝ, of τ into a page."""
-    found = {}
+    descriptions = {}
     kinds: dict[str, tuple[type, int | None]] = {"deformation": (np.int16, sizes.modes)}
     if model.pipeline.sources.neural_stress or stress:
         kinds["stress"] = np.int8, max(stress, 1, sizes.stress // (6 * len(model.X)))
@@ -171,10 +171,10 @@ def _fields(model: LiveModel, arrays: dict, header: dict, sizes: Sizes, stress: 
             "quantities"
         ]
     for phase, how in kinds.items():
-        told, own = modal_field(model.at.fields[phase], *how)
-        found[phase] = told | {"parameters": model.manifold.takes_parameters(phase)}
-        arrays |= {f"{phase}.{name}": a for name, a in own.items()}
-    return found
+        description, values = modal_field(model.at.fields[phase], *how)
+        descriptions[phase] = description | {"parameters": model.manifold.takes_parameters(phase)}
+        arrays |= {f"{phase}.{name}": a for name, a in values.items()}
+    return descriptions
 
 
 def _corners(model: LiveModel) -> list[Case]:
@@ -184,7 +184,10 @@ def _corners(model: LiveModel) -> list[Case]:
     names = [p.name for p in model.parameters]
     return [
         first,
-        *(model.pipeline.scene.case(dict(first) | dict(zip(names, own, strict=True))) for own in corners),
+        *(
+            model.pipeline.scene.case(dict(first) | dict(zip(names, values, strict=True)))
+            for values in corners
+        ),
     ]
 
 
@@ -223,14 +226,14 @@ def _tilt(model: LiveModel, recurrence: RecurrenceEngine) -> dict | None:
 def _trust(model: LiveModel, recurrence: RecurrenceEngine, arrays: dict) -> dict:
     """Put the distances to the training runs into a page."""
     trust, taught = model.trust, recurrence.taught
-    matrix, known = trust.latent_distance.embedded(_TUBE * trust.distance)
+    matrix, latents = trust.latent_distance.embedded(_TUBE * trust.distance)
     matrix = matrix[:, : len(arrays["deformation.scale"])]  # modes that were left out move little
-    known = known[:: -(-len(known) // _SNAPSHOTS)]
-    scale = np.maximum(np.abs(known).max(0), np.finfo(np.float32).tiny) / np.iinfo(np.int16).max
+    latents = latents[:: -(-len(latents) // _SNAPSHOTS)]
+    scale = np.maximum(np.abs(latents).max(0), np.finfo(np.float32).tiny) / np.iinfo(np.int16).max
     arrays |= {
         "tube.matrix": matrix,
         "tube.scale": scale,
-        "tube.known": np.rint(known / scale).astype(np.int16),
+        "tube.known": np.rint(latents / scale).astype(np.int16),
     }
     gravity = (
         {"middle": list(taught.gravity), "reach": taught.reach} if recurrence.form.sizes.gravity else None
@@ -240,31 +243,31 @@ def _trust(model: LiveModel, recurrence: RecurrenceEngine, arrays: dict) -> dict
 
 def _cases(model: LiveModel, names, arrays: dict, header: dict, sizes: Sizes) -> list[dict]:
     """The held-out cases: their parameters, forcing, and the full-order runs of some."""
-    pipeline, found, movable = model.pipeline, [], _movable(model)
+    pipeline, entries, movable = model.pipeline, [], _movable(model)
     for index, case in enumerate(pipeline.held_out):
         scene = pipeline.deployed.at(case)
         rollout = Rollout.open(model.run.file(rollout_file(index)), model.manifold.latent_dim)
-        own = {
+        entry = {
             "label": str(case).replace("_", " "),
             "values": [case[name] for name in names],
             "gravity": _gravity(scene),
-            "solids": [own | {"movable": movable.get(own["name"])} for own in model.solids(case)],
+            "solids": [solid | {"movable": movable.get(solid["name"])} for solid in model.solids(case)],
             "estimate": None if math.isnan(off := rollout.estimated_error) else float(np.nan_to_num(off)),
             "recording": None,
         }  # fmt: skip
         if case in model.known and len(header["recordings"]) < sizes.runs:
-            own["recording"] = f"full{index}"
-            told, planes = _recorded(model, case, header["quantities"], sizes)
-            header["recordings"][own["recording"]] = told
-            arrays |= {f"{own['recording']}.{name}": a for name, a in planes.items()}
-        found.append(own)
+            entry["recording"] = f"full{index}"
+            recording, planes = _recorded(model, case, header["quantities"], sizes)
+            header["recordings"][entry["recording"]] = recording
+            arrays |= {f"{entry['recording']}.{name}": a for name, a in planes.items()}
+        entries.append(entry)
     _check_forcing(model)
-    return found
+    return entries
 
 
 def _movable(model: LiveModel) -> dict[str, dict]:
     """Direction, reach [m] and speed [m/s] of the solids that programs move, as training runs have them."""
-    found = {}
+    movable = {}
     scenes = [model.pipeline.scene.at(case) for case in model.pipeline.split.train]
     for name in model.pipeline.scene.forcing.colliders:
         index = list(model.pipeline.scene.colliders).index(name)
@@ -274,11 +277,11 @@ def _movable(model: LiveModel) -> dict[str, dict]:
         axis *= np.sign(axis[np.abs(axis).argmax()])
         speed = max(np.abs(np.diff(s @ axis) / np.diff(t)).max() for t, s, _ in motions)
         places = shifts @ axis
-        found[name] = {
+        movable[name] = {
             "axis": axis.tolist(), "low": float(places.min()), "high": float(places.max()),
             "speed": float(speed),
         }  # fmt: skip
-    return found
+    return movable
 
 
 def _gravity(scene: Scene) -> dict:
