@@ -18,18 +18,18 @@ class Model(ABC):
     Attributes:
         name: as `model=` takes it, and as tables call it.
         learns: whether the stage `teach` makes something of it, once, that all its runs use.
-        projects: whether its runs, or the error of these, take projected steps, on which trust is calibrated.
+        projects: whether its runs take projected steps, on which trust is calibrated.
     """
 
     name: str
     learns: ClassVar[bool] = False
     projects: ClassVar[bool] = False
 
-    def refuse(self, names) -> None:  # noqa: B027 — most models run whatever is configured
+    def refuse(self, pipeline) -> None:  # noqa: B027 — most models run whatever is configured
         """Refuse a configuration that the model cannot run.
 
         Args:
-            names: the stages of the configuration, a `nsf.pipeline.Pipeline`.
+            pipeline: the chain of the configuration, a `nsf.pipeline.Pipeline`.
 
         Raises:
             ConfigError: names the key and the remedy.

@@ -16,8 +16,8 @@ class FullOrder(Model):
     projects: ClassVar[bool] = True  # under one's hands, in `nsf view`
 
     @override
-    def refuse(self, names) -> None:
-        c = names.config
+    def refuse(self, pipeline) -> None:
+        c = pipeline.config
         if c.fallback != "none":
             raise ConfigError(f"fallback={c.fallback} has no use with model=full; set fallback=none")
         if c.deploy.dt_multiplier != 1:

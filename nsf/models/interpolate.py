@@ -83,11 +83,11 @@ class Interpolate(LatentModel):
     knows_forcing = False
 
     @override
-    def refuse(self, names) -> None:
-        super().refuse(names)
-        if names.scene.forcing:
+    def refuse(self, pipeline) -> None:
+        super().refuse(pipeline)
+        if pipeline.scene.forcing:
             raise ConfigError(
-                f"model=interpolate knows no forcing, and programs force scene={names.scene.name}; set "
+                f"model=interpolate knows no forcing, and programs force scene={pipeline.scene.name}; set "
                 "model=projected, or model=recurrence"
             )
 

@@ -44,8 +44,8 @@ class LatentModel(Model):
         """x̂ [B, N + 1, r] of runs."""
 
     @override
-    def refuse(self, names) -> None:
-        c = names.config
+    def refuse(self, pipeline) -> None:
+        c = pipeline.config
         if c.deploy.dt_multiplier != 1:
             raise ConfigError(
                 f"model={self.name} gives frames of the scene's Δt, and deploy.dt_multiplier is "

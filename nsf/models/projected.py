@@ -16,8 +16,8 @@ class Projected(Model):
     projects: ClassVar[bool] = True
 
     @override
-    def refuse(self, names) -> None:
-        if names.config.fallback == "projected":
+    def refuse(self, pipeline) -> None:
+        if pipeline.config.fallback == "projected":
             raise ConfigError(
                 "fallback=projected goes on for another model, and model=projected is that already; set "
                 "fallback=full, or none"

@@ -63,9 +63,9 @@ class Recurrence(Model):
         return self.stress if self.stress is not None else STRESS[forced]
 
     @override
-    def refuse(self, names) -> None:
-        c, split, forced = names.config, names.split, bool(names.scene.forcing)
-        check_stride(self.stride_of(names.scene.steps), names.scene.steps)
+    def refuse(self, pipeline) -> None:
+        c, split, forced = pipeline.config, pipeline.split, bool(pipeline.scene.forcing)
+        check_stride(self.stride_of(pipeline.scene.steps), pipeline.scene.steps)
         if c.deploy.dt_multiplier != 1:
             raise ConfigError(
                 f"model=recurrence takes strides of the scene's Δt, and deploy.dt_multiplier is "
