@@ -45,7 +45,7 @@ class Split:
 
     @property
     def cases(self) -> tuple[Case, ...]:
-        """Those of all parts."""
+        """The cases of all parts."""
         return (*self.train, *self.validation, *self.test)
 
     @property

@@ -140,7 +140,7 @@ class Rivals:
 
     @property
     def factors(self) -> list[int]:
-        """Those at which there is a coarse run."""
+        """The factors of Δx at which there is a coarse run."""
         return [factor for factor, run in self.coarse.items() if "why" not in run]
 
 

@@ -95,7 +95,7 @@ class Observations:
 
     @classmethod
     def read(cls, path: Path | str, model: Model) -> "Observations":
-        """Those of a CSV or HDF5 file (docs/howto/inverse.md).
+        """The observations of a CSV or HDF5 file (docs/howto/inverse.md).
 
         Raises:
             ConfigError: a column is missing or unknown, or a value refused; names the row.

@@ -29,7 +29,7 @@ class TrainingRuns:
 
     @classmethod
     def of(cls, manifold, forcing: Sequence[np.ndarray] = ()) -> "TrainingRuns":
-        """Those that a manifold was trained on; all have the same frames.
+        """The runs that a manifold was trained on; all have the same frames.
 
         Args:
             manifold: trained fields.

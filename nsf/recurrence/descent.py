@@ -45,7 +45,7 @@ class Runs:
 
     @classmethod
     def in_strides(cls, stride: int, xhat, stress, first, parameters, gravity, features) -> "Runs":
-        """Those of runs at every step: x̂ [N k + 1, R, r] and so on.
+        """Runs in strides, from their values at every step: x̂ [N k + 1, R, r] and so on.
 
         Raises:
             ConfigError: the stride does not divide the steps.
@@ -319,7 +319,7 @@ class Descent:
         return (loss / window + _SINGLE * single).sum()
 
     def _captured(self, window: int) -> Callable[..., None]:
-        """The same step as a graph."""
+        """A step of the descent as a CUDA graph."""
         state = self._generator.get_state()
         held = self._drawn(window)
         self._generator.set_state(state)

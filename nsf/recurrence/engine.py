@@ -42,7 +42,7 @@ class RecurrenceEngine(Engine):
 
     @classmethod
     def load(cls, path: Path | str) -> "RecurrenceEngine":
-        """That of a file that `nsf teach` wrote.
+        """The engine of a file that `nsf teach` wrote.
 
         Raises:
             MissingRunError, SchemaError: see `nsf.recurrence.taught.load`.
@@ -75,7 +75,7 @@ class RecurrenceEngine(Engine):
 
 
 def first_change(manifold, X: np.ndarray, velocity: np.ndarray, dt: float) -> Tensor:
-    """What stands for d at t = 0 [r], in fp64 on the host: x̂ of X less that of X − v₀ Δt.
+    """The change d [r] at t = 0, in fp64 on the host: x̂ of X less x̂ of X − v₀ Δt.
 
     Args:
         manifold: trained fields.

@@ -131,7 +131,7 @@ def _frames(solver, steps: int, after: Callable[[], object]) -> Iterator[tuple[T
 
 
 def encoded_trajectory(trajectory, encoder: Encoder, device) -> Encoded:
-    """The same of a stored trajectory, a `nsf.data.Trajectory`, whose frames are its steps."""
+    """A stored trajectory in latent coordinates; a `nsf.data.Trajectory` whose frames are its steps."""
     parts = []
     for first in range(0, trajectory.frames, _FRAMES):
         rows = range(first, min(first + _FRAMES, trajectory.frames))

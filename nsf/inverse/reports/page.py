@@ -38,7 +38,7 @@ class Problem:
 
     @property
     def forcing(self) -> Forcing | None:
-        """That of the program; None for the scene's own at each run's parameters."""
+        """Forcing by the program; None for the scene's at each run's parameters."""
         return None if self.program is None else self.model.forcing(program=self.program)
 
     def full_order(self, parameters: Iterable[Mapping[str, float]]) -> list[Run]:

@@ -171,7 +171,7 @@ def _run(encoder: Encoder, how: tuple[str, str], lesson: Lesson, path: Path, aft
 
 
 def _alone(trained: Path, stress: int, how: tuple[str, str], lesson: Lesson, path: Path) -> str:
-    """The same in a process of its own."""
+    """Make one run in another process, which reads the manifold's file; why it is lost, or nothing."""
     return _run(_encoder(trained, stress), how, lesson, path)
 
 
