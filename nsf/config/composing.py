@@ -11,7 +11,7 @@ import re
 import typing
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache, lru_cache
 from pathlib import Path
 
@@ -50,6 +50,8 @@ _SWEEP = (
     "hydra.sweep.subdir=.",
 )
 
+#: Keys for which a scene has a default.
+_DEFAULTED = ("scene.size", "scene.gravity", "scene.walls")
 #: Raised by Hydra and the yaml parser on files that are no configuration, beside their own errors.
 _OF_BROKEN_FILES = (
     YAMLError,
@@ -78,6 +80,7 @@ def load(overrides: Sequence[str] = (), config_name: str = "config") -> DictConf
             or a key that was removed.
     """
     refuse_overrides(overrides)
+    _refuse_gaps(overrides)
     try:
         return checked(_compose(config_name, overrides))
     except (HydraException, OmegaConfBaseException) as error:
@@ -89,7 +92,26 @@ def load(overrides: Sequence[str] = (), config_name: str = "config") -> DictConf
         for path in files():
             text_of(path)  # tells of the one that cannot be read
         reason = explained(error, config_name, overrides)
-        raise ConfigError(f"the configuration cannot be composed: {reason}") from error
+        culprit = _culprit(config_name, overrides)
+        raise ConfigError(f"the configuration cannot be composed{culprit}: {reason}") from error
+
+
+def _refuse_gaps(overrides: Sequence[str]) -> None:
+    """Refuse to take away a key for which a scene has a default, which nobody would see, and not set it."""
+    fresh = {override.lstrip("+").partition("=")[0] for override in overrides}
+    for override in overrides:
+        key = override.removeprefix("~").partition("=")[0]
+        if override.startswith("~") and key.startswith(_DEFAULTED) and key not in fresh:
+            raise ConfigError(f"~{key} leaves a scene without what it needs; set {key} to what it should be")
+
+
+def _culprit(config_name: str, overrides: Sequence[str]) -> str:
+    """The override of a key without which the rest can be composed, as a part of a message."""
+    for override in (o for o in overrides if "." in o.partition("=")[0]):
+        with suppress(HydraException, OmegaConfBaseException, ConfigError, *_OF_BROKEN_FILES):
+            _compose(config_name, [o for o in overrides if o != override])
+            return f" with {override}"
+    return ""
 
 
 def read(path: Path) -> DictConfig:
