@@ -12,7 +12,7 @@ from nsf.config.composing import (
 from nsf.config.keys import naming_the_missing, replaced, section
 from nsf.config.sweeps import check_sweep, jobs, scene_of
 from nsf.config.targets import build, build_all
-from nsf.vectors import length, number, text
+from nsf.scalars import length, number, text
 
 __all__ = [
     "build",

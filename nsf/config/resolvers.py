@@ -12,7 +12,7 @@ from omegaconf import MISSING, DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from nsf.errors import ConfigError
-from nsf.vectors import direction, number, rotation, vector
+from nsf.scalars import number
 
 #: Resolvers that any key may call.
 ALLOWED = ("scaled", "per", "turned", "oc.select")
@@ -49,6 +49,8 @@ def per(count) -> float:
 
 def turned(values, axis, angle) -> list[float]:
     """`${turned:[1,0,0],[0,1,0],30}`: the vector turned by 30° about the axis, right-handed."""
+    from nsf.vectors import direction, rotation, vector  # NumPy takes 0.1 s to load
+
     matrix = rotation(direction("axis of ${turned:…}", axis), number("angle of ${turned:…}", angle))
     return (matrix @ vector("vector of ${turned:…}", values)).tolist()
 

@@ -14,9 +14,9 @@ from nsf.config.resolvers import following
 from nsf.config.targets import build, build_all, filled
 from nsf.data import PROGRAM
 from nsf.errors import ConfigError
+from nsf.scalars import text
 from nsf.scenes import Design, Parameter, Programs, Scene
 from nsf.scenes.identity import plain_scene, plain_value
-from nsf.vectors import text
 
 #: Keys of a configuration's scene that say nothing of its physics.
 NOT_PHYSICS = ("name", "title", "parameters", "design", "paper")

@@ -20,7 +20,7 @@ from omegaconf import DictConfig
 from nsf.config.resolvers import resolved
 from nsf.errors import ConfigError, NSFError, first_line, unknown
 from nsf.installed import entry_point_of
-from nsf.vectors import is_finite
+from nsf.scalars import is_finite
 
 
 class Kind(NamedTuple):

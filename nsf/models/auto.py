@@ -8,7 +8,7 @@ from typing_extensions import override
 
 from nsf.errors import ConfigError
 from nsf.models.base import Model
-from nsf.vectors import number
+from nsf.scalars import number
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from typing_extensions import override
 from nsf.errors import ConfigError
 from nsf.models.base import Model
 from nsf.recurrence.fitting import Fitting, check_stride
-from nsf.vectors import number
+from nsf.scalars import number
 
 #: Drawn full-order runs that teach it, and coordinates of stress, where programs force a scene or do not.
 RUNS, STRESS = {True: 256, False: 32}, {True: 32, False: 0}

@@ -19,11 +19,6 @@ from nsf.scenes import Scene
 if TYPE_CHECKING:
     from nsf.dynamics import Sources
 
-#: Keys that hold others, none of which is left out.
-_SECTIONS = (
-    *("material", "transfer", "field", "trainer", "model", "sampler", "projector", "integration"),
-    *("data", "deploy", "evaluation", "super_resolution", "report"),
-)
 #: Precision of stored frames by the name of their type.
 _STORED = {"float32": FP32, "float64": FP64}
 
@@ -58,8 +53,6 @@ class Configured:
             self._begin(config)
 
     def _begin(self, config: DictConfig) -> None:
-        for key in _SECTIONS:
-            configuration.section(config, key)
         check_numbers(config)
         self.template = configuration.checked(with_candidates(config))
         c = self.config = configuration.resolve(self.template)

@@ -16,7 +16,7 @@ from nsf.paths import experiments, groups, option, reports_folder
 from nsf.pipeline.chain import Pipeline
 from nsf.results.question import Question, unchanged
 from nsf.runs import Run
-from nsf.vectors import is_finite
+from nsf.scalars import is_finite
 
 _KEYS = {"title", "question", "paper", "jobs"}
 _OPTIONAL = {"stages", "each", "printed", "plots"}

@@ -10,6 +10,11 @@ from nsf.errors import ConfigError
 from nsf.kinematics.training.tracking import check_tracking
 from nsf.models.base import FALLBACKS
 
+#: Keys that hold others, none of which is left out.
+_SECTIONS = (
+    *("material", "transfer", "field", "trainer", "model", "sampler", "projector", "integration"),
+    *("data", "deploy", "evaluation", "super_resolution", "report"),
+)
 #: Types of stored frames.
 STORED = ("float32", "float64")
 PRECISIONS = ("fp32", "fp64")
@@ -18,7 +23,18 @@ _LEAST_STEP = 1e-3
 
 
 def check_numbers(c: DictConfig) -> None:
-    """Raises ConfigError where a number is none, too small or not whole."""
+    """Refuse a configuration whose numbers are none, too small or not whole; takes no time and loads no Warp.
+
+    Raises:
+        ConfigError: names the key; also where a section is missing.
+    """
+    for key in _SECTIONS:
+        configuration.section(c, key)
+    with configuration.naming_the_missing():
+        _check_numbers(c)
+
+
+def _check_numbers(c: DictConfig) -> None:
     for key, least in (("latent_dim", 1), ("seed", 0)):
         configuration.number(key, c[key], least=least, whole=True)
     for key, least in (("trials", 0), ("picture_particles", 1), ("picture_frames", 1)):

@@ -7,7 +7,7 @@ import torch
 from typing_extensions import override
 
 from nsf.sampling.cubature import CubatureSampler, Equations, nonnegative_fit
-from nsf.vectors import number
+from nsf.scalars import number
 
 
 @dataclass(frozen=True)

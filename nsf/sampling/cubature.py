@@ -11,7 +11,7 @@ from typing_extensions import override
 
 from nsf.errors import ConfigError, ProjectionError
 from nsf.sampling.sampler import EquationSolver, Sampler, SampleSpan
-from nsf.vectors import number
+from nsf.scalars import number
 
 _EXACT = 1e-9  # residual over target at which a cubature counts as exact
 _STILL = 1e-6  # root mean square motion in a step over Δx, below which a body counts as at rest

@@ -6,7 +6,7 @@ import torch
 from typing_extensions import override
 
 from nsf.sampling.sampler import UnweightedSampler
-from nsf.vectors import number
+from nsf.scalars import number
 
 _CHUNK = 2**25  # values decoded at once
 _SNAPSHOTS = 256  # latents that displacement modes are taken from

@@ -10,7 +10,7 @@ import torch
 from typing_extensions import override
 
 from nsf.errors import ConfigError, ProjectionError
-from nsf.vectors import number
+from nsf.scalars import number
 
 
 class EquationSolver(Protocol):

@@ -8,9 +8,10 @@ from dataclasses import KW_ONLY, dataclass, replace
 import numpy as np
 
 from nsf.errors import ConfigError
+from nsf.scalars import is_finite
 from nsf.scenes.shapes.geometry import Shape
 from nsf.scenes.weakness import Weakness
-from nsf.vectors import is_finite, vector
+from nsf.vectors import vector
 
 # Particles are numbered with 32 bits.
 _MOST = 2**31 - 1

@@ -9,8 +9,9 @@ import numpy as np
 from nsf.data.case import PROGRAM, Case
 from nsf.data.split import Split
 from nsf.errors import ConfigError
+from nsf.scalars import is_finite, number
 from nsf.scenes.parameters import Parameter
-from nsf.vectors import is_finite, is_list, number
+from nsf.vectors import is_list
 
 #: Programs are numbered apart: those of another part, and of another seed, have other numbers.
 _PARTS, _SEEDS = 1000, 10_000

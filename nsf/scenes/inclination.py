@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nsf.vectors import direction, number, rotation
+from nsf.scalars import number
+from nsf.vectors import direction, rotation
 
 
 @dataclass(frozen=True)

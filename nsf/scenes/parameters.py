@@ -7,8 +7,9 @@ from functools import cached_property
 from typing import Any
 
 from nsf.errors import ConfigError
+from nsf.scalars import is_finite
 from nsf.scenes.paths import parts_of, value_at
-from nsf.vectors import is_finite, numbers
+from nsf.vectors import numbers
 
 _NAME = re.compile(r"[A-Za-z]\w{0,39}", re.ASCII)
 #: What a parameter may change.

@@ -13,7 +13,8 @@ import numpy as np
 
 from nsf.errors import ConfigError
 from nsf.mpm import Gravity, Motion
-from nsf.vectors import direction, number, numbers
+from nsf.scalars import number
+from nsf.vectors import direction, numbers
 
 #: Keyframes between two knots of a program.
 _KEYFRAMES = 8

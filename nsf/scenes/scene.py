@@ -12,6 +12,7 @@ from nsf.data import PROGRAM, Case, Split
 from nsf.errors import ConfigError
 from nsf.mpm import Collider, DomainWalls, FullOrderMPM, Gravity, GridGeometry, ParticleConstants, Transfer
 from nsf.mpm.materials import Material
+from nsf.scalars import length, number, text
 from nsf.scenes.body import Body
 from nsf.scenes.checks import check_memory, check_particles, check_physics
 from nsf.scenes.designs import Design, case_of
@@ -19,7 +20,7 @@ from nsf.scenes.inclination import Inclination
 from nsf.scenes.parameters import Parameter, check_parameters
 from nsf.scenes.paths import parts_of, value_at, with_value
 from nsf.scenes.programs import Programs
-from nsf.vectors import length, number, text, vector
+from nsf.vectors import vector
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from nsf.errors import ConfigError
+from nsf.scalars import number
 from nsf.scenes.shapes.geometry import Shape
-from nsf.vectors import number
 
 
 @dataclass(frozen=True)

@@ -39,8 +39,8 @@ from nsf.kinematics.fields.networks import Committee, FullyConnected, zero_at_re
 from nsf.kinematics.interpolation import Interpolation, interpolation
 from nsf.kinematics.manifold import Manifold
 from nsf.kinematics.training.phases import MOST_DEEP, MOST_MEMBERS, PHASES, TARGETS, Fit, per_phase
+from nsf.scalars import number
 from nsf.schemas import Number
-from nsf.vectors import number
 
 AFFINE = ("latent", "rate")
 ENCODED_ENTRIES = 1 << 26  # values encoded at once

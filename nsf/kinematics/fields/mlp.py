@@ -24,8 +24,9 @@ from nsf.kinematics.fields.encoder import Encoder
 from nsf.kinematics.fields.networks import ARITHMETIC, FullyConnected, TensorCores
 from nsf.kinematics.manifold import Manifold, identity
 from nsf.kinematics.training.phases import PHASES, TARGETS, Fit, per_phase
+from nsf.scalars import number
 from nsf.schemas import Number
-from nsf.vectors import number, spaced
+from nsf.vectors import spaced
 
 HIDDEN_LAYERS = 5
 MOST_OCTAVES = 7  # the last one's waves are as short as the gaps of 64 particles across a body

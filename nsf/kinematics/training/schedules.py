@@ -15,7 +15,7 @@ from typing_extensions import override
 
 from nsf.errors import ConfigError
 from nsf.kinematics.training.phases import MOST_STEPS, PHASES, Fit, per_phase, seeded
-from nsf.vectors import number
+from nsf.scalars import number
 
 # A field fitted to whole snapshots sees all of them in a step, up to so many; of more, so many drawn anew.
 MOST_AT_ONCE, DRAWN = 6000, 2048

@@ -18,8 +18,8 @@ from nsf.kinematics.manifold import Manifold
 from nsf.kinematics.training.phases import CHECKPOINT, Fit, seeded
 from nsf.kinematics.training.schedules import Trainer
 from nsf.kinematics.training.tracking import check_tracking
+from nsf.scalars import number
 from nsf.storage import refusals
-from nsf.vectors import number
 
 WEIGHTS_STREAM = 1 << 30  # apart from the phases' streams
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from nsf.errors import ConfigError
-from nsf.vectors import length, vector
+from nsf.scalars import length
+from nsf.vectors import vector
 
 
 @dataclass(frozen=True)

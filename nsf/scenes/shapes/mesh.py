@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from nsf.errors import ConfigError
+from nsf.scalars import length
 from nsf.scenes.shapes.formats import MeshFileError, read_polygons
 from nsf.scenes.shapes.geometry import AXES, Ball, Box, Shape
 from nsf.scenes.shapes.polygons import MAX_CORNERS, CrossingError, triangulated
 from nsf.scenes.shapes.winding import WindingNumber
-from nsf.vectors import length, vector
+from nsf.vectors import vector
 
 EXTENSIONS = (".obj", ".ply", ".stl")
 # A triangle takes some 50 bytes of a file and 500 of memory while a mesh is read.

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from nsf.errors import ConfigError
+from nsf.scalars import length
 from nsf.scenes.shapes.geometry import Shape
-from nsf.vectors import length, vector
+from nsf.vectors import vector
 
 # Radii along a path: its check for coming back looks at four points a radius, each with each.
 _LONGEST = 5000

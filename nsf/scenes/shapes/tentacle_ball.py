@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from nsf.errors import ConfigError
+from nsf.scalars import length, number
 from nsf.scenes.shapes.geometry import Ball, Shape
-from nsf.vectors import length, number, vector
+from nsf.vectors import vector
 
 # Each is held to each other, and each point to each.
 _MOST = 2000
