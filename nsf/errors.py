@@ -69,8 +69,17 @@ def first_line(error: BaseException) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0]
 
 
-def unknown(key: str, keys: Iterable[str], remedy: str = "see `nsf --help` for the groups") -> str:
-    """A message that names a dotted key that there is not, and the nearest one, or the keys beside it."""
+def unknown(
+    key: str, keys: Iterable[str], remedy: str = "see `nsf --help` for the groups", taker: str = ""
+) -> str:
+    """A message that names a dotted key that there is not, and the nearest one, or those next to it.
+
+    Args:
+        key: that nothing reads; keys: those that are read.
+        remedy: where no key is near.
+        taker: the class that does not take the key.
+    """
+    head = f"unknown key {key!r}{f' of {taker}' if taker else ''}"
     parent, _, last = key.rpartition(".")
     keys = [other for other in keys if not key.startswith(f"{other}.")]
     beside = {other.rpartition(".")[2]: other for other in keys if other.rpartition(".")[0] == parent}
@@ -78,9 +87,9 @@ def unknown(key: str, keys: Iterable[str], remedy: str = "see `nsf --help` for t
     same_end = [other for other in keys if other.rpartition(".")[2] == last]
     near = near or difflib.get_close_matches(key, same_end, n=1, cutoff=0.0)
     if not near and parent and beside:
-        return f"unknown key {key!r}; {parent} has {', '.join(beside)}"
+        return f"{head}; {parent} has {', '.join(beside)}"
     near = near or difflib.get_close_matches(key, keys, n=1)
-    return f"unknown key {key!r}; {f'did you mean {near[0]}?' if near else remedy}"
+    return f"{head}; {f'did you mean {near[0]}?' if near else remedy}"
 
 
 # How libraries say that memory ran out, or that a limit on it, as `ulimit -v`, was met.

@@ -27,7 +27,7 @@ def write_project(folder: Path) -> str:
     folder = Path(os.path.abspath(folder.expanduser()))
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise ConfigError(f"{folder} is there already; name a folder that is new or empty")
-    name = re.sub(r"\W", "_", folder.name.lower(), flags=re.ASCII)
+    name = re.sub(r"\W", "_", folder.name.lower(), flags=re.ASCII).rstrip("_")
     if not re.match("[a-z]", name) or keyword.iskeyword(name):
         raise ConfigError(f"{folder.name!r} cannot name a package; begin the folder's name with a letter")
     if importlib.util.find_spec(name) is not None:

@@ -281,7 +281,8 @@ def _unknown(key: str, config_name: str, overrides: Sequence[str]) -> str:
         return unknown(key, [".".join(path) for path, _ in leaves(tree)])
     added = [f"+{o}" if o.startswith(f"{key}=") else o for o in overrides]
     try:
-        if OmegaConf.select(_compose(config_name, others), key) is not None:
+        mapping = any(o.startswith(f"{key}={{") for o in overrides)
+        if mapping and OmegaConf.select(_compose(config_name, others), key) is not None:
             return f"{key!r} takes no keys beyond its own; set them one by one, or write a scene's yaml"
         checked(_compose(config_name, added))
     except ConfigError as error:
@@ -300,8 +301,15 @@ def explained(error: Exception, config_name: str, overrides: Sequence[str]) -> s
         if key == "experiment":
             return "an experiment is named with a plus: +experiment=NAME"
         return _unknown(key, config_name, overrides)
+    if missing := re.search(r"Could not delete from config. '([^']+)' does not exist", text):
+        others = [o for o in overrides if o.lstrip("~").partition("=")[0] != missing[1]]
+        tree = OmegaConf.to_container(_compose(config_name, others))
+        keys = {".".join(path[: n + 1]): None for path, _ in leaves(tree) for n in range(len(path))}
+        return unknown(missing[1], keys)
     if isinstance(error, OverrideParseException):
         return _unparsed(str(error.override), first)
+    if first.startswith("Could not append to config"):
+        return f"{first.rstrip('.')}; leave out the plus, or quote braces for the shell"
     if first.startswith("Ambiguous value"):
         return f"{first}; several values of a key need -m"
     if "hydra.searchpath" in text:

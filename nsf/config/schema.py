@@ -38,7 +38,16 @@ def refuse_unread(raw: Mapping[str, Any], plain: Mapping[str, Any]) -> None:
     readable: list[Keys] = []
     if unread := list(_unread(plain, stock, (), referred, readable)):
         names = [".".join(keys) for keys in readable]
-        raise ConfigError(" ".join(unknown(".".join(keys), names) for keys in unread))
+        messages = [unknown(".".join(keys), names, taker=_taker(plain, keys)) for keys in unread]
+        raise ConfigError("; ".join(messages).replace("?; ", "? "))
+
+
+def _taker(plain: Mapping[str, Any], keys: Keys) -> str:
+    """The user's class that is built from the node of a key; empty where there is none."""
+    for name in keys[:-1]:
+        plain = plain[name]
+    target = str(plain.get("_target_", ""))
+    return "" if target.startswith("nsf.") else target
 
 
 def _unread(

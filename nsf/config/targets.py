@@ -6,6 +6,7 @@ refused before it is imported.
 """
 
 import dataclasses
+import difflib
 import importlib
 import inspect
 import re
@@ -230,13 +231,16 @@ def _imported(target: str, where: str) -> Any:
     module, _, name = target.rpartition(".")
     point = None if target.startswith("nsf.") else entry_point_of(target)
     try:
-        return getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError) as error:
-        if point is None or isinstance(error, AttributeError):
+        imported = importlib.import_module(module)
+    except Exception as error:
+        if point is None and isinstance(error, ImportError):
             raise ConfigError(f"{where}: _target_: {target} does not exist ({error})") from error
         raise _broken(target, where, point, error) from error
-    except Exception as error:
-        raise _broken(target, where, point, error) from error
+    if not hasattr(imported, name):
+        near = difflib.get_close_matches(name, dir(imported), n=1)
+        remedy = f"did you mean {module}.{near[0]}?" if near else f"name a class of {module}"
+        raise ConfigError(f"{where}: _target_: {target} does not exist; {remedy}")
+    return getattr(imported, name)
 
 
 def _broken(target: str, where: str, point: EntryPoint, error: Exception) -> ConfigError:

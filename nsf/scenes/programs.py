@@ -256,13 +256,17 @@ class Programs:
         found = Gravity.constant(gravity)
         for name, own in self.gravity.items():
             found = own.of(found, duration, _generator(program, f"gravity.{name}"))
+            _check_made("gravity", name, own, found, Gravity)
         return found
 
     def motion_of(self, collider: str, duration: float, program: int) -> Motion | None:
         """The motion that a collider has in one run; None where no program moves it."""
         if collider not in self.colliders:
             return None
-        return self.colliders[collider].motion(duration, _generator(program, f"colliders.{collider}"))
+        own = self.colliders[collider]
+        motion = own.motion(duration, _generator(program, f"colliders.{collider}"))
+        _check_made("colliders", collider, own, motion, Motion)
+        return motion
 
     def reach(self, gravity: Sequence[float]) -> float:
         """How far from the scene's gravity [3] any run's may be [m/s²]."""
@@ -296,6 +300,14 @@ def tilted(gravity: np.ndarray, tilt: np.ndarray) -> np.ndarray:
     angle = np.linalg.norm(tilt, axis=1, keepdims=True)
     aside = tilt @ across(gravity[0])
     return size * (np.cos(angle) * _unit(gravity) + np.sinc(angle / np.pi) * aside)
+
+
+def _check_made(group: str, name: str, program: object, made: object, kind: type) -> None:
+    if not isinstance(made, kind):
+        raise ConfigError(
+            f"scene.forcing.{group}.{name}: {type(program).__name__} gives a {type(made).__name__}; "
+            f"return a nsf.mpm.{kind.__name__}"
+        )
 
 
 def _check_angle(name: str, angle: float) -> None:

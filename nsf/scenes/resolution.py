@@ -41,7 +41,8 @@ def resolution_warnings(scene: Scene) -> list[str]:
         if body.particles < _LENIENT * LEAST_PARTICLES * cells:
             found.append(
                 f"{key}: {body.particles} particles are {body.particles / cells:.2g} a cell, and gaps open "
-                f"between them; set {key}.particles={np.ceil(LEAST_PARTICLES * cells):.0f} or more"
+                f"between them; set {key}.particles={np.ceil(LEAST_PARTICLES * cells):.0f} or more, "
+                f"or particles_per_cell={LEAST_PARTICLES:g}"
             )
         held = (depth_in_walls(scene, body.points()) > 0.0).mean()
         if held:

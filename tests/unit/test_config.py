@@ -143,6 +143,24 @@ def test_values_of_the_wrong_type_or_size_name_key_and_value(override, quoted):
         config.build(config.load([override])[group], group)
 
 
+@pytest.mark.parametrize(
+    ("override", "remedy"),
+    [
+        ("~scene.gravty", "did you mean scene.gravity?"),
+        ("+scene.dt=4", "leave out the plus"),
+    ],
+)
+def test_a_key_that_cannot_be_left_out_or_added(override, remedy):
+    with pytest.raises(ConfigError, match=re.escape(remedy)):
+        config.load(["scene=sand", override])
+
+
+def test_a_misspelt_class_is_told_the_nearest():
+    target = "nsf.mpm.materials.DruckrPrager"
+    with pytest.raises(ConfigError, match=re.escape("did you mean nsf.mpm.materials.DruckerPrager?")):
+        config.build({"_target_": target}, "material")
+
+
 def test_a_node_cannot_be_replaced_by_other_keys():
     with pytest.raises(ConfigError, match=r"scene.bodies.column.shape' takes no keys beyond its own"):
         config.load(["scene.bodies.column.shape={_target_:nsf.scenes.Ball,centre:[0.5,0.5,0.5]}"])

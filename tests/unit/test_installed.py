@@ -82,7 +82,9 @@ def test_all_else_is_refused_in_one_line(target, told):
 
 @pytest.mark.usefixtures("folder")
 def test_a_misspelt_value_of_it_is_refused_before_an_import():
-    with pytest.raises(ConfigError, match=r"unknown key 'material.factr'; did you mean material.factor"):
+    with pytest.raises(
+        ConfigError, match=r"unknown key 'material.factr' of mine.laws.Stiff; did you mean material.factor"
+    ):
         config.load(["material._target_=mine.laws.Stiff", "+material.factr=3"], "point")
     assert "mine.laws" not in sys.modules
 

@@ -7,7 +7,7 @@ import nsf
 import nsf.scenes
 from nsf.errors import ConfigError
 from nsf.mpm import Gravity
-from nsf.scenes import Keyframes, RandomPress, RandomPush, RandomShake, RandomTilt
+from nsf.scenes import Keyframes, Programs, RandomPress, RandomPush, RandomShake, RandomTilt
 
 DOWN = (0.0, 0.0, -9.81)
 T = np.linspace(0.0, 1.2, 400)
@@ -70,9 +70,17 @@ def test_a_solid_is_no_faster_and_goes_no_further_than_declared(program, seed):
         assert along.max() <= 0.05 + 1e-12
 
 
+class Numbers(RandomTilt):
+    """Gives the values of gravity instead of its keyframes."""
+
+    def of(self, gravity, duration, generator):
+        return gravity.at([0.0])
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
+        (lambda: Programs({"own": Numbers(35.0)}).gravity_of(DOWN, 1.0, 0), "return a nsf.mpm.Gravity"),
         (lambda: RandomTilt(0.0), "angle=0° must lie between 0° and 180°"),
         (lambda: RandomTilt(35.0, knots=0), "knots=0 must be a whole number"),
         (lambda: RandomShake(float("nan")), "acceleration=nan must be a finite number"),
