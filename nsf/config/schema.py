@@ -45,7 +45,7 @@ def refuse_unread(raw: Mapping[str, Any], plain: Mapping[str, Any]) -> None:
 def _taker(plain: Mapping[str, Any], keys: Keys) -> str:
     """The user's class that is built from the node of a key; empty where there is none."""
     for name in keys[:-1]:
-        plain = plain[name]
+        plain = next(child for key, child in plain.items() if str(key) == name)
     target = str(plain.get("_target_", ""))
     return "" if target.startswith("nsf.") else target
 

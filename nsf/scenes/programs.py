@@ -253,19 +253,19 @@ class Programs:
             duration: of the run [s].
             program: its number.
         """
-        found = Gravity.constant(gravity)
-        for name, own in self.gravity.items():
-            found = own.of(found, duration, _generator(program, f"gravity.{name}"))
-            _check_made("gravity", name, own, found, Gravity)
-        return found
+        acting = Gravity.constant(gravity)
+        for name, change in self.gravity.items():
+            acting = change.of(acting, duration, _generator(program, f"gravity.{name}"))
+            _check_made("gravity", name, change, acting, Gravity)
+        return acting
 
     def motion_of(self, collider: str, duration: float, program: int) -> Motion | None:
         """The motion that a collider has in one run; None where no program moves it."""
         if collider not in self.colliders:
             return None
-        own = self.colliders[collider]
-        motion = own.motion(duration, _generator(program, f"colliders.{collider}"))
-        _check_made("colliders", collider, own, motion, Motion)
+        drive = self.colliders[collider]
+        motion = drive.motion(duration, _generator(program, f"colliders.{collider}"))
+        _check_made("colliders", collider, drive, motion, Motion)
         return motion
 
     def reach(self, gravity: Sequence[float]) -> float:
