@@ -90,7 +90,7 @@ class PointFeed(LatentFeed):
             "tilt": None if model.tilt is None else {"trained": self._most / BEYOND, "most": self._most},
             "known": [
                 {"label": str(case).replace("_", " "), "values": list(case.parameters.values())}
-                for case in model.known
+                for case in model.simulated
             ],
         }
         self.field = page.packed(header, {"rest": model.X})
@@ -125,8 +125,8 @@ class PointFeed(LatentFeed):
 
     def state(self, moment: Moment, player: Player) -> dict:
         """As of `nsf serve`, with the colour, whether gravity is tilted, and which known case is shown."""
-        run, known = moment.run, self._model.known
-        index = known.index(run.case) if run.case in known and not run.by_hand else None
+        run, simulated = moment.run, self._model.simulated
+        index = simulated.index(run.case) if run.case in simulated and not run.by_hand else None
         more = {"color": self.color, "tilted": run.by_hand, "known": index}
         return super().state(moment, player) | more
 

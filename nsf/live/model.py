@@ -208,7 +208,7 @@ class LiveModel:
 
     Attributes:
         run, manifold, pipeline.
-        parameters: what can be asked for; known: cases with a full-order trajectory, ascending.
+        parameters: what can be set; simulated: cases with a full-order trajectory, ascending.
         title: of the scene.
         particles: P.
         sample: indices of the sample particles.
@@ -228,8 +228,8 @@ class LiveModel:
         self.title = self.pipeline.config.scene.title
         self.manifold = self.pipeline.manifold()
         self._truths = _truths(self.pipeline)
-        self.known = tuple(sorted(self._truths))
-        self.parameters = _parameters(self.pipeline, self.known)
+        self.simulated = tuple(sorted(self._truths))
+        self.parameters = _parameters(self.pipeline, self.simulated)
         # Live runs share the samples and sets, which are found in the deployment's own precision.
         solver = self.pipeline.solver_at(self.manifold, self.initial)
         sample = np.unique(np.concatenate([sets.sample for sets in solver.sets]))
@@ -263,7 +263,7 @@ class LiveModel:
         def off(case: Case) -> float:
             return max(abs(np.subtract(list(case.parameters.values()), numbers)) / steps)
 
-        nearest = min(self.known, key=off, default=None)
+        nearest = min(self.simulated, key=off, default=None)
         if nearest is not None and off(nearest) <= 0.5:
             return nearest
         return self.pipeline.scene.case(numbers)

@@ -255,7 +255,7 @@ def _cases(model: LiveModel, names, arrays: dict, header: dict, sizes: Sizes) ->
             "estimate": None if math.isnan(off := rollout.estimated_error) else float(np.nan_to_num(off)),
             "recording": None,
         }  # fmt: skip
-        if case in model.known and len(header["recordings"]) < sizes.runs:
+        if case in model.simulated and len(header["recordings"]) < sizes.runs:
             entry["recording"] = f"full{index}"
             recording, planes = _recorded(model, case, header["quantities"], sizes)
             header["recordings"][entry["recording"]] = recording

@@ -36,12 +36,12 @@ def outcome_table(sweeps: Sequence[Sequence[str]], failed: Mapping[str, str]) ->
         table.add_column(escape(COLUMNS[name].heading), justify="right")
     table.add_column("run", no_wrap=True)
     for job in jobs:
-        told = " ".join(f"{key}={job[key]}" for key in keys if key in varied and key in job)
+        setting = " ".join(f"{key}={job[key]}" for key in keys if key in varied and key in job)
         try:
             run = Pipeline(configuration.load([f"{key}={value}" for key, value in job.items()])).evaluated()
             cells = [*_means(run), run.hash]
         except MissingRunError:
-            cells = [""] * len(_SHOWN) + ["failed" if told in failed else "not evaluated"]
+            cells = [""] * len(_SHOWN) + ["failed" if setting in failed else "not evaluated"]
         table.add_row(*(escape(job.get(key, "")) for key in varied), *map(escape, cells))
     return table
 

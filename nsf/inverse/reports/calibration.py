@@ -87,7 +87,7 @@ def calibration(
         facts=[("Distrust of the fitted run", number(best.distrust)), ("Seconds", number(best.seconds))],
         definitions=_TERMS,
         warnings=warnings_of(best, view.observations),
-        asked={
+        settings={
             "ranges": dict(zip(space.free, space.ranges.tolist(), strict=True)),
             "fixed": dict(space.fixed),
         },

@@ -79,8 +79,8 @@ def calibrate(words: Sequence[str], say: Callable[[str], object] = print) -> Pat
     Raises:
         NSFError: a word is refused, a run is missing, or the observations do not tell.
     """
-    asked = Words.of("calibrate", words)
-    values, named = asked.values, asked.named
+    call = Words.of("calibrate", words)
+    values, named = call.values, call.named
     if ("trials" in values) == ("observations" in values):
         raise ConfigError(
             "nsf calibrate takes observations=FILE, or trials=N to calibrate N full-order runs at known "
@@ -92,15 +92,15 @@ def calibrate(words: Sequence[str], say: Callable[[str], object] = print) -> Pat
         from nsf.inverse.reports.trials import Trials, trying
 
         trials = Trials(values["trials"], seed=values.get("seed", 0))
-        of = values.get("+experiment", "_".join(model.scene.name for model in asked.models))
-        folder = asked.folder(f"calibration_{of.replace('/', '_')}_{trials.count}_seed{trials.seed}")
-        return _written(trying(asked.models, trials, say), folder, "calibrate", say)
+        of = values.get("+experiment", "_".join(model.scene.name for model in call.models))
+        folder = call.folder(f"calibration_{of.replace('/', '_')}_{trials.count}_seed{trials.seed}")
+        return _written(trying(call.models, trials, say), folder, "calibrate", say)
     from nsf.inverse.reports.calibration import calibration
     from nsf.inverse.reports.page import Problem
 
-    problem, folder = Problem(asked.model, asked.program), asked.folder(f"calibrate_{asked.scene}")
-    view = View(Observations.read(values["observations"], asked.model), asked.model)
-    space = Space.of(asked.model, ranges_of(named))
+    problem, folder = Problem(call.model, call.program), call.folder(f"calibrate_{call.scene}")
+    view = View(Observations.read(values["observations"], call.model), call.model)
+    space = Space.of(call.model, ranges_of(named))
     options = {key: values[key] for key in ("full_order", "starts") if key in values}
     return _written(calibration(problem, view, space, **options, say=say), folder, "calibrate", say)
 
@@ -115,22 +115,22 @@ def sample(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
     Raises:
         NSFError: a word is refused, or a run or an extra is missing.
     """
-    asked = Words.of("sample", words)
+    call = Words.of("sample", words)
     from nsf.extras import optional
     from nsf.inverse.reports.page import Problem
     from nsf.inverse.reports.sample import sampling
     from nsf.inverse.sampling import Prior, Scalars
 
-    values, model = asked.values, asked.model
+    values, model = call.values, call.model
     if values.get("full_order") and not values.get("sensitivities"):
         raise ConfigError("full_order= are runs beside sensitivities; give sensitivities= too")
     for needed in ("SALib",) * bool(values.get("sensitivities")) + ("emcee",) * ("observations" in values):
         optional(needed, "inverse")  # before any work
-    problem, folder = Problem(model, asked.program), asked.folder(f"sample_{asked.scene}")
+    problem, folder = Problem(model, call.program), call.folder(f"sample_{call.scene}")
     observed = "observations" in values
     results = sampling(
         problem,
-        Prior.of(model, asked.named),
+        Prior.of(model, call.named),
         Scalars(values.get("of", "height").split(","), model),
         count=values.get("runs", 10_000),
         indices=values.get("sensitivities", 0),
@@ -153,11 +153,11 @@ def design(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
         NSFError: a word is refused, or a run is missing.
     """
     scalars = [key for word in words if is_scalar(key := word.split("=")[0])]
-    asked = Words.of("design", words, dict.fromkeys(scalars, _number))
+    call = Words.of("design", words, dict.fromkeys(scalars, _number))
     from nsf.inverse.design import Moves, Tilt
     from nsf.inverse.reports.design import designing
 
-    model, values = asked.model, asked.values
+    model, values = call.model, call.values
     if ("target" in values) == bool(scalars):
         raise ConfigError(
             f"nsf design takes target=FILE, or scalars at the end, as {next(iter(QUANTITIES))}=0.1"
@@ -170,13 +170,13 @@ def design(words: Sequence[str], say: Callable[[str], object] = print) -> Path:
         seen = Observations.read(values["target"], model)
     else:
         seen = Observations.of_scalars({key: values[key] for key in scalars}, float(model.t[-1]))
-    ranges = ranges_of(asked.named)
+    ranges = ranges_of(call.named)
     if wide := [name for name, value in ranges.items() if isinstance(value, list)]:
-        raise ConfigError(f"{wide[0]}={asked.named[wide[0]]} must be one value: the run's own")
+        raise ConfigError(f"{wide[0]}={call.named[wide[0]]} must be one value: the run's own")
     for name, value in ranges.items():
         check_taught(model, name, value, value)
     parameters = dict(zip(model.names, model.ranges.mean(1).tolist(), strict=True)) | ranges
-    folder = asked.folder(f"design_{asked.scene}_{'tilt' if 'tilt' in values else '_'.join(moves)}")
+    folder = call.folder(f"design_{call.scene}_{'tilt' if 'tilt' in values else '_'.join(moves)}")
     run_full_order, seed = values.get("full_order", True), values.get("seed", 0)
     results = designing(program, View(seen, model), parameters, run_full_order, seed, say)
     return _written(results, folder, "design", say)

@@ -66,7 +66,7 @@ def designing(
         facts=[("Search", designed.stopped), ("Distrust", number(designed.distrust))],
         definitions=_TERMS,
         warnings=_warnings(program, designed, rms((rows["value"] - rows["fitted"]) / rows["tolerance"])),
-        asked={"seed": seed, "knots": program.knots, "bounds": program.bounds.tolist()},
+        settings={"seed": seed, "knots": program.knots, "bounds": program.bounds.tolist()},
     )
 
 

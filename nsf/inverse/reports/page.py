@@ -69,7 +69,7 @@ class Results:
         charts: of the page.
         facts, definitions: terms and their meaning.
         warnings: sentences.
-        asked: settings of the command, for sources.json.
+        settings: of the command, for sources.json.
     """
 
     title: str
@@ -82,7 +82,7 @@ class Results:
     facts: Sequence[tuple[str, str]] = ()
     definitions: Sequence[tuple[str, str]] = ()
     warnings: Sequence[str] = ()
-    asked: Mapping = field(default_factory=dict)
+    settings: Mapping = field(default_factory=dict)
 
     @property
     def origins(self) -> dict[str, dict]:
@@ -118,7 +118,7 @@ def write(results: Results, folder: Path) -> Path:
         content = {
             "title": results.title,
             "question": results.lead,
-            "asked": dict(results.asked),
+            "asked": dict(results.settings),
             "files": {path.name: file_hash(path) for path in sorted(fresh.iterdir())},
             "runs": origins,
             "chart": {"file": f"{first.stem}.png", "caption": first.caption},

@@ -99,7 +99,7 @@ def sampling(
         facts=[("Runs", f"{count:,} in {made.seconds:.2f} s"), ("Distrusted", f"{lost:,}")],
         definitions=_TERMS,
         warnings=warnings,
-        asked={"count": count, "of": scalars.names, "seed": seed, "sensitivities": indices}
+        settings={"count": count, "of": scalars.names, "seed": seed, "sensitivities": indices}
         | ({} if problem.program is None else {"program": problem.program}),
     )
 

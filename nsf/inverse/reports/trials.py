@@ -57,7 +57,7 @@ def trying(models: Sequence[Model], trials: Trials, say: Callable[[str], object]
         charts=[Chart("Trials", "trials", _CHART, trials_chart(table.assign(**ends), units))],
         facts=[("Observed", settings)],
         definitions=_TERMS,
-        asked=vars(trials),
+        settings=vars(trials),
     )
 
 

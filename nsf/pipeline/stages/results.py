@@ -41,8 +41,8 @@ def costs(measured: Mapping[str, SolverCost], decode_ms: float = math.nan) -> di
         "reduced": reduced.as_dict(),
         **{name: measured[name].as_dict() for name in ("projected",) if name in measured},
         "coarse": {
-            name.removeprefix(_COARSE): found.as_dict()
-            for name, found in measured.items()
+            name.removeprefix(_COARSE): solver.as_dict()
+            for name, solver in measured.items()
             if name.startswith(_COARSE)
         },
         "breakdown": {"reduced": reduced.stages, "full_order": full.stages},

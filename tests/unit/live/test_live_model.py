@@ -61,7 +61,7 @@ def test_the_parameter_reaches_beyond_its_training_values(model):
     (p,) = model.parameters
     assert (p.name, p.unit, p.trained) == ("friction_angle", "°", (22.0, 38.0))
     assert (p.lower, p.upper) == (14.0, 46.0)
-    assert model.known == tuple(map(angle, (22.0, 26.0, 30.0, 38.0)))
+    assert model.simulated == tuple(map(angle, (22.0, 26.0, 30.0, 38.0)))
     away = [model.start(angle(value)).away for value in (21.9, 22.0, 38.0, 42.0)]
     assert away == pytest.approx([1.0 + 0.1 / 8.0, 0.0, 0.0, 1.5])
 
@@ -126,5 +126,5 @@ def test_without_full_order_runs_there_is_no_truth(chain, tmp_path):
     shutil.copytree(chain.root, tmp_path / "runs")
     shutil.rmtree(tmp_path / "runs/simulate")
     model = LiveModel(replace(chain.pipeline.deployment, root=tmp_path / "runs"), device="cpu")
-    assert model.known == ()
+    assert model.simulated == ()
     assert model.truth(angle(26.0)) is None

@@ -58,7 +58,7 @@ def test_a_frame_is_both_runs_at_the_moment(model, run):
     header, _ = unpacked(feed.field)
     assert set(header["quantities"]) == set(Coloring(model).quantities)
     assert [known["values"] for known in header["known"]] == [
-        [case["friction_angle"]] for case in model.known
+        [case["friction_angle"]] for case in model.simulated
     ]
     _, frame = unpacked(feed.frame(Moment(run, run.steps)))
     np.testing.assert_array_equal(frame["x"], run.positions(run.steps))
@@ -73,7 +73,7 @@ def test_a_frame_is_both_runs_at_the_moment(model, run):
 @pytest.mark.slow
 def test_what_is_said_is_what_is_shown(tilting_model):
     """A run beside it is of the same problem; a hand that tilts gravity makes another."""
-    player, feed, (known, *_) = Player(tilting_model), PointFeed(tilting_model), tilting_model.known
+    player, feed, (known, *_) = Player(tilting_model), PointFeed(tilting_model), tilting_model.simulated
 
     def shown():
         while player.work():
