@@ -25,6 +25,7 @@ from nsf.mpm import FullOrderMPM
 from nsf.pipeline.stages import evaluation
 from nsf.results.columns import EVALUATED
 from nsf.results.overview.tables import cells
+from nsf.results.sources import open_sources
 from nsf.runs import Run
 from nsf.runs.listing import entries
 
@@ -637,3 +638,10 @@ def test_nsf_run_in_a_process_of_its_own(copied, tiny, tmp_path):
 
 def test_a_manifold_of_the_chain_loads_by_path_or_name(chain):
     assert torch.equal(Manifold.load(str(chain.checkpoint)).X, Manifold.load(chain.checkpoint).X)
+
+
+def test_warnings_of_simulations_reach_the_report(chain):
+    """The tiny column has few particles a cell, which its simulations said."""
+    (source,) = open_sources([chain.pipeline.evaluation])
+    (line,) = source.warnings
+    assert "2.2 a cell" in line
