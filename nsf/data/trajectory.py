@@ -19,6 +19,7 @@ from nsf.storage import require_space, writing
 
 _EXACT, _STORED = ("<f8",), ("<f4", "<f8")  # types of constants and of frames
 _MOST_SCALARS = 1000
+_WIDEST = 100.0  # Δx in units of how far particles lie from the origin: a grid ends beyond them
 
 
 class TrajectoryWriter:
@@ -195,6 +196,7 @@ class Trajectory:
         )
         self.t = hdf5.values(file, "frames/t", _EXACT, (None,), increasing=True)
         self.frames = len(self.t)
+        self._check_spacing()
         self._frames = {
             name: _mapped(path, hdf5.array(file, f"frames/{name}", _STORED, (self.frames, P, c)))
             for name, c in COMPONENTS.items()
@@ -208,6 +210,13 @@ class Trajectory:
             }
         if (x_sha256 := hash_of_positions(self.X)) != self.x_sha256:
             raise SchemaError(f"says x_sha256={self.x_sha256[:12]}, but its X has {x_sha256[:12]}")
+
+    def _check_spacing(self) -> None:
+        """Refuse a grid far wider than the particles' places, and steps longer than from frame to frame."""
+        if _WIDEST * np.abs(self.X).max(initial=0.0) < self.dx:
+            raise SchemaError(f"has dx={self.dx:g} m, far beyond its particles")
+        if self.frames > 1 and np.diff(self.t).min() < (1 - 1e-6) * self.dt:
+            raise SchemaError(f"has dt={self.dt:g} s, longer than from frame to frame")
 
     @classmethod
     def open(cls, path: str | Path) -> "Trajectory":

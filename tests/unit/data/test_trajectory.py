@@ -230,6 +230,8 @@ def swap_particles(file):
         ],
         (attribute("units", '{"x": "mm"}'), "has units that are not those of this schema"),
         (attribute("dt", 0.0), "values of dt and dx that are not positive"),
+        (attribute("dt", 1e300), "longer than from frame to frame"),
+        (attribute("dx", 1e300), "far beyond its particles"),
         *[
             (at(f"particles/{name}", 3, value), rf"{told} particles/{name}")
             for name in ("mass", "volume0")
