@@ -99,24 +99,30 @@ def tensors(
     """
     import torch
 
-    path = Path(path)
+    with _reading(path, what, stage):
+        path = verified(path)
+        try:
+            _check_members(path)
+            content = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
+            _check_plain(content, path.stat().st_size)
+            if version is not None:
+                _check_version(content, what, *version)
+        except SchemaError as error:
+            raise SchemaError(f"{path} {error}; {stage} again with `nsf {stage}`") from error
+        return content
+
+
+@contextmanager
+def _reading(path: Path | str, what: str, stage: str) -> Iterator[None]:
+    """Say of a file that is missing, truncated or foreign how it is made again."""
     try:
-        verified(path)
+        yield
     except FileNotFoundError as error:
         raise MissingRunError(f"no {what} at {path}; run `nsf {stage}` first") from error
-    try:
-        _check_members(path)
-        content = torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
-        _check_plain(content, path.stat().st_size)
-        if version is not None:
-            _check_version(content, what, *version)
-    except SchemaError as error:
-        raise SchemaError(f"{path} {error}; {stage} again with `nsf {stage}`") from error
     except _UNREADABLE as error:
         raise SchemaError(
             f"{path} is truncated or no {what} ({first_line(error)}); delete it and run `nsf {stage}` again"
         ) from error
-    return content
 
 
 def _check_members(path: Path) -> None:
@@ -196,7 +202,7 @@ def arrays(
         SchemaError: it was changed after its run, is truncated, foreign, holds objects, or takes far more
             memory than disk.
     """
-    try:
+    with _reading(path, what, stage):
         path = verified(path)
         most = max(_MOST_UNPACKED, _MOST_RATIO * path.stat().st_size)
         with zipfile.ZipFile(path) as archive:
@@ -206,12 +212,6 @@ def arrays(
             found = {m.filename.removesuffix(".npy"): _array(_unpacked(archive, m)) for m in members}
             _check_layout(found, layout or {})
             return found
-    except FileNotFoundError as error:
-        raise MissingRunError(f"no {what} at {path}; run `nsf {stage}` first") from error
-    except _UNREADABLE as error:
-        raise SchemaError(
-            f"{path} is truncated or no {what} ({first_line(error)}); delete it and run `nsf {stage}` again"
-        ) from error
 
 
 def _check_layout(found: Mapping[str, np.ndarray], layout: Mapping[str | Maybe, str]) -> None:
