@@ -1,17 +1,16 @@
 """Columns of a file of observations, CSV or HDF5: sizes are bounded before reading, nothing is lost."""
 
-import csv
 import gzip
+import io
 import itertools
-import math
 import os
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TextIO
 
 import h5py
 import numpy as np
+import pandas as pd
 
 from nsf.data import hdf5, heaps
 from nsf.errors import ConfigError, SchemaError, first_line
@@ -19,7 +18,7 @@ from nsf.errors import ConfigError, SchemaError, first_line
 COLUMNS = ("t", "particle", "X", "Y", "Z", "x", "y", "z", "quantity", "value", "deviation")
 _MOST_ROWS = 1_000_000
 _MOST_BYTES = 2**28  # of a file, and of the text that is packed in it
-_LINE = 4096  # letters of a line of text
+_HEAD = 4096  # letters of the line of names
 _TEXT_BYTES = 64  # of a quantity's name
 _HDF5 = (".h5", ".hdf5")
 _MISSING = ("", "nan", "na")
@@ -78,80 +77,64 @@ def _check_rows(path: Path, count: int) -> None:
 
 
 def _of_csv(path: Path) -> dict[str, np.ndarray]:
-    packed = path.suffix == ".gz"
     try:
-        with path.open("rb") as raw:
-            head = raw.read(8)
-        if kinds := [kind for first, kind in _KINDS.items() if head.startswith(first) and not packed]:
-            raise ConfigError(f"{path} is {kinds[0]}")
-        opened = gzip.open if packed else open
-        with opened(path, "rt", encoding="utf-8-sig", newline="") as file:
-            return _of_text(path, file)
+        text = _text(path).decode("utf-8-sig").replace("\r\n", "\n")
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path} is no UTF-8 text; save it as CSV in UTF-8") from error
     except (OSError, EOFError, zlib.error) as error:
         raise SchemaError(
             f"{path} is damaged or cannot be read; write it again ({first_line(error)})"
         ) from error
-
-
-def _of_text(path: Path, file: TextIO) -> dict[str, np.ndarray]:
-    records = _records(path, file)
-    names = [name.strip() for name in next(records, [])]
+    head, _, body = text.partition("\n")
+    names = [name.strip() for name in head[:_HEAD].split(",")] if head.strip() else []
     _check_names(path, names)
-    cells: dict[str, list] = {name: [] for name in names}
-    for k, fields in enumerate(records, 1):
-        if len(fields) != len(names):
-            raise ConfigError(
-                f"{path}, row {k} has {len(fields)} fields for {len(names)} columns; give each column one"
-            )
-        for name, text in zip(names, fields, strict=True):
-            try:
-                cells[name].append(_cell(name, text.strip()))
-            except ValueError:
-                raise ConfigError(f"{path}, row {k}: {name}={text[:80]} must be a number") from None
-    return {name: np.array(cells[name], object if name == "quantity" else float) for name in names}
+    _check_rows(path, body.count("\n"))
+    try:
+        # Read as a row, so that no row has more fields than there are names.
+        cells = pd.read_csv(
+            io.StringIO(text), header=None, dtype=str, keep_default_na=False, skipinitialspace=True
+        )
+    except (ValueError, pd.errors.ParserError) as error:
+        raise ConfigError(f"{path} is no CSV file of these columns ({first_line(error)})") from error
+    cells = cells.iloc[1:].set_axis(names, axis=1)  # a row of fewer fields ends in empty cells
+    return {name: _numbers(path, name, cells[name].str.strip()) for name in names}
 
 
-def _cell(name: str, text: str) -> float | str:
-    """The value of a cell.
+def _text(path: Path) -> bytes:
+    """The bytes of a file of text, unpacked.
 
     Raises:
-        ValueError: it is no number, or one as only Python writes it.
+        ConfigError: it is none, or holds too many.
     """
-    missing = text.lower() in _MISSING
+    packed = path.suffix == ".gz"
+    with path.open("rb") as raw:
+        head = raw.read(8)
+    if kinds := [kind for first, kind in _KINDS.items() if head.startswith(first) and not packed]:
+        raise ConfigError(f"{path} is {kinds[0]}")
+    with (gzip.open if packed else open)(path, "rb") as file:
+        text = file.read(_MOST_BYTES + 1)
+    if len(text) > _MOST_BYTES:
+        raise ConfigError(
+            f"{path} holds more than {_MOST_BYTES >> 20} MiB of text; observe fewer points or times"
+        )
+    return text
+
+
+def _numbers(path: Path, name: str, cells: pd.Series) -> np.ndarray:
+    """The values [rows] of a column: NaN in empty cells, or the texts of `quantity`.
+
+    Raises:
+        ConfigError: a cell is no number.
+    """
+    cells = cells.mask(cells.str.lower().isin(_MISSING), "")
     if name == "quantity":
-        return "" if missing else text
-    if "_" in text or not text.isascii():
-        raise ValueError(text)
-    return math.nan if missing else float(text)
-
-
-def _records(path: Path, file: TextIO) -> Iterator[list[str]]:
-    """Fields of each line that is not blank."""
-    records = csv.reader(_lines(path, file), strict=True, skipinitialspace=True)
-    try:
-        yield from (fields for fields in records if fields not in ([], [""]))
-    except csv.Error as error:
-        raise ConfigError(f"{path}, line {records.line_num} is no line of a CSV file ({error})") from error
-
-
-def _lines(path: Path, file: TextIO) -> Iterator[str]:
-    """Lines of bounded length and number; the first one names the columns."""
-    letters = 0
-    for k in itertools.count():
-        line = file.readline(_LINE + 1)
-        if not line:
-            return
-        _check_rows(path, k)
-        letters += len(line)
-        if len(line) > _LINE:
-            raise ConfigError(f"{path}, line {k + 1} has more than {_LINE:,} letters; give a row a line")
-        if letters > _MOST_BYTES:
-            raise ConfigError(
-                f"{path} holds more than {_MOST_BYTES >> 20} MiB of text; observe fewer points or times"
-            )
-        yield line
+        return cells.to_numpy(object)
+    values = pd.to_numeric(cells.replace("", "nan"), errors="coerce").to_numpy(float)
+    wrong = np.isnan(values) & cells.ne("").to_numpy()
+    if wrong.any():
+        row = int(wrong.argmax())
+        raise ConfigError(f"{path}, row {row + 1}: {name}={cells.iloc[row][:80]} must be a number")
+    return values
 
 
 # -- HDF5 -----------------------------------------------------------------------------------------------

@@ -15,13 +15,10 @@ Student's, with the degrees of freedom of Welch and Satterthwaite.
 
 import time
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 import torch
 from scipy import stats
-from scipy.optimize import least_squares
-from scipy.stats import qmc
 from torch import Tensor
 
 from nsf.errors import ConfigError, InstabilityError
@@ -29,13 +26,13 @@ from nsf.inverse.error import ModelError
 from nsf.inverse.model import Forcing, Model
 from nsf.inverse.observations import View
 from nsf.inverse.recurrence import with_jacobian
+from nsf.inverse.search import nearest
 from nsf.inverse.space import UNKNOWN, Space
 
 #: Share of the truths that an interval is to hold.
 CONFIDENCE = 0.9
 #: Entry of a direction's unit vector from which on a parameter is named as part of it.
 _PART = 0.3
-_POLISHED = 3  # starts that are followed to their end
 
 
 @dataclass(frozen=True)
@@ -106,7 +103,7 @@ def fit(
         model: of the runs.
         space: where to look; all that was taught by default.
         error: the model's own; from the validation runs by default.
-        starts: points of the space that are looked at in one batch, from the best of which the fit goes on.
+        starts: points of the space to begin at; see `nsf.inverse.search`.
         forcing: of the run that was observed; the scene's own by default.
 
     Raises:
@@ -127,12 +124,11 @@ def fit(
     def seen(u: Tensor) -> Tensor:
         return view.of_runs(model(space.parameters(u), forcing))
 
-    def residuals(u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        values, slopes = with_jacobian(seen, torch.as_tensor(u, device=model.device)[None])
-        return (values[0].cpu().numpy() - observations.values) / s, slopes[0].cpu().numpy() / s[:, None]
-
-    first = _best_starts(seen, observations.values, s, len(space.free), starts, model.device)
-    best = min((_followed(residuals, u) for u in first), key=lambda result: result.cost)
+    best = nearest(seen, observations.values, s, len(space.free), starts, model.device)
+    if best is None:
+        raise InstabilityError(
+            "no run of the ranges stays finite; choose smaller ranges, or teach again with more model.runs"
+        )
     J = best.jac
     _check_told_apart(J, space)
     A = np.linalg.pinv(J)
@@ -172,44 +168,6 @@ def fit(
         project=A / s,
         seconds=time.perf_counter() - began,
     )
-
-
-def _best_starts(seen, values: np.ndarray, s: np.ndarray, n: int, starts: int, device) -> list[np.ndarray]:
-    """Points [n] of the unit cube with the least residuals, of so many that are evenly spread."""
-    power = max(0, starts - 1).bit_length()
-    cube = qmc.Sobol(n, seed=0).random_base2(power)[:starts]
-    with torch.no_grad():
-        runs = seen(torch.as_tensor(cube, device=device)).cpu().numpy()
-    costs = np.nansum(((runs - values) / s) ** 2, axis=1)
-    costs[~np.isfinite(runs).all(1)] = np.inf
-    order = np.argsort(costs)
-    if not np.isfinite(costs[order[0]]):
-        raise InstabilityError(
-            "no run of the ranges stays finite; choose smaller ranges, or teach again with more model.runs"
-        )
-    # Those beside a better one would end where it ends.
-    reach, chosen = 1.5 * starts ** (-1.0 / n), []
-    for i in order[np.isfinite(costs[order])]:
-        if all(np.abs(cube[i] - other).max() > reach for other in chosen):
-            chosen.append(cube[i])
-        if len(chosen) == _POLISHED:
-            break
-    return chosen
-
-
-def _followed(residuals, u: np.ndarray):
-    """scipy's least squares from a start, within the ranges."""
-
-    @lru_cache(maxsize=1)  # of values and slopes, which scipy asks for one after the other
-    def both(at: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-        values, slopes = residuals(np.array(at))
-        # A step that leaves what is finite is no step down: it gets residuals that are too large to take.
-        return np.nan_to_num(values, nan=1e6, posinf=1e6, neginf=-1e6), np.nan_to_num(slopes)
-
-    return least_squares(
-        lambda at: both(tuple(at))[0], u, jac=lambda at: both(tuple(at))[1], bounds=(0.0, 1.0), x_scale=1.0,
-        max_nfev=40, xtol=1e-7, ftol=1e-7, gtol=1e-7,
-    )  # fmt: skip
 
 
 def _check_told_apart(J: np.ndarray, space: Space) -> None:

@@ -302,6 +302,18 @@ def tilted(gravity: np.ndarray, tilt: np.ndarray) -> np.ndarray:
     return size * (np.cos(angle) * _unit(gravity) + np.sinc(angle / np.pi) * aside)
 
 
+def largest_tilt(gravity: np.ndarray, middle: np.ndarray, reach: float) -> float:
+    """Largest angle [rad] by which gravity [3] may tilt either way and stay within a ball [3] [m/s²].
+
+    Tilted by θ away from the middle m it is off by |g|² + |m|² − 2 |g| |m| cos(θ + φ), squared, with φ the
+    angle between both.
+    """
+    size, around = np.linalg.norm(gravity), max(float(np.linalg.norm(middle)), 1e-30)
+    between = np.arccos(np.clip(gravity @ middle / (size * around), -1.0, 1.0))
+    cosine = (size**2 + around**2 - reach**2) / (2.0 * size * around)
+    return max(0.0, float(np.arccos(np.clip(cosine, -1.0, 1.0)) - between))
+
+
 def _check_made(group: str, name: str, program: object, made: object, kind: type) -> None:
     if not isinstance(made, kind):
         raise ConfigError(

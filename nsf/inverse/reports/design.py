@@ -36,14 +36,14 @@ def designing(
     Args:
         program, view, parameters: as for `design`.
         run_full_order: whether to make that run.
-        seed: of the random programs.
+        seed: of the programs to begin at.
         say: told what is done.
 
     Returns:
         A page with `program.csv` and `targets.csv`.
     """
     model = program.model
-    designed = design(program, view, parameters, seed, say)
+    designed = design(program, view, parameters, seed)
     rows = view.observations.frame.rename(columns={"deviation": "tolerance"}).assign(fitted=designed.seen)
     off = {"run by recurrence": rms(rows["value"] - rows["fitted"])}
     if run_full_order:
@@ -52,9 +52,9 @@ def designing(
     with suppress(ConfigError):  # without validation runs nothing is known of it
         off["the model's own error"] = rms(ModelError.of(view, model).deviations)
     say("design: off by: " + ", ".join(f"{name} {number(1e3 * value)} mm" for name, value in off.items()))
-    ways = dict(zip(program.names, designed.values.T, strict=True))
+    ways = dict(zip(program.coordinates.names, designed.values.T, strict=True))
     table = pd.DataFrame({"": list(off), "off [mm]": [1e3 * value for value in off.values()]})
-    drawn, over = program_chart(model.t, ways, program.unit), "The program over time."
+    drawn, over = program_chart(model.t, ways, program.coordinates.unit), "The program over time."
     left, less = targets_chart(rows), "Targets less the values of the runs; a bar is the tolerance."
     return Results(
         title=f"{title_of(model)}: design",
@@ -66,7 +66,7 @@ def designing(
         facts=[("Search", designed.stopped), ("Distrust", number(designed.distrust))],
         definitions=_TERMS,
         warnings=_warnings(program, designed, rms((rows["value"] - rows["fitted"]) / rows["tolerance"])),
-        settings={"seed": seed, "knots": program.knots, "bounds": program.bounds.tolist()},
+        settings={"seed": seed, "knots": program.knots, "bounds": program.coordinates.bounds.tolist()},
     )
 
 
