@@ -195,13 +195,14 @@ def variants(frame: pd.DataFrame, without: Iterable[str] = ()) -> list[str]:
     hidden = {*SEEDS, _TRAIN if "training_runs" in names else "", *without}
     keys = telling(frame, [name for name in names if name in frame and name not in hidden])
     shown = frame[keys].drop(columns="model_name", errors="ignore")
-    names = frame["model_name"] if "model_name" in keys or shown.empty else pd.Series("", frame.index)
+    if not len(shown.columns):
+        return frame["model_name"].to_list()
+    names = frame["model_name"] if "model_name" in keys else pd.Series("", frame.index)
     parts = [
         [name, *(_named(key, value) for key, value in row.items() if not _is_empty(value))]
         for name, row in zip(names, shown.to_dict("records"), strict=True)
     ]
-    default = "default" if keys else frame["model_name"].iloc[0]
-    return [" · ".join(filter(None, part)) or default for part in parts]
+    return [" · ".join(filter(None, part)) or "default" for part in parts]
 
 
 def telling(frame: pd.DataFrame, keys: Sequence[str]) -> list[str]:
