@@ -8,7 +8,7 @@ from typing_extensions import override
 
 from nsf.data.normalize import deviation
 from nsf.errors import ConfigError
-from nsf.models.inputs import Inputs
+from nsf.models.inputs import Inputs, Lessons, Validation
 from nsf.models.latent import LatentModel
 
 
@@ -92,7 +92,7 @@ class Interpolate(LatentModel):
             )
 
     @override
-    def fit(self, manifold, training: Inputs, seed: int) -> TrainingRuns:
+    def fit(self, manifold, lessons: Lessons, validation: Validation | None, seed: int) -> TrainingRuns:
         return TrainingRuns.of(manifold)
 
     @override

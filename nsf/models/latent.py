@@ -9,7 +9,7 @@ from typing_extensions import override
 
 from nsf.errors import ConfigError
 from nsf.models.base import Model
-from nsf.models.inputs import Inputs
+from nsf.models.inputs import Inputs, Lessons, Validation
 
 
 @dataclass(frozen=True)
@@ -25,17 +25,17 @@ class LatentModel(Model):
     knows_forcing: ClassVar[bool] = True
 
     @abstractmethod
-    def fit(self, manifold, training: Inputs, seed: int) -> Any:
-        """Learn from the training runs.
+    def fit(self, manifold, lessons: Lessons, validation: Validation | None, seed: int) -> Any:
+        """Learn from full-order runs.
 
         Args:
-            manifold: trained fields, whose `training_latents` [K (N + 1), r] are x̂ of the runs of `training`,
-                one run after the other.
-            training: the training runs.
+            manifold: trained fields.
+            lessons: the runs; those of training, and with `nsf.models.drawn.Drawn` of drawn cases.
+            validation: by which to choose; None of a model that does not derive from `Drawn`.
             seed: of all randomness.
 
         Returns:
-            The first argument of `run`. With `learns` `nsf teach` writes it into a file: tensors, numbers and
+            The first argument of `run`. With `Drawn` `nsf teach` writes it into a file: tensors, numbers and
             texts, in dicts and lists.
         """
 

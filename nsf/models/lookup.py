@@ -12,8 +12,9 @@ from nsf.dynamics.setup import Setup
 from nsf.dynamics.span import Span, Stages
 from nsf.engines.base import Engine
 from nsf.models.base import Model
-from nsf.models.inputs import Inputs
+from nsf.models.inputs import Inputs, Lessons
 from nsf.mpm import Gravity
+from nsf.recurrence.engine import first_change
 from nsf.recurrence.solids import collider_states
 
 
@@ -22,34 +23,50 @@ def inputs_of(batch: Batch) -> Inputs:
     one, forcing = batch.shared, batch.forcing
     t, runs = one.dt * np.arange(one.total_steps), range(len(batch))
     states = [collider_states(forcing.colliders_of(run), one.dt, one.total_steps) for run in runs]
+    first = [first_change(one.manifold, s.constants.X, s.initial_velocity, one.dt) for s in batch.setups]
     return Inputs(
         names=tuple(one.manifold.parameter_names),
         parameters=torch.stack([setup.parameters for setup in batch.setups]).double().cpu().numpy(),
         start=torch.stack([setup.xhat for setup in batch.setups]).double().cpu().numpy(),
+        first=torch.stack(first).numpy(),
         gravity=np.asarray(forcing.gravity_at(t)),
         solids=np.stack(states),
         dt=one.dt,
     )
 
 
-def training_inputs(manifold, scene, cases: Sequence[Case]) -> Inputs:
-    """Parameters, start and forcing of the training runs of a manifold, in their order.
+def inputs_in(manifold, cases: Sequence[Case], scenes: Sequence, start: np.ndarray) -> Inputs:
+    """Parameters, start and forcing of full-order runs.
+
+    Args:
+        manifold: trained fields.
+        cases: of the runs; scenes: the scene in each, whose gravity may be another than the case has.
+        start: [B, r] x̂ at t = 0.
+    """
+    names, (dt, steps) = tuple(manifold.parameter_names), (scenes[0].dt, scenes[0].steps)
+    parameters = np.array([[case[name] for name in names] for case in cases])
+    first = [first_change(manifold, s.particles().X, s.initial_velocity(), dt).numpy() for s in scenes]
+    return Inputs(
+        names=names,
+        parameters=parameters.reshape(len(cases), -1),
+        start=np.asarray(start, float),
+        first=np.stack(first),
+        gravity=np.stack([scene.acting_gravity.at(dt * np.arange(steps)) for scene in scenes]),
+        solids=np.stack([collider_states(scene.solids, dt, steps) for scene in scenes]),
+        dt=dt,
+    )
+
+
+def training_lessons(manifold, scene, cases: Sequence[Case]) -> Lessons:
+    """The training runs of a manifold, in their order.
 
     Args:
         manifold: trained fields.
         scene: of training; cases: those of training.
     """
-    at = [scene.at(case) for case in cases]
-    names, t = tuple(manifold.parameter_names), scene.dt * np.arange(scene.steps)
-    latents = manifold.training_latents.double().cpu().numpy()
-    return Inputs(
-        names=names,
-        parameters=np.array([[case[name] for name in names] for case in cases]),
-        start=latents.reshape(len(cases), -1, latents.shape[1])[:, 0],
-        gravity=np.stack([one.acting_gravity.at(t) for one in at]),
-        solids=np.stack([collider_states(one.solids, scene.dt, scene.steps) for one in at]),
-        dt=scene.dt,
-    )
+    xhat = manifold.training_latents.double().cpu().numpy().reshape(len(cases), -1, manifold.latent_dim)
+    inputs = inputs_in(manifold, cases, list(map(scene.at, cases)), xhat[:, 0])
+    return Lessons(inputs, xhat, xhat[..., :0])
 
 
 class LatentEngine(Engine):

@@ -18,7 +18,8 @@ from omegaconf import DictConfig
 from nsf import config as configuration
 from nsf.data.case import Case
 from nsf.errors import MissingRunError
-from nsf.models import Auto, Model, Recurrence
+from nsf.models import Auto, Model
+from nsf.models.drawn import Drawn
 from nsf.pipeline import naming
 from nsf.pipeline.configured import Configured
 from nsf.results.folder import check_place
@@ -46,7 +47,8 @@ class Pipeline(Configured):
         root: folder of runs; `NSF_RUNS` or `runs` by default.
 
     Attributes:
-        training, taught, deployment, evaluation, superresolution: runs of the stages (`nsf.pipeline.naming`).
+        training, encoding, taught, deployment, evaluation, superresolution: runs of the stages
+            (`nsf.pipeline.naming`); `encoding` is a part of `teach`.
 
     Raises:
         ConfigError: a value is missing or refused; names it. What only a stage's work needs is built, and
@@ -124,12 +126,12 @@ class Pipeline(Configured):
 
     @property
     def lessons(self) -> list[list[Case]]:
-        """Cases that a model learns from: of training, and for a recurrence those drawn and of validation.
+        """Cases that a model learns from: of training, those drawn and of validation.
 
         Validation runs choose its weights; where there are none, and no programs, those of training do.
         """
         training = sorted(self.split.train)
-        if not isinstance(self.model, Recurrence):
+        if not isinstance(self.model, Drawn):
             return [training]
         taken = [*training, *self.split.validation, *self.split.test]
         count = self.model.runs_of(self.forced)
@@ -157,6 +159,7 @@ class Pipeline(Configured):
         return [self.simulation(case) for case in self.split.train]
 
     training = property(naming.training)
+    encoding = property(naming.encoding)
     taught = property(naming.taught)
     deployment = property(naming.deployment)
     evaluation = property(naming.evaluation)
@@ -290,9 +293,9 @@ class Pipeline(Configured):
         Raises:
             ConfigError: it learns nothing.
         """
-        return self._made(
-            self.taught, "teaching.teach" if isinstance(self.model, Recurrence) else "fitting.fit"
-        )
+        if not self.taught.complete:
+            self._made(self.encoding, "encoding.encode")
+        return self._made(self.taught, "teaching.teach")
 
     def deploy(self) -> Run:
         """Reduced trajectories of the held-out cases, through Lightning's `Trainer.predict`."""
@@ -439,7 +442,7 @@ class Pipeline(Configured):
             MissingRunError: it was not taught.
         """
         if self._fitted is None:
-            from nsf.pipeline.stages.fitting import fitted, loaded
+            from nsf.pipeline.stages.teaching import fitted, loaded
 
             self._fitted = loaded(self.taught) if self.model.learns else fitted(self, manifold)
         return self._fitted

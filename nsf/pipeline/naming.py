@@ -13,6 +13,7 @@ from nsf.code import code_of
 from nsf.data.case import Case
 from nsf.engines.modal.mirrors import edits
 from nsf.errors import ConfigError
+from nsf.models import Model
 from nsf.runs import Run
 from nsf.scenes import Scene
 from nsf.scenes.identity import plain_scene
@@ -50,20 +51,39 @@ def deployment(pipeline) -> Run:
     return _run(pipeline, "deploy", content | _edited(), parents)
 
 
+def encoding(pipeline) -> Run:
+    """The run of full-order runs in latent coordinates, from which the model learns.
+
+    Raises:
+        ConfigError: the model learns nothing.
+    """
+    model, c = _learning(pipeline), pipeline.config
+    training, drawn, _ = pipeline.lessons
+    content = _content(pipeline, "precision") | _physics(c.scale, pipeline.scene, training[0])
+    content |= {"cases": [list(map(dict, cases)) for cases in (training, drawn)], "device": pipeline.device}
+    if not pipeline.scene.forcing.gravity:
+        content |= {"gravity": model.gravity, "seed": c.seed}
+    return _run(pipeline, "encode", content | _edited(), [pipeline.training])
+
+
 def taught(pipeline) -> Run:
     """The run of what the model learns.
 
     Raises:
         ConfigError: the model learns nothing.
     """
-    model = pipeline.model
-    if not model.learns:
-        raise ConfigError(f"model={model.name} is not taught; set model=recurrence")
-    case = pipeline.split.train[0]
+    model, case = _learning(pipeline), pipeline.split.train[0]
     content = _content(pipeline, "precision", "seed") | _physics(pipeline.config.scale, pipeline.scene, case)
     content |= {"cases": [list(map(dict, cases)) for cases in pipeline.lessons], "device": pipeline.device}
     content |= {"model": model.lesson}
-    return _run(pipeline, "teach", content | _edited(), [pipeline.training])
+    return _run(pipeline, "teach", content | _edited(), [pipeline.training, pipeline.encoding])
+
+
+def _learning(pipeline) -> Model:
+    """The model, which learns."""
+    if not pipeline.model.learns:
+        raise ConfigError(f"model={pipeline.model.name} is not taught; set model=recurrence")
+    return pipeline.model
 
 
 def evaluation(pipeline) -> Run:

@@ -54,6 +54,19 @@ class Runs:
         g, f = (of_strides(values, stride) for values in (gravity, features))
         return cls(xhat[::stride], stress[::stride], stride * first, parameters, g, f)
 
+    @classmethod
+    def of(cls, lessons, stride: int, stress: int) -> "Runs":
+        """Encoded runs in strides, with the first coordinates of their stress.
+
+        Args:
+            lessons: a `nsf.models.inputs.Lessons`; stride: k; stress: n_s.
+        """
+        of = lessons.inputs
+        along = (lessons.xhat, lessons.stress[..., :stress], of.first, of.parameters, of.gravity, of.solids)
+        xhat, shat, first, parameters, gravity, solids = (torch.as_tensor(v).double() for v in along)
+        xhat, shat, gravity, solids = (v.transpose(0, 1) for v in (xhat, shat, gravity, solids))
+        return cls.in_strides(stride, xhat, shat, first, parameters, gravity, solids)
+
     @property
     def changes(self) -> Tensor:
         """d [N + 1, R, r]."""
@@ -73,13 +86,14 @@ class Yardstick:
         runs: in strides.
         positions: x̂ [F, r] → [F, s, 3] [m] of particles all over the body.
         truth: [F, R, s, 3] [m] where these are, at every `every`-th stride.
-        every: strides.
+        every: strides; stride: k steps.
     """
 
     runs: Runs
     positions: Callable[[Tensor], Tensor]
     truth: Tensor
     every: int = 1
+    stride: int = 1
 
     def errors(self, form: Form) -> Tensor:
         """[R] displacement error of the members' mean, a fraction; not finite of a run that is lost."""
@@ -87,11 +101,21 @@ class Yardstick:
         start = form.begin(runs.xhat[0], runs.first, runs.stress[0])
         with torch.no_grad():
             xhat, _ = form.run(start, runs.parameters, runs.gravity, form.collider_state(runs.features))
+        return self.off(xhat.mean(1))
+
+    def off(self, xhat: Tensor) -> Tensor:
+        """[R] displacement error of x̂ [N + 1, R, r] at strides, likewise."""
         errors = []
-        for run, truth in zip(xhat.mean(1)[:: self.every].unbind(1), self.truth.unbind(1), strict=True):
+        for run, truth in zip(xhat[:: self.every].unbind(1), self.truth.unbind(1), strict=True):
             off = (self.positions(run) - truth).square().sum()
             errors.append((off / (truth - truth[:1]).square().sum()).sqrt())
         return torch.stack(errors)
+
+    def moves(self, xhat: Tensor, scale: Tensor) -> Tensor:
+        """[r] how far particles move with each coordinate, RMS [m] a unit of it; at x̂ [r], by ± scale [r]."""
+        either = [self.positions(xhat + way * torch.diag(scale)) for way in (1.0, -1.0)]
+        moved = (either[0] - either[1]).square().sum(-1).mean(1).sqrt() / (2.0 * scale)
+        return moved.clamp_min(max(1e-3 * float(moved.max()), torch.finfo(moved.dtype).tiny))
 
 
 def standardised(runs: Runs, fitting: Fitting, dt: float, stride: int, programs: bool, seed: int) -> Form:

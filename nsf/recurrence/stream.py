@@ -98,6 +98,13 @@ def stress_modes(manifold, count: int) -> Tensor:
     return modes[..., :count]
 
 
+def modes_of_stress(manifold) -> int:
+    """How many modes a manifold's stress field has; 0 of networks."""
+    fields = getattr(manifold, "fields", {})
+    modes = getattr(fields["stress"], "modes", None) if "stress" in fields else None
+    return 0 if modes is None else modes.shape[2]
+
+
 def streamed(solver, steps: int, encoder: Encoder, after: Callable[[], object] = lambda: None) -> Encoded:
     """Take a full-order run to its end and encode each frame on the device where it is.
 

@@ -1,11 +1,12 @@
 """Models by name, from the configuration to the errors of their runs on the tiny chain."""
 
+import re
 import sys
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
-import torch
 from angles import angle
 
 import nsf.models
@@ -17,58 +18,7 @@ from nsf.models import describe
 from nsf.models.auto import Auto, Measured
 from nsf.pipeline import Pipeline
 
-#: A recurrent network from parameters and forcing to latent vectors; docs/howto/model.md has the same.
-GRU = '''
-from dataclasses import dataclass
-from typing import ClassVar
-
-import numpy as np
-import torch
-
-from nsf.models import LatentModel
-
-
-@dataclass(frozen=True)
-class GRU(LatentModel):
-    """A gated recurrent network from gravity and parameters to latent vectors."""
-
-    width: int = 16
-    descent: int = 200
-    learns: ClassVar[bool] = True
-
-    def fit(self, manifold, known, seed):
-        torch.manual_seed(seed)
-        runs = manifold.training_latents.float().cpu().unflatten(0, (len(known.start), -1))
-        net = self._net(inputs(known).shape[-1], runs.shape[-1])
-        optimiser = torch.optim.Adam(net.parameters(), 1e-2)
-        for _ in range(self.descent):
-            loss = (self._changes(net, known) - (runs[:, 1:] - runs[:, :1])).square().mean()
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-        return net.state_dict()
-
-    def run(self, fitted, asked):
-        net = self._net(inputs(asked).shape[-1], asked.start.shape[-1])
-        net.load_state_dict(fitted)
-        with torch.no_grad():
-            changes = self._changes(net, asked).double().numpy()
-        return np.concatenate([asked.start[:, None], asked.start[:, None] + changes], axis=1)
-
-    def _net(self, inputs, latents):
-        return torch.nn.ModuleList([torch.nn.GRU(inputs, self.width, batch_first=True),
-                                    torch.nn.Linear(self.width, latents)])
-
-    def _changes(self, net, of):
-        hidden, _ = net[0](torch.as_tensor(inputs(of)).float())
-        return net[1](hidden)
-
-
-def inputs(of):
-    """[B, N, n + 3] parameters and gravity at each step, of the order of one."""
-    parameters = np.repeat(of.parameters[:, None] / 30.0, of.gravity.shape[1], axis=1)
-    return np.concatenate([parameters, of.gravity / 10.0], axis=2)
-'''
+HOWTO = (Path(__file__).parents[2] / "docs/howto/model.md").read_text(encoding="utf-8")
 
 
 def run_of(pipeline_at, root, *overrides):
@@ -197,29 +147,41 @@ def test_a_model_is_described(tiny):
 
 @pytest.fixture
 def own_model(tmp_path, monkeypatch):
-    """A model of one's own, in one file of Python and one yaml."""
+    """The model of docs/howto/model.md, in one file of Python and one yaml."""
     monkeypatch.setattr(nsf.models, "__path__", [*nsf.models.__path__, str(tmp_path)])
-    (tmp_path / "gru.py").write_text(GRU)
-    (tmp_path / "conf/model").mkdir(parents=True)
-    yaml = "_target_: nsf.models.gru.GRU\nname: gru\nwidth: 8\ndescent: 200\n"
-    (tmp_path / "conf/model/gru.yaml").write_text(yaml)
     monkeypatch.setenv("NSF_CONFIG", str(tmp_path / "conf"))
-    yield "gru"
-    sys.modules.pop("nsf.models.gru", None)
+    (tmp_path / "conf/model").mkdir(parents=True)
+    for path, text in re.findall(r"```\w+ title=\"(?:nsf/models/)?(\S+)\"\n(.*?)```", HOWTO, re.DOTALL):
+        (tmp_path / path).write_text(text)
+    yield "polynomial"
+    sys.modules.pop("nsf.models.polynomial", None)
 
 
-def test_a_model_of_ones_own_is_taught_run_and_chosen(own_model, copied, pipeline_at):
+def test_a_model_of_ones_own_is_run_and_chosen(own_model, copied, pipeline_at):
     root = copied("simulate", "train")
-    pipeline, rows, said = run_of(pipeline_at, root, f"model={own_model}", "model.descent=300")
-    assert rows["model"].tolist() == ["gru"]
+    _, rows, _ = run_of(pipeline_at, root, f"model={own_model}")
+    assert rows["model"].tolist() == [own_model]
     assert rows["displacement_error"][0] < 0.5
-    assert pipeline.taught.complete
-    assert any(line.startswith("teach: model=gru in") for line in said)
-    fitted = torch.load(pipeline.taught.file("model.pt"), weights_only=True)
-    assert fitted["0.weight_ih_l0"].shape == (24, 4)
-    keys = ("model=auto", "scene.design.validation=[24]", "model.candidates=[gru,projected]")
-    chosen, _, _ = run_of(pipeline_at, root, *keys, "+model.of.gru.descent=300", "model.slack=1e6")
-    assert {one["model"] for one in chosen.deployment.manifest["metrics"]["candidates"]} == {
-        "gru",
-        "projected",
-    }
+    keys = ("model=auto", "scene.design.validation=[24]", f"model.candidates=[{own_model},projected]")
+    chosen, _, _ = run_of(pipeline_at, root, *keys, "+model.of.polynomial.degree=1", "model.slack=1e6")
+    candidates = chosen.deployment.manifest["metrics"]["candidates"]
+    assert {one["model"] for one in candidates} == {own_model, "projected"}
+
+
+def test_models_that_learn_share_encoded_runs(copied, pipeline_at):
+    root, runs = copied("simulate", "train"), []
+    for keys in (("model=dmdc",), ("model=gru", "model.descents=200", "model.width=16")):
+        pipeline, rows, said = run_of(pipeline_at, root, *keys, "model.runs=8", "model.stride=2")
+        name = pipeline.model.name
+        assert rows["model"].tolist() == [name]
+        assert rows["displacement_error"][0] < 0.3
+        assert any(line.startswith(f"teach: model={name}, 11 full-order runs, 8 streamed") for line in said)
+        metrics = pipeline.taught.manifest["metrics"]
+        assert metrics["teach_seconds"] == metrics["stream_seconds"] + metrics["fit_seconds"]
+        runs.append(pipeline.encoding)
+    assert runs[0] == runs[1]
+    assert sum(line.startswith("encode: inputs unchanged") for line in said) == 1
+    with pytest.raises(ConfigError, match=r"model=dmdc takes strides .* set it to 1, and model.stride"):
+        pipeline_at(root, "model=dmdc", "deploy.dt_multiplier=1.5")
+    with pytest.raises(ConfigError, match=r"model.delays=\[0\] must be at least 1"):
+        pipeline_at(root, "model=dmdc", "model.delays=[0]")

@@ -13,7 +13,7 @@ from angles import angle
 import nsf
 from nsf.deployment import LATENT_MODEL, PROJECTED, Fallback, Rollout, rollouts
 from nsf.errors import ConfigError, InstabilityError, MissingRunError
-from nsf.pipeline.stages import teaching
+from nsf.pipeline.stages import encoding
 from nsf.recurrence import RecurrenceEngine
 
 ANGLE = {"friction_angle": 26.0}
@@ -64,12 +64,11 @@ def test_the_chain(lesson, chain):
     assert [line.split(":")[0] for line in said if "warning" not in line] == ["teach", "deploy", "evaluate"]
     assert any("the training cases, as no others are there" in line for line in said)
     run = pipeline.taught
-    assert run.manifest["parents"] == [pipeline.training.id]
+    assert run.manifest["parents"] == [pipeline.training.id, pipeline.encoding.id]
     assert pipeline.deployment.manifest["parents"] == [pipeline.training.id, run.id]
     metrics = run.manifest["metrics"]
     assert (metrics["runs"], metrics["streamed"], len(metrics["errors"])) == (11, 8, 3)
     assert 0 < metrics["run_seconds"] <= metrics["stream_seconds"] < metrics["teach_seconds"]
-    assert [path.name for path in run.path.glob("*.[np][pt]*")] == ["recurrence.pt"]  # no encoded run is left
     row = pd.read_csv(pipeline.evaluation.path / "results.csv").iloc[0]
     assert (row["model"], row["teacher"], row["integration"]) == ("recurrence", "runs", 0)
     assert row["displacement_error"] < 0.06  # a run that does not move is off by 1
@@ -97,7 +96,7 @@ def test_no_held_out_value_is_a_lesson(pipeline_at, tmp_path):
 def test_runs_of_a_teaching_that_was_broken_off_are_taken_up(lesson, copied, pipeline_at, monkeypatch):
     pipeline, _ = lesson
     root = copied("simulate", "train")
-    streamed, made = teaching.streamed, []
+    streamed, made = encoding.streamed, []
 
     def broken(*given):
         if len(made) == 5:
@@ -105,7 +104,7 @@ def test_runs_of_a_teaching_that_was_broken_off_are_taken_up(lesson, copied, pip
         made.append(1)
         return streamed(*given)
 
-    monkeypatch.setattr(teaching, "streamed", broken)
+    monkeypatch.setattr(encoding, "streamed", broken)
     with pytest.raises(KeyboardInterrupt):
         pipeline_at(root, *TAUGHT).teach()
     damaged, said = [next(root.rglob(f"encoded_{index}.npz")) for index in (0, 3)], []
@@ -125,16 +124,16 @@ def test_runs_of_a_teaching_that_was_broken_off_are_taken_up(lesson, copied, pip
 @pytest.mark.slow
 def test_runs_by_several_processes_are_the_same(lesson, copied, pipeline_at, monkeypatch):
     pipeline, _ = lesson
-    monkeypatch.setattr(teaching, "_LEAST_RUNS", 1)
-    monkeypatch.setattr(teaching, "cpu_count", lambda: 2)
-    monkeypatch.setattr(teaching, "_run", None)  # of this process, which makes none
+    monkeypatch.setattr(encoding, "_LEAST_RUNS", 1)
+    monkeypatch.setattr(encoding, "cpu_count", lambda: 2)
+    monkeypatch.setattr(encoding, "_run", None)  # of this process, which makes none
     again = pipeline_at(copied("simulate", "train"), *TAUGHT).teach()
     one, other = (torch.load(r.path / "recurrence.pt", weights_only=True) for r in (pipeline.taught, again))
     assert all(torch.equal(one["state"][name], other["state"][name]) for name in one["state"])
 
 
 def test_runs_that_are_lost_teach_nothing(copied, pipeline_at, monkeypatch):
-    streamed, made, said = teaching.streamed, [], []
+    streamed, made, said = encoding.streamed, [], []
 
     def lost(*given):
         made.append(1)
@@ -142,7 +141,7 @@ def test_runs_that_are_lost_teach_nothing(copied, pipeline_at, monkeypatch):
             raise InstabilityError("it burst")
         return streamed(*given)
 
-    monkeypatch.setattr(teaching, "streamed", lost)
+    monkeypatch.setattr(encoding, "streamed", lost)
     pipeline = pipeline_at(copied("simulate", "train"), *TAUGHT, say=said.append)
     assert pipeline.teach().manifest["metrics"]["runs"] == 10
     assert any("warning: 1 of 11 full-order runs are lost" in line and "it burst" in line for line in said)

@@ -1,0 +1,182 @@
+"""Full-order runs in latent coordinates, of training and of drawn cases: what models learn from.
+
+They are a run of their own, `encode`, which all models that learn from the same cases share. A run of a drawn
+case is encoded as it is made, and not stored.
+"""
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache, partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from joblib.externals.loky import ProcessPoolExecutor, cpu_count
+
+from nsf.data import Case, Trajectory
+from nsf.data.schema import TRAJECTORY
+from nsf.errors import InstabilityError
+from nsf.kinematics.manifold import Manifold
+from nsf.models.inputs import Lessons
+from nsf.models.lookup import inputs_in
+from nsf.progress import Progress
+from nsf.recurrence.stream import Encoded, Encoder, encoded_trajectory, modes_of_stress, streamed
+from nsf.runs import Record, Run
+from nsf.scenes import Scene
+from nsf.storage import intact
+
+_MANIFOLD = "manifold.pt"
+#: Runs of a process, at least: it takes seconds to start.
+_LEAST_RUNS = 8
+
+
+class Lesson(NamedTuple):
+    """A case, and the scene in it, whose gravity may be another than the case has."""
+
+    case: Case
+    scene: Scene
+
+
+def encode(pipeline, run: Run) -> None:
+    """Encode the runs that the model of a pipeline learns from; those in the run's folder are taken up.
+
+    Args:
+        pipeline: a `nsf.pipeline.Pipeline`.
+        run: its encode run.
+    """
+    manifold, c = pipeline.manifold().to(pipeline.device), pipeline.config
+    with run.record(device=pipeline.device, seed=c.seed, precision=c.precision) as record:
+        started = time.perf_counter()
+        encoder = Encoder(manifold, modes_of_stress(manifold))
+        files = _encoded(pipeline, encoder, lessons_of(pipeline), record)
+        for file in files:
+            record.output(file)
+        runs = list(map(Encoded.open, files))
+        record.metrics |= {
+            "runs": len(runs),
+            "streamed": sum(one.seconds > 0.0 for one in runs),
+            "run_seconds": sum(one.seconds for one in runs),
+            "stream_seconds": time.perf_counter() - started,
+        }
+
+
+def lessons_of(pipeline) -> list[Lesson]:
+    """The cases that the model of a pipeline learns from, each with its scene."""
+    training, drawn, _ = pipeline.lessons
+    return list(
+        map(Lesson, [*training, *drawn], [*map(pipeline.scene.at, training), *_varied(pipeline, drawn)])
+    )
+
+
+def _varied(pipeline, cases: Sequence[Case]) -> list[Scene]:
+    """The scene in drawn cases; where no program forces it, gravity is varied in a ball about its own."""
+    scenes = [pipeline.scene.at(case) for case in cases]
+    if pipeline.scene.forcing.gravity:
+        return scenes
+    generator = np.random.default_rng(pipeline.config.seed)
+    ways = generator.standard_normal((len(cases), 3))
+    ways *= generator.random((len(cases), 1)) ** (1 / 3) / np.linalg.norm(ways, axis=1, keepdims=True)
+    reach = pipeline.model.gravity * float(np.linalg.norm(pipeline.scene.gravity))
+    varied = zip(scenes, reach * ways, strict=True)
+    return [replace(scene, gravity=tuple((scene.gravity + way).tolist())) for scene, way in varied]
+
+
+def encoded_runs(pipeline, manifold: Manifold) -> Lessons:
+    """The whole runs of a pipeline's encode run, with what determines them.
+
+    Raises:
+        MissingRunError: they are not there.
+        SchemaError: a file was changed after its run.
+    """
+    run = pipeline.encoding.require()
+    there = {output["path"] for output in run.manifest["outputs"]}
+    pairs = [
+        (lesson, Encoded.open(run.file(_file(index))))
+        for index, lesson in enumerate(lessons_of(pipeline))
+        if _file(index) in there
+    ]
+    return joined(manifold, [(lesson, one) for lesson, one in pairs if one.finite])
+
+
+def encoded_validation(pipeline, manifold: Manifold) -> Lessons:
+    """Likewise of the stored full-order runs by which a model is chosen, none of them held out."""
+    encoder, pairs = Encoder(manifold, modes_of_stress(manifold)), []
+    for case in pipeline.lessons[2]:
+        with Trajectory.open(pipeline.simulation(case).require().file(TRAJECTORY)) as trajectory:
+            run = encoded_trajectory(trajectory, encoder, pipeline.device)
+        pairs.append((Lesson(case, pipeline.scene.at(case)), run))
+    return joined(manifold, pairs)
+
+
+def joined(manifold: Manifold, pairs: Sequence[tuple[Lesson, Encoded]]) -> Lessons:
+    """Encoded runs, and what determines each of them."""
+    cases, scenes = zip(*(lesson for lesson, _ in pairs), strict=True)
+    xhat, stress = (np.stack([getattr(run, name) for _, run in pairs]) for name in ("xhat", "stress"))
+    return Lessons(inputs_in(manifold, cases, scenes, xhat[:, 0]), xhat, stress)
+
+
+def _file(index: int) -> str:
+    return f"encoded_{index}.npz"
+
+
+def _encoded(pipeline, encoder: Encoder, lessons: Sequence[Lesson], record: Record) -> list[Path]:
+    """Files of the runs of some lessons, without those that are lost."""
+    paths = [record.path / _file(index) for index in range(len(lessons))]
+    steps, training = pipeline.scene.steps, pipeline.split.train
+    with Progress("teach: full-order runs", len(lessons) * steps, "steps") as progress:
+        missing = []
+        for lesson, path in zip(lessons, paths, strict=True):
+            stored = pipeline.simulation(lesson.case)
+            if intact(path, pipeline.say):
+                progress.advance(steps)
+            elif lesson.case in training and stored.complete:
+                with Trajectory.open(stored.file(TRAJECTORY)) as trajectory:
+                    encoded_trajectory(trajectory, encoder, pipeline.device).save(path)
+                progress.advance(steps)
+            else:
+                missing.append((lesson, path))
+        lost = _stream(pipeline, encoder, missing, progress.advance)
+    if lost:
+        line = f"{len(lost)} of {len(lessons)} full-order runs are lost: {lost[0]}"
+        record.warn([line])
+        pipeline.say(f"teach: warning: {line}")
+    return [path for path in paths if path.is_file()]
+
+
+def _stream(pipeline, encoder: Encoder, missing, after: Callable[[int], object]) -> list[str]:
+    """Make runs and write each one's file, side by side where there are cores; why some are lost."""
+    how = pipeline.config.precision, pipeline.device
+    processes = min(cpu_count(), len(missing) // _LEAST_RUNS)
+    if processes > 1 and pipeline.device == "cpu":
+        trained = pipeline.training.file(_MANIFOLD)
+        with ProcessPoolExecutor(processes, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+            ends = []
+            for end in pool.map(partial(_alone, trained, encoder.stress, how), *zip(*missing, strict=True)):
+                ends.append(end)
+                after(pipeline.scene.steps)
+    else:
+        ends = [_run(encoder, how, *pair, lambda: after(1)) for pair in missing]
+    return [end for end in ends if end]
+
+
+def _run(encoder: Encoder, how: tuple[str, str], lesson: Lesson, path: Path, after=lambda: None) -> str:
+    """Make one run and write its file; why it is lost, empty where it is not."""
+    try:
+        solver = lesson.scene.full_order({}, *how)
+        streamed(solver, lesson.scene.steps, encoder, after).save(path)
+    except InstabilityError as error:
+        return f"{lesson.case.named}: {error}"
+    return ""
+
+
+def _alone(trained: Path, stress: int, how: tuple[str, str], lesson: Lesson, path: Path) -> str:
+    """Make one run in another process, which reads the manifold's file; why it is lost, or nothing."""
+    return _run(_encoder(trained, stress), how, lesson, path)
+
+
+@cache
+def _encoder(trained: Path, stress: int) -> Encoder:
+    """The encoder of a manifold's file, once in a process."""
+    return Encoder(Manifold.load(trained), stress)
