@@ -4,7 +4,7 @@ STAGES = {
     "run": "the whole chain: simulate, train, deploy, evaluate, report; unchanged stages are reused",
     "simulate": "full-order trajectories of every case",
     "train": "the manifold: encoder and deformation, stress and affine fields",
-    "teach": "what model=recurrence learns of the reduced step; deploy asks for it by itself",
+    "teach": "what model=recurrence, dmdc or gru learns from full-order runs; deploy asks for it by itself",
     "deploy": "reduced runs of the held-out cases",
     "evaluate": "errors and costs of the reduced runs beside the full-order ones",
     "report": "tables, charts and pictures of every evaluated variant of the scene",

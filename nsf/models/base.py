@@ -17,7 +17,8 @@ class Model(ABC):
 
     Attributes:
         name: as `model=` takes it, and as tables call it.
-        learns: whether the stage `teach` makes something of it, once, that all its runs use.
+        learns: whether the stage `teach` makes something of it, once, that all its runs use
+            (`nsf.models.drawn.Drawn`).
         projects: whether its runs take projected steps, on which trust is calibrated.
     """
 

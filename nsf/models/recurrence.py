@@ -19,13 +19,14 @@ class Recurrence(Drawn):
 
     Attributes:
         stress: coordinates ŝ of τ beside x̂; None: `STRESS`.
-        members, width, descents: as for `nsf.recurrence.Fitting`.
+        members, width, descents, window: as for `nsf.recurrence.Fitting`.
     """
 
     stress: int | None = None
     members: int = 4
     width: int = 96
     descents: int = 2000
+    window: int | None = None
 
     def __post_init__(self):
         super().__post_init__()
@@ -36,7 +37,7 @@ class Recurrence(Drawn):
     @property
     def fitting(self) -> Fitting:
         """How it is fitted."""
-        return Fitting(self.width, self.members, self.descents)
+        return Fitting(self.width, self.members, self.descents, window=self.window)
 
     @override
     def stress_of(self, forced: bool) -> int:

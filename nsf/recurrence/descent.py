@@ -199,7 +199,7 @@ def fit(
     descent = Descent(form, runs, sigma, fitting, seed, device)
     errors, best = [], None
     with one_thread():
-        for window, steps in windows(len(runs.xhat) - 1, fitting.descents):
+        for window, steps in windows(len(runs.xhat) - 1, fitting):
             descent.run(window, steps, after)
             descent.copy_to(form)
             error = float(yardstick.errors(form).mean())
@@ -233,12 +233,12 @@ def _check_members(form: Form, runs: Runs) -> None:
         )
 
 
-def windows(strides: int, descents: int) -> list[tuple[int, int]]:
+def windows(strides: int, fitting: Fitting) -> list[tuple[int, int]]:
     """Strides of each kind of window, and how many steps of the descent take it."""
     longest = max(1, strides - 2)
-    lengths = [min(length, longest) for length, _ in _WINDOWS[:-1]]
-    lengths.append(min(max(_WINDOWS[-1][0], strides // 2), longest))
-    steps = [max(1, round(share * descents)) for _, share in _WINDOWS]
+    last = fitting.window or max(_WINDOWS[-1][0], strides // 2)
+    lengths = [min(length, last, longest) for length in (*(length for length, _ in _WINDOWS[:-1]), last)]
+    steps = [max(1, round(share * fitting.descents)) for _, share in _WINDOWS]
     return list(zip(lengths, steps, strict=True))
 
 

@@ -14,6 +14,7 @@ class Fitting:
         width: of both hidden layers of each network.
         members: fitted side by side, whose runs are averaged.
         descents: steps of the descent.
+        window: strides of the longest windows; None: half a run.
         batch: windows of each, a member.
         noise: on x̂ and ŝ at the start of a window [deviations].
 
@@ -26,10 +27,11 @@ class Fitting:
     descents: int = 2000
     batch: int = 128
     noise: float = 0.01
+    window: int | None = None
 
     def __post_init__(self):
-        for name in ("width", "members", "descents", "batch"):
-            if getattr(self, name) < 1:
+        for name in ("width", "members", "descents", "batch", "window"):
+            if getattr(self, name) is not None and getattr(self, name) < 1:
                 raise ConfigError(f"{name}={getattr(self, name)} must be at least 1")
         if not (math.isfinite(self.noise) and self.noise >= 0):
             raise ConfigError(f"noise={self.noise} must be finite and at least 0")

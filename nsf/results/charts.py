@@ -18,6 +18,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from nsf.data.case import PROGRAM
 from nsf.results.columns import COLUMNS, RIVALS, SEEDS, axis, column, number
 from nsf.results.formats import file_name
 from nsf.results.style import (
@@ -108,6 +109,55 @@ def chart(caption: str) -> Callable[[Callable[[View], Figures]], Callable[[View]
         return drawn
 
     return register
+
+
+# -- errors of programs ---------------------------------------------------------------------------------
+
+
+@chart(
+    "Displacement error at each held-out program, the mean over seeds (dots), and their median (line): of "
+    "every model, and below the line of rivals that need none. A dot at the right edge is a run that is lost."
+)
+def programs(view: View) -> Figures:
+    """Displacement error of every program by model, a panel a body; of scenes that programs force."""
+    forced = view.frame[view.frame["case"].str.contains(f"{PROGRAM}=")]
+    if forced.empty:
+        return {}
+    groups = list(forced.groupby("body", sort=False))
+    most = max(part["variant"].nunique() for _, part in groups) + len(RIVALS)
+    fig, drawn = panels(len(groups), 0.9 + 0.27 * most, 2)
+    for panel, (body, part) in zip(drawn, groups, strict=True):
+        rows = {
+            name: _of_programs(one["displacement_error"], one)
+            for name, one in part.groupby("variant", sort=False)
+        }
+        models = len(rows)
+        rows |= {COLUMNS[name].title: _of_programs(part[name], part) for name in RIVALS}
+        every = np.concatenate(list(rows.values()))
+        error_scale(panel, every, "x")
+        for y, errors in enumerate(rows.values()):
+            color = REDUCED if y < models else MUTED
+            _dots(panel, y, errors, color)
+        panel.axhline(models - 0.5, color=MUTED, lw=0.8)
+        panel.set_yticks(range(len(rows)), ["\n".join(textwrap.wrap(name, 30)) for name in rows])
+        panel.set(title=body, xlabel=ERROR, ylim=(len(rows) - 0.45, -0.55))
+        panel.tick_params(axis="y", length=0)
+    return {"programs": fig}
+
+
+def _of_programs(errors: pd.Series, part: pd.DataFrame) -> np.ndarray:
+    """Errors [%] of each case, means over seeds; ∞ where one is lost, none where nothing was measured."""
+    return 100 * errors.groupby(part["case"]).agg(whole_mean).dropna().to_numpy()
+
+
+def _dots(panel, y: int, errors: np.ndarray, color: str) -> None:
+    """Errors [%] as dots in a row, with their median; those beyond the axis at its end."""
+    edge = panel.get_xlim()[1]
+    panel.plot(
+        np.minimum(errors, edge), np.full(len(errors), y), "o", ms=4.5, mfc="white", mec=color, clip_on=False
+    )
+    if len(errors) and (middle := np.median(errors)) <= edge:
+        panel.plot([middle] * 2, [y - 0.34, y + 0.34], color=color, lw=2.4)
 
 
 # -- errors of the variants -----------------------------------------------------------------------------

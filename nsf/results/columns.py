@@ -135,15 +135,13 @@ def brief(text: str) -> str:
 
 
 def model_name(row: Mapping) -> str:
-    """A model in words: `projected`, the baseline under its own name, `recurrence taught by projected`."""
+    """A model in words: `projected`, the baseline under its own name."""
     stress, affine = row.get("stress") or "field", row.get("affine") or "field"
     name = str(row["model"])
     if name == "projected" and (stress, affine) == ("deformation", "none"):
         return BASELINE
     if name == "projected" and (stress, affine) != ("field", "field"):
         return f"projected, stress={stress}, affine={affine}"
-    if name == "recurrence" and row.get("teacher"):
-        return f"recurrence taught by {row['teacher']}"
     return name
 
 

@@ -20,7 +20,7 @@ from nsf.runs.run import Run
 FILES = ("results.csv", "series.csv", "frames.npz", "cost.json", "summary.json")
 """Files of an evaluate run."""
 _IN_COLUMNS = (
-    *("scene", "model", "model.teacher", "stress", "affine", "field"),
+    *("scene", "model", "stress", "affine", "field"),
     *("latent_dim", "material", "seed", "scale", "precision", "device", "deploy.split"),
 )
 _PASSING = ("evaluation.", "data.", "super_resolution.", "report.")  # keys that tell no models apart

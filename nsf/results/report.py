@@ -36,7 +36,7 @@ from nsf.runs.columns import differing
 from nsf.runs.listing import Entry
 
 _IDENTITY = (
-    *("scene", "material", "model", "teacher", "stress", "affine", "field", "r", "particles", "case"),
+    *("scene", "material", "model", "stress", "affine", "field", "r", "particles", "case"),
     *("seed", "setting", "split", "precision", "device"),
 )
 _MEANS = (

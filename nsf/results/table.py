@@ -242,7 +242,7 @@ def means(frame: pd.DataFrame, by: Sequence[str] = ("body", "variant")) -> pd.Da
 
 
 _KEPT = (
-    *("scene", "material", "model", "model_name", "stress", "affine", "teacher", "field", "r", "sample"),
+    *("scene", "material", "model", "model_name", "stress", "affine", "field", "r", "sample"),
     *("particles", "precision", "device"),
 )
 

@@ -87,7 +87,7 @@ def test_results_have_the_columns_of_a_report(chain):
     assert list(results) == list(EVALUATED)
     assert len(results) == 1
     assert set(results.columns[results.isna().any()]) == {
-        *("teacher", "estimated_error", "distrusted_at", "fallback_at")
+        *("estimated_error", "distrusted_at", "fallback_at")
     }  # a recurrence has the first two; this run is believed to its end
     row = results.iloc[0]
     assert (row["scene"], row["model"], row["field"], row["split"]) == ("sand", "projected", "basis", "test")
@@ -498,7 +498,7 @@ def test_a_diverged_rollout_is_infinite_and_never_nan(copied, pipeline_at):
         "fallback_at",
     ]
     assert results[costs].isna().all().all()  # of a run that has left the grid, and is none by a recurrence
-    assert not results.drop(columns=[*costs, "teacher", "distrusted_at"]).isna().any().any()
+    assert not results.drop(columns=[*costs, "distrusted_at"]).isna().any().any()
     frames = np.load(pipeline.evaluation.path / "frames.npz")
     assert np.isfinite(frames["x_reduced"]).all()
     for name in ("cost.json", "summary.json"):

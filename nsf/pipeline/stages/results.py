@@ -79,7 +79,7 @@ def rows(
         offline: times of training and of teaching [s].
     """
     commit = str(manifest.get("commit") or "unknown")[:12] + ("-dirty" if manifest.get("dirty") else "")
-    shared = model_columns(config, model) | {
+    shared = describe(config, model) | {
         "scene": config.scene.name,
         "material": _material(config),
         "field": manifold.field,
@@ -121,12 +121,6 @@ def rows(
         off = {f"{name}_error": comparison.quantities.get(name, math.nan) for name in QUANTITIES}
         content.append(shared | of_case | _beside(rival) | times | off)
     return pd.DataFrame(content).reindex(columns=list(EVALUATED))
-
-
-def model_columns(config: DictConfig, chosen: str = "") -> dict[str, str]:
-    """Which model took the steps, what it learned from, and where a projected step takes τ and C from."""
-    columns = describe(config, chosen)
-    return columns | {"teacher": "runs" if columns["model"] == "recurrence" else ""}
 
 
 def _material(config: DictConfig) -> str:

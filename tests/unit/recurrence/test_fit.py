@@ -112,9 +112,10 @@ def test_members_that_disagree_from_the_first_step_are_an_error(monkeypatch):
 
 
 def test_windows_grow_to_half_a_run():
-    assert windows(400, 1000) == [(16, 350), (64, 450), (200, 200)]
-    assert windows(50, 100) == [(16, 35), (48, 45), (48, 20)]
-    assert [length for length, _ in windows(2, 3)] == [1, 1, 1]
+    assert windows(400, replace(SHORT, descents=1000)) == [(16, 350), (64, 450), (200, 200)]
+    assert windows(50, replace(SHORT, descents=100)) == [(16, 35), (48, 45), (48, 20)]
+    assert [length for length, _ in windows(2, replace(SHORT, descents=3))] == [1, 1, 1]
+    assert windows(400, replace(SHORT, window=30))[1][0] == 30
 
 
 def test_a_captured_descent_is_that_of_the_host(device):

@@ -65,7 +65,7 @@ def frame(*runs: Made) -> pd.DataFrame:
 
 def _rows(made: Made) -> list[dict]:
     shared = {
-        "scene": made.scene, "material": "drucker_prager", "model": made.model, "teacher": "",
+        "scene": made.scene, "material": "drucker_prager", "model": made.model,
         "stress": made.stress, "affine": made.affine, "field": "basis", "r": made.r, "sample": 50,
         "integration": 900.0, "particles": made.particles, "seed": made.seed, "split": "test",
         "displacement_static": 1.0, "displacement_nearest": 0.2, "displacement_interpolated": 0.05,
