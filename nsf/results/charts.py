@@ -125,7 +125,7 @@ def programs(view: View) -> Figures:
         return {}
     groups = list(forced.groupby("body", sort=False))
     most = max(part["variant"].nunique() for _, part in groups) + len(RIVALS)
-    fig, drawn = panels(len(groups), 0.9 + 0.27 * most, 2)
+    fig, drawn = panels(len(groups), 0.5 + 0.27 * most, 2)
     for panel, (body, part) in zip(drawn, groups, strict=True):
         rows = {
             name: _of_programs(one["displacement_error"], one)

@@ -15,7 +15,7 @@ import pandas as pd
 import rich.console
 
 from nsf import schemas
-from nsf.data.case import Case
+from nsf.data.case import PROGRAM, Case
 from nsf.errors import ConfigError, MissingRunError, SchemaError, first_line
 from nsf.results.columns import (
     ABSENT,
@@ -54,6 +54,8 @@ _CONSOLE = (
 )
 _TELLING = ("variant", "case", "cases", "paper_delta")  # shown where they vary
 _DRAWS = 10_000  # of seeds and cases, for the interval of a mean
+BEYOND = " (programs beyond what was taught)"
+"""Ends the variant of rows whose program led beyond what was taught; no mean of the others counts them."""
 DEVIATION = ", deviation"
 """Ends the names of columns of `means` that have the deviation over seeds."""
 
@@ -177,6 +179,7 @@ def labelled(frame: pd.DataFrame) -> pd.DataFrame:
     frame["body"] = _bodies(frame)
     frame["model_name"] = [model_name(row) for row in frame.to_dict("records")]
     frame["variant"] = variants(frame)
+    frame.loc[_beyond(frame), "variant"] += BEYOND
     # Both errors of a run divide one distance, so that their ratio is of the full-order run alone.
     ratio = (frame["delta"] / frame["displacement_error"]).groupby([frame["body"], frame["case"]])
     ratio = ratio.transform("median")
@@ -186,6 +189,13 @@ def labelled(frame: pd.DataFrame) -> pd.DataFrame:
     frame["decoded_ms"] = frame["total_ms"] + frame["decode_ms"]
     keys = [frame[name].map(natural) for name in ("body", "variant", "split", "seed", "case")]
     return frame.loc[pd.concat(keys, axis=1).apply(tuple, axis=1).sort_values(kind="stable").index]
+
+
+def _beyond(frame: pd.DataFrame) -> pd.Series:
+    """Whether most runs by recurrence say of a row's program that it led beyond what was taught."""
+    said = frame.get("beyond", pd.Series(np.nan, frame.index)).where(frame["model"] == "recurrence")
+    share = said.astype(float).groupby([frame["body"], frame["case"]]).transform("mean")
+    return (share > 0.5) & frame["case"].str.contains(f"{PROGRAM}=")
 
 
 def variants(frame: pd.DataFrame, without: Iterable[str] = ()) -> list[str]:

@@ -15,6 +15,7 @@ PLANE = tuple(
 )
 #: What each chart needs to have something to draw.
 NEEDS = {
+    "programs": {"case": [*PLANE, PLANE[0].replace("program=0", "program=9")]},
     "delta_over": {"setting": ["sampler.size=12", "sampler.size=12", "sampler.size=50", "sampler.size=50"]},
     "step_over_particles": {"particles": [1000, 1000, 9000, 9000]},
     "error_over_parameters": {"case": [*PLANE, PLANE[0].replace("program=0", "program=9")]},
@@ -54,6 +55,16 @@ def test_a_chart_draws_something_with_units(name):
 def test_a_chart_is_left_out_where_there_is_nothing_of_its_kind(name):
     rows = table.labelled(table.complete(frame(Made(timed=False)), "here"))
     assert CHARTS[name].draw(View(rows)) == {}
+
+
+def test_every_program_is_a_dot_beside_its_rivals():
+    rows = table.labelled(table.complete(frame(Made((0.01, np.inf), PLANE[:2])), "here"))
+    panel = charts.programs(View(rows))["programs"].axes[0]
+    dots = {y: line.get_xdata() for line in panel.lines if (y := line.get_ydata()[0]) == line.get_ydata()[-1]}
+    names = [text.get_text().replace("\n", " ") for text in panel.get_yticklabels()]
+    assert names[:2] == ["projected", "nothing moves"]
+    assert len(dots[0]) == 2
+    assert max(dots[0]) == panel.get_xlim()[1]  # lost
 
 
 def test_a_run_that_diverged_leaves_a_gap_and_is_said():

@@ -134,7 +134,7 @@ def test_no_complete_run_is_refused(tmp_path):
 
 
 def test_an_unknown_chart_and_a_foreign_folder_are_refused(runs, tmp_path):
-    with pytest.raises(ConfigError, match="plots=pie is no chart; choose of delta"):
+    with pytest.raises(ConfigError, match="plots=pie is no chart; choose of programs, delta"):
         build_report(runs, tmp_path / "r", Question("trial", "T", plots=["pie"]))
     (tmp_path / "r").mkdir()
     (tmp_path / "r/thesis.tex").write_text("mine")

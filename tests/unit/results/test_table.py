@@ -57,6 +57,17 @@ def test_variants_are_named_by_what_differs():
     assert shown["sampler.size"].tolist() == [12] * 4
 
 
+def test_programs_beyond_what_was_taught_are_a_row_of_their_own():
+    cases, models = ("E=5 Pa, program=0", "E=6 Pa, program=1"), ("projected", "recurrence")
+    made = frame(*(Made((0.01, 9.0), cases, model=model) for model in models))
+    shown = table.labelled(table.complete(made, "here").assign(beyond=[0, 0, 0, 1]))
+    averages = table.means(shown).set_index("variant")
+    assert averages["cases"].tolist() == [1] * 4
+    for model in models:
+        assert averages["delta"][model] == 0.01
+        assert averages["delta"][model + table.BEYOND] == 9.0
+
+
 def test_a_body_has_its_material_or_size_where_a_scene_has_several():
     assert set(rows(Made(), Made(particles=1_000_000))["body"]) == {
         "sand · 3,000 particles", "sand · 1,000,000 particles",
