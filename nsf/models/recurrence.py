@@ -19,13 +19,14 @@ class Recurrence(Drawn):
 
     Attributes:
         stress: coordinates ŝ of τ beside x̂; None: `STRESS`.
-        members, width, descents, window: as for `nsf.recurrence.Fitting`.
+        members, width, descents, batch, window: as for `nsf.recurrence.Fitting`.
     """
 
     stress: int | None = None
     members: int = 4
     width: int = 96
     descents: int = 2000
+    batch: int = 128
     window: int | None = None
 
     def __post_init__(self):
@@ -37,7 +38,7 @@ class Recurrence(Drawn):
     @property
     def fitting(self) -> Fitting:
         """How it is fitted."""
-        return Fitting(self.width, self.members, self.descents, window=self.window)
+        return Fitting(self.width, self.members, self.descents, self.batch, window=self.window)
 
     @override
     def stress_of(self, forced: bool) -> int:

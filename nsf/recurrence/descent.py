@@ -1,8 +1,10 @@
 """Fits a recurrence to runs: descent on windows of them, from 16 strides to half a run."""
 
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 import numpy as np
 import torch
@@ -245,8 +247,9 @@ def windows(strides: int, fitting: Fitting) -> list[tuple[int, int]]:
 class Descent:
     """Steps of Adam on all members together, none of which sees the others.
 
-    On a GPU a step is captured once for each kind of window: its thousands of kernels are so small that to
-    launch them one by one takes longer than the step on a CPU.
+    On a GPU a stride is compiled, where Triton and a C compiler are there, and a step captured once for each
+    kind of window: its thousands of kernels are so small that to launch them one by one takes longer than
+    the step on a CPU.
 
     Args:
         form: where it begins; it stays as it is.
@@ -269,6 +272,7 @@ class Descent:
         captured = self._device.type == "cuda"
         rate = torch.tensor(_RATE, device=device) if captured else _RATE
         self._adam = torch.optim.Adam(self._form.parameters(), lr=rate, betas=_BETAS, capturable=captured)
+        self._stride = torch.compile(self._take, dynamic=False) if captured and _compiles() else self._take
 
     def run(self, window: int, steps: int, after: Callable[[int], object]) -> None:
         """Take steps on windows of some strides."""
@@ -321,26 +325,33 @@ class Descent:
         """Sum over members of the mean loss of their windows."""
         form, noise = self._form, self._fitting.noise
         x, d, s, mu, g = self._runs
-        begun = State(x[n, k], d[n, k], s[n, k])
-        state = State(
-            begun.xhat + noise * form.x_scale * of_x, begun.change, begun.stress + noise * form.s_scale * of_s
-        )
-        loss = 0.0
+        steps = n + torch.arange(window + 1, device=n.device)[:, None, None]
+        x, d, s = x[steps, k], d[steps, k], s[steps, k]
+        mu, g, c = mu[k], g[steps[:-1], k], self._c[steps[:-1], k]
+        begun = State(x[0], d[0], s[0])
+        state = State(x[0] + noise * form.x_scale * of_x, d[0], s[0] + noise * form.s_scale * of_s)
+        errors = []
         for j in range(window):
-            state = form.step(state, mu[k], g[n + j, k], self._c[n + j, k])
-            target = State(x[n + j + 1, k], d[n + j + 1, k], s[n + j + 1, k])
-            scales = form.x_scale, form.d_scale, form.s_scale
-            off = [_held(a - b, scale) for a, b, scale in zip(state, target, scales, strict=True)]
-            state = State(*(b + by for b, by in zip(target, off, strict=True)))
-            error = (self._weight * off[0].square()).sum(-1)
-            if form.sizes.stress:
-                error = error + _STRESS * (off[2] / form.s_scale).square().mean(-1)
-            loss = loss + torch.log1p(_GROWTH * error / (1 + j)).mean(1)
-        after = form.step(begun, mu[k], g[n, k], self._c[n, k])
-        single = ((after.change - d[n + 1, k]) / form.a_scale).square().mean((1, 2))
+            state, error = self._stride(state, State(x[j + 1], d[j + 1], s[j + 1]), mu, g[j], c[j])
+            errors.append(error)
+        growth = _GROWTH / torch.arange(1.0, window + 1, device=n.device)
+        loss = torch.log1p(growth[:, None, None] * torch.stack(errors)).mean((0, 2))
+        after = form.step(begun, mu, g[0], c[0])
+        single = ((after.change - d[1]) / form.a_scale).square().mean((1, 2))
         if form.sizes.stress:
-            single = single + ((after.stress - s[n + 1, k]) / form.t_scale).square().mean((1, 2))
-        return (loss / window + _SINGLE * single).sum()
+            single = single + ((after.stress - s[1]) / form.t_scale).square().mean((1, 2))
+        return (loss + _SINGLE * single).sum()
+
+    def _take(self, state: State, target: State, mu: Tensor, g: Tensor, c: Tensor) -> tuple[State, Tensor]:
+        """The state after a stride, held near the target, and its error [M, b]."""
+        form = self._form
+        state = form.step(state, mu, g, c)
+        scales = form.x_scale, form.d_scale, form.s_scale
+        off = [_held(a - b, scale) for a, b, scale in zip(state, target, scales, strict=True)]
+        error = (self._weight * off[0].square()).sum(-1)
+        if form.sizes.stress:
+            error = error + _STRESS * (off[2] / form.s_scale).square().mean(-1)
+        return State(*(b + by for b, by in zip(target, off, strict=True))), error
 
     def _captured(self, window: int) -> Callable[..., None]:
         """A step of the descent as a CUDA graph."""
@@ -375,6 +386,11 @@ class Descent:
         for i, state in enumerate(self._adam.state.values()):
             for name, value in state.items():
                 value.copy_(moments[i][name]) if i in moments else value.zero_()
+
+
+def _compiles() -> bool:
+    """Whether torch can compile kernels for a GPU here."""
+    return find_spec("triton") is not None and any(map(shutil.which, ("cc", "gcc", "clang")))
 
 
 def _held(values: Tensor, scale: Tensor) -> Tensor:
