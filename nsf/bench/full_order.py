@@ -7,7 +7,7 @@ import numpy as np
 from nsf.bench.measure import WARM_UP, WINDOW, bandwidth, build, pass_time, window_times
 from nsf.bench.rows import Case, Measurements, name_of, size_name
 from nsf.mpm import DomainWalls, FullOrderMPM, GridGeometry, HalfSpace, ParticleConstants
-from nsf.mpm.grid.nodes import BLOCK
+from nsf.mpm.grid.geometry import BLOCK
 from nsf.mpm.materials import DruckerPrager
 from nsf.scenes import Box
 from nsf.timing import elapsed_ms, synchronizer

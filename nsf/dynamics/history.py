@@ -10,7 +10,7 @@ from nsf.dynamics.integration import ParticleSets
 from nsf.dynamics.interop import as_scalars
 from nsf.dynamics.span import Stages
 from nsf.dynamics.step import Step
-from nsf.mpm import stressed
+from nsf.mpm.stressed import stressed
 from nsf.mpm.transfer import make_g2p_stress
 from nsf.sampling.sampler import SampleSpan
 

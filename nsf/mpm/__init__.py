@@ -1,41 +1,26 @@
-"""Full-order material point method (paper section 3). Never imports torch."""
+"""Full-order material point method (paper section 3). Never imports torch.
 
-import os
-from contextlib import suppress
+Names are imported on first use: bodies, laws and boundaries are checked without Warp.
+"""
 
-import warp as wp
+from typing import TYPE_CHECKING
 
-from nsf.gpu import has_driver
+from nsf.extras import on_first_use
 
-wp.config.log_level = wp.LOG_ERROR  # kernels are compiled without a word; errors still show
-
-
-def _begin_without_gpu() -> None:
-    """Start Warp where no GPU can be, without its warning; `nsf doctor` says what is missing."""
-    with suppress(OSError), open(os.devnull, "wb") as nowhere:
-        stderr = os.dup(2)  # the warning comes from C++, which knows no sys.stderr
-        try:
-            os.dup2(nowhere.fileno(), 2)
-            wp.init()
-        finally:
-            os.dup2(stderr, 2)
-            os.close(stderr)
-
-
-if not has_driver():
-    _begin_without_gpu()
-
-from nsf.mpm.boundaries.arrays import BoundaryArrays, DomainWalls  # noqa: E402
-from nsf.mpm.boundaries.colliders import Collider, Cuboid, HalfSpace, Sphere, floor_height  # noqa: E402
-from nsf.mpm.boundaries.motion import Motion  # noqa: E402
-from nsf.mpm.forcing import Forcing, Gravity, Hand  # noqa: E402
-from nsf.mpm.grid.nodes import Grid, GridGeometry  # noqa: E402
-from nsf.mpm.precision import FP32, FP64, Precision, precision_of  # noqa: E402
-from nsf.mpm.solver import FullOrderMPM, Solver, diagnosed  # noqa: E402
-from nsf.mpm.state import ParticleConstants, ParticleState  # noqa: E402
-from nsf.mpm.step import GridStep  # noqa: E402
-from nsf.mpm.stressed import stressed  # noqa: E402
-from nsf.mpm.transfer import Transfer  # noqa: E402
+if TYPE_CHECKING:
+    from nsf.mpm.boundaries.arrays import BoundaryArrays
+    from nsf.mpm.boundaries.colliders import Collider, Cuboid, HalfSpace, Sphere, floor_height
+    from nsf.mpm.boundaries.motion import Motion
+    from nsf.mpm.boundaries.walls import DomainWalls
+    from nsf.mpm.forcing import Forcing, Gravity, Hand
+    from nsf.mpm.grid.geometry import GridGeometry
+    from nsf.mpm.grid.nodes import Grid
+    from nsf.mpm.particles import ParticleConstants
+    from nsf.mpm.precision import FP32, FP64, Precision, precision_of
+    from nsf.mpm.solver import FullOrderMPM, Solver, diagnosed
+    from nsf.mpm.state import ParticleState
+    from nsf.mpm.step import GridStep
+    from nsf.mpm.transfer.scheme import Transfer
 
 __all__ = [
     "FP32",
@@ -62,5 +47,6 @@ __all__ = [
     "diagnosed",
     "floor_height",
     "precision_of",
-    "stressed",
 ]
+
+__getattr__ = on_first_use(__name__)

@@ -1,11 +1,31 @@
-"""Devices by name, and the GPUs of a host."""
+"""Warp and its devices by name, and the GPUs of a host."""
 
 import os
+from contextlib import suppress
 from functools import cache
 
 import warp as wp
 
 from nsf.errors import DeviceError, StorageError
+from nsf.gpu import has_driver
+
+wp.config.log_level = wp.LOG_ERROR  # kernels are compiled without a word; errors still show
+
+
+def _begin_without_gpu() -> None:
+    """Start Warp where no GPU can be, without its warning; `nsf doctor` says what is missing."""
+    with suppress(OSError), open(os.devnull, "wb") as nowhere:
+        stderr = os.dup(2)  # the warning comes from C++, which knows no sys.stderr
+        try:
+            os.dup2(nowhere.fileno(), 2)
+            wp.init()
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+
+
+if not has_driver():
+    _begin_without_gpu()
 
 
 def warp_device(name: str):

@@ -2,17 +2,19 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
+from typing import TYPE_CHECKING
 
 import numpy as np
-import warp as wp
 
 from nsf.errors import ConfigError
-from nsf.mpm.boundaries.arrays import BoundaryArrays
 from nsf.mpm.boundaries.colliders import Collider
-from nsf.mpm.boundaries.motion import Motion, keyframe_before
+from nsf.mpm.boundaries.motion import Motion
 from nsf.mpm.precision import Precision
 from nsf.vectors import numbers, vector
+
+if TYPE_CHECKING:
+    from nsf.mpm.boundaries.arrays import BoundaryArrays
 
 
 @dataclass(frozen=True)
@@ -79,19 +81,20 @@ class Forcing:
     def __init__(
         self,
         gravities: Sequence[Gravity | Sequence[float]],
-        boundaries: BoundaryArrays,
+        boundaries: "BoundaryArrays",
         precision: Precision,
         device,
     ):
+        import warp as wp
+
         gravities = [g if isinstance(g, Gravity) else Gravity.constant(g) for g in gravities]
-        self.boundaries, self._programs, self._device = boundaries, tuple(gravities), device
+        self.boundaries, self._programs = boundaries, tuple(gravities)
         self.gravities, self.version = list(gravities), 0
         self._real = precision.numpy
         self.now = wp.array(self._first(), dtype=precision.vec3, device=device)
         self._varies = any(gravity.varies for gravity in gravities)
         if not self._varies:
             return
-        self._follow = make_follow_gravity(precision)
         self._steps = wp.zeros(len(gravities), dtype=wp.int32, device=device)
         # The first keyframe of each run is for a hand.
         ends = np.cumsum([1 + len(gravity.times) for gravity in gravities])
@@ -101,6 +104,7 @@ class Forcing:
         self._times = wp.array(times, dtype=wp.float64, device=device)
         self._values = wp.array(self._keyframe_values, dtype=wp.vec3d, device=device)
         self._from, self._last = (wp.array(rows, dtype=wp.int32, device=device) for rows in (begin, last))
+        self._follow = partial(wp.launch, make_follow_gravity(precision), dim=len(self), device=device)
 
     def __len__(self) -> int:
         return len(self._programs)
@@ -121,7 +125,7 @@ class Forcing:
         self.boundaries.advance(dt)
         if self._varies:
             inputs = [self._times, self._values, self._from, self._last, dt, self._steps, self.now]
-            wp.launch(self._follow, dim=len(self), inputs=inputs, device=self._device)
+            self._follow(inputs=inputs)
 
     def set_gravity(self, values: np.ndarray, runs: Sequence[int] | None = None) -> None:
         """Gravity [n, 3] [m/s²] of some runs, all by default, from the next step on, in place of programs."""
@@ -232,6 +236,10 @@ class Hand:
 @cache
 def make_follow_gravity(precision: Precision):
     """Kernel that sets the gravity of each run for the step that starts at t^n, and counts the step."""
+    import warp as wp
+
+    from nsf.mpm.boundaries.following import keyframe_before
+
     vec3, f64, vec3d = precision.vec3, wp.float64, wp.vec3d
 
     @wp.kernel(enable_backward=False, module="unique")

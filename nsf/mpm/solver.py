@@ -9,19 +9,23 @@ import warp as wp
 
 from nsf.errors import ConfigError, InstabilityError, ShapeError
 from nsf.gpu import without_collection
-from nsf.mpm.boundaries.arrays import BoundaryArrays, DomainWalls
+from nsf.mpm.boundaries.arrays import BoundaryArrays
 from nsf.mpm.boundaries.colliders import Collider
+from nsf.mpm.boundaries.walls import DomainWalls
 from nsf.mpm.device import warp_device
 from nsf.mpm.forcing import Forcing, Gravity, Hand
-from nsf.mpm.grid import Grid, GridGeometry
+from nsf.mpm.grid.geometry import GridGeometry
+from nsf.mpm.grid.nodes import Grid
 from nsf.mpm.grid.shape import stencil_offset
-from nsf.mpm.materials import Material, make_elastic_stress, make_stress_update
+from nsf.mpm.materials.base import Material, make_elastic_stress, make_stress_update
+from nsf.mpm.particles import ParticleConstants
 from nsf.mpm.precision import Precision, precision_of
 from nsf.mpm.stability import MAX_ELASTIC_CFL, check_time_step, wave_speed_at
-from nsf.mpm.state import ParticleConstants, ParticleState, cell_order
+from nsf.mpm.state import ParticleState, cell_order
 from nsf.mpm.step import GridStep
 from nsf.mpm.stressed import stressed
-from nsf.mpm.transfer import Transfer, make_g2p_stress
+from nsf.mpm.transfer.g2p import make_g2p_stress
+from nsf.mpm.transfer.scheme import Transfer
 from nsf.mpm.watch import Watch
 from nsf.timing import StageTimer
 

@@ -6,8 +6,8 @@ import numpy as np
 
 from nsf.errors import ConfigError, InstabilityError
 from nsf.mpm.boundaries.colliders import Collider
-from nsf.mpm.grid.nodes import GridGeometry
-from nsf.mpm.state import ParticleConstants
+from nsf.mpm.grid.geometry import GridGeometry
+from nsf.mpm.particles import ParticleConstants
 
 # c Δt/Δx = 1 is the limit of one quadrature point in the middle of each cell, the worst regular
 # arrangement of particles under B-splines (quadratic with exact quadrature: 1.63).

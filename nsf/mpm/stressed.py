@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from nsf.mpm.materials import Material
+from nsf.mpm.materials.base import Material
 
 _OFF_THE_EDGE = 1e-2  # of a stress, by which it is scaled down in a turn
 _TURNS = 1000  # to a share of 4e-5

@@ -6,7 +6,6 @@ from nsf import config as configuration
 from nsf.data import Case
 from nsf.errors import ConfigError
 from nsf.kinematics.fields.basis import BasisField
-from nsf.mpm.recording import frame_bytes
 from nsf.mpm.stability import check_colliders, check_time_step
 from nsf.runs import Run
 from nsf.sampling.sampler import check_well_posed
@@ -99,6 +98,8 @@ def check_room(pipeline, runs: Mapping[Run, tuple[Case, Scene]]) -> None:
         ConfigError: names the bytes of memory that are needed and available.
         StorageError: names the bytes of the disk.
     """
+    from nsf.mpm.recording import frame_bytes
+
     stored = pipeline.stored
     for _, scene in runs.values():
         check_memory(scene, pipeline.config.precision, pipeline.device, stored)

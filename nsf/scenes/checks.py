@@ -7,10 +7,7 @@ import numpy as np
 
 from nsf.errors import ConfigError
 from nsf.memory import host_memory, require_memory
-from nsf.mpm import Precision, precision_of
-from nsf.mpm.device import warp_device
-from nsf.mpm.recording import block_bytes
-from nsf.mpm.solver import bytes_on_device
+from nsf.mpm.precision import Precision, precision_of
 from nsf.mpm.stability import wave_speed
 
 # [byte] a particle that placing it and building a solver take on the host, measured.
@@ -45,6 +42,10 @@ def check_memory(scene, precision: str, device: str, stored: Precision | None = 
         ConfigError: names the bytes needed and available.
         DeviceError: the device does not exist.
     """
+    from nsf.mpm.device import warp_device  # Warp takes 0.3 s to load
+    from nsf.mpm.recording import block_bytes
+    from nsf.mpm.solver import bytes_on_device
+
     on, particles, grid = warp_device(device), scene.particle_count, scene.grid
     solver = bytes_on_device(particles, grid, scene.material, precision_of(precision))
     block = block_bytes(particles, stored) if stored else 0

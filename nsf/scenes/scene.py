@@ -4,13 +4,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
 from nsf.data import PROGRAM, Case, Split
 from nsf.errors import ConfigError
-from nsf.mpm import Collider, DomainWalls, FullOrderMPM, Gravity, GridGeometry, ParticleConstants, Transfer
+from nsf.mpm import Collider, DomainWalls, Gravity, GridGeometry, ParticleConstants, Transfer
 from nsf.mpm.materials import Material
 from nsf.scalars import length, number, text
 from nsf.scenes.body import Body
@@ -21,6 +21,9 @@ from nsf.scenes.parameters import Parameter, check_parameters
 from nsf.scenes.paths import parts_of, value_at, with_value
 from nsf.scenes.programs import Programs
 from nsf.vectors import vector
+
+if TYPE_CHECKING:
+    from nsf.mpm import FullOrderMPM
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -283,7 +286,7 @@ class Scene:
 
     def full_order(
         self, parameters: Mapping[str, float] | None = None, precision: str = "fp64", device: str = "auto"
-    ) -> FullOrderMPM:
+    ) -> "FullOrderMPM":
         """The full-order solver at t = 0 (paper section 3).
 
         Args:
@@ -296,6 +299,8 @@ class Scene:
                 (`nsf.scenes.checks`); and see `FullOrderMPM`.
             InstabilityError, DeviceError: see `FullOrderMPM`.
         """
+        from nsf.mpm import FullOrderMPM
+
         scene = self.at(parameters or {})
         check_memory(scene, precision, device)
         check_physics(scene)

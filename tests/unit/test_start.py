@@ -8,8 +8,7 @@ import pytest
 
 from nsf.cli import main
 
-#: Warp is imported with the classes of a scene, in a quarter of a second.
-HEAVY = ("torch", "pytorch_lightning", "lightning_fabric", "matplotlib", "pandas", "scipy")
+HEAVY = ("warp", "torch", "pytorch_lightning", "lightning_fabric", "matplotlib", "pandas", "scipy")
 #: Every command line of `sys.argv[1]` in turn: its exit code, both outputs, and what is imported by then.
 _PROGRAM = f"""
 import contextlib, io, json, sys
@@ -51,6 +50,9 @@ REFUSED = [
     (["run", "+experiment=tabel1"], "did you mean table1"),
     (["run", "-m", "scene=sand", "latent_dim=4,0"], "latent_dim=0 must be"),
     (["run", "scene=sand", "scene.bodies.column.density=0"], "density=0"),
+    (["plan", "scene=sand", "scene.dt=-1"], "scene.dt=-1 s must be positive"),
+    (["plan", "scene=sand", "scene.gravity=down"], "scene.gravity=down"),
+    (["plan", "scene=sand", "material._target_=nsf.mpm.Transfer"], "nsf.mpm.Transfer"),
     (["run", "scene=sand", "scene.design.train=[30]"], "1 training cases"),
     (["run", "scene=drop", "scene.geometry.mesh=none.obj"], "none.obj"),
     (["run"], "choose one of block, bread"),

@@ -1,42 +1,22 @@
-"""Boundaries of the grid: the walls of the domain, and all solids and walls on the device."""
+"""All solids and walls on the device."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 import warp as wp
 
-from nsf.errors import ConfigError
-from nsf.mpm.boundaries.colliders import Collider, check_kind
+from nsf.mpm.boundaries.colliders import Collider
 from nsf.mpm.boundaries.contact import KINDS
-from nsf.mpm.boundaries.motion import Motion, make_follow
+from nsf.mpm.boundaries.following import make_follow
+from nsf.mpm.boundaries.motion import Motion
+from nsf.mpm.boundaries.walls import DomainWalls
 from nsf.mpm.precision import Precision
 
 # Keyframes of a solid that a hand moves.
 _BY_HAND = 2
 _AT_REST = Motion((0.0, 1.0), ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
-
-
-@dataclass(frozen=True)
-class DomainWalls:
-    """The six faces of the domain, `padding` nodes deep.
-
-    Attributes:
-        kind: as for `Collider`, without friction.
-        padding: nodes from the edge on which the condition holds.
-
-    Raises:
-        ConfigError: unknown kind, or a padding that is not a whole number of at least 1.
-    """
-
-    kind: str = "separate"
-    padding: int = 3
-
-    def __post_init__(self):
-        check_kind(self.kind, "walls")
-        if not (isinstance(self.padding, int) and self.padding >= 1):
-            raise ConfigError(f"walls.padding={self.padding} must be a whole number of nodes, at least 1")
 
 
 @cache

@@ -2,8 +2,6 @@
 
 from functools import cache
 
-import warp as wp
-
 from nsf.mpm.precision import Precision
 
 # Kinds of contact. Sticky: no motion. Slip: no normal motion. Separate: no motion into the solid.
@@ -24,6 +22,8 @@ def make_contact(precision: Precision):
 
     Source: Coulomb friction, Stomakhin et al. 2013, section 8.
     """
+    import warp as wp
+
     real, vec3, mat33 = precision.real, precision.vec3, precision.mat33
 
     @wp.func

@@ -1,5 +1,1 @@
 """The background grid: its nodes, their storage and interpolation weights (paper sections 3.2 and 3.3)."""
-
-from nsf.mpm.grid.nodes import Grid, GridGeometry
-
-__all__ = ["Grid", "GridGeometry"]

@@ -4,8 +4,6 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
-import warp as wp
-
 from nsf.errors import ConfigError
 from nsf.mpm.precision import Precision
 
@@ -56,6 +54,8 @@ def shape_functions(precision: Precision, name: str) -> ShapeFunctions:
 
     Source: Jiang et al. 2016, The material point method, eqs. 122-123.
     """
+    import warp as wp
+
     if name not in DEGREES:
         raise ConfigError(f"shape={name!r} is unknown; choose one of {', '.join(DEGREES)}")
     degree = DEGREES[name]

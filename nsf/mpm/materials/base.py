@@ -7,7 +7,6 @@ from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
-import warp as wp
 
 from nsf.errors import ConfigError, InstabilityError
 from nsf.mpm.precision import Precision
@@ -160,6 +159,8 @@ class Material(ABC):
 @cache
 def make_law_update(law: LawFunctions, precision: Precision, history_size: int):
     """Warp function (F_trial, history, mu, lam, params, dt) → (F_e, history, τ): the constitutive update."""
+    import warp as wp
+
     if law.update is not None:
         return law.update
     tau_of, return_map, Params = law.tau_of, law.return_map, law.Params
@@ -182,6 +183,8 @@ def make_stress_update(law: LawFunctions, precision: Precision, history_size: in
 
     Source: paper section 3.3, step 3.
     """
+    import warp as wp
+
     law_update, Params = make_law_update(law, precision, history_size), law.Params
     real, mat33 = precision.real, precision.mat33
     vecH = wp.types.vector(length=history_size, dtype=real)
@@ -209,6 +212,8 @@ def make_stress_update(law: LawFunctions, precision: Precision, history_size: in
 @cache
 def make_elastic_stress(law: LawFunctions, precision: Precision, history_size: int):
     """Kernel of the elastic law alone: τ = τ(F) at a given history, no return map."""
+    import warp as wp
+
     tau_of = law.tau_of
     real, mat33 = precision.real, precision.mat33
     vecH = wp.types.vector(length=history_size, dtype=real)
@@ -230,6 +235,7 @@ def make_elastic_stress(law: LawFunctions, precision: Precision, history_size: i
 @cache
 def no_params():
     """Struct of a law without constants of its own."""
+    import warp as wp
 
     @wp.struct
     class NoParams:
@@ -241,6 +247,8 @@ def no_params():
 @cache
 def no_return_map(precision: Precision):
     """Return map of a purely elastic law: F_e = F_trial."""
+    import warp as wp
+
     real, mat33, NoParams = precision.real, precision.mat33, no_params()
     vecH = wp.types.vector(length=1, dtype=real)
 

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-import warp as wp
 
 from nsf.errors import ConfigError
 from nsf.mpm.materials.base import LawFunctions, Material
@@ -15,6 +14,8 @@ from nsf.mpm.precision import Precision
 
 @cache
 def _functions(precision: Precision) -> LawFunctions:
+    import warp as wp
+
     real, vec3 = precision.real, precision.vec3
     vecH = wp.types.vector(length=1, dtype=real)
 

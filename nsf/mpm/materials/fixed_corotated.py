@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-import warp as wp
 
 from nsf.mpm.materials.base import LawFunctions, Material, no_params, no_return_map
 from nsf.mpm.precision import Precision
@@ -20,6 +19,8 @@ def fixed_corotated_tau(precision: Precision):
 
     Source: paper, appendix "Fixed corotated elasticity"; the identity is missing in print.
     """
+    import warp as wp
+
     real, vec3, mat33 = precision.real, precision.vec3, precision.mat33
     vecH = wp.types.vector(length=1, dtype=real)
 

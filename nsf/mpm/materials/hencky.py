@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-import warp as wp
 
 from nsf.mpm.materials.base import LawFunctions, Material, no_params, no_return_map
 from nsf.mpm.precision import Precision
@@ -13,6 +12,8 @@ from nsf.mpm.precision import Precision
 @cache
 def log_strain(precision: Precision):
     """Warp function F → (U, ε, V) with F = U exp(ε) Vᵀ, ε [3] the principal logarithmic strains."""
+    import warp as wp
+
     vec3, mat33 = precision.vec3, precision.mat33
 
     @wp.func
@@ -29,6 +30,8 @@ def log_strain(precision: Precision):
 @cache
 def from_log_strain(precision: Precision):
     """Warp function (U, ε, V) → F = U exp(ε) Vᵀ, the inverse of `log_strain`."""
+    import warp as wp
+
     vec3, mat33 = precision.vec3, precision.mat33
 
     @wp.func
@@ -41,6 +44,8 @@ def from_log_strain(precision: Precision):
 @cache
 def principal_tau(precision: Precision):
     """Warp function (U, ε, mu, lam) → τ = U (2μ̂ ε + λ tr(ε) 1) Uᵀ, `hencky_tau` of principal log strains."""
+    import warp as wp
+
     real, vec3, mat33 = precision.real, precision.vec3, precision.mat33
 
     @wp.func
@@ -60,6 +65,8 @@ def hencky_tau(precision: Precision):
     neither symmetric nor objective; with Uᵀ it is the Kirchhoff stress of the energy
     ψ = μ̂ tr(ε²) + λ/2 tr(ε)².
     """
+    import warp as wp
+
     real, mat33 = precision.real, precision.mat33
     vecH = wp.types.vector(length=1, dtype=real)
     decompose, stress = log_strain(precision), principal_tau(precision)
@@ -82,6 +89,8 @@ def hencky_update(precision: Precision, flow, Params):
         flow: Warp function (ε, history, mu, lam, params) → (ε, history); ε is unchanged where nothing flows.
         Params: Warp struct of the law's constants.
     """
+    import warp as wp
+
     real, mat33 = precision.real, precision.mat33
     vecH = wp.types.vector(length=1, dtype=real)
     decompose, compose = log_strain(precision), from_log_strain(precision)

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-import warp as wp
 
 from nsf.errors import ConfigError
 from nsf.mpm.materials.base import LawFunctions, Material
@@ -24,6 +23,8 @@ def volumetric_deviatoric_tau(precision: Precision):
     Source: Yue et al. 2015; paper, appendix "Herschel-Bulkley plasticity", where
     det(b)^(−1/3) = J^(−2/3).
     """
+    import warp as wp
+
     real, mat33 = precision.real, precision.mat33
     vecH = wp.types.vector(length=1, dtype=real)
 
@@ -46,6 +47,8 @@ def isochoric_mean(precision: Precision):
     convex to the right of the root. Newton's steps from a start above the root therefore only go down, and
     end where rounding stops them.
     """
+    import warp as wp
+
     real, vec3 = precision.real, precision.vec3
 
     @wp.func
@@ -91,6 +94,8 @@ def volumetric_deviatoric_stretches(principal: np.ndarray, mu: np.ndarray, lam: 
 
 @cache
 def _functions(precision: Precision) -> LawFunctions:
+    import warp as wp
+
     real, vec3, mat33 = precision.real, precision.vec3, precision.mat33
     vecH = wp.types.vector(length=1, dtype=real)
     mean_of = isochoric_mean(precision)

@@ -1,6 +1,6 @@
 """G2P: velocities of the nodes → particles, with the constitutive update (paper section 3.3, step 3).
 
-The reduced solver's G2P for few sample particles is in `nsf.mpm.update`; it needs neither C nor the
+The reduced solver's G2P for few sample particles is in `nsf.mpm.step`; it needs neither C nor the
 deformation increment.
 """
 
@@ -10,7 +10,7 @@ import warp as wp
 
 from nsf.mpm.grid.nodes import flat_index, inside, storage
 from nsf.mpm.grid.shape import shape_functions
-from nsf.mpm.materials import LawFunctions, make_law_update
+from nsf.mpm.materials.base import LawFunctions, make_law_update
 from nsf.mpm.native.access import make_load
 from nsf.mpm.precision import Precision
 

@@ -10,8 +10,8 @@ from nsf.engines.modal.networks import make_layer, make_product
 from nsf.engines.modal.placing import make_neighbours, make_sample
 from nsf.engines.modal.projection import make_projection
 from nsf.mpm import precision_of
+from nsf.mpm.step import make_grid_update, make_update_g2p
 from nsf.mpm.transfer import make_g2p, make_p2g
-from nsf.mpm.update import make_grid_update, make_update_g2p
 
 ARCH = 90  # compute capability 9.0, which has reductions of its own in P2G
 KERNELS = {
