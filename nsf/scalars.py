@@ -6,6 +6,11 @@ from numbers import Real
 from nsf.errors import ConfigError
 
 
+def shown(value) -> str:
+    """A value as a configuration writes it."""
+    return "null" if value is None else str(value)
+
+
 def is_finite(value) -> bool:
     """Whether a value is a number that a float can hold."""
     try:
@@ -33,7 +38,7 @@ def number(
         kind = "a whole number" if whole else "a finite number"
         above = f" of at least {least:g}" if least > -math.inf else ""
         limits = above if most == math.inf else f" from {least:g} to {most:g}"
-        raise ConfigError(f"{key}={value} must be {kind}{limits}")
+        raise ConfigError(f"{key}={shown(value)} must be {kind}{limits}")
     return value
 
 
@@ -55,5 +60,5 @@ def text(key: str, value) -> str:
         ConfigError: quotes the key and the value.
     """
     if not isinstance(value, str) or not value.strip():
-        raise ConfigError(f"{key}={value!r} must be text, and not empty")
+        raise ConfigError(f"{key}={shown(value)} must be text, and not empty")
     return value

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from nsf.errors import ConfigError
-from nsf.scalars import is_finite
+from nsf.scalars import is_finite, shown
 
 
 def spaced(count: int, most: int) -> np.ndarray:
@@ -28,7 +28,7 @@ def numbers(key: str, values, unit: str = "", count: int | None = None) -> np.nd
     finite = is_list(values) and all(map(is_finite, values))
     if not finite or count not in (None, len(values)):
         wanted = "a list of finite numbers" if count is None else f"{count} finite numbers"
-        raise ConfigError(f"{key}={values}{' ' * bool(unit)}{unit} must be {wanted}")
+        raise ConfigError(f"{key}={shown(values)}{' ' * bool(unit)}{unit} must be {wanted}")
     return np.array(values, float)
 
 

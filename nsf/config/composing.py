@@ -50,8 +50,6 @@ _SWEEP = (
     "hydra.sweep.subdir=.",
 )
 
-#: Keys for which a scene has a default.
-_DEFAULTED = ("scene.size", "scene.gravity", "scene.walls")
 #: Raised by Hydra and the yaml parser on files that are no configuration, beside their own errors.
 _OF_BROKEN_FILES = (
     YAMLError,
@@ -80,7 +78,6 @@ def load(overrides: Sequence[str] = (), config_name: str = "config") -> DictConf
             or a key that was removed.
     """
     refuse_overrides(overrides)
-    _refuse_gaps(overrides)
     try:
         return checked(_compose(config_name, overrides))
     except (HydraException, OmegaConfBaseException) as error:
@@ -94,15 +91,6 @@ def load(overrides: Sequence[str] = (), config_name: str = "config") -> DictConf
         reason = explained(error, config_name, overrides)
         culprit = _culprit(config_name, overrides)
         raise ConfigError(f"the configuration cannot be composed{culprit}: {reason}") from error
-
-
-def _refuse_gaps(overrides: Sequence[str]) -> None:
-    """Refuse to take away a key for which a scene has a default, which nobody would see, and not set it."""
-    fresh = {override.lstrip("+").partition("=")[0] for override in overrides}
-    for override in overrides:
-        key = override.removeprefix("~").partition("=")[0]
-        if override.startswith("~") and key.startswith(_DEFAULTED) and key not in fresh:
-            raise ConfigError(f"~{key} leaves a scene without what it needs; set {key} to what it should be")
 
 
 def _culprit(config_name: str, overrides: Sequence[str]) -> str:
@@ -290,7 +278,17 @@ def _unknown(key: str, config_name: str, overrides: Sequence[str]) -> str:
     except HydraException as error:
         other = _missing_key(error)
         return first_line(error) if other in (None, key) else _unknown(other, config_name, added)
+    keys = _keys(config_name, others)
+    parents = [key[:at] for at, letter in enumerate(key) if letter == "."]
+    if gone := [parent for parent in parents if parent not in keys]:
+        return unknown(gone[0], keys)
     return f"no file sets {key!r}; add it with a plus, +{key}=…"
+
+
+def _keys(config_name: str, overrides: Sequence[str]) -> dict[str, None]:
+    """Every dotted key of a composed configuration, also of those that hold others."""
+    tree = OmegaConf.to_container(_compose(config_name, overrides))
+    return {".".join(path[: n + 1]): None for path, _ in leaves(tree) for n in range(len(path))}
 
 
 def explained(error: Exception, config_name: str, overrides: Sequence[str]) -> str:
@@ -303,9 +301,7 @@ def explained(error: Exception, config_name: str, overrides: Sequence[str]) -> s
         return _unknown(key, config_name, overrides)
     if missing := re.search(r"Could not delete from config. '([^']+)' does not exist", text):
         others = [o for o in overrides if o.lstrip("~").partition("=")[0] != missing[1]]
-        tree = OmegaConf.to_container(_compose(config_name, others))
-        keys = {".".join(path[: n + 1]): None for path, _ in leaves(tree) for n in range(len(path))}
-        return unknown(missing[1], keys)
+        return unknown(missing[1], _keys(config_name, others))
     if isinstance(error, OverrideParseException):
         return _unparsed(str(error.override), first)
     if first.startswith("Could not append to config"):
@@ -314,6 +310,11 @@ def explained(error: Exception, config_name: str, overrides: Sequence[str]) -> s
         return f"{first}; several values of a key need -m"
     if "hydra.searchpath" in text:
         return f"hydra.searchpath is refused; {REMEDY}"
+    if first.startswith("You must specify"):
+        gone = [o for o in overrides if o.startswith("~") and o[1:].partition("=")[0] in groups()]
+        return f"{gone[0]} leaves nothing in its place; choose an option" if gone else first
+    if "raised while composing config" in first:
+        return f"{first} {text.splitlines()[1]}; a file of a group maps keys to values"
     nameless = [o for o in overrides if o.startswith("=")]
     if nameless:
         return f"{nameless[0]!r} has no key; give key=value"

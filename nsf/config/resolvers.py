@@ -25,6 +25,8 @@ _BEGINNING = re.compile(r"\$\{\s*([^:{}$]*?)\s*([:{}$]|\Z)")
 _SELECTION = re.compile(r"\$\{\s*oc\.select\s*:\s*[\w.\[\]-]+\s*[,}]")
 #: A reference to another key, by itself or through `oc.select`; leading dots count from where it stands.
 _REFERENCE = re.compile(r"\$\{\s*(?:oc\.select\s*:\s*)?(\.*)([\w-]+(?:\.[\w-]+|\[\w+\])*)")
+#: How OmegaConf says that a key refers to one that is not there.
+_MISSING = re.compile(r"(?:Interpolation key '|Error trying to access )([\w.]+)")
 _MOST = (
     20_000  # values of a whole configuration with those that it refers to; those of conf/ have some hundred
 )
@@ -93,6 +95,8 @@ def resolved(config: DictConfig) -> Any:
         detail = re.sub(r"^\w*Error raised while resolving interpolation: ", "", str(error).splitlines()[0])
         if detail.startswith("Recursive interpolation"):
             detail = "it refers to itself, by way of other keys or not; give one of them a value"
+        if missing := _MISSING.match(detail):
+            detail = f"it refers to {missing[1]}, which is missing; give that a value"
         raise ConfigError(f"{error.full_key}: {detail}" if error.full_key else detail) from error
     for path, value in leaves(plain):
         if (

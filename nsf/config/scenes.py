@@ -20,7 +20,7 @@ from nsf.scenes.identity import plain_scene, plain_value
 
 #: Keys of a configuration's scene that say nothing of its physics.
 NOT_PHYSICS = ("name", "title", "parameters", "design", "paper")
-_REQUIRED, _OPTIONAL = ("name", "dx", "dt", "steps"), ("size", "gravity", "program")
+_REQUIRED, _OPTIONAL = ("name", "size", "dx", "dt", "steps", "gravity"), ("program",)
 _PHYSICS = re.compile(
     r"(material|transfer|scene\.(dx|dt|steps|size|gravity|inclination|bodies|colliders|walls|forcing))\b"
 )
@@ -65,12 +65,11 @@ def _built(whole: DictConfig, design: Design | None) -> Scene:
     values = {key: _plain(s[key]) for key in (*_REQUIRED, *_OPTIONAL) if key in s or key in _REQUIRED}
     if s.get("inclination") is not None:
         values["inclination"] = build(s.inclination, "scene.inclination")
-    if "walls" in s:
-        values["walls"] = build(s.walls, "scene.walls")
     return Scene(
         **values,
         bodies=build_all(s.bodies, "scene.bodies"),
         colliders=build_all(s.get("colliders", {}), "scene.colliders"),
+        walls=build(s.walls, "scene.walls"),
         material=build(whole.material, "material"),
         transfer=build(whole.transfer, "transfer"),
         forcing=_programs(s.get("forcing") or {}),

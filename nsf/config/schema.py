@@ -13,13 +13,15 @@ import yaml
 from nsf.code import arguments
 from nsf.config.documents import LOADER, text_of
 from nsf.config.resolvers import references
-from nsf.config.targets import kind_at
+from nsf.config.targets import kind_at, named_class
 from nsf.errors import ConfigError, unknown
 from nsf.paths import CONF
 
 Keys = tuple[str, ...]
 #: Mappings whose readers refuse what they do not take.
 _CHECKED_BY_READER = {("scene", "parameters"), ("deploy", "changes")}
+#: Keys whose classes are imported without torch.
+_LIGHT = ("scene", "material", "transfer")
 
 
 def refuse_unread(raw: Mapping[str, Any], plain: Mapping[str, Any]) -> None:
@@ -37,17 +39,31 @@ def refuse_unread(raw: Mapping[str, Any], plain: Mapping[str, Any]) -> None:
     stock = stock_keys("point" if alone else "config")
     readable: list[Keys] = []
     if unread := list(_unread(plain, stock, (), referred, readable)):
+        for keys in unread:
+            _check_class(plain, keys)
         names = [".".join(keys) for keys in readable]
         messages = [unknown(".".join(keys), names, taker=_taker(plain, keys)) for keys in unread]
         raise ConfigError("; ".join(messages).replace("?; ", "? "))
 
 
+def _check_class(plain: Mapping[str, Any], keys: Keys) -> None:
+    """Refuse a class of another kind than its key expects, before the keys that it does not take."""
+    target = _class_of(plain, keys)
+    if target and keys[0] in _LIGHT:
+        named_class(target, keys[:-1])
+
+
 def _taker(plain: Mapping[str, Any], keys: Keys) -> str:
     """The user's class that is built from the node of a key; empty where there is none."""
+    target = _class_of(plain, keys)
+    return "" if target.startswith("nsf.") else target
+
+
+def _class_of(plain: Mapping[str, Any], keys: Keys) -> str:
+    """The class that is built from the node of a key; empty where there is none."""
     for name in keys[:-1]:
         plain = next(child for key, child in plain.items() if str(key) == name)
-    target = str(plain.get("_target_", ""))
-    return "" if target.startswith("nsf.") else target
+    return str(plain.get("_target_", ""))
 
 
 def _unread(

@@ -21,7 +21,7 @@ from omegaconf import DictConfig
 from nsf.config.resolvers import resolved
 from nsf.errors import ConfigError, NSFError, first_line, unknown
 from nsf.installed import entry_point_of
-from nsf.scalars import is_finite
+from nsf.scalars import is_finite, shown
 
 
 class Kind(NamedTuple):
@@ -126,9 +126,7 @@ def build_all(nodes: Any, where: str) -> dict[str, Any]:
         ConfigError: there is no such mapping; and as for `build`.
     """
     if not isinstance(nodes, Mapping):
-        raise ConfigError(
-            f"{where}={'null' if nodes is None else nodes} must map names to nodes; {{}} is none"
-        )
+        raise ConfigError(f"{where}={shown(nodes)} must map names to nodes; {{}} is none")
     if dotted := [name for name in nodes if "." in str(name)]:
         raise ConfigError(f"{where} has the name {dotted[0]!r}; leave the dot out, which parts keys")
     return {str(name): build(node, f"{where}.{name}") for name, node in nodes.items()}
@@ -155,7 +153,7 @@ def filled(made_of: Any, values: Mapping[str, Any], where: str) -> Any:
     hints = _hints(made_of)
     for name, value in values.items():
         if not _fits(value, hints.get(name)):
-            raise ConfigError(f"{where}.{name}={value} must be {_told(hints[name])}")
+            raise ConfigError(f"{where}.{name}={shown(value)} must be {_in_words(hints[name])}")
         if not _all_finite(value):
             raise ConfigError(f"{where}.{name}={value} must be finite")
     try:
@@ -172,7 +170,9 @@ def _built(node: Any, path: tuple[str, ...]) -> Any:
     if not isinstance(node, dict):
         return node
     values = {key: _built(child, (*path, str(key))) for key, child in node.items() if key != "_target_"}
-    return filled(_named(node["_target_"], path), values, ".".join(path)) if "_target_" in node else values
+    if "_target_" not in node:
+        return values
+    return filled(named_class(node["_target_"], path), values, ".".join(path))
 
 
 def kind_at(path: tuple[str, ...]) -> Kind | None:
@@ -193,9 +193,7 @@ def _kind(path: tuple[str, ...], target: Any) -> Kind:
     if not (
         _NAME.fullmatch(str(target)) and (target.startswith(f"{kind.package}.") or _is_installed(target))
     ):
-        raise ConfigError(
-            f"{refused}{_wanted(kind)}, or of an installed package that declares the entry point group nsf"
-        )
+        raise ConfigError(f"{refused}name a {_noun(kind)} {_homes(kind)}")
     return kind
 
 
@@ -204,12 +202,24 @@ def _is_installed(target: str) -> bool:
     return not target.startswith("nsf.") and entry_point_of(target) is not None
 
 
-def _wanted(kind: Kind) -> str:
-    return f"name a {kind.base.rpartition('.')[2]} of {kind.package}"
+def _noun(kind: Kind) -> str:
+    return kind.base.rpartition(".")[2]
 
 
-def _named(target: str, path: tuple[str, ...]) -> Any:
-    """The class, or the function, that a target names."""
+def _homes(kind: Kind) -> str:
+    return f"of {kind.package}, or of an installed package that declares the entry point group nsf"
+
+
+def named_class(target: str, path: tuple[str, ...]) -> Any:
+    """The class, or the function, that a target names.
+
+    Args:
+        target: its dotted name.
+        path: of the key, which says what is expected.
+
+    Raises:
+        ConfigError: there is no such class, or it is of another kind, or abstract.
+    """
     kind, where = _kind(path, target), ".".join(path)
     named = _imported(target, where)
     if target in kind.functions:
@@ -217,7 +227,9 @@ def _named(target: str, path: tuple[str, ...]) -> Any:
     module, _, name = kind.base.rpartition(".")
     base = getattr(importlib.import_module(module), name)
     if not (inspect.isclass(named) and _is_a(named, base)):
-        raise ConfigError(f"{where}: _target_: {target} is refused; {_wanted(kind)}{_lacking(named, base)}")
+        raise ConfigError(
+            f"{where}: _target_: {target} is no {_noun(kind)}{_lacking(named, base)}; name one {_homes(kind)}"
+        )
     if inspect.isabstract(named):
         missing = ", ".join(sorted(named.__abstractmethods__))
         raise ConfigError(
@@ -237,7 +249,7 @@ def _imported(target: str, where: str) -> Any:
             raise ConfigError(f"{where}: _target_: {target} does not exist ({error})") from error
         raise _broken(target, where, point, error) from error
     if not hasattr(imported, name):
-        near = difflib.get_close_matches(name, dir(imported), n=1)
+        near = difflib.get_close_matches(name, getattr(imported, "__all__", dir(imported)), n=1)
         remedy = f"did you mean {module}.{near[0]}?" if near else f"name a class of {module}"
         raise ConfigError(f"{where}: _target_: {target} does not exist; {remedy}")
     return getattr(imported, name)
@@ -293,13 +305,13 @@ def _fits(value: Any, hint: Any) -> bool:
     return hint not in _WORDS or type(value) is hint or (hint is float and type(value) is int)
 
 
-def _told(hint: Any, several: bool = False) -> str:
+def _in_words(hint: Any, several: bool = False) -> str:
     """A type in words."""
     origin, inner = typing.get_origin(hint), typing.get_args(hint)
     if origin in (typing.Union, UnionType):
-        return " or ".join(_told(kind, several) for kind in inner)
+        return " or ".join(_in_words(kind, several) for kind in inner)
     if origin is Sequence:
-        return ("lists of " if several else "a list of ") + _told(inner[0], several=True)
+        return ("lists of " if several else "a list of ") + _in_words(inner[0], several=True)
     return _WORDS[hint][several] if hint in _WORDS else hint.__name__
 
 
