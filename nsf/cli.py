@@ -225,7 +225,7 @@ def _init(words: list[str]) -> int:
 
     folder = Path(words[0])
     write_project(folder)
-    print(f"wrote {folder}; its README.md has two commands: pip install -e . and nsf run")
+    print(f"wrote {folder}; next: cd {folder}, pip install -e . and nsf run --config-dir conf scene=bracket")
     return 0
 
 

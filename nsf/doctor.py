@@ -41,9 +41,9 @@ def _versions() -> Iterator[str]:
 
 def _devices() -> Iterator[str]:
     import torch
-    import warp as wp
 
-    wp.config.log_level = wp.LOG_ERROR
+    from nsf.mpm.device import wp
+
     wp.init()
     yield f"cpu        {os.cpu_count()} cores, {torch.get_num_threads()} threads of torch"
     for device in wp.get_cuda_devices():

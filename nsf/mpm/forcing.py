@@ -238,7 +238,7 @@ def make_follow_gravity(precision: Precision):
     """Kernel that sets the gravity of each run for the step that starts at t^n, and counts the step."""
     import warp as wp
 
-    from nsf.mpm.boundaries.following import keyframe_before
+    from nsf.mpm.boundaries.arrays import keyframe_before
 
     vec3, f64, vec3d = precision.vec3, wp.float64, wp.vec3d
 

@@ -49,7 +49,7 @@ PLACES = sorted(key.replace("*", "column" if "bodies" in key else "floor") for k
 @pytest.mark.parametrize("place", PLACES)
 def test_a_key_takes_only_the_classes_that_it_expects(place):
     for target in CALLABLES:
-        told = re.escape(f"{place}: _target_: {target} ") + "(is refused|does not exist)"
+        told = re.escape(f"{place}: _target_: {target} ") + "(is refused|is no |does not exist)"
         with pytest.raises(ConfigError, match=told):
             config.build({"_target_": target, "folder": "/nowhere"}, place)
 

@@ -1,4 +1,4 @@
-"""Prescribed motion of a solid, by keyframes; `nsf.mpm.boundaries.following` follows them on the device."""
+"""Prescribed motion of a solid, by keyframes; `nsf.mpm.boundaries.arrays` follows them on the device."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -37,9 +37,9 @@ class Material(ABC):
     """A constitutive law with its parameters.
 
     A law defines `functions` and `stretches_of`. It inherits one history variable a particle, which is zero
-    at rest (`history_size`, `initial_history`), that at rest where τ alone is known (`history_of`), and
-    constants that are all zero (`params`). A law whose return map reads a history or constants overrides
-    these: with a yield stress of zero everything would flow.
+    at rest (`history_size`, `initial_history`), and that at rest where τ alone is known (`history_of`). A law
+    whose return map reads a history overrides these: with a yield stress of zero everything would flow.
+    Constants of the return map are its attributes (`params`).
 
     Attributes:
         E: Young's modulus [Pa].
@@ -152,8 +152,16 @@ class Material(ABC):
         return self.initial_history(len(tau))
 
     def params(self, precision: Precision):
-        """The law's constants as its Warp struct."""
-        return self.functions(precision).Params()
+        """The law's constants as its Warp struct: each has the value of the law's attribute of that name.
+
+        One without such an attribute is zero.
+        """
+        Params = self.functions(precision).Params
+        params = Params()
+        for name, field in Params.vars.items():
+            if hasattr(self, name):
+                setattr(params, name, field.type(getattr(self, name)))
+        return params
 
 
 @cache

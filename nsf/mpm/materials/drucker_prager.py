@@ -73,9 +73,3 @@ class DruckerPrager(Material):
     def stretches_of(self, principal: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
         """[P, 3] stretches of [P, 3] principal stresses, in closed form."""
         return hencky_stretches(principal, mu, lam)
-
-    def params(self, precision: Precision):
-        """The law's constants."""
-        params = self.functions(precision).Params()
-        params.alpha = precision.real(self.alpha)
-        return params

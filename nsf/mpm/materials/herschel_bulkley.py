@@ -159,6 +159,11 @@ class HerschelBulkley(Material):
         if not 0.0 <= self.viscosity < math.inf:
             raise ConfigError(f"material.viscosity={self.viscosity} Pa s must be finite and not negative")
 
+    @property
+    def radius(self) -> float:
+        """√(2/3) σ_Y, the largest ‖s‖ of an elastic state [Pa]."""
+        return math.sqrt(2.0 / 3.0) * self.yield_stress
+
     def functions(self, precision: Precision) -> LawFunctions:
         """The law's Warp functions."""
         return _functions(precision)
@@ -166,10 +171,3 @@ class HerschelBulkley(Material):
     def stretches_of(self, principal: np.ndarray, mu: np.ndarray, lam: np.ndarray) -> np.ndarray:
         """[P, 3] stretches of [P, 3] principal stresses; volume and shape apart."""
         return volumetric_deviatoric_stretches(principal, mu, lam)
-
-    def params(self, precision: Precision):
-        """The law's constants."""
-        params = self.functions(precision).Params()
-        params.radius = precision.real(math.sqrt(2.0 / 3.0) * self.yield_stress)
-        params.viscosity = precision.real(self.viscosity)
-        return params

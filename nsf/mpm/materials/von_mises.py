@@ -12,11 +12,40 @@ from nsf.mpm.materials.hencky import hencky_stretches, hencky_tau, hencky_update
 from nsf.mpm.precision import Precision
 
 
+def von_mises_update(precision: Precision, hardened, Params):
+    """Warp function of the constitutive update of a von Mises law over Hencky elasticity.
+
+    Args:
+        precision: floating-point types.
+        hardened: Warp function (τ_Y, δγ, mu, params) → τ_Y [Pa] after plastic flow δγ, the ‖ε̂‖ that it takes.
+        Params: Warp struct of the constants that `hardened` takes.
+    """
+    import warp as wp
+
+    real, vec3 = precision.real, precision.vec3
+    vecH = wp.types.vector(length=1, dtype=real)
+
+    # Written so that a NaN does not count as elastic, and reaches the solver's check.
+    @wp.func
+    def flow(eps: vec3, history: vecH, mu: real, lam: real, params: Params):
+        tau_Y = history[0]
+        third = (eps[0] + eps[1] + eps[2]) / real(3.0)
+        deviator = eps - vec3(third, third, third)
+        size = wp.length(deviator)
+        if real(2.0) * mu * size <= tau_Y:
+            return eps, history
+        # The return removes `flowed` along a unit direction, so ‖ε − proj ε‖ is `flowed` itself.
+        flowed = size - tau_Y / (real(2.0) * mu)
+        return eps - (flowed / size) * deviator, vecH(hardened(tau_Y, flowed, mu, params))
+
+    return hencky_update(precision, flow, Params)
+
+
 @cache
 def _functions(precision: Precision) -> LawFunctions:
     import warp as wp
 
-    real, vec3, mat33 = precision.real, precision.vec3, precision.mat33
+    real, mat33 = precision.real, precision.mat33
     vecH = wp.types.vector(length=1, dtype=real)
     elastic_tau = hencky_tau(precision)
 
@@ -26,27 +55,18 @@ def _functions(precision: Precision) -> LawFunctions:
         softening: real
 
     @wp.func
+    def hardened(tau_Y: real, flowed: real, mu: real, params: Params):
+        return tau_Y + (real(2.0) * mu * params.hardening - params.softening) * flowed
+
+    flowing_update = von_mises_update(precision, hardened, Params)
+
+    @wp.func
     def tau_of(F: mat33, history: vecH, mu: real, lam: real):
         if history[0] <= real(0.0):
             return mat33()
         return elastic_tau(F, history, mu, lam)
 
-    # Both are written so that a NaN counts neither as damaged nor as elastic, and reaches the solver's check.
-    @wp.func
-    def flow(eps: vec3, history: vecH, mu: real, lam: real, params: Params):
-        tau_Y = history[0]
-        third = (eps[0] + eps[1] + eps[2]) / real(3.0)
-        deviator = eps - vec3(third, third, third)
-        size = wp.length(deviator)
-        if real(2.0) * mu * size <= tau_Y:
-            return eps, history
-        flowed = size - tau_Y / (real(2.0) * mu)
-        # The return removes `flowed` along a unit direction, so ‖ε − proj ε‖ is `flowed` itself.
-        tau_Y = tau_Y + (real(2.0) * mu * params.hardening - params.softening) * flowed
-        return eps - (flowed / size) * deviator, vecH(tau_Y)
-
-    flowing_update = hencky_update(precision, flow, Params)
-
+    # Written so that a NaN does not count as damaged, and reaches the solver's check.
     @wp.func
     def update(F_trial: mat33, history: vecH, mu: real, lam: real, params: Params, dt: real):
         if history[0] <= real(0.0):
@@ -128,12 +148,6 @@ class VonMisesHardening(VonMises):
         carried = np.linalg.norm(tau - mean * np.eye(3), axis=(1, 2))
         return np.maximum(carried, self.yield_stress)[:, None]
 
-    def params(self, precision: Precision):
-        """The law's constants."""
-        params = self.functions(precision).Params()
-        params.hardening = precision.real(self.hardening)
-        return params
-
 
 @dataclass(frozen=True)
 class VonMisesSoftening(VonMises):
@@ -162,9 +176,3 @@ class VonMisesSoftening(VonMises):
         super().__post_init__()
         if not 0.0 <= self.softening < math.inf:
             raise ConfigError(f"material.softening={self.softening} Pa must be finite and not negative")
-
-    def params(self, precision: Precision):
-        """The law's constants."""
-        params = self.functions(precision).Params()
-        params.softening = precision.real(self.softening)
-        return params

@@ -4,38 +4,30 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-import warp as wp
 
 from nsf.errors import ConfigError
-from nsf.mpm.materials import VonMises
-from nsf.mpm.materials.base import LawFunctions
-from nsf.mpm.materials.hencky import hencky_tau, hencky_update
+from nsf.mpm.materials import LawFunctions, VonMises
+from nsf.mpm.materials.hencky import hencky_tau
+from nsf.mpm.materials.von_mises import von_mises_update
 from nsf.mpm.precision import Precision
 
 
 @cache
 def _functions(precision: Precision) -> LawFunctions:
-    real, vec3 = precision.real, precision.vec3
-    vecH = wp.types.vector(length=1, dtype=real)
+    import warp as wp  # where the law is simulated: its values are checked without it
+
+    real = precision.real
 
     @wp.struct
-    class Params:
+    class Params:  # attributes of the law, by name
         saturation: real
         rate: real
 
     @wp.func
-    def flow(eps: vec3, history: vecH, mu: real, lam: real, params: Params):
-        tau_Y = history[0]
-        third = (eps[0] + eps[1] + eps[2]) / real(3.0)
-        deviator = eps - vec3(third, third, third)
-        size = wp.length(deviator)
-        if real(2.0) * mu * size <= tau_Y:
-            return eps, history
-        flowed = size - tau_Y / (real(2.0) * mu)
-        tau_Y = params.saturation + (tau_Y - params.saturation) * wp.exp(-params.rate * flowed)
-        return eps - (flowed / size) * deviator, vecH(tau_Y)
+    def hardened(tau_Y: real, flowed: real, mu: real, params: Params):  # the law: τ_Y [Pa] after flow δγ
+        return params.saturation + (tau_Y - params.saturation) * wp.exp(-params.rate * flowed)
 
-    return LawFunctions(hencky_tau(precision), None, Params, hencky_update(precision, flow, Params))
+    return LawFunctions(hencky_tau(precision), None, Params, von_mises_update(precision, hardened, Params))
 
 
 @dataclass(frozen=True)
@@ -67,10 +59,3 @@ class Saturating(VonMises):
     def functions(self, precision: Precision) -> LawFunctions:
         """The law's Warp functions."""
         return _functions(precision)
-
-    def params(self, precision: Precision):
-        """The law's constants as its Warp struct."""
-        params = self.functions(precision).Params()
-        params.saturation = precision.real(self.saturation)
-        params.rate = precision.real(self.rate)
-        return params

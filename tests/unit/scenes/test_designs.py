@@ -126,7 +126,7 @@ def test_a_bad_design_says_what_to_do(make, message):
         (["scene.parameters.E=3"], "scene.parameters.E=3 must map keys to values"),
         (["+scene.parameters.E.range=[3000,2000]"], r"parameters.E: range=\[3000, 2000\] has nothing inside"),
         (["~scene.design"], "scene.design=null must map keys to values"),
-        (["scene.design._target_=nsf.scenes.Box"], r"unknown key 'scene\.design\.train'"),
+        (["scene.design._target_=nsf.scenes.Box"], "nsf.scenes.Box is no Design"),
         (["scene.parameters.E.key=scene.name"], "'scene.name' names no key that holds a number"),
     ],
 )

@@ -136,7 +136,7 @@ def test_a_case_left_out_is_as_configured(block):
         (["scene.forcing.gravity.tilt.angle=-3"], "angle=-3° must lie between"),
         (["+scene.forcing.wind={}"], r"unknown key 'scene\.forcing\.wind'"),
         (["scene.program=-1"], "scene.program=-1 must be a whole number of at least 0"),
-        (["scene.forcing.gravity.tilt._target_=nsf.scenes.Ball"], r"unknown key 'scene.forcing.gravity.tilt"),
+        (["scene.forcing.gravity.tilt._target_=nsf.scenes.Ball"], "nsf.scenes.Ball is no GravityProgram"),
     ],
 )  # fmt: skip
 def test_a_forcing_that_cannot_be_meant_is_refused(overrides, message):

@@ -301,7 +301,7 @@ def test_what_memory_cannot_hold_is_refused_before_any_work(make, override, quot
     scene = load_scene("sand", [FEW, "scene.dt=1e-4", override])
     monkeypatch.setattr("nsf.scenes.checks.host_memory", lambda: 2**30)
     monkeypatch.setattr(Cylinder, "sample", None)
-    monkeypatch.setattr("nsf.scenes.checks.warp_device", lambda name: SimpleNamespace(is_cuda=False))
+    monkeypatch.setattr("nsf.mpm.device.warp_device", lambda name: SimpleNamespace(is_cuda=False))
     expected = f"{quoted} GiB of memory and 1.0 GiB are available; take fewer"
     with pytest.raises(ConfigError, match=re.escape(expected)):
         make(scene)
@@ -310,7 +310,7 @@ def test_what_memory_cannot_hold_is_refused_before_any_work(make, override, quot
 def test_memory_of_a_gpu(sand, monkeypatch):
     """Solver and a block of frames on the GPU, the rest on the host."""
     gpu = SimpleNamespace(is_cuda=True, alias="cuda:0", free_memory=10 * 2**20)
-    monkeypatch.setattr("nsf.scenes.checks.warp_device", lambda name: gpu)
+    monkeypatch.setattr("nsf.mpm.device.warp_device", lambda name: gpu)
     with pytest.raises(ConfigError, match=r"nodes, on cuda:0, would take 0\.1 GiB of memory"):
         check_memory(sand, "fp64", "cuda", FP32)
     gpu.free_memory = 2**30
