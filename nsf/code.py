@@ -3,7 +3,7 @@
 import ast
 import hashlib
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -41,26 +41,29 @@ def _targets(node: Any) -> Iterator[str]:
             yield from _targets(child)
 
 
-def arguments(target: str) -> set[str] | None:
-    """Names of what a class or function takes, without an import; None where its text does not tell."""
+def arguments(target: str) -> dict[str, str] | None:
+    """Names of what a class or function takes, and their types as its text has them; nothing is imported.
+
+    None where the text does not tell.
+    """
     home = _home(target)
     return _arguments(home, target.rpartition(".")[2]) if home else None
 
 
 @cache
-def _arguments(path: Path, name: str) -> set[str] | None:
+def _arguments(path: Path, name: str) -> dict[str, str] | None:
     """Those of a definition in a file: of `__init__`, or the fields of a dataclass and of its bases."""
     definition = next((node for node in _tree(path).body if getattr(node, "name", None) == name), None)
     if definition is None and (passed := _imported(path).get(name, path)) != path:
         return _arguments(passed, name)
     if isinstance(definition, ast.FunctionDef):
-        return {one.arg for one in (*definition.args.args, *definition.args.kwonlyargs)}
+        return _declared((*definition.args.args, *definition.args.kwonlyargs))
     if not isinstance(definition, ast.ClassDef):
         return None
     for node in definition.body:
         if isinstance(node, ast.FunctionDef) and node.name == "__init__":
-            return {one.arg for one in (*node.args.args[1:], *node.args.kwonlyargs)}
-    names: set[str] = set()
+            return _declared((*node.args.args[1:], *node.args.kwonlyargs))
+    names: dict[str, str] = {}
     for base in (ast.unparse(base).partition("[")[0] for base in definition.bases):
         if base not in _WITHOUT_ARGUMENTS:
             inherited = _arguments(_imported(path).get(base, path), base)
@@ -69,7 +72,13 @@ def _arguments(path: Path, name: str) -> set[str] | None:
             names |= inherited
     if not any("dataclass" in ast.unparse(decorator) for decorator in definition.decorator_list):
         return names
-    return names | {node.target.id for node in definition.body if _is_argument(node)}
+    return names | _declared(node for node in definition.body if _is_argument(node))
+
+
+def _declared(nodes: Iterable[ast.arg | ast.AnnAssign]) -> dict[str, str]:
+    """Names and types of arguments of a function, or of fields of a dataclass."""
+    named = ((node.arg if isinstance(node, ast.arg) else node.target.id, node.annotation) for node in nodes)
+    return {name: ast.unparse(kind) if kind else "" for name, kind in named}
 
 
 def _is_argument(node: ast.stmt) -> bool:

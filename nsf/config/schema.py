@@ -39,24 +39,14 @@ def refuse_unread(raw: Mapping[str, Any], plain: Mapping[str, Any]) -> None:
     stock = stock_keys("point" if alone else "config")
     readable: list[Keys] = []
     if unread := list(_unread(plain, stock, (), referred, readable)):
-        for keys in unread:
-            _check_class(plain, keys)
+        takers = [_class_of(plain, keys) for keys in unread]
+        for keys, taker in zip(unread, takers, strict=True):
+            if taker and keys[0] in _LIGHT:
+                named_class(taker, keys[:-1])  # refused first where it is of another kind
         names = [".".join(keys) for keys in readable]
-        messages = [unknown(".".join(keys), names, taker=_taker(plain, keys)) for keys in unread]
+        users = ["" if taker.startswith("nsf.") else taker for taker in takers]
+        messages = [unknown(".".join(keys), names, taker=of) for keys, of in zip(unread, users, strict=True)]
         raise ConfigError("; ".join(messages).replace("?; ", "? "))
-
-
-def _check_class(plain: Mapping[str, Any], keys: Keys) -> None:
-    """Refuse a class of another kind than its key expects, before the keys that it does not take."""
-    target = _class_of(plain, keys)
-    if target and keys[0] in _LIGHT:
-        named_class(target, keys[:-1])
-
-
-def _taker(plain: Mapping[str, Any], keys: Keys) -> str:
-    """The user's class that is built from the node of a key; empty where there is none."""
-    target = _class_of(plain, keys)
-    return "" if target.startswith("nsf.") else target
 
 
 def _class_of(plain: Mapping[str, Any], keys: Keys) -> str:

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 from omegaconf import DictConfig
 
+from nsf.code import arguments
 from nsf.config.resolvers import resolved
 from nsf.errors import ConfigError, NSFError, first_line, unknown
 from nsf.installed import entry_point_of
@@ -74,28 +75,38 @@ _WORDS = {
     dict: ("keys with values", "mappings of keys to values"),
     NoneType: ("null", "null"),
 }
+#: Types by their names in the text of a class.
+_PLAIN = {"int": int, "float": float, "bool": bool, "str": str, "None": NoneType}
+_PLAIN |= {f"Sequence[{name}]": Sequence[kind] for name, kind in _PLAIN.items()}
 
 
 def check(node: Any, path: tuple[str, ...] = ()) -> None:
-    """Refuse a plain tree with a `_target_` that its key does not expect; nothing is imported.
+    """Refuse a `_target_` that its key does not expect, and values that its class does not take.
+
+    A type is read from the text of the class; nothing is imported.
 
     Args:
         node: without interpolations.
         path: of its key.
 
     Raises:
-        ConfigError: names the key and the target.
+        ConfigError: names the key, and the target or the value.
     """
+    declared: dict[str, str] = {}
     if isinstance(node, dict):
         for key in node:
             if key == "_target_":
                 _kind(path, node[key])
+                declared = arguments(str(node[key])) or {}
             elif re.fullmatch("_.*_", str(key)):
                 raise ConfigError(
                     f"{'.'.join((*path, str(key)))} is refused; of such keys there is only _target_"
                 )
     children = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
     for key, child in children:
+        kinds = [_PLAIN.get(name) for name in declared.get(key, "").split(" | ")]
+        if None not in kinds:
+            _check_type(".".join((*path, str(key))), child, typing.Union[*kinds])
         check(child, (*path, str(key)))
 
 
@@ -152,8 +163,7 @@ def filled(made_of: Any, values: Mapping[str, Any], where: str) -> Any:
             raise ConfigError(f"{where}.{name} is missing; give it a value")
     hints = _hints(made_of)
     for name, value in values.items():
-        if not _fits(value, hints.get(name)):
-            raise ConfigError(f"{where}.{name}={shown(value)} must be {_in_words(hints[name])}")
+        _check_type(f"{where}.{name}", value, hints.get(name))
         if not _all_finite(value):
             raise ConfigError(f"{where}.{name}={value} must be finite")
     try:
@@ -293,6 +303,11 @@ def _hints(made_of: Any) -> dict[str, Any]:
         return typing.get_type_hints(made_of)
     except NameError:  # one that is imported for type checkers alone
         return {}
+
+
+def _check_type(key: str, value: Any, hint: Any) -> None:
+    if not _fits(value, hint):
+        raise ConfigError(f"{key}={shown(value)} must be {_in_words(hint)}")
 
 
 def _fits(value: Any, hint: Any) -> bool:

@@ -11,7 +11,7 @@ from nsf.dynamics.interop import as_scalars
 from nsf.dynamics.span import Stages
 from nsf.dynamics.step import Step
 from nsf.mpm.stressed import stressed
-from nsf.mpm.transfer import make_g2p_stress
+from nsf.mpm.transfer.g2p import make_g2p_stress
 from nsf.sampling.sampler import SampleSpan
 
 

@@ -48,7 +48,7 @@ def folder(tmp_path, monkeypatch):
 @pytest.mark.usefixtures("folder")
 def test_a_class_of_an_entry_point_is_built():
     assert config.build(LAW, "material").factor == 2.0
-    assert code.arguments("mine.laws.Stiff") == {"E", "nu", "factor"}
+    assert code.arguments("mine.laws.Stiff") == {"E": "float", "nu": "float", "factor": "float"}
     assert "mine       mine.laws of mine 1.0: there" in doctor.report()
     assert "broken of mine 1.0: cannot be imported, ModuleNotFoundError" in doctor.report()
 

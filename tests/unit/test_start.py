@@ -51,6 +51,7 @@ REFUSED = [
     (["run", "-m", "scene=sand", "latent_dim=4,0"], "latent_dim=0 must be"),
     (["run", "scene=sand", "scene.bodies.column.density=0"], "density=0"),
     (["plan", "scene=sand", "scene.dt=-1"], "scene.dt=-1 s must be positive"),
+    (["plan", "scene=sand", "trainer.steps=many"], "trainer.steps=many must be a whole number or a list"),
     (["plan", "scene=sand", "scene.gravity=down"], "scene.gravity=down"),
     (["plan", "scene=sand", "material._target_=nsf.mpm.Transfer"], "nsf.mpm.Transfer"),
     (["run", "scene=sand", "scene.design.train=[30]"], "1 training cases"),

@@ -11,7 +11,8 @@ from nsf.engines.modal.placing import make_neighbours, make_sample
 from nsf.engines.modal.projection import make_projection
 from nsf.mpm import precision_of
 from nsf.mpm.step import make_grid_update, make_update_g2p
-from nsf.mpm.transfer import make_g2p, make_p2g
+from nsf.mpm.transfer.g2p import make_g2p
+from nsf.mpm.transfer.p2g import make_p2g
 
 ARCH = 90  # compute capability 9.0, which has reductions of its own in P2G
 KERNELS = {
