@@ -76,9 +76,10 @@ class Body:
         """
         lower, upper = self.shape.bounds
         if not ((lower >= 0).all() and (upper <= np.asarray(size)).all()):
+            unit = ", or set the unit of its mesh, as unit: mm" if hasattr(self.shape, "unit") else ""
             raise ConfigError(
                 f"body from {lower} to {upper} m reaches outside the domain [0, {tuple(size)}] m; "
-                "move it or make it smaller"
+                f"move it or make it smaller{unit}"
             )
         if not (extent := (upper - lower).max()) >= dx:
             raise ConfigError(

@@ -89,8 +89,11 @@ def _check_key(scene: Any, where: str, parameter: Parameter) -> None:
         )
     try:
         configured = value_at(scene, parameter.path)
-    except KeyError:
-        configured = None
+    except KeyError as error:
+        part, there = error.args
+        raise ConfigError(
+            f"{where}={key!r}: there is no {part!r}, but {', '.join(there) or 'nothing'}; {remedy}"
+        ) from error
     if not is_finite(configured):
         raise ConfigError(f"{where}={key!r} names no key that holds a number; {remedy}")
     if not _PHYSICS.match(path):

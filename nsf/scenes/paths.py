@@ -18,18 +18,23 @@ def value_at(node: Any, parts: Sequence[str]) -> Any:
     """The value at the end of a path.
 
     Raises:
-        KeyError: there is nothing.
+        KeyError: there is nothing; has the part that is missing, and those in its place.
     """
     for part in parts:
-        if is_dataclass(node) and part in {own.name for own in fields(node)}:
-            node = getattr(node, part)
-        elif isinstance(node, Mapping) and part in node:
-            node = node[part]
-        elif is_list(node) and part.isdigit() and int(part) < len(node):
-            node = node[int(part)]
-        else:
-            raise KeyError(part)
+        inside = _inside(node)
+        if part not in inside:
+            raise KeyError(part, tuple(inside))
+        node = inside[part]
     return node
+
+
+def _inside(node: Any) -> dict[str, Any]:
+    """What a dataclass, a mapping or a list holds, by the part of a path that leads there."""
+    if is_dataclass(node):
+        return {own.name: getattr(node, own.name) for own in fields(node)}
+    if isinstance(node, Mapping):
+        return dict(node)
+    return {str(at): inner for at, inner in enumerate(node)} if is_list(node) else {}
 
 
 def with_value(node: Any, parts: Sequence[str], value: Any, where: str) -> Any:

@@ -193,7 +193,9 @@ class Scene:
             try:
                 value_at(self, path)
             except KeyError as error:
-                raise ConfigError(f"scene {self.name} has no {key!r}: there is no {error}") from error
+                raise ConfigError(
+                    f"scene {self.name} has no {key!r}: there is no {error.args[0]!r}"
+                ) from error
             found[first] = with_value(found.get(first, getattr(self, first)), rest, value, first)
         return replace(self, **found)
 

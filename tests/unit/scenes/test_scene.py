@@ -101,10 +101,9 @@ def test_parameters_are_refused(sand, parameters, quoted):
 @pytest.mark.parametrize(
     ("key", "told"),
     [
-        ("material._target_", "names no key that holds a number"),
-        ("scene..dx", "names no key that holds a number"),
-        ("reduction.sample", "names no key that holds a number"),
-        ("sampler.size", "names no key that holds a number"),
+        ("material.e", "there is no 'e', but E, nu, friction_angle; name a key of the material"),
+        ("scene..dx", "there is no ''"),
+        ("sampler.size", "there is no 'sampler'"),
         ("scene.dx", "changes scene.dx"),
         ("scene.bodies.column.particles", "changes scene.bodies.column.particles"),
         ("scene.bodies.column.shape.radius", "changes scene.bodies.column.shape.radius"),
