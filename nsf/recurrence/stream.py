@@ -86,16 +86,14 @@ def stress_modes(manifold, count: int) -> Tensor:
     Raises:
         ConfigError: it has none, or fewer.
     """
-    fields = getattr(manifold, "fields", {})
-    modes = getattr(fields["stress"], "modes", None) if "stress" in fields else None
-    if modes is None:
+    if not (most := modes_of_stress(manifold)):
         raise ConfigError("model.stress needs modes of stress, which field=mlp has not; set model.stress=0")
-    if modes.shape[2] < count:
+    if most < count:
         raise ConfigError(
-            f"model.stress={count} coordinates, and the stress field has {modes.shape[2]} modes; set "
-            f"model.stress={modes.shape[2]} or fewer, or train with more field.modes"
+            f"model.stress={count} coordinates, and the stress field has {most} modes; set "
+            f"model.stress={most} or fewer, or train with more field.modes"
         )
-    return modes[..., :count]
+    return manifold.fields["stress"].modes[..., :count]
 
 
 def modes_of_stress(manifold) -> int:

@@ -22,7 +22,14 @@ from nsf.kinematics.manifold import Manifold
 from nsf.models.inputs import Lessons
 from nsf.models.lookup import inputs_in
 from nsf.progress import Progress
-from nsf.recurrence.stream import Encoded, Encoder, encoded_trajectory, modes_of_stress, streamed
+from nsf.recurrence.stream import (
+    Encoded,
+    Encoder,
+    encoded_trajectory,
+    modes_of_stress,
+    streamed,
+    stress_modes,
+)
 from nsf.runs import Record, Run
 from nsf.scenes import Scene
 from nsf.storage import intact
@@ -49,7 +56,7 @@ def encode(pipeline, run: Run) -> None:
     manifold, c = pipeline.manifold().to(pipeline.device), pipeline.config
     with run.record(device=pipeline.device, seed=c.seed, precision=c.precision) as record:
         started = time.perf_counter()
-        encoder = Encoder(manifold, modes_of_stress(manifold))
+        encoder = encoder_of(pipeline, manifold)
         files = _encoded(pipeline, encoder, lessons_of(pipeline), record)
         for file in files:
             record.output(file)
@@ -60,6 +67,17 @@ def encode(pipeline, run: Run) -> None:
             "run_seconds": sum(one.seconds for one in runs),
             "stream_seconds": time.perf_counter() - started,
         }
+
+
+def encoder_of(pipeline, manifold: Manifold) -> Encoder:
+    """An encoder with all modes of stress, of which models take as many as they have.
+
+    Raises:
+        ConfigError: the model has more.
+    """
+    if stress := pipeline.model.stress_of(pipeline.forced):
+        stress_modes(manifold, stress)
+    return Encoder(manifold, modes_of_stress(manifold))
 
 
 def lessons_of(pipeline) -> list[Lesson]:
@@ -102,7 +120,7 @@ def encoded_runs(pipeline, manifold: Manifold) -> Lessons:
 
 def encoded_validation(pipeline, manifold: Manifold) -> Lessons:
     """Likewise of the stored full-order runs by which a model is chosen, none of them held out."""
-    encoder, pairs = Encoder(manifold, modes_of_stress(manifold)), []
+    encoder, pairs = encoder_of(pipeline, manifold), []
     for case in pipeline.lessons[2]:
         with Trajectory.open(pipeline.simulation(case).require().file(TRAJECTORY)) as trajectory:
             run = encoded_trajectory(trajectory, encoder, pipeline.device)
