@@ -44,7 +44,7 @@ _TIMES = {
 _ORDER = ("test", "validation", "extrapolation")
 _COMPUTED = (
     *("body", "variant", "model_name", "delta_static", "delta_interpolated", "integration_share", "gamma"),
-    *("decoded_ms", "line", "rank"),
+    *("decoded_ms", "line", "rank", "beyond"),
 )
 SAID_ONCE = ("model_name", "stress", "affine", "field", "r", "material", "particles", "precision", "device")
 """Columns that are said above a table where all rows have one value."""
