@@ -8,6 +8,7 @@ from omegaconf import OmegaConf
 
 import nsf.paths
 from nsf import config
+from nsf.config import composing
 from nsf.config.resolvers import following, resolved
 from nsf.errors import ConfigError
 from nsf.paths import CONF, groups
@@ -75,6 +76,22 @@ def test_a_group_option_replaces_the_whole_group():
     assert config.load(["model=interpolate"]).model.name == "interpolate"
 
 
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ("scene=block", "scale=paper", "model=recurrence", "model.runs=8"),
+        ("seed=1", "+scene.parameters.E={key:material.E,unit:Pa,range:[1,2]}", "seed=2", "material=hencky"),
+        ("~scene.bodies.column", "++scene.new=[3]", "scene.dx=0.3", "latent_dim=${seed}"),
+    ],
+)
+def test_values_are_set_as_by_hydra(overrides):
+    ours = composing._with_values("config", overrides, composing.check_sizes(nsf.paths.files()))
+    trees = [OmegaConf.to_container(found) for found in (ours, composing._with_hydra("config", overrides))]
+    for tree in trees:
+        del tree["hydra"]
+    assert trees[0] == trees[1]
+
+
 def test_one_load_leaves_no_trace_in_the_next():
     before = config.load()
     config.load(["scale=paper", "latent_dim=3", "stress=deformation", "affine=none"])
@@ -92,7 +109,7 @@ def test_every_yaml_is_in_a_group_or_primary():
     [
         ("lantent_dim=4", "unknown key 'lantent_dim'; did you mean latent_dim"),
         ("modl=full", "did you mean model"),
-        ("model=projecte", "unknown model=projecte; choose one of auto, full"),
+        ("model=projecte", "unknown model=projecte; choose one of auto, dmdc"),
         ("scene=snad", "(did you mean sand?)"),
         ("scene.design.test=[1", "'scene.design.test=[1'"),
     ],
