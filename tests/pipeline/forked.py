@@ -1,6 +1,6 @@
 """The command line in a process of its own that need not import torch again.
 
-A server process imports once what the stages import when they work; each call is a fork of it. `spoil`
+A server process imports once what the stages import when they work; each call is a fork of it. A fault
 names a fault that the child brings upon itself at an exact moment, so that no test depends on how fast it
 runs.
 """
@@ -9,27 +9,28 @@ import gc
 import importlib
 import multiprocessing
 import os
-import pkgutil
 import resource
 import shutil
 import signal
 import sys
 from dataclasses import dataclass
+from functools import cache
+from multiprocessing import forkserver
 from pathlib import Path
 
-from nsf.pipeline import stages
+import pytest
 
-CONTEXT = multiprocessing.get_context("forkserver")
-CONTEXT.set_forkserver_preload(
-    ["torch", "warp", "pytorch_lightning", "h5py", "hydra", "scipy.spatial", "nsf.cli", "nsf.pipeline.chain"]
-    + [
-        "nsf.pipeline.sweep",
-        "nsf.pipeline.experiment",
-        "nsf.results.report",
-        "matplotlib.backends.backend_svg",
-    ]
-    + [f"nsf.pipeline.stages.{module.name}" for module in pkgutil.iter_modules(stages.__path__)]
-)
+
+@cache
+def _context():
+    """Processes that are forks of one server; it finds `preloaded` and what that imports by their folders."""
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["preloaded", "forked"])
+    folders = [str(Path(__file__).parent), str(Path(__file__).parents[1]), os.environ.get("PYTHONPATH")]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, folders)))
+        forkserver.ensure_running()
+    return context
 
 
 @dataclass(frozen=True)
@@ -143,7 +144,7 @@ def run_nsf(arguments, root: Path, folder: Path, *faults, timeout=120) -> Outcom
     """`nsf *arguments` with NSF_RUNS = root, from within an empty folder."""
     folder.mkdir(parents=True, exist_ok=True)
     environment = {"NSF_RUNS": str(root), "NSF_REPORTS": str(folder / "reports"), "OMP_NUM_THREADS": "1"}
-    process = CONTEXT.Process(target=_child, args=(list(arguments), environment, folder, faults))
+    process = _context().Process(target=_child, args=(list(arguments), environment, folder, faults))
     process.start()
     process.join(timeout)
     if process.exitcode is None:
