@@ -58,12 +58,14 @@ def garbage_stays():
 
 @pytest.fixture(scope="session", autouse=True)
 def coarse_pictures():
-    """Half the pixels an inch, and one sample a pixel: a picture takes a third of the time."""
+    """A quarter of the pixels an inch, and one sample a pixel: a picture takes a sixth of the time."""
     from nsf.bodies import camera
+    from nsf.bodies import pictures as of_bodies
     from nsf.results import style
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(style, "PIXELS", style.PIXELS // 2)
+        patch.setattr(style, "PIXELS", style.PIXELS // 4)
+        patch.setattr(of_bodies, "WIDE", of_bodies.WIDE // 4)
         patch.setattr(camera, "_OVERSAMPLE", 1)
         yield
 

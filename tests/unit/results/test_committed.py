@@ -62,7 +62,7 @@ def test_rows_of_all_reports_are_one_table(folder):
 
 def test_a_report_that_is_made_anew_takes_the_place_of_its_rows(folder, tmp_path):
     run = write_run(tmp_path / "runs", Made((0.05, 0.07)))
-    build_report([run], folder / "noise/weak", Question("noise/weak", "New"))
+    build_report([run], folder / "noise/weak", Question("noise/weak", "New", plots=["delta"]))
     committed.write_list(folder)
     frame = table.read(folder / "results.csv")
     assert frame.groupby("report")["delta"].mean().to_dict() == pytest.approx(

@@ -15,7 +15,9 @@ from nsf.results.report import build_report
 from nsf.results.sources import open_sources
 from nsf.results.table import interval
 
-ASKED = Question("trial", "Sand & <friends>", "How far?", "Table 1: 0.4 %.", missing=["seed=2: not run"])
+ASKED = Question(
+    "trial", "Sand & <friends>", "How far?", "Table 1: 0.4 %.", missing=["seed=2: not run"], plots=["delta"]
+)
 SCRIPT = "</title><script>alert(1)</script> | [x](javascript:alert(1)) $x^2$ \\input{/etc/passwd}"
 
 
@@ -34,9 +36,10 @@ def report(runs, tmp_path_factory):
 
 
 @pytest.fixture
-def no_pictures(monkeypatch):
-    """Bodies take seconds to draw, and some tests are about the rest."""
+def text_alone(monkeypatch):
+    """Bodies and charts take seconds to draw, and some tests are about the rest."""
     monkeypatch.setattr(pictures, "sections", lambda *_: [])
+    monkeypatch.setattr("nsf.results.report.figures", lambda *_: [])
 
 
 def test_the_page_has_question_results_cases_and_origin(report):
@@ -68,7 +71,7 @@ def test_files_and_pictures_have_their_hashes_and_runs(report, runs):
     assert content["pictures"]["projected-strip.png"]["runs"] == sorted({runs[0].id, runs[2].id})
 
 
-def test_a_report_stands_as_it_is_until_something_changes(runs, report, tmp_path, no_pictures):
+def test_a_report_stands_as_it_is_until_something_changes(runs, report, tmp_path, text_alone):
     assert unchanged(report, runs, ASKED) == report / "index.html"
     assert unchanged(report, runs[:2], ASKED) is None
     build_report(runs, tmp_path / "trial", ASKED)
@@ -77,7 +80,7 @@ def test_a_report_stands_as_it_is_until_something_changes(runs, report, tmp_path
     assert unchanged(tmp_path / "trial", runs, ASKED) is None
 
 
-def test_the_newest_run_counts(tmp_path, no_pictures):
+def test_the_newest_run_counts(tmp_path, text_alone):
     old = write_run(tmp_path, Made((0.5, 0.5)), code=1)
     new = write_run(tmp_path, Made((0.1, 0.1), created="2026-11-02T10:00:00+00:00"), code=2)
     question = Question("trial", "T", keys={old.id: {}, new.id: {}})
@@ -87,7 +90,7 @@ def test_the_newest_run_counts(tmp_path, no_pictures):
     assert table.read(tmp_path / "r/results.csv")["delta"].tolist() == [0.5, 0.5]
 
 
-def test_what_jobs_vary_is_their_setting(tmp_path, no_pictures):
+def test_what_jobs_vary_is_their_setting(tmp_path, text_alone):
     some = [write_run(tmp_path, Made((0.1 * k, 0.2)), code=k) for k in (1, 2)]
     keys = {
         run.id: {"scene": "sand", "sampler": "random", "sampler.size": f"{k}2"} for k, run in enumerate(some)
@@ -96,14 +99,14 @@ def test_what_jobs_vary_is_their_setting(tmp_path, no_pictures):
     assert set(table.read(tmp_path / "r/results.csv")["setting"]) == {"sampler.size=02", "sampler.size=12"}
 
 
-def test_the_papers_figure_of_single_jobs(tmp_path, no_pictures):
+def test_the_papers_figure_of_single_jobs(tmp_path, text_alone):
     run = write_run(tmp_path, Made())
     printed = [{"scene": "sand", "parameter": "30", "delta": 0.018}]
     build_report([run], tmp_path / "r", Question("trial", "T", keys={run.id: {}}, printed=printed))
     assert table.read(tmp_path / "r/results.csv")["paper_delta"].fillna(0).tolist() == [0.0, 0.018]
 
 
-def test_an_altered_file_is_refused(tmp_path, no_pictures):
+def test_an_altered_file_is_refused(tmp_path, text_alone):
     run = write_run(tmp_path, Made())
     rows = pd.read_csv(run.path / "results.csv")
     rows.assign(delta=0.0).to_csv(run.path / "results.csv", index=False)
@@ -117,7 +120,7 @@ def test_an_altered_file_is_refused(tmp_path, no_pictures):
         build_report([run], tmp_path / "r", ASKED)
 
 
-def test_a_run_of_another_version_is_refused(tmp_path, no_pictures):
+def test_a_run_of_another_version_is_refused(tmp_path, text_alone):
     run = write_run(tmp_path, Made())
     rows = pd.read_csv(run.path / "results.csv")
     rows.drop(columns=["case", "model"]).to_csv(run.path / "results.csv", index=False)
@@ -142,7 +145,7 @@ def test_an_unknown_chart_and_a_foreign_folder_are_refused(runs, tmp_path):
         build_report(runs, tmp_path / "r", ASKED)
 
 
-def test_titles_are_no_markup(tmp_path, no_pictures):
+def test_titles_are_no_markup(tmp_path, text_alone):
     run = write_run(tmp_path, Made())
     build_report([run], tmp_path / "r", Question("trial", SCRIPT, SCRIPT))
     page, text = ((tmp_path / "r" / name).read_text() for name in ("index.html", "index.md"))
@@ -178,7 +181,7 @@ def test_an_interval_is_of_seeds_and_cases_drawn_anew():
         ),
     ],
 )
-def test_a_forged_file_is_refused(tmp_path, no_pictures, name, content):
+def test_a_forged_file_is_refused(tmp_path, text_alone, name, content):
     run = write_run(tmp_path / "runs", Made())
     (run.path / name).write_bytes(content.encode())
     seal(run)
@@ -186,7 +189,7 @@ def test_a_forged_file_is_refused(tmp_path, no_pictures, name, content):
         build_report([run], tmp_path / "reports", ASKED)
 
 
-def test_a_forged_table_of_more_points_is_refused(tmp_path, no_pictures):
+def test_a_forged_table_of_more_points_is_refused(tmp_path, text_alone):
     run = write_run(tmp_path / "runs", Made())
     (run.path / "superresolution.csv").write_text("case,displacement_error\na=1,abc\n")
     seal(run, "superresolution.csv")
