@@ -109,7 +109,7 @@ def mlp(own_root, tiny):
     return pipeline.deploy()
 
 
-@pytest.fixture(scope="module", params=["basis", "mlp"])
+@pytest.fixture(scope="module", params=["basis", pytest.param("mlp", marks=pytest.mark.slow)])
 def graphs(request, deployed, tmp_path_factory):
     """A playback and the folder of its graphs; of networks, at points in between."""
     pytest.importorskip("onnxscript")

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from nsf.errors import NSFError
+from nsf.inverse import columns
 from nsf.inverse.observations import Observations
 
 MODEL = SimpleNamespace(t=np.linspace(0.0, 1.0, 11), manifold=SimpleNamespace(X=torch.zeros(100, 3)))
@@ -85,10 +86,17 @@ def test_text_is_utf_8(tmp_path):
     refused(path, "UTF-8")
 
 
-def test_rows_beyond_a_million(tmp_path):
+@pytest.fixture
+def short(monkeypatch):
+    """Files may have a thousandth of the rows, and a hundredth of the bytes."""
+    monkeypatch.setattr(columns, "_MOST_ROWS", columns._MOST_ROWS // 1000)
+    monkeypatch.setattr(columns, "_MOST_BYTES", columns._MOST_BYTES // 100)
+
+
+def test_rows_beyond_the_most(tmp_path, short):
     path = tmp_path / "seen.csv"
-    path.write_text(f"{HEAD}\n" + f"{ROW}\n" * 1_000_001)
-    refused(path, "1,000,000 rows")
+    path.write_text(f"{HEAD}\n" + f"{ROW}\n" * 1001)
+    refused(path, "1,000 rows")
 
 
 # -- compression ----------------------------------------------------------------------------------------
@@ -101,13 +109,13 @@ def test_a_compressed_file(tmp_path):
 
 
 @pytest.mark.parametrize("line", [b"\n", b" " * 4000 + b"\n", f"{ROW}\n".encode(), b" "])
-def test_a_bomb(tmp_path, line):
+def test_a_bomb(tmp_path, line, short):
     # 6 MB of such lines took 13 GB.
     whole = io.BytesIO()
     with gzip.GzipFile(fileobj=whole, mode="wb", compresslevel=1) as packed:
         packed.write(f"{HEAD}\n".encode())
         block = line * (2**20 // len(line))
-        for _ in range(300):
+        for _ in range(3):
             packed.write(block)
     path = tmp_path / "seen.csv.gz"
     path.write_bytes(whole.getvalue())
@@ -191,10 +199,10 @@ def test_columns_that_lie_elsewhere(tmp_path):
         ({"quantity": np.array([b"h" * 80] * 2, object)}, ("quantity", "80 bytes")),
         ({"quantity": np.array([b"\xff", b""], "S6")}, ("utf-8",)),
         ({"deep": np.array([1.0, 1.0])}, ("the column 'deep'", "leave it out")),
-        ({name: np.zeros(1_000_001) for name in COLUMNS}, ("1,000,000 rows",)),
+        ({name: np.zeros(1001) for name in COLUMNS}, ("1,000 rows",)),
     ],
 )
-def test_columns_of_another_kind(tmp_path, changes, words):
+def test_columns_of_another_kind(tmp_path, changes, words, short):
     refused(hdf5(tmp_path / "seen.h5", **changes), *words)
 
 
