@@ -338,7 +338,8 @@ def _has(group: str, name: str, key: str) -> bool:
     if name not in groups()[group]:
         return True
     node = yaml.safe_load(text_of(option(group, name)))
-    for part in key.split(".")[1:]:
+    whole = isinstance(node, dict) and group in node  # a scene's file is of the package _global_
+    for part in key.split(".")[0 if whole else 1 :]:
         if not isinstance(node, dict) or part not in node:
             return False
         node = node[part]

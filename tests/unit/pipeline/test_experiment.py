@@ -178,6 +178,10 @@ def test_an_option_that_lacks_a_key_of_the_experiment_is_named(written):
     with pytest.raises(ConfigError, match=r"sets model\.runs, which model=interpolate does not have"):
         written(text, "model=interpolate")
     assert written(text, "model=recurrence")
+    of_scene = TEXT.replace("field.modes: null", "scene.design.test_seed: 1")
+    assert written(of_scene, "scene=tray")  # whose file holds `scene.` itself
+    with pytest.raises(ConfigError, match=r"sets scene\.design\.test_seed, which scene=sand does not have"):
+        written(of_scene, "scene=sand")
 
 
 def test_keys_of_another_part_refuse_no_option(tmp_path):
