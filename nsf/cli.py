@@ -105,10 +105,6 @@ def _dispatch(arguments: list[str]) -> int:
     if launcher:
         raise ConfigError(f"{launcher[0]} is about the jobs of a sweep; add -m")
     loaded = config.load(overrides, usage.primary(stage))  # refused before the import of what would use it
-    if stage != "point":
-        from nsf.pipeline.values import check_numbers
-
-        check_numbers(loaded)
     from nsf.pipeline.sweep import work
 
     result = work(loaded, _stages(stage))

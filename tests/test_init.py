@@ -50,8 +50,9 @@ def test_a_project_is_installed_and_run(tmp_path):
         return done.stdout
 
     short = ["device=cpu", "trainer.steps=20", "scene.steps=8"]
-    run("nsf.cli", "run", "--config-dir", "conf", "scene=bracket", *short)
-    run("nsf.cli", "run", "--config-dir", "conf", "+experiment=bracket", *short)
+    few = ["model.runs=4", "model.descents=20"]
+    run("nsf.cli", "run", "--config-dir", "conf", "scene=bracket", *short, *few)
+    assert "2 jobs" in run("nsf.cli", "plan", "--config-dir", "conf", "+experiment=bracket", *short)
     values = ["material.yield_stress=40", "material.saturation=200"]
     assert "Saturating" in run("nsf.cli", "point", "--config-dir", "conf", "material=saturating", *values)
     run("pytest", "-q", "-p", "no:cacheprovider")

@@ -13,7 +13,7 @@ from nsf.gpu import has_driver
 from nsf.models import Model
 from nsf.mpm import FP32, FP64, Precision
 from nsf.paths import groups, option
-from nsf.pipeline.values import check_numbers, check_words, factors
+from nsf.pipeline.values import check_values, factors
 from nsf.scenes import Scene
 
 if TYPE_CHECKING:
@@ -53,9 +53,9 @@ class Configured:
             self._begin(config)
 
     def _begin(self, config: DictConfig) -> None:
-        check_numbers(config)
         self.template = configuration.checked(with_candidates(config))
         c = self.config = configuration.resolve(self.template)
+        check_values(c)
         self.scene = scene_of(self.template)
         self.split = self.scene.split
         names, count = self.split.names, len(self.split.train)
@@ -66,7 +66,6 @@ class Configured:
             )
         self.configured: Model = configuration.build(c.model, "model")
         self.coarse = factors("evaluation.coarse", c.evaluation.coarse)
-        check_words(c)
         self.configured.refuse(self)
         self.deployed = self._deployed(c.deploy.changes)
         self.device = _device(c.device)
@@ -135,7 +134,7 @@ class Configured:
 
 def with_candidates(config: DictConfig) -> DictConfig:
     """A configuration with the candidates of `model=auto`, as their files have them; others as they are."""
-    model = config.model
+    model = configuration.section(config, "model")
     if model.get("name") != "auto":
         return config
     config = config.copy()

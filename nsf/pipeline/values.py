@@ -22,19 +22,14 @@ PRECISIONS = ("fp32", "fp64")
 _LEAST_STEP = 1e-3
 
 
-def check_numbers(c: DictConfig) -> None:
-    """Refuse a configuration whose numbers are none, too small or not whole; takes no time and loads no Warp.
+def check_values(c: DictConfig) -> None:
+    """Refuse a configuration without a section, or with a value that is none of those that it may be.
 
     Raises:
-        ConfigError: names the key; also where a section is missing.
+        ConfigError: names the key.
     """
     for key in _SECTIONS:
         configuration.section(c, key)
-    with configuration.naming_the_missing():
-        _check_numbers(c)
-
-
-def _check_numbers(c: DictConfig) -> None:
     for key, least in (("latent_dim", 1), ("seed", 0)):
         configuration.number(key, c[key], least=least, whole=True)
     for key, least in (("trials", 0), ("picture_particles", 1), ("picture_frames", 1)):
@@ -43,10 +38,6 @@ def _check_numbers(c: DictConfig) -> None:
         configuration.number(f"super_resolution.{key}", c.super_resolution[key], least=least, whole=True)
     configuration.number("deploy.dt_multiplier", c.deploy.dt_multiplier, least=_LEAST_STEP)
     configuration.number("deploy.batch", c.deploy.batch, least=1, whole=True)
-
-
-def check_words(c: DictConfig) -> None:
-    """Raises ConfigError where a value is not one of the few that it may be, or the report's name is none."""
     one_of("deploy.split", c.deploy.split, ("test", "validation", "train"))
     one_of("fallback", c.fallback, FALLBACKS)
     check_tracking(c.tracking)
