@@ -104,10 +104,10 @@ def check(node: Any, path: tuple[str, ...] = ()) -> None:
                 )
     children = node.items() if isinstance(node, dict) else enumerate(node) if isinstance(node, list) else ()
     for key, child in children:
+        check(child, (*path, str(key)))
         kinds = [_PLAIN.get(name) for name in declared.get(key, "").split(" | ")]
         if None not in kinds:
             _check_type(".".join((*path, str(key))), child, typing.Union[*kinds])
-        check(child, (*path, str(key)))
 
 
 def build(node: DictConfig | Mapping, where: str) -> Any:
