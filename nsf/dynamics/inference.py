@@ -1,6 +1,6 @@
 """Network inference: x, v, τ and C of particles at a latent vector (paper section 5.1)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import torch
 
@@ -81,6 +81,10 @@ class Decoder:
     def position(self, xhat: torch.Tensor) -> torch.Tensor:
         """x = g(X, x̂), [n, 3] of x̂ [r] or [F, n, 3] of x̂ [F, r], in metres."""
         return self.at.position(xhat)
+
+    def positions(self, xhat: torch.Tensor) -> Iterator[torch.Tensor]:
+        """Positions of x̂ [F, r] in blocks of frames; see `Restriction.positions`."""
+        return self.at.positions(xhat)
 
     def stress(self, xhat: torch.Tensor, stress: torch.Tensor | None = None) -> torch.Tensor:
         """τ [F, n, 3, 3] of x̂ [F, r], in pascals; of ŝ [F, n_s], coordinates of τ, where there are any."""

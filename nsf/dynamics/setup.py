@@ -17,9 +17,6 @@ from nsf.mpm import precision_of
 from nsf.mpm.device import warp_device
 from nsf.sampling.sampler import SampleSpan, check_well_posed
 
-#: Positions of all particles decoded at once [values].
-_CHUNK = 2**25
-
 
 class Setup:
     """The inputs of a reduced run: fields, scene, sample, start, and how steps are taken.
@@ -117,13 +114,12 @@ class Setup:
         decoder = self.decoder()
         latents = self.manifold.training_latents.to(self.torch_device, self.dtype)
         fraction = self.manifold.training_times.to(self.torch_device) / (self.scene.dt * self.scene.steps)
-        rows = max(1, _CHUNK // (3 * P))
         ends = [sample.start for sample in self.samples[1:]] + [1.0]
         slack = 2.0 / self.scene.steps  # a span also meets the frames just before and after it
         sets = []
         for sample, end in zip(self.samples, ends, strict=True):
             of_span = latents[(fraction >= sample.start - slack) & (fraction <= end + slack)]
-            frames = (decoder.position(chunk) for chunk in of_span.split(rows))
+            frames = decoder.positions(of_span)
             sets.append(self.search.superset(frames, sample.particles, self.integration.margin))
         return sets
 

@@ -18,8 +18,6 @@ from nsf.kinematics.manifold import Restriction
 from nsf.mpm import Hand
 from nsf.timing import StageTimer, untimed
 
-_CHUNK = 2**22  # positions of sample particles decoded at once [values]
-
 
 class ReducedBatch:
     """Steps the latent vectors of B runs together; one run is a batch of one.
@@ -340,12 +338,11 @@ class ReducedMPM:
         """
         first = since
         for count, span in self.together.steps_by_span(since - 1):
-            rows = max(1, _CHUNK // (3 * span.s))
-            for xhat in self.record.xhat[first : first + count].split(rows):
-                lost = ~self.setup.search.on_grid(span.at_sample.position(xhat)).all(1)
+            for x in span.at_sample.positions(self.record.xhat[first : first + count]):
+                lost = ~self.setup.search.on_grid(x).all(1)
                 if bool(lost.any()):
                     return first + int(lost.int().argmax())
-                first += len(xhat)
+                first += len(x)
         return -1
 
     def needed_outside(self, steps: int | None = None) -> int:
@@ -358,10 +355,13 @@ class ReducedMPM:
         """
         if self.sets[0].nodes is None or self.span.latent_only:
             return 0
-        decoder, search, worst = self.decoder(), self.setup.search, 0
-        for n in range(self.steps_taken if steps is None else steps):
-            x = decoder.position(self.record.xhat[n])
-            worst = max(worst, search.missing(x, self.sets_at(n)))
+        search, worst, n = self.setup.search, 0, 0
+        for block in self.decoder().positions(
+            self.record.xhat[: self.steps_taken if steps is None else steps]
+        ):
+            for x in block:
+                worst = max(worst, search.missing(x, self.sets_at(n)))
+                n += 1
         return worst
 
     def equations_at(

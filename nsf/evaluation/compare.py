@@ -16,10 +16,11 @@ from nsf.errors import SchemaError
 from nsf.evaluation import metrics
 from nsf.evaluation.quantities import QUANTITIES, at_end, height
 from nsf.evaluation.surroundings import surroundings
+from nsf.kinematics.blocks import frames_at_once
 from nsf.mpm.grid.shape import DEGREES
 from nsf.vectors import spaced
 
-_CHUNK = 2**24  # values of one field decoded at once
+_VALUES = 90  # of a particle and frame that are held together: x, v, C and τ of three kinds
 _SAME_TIME = 1e-9  # [s]
 _HARDLY = 1e-4  # of the most in a run
 _UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])  # entries xx, xy, xz, yy, yz, zz of a symmetric matrix
@@ -153,7 +154,7 @@ def compare(
 
     carried = _Carried(solver) if _carries(solver, rollout, trajectory) else None
     previous = decoder.position(xhat[0])
-    per_chunk = max(1, _CHUNK // (9 * trajectory.particles))
+    per_chunk = frames_at_once(_VALUES * trajectory.particles, setup.dtype, device)
     for start in range(0, frames, per_chunk):
         block = slice(start, min(start + per_chunk, frames))
         x, tau, C, v = (tensor(trajectory.read(name, frames=block)) for name in ("x", "tau", "C", "v"))

@@ -15,12 +15,13 @@ from nsf.dynamics import ReducedMPM
 from nsf.errors import InstabilityError, NSFError
 from nsf.evaluation import metrics
 from nsf.evaluation.cost import Subject
+from nsf.kinematics.blocks import frames_at_once
 from nsf.kinematics.interpolation import interpolation
 from nsf.models import TrainingRuns
 from nsf.mpm.stability import largest_stable_dt
 from nsf.scenes import Scene
 
-_CHUNK = 2**24  # positions decoded at once
+_VALUES = 18  # of a particle and frame that are held together: the truth, and six distances from it
 
 
 def forcing_of(scene: Scene) -> np.ndarray:
@@ -176,7 +177,7 @@ def rivals(
     coarse = {factor: coarse_run(scene, setup.values, trajectory.X, factor, *how) for factor in factors}
     ran = {factor: run for factor, run in coarse.items() if not isinstance(run, str)}
     X, squares = tensor(trajectory.X), {}
-    rows = max(1, _CHUNK // (3 * trajectory.particles))
+    rows = frames_at_once(_VALUES * trajectory.particles, setup.dtype, setup.torch_device)
     for start in range(1, trajectory.frames, rows):
         block = slice(start, min(start + rows, trajectory.frames))
         x = tensor(trajectory.read("x", frames=block))

@@ -16,6 +16,7 @@ from nsf import schemas
 from nsf.data import Standardizer, archives
 from nsf.errors import NSFError, SchemaError, ShapeError, first_line
 from nsf.kinematics import checkpoint
+from nsf.kinematics.blocks import frames_at_once
 from nsf.schemas import Number
 from nsf.storage import writing
 
@@ -38,6 +39,16 @@ class Restriction(ABC):
     @abstractmethod
     def position(self, xhat: Tensor) -> Tensor:
         """x = g(X, xhat), [n, 3] in metres."""
+
+    def positions(self, xhat: Tensor) -> Iterator[Tensor]:
+        """Positions [f, n, 3] [m] of x̂ [F, r], in blocks of as many frames f as memory has room for.
+
+        A block is good until the next one is taken, which may be written over it. Nothing is differentiable.
+        """
+        for part in xhat.split(frames_at_once(3 * self.points, self.dtype, self.device)):
+            with torch.no_grad():
+                block = self.position(part.to(self.device))
+            yield block
 
     @abstractmethod
     def position_and_jacobian(self, xhat: Tensor) -> tuple[Tensor, Tensor]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from nsf.errors import ShapeError
+from nsf.kinematics.blocks import TILE, frames_at_once
 from nsf.kinematics.fields.networks import Committee, FullyConnected
 from nsf.kinematics.manifold import Restriction
 from nsf.kinematics.training.phases import joined, shaped
@@ -137,14 +138,34 @@ class RestrictedField:
         Raises:
             ShapeError: dx̂/dt is missing.
         """
+        a = self._coefficients(inputs, rate)
+        return F.linear(a, self.modes.flatten(0, 1), self.mean.flatten()).unflatten(-1, self.mean.shape)
+
+    def blocks(self, inputs: Tensor) -> Iterator[Tensor]:
+        """`values` [f, n, c] of inputs [F, ·], all blocks of frames in one memory.
+
+        A block is one product on a GPU. On the CPU it is one for each part of the points whose modes stay in
+        the cache.
+        """
+        modes, mean = self.modes.flatten(0, 1), self.mean.flatten()
+        size = min(len(inputs), frames_at_once(len(mean), mean.dtype, mean.device))
+        with torch.no_grad():
+            a, memory = self._coefficients(inputs), mean.new_empty(size, len(mean))
+        width = len(mean) if mean.is_cuda else max(1, TILE // modes.shape[1])
+        tiles = [slice(start, start + width) for start in range(0, len(mean), width)]
+        for part in a.split(max(1, size)):
+            block = memory[: len(part)]
+            with torch.no_grad():
+                for rows in tiles:
+                    torch.addmm(mean[rows], part, modes[rows].T, out=block[:, rows])
+            yield block.unflatten(-1, self.mean.shape)
+
+    def _coefficients(self, inputs: Tensor, rate: Tensor | None = None) -> Tensor:
         a = [inputs[..., : self.leading]] if self.leading or self.network is None else []
         if self.network is not None:
             outputs = self.network(inputs)
             a.append(at_rate(outputs, self._checked(rate)) if self.rates else outputs)
-        coefficients = torch.cat(a, -1) if len(a) > 1 else a[0]
-        return F.linear(coefficients, self.modes.flatten(0, 1), self.mean.flatten()).unflatten(
-            -1, self.mean.shape
-        )
+        return torch.cat(a, -1) if len(a) > 1 else a[0]
 
     def _checked(self, rate: Tensor | None) -> Tensor:
         if rate is None:
@@ -274,6 +295,10 @@ class ModalRestriction(Restriction):
     @override
     def position(self, xhat):
         return self.fields["deformation"].values(xhat.to(self.dtype))
+
+    @override
+    def positions(self, xhat):
+        return self.fields["deformation"].blocks(xhat.to(self.device, self.dtype))
 
     @override
     def position_and_jacobian(self, xhat):

@@ -1,0 +1,34 @@
+"""Frames that are decoded block by block, and what fp32 costs them."""
+
+import pytest
+import torch
+
+from nsf.kinematics import blocks
+from nsf.kinematics.fields import modal
+
+
+@pytest.mark.parametrize("frames", [1, 5, 26])
+def test_blocks_are_the_positions_of_each_frame(manifold, frames, monkeypatch):
+    monkeypatch.setattr(blocks, "_HOST_BYTES", 3 * 8 * 150 * 4)  # four frames
+    monkeypatch.setattr(modal, "TILE", 9 * 100)
+    xhat = manifold.training_latents[:frames]
+    at = manifold.restrict()
+    taken = [block.clone() for block in at.positions(xhat)]
+    assert [len(block) for block in taken] == [len(part) for part in xhat.split(4)]
+    torch.testing.assert_close(torch.cat(taken), at.position(xhat))
+    assert not any(block.requires_grad for block in taken)
+
+
+def test_fp32_is_off_by_less_than_a_tenth_of_the_model(manifold, snapshots):
+    """Of the displacements; the model's error is that of the training frames, encoded and decoded."""
+    x = snapshots.slab("x", slice(None)).double()
+    xhat = manifold.encode(x)
+    double, single = (
+        torch.cat([block.double() for block in manifold.restrict(dtype=dtype).positions(xhat)])
+        for dtype in (torch.float64, torch.float32)
+    )
+    assert (single - double).norm() < 0.1 * (double - x).norm()
+
+
+def test_a_block_has_a_frame_at_least():
+    assert blocks.frames_at_once(10**12, torch.float64, "cpu") == 1
