@@ -128,11 +128,11 @@ def _check_words(command: str, words: Sequence[str]) -> None:
         raise ConfigError(f"{unknown[0]!r} is not key=value; see `nsf {command} --help`")
 
 
-def _asked(command: str, words: Sequence[str], *known: str) -> dict[str, str]:
-    """The values of a tool's keys."""
+def _asked(command: str, words: Sequence[str], *known: str, dotted: bool = False) -> dict[str, str]:
+    """The values of a tool's keys, and with `dotted` of those of a configuration that have a dot."""
     _check_words(command, words)
     asked = dict(word.split("=", 1) for word in words)
-    if unknown := [key for key in asked if key not in known]:
+    if unknown := [key for key in asked if key not in known and not (dotted and "." in key)]:
         keys = " and ".join(f"{key}=" for key in known)
         raise ConfigError(f"nsf {command} has no key {unknown[0]!r}; it takes {keys}")
     return asked
@@ -168,8 +168,9 @@ def _open(page: Path) -> int:
 def _bench(words: list[str]) -> int:
     """Benchmarks, and the report of all there are."""
     asked = _asked(
-        "bench", words, "benches", "particles", "precision", "device", "trials", "scenes", "folder"
-    )
+        "bench", words, "benches", "particles", "precision", "device", "trials", "scenes", "limit", "folder",
+        dotted=True,
+    )  # fmt: skip
     from nsf.bench import bench, table
 
     folder = asked.pop("folder", reports_folder("speed"))

@@ -6,16 +6,17 @@ from importlib import import_module
 from pathlib import Path
 
 from nsf.bench.report import write_report
-from nsf.bench.rows import FILE, Measurements, Settings, merge
+from nsf.bench.rows import Measurements, Settings
 from nsf.errors import ConfigError
 from nsf.mpm.device import warp_device
 from nsf.mpm.precision import precision_of
 from nsf.storage import require_folder
 
-BENCHES = ("full_order", "scaling", "reduced", "batch", "recurrence", "training")
+BENCHES = ("whole", "full_order", "scaling", "reduced", "batch", "recurrence", "training")
 """Modules of this package with `run(figures)`, which adds its figures to `Measurements`."""
 
 SCENES = ("cake", "metal")  # of benchmarks of reduced steps
+_KNOWN = ("bread", "cake", "jelly_cube", "metal", "sand", "squishy_ball", "toothpaste")
 _MOST = 10**9  # particles: some hundred GB of them
 _UNITS = {"": 1, "k": 1_000, "m": 1_000_000}
 
@@ -25,8 +26,9 @@ def bench(folder: str | Path, options: Mapping[str, str], say: Callable[[str], o
 
     Args:
         folder: of the table, index.md and charts; rows of other benchmarks or devices are kept.
-        options: `benches`, `particles`, `precision`, `device`, `trials`, `scenes`, as on the command line.
-        say: told of every result.
+        options: `benches`, `particles`, `precision`, `device`, `trials`, `scenes`, `limit` and keys of the
+            configuration, as on the command line.
+        say: called with a line on each result.
 
     Returns:
         The report's page.
@@ -41,33 +43,35 @@ def bench(folder: str | Path, options: Mapping[str, str], say: Callable[[str], o
     settings = _settings(options)
     require_folder(folder)
     for name in names:
-        figures = Measurements(settings, say)
+        figures = Measurements(settings, say, folder=folder)
         try:
             import_module(f"nsf.bench.{name}").run(figures)
         except BaseException:
             if figures.rows:  # those that were measured stay
-                _write(folder, figures)
+                figures.save()
+                write_report(folder)
             raise
-        page = _write(folder, figures)
+        figures.save()
+        page = write_report(folder)
     return page
 
 
-def _write(folder: Path, figures: Measurements) -> Path:
-    merge(folder / FILE, figures.frame)
-    return write_report(folder)
-
-
 def _settings(options: Mapping[str, str]) -> Settings:
-    trials, sizes, scenes = (options.get(key, "") for key in ("trials", "particles", "scenes"))
-    if trials and not (trials.isdigit() and int(trials)):
-        raise ConfigError(f"trials={trials} must be a whole number of at least 1")
+    trials, sizes, scenes, limit = (
+        options.get(key, "") for key in ("trials", "particles", "scenes", "limit")
+    )
+    for key, text in (("trials", trials), ("limit", limit)):
+        if text and not (text.isdigit() and int(text)):
+            raise ConfigError(f"{key}={text} must be a whole number of at least 1")
     precisions = options.get("precision", "fp32,fp64").split(",")
     return Settings(
         particles=tuple(map(_count, sizes.split(","))) if sizes else (),
         precisions=tuple(precision_of(name).name for name in precisions),
         device=str(warp_device(options.get("device", "auto"))),
         trials=int(trials or 10),
-        scenes=_chosen("scenes", scenes, SCENES) if scenes else (),
+        scenes=_chosen("scenes", scenes, _KNOWN) if scenes else (),
+        limit=float(limit or Settings.limit),
+        keys=tuple(f"{key}={value}" for key, value in options.items() if "." in key),
     )
 
 

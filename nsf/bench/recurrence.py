@@ -1,6 +1,6 @@
-"""A step by a recurrence beside the full-order one: single runs, many at once, and many particles."""
+"""A step by a recurrence beside the full-order one: single runs, and many at once."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -9,11 +9,9 @@ import numpy as np
 import torch
 
 from nsf import config
-from nsf.bench.command import SCENES
 from nsf.bench.measure import build, run_times, window_times
-from nsf.bench.reduced import Frames, deformation_error, error_of_latents
-from nsf.bench.rows import Case, Measurements, Settings, size_name
-from nsf.bench.scaling import at_size, carried_over, frames_after
+from nsf.bench.reduced import deformation_error, error_of_latents, scenes
+from nsf.bench.rows import Case, Measurements
 from nsf.data import Case as Parameters
 from nsf.data.schema import TRAJECTORY
 from nsf.dynamics import ReducedMPM
@@ -21,30 +19,18 @@ from nsf.pipeline import Pipeline
 from nsf.recurrence import Loop, RecurrenceEngine, collider_states, first_change
 from nsf.recurrence.descent import of_strides
 from nsf.recurrence.engine import between
-from nsf.scenes import Scene
-from nsf.timing import elapsed_ms, synchronizer
 
 #: Runs at once, and the scene that they are of.
 MANY, OF_MANY = 1024, "metal"
-#: Particles of the sand column whose frames are decoded.
-PARTICLES = {"cuda": 4_000_000, "cpu": 20_000}
-#: x̂ [r] → positions [P, 3] [m] of all particles.
-Decode = Callable[[torch.Tensor], torch.Tensor]
 
 
 def run(figures: Measurements) -> None:
-    """Each scene, 1 024 runs of `metal` at once, and the sand column with 4 million particles.
+    """Each scene, and 1 024 runs of `metal` at once: at the paper's size on a GPU, at small scale on a CPU.
 
-    At the paper's size on a GPU; on a CPU at small scale, and with 20 000 particles. Data, training and
-    teaching are made, or reused, as by `nsf teach model=recurrence`. Where `scenes` or `particles` are given,
-    these are all.
+    Data, training and teaching are made, or reused, as by `nsf teach model=recurrence`.
     """
-    settings = figures.settings
-    for scene in settings.scenes or (() if settings.particles else SCENES):
+    for scene in scenes(figures):
         measured(_chain(scene, figures), figures, MANY if scene == OF_MANY else 0)
-    if settings.particles or not settings.scenes:
-        for particles in settings.particles or (PARTICLES["cuda" if settings.on_gpu else "cpu"],):
-            measured_decoded(_chain("sand", figures), particles, figures)
 
 
 def _chain(scene: str, figures: Measurements) -> Pipeline:
@@ -60,90 +46,41 @@ def measured(chain: Pipeline, figures: Measurements, many: int = 0) -> None:
         figures: as for `run`.
         many: runs at once, in rows of their own; 0 for none.
     """
-    _taught(chain)
+    chain.simulate(("train",))
+    chain.train()
+    chain.teach()
     manifold, truth = chain.manifold(), chain.truth(chain.held_out[0]).path / TRAJECTORY
     for precision in figures.settings.precisions:
-        full_ms, case, run = _compared(
-            chain, manifold, chain.scene, chain.scene.name, precision, truth, figures
-        )
+        full_ms, case, run = _compared(chain, manifold, precision, truth, figures)
         if many:
             _together(run, chain, many, full_ms, case, truth, figures)
 
 
-def measured_decoded(chain: Pipeline, particles: int, figures: Measurements) -> None:
-    """Add the rows of one scene with another number of particles, in its first held-out case.
-
-    A step by a recurrence does not depend on the particles. So the run is that of the chain's own scene, and
-    its frames are decoded at the particles asked for. The full-order run is theirs, on a finer grid and in
-    shorter steps (`scaling.at_size`), each of which counts as one by the recurrence.
-
-    Args:
-        chain: of the scene, with `model=recurrence` and `field=basis`.
-        particles: P.
-        figures: as for `run`.
-    """
-    _taught(chain)
-    settings = figures.settings
-    scene, manifold, case = at_size(chain.scene, particles), chain.manifold(), chain.held_out[0]
-    fields = carried_over(chain.manifold(), scene, settings.device)
-    truth = frames_after(scene.full_order(case, max(settings.precisions), settings.device), scene)
-
-    def decode(run: ReducedMPM) -> Decode:
-        like = {"dtype": run.setup.dtype, "device": run.setup.torch_device}
-        return fields.restrict(np.arange(particles), **like).position
-
-    for precision in settings.precisions:
-        _compared(chain, manifold, scene, size_name(particles), precision, truth, figures, decode)
-
-
-def _taught(chain: Pipeline) -> None:
-    """Make, or reuse, all that a run needs."""
-    chain.simulate(("train",))
-    chain.train()
-    chain.teach()
-
-
 @torch.no_grad()
 def _compared(
-    chain: Pipeline,
-    manifold,
-    scene: Scene,
-    name: str,
-    precision: str,
-    truth: Path | Frames,
-    figures: Measurements,
-    decode: Callable[[ReducedMPM], Decode] = lambda run: run.decoder().position,
+    chain: Pipeline, manifold, precision: str, truth: Path, figures: Measurements
 ) -> tuple[float, Case, ReducedMPM]:
     """Add the rows of either solver in one precision, turn by turn.
 
     Args:
         chain, manifold: whose recurrence is run.
-        scene: of the full-order step.
-        name: the end of both cases.
         precision, truth, figures: of the rows.
-        decode: run → positions of all particles.
 
     Returns:
         Time of a full-order step [ms], the case of the run by recurrence, and that run at its end.
     """
-    settings, device, held_out, teaching = (
-        figures.settings,
-        figures.settings.device,
-        chain.held_out[0],
-        chain.taught,
-    )
+    settings, device = figures.settings, figures.settings.device
+    scene, held_out = chain.scene, chain.held_out[0]
     full, full_peak = build(partial(scene.full_order, held_out, precision, device), device)
     run, peak = build(partial(chain.solver_at, manifold, held_out, precision=precision), device)
     times = window_times({"full": full}, scene.steps, settings.trials, device, whole={"own": run})
-    position = decode(run)
     of = partial(Case, bench="recurrence", particles=scene.particle_count, precision=precision)
-    case = of(name=f"full_order_{name}")
+    case = of(name=f"full_order_{scene.name}")
     full_ms = figures.add(case, "step", times["full"])
     figures.add(case, "peak memory", full_peak, "MiB")
-    case = of(name=f"recurrence_{name}", sample=run.sample_size)
-    delta = deformation_error(run, truth, position)
-    _add_run(figures, case, times["own"], full_ms, delta, run.nbytes, peak, teaching)
-    figures.add(case, "decoding of a frame", _decode_ms(position, run.xhat, settings))
+    case = of(name=f"recurrence_{scene.name}", sample=run.sample_size)
+    delta = deformation_error(run, truth)
+    _add_run(figures, case, times["own"], full_ms, delta, run.nbytes, peak, chain.taught)
     return full_ms, case, run
 
 
@@ -243,10 +180,3 @@ class Many:
     def nbytes(self) -> int:
         """Bytes on the device."""
         return self._loop.nbytes
-
-
-def _decode_ms(position: Decode, xhat: torch.Tensor, settings: Settings) -> float:
-    """Median time [ms] of the positions of one frame."""
-    wait = synchronizer(settings.device)
-    times = [elapsed_ms(lambda: position(xhat), wait) for _ in range(settings.trials + 1)]
-    return float(np.median(times[1:]))  # the first one loads

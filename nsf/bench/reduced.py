@@ -44,14 +44,19 @@ def run(figures: Measurements) -> None:
     chosen, else in the scene's own way. With field=mlp it names what multiplies the hidden layers of h and
     l: tf32 or bf16 on tensor cores, or nothing where they are in the precision of the step.
     """
-    for scene in figures.settings.scenes or SCENES:
+    for scene in scenes(figures):
         measured(dict(_by_sampler(scene, figures)), figures)
         measured_networks(_pipeline(scene, figures, "field=mlp"), figures)
 
 
+def scenes(figures: Measurements) -> list[str]:
+    """The scenes of reduced steps that are measured."""
+    return [scene for scene in figures.settings.scenes or SCENES if scene in SCENES]
+
+
 def pipelines(figures: Measurements, samplers: bool = False) -> Iterator[tuple[str, Pipeline]]:
     """The configuration of each scene, after the end of its cases; with another sampler too where asked."""
-    for scene in figures.settings.scenes or SCENES:
+    for scene in scenes(figures):
         yield from itertools.islice(_by_sampler(scene, figures), 1 + samplers)
 
 
@@ -186,20 +191,17 @@ def _add_floors(
     add_pass(figures, case, f"{_DEPENDENT} empty launches", launches, 0.0, launches)
 
 
-def deformation_error(
-    solver, truth: Path | Frames, position: Callable[[Tensor], Tensor] | None = None
-) -> float:
+def deformation_error(solver, truth: Path | Frames) -> float:
     """δ of a reduced run that has ended; ∞ for one that diverged.
 
     Args:
         solver: the run.
         truth: file of the full-order trajectory, or its frames.
-        position: x̂ [r] → [P, 3] [m]; the run's own decoder by default.
     """
     if solver.left_grid() >= 0:
         return float("inf")
     run = solver.trajectory()
-    return error_of_latents(run.t, run.xhat, position or solver.decoder().position, truth, solver.xhat)
+    return error_of_latents(run.t, run.xhat, solver.decoder().position, truth, solver.xhat)
 
 
 @torch.no_grad()
@@ -211,7 +213,7 @@ def error_of_latents(
     Args:
         t: [N + 1] their times [s].
         xhat: [N + 1, r] of them.
-        position, truth: as for `deformation_error`.
+        position: x̂ [r] → [P, 3] [m]; truth: as for `deformation_error`.
         like: a tensor of the precision and device of `position`.
     """
     columns, errors, norms = torch.as_tensor(xhat).cpu().numpy().T, [], []

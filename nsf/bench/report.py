@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from nsf.bench.rows import FILE, read, size_name
+from nsf.bench.rows import FILE, WIDE, read, size_name
 from nsf.results.charts import bars
 from nsf.results.columns import axis, number
 from nsf.results.formats import Rows, markdown_document, terminal_table
@@ -23,6 +23,14 @@ _LEAD = (
     "synchronised device: the median over the trials, each the mean of many steps, with 10 and 90 % of them. "
     "Memory is the peak of every allocator beyond what was held before the solver was built. "
     f"`nsf bench` writes this report from {FILE}."
+)
+_WHOLE = (
+    "Whole runs from t = 0, all sides of a scene turn by turn: the run by recurrence has every frame decoded "
+    "in fp32 and the spread of its members computed, the others leave their states on the device. The grid "
+    "of `coarse` is twice as coarse. Error: of the displacements of all particles over five frames, beside "
+    "those of the full-order run in the highest precision measured; error bar: the spread of the members "
+    "over the same displacements. First frame: from the files of a deployed model, nothing compiled anew. "
+    "The model is trained and taught quickly, with fewer runs and steps than by default."
 )
 _REDUCED = "Time of a step of both solvers by scene; a point names δ of its run, at the first held-out value."
 _STAGES = (
@@ -42,9 +50,7 @@ _TRAINING = (
 _RECURRENCE = (
     "Time of a step by the recurrence: all steps of a run in one launch, over their number; of many runs at "
     "once, over their number too. Speed-up: over the full-order step of the same call. A run holds no "
-    "particles but S; the time of decoding a frame stands apart. The recurrence of the sand column steps as "
-    "at the scene's own size, while the full-order step of as many particles as are decoded is on a finer "
-    "grid, and shorter."
+    "particles but S."
 )
 _BATCH = (
     "Time of a simulation-step, which is the step of a batch over the simulations that take it together, by "
@@ -111,9 +117,16 @@ def _parts(folder: Path, rows: pd.DataFrame) -> list[dict]:
         if section.draw:
             save(section.draw(rows), folder, chart, kinds=("png",))
         constant, table = _rows(chosen)
-        texts = [section.text, constant] if section.listed and constant else [section.text]
+        texts = [section.text, *([constant] if section.listed and constant else []), *_spread_widely(chosen)]
         parts.append({"chart": chart, "texts": texts, "table": table if section.listed else None})
     return parts
+
+
+def _spread_widely(rows: pd.DataFrame) -> list[str]:
+    """A warning that names the cases whose trials spread widely; none where there are none."""
+    wide = rows[rows["p90"] > WIDE * rows["p10"]]
+    names = dict.fromkeys(wide["case"] + " " + wide["precision"])
+    return [f"Trials of {', '.join(names)} spread by more than {WIDE:g} times: measure again."] * bool(names)
 
 
 def wide(rows: pd.DataFrame) -> pd.DataFrame:
@@ -328,6 +341,7 @@ def _sizes(rows: pd.DataFrame) -> pd.Series:
 
 
 SECTIONS = (
+    Section(_WHOLE, _of_bench("whole")),
     Section(_REDUCED, _of_bench("reduced"), "reduced", steps_by_scene),
     Section(_STAGES, _paper, "stages", step_beside_paper, listed=False),
     Section(_FLOORS, _floors),

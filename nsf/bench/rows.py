@@ -18,6 +18,8 @@ SUBJECT = ("bench", "case", "particles", "sample", "integration", "batch", "prec
 #: Pass or stage of a step, empty of the whole; then which figure, its median over the trials and quantiles.
 COLUMNS = (*SUBJECT, "part", "what", "median", "p10", "p90", "unit", "commit")
 FILE = "bench.csv"
+#: 90 % over 10 % of the trials, above which a row is warned of.
+WIDE = 1.5
 
 
 @dataclass(frozen=True)
@@ -29,7 +31,9 @@ class Settings:
         precisions: `fp32`, `fp64` or both, measured turn by turn.
         device: `cpu` or `cuda:N`.
         trials: measurements of each side.
-        scenes: of benchmarks of reduced steps; empty for all that these have.
+        scenes: of benchmarks of reduced steps and whole runs; empty for all that these have.
+        limit: [s] after which whole runs of a scene begin no further turn.
+        keys: of the configuration of whole runs, as on the command line.
     """
 
     particles: tuple[int, ...]
@@ -37,6 +41,8 @@ class Settings:
     device: str
     trials: int
     scenes: tuple[str, ...] = ()
+    limit: float = 60.0
+    keys: tuple[str, ...] = ()
 
     @property
     def on_gpu(self) -> bool:
@@ -74,12 +80,14 @@ class Measurements:
     """Where a benchmark puts its figures.
 
     Attributes:
-        settings: of the measurement; say: told of every result; rows: dicts of `COLUMNS`.
+        settings: of the measurement; say: called with a line on each result; rows: dicts of `COLUMNS`.
+        folder: whose table `save` puts the rows into; None to keep them in memory.
     """
 
     settings: Settings
     say: Callable[[str], object]
     rows: list[dict] = field(default_factory=list)
+    folder: Path | None = None
 
     def add(
         self, case: Case, what: str, values, unit: str = "ms", part: str = "", quantiles: Sequence = ()
@@ -88,11 +96,21 @@ class Measurements:
         median = float(np.median(values))
         if np.ndim(values):
             quantiles = np.percentile(values, [10, 90]).tolist()
+        if quantiles and quantiles[1] > WIDE * quantiles[0]:
+            self.say(
+                f"warning: {case.name} {case.precision}: {what} spreads from {quantiles[0]:.4g} to "
+                f"{quantiles[1]:.4g} {unit} over the trials; measure again where nothing else runs"
+            )
         subject = asdict(case) | {"case": case.name, "device": name_of(self.settings.device)}
         row = [*(subject[name] for name in SUBJECT), part, what, median]
         row += [*(quantiles or (None, None)), unit, commit()]
         self.rows.append(dict(zip(COLUMNS, row, strict=True)))
         return median
+
+    def save(self) -> None:
+        """Put the rows so far into the table of the folder."""
+        if self.folder and self.rows:
+            merge(self.folder / FILE, self.frame)
 
     @property
     def frame(self) -> pd.DataFrame:

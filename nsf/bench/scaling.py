@@ -17,7 +17,7 @@ from nsf.engines import reduced
 from nsf.evaluation.superresolution import POINTS
 from nsf.kinematics.fields.basis import BasisManifold
 from nsf.kinematics.interpolation import interpolation, lying_together
-from nsf.mpm import FullOrderMPM
+from nsf.mpm import FullOrderMPM, HalfSpace
 from nsf.pipeline import Pipeline
 from nsf.scenes import Scene
 from nsf.vectors import spaced
@@ -68,10 +68,12 @@ def measured(chain: Pipeline, sizes: Sequence[int], samples: Sequence[int], figu
 def at_size(scene: Scene, particles: int) -> Scene:
     """The same body of that many particles, on a grid about as much finer, and in steps as much shorter.
 
-    The floor lies as far from the nodes next to it, in cells: what it holds depends on that.
+    A floor lies as far from the nodes next to it, in cells: what it holds depends on that. Without one the
+    domain keeps a whole number of cells.
     """
-    ratio, (floor,) = (particles / scene.particle_count) ** (1 / 3), scene.solids
-    cells = floor.point[2] / scene.dx
+    ratio = (particles / scene.particle_count) ** (1 / 3)
+    floors = [solid.point[2] for solid in scene.solids if isinstance(solid, HalfSpace)]
+    cells = (floors or [scene.size[2]])[0] / scene.dx
     ratio = 1.0 + round((ratio - 1.0) * cells) / cells
     steps = round(scene.steps * ratio)
     return replace(scene.resampled(particles), dx=scene.dx / ratio, dt=scene.dt / ratio, steps=steps)

@@ -1,6 +1,7 @@
-"""How many frames are decoded together: as many as memory has room for."""
+"""How many frames are decoded together, and how far tensor cores put them off."""
 
 import torch
+from torch import Tensor
 
 _HOST_BYTES = 2**25  # of a block on the CPU: about its last cache
 _SHARE = 0.25  # of the free memory of a GPU
@@ -16,3 +17,21 @@ def frames_at_once(values: int, dtype: torch.dtype, device: torch.device | str) 
         spare = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
         room = int(_SHARE * (free + spare))
     return max(1, room // max(1, values * dtype.itemsize))
+
+
+def tf32_error(coefficients: Tensor, modes: Tensor, rows: int = 3 * 500) -> float:
+    """Error of a product whose factors are rounded to tf32, over its size; at some evenly spread rows.
+
+    Args:
+        coefficients: [F, K] float32; modes: [n, K] float32.
+        rows: of the modes, at most.
+    """
+    some = modes[:: max(1, len(modes) // rows)]
+    exact = coefficients.double() @ some.double().T
+    off = _as_tf32(coefficients).double() @ _as_tf32(some).double().T - exact
+    return float(off.norm() / exact.norm().clamp_min(1e-300))
+
+
+def _as_tf32(values: Tensor) -> Tensor:
+    """float32 with the 10 bits of mantissa that tensor cores take, to the nearest."""
+    return ((values.contiguous().view(torch.int32) + 0x1000) & ~0x1FFF).view(torch.float32)

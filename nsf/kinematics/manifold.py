@@ -40,10 +40,15 @@ class Restriction(ABC):
     def position(self, xhat: Tensor) -> Tensor:
         """x = g(X, xhat), [n, 3] in metres."""
 
-    def positions(self, xhat: Tensor) -> Iterator[Tensor]:
+    def positions(self, xhat: Tensor, tolerance: float = 0.0) -> Iterator[Tensor]:
         """Positions [f, n, 3] [m] of x̂ [F, r], in blocks of as many frames f as memory has room for.
 
         A block is good until the next one is taken, which may be written over it. Nothing is differentiable.
+
+        Args:
+            xhat: latent vectors.
+            tolerance: error over the displacements that arithmetic may add; a tenth of the model's is hidden
+                in it. A field of modes in fp32 then takes a GPU's tensor cores, where these are near enough.
         """
         for part in xhat.split(frames_at_once(3 * self.points, self.dtype, self.device)):
             with torch.no_grad():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -12,7 +13,8 @@ from torch import Tensor, nn
 from typing_extensions import override
 
 from nsf.errors import ShapeError
-from nsf.kinematics.blocks import TILE, frames_at_once
+from nsf.gpu import tf32
+from nsf.kinematics.blocks import TILE, frames_at_once, tf32_error
 from nsf.kinematics.fields.networks import Committee, FullyConnected
 from nsf.kinematics.manifold import Restriction
 from nsf.kinematics.training.phases import joined, shaped
@@ -141,21 +143,23 @@ class RestrictedField:
         a = self._coefficients(inputs, rate)
         return F.linear(a, self.modes.flatten(0, 1), self.mean.flatten()).unflatten(-1, self.mean.shape)
 
-    def blocks(self, inputs: Tensor) -> Iterator[Tensor]:
+    def blocks(self, inputs: Tensor, tolerance: float = 0.0) -> Iterator[Tensor]:
         """`values` [f, n, c] of inputs [F, ·], all blocks of frames in one memory.
 
-        A block is one product on a GPU. On the CPU it is one for each part of the points whose modes stay in
-        the cache.
+        A block is one product on a GPU, in tf32 where that is off by no more than `tolerance` of modes times
+        coefficients. On the CPU it is one for each part of the points whose modes stay in the cache.
         """
         modes, mean = self.modes.flatten(0, 1), self.mean.flatten()
         size = min(len(inputs), frames_at_once(len(mean), mean.dtype, mean.device))
         with torch.no_grad():
             a, memory = self._coefficients(inputs), mean.new_empty(size, len(mean))
+            tensor_cores = tolerance > 0 and mean.is_cuda and mean.dtype == torch.float32
+            fast = tensor_cores and tf32_error(a[:: max(1, len(a) // 16)], modes) <= tolerance
         width = len(mean) if mean.is_cuda else max(1, TILE // modes.shape[1])
         tiles = [slice(start, start + width) for start in range(0, len(mean), width)]
         for part in a.split(max(1, size)):
             block = memory[: len(part)]
-            with torch.no_grad():
+            with torch.no_grad(), tf32() if fast else contextlib.nullcontext():
                 for rows in tiles:
                     torch.addmm(mean[rows], part, modes[rows].T, out=block[:, rows])
             yield block.unflatten(-1, self.mean.shape)
@@ -297,8 +301,8 @@ class ModalRestriction(Restriction):
         return self.fields["deformation"].values(xhat.to(self.dtype))
 
     @override
-    def positions(self, xhat):
-        return self.fields["deformation"].blocks(xhat.to(self.device, self.dtype))
+    def positions(self, xhat, tolerance=0.0):
+        return self.fields["deformation"].blocks(xhat.to(self.device, self.dtype), tolerance)
 
     @override
     def position_and_jacobian(self, xhat):

@@ -8,7 +8,8 @@ import pytest
 import torch
 from angles import angle
 
-from nsf.bench.recurrence import Many, measured, measured_decoded
+from nsf.bench import whole
+from nsf.bench.recurrence import Many, measured
 from nsf.bench.report import wide
 from nsf.bench.rows import Measurements, Settings
 
@@ -27,24 +28,21 @@ def taught(chain, pipeline_at, tmp_path_factory):
         shutil.copytree(chain.root / stage, root / stage)
     pipeline = pipeline_at(root, *TAUGHT)
     measured(pipeline, found, many=3)
-    measured_decoded(pipeline, 1200, found)
     return pipeline, wide(found.frame), said
 
 
 def test_every_case_has_a_row(taught):
     _, rows, _ = taught
     cases = ["full_order_sand", "recurrence_sand", "recurrence_batch3"]
-    assert rows["case"].tolist() == 2 * cases + 2 * ["full_order_1k", "recurrence_1k"]
-    assert rows["precision"].tolist() == 3 * ["fp32"] + 3 * ["fp64"] + 2 * ["fp32"] + 2 * ["fp64"]
-    assert rows["particles"].tolist() == 6 * [500] + 4 * [1200]
+    assert rows["case"].tolist() == 2 * cases
+    assert rows["precision"].tolist() == 3 * ["fp32"] + 3 * ["fp64"]
+    assert rows["particles"].tolist() == 6 * [500]
     own, full = (rows[rows["case"].str.startswith(kind)] for kind in ("recurrence", "full_order"))
-    assert own["batch"].tolist() == [1, 3, 1, 3, 1, 1]
+    assert own["batch"].tolist() == [1, 3, 1, 3]
     for name in ("sample", "δ", "speed-up", "memory of a run [MiB]", "teaching [s]"):
         assert own[name].notna().all()
         assert full[name].isna().all()
-    alone = [True, False, True, False, True, True]
-    assert own["decoding of a frame [ms]"].notna().tolist() == alone
-    ratios = full["step [ms]"].to_numpy()[[0, 0, 1, 1, 2, 3]] / own["step [ms]"]
+    ratios = full["step [ms]"].to_numpy()[[0, 0, 1, 1]] / own["step [ms]"]
     np.testing.assert_allclose(own["speed-up"], ratios)
     assert (own["runs that taught it"] == 6).all()
 
@@ -57,8 +55,6 @@ def test_delta_is_that_of_the_evaluation(taught):
     double = rows[rows["precision"] == "fp64"].set_index("case")["δ"]
     assert double["recurrence_sand"] == pytest.approx(evaluated, rel=1e-6)
     assert double["recurrence_batch3"] == pytest.approx(evaluated, rel=1e-6)
-    # Another body, by its grid; see the same bound in test_bench.
-    assert double["recurrence_1k"] < 0.03
 
 
 def test_a_run_holds_little(taught):
@@ -83,3 +79,45 @@ def test_many_runs_are_those_of_a_batch(taught):
         many.step(14)
         torch.testing.assert_close(many.xhat, batch.batch.record.xhat, rtol=0, atol=1e-13)
     assert (many.xhat[0] - many.xhat[2]).abs().max() > 1e-3
+
+
+@pytest.fixture(scope="module")
+def whole_runs(taught):
+    """Rows of whole runs of the tiny chain."""
+    pipeline, _, _ = taught
+    figures = Measurements(Settings((), ("fp32", "fp64"), "cpu", 2), lambda line: None)
+    whole.measured(pipeline, figures, pipeline.held_out[0])
+    return wide(figures.frame).set_index(["case", "precision"])
+
+
+def test_whole_runs_take_turns_with_both_precisions_and_a_coarse_grid(whole_runs):
+    names = [("full_order", p) for p in ("fp32", "fp64")]
+    names += [(kind, "fp32") for kind in ("coarse", "recurrence")]
+    rows = [(f"{kind}_sand_500", precision) for kind, precision in names]
+    assert set(whole_runs.index) == {*rows, ("recurrence_sand_500_no_error_bar", "fp32")}
+    assert (whole_runs["run [ms]"] > 0).all()
+    own = whole_runs.loc["recurrence_sand_500", "fp32"]
+    for kind, precision in names[:3]:
+        ratio = whole_runs.loc[(f"{kind}_sand_500", precision), "run [ms]"] / own["run [ms]"]
+        assert own[f"time of {kind.replace('_', ' ')} {precision} over it"] == pytest.approx(ratio)
+
+
+def test_errors_of_whole_runs_are_of_displacements(whole_runs, taught):
+    pipeline, _, _ = taught
+    evaluated = pd.read_csv(pipeline.evaluation.path / "results.csv").iloc[0]
+    error = whole_runs.loc[("recurrence_sand_500", "fp32"), "error"]
+    assert 0.3 * evaluated["displacement_error"] < error < 3 * evaluated["displacement_error"]
+    assert whole_runs.loc[("coarse_sand_500", "fp32"), "error"] > 0
+    assert whole_runs.loc[("recurrence_sand_500", "fp32"), "error bar"] > 0
+    assert whole_runs.loc[("recurrence_sand_500", "fp32"), "first frame [s]"] > 0
+
+
+def test_another_size_is_as_long_a_run_on_a_finer_grid():
+    figures = Measurements(Settings((), ("fp32",), "cpu", 2), lambda line: None)
+    chain, values = whole.quick_chain("sand", 12_000, figures)
+    plain = whole.quick_chain("sand", None, figures)[0].scene
+    assert (chain.scene.particle_count, values) == (12_000, [26.0])
+    assert chain.scene.steps % 10 == 0
+    assert chain.scene.steps * chain.scene.dt == pytest.approx(plain.steps * plain.dt)
+    assert chain.scene.dx < plain.dx
+    assert (len(chain.split.train), len(chain.split.validation), len(chain.split.test)) == (6, 1, 0)

@@ -79,7 +79,7 @@ def test_the_rollout_is_worse_than_the_reconstruction(comparison_of, made, perfe
 def test_chunks_change_nothing(comparison_of, made, monkeypatch):
     whole = comparison_of(made)
     # The package exports a function of the module's name.
-    monkeypatch.setattr(sys.modules["nsf.evaluation.compare"], "_CHUNK", 9 * 500 * 4)
+    monkeypatch.setattr(sys.modules["nsf.evaluation.compare"], "frames_at_once", lambda *of: 4)
     pieces = comparison_of(made)
     np.testing.assert_allclose(
         pieces.series.drop(columns=["case", "split"]).to_numpy(),
@@ -330,12 +330,12 @@ def continuation(chain, tiny_manifold, made, tmp_path_factory):
         yield handed, rest
 
 
-@pytest.mark.parametrize("chunk", [None, 9 * 500 * 4])
+@pytest.mark.parametrize("chunk", [None, 4])
 def test_a_continued_run_is_compared_with_its_own_frames(
     continuation, chunk, chain, tiny_manifold, truth, comparison_of, made, monkeypatch
 ):
     if chunk:
-        monkeypatch.setattr(sys.modules["nsf.evaluation.compare"], "_CHUNK", chunk)
+        monkeypatch.setattr(sys.modules["nsf.evaluation.compare"], "frames_at_once", lambda *of: chunk)
     solver, (handed, rest) = chain.pipeline.solver_at(tiny_manifold, angle(26.0), "cpu"), continuation
     found = compare(solver, truth, handed, "test", (500, 25), rest)
     reduced = comparison_of(made).series

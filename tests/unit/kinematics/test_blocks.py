@@ -30,5 +30,14 @@ def test_fp32_is_off_by_less_than_a_tenth_of_the_model(manifold, snapshots):
     assert (single - double).norm() < 0.1 * (double - x).norm()
 
 
+def test_rounding_to_tf32_is_that_of_its_mantissa():
+    """One in 2^11 at most of each factor; over many of them, a few in ten thousand."""
+    torch.manual_seed(0)
+    coefficients, modes = torch.randn(40, 48), torch.randn(3000, 48)
+    assert 1e-4 < blocks.tf32_error(coefficients, modes) < 5e-4
+    exact = torch.tensor([[1.0, -0.5, 3.0]])
+    assert blocks.tf32_error(exact, exact) == 0.0
+
+
 def test_a_block_has_a_frame_at_least():
     assert blocks.frames_at_once(10**12, torch.float64, "cpu") == 1
