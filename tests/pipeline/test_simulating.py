@@ -1,12 +1,20 @@
 """Trajectories whose writers work while the next one is computed."""
 
+import os
 import threading
 import weakref
 from dataclasses import replace
 
-from nsf.data import TrajectoryWriter
+import numpy as np
+import pytest
+
+from nsf.data import Trajectory, TrajectoryWriter
+from nsf.data.schema import TRAJECTORY
+from nsf.errors import InstabilityError
 from nsf.gpu import without_collection
+from nsf.pipeline import cores
 from nsf.pipeline.stages import simulation
+from nsf.progress import Progress
 
 
 def test_a_solver_is_gone_before_the_next_is_made(pipeline_at, tmp_path, monkeypatch):
@@ -36,3 +44,60 @@ def test_a_solver_is_gone_before_the_next_is_made(pipeline_at, tmp_path, monkeyp
     assert len(solvers) > 1
     assert left == [0] * len(solvers)
     assert not any(solver() for solver in solvers)
+
+
+def test_trajectories_of_several_processes_are_the_same(chain, pipeline_at, tmp_path, monkeypatch):
+    """Bit for bit, and the bar ends at its total."""
+    counted = []
+    monkeypatch.setattr(simulation, "cores", lambda device: 2)
+    monkeypatch.setattr(simulation, "_WORTH", 0)
+    monkeypatch.setattr(Progress, "advance", lambda self, count=1: counted.append(count))
+    pipeline = pipeline_at(tmp_path)
+    for run in pipeline.simulate():
+        alone = chain.pipeline.root / run.id / TRAJECTORY
+        with Trajectory.open(run.file(TRAJECTORY)) as ours, Trajectory.open(alone) as theirs:
+            for field in ("x", "v", "C", "tau"):
+                np.testing.assert_array_equal(ours.read(field), theirs.read(field))
+    assert sum(counted) == len(pipeline.runs_of("simulate")) * (pipeline.scene.steps + 1)
+
+
+def count(number, advance):
+    """The work of a process in the tests below."""
+    for _ in range(3):
+        advance(1)
+    return number, os.getpid()
+
+
+def fail(number, advance):
+    raise InstabilityError("it burst")
+
+
+def go_on(number, advance):
+    while True:
+        advance(1)
+
+
+def test_processes_beside_this_one_count_here():
+    steps = []
+    with cores.beside(count, 1, steps.append) as others:
+        ((number, process),) = others(wait=True)
+    assert (number, sum(steps)) == (0, 3)
+    assert process != os.getpid()
+
+
+def test_an_error_of_another_process_is_one_here():
+    with pytest.raises(InstabilityError, match="it burst"), cores.beside(fail, 1, print) as others:
+        others(wait=True)
+
+
+def test_processes_end_where_this_one_fails():
+    with pytest.raises(KeyboardInterrupt), cores.beside(go_on, 1, lambda steps: None):
+        raise KeyboardInterrupt
+
+
+def test_a_launcher_says_how_many_cores_there_are(monkeypatch):
+    monkeypatch.setattr(cores, "cpu_count", lambda: 8)
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    assert (cores.cores("cpu"), cores.cores("cuda:0")) == (3, 1)
+    monkeypatch.delenv("OMP_NUM_THREADS")
+    assert cores.cores("cpu") == 8

@@ -135,8 +135,7 @@ def same_runs(one, other):
 def test_runs_by_several_processes_are_the_same(lesson, copied, pipeline_at, monkeypatch):
     pipeline, _ = lesson
     monkeypatch.setattr(encoding, "_LEAST_RUNS", 1)
-    monkeypatch.setattr(encoding, "cpu_count", lambda: 2)
-    monkeypatch.setattr(encoding, "_run", None)  # of this process, which makes none
+    monkeypatch.setattr(encoding, "cores", lambda device: 2)
     same_runs(encoded(pipeline_at(copied("simulate", "train"), *TAUGHT)), pipeline.encoding)
 
 

@@ -7,13 +7,11 @@ case is encoded as it is made, and not stored.
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from joblib.externals.loky import ProcessPoolExecutor, cpu_count
 
 from nsf.data import Case, Trajectory
 from nsf.data.schema import TRAJECTORY
@@ -21,6 +19,7 @@ from nsf.errors import InstabilityError
 from nsf.kinematics.manifold import Manifold
 from nsf.models.inputs import Lessons
 from nsf.models.lookup import inputs_in
+from nsf.pipeline.cores import Advance, beside, cores
 from nsf.progress import Progress
 from nsf.recurrence.stream import (
     Encoded,
@@ -166,17 +165,27 @@ def _encoded(pipeline, encoder: Encoder, lessons: Sequence[Lesson], record: Reco
 def _stream(pipeline, encoder: Encoder, missing, after: Callable[[int], object]) -> list[str]:
     """Make runs and write each one's file, side by side where there are cores; why some are lost."""
     how = pipeline.config.precision, pipeline.device
-    processes = min(cpu_count(), len(missing) // _LEAST_RUNS)
-    if processes > 1 and pipeline.device == "cpu":
-        trained = pipeline.training.file(_MANIFOLD)
-        with ProcessPoolExecutor(processes, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-            ends = []
-            for end in pool.map(partial(_alone, trained, encoder.stress, how), *zip(*missing, strict=True)):
-                ends.append(end)
-                after(pipeline.scene.steps)
-    else:
-        ends = [_run(encoder, how, *pair, lambda: after(1)) for pair in missing]
+    processes = max(1, min(cores(pipeline.device), len(missing) // _LEAST_RUNS))
+    trained = pipeline.training.file(_MANIFOLD)
+    parts = [missing[k::processes] for k in range(processes)]
+    help_with = partial(_help, trained, encoder.stress, how, parts)
+    with beside(help_with, processes - 1, after) as others:
+
+        def advance() -> None:
+            after(1)
+            others()
+
+        ends = [_run(encoder, how, *pair, advance) for pair in parts[0]]
+        ends += [end for part in others(wait=True) for end in part]
     return [end for end in ends if end]
+
+
+def _help(
+    trained: Path, stress: int, how: tuple[str, str], parts, number: int, advance: Advance
+) -> list[str]:
+    """Make another process's part of the runs; why some are lost, empty texts for others."""
+    encoder = Encoder(Manifold.load(trained), stress)
+    return [_run(encoder, how, *pair, lambda: advance(1)) for pair in parts[number + 1]]
 
 
 def _run(encoder: Encoder, how: tuple[str, str], lesson: Lesson, path: Path, after=lambda: None) -> str:
@@ -187,14 +196,3 @@ def _run(encoder: Encoder, how: tuple[str, str], lesson: Lesson, path: Path, aft
     except InstabilityError as error:
         return f"{lesson.case.named}: {error}"
     return ""
-
-
-def _alone(trained: Path, stress: int, how: tuple[str, str], lesson: Lesson, path: Path) -> str:
-    """Make one run in another process, which reads the manifold's file; why it is lost, or nothing."""
-    return _run(_encoder(trained, stress), how, lesson, path)
-
-
-@cache
-def _encoder(trained: Path, stress: int) -> Encoder:
-    """The encoder of a manifold's file, once in a process."""
-    return Encoder(Manifold.load(trained), stress)

@@ -1,4 +1,4 @@
-"""Full-order trajectories onto disk: the solver goes on while threads write what it made."""
+"""Full-order trajectories onto disk, side by side on a CPU; the solver goes on while threads write."""
 
 import contextlib
 import os
@@ -19,6 +19,7 @@ from nsf.errors import InstabilityError
 from nsf.mpm import FullOrderMPM, ParticleConstants, Precision, diagnosed
 from nsf.mpm.recording import HostMemory, blocks
 from nsf.pipeline.checks import check_room
+from nsf.pipeline.cores import Advance, beside, cores
 from nsf.progress import Progress
 from nsf.runs import Run
 from nsf.scenes import Scene
@@ -27,6 +28,8 @@ from nsf.scenes.resolution import resolution_warnings
 # Trajectories that are written at once; each holds about ten blocks of frames (64 MiB) at most.
 _WRITERS = min(8, os.cpu_count() or 1)
 _BLOCKS = 8
+#: Steps of particles, some seconds of them, from which on other processes are worth their start.
+_WORTH = 1_000_000
 
 
 @dataclass
@@ -57,6 +60,7 @@ class Shared:
         dx: grid spacing [m], for the file.
         stored: precision of the stored frames.
         device, precision: of the physics, for the manifest.
+        helpers: processes beside this one, which share the jobs.
     """
 
     steps: int
@@ -64,6 +68,7 @@ class Shared:
     stored: Precision
     device: str
     precision: str
+    helpers: int = 0
 
 
 class Cost(NamedTuple):
@@ -83,38 +88,78 @@ class Ending(NamedTuple):
 def simulate(jobs: Sequence[Job], shared: Shared, say: Callable[[str], object]) -> int:
     """Run and store every job; each file appears when it is whole.
 
-    Processes that are given the same jobs share them: what another one is making is left to it, and waited
-    for at the end.
+    Processes with the same jobs share them: what another one is making is left to it, and waited for at the
+    end. Files are the same, bit for bit, whoever makes them.
 
     Args:
         jobs: trajectories to be made.
         shared: what they have in common.
-        say: told which trajectory is waited for, and what was odd in one.
+        say: called with a line on a trajectory that is waited for, or where something was odd.
 
     Returns:
-        How many were made here.
+        How many were made, here and by the helpers.
 
     Raises:
         InstabilityError: law or step of a run no longer hold, see `FullOrderMPM.check`.
         StorageError: the disk refused a file.
         KeyboardInterrupt: passed on; what is whole stays, what is not is removed.
     """
-    frames = len(jobs) * (shared.steps + 1)
-    with Progress("simulate", frames, "frames") as progress, ThreadPoolExecutor(_WRITERS) as pool:
-        memory, writing = HostMemory(), []
-        for wait in (None, say):
-            left = []
-            for job in jobs:
-                with contextlib.ExitStack() as claim:
-                    if not claim.enter_context(job.run.claimed(wait)):
-                        left.append(job)
-                    elif not job.run.complete:
-                        progress.describe(job.case.named)
-                        writing.append(_start(job, claim, pool, shared, progress, memory, say))
-            jobs = left
+    frames, help_with = len(jobs) * (shared.steps + 1), partial(_help, jobs, shared)
+    with (
+        Progress("simulate", frames, "frames") as progress,
+        beside(help_with, shared.helpers, progress.advance) as others,
+        ThreadPoolExecutor(_WRITERS) as pool,
+    ):
+
+        def advance(count: int = 1) -> None:
+            progress.advance(count)
+            others()
+
+        writing, left = _share(jobs, shared, pool, HostMemory(), advance, say, progress.describe)
+        made = len(writing)
+        for count, lines in others(wait=True):
+            made += count
+            for line in lines:
+                say(line)
+        if left:
+            late, _ = _share(left, shared, pool, HostMemory(), advance, say, progress.describe, wait=True)
+            writing, made = writing + late, made + len(late)
         for future in writing:
             future.result()
-    return len(writing)
+    return made
+
+
+def _help(jobs: Sequence[Job], shared: Shared, number: int, advance: Advance) -> tuple[int, list[str]]:
+    """Make what no other process makes, each helper from elsewhere on; how many, and lines for the user."""
+    begin, lines = (number + 1) * len(jobs) // (shared.helpers + 1), []
+    with ThreadPoolExecutor(_WRITERS) as pool:
+        order = [*jobs[begin:], *jobs[:begin]]
+        writing, _ = _share(order, shared, pool, HostMemory(), advance, lines.append)
+        for future in writing:
+            future.result()
+    return len(writing), lines
+
+
+def _share(
+    jobs: Sequence[Job],
+    shared: Shared,
+    pool: ThreadPoolExecutor,
+    memory: HostMemory,
+    advance: Advance,
+    say: Callable[[str], object],
+    describe: Callable[[str], object] = lambda case: None,
+    wait: bool = False,
+) -> tuple[list[Future], list[Job]]:
+    """Compute each job that is not there; the writers at work, and the jobs that other processes make."""
+    writing, left = [], []
+    for job in jobs:
+        with contextlib.ExitStack() as claim:
+            if not claim.enter_context(job.run.claimed(say if wait else None)):
+                left.append(job)
+            elif not job.run.complete:
+                describe(job.case.named)
+                writing.append(_start(job, claim, pool, shared, advance, memory, say))
+    return writing, left
 
 
 def _start(
@@ -122,7 +167,7 @@ def _start(
     claim: contextlib.ExitStack,
     pool: ThreadPoolExecutor,
     shared: Shared,
-    progress: Progress,
+    advance: Advance,
     memory: HostMemory,
     say: Callable[[str], object],
 ) -> Future:
@@ -133,7 +178,7 @@ def _start(
         stored_by = pool.submit(_store, job, frames, claim.pop_all(), solver.constants, solver.dt, shared)
         started = time.perf_counter()
         try:
-            for block in blocks(solver, shared.steps, shared.stored, progress.advance, memory):
+            for block in blocks(solver, shared.steps, shared.stored, advance, memory):
                 _hand_over(frames, block, stored_by)
         except InstabilityError as error:
             raise diagnosed(error, job.build, solver.steps_taken) from error
@@ -246,5 +291,7 @@ def make(
         return Job(run, case, build, forcing, warnings.get(run, ()))
 
     jobs = [job(run, *needed) for run, needed in runs.items()]
-    shared = Shared(pipeline.scene.steps, pipeline.scene.dx, pipeline.stored, device, c.precision)
+    work = sum(scene.steps * scene.particle_count for _, scene in runs.values())
+    helpers = min(cores(device), len(jobs)) - 1 if work > _WORTH else 0
+    shared = Shared(pipeline.scene.steps, pipeline.scene.dx, pipeline.stored, device, c.precision, helpers)
     return simulate(jobs, shared, pipeline.say)
