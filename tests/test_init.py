@@ -50,7 +50,7 @@ def test_a_project_is_installed_and_run(tmp_path):
         return done.stdout
 
     short = ["device=cpu", "trainer.steps=20", "scene.steps=8"]
-    few = ["model.runs=4", "model.descents=20"]
+    few = ["model.runs=4", "model.stress=4", "model.descents=20"]
     run("nsf.cli", "run", "--config-dir", "conf", "scene=bracket", *short, *few)
     assert "2 jobs" in run("nsf.cli", "plan", "--config-dir", "conf", "+experiment=bracket", *short)
     values = ["material.yield_stress=40", "material.saturation=200"]

@@ -101,7 +101,7 @@ def test_equal_jobs_are_one(written):
         (TEXT + "each: 3\n", "each=3 must be keys"),
         (TEXT + "printed: [{delta: .inf}]\n", "each with a number delta"),
         (TEXT.replace("A title", "[1, 2]"), r"title=\[1, 2\] must be text"),
-        (TEXT.replace("Which?", "null"), "question=None must be text"),
+        (TEXT.replace("Which?", "null"), "question=null must be text"),
         ("title: a\0b", "control character"),
         ("a: &a [*a]", "holds itself"),
         ("a: 2024-99-99", "month must be in"),
