@@ -58,7 +58,7 @@ def encode(pipeline, run: Run) -> None:
         encoder = encoder_of(pipeline, manifold)
         files = _encoded(pipeline, encoder, lessons_of(pipeline), record)
         for file in files:
-            record.output(file)
+            record.output(file.name)
         runs = list(map(Encoded.open, files))
         record.metrics |= {
             "runs": len(runs),

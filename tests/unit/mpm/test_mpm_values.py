@@ -73,7 +73,7 @@ REFUSED = [
     (lambda: Motion((0.0, 1.0)), "motion has neither translations nor angles"),
     (lambda: Motion((0.0, 1.0), (ORIGIN,)), "motion.translations=((0.0, 0.0, 0.0),) must be a list of 2"),
     (lambda: Motion((0.0, 1.0), angles=(0.0, 1.0, 2.0)), "motion.angles=(0.0, 1.0, 2.0) must be a list of 2"),
-    (lambda: Motion((0.0, 1.0), angles=(0.0, 9.0)), "motion.axis=None must be 3 finite numbers"),
+    (lambda: Motion((0.0, 1.0), angles=(0.0, 9.0)), "motion.axis=null must be 3 finite numbers"),
     (lambda: Motion((0.0, 1.0), angles=(0.0, 9.0), axis=UP), "motion.pivot=null m must be 3 finite numbers"),
     (lambda: Motion((0.0, 1.0), (ORIGIN, UP), pivot=UP), "no effect without motion.angles"),
     (
