@@ -1,10 +1,8 @@
 """Fits a recurrence to runs: descent on windows of them, from 16 strides to half a run."""
 
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.util import find_spec
 
 import numpy as np
 import torch
@@ -247,9 +245,8 @@ def windows(strides: int, fitting: Fitting) -> list[tuple[int, int]]:
 class Descent:
     """Steps of Adam on all members together, none of which sees the others.
 
-    On a GPU a stride is compiled, where Triton and a C compiler are there, and a step captured once for each
-    kind of window: its thousands of kernels are so small that to launch them one by one takes longer than
-    the step on a CPU.
+    On a GPU a step is captured once for each kind of window: its thousands of kernels are so small that to
+    launch them one by one takes longer than the step on a CPU.
 
     Args:
         form: where it begins; it stays as it is.
@@ -272,7 +269,6 @@ class Descent:
         captured = self._device.type == "cuda"
         rate = torch.tensor(_RATE, device=device) if captured else _RATE
         self._adam = torch.optim.Adam(self._form.parameters(), lr=rate, betas=_BETAS, capturable=captured)
-        self._stride = torch.compile(self._take, dynamic=False) if captured and _compiles() else self._take
 
     def run(self, window: int, steps: int, after: Callable[[int], object]) -> None:
         """Take steps on windows of some strides."""
@@ -332,7 +328,7 @@ class Descent:
         state = State(x[0] + noise * form.x_scale * of_x, d[0], s[0] + noise * form.s_scale * of_s)
         errors = []
         for j in range(window):
-            state, error = self._stride(state, State(x[j + 1], d[j + 1], s[j + 1]), mu, g[j], c[j])
+            state, error = self._take(state, State(x[j + 1], d[j + 1], s[j + 1]), mu, g[j], c[j])
             errors.append(error)
         growth = _GROWTH / torch.arange(1.0, window + 1, device=n.device)
         loss = torch.log1p(growth[:, None, None] * torch.stack(errors)).mean((0, 2))
@@ -386,11 +382,6 @@ class Descent:
         for i, state in enumerate(self._adam.state.values()):
             for name, value in state.items():
                 value.copy_(moments[i][name]) if i in moments else value.zero_()
-
-
-def _compiles() -> bool:
-    """Whether torch can compile kernels for a GPU here."""
-    return find_spec("triton") is not None and any(map(shutil.which, ("cc", "gcc", "clang")))
 
 
 def _held(values: Tensor, scale: Tensor) -> Tensor:
