@@ -11,7 +11,6 @@ REMOVED = {
     "reduction.teacher": "leave it out: a recurrence learns from full-order runs",
     "reduction.unroll": "leave it out: windows grow to half a run",
     "reduction.descent": "set model.descents",
-    "reduction.runs": "set model.runs",
     "reduction.memory": "set model.stress: a state of stress holds what a run went through",
     "reduction.symmetry": "set model.runs: drawn runs take the place of mirror images",
     "scene.reduced": "set reduction, whose keys are those of scene.reduced, at the top",
